@@ -1,0 +1,1 @@
+"""The rig: drives the table and acquires the sensors. Never imports `twin`."""

@@ -1,0 +1,187 @@
+"""The simulated machine: converters and sensors round the plant, paced by any clock.
+
+Nothing in the samples depends on the clock or on how reads are cut: real time, as fast as possible
+and a test see the same run to the bit.
+"""
+
+import numpy as np
+
+from table_io.backends.plant import SIGNALS, Plant
+from table_io.block import Float1D, Float2D
+from table_io.clock import Clock
+from table_io.profile import BadInput, Output, Rig, Sensor, SimulatedTable, Specimen
+
+REPLACE_AFTER_S = 0.02
+
+
+def plant_on(table: SimulatedTable, specimen: Specimen, rate_hz: float) -> Plant:
+    """The plant that a machine card and a specimen describe."""
+    right, left = specimen.gaps_m
+    return Plant(
+        mass_kg=specimen.mass_kg,
+        damper_stiffness_n_m=table.damper_stiffness_n_m,
+        damper_damping_n_s_m=table.damper_damping_n_s_m,
+        bumper_stiffness_n_m=table.bumper_stiffness_n_m,
+        bumper_damping_n_s_m=table.bumper_damping_n_s_m,
+        gap_right_m=right,
+        gap_left_m=left,
+        table_mass_kg=table.moving_mass_kg,
+        servo_bandwidth_hz=table.servo_bandwidth_hz,
+        servo_delay_s=table.servo_delay_ms * 1e-3,
+        payload_reaction=table.payload_reaction,
+        rate_hz=rate_hz,
+    )
+
+
+def played(volts: Float1D, output: Output) -> Float1D:
+    """Command in m, (sample,), as the converter plays it: whole steps, held at the rails."""
+    step = 2 * output.span_v / 2**output.bits
+    half = 2 ** (output.bits - 1)
+    codes = np.clip(np.rint(volts / step), -half, half - 1)
+    metres: Float1D = codes * (step / output.volts_per_m)
+    return metres
+
+
+class Digitiser:
+    """Volts of all sensors from true values: offset, noise, range and steps of the card."""
+
+    def __init__(self, sensors: tuple[Sensor, ...]) -> None:
+        def column(values: list[float]) -> Float2D:
+            return np.array(values, dtype=np.float64)[:, None]
+
+        self._gain = column([s.volts_per_si for s in sensors])
+        # The command wired back has no sensor, and it is never tared: no offset.
+        wired = [s.channel == "drive_disp_m" for s in sensors]
+        offsets = [
+            0.0 if w else s.offset * s.si_per_unit for s, w in zip(sensors, wired, strict=True)
+        ]
+        self._offset = column(offsets)
+        self._noise = column([s.noise_rms * s.si_per_unit for s in sensors])
+        self._half = column([2.0 ** (s.bits - 1) for s in sensors])
+        self._step = column([abs(s.range * s.volts_per_unit) for s in sensors]) / self._half
+
+    def volts(self, values: Float2D, noise: np.random.Generator) -> Float2D:
+        """Volts, (channel, sample), from SI values of the same shape.
+
+        Noise is drawn sample by sample, so the cut of the samples into calls does not change it.
+        """
+        draw = noise.standard_normal(values.shape[::-1]).T
+        codes = np.rint((values + self._offset + self._noise * draw) * self._gain / self._step)
+        digitised: Float2D = np.clip(codes, -self._half, self._half - 1) * self._step
+        return digitised
+
+
+class SimulatedBackend:
+    """The Backend contract on a simulated machine; sample i is taken at start + i / rate_hz."""
+
+    def __init__(self, rig: Rig, specimen: Specimen, rate_hz: float, clock: Clock) -> None:
+        if rig.simulated is None:
+            raise BadInput(f"rig {rig.name}: no [simulated] table; add it, or name another backend")
+        self.channels = rig.channels
+        self.rate_hz = rate_hz
+        self.replace_after = round(REPLACE_AFTER_S * rate_hz)
+        self._rig = rig
+        self._clock = clock
+        self._plant = plant_on(rig.simulated, specimen, rate_hz)
+        self._state = self._plant.rest()
+        self._digitiser = Digitiser(rig.sensors)
+        self._noise = np.random.default_rng([rig.simulated.seed, 0])
+        self._tare_noise = np.random.default_rng([rig.simulated.seed, 1])
+        # Played command in m from sample `_origin` on; before sample 0 the output stands at 0 V.
+        self._command = np.zeros(self._plant.history)
+        self._origin = -self._plant.history
+        self._next = 0
+        self._epoch: float | None = None
+        self._is_open = False
+
+    def open(self) -> None:
+        """Checks the rate and compiles the plant, so that the first read is not late."""
+        if self.rate_hz not in self._rig.rates_hz:
+            allowed = ", ".join(f"{rate:g}" for rate in self._rig.rates_hz)
+            raise BadInput(
+                f"acquisition.rate_hz = {self.rate_hz:g}: rig {self._rig.name} does not sample so; "
+                f"allowed: {allowed}"
+            )
+        nothing = np.empty((len(SIGNALS), 0))
+        self._plant.advance(self._plant.rest(), np.zeros(self._plant.history), nothing)
+        self._is_open = True
+
+    def tare(self, samples: int) -> Float2D:
+        """Volts at rest before precompression, (channel, sample)."""
+        self._demand(self._is_open, "open() comes first")
+        return self._digitiser.volts(np.zeros((len(self.channels), samples)), self._tare_noise)
+
+    def queue(self, index: int, volts: Float1D) -> None:
+        """Replace the command from sample `index` on, (sample,); the last value is held."""
+        self._demand(self._is_open, "open() comes first")
+        earliest = 0 if self._epoch is None else self._next - 1 + self.replace_after
+        if index < earliest:
+            raise ValueError(
+                f"the command from sample {index} on is already in the device; allowed: from "
+                f"{earliest} on ({self.replace_after} after the newest acquired sample)"
+            )
+        if not np.isfinite(volts).all():
+            raise ValueError(f"the command from sample {index} on holds NaN or inf; send volts")
+        oldest = self._next - self._plant.history
+        kept = self._commanded(oldest, index)
+        self._command = np.concatenate([kept, played(volts, self._rig.output)])
+        self._origin = oldest
+
+    def start(self) -> None:
+        """Start output and input at sample 0, now."""
+        self._demand(self._is_open, "open() comes first")
+        self._demand(self._epoch is None, "it runs already; one start() a life")
+        self._epoch = self._clock.now()
+
+    def read(self, samples: int) -> Float2D:
+        """Volts of the next samples, (channel, sample), when they have been taken."""
+        self._clock.wait_until(self.scheduled(self._next + samples - 1))
+        self._demand(self._is_open, "it is closed")
+        first = self._next
+        command = self._commanded(first - self._plant.history, first + samples)
+        signals = np.empty((len(SIGNALS), samples))
+        self._plant.advance(self._state, command, signals)
+        self._next += samples
+        values = self._values(command[self._plant.history :], signals)
+        return self._digitiser.volts(values, self._noise)
+
+    def scheduled(self, index: int) -> float:
+        """Time on the session's clock at which sample `index` is taken, in s."""
+        if self._epoch is None:
+            raise RuntimeError("simulated table: start() comes first")
+        return self._epoch + index / self.rate_hz
+
+    def close(self) -> None:
+        """Release the machine; safe to call twice."""
+        self._is_open = False
+
+    def _demand(self, condition: bool, remedy: str) -> None:
+        if not condition:
+            raise RuntimeError(f"simulated table: {remedy}")
+
+    def _commanded(self, first: int, last: int) -> Float1D:
+        """Played command in m of samples first .. last - 1; beyond the queue its last value."""
+        start, stop = first - self._origin, last - self._origin
+        size = self._command.size
+        if stop <= size:
+            return self._command[start:stop]
+        held = np.full(stop - max(start, size), self._command[-1])
+        return np.concatenate([self._command[start:], held])
+
+    def _values(self, drive: Float1D, signals: Float2D) -> Float2D:
+        """True values in SI, (channel, sample); the two cells of a side share its force."""
+        y, y_acc, x, x_acc, right, left = signals
+        true = {
+            "drive_disp_m": drive,
+            "table_disp_m": y,
+            "table_acc_m_s2": y_acc,
+            "mass_disp_m": x,
+            "mass_acc_m_s2": x_acc,
+            "force_r1_n": 0.5 * right,
+            "force_r2_n": 0.5 * right,
+            "force_l1_n": -0.5 * left,
+            "force_l2_n": -0.5 * left,
+            "damper_force_n": -self._plant.mass_kg * x_acc - right - left,
+            "rel_disp_m": x - y,
+        }
+        return np.array([true[name] for name in self.channels])

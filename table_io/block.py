@@ -1,0 +1,133 @@
+"""A Block: consecutive samples of several channels, labelled by the drive.
+
+The sample index is the time: sample i is taken i / rate_hz seconds after the start of the run.
+Nothing in a calculation ever asks a wall clock.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import numpy.typing as npt
+
+Float1D = npt.NDArray[np.float64]
+Float2D = npt.NDArray[np.float64]
+Int1D = npt.NDArray[np.int64]
+
+
+class Label(IntEnum):
+    """What the drive is doing at a sample."""
+
+    REST = 0  # no motion commanded
+    BLEND = 1  # soft start, soft stop, or change of step: never measured
+    SETTLE = 2  # held cycle before the measured ones
+    MEASURE = 3  # held cycle that enters the PRC point
+    STOP = 4  # decay to rest after a stop or a trip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """Samples index .. index + n - 1 of one stream: `values` is float64 (channel, sample), SI.
+
+    `step`, `label` and `cycle` are int64 (sample): the sweep step (-1 outside), its Label, and the
+    number of the held cycle within the step (-1 outside held cycles).
+    """
+
+    stream: str
+    index: int
+    rate_hz: float
+    channels: tuple[str, ...]
+    values: Float2D
+    step: Int1D
+    label: Int1D
+    cycle: Int1D
+
+    def __post_init__(self) -> None:
+        shape = (len(self.channels), self.step.size)
+        if self.values.shape != shape or self.label.size != shape[1] or self.cycle.size != shape[1]:
+            raise ValueError(f"block values {self.values.shape} and labels do not fit {shape}")
+        for array in (self.values, self.step, self.label, self.cycle):
+            array.setflags(write=False)
+
+    def __len__(self) -> int:
+        return self.step.size
+
+    @property
+    def end(self) -> int:
+        """Index of the first sample after this block."""
+        return self.index + self.step.size
+
+    @property
+    def time_s(self) -> Float1D:
+        """Time of each sample in s since the start of the run, (sample,)."""
+        return (self.index + np.arange(len(self), dtype=np.float64)) / self.rate_hz
+
+    def channel(self, name: str) -> Float1D:
+        """Samples of one channel, (sample,); KeyError names what there is."""
+        try:
+            return self.values[self.channels.index(name)]
+        except ValueError:
+            raise KeyError(f"{name} is not in {self.stream}: {', '.join(self.channels)}") from None
+
+    def cut(self, first: int, last: int) -> "Block":
+        """Samples with index first <= i < last, as a view; both inside the block."""
+        window = slice(first - self.index, last - self.index)
+        return Block(
+            self.stream,
+            first,
+            self.rate_hz,
+            self.channels,
+            self.values[:, window],
+            self.step[window],
+            self.label[window],
+            self.cycle[window],
+        )
+
+    def identical(self, other: "Block") -> bool:
+        """True if every field is equal to the bit (NaN equal to the same NaN)."""
+        return (
+            (self.stream, self.index, self.rate_hz, self.channels)
+            == (other.stream, other.index, other.rate_hz, other.channels)
+            and self.values.tobytes() == other.values.tobytes()
+            and all(
+                np.array_equal(getattr(self, name), getattr(other, name))
+                for name in ("step", "label", "cycle")
+            )
+        )
+
+
+def join(blocks: Sequence[Block]) -> Block:
+    """One block from consecutive ones; ValueError where samples are missing between them."""
+    for left, right in zip(blocks, blocks[1:], strict=False):
+        if left.end != right.index or left.channels != right.channels:
+            raise ValueError(f"block at {right.index} does not continue the one that ends at {left.end}")
+    head = blocks[0]
+    if len(blocks) == 1:
+        return head
+    return Block(
+        head.stream,
+        head.index,
+        head.rate_hz,
+        head.channels,
+        np.concatenate([b.values for b in blocks], axis=1),
+        np.concatenate([b.step for b in blocks]),
+        np.concatenate([b.label for b in blocks]),
+        np.concatenate([b.cycle for b in blocks]),
+    )
+
+
+def recut(blocks: Iterable[Block], samples: int) -> Iterable[Block]:
+    """The same samples in blocks of `samples` (the last one may be shorter)."""
+    rest: list[Block] = []
+    held = 0
+    for block in blocks:
+        rest.append(block)
+        held += len(block)
+        while held >= samples:
+            whole = join(rest)
+            yield whole.cut(whole.index, whole.index + samples)
+            held -= samples
+            rest = [whole.cut(whole.index + samples, whole.end)] if held else []
+    if held:
+        yield join(rest)

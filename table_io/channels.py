@@ -1,0 +1,64 @@
+"""The one table of channels: name, unit, what is positive, one sentence each.
+
+Right is positive everywhere. The names are also the columns of CSV and Parquet files.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from table_io.block import Block, Float1D
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One measured quantity; `unit` is SI."""
+
+    name: str
+    unit: str
+    positive: str
+    meaning: str
+
+
+CHANNELS: tuple[Channel, ...] = (
+    Channel("drive_disp_m", "m", "right", "Commanded table displacement, acquired back."),
+    Channel("table_disp_m", "m", "right", "Table displacement in the laboratory frame."),
+    Channel("table_acc_m_s2", "m/s2", "right", "Table acceleration in the laboratory frame."),
+    Channel("mass_disp_m", "m", "right", "Total displacement of the mass, laboratory frame."),
+    Channel("mass_acc_m_s2", "m/s2", "right", "Total acceleration of the mass, laboratory frame."),
+    Channel("force_r1_n", "N", "compression", "First load cell on the right bumper."),
+    Channel("force_r2_n", "N", "compression", "Second load cell on the right bumper."),
+    Channel("force_l1_n", "N", "compression", "First load cell on the left bumper."),
+    Channel("force_l2_n", "N", "compression", "Second load cell on the left bumper."),
+    Channel("damper_force_n", "N", "resists motion to the right", "Damper force, component tests."),
+    Channel("rel_disp_m", "m", "right", "Mass minus table displacement, where measured itself."),
+)
+BY_NAME = {channel.name: channel for channel in CHANNELS}
+
+RIGHT_CELLS = ("force_r1_n", "force_r2_n")
+LEFT_CELLS = ("force_l1_n", "force_l2_n")
+
+
+def rel_disp(block: Block) -> Float1D:
+    """u in m, right positive, (sample,): measured itself, else mass minus table displacement.
+
+    All NaN where the channels are missing: a lost sensor is not a zero.
+    """
+    if "rel_disp_m" in block.channels:
+        return block.channel("rel_disp_m")
+    if {"mass_disp_m", "table_disp_m"} <= set(block.channels):
+        return block.channel("mass_disp_m") - block.channel("table_disp_m")
+    return np.full(len(block), np.nan)
+
+
+def contact_forces(block: Block) -> tuple[Float1D, Float1D]:
+    """(F_R, F_L) in N, (sample,) each: F_R = r1 + r2 >= 0, F_L = -(l1 + l2) <= 0.
+
+    NaN where the load cells of a side are missing.
+    """
+    sides = []
+    for cells, sign in ((RIGHT_CELLS, 1.0), (LEFT_CELLS, -1.0)):
+        present = [block.channel(name) for name in cells if name in block.channels]
+        total = present[0] if len(present) == 1 else sum(present, np.zeros(len(block)))
+        sides.append(sign * total if present else np.full(len(block), np.nan))
+    return sides[0], sides[1]

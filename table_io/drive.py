@@ -1,0 +1,258 @@
+"""Stepped sine of constant peak acceleration -> displacement command, sample by sample.
+
+A drive is a value: a tuple of segments, each a closed form of the sample index, so any sample can be
+had at any time and cutting it into blocks changes no bit. Phase is continuous throughout; amplitude
+and frequency change by quintic blends (C2), because switching at a zero crossing would jump the
+table's velocity.
+
+In a segment, with s(x) = 6x^5 - 15x^4 + 10x^3 over its length,
+    f = f0 + (f1 - f0) s,   level = l0 + (l1 - l0) s,   theta = 2 pi (phase0 + integral f dt)
+    displacement = -level / (2 pi f)^2 sin(theta), so that in a held segment the acceleration is
+    level sin(theta).
+"""
+
+import math
+from bisect import bisect_right
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from table_io.block import Float1D, Int1D, Label
+from table_io.profile import Profile
+from table_io.records import Step
+
+PEAK_RATIO = 1.05  # of the level: the most acceleration that a blend may ask for
+RAMP_CYCLES = 2.0  # a soft start over one cycle would peak at 1.12, over two at 1.02
+RAMP_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """`count` samples from `start` on; frequencies in Hz, levels in m/s2, phase0 in cycles."""
+
+    start: int
+    count: int
+    label: Label
+    step: int
+    f0: float
+    f1: float
+    level0: float
+    level1: float
+    phase0: float
+    cycles: int = 0  # held cycles, 0 in a blend
+    settle: int = 0  # the first of them that are not measured
+
+    @property
+    def end(self) -> int:
+        return self.start + self.count
+
+    def phase(self, x: Float1D, rate_hz: float) -> Float1D:
+        """Phase in cycles at the fractions x of the segment."""
+        ramp = x**4 * (2.5 + x * (-3.0 + x))
+        return self.phase0 + self.count / rate_hz * (self.f0 * x + (self.f1 - self.f0) * ramp)
+
+
+def smoothstep(x: Float1D) -> Float1D:
+    """Quintic blend from 0 at x = 0 to 1 at x = 1, first and second derivative 0 at both ends."""
+    return x**3 * (10.0 + x * (-15.0 + 6.0 * x))
+
+
+def displacement(segment: Segment, x: Float1D, rate_hz: float) -> Float1D:
+    """Commanded displacement in m at the fractions x of a segment."""
+    s = smoothstep(x)
+    f = segment.f0 + (segment.f1 - segment.f0) * s
+    level = segment.level0 + (segment.level1 - segment.level0) * s
+    return -level / (2 * math.pi * f) ** 2 * np.sin(2 * math.pi * segment.phase(x, rate_hz))
+
+
+def _quadratures(
+    segment: Segment, x: Float1D, rate_hz: float
+) -> tuple[Float1D, Float1D, Float1D, Float1D]:
+    """(v_sin, v_cos, a_sin, a_cos): velocity = v_sin sin + v_cos cos, acceleration likewise."""
+    duration = segment.count / rate_hz
+    s = smoothstep(x)
+    ds = 30 * x**2 * (1 - x) ** 2 / duration
+    dds = 60 * x * (1 - x) * (1 - 2 * x) / duration**2
+    df, dl = segment.f1 - segment.f0, segment.level1 - segment.level0
+    f, level = segment.f0 + df * s, segment.level0 + dl * s
+    w = 2 * math.pi * f
+    g = level / w**2
+    dg = (dl * ds - 2 * level * df * ds / f) / w**2
+    ddg = (
+        dl * dds - 4 * dl * df * ds**2 / f - 2 * level * df * dds / f + 6 * level * (df * ds / f) ** 2
+    ) / w**2
+    dw = 2 * math.pi * df * ds
+    return -dg, -g * w, g * w**2 - ddg, -(2 * dg * w + g * dw)
+
+
+def motion(segment: Segment, x: Float1D, rate_hz: float) -> tuple[Float1D, Float1D]:
+    """(velocity in m/s, acceleration in m/s2) of the ideal table at the fractions x."""
+    v_sin, v_cos, a_sin, a_cos = _quadratures(segment, x, rate_hz)
+    theta = 2 * math.pi * segment.phase(x, rate_hz)
+    sin, cos = np.sin(theta), np.cos(theta)
+    return v_sin * sin + v_cos * cos, a_sin * sin + a_cos * cos
+
+
+def worst_acceleration(segment: Segment, rate_hz: float) -> float:
+    """Largest acceleration in m/s2 that the segment can ask for at its worst phase."""
+    x = np.linspace(0.0, 1.0, 401)
+    _, _, a_sin, a_cos = _quadratures(segment, x, rate_hz)
+    return float(np.hypot(a_sin, a_cos).max())
+
+
+@dataclass(frozen=True)
+class Drive:
+    """The whole command. From sample `decay_at` on it is multiplied down to rest, if that is set."""
+
+    rate_hz: float
+    segments: tuple[Segment, ...]
+    steps: tuple[Step, ...]
+    decay_at: int | None = None
+
+    @cached_property
+    def _starts(self) -> list[int]:
+        return [segment.start for segment in self.segments]
+
+    def segment_at(self, index: int) -> Segment:
+        """The segment that sample `index` lies in; the first or last one outside the drive."""
+        return self.segments[max(bisect_right(self._starts, index) - 1, 0)]
+
+    @property
+    def planned_end(self) -> int:
+        """Index from which the drive would be at rest if it were not stopped."""
+        return self.segments[-1].end
+
+    @cached_property
+    def decay_samples(self) -> int:
+        """Length of the decay: max(2 cycles, 0.5 s) at the frequency where it begins."""
+        if self.decay_at is None:
+            return 0
+        segment = self.segment_at(self.decay_at)
+        x = np.clip(np.array([(self.decay_at - segment.start) / segment.count]), 0.0, 1.0)
+        f = segment.f0 + (segment.f1 - segment.f0) * float(smoothstep(x)[0])
+        return math.ceil(max(RAMP_CYCLES / f, RAMP_S) * self.rate_hz)
+
+    @property
+    def rest_from(self) -> int:
+        """Index from which the command is exactly zero."""
+        if self.decay_at is None:
+            return self.planned_end
+        return min(self.decay_at + self.decay_samples, max(self.planned_end, self.decay_at))
+
+    def decayed(self, at: int) -> "Drive":
+        """The same drive, brought to rest smoothly from sample `at` on."""
+        return replace(self, decay_at=at if self.decay_at is None else min(at, self.decay_at))
+
+    def command(self, first: int, count: int) -> Float1D:
+        """Displacement in m of samples first .. first + count - 1; zero before and after."""
+        out = np.zeros(count)
+        for segment, window, x in self._pieces(first, count):
+            out[window] = displacement(segment, x, self.rate_hz)
+        if self.decay_at is not None:
+            x = (np.arange(first, first + count) - self.decay_at) / self.decay_samples
+            out *= 1.0 - smoothstep(np.clip(x, 0.0, 1.0))
+        return out
+
+    def acceleration(self, first: int, count: int) -> Float1D:
+        """Acceleration in m/s2 of an ideal table on the undecayed drive, (count,)."""
+        out = np.zeros(count)
+        for segment, window, x in self._pieces(first, count):
+            out[window] = motion(segment, x, self.rate_hz)[1]
+        return out
+
+    def labels(self, first: int, count: int) -> tuple[Int1D, Int1D, Int1D]:
+        """(step, label, held cycle) of each sample, (count,) each; -1 outside the sweep."""
+        step = np.full(count, -1, dtype=np.int64)
+        label = np.full(count, int(Label.REST), dtype=np.int64)
+        cycle = np.full(count, -1, dtype=np.int64)
+        for segment, window, x in self._pieces(first, count):
+            step[window] = segment.step
+            label[window] = segment.label
+            if segment.cycles:
+                done = np.floor(x * segment.count * segment.f0 / self.rate_hz).astype(np.int64)
+                cycle[window] = np.minimum(done, segment.cycles - 1)
+                label[window] = np.where(
+                    cycle[window] >= segment.settle, int(Label.MEASURE), int(Label.SETTLE)
+                )
+        if self.decay_at is not None:
+            index = np.arange(first, first + count)
+            stopping = (index >= self.decay_at) & (index < self.rest_from)
+            label[stopping] = int(Label.STOP)
+            label[index >= self.rest_from] = int(Label.REST)
+            cycle[index >= self.decay_at] = -1
+            step[index >= self.rest_from] = -1
+        return step, label, cycle
+
+    def _pieces(self, first: int, count: int) -> list[tuple[Segment, slice, Float1D]]:
+        """(segment, window in the asked samples, fractions of the segment) for what overlaps."""
+        last = first + count
+        pieces = []
+        place = max(bisect_right(self._starts, first) - 1, 0)
+        for segment in self.segments[place:]:
+            if segment.start >= last:
+                break
+            lo, hi = max(first, segment.start), min(last, segment.end)
+            if lo < hi:
+                x = (np.arange(lo, hi) - segment.start) / segment.count
+                pieces.append((segment, slice(lo - first, hi - first), x))
+        return pieces
+
+
+def plan(profile: Profile) -> Drive:
+    """The drive of a test profile: rest, soft start, the steps with blends between, soft stop."""
+    rate, sweep = profile.acquisition.rate_hz, profile.sweep
+    steps = sweep.steps
+    segments: list[Segment] = []
+    at, phase = math.ceil(profile.acquisition.rest_s * rate), 0.0
+
+    def add(segment: Segment) -> None:
+        nonlocal at, phase
+        segments.append(segment)
+        at = segment.end
+        phase = float(segment.phase(np.ones(1), rate)[0]) % 1.0
+
+    before = Step(-1, "forward", steps[0].frequency_hz, 0.0)
+    for step in steps:
+        if (before.frequency_hz, before.acceleration_m_s2) != (
+            step.frequency_hz,
+            step.acceleration_m_s2,
+        ):
+            add(_blend(before, step, step.index, at, phase, sweep.blend_cycles, rate))
+        count = math.ceil(sweep.cycles * rate / step.frequency_hz)
+        level, f = step.acceleration_m_s2, step.frequency_hz
+        settle = sweep.cycles - sweep.measured_cycles
+        add(
+            Segment(
+                at, count, Label.MEASURE, step.index, f, f, level, level, phase, sweep.cycles, settle
+            )
+        )
+        before = step
+    rest = replace(before, acceleration_m_s2=0.0)
+    add(_blend(before, rest, before.index, at, phase, sweep.blend_cycles, rate))
+    return Drive(rate, tuple(segments), steps)
+
+
+def _blend(
+    a: Step, b: Step, step: int, at: int, phase: float, cycles: float, rate_hz: float
+) -> Segment:
+    """The shortest blend from a to b that asks for no more than 1.05 of the larger level."""
+    level = max(a.acceleration_m_s2, b.acceleration_m_s2)
+    ramp = min(a.acceleration_m_s2, b.acceleration_m_s2) == 0.0
+    mean_hz = 0.5 * (a.frequency_hz + b.frequency_hz)
+    seconds = max(RAMP_CYCLES / mean_hz, RAMP_S) if ramp else cycles / mean_hz
+    while True:
+        segment = Segment(
+            at,
+            math.ceil(seconds * rate_hz),
+            Label.BLEND,
+            step,
+            a.frequency_hz,
+            b.frequency_hz,
+            a.acceleration_m_s2,
+            b.acceleration_m_s2,
+            phase,
+        )
+        if worst_acceleration(segment, rate_hz) <= PEAK_RATIO * level:
+            return segment
+        seconds += 0.25 / mean_hz

@@ -1,0 +1,196 @@
+"""The closed set of small records that flow beside Blocks.
+
+Every record carries the sample index from which it holds, so a replay can put it back in its place.
+"""
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One step of the sweep as planned: `direction` is "forward" or "backward"."""
+
+    index: int
+    direction: str
+    frequency_hz: float
+    acceleration_m_s2: float
+
+
+@dataclass(frozen=True, slots=True)
+class RunStart:
+    """All that is needed to understand and repeat the run: the texts are whole TOML files."""
+
+    index: int
+    run: str
+    name: str
+    source: str  # "table", "model": who made the measured stream
+    profile_toml: str
+    rig_toml: str
+    model_toml: str
+    rate_hz: float
+    block_samples: int
+    channels: tuple[str, ...]
+    steps: tuple[Step, ...]
+    planned_samples: int
+    tare: dict[str, float]  # SI value subtracted from each channel, taken before precompression
+    versions: dict[str, str]
+    host: str
+    started_at: str  # ISO 8601, for people; never enters a calculation
+    epoch_s: float  # monotonic clock of the host at sample 0; only latencies are taken against it
+
+
+@dataclass(frozen=True, slots=True)
+class Params:
+    """Model parameters in SI that hold from sample `index` on."""
+
+    index: int
+    values: dict[str, float]
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Model against measurement over samples index .. index + count - 1, no wall clock inside.
+
+    Per channel, sums over the samples: measured squared, error squared of the free-running twin,
+    error squared of the twin that restarts from the measured state. NaN where there is nothing to
+    compare.
+    """
+
+    index: int
+    count: int
+    channels: tuple[str, ...]
+    measured_ss: tuple[float, ...]
+    free_error_ss: tuple[float, ...]
+    window_error_ss: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Extremes:
+    """Extremes of one forcing cycle, SI, right positive; `onsets_*` are sample indices."""
+
+    u_max: float
+    u_min: float
+    a_max: float
+    a_min: float
+    force_r: float  # max of F_R, N
+    force_l: float  # max of -F_L, N
+    onsets_r: tuple[int, ...]
+    onsets_l: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Cycle:
+    """One held forcing cycle that ends before sample `index`."""
+
+    index: int
+    step: int
+    cycle: int
+    label: int  # Label.SETTLE or Label.MEASURE
+    count: int
+    measured: Extremes | None
+    twin: Extremes | None
+
+
+@dataclass(frozen=True, slots=True)
+class Quantities:
+    """What the laboratory reports at a step (Stefani et al., Eq. 1); all ratios >= 0.
+
+    `drift` is the change of eta_d over the measured cycles relative to its mean, the part of a
+    transient that is left; `spread` its range over them relative to its mean.
+    """
+
+    eta_d: float
+    eta_a: float
+    eta_r: float
+    eta_l: float
+    r_r: float
+    r_l: float
+    impacts_right: tuple[int, ...]
+    impacts_left: tuple[int, ...]
+    drift: float
+    spread: float
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """The PRC point of a step whose measured cycles end before sample `index`."""
+
+    index: int
+    step: int
+    direction: str
+    frequency_hz: float
+    measured: Quantities | None
+    twin: Quantities | None
+    table_acc_peak_m_s2: float
+    table_acc_fundamental_m_s2: float
+    thd: float
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something a person should read: `kind` is one word."""
+
+    index: int
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Samples index .. index + count - 1 that are not a true measurement of `channel` ("" = all)."""
+
+    index: int
+    count: int
+    channel: str
+    reason: str  # "lost", "late", "clipped"
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A component failed: what it should have made for from_index .. to_index - 1 is missing.
+
+    A replay does the same: nothing in between, then a fresh start at `to_index`.
+    """
+
+    index: int
+    component: str
+    from_index: int
+    to_index: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """How punctual a component was, over all blocks so far, in ms; `missed` counts deadlines.
+
+    The only record with a wall clock in it; no calculation reads it.
+    """
+
+    index: int
+    component: str
+    p50_ms: float
+    p99_ms: float
+    max_ms: float
+    missed: int
+    blocks: int
+    cpu_share: float
+    scheduler: str
+
+
+@dataclass(frozen=True, slots=True)
+class RunStop:
+    """The end: `index` samples were acquired; verdict complete, stopped, aborted or halted."""
+
+    index: int
+    verdict: str
+    reason: str
+    states: tuple[str, ...] = field(default=())
+
+
+Record = (
+    RunStart | Params | Comparison | Cycle | Point | Event | Gap | Fault | Timing | RunStop
+)
+RECORDS: tuple[type, ...] = (
+    RunStart, Params, Comparison, Cycle, Point, Event, Gap, Fault, Timing, RunStop,
+)  # fmt: skip

@@ -1,0 +1,175 @@
+"""The rig's loop: a generator that plays a drive on a backend and yields Blocks and records.
+
+States: idle, checking, armed, running, stopping, at rest, fault. Every way to end decays the command
+to rest: it is always queued to end there, so the decay also plays if this process dies.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from table_io.backends import Backend
+from table_io.block import Block, Float1D, Float2D
+from table_io.calibration import command_to_volts, tare_from, to_si
+from table_io.clock import Clock
+from table_io.drive import Drive
+from table_io.limits import tripped
+from table_io.profile import Profile, Rig
+from table_io.records import Event, Gap, Record, RunStart, RunStop
+
+TARE_S = 1.0
+DECISION_S = 0.05  # from the decision to stop to the first changed sample, at the most
+TAIL_FACTOR = 0.999  # of a sensor's range: beyond it a sample counts as clipped
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What a session plays, and on what machine."""
+
+    profile: Profile
+    rig: Rig
+    drive: Drive
+
+
+@dataclass(slots=True)
+class Punctuality:
+    """Lateness of each block in s: from its last sample's scheduled time to when it was handed on."""
+
+    late_s: list[float] = field(default_factory=list)
+
+
+Describe = Callable[[dict[str, float], float], RunStart]  # (tare, epoch_s) -> start record
+Commands = Callable[[], str | None]  # "stop" or None; must not wait
+
+
+def play(
+    setup: Setup,
+    backend: Backend,
+    clock: Clock,
+    describe: Describe,
+    commands: Commands,
+    punctuality: Punctuality | None = None,
+) -> Iterator[Block | Record]:
+    """RunStart, then every Block with the records that belong to it, then RunStop.
+
+    Closing the generator early also brings the table to rest before the machine is released.
+    """
+    states = ["idle", "checking"]
+    backend.open()
+    run = _Run(setup, backend)
+    try:
+        tare = tare_from(
+            backend.tare(int(TARE_S * setup.drive.rate_hz)), setup.rig.sensors
+        )
+        states.append("armed")
+        run.feed()
+        backend.start()
+        states.append("running")
+        yield describe(tare, backend.scheduled(0))
+        verdict, reason = "complete", "the whole drive was played"
+        while run.acquired < run.end:
+            block, clipped = run.acquire(tare)
+            if punctuality is not None:
+                punctuality.late_s.append(clock.now() - backend.scheduled(block.end - 1))
+            yield block
+            yield from _gaps(block, clipped)
+            if states[-1] == "running":
+                trip = tripped(block, setup.rig)
+                asked = commands()
+                if trip or asked == "stop":
+                    verdict = "aborted" if trip else "stopped"
+                    reason = trip or "asked to stop"
+                    states.append("stopping")
+                    run.stop()
+                    yield Event(block.end, "stop", f"{reason}; decaying to rest")
+            run.feed()
+        states.append("at rest")
+        yield RunStop(run.acquired, verdict, reason, tuple(states))
+    finally:
+        run.to_rest()
+        backend.close()
+
+
+class _Run:
+    """The moving part of a session: what has been queued, what has been acquired."""
+
+    def __init__(self, setup: Setup, backend: Backend) -> None:
+        self.setup = setup
+        self.backend = backend
+        self.drive = setup.drive
+        self.acquired = 0
+        self._queued = 0  # samples of the true drive that are queued; a decay follows them
+        self._rest = round(setup.profile.acquisition.rest_s * self.drive.rate_hz)
+
+    @property
+    def end(self) -> int:
+        """Index at which the recording ends: the drive at rest, the servo too."""
+        return self.drive.rest_from + self._rest
+
+    def _volts(self, displacement_m: Float1D) -> Float1D:
+        return command_to_volts(displacement_m, self.setup.rig.output)
+
+    def feed(self) -> None:
+        """Keep `lead_s` of checked command queued, with a decay to rest after it."""
+        lead = round(self.setup.rig.output.lead_s * self.drive.rate_hz)
+        if self._queued - self.acquired >= lead or self._queued >= self.drive.rest_from:
+            return
+        first, last = self._queued, self.acquired + 2 * lead
+        tail = self.drive.decayed(last)
+        self.backend.queue(first, self._volts(tail.command(first, tail.rest_from + 1 - first)))
+        self._queued = last
+
+    def stop(self) -> None:
+        """Replace what is queued by a decay from the first sample that can still be changed."""
+        room = max(round(DECISION_S * self.drive.rate_hz), self.backend.replace_after)
+        at = self.acquired + room
+        if at >= self.drive.rest_from:
+            return
+        self.drive = self.drive.decayed(at)
+        self.backend.queue(at, self._volts(self.drive.command(at, self.drive.rest_from + 1 - at)))
+        self._queued = self.drive.rest_from
+
+    def acquire(self, tare: dict[str, float]) -> tuple[Block, Float2D]:
+        """(the next block in SI, True where a sample lies at its sensor's range)."""
+        rig = self.setup.rig
+        count = min(self.setup.profile.acquisition.block_samples, self.end - self.acquired)
+        volts = self.backend.read(count)
+        full = np.array([abs(one.range_si * one.volts_per_si) for one in rig.sensors])
+        step, label, cycle = self.drive.labels(self.acquired, count)
+        block = Block(
+            "meas",
+            self.acquired,
+            self.drive.rate_hz,
+            rig.channels,
+            to_si(volts, rig.sensors, tare),
+            step,
+            label,
+            cycle,
+        )
+        self.acquired += count
+        return block, np.abs(volts) >= TAIL_FACTOR * full[:, None]
+
+    def to_rest(self) -> None:
+        """Decay and wait for rest where the session ends before the table is at rest."""
+        if not 0 < self.acquired < self.drive.rest_from:
+            return
+        self.stop()
+        while self.acquired < self.drive.rest_from:
+            count = min(200, self.drive.rest_from - self.acquired)
+            self.backend.read(count)
+            self.acquired += count
+
+
+def _gaps(block: Block, clipped: Float2D) -> Iterator[Gap]:
+    """A Gap for every channel of the block with lost or clipped samples."""
+    if not (clipped.any() or np.isnan(block.values).any()):
+        return
+    for name, values, at_range in zip(block.channels, block.values, clipped, strict=True):
+        for bad, reason in ((np.isnan(values), "lost"), (at_range, "clipped")):
+            places = np.flatnonzero(bad)
+            if places.size:
+                first = int(places[0])
+                yield Gap(block.index + first, int(places[-1]) - first + 1, name, reason)
+
+

@@ -1,0 +1,173 @@
+"""`step(setup, state, block) -> state, items`: everything that the twin says about a block.
+
+Pure: the same samples give the same items to the bit, however they are cut into blocks. Live, replay
+and `--speed max` call this same function.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from table_io.block import Block, Float1D, Label
+from table_io.channels import contact_forces, rel_disp
+from table_io.profile import Profile
+from table_io.records import Cycle, Event, Params, Point, Record, Step
+from twin.compare.curves import sudden
+from twin.compare.cycles import Motion, Scale, Touching, extremes, point
+from twin.compare.windows import Tracks, TwinSetup, begin, follow
+from twin.model.parameters import Parameters, resonance
+
+SHORT = 3  # samples by which a held cycle may miss its length and still be whole
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """All that a twin needs to know of a run."""
+
+    twin: TwinSetup
+    scale: Scale
+    steps: tuple[Step, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """Before sample `tracks.index`. `held` are the pieces of the unfinished held cycle."""
+
+    tracks: Tracks
+    key: tuple[int, int] | None = None  # (step, cycle) of the last sample seen; None = unknown
+    held: tuple[tuple[Block, Block], ...] = ()
+    cycles: tuple[Cycle, ...] = ()  # of the step under way
+    base_acc: tuple[Float1D, ...] = ()  # of its measured cycles
+    touching: tuple[Touching, Touching] = field(default=((False, False), (False, False)))
+    last_point: Point | None = None
+
+
+def prepare(
+    profile: Profile, parameters: Parameters, steps: tuple[Step, ...], from_rest: bool = False
+) -> Setup:
+    """The setup of a run. u* and a* are the model's free-flight maxima, continuous in frequency."""
+    rate = profile.acquisition.rate_hz
+    level = max(step.acceleration_m_s2 for step in steps)
+    u_star, a_star, _ = resonance(parameters, level)
+    contact_n = profile.comparison.contact_n
+    twin = TwinSetup(
+        parameters,
+        rate,
+        round(profile.comparison.window_s * rate),
+        profile.acquisition.block_samples,
+        contact_n,
+        from_rest,
+    )
+    scale = Scale(parameters, rate, contact_n, u_star, a_star)
+    return Setup(twin, scale, steps)
+
+
+def start(setup: Setup, index: int = 0) -> tuple[State, list[Record]]:
+    """The state of a twin that starts at sample `index`, and the parameters it starts with."""
+    params = Params(index, setup.twin.parameters.as_dict(), "start")
+    return State(begin(setup.twin, index)), [params]
+
+
+def step(setup: Setup, state: State, block: Block) -> tuple[State, list[Block | Record]]:
+    """State after the block; predicted Block, Comparisons, Cycles, Points, Events it completes."""
+    if block.index != state.tracks.index:
+        state = State(begin(setup.twin, block.index), last_point=state.last_point)
+    tracks, predicted, comparisons = follow(setup.twin, state.tracks, block)
+    items: list[Block | Record] = [predicted, *comparisons]
+    state = replace(state, tracks=tracks)
+    changes = np.flatnonzero(np.diff(block.step) | np.diff(block.cycle)) + 1
+    edges = [0, *changes.tolist(), len(block)]
+    for first, last in zip(edges, edges[1:], strict=False):
+        key = (int(block.step[first]), int(block.cycle[first]))
+        if key != state.key:
+            state, made = _finish(setup, state, key)
+            items.extend(made)
+        if key[1] >= 0 and (state.held or _begins(state, key)):
+            piece = (
+                block.cut(block.index + first, block.index + last),
+                predicted.cut(block.index + first, block.index + last),
+            )
+            state = replace(state, held=(*state.held, piece))
+        state = replace(state, key=key)
+    return state, items
+
+
+def _begins(state: State, key: tuple[int, int]) -> bool:
+    """True at the true first sample of a held cycle, not where the twin woke up inside it."""
+    return state.key is not None and state.key != key
+
+
+def _finish(
+    setup: Setup, state: State, key: tuple[int, int]
+) -> tuple[State, list[Block | Record]]:
+    """Close the cycle that ended, and the step with it if another step or no cycle follows."""
+    items: list[Block | Record] = []
+    if state.held and state.key is not None:
+        state, cycle = _cycle(setup, state, *state.key)
+        items.extend(cycle)
+    if state.key is not None and state.cycles and (key[1] < 0 or key[0] != state.key[0]):
+        state, made = _point(setup, state)
+        items.extend(made)
+    return state, items
+
+
+def _motions(held: tuple[tuple[Block, Block], ...]) -> tuple[Motion, Motion]:
+    """(measured, free twin) motion over the pieces of a cycle."""
+
+    def whole(columns: list[Float1D]) -> Float1D:
+        return np.concatenate(columns)
+
+    forces = [contact_forces(block) for block, _ in held]
+    nothing = [np.full(len(block), np.nan) for block, _ in held]
+    has_acc = "mass_acc_m_s2" in held[0][0].channels
+    measured = Motion(
+        whole([rel_disp(block) for block, _ in held]),
+        whole([block.channel("mass_acc_m_s2") for block, _ in held] if has_acc else nothing),
+        whole([right for right, _ in forces]),
+        whole([-left for _, left in forces]),
+    )
+    twin = Motion(
+        whole([one.channel("free/rel_disp_m") for _, one in held]),
+        whole([one.channel("free/mass_acc_m_s2") for _, one in held]),
+        whole([2 * one.channel("free/force_r1_n") for _, one in held]),
+        whole([2 * one.channel("free/force_l1_n") for _, one in held]),
+    )
+    return measured, twin
+
+
+def _cycle(setup: Setup, state: State, step: int, number: int) -> tuple[State, list[Record]]:
+    """The finished cycle, unless it was cut short by a stop."""
+    first, end = state.held[0][0].index, state.held[-1][0].end
+    length = setup.twin.rate_hz / setup.steps[step].frequency_hz
+    held, state = state.held, replace(state, held=())
+    if end - first < length - SHORT:
+        return state, []
+    measured, twin = _motions(held)
+    from_measured, touch_m = extremes(measured, first, setup.scale, state.touching[0])
+    from_twin, touch_t = extremes(twin, first, setup.scale, state.touching[1])
+    label = int(held[0][0].label[0])
+    cycle = Cycle(end, step, number, label, end - first, from_measured, from_twin)
+    base_acc = state.base_acc
+    if label == Label.MEASURE:
+        base_acc = (*base_acc, *(block.channel("table_acc_m_s2") for block, _ in held))
+    return replace(
+        state, cycles=(*state.cycles, cycle), base_acc=base_acc, touching=(touch_m, touch_t)
+    ), [cycle]
+
+
+def _point(setup: Setup, state: State) -> tuple[State, list[Record]]:
+    """The step's PRC point, where at least one measured cycle is whole, and a hint of a jump."""
+    items: list[Record] = []
+    last = state.last_point
+    if state.base_acc:
+        last = point(
+            setup.steps[state.cycles[-1].step],
+            list(state.cycles),
+            np.concatenate(state.base_acc),
+            setup.scale,
+        )
+        items.append(last)
+        if hint := sudden(state.last_point, last):
+            items.append(Event(last.index, "jump", hint))
+    return replace(state, cycles=(), base_acc=(), last_point=last), items
+

@@ -1,0 +1,1 @@
+"""What the rig should do: parameters, effects, exact solver."""

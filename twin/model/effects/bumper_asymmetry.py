@@ -1,0 +1,41 @@
+"""The right bumper is not as stiff as the left one.
+
+    K_R = 2 K ratio / (1 + ratio),  K_L = 2 K / (1 + ratio),  K the mean, which is kept
+
+Damping stays, so the relaxation times C_j/K_j part as well. On bumpers that differ already the
+ratio multiplies theirs.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from twin.model.effects.effect import Effect, EffectParameter
+
+if TYPE_CHECKING:
+    from twin.model.parameters import Parameters
+
+
+def _change(parameters: "Parameters", values: Mapping[str, float]) -> "Parameters":
+    total = parameters.bumper_stiffness_r + parameters.bumper_stiffness_l
+    ratio = values["ratio"] * parameters.bumper_stiffness_r / parameters.bumper_stiffness_l
+    return replace(
+        parameters,
+        bumper_stiffness_r=total * ratio / (1 + ratio),
+        bumper_stiffness_l=total / (1 + ratio),
+    )
+
+
+BUMPER_ASYMMETRY = Effect(
+    id="bumper_asymmetry",
+    term="K_R u_R on the right, K_L u_L on the left, K_R/K_L = ratio",
+    parameters=(
+        EffectParameter("ratio", "", 0.2, 5.0, 1.0, "Right over left bumper stiffness, K_R/K_L."),
+    ),
+    change=_change,
+    residual=(
+        "In contact only, and of the same sign on both sides: force in proportion to |u_j|, so even "
+        "harmonics of the drive. Slopes of the two F_j-v_j loops differ; touching points do not."
+    ),
+    confused_with=("gap_offset", "bumper_hardening"),
+)

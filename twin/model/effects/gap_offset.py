@@ -1,0 +1,37 @@
+"""The mass does not rest midway between the bumpers.
+
+    G0R = G/2 + offset,  G0L = G/2 - offset;  the total gap G is kept
+
+Where the specimen states unequal gaps the offset comes on top of them. A side without a bumper
+(infinite gap) stays without.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from twin.model.effects.effect import Effect, EffectParameter
+
+if TYPE_CHECKING:
+    from twin.model.parameters import Parameters
+
+
+def _change(parameters: "Parameters", values: Mapping[str, float]) -> "Parameters":
+    offset = values["offset"]
+    return replace(parameters, gap_r=parameters.gap_r + offset, gap_l=parameters.gap_l - offset)
+
+
+GAP_OFFSET = Effect(
+    id="gap_offset",
+    term="contact at u = G/2 + offset on the right, at u = -(G/2 - offset) on the left",
+    parameters=(
+        EffectParameter("offset", "m", -0.015, 0.015, 0.0, "Right gap minus half the total gap."),
+    ),
+    change=_change,
+    residual=(
+        "Contact begins early on one side and late on the other: force residual in short bursts at "
+        "onset and release, of one sign through the contact, and a mean of u. Slopes of the F_j-v_j "
+        "loops agree; their feet do not."
+    ),
+    confused_with=("bumper_asymmetry", "sensor_offset"),
+)

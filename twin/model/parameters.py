@@ -1,0 +1,143 @@
+"""What the model is made of: `Parameters` in SI, the model card, the free-flight resonance."""
+
+import difflib
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+
+from pydantic import model_validator
+
+from table_io.profile import BadInput, Card, Finite, NonNegative, Positive, Specimen
+from twin.model.effects import EFFECTS
+from twin.model.effects.effect import Effect
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """The SNM in SI: kg, N/m, N s/m, m. Gaps at rest, inf = no bumper, negative = precompressed.
+
+    M u'' + C u' + K u + F_R + F_L = -M A;  F_j = C_j u_j' + K_j u_j in contact, 0 in flight.
+    Source: Stefani, De Angelis, Andreaus, Sect. 5.
+    """
+
+    mass: float
+    stiffness: float
+    damping: float
+    bumper_stiffness_r: float
+    bumper_damping_r: float
+    bumper_stiffness_l: float
+    bumper_damping_l: float
+    gap_r: float
+    gap_l: float
+
+    def __post_init__(self) -> None:
+        for name, value in self.as_dict().items():
+            if name.startswith("gap"):
+                if math.isnan(value) or value == -math.inf:
+                    raise BadInput(f"{name} = {value}: allowed: m, or inf for no bumper; mend it")
+            elif not math.isfinite(value) or value < 0 or (value == 0 and name != "damping"):
+                allowed = "0 or more" if name == "damping" else "more than 0"
+                raise BadInput(f"{name} = {value}: allowed: {allowed}, finite, in SI; mend it")
+
+    def as_dict(self) -> dict[str, float]:
+        """Field name -> SI value."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, float]) -> "Parameters":
+        """The inverse of `as_dict`; BadInput names what is missing or unknown."""
+        known = [field.name for field in fields(cls)]
+        for name in values:
+            if name not in known:
+                raise BadInput(f"{name}: unknown model parameter; {nearest(name, known)}")
+        missing = [name for name in known if name not in values]
+        if missing:
+            raise BadInput(f"model parameters lack {', '.join(missing)}; add them in SI")
+        return cls(**{name: float(values[name]) for name in known})
+
+
+def nearest(name: str, known: list[str]) -> str:
+    """The hint that ends a message about an unknown name."""
+    near = difflib.get_close_matches(name, known, 1, 0.4)
+    return f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
+
+
+class Base(Card):
+    """The linear springs and dashpots; both bumpers alike."""
+
+    stiffness_n_m: Positive
+    damping_n_s_m: NonNegative
+    bumper_stiffness_n_m: Positive
+    bumper_damping_n_s_m: Positive
+
+
+class EffectEntry(Card):
+    """One [[effects]] of a model card: an id of `EFFECTS` and a value for each parameter, in SI."""
+
+    id: str
+    parameters: dict[str, Finite] = {}
+
+    @model_validator(mode="after")
+    def _known(self) -> "EffectEntry":
+        ids = [effect.id for effect in EFFECTS]
+        if self.id not in ids:
+            raise BadInput(f"effect {self.id!r} is unknown; {nearest(self.id, ids)}")
+        self.effect.check(self.parameters)
+        return self
+
+    @property
+    def effect(self) -> Effect:
+        return next(effect for effect in EFFECTS if effect.id == self.id)
+
+
+class ModelCard(Card):
+    """A model from models/*.toml: the base and the effects that stand on it."""
+
+    title: str
+    citation: str = ""
+    fitted_on: str = ""
+    base: Base
+    effects: tuple[EffectEntry, ...] = ()
+
+    @model_validator(mode="after")
+    def _once(self) -> "ModelCard":
+        ids = [entry.id for entry in self.effects]
+        twice = sorted({name for name in ids if ids.count(name) > 1})
+        if twice:
+            raise BadInput(f"effects name {', '.join(twice)} more than once; keep one of each")
+        return self
+
+    def parameters(self, specimen: Specimen) -> Parameters:
+        """The model of this specimen: its mass and gaps, this card's base, then each effect."""
+        base = self.base
+        stiffness, damping = base.bumper_stiffness_n_m, base.bumper_damping_n_s_m
+        bumpers = (stiffness, damping, stiffness, damping)
+        result = Parameters(
+            specimen.mass_kg, base.stiffness_n_m, base.damping_n_s_m, *bumpers, *specimen.gaps_m
+        )
+        for entry in self.effects:
+            result = entry.effect.apply(result, entry.parameters)
+        return result
+
+
+def resonance(parameters: Parameters, acceleration: float) -> tuple[float, float, float]:
+    """(u* in m, a* in m/s2, frequency of u* in Hz): free-flight maxima at peak A in m/s2.
+
+    Linear oscillator, steady, continuous in frequency; u relative, a total; w0^2 = K/M,
+    z = C / (2 M w0). Each maximum stands at its own frequency:
+        u* = A / (2 z w0^2 sqrt(1 - z^2))        at w = w0 sqrt(1 - 2 z^2), or A/w0^2 at w = 0
+        a* = A T,  T^2 = (1 + x) / ((1 - r^2)^2 + x),  x = (2 z r)^2,
+                                                 at r^2 = (sqrt(1 + 8 z^2) - 1) / (4 z^2)
+    For the SNM at 0.05 g: 30.537 mm at 1.2678 Hz, and 2.057 m/s2 at 1.2690 Hz.
+    """
+    if parameters.damping == 0:
+        raise BadInput("damping = 0: the resonance has no bound; give a damping above 0 N s/m")
+    w02 = parameters.stiffness / parameters.mass
+    z2 = parameters.damping**2 / (4 * parameters.mass * parameters.stiffness)
+    r2 = 4 / (math.sqrt(1 + 8 * z2) + 1) / 2
+    x = 4 * z2 * r2
+    a = acceleration * math.sqrt((1 + x) / ((1 - r2) ** 2 + x))
+    if 2 * z2 >= 1:
+        return acceleration / w02, a, 0.0
+    u = acceleration / (2 * w02 * math.sqrt(z2 * (1 - z2)))
+    return u, a, math.sqrt(w02 * (1 - 2 * z2)) / (2 * math.pi)

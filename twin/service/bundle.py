@@ -1,0 +1,135 @@
+"""A test profile with its machine card, model and drive, checked together before anything moves."""
+
+import platform
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+from table_io.clock import today
+from table_io.drive import Drive, plan
+from table_io.limits import Margin, margins, refuse
+from table_io.profile import Profile, Rig, find, load, parse
+from table_io.records import RunStart, Step
+from table_io.session import Setup as SessionSetup
+from twin.compare import pipeline
+from twin.model.parameters import ModelCard, Parameters
+
+LIBRARIES = ("shaketwin", "numpy", "scipy", "numba", "protobuf", "eclipse-zenoh", "mcap")
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """All that a run needs, as texts and as what they mean."""
+
+    name: str
+    profile: Profile
+    rig: Rig
+    parameters: Parameters
+    drive: Drive
+    margins: tuple[Margin, ...]
+    profile_toml: str
+    rig_toml: str
+    model_toml: str
+
+    @property
+    def session(self) -> SessionSetup:
+        return SessionSetup(self.profile, self.rig, self.drive)
+
+    def twin(self, from_rest: bool = False) -> pipeline.Setup:
+        return pipeline.prepare(self.profile, self.parameters, self.steps, from_rest)
+
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        return self.drive.steps
+
+    def describe(self, run: str, source: str) -> Callable[[dict[str, float], float], RunStart]:
+        """What makes the RunStart once tare and epoch are known."""
+
+        def start(tare: dict[str, float], epoch_s: float) -> RunStart:
+            table = ("drive_disp_m", "table_disp_m", "table_acc_m_s2")
+            return RunStart(
+                index=0,
+                run=run,
+                name=self.name,
+                source=source,
+                profile_toml=self.profile_toml,
+                rig_toml=self.rig_toml,
+                model_toml=self.model_toml,
+                rate_hz=self.profile.acquisition.rate_hz,
+                block_samples=self.profile.acquisition.block_samples,
+                channels=self.rig.channels if source == "table" else table,
+                steps=self.steps,
+                planned_samples=self.drive.planned_end,
+                tare=tare,
+                versions={name: version(name) for name in LIBRARIES}
+                | {"python": platform.python_version()},
+                host=platform.node(),
+                started_at=today().isoformat(timespec="seconds"),
+                epoch_s=epoch_s,
+            )
+
+        return start
+
+
+def from_texts(name: str, profile_toml: str, rig_toml: str, model_toml: str, where: str) -> Bundle:
+    """A bundle from texts that were read or recorded; BadInput with every fault of each."""
+    profile = parse(profile_toml, Profile, where)
+    rig = parse(rig_toml, Rig, f"machine card of {where}")
+    card = parse(model_toml, ModelCard, f"model of {where}")
+    drive = plan(profile)
+    return Bundle(
+        name,
+        profile,
+        rig,
+        card.parameters(profile.specimen),
+        drive,
+        margins(drive, profile, rig),
+        profile_toml,
+        rig_toml,
+        model_toml,
+    )
+
+
+def read_bundle(path: Path, table: str | None = None, model: str | None = None) -> Bundle:
+    """The bundle of a test profile; BadInput where the table cannot do the test."""
+    profile, profile_toml = load(path, Profile, "test profile")
+    _, rig_toml = load(find(table or profile.rig, "rigs", path), Rig, "machine card")
+    _, model_toml = read_model(model or profile.model, path)
+    bundle = from_texts(path.stem, profile_toml, rig_toml, model_toml, str(path))
+    refuse(bundle.margins, bundle.profile, bundle.rig, str(path))
+    return bundle
+
+
+def read_model(name: str, beside: Path | None = None) -> tuple[ModelCard, str]:
+    """(model card, its text) of a name in models/ or a path."""
+    return load(find(name, "models", beside), ModelCard, "model")
+
+
+def run_id(name: str) -> str:
+    """<date>-<time>-<profile>: the run's id and the name of its folder."""
+    return f"{today():%Y%m%d-%H%M%S}-{name}"
+
+
+def warm(kernels: str) -> None:
+    """Compile or load the kernels of "plant" or "twin" by running them once on a few samples."""
+    import numpy as np
+
+    if kernels == "twin":
+        from twin.model.exact import advance, constants, rest
+
+        parameters = Parameters(550.0, 36e3, 1.1e3, 510e3, 900.0, 510e3, 900.0, 0.002, 0.002)
+        state = rest(parameters)
+        advance(state, constants(parameters, 2000.0), np.zeros(4), np.empty((7, 4)))
+        return
+    from table_io.backends import open_backend
+    from table_io.clock import ManualClock
+
+    path = find("quickstart", "tests")
+    bundle = read_bundle(path)
+    backend = open_backend(bundle.rig, bundle.profile, ManualClock())
+    backend.open()
+    backend.queue(0, np.zeros(4))
+    backend.start()
+    backend.read(2)
+    backend.close()

@@ -1,0 +1,150 @@
+"""The command line. Heavy imports stand inside the commands, so that --help is quick."""
+
+import contextlib
+import enum
+import sys
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    help="Drive a shaking table through a stepped sine test, with a digital twin of the specimen "
+    "beside it; record, compare, replay, report.",
+)
+
+PLAN, DRIVE, LOOK = "Before a test", "Drive and compute", "Look at what was recorded"
+EXIT_ABORTED, EXIT_GAPS, EXIT_NOT_IDENTICAL, EXIT_INTERRUPTED = 3, 4, 5, 130
+
+TestProfile = Annotated[Path, typer.Argument(metavar="PROFILE", help="Test profile, a .toml file.")]
+Log = Annotated[Path, typer.Argument(metavar="LOG", help="A run.mcap, or the folder of a run.")]
+Out = Annotated[Optional[Path], typer.Option("--out", help="Folder for the results; must be new.")]
+Model = Annotated[Optional[str], typer.Option("--model", help="Model: a name or a .toml file.")]
+
+
+class Speed(str, enum.Enum):
+    """How a run is paced."""
+
+    realtime = "realtime"
+    max = "max"
+
+
+@app.command(rich_help_panel=PLAN)
+def check(
+    profile: TestProfile,
+    table: Annotated[Optional[str], typer.Option("--table", help="Machine card instead.")] = None,
+    out: Annotated[
+        Optional[Path], typer.Option("--out", help="Folder for the drawing of the drive.")
+    ] = None,
+) -> None:
+    """Pre-flight only: the plan, the margins against the machine card, a drawing of the drive."""
+    from twin.service.commands import check as command
+
+    command(profile, table, out)
+
+
+@app.command(rich_help_panel=DRIVE)
+def run(
+    profile: TestProfile,
+    out: Out = None,
+    speed: Annotated[
+        Speed, typer.Option("--speed", help="max needs a simulated table.")
+    ] = Speed.realtime,
+    model: Model = None,
+    table: Annotated[Optional[str], typer.Option("--table", help="Machine card instead.")] = None,
+    view: Annotated[
+        bool, typer.Option("--view", help="Serve a Rerun view and leave view.rrd.")
+    ] = False,
+    listen: Annotated[
+        str, typer.Option("--listen", help="Endpoint of the run's bus.")
+    ] = "tcp/127.0.0.1:7447",
+) -> None:
+    """Drive the table, acquire, run the twin beside it, publish, record, report."""
+    from twin.service.commands import run as command
+
+    raise typer.Exit(command(profile, out, speed is Speed.max, model, table, view, listen))
+
+
+@app.command(rich_help_panel=DRIVE)
+def simulate(
+    profile: TestProfile,
+    model: Model = None,
+    out: Out = None,
+    view: Annotated[bool, typer.Option("--view", help="Also write view.rrd.")] = False,
+) -> None:
+    """The model alone on the ideal drive: no table, no noise."""
+    from twin.service.commands import simulate as command
+
+    raise typer.Exit(command(profile, model, out, view))
+
+
+@app.command(rich_help_panel=LOOK)
+def replay(
+    log: Log,
+    model: Model = None,
+    out: Out = None,
+    speed: Annotated[str, typer.Option("--speed", help="Times real time, or max.")] = "max",
+    view: Annotated[bool, typer.Option("--view", help="Also write view.rrd.")] = False,
+) -> None:
+    """The same pipeline on a recording; with the recorded model equal to the bit."""
+    from twin.service.commands import replay as command
+
+    raise typer.Exit(command(log, model, out, speed, view))
+
+
+@app.command(rich_help_panel=LOOK)
+def prc(
+    log: Log,
+    json: Annotated[bool, typer.Option("--json", help="As JSON on standard output.")] = False,
+) -> None:
+    """Pseudo-resonance curves, jumps, hysteresis, impacts per cycle."""
+    from twin.service.commands import prc as command
+
+    command(log, json)
+
+
+@app.command(rich_help_panel=LOOK)
+def report(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")],
+) -> None:
+    """One self-contained HTML file of a run."""
+    from twin.service.commands import report as command
+
+    command(folder)
+
+
+@app.command(rich_help_panel=LOOK)
+def view(
+    log: Annotated[
+        Optional[Path], typer.Argument(metavar="[LOG]", help="A run.mcap or a run's folder.")
+    ] = None,
+    save: Annotated[
+        Optional[Path], typer.Option("--save", help="Only write this .rrd file.")
+    ] = None,
+    picture: Annotated[
+        Optional[Path], typer.Option("--picture", help="Render the view to this .png file.")
+    ] = None,
+    connect: Annotated[
+        str, typer.Option("--connect", help="Bus of a running test, without LOG.")
+    ] = "tcp/127.0.0.1:7447",
+) -> None:
+    """Rerun with the project's layout, on a recording or on a running test."""
+    from twin.service.commands import view as command
+
+    command(log, save, picture, connect)
+
+
+def main() -> None:
+    """Entry point: every fault of the input is one message on standard error and exit code 2."""
+    from table_io.profile import BadInput
+
+    with contextlib.suppress(BrokenPipeError):
+        try:
+            app()
+        except BadInput as error:
+            print(f"shaketwin: {error}", file=sys.stderr)
+            raise SystemExit(2) from None

@@ -1,0 +1,139 @@
+"""summary.json: what a run found, from its recording alone. Keys as users script against them."""
+
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from table_io.profile import Profile, parse
+from table_io.records import Comparison, Fault, Gap, Point, Quantities, Timing
+from twin.compare import COMPARED
+from twin.compare.curves import branches
+from twin.model.parameters import Parameters, resonance
+from twin.stream.mcap_log import Recording
+
+Json = dict[str, Any]
+
+
+def summarise(recording: Recording, parameters: Parameters) -> Json:
+    """The summary of a recording whose twin ran with these parameters."""
+    start = recording.start
+    profile = parse(start.profile_toml, Profile, "recorded profile")
+    level = max(step.acceleration_m_s2 for step in start.steps)
+    u_star, a_star, peak_hz = resonance(parameters, level)
+    points = recording.of(Point)
+    source = "twin" if start.source == "model" else "measured"
+    jumps, intervals = branches(points, source)
+    twin_jumps, twin_intervals = branches(points, "twin")
+    stop = recording.stop
+    return {
+        "run": {
+            "id": start.run,
+            "name": start.name,
+            "title": profile.title,
+            "source": start.source,
+            "started_at": start.started_at,
+            "host": start.host,
+            "rate_hz": start.rate_hz,
+            "samples": stop.index if stop else 0,
+            "duration_s": stop.index / start.rate_hz if stop else 0.0,
+            "normalisation": (
+                f"u* and a* are the maxima of the model in free flight, continuous in frequency "
+                f"(at {peak_hz:.3f} Hz, {level:.4g} m/s2)"
+            ),
+            "branches_from": source,
+        },
+        "verdict": stop.verdict if stop else "halted",
+        "reason": stop.reason if stop else "the recording ends without a stop record",
+        "gaps": len(recording.of(Gap)) + (1 if recording.missing_samples else 0),
+        "lost_samples": recording.missing_samples,
+        "faults": [asdict(fault) for fault in recording.of(Fault)],
+        "u_star_m": u_star,
+        "a_star_m_s2": a_star,
+        "steps": [_step(point) for point in points],
+        "jumps": [asdict(jump) for jump in jumps],
+        "hysteresis": [asdict(interval) for interval in intervals],
+        "twin_jumps": [asdict(jump) for jump in twin_jumps],
+        "twin_hysteresis": [asdict(interval) for interval in twin_intervals],
+        "timing": _timing(recording.of(Timing)),
+        "comparison": _nrmse(recording.of(Comparison)),
+    }
+
+
+def _step(point: Point) -> Json:
+    def block(values: Quantities | None) -> Json | None:
+        return None if values is None else asdict(values)
+
+    return {
+        "index": point.step,
+        "direction": point.direction,
+        "frequency_hz": point.frequency_hz,
+        "measured": block(point.measured),
+        "twin": block(point.twin),
+        "table_acc_peak_m_s2": point.table_acc_peak_m_s2,
+        "table_acc_fundamental_m_s2": point.table_acc_fundamental_m_s2,
+        "thd": point.thd,
+    }
+
+
+def _timing(records: tuple[Timing, ...]) -> Json:
+    """Latency of the twin (last sample of a block scheduled -> its Comparison put), and the rest."""
+    last = {record.component: record for record in records}
+    twin = last.get("twin")
+    return {
+        "latency_ms": {
+            "p50": twin.p50_ms if twin else None,
+            "p99": twin.p99_ms if twin else None,
+            "max": twin.max_ms if twin else None,
+        },
+        "missed_deadlines": sum(record.missed for record in last.values()) if last else None,
+        "components": {
+            name: {key: value for key, value in asdict(record).items() if key != "component"}
+            for name, record in last.items()
+        },
+    }
+
+
+def _nrmse(comparisons: tuple[Comparison, ...]) -> Json:
+    """Root of error squares over measured squares; `nrmse` of the restarted twin, and of the free.
+
+    The restarted twin measures the model; the free one also carries where two solutions part.
+    """
+    if not comparisons:
+        return {}
+    measured, free, window = (
+        np.array([getattr(one, name) for one in comparisons])
+        for name in ("measured_ss", "free_error_ss", "window_error_ss")
+    )
+    out: Json = {}
+    for place, name in enumerate(COMPARED):
+        values = {}
+        for key, error in (("nrmse", window), ("free_nrmse", free)):
+            known = np.isfinite(error[:, place]) & np.isfinite(measured[:, place])
+            total = measured[known, place].sum()
+            values[key] = math.sqrt(error[known, place].sum() / total) if total > 0 else None
+        out[name] = values
+    return out
+
+
+def write(summary: Json, path: Path) -> None:
+    """Write a summary as strict JSON: what is not a number becomes null."""
+    path.write_text(dumps(summary) + "\n")
+
+
+def dumps(summary: Json) -> str:
+    """Strict JSON text of a summary."""
+    return json.dumps(_clean(summary), indent=1, allow_nan=False)
+
+
+def _clean(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, dict):
+        return {key: _clean(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_clean(one) for one in value]
+    return value

@@ -1,0 +1,238 @@
+"""Starts the processes of a live run, watches them, restarts what died, ends them in order."""
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from table_io.clock import Clock
+from table_io.profile import BadInput, OnDeath
+from table_io.records import Comparison, Event, Fault, RunStop
+from twin.service.processes import Spec
+from twin.stream.mcap_log import merge, read
+from twin.stream.wire import RECORD_TOPICS, Item, decode, encode, topic
+from twin.stream.zenoh_link import Link, open_spoke
+
+READY_S = 30.0
+END_S = 15.0  # after the last sample, for everybody to finish
+DRAIN_S = 0.1  # after a death, for what the dead one had still sent
+RESTARTS = 5
+PARTS = ".parts"
+WATCHED = tuple(RECORD_TOPICS.values())
+
+
+@dataclass(slots=True)
+class Child:
+    """A process of the run: its output goes to a file in the run's folder."""
+
+    component: str
+    process: subprocess.Popen[bytes]
+    log: Path
+    restarts: int = 0
+
+
+@dataclass(slots=True)
+class Supervisor:
+    """One live run. `watch` sees every small record; `asked` says "stop" when a person does."""
+
+    spec: Spec
+    on_death: OnDeath
+    clock: Clock
+    watch: Callable[[Item], None]
+    asked: Callable[[], str | None]
+    say: Callable[[str], None]
+    children: dict[str, Child] = field(default_factory=dict)
+    compared_to: int = 0
+    stop: RunStop | None = None
+    _parts: int = 0
+
+    @property
+    def parts(self) -> Path:
+        return Path(self.spec.folder) / PARTS
+
+    def run(self) -> int:
+        """Play the run to its end; the number of processes that had to be restarted."""
+        self.parts.mkdir(parents=True)
+        self.spec.write(self.parts / "spec.json")
+        rig = self.spec.bundle().rig.name
+        try:
+            self._start("rig")
+            link = self._connect(rig)
+            for component in ("twin", "recorder", *self._views()):
+                self._start(component)
+            self._ready(link)
+            inbox = link.subscribe(WATCHED, history=True, capacity=5000)
+            link.declare(("/run/event", "/run/fault"))
+            if link.request("start", timeout_s=2.0) is None:
+                raise BadInput("the rig does not answer; nothing moved")
+            self._attend(link, inbox)
+            self._finish(link)
+        finally:
+            self._reap()
+        return sum(child.restarts for child in self.children.values())
+
+    def _views(self) -> tuple[str, ...]:
+        return ("viewer",) if self.spec.save_view or self.spec.serve_view else ()
+
+    def _start(self, component: str, argument: str = "") -> None:
+        """Start or restart a process in a session of its own, so that Ctrl-C passes it by."""
+        if component == "recorder":
+            self._parts += 1
+            argument = str(self.parts / f"part-{self._parts:03d}.mcap")
+        if component == "viewer":
+            restarts = self.children[component].restarts if component in self.children else -1
+            suffix = f"-{restarts + 1}" if restarts >= 0 else ""
+            argument = str(Path(self.spec.folder) / f"view{suffix}.rrd")
+        log = self.parts / f"{component}.log"
+        command = [sys.executable, "-m", "twin.service.processes", component]
+        command += [str(self.parts / "spec.json"), argument]
+        with log.open("ab") as out:
+            process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=out, stderr=out, start_new_session=True
+            )
+        if component in self.children:
+            self.children[component].process = process
+        else:
+            self.children[component] = Child(component, process, log)
+
+    def _words(self, component: str) -> str:
+        """The last words of a process."""
+        lines = self.children[component].log.read_text(errors="replace").strip().splitlines()
+        return lines[-1] if lines else "it said nothing"
+
+    def _died(self, component: str) -> bool:
+        return self.children[component].process.poll() is not None
+
+    def _connect(self, rig: str) -> Link:
+        until = self.clock.now() + READY_S
+        while self.clock.now() < until and not self._died("rig"):
+            try:
+                return open_spoke(rig, self.spec.endpoint, 0.3)
+            except BadInput:
+                continue
+        raise BadInput(f"the rig did not start: {self._words('rig')}")
+
+    def _ready(self, link: Link) -> None:
+        """Wait until everybody is there; nothing moves before."""
+        until = self.clock.now() + READY_S
+        while not set(self.children) <= link.components():
+            for component in self.children:
+                if self._died(component):
+                    raise BadInput(f"the {component} did not start: {self._words(component)}")
+            if self.clock.now() > until:
+                missing = sorted(set(self.children) - link.components())
+                raise BadInput(f"not ready after {READY_S:g} s: {', '.join(missing)}")
+            self.clock.wait_until(self.clock.now() + 0.02)
+
+    def _attend(self, link: Link, inbox: object) -> None:
+        """Until the rig has ended: show what happens, pass a stop on, restart what died."""
+        stopping = False
+        while self.stop is None:
+            self._listen(inbox, 0.1)
+            if not stopping and self.asked() == "stop":
+                stopping = link.request("stop", timeout_s=1.0) is not None
+            for component in self.children:
+                if self._died(component) and self.stop is None:
+                    self._listen(inbox, DRAIN_S)
+                    if self.stop is None:
+                        self._bury(component, link)
+
+    def _listen(self, inbox: object, seconds: float) -> None:
+        until = self.clock.now() + seconds
+        while (left := until - self.clock.now()) > 0:
+            arrived = inbox.get(left)  # type: ignore[attr-defined]
+            if arrived is None:
+                return
+            _, item = decode(*arrived)
+            if isinstance(item, Comparison):
+                self.compared_to = max(self.compared_to, item.index + item.count)
+            if isinstance(item, RunStop):
+                self.stop = item
+            self.watch(item)
+
+    def _bury(self, component: str, link: Link) -> None:
+        """Say what died, stop the table if so configured, start a successor."""
+        child = self.children[component]
+        how = child.process.returncode
+        if component == "rig":
+            raise _RigDied(f"the rig process died ({_how(how)}): {self._words('rig')}")
+        choice = getattr(self.on_death, component)
+        self.say(f"{component} died ({_how(how)}); restarting it, the table goes on")
+        event = Event(self.compared_to, "died", f"{component} died ({_how(how)})")
+        link.publish(topic(event), encode(event, self.spec.run))
+        if choice == "stop":
+            link.request("stop", timeout_s=1.0)
+        if child.restarts >= RESTARTS:
+            self.say(f"{component} died {RESTARTS + 1} times and stays down")
+            del self.children[component]
+            return
+        child.restarts += 1
+        self._start(component, str(self.compared_to) if component == "twin" else "")
+
+    def _finish(self, link: Link) -> None:
+        """Let everybody finish in order; the hub goes last."""
+        until = self.clock.now() + END_S
+        for component in ("twin", "recorder", "viewer"):
+            if component in self.children:
+                left = max(until - self.clock.now(), 0.1)
+                self._await(component, left)
+        link.request("quit", timeout_s=1.0)
+        link.close()
+
+    def _await(self, component: str, seconds: float) -> None:
+        try:
+            self.children[component].process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            self.say(f"{component} does not finish; ending it")
+
+    def _reap(self) -> None:
+        """End whatever still runs: first its input, then a signal."""
+        for child in self.children.values():
+            if child.process.stdin is not None:
+                child.process.stdin.close()
+        for child in self.children.values():
+            try:
+                child.process.wait(5.0 if child.component != "rig" else 10.0)
+            except subprocess.TimeoutExpired:
+                os.killpg(child.process.pid, signal.SIGKILL)
+                child.process.wait()
+
+
+class _RigDied(Exception):
+    """The rig is gone; what was recorded is kept."""
+
+
+def _how(code: int) -> str:
+    return signal.Signals(-code).name if code < 0 else f"exit {code}"
+
+
+def gather(folder: Path) -> Path:
+    """run.mcap from the parts of a recording; they go only when it has been read back whole."""
+    parts = sorted((folder / PARTS).glob("part-*.mcap"))
+    out = folder / "run.mcap"
+    if not parts:
+        raise BadInput(f"{folder}: the recorder wrote nothing")
+    first = read(parts[0]) if len(parts) == 1 else None
+    if first is not None and first.whole:
+        parts[0].rename(out)
+    else:
+        count = merge(parts, out)
+        if len(read(out).items) != count:
+            raise BadInput(f"{out}: differs from its parts, which are kept in {folder / PARTS}")
+    shutil.rmtree(folder / PARTS)
+    return out
+
+
+def free_endpoint() -> str:
+    """A loopback endpoint that nobody uses, for tests."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+__all__ = ["Fault", "Supervisor", "free_endpoint", "gather"]

@@ -1,0 +1,1 @@
+"""The outside world: one encoder, one link, one log, one view."""

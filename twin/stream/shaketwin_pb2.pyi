@@ -1,0 +1,304 @@
+from google.protobuf.internal import containers as _containers
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class Channel(_message.Message):
+    __slots__ = ("name", "values")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    values: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, name: _Optional[str] = ..., values: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class Block(_message.Message):
+    __slots__ = ("run", "stream", "index", "rate_hz", "channels", "step", "label", "cycle")
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    STREAM_FIELD_NUMBER: _ClassVar[int]
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    CHANNELS_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    LABEL_FIELD_NUMBER: _ClassVar[int]
+    CYCLE_FIELD_NUMBER: _ClassVar[int]
+    run: str
+    stream: str
+    index: int
+    rate_hz: float
+    channels: _containers.RepeatedCompositeFieldContainer[Channel]
+    step: _containers.RepeatedScalarFieldContainer[int]
+    label: _containers.RepeatedScalarFieldContainer[int]
+    cycle: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, run: _Optional[str] = ..., stream: _Optional[str] = ..., index: _Optional[int] = ..., rate_hz: _Optional[float] = ..., channels: _Optional[_Iterable[_Union[Channel, _Mapping]]] = ..., step: _Optional[_Iterable[int]] = ..., label: _Optional[_Iterable[int]] = ..., cycle: _Optional[_Iterable[int]] = ...) -> None: ...
+
+class Step(_message.Message):
+    __slots__ = ("index", "direction", "frequency_hz", "acceleration_m_s2")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    DIRECTION_FIELD_NUMBER: _ClassVar[int]
+    FREQUENCY_HZ_FIELD_NUMBER: _ClassVar[int]
+    ACCELERATION_M_S2_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    direction: str
+    frequency_hz: float
+    acceleration_m_s2: float
+    def __init__(self, index: _Optional[int] = ..., direction: _Optional[str] = ..., frequency_hz: _Optional[float] = ..., acceleration_m_s2: _Optional[float] = ...) -> None: ...
+
+class RunStart(_message.Message):
+    __slots__ = ("index", "run", "name", "source", "profile_toml", "rig_toml", "model_toml", "rate_hz", "block_samples", "channels", "steps", "planned_samples", "tare", "versions", "host", "started_at", "epoch_s")
+    class TareEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: float
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
+    class VersionsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: str
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    PROFILE_TOML_FIELD_NUMBER: _ClassVar[int]
+    RIG_TOML_FIELD_NUMBER: _ClassVar[int]
+    MODEL_TOML_FIELD_NUMBER: _ClassVar[int]
+    RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    BLOCK_SAMPLES_FIELD_NUMBER: _ClassVar[int]
+    CHANNELS_FIELD_NUMBER: _ClassVar[int]
+    STEPS_FIELD_NUMBER: _ClassVar[int]
+    PLANNED_SAMPLES_FIELD_NUMBER: _ClassVar[int]
+    TARE_FIELD_NUMBER: _ClassVar[int]
+    VERSIONS_FIELD_NUMBER: _ClassVar[int]
+    HOST_FIELD_NUMBER: _ClassVar[int]
+    STARTED_AT_FIELD_NUMBER: _ClassVar[int]
+    EPOCH_S_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    run: str
+    name: str
+    source: str
+    profile_toml: str
+    rig_toml: str
+    model_toml: str
+    rate_hz: float
+    block_samples: int
+    channels: _containers.RepeatedScalarFieldContainer[str]
+    steps: _containers.RepeatedCompositeFieldContainer[Step]
+    planned_samples: int
+    tare: _containers.ScalarMap[str, float]
+    versions: _containers.ScalarMap[str, str]
+    host: str
+    started_at: str
+    epoch_s: float
+    def __init__(self, index: _Optional[int] = ..., run: _Optional[str] = ..., name: _Optional[str] = ..., source: _Optional[str] = ..., profile_toml: _Optional[str] = ..., rig_toml: _Optional[str] = ..., model_toml: _Optional[str] = ..., rate_hz: _Optional[float] = ..., block_samples: _Optional[int] = ..., channels: _Optional[_Iterable[str]] = ..., steps: _Optional[_Iterable[_Union[Step, _Mapping]]] = ..., planned_samples: _Optional[int] = ..., tare: _Optional[_Mapping[str, float]] = ..., versions: _Optional[_Mapping[str, str]] = ..., host: _Optional[str] = ..., started_at: _Optional[str] = ..., epoch_s: _Optional[float] = ...) -> None: ...
+
+class Params(_message.Message):
+    __slots__ = ("index", "values", "reason", "run")
+    class ValuesEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: float
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    values: _containers.ScalarMap[str, float]
+    reason: str
+    run: str
+    def __init__(self, index: _Optional[int] = ..., values: _Optional[_Mapping[str, float]] = ..., reason: _Optional[str] = ..., run: _Optional[str] = ...) -> None: ...
+
+class Comparison(_message.Message):
+    __slots__ = ("index", "count", "channels", "measured_ss", "free_error_ss", "window_error_ss", "run")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    CHANNELS_FIELD_NUMBER: _ClassVar[int]
+    MEASURED_SS_FIELD_NUMBER: _ClassVar[int]
+    FREE_ERROR_SS_FIELD_NUMBER: _ClassVar[int]
+    WINDOW_ERROR_SS_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    count: int
+    channels: _containers.RepeatedScalarFieldContainer[str]
+    measured_ss: _containers.RepeatedScalarFieldContainer[float]
+    free_error_ss: _containers.RepeatedScalarFieldContainer[float]
+    window_error_ss: _containers.RepeatedScalarFieldContainer[float]
+    run: str
+    def __init__(self, index: _Optional[int] = ..., count: _Optional[int] = ..., channels: _Optional[_Iterable[str]] = ..., measured_ss: _Optional[_Iterable[float]] = ..., free_error_ss: _Optional[_Iterable[float]] = ..., window_error_ss: _Optional[_Iterable[float]] = ..., run: _Optional[str] = ...) -> None: ...
+
+class Extremes(_message.Message):
+    __slots__ = ("u_max", "u_min", "a_max", "a_min", "force_r", "force_l", "onsets_r", "onsets_l")
+    U_MAX_FIELD_NUMBER: _ClassVar[int]
+    U_MIN_FIELD_NUMBER: _ClassVar[int]
+    A_MAX_FIELD_NUMBER: _ClassVar[int]
+    A_MIN_FIELD_NUMBER: _ClassVar[int]
+    FORCE_R_FIELD_NUMBER: _ClassVar[int]
+    FORCE_L_FIELD_NUMBER: _ClassVar[int]
+    ONSETS_R_FIELD_NUMBER: _ClassVar[int]
+    ONSETS_L_FIELD_NUMBER: _ClassVar[int]
+    u_max: float
+    u_min: float
+    a_max: float
+    a_min: float
+    force_r: float
+    force_l: float
+    onsets_r: _containers.RepeatedScalarFieldContainer[int]
+    onsets_l: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, u_max: _Optional[float] = ..., u_min: _Optional[float] = ..., a_max: _Optional[float] = ..., a_min: _Optional[float] = ..., force_r: _Optional[float] = ..., force_l: _Optional[float] = ..., onsets_r: _Optional[_Iterable[int]] = ..., onsets_l: _Optional[_Iterable[int]] = ...) -> None: ...
+
+class Cycle(_message.Message):
+    __slots__ = ("index", "step", "cycle", "count", "measured", "twin", "run", "label")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    CYCLE_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    MEASURED_FIELD_NUMBER: _ClassVar[int]
+    TWIN_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    LABEL_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    step: int
+    cycle: int
+    count: int
+    measured: Extremes
+    twin: Extremes
+    run: str
+    label: int
+    def __init__(self, index: _Optional[int] = ..., step: _Optional[int] = ..., cycle: _Optional[int] = ..., count: _Optional[int] = ..., measured: _Optional[_Union[Extremes, _Mapping]] = ..., twin: _Optional[_Union[Extremes, _Mapping]] = ..., run: _Optional[str] = ..., label: _Optional[int] = ...) -> None: ...
+
+class Quantities(_message.Message):
+    __slots__ = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l", "impacts_right", "impacts_left", "drift", "spread")
+    ETA_D_FIELD_NUMBER: _ClassVar[int]
+    ETA_A_FIELD_NUMBER: _ClassVar[int]
+    ETA_R_FIELD_NUMBER: _ClassVar[int]
+    ETA_L_FIELD_NUMBER: _ClassVar[int]
+    R_R_FIELD_NUMBER: _ClassVar[int]
+    R_L_FIELD_NUMBER: _ClassVar[int]
+    IMPACTS_RIGHT_FIELD_NUMBER: _ClassVar[int]
+    IMPACTS_LEFT_FIELD_NUMBER: _ClassVar[int]
+    DRIFT_FIELD_NUMBER: _ClassVar[int]
+    SPREAD_FIELD_NUMBER: _ClassVar[int]
+    eta_d: float
+    eta_a: float
+    eta_r: float
+    eta_l: float
+    r_r: float
+    r_l: float
+    impacts_right: _containers.RepeatedScalarFieldContainer[int]
+    impacts_left: _containers.RepeatedScalarFieldContainer[int]
+    drift: float
+    spread: float
+    def __init__(self, eta_d: _Optional[float] = ..., eta_a: _Optional[float] = ..., eta_r: _Optional[float] = ..., eta_l: _Optional[float] = ..., r_r: _Optional[float] = ..., r_l: _Optional[float] = ..., impacts_right: _Optional[_Iterable[int]] = ..., impacts_left: _Optional[_Iterable[int]] = ..., drift: _Optional[float] = ..., spread: _Optional[float] = ...) -> None: ...
+
+class Point(_message.Message):
+    __slots__ = ("index", "step", "direction", "frequency_hz", "measured", "twin", "table_acc_peak_m_s2", "table_acc_fundamental_m_s2", "thd", "run")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    DIRECTION_FIELD_NUMBER: _ClassVar[int]
+    FREQUENCY_HZ_FIELD_NUMBER: _ClassVar[int]
+    MEASURED_FIELD_NUMBER: _ClassVar[int]
+    TWIN_FIELD_NUMBER: _ClassVar[int]
+    TABLE_ACC_PEAK_M_S2_FIELD_NUMBER: _ClassVar[int]
+    TABLE_ACC_FUNDAMENTAL_M_S2_FIELD_NUMBER: _ClassVar[int]
+    THD_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    step: int
+    direction: str
+    frequency_hz: float
+    measured: Quantities
+    twin: Quantities
+    table_acc_peak_m_s2: float
+    table_acc_fundamental_m_s2: float
+    thd: float
+    run: str
+    def __init__(self, index: _Optional[int] = ..., step: _Optional[int] = ..., direction: _Optional[str] = ..., frequency_hz: _Optional[float] = ..., measured: _Optional[_Union[Quantities, _Mapping]] = ..., twin: _Optional[_Union[Quantities, _Mapping]] = ..., table_acc_peak_m_s2: _Optional[float] = ..., table_acc_fundamental_m_s2: _Optional[float] = ..., thd: _Optional[float] = ..., run: _Optional[str] = ...) -> None: ...
+
+class Event(_message.Message):
+    __slots__ = ("index", "kind", "text", "run")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    TEXT_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    kind: str
+    text: str
+    run: str
+    def __init__(self, index: _Optional[int] = ..., kind: _Optional[str] = ..., text: _Optional[str] = ..., run: _Optional[str] = ...) -> None: ...
+
+class Gap(_message.Message):
+    __slots__ = ("index", "count", "channel", "reason", "run")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    CHANNEL_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    count: int
+    channel: str
+    reason: str
+    run: str
+    def __init__(self, index: _Optional[int] = ..., count: _Optional[int] = ..., channel: _Optional[str] = ..., reason: _Optional[str] = ..., run: _Optional[str] = ...) -> None: ...
+
+class Fault(_message.Message):
+    __slots__ = ("index", "component", "from_index", "to_index", "reason", "run")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    COMPONENT_FIELD_NUMBER: _ClassVar[int]
+    FROM_INDEX_FIELD_NUMBER: _ClassVar[int]
+    TO_INDEX_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    component: str
+    from_index: int
+    to_index: int
+    reason: str
+    run: str
+    def __init__(self, index: _Optional[int] = ..., component: _Optional[str] = ..., from_index: _Optional[int] = ..., to_index: _Optional[int] = ..., reason: _Optional[str] = ..., run: _Optional[str] = ...) -> None: ...
+
+class Timing(_message.Message):
+    __slots__ = ("index", "component", "p50_ms", "p99_ms", "max_ms", "missed", "blocks", "cpu_share", "scheduler", "run")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    COMPONENT_FIELD_NUMBER: _ClassVar[int]
+    P50_MS_FIELD_NUMBER: _ClassVar[int]
+    P99_MS_FIELD_NUMBER: _ClassVar[int]
+    MAX_MS_FIELD_NUMBER: _ClassVar[int]
+    MISSED_FIELD_NUMBER: _ClassVar[int]
+    BLOCKS_FIELD_NUMBER: _ClassVar[int]
+    CPU_SHARE_FIELD_NUMBER: _ClassVar[int]
+    SCHEDULER_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    component: str
+    p50_ms: float
+    p99_ms: float
+    max_ms: float
+    missed: int
+    blocks: int
+    cpu_share: float
+    scheduler: str
+    run: str
+    def __init__(self, index: _Optional[int] = ..., component: _Optional[str] = ..., p50_ms: _Optional[float] = ..., p99_ms: _Optional[float] = ..., max_ms: _Optional[float] = ..., missed: _Optional[int] = ..., blocks: _Optional[int] = ..., cpu_share: _Optional[float] = ..., scheduler: _Optional[str] = ..., run: _Optional[str] = ...) -> None: ...
+
+class RunStop(_message.Message):
+    __slots__ = ("index", "verdict", "reason", "states", "run")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    VERDICT_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    STATES_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    verdict: str
+    reason: str
+    states: _containers.RepeatedScalarFieldContainer[str]
+    run: str
+    def __init__(self, index: _Optional[int] = ..., verdict: _Optional[str] = ..., reason: _Optional[str] = ..., states: _Optional[_Iterable[str]] = ..., run: _Optional[str] = ...) -> None: ...
