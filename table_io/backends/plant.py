@@ -35,8 +35,7 @@ SIGNALS = ("table_disp", "table_acc", "mass_disp", "mass_acc", "force_right", "f
 
 # The state, float64 (8,): positions in m, velocities in m/s, compressions in m, 1.0 where touched.
 X, VX, Y, VY, D, ON = 0, 1, 2, 3, 4, 6
-MOVING = 6  # the first six entries have a rate
-STAGES = 6  # rows of the work space: four rates, a stage, a trial
+MOVING, ROWS = 6, 6  # entries with a rate; work space: four rates, a stage, a trial
 TOUCH_M = 1e-14  # above the rounding of positions: a face just left is not touched again by it
 SWITCHES = 12  # of contact within one sub-step; more is a graze below rounding
 DENORMAL_M = 1e-30
@@ -45,8 +44,8 @@ DENORMAL_M = 1e-30
 class _Law(NamedTuple):
     """What the kernels read, SI: M K C, K_j C_j, gaps, pole, 1/m (0: no payload reaction), h, phi.
 
-    h is the sample interval in s, phi the fraction of it at which the delayed command has a corner;
-    `before` and `after` are the sub-steps on either side of the corner.
+    h is the sample interval in s, phi the fraction of it at which the spline has a corner, with
+    `before` and `after` sub-steps on either side.
     """
 
     m: float
@@ -127,8 +126,7 @@ def _margin(s, j, law):  # type: ignore[no-untyped-def]
 def _change(s, j, path, h, law, work):  # type: ignore[no-untyped-def]
     """Time in s within h at which the margin of face j is gone, a hair late rather than early.
 
-    Illinois false position, every point a Runge-Kutta step of its own. Late, because a face left a
-    hair early would still close and be touched again.
+    Illinois false position over Runge-Kutta steps. A face left early would be touched again.
     """
     low, at_low = 0.0, _margin(s, j, law)
     high, at_high = h, _margin(work[5], j, law)
@@ -168,13 +166,12 @@ def _substep(s, path, h, law, work):  # type: ignore[no-untyped-def]
     left = h
     for _ in range(SWITCHES):
         _runge_kutta(s, path, left, law, work)
-        gone_r = _margin(work[5], 0, law) < -TOUCH_M
-        gone_l = _margin(work[5], 1, law) < -TOUCH_M
-        if not (gone_r or gone_l):
+        gone = (_margin(work[5], 0, law) < -TOUCH_M, _margin(work[5], 1, law) < -TOUCH_M)
+        if not (gone[0] or gone[1]):
             break
         first, side = left, -1
         for j in range(2):
-            if (gone_r, gone_l)[j]:
+            if gone[j]:
                 _runge_kutta(s, path, left, law, work)
                 when = _change(s, j, path, left, law, work)
                 if side < 0 or when < first:
@@ -222,7 +219,7 @@ class Plant:
 
     `state` arrays are float64 (8,): x, x', y, y', compression right and left, and 1.0 where the
     right and the left face are touched. Whoever holds the state holds the plant. The output stage
-    alone takes half a sample, so a smaller servo_delay_s counts as that.
+    takes half a sample, so a smaller servo_delay_s counts as that.
     """
 
     mass_kg: float
@@ -255,23 +252,19 @@ class Plant:
 
     @property
     def _corner(self) -> tuple[int, float]:
-        """Whole samples, and fraction of one, by which the spline's corners lag the samples.
-
-        The corners of a quadratic spline lie half way between its samples.
-        """
+        """Whole samples, and part of one, by which the spline's corners lag the samples."""
         lag = max(self.servo_delay_s * self.rate_hz - 0.5, 0.0)
-        whole = math.floor(lag + 1e-9)
+        whole = math.floor(lag + 1e-9)  # a delay of whole half samples must not leave a splinter
         return whole, lag - whole if lag - whole > 1e-9 else 0.0
 
     @cached_property
     def _law(self) -> _Law:
         h, phi = 1.0 / self.rate_hz, self._corner[1]
-        relaxation_s = self.bumper_damping_n_s_m / self.bumper_stiffness_n_m
-        longest = min(self.substep_s, RELAXATION * relaxation_s)
+        kj, cj = self.bumper_stiffness_n_m, self.bumper_damping_n_s_m
+        longest = min(self.substep_s, RELAXATION * cj / kj)
         before, after = (math.ceil(part * h / longest - 1e-9) for part in (phi, 1.0 - phi))
         return _Law(
-            self.mass_kg, self.damper_stiffness_n_m, self.damper_damping_n_s_m,
-            self.bumper_stiffness_n_m, self.bumper_damping_n_s_m,
+            self.mass_kg, self.damper_stiffness_n_m, self.damper_damping_n_s_m, kj, cj,
             (self.gap_right_m, self.gap_left_m),
             2 * math.pi * self.servo_bandwidth_hz / math.sqrt(math.sqrt(2.0) - 1.0),
             1.0 / self.table_mass_kg if self.payload_reaction else 0.0,
@@ -301,5 +294,5 @@ class Plant:
         """
         if command_m.shape != (self.history + out.shape[1],) or out.shape[0] != len(SIGNALS):
             raise ValueError(f"command {command_m.shape} does not span output {out.shape}")
-        work = np.empty((STAGES, state.size))
+        work = np.empty((ROWS, state.size))
         _advance(state, command_m, self._law, work, out)

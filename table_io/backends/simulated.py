@@ -135,8 +135,8 @@ class SimulatedBackend:
 
     def read(self, samples: int) -> Float2D:
         """Volts of the next samples, (channel, sample), when they have been taken."""
-        self._clock.wait_until(self.scheduled(self._next + samples - 1))
         self._demand(self._is_open, "it is closed")
+        self._clock.wait_until(self.scheduled(self._next + samples - 1))
         first = self._next
         command = self._commanded(first - self._plant.history, first + samples)
         signals = np.empty((len(SIGNALS), samples))

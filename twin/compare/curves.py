@@ -15,7 +15,7 @@ import numpy as np
 from table_io.records import Point, Quantities
 
 DIFFERENCE = 0.10  # of the larger eta_d: what counts as another solution
-SUDDEN = 1.4  # ratio of eta_d between neighbours that a smooth branch does not reach
+SUDDEN = 1.6  # ratio of eta_d between neighbours that a smooth branch does not reach
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """The SNM on sampled table acceleration, exact between the samples: state in, state out.
 
-The table acceleration is linear between samples (first-order hold); under it every phase is known in
-closed form and every contact is found where it happens. The state is a float64 array of `STATE_SIZE`:
+The table acceleration is linear between samples (first-order hold); under it every phase is known
+in closed form and every contact is found where it happens. The state is float64 (STATE_SIZE,):
     u, v, u_r, u_l          m, m/s, m, m (u_r >= 0, u_l <= 0)
     contact_r, contact_l    1.0 in contact, else 0.0
     A                       table acceleration at this sample, m/s2
@@ -15,21 +15,9 @@ import numpy as np
 
 from table_io.block import Float1D, Float2D
 from twin.model.kernels import (
-    BASE,
-    CONSTANTS_SIZE,
-    CONTACT_L,
-    CONTACT_R,
-    MODE_SIZE,
-    MODES,
-    STATE_SIZE,
-    SUBSTEPS,
-    U_L,
-    U_R,
-    U,
-    V,
-    march,
-    tabulate,
-)
+    BASE, C_L, C_R, CONSTANTS_SIZE, CONTACT_L, CONTACT_R, E_L, E_R, G_L, G_R, K_L, K_R, MASS,
+    MODE_SIZE, MODES, R_L, R_R, STATE_SIZE, STEP, SUBSTEPS, U_L, U_R, U, V, flow, march,
+)  # fmt: skip
 from twin.model.parameters import Parameters
 
 OUTPUTS = ("u", "v", "a", "f_r", "f_l", "u_r", "u_l")
@@ -69,8 +57,8 @@ def parameter_constants(parameters: Parameters) -> Float1D:
         p.bumper_stiffness_l,
         p.bumper_damping_l,
     )
-    con[:7] = p.mass, kr, cr, kl, cl, p.gap_r, p.gap_l
-    con[9:11] = kr / cr, kl / cl
+    con[MASS], con[R_R], con[R_L] = p.mass, kr / cr, kl / cl
+    con[K_R], con[K_L], con[C_R], con[C_L], con[G_R], con[G_L] = kr, kl, cr, cl, p.gap_r, p.gap_l
     for mode in range(4):
         right, left = mode & 1, mode >> 1
         k = p.stiffness + right * kr + left * kl
@@ -84,7 +72,7 @@ def parameter_constants(parameters: Parameters) -> Float1D:
 
 
 def substeps(constants: Float1D, step: float) -> int:
-    """Parts into which a step in s is cut so that the stiffest phase turns at most `TURN` in one."""
+    """Parts of a step in s such that the stiffest phase turns at most `TURN` in each."""
     return max(1, math.ceil(step * math.sqrt(constants[MODES + 3 * MODE_SIZE + 4]) / TURN))
 
 
@@ -92,8 +80,11 @@ def constants(parameters: Parameters, rate_hz: float) -> Float1D:
     """What `advance` needs of the parameters at this sampling rate, (CONSTANTS_SIZE,)."""
     con = parameter_constants(parameters)
     parts = substeps(con, 1 / rate_hz)
-    con[SUBSTEPS] = parts
-    tabulate(con, 1 / (rate_hz * parts))
+    step = 1 / (rate_hz * parts)
+    con[STEP], con[SUBSTEPS] = step, parts
+    con[E_R], con[E_L] = math.exp(-con[R_R] * step), math.exp(-con[R_L] * step)
+    for b in range(MODES, CONSTANTS_SIZE, MODE_SIZE):
+        con[b + 5 : b + 9] = flow(step, con[b + 3], con[b + 4])
     return con
 
 

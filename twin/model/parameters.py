@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from table_io.profile import BadInput, Card, Finite, NonNegative, Positive, Specimen
 from twin.model.effects import EFFECTS
@@ -75,7 +75,7 @@ class EffectEntry(Card):
     """One [[effects]] of a model card: an id of `EFFECTS` and a value for each parameter, in SI."""
 
     id: str
-    parameters: dict[str, Finite] = {}
+    parameters: dict[str, Finite] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _known(self) -> "EffectEntry":

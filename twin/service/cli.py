@@ -131,11 +131,12 @@ def view(
     connect: Annotated[
         str, typer.Option("--connect", help="Bus of a running test, without LOG.")
     ] = "tcp/127.0.0.1:7447",
+    rig: Annotated[str, typer.Option("--rig", help="Name of the running rig.")] = "simulated",
 ) -> None:
     """Rerun with the project's layout, on a recording or on a running test."""
     from twin.service.commands import view as command
 
-    command(log, save, picture, connect)
+    command(log, save, picture, connect, rig)
 
 
 def main() -> None:

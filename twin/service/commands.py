@@ -330,12 +330,14 @@ def report(folder: Path) -> None:
     console.print(f"{folder / 'report.html'}", soft_wrap=True)
 
 
-def view(log: Path | None, save: Path | None, picture: Path | None, connect: str) -> None:
+def view(
+    log: Path | None, save: Path | None, picture: Path | None, connect: str, rig: str
+) -> None:
     """Rerun on a recording or on a running test."""
     from twin.service.viewing import view_live, view_log
 
     if log is None:
-        view_live(connect, console)
+        view_live(connect, rig, VIEW_ADDRESS, console)
     else:
         view_log(log_path(log), save, picture, console)
 

@@ -18,6 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 
 from table_io.block import Block, Float1D
 from table_io.channels import rel_disp
@@ -37,8 +38,9 @@ from twin.stream.mcap_log import Recording
 
 COLOUR = {"forward": "#c4161c", "backward": "#1559b0"}
 DASH: dict[str, Any] = {"forward": "-", "backward": (0, (4, 1.8))}
+MARKER = {"forward": 4.6, "backward": 2.6}  # both show where they coincide
 BAND = {"right": "#fff0a8", "left": "#b9f0f4"}
-TWIN, GUIDE = "#111111", "#707070"
+TWIN, GUIDE = "#111111", "#555555"
 WIDTH, BINS, HISTORY_CYCLES, LABELLED_JUMPS = 10.0, 1600, 3, 4
 STYLE = {
     "font.size": 9, "axes.titlesize": 9.5, "axes.titlelocation": "left", "axes.linewidth": 0.7,
@@ -85,13 +87,14 @@ def _curve(run: Run, who: str, direction: str, name: str) -> tuple[Float1D, Floa
     return table[:, 0], table[:, 1]
 
 
-def _key(run: Run, figure: Figure, *more: Line2D | Patch) -> None:
+def _key(run: Run, figure: Figure, *more: Line2D | Patch, marker: str = "") -> None:
     """The legend above the panels: who is which line."""
     lines: list[Line2D | Patch] = []
     driven = [one for one in DIRECTIONS if any(step["direction"] == one for step in run.steps)]
     if run.who == "measured":
         lines += [
-            Line2D([], [], color=COLOUR[one], marker="o", label=f"measured {one}") for one in driven
+            Line2D([], [], color=COLOUR[one], marker=marker, label=f"measured {one}")
+            for one in driven
         ]
     lines += [Line2D([], [], color=TWIN, ls=DASH[one], label=f"twin {one}") for one in driven]
     figure.legend(handles=[*lines, *more], loc="outside upper center", ncols=6)
@@ -135,7 +138,12 @@ def _curves(run: Run) -> Drawn:
     for ax in axes[-1]:
         ax.set_xlabel("frequency in Hz")
     kinds = sorted({one["kind"] for one in intervals})
-    _key(run, figure, *(Patch(color=BAND[kind], label=f"{kind} hysteresis") for kind in kinds))
+    _key(
+        run,
+        figure,
+        *(Patch(color=BAND[kind], label=f"{kind} hysteresis") for kind in kinds),
+        marker="o",
+    )
     caption = (
         "Per frequency step, on its steady cycles. Arrows mark jumps, between the two grid "
         "frequencies they lie between. Displacement, deformation and acceleration are divided by "
@@ -147,7 +155,7 @@ def _curves(run: Run) -> Drawn:
 def _prc_lines(run: Run, ax: Axes, name: str, sign: int) -> None:
     for one in DIRECTIONS:
         f, y = _curve(run, "measured", one, name)
-        ax.plot(f, sign * y, "o-", color=COLOUR[one], lw=0.9)
+        ax.plot(f, sign * y, "o-", color=COLOUR[one], ms=MARKER[one], lw=0.9)
     for one in DIRECTIONS:
         f, y = _curve(run, "twin", one, name)
         ax.plot(f, sign * y, color=TWIN, ls=DASH[one], lw=1.0, marker="." if f.size == 1 else "")
@@ -164,7 +172,7 @@ def _jumps(run: Run, ax: Axes, name: str, sign: int) -> None:
         colour = COLOUR[jump["direction"]]
         style = {"arrowstyle": "-|>", "color": colour, "lw": 1.6, "shrinkA": 0, "shrinkB": 0}
         ax.annotate("", (x, stop), (x, start), arrowprops=style)
-        if name in ("eta_d", "eta_a"):
+        if name == "eta_d":
             few = len(jumps) <= LABELLED_JUMPS
             low, high = sorted((jump["from_hz"], jump["to_hz"]))
             text = f"{low:g}–{high:g} Hz" if few else f"{number}"
@@ -172,6 +180,7 @@ def _jumps(run: Run, ax: Axes, name: str, sign: int) -> None:
             ax.annotate(
                 text, (x, (start + stop) / 2), (5 if right else -5, 0), color=colour, size=8,
                 textcoords="offset points", ha="left" if right else "right", va="center",
+                bbox={"facecolor": "white", "alpha": 0.85, "lw": 0, "pad": 1}, zorder=5,
             )  # fmt: skip
 
 
@@ -192,6 +201,7 @@ def _impacts(run: Run) -> Drawn:
             ax.plot(f, sign * y, "o", ms=6.5, mfc="none", mec=TWIN, mew=0.8)
         ax.set_ylabel("impacts per cycle")
         ax.set_title(one)
+        ax.yaxis.set_major_locator(MaxNLocator(integer=True))
         _mirrored(ax)
     rows[-1].set_xlabel("frequency in Hz")
     handles = [Line2D([], [], color=TWIN, marker="o", ms=6.5, mfc="none", ls="", label="twin")]
@@ -298,12 +308,12 @@ def _cycles(run: Run) -> Drawn:
     def bumper(ax: Axes, data: Motion, look: dict[str, Any]) -> None:
         for force in (data.force_r, data.force_l):
             touching = np.abs(force) > run.contact_n
-            ax.plot(np.where(touching, data.u, np.nan) * 1e3, force / 1e3, **look)
+            ax.plot(data.u * 1e3, np.where(touching, force, np.nan) / 1e3, **look)
 
     yield from _grid(
         run, columns, portrait, ("portraits", "Phase portraits", "$u$ in mm", "$u'$ in mm/s"),
         "Relative displacement and its rate over all measured cycles. The rig does not measure "
-        "u'; here it is a Savitzky-Golay derivative of u over 10 ms, for this picture only.",
+        "u'; here it is a Savitzky-Golay derivative of u over 20 ms, for this picture only.",
     )  # fmt: skip
     if mass is not None:
         yield from _grid(
@@ -336,10 +346,14 @@ def _grid(
     for column, (hz, pairs) in zip(axes.T, columns.items(), strict=False):
         for one, measured, twin in pairs:
             ax = column[driven.index(one)]
+            ax.axhline(0, color=GUIDE, lw=0.5)
             ax.set_title(f"{hz:g} Hz {one}")
             for data, look in ((measured, {"color": COLOUR[one]}), (twin, _twin(one))):
                 if data is not None:
                     draw(ax, data, look)
+            if not any(np.isfinite(line.get_ydata()).any() for line in ax.lines[1:]):
+                ax.text(0.5, 0.6, "no contact", transform=ax.transAxes, ha="center", color=GUIDE)
+                ax.set_yticks([0])
             _guides(run, ax.axvline)
         column[-1].set_xlabel(names[2])
     for ax in axes[:, 0]:
@@ -399,7 +413,10 @@ def _overview(run: Run) -> Drawn:
         "table in m/s²": lambda block: get(block, "table_acc_m_s2"),
         "$u$ in mm": lambda block: (get(block, "rel_disp_m") if track else rel_disp(block)) * 1e3,
     }
-    every = {label: [_envelope(piece, of) for piece in pieces] for label, of in rows.items()}
+    low_hz = min((step["frequency_hz"] for step in run.steps), default=1.0)
+    every = {
+        label: [_envelope(piece, of, low_hz) for piece in pieces] for label, of in rows.items()
+    }
     drawn = {
         label: envelopes
         for label, envelopes in every.items()
@@ -411,7 +428,7 @@ def _overview(run: Run) -> Drawn:
     axes = figure.subplots(len(drawn), 1, sharex=True, squeeze=False)[:, 0]
     for ax, (label, envelopes) in zip(axes, drawn.items(), strict=True):
         for time, low, high in envelopes:
-            ax.fill_between(time, low, high, color="#3a3a3a", lw=0.3)
+            ax.fill_between(time, low, high, color="#8b929c", lw=0.3)
         ax.set_ylabel(label)
         _shade_steps(run, ax, pieces, ax is axes[0])
         if label.startswith("$u$"):
@@ -419,8 +436,8 @@ def _overview(run: Run) -> Drawn:
     peaks = {step.acceleration_m_s2 for step in run.recording.start.steps}
     for ax in axes[1:2] if "table in m/s²" in drawn else ():
         for peak in peaks:
-            ax.axhline(peak, color="#b36b00", ls="--", lw=0.9)
-            ax.axhline(-peak, color="#b36b00", ls="--", lw=0.9)
+            ax.axhline(peak, color="#111111", ls="--", lw=0.9)
+            ax.axhline(-peak, color="#111111", ls="--", lw=0.9)
     axes[-1].set_xlabel("time in s")
     axes[-1].set_xlim(pieces[0].time_s[0], pieces[-1].time_s[-1])
     caption = (
@@ -430,11 +447,15 @@ def _overview(run: Run) -> Drawn:
     yield "overview", "The drive and the answer", caption, figure
 
 
-def _envelope(block: Block, of: Callable[[Block], Float1D]) -> tuple[Float1D, Float1D, Float1D]:
-    """(time, smallest, largest) in about BINS bins; NaN where a bin has no sample."""
-    starts = np.arange(0, len(block), max(1, len(block) // BINS))
+def _envelope(
+    block: Block, of: Callable[[Block], Float1D], low_hz: float
+) -> tuple[Float1D, Float1D, Float1D]:
+    """(time, smallest, largest) of bins that hold a whole cycle; NaN where nothing was sampled."""
+    width = max(len(block) // BINS, round(block.rate_hz / low_hz), 1)
+    starts = np.arange(0, len(block), width)
     values = of(block)
-    return block.time_s[starts], np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)
+    middle = block.time_s[np.minimum(starts + width // 2, len(block) - 1)]
+    return middle, np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)
 
 
 def _shade_steps(run: Run, ax: Axes, pieces: tuple[Block, ...], numbered: bool) -> None:
@@ -449,7 +470,7 @@ def _shade_steps(run: Run, ax: Axes, pieces: tuple[Block, ...], numbered: bool) 
                 continue
             start, stop = piece.time_s[first], piece.time_s[last - 1]
             shade = 0.20 if step["index"] % 2 else 0.09
-            ax.axvspan(start, stop, color=COLOUR[step["direction"]], alpha=shade, lw=0)
+            ax.axvspan(start, stop, color=COLOUR[step["direction"]], alpha=shade, lw=0, zorder=0)
             if numbered and start >= free_from:
                 middle = (start + stop) / 2
                 ax.annotate(

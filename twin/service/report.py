@@ -36,7 +36,7 @@ COMPARED_PARTS: dict[str, tuple[str, ...]] = {
     "F_R": RIGHT_CELLS,
     "F_L": LEFT_CELLS,
 }
-MOST_INTERVALS, SLOPE_S, MOST_ROWS = 2, 0.010, 200
+MOST_INTERVALS, SLOPE_S, MOST_ROWS = 2, 0.020, 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +108,10 @@ def _toml(text: str) -> dict[str, Any]:
         return {}
 
 
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
 def quantity(step: dict[str, Any], who: str, name: str) -> float:
     """A quantity of a step, its mean where it is given per cycle; NaN where there is none."""
     found = (step.get(who) or {}).get(name)
@@ -163,7 +167,7 @@ def motion(run: Run, stream: str, step: int) -> Motion | None:
 
 
 def _slope(u: Float1D, rate_hz: float) -> Float1D:
-    """u' by a Savitzky-Golay fit over 10 ms, for pictures only; NaN at both ends."""
+    """u' by a Savitzky-Golay fit over 20 ms, for pictures only; NaN at both ends."""
     half = max(2, round(SLOPE_S * rate_hz / 2))
     v = np.full(u.size, np.nan)
     if u.size > 2 * half:
@@ -181,9 +185,8 @@ def step_errors(run: Run) -> dict[str, dict[int, tuple[float, float]]]:
     owner = np.full(max((piece.end for piece in run.streams["meas"]), default=0), -1)
     for piece in run.streams["meas"]:
         owner[piece.index : piece.end] = np.where(piece.label == Label.MEASURE, piece.step, -1)
-    inside = [one for one in records if one.index + one.count <= owner.size]
     of_step: dict[int, list[Comparison]] = {}
-    for one in inside:
+    for one in (one for one in records if one.index + one.count <= owner.size):
         step = int(owner[one.index])
         if step >= 0 and step == owner[one.index + one.count - 1]:
             of_step.setdefault(step, []).append(one)
@@ -264,22 +267,16 @@ def render(run: Run, pictures: "list[Picture]") -> str:
     )
     environment.filters["sig"] = significant
     start, recording = run.recording.start, run.recording
-    texts = {
-        "profile.toml": start.profile_toml,
-        "rig.toml": start.rig_toml,
-        "model.toml": start.model_toml,
-    }
+    texts = {name: getattr(start, f"{name}_toml") for name in ("profile", "rig", "model")}
     return environment.get_template("report.html").render(
         run=run,
         summary=run.summary,
         start=start,
         headline=headline(run),
-        cards={name.removesuffix(".toml"): _toml(text) for name, text in texts.items()},
+        cards={name: _toml(text) for name, text in texts.items()},
         images=[(one, base64.b64encode(one.path.read_bytes()).decode()) for one in pictures],
         demand={step.index: step.acceleration_m_s2 for step in start.steps},
-        texts=[
-            (name, hashlib.sha256(text.encode()).hexdigest(), text) for name, text in texts.items()
-        ],
+        texts=[(name, _digest(text), text) for name, text in texts.items()],
         timings={one.component: one for one in recording.of(Timing)},
         gaps=recording.of(Gap),
         faults=recording.of(Fault),
@@ -293,17 +290,14 @@ def render(run: Run, pictures: "list[Picture]") -> str:
 def headline(run: Run) -> str:
     """One sentence: how far it came, what it found."""
     done = sum(1 for step in run.steps if step.get("measured") or step.get("twin"))
-    planned = len(run.recording.start.steps) or len(run.steps)
-    said = [f"{done} of {planned} steps"]
-    intervals = run.summary.get("hysteresis") or []
+    said = [f"{done} of {len(run.recording.start.steps) or len(run.steps)} steps"]
     said += [
-        f"{one['kind']} hysteresis {significant(one['from_hz'])} to {significant(one['to_hz'])} Hz"
-        for one in intervals
+        f"{one['kind']} hysteresis {one['from_hz']:g} to {one['to_hz']:g} Hz"
+        for one in run.summary.get("hysteresis") or []
     ] or ["no hysteresis"]
-    best = max(run.steps, key=lambda s: np.nan_to_num(quantity(s, run.who, "eta_d")), default=None)
-    if best is not None and quantity(best, run.who, "eta_d") > 0:
-        said.append(
-            f"largest excursion η_d {significant(quantity(best, run.who, 'eta_d'))} "
-            f"at {significant(best['frequency_hz'])} Hz {best['direction']}"
-        )
+    sizes = np.nan_to_num([quantity(step, run.who, "eta_d") for step in run.steps])
+    if sizes.any():
+        best = run.steps[int(np.argmax(sizes))]
+        where = f"{best['frequency_hz']:g} Hz {best['direction']}"
+        said.append(f"largest normalised excursion {significant(sizes.max())} at {where}")
     return "; ".join(said) + "."

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.profile import Profile, parse
 from table_io.records import Comparison, Fault, Gap, Point, Quantities, Timing
 from twin.compare import COMPARED
@@ -59,7 +60,7 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         "twin_jumps": [asdict(jump) for jump in twin_jumps],
         "twin_hysteresis": [asdict(interval) for interval in twin_intervals],
         "timing": _timing(recording.of(Timing)),
-        "comparison": _nrmse(recording.of(Comparison)),
+        "comparison": _nrmse(recording.of(Comparison), parameters),
     }
 
 
@@ -97,11 +98,18 @@ def _timing(records: tuple[Timing, ...]) -> Json:
     }
 
 
-def _nrmse(comparisons: tuple[Comparison, ...]) -> Json:
+def _nrmse(comparisons: tuple[Comparison, ...], parameters: Parameters) -> Json:
     """Root of error squares over measured squares; `nrmse` of the restarted twin, and of the free.
 
     The restarted twin measures the model; the free one also carries where two solutions part.
+    A load cell where there is no bumper measures its own noise: nothing to compare, null.
     """
+    absent = {
+        cell
+        for cells, gap in ((RIGHT_CELLS, parameters.gap_r), (LEFT_CELLS, parameters.gap_l))
+        for cell in cells
+        if math.isinf(gap)
+    }
     if not comparisons:
         return {}
     measured, free, window = (
@@ -114,7 +122,7 @@ def _nrmse(comparisons: tuple[Comparison, ...]) -> Json:
         for key, error in (("nrmse", window), ("free_nrmse", free)):
             known = np.isfinite(error[:, place]) & np.isfinite(measured[:, place])
             total = measured[known, place].sum()
-            values[key] = math.sqrt(error[known, place].sum() / total) if total > 0 else None
+            values[key] = math.sqrt(error[known, place].sum() / total) if total > 0 and name not in absent else None
         out[name] = values
     return out
 

@@ -9,7 +9,7 @@ import os
 import subprocess
 import sys
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from socket import socket
@@ -19,10 +19,10 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun.experimental import ViewerClient
 
 from table_io.block import Block, Float1D
 from table_io.channels import BY_NAME
-from table_io.clock import pause
 from table_io.profile import BadInput, Profile, parse
 from table_io.records import (
     Comparison,
@@ -423,7 +423,7 @@ def _plot(origin: str, name: str, contents: str | None = None) -> Any:
         axis_x=rrb.TimeAxis(view_range=_sliding(WINDOW_S)),
         time_ranges=rrb.VisibleTimeRange("time", range=_sliding(WINDOW_S)),
         plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
-        background=BACKGROUND,
+        background=rrb.archetypes.PlotBackground(color=BACKGROUND),
     )
 
 
@@ -545,53 +545,43 @@ def screenshot(source: Path | str, png: Path, at_s: float | None = None) -> list
 
     `at_s` is the time shown, the end where none is given.
     """
-    from rerun.experimental import ViewerClient
-
     with socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     process = _start(viewer(), "--headless", "--port", str(port))
     try:
-        client = _connected(ViewerClient, process, port)
+        client = _connected(process, f"rerun+http://127.0.0.1:{port}/proxy")
         client.open(str(source))
-        _until(lambda: not client.get_state().loading)
+        while client.get_state().loading:
+            _wait(process, 0.1)
         client.set_time("time", duration=at_s, play_state="paused")
-        pause(3.0)  # the first frames come without data
+        _wait(process, 3.0)  # the first frames come without data
         client.save_screenshot(str(png.resolve()))
-        return [
-            f"{view.name}: {report.summary}"
-            for view in client.get_state().views
-            for report in view.reports
-        ]
+        views = client.get_state().views
+        return [f"{view.name}: {one.summary}" for view in views for one in view.reports]
     finally:
         process.terminate()
         process.wait(10)
 
 
-def _until(done: Callable[[], bool], tries: int = 150) -> None:
-    for _ in range(tries):
-        if done():
-            return
-        pause(0.1)
-    raise TimeoutError
+def _wait(process: "subprocess.Popen[bytes]", seconds: float) -> None:
+    """Let time pass; BadInput if the viewer ends meanwhile."""
+    try:
+        process.wait(seconds)
+    except subprocess.TimeoutExpired:
+        return
+    raise BadInput(
+        "the Rerun viewer cannot draw here; it needs a graphics library: "
+        "apt-get install mesa-vulkan-drivers libvulkan1 libxkbcommon-x11-0"
+    )
 
 
-def _connected(client: Any, process: "subprocess.Popen[bytes]", port: int) -> Any:
-    """A client of the headless viewer once it answers; BadInput where it cannot start."""
-    found: list[Any] = []
-
-    def answers() -> bool:
-        if process.poll() is not None:
-            raise BadInput(
-                "the Rerun viewer cannot draw here; it needs Vulkan libraries: apt-get install "
-                "mesa-vulkan-drivers libvulkan1 libxkbcommon-x11-0"
-            )
+def _connected(process: "subprocess.Popen[bytes]", url: str) -> Any:
+    """A client of the viewer once it answers, at most 15 s from now."""
+    for _ in range(150):
+        _wait(process, 0.1)
         try:
-            found.append(client.connect(f"rerun+http://127.0.0.1:{port}/proxy"))
-            found[-1].get_state()
-        except Exception:
-            return False
-        return True
-
-    _until(answers)
-    return found[-1]
+            return ViewerClient(url)
+        except ConnectionError:
+            continue
+    raise BadInput("the Rerun viewer does not answer; try again, or look whether it starts: rerun")

@@ -3,35 +3,52 @@
 A star: the rig opens the hub, everybody else is a spoke; what a spoke publishes reaches the other
 spokes through the hub. Keys, with <topic> as in `wire.TOPIC_TYPES`:
 
-| key on the bus                   | carries                                | made by           |
-|----------------------------------|----------------------------------------|-------------------|
-| shaketwin/<rig>/stream<topic>    | what comes with every block            | publish()         |
-| shaketwin/<rig>/event<topic>     | every other record, when it happens    | publish()         |
-| shaketwin/<rig>/cmd/<name>       | a command to the rig, and its answer   | request()         |
-| shaketwin/<rig>/alive/<component>| nothing; is there while the process is | alive()           |
+| key on the bus                    | carries                               | called by         |
+|-----------------------------------|---------------------------------------|-------------------|
+| shaketwin/<rig>/stream<topic>     | what comes with every block           | publish()         |
+| shaketwin/<rig>/event<topic>      | every other record, when it happens   | publish()         |
+| shaketwin/<rig>/state/held        | question: what do you hold from n on? | Inbox.get()       |
+| shaketwin/<rig>/cmd/<name>        | a command to the rig, and its answer  | request()         |
+| shaketwin/<rig>/alive/<component> | nothing; is there as long as it lives | alive()           |
 
 so /rig/meas travels on shaketwin/<rig>/stream/rig/meas and /run/start on .../event/run/start.
+
+Full queues drop, so a stalled spoke never slows a publisher. Every publisher numbers its messages
+and holds the newest of them; an inbox that finds a number missing asks for the rest, a chunk at a
+time, and takes nothing newer until it has it. zenoh's own AdvancedPublisher does not serve: its
+put() waits while history is sent (100 ms for 5000 blocks, 5 s if the one who asked is stopped) and
+its subscriber silently loses the history of a publisher that goes on publishing (zenoh 1.10.2).
 """
 
 import json
 import re
+import secrets
+import struct
 import threading
 from collections import deque
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any
 
 import zenoh
-import zenoh.ext
 
+from table_io.clock import RealClock
 from table_io.profile import BadInput
 from twin.stream.wire import BLOCK_TOPICS, COMPARED
 
-HUB_MODE = "router"
-CACHE_SAMPLES = 5000
-HEARTBEAT_S = 0.5
-LARGEST_BYTES = 4 * 2**20
-COMMANDS_WAITING = 16
+LARGEST_BYTES = 4 * 2**20  # of one payload
+HELD_MESSAGES = 5000  # per topic and publisher: 50 s of blocks
+HELD_BYTES = 64 * 2**20
+CHUNK_BYTES = 128 * 2**10  # of one answer: what a publisher's loop can spare time for
+QUESTIONS_WAITING = 16
+ASK_EVERY_S = 0.5  # in case the last message of a topic was lost
+ASK_AGAIN_S = 0.2  # in case question or answer was lost
+ASK_MORE_S = 0.002
+GIVE_UP_S = 10.0  # zenoh's lease: then a silent publisher counts as dead
+TURN_S = 0.02  # while waiting, others are answered this often
 STREAMS = frozenset((*BLOCK_TOPICS.values(), COMPARED))
+STAMP = struct.Struct("<8sQ")  # publisher, number of the message within its topic
+CLOCK = RealClock()
 
 
 def key(rig: str, topic: str) -> str:
@@ -39,45 +56,156 @@ def key(rig: str, topic: str) -> str:
     return f"shaketwin/{rig}/{'stream' if topic in STREAMS else 'event'}{topic}"
 
 
-class Inbox:
-    """What arrived and was not fetched yet, in order per topic, at most `capacity` messages.
+class Shelf:
+    """The newest messages of one published topic; they are numbered `first` to `end` - 1."""
 
-    `missed` messages were lost on the way beyond recovery, `dropped` ones pushed out by newer ones
-    because nobody fetched them, `ignored` ones too large.
+    def __init__(self, publisher: Any) -> None:
+        self.publisher = publisher
+        self.end = 0
+        self._held: deque[bytes] = deque()
+        self._bytes = 0
+
+    @property
+    def first(self) -> int:
+        return self.end - len(self._held)
+
+    def add(self, payload: bytes) -> None:
+        """Hold one more; the oldest give way."""
+        self._held.append(payload)
+        self._bytes += len(payload)
+        self.end += 1
+        while len(self._held) > HELD_MESSAGES or self._bytes > HELD_BYTES:
+            self._bytes -= len(self._held.popleft())
+
+    def take(self, first: int, room: int) -> list[bytes]:
+        """Messages from number `first` on that fit into `room` bytes, at least one if `room` > 0."""
+        taken: list[bytes] = []
+        for payload in islice(self._held, first - self.first, None):
+            if room <= 0 or (taken and len(payload) > room):
+                break
+            taken.append(payload)
+            room -= len(payload)
+        return taken
+
+
+@dataclass(slots=True)
+class Source:
+    """How far an inbox has come with one topic of one publisher; None before the first message."""
+
+    next: int | None
+    seen: int = 0
+    behind_since: float | None = None
+
+
+class Inbox:
+    """Messages in order per topic and publisher; `subscribe` makes it, one thread reads it.
+
+    `missed` messages were gone before they could be asked for again, `dropped` ones were pushed out
+    by newer ones because nobody fetched them, `ignored` ones too large.
     """
 
-    def __init__(self, capacity: int) -> None:
+    def __init__(self, link: "Link", topics: tuple[str, ...], history: bool, capacity: int) -> None:
         self.missed = 0
         self.dropped = 0
         self.ignored = 0
+        self._link = link
+        self._topics = topics
+        self._history = history
         self._capacity = capacity
-        self._queue: deque[tuple[str, bytes]] = deque()
+        self._arrived: deque[tuple[str, bytes, bytes]] = deque()  # topic "" = an answer
         self._filled = threading.Condition()
-
-    def __len__(self) -> int:
-        return len(self._queue)
+        self._skipped: dict[tuple[str, str], int] = {}
+        self._ready: deque[tuple[str, bytes]] = deque()
+        self._sources: dict[tuple[str, str], Source] = {}
+        self._asked_at = float("-inf")
+        self._answered = False
 
     def get(self, timeout_s: float) -> tuple[str, bytes] | None:
-        """The oldest (topic, payload); None when nothing comes within `timeout_s`."""
-        with self._filled:
-            if not self._queue and not self._filled.wait_for(lambda: self._queue, timeout_s):
+        """The next (topic, payload); None when there is none within `timeout_s`."""
+        deadline = CLOCK.now() + timeout_s
+        while not self._ready:
+            self._link.serve()
+            now = CLOCK.now()
+            self._ask_if_due(now)
+            with self._filled:
+                if not self._arrived and now < deadline:
+                    self._filled.wait(min(TURN_S, deadline - now))
+                entry = self._arrived.popleft() if self._arrived else None
+            if entry is not None:
+                self._sort(*entry)
+            elif now >= deadline:
                 return None
-            return self._queue.popleft()
+        return self._ready.popleft()
 
-    def _put(self, topic: str, sample: Any) -> None:
-        if len(sample.payload) > LARGEST_BYTES:
+    def arrive(self, topic: str, stamp: Any, payload: Any) -> None:
+        """Take what zenoh's thread brings; a copy and no more, since that thread feeds the rest."""
+        if len(payload) > LARGEST_BYTES + CHUNK_BYTES or stamp is None:
             self.ignored += 1
             return
-        payload = sample.payload.to_bytes()
+        entry = (topic, stamp.to_bytes(), payload.to_bytes())
         with self._filled:
-            if len(self._queue) >= self._capacity:
-                self._queue.popleft()
-                self.dropped += 1
-            self._queue.append((topic, payload))
+            if len(self._arrived) >= self._capacity:
+                self._drop(*self._arrived.popleft())
+            self._arrived.append(entry)
             self._filled.notify()
 
-    def _miss(self, miss: Any) -> None:
-        self.missed += miss.nb
+    def _drop(self, topic: str, stamp: bytes, _: bytes) -> None:
+        # With history it is only put off: the gap it leaves is asked for when there is time.
+        if topic and not self._history:
+            source, number = STAMP.unpack(stamp)
+            self._skipped[topic, source.hex()] = number + 1
+            self.dropped += 1
+
+    def _sort(self, topic: str, stamp: bytes, payload: bytes) -> None:
+        """Move what arrived to `_ready` if it is next in order; else note that we are behind."""
+        if not topic:
+            self._take(json.loads(stamp), payload)
+            return
+        name, number = STAMP.unpack(stamp)
+        where = (topic, name.hex())
+        source = self._sources.setdefault(where, Source(0 if number == 0 else None))
+        if source.next is None and not self._history:
+            source.next = number
+        if source.next is not None and where in self._skipped:
+            source.next = max(source.next, self._skipped.pop(where))
+        source.seen = max(source.seen, number)
+        if number == source.next:
+            source.next += 1
+            self._ready.append((topic, payload))
+        elif (source.next is None or number > source.next) and source.behind_since is None:
+            source.behind_since = CLOCK.now()
+
+    def _take(self, header: dict[str, Any], body: bytes) -> None:
+        """Move the messages of an answer to `_ready`; count those that their publisher lacks."""
+        self._answered = True
+        at = 0
+        for topic, (first, end, sizes) in header["topics"].items():
+            source = self._sources.setdefault((topic, header["source"]), Source(None))
+            if source.next is None:
+                source.next = first
+            self.missed += max(0, first - source.next)
+            source.next = max(first, source.next)
+            for number, size in enumerate(sizes, first):
+                if number == source.next:
+                    self._ready.append((topic, body[at : at + size]))
+                    source.next += 1
+                at += size
+            source.behind_since = CLOCK.now() if source.next < end else None
+
+    def _ask_if_due(self, now: float) -> None:
+        behind = [one for one in self._sources.values() if one.behind_since is not None]
+        for source in behind:
+            if now - (source.behind_since or now) > GIVE_UP_S:
+                self.missed += source.seen + 1 - (source.next or 0)
+                source.next, source.behind_since = source.seen + 1, None
+        pause = ASK_EVERY_S if not behind else ASK_MORE_S if self._answered else ASK_AGAIN_S
+        if now - self._asked_at >= pause:
+            self._asked_at, self._answered = now, False
+            known: dict[str, dict[str, int]] = {topic: {} for topic in self._topics}
+            for (topic, name), one in self._sources.items():
+                if one.next is not None:
+                    known[topic][name] = one.next
+            self._link.ask({"history": self._history, "next": known}, self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,29 +223,30 @@ class Command:
 
 
 class Commands:
-    """Commands to the rig. No thread: they wait in zenoh, the oldest gives way when it is full."""
+    """Commands to this process. No thread: they wait in zenoh, where the oldest gives way."""
 
-    def __init__(self, queryable: Any) -> None:
+    def __init__(self, link: "Link", queryable: Any) -> None:
         self.ignored = 0
+        self._link = link
         self._queryable = queryable
 
     def poll(self) -> Command | None:
         """The next command, or None at once."""
+        self._link.serve()
         while (query := self._queryable.try_recv()) is not None:
-            payload = query.payload
-            if payload is None or len(payload) <= LARGEST_BYTES:
-                try:
-                    text = "" if payload is None else payload.to_string()
-                    return Command(str(query.key_expr).rsplit("/", 1)[1], text, query)
-                except UnicodeDecodeError:
-                    pass
+            payload = b"" if query.payload is None else query.payload.to_bytes()
+            try:
+                if len(payload) <= LARGEST_BYTES:
+                    return Command(str(query.key_expr).rsplit("/", 1)[1], payload.decode(), query)
+            except UnicodeDecodeError:
+                pass
             self.ignored += 1
             query.drop()
         return None
 
 
 class Link:
-    """One process's end of the star; made by `open_hub` or `open_spoke`.
+    """One process's end of the star; made by `open_hub` or `open_spoke`, used by one thread.
 
     `refused` counts payloads that were too large to publish.
     """
@@ -126,58 +255,114 @@ class Link:
         self.refused = 0
         self._rig = rig
         self._session = session
-        self._publishers: dict[str, Any] = {}
-        self._subscribers: list[Any] = []
-        self._others: list[Any] = []
+        self._name = secrets.token_bytes(8)
+        self._shelves: dict[str, Shelf] = {}
+        self._open: list[Any] = []
+        self._questions: Any = None
 
     def declare(self, topics: tuple[str, ...]) -> None:
         """Make ready to publish `topics`, so that the first one costs no more than the others."""
         for topic in topics:
-            if topic not in self._publishers:
-                self._publishers[topic] = zenoh.ext.declare_advanced_publisher(
-                    self._session,
-                    key(self._rig, topic),
-                    congestion_control=zenoh.CongestionControl.DROP,
-                    cache=zenoh.ext.CacheConfig(max_samples=CACHE_SAMPLES),
-                    sample_miss_detection=zenoh.ext.MissDetectionConfig(
-                        heartbeat=HEARTBEAT_S, sporadic_heartbeat=None
-                    ),
-                    publisher_detection=True,
+            if topic not in self._shelves:
+                publisher = self._session.declare_publisher(
+                    key(self._rig, topic), congestion_control=zenoh.CongestionControl.DROP
                 )
+                self._shelves[topic] = Shelf(publisher)
+        if self._questions is None:
+            self._questions = self._queryable("state/held")
 
     def publish(self, topic: str, payload: bytes) -> None:
-        """Send to whoever subscribed, and keep for those who come late. Never waits."""
+        """Send to whoever subscribed, and hold for those who ask later. Never waits."""
         if len(payload) > LARGEST_BYTES:
             self.refused += 1
             return
-        self._publishers[topic].put(payload)
+        shelf = self._shelves[topic]
+        shelf.publisher.put(payload, attachment=STAMP.pack(self._name, shelf.end))
+        shelf.add(payload)
+        self.serve()
+
+    def serve(self) -> None:
+        """Answer one question for held messages if there is one, with at most a chunk.
+
+        Everything one does with a link does this too; a publisher that does nothing for long must
+        call it, until those who listen have what they need.
+        """
+        query = self._questions.try_recv() if self._questions is not None else None
+        if query is None:
+            return
+        with query:
+            try:
+                question = json.loads(query.payload.to_bytes())
+                topics, body = self._answer(question["next"], bool(question["history"]))
+            except (ValueError, TypeError, KeyError, AttributeError):
+                return  # not one of ours: nothing to say
+            if topics:
+                header = json.dumps({"source": self._name.hex(), "topics": topics})
+                query.reply(query.key_expr, body, attachment=header)
+
+    def _answer(self, asked: dict[str, dict[str, int]], history: bool) -> tuple[dict[str, Any], bytes]:
+        """({topic: [first, end, sizes]}, their payloads in a row): a chunk of what was asked for."""
+        topics: dict[str, Any] = {}
+        chunk: list[bytes] = []
+        room = CHUNK_BYTES
+        # Rare topics first, so that the start of a run comes before its blocks.
+        for topic in sorted(self._shelves.keys() & asked, key=lambda one: self._shelves[one].end):
+            shelf = self._shelves[topic]
+            known = asked[topic].get(self._name.hex())
+            first = (shelf.first if history else shelf.end) if known is None else int(known)
+            first = max(first, shelf.first)
+            payloads = shelf.take(first, room)
+            room -= sum(map(len, payloads))
+            chunk += payloads
+            if payloads or known is None:
+                topics[topic] = [first, shelf.end, [len(one) for one in payloads]]
+        return topics, b"".join(chunk)
+
+    def ask(self, question: dict[str, Any], inbox: Inbox) -> None:
+        """Ask all publishers for what they hold; answers arrive in the inbox. Never waits."""
+
+        def answered(reply: Any) -> None:
+            if reply.ok is not None:
+                inbox.arrive("", reply.ok.attachment, reply.ok.payload)
+
+        # Answers are sent with the congestion control of the question: dropped if we are stalled.
+        self._session.get(
+            f"shaketwin/{self._rig}/state/held",
+            zenoh.handlers.Callback(answered, indirect=False),
+            payload=json.dumps(question),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            congestion_control=zenoh.CongestionControl.DROP,
+            allowed_destination=zenoh.Locality.REMOTE,
+            timeout=ASK_EVERY_S,
+        )
 
     def subscribe(self, topics: tuple[str, ...], *, history: bool, capacity: int) -> Inbox:
-        """Inbox of `topics`; with `history` it begins with what their publishers still hold."""
-        inbox = Inbox(capacity)
-        for topic in topics:
-            self._subscribe(topic, inbox, history)
-        return inbox
+        """Inbox of `topics` that keeps at most `capacity` messages waiting.
 
-    def _subscribe(self, topic: str, inbox: Inbox, history: bool) -> None:
-        # indirect=False: zenoh's own thread fills the inbox, instead of a Python thread per topic.
-        subscriber = zenoh.ext.declare_advanced_subscriber(
-            self._session,
-            key(self._rig, topic),
-            zenoh.handlers.Callback(lambda sample: inbox._put(topic, sample), indirect=False),
-            history=zenoh.ext.HistoryConfig(detect_late_publishers=True) if history else None,
-            recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
-        )
-        self._subscribers.append(subscriber)
-        subscriber.sample_miss_listener(zenoh.handlers.Callback(inbox._miss, indirect=False))
+        With `history` it begins with what the publishers still hold and loses nothing that they
+        hold; without, it begins now and, when full, drops the oldest.
+        """
+        inbox = Inbox(self, topics, history, capacity)
+        for topic in topics:
+
+            def arrived(sample: Any, topic: str = topic) -> None:
+                inbox.arrive(topic, sample.attachment, sample.payload)
+
+            # indirect=False: zenoh's own thread fills the inbox, instead of a Python thread each.
+            callback = zenoh.handlers.Callback(arrived, indirect=False)
+            self._open.append(self._session.declare_subscriber(key(self._rig, topic), callback))
+        return inbox
 
     def commands(self) -> Commands:
         """The commands that others send to this process."""
-        queryable = self._session.declare_queryable(
-            f"shaketwin/{self._rig}/cmd/*", zenoh.handlers.RingChannel(COMMANDS_WAITING)
-        )
-        self._others.append(queryable)
-        return Commands(queryable)
+        return Commands(self, self._queryable("cmd/*"))
+
+    def _queryable(self, what: str) -> Any:
+        where = f"shaketwin/{self._rig}/{what}"
+        waiting = zenoh.handlers.RingChannel(QUESTIONS_WAITING)
+        self._open.append(self._session.declare_queryable(where, waiting))
+        return self._open[-1]
 
     def request(self, command: str, text: str = "", timeout_s: float = 1.0) -> str | None:
         """The rig's answer to a command; None if there is none within `timeout_s`."""
@@ -188,22 +373,21 @@ class Link:
         return None
 
     def alive(self, component: str) -> None:
-        """Be among `components()` of everybody until this process ends."""
+        """Be among everybody's `components()` until this process ends."""
         where = f"shaketwin/{self._rig}/alive/{component}"
-        self._others.append(self._session.liveliness().declare_token(where))
+        self._open.append(self._session.liveliness().declare_token(where))
 
     def components(self) -> set[str]:
         """Names of the components whose processes are connected."""
-        where = f"shaketwin/{self._rig}/alive/*"
-        replies = self._session.liveliness().get(where, timeout=1.0)
+        self.serve()
+        replies = self._session.liveliness().get(f"shaketwin/{self._rig}/alive/*", timeout=1.0)
         return {str(one.ok.key_expr).rsplit("/", 1)[1] for one in replies if one.ok is not None}
 
     def close(self) -> None:
         """Leave the star; may be called again."""
-        # Subscribers first: a session that closes under them never ends (zenoh-python issue 624).
-        for one in (*self._subscribers, *self._others, *self._publishers.values()):
+        for one in (*self._open, *(shelf.publisher for shelf in self._shelves.values())):
             one.undeclare()
-        self._subscribers, self._others, self._publishers = [], [], {}
+        self._open, self._shelves, self._questions = [], {}, None
         if not self._session.is_closed():
             self._session.close()
 
@@ -212,11 +396,11 @@ def open_hub(rig: str, endpoint: str) -> Link:
     """The end that listens at `endpoint`; BadInput where that cannot be."""
     _check(rig, endpoint)
     try:
-        return Link(rig, zenoh.open(_config(HUB_MODE, "listen", endpoint, 0)))
+        return Link(rig, zenoh.open(_config("router", "listen", endpoint, 0)))
     except zenoh.ZError as error:
         raise BadInput(
-            f"endpoint {endpoint}: cannot listen there ({_last(error)}); end the run that holds the "
-            "port, or give a free one"
+            f"endpoint {endpoint}: cannot listen there ({_why(error)}); "
+            "end the run that holds the port, or give another one"
         ) from None
 
 
@@ -225,58 +409,40 @@ def open_spoke(rig: str, endpoint: str, timeout_s: float) -> Link:
     _check(rig, endpoint)
     try:
         return Link(rig, zenoh.open(_config("client", "connect", endpoint, timeout_s)))
-    except zenoh.ZError as error:
+    except zenoh.ZError:
         raise BadInput(
-            f"endpoint {endpoint}: no rig answers there within {timeout_s:g} s ({_last(error)}); "
-            "start the run first, or give its endpoint"
+            f"endpoint {endpoint}: no rig answers there within {timeout_s:g} s; "
+            "start the run first, or give the endpoint it listens at"
         ) from None
 
 
 def _check(rig: str, endpoint: str) -> None:
-    if not re.fullmatch(r"[^*$?#/\s]+", rig):
-        raise BadInput(f"rig {rig!r}: not a name for the bus; allowed: no spaces and none of * $ ? # /")
+    if not re.fullmatch(r"[\w.-]+", rig):
+        raise BadInput(f"rig {rig!r}: not a name for the bus; allowed: letters, digits and _ . -")
     match = re.fullmatch(r"tcp/(\[[0-9A-Fa-f:]+\]|[\w.-]+):(\d{1,5})", endpoint)
     if not match or not 0 < int(match[2]) < 2**16:
         raise BadInput(
-            f"endpoint {endpoint!r}: not an endpoint; write tcp/<host>:<port>, e.g. tcp/127.0.0.1:7447"
+            f"endpoint {endpoint!r}: not understood; write tcp/<host>:<port>, as tcp/127.0.0.1:7447"
         )
 
 
-def _last(error: Exception) -> str:
-    return str(error)
+def _why(error: Exception) -> str:
+    """The innermost reason in zenoh's message, without its source files."""
+    reason = re.search(r"([A-Z][^\[\]:]*) \(os error", str(error))
+    return reason[1] if reason else re.sub(r" at /\S+", "", str(error))
 
 
 def _config(mode: str, way: str, endpoint: str, timeout_s: float) -> Any:
-    """Session settings: nothing but the one endpoint; full queues drop at once."""
-    return zenoh.Config.from_json5(
-        json.dumps(
-            {
-                "mode": mode,
-                "listen": {"endpoints": [], "timeout_ms": 0, "exit_on_failure": True},
-                "connect": {"endpoints": [], "timeout_ms": 0, "exit_on_failure": True},
-                "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-                "transport": {
-                    "shared_memory": {"enabled": False},
-                    "link": {
-                        "tx": {
-                            "queue": {
-                                "congestion_control": {
-                                    "drop": {
-                                        "wait_before_drop": 0,
-                                        "max_wait_before_drop_fragments": 0,
-                                    }
-                                }
-                            }
-                        }
-                    },
-                },
-            }
-            | {
-                way: {
-                    "endpoints": [endpoint],
-                    "timeout_ms": round(timeout_s * 1000),
-                    "exit_on_failure": True,
-                }
-            }
-        )
-    )
+    """Session settings: the one endpoint and no other; full queues drop at once."""
+    ends = {way: {"endpoints": [endpoint], "timeout_ms": round(timeout_s * 1000)}}
+    drop = {"wait_before_drop": 0, "max_wait_before_drop_fragments": 0}
+    queue = {"congestion_control": {"drop": drop}, "size": {"data": 16}}
+    config = {
+        "mode": mode,
+        "listen": {"endpoints": []},
+        "connect": {"endpoints": [], "exit_on_failure": True},
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "transport": {"shared_memory": {"enabled": False}, "link": {"tx": {"queue": queue}}},
+    }
+    config[way] = {**config[way], **ends[way], "exit_on_failure": True}  # type: ignore[dict-item]
+    return zenoh.Config.from_json5(json.dumps(config))

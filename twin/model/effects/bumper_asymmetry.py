@@ -34,8 +34,8 @@ BUMPER_ASYMMETRY = Effect(
     ),
     change=_change,
     residual=(
-        "In contact only, and of the same sign on both sides: force in proportion to |u_j|, so even "
-        "harmonics of the drive. Slopes of the two F_j-v_j loops differ; touching points do not."
+        "In contact only, of the same sign on both sides: force in proportion to |u_j|, so even "
+        "harmonics of the drive. Slopes of the two F_j-v_j loops differ; their feet do not."
     ),
     confused_with=("gap_offset", "bumper_hardening"),
 )

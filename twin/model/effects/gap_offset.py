@@ -29,9 +29,9 @@ GAP_OFFSET = Effect(
     ),
     change=_change,
     residual=(
-        "Contact begins early on one side and late on the other: force residual in short bursts at "
-        "onset and release, of one sign through the contact, and a mean of u. Slopes of the F_j-v_j "
-        "loops agree; their feet do not."
+        "Contact begins early on one side and late on the other: force residual of one sign "
+        "through the contact, largest at onset and release, and a mean of u. Slopes of the two "
+        "F_j-v_j loops agree; their feet do not."
     ),
     confused_with=("bumper_asymmetry", "sensor_offset"),
 )
