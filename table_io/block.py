@@ -7,6 +7,7 @@ Nothing in a calculation ever asks a wall clock.
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,7 @@ import numpy.typing as npt
 Float1D = npt.NDArray[np.float64]
 Float2D = npt.NDArray[np.float64]
 Int1D = npt.NDArray[np.int64]
+Bool2D = npt.NDArray[np.bool_]
 
 
 class Label(IntEnum):
@@ -99,9 +101,11 @@ class Block:
 
 def join(blocks: Sequence[Block]) -> Block:
     """One block from consecutive ones; ValueError where samples are missing between them."""
-    for left, right in zip(blocks, blocks[1:], strict=False):
+    for left, right in pairwise(blocks):
         if left.end != right.index or left.channels != right.channels:
-            raise ValueError(f"block at {right.index} does not continue the one that ends at {left.end}")
+            raise ValueError(
+                f"block at {right.index} does not continue the one that ends at {left.end}"
+            )
     head = blocks[0]
     if len(blocks) == 1:
         return head

@@ -1,4 +1,4 @@
-"""Volts <-> SI, both directions side by side: volts = (value - offset) * volts_per_si.
+"""Volts <-> SI, both directions side by side: volts = (value + offset) * volts_per_si.
 
 The offset is the tare: the SI value that the sensor showed at rest, before precompression.
 """

@@ -1,9 +1,9 @@
 """Stepped sine of constant peak acceleration -> displacement command, sample by sample.
 
-A drive is a value: a tuple of segments, each a closed form of the sample index, so any sample can be
-had at any time and cutting it into blocks changes no bit. Phase is continuous throughout; amplitude
-and frequency change by quintic blends (C2), because switching at a zero crossing would jump the
-table's velocity.
+A drive is a value: a tuple of segments, each a closed form of the sample index, so any sample can
+be had at any time and cutting it into blocks changes no bit. Phase is continuous throughout;
+amplitude and frequency change by quintic blends (C2), because switching at a zero crossing would
+jump the table's velocity.
 
 In a segment, with s(x) = 6x^5 - 15x^4 + 10x^3 over its length,
     f = f0 + (f1 - f0) s,   level = l0 + (l1 - l0) s,   theta = 2 pi (phase0 + integral f dt)
@@ -80,7 +80,10 @@ def _quadratures(
     g = level / w**2
     dg = (dl * ds - 2 * level * df * ds / f) / w**2
     ddg = (
-        dl * dds - 4 * dl * df * ds**2 / f - 2 * level * df * dds / f + 6 * level * (df * ds / f) ** 2
+        dl * dds
+        - 4 * dl * df * ds**2 / f
+        - 2 * level * df * dds / f
+        + 6 * level * (df * ds / f) ** 2
     ) / w**2
     dw = 2 * math.pi * df * ds
     return -dg, -g * w, g * w**2 - ddg, -(2 * dg * w + g * dw)
@@ -103,7 +106,7 @@ def worst_acceleration(segment: Segment, rate_hz: float) -> float:
 
 @dataclass(frozen=True)
 class Drive:
-    """The whole command. From sample `decay_at` on it is multiplied down to rest, if that is set."""
+    """The whole command; from sample `decay_at` on, if set, it is multiplied down to rest."""
 
     rate_hz: float
     segments: tuple[Segment, ...]
@@ -224,7 +227,17 @@ def plan(profile: Profile) -> Drive:
         settle = sweep.cycles - sweep.measured_cycles
         add(
             Segment(
-                at, count, Label.MEASURE, step.index, f, f, level, level, phase, sweep.cycles, settle
+                at,
+                count,
+                Label.MEASURE,
+                step.index,
+                f,
+                f,
+                level,
+                level,
+                phase,
+                sweep.cycles,
+                settle,
             )
         )
         before = step

@@ -35,9 +35,15 @@ def margins(drive: Drive, profile: Profile, rig: Rig) -> tuple[Margin, ...]:
         held = step.acceleration_m_s2 / (2 * np.pi * step.frequency_hz) ** 2
         rows.append(
             Margin(
-                step.index, step.direction, step.frequency_hz, d, v, a, mass * a,
+                step.index,
+                step.direction,
+                step.frequency_hz,
+                d,
+                v,
+                a,
+                mass * a,
                 held / rig.output.lsb_m,
-            )  # fmt: skip
+            )
         )
     return tuple(rows)
 
@@ -79,9 +85,9 @@ def refuse(rows: tuple[Margin, ...], profile: Profile, rig: Rig, where: str) -> 
     coarse = min(rows, key=lambda row: row.lsb)
     if coarse.lsb < rig.output.least_lsb:
         faults.append(
-            f"step {coarse.step} ({coarse.frequency_hz:g} Hz): amplitude is {coarse.lsb:.1f} steps of "
-            f"the DAC; allowed: at least {rig.output.least_lsb}. Raise sweep.acceleration_g, lower "
-            "sweep.stop_hz, or use an output with more bits or a smaller span"
+            f"step {coarse.step} ({coarse.frequency_hz:g} Hz): amplitude is {coarse.lsb:.1f} steps "
+            f"of the DAC; allowed: at least {rig.output.least_lsb}. Raise sweep.acceleration_g, "
+            "lower sweep.stop_hz, or use an output with more bits or a smaller span"
         )
     if faults:
         head = f"{where}: the table {rig.name!r} cannot do this test; nothing was started"

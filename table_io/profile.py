@@ -40,7 +40,7 @@ UNITS: dict[str, tuple[str, float]] = {
 
 
 class Sensor(Card):
-    """A channel's way from the quantity to volts: volts = (value - offset) * volts_per_unit."""
+    """A channel's way from the quantity to volts: volts = (value + offset) * volts_per_unit."""
 
     channel: str
     unit: str
@@ -144,12 +144,18 @@ class Rig(Card):
         names = [sensor.channel for sensor in self.sensors]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise ValueError(f"sensors name {', '.join(twice)} more than once; one sensor a channel")
+            raise ValueError(
+                f"sensors name {', '.join(twice)} more than once; one sensor a channel"
+            )
         missing = {"drive_disp_m", "table_disp_m", "table_acc_m_s2"} - set(names)
         if missing:
-            raise ValueError(f"sensors lack {', '.join(sorted(missing))}; the controller needs them")
+            raise ValueError(
+                f"sensors lack {', '.join(sorted(missing))}; the controller needs them"
+            )
         if self.backend == "simulated" and self.simulated is None:
-            raise ValueError("backend 'simulated' needs a [simulated] table with servo and specimen")
+            raise ValueError(
+                "backend 'simulated' needs a [simulated] table with servo and specimen"
+            )
         return self
 
     @property
@@ -200,8 +206,8 @@ class Sweep(Card):
     def _grid(self) -> "Sweep":
         if self.stop_hz < self.start_hz:
             raise ValueError(
-                f"stop_hz {self.stop_hz} lies below start_hz {self.start_hz}; give the grid upwards, "
-                "`directions` says which way it is driven"
+                f"stop_hz {self.stop_hz} lies below start_hz {self.start_hz}; give the grid "
+                "upwards, `directions` says which way it is driven"
             )
         whole = round((self.stop_hz - self.start_hz) / self.step_hz)
         if abs(self.start_hz + whole * self.step_hz - self.stop_hz) > 1e-6:
@@ -351,7 +357,7 @@ def read_text(path: Path, what: str) -> str:
 
 
 def find(name: str, folder: str, beside: Path | None = None) -> Path:
-    """Path of the card `name` (a path, or a name in `folder` beside a profile or in the project)."""
+    """Path of the card `name`: a path, or a name in `folder`, beside a profile or ours."""
     direct = Path(name)
     if direct.suffix == ".toml":
         return direct

@@ -138,7 +138,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """Samples index .. index + count - 1 that are not a true measurement of `channel` ("" = all)."""
+    """Samples index .. index + count - 1 are no true measurement of `channel` ("" = all)."""
 
     index: int
     count: int
@@ -188,9 +188,7 @@ class RunStop:
     states: tuple[str, ...] = field(default=())
 
 
-Record = (
-    RunStart | Params | Comparison | Cycle | Point | Event | Gap | Fault | Timing | RunStop
-)
+Record = RunStart | Params | Comparison | Cycle | Point | Event | Gap | Fault | Timing | RunStop
 RECORDS: tuple[type, ...] = (
     RunStart, Params, Comparison, Cycle, Point, Event, Gap, Fault, Timing, RunStop,
 )  # fmt: skip

@@ -1,7 +1,7 @@
 """The rig's loop: a generator that plays a drive on a backend and yields Blocks and records.
 
-States: idle, checking, armed, running, stopping, at rest, fault. Every way to end decays the command
-to rest: it is always queued to end there, so the decay also plays if this process dies.
+States: idle, checking, armed, running, stopping, at rest, fault. Every way to end decays the
+command to rest: it is always queued to end there, so the decay also plays if this process dies.
 """
 
 from collections.abc import Callable, Iterator
@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from table_io.backends import Backend
-from table_io.block import Block, Float1D, Float2D
+from table_io.block import Block, Bool2D, Float1D
 from table_io.calibration import command_to_volts, tare_from, to_si
 from table_io.clock import Clock
 from table_io.drive import Drive
@@ -34,7 +34,7 @@ class Setup:
 
 @dataclass(slots=True)
 class Punctuality:
-    """Lateness of each block in s: from its last sample's scheduled time to when it was handed on."""
+    """Lateness of each block in s: from its last sample's schedule to when it is handed on."""
 
     late_s: list[float] = field(default_factory=list)
 
@@ -59,9 +59,7 @@ def play(
     backend.open()
     run = _Run(setup, backend)
     try:
-        tare = tare_from(
-            backend.tare(int(TARE_S * setup.drive.rate_hz)), setup.rig.sensors
-        )
+        tare = tare_from(backend.tare(int(TARE_S * setup.drive.rate_hz)), setup.rig.sensors)
         states.append("armed")
         run.feed()
         backend.start()
@@ -130,7 +128,7 @@ class _Run:
         self.backend.queue(at, self._volts(self.drive.command(at, self.drive.rest_from + 1 - at)))
         self._queued = self.drive.rest_from
 
-    def acquire(self, tare: dict[str, float]) -> tuple[Block, Float2D]:
+    def acquire(self, tare: dict[str, float]) -> tuple[Block, Bool2D]:
         """(the next block in SI, True where a sample lies at its sensor's range)."""
         rig = self.setup.rig
         count = min(self.setup.profile.acquisition.block_samples, self.end - self.acquired)
@@ -161,7 +159,7 @@ class _Run:
             self.acquired += count
 
 
-def _gaps(block: Block, clipped: Float2D) -> Iterator[Gap]:
+def _gaps(block: Block, clipped: Bool2D) -> Iterator[Gap]:
     """A Gap for every channel of the block with lost or clipped samples."""
     if not (clipped.any() or np.isnan(block.values).any()):
         return
@@ -171,5 +169,3 @@ def _gaps(block: Block, clipped: Float2D) -> Iterator[Gap]:
             if places.size:
                 first = int(places[0])
                 yield Gap(block.index + first, int(places[-1]) - first + 1, name, reason)
-
-

@@ -4,7 +4,8 @@ A backend owns one machine: an analogue output (the displacement command) and an
 sensors), on one sample clock. It speaks volts and sample indices; it knows nothing of sweeps.
 
 Life, in this order, all calls from one thread:
-1. `open()` claims the machine. Nothing moves. Errors here are BadInput: what is missing, what to do.
+1. `open()` claims the machine. Nothing moves. Errors are BadInput: what is missing,
+   what to do.
 2. `tare(samples)` returns the inputs at rest, before bumpers are precompressed.
 3. `queue(0, volts)` hands over the first command.
 4. `start()` starts output and input together: output sample i leaves when input sample i is taken.

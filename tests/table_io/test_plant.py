@@ -1,5 +1,6 @@
 """The simulated truth against closed forms, conservation laws and published numbers."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -26,7 +27,7 @@ def run(plant: Plant, command: Float1D, state: Float1D | None = None) -> Float2D
 
 def servo_gain(plant: Plant, f: float) -> float:
     """|H| of the double pole that is 3 dB down at the bandwidth."""
-    return 1.0 / (1.0 + (np.sqrt(2.0) - 1.0) * (f / plant.servo_bandwidth_hz) ** 2)
+    return 1.0 / (1.0 + (math.sqrt(2.0) - 1.0) * (f / plant.servo_bandwidth_hz) ** 2)
 
 
 def sine(plant: Plant, f: float, seconds: float, acc: float = A) -> Float1D:
@@ -56,7 +57,8 @@ def one_at_a_time(plant: Plant, state: Float1D, samples: int) -> tuple[Float2D, 
 def energy(state: Float2D) -> Float1D:
     """Kinetic and elastic energy in J, faces included; the table at rest."""
     x, v, d_r, d_l = state[0], state[1], state[4], state[5]
-    return 0.5 * (M * v**2 + K * x**2 + KJ * (d_r**2 + d_l**2))
+    total: Float1D = 0.5 * (M * v**2 + K * x**2 + KJ * (d_r**2 + d_l**2))
+    return total
 
 
 @pytest.mark.parametrize("f", [0.7, 1.268, 3.0])
@@ -92,6 +94,33 @@ def test_both_branches_at_3_4_hz_and_4_mm(start: float, u_mm: float) -> None:
     u = out[X] - out[Y]
     assert 1e3 * u.max() == pytest.approx(u_mm, abs=6e-4)
     assert 1e3 * u.min() == pytest.approx(-u_mm, abs=6e-4)
+
+
+@pytest.mark.parametrize("toward", [1.0, -1.0])
+def test_a_touch_from_zero_gap_follows_the_closed_form_of_the_contact(toward: float) -> None:
+    plant = replace(RIG, gap_right_m=0.0, gap_left_m=0.0, substep_s=1e-4)
+    state = plant.rest()
+    state[1] = 0.1 * toward
+    out = run(plant, np.zeros(40), state)
+    time, a = np.arange(1, 41) / 1000.0, (C + CJ) / (2 * M)
+    wd = np.sqrt((K + KJ) / M - a**2)
+    x = 0.1 / wd * np.exp(-a * time) * np.sin(wd * time)
+    v = 0.1 * np.exp(-a * time) * (np.cos(wd * time) - a / wd * np.sin(wd * time))
+    np.testing.assert_allclose(toward * out[X], x, atol=1e-10)
+    push = out[F_R] if toward > 0 else -out[F_L]
+    np.testing.assert_allclose(push, KJ * x + CJ * v, atol=1e-4)
+
+
+def test_bumpers_that_never_detach_make_a_stiffer_linear_oscillator() -> None:
+    plant = replace(RIG, gap_right_m=-5e-3, gap_left_m=-5e-3)
+    out = run(plant, sine(plant, 6.95, 10.0))
+    w = 2 * np.pi * 6.95
+    u = phasor((out[X] - out[Y])[-2000:], 6.95, 1000.0)
+    table = phasor(out[Y_ACC][-2000:], 6.95, 1000.0)
+    stiff = K + 2 * KJ - M * w**2 + 1j * w * (C + 2 * CJ)
+    assert abs(u / table) == pytest.approx(M / abs(stiff), rel=2e-4)
+    assert out[F_R].min() > 0
+    assert out[F_L].max() < 0
 
 
 @pytest.mark.parametrize("bumper_damping", [900.0, 20.0])

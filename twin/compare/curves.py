@@ -1,9 +1,9 @@
 """PRC points of a run -> hysteresis intervals and jumps.
 
-The two directions differ at a grid frequency if their eta_d do so by more than a tenth of the larger
-and by more than what drift and scatter over the measured cycles leave open. An interval of them is a
-right hysteresis (hardening) where the forward branch is the larger, a left one (softening) where it
-is the smaller. Each end of an interval is a jump of one direction.
+The two directions differ at a grid frequency if their eta_d do so by more than a tenth of the
+larger and by more than what drift and scatter over the measured cycles leave open. An interval of
+them is a right hysteresis (hardening) where the forward branch is the larger, a left one
+(softening) where it is the smaller. Each end of an interval is a jump of one direction.
 """
 
 from collections.abc import Sequence

@@ -84,7 +84,9 @@ def extremes(
     if not (np.isfinite(motion.u).all() and np.isfinite(motion.a).all()):
         return None, touching
     u, a = smooth(motion.u, scale.weights), smooth(motion.a, scale.weights)
-    forces, begins, after = [], [], []
+    forces: list[float] = []
+    begins: list[tuple[int, ...]] = []
+    after: list[bool] = []
     for force, was in ((motion.right, touching[0]), (motion.left, touching[1])):
         known = np.nan_to_num(force)
         forces.append(float(smooth(known, scale.weights).max()))
@@ -92,7 +94,14 @@ def extremes(
         begins.append(tuple(first + place for place in places))
         after.append(now)
     return Extremes(
-        float(u.max()), float(u.min()), float(a.max()), float(a.min()), *forces, *begins
+        float(u.max()),
+        float(u.min()),
+        float(a.max()),
+        float(a.min()),
+        forces[0],
+        forces[1],
+        begins[0],
+        begins[1],
     ), (after[0], after[1])
 
 
@@ -112,7 +121,7 @@ def _impacts(cycles: list[Cycle], all_onsets: list[int]) -> tuple[int, ...]:
     shift = (phases[widest] + 0.5 * gaps[widest]) % 1.0
     offset = (shift - 1.0 if shift > 0.0 else 0.0) * length
     return tuple(
-        sum(start + offset <= place < start + cycle.count + offset for place in inside)
+        sum(1 for place in inside if 0 <= place - start - offset < cycle.count)
         for start, cycle in zip(starts, cycles, strict=True)
     )
 
@@ -151,7 +160,9 @@ def quantities(cycles: list[Cycle], source: str, scale: Scale) -> Quantities | N
     )
 
 
-def table_motion(base_acc: Float1D, frequency_hz: float, rate_hz: float) -> tuple[float, float, float]:
+def table_motion(
+    base_acc: Float1D, frequency_hz: float, rate_hz: float
+) -> tuple[float, float, float]:
     """(peak in m/s2, fundamental amplitude in m/s2, THD) of the table over whole cycles.
 
     THD is the root sum of squares of harmonics 2 to 10 over the fundamental.

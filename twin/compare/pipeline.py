@@ -1,10 +1,11 @@
 """`step(setup, state, block) -> state, items`: everything that the twin says about a block.
 
-Pure: the same samples give the same items to the bit, however they are cut into blocks. Live, replay
-and `--speed max` call this same function.
+Pure: the same samples give the same items to the bit, however they are cut into blocks. Live,
+replay and `--speed max` call this same function.
 """
 
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -77,7 +78,7 @@ def step(setup: Setup, state: State, block: Block) -> tuple[State, list[Block | 
     state = replace(state, tracks=tracks)
     changes = np.flatnonzero(np.diff(block.step) | np.diff(block.cycle)) + 1
     edges = [0, *changes.tolist(), len(block)]
-    for first, last in zip(edges, edges[1:], strict=False):
+    for first, last in pairwise(edges):
         key = (int(block.step[first]), int(block.cycle[first]))
         if key != state.key:
             state, made = _finish(setup, state, key)
@@ -97,9 +98,7 @@ def _begins(state: State, key: tuple[int, int]) -> bool:
     return state.key is not None and state.key != key
 
 
-def _finish(
-    setup: Setup, state: State, key: tuple[int, int]
-) -> tuple[State, list[Block | Record]]:
+def _finish(setup: Setup, state: State, key: tuple[int, int]) -> tuple[State, list[Block | Record]]:
     """Close the cycle that ended, and the step with it if another step or no cycle follows."""
     items: list[Block | Record] = []
     if state.held and state.key is not None:
@@ -170,4 +169,3 @@ def _point(setup: Setup, state: State) -> tuple[State, list[Record]]:
         if hint := sudden(state.last_point, last):
             items.append(Event(last.index, "jump", hint))
     return replace(state, cycles=(), base_acc=(), last_point=last), items
-

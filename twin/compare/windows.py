@@ -49,7 +49,7 @@ class TwinSetup:
 
 @dataclass(frozen=True, slots=True)
 class Tracks:
-    """State of both twins before sample `index`. `past` holds u, a - A, A, F_R, F_L of the history."""
+    """State of both twins before sample `index`; `past` holds u, a - A, A, F_R, F_L (5, n)."""
 
     index: int
     free: Float1D | None
@@ -112,12 +112,8 @@ def _restarted(setup: TwinSetup, past: Float2D) -> Float1D | None:
         return None
     p = setup.parameters
     u0, v0 = measured_state(u[-recent:], relative_acc[-recent:], setup.rate_hz)
-    u_r, touch_r = _bumper(
-        setup, u - p.gap_r, force_r, p.bumper_stiffness_r, p.bumper_damping_r
-    )
-    u_l, touch_l = _bumper(
-        setup, -u - p.gap_l, -force_l, p.bumper_stiffness_l, p.bumper_damping_l
-    )
+    u_r, touch_r = _bumper(setup, u - p.gap_r, force_r, p.bumper_stiffness_r, p.bumper_damping_r)
+    u_l, touch_l = _bumper(setup, -u - p.gap_l, -force_l, p.bumper_stiffness_l, p.bumper_damping_l)
     return restart(u0, v0, u_r, -u_l, touch_r, touch_l, float(base_acc[-1]), p)
 
 

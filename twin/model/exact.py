@@ -14,11 +14,35 @@ import math
 import numpy as np
 
 from table_io.block import Float1D, Float2D
-from twin.model.kernels import (
-    BASE, C_L, C_R, CONSTANTS_SIZE, CONTACT_L, CONTACT_R, E_L, E_R, G_L, G_R, K_L, K_R, MASS,
-    MODE_SIZE, MODES, R_L, R_R, STATE_SIZE, STEP, SUBSTEPS, U_L, U_R, U, V, flow, march,
-)  # fmt: skip
 from twin.model.parameters import Parameters
+from twin.model.phase import (
+    BASE,
+    C_L,
+    C_R,
+    CONSTANTS_SIZE,
+    CONTACT_L,
+    CONTACT_R,
+    E_L,
+    E_R,
+    G_L,
+    G_R,
+    K_L,
+    K_R,
+    MASS,
+    MODE_SIZE,
+    MODES,
+    R_L,
+    R_R,
+    STATE_SIZE,
+    STEP,
+    SUBSTEPS,
+    U_L,
+    U_R,
+    U,
+    V,
+    flow,
+)  # fmt: skip
+from twin.model.sampled import march
 
 OUTPUTS = ("u", "v", "a", "f_r", "f_l", "u_r", "u_l")
 EVENT_COLUMNS = ("time_s", "side", "onset", "closing_speed", "impulse")
@@ -72,8 +96,13 @@ def parameter_constants(parameters: Parameters) -> Float1D:
 
 
 def substeps(constants: Float1D, step: float) -> int:
-    """Parts of a step in s such that the stiffest phase turns at most `TURN` in each."""
-    return max(1, math.ceil(step * math.sqrt(constants[MODES + 3 * MODE_SIZE + 4]) / TURN))
+    """Parts of a step in s such that the stiffest phase turns at most `TURN` rad in each.
+
+    Both contacts at once are possible only where the total gap is not positive.
+    """
+    both = constants[G_R] + constants[G_L] <= 0
+    w2 = max(constants[MODES + mode * MODE_SIZE + 4] for mode in ((3,) if both else (1, 2)))
+    return max(1, math.ceil(step * math.sqrt(w2) / TURN))
 
 
 def constants(parameters: Parameters, rate_hz: float) -> Float1D:

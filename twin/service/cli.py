@@ -4,7 +4,7 @@ import contextlib
 import enum
 import sys
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -22,11 +22,11 @@ EXIT_ABORTED, EXIT_GAPS, EXIT_NOT_IDENTICAL, EXIT_INTERRUPTED = 3, 4, 5, 130
 
 TestProfile = Annotated[Path, typer.Argument(metavar="PROFILE", help="Test profile, a .toml file.")]
 Log = Annotated[Path, typer.Argument(metavar="LOG", help="A run.mcap, or the folder of a run.")]
-Out = Annotated[Optional[Path], typer.Option("--out", help="Folder for the results; must be new.")]
-Model = Annotated[Optional[str], typer.Option("--model", help="Model: a name or a .toml file.")]
+Out = Annotated[Path | None, typer.Option("--out", help="Folder for the results; must be new.")]
+Model = Annotated[str | None, typer.Option("--model", help="Model: a name or a .toml file.")]
 
 
-class Speed(str, enum.Enum):
+class Speed(enum.StrEnum):
     """How a run is paced."""
 
     realtime = "realtime"
@@ -36,9 +36,9 @@ class Speed(str, enum.Enum):
 @app.command(rich_help_panel=PLAN)
 def check(
     profile: TestProfile,
-    table: Annotated[Optional[str], typer.Option("--table", help="Machine card instead.")] = None,
+    table: Annotated[str | None, typer.Option("--table", help="Machine card instead.")] = None,
     out: Annotated[
-        Optional[Path], typer.Option("--out", help="Folder for the drawing of the drive.")
+        Path | None, typer.Option("--out", help="Folder for the drawing of the drive.")
     ] = None,
 ) -> None:
     """Pre-flight only: the plan, the margins against the machine card, a drawing of the drive."""
@@ -55,7 +55,7 @@ def run(
         Speed, typer.Option("--speed", help="max needs a simulated table.")
     ] = Speed.realtime,
     model: Model = None,
-    table: Annotated[Optional[str], typer.Option("--table", help="Machine card instead.")] = None,
+    table: Annotated[str | None, typer.Option("--table", help="Machine card instead.")] = None,
     view: Annotated[
         bool, typer.Option("--view", help="Serve a Rerun view and leave view.rrd.")
     ] = False,
@@ -120,13 +120,11 @@ def report(
 @app.command(rich_help_panel=LOOK)
 def view(
     log: Annotated[
-        Optional[Path], typer.Argument(metavar="[LOG]", help="A run.mcap or a run's folder.")
+        Path | None, typer.Argument(metavar="[LOG]", help="A run.mcap or a run's folder.")
     ] = None,
-    save: Annotated[
-        Optional[Path], typer.Option("--save", help="Only write this .rrd file.")
-    ] = None,
+    save: Annotated[Path | None, typer.Option("--save", help="Only write this .rrd file.")] = None,
     picture: Annotated[
-        Optional[Path], typer.Option("--picture", help="Render the view to this .png file.")
+        Path | None, typer.Option("--picture", help="Render the view to this .png file.")
     ] = None,
     connect: Annotated[
         str, typer.Option("--connect", help="Bus of a running test, without LOG.")

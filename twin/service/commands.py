@@ -100,7 +100,8 @@ def run(
         console.print(f"warning: {sentence}", highlight=False)
     console.print(
         f"{bundle.profile.title}: {len(bundle.steps)} steps, "
-        f"{bundle.drive.planned_end / bundle.drive.rate_hz:.0f} s on {bundle.rig.title} -> {folder}",
+        f"{bundle.drive.planned_end / bundle.drive.rate_hz:.0f} s on {bundle.rig.title} "
+        f"-> {folder}",
         highlight=False,
         soft_wrap=True,
     )
@@ -330,9 +331,7 @@ def report(folder: Path) -> None:
     console.print(f"{folder / 'report.html'}", soft_wrap=True)
 
 
-def view(
-    log: Path | None, save: Path | None, picture: Path | None, connect: str, rig: str
-) -> None:
+def view(log: Path | None, save: Path | None, picture: Path | None, connect: str, rig: str) -> None:
     """Rerun on a recording or on a running test."""
     from twin.service.viewing import view_live, view_log
 
@@ -340,4 +339,3 @@ def view(
         view_live(connect, rig, VIEW_ADDRESS, console)
     else:
         view_log(log_path(log), save, picture, console)
-

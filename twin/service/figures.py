@@ -42,7 +42,7 @@ MARKER = {"forward": 4.6, "backward": 2.6}  # both show where they coincide
 BAND = {"right": "#fff0a8", "left": "#b9f0f4"}
 TWIN, GUIDE = "#111111", "#555555"
 WIDTH, BINS, HISTORY_CYCLES, LABELLED_JUMPS = 10.0, 1600, 3, 4
-STYLE = {
+STYLE: dict[Any, Any] = {
     "font.size": 9, "axes.titlesize": 9.5, "axes.titlelocation": "left", "axes.linewidth": 0.7,
     "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True,
     "grid.color": "#e4e4e4", "grid.linewidth": 0.6, "axes.axisbelow": True, "savefig.dpi": 150,
@@ -155,10 +155,10 @@ def _curves(run: Run) -> Drawn:
 def _prc_lines(run: Run, ax: Axes, name: str, sign: int) -> None:
     for one in DIRECTIONS:
         f, y = _curve(run, "measured", one, name)
-        ax.plot(f, sign * y, "o-", color=COLOUR[one], ms=MARKER[one], lw=0.9)
+        ax.plot(f, sign * y, "o-", color=COLOUR[one], ms=MARKER[one], lw=2.2)
     for one in DIRECTIONS:
         f, y = _curve(run, "twin", one, name)
-        ax.plot(f, sign * y, color=TWIN, ls=DASH[one], lw=1.0, marker="." if f.size == 1 else "")
+        ax.plot(f, sign * y, color=TWIN, ls=DASH[one], lw=0.8, marker="." if f.size == 1 else "")
 
 
 def _jumps(run: Run, ax: Axes, name: str, sign: int) -> None:
@@ -176,7 +176,7 @@ def _jumps(run: Run, ax: Axes, name: str, sign: int) -> None:
             few = len(jumps) <= LABELLED_JUMPS
             low, high = sorted((jump["from_hz"], jump["to_hz"]))
             text = f"{low:g}–{high:g} Hz" if few else f"{number}"
-            right = jump["to_hz"] >= jump["from_hz"]
+            right = jump["to_hz"] >= jump["from_hz"] and x < f[0] + 0.85 * (f[-1] - f[0])
             ax.annotate(
                 text, (x, (start + stop) / 2), (5 if right else -5, 0), color=colour, size=8,
                 textcoords="offset points", ha="left" if right else "right", va="center",
@@ -247,7 +247,7 @@ def _histories(run: Run) -> Drawn:
         for column, (one, measured, twin) in zip(axes.T, pairs, strict=True):
             column[0].set_title(f"{one}, {hz:g} Hz")
             column[-1].set_xlabel("time in s")
-            for data, look in ((measured, {"color": COLOUR[one]}), (twin, _twin(one))):
+            for data, look in ((measured, _rig(one)), (twin, _twin(one))):
                 if data is not None:
                     _history(run, column, data.last(HISTORY_CYCLES), look)
             shown = measured if measured is not None else twin
@@ -266,8 +266,13 @@ def _histories(run: Run) -> Drawn:
         yield f"histories_{hz:g}hz", f"Histories at {hz:g} Hz: {why}", caption, figure
 
 
+def _rig(direction: str) -> dict[str, Any]:
+    """Wide, so that it shows beside a twin that lies on it."""
+    return {"color": COLOUR[direction], "lw": 2.2}
+
+
 def _twin(direction: str) -> dict[str, Any]:
-    return {"color": TWIN, "ls": DASH[direction], "lw": 0.9}
+    return {"color": TWIN, "ls": DASH[direction], "lw": 0.8}
 
 
 def _guide_key(run: Run) -> list[Line2D | Patch]:
@@ -348,7 +353,7 @@ def _grid(
             ax = column[driven.index(one)]
             ax.axhline(0, color=GUIDE, lw=0.5)
             ax.set_title(f"{hz:g} Hz {one}")
-            for data, look in ((measured, {"color": COLOUR[one]}), (twin, _twin(one))):
+            for data, look in ((measured, _rig(one)), (twin, _twin(one))):
                 if data is not None:
                     draw(ax, data, look)
             if not any(np.isfinite(line.get_ydata()).any() for line in ax.lines[1:]):
@@ -428,7 +433,7 @@ def _overview(run: Run) -> Drawn:
     axes = figure.subplots(len(drawn), 1, sharex=True, squeeze=False)[:, 0]
     for ax, (label, envelopes) in zip(axes, drawn.items(), strict=True):
         for time, low, high in envelopes:
-            ax.fill_between(time, low, high, color="#8b929c", lw=0.3)
+            ax.fill_between(time, low, high, color="#8b929c", lw=0)
         ax.set_ylabel(label)
         _shade_steps(run, ax, pieces, ax is axes[0])
         if label.startswith("$u$"):

@@ -1,8 +1,8 @@
 """The processes of a live run: each a small loop round a pure step. `PROCESSES` is their table.
 
-Started by the supervisor as `python -m twin.service.processes COMPONENT SPEC`, each in a session of
-its own so that Ctrl-C reaches only the supervisor; its standard input is a pipe whose end tells that
-the supervisor is gone.
+Started by the supervisor as `python -m twin.service.processes COMPONENT SPEC`, each in a session
+of its own so that Ctrl-C reaches only the supervisor; its standard input is a pipe whose end tells
+that the supervisor is gone.
 """
 
 import json
@@ -44,9 +44,12 @@ TIMING_BLOCKS = 100
 CAPACITY = 50_000
 CONTROL = ("/run/start", "/run/stop")
 RIG_TOPICS = (MEASURED, "/rig/gap", "/run/start", "/run/stop", "/run/event", "/run/timing")
-TWIN_TOPICS = tuple(
-    name for name in TOPIC_TYPES if name.startswith("/twin/")
-) + ("/run/fault", "/run/timing", "/run/event")  # fmt: skip
+TWIN_TOPICS = (
+    *(name for name in TOPIC_TYPES if name.startswith("/twin/")),
+    "/run/fault",
+    "/run/timing",
+    "/run/event",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,9 +234,9 @@ def recorder(spec: Spec, part: str) -> None:
                 writer.describe(item)
             writer.write(name, payload, item.index)
             waiting.heard(item)
-        elif waiting.end is not None and now - heard > QUIET_S:
-            break
-        elif now - heard > QUIET_S and _orphaned():
+        elif (waiting.end is not None and now - heard > QUIET_S) or (
+            now - heard > QUIET_S and _orphaned()
+        ):
             break
         if now - flushed > FLUSH_S:
             writer.flush()

@@ -1,15 +1,14 @@
 """One HTML file that tells a run, and the evidence its pictures are drawn from.
 
-Everything shown is read from run.mcap and summary.json; nothing is computed anew that the summary
-states. The file refers to nothing outside itself.
+What the summary states is shown as it stands there; the file refers to nothing outside itself.
 """
 
 import base64
-import hashlib
 import json
 import math
 import tomllib
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -96,9 +95,9 @@ def gather(recording: Recording, summary: Summary) -> Run:
         specimen = Specimen.model_validate(cards.get("specimen"))
     except ValidationError:
         specimen = None
-    contact_n = (cards.get("comparison") or {}).get("contact_n", ComparisonCard().contact_n)
+    contact_n = ComparisonCard.model_validate(cards.get("comparison") or {}).contact_n
     streams = {name: recording.pieces(name) for name in ("meas", "pred")}
-    return Run(recording, summary, streams, specimen, float(contact_n))
+    return Run(recording, summary, streams, specimen, contact_n)
 
 
 def _toml(text: str) -> dict[str, Any]:
@@ -106,10 +105,6 @@ def _toml(text: str) -> dict[str, Any]:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError:
         return {}
-
-
-def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def quantity(step: dict[str, Any], who: str, name: str) -> float:
@@ -276,7 +271,7 @@ def render(run: Run, pictures: "list[Picture]") -> str:
         cards={name: _toml(text) for name, text in texts.items()},
         images=[(one, base64.b64encode(one.path.read_bytes()).decode()) for one in pictures],
         demand={step.index: step.acceleration_m_s2 for step in start.steps},
-        texts=[(name, _digest(text), text) for name, text in texts.items()],
+        texts=[(name, sha256(text.encode()).hexdigest(), text) for name, text in texts.items()],
         timings={one.component: one for one in recording.of(Timing)},
         gaps=recording.of(Gap),
         faults=recording.of(Fault),

@@ -1,8 +1,9 @@
-"""Runs in one process: `--speed max`, `simulate`, `replay`. The same steps as live, other sources."""
+"""Runs in one process: `--speed max`, `simulate`, `replay`: the same steps, other sources."""
 
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from table_io.records import (
     Record,
     RunStart,
     RunStop,
+    Timing,
 )
 from table_io.session import play
 from twin.compare import COMPARED, pipeline
@@ -71,8 +73,8 @@ def _beside(source: Iterator[Block | Record], setup: pipeline.Setup) -> Iterator
     for item in source:
         yield item
         if isinstance(item, RunStart):
-            state, items = pipeline.start(setup)
-            yield from items
+            state, begun = pipeline.start(setup)
+            yield from begun
         elif isinstance(item, Block) and state is not None:
             state, items = pipeline.step(setup, state, item)
             yield from items
@@ -164,15 +166,15 @@ def _again(recording: Recording, setup: pipeline.Setup, run: str, bundle: Bundle
     """What the rig recorded, with a twin beside it that respects the recorded faults."""
     faults = [fault for fault in recording.of(Fault) if fault.component == "twin"]
     yield replace(recording.start, run=run, model_toml=bundle.model_toml)
-    state, items = pipeline.start(setup)
-    yield from items
+    state, begun = pipeline.start(setup)
+    yield from begun
     for item in recording.items:
         if isinstance(item, Block) and item.stream == "meas":
             yield item
             for block in _alive(item, faults):
                 if any(fault.to_index == block.index for fault in faults):
-                    state, items = pipeline.start(setup, block.index)
-                    yield from items
+                    state, begun = pipeline.start(setup, block.index)
+                    yield from begun
                 state, items = pipeline.step(setup, state, block)
                 yield from items
         elif _of_the_rig(item):
@@ -183,7 +185,7 @@ def _of_the_rig(item: Item) -> bool:
     """True for what a replay repeats; what the twin said is said anew."""
     if isinstance(item, Event):
         return item.kind != "jump"
-    return not isinstance(item, (Block, RunStart, *TWIN_RECORDS))
+    return not isinstance(item, (Block, RunStart, Timing, *TWIN_RECORDS))
 
 
 def _alive(block: Block, faults: list[Fault]) -> Iterator[Block]:
@@ -196,6 +198,6 @@ def _alive(block: Block, faults: list[Fault]) -> Iterator[Block]:
         if block.index < edge < block.end
     }
     cuts = sorted(edges)
-    for first, last in zip(cuts, cuts[1:], strict=False):
+    for first, last in pairwise(cuts):
         if not any(fault.from_index <= first < fault.to_index for fault in faults):
             yield block.cut(first, last)

@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.profile import Profile, parse
 from table_io.records import Comparison, Fault, Gap, Point, Quantities, Timing
-from twin.compare import COMPARED
+from twin.compare import COMPARED, pipeline
 from twin.compare.curves import branches
 from twin.model.parameters import Parameters, resonance
 from twin.stream.mcap_log import Recording
@@ -25,7 +25,7 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
     profile = parse(start.profile_toml, Profile, "recorded profile")
     level = max(step.acceleration_m_s2 for step in start.steps)
     u_star, a_star, peak_hz = resonance(parameters, level)
-    points = recording.of(Point)
+    points = _points(recording, parameters, profile)
     source = "twin" if start.source == "model" else "measured"
     jumps, intervals = branches(points, source)
     twin_jumps, twin_intervals = branches(points, "twin")
@@ -64,6 +64,20 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
     }
 
 
+def _points(recording: Recording, parameters: Parameters, profile: Profile) -> tuple[Point, ...]:
+    """The recorded points, and the measured part of those that a dead twin could not make."""
+    recorded = {point.step: point for point in recording.of(Point)}
+    if recording.of(Fault):
+        setup = pipeline.prepare(profile, parameters, recording.start.steps)
+        state, _ = pipeline.start(setup)
+        for block in recording.pieces("meas"):
+            state, items = pipeline.step(setup, state, block)
+            for item in items:
+                if isinstance(item, Point):
+                    recorded.setdefault(item.step, replace(item, twin=None))
+    return tuple(recorded[step] for step in sorted(recorded))
+
+
 def _step(point: Point) -> Json:
     def block(values: Quantities | None) -> Json | None:
         return None if values is None else asdict(values)
@@ -81,7 +95,7 @@ def _step(point: Point) -> Json:
 
 
 def _timing(records: tuple[Timing, ...]) -> Json:
-    """Latency of the twin (last sample of a block scheduled -> its Comparison put), and the rest."""
+    """Latency of the twin: last sample of a block scheduled -> its Comparison put."""
     last = {record.component: record for record in records}
     twin = last.get("twin")
     return {
@@ -122,7 +136,11 @@ def _nrmse(comparisons: tuple[Comparison, ...], parameters: Parameters) -> Json:
         for key, error in (("nrmse", window), ("free_nrmse", free)):
             known = np.isfinite(error[:, place]) & np.isfinite(measured[:, place])
             total = measured[known, place].sum()
-            values[key] = math.sqrt(error[known, place].sum() / total) if total > 0 and name not in absent else None
+            values[key] = (
+                math.sqrt(error[known, place].sum() / total)
+                if total > 0 and name not in absent
+                else None
+            )
         out[name] = values
     return out
 

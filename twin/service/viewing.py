@@ -62,5 +62,3 @@ def view_live(endpoint: str, rig: str, address: str, console: Console) -> None:
         if shown is not None:
             shown.close()
         link.close()
-
-

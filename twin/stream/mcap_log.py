@@ -42,7 +42,9 @@ class LogWriter:
         try:
             self._file = path.open("xb")
         except FileExistsError:
-            raise BadInput(f"{path}: exists already; nothing recorded is ever overwritten") from None
+            raise BadInput(
+                f"{path}: exists already; nothing recorded is ever overwritten"
+            ) from None
         except OSError as error:
             raise BadInput(f"{path}: cannot write here: {error.strerror}") from None
         self._writer = Writer(self._file)
@@ -209,9 +211,7 @@ def merge(parts: list[Path], out: Path) -> int:
     writer.describe(start)
     order = {topic: place for place, topic in enumerate(["/run/start", *TOPIC_TYPES])}
     for message in sorted(unique, key=lambda one: (one.log_time, order.get(one.topic, 99))):
-        writer.write(
-            message.topic, message.payload, round(message.log_time * start.rate_hz / 1e9)
-        )
+        writer.write(message.topic, message.payload, round(message.log_time * start.rate_hz / 1e9))
     writer.close()
     return len(unique)
 

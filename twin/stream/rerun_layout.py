@@ -7,8 +7,9 @@ so a bumper is touched in the picture exactly when it is touched on the rig.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +17,18 @@ import numpy.typing as npt
 from table_io.block import Block, Float1D, Float2D, Label, join
 from table_io.channels import contact_forces, rel_disp
 from table_io.profile import Profile
-from table_io.records import Event, Fault, Gap, Point, Quantities, RunStart, RunStop
+from table_io.records import (
+    Comparison,
+    Cycle,
+    Event,
+    Fault,
+    Gap,
+    Params,
+    Point,
+    Quantities,
+    RunStart,
+    RunStop,
+)
 
 Float3D = npt.NDArray[np.float64]
 Colours = npt.NDArray[np.uint8]
@@ -25,6 +37,26 @@ RED, BLUE = (255, 92, 87), (84, 160, 255)
 WHITE, GREY, DIM = (245, 245, 245), (150, 156, 168), (58, 62, 70)
 STEEL, MASS, RUBBER, CONTACT = (104, 110, 122), (66, 126, 148), (40, 42, 48), (255, 176, 46)
 IDLE = (146, 150, 160)
+
+# Legend name, colour and width of every line, in the order of the columns of an entity.
+Rgb = tuple[int, int, int]
+RESTARTED, FREE = "twin, restarted", "twin, free-running"
+LINES: dict[str, tuple[tuple[str, Rgb, float], ...]] = {
+    "u/measured": (("measured", RED, 3.5),),
+    "u/twin": ((FREE, GREY, 1.5), (RESTARTED, WHITE, 1.3)),
+    "a/measured": (("measured", RED, 3.5), ("table, measured", BLUE, 1.5)),
+    "a/twin": ((FREE, GREY, 1.5), (RESTARTED, WHITE, 1.3)),
+    "force/measured": (("right, measured", RED, 3.5), ("left, measured", BLUE, 3.5)),
+    "force/twin": ((f"right, {RESTARTED}", WHITE, 1.5), (f"left, {RESTARTED}", WHITE, 1.5)),
+    "error": ((f"u, {FREE}", GREY, 2.0), (f"u, {RESTARTED}", WHITE, 2.0)),
+    "impacts": (
+        ("right, measured", RED, 3.5),
+        ("left, measured", BLUE, 3.5),
+        ("right, twin", WHITE, 1.5),
+        ("left, twin", GREY, 1.2),
+    ),
+}
+PRC_COLOURS = {"measured": (RED, BLUE), "twin": (WHITE, GREY)}
 
 HALF_MASS = np.array([0.36, 0.30, 0.20])
 HALF_TABLE = np.array([1.00, 0.50, 0.05])
@@ -62,6 +94,12 @@ class Motion:
     force_r: Float1D
     force_l: Float1D
 
+    def known_every(self, stride: int) -> "Motion":
+        """Every sample whose index is a multiple of `stride`, where the rig's place is known."""
+        known = np.isfinite(self.u) & np.isfinite(self.table)
+        at = np.flatnonzero((self.index % stride == 0) & known)
+        return Motion(*(getattr(self, name)[at] for name in Motion.__slots__))
+
 
 def motion(block: Block) -> Motion:
     """What a block of measured or stripped predicted channels draws."""
@@ -96,7 +134,7 @@ def track(block: Block, name: str) -> Block:
 
 @dataclass(frozen=True, slots=True)
 class Boxes:
-    """Boxes over time: centres and half sizes (frame, box, 3) in drawn m, colours (frame, box, 3)."""
+    """Boxes over time, (frame, box, 3) each: centres and half sizes in drawn m, colours."""
 
     index: npt.NDArray[np.int64]
     centres: Float3D
@@ -132,7 +170,7 @@ class Scene:
     def walls(self) -> bool:
         return all(math.isfinite(gap) for gap in self.gaps_m)
 
-    def mass_centres(self, moves: Motion) -> Float2D:
+    def mass(self, moves: Motion) -> Float2D:
         """Centre of the mass in drawn m, (frame, 3)."""
         x = self.table_factor * moves.table + self.factor * moves.u
         height = BEARING_HEIGHT + HALF_MASS[2]
@@ -142,10 +180,11 @@ class Scene:
         """Table, mass and, where there are gaps, right and left bumper; lit while in contact."""
         x = self.table_factor * moves.table
         table = np.stack([x, np.zeros_like(x), np.full_like(x, -HALF_TABLE[2])], axis=1)
-        centres = [table, self.mass_centres(moves)]
+        centres = [table, self.mass(moves)]
         halves = [np.broadcast_to(size, table.shape) for size in (HALF_TABLE, HALF_MASS)]
-        colours = [np.broadcast_to(np.uint8(one), table.shape) for one in (STEEL, MASS)]
+        colours = [np.broadcast_to(np.array(one, np.uint8), table.shape) for one in (STEEL, MASS)]
         if self.walls:
+            lit, idle = np.array(CONTACT, np.uint8), np.array(IDLE, np.uint8)
             for sign, gap, force in (
                 (1.0, self.gaps_m[0], moves.force_r),
                 (-1.0, self.gaps_m[1], -moves.force_l),
@@ -154,7 +193,7 @@ class Scene:
                 touches = np.where(np.isnan(force), sign * moves.u > gap, force > self.contact_n)
                 centres.append(centre)
                 halves.append(half)
-                colours.append(np.where(touches[:, None], np.uint8(CONTACT), np.uint8(IDLE)))
+                colours.append(np.where(touches[:, None], lit, idle))
         stacks = (np.stack(one, axis=1) for one in (centres, halves, colours))
         return Boxes(moves.index, *stacks)
 
@@ -185,7 +224,9 @@ class Scene:
                 paint.append(STEEL)
         centres = np.stack([np.stack([at, zero, zero + z], axis=1) for at, z in places], axis=1)
         halves = np.broadcast_to(np.array(sizes), centres.shape)
-        return Boxes(moves.index, centres, halves, np.broadcast_to(np.uint8(paint), centres.shape))
+        return Boxes(
+            moves.index, centres, halves, np.broadcast_to(np.array(paint, np.uint8), centres.shape)
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,8 +238,8 @@ class Axes:
     x_label: str
     y_label: str
 
-    WIDTH = 1.7
-    HEIGHT = 1.0
+    WIDTH: ClassVar = 2.2
+    HEIGHT: ClassVar = 1.0
 
     @property
     def scale(self) -> tuple[float, float]:
@@ -215,7 +256,7 @@ class Axes:
         """Four to ten round numbers within low .. high."""
         step = nice_below((high - low) / 4)
         first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
-        return np.arange(first, last + 1) * step
+        return np.arange(first, last + 1, dtype=np.float64) * step
 
     def grid(self) -> list[Float2D]:
         """The frame and a line at every tick, drawn units, each (point, 2)."""
@@ -225,13 +266,18 @@ class Axes:
         lines += [np.array([[0, oy + sy * y], [w, oy + sy * y]]) for y in self.ticks(*self.y)]
         return lines
 
+    def uprights(self, values: Iterable[float]) -> list[Float2D]:
+        """A vertical line at each value of x within the axes, drawn units, each (2, 2)."""
+        places = [self.origin[0] + self.scale[0] * x for x in values if self.x[0] <= x <= self.x[1]]
+        return [np.array([[x, 0.0], [x, self.HEIGHT]]) for x in places]
+
     def labels(self) -> tuple[Float2D, list[str]]:
         """Where the numbers and names stand, drawn units (label, 2), and what they say."""
         (sx, sy), (ox, oy), w, h = self.scale, self.origin, self.WIDTH, self.HEIGHT
         places = [(ox + sx * x, h + 0.005) for x in self.ticks(*self.x)]
         places += [(-0.055, oy + sy * y - 0.035) for y in self.ticks(*self.y)]
         texts = [f"{tick:.6g}" for tick in (*self.ticks(*self.x), *self.ticks(*self.y))]
-        names = [((w / 2, h + 0.09), self.x_label), ((0.12, -0.11), self.y_label)]
+        names = [((w / 2, h + 0.08), self.x_label), ((0.12, -0.11), self.y_label)]
         return (
             np.array([*places, *(place for place, _ in names)]),
             [*texts, *(text for _, text in names)],
@@ -274,7 +320,7 @@ class Trail:
 
 
 class Reach:
-    """The half range of an axis: grows at once, shrinks once the last `hold` peaks fill under 40 %."""
+    """The half range of an axis: grows at once, shrinks when `hold` peaks fill less than 40 %."""
 
     def __init__(self, least: float, hold: int) -> None:
         self.value = least
@@ -293,15 +339,87 @@ class Reach:
         return self.value != before
 
 
-def curve(points: Sequence[Point], way: str, who: str) -> Float2D:
-    """(point, 2): frequency in Hz and eta_d of one direction, "measured" or "twin"."""
-    rows = [
-        (point.frequency_hz, quantities.eta_d)
-        for point in points
-        if point.direction == way and (quantities := getattr(point, who)) is not None
-    ]
-    found = np.array(rows, dtype=np.float64).reshape(-1, 2)
-    return found[np.isfinite(found).all(axis=1)]
+class Progress:
+    """Where in the sweep the run is."""
+
+    def __init__(self) -> None:
+        self._now: tuple[int, int] | None = None
+
+    def add(self, block: Block) -> Iterator[tuple[int, int, int]]:
+        """(sample index, step, label) at every sample at which step or label changes."""
+        changed = (np.diff(block.step) != 0) | (np.diff(block.label) != 0)
+        for at in (0, *(np.flatnonzero(changed) + 1).tolist()):
+            now = (int(block.step[at]), int(block.label[at]))
+            if now != self._now:
+                self._now = now
+                yield block.index + at, *now
+
+
+class Curves:
+    """The PRC as it grows: eta_d over frequency."""
+
+    def __init__(self, low_hz: float, high_hz: float) -> None:
+        room = max(0.03 * (high_hz - low_hz), 0.05)
+        self._range = (low_hz - room, high_hz + room)
+        self._points: list[Point] = []
+        self._top = 0.1
+
+    @property
+    def axes(self) -> Axes:
+        return Axes(self._range, (0.0, self._top), "f [Hz]", "η_d [-]")
+
+    def add(self, point: Point) -> bool:
+        """True if the axes had to grow for this point."""
+        self._points.append(point)
+        etas = [who.eta_d for who in (point.measured, point.twin) if who is not None]
+        highest = max((eta for eta in etas if math.isfinite(eta)), default=0.0)
+        if highest <= self._top:
+            return False
+        self._top = nice(1.1 * highest)
+        return True
+
+    def of(self, who: str) -> list[tuple[Rgb, Float2D]]:
+        """(colour, (point, 2) Hz and eta_d) of each direction that has points."""
+        found = []
+        for way, colour in zip(("forward", "backward"), PRC_COLOURS[who], strict=True):
+            rows = [
+                (point.frequency_hz, quantities.eta_d)
+                for point in self._points
+                if point.direction == way and (quantities := getattr(point, who)) is not None
+            ]
+            curve = np.array(rows, dtype=np.float64).reshape(-1, 2)
+            curve = curve[np.isfinite(curve).all(axis=1)]
+            if len(curve):
+                found.append((colour, curve))
+        return found
+
+
+class ErrorShare:
+    """Twin error of u in % of the measured RMS, gathered over half a second."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._half = max(1, round(rate_hz / 2))
+        self._sums = np.zeros(3)
+
+    def add(self, one: Comparison) -> tuple[int, Float2D] | None:
+        """(sample index, (1, 2) free-running and restarted) when half a second is whole."""
+        if "rel_disp_m" in one.channels:
+            at = one.channels.index("rel_disp_m")
+            self._sums += [one.measured_ss[at], one.free_error_ss[at], one.window_error_ss[at]]
+        end = one.index + one.count
+        if end // self._half == one.index // self._half:
+            return None
+        (measured, *errors), self._sums = self._sums, np.zeros(3)
+        share = 100 * np.sqrt(np.array(errors) / measured) if measured > 0 else [math.nan] * 2
+        return end, np.array([share])
+
+
+def impacts(cycle: Cycle) -> Float2D:
+    """(1, 4) impacts of a cycle: measured right, left, twin right, left; NaN where unknown."""
+    counts: list[float] = []
+    for one in (cycle.measured, cycle.twin):
+        counts += [math.nan] * 2 if one is None else [len(one.onsets_r), len(one.onsets_l)]
+    return np.array([counts])
 
 
 def pieces(blocks: Sequence[Block]) -> list[Block]:
@@ -364,7 +482,10 @@ LEVELS = {
 }
 
 
-def sentence(record: Event | Gap | Fault | RunStop, rate_hz: float) -> tuple[str, str]:
+Told = Event | Gap | Fault | Params | RunStop
+
+
+def sentence(record: Told, rate_hz: float) -> tuple[str, str]:
     """(level, text) of a record as a person reads it in the event list."""
     match record:
         case Event(kind=kind, text=text):
@@ -375,5 +496,7 @@ def sentence(record: Event | Gap | Fault | RunStop, rate_hz: float) -> tuple[str
         case Fault(component=component, from_index=first, to_index=last, reason=reason):
             span = f"{first / rate_hz:.3f} s to {last / rate_hz:.3f} s"
             return "ERROR", f"{component} failed, nothing from {span}: {reason}"
+        case Params(reason=reason):
+            return "INFO", f"parameters of the twin: {reason}"
         case RunStop(verdict=verdict, reason=reason):
             return ("INFO" if verdict == "complete" else "WARN"), f"{verdict}: {reason}"

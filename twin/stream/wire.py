@@ -53,7 +53,7 @@ RECORD_TOPICS: dict[type, str] = {
     Timing: "/run/timing",
 }
 TOPIC_TYPES: dict[str, type] = {
-    **{topic: Block for topic in BLOCK_TOPICS.values()},
+    **dict.fromkeys(BLOCK_TOPICS.values(), Block),
     **{topic: kind for kind, topic in RECORD_TOPICS.items()},
 }
 
@@ -172,7 +172,7 @@ def _record(kind: Any, message: Any) -> Any:
     """The dataclass that `_message` was made from."""
     if kind not in _PLANS:
         _PLANS[kind] = _plan(kind)[1]
-    values = {}
+    values: dict[str, Any] = {}
     for name, hint, optional in _PLANS[kind]:
         if optional and not message.HasField(name):
             values[name] = None
@@ -180,7 +180,9 @@ def _record(kind: Any, message: Any) -> Any:
         value = getattr(message, name)
         if get_origin(hint) is tuple:
             inner = get_args(hint)[0]
-            value = tuple(_record(inner, one) for one in value) if is_dataclass(inner) else tuple(value)
+            value = (
+                tuple(_record(inner, one) for one in value) if is_dataclass(inner) else tuple(value)
+            )
         elif get_origin(hint) is dict:
             value = dict(value)
         elif is_dataclass(hint):

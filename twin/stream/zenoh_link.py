@@ -39,7 +39,7 @@ from twin.stream.wire import BLOCK_TOPICS, COMPARED
 LARGEST_BYTES = 4 * 2**20  # of one payload
 HELD_MESSAGES = 5000  # per topic and publisher: 50 s of blocks
 HELD_BYTES = 64 * 2**20
-CHUNK_BYTES = 128 * 2**10  # of one answer: what a publisher's loop can spare time for
+CHUNK_BYTES = 48 * 2**10  # of one answer: one batch of zenoh, which is sent in one piece
 QUESTIONS_WAITING = 16
 ASK_EVERY_S = 0.5  # in case the last message of a topic was lost
 ASK_AGAIN_S = 0.2  # in case question or answer was lost

@@ -1,0 +1,93 @@
+"""The SNM written down a second time: scipy's DOP853 with events. Slow, and nothing of the twin's."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from twin.model.parameters import Parameters
+
+G = 9.80665
+AG = 0.05 * G
+SNM = {
+    "mass": 550.0, "stiffness": 36e3, "damping": 1100.0,
+    "bumper_stiffness_r": 510e3, "bumper_damping_r": 900.0,
+    "bumper_stiffness_l": 510e3, "bumper_damping_l": 900.0,
+}  # fmt: skip
+
+
+def snm(gap_m: float = 0.004, **changes: float) -> Parameters:
+    """The paper's SNM at a total gap in m, with changes by field name."""
+    return Parameters(**{**SNM, "gap_r": gap_m / 2, "gap_l": gap_m / 2, **changes})
+
+
+def right_hand_side(p: Parameters, contact: list[bool], base: Callable[[float], float]):
+    """d/dt of (u, v, u_R, u_L)."""
+
+    def rhs(t, x):
+        u, v, ur, ul = x
+        fr = p.bumper_damping_r * v + p.bumper_stiffness_r * (u - p.gap_r) if contact[0] else 0.0
+        fl = p.bumper_damping_l * v + p.bumper_stiffness_l * (u + p.gap_l) if contact[1] else 0.0
+        dv = -base(t) - (p.damping * v + p.stiffness * u + fr + fl) / p.mass
+        dr = v if contact[0] else -ur * p.bumper_stiffness_r / p.bumper_damping_r
+        dl = v if contact[1] else -ul * p.bumper_stiffness_l / p.bumper_damping_l
+        return [v, dv, dr, dl]
+
+    return rhs
+
+
+def guards(p: Parameters, contact: list[bool]):
+    """Clearance or push of both sides as terminal events."""
+
+    def right(t, x):
+        u, v, ur, _ = x
+        if contact[0]:
+            return p.bumper_damping_r * v + p.bumper_stiffness_r * (u - p.gap_r)
+        return p.gap_r + ur - u if math.isfinite(p.gap_r) else 1.0
+
+    def left(t, x):
+        u, v, _, ul = x
+        if contact[1]:
+            return -p.bumper_damping_l * v - p.bumper_stiffness_l * (u + p.gap_l)
+        return u - ul + p.gap_l if math.isfinite(p.gap_l) else 1.0
+
+    for event in (right, left):
+        event.terminal, event.direction = True, -1
+    return right, left
+
+
+def reference(
+    p: Parameters, x0, contact, base: Callable[[float], float], times, tolerance=1e-12, dt=2e-3
+):
+    """(u, v, u_R, u_L) at `times` (4, n) and the events [(t, side)], from x0 at t = 0."""
+    contact, x, t, end = list(contact), list(x0), 0.0, times[-1]
+    states = np.full((4, len(times)), np.nan)
+    events = []
+    while t < end:
+        solution = solve_ivp(
+            right_hand_side(p, contact, base), (t, end), x, method="DOP853", dense_output=True,
+            rtol=tolerance, atol=tolerance, max_step=dt, events=guards(p, contact),
+        )  # fmt: skip
+        inside = (times >= t) & (times <= solution.t[-1])
+        states[:, inside] = solution.sol(times[inside])
+        t, x = solution.t[-1], list(solution.y[:, -1])
+        if t >= end:
+            break
+        side = 0 if solution.t_events[0].size else 1
+        contact[side] = not contact[side]
+        x[2 + side] = x[0] - p.gap_r if side == 0 else x[0] + p.gap_l
+        events.append((t, side))
+        # scipy sees the guard at zero at the start of the phase and would end it there.
+        t, x = small_step(p, contact, base, t, x)
+    return states, events
+
+
+def small_step(p, contact, base, t, x, step=1e-7):
+    """One Runge-Kutta step of 1e-7 s, away from the zero of the guard."""
+    rhs, x = right_hand_side(p, contact, base), np.array(x)
+    k1 = np.array(rhs(t, x))
+    k2 = np.array(rhs(t + step / 2, x + step / 2 * k1))
+    k3 = np.array(rhs(t + step / 2, x + step / 2 * k2))
+    k4 = np.array(rhs(t + step, x + step * k3))
+    return t + step, list(x + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4))

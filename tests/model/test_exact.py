@@ -1,0 +1,314 @@
+"""The sampled driver: closed forms, an independent integrator, physics, and the shape of its state."""
+
+import math
+
+import numpy as np
+import pytest
+from twin.model import exact
+from twin.model.parameters import Parameters
+
+from .reference import AG, reference, snm
+
+U, V, A, F_R, F_L, U_R, U_L = range(7)
+STEEL = {"bumper_damping_r": 6e4, "bumper_damping_l": 2e4}
+CRITICAL = 2 * math.sqrt(550.0 * 36e3)
+
+
+def run(p: Parameters, rate: float, base: np.ndarray, state: np.ndarray | None = None):
+    """(state, out, events) after the samples `base` from `state` or from rest."""
+    state = exact.rest(p) if state is None else state.copy()
+    out, events = np.empty((7, base.size)), np.zeros((4 * base.size + 10, 5))
+    count = exact.advance_logged(state, exact.constants(p, rate), base, out, events)
+    return state, out, events[:count]
+
+
+def sine(frequency: float, rate: float, seconds: float, peak: float = AG) -> np.ndarray:
+    """A at samples 1 .. n."""
+    return peak * np.sin(2 * math.pi * frequency * np.arange(1, round(seconds * rate) + 1) / rate)
+
+
+def kicked(p: Parameters, speed: float) -> np.ndarray:
+    state = exact.rest(p)
+    state[V] = speed
+    return state
+
+
+@pytest.mark.parametrize("ratio", [0.1, 0.999, 1.0, 1.001, 3.0])
+def test_flight_is_the_textbook_oscillator(ratio):
+    """Free decay from u0 at rest, under-, over- and critically damped, no bumpers."""
+    p = snm(math.inf, damping=ratio * CRITICAL)
+    state = exact.rest(p)
+    state[U] = 0.01
+    _, out, _ = run(p, 500.0, np.zeros(1000), state)
+    t, w0 = np.arange(1, 1001) / 500, math.sqrt(36e3 / 550)
+    root = np.sqrt(complex(ratio**2 - 1)) * w0
+    if ratio == 1:
+        want = 0.01 * np.exp(-w0 * t) * (1 + w0 * t)
+    else:
+        s1, s2 = -ratio * w0 + root, -ratio * w0 - root
+        want = (0.01 * (s1 * np.exp(s2 * t) - s2 * np.exp(s1 * t)) / (s1 - s2)).real
+    assert np.abs(out[U] - want).max() < 1e-14
+
+
+CASES = [
+    (snm(), 2.0, 0.1),
+    (snm(), 3.4, 0.1),
+    (snm(-0.002), 5.8, 0.3),
+    (snm(-0.010), 7.0, 0.1),
+    (snm(0.004, **STEEL), 2.0, 0.1),
+    (snm(0.004, damping=1.2 * CRITICAL, bumper_damping_r=3e4), 1.0, -0.2),
+    (snm(0.004, bumper_damping_r=2e4 * 3, bumper_stiffness_r=2e4), 1.3, 0.2),
+    (snm(0.004, bumper_stiffness_l=9e5, gap_r=0.003, gap_l=-0.0005), 2.4, 0.1),
+    (snm(0.004, gap_l=math.inf), 1.5, 0.1),
+]
+
+
+@pytest.mark.parametrize("p, frequency, speed", CASES)
+def test_agrees_with_dop853(p, frequency, speed):
+    """Ten cycles of a drive that is linear between samples, so that both solve the same problem."""
+    knots = 60
+    rate = knots * frequency
+    base = sine(frequency, rate, 10 / frequency)
+    start = kicked(p, speed)
+    table = np.concatenate([[0.0], base])
+    times = np.arange(1, base.size + 1) / rate
+
+    def drive(t: float) -> float:
+        return float(np.interp(t * rate, np.arange(table.size), table))
+
+    contact = (bool(start[4]), bool(start[5]))
+    want, events = reference(p, start[:4], contact, drive, times, 1e-12, 1 / rate)
+    _, out, found = run(p, rate, base, start)
+    assert len(found) == len(events) > 0 or p.gap_r + p.gap_l < -0.005
+    scale = np.abs(want[0]).max()
+    for row, state in ((U, 0), (V, 1), (U_R, 2), (U_L, 3)):
+        assert np.abs(out[row] - want[state]).max() < 1e-7 * scale * (30 if row == V else 1)
+
+
+def test_refining_a_drive_that_is_linear_between_samples_changes_nothing():
+    """First-order hold is exact, and several events in one step of 0.1 s are all found."""
+    coarse = AG * np.sin(2 * math.pi * 1.9 * np.arange(0, 101) / 10)
+    fine = np.interp(np.arange(1, 16001) / 1600, np.arange(0, 101) / 10, coarse)
+    p = snm(0.003)
+    _, few, events = run(p, 10.0, coarse[1:], kicked(p, 0.1))
+    _, many, events_fine = run(p, 1600.0, fine, kicked(p, 0.1))
+    assert len(events) == len(events_fine) > 20
+    assert np.abs(few - many[:, 159::160])[[U, U_R, U_L]].max() < 1e-12
+    steps = np.floor(events[:, 0] * 10)
+    assert np.unique(steps, return_counts=True)[1].max() >= 2
+
+
+def test_impacting_and_flight_solutions_coexist_at_g4():
+    """The paper's 3.4 Hz: 5.123 mm impacting, 1.247 mm flight."""
+    base = sine(3.4, 2000.0, 60)
+    for speed, want in ((0.1, 5.123e-3), (0.0, 1.247e-3)):
+        _, out, _ = run(snm(), 2000.0, base, kicked(snm(), speed))
+        assert np.abs(out[U, -4000:]).max() == pytest.approx(want, abs=1e-6)
+
+
+def test_converges_to_the_sinusoid_with_order_two():
+    from twin.model.sweep import stepped_sine
+
+    p, errors = snm(), []
+    want = stepped_sine(p, [2.0], AG, 10, state=kicked(p, 0.1)).states[0]
+    for rate in (500.0, 1000.0, 2000.0, 4000.0):
+        state, _, _ = run(p, rate, sine(2.0, rate, 5), kicked(p, 0.1))
+        errors.append(np.abs(state[:2] - want[:2]).max())
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert np.all(np.abs(orders - 2) < 0.1)
+    assert errors[-1] < 1e-9
+
+
+@pytest.mark.parametrize("gap", [0.004, 0.0, -0.002])
+def test_contact_never_creates_energy(gap):
+    """Without drive, kinetic and all elastic energy (bumpers too) only falls, events included."""
+    p = snm(gap, damping=0.0)
+    _, out, events = run(p, 2000.0, np.zeros(8000), kicked(p, 0.3))
+    energy = 0.5 * (
+        p.mass * out[V] ** 2 + p.stiffness * out[U] ** 2
+        + p.bumper_stiffness_r * out[U_R] ** 2 + p.bumper_stiffness_l * out[U_L] ** 2
+    )  # fmt: skip
+    assert len(events) >= 4
+    assert np.diff(energy).max() <= 1e-13 * energy[0]
+    assert energy[-1] < 0.9 * energy[0]
+
+
+def test_work_of_the_drive_is_dissipated_in_steady_motion():
+    """Over a period: -M int A v = C int v^2 + sum of int F_j v, 3.4 Hz impacting."""
+    rate, p = 34000.0, snm()
+    state, _, _ = run(p, rate, sine(3.4, rate, 40 / 3.4), kicked(p, 0.1))
+    _, out, _ = run(p, rate, sine(3.4, rate, 1 / 3.4), state)
+    base = sine(3.4, rate, 1 / 3.4)
+    lost = p.damping * out[V] ** 2 + (out[F_R] + out[F_L]) * out[V]
+    assert np.sum(lost) == pytest.approx(-p.mass * np.sum(base * out[V]), rel=1e-4)
+
+
+def test_outputs_fit_the_equation_of_motion_and_the_signs():
+    p = snm(-0.001)
+    base = sine(5.2, 2000.0, 4)
+    _, out, _ = run(p, 2000.0, base)
+    force = p.damping * out[V] + p.stiffness * out[U] + out[F_R] + out[F_L]
+    assert np.abs(p.mass * out[A] + force).max() < 1e-9 * np.abs(force).max()
+    assert (out[F_R] >= 0).all()
+    assert (out[F_L] <= 0).all()
+    assert (out[U_R] >= 0).all()
+    assert (out[U_L] <= 0).all()
+    assert out[F_R].max() > 100 < -out[F_L].min()
+    assert (out[U_R] - out[U] + p.gap_r > -1e-13).all()
+    assert (out[U] - out[U_L] + p.gap_l > -1e-13).all()
+
+
+def test_events_tell_side_time_speed_and_impulse():
+    """Impulses add up to the momentum balance; onset force is C times the closing speed."""
+    p, rate = snm(), 2000.0
+    base = sine(3.4, rate, 10)
+    start = kicked(p, 0.1)
+    end, out, events = run(p, rate, base, start)
+    times, side, onset, speed, impulse = events.T
+    assert (np.diff(times) > 0).all()
+    assert (speed[onset == 1] > 0).all()
+    assert (side * impulse)[onset == 0].min() > 0
+    assert (onset[side > 0] == np.arange((side > 0).sum()) % 2 - 1).sum() == 0
+    area = np.trapezoid(np.concatenate([[0.0], out[U]]), dx=1 / rate)
+    drive = np.trapezoid(np.concatenate([[0.0], base]), dx=1 / rate)
+    want = -p.mass * (end[V] - start[V] + drive) - p.damping * end[U] - p.stiffness * area
+    assert impulse.sum() + end[7] + end[8] == pytest.approx(want, rel=1e-3)
+    fine = run(p, 200000.0, sine(3.4, 200000.0, 0.1), start)
+    first = fine[2][0]
+    after = math.ceil(first[0] * 200000.0)
+    assert fine[1][F_R, after] == pytest.approx(p.bumper_damping_r * first[3], rel=0.02)
+
+
+def test_more_events_than_rows_are_counted():
+    p, base = snm(), sine(3.4, 2000.0, 5)
+    state, events = kicked(p, 0.1), np.zeros((3, 5))
+    out = np.empty((7, base.size))
+    count = exact.advance_logged(state, exact.constants(p, 2000.0), base, out, events)
+    assert count > 3
+    assert (events[:, 0] > 0).all()
+
+
+@pytest.mark.parametrize("gap_r, gap_l", [(-1e-3, -1e-3), (-2e-3, -1e-3), (-1e-3, 2e-3), (0.0, 0.0),
+                                          (3e-3, -1e-3), (math.inf, -1e-3), (-1e-3, 1e-4)])  # fmt: skip
+def test_rest_is_an_equilibrium(gap_r, gap_l):
+    p = snm(gap_r=gap_r, gap_l=gap_l, bumper_stiffness_l=7e5)
+    state = exact.rest(p)
+    if gap_r < 0 and gap_l == -1e-3:
+        k = p.stiffness + p.bumper_stiffness_r + p.bumper_stiffness_l
+        want = (p.bumper_stiffness_l * 1e-3 + p.bumper_stiffness_r * gap_r) / k
+        assert state[U] == pytest.approx(want)
+    _, out, events = run(p, 2000.0, np.zeros(2000))
+    assert np.abs(out[V]).max() < 1e-13
+    assert np.abs(out[U] - state[U]).max() < 1e-15
+    assert len(events) == 0
+
+
+def test_left_and_right_are_mirror_images():
+    """Swapping the sides and the sign of A mirrors the response, to the bit."""
+    p = snm(bumper_stiffness_l=7e5, bumper_damping_l=2e3, gap_r=1e-3, gap_l=-5e-4)
+    q = snm(bumper_stiffness_r=7e5, bumper_damping_r=2e3, gap_l=1e-3, gap_r=-5e-4)
+    base = sine(2.7, 2000.0, 8)
+    _, one, events = run(p, 2000.0, base)
+    _, two, _ = run(q, 2000.0, -base)
+    assert len(events) > 10
+    assert np.array_equal(one[[U, V, A, F_R, F_L, U_R, U_L]], -two[[U, V, A, F_L, F_R, U_L, U_R]])
+
+
+@pytest.mark.parametrize("p, rate", [(snm(), 2000.0), (snm(-0.001), 1000.0), (snm(), 40.0)])
+@pytest.mark.parametrize("size", [1, 7, 64, 500])
+def test_blocks_of_any_size_give_the_same_bits(p, rate, size):
+    base = sine(2.2, rate, 4000 / rate)
+    base[1234] *= 1.5
+    whole, out, events = run(p, rate, base)
+    state, con, cut = exact.rest(p), exact.constants(p, rate), np.empty_like(out)
+    for first in range(0, base.size, size):
+        window = slice(first, first + size)
+        part = base[window]
+        part.setflags(write=False)
+        exact.advance(state, con, part, cut[:, window])
+    assert len(events) > 10
+    assert cut.tobytes() == out.tobytes()
+    assert state.tobytes() == whole.tobytes()
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+@pytest.mark.parametrize("gap", [0.004, 0.0, -0.002, math.inf])
+def test_a_lost_sample_makes_everything_after_it_nan(bad, gap):
+    base = sine(3.4, 2000.0, 1)
+    base[500] = bad
+    state, out, _ = run(snm(gap), 2000.0, base)
+    assert np.isfinite(out[:, :500]).all()
+    assert np.isnan(out[:, 502:]).all()
+    assert np.isnan(state).all()
+    again = exact.restart(0.0, 0.0, 0.0, 0.0, False, False, 0.0, snm(gap))
+    assert np.isfinite(run(snm(gap), 2000.0, sine(3.4, 2000.0, 1), again)[1]).all()
+
+
+@pytest.mark.parametrize("depth", [1e-15, 1e-13, 1e-11, 1e-9, 1e-7, -1e-9])
+def test_a_graze_inside_a_step_is_found_and_left_again(depth):
+    """Half a cosine whose top lies between two samples and `depth` beyond the bumper."""
+    top = 2e-3
+    p = snm(gap_r=top - depth, gap_l=1.0, damping=0.0)
+    w0, rate = math.sqrt(36e3 / 550), 1000.0
+    state = exact.rest(p)
+    start = (20.4 / rate) * w0
+    state[U], state[V] = top * math.cos(start), top * w0 * math.sin(start)
+    _, out, events = run(p, rate, np.zeros(60), state)
+    want = top * np.cos(w0 * np.arange(1, 61) / rate - start)
+    assert np.abs(out[U] - want).max() < 30 * math.sqrt(abs(depth)) * abs(depth) ** 0.5 + 1e-15
+    assert len(events) == (2 if depth > 1e-13 else 0 if depth < 0 else len(events))
+    if depth > 1e-13:
+        assert events[1, 0] - events[0, 0] < 1.1 * math.sqrt(8 * depth / (top * w0**2))
+
+
+def test_the_bumper_remembers():
+    """A released bumper relaxes with C/K and is hit again where it stands then."""
+    p = snm(gap_l=math.inf, bumper_damping_r=2e5)
+    _, out, events = run(p, 2000.0, sine(1.3, 2000.0, 6))
+    release = int(np.ceil(events[1, 0] * 2000)) - 1
+    free = out[U_R, release : int(events[2, 0] * 2000)]
+    tau = p.bumper_damping_r / p.bumper_stiffness_r
+    want = free[0] * np.exp(-np.arange(free.size) / 2000 / tau)
+    assert free[0] > 1e-4
+    assert free == pytest.approx(want, rel=1e-10)
+    second = int(np.ceil(events[2, 0] * 2000)) - 1
+    assert out[U_R, second] > 1e-6
+
+
+def test_a_relaxed_bumper_is_flushed_before_it_is_denormal():
+    p = snm()
+    state = exact.restart(0.0, 0.0, 1e-3, -1e-3, False, False, 0.0, p)
+    state, _, _ = run(p, 2000.0, np.zeros(1000), state)
+    assert state[2] == 0.0 == state[3]
+
+
+def test_restart_makes_a_state_the_model_allows():
+    p = snm()
+    pushed = exact.restart(0.003, 0.05, 0.0, 0.0, True, False, 0.1, p)
+    assert pushed[2] == pytest.approx(0.001)
+    assert pushed[4:7].tolist() == [1.0, 0.0, 0.1]
+    pulled = exact.restart(0.0021, -0.5, 0.0, 0.0, True, False, 0.0, p)
+    assert pulled[2] == pytest.approx(0.0001)
+    assert pulled[4] == 0.0
+    sunk = exact.restart(-0.003, -0.05, 0.0, -0.0002, False, False, 0.0, p)
+    assert sunk[3] == pytest.approx(-0.001)
+    assert sunk[5] == 1.0
+    apart = exact.restart(0.0, 0.1, 0.0005, 0.0, True, False, 0.0, p)
+    assert apart[2] == 0.0005
+    assert apart[4] == 0.0
+    none = exact.restart(0.003, 0.05, 0.0, 0.0, True, True, 0.0, snm(math.inf))
+    assert none[2:6].tolist() == [0.0, 0.0, 0.0, 0.0]
+
+
+def test_restart_from_the_models_own_state_goes_on_as_before():
+    p, con = snm(), exact.constants(snm(), 2000.0)
+    base = sine(3.4, 2000.0, 2)
+    state = kicked(p, 0.1)
+    for first in range(0, 4000, 37):
+        out, other = np.empty((7, 37)), np.empty((7, 37))
+        again = exact.restart(*state[:4], state[4] > 0, state[5] > 0, state[6], p)
+        again[7:] = state[7:]
+        part = base[first : first + 37]
+        exact.advance(state, con, part, out[:, : part.size])
+        exact.advance(again, con, part, other[:, : part.size])
+        assert other[:, : part.size].tobytes() == out[:, : part.size].tobytes()

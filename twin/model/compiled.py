@@ -1,0 +1,31 @@
+"""How this room compiles, and what keeps numba's cache honest across files."""
+
+import zlib
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+from numba import njit
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def compiled(*signature: Any) -> Callable[[F], F]:
+    """numba.njit as this room uses it, with types that survive it."""
+    decorator: Callable[[F], F] = njit(*signature, cache=True, nogil=True)
+    return decorator
+
+
+def revision(namespace: Mapping[str, Any]) -> int:
+    """A number that changes with any compiled function or number of a module.
+
+    numba's cache notices a change in a kernel's own file only. A kernel that calls into another
+    module takes this as a last argument with this default: it becomes part of the cache's key.
+    """
+    parts: list[tuple[str, ...]] = []
+    for name, item in sorted(namespace.items()):
+        code = getattr(getattr(item, "py_func", None), "__code__", None)
+        if code is not None:
+            parts.append((name, code.co_code.hex(), repr(code.co_consts), repr(code.co_names)))
+        elif isinstance(item, int | float):
+            parts.append((name, repr(item)))
+    return zlib.crc32(repr(parts).encode())
