@@ -1,4 +1,4 @@
-"""The SNM written down a second time: scipy's DOP853 with events. Slow, and nothing of the twin's."""
+"""The SNM written down a second time: scipy's DOP853 with events; slow, and independent."""
 
 import math
 from collections.abc import Callable
@@ -70,7 +70,8 @@ def reference(
             rtol=tolerance, atol=tolerance, max_step=dt, events=guards(p, contact),
         )  # fmt: skip
         inside = (times >= t) & (times <= solution.t[-1])
-        states[:, inside] = solution.sol(times[inside])
+        if inside.any():
+            states[:, inside] = solution.sol(times[inside])
         t, x = solution.t[-1], list(solution.y[:, -1])
         if t >= end:
             break

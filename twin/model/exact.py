@@ -152,9 +152,12 @@ def restart(
     """A state that the model allows, from a measured estimate (SI, right positive, base = A).
 
     In contact u_j is slaved to u; a contact that would pull is flight from the touching point, one
-    on an uncompressed bumper is plain flight; a flight that penetrates is set touching.
+    on an uncompressed bumper is plain flight; a flight that penetrates is set touching. All NaN
+    where anything is.
     """
     p = parameters
+    if math.isnan(u + v + u_r + u_l + base):
+        return np.full(STATE_SIZE, np.nan)
     state = np.zeros(STATE_SIZE)
     state[U], state[V], state[BASE] = u, v, base
     # On the left everything is mirrored: face(u, v, u_j, gap) with right-hand signs.

@@ -1,5 +1,7 @@
 """The kernel of the sampled driver: table acceleration linear between samples."""
 
+import math
+
 from numba import float64, int64, types
 
 from table_io.block import Float1D, Float2D
@@ -79,6 +81,8 @@ def eventful(
         if side < 0:
             break
         count = record(state, con, start + t, side, log, count)
+    if not abs(state[U]) + abs(state[U_R]) + abs(state[U_L]) < math.inf:
+        state[:] = math.nan
     return count
 
 
@@ -141,13 +145,14 @@ def march(  # noqa: PLR0915
             count = eventful(state, con, i * h, slope, log, count)
             u, v, ur, ul = state[U], state[V], state[U_R], state[U_L]
             mode = int(state[CONTACT_R] > 0) + 2 * int(state[CONTACT_L] > 0)
-        base = next_base
+        idle = 0.0 if u == u else math.nan  # noqa: PLR0124
+        base = next_base + idle
         if part + 1 == parts:
             b = MODES + mode * MODE_SIZE
             out[0, sample], out[1, sample] = u, v
             out[2, sample] = (con[b + 2] - con[b + 1] * v - con[b] * u) / mass
-            out[3, sample] = max(0.0, con[C_R] * v + con[K_R] * ur) if mode & 1 else 0.0
-            out[4, sample] = min(0.0, con[C_L] * v + con[K_L] * ul) if mode & 2 else 0.0
+            out[3, sample] = max(0.0, con[C_R] * v + con[K_R] * ur) if mode & 1 else idle
+            out[4, sample] = min(0.0, con[C_L] * v + con[K_L] * ul) if mode & 2 else idle
             out[5, sample], out[6, sample] = ur, ul
     state[U], state[V], state[U_R], state[U_L], state[BASE] = u, v, ur, ul, base
     return count

@@ -261,7 +261,7 @@ class RerunView:
                 names=names, colors=paint, widths=widths, aggregation_policy=policy
             )
             fix(entity, style)
-        sides = ["bumper R", "bumper L"] if self._scene.walls else []
+        sides = ["R", "L"] if self._scene.walls else []
         labels = ["table", f"mass {profile.specimen.mass_kg:g} kg", *sides]
         box, strip, dot = (kind.from_fields for kind in (rr.Boxes3D, rr.LineStrips2D, rr.Points2D))
         fix("rig/bodies", box(fill_mode="solid", labels=labels, show_labels=True))
@@ -333,7 +333,7 @@ def _drawing(origin: str, name: str, **overrides: Any) -> Any:
 def _blueprint(scene: Scene, live: bool) -> Any:
     """The layout: rig, PRC and phase plane on the left, time series and words on the right."""
     factors = f"table motion x {scene.table_factor:g}, motion and gaps on it x {scene.factor:g}"
-    eye = rrb.EyeControls3D(position=(0.0, -1.9, 0.75), look_target=(0.0, 0.0, 0.27))
+    eye = rrb.EyeControls3D(position=(0.0, -1.75, 0.7), look_target=(0.0, 0.0, 0.27))
     rig = rrb.Spatial3DView(
         origin="/rig",
         name=f"Rig: {factors}; twin outlined",

@@ -13,11 +13,12 @@ spokes through the hub. Keys, with <topic> as in `wire.TOPIC_TYPES`:
 
 so /rig/meas travels on shaketwin/<rig>/stream/rig/meas and /run/start on .../event/run/start.
 
-Full queues drop, so a stalled spoke never slows a publisher. Every publisher numbers its messages
-and holds the newest of them; an inbox that finds a number missing asks for the rest, a chunk at a
-time, and takes nothing newer until it has it. zenoh's own AdvancedPublisher does not serve: its
-put() waits while history is sent (100 ms for 5000 blocks, 5 s if the one who asked is stopped) and
-its subscriber silently loses the history of a publisher that goes on publishing (zenoh 1.10.2).
+Full queues drop, so a stalled spoke never slows a publisher. A payload travels in pieces that fit
+into one batch of zenoh (with such queues, larger ones never arrive). Every publisher numbers its
+pieces and holds the newest; an inbox that finds one missing asks for the rest, a chunk at a time,
+and takes nothing newer until it has it. zenoh's own AdvancedPublisher will not do: its put() waits
+while history is sent (0.1 s for 5000 blocks, 5 s if the one who asked is stopped), and its
+subscriber loses, without a word, the history of a publisher that goes on publishing (1.10.2).
 """
 
 import json
@@ -37,9 +38,9 @@ from table_io.profile import BadInput
 from twin.stream.wire import BLOCK_TOPICS, COMPARED
 
 LARGEST_BYTES = 4 * 2**20  # of one payload
-HELD_MESSAGES = 5000  # per topic and publisher: 50 s of blocks
+HELD_PIECES = 5000  # per topic and publisher: 50 s of blocks
 HELD_BYTES = 64 * 2**20
-CHUNK_BYTES = 48 * 2**10  # of one answer: one batch of zenoh, which is sent in one piece
+PIECE_BYTES = 48 * 2**10  # of one message on the bus: less than a batch of zenoh, 64 kB
 QUESTIONS_WAITING = 16
 ASK_EVERY_S = 0.5  # in case the last message of a topic was lost
 ASK_AGAIN_S = 0.2  # in case question or answer was lost
@@ -47,7 +48,8 @@ ASK_MORE_S = 0.002
 GIVE_UP_S = 10.0  # zenoh's lease: then a silent publisher counts as dead
 TURN_S = 0.02  # while waiting, others are answered this often
 STREAMS = frozenset((*BLOCK_TOPICS.values(), COMPARED))
-STAMP = struct.Struct("<8sQ")  # publisher, number of the message within its topic
+STAMP = struct.Struct("<8sQB")  # publisher, number of the piece within its topic, its place
+BEGINS, ENDS = 1, 2  # the place of a piece in its payload
 CLOCK = RealClock()
 
 
@@ -57,51 +59,71 @@ def key(rig: str, topic: str) -> str:
 
 
 class Shelf:
-    """The newest messages of one published topic; they are numbered `first` to `end` - 1."""
+    """The newest pieces published on a topic; they are numbered `first` to `end` - 1."""
 
     def __init__(self, publisher: Any) -> None:
         self.publisher = publisher
         self.end = 0
-        self._held: deque[bytes] = deque()
+        self._held: deque[tuple[int, bytes]] = deque()
         self._bytes = 0
 
     @property
     def first(self) -> int:
         return self.end - len(self._held)
 
-    def add(self, payload: bytes) -> None:
+    def add(self, place: int, piece: bytes) -> None:
         """Hold one more; the oldest give way."""
-        self._held.append(payload)
-        self._bytes += len(payload)
+        self._held.append((place, piece))
+        self._bytes += len(piece)
         self.end += 1
-        while len(self._held) > HELD_MESSAGES or self._bytes > HELD_BYTES:
-            self._bytes -= len(self._held.popleft())
+        while len(self._held) > HELD_PIECES or self._bytes > HELD_BYTES:
+            self._bytes -= len(self._held.popleft()[1])
 
-    def take(self, first: int, room: int) -> list[bytes]:
-        """Messages from number `first` on that fit into `room` bytes, at least one if `room` > 0."""
-        taken: list[bytes] = []
-        for payload in islice(self._held, first - self.first, None):
-            if room <= 0 or (taken and len(payload) > room):
+    def take(self, first: int, room: int) -> list[tuple[int, bytes]]:
+        """(place, piece) from number `first` on, as many as fit into `room` bytes."""
+        taken = []
+        for place, piece in islice(self._held, first - self.first, None):
+            room -= len(piece)
+            if room < 0:
                 break
-            taken.append(payload)
-            room -= len(payload)
+            taken.append((place, piece))
         return taken
 
 
 @dataclass(slots=True)
 class Source:
-    """How far an inbox has come with one topic of one publisher; None before the first message."""
+    """How far an inbox has come with one topic of one publisher; `next` is None before it began."""
 
     next: int | None
     seen: int = 0
     behind_since: float | None = None
+    pieces: list[bytes] | None = None  # of a payload whose end has not come yet
+
+    def advance(self, number: int) -> int:
+        """Go on at `number`; the count of pieces left out."""
+        left_out = 0 if self.next is None else max(0, number - self.next)
+        if left_out:
+            self.pieces = None
+        self.next = number if self.next is None else max(number, self.next)
+        return left_out
+
+    def accept(self, place: int, piece: bytes) -> bytes | None:
+        """Take the piece numbered `next`; the whole payload if this ends it."""
+        assert self.next is not None
+        self.next += 1
+        if place & BEGINS:
+            self.pieces = []
+        if self.pieces is None or len(self.pieces) * PIECE_BYTES > LARGEST_BYTES:
+            return None
+        self.pieces.append(piece)
+        return b"".join(self.pieces) if place & ENDS else None
 
 
 class Inbox:
-    """Messages in order per topic and publisher; `subscribe` makes it, one thread reads it.
+    """Payloads in order per topic and publisher; `subscribe` makes it, one thread reads it.
 
-    `missed` messages were gone before they could be asked for again, `dropped` ones were pushed out
-    by newer ones because nobody fetched them, `ignored` ones too large.
+    `missed` pieces were gone before they could be asked for again, `dropped` ones were pushed out
+    by newer ones because nobody fetched them, `ignored` ones not ours.
     """
 
     def __init__(self, link: "Link", topics: tuple[str, ...], history: bool, capacity: int) -> None:
@@ -137,12 +159,12 @@ class Inbox:
                 return None
         return self._ready.popleft()
 
-    def arrive(self, topic: str, stamp: Any, payload: Any) -> None:
+    def arrive(self, topic: str, stamp: Any, body: Any) -> None:
         """Take what zenoh's thread brings; a copy and no more, since that thread feeds the rest."""
-        if len(payload) > LARGEST_BYTES + CHUNK_BYTES or stamp is None:
+        if stamp is None or len(body) > PIECE_BYTES or (topic and len(stamp) != STAMP.size):
             self.ignored += 1
             return
-        entry = (topic, stamp.to_bytes(), payload.to_bytes())
+        entry = (topic, stamp.to_bytes(), body.to_bytes())
         with self._filled:
             if len(self._arrived) >= self._capacity:
                 self._drop(*self._arrived.popleft())
@@ -152,52 +174,54 @@ class Inbox:
     def _drop(self, topic: str, stamp: bytes, _: bytes) -> None:
         # With history it is only put off: the gap it leaves is asked for when there is time.
         if topic and not self._history:
-            source, number = STAMP.unpack(stamp)
-            self._skipped[topic, source.hex()] = number + 1
+            name, number, _place = STAMP.unpack(stamp)
+            self._skipped[topic, name.hex()] = number + 1
             self.dropped += 1
 
-    def _sort(self, topic: str, stamp: bytes, payload: bytes) -> None:
+    def _sort(self, topic: str, stamp: bytes, body: bytes) -> None:
         """Move what arrived to `_ready` if it is next in order; else note that we are behind."""
         if not topic:
-            self._take(json.loads(stamp), payload)
+            self._take(stamp, body)
             return
-        name, number = STAMP.unpack(stamp)
+        name, number, place = STAMP.unpack(stamp)
         where = (topic, name.hex())
         source = self._sources.setdefault(where, Source(0 if number == 0 else None))
         if source.next is None and not self._history:
-            source.next = number
-        if source.next is not None and where in self._skipped:
-            source.next = max(source.next, self._skipped.pop(where))
+            source.advance(number)
+        if where in self._skipped:
+            source.advance(self._skipped.pop(where))
         source.seen = max(source.seen, number)
         if number == source.next:
-            source.next += 1
-            self._ready.append((topic, payload))
+            self._accept(topic, source, place, body)
         elif (source.next is None or number > source.next) and source.behind_since is None:
             source.behind_since = CLOCK.now()
 
-    def _take(self, header: dict[str, Any], body: bytes) -> None:
-        """Move the messages of an answer to `_ready`; count those that their publisher lacks."""
+    def _take(self, stamp: bytes, body: bytes) -> None:
+        """Move the pieces of an answer to `_ready`; count those that their publisher lacks."""
         self._answered = True
+        header = json.loads(stamp)
         at = 0
         for topic, (first, end, sizes) in header["topics"].items():
             source = self._sources.setdefault((topic, header["source"]), Source(None))
-            if source.next is None:
-                source.next = first
-            self.missed += max(0, first - source.next)
-            source.next = max(first, source.next)
-            for number, size in enumerate(sizes, first):
+            self.missed += source.advance(first)
+            for number, (place, size) in enumerate(sizes, first):
                 if number == source.next:
-                    self._ready.append((topic, body[at : at + size]))
-                    source.next += 1
+                    self._accept(topic, source, place, body[at : at + size])
                 at += size
-            source.behind_since = CLOCK.now() if source.next < end else None
+            source.behind_since = CLOCK.now() if (source.next or 0) < end else None
+
+    def _accept(self, topic: str, source: Source, place: int, piece: bytes) -> None:
+        whole = source.accept(place, piece)
+        if whole is not None:
+            self._ready.append((topic, whole))
 
     def _ask_if_due(self, now: float) -> None:
+        """Ask for what is missing, and now and then for what may be."""
         behind = [one for one in self._sources.values() if one.behind_since is not None]
         for source in behind:
             if now - (source.behind_since or now) > GIVE_UP_S:
-                self.missed += source.seen + 1 - (source.next or 0)
-                source.next, source.behind_since = source.seen + 1, None
+                self.missed += source.advance(source.seen + 1)
+                source.behind_since = None
         pause = ASK_EVERY_S if not behind else ASK_MORE_S if self._answered else ASK_AGAIN_S
         if now - self._asked_at >= pause:
             self._asked_at, self._answered = now, False
@@ -277,8 +301,11 @@ class Link:
             self.refused += 1
             return
         shelf = self._shelves[topic]
-        shelf.publisher.put(payload, attachment=STAMP.pack(self._name, shelf.end))
-        shelf.add(payload)
+        for at in range(0, max(len(payload), 1), PIECE_BYTES):
+            piece = payload[at : at + PIECE_BYTES]
+            place = BEGINS * (at == 0) | ENDS * (at + PIECE_BYTES >= len(payload))
+            shelf.publisher.put(piece, attachment=STAMP.pack(self._name, shelf.end, place))
+            shelf.add(place, piece)
         self.serve()
 
     def serve(self) -> None:
@@ -300,22 +327,24 @@ class Link:
                 header = json.dumps({"source": self._name.hex(), "topics": topics})
                 query.reply(query.key_expr, body, attachment=header)
 
-    def _answer(self, asked: dict[str, dict[str, int]], history: bool) -> tuple[dict[str, Any], bytes]:
-        """({topic: [first, end, sizes]}, their payloads in a row): a chunk of what was asked for."""
+    def _answer(
+        self, asked: dict[str, dict[str, int]], history: bool
+    ) -> tuple[dict[str, Any], bytes]:
+        """({topic: [first, end, [(place, size)]]}, the pieces in a row): a chunk of what is asked."""
         topics: dict[str, Any] = {}
         chunk: list[bytes] = []
-        room = CHUNK_BYTES
+        room = PIECE_BYTES
         # Rare topics first, so that the start of a run comes before its blocks.
         for topic in sorted(self._shelves.keys() & asked, key=lambda one: self._shelves[one].end):
             shelf = self._shelves[topic]
             known = asked[topic].get(self._name.hex())
             first = (shelf.first if history else shelf.end) if known is None else int(known)
             first = max(first, shelf.first)
-            payloads = shelf.take(first, room)
-            room -= sum(map(len, payloads))
-            chunk += payloads
-            if payloads or known is None:
-                topics[topic] = [first, shelf.end, [len(one) for one in payloads]]
+            taken = shelf.take(first, room)
+            room -= sum(len(piece) for _, piece in taken)
+            chunk += [piece for _, piece in taken]
+            if known is None or first < shelf.end:
+                topics[topic] = [first, shelf.end, [(place, len(piece)) for place, piece in taken]]
         return topics, b"".join(chunk)
 
     def ask(self, question: dict[str, Any], inbox: Inbox) -> None:
@@ -338,7 +367,7 @@ class Link:
         )
 
     def subscribe(self, topics: tuple[str, ...], *, history: bool, capacity: int) -> Inbox:
-        """Inbox of `topics` that keeps at most `capacity` messages waiting.
+        """Inbox of `topics` that keeps at most `capacity` pieces waiting.
 
         With `history` it begins with what the publishers still hold and loses nothing that they
         hold; without, it begins now and, when full, drops the oldest.
@@ -434,15 +463,15 @@ def _why(error: Exception) -> str:
 
 def _config(mode: str, way: str, endpoint: str, timeout_s: float) -> Any:
     """Session settings: the one endpoint and no other; full queues drop at once."""
-    ends = {way: {"endpoints": [endpoint], "timeout_ms": round(timeout_s * 1000)}}
+    end = {"endpoints": [endpoint], "timeout_ms": round(timeout_s * 1000), "exit_on_failure": True}
     drop = {"wait_before_drop": 0, "max_wait_before_drop_fragments": 0}
     queue = {"congestion_control": {"drop": drop}, "size": {"data": 16}}
     config = {
         "mode": mode,
         "listen": {"endpoints": []},
-        "connect": {"endpoints": [], "exit_on_failure": True},
+        "connect": {"endpoints": []},
+        way: end,
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {"shared_memory": {"enabled": False}, "link": {"tx": {"queue": queue}}},
     }
-    config[way] = {**config[way], **ends[way], "exit_on_failure": True}  # type: ignore[dict-item]
     return zenoh.Config.from_json5(json.dumps(config))
