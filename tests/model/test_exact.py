@@ -78,25 +78,31 @@ def test_agrees_with_dop853(p, frequency, speed):
         return float(np.interp(t * rate, np.arange(table.size), table))
 
     contact = (bool(start[4]), bool(start[5]))
-    want, events = reference(p, start[:4], contact, drive, times, 1e-12, 1 / rate)
+    want, events = reference(p, start[:4], contact, drive, times, 1e-13, 1 / rate)
     _, out, found = run(p, rate, base, start)
     assert len(found) == len(events) > 0 or p.gap_r + p.gap_l < -0.005
-    scale = np.abs(want[0]).max()
-    for row, state in ((U, 0), (V, 1), (U_R, 2), (U_L, 3)):
-        assert np.abs(out[row] - want[state]).max() < 1e-7 * scale * (30 if row == V else 1)
+    error = np.abs(out[[U, V, U_R, U_L]] - want).max(axis=1)
+    # What is left is the integrator's: it shrinks with its tolerance.
+    assert (error < [1e-9, 1e-7, 1e-9, 1e-9]).all()
 
 
-def test_refining_a_drive_that_is_linear_between_samples_changes_nothing():
-    """First-order hold is exact, and several events in one step of 0.1 s are all found."""
-    coarse = AG * np.sin(2 * math.pi * 1.9 * np.arange(0, 101) / 10)
-    fine = np.interp(np.arange(1, 16001) / 1600, np.arange(0, 101) / 10, coarse)
-    p = snm(0.003)
-    _, few, events = run(p, 10.0, coarse[1:], kicked(p, 0.1))
-    _, many, events_fine = run(p, 1600.0, fine, kicked(p, 0.1))
-    assert len(events) == len(events_fine) > 20
-    assert np.abs(few - many[:, 159::160])[[U, U_R, U_L]].max() < 1e-12
-    steps = np.floor(events[:, 0] * 10)
-    assert np.unique(steps, return_counts=True)[1].max() >= 2
+@pytest.mark.parametrize("gap", [0.003, 0.0, -0.001])
+@pytest.mark.parametrize("rate, peak", [(4.0, 0.4), (10.0, 1.0), (100.0, 60.0), (300.0, 60.0)])
+def test_refining_a_drive_that_is_linear_between_samples_changes_nothing(gap, rate, peak):
+    """First-order hold is exact, and all events are found, many in one step or none.
+
+    The drive is violent, so that a mass may leave a bumper and come back within one substep.
+    """
+    parts, p = round(32000 / rate), snm(gap)
+    coarse = peak * np.random.default_rng(0).uniform(-1, 1, 61)
+    coarse[0] = 0.0
+    fine = np.interp(np.arange(1, 60 * parts + 1) / parts, np.arange(61), coarse)
+    _, few, events = run(p, rate, coarse[1:], kicked(p, 0.1))
+    _, many, events_fine = run(p, rate * parts, fine, kicked(p, 0.1))
+    assert len(events) == len(events_fine) > 5
+    assert events[:, 1:3].tolist() == events_fine[:, 1:3].tolist()
+    scale = np.abs(few[U]).max()
+    assert np.abs(few - many[:, parts - 1 :: parts])[[U, U_R, U_L]].max() < 1e-8 * scale
 
 
 def test_impacting_and_flight_solutions_coexist_at_g4():
@@ -249,17 +255,19 @@ def test_a_lost_sample_makes_everything_after_it_nan(bad, gap):
     assert np.isfinite(run(snm(gap), 2000.0, sine(3.4, 2000.0, 1), again)[1]).all()
 
 
+@pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("depth", [1e-15, 1e-13, 1e-11, 1e-9, 1e-7, -1e-9])
-def test_a_graze_inside_a_step_is_found_and_left_again(depth):
+def test_a_graze_inside_a_step_is_found_and_left_again(depth, side):
     """Half a cosine whose top lies between two samples and `depth` beyond the bumper."""
     top = 2e-3
-    p = snm(gap_r=top - depth, gap_l=1.0, damping=0.0)
+    gaps = (top - depth, 1.0)[::side]
+    p = snm(gap_r=gaps[0], gap_l=gaps[1], damping=0.0)
     w0, rate = math.sqrt(36e3 / 550), 1000.0
     state = exact.rest(p)
     start = (20.4 / rate) * w0
-    state[U], state[V] = top * math.cos(start), top * w0 * math.sin(start)
+    state[U], state[V] = side * top * math.cos(start), side * top * w0 * math.sin(start)
     _, out, events = run(p, rate, np.zeros(60), state)
-    want = top * np.cos(w0 * np.arange(1, 61) / rate - start)
+    want = side * top * np.cos(w0 * np.arange(1, 61) / rate - start)
     assert np.abs(out[U] - want).max() < 30 * math.sqrt(abs(depth)) * abs(depth) ** 0.5 + 1e-15
     assert len(events) == (2 if depth > 1e-13 else 0 if depth < 0 else len(events))
     if depth > 1e-13:

@@ -41,7 +41,6 @@ STEPS = (
     Step(2, "backward", 2.0, 0.49),
 )
 MEASURED = tuple(BY_NAME)[:9]
-NOT_BLOCKS_OR_START = slice(1, None)
 
 
 def start(gap_mm: str = "4.0") -> RunStart:
@@ -56,7 +55,7 @@ def start(gap_mm: str = "4.0") -> RunStart:
 
 
 def samples() -> tuple[Any, Any]:
-    """(measured, predicted) values (channel, sample): sines, and a force where u is past the gap."""
+    """(measured, predicted) values (channel, sample): sines, and a force beyond the gap."""
     t = np.arange(SAMPLES) / RATE
     table, u = 2e-3 * np.sin(4 * np.pi * t), 4e-3 * np.sin(4 * np.pi * t + 1)
     right, left = 5e5 * np.clip(u - 2e-3, 0, None), 5e5 * np.clip(-u - 2e-3, 0, None)
@@ -128,7 +127,7 @@ def content(path: Path) -> dict[str, dict[str, tuple[Any, Any]]]:
     return {
         entity: {name: tuple(zip(*rows, strict=True)) for name, rows in columns.items()}
         for entity, columns in found.items()
-    }  # type: ignore[return-value]
+    }
 
 
 def scalars(path: Path, entity: str) -> tuple[Any, Any]:
@@ -177,6 +176,7 @@ def test_every_record_is_shown(whole: Path) -> None:
     assert np.isnan(counts[:, 2:]).all()
     assert scalars(whole, "/error")[1] == pytest.approx(np.tile([50.0, 10.0], (12, 1)))
     assert len(found["/status"]["TextDocument:text"][1]) == len(STEPS)
+    assert "-4.00 … 4.00 | - |" in found["/cycle"]["TextDocument:text"][1][0][0]
     assert "η_d" in found["/point"]["TextDocument:text"][1][0][0]
 
 

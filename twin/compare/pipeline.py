@@ -28,6 +28,7 @@ class Setup:
     twin: TwinSetup
     scale: Scale
     steps: tuple[Step, ...]
+    measured_cycles: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +61,7 @@ def prepare(
         from_rest,
     )
     scale = Scale(parameters, rate, contact_n, u_star, a_star)
-    return Setup(twin, scale, steps)
+    return Setup(twin, scale, steps, profile.sweep.measured_cycles)
 
 
 def start(setup: Setup, index: int = 0) -> tuple[State, list[Record]]:
@@ -155,10 +156,11 @@ def _cycle(setup: Setup, state: State, step: int, number: int) -> tuple[State, l
 
 
 def _point(setup: Setup, state: State) -> tuple[State, list[Record]]:
-    """The step's PRC point, where at least one measured cycle is whole, and a hint of a jump."""
+    """The step's PRC point, where all its measured cycles were seen, and a hint of a jump."""
     items: list[Record] = []
     last = state.last_point
-    if state.base_acc:
+    seen = sum(cycle.label == Label.MEASURE for cycle in state.cycles)
+    if seen == setup.measured_cycles:
         last = point(
             setup.steps[state.cycles[-1].step],
             list(state.cycles),

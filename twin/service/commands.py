@@ -112,7 +112,7 @@ def run(
         else:
             _run_live(bundle, run_name, folder, asked, view, listen)
     code = _close(folder, bundle)
-    if view and unpaced:
+    if view:
         _write_view(folder)
     return EXIT_INTERRUPTED if asked() else code
 
@@ -145,7 +145,6 @@ def _run_live(
         bundle.profile_toml,
         bundle.rig_toml,
         bundle.model_toml,
-        save_view=view,
         serve_view=VIEW_ADDRESS if view else "",
     )
     with RunProgress(console, len(bundle.steps), bundle.drive.planned_end) as progress:

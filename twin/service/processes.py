@@ -23,10 +23,7 @@ from table_io.session import Punctuality, play
 from twin.service.bundle import Bundle, from_texts, warm
 from twin.service.stopwatch import Stopwatch
 from twin.stream.wire import (
-    BLOCK_TOPICS,
-    COMPARED,
     MEASURED,
-    RECORD_TOPICS,
     TOPIC_TYPES,
     Item,
     decode,
@@ -63,8 +60,7 @@ class Spec:
     profile_toml: str
     rig_toml: str
     model_toml: str
-    save_view: bool = False
-    serve_view: str = ""
+    serve_view: str = ""  # address of the live Rerun view, if one is wanted
 
     def write(self, path: Path) -> None:
         path.write_text(json.dumps(asdict(self)))
@@ -275,39 +271,13 @@ class _Awaited:
         return self.end is not None and self.block_end >= self.end and self.twin_done
 
 
-VIEWED = (*BLOCK_TOPICS.values(), *(name for name in RECORD_TOPICS.values() if name != COMPARED))
+def viewer(spec: Spec, _: str) -> None:
+    """Feeds Rerun; a courtesy, it may be slow or die."""
+    from twin.service.viewing import serve
 
-
-def viewer(spec: Spec, part: str) -> None:
-    """Feeds Rerun in batches of 100 ms; a courtesy, it may be slow or die."""
-    from twin.stream.rerun_view import RerunView
-
-    bundle = spec.bundle()
-    clock = RealClock()
-    link = open_spoke(bundle.rig.name, spec.endpoint, CONNECT_S)
-    inbox = link.subscribe(VIEWED, history=True, capacity=5000)
+    link = open_spoke(spec.bundle().rig.name, spec.endpoint, CONNECT_S)
     link.alive("viewer")
-    view: RerunView | None = None
-    end, early = None, list[Item]()
-    while end is None:
-        until, batch = clock.now() + 0.1, list[Item]()
-        while (left := until - clock.now()) > 0:
-            if (arrived := inbox.get(left)) is not None:
-                batch.append(decode(*arrived)[1])
-        for item in batch:
-            if isinstance(item, RunStart) and view is None:
-                save = Path(part) if spec.save_view else None
-                view = RerunView(item, save=save, serve=spec.serve_view or None)
-            end = item.index if isinstance(item, RunStop) else end
-        if view is None:
-            early.extend(batch)
-            continue
-        view.feed([*early, *batch])
-        early = []
-        if _orphaned():
-            break
-    if view is not None:
-        view.close()
+    serve(link, spec.serve_view, _orphaned)
     link.close()
 
 

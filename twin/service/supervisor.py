@@ -3,7 +3,6 @@
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,7 +11,7 @@ from pathlib import Path
 
 from table_io.clock import Clock
 from table_io.profile import BadInput, OnDeath
-from table_io.records import Comparison, Event, Fault, RunStop
+from table_io.records import Comparison, Event, RunStop
 from twin.service.processes import Spec
 from twin.stream.mcap_log import merge, read
 from twin.stream.wire import RECORD_TOPICS, Item, decode, encode, topic
@@ -77,17 +76,13 @@ class Supervisor:
         return sum(child.restarts for child in self.children.values())
 
     def _views(self) -> tuple[str, ...]:
-        return ("viewer",) if self.spec.save_view or self.spec.serve_view else ()
+        return ("viewer",) if self.spec.serve_view else ()
 
     def _start(self, component: str, argument: str = "") -> None:
         """Start or restart a process in a session of its own, so that Ctrl-C passes it by."""
         if component == "recorder":
             self._parts += 1
             argument = str(self.parts / f"part-{self._parts:03d}.mcap")
-        if component == "viewer":
-            restarts = self.children[component].restarts if component in self.children else -1
-            suffix = f"-{restarts + 1}" if restarts >= 0 else ""
-            argument = str(Path(self.spec.folder) / f"view{suffix}.rrd")
         log = self.parts / f"{component}.log"
         command = [sys.executable, "-m", "twin.service.processes", component]
         command += [str(self.parts / "spec.json"), argument]
@@ -226,13 +221,3 @@ def gather(folder: Path) -> Path:
             raise BadInput(f"{out}: differs from its parts, which are kept in {folder / PARTS}")
     shutil.rmtree(folder / PARTS)
     return out
-
-
-def free_endpoint() -> str:
-    """A loopback endpoint that nobody uses, for tests."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
-__all__ = ["Fault", "Supervisor", "free_endpoint", "gather"]

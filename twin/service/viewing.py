@@ -1,64 +1,71 @@
-"""`shaketwin view`: Rerun with the project's layout, on a recording or on a running test."""
+"""Rerun with the project's layout, on a recording or on a running test."""
 
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 from rich.console import Console
 
 from table_io.clock import RealClock
 from table_io.records import RunStart, RunStop
-from twin.service.processes import VIEWED
 from twin.stream.mcap_log import read
 from twin.stream.rerun_view import RerunView, open_viewer, screenshot, write_rrd
-from twin.stream.wire import Item, decode
+from twin.stream.wire import TOPIC_TYPES, Item, decode
+from twin.stream.zenoh_link import Link, open_spoke
 
 BATCH_S = 0.1
+CAPACITY = 5000  # what does not fit is dropped: a viewer never slows a test
+ANSWER_S = 2.0
 
 
 def view_log(log: Path, save: Path | None, picture: Path | None, console: Console) -> None:
     """Opens a recording; with `save` or `picture` it only writes these."""
     recording = read(log)
-    if save is not None:
-        write_rrd(recording, save)
-        console.print(f"{save}", soft_wrap=True)
+    if save is None and picture is None:
+        rrd = Path(tempfile.mkdtemp(prefix="shaketwin-")) / "view.rrd"
+        write_rrd(recording, rrd)
+        console.print(open_viewer(rrd), soft_wrap=True, highlight=False)
+        return
     with tempfile.TemporaryDirectory() as folder:
         rrd = save if save is not None else Path(folder) / "view.rrd"
-        if save is None:
-            write_rrd(recording, rrd)
+        write_rrd(recording, rrd)
         if picture is not None:
             screenshot(rrd, picture)
-            console.print(f"{picture}", soft_wrap=True)
-        if save is None and picture is None:
-            open_viewer(rrd)
+    for written in (save, picture):
+        if written is not None:
+            console.print(f"{written}", soft_wrap=True, highlight=False)
 
 
 def view_live(endpoint: str, rig: str, address: str, console: Console) -> None:
     """Serves a running test to Rerun until it ends or Ctrl-C."""
-    from twin.stream.zenoh_link import open_spoke
-
-    link = open_spoke(rig, endpoint, 2.0)
-    clock = RealClock()
-    inbox = link.subscribe(VIEWED, history=True, capacity=5000)
-    shown: RerunView | None = None
+    link = open_spoke(rig, endpoint, ANSWER_S)
+    console.print(f"live view: rerun rerun+http://{address}/proxy", soft_wrap=True)
     try:
-        waiting: list[Item] = []
-        ended = False
-        while not ended:
-            until = clock.now() + BATCH_S
-            while (left := until - clock.now()) > 0:
-                if (arrived := inbox.get(left)) is not None:
-                    waiting.append(decode(*arrived)[1])
-            for item in waiting:
-                ended = ended or isinstance(item, RunStop)
-                if isinstance(item, RunStart) and shown is None:
-                    shown = RerunView(item, serve=address)
-                    console.print(f"live view: rerun rerun+http://{address}/proxy", soft_wrap=True)
-            if shown is not None:
-                shown.feed(waiting)
-                waiting = []
+        serve(link, address, lambda: False)
     except KeyboardInterrupt:
-        pass
+        console.print("view closed; the test goes on")
     finally:
-        if shown is not None:
-            shown.close()
         link.close()
+
+
+def serve(link: Link, address: str, given_up: Callable[[], bool]) -> None:
+    """Feeds a view served at `address` in batches of 100 ms until the run has ended."""
+    inbox = link.subscribe(tuple(TOPIC_TYPES), history=True, capacity=CAPACITY)
+    clock = RealClock()
+    view: RerunView | None = None
+    waiting: list[Item] = []
+    ended = False
+    while not ended and not given_up():
+        until = clock.now() + BATCH_S
+        while (left := until - clock.now()) > 0:
+            if (arrived := inbox.get(left)) is not None:
+                waiting.append(decode(*arrived)[1])
+        ended = any(isinstance(item, RunStop) for item in waiting)
+        if view is None:
+            starts = [item for item in waiting if isinstance(item, RunStart)]
+            view = RerunView(starts[0], serve=address) if starts else None
+        if view is not None:
+            view.feed(waiting)
+            waiting = []
+    if view is not None:
+        view.close()

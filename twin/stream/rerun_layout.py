@@ -21,6 +21,7 @@ from table_io.records import (
     Comparison,
     Cycle,
     Event,
+    Extremes,
     Fault,
     Gap,
     Params,
@@ -474,6 +475,25 @@ def point_table(point: Point) -> str:
     head = f"### {point.frequency_hz:g} Hz {point.direction}\n"
     drive = f"table {point.table_acc_peak_m_s2:.3f} m/s², THD {100 * point.thd:.1f} %\n\n"
     return head + drive + "| | measured | twin |\n|---|---|---|\n" + "\n".join(rows)
+
+
+def cycle_table(cycle: Cycle) -> str:
+    """Markdown: least and greatest values of a forcing cycle, measured beside twin."""
+
+    def cells(one: Extremes | None) -> tuple[str, ...]:
+        if one is None:
+            return ("-",) * 4
+        return (
+            f"{1e3 * one.u_min:.2f} … {1e3 * one.u_max:.2f}",
+            f"{one.a_min:.2f} … {one.a_max:.2f}",
+            f"{-1e-3 * one.force_l:.2f} … {1e-3 * one.force_r:.2f}",
+            f"{len(one.onsets_l)}, {len(one.onsets_r)}",
+        )
+
+    names = ("u [mm]", "a [m/s²]", "F [kN]", "impacts L, R")
+    rows = zip(names, cells(cycle.measured), cells(cycle.twin), strict=True)
+    lines = (f"| {name} | {measured} | {twin} |" for name, measured, twin in rows)
+    return "| | measured | twin |\n|---|---|---|\n" + "\n".join(lines)
 
 
 LEVELS = {

@@ -41,6 +41,7 @@ from twin.stream.rerun_layout import (
     Reach,
     Scene,
     Trail,
+    cycle_table,
     impacts,
     motion,
     pieces,
@@ -214,6 +215,7 @@ class RerunView:
                 self._point(item)
             case Cycle():
                 self._send("impacts", [item.index], rr.Scalars.columns(scalars=impacts(item)))
+                self._document("cycle", item.index, cycle_table(item))
             case Comparison():
                 if (share := self._errors.add(item)) is not None:
                     self._send("error", [share[0]], rr.Scalars.columns(scalars=share[1]))
@@ -363,11 +365,12 @@ def _blueprint(scene: Scene, live: bool) -> Any:
         _plot("/other", "Other channels"),
     )
     now = rrb.TextDocumentView(origin="/status", name="Now")
+    cycle = rrb.TextDocumentView(origin="/cycle", name="Last cycle")
     right = rrb.Vertical(
         _plot("/u", "Relative displacement u [mm], right positive"),
         _plot("/a", "Total acceleration of the mass [m/s²], right positive"),
         _plot("/force", "Contact forces F_R ≥ 0, F_L ≤ 0 [kN]"),
-        rrb.Horizontal(now, words, column_shares=[1, 2]),
+        rrb.Horizontal(now, cycle, words, column_shares=[2, 2, 4]),
         row_shares=[3, 3, 3, 2.2],
     )
     play = "following" if live else "playing"
@@ -425,20 +428,20 @@ def _launch(program: Path, *arguments: str) -> "subprocess.Popen[bytes]":
 def screenshot(source: Path | str, png: Path, at_s: float | None = None) -> list[str]:
     """Writes a 1920 x 1080 picture without a screen; returns what views complain of, if anything.
 
-    `at_s` is the time shown, else nine tenths through the run.
+    `at_s` is the time shown, else nine tenths through a file, or now where it is a live URL.
     """
+    live = isinstance(source, str)
     with socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = str(probe.getsockname()[1])
     process = _launch(viewer(), "--headless", "--port", port)
     try:
         client = _client(process, f"rerun+http://127.0.0.1:{port}/proxy")
-        client.open(str(source))
-        while (state := client.get_state()).loading:
-            _wait(process, 0.1)
-        ends = [one.end for one in state.recordings[0].timelines if one.name == "time"]
-        at = at_s if at_s is not None else 0.9e-9 * max(ends, default=0)
-        client.set_time("time", duration=at, play_state="paused")
+        client.open(source if isinstance(source, str) else str(source.resolve()))
+        end_s = _loaded(process, client, live)
+        if at_s is not None or not live:
+            at = 0.9 * end_s if at_s is None else at_s
+            client.set_time("time", duration=float(at), play_state="paused")
         _wait(process, 3.0)  # the first frames come without data
         client.save_screenshot(str(png.resolve()))
         views = client.get_state().views
@@ -446,6 +449,20 @@ def screenshot(source: Path | str, png: Path, at_s: float | None = None) -> list
     finally:
         process.terminate()
         process.wait(10)
+
+
+def _loaded(process: "subprocess.Popen[bytes]", client: Any, live: bool) -> float:
+    """Time at the end of what the viewer has loaded, in s, once that is all or something live."""
+    for _ in range(600):
+        state = client.get_state()
+        timelines = [line for one in state.recordings for line in one.timelines]
+        ends = [line.end for line in timelines if line.name == "time"]
+        if ends and (live or not state.loading):
+            return 1e-9 * float(max(ends))
+        _wait(process, 0.1)
+    raise BadInput(
+        "the viewer finds no recording there; give an .rrd file or the URL of a live view"
+    )
 
 
 def _wait(process: "subprocess.Popen[bytes]", seconds: float) -> None:

@@ -330,7 +330,7 @@ class Link:
     def _answer(
         self, asked: dict[str, dict[str, int]], history: bool
     ) -> tuple[dict[str, Any], bytes]:
-        """({topic: [first, end, [(place, size)]]}, the pieces in a row): a chunk of what is asked."""
+        """({topic: [first, end, [(place, size)]]}, pieces in a row): a chunk of what is asked."""
         topics: dict[str, Any] = {}
         chunk: list[bytes] = []
         room = PIECE_BYTES
@@ -389,7 +389,7 @@ class Link:
 
     def _queryable(self, what: str) -> Any:
         where = f"shaketwin/{self._rig}/{what}"
-        waiting = zenoh.handlers.RingChannel(QUESTIONS_WAITING)
+        waiting: Any = zenoh.handlers.RingChannel(QUESTIONS_WAITING)
         self._open.append(self._session.declare_queryable(where, waiting))
         return self._open[-1]
 
@@ -417,8 +417,7 @@ class Link:
         for one in (*self._open, *(shelf.publisher for shelf in self._shelves.values())):
             one.undeclare()
         self._open, self._shelves, self._questions = [], {}, None
-        if not self._session.is_closed():
-            self._session.close()
+        self._session.close()
 
 
 def open_hub(rig: str, endpoint: str) -> Link:
@@ -471,7 +470,7 @@ def _config(mode: str, way: str, endpoint: str, timeout_s: float) -> Any:
         "listen": {"endpoints": []},
         "connect": {"endpoints": []},
         way: end,
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {"shared_memory": {"enabled": False}, "link": {"tx": {"queue": queue}}},
     }
     return zenoh.Config.from_json5(json.dumps(config))

@@ -1,0 +1,86 @@
+"""Speed of the model beside scipy's on the same motion; the ratio is printed, nothing is asserted.
+
+Run with: pytest tests/bench/test_bench_model.py --benchmark-enable
+"""
+
+import math
+import time
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from twin.model import exact
+from twin.model.parameters import Parameters
+from twin.model.sweep import stepped_sine
+
+AG, FREQUENCY, CYCLES, RATE = 0.05 * 9.80665, 3.4, 10, 2000.0
+G4 = Parameters(550.0, 36e3, 1100.0, 510e3, 900.0, 510e3, 900.0, 2e-3, 2e-3)
+W = 2 * math.pi * FREQUENCY
+SECONDS = CYCLES / FREQUENCY
+
+
+def impacting() -> np.ndarray:
+    return stepped_sine(G4, np.arange(300, 341, 2) / 100, AG, 40).states[-1]
+
+
+def scipy_seconds() -> float:
+    """Wall time of solve_ivp (RK45, rtol 1e-6) with events over ten impacting cycles."""
+
+    def rhs(t, x):
+        u, v = x
+        force = 0.0
+        if contact:
+            force = 900.0 * v + 510e3 * (u - contact * 2e-3)
+        return [v, -AG * math.sin(W * t) - (1100.0 * v + 36e3 * u + force) / 550.0]
+
+    def right(t, x):
+        return 2e-3 - x[0] if contact == 0 else contact * (900 * x[1] + 510e3 * x[0]) - 1020.0
+
+    def left(t, x):
+        return x[0] + 2e-3 if contact == 0 else 1.0
+
+    for event in (right, left):
+        event.terminal, event.direction = True, -1
+    begin = time.perf_counter()
+    contact, t, x = 0, 0.0, list(impacting()[:2])
+    while t < SECONDS:
+        piece = solve_ivp(rhs, (t, SECONDS), x, rtol=1e-6, atol=1e-9, events=(right, left))
+        t, x = piece.t[-1] + 1e-6, list(piece.y[:, -1])
+        contact = 0 if contact else (1 if x[0] > 0 else -1)
+    return time.perf_counter() - begin
+
+
+def compare(benchmark, seconds_of_motion: float) -> None:
+    if benchmark.stats is None:
+        return
+    ours = benchmark.stats.stats.min / seconds_of_motion
+    scipys = min(scipy_seconds() for _ in range(3)) / SECONDS
+    benchmark.extra_info["solve_ivp_ratio"] = round(scipys / ours)
+    print(f"\nsolve_ivp takes {scipys / ours:.0f} times as long")
+
+
+@pytest.mark.benchmark(group="model")
+def test_sampled_driver(benchmark):
+    base = AG * np.sin(W * np.arange(1, round(SECONDS * RATE) + 1) / RATE)
+    con, start, out = exact.constants(G4, RATE), impacting(), np.empty((7, base.size))
+    benchmark(lambda: exact.advance(start.copy(), con, base, out))
+    assert np.isfinite(out).all()
+    compare(benchmark, SECONDS)
+
+
+@pytest.mark.benchmark(group="model")
+def test_one_block(benchmark):
+    base = np.zeros(20)
+    con, state, out = exact.constants(G4, RATE), exact.rest(G4), np.empty((7, 20))
+    benchmark(exact.advance, state, con, base, out)
+    assert not out.any()
+
+
+@pytest.mark.benchmark(group="model")
+def test_sweep_of_the_paper_at_g4(benchmark):
+    up = np.arange(5, 51) / 10
+    frequencies = np.concatenate([up, up[::-1]])
+    sweep = benchmark(stepped_sine, G4, frequencies, AG, 10)
+    assert np.isfinite(sweep.extremes).all()
+    compare(benchmark, float(np.sum(10 / frequencies)))
