@@ -73,7 +73,11 @@ class Block:
             raise KeyError(f"{name} is not in {self.stream}: {', '.join(self.channels)}") from None
 
     def cut(self, first: int, last: int) -> "Block":
-        """Samples with index first <= i < last, as a view; both inside the block."""
+        """Samples with index first <= i < last, as a view; ValueError outside the block."""
+        if not self.index <= first <= last <= self.end:
+            raise ValueError(
+                f"samples {first} to {last} do not lie in the block {self.index} to {self.end}"
+            )
         window = slice(first - self.index, last - self.index)
         return Block(
             self.stream,
@@ -100,9 +104,14 @@ class Block:
 
 
 def join(blocks: Sequence[Block]) -> Block:
-    """One block from consecutive ones; ValueError where samples are missing between them."""
+    """One block from consecutive ones of a stream; ValueError where samples are missing."""
     for left, right in pairwise(blocks):
-        if left.end != right.index or left.channels != right.channels:
+        if (left.stream, left.end, left.rate_hz, left.channels) != (
+            right.stream,
+            right.index,
+            right.rate_hz,
+            right.channels,
+        ):
             raise ValueError(
                 f"block at {right.index} does not continue the one that ends at {left.end}"
             )

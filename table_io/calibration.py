@@ -34,10 +34,14 @@ def command_to_si(volts: Float1D, output: Output) -> Float1D:
 
 
 def tare_from(volts: Float2D, sensors: tuple[Sensor, ...]) -> dict[str, float]:
-    """Mean SI value of each channel at rest; the command channel is not tared."""
-    means = to_si(volts, sensors, {}).mean(axis=1)
+    """Mean SI value of each channel at rest; the command channel is not tared.
+
+    Lost samples do not count; NaN for a sensor that is lost altogether, so that it stays lost.
+    """
     return {
-        sensor.channel: float(mean)
-        for sensor, mean in zip(sensors, means, strict=True)
+        sensor.channel: float(samples[~np.isnan(samples)].mean())
+        if not np.isnan(samples).all()
+        else float("nan")
+        for sensor, samples in zip(sensors, to_si(volts, sensors, {}), strict=True)
         if sensor.channel != "drive_disp_m"
     }

@@ -128,9 +128,14 @@ class Drive:
 
     @cached_property
     def decay_samples(self) -> int:
-        """Length of the decay: max(2 cycles, 0.5 s) at the frequency where it begins."""
+        """Length of the decay: max(2 cycles, 0.5 s) at the frequency where it begins.
+
+        One sample before the soft start: a table that does not move yet never begins to.
+        """
         if self.decay_at is None:
             return 0
+        if self.decay_at < self.segments[0].start:
+            return 1
         segment = self.segment_at(self.decay_at)
         x = np.clip(np.array([(self.decay_at - segment.start) / segment.count]), 0.0, 1.0)
         f = segment.f0 + (segment.f1 - segment.f0) * float(smoothstep(x)[0])
@@ -173,7 +178,9 @@ class Drive:
             step[window] = segment.step
             label[window] = segment.label
             if segment.cycles:
-                done = np.floor(x * segment.count * segment.f0 / self.rate_hz).astype(np.int64)
+                turns = x * segment.count * segment.f0 / self.rate_hz
+                # A cycle may begin exactly on a sample, where rounding must not decide.
+                done = np.floor(turns + 1e-9).astype(np.int64)
                 cycle[window] = np.minimum(done, segment.cycles - 1)
                 label[window] = np.where(
                     cycle[window] >= segment.settle, int(Label.MEASURE), int(Label.SETTLE)

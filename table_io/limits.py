@@ -74,12 +74,13 @@ def refuse(rows: tuple[Margin, ...], profile: Profile, rig: Rig, where: str) -> 
         ("force", "kN", 1e-3, limits.force_kn, "force_n"),
     )
     for name, unit, scale, limit, field in checks:
-        worst = max(rows, key=lambda row: float(getattr(row, field)))
-        value = getattr(worst, field) * scale
-        if value > limit:
+        beyond = [row for row in rows if getattr(row, field) * scale > limit]
+        if beyond:
+            first = beyond[0]
+            more = f" and {len(beyond) - 1} more" if len(beyond) > 1 else ""
             faults.append(
-                f"step {worst.step} ({worst.frequency_hz:g} Hz {worst.direction}): {name} "
-                f"{value:.4g} {unit}; allowed: at most {limit:g} {unit}. "
+                f"step {first.step} ({first.frequency_hz:g} Hz {first.direction}){more}: {name} "
+                f"{getattr(first, field) * scale:.4g} {unit}; allowed: at most {limit:g} {unit}. "
                 "Lower sweep.acceleration_g or raise sweep.start_hz"
             )
     coarse = min(rows, key=lambda row: row.lsb)

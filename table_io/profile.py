@@ -9,7 +9,14 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
 
 from table_io.channels import BY_NAME
 from table_io.records import Step
@@ -17,9 +24,12 @@ from table_io.records import Step
 GRAVITY_M_S2 = 9.80665
 PROFILES = Path(__file__).resolve().parent.parent / "profiles"
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+# Strict: `true` or "0.05" where a number belongs is a slip, not a 1 or a 0.05.
+Number = Annotated[float, Field(strict=True)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
+Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+Count = Annotated[int, Field(strict=True)]
 
 
 class BadInput(ValueError):
@@ -27,7 +37,11 @@ class BadInput(ValueError):
 
 
 class Card(BaseModel):
-    """Base of everything read from a file: no unknown keys, nothing changes afterwards."""
+    """Base of everything read from a file: no unknown keys, nothing changes afterwards.
+
+    What a value must be beside another one is checked where the later of the two keys is read, from
+    the valid ones before it (`info.data`): so a fault elsewhere hides nothing.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -50,24 +64,37 @@ class Sensor(Card):
     noise_rms: NonNegative = Field(0.0, description="In `unit`; the simulated table's noise.")
     offset: Finite = Field(0.0, description="In `unit`; the simulated table's sensor offset.")
 
-    @model_validator(mode="after")
-    def _unit_fits(self) -> "Sensor":
-        if self.channel not in BY_NAME:
-            near = difflib.get_close_matches(self.channel, BY_NAME, 1)
+    @field_validator("channel")
+    @classmethod
+    def _known(cls, channel: str) -> str:
+        if channel not in BY_NAME:
+            near = difflib.get_close_matches(channel, BY_NAME, 1)
             raise ValueError(
-                f"channel {self.channel!r} is unknown"
+                f"channel {channel!r} is unknown"
                 + (f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(BY_NAME)}")
             )
-        want = BY_NAME[self.channel].unit
+        return channel
+
+    @field_validator("unit")
+    @classmethod
+    def _unit_fits(cls, unit: str, info: ValidationInfo) -> str:
+        channel = info.data.get("channel")
+        if channel is None:
+            return unit
+        want = BY_NAME[channel].unit
         allowed = [name for name, (si, _) in UNITS.items() if si == want]
-        if self.unit not in allowed:
+        if unit not in allowed:
             raise ValueError(
-                f"unit {self.unit!r} does not measure {self.channel} ({want}); "
-                f"allowed: {', '.join(allowed)}"
+                f"unit {unit!r} does not measure {channel} ({want}); allowed: {', '.join(allowed)}"
             )
-        if self.volts_per_unit == 0:
+        return unit
+
+    @field_validator("volts_per_unit")
+    @classmethod
+    def _not_silent(cls, volts: float) -> float:
+        if volts == 0:
             raise ValueError("volts_per_unit is 0, so the channel would be silent; allowed: not 0")
-        return self
+        return volts
 
     @property
     def si_per_unit(self) -> float:
@@ -98,7 +125,7 @@ class Output(Card):
     span_mm: Positive
     span_v: Positive = 10.0
     bits: int = Field(ge=8, le=32)
-    lead_s: float = Field(0.5, ge=0.2, le=5.0, description="Checked command queued ahead.")
+    lead_s: Number = Field(0.5, ge=0.2, le=5.0, description="Checked command queued ahead.")
     warn_lsb: int = Field(100, ge=1, description="Warn where an amplitude has fewer LSB.")
     least_lsb: int = Field(20, ge=1, description="Refuse where an amplitude has fewer LSB.")
 
@@ -137,11 +164,12 @@ class Rig(Card):
     limits: Limits
     output: Output
     sensors: tuple[Sensor, ...] = Field(min_length=1)
-    simulated: SimulatedTable | None = None
+    simulated: SimulatedTable | None = Field(None, validate_default=True)
 
-    @model_validator(mode="after")
-    def _whole(self) -> "Rig":
-        names = [sensor.channel for sensor in self.sensors]
+    @field_validator("sensors")
+    @classmethod
+    def _complete(cls, sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
+        names = [sensor.channel for sensor in sensors]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(
@@ -152,11 +180,18 @@ class Rig(Card):
             raise ValueError(
                 f"sensors lack {', '.join(sorted(missing))}; the controller needs them"
             )
-        if self.backend == "simulated" and self.simulated is None:
+        return sensors
+
+    @field_validator("simulated")
+    @classmethod
+    def _present(
+        cls, simulated: SimulatedTable | None, info: ValidationInfo
+    ) -> SimulatedTable | None:
+        if simulated is None and info.data.get("backend") == "simulated":
             raise ValueError(
                 "backend 'simulated' needs a [simulated] table with servo and specimen"
             )
-        return self
+        return simulated
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -167,20 +202,28 @@ class Specimen(Card):
     """What stands on the table. Gaps are totals, right plus left; negative = precompressed."""
 
     mass_kg: Positive
-    gap_mm: float = Field(description="Nominal total gap; inf = no bumpers.")
-    gap_right_mm: float | None = Field(None, description="Measured gap on the right.")
-    gap_left_mm: float | None = Field(None, description="Measured gap on the left.")
+    gap_mm: Number = Field(description="Nominal total gap; inf = no bumpers.")
+    gap_right_mm: Number | None = Field(None, description="Measured gap on the right.")
+    gap_left_mm: Number | None = Field(
+        None, validate_default=True, description="Measured gap on the left."
+    )
     temperature_c: Finite | None = None
 
-    @model_validator(mode="after")
-    def _gaps(self) -> "Specimen":
-        for key in ("gap_mm", "gap_right_mm", "gap_left_mm"):
-            gap = getattr(self, key)
-            if gap is not None and (math.isnan(gap) or gap == -math.inf):
-                raise ValueError(f"{key} is {gap}; allowed: a number of mm, or inf for no bumpers")
-        if (self.gap_right_mm is None) != (self.gap_left_mm is None):
+    @field_validator("gap_mm", "gap_right_mm", "gap_left_mm")
+    @classmethod
+    def _is_a_gap(cls, gap: float | None, info: ValidationInfo) -> float | None:
+        if gap is not None and (math.isnan(gap) or gap == -math.inf):
+            raise ValueError(
+                f"{info.field_name} is {gap}; allowed: a number of mm, or inf for no bumpers"
+            )
+        return gap
+
+    @field_validator("gap_left_mm")
+    @classmethod
+    def _pair(cls, left: float | None, info: ValidationInfo) -> float | None:
+        if "gap_right_mm" in info.data and (info.data["gap_right_mm"] is None) != (left is None):
             raise ValueError("gap_right_mm and gap_left_mm go together; give both or neither")
-        return self
+        return left
 
     @property
     def gaps_m(self) -> tuple[float, float]:
@@ -196,34 +239,58 @@ class Sweep(Card):
     start_hz: Positive
     stop_hz: Positive
     step_hz: Positive
-    cycles: int = Field(ge=2, le=1000, description="Held cycles a step.")
-    measured_cycles: int = Field(3, ge=1, description="The last of them enter the PRC point.")
+    cycles: Count = Field(ge=2, le=1000, description="Held cycles a step.")
+    measured_cycles: Count = Field(
+        3, ge=1, validate_default=True, description="The last of them enter the PRC point."
+    )
     acceleration_g: Positive = 0.05
     directions: tuple[Literal["forward", "backward"], ...] = ("forward", "backward")
-    blend_cycles: float = Field(1.5, ge=1.5, le=20, description="Least length of a blend.")
+    blend_cycles: Number = Field(1.5, ge=1.5, le=20, description="Least length of a blend.")
 
-    @model_validator(mode="after")
-    def _grid(self) -> "Sweep":
-        if self.stop_hz < self.start_hz:
+    @field_validator("stop_hz")
+    @classmethod
+    def _upwards(cls, stop: float, info: ValidationInfo) -> float:
+        start = info.data.get("start_hz", 0.0)
+        if stop < start:
             raise ValueError(
-                f"stop_hz {self.stop_hz} lies below start_hz {self.start_hz}; give the grid "
+                f"stop_hz {stop} lies below start_hz {start}; give the grid "
                 "upwards, `directions` says which way it is driven"
             )
-        whole = round((self.stop_hz - self.start_hz) / self.step_hz)
-        if abs(self.start_hz + whole * self.step_hz - self.stop_hz) > 1e-6:
+        return stop
+
+    @field_validator("step_hz")
+    @classmethod
+    def _grid(cls, step: float, info: ValidationInfo) -> float:
+        if not {"start_hz", "stop_hz"} <= info.data.keys():
+            return step
+        start, stop = info.data["start_hz"], info.data["stop_hz"]
+        if (stop - start) / step > 5000.5:
             raise ValueError(
-                f"step_hz {self.step_hz} does not divide {self.start_hz} to {self.stop_hz} Hz; "
-                f"nearest: {(self.stop_hz - self.start_hz) / max(whole, 1):.6g}"
+                f"step_hz {step} makes more than 5001 steps from {start} to {stop} Hz; "
+                f"allowed: at least {(stop - start) / 5000:.6g}"
             )
-        if whole > 5000:
-            raise ValueError(f"the grid has {whole + 1} steps; allowed: at most 5001")
-        if self.measured_cycles > self.cycles:
+        whole = round((stop - start) / step)
+        if abs(start + whole * step - stop) > 1e-6:
             raise ValueError(
-                f"measured_cycles {self.measured_cycles} is more than cycles {self.cycles}"
+                f"step_hz {step} does not divide {start} to {stop} Hz; "
+                f"nearest: {(stop - start) / max(whole, 1):.6g}"
             )
-        if not self.directions:
+        return step
+
+    @field_validator("measured_cycles")
+    @classmethod
+    def _held(cls, measured: int, info: ValidationInfo) -> int:
+        cycles = info.data.get("cycles", measured)
+        if measured > cycles:
+            raise ValueError(f"measured_cycles {measured} is more than cycles {cycles}")
+        return measured
+
+    @field_validator("directions")
+    @classmethod
+    def _some(cls, directions: tuple[str, ...]) -> tuple[str, ...]:
+        if not directions:
             raise ValueError("directions is empty; allowed: 'forward', 'backward', in any order")
-        return self
+        return directions
 
     @property
     def frequencies_hz(self) -> tuple[float, ...]:
@@ -249,14 +316,14 @@ class Acquisition(Card):
     """How the streams are sampled."""
 
     rate_hz: Positive = 2000.0
-    block_samples: int = Field(20, ge=1, le=10000)
-    rest_s: float = Field(0.5, ge=0.2, le=60, description="Recorded rest before and after.")
+    block_samples: Count = Field(20, ge=1, le=10000)
+    rest_s: Number = Field(0.5, ge=0.2, le=60, description="Recorded rest before and after.")
 
 
 class ComparisonCard(Card):
     """How model and measurement are compared."""
 
-    window_s: float = Field(0.25, ge=0.05, le=60, description="Restart from the measured state.")
+    window_s: Number = Field(0.25, ge=0.05, le=60, description="Restart from the measured state.")
     contact_n: Positive = Field(10.0, description="A bumper force above this is contact.")
 
 
@@ -279,19 +346,20 @@ class Profile(Card):
     model: str = "snm"
     specimen: Specimen
     sweep: Sweep
-    acquisition: Acquisition = Acquisition()
+    acquisition: Acquisition = Field(Acquisition(), validate_default=True)
     comparison: ComparisonCard = ComparisonCard()
     on_death: OnDeath = OnDeath()
 
-    @model_validator(mode="after")
-    def _sampled(self) -> "Profile":
-        if self.acquisition.rate_hz < 100 * self.sweep.stop_hz:
+    @field_validator("acquisition")
+    @classmethod
+    def _sampled(cls, acquisition: Acquisition, info: ValidationInfo) -> Acquisition:
+        sweep = info.data.get("sweep")
+        if sweep is not None and acquisition.rate_hz < 100 * sweep.stop_hz:
             raise ValueError(
-                f"acquisition.rate_hz {self.acquisition.rate_hz:g} gives fewer than 100 samples a "
-                f"cycle at sweep.stop_hz {self.sweep.stop_hz:g}; allowed: at least "
-                f"{100 * self.sweep.stop_hz:g}"
+                f"rate_hz {acquisition.rate_hz:g} gives fewer than 100 samples a cycle at "
+                f"sweep.stop_hz {sweep.stop_hz:g}; allowed: at least {100 * sweep.stop_hz:g}"
             )
-        return self
+        return acquisition
 
 
 C = TypeVar("C", bound=Card)
@@ -370,8 +438,9 @@ def find(name: str, folder: str, beside: Path | None = None) -> Path:
     known = sorted({path.stem for place in places for path in place.glob("*.toml")})
     near = difflib.get_close_matches(name, known, 1)
     hint = f"did you mean {near[0]!r}? " if near else ""
+    where = f"{beside}: " if beside is not None else ""
     raise BadInput(
-        f"{name}: not found in {folder}; {hint}known: {', '.join(known) or 'none'}; "
+        f"{where}{name}: not found in {folder}; {hint}known: {', '.join(known) or 'none'}; "
         "or give the path of a .toml file"
     )
 

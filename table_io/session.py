@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from table_io.backends import Backend
-from table_io.block import Block, Bool2D, Float1D
+from table_io.block import Block, Bool2D
 from table_io.calibration import command_to_volts, tare_from, to_si
 from table_io.clock import Clock
 from table_io.drive import Drive
@@ -19,7 +19,9 @@ from table_io.profile import Profile, Rig
 from table_io.records import Event, Gap, Record, RunStart, RunStop
 
 TARE_S = 1.0
-DECISION_S = 0.05  # from the decision to stop to the first changed sample, at the most
+# From the newest sample to the start of a decay. At most 50 ms may pass from the decision to the
+# first changed sample, and the first samples of a C2 decay hardly differ from the drive.
+DECISION_S = 0.04
 TAIL_FACTOR = 0.999  # of a sensor's range: beyond it a sample counts as clipped
 
 
@@ -56,13 +58,13 @@ def play(
     Closing the generator early also brings the table to rest before the machine is released.
     """
     states = ["idle", "checking"]
-    backend.open()
     run = _Run(setup, backend)
     try:
+        backend.open()
         tare = tare_from(backend.tare(int(TARE_S * setup.drive.rate_hz)), setup.rig.sensors)
         states.append("armed")
         run.feed()
-        backend.start()
+        run.start()
         states.append("running")
         yield describe(tare, backend.scheduled(0))
         verdict, reason = "complete", "the whole drive was played"
@@ -85,8 +87,10 @@ def play(
         states.append("at rest")
         yield RunStop(run.acquired, verdict, reason, tuple(states))
     finally:
-        run.to_rest()
-        backend.close()
+        try:
+            run.to_rest(clock)
+        finally:
+            backend.close()
 
 
 class _Run:
@@ -97,7 +101,9 @@ class _Run:
         self.backend = backend
         self.drive = setup.drive
         self.acquired = 0
+        self._playing = False
         self._queued = 0  # samples of the true drive that are queued; a decay follows them
+        self._at_rest = 0  # index at which what is queued has come to rest
         self._rest = round(setup.profile.acquisition.rest_s * self.drive.rate_hz)
 
     @property
@@ -105,17 +111,27 @@ class _Run:
         """Index at which the recording ends: the drive at rest, the servo too."""
         return self.drive.rest_from + self._rest
 
-    def _volts(self, displacement_m: Float1D) -> Float1D:
-        return command_to_volts(displacement_m, self.setup.rig.output)
+    def start(self) -> None:
+        """Start the machine; from here on the table has to be brought to rest."""
+        self.backend.start()
+        self._playing = True
+
+    def _queue(self, first: int, drive: Drive) -> None:
+        """Queue a drive from sample `first` to its rest."""
+        metres = drive.command(first, drive.rest_from + 1 - first)
+        self.backend.queue(first, command_to_volts(metres, self.setup.rig.output))
+        self._at_rest = drive.rest_from
 
     def feed(self) -> None:
-        """Keep `lead_s` of checked command queued, with a decay to rest after it."""
-        lead = round(self.setup.rig.output.lead_s * self.drive.rate_hz)
+        """Keep `lead_s` of checked command queued beyond the next block, then a decay to rest."""
+        lead = max(
+            round(self.setup.rig.output.lead_s * self.drive.rate_hz), self.backend.replace_after
+        )
+        lead += self.setup.profile.acquisition.block_samples
         if self._queued - self.acquired >= lead or self._queued >= self.drive.rest_from:
             return
         first, last = self._queued, self.acquired + 2 * lead
-        tail = self.drive.decayed(last)
-        self.backend.queue(first, self._volts(tail.command(first, tail.rest_from + 1 - first)))
+        self._queue(first, self.drive.decayed(last))
         self._queued = last
 
     def stop(self) -> None:
@@ -125,7 +141,7 @@ class _Run:
         if at >= self.drive.rest_from:
             return
         self.drive = self.drive.decayed(at)
-        self.backend.queue(at, self._volts(self.drive.command(at, self.drive.rest_from + 1 - at)))
+        self._queue(at, self.drive)
         self._queued = self.drive.rest_from
 
     def acquire(self, tare: dict[str, float]) -> tuple[Block, Bool2D]:
@@ -148,24 +164,28 @@ class _Run:
         self.acquired += count
         return block, np.abs(volts) >= TAIL_FACTOR * full[:, None]
 
-    def to_rest(self) -> None:
+    def to_rest(self, clock: Clock) -> None:
         """Decay and wait for rest where the session ends before the table is at rest."""
-        if not 0 < self.acquired < self.drive.rest_from:
+        if not self._playing or self.acquired >= self.drive.rest_from:
             return
-        self.stop()
-        while self.acquired < self.drive.rest_from:
-            count = min(200, self.drive.rest_from - self.acquired)
-            self.backend.read(count)
-            self.acquired += count
+        try:
+            self.stop()
+            while self.acquired < self.drive.rest_from:
+                count = min(200, self.drive.rest_from - self.acquired)
+                self.backend.read(count)
+                self.acquired += count
+        except BaseException:
+            # The machine no longer answers. What is queued ends at rest: let it play to there.
+            clock.wait_until(self.backend.scheduled(self._at_rest))
+            raise
 
 
 def _gaps(block: Block, clipped: Bool2D) -> Iterator[Gap]:
-    """A Gap for every channel of the block with lost or clipped samples."""
+    """A Gap for every stretch of lost or of clipped samples of every channel of the block."""
     if not (clipped.any() or np.isnan(block.values).any()):
         return
     for name, values, at_range in zip(block.channels, block.values, clipped, strict=True):
         for bad, reason in ((np.isnan(values), "lost"), (at_range, "clipped")):
-            places = np.flatnonzero(bad)
-            if places.size:
-                first = int(places[0])
-                yield Gap(block.index + first, int(places[-1]) - first + 1, name, reason)
+            edges = np.flatnonzero(np.diff(bad, prepend=False, append=False))
+            for first, last in edges.reshape(-1, 2).tolist():
+                yield Gap(block.index + first, last - first, name, reason)

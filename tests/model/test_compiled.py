@@ -1,9 +1,7 @@
 """numba's cache key: a kernel must not outlive a change in a module it calls into."""
 
-from twin.model import phase
+from twin.model import phase, sampled, sweep
 from twin.model.compiled import compiled, revision
-from twin.model.sampled import march
-from twin.model.sweep import stepped
 
 
 def test_revision_follows_code_and_numbers():
@@ -19,7 +17,15 @@ def test_revision_follows_code_and_numbers():
     assert len({revision({"f": one}), revision({"f": other}), revision({"f": one, "K": 1})}) == 3
 
 
-def test_revision_of_the_phase_is_part_of_the_cache_keys():
+def test_revision_of_the_phase_is_part_of_every_cache_key():
     assert revision({k: v for k, v in vars(phase).items() if k != "REVISION"}) == phase.REVISION
-    for kernel in (march, stepped):
+    cached = {
+        kernel
+        for module in (phase, sampled, sweep)
+        for kernel in vars(module).values()
+        if hasattr(kernel, "py_func") and kernel.stats.cache_path is not None
+    }
+    # `flow` calls nothing.
+    assert cached == {sampled.march, sweep.stepped, phase.flow}
+    for kernel in (sampled.march, sweep.stepped):
         assert str(phase.REVISION) in str(kernel.signatures)

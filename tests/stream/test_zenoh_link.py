@@ -200,7 +200,7 @@ def test_nothing_listening_is_reported_in_time(endpoint: str) -> None:
 
 
 def test_only_the_given_endpoint_is_open(hub: Link, spoke: Link, endpoint: str) -> None:
-    mine = {os.readlink(f"/proc/self/fd/{fd}") for fd in os.listdir("/proc/self/fd") if _is(fd)}
+    mine = {os.readlink(fd) for fd in Path("/proc/self/fd").iterdir() if os.path.lexists(fd)}
     listening = []
     for table in ("tcp", "tcp6", "udp", "udp6"):
         for line in Path(f"/proc/self/net/{table}").read_text().splitlines()[1:]:
@@ -209,10 +209,6 @@ def test_only_the_given_endpoint_is_open(hub: Link, spoke: Link, endpoint: str) 
                 listening.append((table, words[1]))
     port = int(endpoint.rsplit(":", 1)[1])
     assert listening == [("tcp", f"0100007F:{port:04X}")]
-
-
-def _is(fd: str) -> bool:
-    return os.path.exists(f"/proc/self/fd/{fd}") or os.path.islink(f"/proc/self/fd/{fd}")
 
 
 def test_spokes_hear_hub_and_each_other_without_loss(

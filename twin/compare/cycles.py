@@ -79,18 +79,18 @@ def extremes(
 ) -> tuple[Extremes | None, Touching]:
     """(extremes of one cycle whose first sample is `first`, contact state after it).
 
-    None where the motion has lost samples.
+    None where the displacement has lost samples. The extremes of an acceleration or a force that
+    has lost some are NaN; contact at a lost sample is what it was before.
     """
-    if not (np.isfinite(motion.u).all() and np.isfinite(motion.a).all()):
+    if not np.isfinite(motion.u).all():
         return None, touching
     u, a = smooth(motion.u, scale.weights), smooth(motion.a, scale.weights)
     forces: list[float] = []
     begins: list[tuple[int, ...]] = []
     after: list[bool] = []
     for force, was in ((motion.right, touching[0]), (motion.left, touching[1])):
-        known = np.nan_to_num(force)
-        forces.append(float(smooth(known, scale.weights).max()))
-        places, now = onsets(known, scale.contact_n, was)
+        forces.append(float(smooth(force, scale.weights).max()))
+        places, now = onsets(force, scale.contact_n, was)
         begins.append(tuple(first + place for place in places))
         after.append(now)
     return Extremes(
@@ -165,18 +165,19 @@ def table_motion(
 ) -> tuple[float, float, float]:
     """(peak in m/s2, fundamental amplitude in m/s2, THD) of the table over whole cycles.
 
-    THD is the root sum of squares of harmonics 2 to 10 over the fundamental.
+    THD is the root sum of squares of harmonics 2 to 10 over the fundamental. They are fitted
+    together: a cycle is no whole number of samples, and means of products would leak into each
+    other (up to 1 % at 10 Hz).
     """
-    x = base_acc[np.isfinite(base_acc)]
-    if x.size < 3 or x.size < base_acc.size:
+    if base_acc.size < 2 * HARMONICS + 1 or not np.isfinite(base_acc).all():
         return (float("nan"),) * 3
-    turn = np.exp(-2j * np.pi * frequency_hz * np.arange(x.size) / rate_hz)
-    wave, amplitudes = np.ones_like(turn), []
-    for _ in range(HARMONICS):
-        wave = wave * turn
-        amplitudes.append(2 * abs(np.mean(wave * x)))
+    turn = np.exp(2j * np.pi * frequency_hz * np.arange(base_acc.size) / rate_hz)
+    waves = np.cumprod(np.tile(turn, (HARMONICS, 1)), axis=0)
+    basis = np.concatenate([np.ones((1, base_acc.size)), waves.real, waves.imag])
+    fitted = np.linalg.solve(basis @ basis.T, basis @ base_acc)
+    amplitudes = np.hypot(fitted[1 : HARMONICS + 1], fitted[HARMONICS + 1 :])
     return (
-        float(np.abs(x).max()),
+        float(np.abs(base_acc).max()),
         float(amplitudes[0]),
         float(np.sqrt(np.sum(np.square(amplitudes[1:]))) / amplitudes[0]),
     )

@@ -9,17 +9,21 @@ from numba import njit
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def compiled(*signature: Any) -> Callable[[F], F]:
-    """numba.njit as this room uses it, with types that survive it."""
-    decorator: Callable[[F], F] = njit(*signature, cache=True, nogil=True)
+def compiled(*signature: Any, cache: bool = False) -> Callable[[F], F]:
+    """numba.njit as this room uses it, with types that survive it.
+
+    Cached are only the kernels that Python calls: what they call is compiled into them, and a
+    cached part in between would bring back an old version of what it calls itself.
+    """
+    decorator: Callable[[F], F] = njit(*signature, cache=cache, nogil=True)
     return decorator
 
 
 def revision(namespace: Mapping[str, Any]) -> int:
     """A number that changes with any compiled function or number of a module.
 
-    numba's cache notices a change in a kernel's own file only. A kernel that calls into another
-    module takes this as a last argument with this default: it becomes part of the cache's key.
+    numba's cache notices a change in a kernel's own file only. A cached kernel that calls into
+    another module takes this as its last argument, by default, and so into the cache's key.
     """
     parts: list[tuple[str, ...]] = []
     for name, item in sorted(namespace.items()):

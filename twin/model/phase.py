@@ -31,7 +31,7 @@ DENORMAL = 1e-30  # m: a bumper this near to relaxed is relaxed
 MOST_EVENTS = 40  # in one step; only rounding at a graze can come near it
 
 
-@compiled()
+@compiled(cache=True)
 def flow(t: float, a: float, w2: float) -> tuple[float, float, float, float]:
     """Matrix over t s that takes (y, y') of y'' + 2 a y' + w2 y = 0 onwards, row by row.
 

@@ -91,7 +91,7 @@ _READ = types.Array(float64, 1, "A", readonly=True)
 _WRITE = types.Array(float64, 2, "A")
 
 
-@compiled(int64(float64[::1], _READ, _READ, _WRITE, _WRITE, types.Omitted(REVISION)))
+@compiled(int64(float64[::1], _READ, _READ, _WRITE, _WRITE, types.Omitted(REVISION)), cache=True)
 def march(  # noqa: PLR0915
     state: Float1D, con: Float1D, base_acc: Float1D, out: Float2D, log: Float2D,
     revision: int = REVISION,
@@ -145,12 +145,13 @@ def march(  # noqa: PLR0915
             count = eventful(state, con, i * h, slope, log, count)
             u, v, ur, ul = state[U], state[V], state[U_R], state[U_L]
             mode = int(state[CONTACT_R] > 0) + 2 * int(state[CONTACT_L] > 0)
-        idle = 0.0 if u == u else math.nan  # noqa: PLR0124
-        base = next_base + idle
+            next_base += state[BASE] - base  # NaN stays
+        base = next_base
         if part + 1 == parts:
             b = MODES + mode * MODE_SIZE
             out[0, sample], out[1, sample] = u, v
             out[2, sample] = (con[b + 2] - con[b + 1] * v - con[b] * u) / mass
+            idle = state[BASE] - state[BASE]  # the force in flight: 0, or NaN once all is
             out[3, sample] = max(0.0, con[C_R] * v + con[K_R] * ur) if mode & 1 else idle
             out[4, sample] = min(0.0, con[C_L] * v + con[K_L] * ul) if mode & 2 else idle
             out[5, sample], out[6, sample] = ur, ul

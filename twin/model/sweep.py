@@ -73,7 +73,8 @@ def widen(
     types.void(
         float64[::1], float64[::1], float64[::1], float64[::1], int64, int64[::1],
         float64[:, :, ::1], float64[:, ::1], types.Omitted(REVISION),
-    )
+    ),
+    cache=True,
 )  # fmt: skip
 def stepped(
     state: Float1D, con: Float1D, w: Float1D, peaks: Float1D, cycles: int, steps: Int1D,

@@ -163,7 +163,7 @@ def _close(folder: Path, bundle: Bundle, extra: dict[str, object] | None = None)
     found = summaries.summarise(recording, bundle.parameters)
     found |= extra or {}
     summaries.write(found, folder / "summary.json")
-    _report(folder)
+    _report(folder, recording)
     console.print(_line(found, folder), highlight=False, soft_wrap=True)
     if found["verdict"] in ("aborted", "halted"):
         return EXIT_ABORTED
@@ -193,10 +193,10 @@ def _line(found: summaries.Json, folder: Path) -> str:
     return "; ".join(parts) + f" -> {folder / 'report.html'}"
 
 
-def _report(folder: Path) -> None:
+def _report(folder: Path, recording: Recording) -> None:
     from twin.service.report import write_report
 
-    write_report(folder)
+    write_report(folder, recording)
 
 
 def _write_view(folder: Path) -> None:
@@ -326,7 +326,7 @@ def report(folder: Path) -> None:
     if not (folder / "summary.json").exists():
         found = summaries.summarise(recording, recorded_bundle(recording).parameters)
         summaries.write(found, folder / "summary.json")
-    _report(folder)
+    _report(folder, recording)
     console.print(f"{folder / 'report.html'}", soft_wrap=True)
 
 

@@ -22,6 +22,7 @@ from table_io.records import Event, Fault, RunStart, RunStop, Timing
 from table_io.session import Punctuality, play
 from twin.service.bundle import Bundle, from_texts, warm
 from twin.service.stopwatch import Stopwatch
+from twin.stream.resend import Inbox
 from twin.stream.wire import (
     MEASURED,
     TOPIC_TYPES,
@@ -30,7 +31,7 @@ from twin.stream.wire import (
     encode,
     topic,
 )
-from twin.stream.zenoh_link import Inbox, open_hub, open_spoke
+from twin.stream.zenoh_link import open_hub, open_spoke
 
 CONNECT_S = 15.0
 LINGER_S = 10.0  # that the hub stays up after the run, so that late readers can recover
@@ -123,8 +124,9 @@ def rig(spec: Spec, _: str) -> None:
     for item in _timed(source, watch, punctual):
         link.publish(topic(item), encode(item, spec.run))
     until = clock.now() + LINGER_S
-    while clock.now() < until and not _orphaned() and orders.poll() is None:
-        clock.wait_until(clock.now() + 0.01)
+    while clock.now() < until and not _orphaned():
+        orders.poll()  # serves those who still ask for what this process holds
+        clock.wait_until(clock.now() + 0.005)
     link.close()
 
 
@@ -194,7 +196,9 @@ def twin(spec: Spec, missed_from: str) -> None:
         if block.index // len(block) % TIMING_BLOCKS == TIMING_BLOCKS - 1:
             say([watch.record(block.end)])
     say([watch.record(end or 0)])
-    clock.wait_until(clock.now() + 0.5)  # for what is still on its way out
+    until = clock.now() + LINGER_S
+    while clock.now() < until and not _orphaned():
+        control.get(0.02)  # serves those who still ask for what this process holds
     link.close()
 
 

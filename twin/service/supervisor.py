@@ -14,6 +14,7 @@ from table_io.profile import BadInput, OnDeath
 from table_io.records import Comparison, Event, RunStop
 from twin.service.processes import Spec
 from twin.stream.mcap_log import merge, read
+from twin.stream.resend import Inbox
 from twin.stream.wire import RECORD_TOPICS, Item, decode, encode, topic
 from twin.stream.zenoh_link import Link, open_spoke
 
@@ -124,23 +125,23 @@ class Supervisor:
                 raise BadInput(f"not ready after {READY_S:g} s: {', '.join(missing)}")
             self.clock.wait_until(self.clock.now() + 0.02)
 
-    def _attend(self, link: Link, inbox: object) -> None:
+    def _attend(self, link: Link, inbox: Inbox) -> None:
         """Until the rig has ended: show what happens, pass a stop on, restart what died."""
         stopping = False
         while self.stop is None:
             self._listen(inbox, 0.1)
             if not stopping and self.asked() == "stop":
                 stopping = link.request("stop", timeout_s=1.0) is not None
-            for component in self.children:
+            for component in list(self.children):
                 if self._died(component) and self.stop is None:
                     self._listen(inbox, DRAIN_S)
                     if self.stop is None:
                         self._bury(component, link)
 
-    def _listen(self, inbox: object, seconds: float) -> None:
+    def _listen(self, inbox: Inbox, seconds: float) -> None:
         until = self.clock.now() + seconds
         while (left := until - self.clock.now()) > 0:
-            arrived = inbox.get(left)  # type: ignore[attr-defined]
+            arrived = inbox.get(left)
             if arrived is None:
                 return
             _, item = decode(*arrived)
@@ -170,14 +171,20 @@ class Supervisor:
         self._start(component, str(self.compared_to) if component == "twin" else "")
 
     def _finish(self, link: Link) -> None:
-        """Let everybody finish in order; the hub goes last."""
+        """Let everybody finish in order: those who listen, then those whom they still ask."""
         until = self.clock.now() + END_S
-        for component in ("twin", "recorder", "viewer"):
+        for component in ("recorder", "viewer", "twin", "rig"):
             if component in self.children:
-                left = max(until - self.clock.now(), 0.1)
-                self._await(component, left)
-        link.request("quit", timeout_s=1.0)
+                if component in ("twin", "rig"):
+                    self._dismiss(component)
+                self._await(component, max(until - self.clock.now(), 0.1))
         link.close()
+
+    def _dismiss(self, component: str) -> None:
+        """Close a process's input: it is free to end."""
+        stdin = self.children[component].process.stdin
+        if stdin is not None and not stdin.closed:
+            stdin.close()
 
     def _await(self, component: str, seconds: float) -> None:
         try:
@@ -187,9 +194,8 @@ class Supervisor:
 
     def _reap(self) -> None:
         """End whatever still runs: first its input, then a signal."""
-        for child in self.children.values():
-            if child.process.stdin is not None:
-                child.process.stdin.close()
+        for component in self.children:
+            self._dismiss(component)
         for child in self.children.values():
             try:
                 child.process.wait(5.0 if child.component != "rig" else 10.0)

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
 from mcap.writer import Writer
 
@@ -30,6 +29,11 @@ from twin.stream.wire import (
 )
 
 SCHEMA_VERSION = "1"
+MAGIC = b"\x89MCAP0\r\n"
+# Which of the items of one sample index comes first: the start, then as the table of topics has
+# it, the stop last; so a recording reads the same in whatever order its parts were written.
+ORDER = {topic: place for place, topic in enumerate(TOPIC_TYPES)}
+ORDER |= {RECORD_TOPICS[RunStart]: -1, RECORD_TOPICS[RunStop]: len(TOPIC_TYPES)}
 R = TypeVar("R", bound=Record)
 
 
@@ -106,17 +110,22 @@ class Message:
 
 
 def messages(path: Path) -> tuple[list[Message], bool]:
-    """(every complete message in file order, True if the file ends as it should)."""
+    """(every complete message in file order, True if the file ends as it should).
+
+    A file that was cut off before its first message has none; BadInput where it is no MCAP file.
+    """
     found: list[Message] = []
     try:
         with path.open("rb") as stream:
+            if not MAGIC.startswith(stream.read(len(MAGIC))):
+                raise BadInput(f"{path}: not an MCAP file; give the run.mcap of a run")
+            stream.seek(0)
             reader = NonSeekingReader(stream, validate_crcs=True)
             try:
                 for _, channel, message in reader.iter_messages(log_time_order=False):
                     found.append(Message(channel.topic, message.log_time, message.data))
-            except (McapError, ValueError, EOFError, OverflowError, KeyError) as error:
-                if not found:
-                    raise BadInput(f"{path}: not a readable MCAP log: {error}") from None
+            except Exception:
+                # Where a file is cut or damaged, the parser and its decompressor fail in any way.
                 return found, False
     except OSError as error:
         raise BadInput(f"{path}: cannot read this log: {error.strerror}") from None
@@ -176,18 +185,20 @@ def read(path: Path) -> Recording:
             "give the run.mcap of a run"
         )
     try:
-        decoded = [decode(one.topic, one.payload) for one in raw if one.topic in TOPIC_TYPES]
+        decoded = [
+            (*decode(one.topic, one.payload), (ORDER[one.topic], one.payload))
+            for one in raw
+            if one.topic in TOPIC_TYPES
+        ]
     except WireError as error:
         raise BadInput(f"{path}: damaged or foreign: {error}") from None
-    starts = [(run, item) for run, item in decoded if isinstance(item, RunStart)]
+    starts = [(run, item) for run, item, _ in decoded if isinstance(item, RunStart)]
     if not starts:
         raise BadInput(f"{path}: holds no start record, so profile and model are unknown")
     run, start = starts[0]
     assert isinstance(start, RunStart)
-    items = sorted(
-        (item for _, item in decoded), key=lambda item: (item.index, not isinstance(item, RunStart))
-    )
-    return Recording(path, run, start, tuple(items), whole)
+    decoded.sort(key=lambda entry: (entry[1].index, entry[2]))
+    return Recording(path, run, start, tuple(item for _, item, _ in decoded), whole)
 
 
 def merge(parts: list[Path], out: Path) -> int:
@@ -209,8 +220,7 @@ def merge(parts: list[Path], out: Path) -> int:
     start = starts[0]
     writer = LogWriter(out, start.rate_hz)
     writer.describe(start)
-    order = {topic: place for place, topic in enumerate(["/run/start", *TOPIC_TYPES])}
-    for message in sorted(unique, key=lambda one: (one.log_time, order.get(one.topic, 99))):
+    for message in sorted(unique, key=lambda one: (one.log_time, ORDER[one.topic], one.payload)):
         writer.write(message.topic, message.payload, round(message.log_time * start.rate_hz / 1e9))
     writer.close()
     return len(unique)

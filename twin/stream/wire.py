@@ -98,6 +98,8 @@ def decode(topic_name: str, payload: bytes) -> tuple[str, Item]:
     message: Any = getattr(pb, kind.__name__)()
     try:
         message.ParseFromString(payload)
+        if kind is Block and BLOCK_TOPICS.get(message.stream) != topic_name:
+            raise ValueError(f"it holds the stream {message.stream!r}")
         return message.run, _block(message) if kind is Block else _record(kind, message)
     except (DecodeError, ValueError, TypeError) as error:
         raise WireError(f"{topic_name}: not a {kind.__name__}: {error}") from None
@@ -125,7 +127,7 @@ def _block(message: Any) -> Block:
         message.rate_hz,
         tuple(channel.name for channel in message.channels),
         np.array([channel.values for channel in message.channels], dtype=np.float64).reshape(
-            len(message.channels), -1
+            len(message.channels), len(message.step)
         ),
         np.array(message.step, dtype=np.int64),
         np.array(message.label, dtype=np.int64),

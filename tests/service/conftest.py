@@ -1,0 +1,58 @@
+"""Folders of runs for the report, as the recorder and the summary leave them."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from twin.service import figures
+from twin.service.evidence import gather
+from twin.service.report import render
+from twin.stream.mcap_log import read, write_items
+from twin.stream.wire import Item
+
+from .recordings import blocks, start_record, summary
+
+Maker = Callable[..., Path]
+DRAFT = {**figures.STYLE, "savefig.dpi": 30, "figure.constrained_layout.use": False}
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """A whole run, its pictures and its page, as a user gets them."""
+
+    folder: Path
+    pictures: list[figures.Picture]
+    html: str
+
+
+def make(folder: Path, items: list[Item] | None = None, told: Any = None, gap: str = "4.0") -> Path:
+    """The folder, with run.mcap and summary.json written into it."""
+    start = start_record(gap)
+    write_items(folder / "run.mcap", [start, *(blocks() if items is None else items)], start)
+    (folder / "summary.json").write_text(json.dumps(summary() if told is None else told))
+    return folder
+
+
+@pytest.fixture
+def run_folder(tmp_path: Path) -> Maker:
+    """Writes run.mcap and summary.json; returns their folder."""
+    return lambda *args, **kwargs: make(tmp_path, *args, **kwargs)
+
+
+@pytest.fixture(scope="session")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
+    """Drawn once, in full quality; to look at, not to write into."""
+    folder = make(tmp_path_factory.mktemp("drawn"))
+    run = gather(read(folder / "run.mcap"), summary())
+    pictures = figures.draw_all(run, folder / "figures")
+    return Drawn(folder, pictures, render(run, pictures))
+
+
+@pytest.fixture
+def draft(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Coarse pictures without a layout, in half the time."""
+    monkeypatch.setattr(figures, "STYLE", DRAFT)
