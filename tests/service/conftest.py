@@ -17,7 +17,8 @@ from twin.stream.wire import Item
 from .recordings import blocks, start_record, summary
 
 Maker = Callable[..., Path]
-DRAFT = {**figures.STYLE, "savefig.dpi": 30, "figure.constrained_layout.use": False}
+COARSE = {"savefig.dpi": 30, "figure.constrained_layout.use": False, "axes.grid": False}
+BARE = dict.fromkeys(("xtick.bottom", "ytick.left", "xtick.labelbottom", "ytick.labelleft"), False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,5 +55,5 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
 
 @pytest.fixture
 def draft(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Coarse pictures without a layout, in half the time."""
-    monkeypatch.setattr(figures, "STYLE", DRAFT)
+    """Every line of every picture, but coarse and without ticks: in a third of the time."""
+    monkeypatch.setattr(figures, "STYLE", {**figures.STYLE, **COARSE, **BARE})

@@ -1,4 +1,4 @@
-"""Volts and SI: volts = (value + offset) * volts_per_si, both ways, and the tare takes the offset."""
+"""Volts and SI, both ways: volts = (value + offset) * volts_per_si; the tare takes the offset."""
 
 import numpy as np
 import pytest

@@ -47,16 +47,21 @@ def smooth(x: Float1D, weights: Float1D) -> Float1D:
     return np.convolve(x, weights, "valid") if x.size >= weights.size else x
 
 
-def onsets(force: Float1D, contact_n: float, touching: bool) -> tuple[list[int], bool]:
+def onsets(
+    force: Float1D, contact_n: float, touching: bool | None
+) -> tuple[list[int], bool | None]:
     """(places where contact begins, whether it touches at the end) of a force >= 0.
 
     Contact begins above `contact_n` and ends below half of it, so noise counts nothing twice.
+    Where `touching` before the first sample is not known (None), contact there is no onset.
     """
     states = np.full(force.size, -1, dtype=np.int8)
     states[force > contact_n] = 1
     states[force < 0.5 * contact_n] = 0
     known = np.flatnonzero(states >= 0)
-    levels = np.concatenate([[int(touching)], states[known]])
+    if not known.size:
+        return [], touching
+    levels = np.concatenate([states[known[:1]] if touching is None else [touching], states[known]])
     begins = known[np.flatnonzero(np.diff(levels) == 1)]
     return begins.tolist(), bool(levels[-1])
 
@@ -71,7 +76,8 @@ class Motion:
     left: Float1D
 
 
-Touching = tuple[bool, bool]
+Touching = tuple[bool | None, bool | None]  # right, left; None = not known
+UNKNOWN: Touching = (None, None)
 
 
 def extremes(
@@ -83,11 +89,11 @@ def extremes(
     has lost some are NaN; contact at a lost sample is what it was before.
     """
     if not np.isfinite(motion.u).all():
-        return None, touching
+        return None, UNKNOWN
     u, a = smooth(motion.u, scale.weights), smooth(motion.a, scale.weights)
     forces: list[float] = []
     begins: list[tuple[int, ...]] = []
-    after: list[bool] = []
+    after: list[bool | None] = []
     for force, was in ((motion.right, touching[0]), (motion.left, touching[1])):
         forces.append(float(smooth(force, scale.weights).max()))
         places, now = onsets(force, scale.contact_n, was)
@@ -105,10 +111,11 @@ def extremes(
     ), (after[0], after[1])
 
 
-def _impacts(cycles: list[Cycle], all_onsets: list[int]) -> tuple[int, ...]:
+def _impacts(cycles: list[Cycle], all_onsets: list[int], before: bool) -> tuple[int, ...]:
     """Onsets per measured cycle, counted between cuts that lie in the longest time without one.
 
-    A cut at the drive's zero crossing could split a contact's jitter over two cycles (0 and 2).
+    A cut at the drive's zero crossing could split a contact's jitter over two cycles (0 and 2). The
+    cuts lie up to a cycle early if the cycle `before` was seen too, else at most half a cycle off.
     """
     starts = [cycle.index - cycle.count for cycle in cycles]
     length = np.mean([cycle.count for cycle in cycles])
@@ -119,7 +126,7 @@ def _impacts(cycles: list[Cycle], all_onsets: list[int]) -> tuple[int, ...]:
     gaps = np.diff(np.append(phases, phases[0] + 1.0))
     widest = int(np.argmax(gaps))
     shift = (phases[widest] + 0.5 * gaps[widest]) % 1.0
-    offset = (shift - 1.0 if shift > 0.0 else 0.0) * length
+    offset = (shift - 1.0 if shift > (0.0 if before else 0.5) else shift) * length
     return tuple(
         sum(1 for place in inside if 0 <= place - start - offset < cycle.count)
         for start, cycle in zip(starts, cycles, strict=True)
@@ -129,22 +136,25 @@ def _impacts(cycles: list[Cycle], all_onsets: list[int]) -> tuple[int, ...]:
 def quantities(cycles: list[Cycle], source: str, scale: Scale) -> Quantities | None:
     """The ratios of Eq. 1 over the measured cycles of a step; None without a whole one.
 
-    `source` is "measured" or "twin".
+    `source` is "measured" or "twin". What a lost sensor would have to tell is not told: NaN, and no
+    impacts. A deformation is then that of the displacement alone.
     """
     used = [c for c in cycles if c.label == Label.MEASURE and getattr(c, source) is not None]
     if not used:
         return None
     some: list[Extremes] = [getattr(cycle, source) for cycle in used]
     every: list[Extremes] = [e for c in cycles if (e := getattr(c, source)) is not None]
+    before = every[0] is not some[0]
+    cells = all(np.isfinite(e.force_r + e.force_l) for e in some)
     p, u_star = scale.parameters, scale.u_star_m
     eta = np.array([(e.u_max - e.u_min) / (2 * u_star) for e in some])
     weight = p.mass * GRAVITY_M_S2
 
     def deformation(depth: float, force: float) -> float:
-        return max(depth, 0.0) / u_star if force > scale.contact_n else 0.0
+        return 0.0 if force <= scale.contact_n else max(depth, 0.0) / u_star
 
     def ratio(force: float) -> float:
-        return force / weight if force > scale.contact_n else 0.0
+        return 0.0 if force <= scale.contact_n else force / weight
 
     return Quantities(
         eta_d=float(eta.mean()),
@@ -153,8 +163,12 @@ def quantities(cycles: list[Cycle], source: str, scale: Scale) -> Quantities | N
         eta_l=float(np.mean([deformation(-e.u_min - p.gap_l, e.force_l) for e in some])),
         r_r=float(np.mean([ratio(e.force_r) for e in some])),
         r_l=float(np.mean([ratio(e.force_l) for e in some])),
-        impacts_right=_impacts(used, [place for e in every for place in e.onsets_r]),
-        impacts_left=_impacts(used, [place for e in every for place in e.onsets_l]),
+        impacts_right=_impacts(used, [place for e in every for place in e.onsets_r], before)
+        if cells
+        else (),
+        impacts_left=_impacts(used, [place for e in every for place in e.onsets_l], before)
+        if cells
+        else (),
         drift=float((eta[-1] - eta[0]) / eta.mean()),
         spread=float(np.ptp(eta) / eta.mean()),
     )

@@ -4,7 +4,7 @@ Pure: the same samples give the same items to the bit, however they are cut into
 replay and `--speed max` call this same function.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -14,7 +14,7 @@ from table_io.channels import contact_forces, rel_disp
 from table_io.profile import Profile
 from table_io.records import Cycle, Event, Params, Point, Record, Step
 from twin.compare.curves import sudden
-from twin.compare.cycles import Motion, Scale, Touching, extremes, point
+from twin.compare.cycles import UNKNOWN, Motion, Scale, Touching, extremes, point
 from twin.compare.windows import Tracks, TwinSetup, begin, follow
 from twin.model.parameters import Parameters, resonance
 
@@ -40,7 +40,7 @@ class State:
     held: tuple[tuple[Block, Block], ...] = ()
     cycles: tuple[Cycle, ...] = ()  # of the step under way
     base_acc: tuple[Float1D, ...] = ()  # of its measured cycles
-    touching: tuple[Touching, Touching] = field(default=((False, False), (False, False)))
+    touching: tuple[Touching, Touching] = (UNKNOWN, UNKNOWN)  # measured, twin
     last_point: Point | None = None
 
 
@@ -170,4 +170,7 @@ def _point(setup: Setup, state: State) -> tuple[State, list[Record]]:
         items.append(last)
         if hint := sudden(state.last_point, last):
             items.append(Event(last.index, "jump", hint))
-    return replace(state, cycles=(), base_acc=(), last_point=last), items
+    # The contact state is not followed through the blend to the next step.
+    return replace(
+        state, cycles=(), base_acc=(), touching=(UNKNOWN, UNKNOWN), last_point=last
+    ), items

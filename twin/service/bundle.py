@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from table_io.clock import today
 from table_io.drive import Drive, plan
@@ -12,8 +13,10 @@ from table_io.limits import Margin, margins, refuse
 from table_io.profile import Profile, Rig, find, load, parse
 from table_io.records import RunStart, Step
 from table_io.session import Setup as SessionSetup
-from twin.compare import pipeline
 from twin.model.parameters import ModelCard, Parameters
+
+if TYPE_CHECKING:
+    from twin.compare.pipeline import Setup
 
 LIBRARIES = ("shaketwin", "numpy", "scipy", "numba", "protobuf", "eclipse-zenoh", "mcap")
 
@@ -36,7 +39,10 @@ class Bundle:
     def session(self) -> SessionSetup:
         return SessionSetup(self.profile, self.rig, self.drive)
 
-    def twin(self, from_rest: bool = False) -> pipeline.Setup:
+    def twin(self, from_rest: bool = False) -> "Setup":
+        """The twin's setup; importing it compiles its kernels where they are not cached."""
+        from twin.compare import pipeline
+
         return pipeline.prepare(self.profile, self.parameters, self.steps, from_rest)
 
     @property

@@ -139,11 +139,13 @@ def view(
 
 def main() -> None:
     """Entry point: every fault of the input is one message on standard error and exit code 2."""
-    from table_io.profile import BadInput
-
     with contextlib.suppress(BrokenPipeError):
         try:
             app()
-        except BadInput as error:
+        except ValueError as error:
+            from table_io.profile import BadInput
+
+            if not isinstance(error, BadInput):
+                raise
             print(f"shaketwin: {error}", file=sys.stderr)
             raise SystemExit(2) from None

@@ -59,7 +59,7 @@ def histories(run: Run) -> Drawn:
             for data, look in ((measured, _rig(one)), (twin, _twin(one))):
                 if data is not None:
                     _history(run, column, data.last(HISTORY_CYCLES), look)
-            shown = measured if measured is not None else twin
+            shown = twin if run.who == "twin" or measured is None else measured
             if shown is not None:
                 _bands(run, column, shown.last(HISTORY_CYCLES), COLOUR[one])
             guides(run, column[0].axhline)

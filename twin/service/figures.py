@@ -238,6 +238,7 @@ def _overview(run: Run) -> Drawn:
         return
     figure = Figure(figsize=(WIDTH, 1.7 * len(drawn) + 0.4))
     axes = figure.subplots(len(drawn), 1, sharex=True, squeeze=False)[:, 0]
+    peaks = {step.acceleration_m_s2 for step in run.recording.start.steps}
     for ax, (label, found) in zip(axes, drawn.items(), strict=True):
         for time, low, high in found:
             ax.fill_between(time, low, high, color="#8b929c", lw=0)
@@ -245,9 +246,7 @@ def _overview(run: Run) -> Drawn:
         _shade_steps(run, ax, pieces, ax is axes[0])
         if label.startswith("$u$"):
             guides(run, ax.axhline)
-    peaks = {step.acceleration_m_s2 for step in run.recording.start.steps}
-    for ax in axes[1:2] if "table in m/s²" in drawn else ():
-        for peak in peaks:
+        for peak in peaks if label == "table in m/s²" else ():
             ax.axhline(peak, color="#111111", ls="--", lw=0.9)
             ax.axhline(-peak, color="#111111", ls="--", lw=0.9)
     axes[-1].set_xlabel("time in s")

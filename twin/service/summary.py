@@ -11,7 +11,7 @@ import numpy as np
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.profile import Profile, parse
 from table_io.records import Comparison, Fault, Gap, Point, Quantities, Timing
-from twin.compare import COMPARED, pipeline
+from twin.compare import COMPARED
 from twin.compare.curves import branches
 from twin.model.parameters import Parameters, resonance
 from twin.stream.mcap_log import Recording
@@ -30,6 +30,7 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
     jumps, intervals = branches(points, source)
     twin_jumps, twin_intervals = branches(points, "twin")
     stop = recording.stop
+    samples = stop.index if stop else max((one.end for one in recording.blocks("meas")), default=0)
     return {
         "run": {
             "id": start.run,
@@ -39,8 +40,8 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
             "started_at": start.started_at,
             "host": start.host,
             "rate_hz": start.rate_hz,
-            "samples": stop.index if stop else 0,
-            "duration_s": stop.index / start.rate_hz if stop else 0.0,
+            "samples": samples,
+            "duration_s": samples / start.rate_hz,
             "normalisation": (
                 f"u* and a* are the maxima of the model in free flight, continuous in frequency "
                 f"(at {peak_hz:.3f} Hz, {level:.4g} m/s2)"
@@ -68,6 +69,8 @@ def _points(recording: Recording, parameters: Parameters, profile: Profile) -> t
     """The recorded points, and the measured part of those that a dead twin could not make."""
     recorded = {point.step: point for point in recording.of(Point)}
     if recording.of(Fault):
+        from twin.compare import pipeline
+
         setup = pipeline.prepare(profile, parameters, recording.start.steps)
         state, _ = pipeline.start(setup)
         for block in recording.pieces("meas"):
