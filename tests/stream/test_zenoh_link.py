@@ -16,19 +16,10 @@ from pathlib import Path
 import pytest
 
 from table_io.profile import BadInput
-from twin.stream import zenoh_link
+from twin.stream import resend
+from twin.stream.resend import HELD_PIECES, LARGEST_BYTES, PIECE_BYTES, Inbox, Shelf
 from twin.stream.wire import COMPARED, MEASURED, PREDICTED, TOPIC_TYPES
-from twin.stream.zenoh_link import (
-    HELD_PIECES,
-    LARGEST_BYTES,
-    PIECE_BYTES,
-    Inbox,
-    Link,
-    Shelf,
-    key,
-    open_hub,
-    open_spoke,
-)
+from twin.stream.zenoh_link import Link, key, open_hub, open_spoke
 
 BLOCK = bytes(2500)
 SETTLED_S = 0.05  # in which a subscription has reached the hub
@@ -318,7 +309,7 @@ def test_a_full_inbox_with_history_loses_nothing(hub: Link, spoke: Link) -> None
 def test_what_is_held_no_more_is_counted_as_missed(
     hub: Link, spoke: Link, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(zenoh_link, "HELD_PIECES", 20)
+    monkeypatch.setattr(resend, "HELD_PIECES", 20)
     inbox = spoke.subscribe((MEASURED,), history=True, capacity=5)
     hub.declare((MEASURED,))
     hub.publish(MEASURED, numbered(0))
@@ -337,7 +328,7 @@ def test_a_stopped_listener_slows_nobody_and_gets_everything_afterwards(
     publish_at_100_hz(hub, MEASURED, range(20))
     with monkeypatch.context() as later:
         later.setattr(hub, "serve", lambda: None)  # so that a question of it is open
-        time.sleep(zenoh_link.ASK_EVERY_S)
+        time.sleep(resend.ASK_EVERY_S)
         listener.send_signal(signal.SIGSTOP)
         took = [
             timed(hub, number, bytes(40_000)) for number in range(20, 520)

@@ -105,6 +105,20 @@ def test_blends_last_at_least_one_and_a_half_cycles(name: str) -> None:
         previous = segment
 
 
+@pytest.mark.parametrize("step_hz", [9.5, 4.75, 1.9])
+@pytest.mark.parametrize("directions", [("forward", "backward"), ("forward", "forward")])
+def test_coarse_grids_get_longer_blends_instead_of_harder_ones(
+    step_hz: float, directions: tuple[str, ...]
+) -> None:
+    sweep = {"start_hz": 0.5, "stop_hz": 10.0, "step_hz": step_hz, "cycles": 2}
+    sweep |= {"measured_cycles": 1, "directions": directions}
+    raw = {"title": "coarse", "specimen": {"mass_kg": 550.0, "gap_mm": 4.0}, "sweep": sweep}
+    one = plan(Profile.model_validate(raw))
+    samples = one.command(0, one.planned_end + MARGIN)
+    assert np.abs(differences(samples, 2, one.rate_hz)).max() <= PEAK * A
+    assert np.abs(one.acceleration(0, samples.size)).max() <= PEAK * A
+
+
 @every_test
 def test_every_step_is_held_for_its_cycles_at_its_frequency_and_amplitude(name: str) -> None:
     one, sweep = drive(name), profile(name).sweep

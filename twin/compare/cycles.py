@@ -126,7 +126,7 @@ def _impacts(cycles: list[Cycle], all_onsets: list[int], before: bool) -> tuple[
     gaps = np.diff(np.append(phases, phases[0] + 1.0))
     widest = int(np.argmax(gaps))
     shift = (phases[widest] + 0.5 * gaps[widest]) % 1.0
-    offset = (shift - 1.0 if shift > (0.0 if before else 0.5) else shift) * length
+    offset = (shift - 1.0 if (shift > 0.0 if before else shift >= 0.5) else shift) * length
     return tuple(
         sum(1 for place in inside if 0 <= place - start - offset < cycle.count)
         for start, cycle in zip(starts, cycles, strict=True)
@@ -179,17 +179,22 @@ def table_motion(
 ) -> tuple[float, float, float]:
     """(peak in m/s2, fundamental amplitude in m/s2, THD) of the table over whole cycles.
 
-    THD is the root sum of squares of harmonics 2 to 10 over the fundamental. They are fitted
-    together: a cycle is no whole number of samples, and means of products would leak into each
-    other (up to 1 % at 10 Hz).
+    THD is the root sum of squares of harmonics 2 to 10 over the fundamental. A cycle is no whole
+    number of samples, so the harmonics leak into each other (up to 1 % at 10 Hz); by how much is
+    known, and undone: the result is that of a least-squares fit of all of them.
     """
-    if base_acc.size < 2 * HARMONICS + 1 or not np.isfinite(base_acc).all():
+    n = base_acc.size
+    if n < 2 * HARMONICS + 1 or not np.isfinite(base_acc).all():
         return (float("nan"),) * 3
-    turn = np.exp(2j * np.pi * frequency_hz * np.arange(base_acc.size) / rate_hz)
-    waves = np.cumprod(np.tile(turn, (HARMONICS, 1)), axis=0)
-    basis = np.concatenate([np.ones((1, base_acc.size)), waves.real, waves.imag])
-    fitted = np.linalg.solve(basis @ basis.T, basis @ base_acc)
-    amplitudes = np.hypot(fitted[1 : HARMONICS + 1], fitted[HARMONICS + 1 :])
+    turn = 2 * np.pi * frequency_hz / rate_hz
+    waves = np.cumprod(np.tile(np.exp(-1j * turn * np.arange(n)), (HARMONICS, 1)), axis=0)
+    seen = (waves * base_acc).mean(axis=1)
+    orders = np.arange(-HARMONICS, HARMONICS + 1)
+    half = 0.5 * turn * np.subtract.outer(orders, orders)
+    # mean of exp(-2i half k) over the samples k: what a unit of one order shows in another
+    leak = np.exp(-1j * (n - 1) * half) * np.sinc(n * half / np.pi) / np.sinc(half / np.pi)
+    both = np.concatenate([seen[::-1].conj(), [base_acc.mean()], seen])
+    amplitudes = 2 * np.abs(np.linalg.solve(leak, both)[HARMONICS + 1 :])
     return (
         float(np.abs(base_acc).max()),
         float(amplitudes[0]),

@@ -115,30 +115,30 @@ def guard(con: Float1D, mode: int, side: int, uj: float) -> Quantity:
 
 
 @compiled()
-def root(lo: float, hi: float, m: Motion, q: Quantity, order: int) -> float:
-    """Time in s at which q (order 0) or q' (order 1) changes sign between lo and hi.
+def root(
+    lo: float, hi: float, guess: float, sign: float, m: Motion, q: Quantity, order: int
+) -> float:
+    """Time in s between lo and hi at which q (order 0) or q' (order 1) takes on `sign`.
 
-    Newton kept in the bracket. It starts from hi, so that a zero at lo which is only the start of
-    a phase is not found again.
+    Newton from `guess`, kept in the bracket. It stops where one more step could not move the time
+    (order 0) or the value there (order 1, an extreme) by what a float holds.
     """
-    values = value(hi, motion_at(hi, m), q)
-    f, df = values[order], values[order + 1]
-    sign = math.copysign(1.0, f)
-    t = hi
+    enough = (1e-6 if order else 1e-8) * hi
+    t = guess if lo < guess < hi else hi
     for _ in range(80):
-        new = t - f / df if df != 0.0 else lo
-        if not lo < new < hi:
-            new = 0.5 * (lo + hi)
-        moved = abs(new - t)
-        t = new
-        if moved <= 1e-10 * hi:
-            break
         values = value(t, motion_at(t, m), q)
         f, df = values[order], values[order + 1]
         if f * sign > 0:
             hi = t
         else:
             lo = t
+        new = t - f / df if df != 0.0 else lo
+        if not lo < new < hi:
+            new = 0.5 * (lo + hi)
+        moved = abs(new - t)
+        t = new
+        if moved <= enough:
+            break
     return t
 
 
@@ -152,17 +152,20 @@ def crossing(h: float, m: Motion, q: Quantity, x0: Point, x1: Point) -> float:
     if not (g1 < -touch or (g1 < 0 and d1 < 0)):
         if not (d0 < 0 < d1) or g0 > -2 * h * d0:
             return math.inf
-        hi = root(0.0, h, m, q, 1)
+        hi = root(0.0, h, h * d0 / (d0 - d1), 1.0, m, q, 1)
         if not value(hi, motion_at(hi, m), q)[0] < -touch:
             return math.inf
     if g0 > 0:
-        return root(0.0, hi, m, q, 0)
+        curve = (g1 - g0 - d0 * h) / (h * h)
+        under = d0 * d0 - 4 * curve * g0
+        guess = 2 * g0 / (math.sqrt(under) - d0) if under > 0 else hi
+        return root(0.0, hi, guess, -1.0, m, q, 0)
     # Just after an event the guard starts at zero, rounded either way: find where it is positive.
     lo = hi
     for _ in range(60):
         lo *= 0.5
         if value(lo, motion_at(lo, m), q)[0] > touch:
-            return root(lo, 2 * lo, m, q, 0)
+            return root(lo, 2 * lo, 2 * lo, -1.0, m, q, 0)
     return 0.0
 
 

@@ -51,7 +51,8 @@ class LogWriter:
             ) from None
         except OSError as error:
             raise BadInput(f"{path}: cannot write here: {error.strerror}") from None
-        self._writer = Writer(self._file)
+        # With a checksum over everything, a record that is lost inside the file cannot go unseen.
+        self._writer = Writer(self._file, enable_data_crcs=True)
         self._writer.start(profile="shaketwin", library="shaketwin")
         self._channels: dict[str, int] = {}
         self._sequence: dict[str, int] = {}

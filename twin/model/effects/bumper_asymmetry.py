@@ -30,8 +30,11 @@ BUMPER_ASYMMETRY = Effect(
     id="bumper_asymmetry",
     term="K_R u_R on the right, K_L u_L on the left, K_R/K_L = ratio",
     parameters=(
-        EffectParameter("ratio", "", 0.2, 5.0, 1.0, "Right over left bumper stiffness, K_R/K_L."),
+        EffectParameter(
+            "ratio", "", 0.2, 5.0, 1.0, 1.2, "Right over left bumper stiffness, K_R/K_L."
+        ),
     ),
+    acts="parameters",
     change=_change,
     residual=(
         "In contact only, of the same sign on both sides: force in proportion to |u_j|, so even "

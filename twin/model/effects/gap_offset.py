@@ -25,8 +25,11 @@ GAP_OFFSET = Effect(
     id="gap_offset",
     term="contact at u = G/2 + offset on the right, at u = -(G/2 - offset) on the left",
     parameters=(
-        EffectParameter("offset", "m", -0.015, 0.015, 0.0, "Right gap minus half the total gap."),
+        EffectParameter(
+            "offset", "m", -0.015, 0.015, 0.0, 3e-4, "Right gap minus half the total gap."
+        ),
     ),
+    acts="parameters",
     change=_change,
     residual=(
         "Contact begins early on one side and late on the other: force residual of one sign "

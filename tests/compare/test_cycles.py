@@ -1,0 +1,377 @@
+"""Extremes, onsets and impacts of a cycle, and the ratios of a step, against closed forms."""
+
+import cmath
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from table_io.block import Float1D, Label
+from table_io.profile import GRAVITY_M_S2
+from table_io.records import Cycle, Extremes, Step
+from twin.compare.cycles import (
+    UNKNOWN,
+    Motion,
+    Scale,
+    extremes,
+    onsets,
+    point,
+    quantities,
+    smooth,
+    table_motion,
+)
+from twin.model.parameters import Parameters, resonance
+
+RATE = 2000.0
+LEVEL = 0.05 * GRAVITY_M_S2
+WEIGHT = 550.0 * GRAVITY_M_S2
+G4 = Parameters(550.0, 36e3, 1.1e3, 510e3, 900.0, 510e3, 900.0, 0.002, 0.002)
+FREE = replace(G4, gap_r=math.inf, gap_l=math.inf)
+
+
+def scale(parameters: Parameters = G4) -> Scale:
+    u_star, a_star, _ = resonance(parameters, LEVEL)
+    return Scale(parameters, RATE, 10.0, u_star, a_star)
+
+
+def motion(u: Float1D, a: Float1D, right: Float1D | None = None) -> Motion:
+    nothing = np.zeros(u.size)
+    return Motion(u, a, nothing if right is None else right, nothing)
+
+
+def cycle(
+    number: int,
+    onsets_r: Sequence[int] = (),
+    length: int = 500,
+    label: Label = Label.MEASURE,
+    u: float = 0.003,
+    force: float = 500.0,
+) -> Cycle:
+    """A held cycle whose measured extremes are given; the twin has nothing to say."""
+    first = number * length
+    found = Extremes(u, -u, 1.0, -1.0, force, 0.0, tuple(onsets_r), ())
+    return Cycle(first + length, 0, number, int(label), length, found, None)
+
+
+# Extremes
+
+
+def test_smoothing_leaves_a_parabola_as_it_is() -> None:
+    weights = scale().weights
+    half = weights.size // 2
+    t = np.arange(200.0)
+    parabola = 3.0 - 0.2 * t + 0.01 * t**2
+    np.testing.assert_allclose(smooth(parabola, weights), parabola[half:-half], rtol=1e-12)
+    assert weights.size >= 3
+    assert weights.size % 2 == 1
+
+
+@pytest.mark.parametrize("gap", [0.002, math.inf])
+def test_smoothing_spans_a_tenth_of_the_shortest_half_period(gap: float) -> None:
+    p = replace(G4, gap_r=gap, gap_l=gap)
+    stiffness = p.stiffness + (2 * p.bumper_stiffness_r if math.isfinite(gap) else 0.0)
+    tenth = 0.1 * math.pi * math.sqrt(p.mass / stiffness) * RATE
+    size = scale(p).weights.size
+    assert size <= 33
+    assert min(tenth, 32) - 2 <= size - 1 <= tenth
+
+
+def test_smoothing_of_what_is_shorter_than_it_changes_nothing() -> None:
+    weights = scale().weights
+    short = np.arange(weights.size - 1.0)
+    np.testing.assert_array_equal(smooth(short, weights), short)
+
+
+def test_noise_hardly_lifts_an_extreme() -> None:
+    """The bias of the greatest of n noisy values is below s sqrt(2 ln n), s that of the mean."""
+    rng, s, sigma = np.random.default_rng(1), scale(), 7e-6
+    t = np.arange(round(RATE / 3.4)) / RATE
+    u = 5e-3 * np.sin(2 * math.pi * 3.4 * t)
+    still = np.zeros(t.size)
+    left = math.sqrt(float(s.weights @ s.weights))
+    smoothed, raw = [], []
+    for _ in range(300):
+        noisy = u + sigma * rng.standard_normal(t.size)
+        found, _ = extremes(motion(noisy, still), 0, s, UNKNOWN)
+        assert found is not None
+        smoothed.append(found.u_max - 5e-3)
+        raw.append(noisy.max() - 5e-3)
+    # few samples lie so near the top that noise can choose between them
+    assert 0 < np.mean(smoothed) < sigma * left * math.sqrt(2 * math.log(t.size))
+    assert np.mean(smoothed) < 0.6 * np.mean(raw)
+
+
+def test_a_contact_is_not_smeared() -> None:
+    """The shortest contact is half a period on both bumpers: its peak is kept within 0.2 %."""
+    s = scale()
+    w = math.sqrt((36e3 + 510e3) / 550)
+    t = np.arange(588) / RATE
+    force = 2000.0 * np.clip(np.sin(w * (t - 0.1)), 0, None) * (abs(t - 0.15) < math.pi / w)
+    found, _ = extremes(motion(t, t, force), 0, s, UNKNOWN)
+    assert found is not None
+    assert found.force_r == pytest.approx(2000.0, rel=2e-3)
+    assert found.force_l == 0.0
+
+
+def test_extremes_keep_signs_and_sides() -> None:
+    t = np.arange(588) / RATE
+    wave = np.sin(2 * math.pi * 3.4 * t)
+    pair = Motion(1e-3 + 2e-3 * wave, 0.5 - wave, np.full(588, 30.0), np.full(588, 70.0))
+    found, touching = extremes(pair, 1000, scale(), (False, True))
+    assert found is not None
+    got = (found.u_max, found.u_min, found.a_max, found.a_min, found.force_r, found.force_l)
+    np.testing.assert_allclose(got, (3e-3, -1e-3, 1.5, -0.5, 30.0, 70.0), rtol=1e-5)
+    assert (found.onsets_r, found.onsets_l) == ((1000,), ())
+    assert touching == (True, True)
+
+
+def test_lost_displacement_leaves_no_extremes_and_an_unknown_contact() -> None:
+    u = np.zeros(500)
+    u[77] = np.nan
+    assert extremes(motion(u, np.zeros(500)), 0, scale(), (True, False)) == (None, UNKNOWN)
+
+
+def test_a_lost_accelerometer_leaves_the_displacement() -> None:
+    t = np.arange(588) / RATE
+    u = 2e-3 * np.sin(2 * math.pi * 3.4 * t)
+    found, _ = extremes(motion(u, np.full(588, np.nan)), 0, scale(), UNKNOWN)
+    assert found is not None
+    assert found.u_max == pytest.approx(2e-3, rel=1e-5)
+    assert math.isnan(found.a_max)
+    values = quantities(
+        [Cycle(588, 0, 0, int(Label.MEASURE), 588, found, None)], "measured", scale()
+    )
+    assert values is not None
+    assert values.eta_d == pytest.approx(2e-3 / scale().u_star_m, rel=1e-5)
+    assert math.isnan(values.eta_a)
+
+
+# Onsets
+
+
+def test_onsets_have_hysteresis() -> None:
+    force = np.array([0.0, 9.0, 11.0, 6.0, 11.0, 4.9, 9.9, 10.1, 20.0])
+    assert onsets(force, 10.0, False) == ([2, 7], True)
+    assert onsets(force[1:], 10.0, True) == ([6], True)
+
+
+def test_contact_at_the_first_sample_is_an_onset_only_where_there_was_none() -> None:
+    force = np.array([50.0, 50.0, 0.0])
+    assert onsets(force, 10.0, False) == ([0], False)
+    assert onsets(force, 10.0, True) == ([], False)
+    assert onsets(force, 10.0, None) == ([], False)
+    assert onsets(np.array([7.0, 8.0]), 10.0, None) == ([], None)
+
+
+def test_lost_samples_of_a_force_are_no_release() -> None:
+    force = np.array([0.0, 50.0, np.nan, 50.0, np.nan, 0.0, np.nan])
+    assert onsets(force, 10.0, None) == ([1], False)
+
+
+def test_noise_counts_nothing_twice() -> None:
+    """Slow contacts through the threshold under the rig's load cell noise: one onset each."""
+    rng = np.random.default_rng(2)
+    t = np.arange(100_000) / RATE
+    force = np.clip(400.0 * np.sin(2 * math.pi * 1.0 * t), 0.0, None)
+    places, _ = onsets(force + 1.4 * rng.standard_normal(t.size), 10.0, False)
+    assert len(places) == 50
+    assert not onsets(1.4 * rng.standard_normal(t.size), 10.0, False)[0]
+
+
+# Impacts per cycle
+
+
+def counted(cycles: list[Cycle]) -> tuple[int, ...]:
+    values = quantities(cycles, "measured", scale())
+    assert values is not None
+    assert values.impacts_left == (0,) * len(values.impacts_right)
+    return values.impacts_right
+
+
+def held(places: Sequence[int], settle: int = 1, measure: int = 3) -> list[Cycle]:
+    """Settle and measured cycles of 500 samples with onsets where they fall."""
+    return [
+        cycle(
+            number,
+            [one for one in places if number * 500 <= one < (number + 1) * 500],
+            label=Label.SETTLE if number < settle else Label.MEASURE,
+        )
+        for number in range(settle + measure)
+    ]
+
+
+def test_jitter_about_the_cut_between_cycles_counts_one_each() -> None:
+    places = [498, 1003, 1496, 2001]  # about 500, 1000, 1500, 2000: 2 0 1 1 between plain cuts
+    cycles = held(places)
+    assert [len(one.measured.onsets_r) for one in cycles if one.measured] == [1, 0, 2, 0]
+    assert counted(cycles) == (1, 1, 1)
+
+
+@pytest.mark.parametrize("phase", range(0, 500, 25))
+@pytest.mark.parametrize("settle", [0, 1, 2])
+def test_one_impact_per_cycle_at_any_phase(phase: int, settle: int) -> None:
+    places = [phase + 500 * number for number in range(3 + settle)]
+    assert counted(held(places, settle)) == (1, 1, 1)
+
+
+@pytest.mark.parametrize("phase", range(0, 500, 50))
+def test_a_third_slight_impact_in_one_cycle_is_that_cycles(phase: int) -> None:
+    """Two a cycle, in the last but one a third (physics.md: 0.71 Hz)."""
+    places = [phase + 500 * k + more for k in range(-1, 4) for more in (0, 60)]
+    places.append(phase + 500 * 2 + 120)
+    impacts = counted(held([one for one in places if one >= 0]))
+    assert sorted(impacts) == [2, 2, 3]
+
+
+def test_no_onset_is_no_impact() -> None:
+    assert counted(held([])) == (0, 0, 0)
+
+
+def test_impacts_of_settle_cycles_do_not_count() -> None:
+    assert counted(held([100, 200, 300], settle=2)) == (0, 0, 0)
+
+
+# Quantities
+
+
+def swing(hz: float, parameters: Parameters = FREE) -> tuple[Float1D, Float1D]:
+    """(u, a) of two steady cycles in free flight at 0.05 g: the linear oscillator."""
+    p, w = parameters, 2 * math.pi * hz
+    t = np.arange(2 * math.ceil(RATE / hz)) / RATE
+    x = -LEVEL / complex(p.stiffness / p.mass - w**2, p.damping * w / p.mass)
+    total = LEVEL - w**2 * x
+    return tuple(abs(one) * np.sin(w * t + cmath.phase(one)) for one in (x, total))  # type: ignore[return-value]
+
+
+def flying(hz: float, s: Scale) -> Cycle:
+    found, _ = extremes(motion(*swing(hz, s.parameters)), 0, s, UNKNOWN)
+    return Cycle(1, 0, 0, int(Label.MEASURE), 1, found, found)
+
+
+def test_free_flight_at_resonance_is_the_unit() -> None:
+    s = scale(FREE)
+    assert s.u_star_m == pytest.approx(30.537e-3, abs=1e-6)
+    assert s.a_star_m_s2 == pytest.approx(2.057, abs=1e-3)
+    for source in ("measured", "twin"):
+        values = quantities([flying(1.268, s)], source, s)
+        assert values is not None
+        assert values.eta_d == pytest.approx(1.0, abs=2e-5)
+        assert values.eta_a == pytest.approx(1.0, abs=2e-5)
+        assert (values.eta_r, values.eta_l, values.r_r, values.r_l) == (0, 0, 0, 0)
+        assert (values.drift, values.spread) == (0, 0)
+    # on the paper's 0.1 Hz grid the largest is 2 % less
+    grid = quantities([flying(1.3, s)], "measured", s)
+    assert grid is not None
+    assert grid.eta_d == pytest.approx(29.95 / 30.537, abs=1e-3)
+
+
+def test_no_contact_is_no_deformation_whatever_the_noise() -> None:
+    """Load cells below the threshold carry nothing, even where u alone would say contact."""
+    values = quantities([cycle(0, u=0.0021, force=9.9)], "measured", scale())
+    assert values is not None
+    assert (values.eta_r, values.r_r) == (0, 0)
+
+
+def test_contact_gives_deformation_beyond_the_gap_and_force_over_weight() -> None:
+    s = scale()
+    values = quantities([cycle(0, u=0.003), cycle(1, u=0.004, force=1500.0)], "measured", s)
+    assert values is not None
+    assert values.eta_d == pytest.approx(0.0035 / s.u_star_m)
+    assert values.eta_r == pytest.approx((0.001 + 0.002) / 2 / s.u_star_m)
+    assert values.r_r == pytest.approx(1000.0 / WEIGHT)
+    assert (values.eta_l, values.r_l) == (0, 0)
+    assert values.drift == pytest.approx(1 / 3.5)
+    assert values.spread == pytest.approx(1 / 3.5)
+
+
+def test_drift_has_a_sign_and_spread_has_none() -> None:
+    values = quantities([cycle(k, u=u) for k, u in enumerate((0.003, 0.004, 0.002))], "measured",
+                        scale())  # fmt: skip
+    assert values is not None
+    assert values.drift == pytest.approx(-1 / 3)
+    assert values.spread == pytest.approx(2 / 3)
+
+
+def test_negative_gap_includes_precompression() -> None:
+    """At rest both bumpers are pressed in by 1 mm and bear 510 N."""
+    s = scale(replace(G4, gap_r=-0.001, gap_l=-0.001))
+    still = np.zeros(500)
+    swing = 1e-4 * np.sin(2 * math.pi * np.arange(500) / 500)
+    pair = Motion(swing, still, still + 561.0, still + 459.0)
+    found, _ = extremes(pair, 0, s, UNKNOWN)
+    values = quantities([Cycle(500, 0, 0, int(Label.MEASURE), 500, found, None)], "measured", s)
+    assert values is not None
+    assert values.eta_r == pytest.approx(1.1e-3 / s.u_star_m, rel=1e-5)
+    assert values.eta_l == pytest.approx(1.1e-3 / s.u_star_m, rel=1e-5)
+    assert values.r_r == pytest.approx(561.0 / WEIGHT)
+    assert (values.impacts_right, values.impacts_left) == ((0,), (0,))
+
+
+def test_lost_load_cells_are_not_zeros() -> None:
+    """Force and impacts are unknown; the deformation is that of the displacement."""
+    s = scale()
+    values = quantities([cycle(0, u=0.003, force=math.nan)], "measured", s)
+    assert values is not None
+    assert math.isnan(values.r_r)
+    assert values.impacts_right == ()
+    assert values.eta_r == pytest.approx(0.001 / s.u_star_m)
+
+
+def test_no_measured_cycle_is_no_point() -> None:
+    assert quantities([cycle(0, label=Label.SETTLE)], "measured", scale()) is None
+    assert quantities([cycle(0)], "twin", scale()) is None
+
+
+# The table
+
+
+HARMONICS = {2: 0.03, 3: 0.02, 7: 0.01}
+
+
+@pytest.mark.parametrize("cycles", [2, 3])
+@pytest.mark.parametrize("hz", [0.53, 3.4, 4.7, 9.9])
+def test_harmonics_of_the_table_at_40_db(hz: float, cycles: int) -> None:
+    """Fundamental and THD within 0.5 % though a cycle is no whole number of samples."""
+    rng = np.random.default_rng(5)
+    n = math.ceil(cycles * RATE / hz)
+    got = []
+    for parts in ({}, HARMONICS):
+        for _ in range(20):
+            turn = 2 * math.pi * hz * np.arange(n) / RATE + rng.uniform(0, 2 * math.pi)
+            x = np.sin(turn)
+            for order, part in parts.items():
+                x += part * np.sin(order * turn + rng.uniform(0, 2 * math.pi))
+            noise = 0.01 / math.sqrt(2) * rng.standard_normal(n)
+            got.append(table_motion(LEVEL * (x + noise), hz, RATE)[1:])
+    fundamental, thd = np.array(got).reshape(2, 20, 2).transpose(2, 0, 1)
+    assert abs(fundamental / LEVEL - 1).max() < 0.005
+    want = np.array([0.0, math.hypot(*HARMONICS.values())])
+    assert (abs(thd - want[:, None]) < 0.005).all()
+    assert abs(thd[1].mean() - want[1]) < 0.0005
+
+
+def test_an_offset_of_the_accelerometer_is_no_harmonic() -> None:
+    turn = 2 * math.pi * 4.7 * np.arange(852) / RATE
+    peak, fundamental, thd = table_motion(LEVEL * np.sin(turn) + 0.05, 4.7, RATE)
+    assert peak == pytest.approx(LEVEL + 0.05, rel=1e-3)
+    assert fundamental == pytest.approx(LEVEL, rel=1e-9)
+    assert thd < 1e-9
+
+
+def test_lost_samples_of_the_table_leave_it_unknown() -> None:
+    x = np.sin(2 * math.pi * 4.0 * np.arange(1000) / RATE)
+    x[500] = np.nan
+    assert all(math.isnan(one) for one in table_motion(x, 4.0, RATE))
+    assert all(math.isnan(one) for one in table_motion(np.empty(0), 4.0, RATE))
+
+
+def test_a_point_says_step_direction_and_frequency() -> None:
+    turn = 2 * math.pi * 4.0 * np.arange(1000) / RATE
+    got = point(Step(7, "backward", 4.0, LEVEL), held([]), LEVEL * np.sin(turn), scale())
+    assert (got.index, got.step, got.direction, got.frequency_hz) == (2000, 7, "backward", 4.0)
+    assert got.measured is not None
+    assert got.twin is None
+    assert got.table_acc_fundamental_m_s2 == pytest.approx(LEVEL)
+    assert got.table_acc_peak_m_s2 == pytest.approx(LEVEL)

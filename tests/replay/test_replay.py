@@ -1,0 +1,316 @@
+"""A recording played again: the same to the bit with its model, not so with another."""
+
+import math
+import subprocess
+import sys
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from table_io.block import Block
+from table_io.records import Comparison, Event, Fault, Params, Point, Record, RunStart, RunStop
+from twin.compare import pipeline
+from twin.service.bundle import Bundle, from_texts, read_bundle
+from twin.service.runs import Identity, play_unpaced, replay, simulate
+from twin.service.summary import dumps, summarise
+from twin.stream.mcap_log import Recording, read, write_items
+from twin.stream.wire import Item, encode
+
+PROFILE = """
+title = "Across the down-jump and back"
+[specimen]
+mass_kg = 550.0
+gap_mm = 4.0
+[sweep]
+start_hz = 3.4
+stop_hz = 4.4
+step_hz = 0.5
+cycles = 4
+measured_cycles = 2
+"""
+
+
+def silent(item: Item) -> None:
+    """Nobody watches."""
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+    path = tmp_path_factory.mktemp("replay") / "across.toml"
+    path.write_text(PROFILE)
+    return read_bundle(path)
+
+
+@pytest.fixture(scope="module")
+def recording(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    path = tmp_path_factory.mktemp("replay") / "run.mcap"
+    play_unpaced(bundle, "first", path, lambda: None, silent)
+    return read(path)
+
+
+def again(recording: Recording, bundle: Bundle, folder: Path) -> tuple[Identity, Recording]:
+    """What a replay found, and the log that it wrote."""
+    path = folder / f"again-{len(list(folder.iterdir()))}.mcap"
+    identity = replay(recording, bundle, path, "again", silent)
+    return identity, read(path)
+
+
+def comparisons(recording: Recording) -> list[bytes]:
+    return [encode(one, "") for one in recording.of(Comparison)]
+
+
+def bundle_of(recording: Recording, model_toml: str | None = None) -> Bundle:
+    """The bundle from the recording and nothing else."""
+    start = recording.start
+    model = start.model_toml if model_toml is None else model_toml
+    return from_texts(start.name, start.profile_toml, start.rig_toml, model, "recording")
+
+
+def test_the_recorded_model_gives_the_recorded_comparisons(
+    recording: Recording, tmp_path: Path
+) -> None:
+    """From the file alone: profile, machine card and model are in it."""
+    identity, made = again(recording, bundle_of(recording), tmp_path)
+    assert identity.identical
+    assert identity.recorded == identity.compared == len(recording.of(Comparison)) > 500
+    assert (identity.differing, identity.missing, identity.first_difference) == (0, 0, None)
+    assert comparisons(made) == comparisons(recording)
+    assert made.of(Point) == recording.of(Point)
+    for stream in ("meas", "pred"):
+        assert made.pieces(stream)[0].identical(recording.pieces(stream)[0])
+    assert made.start == replace(recording.start, run="again")
+    assert made.stop == recording.stop
+
+
+def test_a_replay_in_another_process_is_identical(recording: Recording, tmp_path: Path) -> None:
+    """As its user starts it; nothing of this process is left over in the twin."""
+    program = str(Path(sys.executable).parent / "shaketwin")
+    done = subprocess.run(
+        [program, "replay", str(recording.path), "--out", str(tmp_path / "out")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert comparisons(read(tmp_path / "out" / "run.mcap")) == comparisons(recording)
+
+
+def test_a_replay_of_a_replay_is_identical(
+    recording: Recording, bundle: Bundle, tmp_path: Path
+) -> None:
+    _, first = again(recording, bundle, tmp_path)
+    identity, second = again(first, bundle, tmp_path)
+    assert identity.identical
+    assert [encode(one, "") for one in first.items] == [encode(one, "") for one in second.items]
+
+
+def test_a_stiffer_model_differs_and_is_worse(
+    recording: Recording, bundle: Bundle, tmp_path: Path
+) -> None:
+    other = bundle_of(recording, bundle.model_toml.replace("36000.0", "37800.0"))
+    identity, made = again(recording, other, tmp_path)
+    assert not identity.identical
+    assert identity.compared == identity.recorded
+    # before the first restart there is nothing to differ
+    assert identity.first_difference == 500
+    assert identity.differing > 0.9 * (identity.recorded - 25)
+    assert identity.largest["rel_disp_m"] > 0
+    assert made.start.model_toml == other.model_toml
+    assert made.of(Params)[0].values["stiffness"] == 37800.0
+    before = summarise(recording, bundle.parameters)["comparison"]
+    after = summarise(made, other.parameters)["comparison"]
+    for name in ("rel_disp_m", "mass_acc_m_s2"):
+        assert after[name]["nrmse"] > 2 * before[name]["nrmse"]
+        assert after[name]["free_nrmse"] > 2 * before[name]["free_nrmse"]
+
+
+def test_a_bit_in_the_recording_is_noticed(
+    recording: Recording, bundle: Bundle, tmp_path: Path
+) -> None:
+    """One sample of one channel, changed by one unit in the last place."""
+    items = list(recording.items)
+    place = next(
+        k for k, one in enumerate(items)
+        if isinstance(one, Block) and one.stream == "meas" and one.index >= 6000
+    )  # fmt: skip
+    values = items[place].values.copy()
+    values[recording.start.channels.index("mass_disp_m"), 3] *= 1 + 2**-52
+    items[place] = replace(items[place], values=values)
+    write_items(tmp_path / "bent.mcap", items, recording.start)
+    identity, _ = again(read(tmp_path / "bent.mcap"), bundle, tmp_path)
+    assert not identity.identical
+    assert identity.first_difference == items[place].index
+
+
+def test_a_lost_comparison_is_noticed(recording: Recording, bundle: Bundle, tmp_path: Path) -> None:
+    """A recording may lack what the twin said: what is there must agree, what is not is not asked;
+    but one that a replay does not make again is missing."""
+    extra = replace(recording.of(Comparison)[300], index=6007)
+    write_items(tmp_path / "extra.mcap", [*recording.items, extra], recording.start)
+    identity, _ = again(read(tmp_path / "extra.mcap"), bundle, tmp_path)
+    assert not identity.identical
+    assert identity.missing == 1
+
+
+# A twin that died
+
+
+def recorded_with_faults(
+    recording: Recording, bundle: Bundle, spans: list[tuple[int, int]], path: Path
+) -> Recording:
+    """The recording as it would be had the twin been dead over `spans` of samples.
+
+    Made with nothing but the pipeline: fed up to the death, started afresh at the end of it.
+    """
+    kept: list[Item] = [
+        one
+        for one in recording.items
+        if (isinstance(one, Block) and one.stream == "meas") or isinstance(one, (RunStart, RunStop))
+    ]
+    setup = bundle.twin()
+    whole = recording.pieces("meas")[0]
+    said: list[Record | Block] = []
+    lives = [0, *(edge for span in spans for edge in span), whole.end]
+    for first, last in list(pairwise(lives))[::2]:
+        state, begun = pipeline.start(setup, first)
+        said.extend(begun)
+        for at in range(first, last, 20):
+            state, made = pipeline.step(setup, state, whole.cut(at, min(at + 20, last)))
+            said.extend(made)
+    said.extend(Fault(b, "twin", a, b, "the process died and was restarted") for a, b in spans)
+    write_items(path, [*kept, *said], recording.start)
+    return read(path)
+
+
+@pytest.mark.parametrize(
+    "spans",
+    [
+        [(4000, 6000)],  # back at a restart index
+        [(4020, 4760)],  # back between two, in the middle of a cycle
+        [(4013, 6007)],  # within blocks, so that grid cells are cut
+        [(2000, 3020), (7000, 9040)],
+        [(0, 2500)],  # dead from the start
+    ],
+)
+def test_replay_is_dead_where_the_twin_was(
+    recording: Recording, bundle: Bundle, tmp_path: Path, spans: list[tuple[int, int]]
+) -> None:
+    died = recorded_with_faults(recording, bundle, spans, tmp_path / "died.mcap")
+    identity, made = again(died, bundle, tmp_path)
+    assert identity.identical
+    assert identity.recorded == len(died.of(Comparison)) < len(recording.of(Comparison))
+    assert comparisons(made) == comparisons(died)
+    assert made.of(Fault) == died.of(Fault)
+    for a, b in spans:
+        assert not any(one.index < b and one.end > a for one in made.blocks("pred"))
+    # after the fresh start it differs from a twin that never died, so the fault mattered
+    never, _ = again(replace(died, items=tuple(
+        one for one in died.items if not isinstance(one, Fault)
+    )), bundle, tmp_path)  # fmt: skip
+    assert not never.identical
+    identity, _ = again(made, bundle, tmp_path)
+    assert identity.identical
+
+
+def test_a_fault_of_another_component_leaves_the_twin_alive(
+    recording: Recording, bundle: Bundle, tmp_path: Path
+) -> None:
+    fault = Fault(6000, "recorder", 4000, 6000, "the process died and was restarted")
+    write_items(tmp_path / "run.mcap", [*recording.items, fault], recording.start)
+    identity, made = again(read(tmp_path / "run.mcap"), bundle, tmp_path)
+    assert identity.identical
+    assert made.of(Fault) == (fault,)
+
+
+def test_missing_samples_are_replayed_as_they_were(
+    recording: Recording, bundle: Bundle, tmp_path: Path
+) -> None:
+    kept = [
+        one
+        for one in recording.items
+        if isinstance(one, (RunStart, RunStop))
+        or (isinstance(one, Block) and one.stream == "meas" and not 5000 <= one.index < 5100)
+    ]
+    write_items(tmp_path / "holed.mcap", kept, recording.start)
+    _, first = again(read(tmp_path / "holed.mcap"), bundle, tmp_path)
+    identity, second = again(first, bundle, tmp_path)
+    assert identity.identical
+    assert identity.recorded > 300
+    assert first.missing_samples == second.missing_samples == 100
+
+
+def test_what_the_rig_said_is_kept_and_hints_are_said_anew(
+    recording: Recording, bundle: Bundle, tmp_path: Path
+) -> None:
+    note = Event(5000, "note", "the operator coughed")
+    write_items(tmp_path / "run.mcap", [*recording.items, note], recording.start)
+    _, made = again(read(tmp_path / "run.mcap"), bundle, tmp_path)
+    assert note in made.of(Event)
+    hints = [one for one in recording.of(Event) if one.kind == "jump"]
+    assert hints
+    assert [one for one in made.of(Event) if one.kind == "jump"] == hints
+
+
+# The model alone
+
+
+@pytest.fixture(scope="module")
+def simulated(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    path = tmp_path_factory.mktemp("simulate") / "run.mcap"
+    simulate(bundle, "model", path, silent)
+    return read(path)
+
+
+def test_a_simulation_has_measured_nothing(simulated: Recording, bundle: Bundle) -> None:
+    assert simulated.start.source == "model"
+    summary = summarise(simulated, bundle.parameters)
+    assert len(summary["steps"]) == 6
+    for step in summary["steps"]:
+        assert step["measured"] is None
+        assert step["twin"]["eta_d"] > 0
+        assert step["table_acc_fundamental_m_s2"] == pytest.approx(0.05 * 9.80665, rel=1e-3)
+        assert step["thd"] < 1e-3
+    assert all(one.measured is None for one in simulated.of(Point))
+    assert all(
+        values == {"nrmse": None, "free_nrmse": None} for values in summary["comparison"].values()
+    )
+    assert "NaN" not in dumps(summary)
+    assert summary["run"]["branches_from"] == "twin"
+
+
+def test_a_simulated_curve_is_smooth_and_repeats(simulated: Recording) -> None:
+    """At 3.4 Hz, with no servo and no noise: physics.md to its digits, as far as drift allows."""
+    found = {(one.direction, one.frequency_hz): one.twin for one in simulated.of(Point)}
+    u_star = 30.537
+    forward, backward = found["forward", 3.4], found["backward", 3.4]
+    assert forward is not None
+    assert backward is not None
+    slack = 1e-3 + abs(forward.drift)
+    assert u_star * forward.eta_d == pytest.approx(5.123, rel=slack)
+    assert u_star * backward.eta_d == pytest.approx(1.247, rel=1e-3 + abs(backward.drift))
+    assert forward.eta_r == pytest.approx(forward.eta_l, rel=0.05)
+    # in flight, four cycles leave a transient of exp(-4/3.4) between the steps, no more
+    assert backward.spread < 0.05
+
+
+def test_a_simulation_predicts_from_its_first_sample(simulated: Recording) -> None:
+    (predicted,) = simulated.pieces("pred")
+    assert np.isfinite(predicted.channel("free/rel_disp_m")).all()
+    assert np.isnan(predicted.channel("window/rel_disp_m")).all()
+
+
+def test_the_replay_of_a_simulation_is_identical(
+    simulated: Recording, bundle: Bundle, tmp_path: Path
+) -> None:
+    identity, made = again(simulated, bundle_of(simulated), tmp_path)
+    assert identity.identical
+    assert identity.recorded > 500
+    assert made.of(Point) == simulated.of(Point) or all(
+        encode(a, "") == encode(b, "")
+        for a, b in zip(made.of(Point), simulated.of(Point), strict=True)
+    )
+    assert made.pieces("pred")[0].identical(simulated.pieces("pred")[0])
+    assert all(math.isnan(one.free_error_ss[0]) for one in made.of(Comparison))

@@ -1,0 +1,25 @@
+"""The bumper relaxes: a spring in series with a dashpot beside K_j and C_j.
+
+    contact: F_j = C_j u_j' + K_j u_j + b_j;   flight: that sum is zero
+    always:  b_j' = kb u_j' - b_j / tau
+
+Linear: exact. Passive: stored b_j^2 / (2 kb), loss b_j^2 / (kb tau). After a release the branch
+still pulls the face back, so for about tau the gap seems larger than it is.
+"""
+
+from twin.model.effects.effect import Effect, EffectParameter
+
+BUMPER_MAXWELL = Effect(
+    id="bumper_maxwell",
+    term="b_j in each bumper, b_j' = kb u_j' - b_j / tau",
+    parameters=(
+        EffectParameter("kb", "N/m", 0.0, 1e7, 0.0, 2e5, "Stiffness that relaxes."),
+        EffectParameter("tau", "s", 1e-4, 100.0, None, 0.05, "Relaxation time."),
+    ),
+    acts="linear",
+    residual=(
+        "In contact only: stiffer at first and softer later, earlier release; after a recent "
+        "contact the gap seems larger."
+    ),
+    confused_with=("gap_drift", "hunt_crossley"),
+)

@@ -1,0 +1,29 @@
+"""The damper's spring hardens (k3 > 0) or softens (k3 < 0) with displacement.
+
+    M u'' + C u' + K u + k3 u^3 + F_R + F_L = -M A
+
+Odd in u, conservative, stored energy k3 u^4 / 4. With k3 < 0 the spring pulls back only up to
+|u| = sqrt(-K/k3); beyond it the mass escapes. Source: Duffing.
+"""
+
+from twin.model.effects.effect import Effect, EffectParameter
+
+
+def force(u: float, k3: float) -> float:
+    """k3 u^3 in N, u in m."""
+    return k3 * u * u * u
+
+
+CUBIC_STIFFNESS = Effect(
+    id="cubic_stiffness",
+    term="k3 u^3 in the damper",
+    parameters=(
+        EffectParameter("k3", "N/m3", -3e7, 1e10, 0.0, 1e7, "Cubic coefficient of the damper."),
+    ),
+    acts="force",
+    residual=(
+        "The resonance moves with the square of the amplitude; a third harmonic in phase with u; "
+        "no change of loss; present in flight."
+    ),
+    confused_with=("bumper_hardening", "bouc_wen"),
+)

@@ -1,0 +1,25 @@
+"""The gap opens or closes during the test: a loose anchor, a creeping or warming bumper.
+
+    G0R(t) = G0R + rate t,  G0L(t) = G0L + rate t;  t in s from sample 0 of the run
+
+The wall moves with `rate`, so in contact u_R' = u' - rate and u_L' = u' + rate; the solver follows
+the moving wall inside every step, not in stairs. A side without a bumper stays without.
+"""
+
+from twin.model.effects.effect import Effect, EffectParameter
+
+GAP_DRIFT = Effect(
+    id="gap_drift",
+    term="both gaps grow by rate x time",
+    parameters=(
+        EffectParameter(
+            "rate", "m/s", -1e-4, 1e-4, 0.0, 5e-6, "Opening speed of the gap of each side."
+        ),
+    ),
+    acts="linear",
+    residual=(
+        "Onset and release move with time on both sides alike, not with frequency: the return "
+        "sweep meets other gaps than the way out."
+    ),
+    confused_with=("bumper_maxwell", "gap_offset"),
+)

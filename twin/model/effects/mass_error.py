@@ -1,0 +1,38 @@
+"""All forces are off by one common factor against the mass that is believed.
+
+    M u'' + ratio (C u' + K u + F_R + F_L) = -M A;  the same as a mass of M / ratio
+
+Motion alone cannot tell it from a factor on K, C, K_j and C_j together: it is pinned only where a
+force is measured, because the forces themselves stay those of K, C, K_j and C_j.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from twin.model.effects.effect import Effect, EffectParameter
+
+if TYPE_CHECKING:
+    from twin.model.parameters import Parameters
+
+
+def _change(parameters: "Parameters", values: Mapping[str, float]) -> "Parameters":
+    return replace(parameters, mass=parameters.mass / values["ratio"])
+
+
+MASS_ERROR = Effect(
+    id="mass_error",
+    term="ratio on all forces over mass",
+    parameters=(
+        EffectParameter(
+            "ratio", "", 0.5, 2.0, 1.0, 1.05, "Believed mass over true mass, forces kept."
+        ),
+    ),
+    acts="parameters",
+    change=_change,
+    residual=(
+        "Acceleration off in proportion to the whole force, resonance moved by its root, in flight "
+        "and in contact alike; load cells against M a off by the same factor."
+    ),
+    confused_with=("sensor_gain", "cubic_stiffness"),
+)

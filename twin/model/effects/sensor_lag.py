@@ -1,0 +1,19 @@
+"""A sensor, its filter or its wire reads late: reading(t) = value(t - lag).
+
+Acts on one predicted channel and not on the motion; between samples the value is a cubic through
+four of them. Before the first prediction is as old as the lag the reading is unknown (NaN).
+"""
+
+from twin.model.effects.effect import Effect, EffectParameter
+
+SENSOR_LAG = Effect(
+    id="sensor_lag",
+    term="reading(t) = value(t - lag), of one channel",
+    parameters=(EffectParameter("lag", "s", 0.0, 0.05, 0.0, 1e-3, "Delay of the reading."),),
+    acts="sensor",
+    residual=(
+        "In proportion to the rate of change of the channel, so it grows with frequency; the "
+        "motion channels no longer fit each other."
+    ),
+    confused_with=("maxwell_damper", "quadratic_damping"),
+)

@@ -1,0 +1,20 @@
+"""A sensor does not read zero at zero: reading = value + offset.
+
+Acts on one predicted channel and not on the motion. The restart from the measured state takes it
+back out of that channel.
+"""
+
+from twin.model.effects.effect import Effect, EffectParameter
+
+SENSOR_OFFSET = Effect(
+    id="sensor_offset",
+    term="reading = value + offset, of one channel",
+    parameters=(
+        EffectParameter(
+            "offset", "unit of the channel", -1e4, 1e4, 0.0, 1e-3, "Reading at a value of zero."
+        ),
+    ),
+    acts="sensor",
+    residual="A constant in one channel, at rest too; no harmonics in the others.",
+    confused_with=("gap_offset", "table_tilt"),
+)

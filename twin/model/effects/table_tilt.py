@@ -1,0 +1,24 @@
+"""The table rocks as it moves, and the mass feels a part of its own weight.
+
+    M u'' + C u' + K u + F_R + F_L = -M A - M g theta,  theta = tilt x table displacement
+
+theta in rad, positive where it pushes the mass to the left when the table is on the right;
+g = 9.80665 m/s2. It acts as base acceleration A + g tilt x, so the solution stays closed form. The
+total acceleration is u'' + A as everywhere, in the laboratory's horizontal direction.
+"""
+
+from twin.model.effects.effect import Effect, EffectParameter
+
+TABLE_TILT = Effect(
+    id="table_tilt",
+    term="-M g tilt x on the right side, x the table displacement",
+    parameters=(
+        EffectParameter("tilt", "rad/m", -10.0, 10.0, 0.0, 0.1, "Rotation per table displacement."),
+    ),
+    acts="input",
+    residual=(
+        "Force in phase with the table's displacement, so it falls with 1/f^2 at constant "
+        "acceleration: quasi-static, at low frequency, in flight and in contact alike."
+    ),
+    confused_with=("sensor_gain", "cubic_stiffness"),
+)
