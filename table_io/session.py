@@ -42,7 +42,7 @@ class Punctuality:
 
 
 Describe = Callable[[dict[str, float], float], RunStart]  # (tare, epoch_s) -> start record
-Commands = Callable[[], str | None]  # "stop" or None; must not wait
+Commands = Callable[[], str | None]  # why to stop, or None; must not wait
 
 
 def play(
@@ -77,9 +77,9 @@ def play(
             if states[-1] == "running":
                 trip = tripped(block, setup.rig)
                 asked = commands()
-                if trip or asked == "stop":
+                if trip or asked:
                     verdict = "aborted" if trip else "stopped"
-                    reason = trip or "asked to stop"
+                    reason = trip or asked or ""
                     states.append("stopping")
                     run.stop()
                     yield Event(block.end, "stop", f"{reason}; decaying to rest")

@@ -226,4 +226,26 @@ def test_a_port_in_use_is_bad_input_and_nothing_is_started(tmp_path: Path) -> No
     assert process.returncode == 2
     assert "in use" in said
     assert "Traceback" not in said
-    assert not list((tmp_path / "out").glob("*.mcap"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_dead_rig_halts_the_run_and_keeps_what_was_recorded(tmp_path: Path) -> None:
+    process = start(tmp_path)
+    running(process)
+    kill(process, "rig")
+    code, said, recording, summary = finish(process, tmp_path)
+    assert code == 3, said
+    assert "the rig process died (SIGKILL)" in said
+    assert "Traceback" not in said
+    assert summary["verdict"] == "halted"
+    assert len(summary["steps"]) >= 1
+    pieces = recording.pieces("meas")
+    assert len(pieces) == 1
+    assert pieces[0].index == 0
+
+
+def test_the_bus_never_listens_to_the_network(tmp_path: Path) -> None:
+    process = start(tmp_path, "--listen", "tcp/0.0.0.0:7447")
+    said, _ = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "would listen to the network" in said

@@ -148,7 +148,7 @@ class Stop:
 
     def __call__(self) -> str | None:
         self.asked += 1
-        return "stop" if self.after is not None and self.asked >= self.after else None
+        return "asked to stop" if self.after is not None and self.asked >= self.after else None
 
 
 def start_record(tare: dict[str, float], epoch_s: float) -> RunStart:

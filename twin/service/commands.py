@@ -40,7 +40,7 @@ def _new_folder(out: Path | None, run: str) -> Path:
 
 @contextmanager
 def _interruptible() -> Iterator[Callable[[], str | None]]:
-    """A question that answers "stop" once Ctrl-C or a termination was asked for."""
+    """A question that answers why to stop once Ctrl-C or a termination was asked for."""
     asked: list[int] = []
 
     def ask(number: int, _: object) -> None:
@@ -51,7 +51,7 @@ def _interruptible() -> Iterator[Callable[[], str | None]]:
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = [signal.signal(number, ask) for number in numbers]
     try:
-        yield lambda: "stop" if asked else None
+        yield lambda: f"interrupted ({signal.Signals(asked[0]).name})" if asked else None
     finally:
         for number, handler in zip(numbers, before, strict=True):
             signal.signal(number, handler)
@@ -114,7 +114,7 @@ def run(
     code = _close(folder, bundle)
     if view:
         _write_view(folder)
-    return EXIT_INTERRUPTED if asked() else code
+    return EXIT_INTERRUPTED if asked() and code == 0 else code
 
 
 def _run_unpaced(

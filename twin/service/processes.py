@@ -5,6 +5,7 @@ of its own so that Ctrl-C reaches only the supervisor; its standard input is a p
 that the supervisor is gone.
 """
 
+import gc
 import json
 import os
 import select
@@ -34,6 +35,7 @@ from twin.stream.wire import (
 from twin.stream.zenoh_link import open_hub, open_spoke
 
 CONNECT_S = 15.0
+RIG_PRIORITY, TWIN_PRIORITY = 50, 40  # of real-time scheduling, where it is permitted
 LINGER_S = 10.0  # that the hub stays up after the run, so that late readers can recover
 FLUSH_S = 0.25
 SYNC_S = 5.0
@@ -80,13 +82,20 @@ def _orphaned() -> bool:
     return bool(ready) and not os.read(sys.stdin.fileno(), 64)
 
 
-def _urgent() -> str:
-    """Ask for real-time scheduling of this thread; what was granted."""
+def _urgent(priority: int) -> str:
+    """Ask for real-time scheduling; what was granted.
+
+    Asked before the link opens, so that the threads in which it sends and receives inherit it.
+    What the imports made is taken out of the garbage collector's sight: a full collection of it
+    costs 15 ms in the middle of a run.
+    """
+    gc.collect()
+    gc.freeze()
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(50))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except (AttributeError, OSError):
         return "normal"
-    return "fifo 50"
+    return f"fifo {priority}"
 
 
 def rig(spec: Spec, _: str) -> None:
@@ -94,6 +103,7 @@ def rig(spec: Spec, _: str) -> None:
     bundle = spec.bundle()
     warm("plant")
     clock = RealClock()
+    scheduler = _urgent(RIG_PRIORITY)
     link = open_hub(bundle.rig.name, spec.endpoint)
     link.declare(RIG_TOPICS)
     orders = link.commands()
@@ -104,9 +114,8 @@ def rig(spec: Spec, _: str) -> None:
         order = orders.poll()
         if order is not None:
             order.reply("yes" if order.name == "stop" else f"unknown command {order.name}")
-        if order is not None and order.name == "stop":
-            return "stop"
-        return "stop" if stop_if_orphan and _orphaned() else None
+            return (order.text or "asked to stop") if order.name == "stop" else None
+        return "the supervisor is gone" if stop_if_orphan and _orphaned() else None
 
     while (order := orders.poll()) is None or order.name != "start":
         if _orphaned():
@@ -114,7 +123,7 @@ def rig(spec: Spec, _: str) -> None:
         clock.wait_until(clock.now() + 0.01)
     order.reply("yes")
     seconds = bundle.profile.acquisition.block_samples / bundle.drive.rate_hz
-    watch = Stopwatch("rig", clock, seconds, _urgent())
+    watch = Stopwatch("rig", clock, seconds, scheduler)
     backend = open_backend(bundle.rig, bundle.profile, clock)
     punctual = Punctuality()
     watch.begin()
@@ -156,6 +165,7 @@ def twin(spec: Spec, missed_from: str) -> None:
     warm("twin")
     setup = bundle.twin()
     clock = RealClock()
+    scheduler = _urgent(TWIN_PRIORITY)
     link = open_spoke(bundle.rig.name, spec.endpoint, CONNECT_S)
     link.declare(TWIN_TOPICS)
     control = link.subscribe(CONTROL, history=True, capacity=16)
@@ -167,7 +177,7 @@ def twin(spec: Spec, missed_from: str) -> None:
             link.publish(topic(item), encode(item, spec.run))
 
     seconds = bundle.profile.acquisition.block_samples / bundle.drive.rate_hz
-    watch = Stopwatch("twin", clock, seconds)
+    watch = Stopwatch("twin", clock, seconds, scheduler)
     state: pipeline.State | None = None
     epoch_s, end, heard = None, None, clock.now()
     while end is None or state is None or state.tracks.index < end:

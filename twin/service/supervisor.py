@@ -1,5 +1,6 @@
 """Starts the processes of a live run, watches them, restarts what died, ends them in order."""
 
+import contextlib
 import os
 import shutil
 import signal
@@ -38,7 +39,7 @@ class Child:
 
 @dataclass(slots=True)
 class Supervisor:
-    """One live run. `watch` sees every small record; `asked` says "stop" when a person does."""
+    """One live run. `watch` sees every small record; `asked` says why once someone wants a stop."""
 
     spec: Spec
     on_death: OnDeath
@@ -55,26 +56,41 @@ class Supervisor:
     def parts(self) -> Path:
         return Path(self.spec.folder) / PARTS
 
-    def run(self) -> int:
-        """Play the run to its end; the number of processes that had to be restarted."""
+    def run(self) -> None:
+        """Play the run to its end. BadInput where it cannot begin; then nothing is left behind."""
         self.parts.mkdir(parents=True)
         self.spec.write(self.parts / "spec.json")
-        rig = self.spec.bundle().rig.name
+        moved = False
         try:
-            self._start("rig")
-            link = self._connect(rig)
-            for component in ("twin", "recorder", *self._views()):
-                self._start(component)
-            self._ready(link)
-            inbox = link.subscribe(WATCHED, history=True, capacity=5000)
-            link.declare(("/run/event", "/run/fault"))
-            if link.request("start", timeout_s=2.0) is None:
-                raise BadInput("the rig does not answer; nothing moved")
+            link, inbox = self._begin()
+            moved = True
             self._attend(link, inbox)
             self._finish(link)
+        except _RigDiedError as error:
+            self.say(f"{error}; what was recorded is kept")
         finally:
             self._reap()
-        return sum(child.restarts for child in self.children.values())
+            if not moved:
+                self._clear()
+
+    def _begin(self) -> tuple[Link, Inbox]:
+        """Start everybody, wait until all are there, and set the rig going."""
+        self._start("rig")
+        link = self._connect(self.spec.bundle().rig.name)
+        for component in ("twin", "recorder", *self._views()):
+            self._start(component)
+        self._ready(link)
+        inbox = link.subscribe(WATCHED, history=True, capacity=5000)
+        link.declare(("/run/event", "/run/fault"))
+        if link.request("start", timeout_s=2.0) is None:
+            raise BadInput("the rig does not answer; nothing moved")
+        return link, inbox
+
+    def _clear(self) -> None:
+        """Take away what a run that never began has left, so that it can be started again."""
+        shutil.rmtree(self.parts)
+        with contextlib.suppress(OSError):
+            self.parts.parent.rmdir()
 
     def _views(self) -> tuple[str, ...]:
         return ("viewer",) if self.spec.serve_view else ()
@@ -130,8 +146,8 @@ class Supervisor:
         stopping = False
         while self.stop is None:
             self._listen(inbox, 0.1)
-            if not stopping and self.asked() == "stop":
-                stopping = link.request("stop", timeout_s=1.0) is not None
+            if not stopping and (why := self.asked()):
+                stopping = link.request("stop", why) is not None
             for component in list(self.children):
                 if self._died(component) and self.stop is None:
                     self._listen(inbox, DRAIN_S)
@@ -156,13 +172,13 @@ class Supervisor:
         child = self.children[component]
         how = child.process.returncode
         if component == "rig":
-            raise _RigDied(f"the rig process died ({_how(how)}): {self._words('rig')}")
+            raise _RigDiedError(f"the rig process died ({_how(how)}): {self._words('rig')}")
         choice = getattr(self.on_death, component)
         self.say(f"{component} died ({_how(how)}); restarting it, the table goes on")
         event = Event(self.compared_to, "died", f"{component} died ({_how(how)})")
         link.publish(topic(event), encode(event, self.spec.run))
         if choice == "stop":
-            link.request("stop", timeout_s=1.0)
+            link.request("stop", f"{component} died ({_how(how)})")
         if child.restarts >= RESTARTS:
             self.say(f"{component} died {RESTARTS + 1} times and stays down")
             del self.children[component]
@@ -204,7 +220,7 @@ class Supervisor:
                 child.process.wait()
 
 
-class _RigDied(Exception):
+class _RigDiedError(Exception):
     """The rig is gone; what was recorded is kept."""
 
 

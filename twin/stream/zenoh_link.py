@@ -243,6 +243,11 @@ class Link:
 def open_hub(rig: str, endpoint: str) -> Link:
     """The end that listens at `endpoint`; BadInput where that cannot be."""
     _check(rig, endpoint)
+    if not re.match(r"tcp/(127\.[\d.]+|localhost|\[::1\]):", endpoint):
+        raise BadInput(
+            f"endpoint {endpoint}: would listen to the network, unprotected; allowed: this machine "
+            "only, as tcp/127.0.0.1:7447"
+        )
     try:
         # "peer" measured the same, loss and latency; "router" is what zenoh documents for clients.
         return Link(rig, zenoh.open(_config("router", "listen", endpoint, 0)))
