@@ -149,8 +149,8 @@ def _message(record: Any) -> Any:
 def _plain(value: Any) -> Any:
     if is_dataclass(value):
         return _message(value)
-    if isinstance(value, tuple):
-        return [_plain(one) for one in value]
+    if isinstance(value, tuple):  # of one type: a look at the first tells all
+        return [_plain(one) for one in value] if value and is_dataclass(value[0]) else value
     return value
 
 
