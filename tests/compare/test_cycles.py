@@ -115,6 +115,29 @@ def test_a_contact_is_not_smeared() -> None:
     assert found.force_l == 0.0
 
 
+@pytest.mark.parametrize("parameters", [G4, FREE])
+def test_a_peak_at_the_cut_between_two_cycles_is_not_lost(parameters: Parameters) -> None:
+    """A held cycle begins at any phase; without the samples that lead up to it 3 % would go."""
+    s, n = scale(parameters), 400
+    for phase in np.linspace(0, 2 * math.pi, 33):
+        wave = np.cos(2 * math.pi * np.arange(-s.lead, n) / n + phase)
+        found, _ = extremes(Motion(wave, wave, wave, wave), 0, s, UNKNOWN, s.lead)
+        assert found is not None
+        got = (found.u_max, -found.u_min, found.a_max, -found.a_min, found.force_r, found.force_l)
+        np.testing.assert_allclose(got, 1.0, rtol=2e-4)
+
+
+def test_contact_before_the_cycle_is_no_onset_of_it() -> None:
+    s = scale()
+    force = np.zeros(s.lead + 500)
+    force[2:6] = 100.0
+    force[s.lead + 50 : s.lead + 60] = 100.0
+    still = np.zeros(force.size)
+    found, _ = extremes(motion(still, still, force), 3000, s, UNKNOWN, s.lead)
+    assert found is not None
+    assert found.onsets_r == (3050,)
+
+
 def test_extremes_keep_signs_and_sides() -> None:
     t = np.arange(588) / RATE
     wave = np.sin(2 * math.pi * 3.4 * t)
@@ -168,6 +191,20 @@ def test_contact_at_the_first_sample_is_an_onset_only_where_there_was_none() -> 
 def test_lost_samples_of_a_force_are_no_release() -> None:
     force = np.array([0.0, 50.0, np.nan, 50.0, np.nan, 0.0, np.nan])
     assert onsets(force, 10.0, None) == ([1], False)
+
+
+def test_a_lost_sample_of_a_force_in_contact_is_no_second_onset_of_its_cycle() -> None:
+    force = np.zeros(500)
+    force[100:160] = 400.0
+    force[130] = np.nan
+    found, touching = extremes(motion(force * 0 + 1, force, force), 0, scale(), UNKNOWN)
+    assert found is None  # the displacement was lost with it
+    still = np.zeros(500)
+    found, touching = extremes(motion(still, still, force), 0, scale(), UNKNOWN)
+    assert found is not None
+    assert found.onsets_r == (100,)
+    assert math.isnan(found.force_r)
+    assert touching == (False, False)
 
 
 def test_noise_counts_nothing_twice() -> None:
@@ -284,6 +321,14 @@ def test_contact_gives_deformation_beyond_the_gap_and_force_over_weight() -> Non
     assert (values.eta_l, values.r_l) == (0, 0)
     assert values.drift == pytest.approx(1 / 3.5)
     assert values.spread == pytest.approx(1 / 3.5)
+
+
+def test_eta_of_a_lopsided_motion_is_half_its_range() -> None:
+    s, found = scale(), Extremes(0.005, -0.001, 2.0, -0.5, 0.0, 0.0, (), ())
+    values = quantities([Cycle(500, 0, 0, int(Label.MEASURE), 500, found, None)], "measured", s)
+    assert values is not None
+    assert values.eta_d == pytest.approx(0.003 / s.u_star_m)
+    assert values.eta_a == pytest.approx(1.25 / s.a_star_m_s2)
 
 
 def test_drift_has_a_sign_and_spread_has_none() -> None:

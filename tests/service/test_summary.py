@@ -1,4 +1,4 @@
-"""summary.json: the keys of contracts.md, strict JSON, and what it says when something is missing."""
+"""summary.json: the keys of contracts.md, strict JSON, and what it says of what is missing."""
 
 import json
 import math
@@ -36,11 +36,13 @@ title = "Two frequencies, up and back"
 mass_kg = 550.0
 gap_mm = 4.0
 [sweep]
-start_hz = 3.4
+start_hz = 2.6
 stop_hz = 4.4
-step_hz = 1.0
+step_hz = 1.8
 cycles = 4
 measured_cycles = 2
+[acquisition]
+rate_hz = 1000.0
 """
 CELLS = ("force_r1_n", "force_r2_n", "force_l1_n", "force_l2_n")
 
@@ -112,7 +114,7 @@ def test_the_keys_of_the_contract(recording: Recording, bundle: Bundle, tmp_path
     assert summary["a_star_m_s2"] == pytest.approx(2.057, abs=1e-3)
     assert summary["run"]["id"] == "two"
     assert summary["run"]["samples"] == recording.stop.index
-    assert summary["run"]["duration_s"] == recording.stop.index / 2000
+    assert summary["run"]["duration_s"] == recording.stop.index / 1000
     assert "continuous in frequency" in summary["run"]["normalisation"]
     assert summary["timing"]["latency_ms"] == {"p50": 1.5, "p99": 4.0, "max": 9.0}
     assert summary["timing"]["missed_deadlines"] == 2
@@ -168,8 +170,8 @@ def test_nrmse_is_that_of_the_samples(recording: Recording, bundle: Bundle) -> N
     found = summarise(recording, bundle.parameters)["comparison"]
     measured, predicted = recording.pieces("meas")[0], recording.pieces("pred")[0]
     u = measured.channel("mass_disp_m") - measured.channel("table_disp_m")
-    # comparisons know whole cells of 20 samples; the first restart is at 500
-    cells = slice(520, 20 * (len(measured) // 20))
+    # comparisons know whole cells of 20 samples; the first restart is at 250
+    cells = slice(260, 20 * (len(measured) // 20))
     for name in COMPARED:
         x = (u if name == "rel_disp_m" else measured.channel(name))[cells]
         for track, key in (("window", "nrmse"), ("free", "free_nrmse")):
@@ -238,7 +240,7 @@ def test_a_dead_twin_leaves_what_was_measured(
 ) -> None:
     """Dead over the second step: its measured part is made from the samples, its twin is null."""
     cycles = {one.step: one for one in recording.of(Cycle)}
-    dead = (cycles[0].index + 500, cycles[1].index + 100)
+    dead = (cycles[0].index + 250, cycles[1].index + 100)
     fault = Fault(dead[1], "twin", *dead, "the process died and was restarted")
     kept = [
         one
@@ -257,7 +259,7 @@ def test_a_dead_twin_leaves_what_was_measured(
 
 
 def test_a_stopped_run_without_a_point(bundle: Bundle, tmp_path: Path) -> None:
-    play_unpaced(bundle, "two", tmp_path / "run.mcap", lambda: "stop", lambda item: None)
+    play_unpaced(bundle, "two", tmp_path / "run.mcap", lambda: "asked to stop", lambda item: None)
     recording = read(tmp_path / "run.mcap")
     assert not recording.of(Point)
     summary = summary_of(list(recording.items), recording, bundle, tmp_path)
@@ -270,11 +272,11 @@ def test_a_stopped_run_without_a_point(bundle: Bundle, tmp_path: Path) -> None:
 def test_a_recording_without_an_end_says_so(
     recording: Recording, bundle: Bundle, tmp_path: Path
 ) -> None:
-    kept = [one for one in without(recording, RunStop) if one.index < 6000]
+    kept = [one for one in without(recording, RunStop) if one.index < 3000]
     summary = summary_of(kept, recording, bundle, tmp_path)
     assert summary["verdict"] == "halted"
     assert summary["reason"] == "the recording ends without a stop record"
-    assert summary["run"]["samples"] == 6000
+    assert summary["run"]["samples"] == 3000
     assert summary["run"]["duration_s"] == 3.0
     assert summary["lost_samples"] == 0
 
@@ -291,12 +293,12 @@ def test_a_recording_of_its_start_alone(
 def test_gaps_and_lost_samples_are_counted(
     recording: Recording, bundle: Bundle, tmp_path: Path
 ) -> None:
-    gaps: list[Record] = [Gap(3000, 5, "mass_disp_m", "lost"), Gap(4000, 2, "", "clipped")]
+    gaps: list[Record] = [Gap(1500, 5, "mass_disp_m", "lost"), Gap(2000, 2, "", "clipped")]
     assert summary_of([*recording.items, *gaps], recording, bundle, tmp_path)["gaps"] == 2
     kept = [
         one
         for one in recording.items
-        if not (isinstance(one, Block) and one.stream == "meas" and 3000 <= one.index < 3100)
+        if not (isinstance(one, Block) and one.stream == "meas" and 1500 <= one.index < 1600)
     ]
     (tmp_path / "holed").mkdir()
     summary = summary_of(kept, recording, bundle, tmp_path / "holed")

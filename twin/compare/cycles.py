@@ -41,6 +41,16 @@ class Scale:
         basis = np.array([np.ones_like(x), x, x * x])
         return np.asarray(np.linalg.solve(basis @ basis.T, basis)[0])
 
+    @property
+    def lead(self) -> int:
+        """Samples before a cycle that its extremes need: what the parabola cannot see of it.
+
+        Without them a peak at the cut between two cycles is lost to both (3 % at 5 Hz). All of
+        them lie before the cycle, so that it is finished when its last sample is there: what is
+        searched is as long as the cycle and ends half a parabola earlier.
+        """
+        return self.weights.size - 1
+
 
 def smooth(x: Float1D, weights: Float1D) -> Float1D:
     """Running least-squares parabola of x, (sample,), shorter by the ends that it cannot see."""
@@ -81,12 +91,13 @@ UNKNOWN: Touching = (None, None)
 
 
 def extremes(
-    motion: Motion, first: int, scale: Scale, touching: Touching
+    motion: Motion, first: int, scale: Scale, touching: Touching, lead: int = 0
 ) -> tuple[Extremes | None, Touching]:
     """(extremes of one cycle whose first sample is `first`, contact state after it).
 
-    None where the displacement has lost samples. The extremes of an acceleration or a force that
-    has lost some are NaN; contact at a lost sample is what it was before.
+    The first `lead` samples of the motion come before the cycle, see `Scale.lead`. None where the
+    displacement has lost samples. The extremes of an acceleration or a force that has lost some are
+    NaN; contact at a lost sample is what it was before.
     """
     if not np.isfinite(motion.u).all():
         return None, UNKNOWN
@@ -96,7 +107,7 @@ def extremes(
     after: list[bool | None] = []
     for force, was in ((motion.right, touching[0]), (motion.left, touching[1])):
         forces.append(float(smooth(force, scale.weights).max()))
-        places, now = onsets(force, scale.contact_n, was)
+        places, now = onsets(force[lead:], scale.contact_n, was)
         begins.append(tuple(first + place for place in places))
         after.append(now)
     return Extremes(

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from table_io.block import Block, Float1D, Label
+from table_io.block import Block, Float1D, Label, join
 from table_io.channels import contact_forces, rel_disp
 from table_io.profile import Profile
 from table_io.records import Cycle, Event, Params, Point, Record, Step
@@ -18,6 +18,7 @@ from twin.compare.cycles import UNKNOWN, Motion, Scale, Touching, extremes, poin
 from twin.compare.windows import Tracks, TwinSetup, begin, follow
 from twin.model.parameters import Parameters, resonance
 
+Piece = tuple[Block, Block]  # the same samples measured and predicted
 SHORT = 3  # samples by which a held cycle may miss its length and still be whole
 
 
@@ -33,11 +34,16 @@ class Setup:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """Before sample `tracks.index`. `held` are the pieces of the unfinished held cycle."""
+    """Before sample `tracks.index`. `held` are the pieces of the unfinished held cycle.
+
+    Pieces are (measured, predicted); the first one holds what leads up to the cycle too.
+    """
 
     tracks: Tracks
     key: tuple[int, int] | None = None  # (step, cycle) of the last sample seen; None = unknown
-    held: tuple[tuple[Block, Block], ...] = ()
+    recent: Piece | None = None  # the last samples seen, as many as lead up to a cycle
+    first: int = 0  # sample at which the held cycle began
+    held: tuple[Piece, ...] = ()
     cycles: tuple[Cycle, ...] = ()  # of the step under way
     base_acc: tuple[Float1D, ...] = ()  # of its measured cycles
     touching: tuple[Touching, Touching] = (UNKNOWN, UNKNOWN)  # measured, twin
@@ -77,6 +83,7 @@ def step(setup: Setup, state: State, block: Block) -> tuple[State, list[Block | 
     tracks, predicted, comparisons = follow(setup.twin, state.tracks, block)
     items: list[Block | Record] = [predicted, *comparisons]
     state = replace(state, tracks=tracks)
+    known = _joined(state.recent, (block, predicted))
     changes = np.flatnonzero(np.diff(block.step) | np.diff(block.cycle)) + 1
     edges = [0, *changes.tolist(), len(block)]
     for first, last in pairwise(edges):
@@ -84,14 +91,23 @@ def step(setup: Setup, state: State, block: Block) -> tuple[State, list[Block | 
         if key != state.key:
             state, made = _finish(setup, state, key)
             items.extend(made)
-        if key[1] >= 0 and (state.held or _begins(state, key)):
-            piece = (
-                block.cut(block.index + first, block.index + last),
-                predicted.cut(block.index + first, block.index + last),
-            )
-            state = replace(state, held=(*state.held, piece))
+        at, end = block.index + first, block.index + last
+        if key[1] >= 0 and state.held:
+            state = replace(state, held=(*state.held, _cut(known, at, end)))
+        elif key[1] >= 0 and _begins(state, key):
+            state = replace(state, first=at, held=(_cut(known, at - setup.scale.lead, end),))
         state = replace(state, key=key)
-    return state, items
+    return replace(state, recent=_cut(known, block.end - setup.scale.lead, block.end)), items
+
+
+def _joined(before: Piece | None, new: Piece) -> Piece:
+    return new if before is None else (join([before[0], new[0]]), join([before[1], new[1]]))
+
+
+def _cut(piece: Piece, first: int, end: int) -> Piece:
+    """The samples first .. end - 1 of a piece, as far as it has them."""
+    first = max(first, piece[0].index)
+    return piece[0].cut(first, end), piece[1].cut(first, end)
 
 
 def _begins(state: State, key: tuple[int, int]) -> bool:
@@ -111,7 +127,7 @@ def _finish(setup: Setup, state: State, key: tuple[int, int]) -> tuple[State, li
     return state, items
 
 
-def _motions(held: tuple[tuple[Block, Block], ...]) -> tuple[Motion, Motion]:
+def _motions(held: tuple[Piece, ...]) -> tuple[Motion, Motion]:
     """(measured, free twin) motion over the pieces of a cycle."""
 
     def whole(columns: list[Float1D]) -> Float1D:
@@ -137,19 +153,21 @@ def _motions(held: tuple[tuple[Block, Block], ...]) -> tuple[Motion, Motion]:
 
 def _cycle(setup: Setup, state: State, step: int, number: int) -> tuple[State, list[Record]]:
     """The finished cycle, unless it was cut short by a stop."""
-    first, end = state.held[0][0].index, state.held[-1][0].end
+    first, end = state.first, state.held[-1][0].end
     length = setup.twin.rate_hz / setup.steps[step].frequency_hz
     held, state = state.held, replace(state, held=())
     if end - first < length - SHORT:
         return state, []
     measured, twin = _motions(held)
-    from_measured, touch_m = extremes(measured, first, setup.scale, state.touching[0])
-    from_twin, touch_t = extremes(twin, first, setup.scale, state.touching[1])
-    label = int(held[0][0].label[0])
+    lead = first - held[0][0].index
+    from_measured, touch_m = extremes(measured, first, setup.scale, state.touching[0], lead)
+    from_twin, touch_t = extremes(twin, first, setup.scale, state.touching[1], lead)
+    label = int(held[0][0].label[lead])
     cycle = Cycle(end, step, number, label, end - first, from_measured, from_twin)
     base_acc = state.base_acc
     if label == Label.MEASURE:
-        base_acc = (*base_acc, *(block.channel("table_acc_m_s2") for block, _ in held))
+        table = np.concatenate([block.channel("table_acc_m_s2") for block, _ in held])
+        base_acc = (*base_acc, table[lead:])
     return replace(
         state, cycles=(*state.cycles, cycle), base_acc=base_acc, touching=(touch_m, touch_t)
     ), [cycle]

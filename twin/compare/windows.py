@@ -92,9 +92,16 @@ def _bumper(
     """(deformation magnitude in m, in contact) of one bumper at the last sample.
 
     `depth` is the mass's position beyond the bumper's undeformed face, `force` >= 0 its load cells.
-    In contact the deformation is the depth; since release it has relaxed exponentially.
+    In contact the deformation is the depth; since release it has relaxed exponentially. Without
+    load cells it is the larger of the two at any time, because no force pulls: F >= 0 is
+    u_j' >= -(K/C) u_j.
     """
-    touching = np.where(np.isnan(force), depth > 0.0, force > setup.contact_n)
+    if np.isnan(force).any():
+        age = np.arange(depth.size - 1, -1, -1) / setup.rate_hz
+        left = np.maximum(depth, 0.0) * np.exp(-age * stiffness / damping)
+        most = int(np.nanargmax(left))
+        return float(left[most]), bool(most == depth.size - 1 and left[most] > 0.0)
+    touching = force > setup.contact_n
     if touching[-1]:
         return float(depth[-1]), True
     places = np.flatnonzero(touching)

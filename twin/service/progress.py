@@ -91,8 +91,8 @@ def _eta(values: Quantities | None) -> str:
 
 def _impacts(values: Quantities | None) -> str:
     """Mean impacts per cycle, right/left."""
-    if values is None or not values.impacts_right:
-        return "-"
+    if values is None or not values.impacts_right or not values.impacts_left:
+        return "-"  # a side whose load cells are lost counts nothing
     right = sum(values.impacts_right) / len(values.impacts_right)
     left = sum(values.impacts_left) / len(values.impacts_left)
     return f"{right:.3g}/{left:.3g}"
