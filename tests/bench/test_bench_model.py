@@ -11,8 +11,11 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from twin.model import exact
+from twin.model.model import Model
 from twin.model.parameters import Parameters
+from twin.model.solver import Solver
 from twin.model.sweep import stepped_sine
+from twin.service.batch import at_gaps, batch
 
 AG, FREQUENCY, CYCLES, RATE = 0.05 * 9.80665, 3.4, 10, 2000.0
 G4 = Parameters(550.0, 36e3, 1100.0, 510e3, 900.0, 510e3, 900.0, 2e-3, 2e-3)
@@ -84,3 +87,58 @@ def test_sweep_of_the_paper_at_g4(benchmark):
     sweep = benchmark(stepped_sine, G4, frequencies, AG, 10)
     assert np.isfinite(sweep.extremes).all()
     compare(benchmark, float(np.sum(10 / frequencies)))
+
+
+def shaken(model: Model, seconds: float = 10.0) -> tuple[Solver, np.ndarray, np.ndarray]:
+    base = AG * np.sin(2 * math.pi * 2.6 * np.arange(1, round(seconds * RATE) + 1) / RATE)
+    return model.prepare(RATE), base, np.empty((7, base.size))
+
+
+EFFECTS = {
+    "linear": {"maxwell_damper": {"k1": 8e3, "tau": 0.05}},
+    "forces": {"bouc_wen": {"force": 150.0, "yield_displacement": 3e-3},
+               "bumper_hardening": {"k2": 1e8}},
+}  # fmt: skip
+
+
+@pytest.mark.benchmark(group="model")
+@pytest.mark.parametrize("kind", EFFECTS)
+def test_sampled_driver_with_effects(benchmark, kind):
+    model = Model(G4)
+    for effect, values in EFFECTS[kind].items():
+        model = model.with_effect(effect, **values)
+    solver, base, out = shaken(model)
+    benchmark(lambda: solver.advance(solver.rest(), base, base, out))
+    assert np.isfinite(out).all()
+    if benchmark.stats is None:
+        return
+    nanoseconds = benchmark.stats.stats.min / base.size * 1e9
+    plain, _, _ = shaken(Model(G4))
+    begin = time.perf_counter()
+    plain.advance(plain.rest(), base, base, out)
+    ratio = nanoseconds / ((time.perf_counter() - begin) / base.size * 1e9)
+    benchmark.extra_info["ns_a_sample"] = round(nanoseconds)
+    print(f"\n{nanoseconds:.0f} ns a sample, {ratio:.0f} times the SNM")
+
+
+@pytest.mark.benchmark(group="batch")
+def test_batch_on_all_cores(benchmark):
+    up = np.arange(5, 51) / 10
+    frequencies = np.concatenate([up, up[::-1]])
+    models = at_gaps(Model(G4), np.linspace(2e-3, 0.03, 64))
+    batch(models[:2], frequencies, AG, 10)
+    benchmark(batch, models, frequencies, AG, 10)
+    if benchmark.stats is None:
+        return
+    one = min(_seconds(models, frequencies) for _ in range(3))
+    ratio = one / benchmark.stats.stats.min
+    benchmark.extra_info["cores_ratio"] = round(ratio, 2)
+    print(
+        f"\n{len(models) / one:.0f} sweeps a second on one core; all cores {ratio:.2f} times that"
+    )
+
+
+def _seconds(models: list[Model], frequencies: np.ndarray) -> float:
+    begin = time.perf_counter()
+    batch(models, frequencies, AG, 10, cores=1)
+    return time.perf_counter() - begin

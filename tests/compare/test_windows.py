@@ -13,6 +13,7 @@ from table_io.records import Comparison
 from twin.compare import COMPARED, PREDICTED_CHANNELS
 from twin.compare.windows import HISTORY_S, Tracks, TwinSetup, begin, follow, measured_state
 from twin.model.exact import OUTPUTS, advance, constants, rest, restart
+from twin.model.model import Model
 from twin.model.parameters import Parameters
 from twin.stream.wire import encode
 
@@ -72,7 +73,7 @@ def spoilt(block: Block, channel: str, first: int, last: int) -> Block:
 
 
 def twin(parameters: Parameters = G4, window: int = 500, grid: int = 20) -> TwinSetup:
-    return TwinSetup(parameters, RATE, window, grid, 10.0)
+    return TwinSetup(Model(parameters), RATE, window, grid, 10.0)
 
 
 def followed(

@@ -1,6 +1,6 @@
 """numba's cache key: a kernel must not outlive a change in a module it calls into."""
 
-from twin.model import phase, sampled, sweep
+from twin.model import orbit, phase, sampled, sweep
 from twin.model.compiled import compiled, revision
 
 
@@ -21,11 +21,11 @@ def test_revision_of_the_phase_is_part_of_every_cache_key():
     assert revision({k: v for k, v in vars(phase).items() if k != "REVISION"}) == phase.REVISION
     cached = {
         kernel
-        for module in (phase, sampled, sweep)
+        for module in (orbit, phase, sampled, sweep)
         for kernel in vars(module).values()
         if hasattr(kernel, "py_func") and kernel.stats.cache_path is not None
     }
     # `flow` calls nothing.
-    assert cached == {sampled.march, sweep.stepped, phase.flow}
-    for kernel in (sampled.march, sweep.stepped):
+    assert cached == {sampled.march, sweep.stepped, orbit.turns, phase.flow}
+    for kernel in (sampled.march, sweep.stepped, orbit.turns):
         assert str(phase.REVISION) in str(kernel.signatures)

@@ -16,7 +16,8 @@ from table_io.records import Cycle, Event, Params, Point, Record, Step
 from twin.compare.curves import sudden
 from twin.compare.cycles import UNKNOWN, Motion, Scale, Touching, extremes, point
 from twin.compare.windows import Tracks, TwinSetup, begin, follow
-from twin.model.parameters import Parameters, resonance
+from twin.model.model import Model
+from twin.model.parameters import resonance
 
 Piece = tuple[Block, Block]  # the same samples measured and predicted
 SHORT = 3  # samples by which a held cycle may miss its length and still be whole
@@ -51,28 +52,29 @@ class State:
 
 
 def prepare(
-    profile: Profile, parameters: Parameters, steps: tuple[Step, ...], from_rest: bool = False
+    profile: Profile, model: Model, steps: tuple[Step, ...], from_rest: bool = False
 ) -> Setup:
-    """The setup of a run. u* and a* are the model's free-flight maxima, continuous in frequency."""
+    """The setup of a run. u* and a* are the free-flight maxima, continuous in frequency, of the
+    model's linear part: one scale, whatever the effects on top of it."""
     rate = profile.acquisition.rate_hz
     level = max(step.acceleration_m_s2 for step in steps)
-    u_star, a_star, _ = resonance(parameters, level)
+    u_star, a_star, _ = resonance(model.parameters, level)
     contact_n = profile.comparison.contact_n
     twin = TwinSetup(
-        parameters,
+        model,
         rate,
         round(profile.comparison.window_s * rate),
         profile.acquisition.block_samples,
         contact_n,
         from_rest,
     )
-    scale = Scale(parameters, rate, contact_n, u_star, a_star)
+    scale = Scale(model.parameters, rate, contact_n, u_star, a_star)
     return Setup(twin, scale, steps, profile.sweep.measured_cycles)
 
 
 def start(setup: Setup, index: int = 0) -> tuple[State, list[Record]]:
     """The state of a twin that starts at sample `index`, and the parameters it starts with."""
-    params = Params(index, setup.twin.parameters.as_dict(), "start")
+    params = Params(index, setup.twin.model.flat(), "start")
     return State(begin(setup.twin, index)), [params]
 
 

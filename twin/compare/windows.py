@@ -13,29 +13,39 @@ import numpy as np
 from table_io.block import Block, Float1D, Float2D
 from table_io.channels import contact_forces, rel_disp
 from table_io.records import Comparison
-from twin.compare import COMPARED, PREDICTED
-from twin.model.exact import advance, constants, rest, restart
+from twin.compare import COMPARED, PREDICTED, TRACKS
+from twin.compare.sensors import corrected, kept, memory, read
+from twin.model.model import Model
 from twin.model.parameters import Parameters
+from twin.model.solver import OUTPUTS, Solver, Start
 
 HISTORY_S = 0.1  # of measured motion, from which a restart takes u and u'
 MEMORY = 8.0  # relaxation times of a bumper after which it has forgotten a contact
-OUTPUTS = 7  # rows of the solver: u, v, a, F_R, F_L, u_r, u_l
 
 
 @dataclass(frozen=True)
 class TwinSetup:
     """What the twin is and how it is compared; `from_rest` where there is nothing measured."""
 
-    parameters: Parameters
+    model: Model
     rate_hz: float
     window: int  # samples
     grid: int  # samples a Comparison covers
     contact_n: float
     from_rest: bool = False
 
+    @property
+    def parameters(self) -> Parameters:
+        return self.model.parameters
+
     @cached_property
-    def constants(self) -> Float1D:
-        return constants(self.parameters, self.rate_hz)
+    def solver(self) -> Solver:
+        return self.model.prepare(self.rate_hz)
+
+    @cached_property
+    def delay(self) -> int:
+        """Samples of the past that the sensors' lags need."""
+        return memory(self.model.sensors, self.rate_hz)
 
     @cached_property
     def history(self) -> int:
@@ -49,20 +59,24 @@ class TwinSetup:
 
 @dataclass(frozen=True, slots=True)
 class Tracks:
-    """State of both twins before sample `index`; `past` holds u, a - A, A, F_R, F_L (5, n)."""
+    """State of both twins before sample `index`; `past` holds u, a - A, A, F_R, F_L (5, n).
+
+    `late` are the last rows of the prediction before the sensors, as far as a lag looks back.
+    """
 
     index: int
     free: Float1D | None
     window: Float1D | None
     past: Float2D
     squares: Float2D  # (3, channel, sample) of the grid cell that is not full yet
+    late: Float2D
 
 
 def begin(setup: TwinSetup, index: int) -> Tracks:
     """Tracks that know nothing yet and start at sample `index`."""
-    free = rest(setup.parameters) if setup.from_rest else None
+    free = setup.solver.rest(index - 1) if setup.from_rest else None
     nothing = np.empty((3, len(COMPARED), 0))
-    return Tracks(index, free, None, np.empty((5, 0)), nothing)
+    return Tracks(index, free, None, np.empty((5, 0)), nothing, np.empty((len(PREDICTED), 0)))
 
 
 def measured_state(u: Float1D, relative_acc: Float1D, rate_hz: float) -> tuple[float, float]:
@@ -98,7 +112,7 @@ def _bumper(
     """
     if np.isnan(force).any():
         age = np.arange(depth.size - 1, -1, -1) / setup.rate_hz
-        left = np.maximum(depth, 0.0) * np.exp(-age * stiffness / damping)
+        left = np.maximum(depth, 0.0) * _memory(age, stiffness, damping)
         most = int(np.nanargmax(left))
         return float(left[most]), bool(most == depth.size - 1 and left[most] > 0.0)
     touching = force > setup.contact_n
@@ -108,31 +122,51 @@ def _bumper(
     if not places.size:
         return 0.0, False
     elapsed = (depth.size - 1 - places[-1]) / setup.rate_hz
-    return float(max(depth[places[-1]], 0.0) * np.exp(-elapsed * stiffness / damping)), False
+    left = max(depth[places[-1]], 0.0) * _memory(np.array(elapsed), stiffness, damping)
+    return float(left), False
 
 
-def _restarted(setup: TwinSetup, past: Float2D) -> Float1D | None:
-    """The model's state at the last sample of the measured past; None where that is not known."""
+def _memory(age: Float1D, stiffness: float, damping: float) -> Float1D:
+    """What is left of a deformation after `age` s; nothing of one without a dashpot."""
+    if damping == 0.0:
+        return np.where(age > 0.0, 0.0, 1.0)
+    return np.exp(-age * stiffness / damping)
+
+
+def _restarted(
+    setup: TwinSetup, past: Float2D, index: int, table_disp: float, hidden: Float1D | None
+) -> Float1D | None:
+    """The model's state at sample `index`, the last one of the past; None where it is not known.
+
+    What no sensor sees (branch forces, hysteresis) goes on from the state `hidden`: that of the
+    windowed twin, whose motion is the nearest to the measured one, else of the free one, else
+    relaxed.
+    """
     u, relative_acc, base_acc, force_r, force_l = past
     recent = round(HISTORY_S * setup.rate_hz)
     if u.size < setup.history or not np.isfinite(past[:3, -recent:]).all():
         return None
-    p = setup.parameters
+    p, opened = setup.parameters, setup.model.opened(index / setup.rate_hz)
+    gap_r, gap_l = p.gap_r + opened, p.gap_l + opened
     u0, v0 = measured_state(u[-recent:], relative_acc[-recent:], setup.rate_hz)
-    u_r, touch_r = _bumper(setup, u - p.gap_r, force_r, p.bumper_stiffness_r, p.bumper_damping_r)
-    u_l, touch_l = _bumper(setup, -u - p.gap_l, -force_l, p.bumper_stiffness_l, p.bumper_damping_l)
-    return restart(u0, v0, u_r, -u_l, touch_r, touch_l, float(base_acc[-1]), p)
+    u_r, touch_r = _bumper(setup, u - gap_r, force_r, p.bumper_stiffness_r, p.bumper_damping_r)
+    u_l, touch_l = _bumper(setup, -u - gap_l, -force_l, p.bumper_stiffness_l, p.bumper_damping_l)
+    base = float(base_acc[-1])
+    start = Start(index, u0, v0, u_r, -u_l, touch_r, touch_l, base, table_disp, hidden)
+    return setup.solver.restart(start)
 
 
 def _lost(state: Float1D | None) -> bool:
     return state is None or bool(np.isnan(state).any())
 
 
-def _run(state: Float1D | None, setup: TwinSetup, base_acc: Float1D) -> Float2D:
+def _run(
+    state: Float1D | None, setup: TwinSetup, base_acc: Float1D, table_disp: Float1D
+) -> Float2D:
     """The solver's rows (7, sample); moves `state` on."""
     out = np.full((OUTPUTS, base_acc.size), np.nan)
     if state is not None:
-        advance(state, setup.constants, base_acc, out)
+        setup.solver.advance(state, base_acc, table_disp, out)
     return out
 
 
@@ -151,13 +185,11 @@ def follow(
     if block.index != tracks.index:
         tracks = begin(setup, block.index)
     base_acc = np.ascontiguousarray(block.channel("table_acc_m_s2"))
-    u = rel_disp(block)
-    force_r, force_l = contact_forces(block)
-    relative = (
-        block.channel("mass_acc_m_s2") - base_acc
-        if "mass_acc_m_s2" in block.channels
-        else np.full(n, np.nan)
-    )
+    table_disp = _column(block, "table_disp_m")
+    true = corrected(setup.model.sensors, block)
+    u = rel_disp(true)
+    force_r, force_l = contact_forces(true)
+    relative = _column(true, "mass_acc_m_s2") - base_acc
     past = np.concatenate([tracks.past, [u, relative, base_acc, force_r, force_l]], axis=1)
     before = tracks.past.shape[1]
 
@@ -170,21 +202,21 @@ def follow(
     for end in ends:
         if start == end:
             continue
-        free_out.append(_run(free, setup, base_acc[start:end]))
-        window_out.append(_run(window, setup, base_acc[start:end]))
+        drive = base_acc[start:end], table_disp[start:end]
+        free_out.append(_run(free, setup, *drive))
+        window_out.append(_run(window, setup, *drive))
         if (block.index + end - 1) % setup.window == 0 and not setup.from_rest:
-            measured = _restarted(
-                setup, past[:, max(before + end - setup.history, 0) : before + end]
-            )
+            known = past[:, max(before + end - setup.history, 0) : before + end]
+            hidden = free if _lost(window) else window
+            index, displaced = block.index + end - 1, float(table_disp[end - 1])
+            measured = _restarted(setup, known, index, displaced, hidden)
             window = None if measured is None else measured.copy()
             if _lost(free):
                 free = measured
         start = end
-    table_disp = (
-        block.channel("table_disp_m") if "table_disp_m" in block.channels else np.full(n, np.nan)
-    )
     tracks_out = (np.concatenate(out, axis=1) for out in (free_out, window_out))
-    values = np.array([row for out in tracks_out for row in _channels(out, table_disp)])
+    exact = np.array([row for out in tracks_out for row in _channels(out, table_disp)])
+    values = _read(setup, block, exact, tracks.late)
     predicted = Block(
         "pred", block.index, block.rate_hz, PREDICTED, values, block.step, block.label, block.cycle
     )
@@ -196,21 +228,39 @@ def follow(
         window=window,
         past=past[:, max(past.shape[1] - setup.history, 0) :],
         squares=squares,
+        late=kept(exact, tracks.late, setup.delay),
     )
     return after, predicted, comparisons
 
 
+def _column(block: Block, name: str) -> Float1D:
+    """A channel, NaN where it is missing."""
+    return block.channel(name) if name in block.channels else np.full(len(block), np.nan)
+
+
+def _read(setup: TwinSetup, block: Block, values: Float2D, late: Float2D) -> Float2D:
+    """The predicted rows as the model's sensors read them.
+
+    Where u is measured as the difference of two sensors, so is the predicted one.
+    """
+    sensors = setup.model.sensors
+    if not sensors:
+        return values
+    readings = read(sensors, setup.rate_hz, PREDICTED, values, late)
+    if "rel_disp_m" not in block.channels and any(s.channel == "mass_disp_m" for s in sensors):
+        for track in TRACKS:
+            total = readings[PREDICTED.index(f"{track}/mass_disp_m")]
+            readings[PREDICTED.index(f"{track}/rel_disp_m")] = total - _column(
+                block, "table_disp_m"
+            )
+    return readings
+
+
 def _measured(block: Block) -> Float2D:
     """The compared channels of a measured block, NaN rows where one is missing."""
-    rows = [
-        rel_disp(block)
-        if name == "rel_disp_m"
-        else block.channel(name)
-        if name in block.channels
-        else np.full(len(block), np.nan)
-        for name in COMPARED
-    ]
-    return np.array(rows)
+    return np.array(
+        [rel_disp(block) if name == "rel_disp_m" else _column(block, name) for name in COMPARED]
+    )
 
 
 _ROWS = [[PREDICTED.index(f"{track}/{name}") for name in COMPARED] for track in ("free", "window")]

@@ -81,7 +81,9 @@ def parameter_constants(parameters: Parameters) -> Float1D:
         p.bumper_stiffness_l,
         p.bumper_damping_l,
     )
-    con[MASS], con[R_R], con[R_L] = p.mass, kr / cr, kl / cl
+    con[MASS] = p.mass
+    # Without a dashpot the face does not move by itself: released at u_j = 0 it is where it stays.
+    con[R_R], con[R_L] = kr / cr if cr > 0 else 0.0, kl / cl if cl > 0 else 0.0
     con[K_R], con[K_L], con[C_R], con[C_L], con[G_R], con[G_L] = kr, kl, cr, cl, p.gap_r, p.gap_l
     for mode in range(4):
         right, left = mode & 1, mode >> 1
@@ -111,7 +113,8 @@ def constants(parameters: Parameters, rate_hz: float) -> Float1D:
     parts = substeps(con, 1 / rate_hz)
     step = 1 / (rate_hz * parts)
     con[STEP], con[SUBSTEPS] = step, parts
-    con[E_R], con[E_L] = math.exp(-con[R_R] * step), math.exp(-con[R_L] * step)
+    for e, r in ((E_R, R_R), (E_L, R_L)):
+        con[e] = math.exp(-con[r] * step) if con[r] > 0 else 0.0
     for b in range(MODES, CONSTANTS_SIZE, MODE_SIZE):
         con[b + 5 : b + 9] = flow(step, con[b + 3], con[b + 4])
     return con

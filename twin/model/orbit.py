@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from numba import float64, int64, types
 
 from table_io.block import Float1D, Float2D
@@ -34,15 +35,15 @@ from twin.model.phase import (
 )  # fmt: skip
 from twin.model.sweep import stepped_sine
 
+Complex1D = npt.NDArray[np.complex128]
+
 LEAST_STEPS = 16  # a cycle
 MOST_ONSETS = 40  # a cycle and side that `onsets` makes room for
 EXACT = 1e-13  # m: a state that comes back this near is periodic
 
 
 @compiled()
-def carry(
-    variations: Float2D, con: Float1D, mode: int, dt: float, side: int, onset: bool
-) -> None:
+def carry(variations: Float2D, con: Float1D, mode: int, dt: float, side: int, onset: bool) -> None:
     """Moves `variations` (4, n) through dt s of a mode and the event on `side` at its end."""
     b = MODES + mode * MODE_SIZE
     e11, e12, e21, e22 = flow(dt, con[b + 3], con[b + 4])
@@ -133,9 +134,7 @@ def period_map(
     for side in range(2):
         if state[CONTACT_R + side] > 0:  # slaved to u: it cannot vary on its own
             jacobian[2 + side] = jacobian[0]
-    moved, _ = _turn(
-        parameters, frequency_hz, acceleration, state, 1, jacobian, _NONE, _NO_LOG
-    )
+    moved, _ = _turn(parameters, frequency_hz, acceleration, state, 1, jacobian, _NONE, _NO_LOG)
     return moved, jacobian
 
 
@@ -172,7 +171,7 @@ class Orbit:
 
     frequency_hz: float
     state: Float1D
-    multipliers: Float1D
+    multipliers: Complex1D
     u_max: float
     u_min: float
 
@@ -194,13 +193,14 @@ def periodic(
         if np.abs(error).max() < EXACT:
             break
         try:
-            x = state[:4] - np.linalg.solve(jacobian - np.eye(4), error)
+            u, v, u_r, u_l = state[:4] - np.linalg.solve(jacobian - np.eye(4), error)
         except np.linalg.LinAlgError:
             return None
-        state = restart(*x, bool(moved[CONTACT_R] > 0), bool(moved[CONTACT_L] > 0), 0.0, parameters)
+        right, left = bool(moved[CONTACT_R] > 0), bool(moved[CONTACT_L] > 0)
+        state = restart(u, v, u_r, u_l, right, left, 0.0, parameters)
     else:
         return None
-    multipliers = np.linalg.eigvals(jacobian)
+    multipliers = np.linalg.eigvals(jacobian).astype(np.complex128)
     multipliers = multipliers[np.argsort(-np.abs(multipliers))]
     cycle = stepped_sine(parameters, [frequency_hz], acceleration, 1, LEAST_STEPS, state)
     top, bottom = cycle.column("u_max")[0, 0], cycle.column("u_min")[0, 0]

@@ -1,15 +1,11 @@
-"""What the model is made of: `Parameters` in SI, the model card, the free-flight resonance."""
+"""The numbers of the SNM: `Parameters` in SI, and its free-flight resonance."""
 
 import difflib
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 
-from pydantic import Field, model_validator
-
-from table_io.profile import BadInput, Card, Finite, NonNegative, Positive, Specimen
-from twin.model.effects import EFFECTS
-from twin.model.effects.effect import Effect
+from table_io.profile import BadInput
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,6 +13,7 @@ class Parameters:
     """The SNM in SI: kg, N/m, N s/m, m. Gaps at rest, inf = no bumper, negative = precompressed.
 
     M u'' + C u' + K u + F_R + F_L = -M A;  F_j = C_j u_j' + K_j u_j in contact, 0 in flight.
+    C_j = 0 is the bumper without memory: its face is back at once, contact ends at u_j = 0.
     Source: Stefani, De Angelis, Andreaus, Sect. 5.
     """
 
@@ -35,8 +32,8 @@ class Parameters:
             if name.startswith("gap"):
                 if math.isnan(value) or value == -math.inf:
                     raise BadInput(f"{name} = {value}: allowed: m, or inf for no bumper; mend it")
-            elif not math.isfinite(value) or value < 0 or (value == 0 and name != "damping"):
-                allowed = "0 or more" if name == "damping" else "more than 0"
+            elif not math.isfinite(value) or value < 0 or (value == 0 and "damping" not in name):
+                allowed = "0 or more" if "damping" in name else "more than 0"
                 raise BadInput(f"{name} = {value}: allowed: {allowed}, finite, in SI; mend it")
 
     def as_dict(self) -> dict[str, float]:
@@ -60,64 +57,6 @@ def nearest(name: str, known: list[str]) -> str:
     """The hint that ends a message about an unknown name."""
     near = difflib.get_close_matches(name, known, 1, 0.4)
     return f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
-
-
-class Base(Card):
-    """The linear springs and dashpots; both bumpers alike."""
-
-    stiffness_n_m: Positive
-    damping_n_s_m: NonNegative
-    bumper_stiffness_n_m: Positive
-    bumper_damping_n_s_m: Positive
-
-
-class EffectEntry(Card):
-    """One [[effects]] of a model card: an id of `EFFECTS` and a value for each parameter, in SI."""
-
-    id: str
-    parameters: dict[str, Finite] = Field(default_factory=dict)
-
-    @model_validator(mode="after")
-    def _known(self) -> "EffectEntry":
-        ids = [effect.id for effect in EFFECTS]
-        if self.id not in ids:
-            raise BadInput(f"effect {self.id!r} is unknown; {nearest(self.id, ids)}")
-        self.effect.check(self.parameters)
-        return self
-
-    @property
-    def effect(self) -> Effect:
-        return next(effect for effect in EFFECTS if effect.id == self.id)
-
-
-class ModelCard(Card):
-    """A model from models/*.toml: the base and the effects that stand on it."""
-
-    title: str
-    citation: str = ""
-    fitted_on: str = ""
-    base: Base
-    effects: tuple[EffectEntry, ...] = ()
-
-    @model_validator(mode="after")
-    def _once(self) -> "ModelCard":
-        ids = [entry.id for entry in self.effects]
-        twice = sorted({name for name in ids if ids.count(name) > 1})
-        if twice:
-            raise BadInput(f"effects name {', '.join(twice)} more than once; keep one of each")
-        return self
-
-    def parameters(self, specimen: Specimen) -> Parameters:
-        """The model of this specimen: its mass and gaps, this card's base, then each effect."""
-        base = self.base
-        stiffness, damping = base.bumper_stiffness_n_m, base.bumper_damping_n_s_m
-        bumpers = (stiffness, damping, stiffness, damping)
-        result = Parameters(
-            specimen.mass_kg, base.stiffness_n_m, base.damping_n_s_m, *bumpers, *specimen.gaps_m
-        )
-        for entry in self.effects:
-            result = entry.effect.apply(result, entry.parameters)
-        return result
 
 
 def resonance(parameters: Parameters, acceleration: float) -> tuple[float, float, float]:

@@ -13,7 +13,9 @@ from table_io.limits import Margin, margins, refuse
 from table_io.profile import Profile, Rig, find, load, parse
 from table_io.records import RunStart, Step
 from table_io.session import Setup as SessionSetup
-from twin.model.parameters import ModelCard, Parameters
+from twin.model.card import ModelCard
+from twin.model.model import Model
+from twin.model.parameters import Parameters
 
 if TYPE_CHECKING:
     from twin.compare.pipeline import Setup
@@ -28,7 +30,7 @@ class Bundle:
     name: str
     profile: Profile
     rig: Rig
-    parameters: Parameters
+    model: Model
     drive: Drive
     margins: tuple[Margin, ...]
     profile_toml: str
@@ -43,7 +45,12 @@ class Bundle:
         """The twin's setup; importing it compiles its kernels where they are not cached."""
         from twin.compare import pipeline
 
-        return pipeline.prepare(self.profile, self.parameters, self.steps, from_rest)
+        return pipeline.prepare(self.profile, self.model, self.steps, from_rest)
+
+    @property
+    def parameters(self) -> Parameters:
+        """The linear part of the model."""
+        return self.model.parameters
 
     @property
     def steps(self) -> tuple[Step, ...]:
@@ -88,7 +95,7 @@ def from_texts(name: str, profile_toml: str, rig_toml: str, model_toml: str, whe
         name,
         profile,
         rig,
-        card.parameters(profile.specimen),
+        card.model(profile.specimen),
         drive,
         margins(drive, profile, rig),
         profile_toml,

@@ -108,6 +108,20 @@ def prc(
 
 
 @app.command(rich_help_panel=LOOK)
+def paper(
+    out: Out = None,
+    campaign: Annotated[
+        list[Path] | None,
+        typer.Option("--campaign", help="A recording, or a folder of them; may be repeated."),
+    ] = None,
+) -> None:
+    """Every figure of the paper by the model, and where the two agree or depart."""
+    from twin.service.paper.command import paper as command
+
+    command(out, campaign or [])
+
+
+@app.command(rich_help_panel=LOOK)
 def report(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")],
 ) -> None:

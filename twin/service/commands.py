@@ -20,7 +20,7 @@ console = Console()
 VIEW_ADDRESS = "127.0.0.1:9876"
 
 
-def _new_folder(out: Path | None, run: str) -> Path:
+def new_folder(out: Path | None, run: str) -> Path:
     """The folder for results, made; BadInput where it has content or cannot be made."""
     folder = out if out is not None else Path("runs") / run
     try:
@@ -77,7 +77,7 @@ def check(profile: Path, table: str | None, out: Path | None) -> None:
     bundle = read_bundle(profile, table)
     print_plan(console, bundle)
     if out is not None:
-        folder = _new_folder(out, bundle.name)
+        folder = new_folder(out, bundle.name)
         console.print(f"drive drawn: {draw_drive(bundle, folder / 'drive.png')}", soft_wrap=True)
 
 
@@ -95,7 +95,7 @@ def run(
     run_name = run_id(bundle.name)
     if unpaced and bundle.rig.simulated is None:
         raise BadInput(f"--speed max: {bundle.rig.name!r} is not simulated; leave --speed away")
-    folder = _new_folder(out, run_name)
+    folder = new_folder(out, run_name)
     for sentence in warnings(bundle.margins, bundle.rig):
         console.print(f"warning: {sentence}", highlight=False)
     console.print(
@@ -211,7 +211,7 @@ def simulate(profile: Path, model: str | None, out: Path | None, view: bool) -> 
 
     bundle = read_bundle(profile, None, model)
     run_name = run_id(f"{bundle.name}-model")
-    folder = _new_folder(out, run_name)
+    folder = new_folder(out, run_name)
     _compile_once()
     with RunProgress(console, len(bundle.steps), bundle.drive.planned_end) as progress:
         play(bundle, run_name, folder / "run.mcap", progress)
@@ -244,7 +244,7 @@ def replay(log: Path, model: str | None, out: Path | None, speed: str, view: boo
     clock = RealClock() if speed != "max" else ManualClock()
     factor = _factor(speed)
     run_name = run_id(f"{bundle.name}-replay")
-    folder = _new_folder(out, run_name)
+    folder = new_folder(out, run_name)
     _compile_once()
     began = clock.now()
     with RunProgress(console, len(bundle.steps), bundle.drive.planned_end) as progress:

@@ -17,7 +17,8 @@ from table_io.block import Block, Float1D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS, contact_forces, rel_disp
 from table_io.profile import GRAVITY_M_S2, ComparisonCard, Specimen
 from table_io.records import Comparison, Params
-from twin.model.parameters import ModelCard
+from twin.model.card import ModelCard
+from twin.model.model import Model
 from twin.stream.mcap_log import Recording
 
 Summary = dict[str, Any]
@@ -142,10 +143,13 @@ def _model(run: Run) -> dict[str, float]:
     """The model's parameters in SI at the start: as recorded, else by its card; {} if unknown."""
     recorded = run.recording.of(Params)
     if recorded:
-        return recorded[0].values
+        try:
+            return Model.from_flat(recorded[0].values).parameters.as_dict()
+        except ValueError:
+            return recorded[0].values
     try:
         card = ModelCard.model_validate(cards(run.recording.start.model_toml))
-        return card.parameters(run.specimen).as_dict() if run.specimen else {}
+        return card.model(run.specimen).parameters.as_dict() if run.specimen else {}
     except ValueError:
         return {}
 

@@ -13,6 +13,7 @@ from table_io.profile import Profile, parse
 from table_io.records import Comparison, Fault, Gap, Point, Quantities, Timing
 from twin.compare import COMPARED
 from twin.compare.curves import branches
+from twin.model.model import Model
 from twin.model.parameters import Parameters, resonance
 from twin.stream.mcap_log import Recording
 
@@ -71,7 +72,7 @@ def _points(recording: Recording, parameters: Parameters, profile: Profile) -> t
     if recording.of(Fault):
         from twin.compare import pipeline
 
-        setup = pipeline.prepare(profile, parameters, recording.start.steps)
+        setup = pipeline.prepare(profile, Model(parameters), recording.start.steps)
         state, _ = pipeline.start(setup)
         for block in recording.pieces("meas"):
             state, items = pipeline.step(setup, state, block)

@@ -62,8 +62,8 @@ def plugins() -> tuple[Effect, ...]:
             raise BadInput(f"{where}: acts on parameters but has no change; mend the package")
         if effect.acts == "force" and effect.force is None:
             raise BadInput(f"{where}: acts as a force but has none; mend the package")
-        if effect.acts in ("input", "linear"):
-            raise BadInput(f"{where}: acts as {effect.acts!r}, for plug-ins only force, parameters")
+        if effect.acts not in ("parameters", "force"):
+            raise BadInput(f"{where}: acts as {effect.acts!r}; a plug-in: parameters or force")
         found.append(effect)
     return tuple(found)
 

@@ -1,0 +1,227 @@
+"""`Model`: made from a card, checked, flat and back, which path it takes, plug-ins, batches."""
+
+import math
+import subprocess
+import sys
+from importlib import metadata
+
+import numpy as np
+import pytest
+
+from table_io.profile import BadInput, Specimen, parse
+from twin.model.card import ModelCard
+from twin.model.closed import ClosedSolver
+from twin.model.effects import EFFECTS, find_effect
+from twin.model.effects.effect import Effect, EffectParameter
+from twin.model.ideal import swept
+from twin.model.model import Model, Sensor
+from twin.model.solver import Start
+
+from .cases import RATE, drive, everything, having, noisy
+from .reference import AG, snm
+from .test_parameters import CARD
+
+G4 = Specimen(mass_kg=550.0, gap_mm=4.0)
+
+
+def quintic(u: float, v: float, c: tuple[float, ...]) -> float:
+    return c[0] * u**5 + c[1] * v * u * u
+
+
+QUINTIC = Effect(
+    id="quintic_spring",
+    term="k5 u^5 + c u^2 u'",
+    parameters=(
+        EffectParameter("k5", "N/m5", 0.0, 1e14, 0.0, 1e12, "Quintic coefficient."),
+        EffectParameter("c", "N s/m3", 0.0, 1e9, 0.0, 1e7, "Loss with it."),
+    ),
+    acts="force",
+    residual="fifth harmonic",
+    confused_with=("cubic_stiffness",),
+    force=quintic,
+)
+
+
+def cube(u: float, v: float, c: tuple[float, ...]) -> float:
+    return c[0] * u * u * u
+
+
+def plugged(monkeypatch, *effects):
+    """Entry points that load these."""
+
+    class Entry:
+        def __init__(self, effect):
+            self.effect, self.value = effect, "their.module:EFFECT"
+
+        def load(self):
+            if isinstance(self.effect, Exception):
+                raise self.effect
+            return self.effect
+
+    monkeypatch.setattr(metadata, "entry_points", lambda group: [Entry(e) for e in effects])
+
+
+def test_a_plug_in_adds_a_force(monkeypatch):
+    plugged(monkeypatch, QUINTIC)
+    text = CARD + '[[effects]]\nid = "quintic_spring"\nparameters = { k5 = 1e12, c = 1e7 }\n'
+    model = parse(text, ModelCard, "x").model(G4)
+    _, out = drive(model, noisy(0.5))
+    p, (u, v) = snm(), out[:2]
+    force = p.damping * v + p.stiffness * u + out[3] + out[4] + 1e12 * u**5 + 1e7 * v * u * u
+    assert np.abs(p.mass * out[2] + force).max() < 1e-9 * np.abs(force).max()
+    plain = drive(Model(snm()), noisy(0.5))[1]
+    assert np.abs(out[0] - plain[0]).max() > 1e-5
+    with pytest.raises(BadInput, match="did you mean 'quintic_spring'"):
+        find_effect("quintic_sprin")
+
+
+def test_plug_ins_that_repeat_a_built_in_law_agree_with_it_and_keep_apart(monkeypatch):
+    ours = find_effect("cubic_stiffness")
+    theirs = Effect("their_cubic", "k3 u^3", ours.parameters, "force", "x", ("bouc_wen",),
+                    force=cube)  # fmt: skip
+    plugged(monkeypatch, QUINTIC, theirs)
+    one = Model(snm()).with_effect("cubic_stiffness", k3=1e7)
+    two = Model(snm()).with_effect("their_cubic", k3=1e7)
+    assert np.abs(drive(one, noisy(0.5))[1] - drive(two, noisy(0.5))[1])[0].max() < 1e-12
+    three = two.with_effect("quintic_spring", k5=1e12, c=1e7)
+    four = one.with_effect("quintic_spring", k5=1e12, c=1e7)
+    assert np.abs(drive(three, noisy(0.5))[1] - drive(four, noisy(0.5))[1])[0].max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    "effect, says",
+    [
+        (ImportError("no module"), "cannot load: no module"),
+        ("text", "is no Effect but str"),
+        (Effect("x", "x", (), "force", "x", ()), "acts as a force but has none"),
+        (Effect("x", "x", (), "linear", "x", ()), "a plug-in: parameters or force"),
+    ],
+)
+def test_a_bad_plug_in_is_named(monkeypatch, effect, says):
+    plugged(monkeypatch, effect)
+    with pytest.raises(BadInput, match=r"plug-in their\.module:EFFECT of shaketwin\.effects") as e:
+        find_effect("not_ours")
+    assert says in str(e.value)
+    assert find_effect("bouc_wen").id == "bouc_wen"
+
+
+def test_flat_names_and_back():
+    model = everything().with_effect("sensor_gain", "mass_acc_m_s2", gain=1.1)
+    model = model.with_effect("sensor_gain", "force_r1_n", gain=0.9)
+    flat = model.flat()
+    assert flat["bouc_wen.yield_displacement"] == 3e-3
+    assert flat["sensor_gain.force_r1_n.gain"] == 0.9
+    assert flat["mass"] == 550.0
+    assert flat["gap_r"] == 2e-3  # the base, before gap_offset
+    again = Model.from_flat(flat)
+    assert again == model
+    with pytest.raises(BadInput, match="did you mean 'bouc_wen'"):
+        Model.from_flat({**flat, "bouc_wem.force": 1.0})
+
+
+def test_a_card_with_sensors():
+    text = CARD + (
+        '[[effects]]\nid = "sensor_gain"\nparameters = { channel = "mass_acc_m_s2", gain = 1.1 }\n'
+        '[[effects]]\nid = "sensor_lag"\nparameters = { channel = "mass_acc_m_s2", lag = 1e-3 }\n'
+        '[[effects]]\nid = "sensor_gain"\nparameters = { channel = "force_l1_n", gain = 0.9 }\n'
+    )
+    model = parse(text, ModelCard, "x").model(G4)
+    assert model.sensors == (
+        Sensor("mass_acc_m_s2", gain=1.1, lag=1e-3), Sensor("force_l1_n", gain=0.9),
+    )  # fmt: skip
+    assert isinstance(model.prepare(RATE), ClosedSolver)
+
+
+@pytest.mark.parametrize(
+    "entry, says",
+    [
+        ('id = "boucwen"\nparameters = {}', "did you mean 'bouc_wen'"),
+        ('id = "sensor_gain"\nparameters = { gain = 1.1 }', "channel '' is not predicted"),
+        ('id = "sensor_gain"\nparameters = { channel = "mass_ac_m_s2", gain = 1.1 }',
+         "did you mean 'mass_acc_m_s2'"),
+        ('id = "coulomb_friction"\nparameters = { channel = "mass_acc_m_s2", fc = 1.0 }',
+         "has no channel"),
+        ('id = "coulomb_friction"\nparameters = { fc = "much" }', "allowed: a finite number"),
+        ('id = "coulomb_friction"\nparameters = { fc = inf }', "allowed: a finite number"),
+        ('id = "coulomb_friction"\nparameters = { fc = -1.0 }', "0 to 5000 N"),
+        ('id = "bouc_wen"\nparameters = { force = 1.0 }', "lacks 'yield_displacement'"),
+    ],
+)  # fmt: skip
+def test_a_bad_effect_is_refused_in_words(entry, says):
+    with pytest.raises(BadInput, match="x:") as caught:
+        parse(CARD + "[[effects]]\n" + entry, ModelCard, "x")
+    assert says in str(caught.value)
+
+
+@pytest.mark.parametrize("key", ["stiffness_n_m", "bumper_stiffness_n_m", "damping_n_s_m"])
+def test_negative_and_zero_numbers_of_a_card(key):
+    with pytest.raises(BadInput, match=key):
+        parse(CARD.replace(f"\n{key} = ", f"\n{key} = -"), ModelCard, "x")
+    no_damping = CARD.replace("bumper_damping_n_s_m = 900.0", "bumper_damping_n_s_m = 0")
+    assert parse(no_damping, ModelCard, "x").model(G4).parameters.bumper_damping_l == 0
+
+
+def test_a_rate_too_low_for_the_bumper_is_refused():
+    with pytest.raises(BadInput, match=r"rate_hz 50: too low for the bumper.*allowed: 100"):
+        Model(snm()).prepare(50.0)
+    assert Model(snm(math.inf)).prepare(50.0)
+    steel = snm(bumper_stiffness_r=5e9)
+    with pytest.raises(BadInput, match="raise rate_hz"):
+        Model(steel).prepare(2000.0)
+    stiff = having(find_effect("bouc_wen"), base=snm(bumper_damping_r=0.1))
+    with pytest.raises(BadInput, match="too low for a relaxation"):
+        stiff.prepare(2000.0)
+
+
+def test_relaxing_face_without_viscous_damping_is_refused():
+    bare = snm(bumper_damping_r=0.0, bumper_damping_l=0.0)
+    model = Model(bare).with_effect("hunt_crossley", ch=1e5)
+    with pytest.raises(BadInput, match="hunt_crossley and bumper_maxwell together"):
+        model.with_effect("bumper_maxwell", kb=1e5, tau=0.1)
+
+
+def test_a_card_for_those_who_know_only_parameters():
+    card = parse(CARD + '[[effects]]\nid = "coulomb_friction"\nparameters = { fc = 5.0 }',
+                 ModelCard, "x")  # fmt: skip
+    with pytest.raises(BadInput, match="coulomb_friction; allowed here"):
+        card.parameters(G4)
+
+
+def test_restart_takes_hidden_states_and_refuses_nan():
+    model = everything()
+    solver = model.prepare(RATE)
+    state, _ = drive(model, noisy(0.5))
+    again = solver.restart(Start(int(state[-1]), *state[:4], hidden=state))
+    assert np.array_equal(again[7:11], state[7:11])
+    assert again[-1] == state[-1]
+    assert not solver.restart(Start(0, 0.0, 0.1)).take(range(7, 11)).any()
+    assert np.isnan(solver.restart(Start(5, math.nan, 0.1))[:-1]).all()
+
+
+def test_the_plain_model_starts_without_the_integrator():
+    code = (
+        "import sys; from twin.compare import pipeline; from twin.model.model import Model;"
+        "from twin.model.parameters import Parameters as P;"
+        "Model(P(550., 36e3, 1100., 5e5, 900., 5e5, 900., .002, .002)).prepare(2000.);"
+        "assert 'twin.model.integrate' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("effect", ["cubic_stiffness", "table_tilt", "gap_drift"])
+def test_sampled_sweep_of_a_model_is_near_the_closed_one(effect):
+    """A vanishingly small effect takes the other road to the same extremes."""
+    parameter = find_effect(effect).parameters[0].name
+    model = Model(snm()).with_effect(effect, **{parameter: 1e-12})
+    frequencies = [2.0, 2.2, 3.0]
+    got = swept(model, frequencies, AG, 6)
+    want = swept(Model(snm()), frequencies, AG, 6)
+    assert got.extremes.shape == want.extremes.shape
+    assert np.array_equal(got.extremes[..., 6:], want.extremes[..., 6:])
+    assert got.extremes[..., :4] == pytest.approx(want.extremes[..., :4], rel=1e-4)
+
+
+def test_every_built_in_effect_is_on_a_path():
+    for effect in EFFECTS:
+        assert (effect.change is not None) == (effect.acts == "parameters")
+        assert effect.force is None

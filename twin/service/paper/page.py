@@ -1,0 +1,81 @@
+"""Pictures, page and paper.json of the whole paper in one folder."""
+
+import base64
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from twin.service.figures import Picture
+from twin.service.paper import against, extra, families, loops, secondary
+from twin.service.paper.look import PAPER_STYLE, Drawing
+from twin.service.paper.rig import Rig
+from twin.service.paper.study import Study
+from twin.service.paper.table import Row
+from twin.service.summary import dumps
+
+ORDER = ("2", "3", "5", "6", "7", "8", "9", "11", "12", "")
+Progress = Callable[[str], None]
+
+
+def draw_all(found: Study, rig: Rig | None, folder: Path, say: Progress) -> list[Picture]:
+    """The paper's pictures of the model, or those that a rig's points add, in the paper's order."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with mpl.rc_context(PAPER_STYLE):
+        drawings: list[Drawing] = []
+        for room in (families, loops, secondary, against, extra):
+            drawings += room.draw(found, rig)
+        drawings.sort(key=lambda one: ORDER.index(one.number))
+        pictures = []
+        for one in drawings:
+            path = folder / f"{one.name}.png"
+            one.figure.savefig(path)
+            say(f"{path}")
+            title = f"Figure {one.number}. {one.title}" if one.number else one.title
+            pictures.append(Picture(path, title, one.caption))
+    return pictures
+
+
+def write_json(rows: list[Row], found: Study, pictures: list[Picture], path: Path) -> None:
+    """The table, the PRC points and the impacts as strict JSON."""
+    told: dict[str, Any] = {
+        "table": [asdict(row) for row in rows],
+        "prc": {
+            name: [
+                {"frequency_hz": one.frequency_hz, "direction": one.direction}
+                | (asdict(one.twin) if one.twin else {})
+                for one in case.points
+            ]
+            for name, case in found.cases.items()
+        },
+        "impacts": {
+            f"{hz:g}": {f"{r}/{l_}": share for (r, l_), share in seen.shares}
+            for hz, seen in found.impacts.items()
+        },
+        "figures": [f"figures/{one.path.name}" for one in pictures],
+    }
+    path.write_text(dumps(told) + "\n", encoding="utf-8")
+
+
+def write_page(
+    rows: list[Row], sets: list[tuple[str, list[Picture]]], models: dict[str, Any], path: Path
+) -> None:
+    """One self-contained HTML file: the table, then each set of pictures."""
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    images = [
+        (title, [(one, base64.b64encode(one.path.read_bytes()).decode()) for one in pictures])
+        for title, pictures in sets
+    ]
+    counts = {verdict: sum(row.verdict == verdict for row in rows) for verdict in
+              ("agrees", "agrees in kind", "departs")}  # fmt: skip
+    page = environment.get_template("paper.html").render(
+        rows=rows, sets=images, counts=counts, models=json.loads(json.dumps(models))
+    )
+    path.write_text(page, encoding="utf-8")
