@@ -236,7 +236,7 @@ class Specimen(Card):
 class Sweep(Card):
     """Stepped sine of constant peak table acceleration, through the grid up and back down."""
 
-    start_hz: Positive
+    start_hz: float = Field(ge=0.01, allow_inf_nan=False)
     stop_hz: Positive
     step_hz: Positive
     cycles: Count = Field(ge=2, le=1000, description="Held cycles a step.")
@@ -290,6 +290,8 @@ class Sweep(Card):
     def _some(cls, directions: tuple[str, ...]) -> tuple[str, ...]:
         if not directions:
             raise ValueError("directions is empty; allowed: 'forward', 'backward', in any order")
+        if len(set(directions)) < len(directions):
+            raise ValueError("directions names one twice; allowed: each once, in any order")
         return directions
 
     @property
@@ -428,7 +430,8 @@ def find(name: str, folder: str, beside: Path | None = None) -> Path:
     """Path of the card `name`: a path, or a name in `folder`, beside a profile or ours."""
     direct = Path(name)
     if direct.suffix == ".toml":
-        return direct
+        by_profile = beside.parent / direct if beside is not None else direct
+        return by_profile if by_profile.is_file() else direct
     places = [PROFILES / folder]
     if beside is not None:
         places.insert(0, beside.resolve().parent.parent / folder)

@@ -33,7 +33,8 @@ FREE = replace(G4, gap_r=math.inf, gap_l=math.inf)
 
 def scale(parameters: Parameters = G4) -> Scale:
     u_star, a_star, _ = resonance(parameters, LEVEL)
-    return Scale(parameters, RATE, 10.0, u_star, a_star)
+    gaps = (parameters.gap_r, parameters.gap_l)
+    return Scale(parameters, RATE, 10.0, u_star, a_star, gaps)
 
 
 def motion(u: Float1D, a: Float1D, right: Float1D | None = None) -> Motion:

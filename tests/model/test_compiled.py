@@ -29,3 +29,17 @@ def test_revision_of_the_phase_is_part_of_every_cache_key():
     assert cached == {sampled.march, sweep.stepped, orbit.turns, phase.flow}
     for kernel in (sampled.march, sweep.stepped, orbit.turns):
         assert str(phase.REVISION) in str(kernel.signatures)
+
+
+def test_the_integrators_key_holds_the_revision_of_all_it_calls():
+    from twin.model import events, integrate, laws
+
+    assert integrate.sampled.stats.cache_path is not None
+    kernel = integrate.sampled.py_func
+    assert kernel.__closure__[0].cell_contents == integrate.REVISION
+    names = {k: v for k, v in vars(laws).items() if k != "REVISION"}
+    assert revision(names) == laws.REVISION
+    assert len({laws.REVISION, events.REVISION, integrate.REVISION}) == 3
+    for module in (laws, events):
+        kernels = [k for k in vars(module).values() if hasattr(k, "py_func")]
+        assert {k.py_func.__name__ for k in kernels if k.stats.cache_path} <= {"no_extra"}

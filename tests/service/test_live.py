@@ -161,7 +161,8 @@ def test_a_dead_twin_stops_the_table_where_so_configured(tmp_path: Path) -> None
     code, said, recording, summary = finish(process, tmp_path)
     assert summary["verdict"] == "stopped", said
     assert_whole(recording)
-    assert code == 0
+    assert code == 3
+    assert summary["reason"].startswith("twin died")
     assert_at_rest(recording)
 
 
@@ -227,6 +228,56 @@ def test_a_port_in_use_is_bad_input_and_nothing_is_started(tmp_path: Path) -> No
     assert "in use" in said
     assert "Traceback" not in said
     assert not (tmp_path / "out").exists()
+
+
+def test_a_second_run_at_the_same_endpoint_is_refused_and_harms_nothing(tmp_path: Path) -> None:
+    listen = endpoint()
+    first = start(tmp_path, "--listen", listen)
+    running(first)
+    (tmp_path / "second").mkdir()
+    second = start(tmp_path / "second", "--listen", listen)
+    said, _ = second.communicate(timeout=60)
+    assert second.returncode == 2, said
+    assert "in use" in said
+    assert not (tmp_path / "second" / "out").exists()
+    # nor does a report written too early take the recording away from under the run
+    early = subprocess.run(
+        [SHAKETWIN, "report", str(tmp_path / "out")], capture_output=True, text=True, check=False
+    )
+    assert early.returncode == 2
+    assert "still going on" in early.stderr
+    code, said, recording, summary = finish(first, tmp_path)
+    assert code == 0, said
+    assert_whole(recording)
+    assert len(summary["steps"]) == 3
+    assert replayed(tmp_path).returncode == 0
+
+
+def test_an_interrupt_before_the_start_moves_nothing(tmp_path: Path) -> None:
+    process = start(tmp_path)
+    assert process.stdout is not None
+    process.stdout.readline()  # what will be run; its processes are being started now
+    time.sleep(0.3)
+    process.send_signal(signal.SIGINT)
+    said, _ = process.communicate(timeout=60)
+    assert process.returncode == 130, said
+    assert "nothing moved" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_twin_dead_at_the_very_end_is_a_fault_too(tmp_path: Path) -> None:
+    process = start(tmp_path)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if re.match(r"\s*3/3 ", line):
+            break
+    kill(process, "twin")
+    code, said, recording, summary = finish(process, tmp_path)
+    assert code == 0, said
+    (fault,) = recording.of(Fault)
+    assert fault.to_index <= summary["run"]["samples"]
+    again = replayed(tmp_path)
+    assert again.returncode == 0, again.stdout + again.stderr
 
 
 def test_a_dead_rig_halts_the_run_and_keeps_what_was_recorded(tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ class Scale:
     contact_n: float
     u_star_m: float
     a_star_m_s2: float
+    gaps_m: tuple[float, float]  # (right, left) of the specimen, whatever the model thinks of them
 
     @cached_property
     def weights(self) -> Float1D:
@@ -161,6 +162,8 @@ def quantities(cycles: list[Cycle], source: str, scale: Scale) -> Quantities | N
     eta = np.array([(e.u_max - e.u_min) / (2 * u_star) for e in some])
     weight = p.mass * GRAVITY_M_S2
 
+    gap_r, gap_l = scale.gaps_m if source == "measured" else (p.gap_r, p.gap_l)
+
     def deformation(depth: float, force: float) -> float:
         return 0.0 if force <= scale.contact_n else max(depth, 0.0) / u_star
 
@@ -170,8 +173,8 @@ def quantities(cycles: list[Cycle], source: str, scale: Scale) -> Quantities | N
     return Quantities(
         eta_d=float(eta.mean()),
         eta_a=float(np.mean([(e.a_max - e.a_min) / (2 * scale.a_star_m_s2) for e in some])),
-        eta_r=float(np.mean([deformation(e.u_max - p.gap_r, e.force_r) for e in some])),
-        eta_l=float(np.mean([deformation(-e.u_min - p.gap_l, e.force_l) for e in some])),
+        eta_r=float(np.mean([deformation(e.u_max - gap_r, e.force_r) for e in some])),
+        eta_l=float(np.mean([deformation(-e.u_min - gap_l, e.force_l) for e in some])),
         r_r=float(np.mean([ratio(e.force_r) for e in some])),
         r_l=float(np.mean([ratio(e.force_l) for e in some])),
         impacts_right=_impacts(used, [place for e in every for place in e.onsets_r], before)

@@ -68,7 +68,7 @@ def prepare(
         contact_n,
         from_rest,
     )
-    scale = Scale(model.parameters, rate, contact_n, u_star, a_star)
+    scale = Scale(model.parameters, rate, contact_n, u_star, a_star, profile.specimen.gaps_m)
     return Setup(twin, scale, steps, profile.sweep.measured_cycles)
 
 

@@ -149,16 +149,9 @@ class Model:
     def prepare(self, rate_hz: float) -> Solver:
         """The solver at this sampling rate; the path is chosen by what the effects leave linear.
 
-        Compiles what that path needs where it is not cached. BadInput where the rate is too low to
-        follow a contact.
+        Compiles what that path needs where it is not cached. BadInput as in `fits`.
         """
-        fastest = self._fastest()
-        least = SAMPLES_PER_CONTACT * fastest / math.pi
-        if not rate_hz >= least:
-            raise BadInput(
-                f"rate_hz {rate_hz:g}: too low for the bumper: a contact of this model lasts "
-                f"{1e3 * math.pi / fastest:.3g} ms; allowed: {least:.4g} Hz or more; raise rate_hz"
-            )
+        self.fits(rate_hz)
         if any(one.effect.acts in ("force", "linear") for one in self.present):
             from twin.model.integrated import IntegratedSolver
 
@@ -166,6 +159,16 @@ class Model:
         from twin.model.closed import ClosedSolver
 
         return ClosedSolver.of(self, rate_hz)
+
+    def fits(self, rate_hz: float) -> None:
+        """BadInput where this sampling rate is too low to follow a contact."""
+        fastest = self._fastest()
+        least = SAMPLES_PER_CONTACT * fastest / math.pi
+        if not rate_hz >= least:
+            raise BadInput(
+                f"rate_hz {rate_hz:g}: too low for the bumper: a contact of this model lasts "
+                f"{1e3 * math.pi / fastest:.3g} ms; allowed: {least:.4g} Hz or more; raise rate_hz"
+            )
 
     def _fastest(self) -> float:
         """The highest angular frequency of any phase in 1/s, without nonlinear terms."""

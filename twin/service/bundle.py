@@ -45,7 +45,9 @@ class Bundle:
         """The twin's setup; importing it compiles its kernels where they are not cached."""
         from twin.compare import pipeline
 
-        return pipeline.prepare(self.profile, self.model, self.steps, from_rest)
+        setup = pipeline.prepare(self.profile, self.model, self.steps, from_rest)
+        setup.twin.solver  # noqa: B018  compiled now, not at the first sample
+        return setup
 
     @property
     def parameters(self) -> Parameters:
@@ -91,11 +93,13 @@ def from_texts(name: str, profile_toml: str, rig_toml: str, model_toml: str, whe
     rig = parse(rig_toml, Rig, f"machine card of {where}")
     card = parse(model_toml, ModelCard, f"model of {where}")
     drive = plan(profile)
+    model = card.model(profile.specimen)
+    model.fits(profile.acquisition.rate_hz)
     return Bundle(
         name,
         profile,
         rig,
-        card.model(profile.specimen),
+        model,
         drive,
         margins(drive, profile, rig),
         profile_toml,

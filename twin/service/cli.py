@@ -18,7 +18,6 @@ app = typer.Typer(
 )
 
 PLAN, DRIVE, LOOK = "Before a test", "Drive and compute", "Look at what was recorded"
-EXIT_ABORTED, EXIT_GAPS, EXIT_NOT_IDENTICAL, EXIT_INTERRUPTED = 3, 4, 5, 130
 
 TestProfile = Annotated[Path, typer.Argument(metavar="PROFILE", help="Test profile, a .toml file.")]
 Log = Annotated[Path, typer.Argument(metavar="LOG", help="A run.mcap, or the folder of a run.")]
@@ -162,4 +161,13 @@ def main() -> None:
             if not isinstance(error, BadInput):
                 raise
             print(f"shaketwin: {error}", file=sys.stderr)
+            raise SystemExit(2) from None
+        except OSError as error:
+            if isinstance(error, BrokenPipeError):
+                raise
+            print(
+                f"shaketwin: {error}; what was recorded is kept: `shaketwin report DIR` once this "
+                "is mended",
+                file=sys.stderr,
+            )
             raise SystemExit(2) from None

@@ -1,5 +1,6 @@
 """What each command does, from input to exit code."""
 
+import math
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,12 +13,13 @@ from table_io.limits import warnings
 from table_io.profile import BadInput
 from twin.service import summary as summaries
 from twin.service.bundle import Bundle, from_texts, read_bundle, read_model, run_id, warm
-from twin.service.cli import EXIT_ABORTED, EXIT_GAPS, EXIT_INTERRUPTED, EXIT_NOT_IDENTICAL
 from twin.service.progress import RunProgress
 from twin.stream.mcap_log import Recording, read
 
 console = Console()
 VIEW_ADDRESS = "127.0.0.1:9876"
+SHORTEST_BLOCK_S, LONGEST_BLOCK_S = 0.002, 0.05  # protection looks once a block
+EXIT_ABORTED, EXIT_GAPS, EXIT_NOT_IDENTICAL, EXIT_INTERRUPTED = 3, 4, 5, 130
 
 
 def new_folder(out: Path | None, run: str) -> Path:
@@ -95,6 +97,8 @@ def run(
     run_name = run_id(bundle.name)
     if unpaced and bundle.rig.simulated is None:
         raise BadInput(f"--speed max: {bundle.rig.name!r} is not simulated; leave --speed away")
+    if not unpaced:
+        _real_time(bundle, profile)
     folder = new_folder(out, run_name)
     for sentence in warnings(bundle.margins, bundle.rig):
         console.print(f"warning: {sentence}", highlight=False)
@@ -110,11 +114,24 @@ def run(
         if unpaced:
             _run_unpaced(bundle, run_name, folder, asked)
         else:
-            _run_live(bundle, run_name, folder, asked, view, listen)
+            began = _run_live(bundle, run_name, folder, asked, view, listen)
+            if not began:
+                return EXIT_INTERRUPTED
     code = _close(folder, bundle)
     if view:
         _write_view(folder)
-    return EXIT_INTERRUPTED if asked() and code == 0 else code
+    return EXIT_INTERRUPTED if asked() and code == EXIT_ABORTED else code
+
+
+def _real_time(bundle: Bundle, profile: Path) -> None:
+    """BadInput where a block is too short to be handled or too long to protect the table."""
+    samples, rate = bundle.profile.acquisition.block_samples, bundle.drive.rate_hz
+    least, most = math.ceil(rate * SHORTEST_BLOCK_S), math.floor(rate * LONGEST_BLOCK_S)
+    if not least <= samples <= most:
+        raise BadInput(
+            f"{profile}: acquisition.block_samples = {samples}: in real time at {rate:g} Hz a "
+            f"block may have {least} to {most} samples; change it, or use --speed max"
+        )
 
 
 def _run_unpaced(
@@ -133,7 +150,8 @@ def _run_live(
     asked: Callable[[], str | None],
     view: bool,
     listen: str,
-) -> None:
+) -> bool:
+    """True where the run began; a person may have stopped it before."""
     from twin.service.processes import Spec
     from twin.service.supervisor import Supervisor, gather
 
@@ -153,8 +171,10 @@ def _run_live(
         )
         if view:
             progress.say(f"live view: rerun rerun+http://{VIEW_ADDRESS}/proxy")
-        supervisor.run()
-    gather(folder)
+        began = supervisor.run()
+    if began:
+        gather(folder)
+    return began
 
 
 def _close(folder: Path, bundle: Bundle, extra: dict[str, object] | None = None) -> int:
@@ -164,33 +184,11 @@ def _close(folder: Path, bundle: Bundle, extra: dict[str, object] | None = None)
     found |= extra or {}
     summaries.write(found, folder / "summary.json")
     _report(folder, recording)
-    console.print(_line(found, folder), highlight=False, soft_wrap=True)
-    if found["verdict"] in ("aborted", "halted"):
+    what = f"{summaries.sentence(found)} -> {folder / 'report.html'}"
+    console.print(what, highlight=False, soft_wrap=True)
+    if found["verdict"] != "complete":
         return EXIT_ABORTED
     return EXIT_GAPS if found["gaps"] else 0
-
-
-def _line(found: summaries.Json, folder: Path) -> str:
-    """What happened, in one line."""
-    parts = [f"{found['verdict']}: {len(found['steps'])} steps"]
-    for interval in found["hysteresis"]:
-        parts.append(
-            f"{interval['kind']} hysteresis {interval['from_hz']:g} to {interval['to_hz']:g} Hz"
-        )
-    for jump in found["jumps"]:
-        parts.append(f"jump {jump['kind']} {jump['from_hz']:g} -> {jump['to_hz']:g} Hz")
-    error = found["comparison"].get("rel_disp_m", {}).get("nrmse")
-    if error is not None:
-        parts.append(f"twin NRMSE of u {100 * error:.2g} %")
-    latency = found["timing"]["latency_ms"]["p99"]
-    if latency is not None:
-        parts.append(f"latency p99 {latency:.2g} ms")
-    parts.append(f"{found['gaps']} gaps")
-    if found["faults"]:
-        parts.append(f"{len(found['faults'])} faults")
-    if found["verdict"] != "complete":
-        parts.append(found["reason"])
-    return "; ".join(parts) + f" -> {folder / 'report.html'}"
 
 
 def _report(folder: Path, recording: Recording) -> None:
@@ -226,6 +224,19 @@ def log_path(log: Path) -> Path:
     return log / "run.mcap" if log.is_dir() else log
 
 
+def open_log(log: Path) -> Recording:
+    """The recording in a log or a run's folder; says so where the file is not whole."""
+    recording = read(log_path(log))
+    if not recording.whole:
+        end = recording.pieces("meas")[-1].end if recording.pieces("meas") else 0
+        Console(stderr=True).print(
+            f"warning: {recording.path} is cut off or damaged; it is readable to sample {end}",
+            highlight=False,
+            soft_wrap=True,
+        )
+    return recording
+
+
 def recorded_bundle(recording: Recording, model: str | None = None) -> Bundle:
     """The bundle that a recording was made with, or with another model in it."""
     start = recording.start
@@ -239,7 +250,7 @@ def replay(log: Path, model: str | None, out: Path | None, speed: str, view: boo
     """The pipeline on a recording; the exit code."""
     from twin.service.runs import replay as play
 
-    recording = read(log_path(log))
+    recording = open_log(log)
     bundle = recorded_bundle(recording, model)
     clock = RealClock() if speed != "max" else ManualClock()
     factor = _factor(speed)
@@ -270,6 +281,7 @@ def replay(log: Path, model: str | None, out: Path | None, speed: str, view: boo
                 "compared": identity.compared,
                 "differing": identity.differing,
                 "missing": identity.missing,
+                "unrecorded": identity.unrecorded,
                 "first_difference_index": identity.first_difference,
                 "largest_difference_of_error_sums": identity.largest,
                 "recorded_comparison": before,
@@ -281,7 +293,8 @@ def replay(log: Path, model: str | None, out: Path | None, speed: str, view: boo
     else:
         console.print(
             f"{identity.differing} of {identity.recorded} comparisons differ, "
-            f"{identity.missing} missing; see summary.json, replay",
+            f"{identity.missing} missing, {identity.unrecorded} never recorded; see summary.json, "
+            "replay",
             highlight=False,
         )
     if view:
@@ -305,7 +318,7 @@ def prc(log: Path, as_json: bool) -> None:
     """The PRC of a recording, as a table or as JSON."""
     from twin.service.preflight import print_prc
 
-    recording = read(log_path(log))
+    recording = open_log(log)
     found = summaries.summarise(recording, recorded_bundle(recording).parameters)
     if as_json:
         keys = ("run", "u_star_m", "a_star_m_s2", "steps", "jumps", "hysteresis")
@@ -320,9 +333,9 @@ def report(folder: Path) -> None:
         raise BadInput(f"{folder}: no such folder; give the folder of a run")
     from twin.service.supervisor import PARTS, gather
 
-    if not (folder / "run.mcap").exists() and (folder / PARTS).is_dir():
+    if (folder / PARTS).is_dir():
         gather(folder)
-    recording = read(folder / "run.mcap")
+    recording = open_log(folder)
     if not (folder / "summary.json").exists():
         found = summaries.summarise(recording, recorded_bundle(recording).parameters)
         summaries.write(found, folder / "summary.json")

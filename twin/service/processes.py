@@ -5,6 +5,7 @@ of its own so that Ctrl-C reaches only the supervisor; its standard input is a p
 that the supervisor is gone.
 """
 
+import fcntl
 import gc
 import json
 import os
@@ -76,6 +77,11 @@ class Spec:
         return from_texts(self.name, self.profile_toml, self.rig_toml, self.model_toml, self.name)
 
 
+def token(spec: Spec, component: str) -> str:
+    """Under which a process of this run is alive on the bus; another run's are others."""
+    return f"{spec.run}.{component}"
+
+
 def _orphaned() -> bool:
     """True once the supervisor's end of our standard input is closed."""
     ready, _, _ = select.select([sys.stdin], [], [], 0.0)
@@ -107,21 +113,29 @@ def rig(spec: Spec, _: str) -> None:
     link = open_hub(bundle.rig.name, spec.endpoint)
     link.declare(RIG_TOPICS)
     orders = link.commands()
-    link.alive("rig")
+    link.alive(token(spec, "rig"))
     stop_if_orphan = bundle.profile.on_death.supervisor == "stop"
 
-    def commands() -> str | None:
+    def ordered() -> tuple[str, str] | None:
+        """(name, reason) of the next command; one that was given to another run is refused."""
         order = orders.poll()
-        if order is not None:
-            order.reply("yes" if order.name == "stop" else f"unknown command {order.name}")
-            return (order.text or "asked to stop") if order.name == "stop" else None
+        if order is None:
+            return None
+        run, _, why = order.text.partition("\n")
+        known = run == spec.run and order.name in ("start", "stop")
+        order.reply("yes" if known else f"refused: this is run {spec.run}")
+        return (order.name, why) if known else None
+
+    def commands() -> str | None:
+        order = ordered()
+        if order is not None and order[0] == "stop":
+            return order[1] or "asked to stop"
         return "the supervisor is gone" if stop_if_orphan and _orphaned() else None
 
-    while (order := orders.poll()) is None or order.name != "start":
+    while (order := ordered()) is None or order[0] != "start":
         if _orphaned():
             return
         clock.wait_until(clock.now() + 0.01)
-    order.reply("yes")
     seconds = bundle.profile.acquisition.block_samples / bundle.drive.rate_hz
     watch = Stopwatch("rig", clock, seconds, scheduler)
     backend = open_backend(bundle.rig, bundle.profile, clock)
@@ -170,7 +184,7 @@ def twin(spec: Spec, missed_from: str) -> None:
     link.declare(TWIN_TOPICS)
     control = link.subscribe(CONTROL, history=True, capacity=16)
     blocks = link.subscribe((MEASURED,), history=not missed_from, capacity=CAPACITY)
-    link.alive("twin")
+    link.alive(token(spec, "twin"))
 
     def say(items: list[Item]) -> None:
         for item in items:
@@ -181,7 +195,7 @@ def twin(spec: Spec, missed_from: str) -> None:
     state: pipeline.State | None = None
     epoch_s, end, heard = None, None, clock.now()
     while end is None or state is None or state.tracks.index < end:
-        for record in _told(control):
+        for record in _told(control, spec.run):
             epoch_s = record.epoch_s if isinstance(record, RunStart) else epoch_s
             end = record.index if isinstance(record, RunStop) else end
         arrived = blocks.get(0.2)
@@ -190,8 +204,9 @@ def twin(spec: Spec, missed_from: str) -> None:
                 break
             continue
         heard = clock.now()
-        _, block = decode(*arrived)
-        assert isinstance(block, Block)
+        run, block = decode(*arrived)
+        if run != spec.run or not isinstance(block, Block):
+            continue
         if state is None:
             state, begun = pipeline.start(setup, block.index)
             say(list(begun))
@@ -212,10 +227,12 @@ def twin(spec: Spec, missed_from: str) -> None:
     link.close()
 
 
-def _told(control: Inbox) -> Iterator[Item]:
-    """Records that wait in an inbox, without waiting for more."""
+def _told(control: Inbox, run: str) -> Iterator[Item]:
+    """Records of a run that wait in an inbox, without waiting for more."""
     while (arrived := control.get(0.0)) is not None:
-        yield decode(*arrived)[1]
+        of, record = decode(*arrived)
+        if of == run:
+            yield record
 
 
 def recorder(spec: Spec, part: str) -> None:
@@ -227,8 +244,10 @@ def recorder(spec: Spec, part: str) -> None:
     link = open_spoke(bundle.rig.name, spec.endpoint, CONNECT_S)
     link.declare(("/run/timing", "/run/event"))
     inbox = link.subscribe(tuple(TOPIC_TYPES), history=True, capacity=CAPACITY)
+    lock = Path(part).with_name("lock").open("a")
+    fcntl.flock(lock, fcntl.LOCK_SH)  # until this process ends: nobody takes the parts away
     writer = LogWriter(Path(part), bundle.drive.rate_hz)
-    link.alive("recorder")
+    link.alive(token(spec, "recorder"))
     watch = Stopwatch("recorder", clock, 1.0)
     watch.begin()
     flushed = synced = heard = clock.now()
@@ -239,7 +258,9 @@ def recorder(spec: Spec, part: str) -> None:
         if arrived is not None:
             heard = now
             name, payload = arrived
-            _, item = decode(name, payload)
+            run, item = decode(name, payload)
+            if run != spec.run:
+                continue
             if isinstance(item, RunStart):
                 writer.describe(item)
             writer.write(name, payload, item.index)
@@ -290,7 +311,7 @@ def viewer(spec: Spec, _: str) -> None:
     from twin.service.viewing import serve
 
     link = open_spoke(spec.bundle().rig.name, spec.endpoint, CONNECT_S)
-    link.alive("viewer")
+    link.alive(token(spec, "viewer"))
     serve(link, spec.serve_view, _orphaned)
     link.close()
 

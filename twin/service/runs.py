@@ -123,12 +123,14 @@ class Identity:
     compared: int = 0
     differing: int = 0
     missing: int = 0
+    unrecorded: int = 0  # that the recording should have and has not
     first_difference: int | None = None
     largest: dict[str, float] = field(default_factory=dict)  # of |difference| of error sums, SI^2
 
     @property
     def identical(self) -> bool:
-        return self.recorded == self.compared and not self.differing and not self.missing
+        wrong = self.differing or self.missing or self.unrecorded
+        return self.compared == self.recorded > 0 and not wrong
 
 
 def replay(recording: Recording, bundle: Bundle, path: Path, run: str, watch: Watch) -> Identity:
@@ -143,6 +145,8 @@ def replay(recording: Recording, bundle: Bundle, path: Path, run: str, watch: Wa
             if isinstance(item, Comparison) and item.index in recorded:
                 seen.add(item.index)
                 _differ(identity, recorded[item.index], item)
+            elif isinstance(item, Comparison) and recording.stop is not None:
+                identity.unrecorded += 1  # a recording that was cut off may lack its last ones
             yield item
         identity.missing = len(recorded) - len(seen)
 

@@ -149,6 +149,29 @@ def _nrmse(comparisons: tuple[Comparison, ...], parameters: Parameters) -> Json:
     return out
 
 
+def sentence(found: Json) -> str:
+    """What happened in a run, in one line."""
+    parts = [f"{found['verdict']}: {len(found['steps'])} steps"]
+    for interval in found["hysteresis"]:
+        parts.append(
+            f"{interval['kind']} hysteresis {interval['from_hz']:g} to {interval['to_hz']:g} Hz"
+        )
+    for jump in found["jumps"]:
+        parts.append(f"jump {jump['kind']} {jump['from_hz']:g} -> {jump['to_hz']:g} Hz")
+    error = found["comparison"].get("rel_disp_m", {}).get("nrmse")
+    if error is not None:
+        parts.append(f"twin NRMSE of u {100 * error:.2g} %")
+    latency = found["timing"]["latency_ms"]["p99"]
+    if latency is not None:
+        parts.append(f"latency p99 {latency:.2g} ms")
+    parts.append(f"{found['gaps']} gaps")
+    if found["faults"]:
+        parts.append(f"{len(found['faults'])} faults")
+    if found["verdict"] != "complete":
+        parts.append(found["reason"])
+    return "; ".join(parts)
+
+
 def write(summary: Json, path: Path) -> None:
     """Write a summary as strict JSON: what is not a number becomes null."""
     path.write_text(dumps(summary) + "\n")

@@ -1,6 +1,7 @@
 """Starts the processes of a live run, watches them, restarts what died, ends them in order."""
 
 import contextlib
+import fcntl
 import os
 import shutil
 import signal
@@ -12,18 +13,20 @@ from pathlib import Path
 
 from table_io.clock import Clock
 from table_io.profile import BadInput, OnDeath
-from table_io.records import Comparison, Event, RunStop
-from twin.service.processes import Spec
-from twin.stream.mcap_log import merge, read
+from table_io.records import Comparison, Event, Fault, RunStop, Timing
+from twin.service.processes import Spec, token
+from twin.stream.mcap_log import merge, messages
 from twin.stream.resend import Inbox
 from twin.stream.wire import RECORD_TOPICS, Item, decode, encode, topic
 from twin.stream.zenoh_link import Link, open_spoke
 
 READY_S = 30.0
 END_S = 15.0  # after the last sample, for everybody to finish
+SILENT_S = 5.0  # the rig reports every second; after this it hangs
 DRAIN_S = 0.1  # after a death, for what the dead one had still sent
 RESTARTS = 5
 PARTS = ".parts"
+LOCK = "lock"  # shared by supervisor and recorder while they live
 WATCHED = tuple(RECORD_TOPICS.values())
 
 
@@ -49,6 +52,8 @@ class Supervisor:
     say: Callable[[str], None]
     children: dict[str, Child] = field(default_factory=dict)
     compared_to: int = 0
+    heard: float = 0.0  # when the rig last spoke
+    twin_missing: bool = False  # a twin died and its successor has not said so yet
     stop: RunStop | None = None
     _parts: int = 0
 
@@ -56,35 +61,49 @@ class Supervisor:
     def parts(self) -> Path:
         return Path(self.spec.folder) / PARTS
 
-    def run(self) -> None:
-        """Play the run to its end. BadInput where it cannot begin; then nothing is left behind."""
+    def run(self) -> bool:
+        """Play the run to its end; False where a person stopped it before it began.
+
+        BadInput where it cannot begin. A run that did not begin leaves nothing behind.
+        """
         self.parts.mkdir(parents=True)
         self.spec.write(self.parts / "spec.json")
+        lock = (self.parts / LOCK).open("a")
+        fcntl.flock(lock, fcntl.LOCK_SH)
         moved = False
         try:
             link, inbox = self._begin()
             moved = True
             self._attend(link, inbox)
             self._finish(link)
+        except _NeverBeganError:
+            self.say("interrupted before the start: nothing moved")
         except _RigDiedError as error:
             self.say(f"{error}; what was recorded is kept")
         finally:
             self._reap()
+            lock.close()
             if not moved:
                 self._clear()
+        return moved
 
     def _begin(self) -> tuple[Link, Inbox]:
         """Start everybody, wait until all are there, and set the rig going."""
         self._start("rig")
         link = self._connect(self.spec.bundle().rig.name)
+        self._ready(link)  # the rig that answers is ours, not another run's at the same endpoint
         for component in ("twin", "recorder", *self._views()):
             self._start(component)
         self._ready(link)
         inbox = link.subscribe(WATCHED, history=True, capacity=5000)
         link.declare(("/run/event", "/run/fault"))
-        if link.request("start", timeout_s=2.0) is None:
+        if self._order(link, "start") != "yes":
             raise BadInput("the rig does not answer; nothing moved")
         return link, inbox
+
+    def _order(self, link: Link, name: str, why: str = "") -> str | None:
+        """The rig's answer to a command of this run."""
+        return link.request(name, f"{self.spec.run}\n{why}", timeout_s=2.0)
 
     def _clear(self) -> None:
         """Take away what a run that never began has left, so that it can be started again."""
@@ -123,36 +142,51 @@ class Supervisor:
     def _connect(self, rig: str) -> Link:
         until = self.clock.now() + READY_S
         while self.clock.now() < until and not self._died("rig"):
+            self._unless_asked()
             try:
                 return open_spoke(rig, self.spec.endpoint, 0.3)
             except BadInput:
                 continue
         raise BadInput(f"the rig did not start: {self._words('rig')}")
 
+    def _unless_asked(self) -> None:
+        if self.asked():
+            raise _NeverBeganError
+
     def _ready(self, link: Link) -> None:
-        """Wait until everybody is there; nothing moves before."""
+        """Wait until everybody started is there; nothing moves before."""
         until = self.clock.now() + READY_S
-        while not set(self.children) <= link.components():
+        wanted = {token(self.spec, component) for component in self.children}
+        while not wanted <= link.components():
+            self._unless_asked()
             for component in self.children:
                 if self._died(component):
                     raise BadInput(f"the {component} did not start: {self._words(component)}")
             if self.clock.now() > until:
-                missing = sorted(set(self.children) - link.components())
-                raise BadInput(f"not ready after {READY_S:g} s: {', '.join(missing)}")
+                missing = ", ".join(sorted(wanted - link.components()))
+                raise BadInput(f"not ready after {READY_S:g} s: {missing}")
             self.clock.wait_until(self.clock.now() + 0.02)
 
     def _attend(self, link: Link, inbox: Inbox) -> None:
         """Until the rig has ended: show what happens, pass a stop on, restart what died."""
         stopping = False
+        self.heard = self.clock.now()
         while self.stop is None:
             self._listen(inbox, 0.1)
             if not stopping and (why := self.asked()):
-                stopping = link.request("stop", why) is not None
+                stopping = self._order(link, "stop", why) == "yes"
+            if self.clock.now() - self.heard > SILENT_S:
+                raise _RigDiedError(
+                    f"the rig has been silent for {SILENT_S:g} s: if the table still moves, use "
+                    "its own stop"
+                )
             for component in list(self.children):
                 if self._died(component) and self.stop is None:
                     self._listen(inbox, DRAIN_S)
                     if self.stop is None:
                         self._bury(component, link)
+        if self.twin_missing:
+            self._fault(link, self.stop.index)
 
     def _listen(self, inbox: Inbox, seconds: float) -> None:
         until = self.clock.now() + seconds
@@ -160,31 +194,52 @@ class Supervisor:
             arrived = inbox.get(left)
             if arrived is None:
                 return
-            _, item = decode(*arrived)
+            run, item = decode(*arrived)
+            if run != self.spec.run:
+                continue
             if isinstance(item, Comparison):
                 self.compared_to = max(self.compared_to, item.index + item.count)
-            if isinstance(item, RunStop):
+            elif isinstance(item, Timing) and item.component == "rig":
+                self.heard = self.clock.now()
+            elif isinstance(item, Fault) and item.component == "twin":
+                self.twin_missing = False
+            elif isinstance(item, RunStop):
                 self.stop = item
             self.watch(item)
 
     def _bury(self, component: str, link: Link) -> None:
-        """Say what died, stop the table if so configured, start a successor."""
+        """Say what died and why, start a successor, stop the table where it must not go on."""
         child = self.children[component]
-        how = child.process.returncode
+        how = f"{component} died ({_how(child.process.returncode)})"
         if component == "rig":
-            raise _RigDiedError(f"the rig process died ({_how(how)}): {self._words('rig')}")
-        choice = getattr(self.on_death, component)
-        self.say(f"{component} died ({_how(how)}); restarting it, the table goes on")
-        event = Event(self.compared_to, "died", f"{component} died ({_how(how)})")
+            raise _RigDiedError(
+                f"the rig process died ({_how(child.process.returncode)}): {self._words('rig')}"
+            )
+        event = Event(self.compared_to, "died", how)
         link.publish(topic(event), encode(event, self.spec.run))
-        if choice == "stop":
-            link.request("stop", f"{component} died ({_how(how)})")
-        if child.restarts >= RESTARTS:
-            self.say(f"{component} died {RESTARTS + 1} times and stays down")
+        given_up = child.restarts >= RESTARTS
+        # unrecorded motion is worthless: without a recorder the table does not go on
+        stop = getattr(self.on_death, component) == "stop" or (given_up and component == "recorder")
+        fate = f"it stays down after {RESTARTS} restarts" if given_up else "restarting it"
+        self.say(f"{how}; {fate}, the table {'stops' if stop else 'goes on'}")
+        if child.process.returncode > 0:
+            self.say(f"  its last words: {self._words(component)}")
+        if stop:
+            self._order(link, "stop", how)
+        if component == "twin":
+            self.twin_missing = True
+        if given_up:
             del self.children[component]
             return
         child.restarts += 1
         self._start(component, str(self.compared_to) if component == "twin" else "")
+
+    def _fault(self, link: Link, end: int) -> None:
+        """Record what a twin that did not come back has missed."""
+        if self.compared_to < end:
+            fault = Fault(end, "twin", self.compared_to, end, "the process died near the end")
+            link.publish(topic(fault), encode(fault, self.spec.run))
+            self.watch(fault)
 
     def _finish(self, link: Link) -> None:
         """Let everybody finish in order: those who listen, then those whom they still ask."""
@@ -220,6 +275,10 @@ class Supervisor:
                 child.process.wait()
 
 
+class _NeverBeganError(Exception):
+    """A person stopped the run before it began."""
+
+
 class _RigDiedError(Exception):
     """The rig is gone; what was recorded is kept."""
 
@@ -230,16 +289,31 @@ def _how(code: int) -> str:
 
 def gather(folder: Path) -> Path:
     """run.mcap from the parts of a recording; they go only when it has been read back whole."""
-    parts = sorted((folder / PARTS).glob("part-*.mcap"))
+    held = folder / PARTS
     out = folder / "run.mcap"
-    if not parts:
-        raise BadInput(f"{folder}: the recorder wrote nothing")
-    first = read(parts[0]) if len(parts) == 1 else None
-    if first is not None and first.whole:
-        parts[0].rename(out)
-    else:
-        count = merge(parts, out)
-        if len(read(out).items) != count:
-            raise BadInput(f"{out}: differs from its parts, which are kept in {folder / PARTS}")
-    shutil.rmtree(folder / PARTS)
+    with (held / LOCK).open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BadInput(f"{folder}: a run is still going on in this folder; wait") from None
+        parts = sorted(held.glob("part-*.mcap"))
+        if not parts:
+            raise BadInput(f"{folder}: the recorder wrote nothing")
+        if not out.exists():
+            _merged(parts, out)
+        shutil.rmtree(held)
     return out
+
+
+def _merged(parts: list[Path], out: Path) -> None:
+    """The parts as one whole log, which takes its name only when it has been read back."""
+    if len(parts) == 1 and messages(parts[0])[1]:
+        parts[0].rename(out)
+        return
+    new = out.with_suffix(".new")
+    new.unlink(missing_ok=True)
+    count = merge(parts, new)
+    back, whole = messages(new)
+    if not whole or len(back) != count:
+        raise BadInput(f"{new}: differs from its parts, which are kept in {parts[0].parent}")
+    new.rename(out)

@@ -7,6 +7,7 @@ from pathlib import Path
 from rich.console import Console
 
 from table_io.clock import RealClock
+from table_io.profile import BadInput
 from table_io.records import RunStart, RunStop
 from twin.stream.mcap_log import read
 from twin.stream.rerun_view import RerunView, open_viewer, screenshot, write_rrd
@@ -20,6 +21,9 @@ ANSWER_S = 2.0
 
 def view_log(log: Path, save: Path | None, picture: Path | None, console: Console) -> None:
     """Opens a recording; with `save` or `picture` it only writes these."""
+    for new in (save, picture):
+        if new is not None and not new.absolute().parent.is_dir():
+            raise BadInput(f"{new}: its folder does not exist; make it, or give another place")
     recording = read(log)
     if save is None and picture is None:
         rrd = Path(tempfile.mkdtemp(prefix="shaketwin-")) / "view.rrd"
