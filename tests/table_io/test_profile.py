@@ -125,7 +125,11 @@ def test_every_fault_of_a_file_stands_in_one_message() -> None:
         ({"sweep__start_hz": None}, "sweep.start_hz", "missing; add it"),
         ({"specimen__gap": 4.0}, "specimen.gap", "did you mean 'gap_mm'?"),
         ({"acquisition__qqq": 4.0}, "acquisition.qqq", "known: rate_hz, block_samples, rest_s"),
-        ({"sweep__start_hz": 0.0}, "sweep.start_hz", "= 0.0: input should be greater than or equal to 0.01"),
+        (
+            {"sweep__start_hz": 0.0},
+            "sweep.start_hz",
+            "= 0.0: input should be greater than or equal to 0.01",
+        ),
         ({"sweep__start_hz": math.nan}, "sweep.start_hz", "nan"),
         ({"sweep__stop_hz": math.inf}, "sweep.stop_hz", "finite"),
         ({"sweep__stop_hz": 0.4}, "sweep.stop_hz", "0.4 lies below start_hz 0.5"),
