@@ -246,18 +246,6 @@ def test_the_queue_does_not_grow_with_the_test() -> None:
     assert machine._command.size < 1300
 
 
-def test_reading_twenty_samples_takes_far_less_than_they_last() -> None:
-    machine = backend()
-    machine.queue(0, command(5.0))
-    machine.start()
-    took = []
-    for _ in range(500):
-        before = time.perf_counter()
-        machine.read(20)
-        took.append(time.perf_counter() - before)
-    assert np.median(took) < 150e-6
-
-
 def test_order_of_life_and_rates_are_kept() -> None:
     with pytest.raises(BadInput, match=r"acquisition.rate_hz = 1234.* allowed: 1000, 2000, 4000"):
         backend(rate_hz=1234.0)

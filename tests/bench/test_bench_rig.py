@@ -1,0 +1,69 @@
+"""What a block of 10 ms costs on its way: the simulated table, the twin beside it, the encoder.
+
+Run with: pytest tests/bench/test_bench_rig.py --benchmark-enable
+"""
+
+from itertools import cycle
+
+import numpy as np
+from pytest_benchmark.fixture import BenchmarkFixture
+
+from table_io.backends import open_backend
+from table_io.block import Block
+from table_io.clock import ManualClock
+from table_io.profile import PROFILES
+from table_io.session import play
+from twin.compare import PREDICTED, pipeline
+from twin.service.bundle import Bundle, read_bundle
+from twin.stream.wire import decode, encode, topic
+
+
+def bundle() -> Bundle:
+    return read_bundle(PROFILES / "tests" / "quickstart.toml")
+
+
+def blocks(of: Bundle, count: int) -> list[Block]:
+    """The first measured blocks of a test on the simulated table."""
+    backend = open_backend(of.rig, of.profile, ManualClock())
+    source = play(of.session, backend, ManualClock(), of.describe("bench", "table"), lambda: None)
+    found: list[Block] = []
+    for item in source:
+        if isinstance(item, Block):
+            found.append(item)
+        if len(found) == count:
+            break
+    source.close()
+    return found
+
+
+def test_the_simulated_table_reads_a_block(benchmark: BenchmarkFixture) -> None:
+    of = bundle()
+    backend = open_backend(of.rig, of.profile, ManualClock())
+    backend.open()
+    backend.queue(0, np.zeros(4))
+    backend.start()
+    assert benchmark(backend.read, 20).shape == (len(of.rig.channels), 20)
+
+
+def test_the_twin_steps_a_block(benchmark: BenchmarkFixture) -> None:
+    of = bundle()
+    setup = of.twin()
+    state, _ = pipeline.start(setup)
+    for block in blocks(of, 200):
+        state, _ = pipeline.step(setup, state, block)
+    (following,) = (block for block in blocks(of, 201) if block.index == state.tracks.index)
+    _, items = benchmark(pipeline.step, setup, state, following)
+    assert isinstance(items[0], Block)
+    assert items[0].channels == PREDICTED
+
+
+def test_a_block_goes_through_the_encoder_and_back(benchmark: BenchmarkFixture) -> None:
+    some = cycle(blocks(bundle(), 50))
+
+    def there_and_back() -> tuple[Block, object]:
+        block = next(some)
+        return block, decode(topic(block), encode(block, "bench"))[1]
+
+    sent, got = benchmark(there_and_back)
+    assert isinstance(got, Block)
+    assert sent.identical(got)
