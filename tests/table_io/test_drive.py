@@ -106,7 +106,7 @@ def test_blends_last_at_least_one_and_a_half_cycles(name: str) -> None:
 
 
 @pytest.mark.parametrize("step_hz", [9.5, 4.75, 1.9])
-@pytest.mark.parametrize("directions", [("forward", "backward"), ("forward", "forward")])
+@pytest.mark.parametrize("directions", [("forward", "backward"), ("backward", "forward")])
 def test_coarse_grids_get_longer_blends_instead_of_harder_ones(
     step_hz: float, directions: tuple[str, ...]
 ) -> None:
