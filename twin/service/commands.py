@@ -11,6 +11,7 @@ from rich.console import Console
 from table_io.clock import ManualClock, RealClock
 from table_io.limits import warnings
 from table_io.profile import BadInput
+from table_io.records import Comparison
 from twin.service import summary as summaries
 from twin.service.bundle import Bundle, from_texts, read_bundle, read_model, run_id, warm
 from twin.service.progress import RunProgress
@@ -117,9 +118,7 @@ def run(
             began = _run_live(bundle, run_name, folder, asked, view, listen)
             if not began:
                 return EXIT_INTERRUPTED
-    code = _close(folder, bundle)
-    if view:
-        _write_view(folder)
+    code = _close(folder, bundle, view)
     return EXIT_INTERRUPTED if asked() and code == EXIT_ABORTED else code
 
 
@@ -177,13 +176,15 @@ def _run_live(
     return began
 
 
-def _close(folder: Path, bundle: Bundle, extra: dict[str, object] | None = None) -> int:
-    """Summary, report, and the one line that says what happened; the exit code."""
+def _close(folder: Path, bundle: Bundle, view: bool, extra: dict[str, object] | None = None) -> int:
+    """Summary, report, view, and the one line that says what happened; the exit code."""
     recording = read(folder / "run.mcap")
     found = summaries.summarise(recording, bundle.parameters)
     found |= extra or {}
     summaries.write(found, folder / "summary.json")
     _report(folder, recording)
+    if view:
+        _write_view(folder, recording)
     what = f"{summaries.sentence(found)} -> {folder / 'report.html'}"
     console.print(what, highlight=False, soft_wrap=True)
     if found["verdict"] != "complete":
@@ -197,10 +198,10 @@ def _report(folder: Path, recording: Recording) -> None:
     write_report(folder, recording)
 
 
-def _write_view(folder: Path) -> None:
+def _write_view(folder: Path, recording: Recording) -> None:
     from twin.stream.rerun_view import write_rrd
 
-    write_rrd(read(folder / "run.mcap"), folder / "view.rrd")
+    write_rrd(recording, folder / "view.rrd")
 
 
 def simulate(profile: Path, model: str | None, out: Path | None, view: bool) -> int:
@@ -213,10 +214,7 @@ def simulate(profile: Path, model: str | None, out: Path | None, view: bool) -> 
     _compile_once()
     with RunProgress(console, len(bundle.steps), bundle.drive.planned_end) as progress:
         play(bundle, run_name, folder / "run.mcap", progress)
-    code = _close(folder, bundle)
-    if view:
-        _write_view(folder)
-    return code
+    return _close(folder, bundle, view)
 
 
 def log_path(log: Path) -> Path:
@@ -267,10 +265,11 @@ def replay(log: Path, model: str | None, out: Path | None, speed: str, view: boo
 
         identity = play(recording, bundle, folder / "run.mcap", run_name, watch)
     same_model = bundle.model_toml == recording.start.model_toml
-    before = summaries.summarise(recording, bundle.parameters)["comparison"]
+    before = summaries.nrmse(recording.of(Comparison), bundle.parameters)
     code = _close(
         folder,
         bundle,
+        view,
         {
             "replay": {
                 "of": str(recording.path),
@@ -297,8 +296,6 @@ def replay(log: Path, model: str | None, out: Path | None, speed: str, view: boo
             "replay",
             highlight=False,
         )
-    if view:
-        _write_view(folder)
     return EXIT_NOT_IDENTICAL if same_model and not identity.identical else code
 
 

@@ -62,7 +62,7 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         "twin_jumps": [asdict(jump) for jump in twin_jumps],
         "twin_hysteresis": [asdict(interval) for interval in twin_intervals],
         "timing": _timing(recording.of(Timing)),
-        "comparison": _nrmse(recording.of(Comparison), parameters),
+        "comparison": nrmse(recording.of(Comparison), parameters),
     }
 
 
@@ -116,7 +116,7 @@ def _timing(records: tuple[Timing, ...]) -> Json:
     }
 
 
-def _nrmse(comparisons: tuple[Comparison, ...], parameters: Parameters) -> Json:
+def nrmse(comparisons: tuple[Comparison, ...], parameters: Parameters) -> Json:
     """Root of error squares over measured squares; `nrmse` of the restarted twin, and of the free.
 
     The restarted twin measures the model; the free one also carries where two solutions part.
