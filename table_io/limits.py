@@ -5,8 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from table_io.block import Block
+from table_io.card import BadInput
 from table_io.drive import Drive, Segment, displacement, motion
-from table_io.profile import GRAVITY_M_S2, BadInput, Profile, Rig
+from table_io.profile import Profile
+from table_io.rig import Rig
+from table_io.units import GRAVITY_M_S2
 
 
 @dataclass(frozen=True, slots=True)

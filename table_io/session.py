@@ -15,8 +15,9 @@ from table_io.calibration import command_to_volts, tare_from, to_si
 from table_io.clock import Clock
 from table_io.drive import Drive
 from table_io.limits import tripped
-from table_io.profile import Profile, Rig
+from table_io.profile import Profile
 from table_io.records import Event, Gap, Record, RunStart, RunStop
+from table_io.rig import Rig
 
 TARE_S = 1.0
 # From the newest sample to the start of a decay. At most 50 ms may pass from the decision to the

@@ -23,7 +23,8 @@ from typing import Protocol
 
 from table_io.block import Float1D, Float2D
 from table_io.clock import Clock
-from table_io.profile import Profile, Rig
+from table_io.profile import Profile
+from table_io.rig import Rig
 
 
 class Backend(Protocol):

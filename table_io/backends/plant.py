@@ -26,7 +26,7 @@ import numpy as np
 from numba import njit
 
 from table_io.block import Float1D, Float2D
-from table_io.profile import BadInput
+from table_io.card import BadInput
 
 SUBSTEP_S = 6.25e-5  # bounds the touch that is not seen; the integration error is far below
 RELAXATION = 0.25  # sub-step over C_j/K_j at most; 2.8 is where Runge-Kutta turns unstable

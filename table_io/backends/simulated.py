@@ -8,8 +8,10 @@ import numpy as np
 
 from table_io.backends.plant import SIGNALS, Plant
 from table_io.block import Float1D, Float2D
+from table_io.card import BadInput
 from table_io.clock import Clock
-from table_io.profile import BadInput, Output, Rig, Sensor, SimulatedTable, Specimen
+from table_io.profile import Specimen
+from table_io.rig import Output, Rig, Sensor, SimulatedTable
 
 REPLACE_AFTER_S = 0.02
 

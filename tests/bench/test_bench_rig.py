@@ -10,8 +10,8 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from table_io.backends import open_backend
 from table_io.block import Block
+from table_io.card import PROFILES
 from table_io.clock import ManualClock
-from table_io.profile import PROFILES
 from table_io.session import play
 from twin.compare import PREDICTED, pipeline
 from twin.service.bundle import Bundle, read_bundle

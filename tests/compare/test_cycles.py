@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from table_io.block import Float1D, Label
-from table_io.profile import GRAVITY_M_S2
 from table_io.records import Cycle, Extremes, Step
+from table_io.units import GRAVITY_M_S2
 from twin.compare.cycles import (
     UNKNOWN,
     Motion,

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from table_io.backends import open_backend
 from table_io.block import Block, Label, join, recut
+from table_io.card import PROFILES
 from table_io.clock import ManualClock
-from table_io.profile import PROFILES
 from table_io.records import Comparison, Cycle, Event, Params, Point
 from table_io.session import play
 from twin.compare import pipeline

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from table_io.profile import BadInput
+from table_io.card import BadInput
 from twin.model.effects import EFFECTS
 from twin.model.model import Model
 

@@ -8,7 +8,8 @@ from importlib import metadata
 import numpy as np
 import pytest
 
-from table_io.profile import BadInput, Specimen, parse
+from table_io.card import BadInput, parse
+from table_io.profile import Specimen
 from twin.model.card import ModelCard
 from twin.model.closed import ClosedSolver
 from twin.model.effects import EFFECTS, find_effect

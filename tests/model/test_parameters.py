@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from table_io.profile import BadInput, Specimen, find, load, parse
+from table_io.card import BadInput, find, load, parse
+from table_io.profile import Specimen
 from twin.model.card import ModelCard
 from twin.model.parameters import Parameters, resonance
 

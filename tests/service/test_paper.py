@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from table_io.profile import BadInput
+from table_io.card import BadInput
 from twin.service.cli import app
 from twin.service.paper import command, page
 from twin.service.paper.cases import curve

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from table_io.block import Block
-from table_io.profile import BadInput
+from table_io.card import BadInput
 from table_io.records import Comparison, Event, Fault, Gap, RunStop, Timing
 from twin.service.evidence import gather
 from twin.service.report import render, significant, write_report

@@ -326,7 +326,7 @@ def test_points_of_a_lost_sensor_are_null_not_zero(
 
 
 def test_the_start_record_must_be_there(recording: Recording, tmp_path: Path) -> None:
-    from table_io.profile import BadInput
+    from table_io.card import BadInput
 
     write_items(tmp_path / "run.mcap", without(recording, RunStart), recording.start)
     with pytest.raises(BadInput, match="no start record"):

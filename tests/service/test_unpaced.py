@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from table_io.block import Label
-from table_io.profile import BadInput
+from table_io.card import BadInput
 from table_io.records import Comparison, Cycle, Fault, Gap, Params, Point, RunStart, RunStop
 from twin.compare.windows import HISTORY_S
 from twin.service.bundle import Bundle, read_bundle

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from table_io.block import Block, join
-from table_io.profile import BadInput
+from table_io.card import BadInput
 from table_io.records import Comparison, Event, Gap, RunStart, RunStop, Step, Timing
 from twin.stream.mcap_log import LogWriter, Recording, merge, messages, read, topics, write_items
 from twin.stream.wire import TOPIC_TYPES, Item, encode, topic

@@ -9,8 +9,8 @@ import pytest
 from rerun.chunk import RrdReader
 
 from table_io.block import Block, Label
+from table_io.card import PROFILES, BadInput
 from table_io.channels import BY_NAME
-from table_io.profile import PROFILES, BadInput
 from table_io.records import (
     Comparison,
     Cycle,

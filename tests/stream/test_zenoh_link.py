@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from table_io.profile import BadInput
+from table_io.card import BadInput
 from twin.stream import resend
 from twin.stream.resend import HELD_PIECES, LARGEST_BYTES, PIECE_BYTES, Inbox, Shelf
 from twin.stream.wire import COMPARED, MEASURED, PREDICTED, TOPIC_TYPES

@@ -10,8 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from table_io.block import Float1D, Label
+from table_io.card import PROFILES, load
 from table_io.drive import Drive, Segment, motion, plan
-from table_io.profile import GRAVITY_M_S2, PROFILES, Profile, load
+from table_io.profile import Profile
+from table_io.units import GRAVITY_M_S2
 
 SHIPPED = sorted(path.stem for path in (PROFILES / "tests").glob("*.toml"))
 A = 0.05 * GRAVITY_M_S2

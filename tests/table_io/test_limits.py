@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 
 from table_io.block import Block
+from table_io.card import PROFILES, BadInput, load
 from table_io.drive import plan
 from table_io.limits import Margin, margins, refuse, tripped, warnings
-from table_io.profile import GRAVITY_M_S2, PROFILES, BadInput, Profile, Rig, load
+from table_io.profile import Profile
+from table_io.rig import Rig
+from table_io.units import GRAVITY_M_S2
 
 RIG = load(PROFILES / "rigs" / "simulated.toml", Rig, "machine card")[0]
 A = 0.05 * GRAVITY_M_S2

@@ -8,7 +8,7 @@ import pytest
 
 from table_io.backends.plant import Plant
 from table_io.block import Float1D, Float2D
-from table_io.profile import BadInput
+from table_io.card import BadInput
 
 M, K, C, KJ, CJ = 550.0, 36e3, 1100.0, 510e3, 900.0
 A = 0.05 * 9.80665

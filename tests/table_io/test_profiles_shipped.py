@@ -5,9 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from table_io.card import PROFILES, find, load
 from table_io.drive import plan
 from table_io.limits import margins, refuse, warnings
-from table_io.profile import PROFILES, Profile, Rig, find, load
+from table_io.profile import Profile
+from table_io.rig import Rig
 
 SHIPPED = sorted((PROFILES / "tests").glob("*.toml"))
 WIDE, TALL = (0.5, 5.0, 0.1, 10), (0.5, 10.0, 0.1, 10)  # start, stop, step in Hz; held cycles

@@ -11,11 +11,14 @@ import pytest
 from table_io.backends.simulated import SimulatedBackend
 from table_io.block import Block, Float1D, Float2D, Label, join
 from table_io.calibration import command_to_si, to_volts
+from table_io.card import PROFILES, BadInput, load
 from table_io.clock import ManualClock
 from table_io.drive import Drive, plan
-from table_io.profile import GRAVITY_M_S2, PROFILES, BadInput, Profile, Rig, load
+from table_io.profile import Profile
 from table_io.records import Event, Gap, Record, RunStart, RunStop
+from table_io.rig import Rig
 from table_io.session import Punctuality, Setup, play
+from table_io.units import GRAVITY_M_S2
 
 RATE = 2000.0
 A = 0.05 * GRAVITY_M_S2

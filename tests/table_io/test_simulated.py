@@ -9,8 +9,10 @@ import pytest
 from table_io.backends.simulated import SimulatedBackend
 from table_io.block import Float1D, Float2D
 from table_io.calibration import command_to_volts, tare_from, to_si
+from table_io.card import PROFILES, BadInput, load
 from table_io.clock import ManualClock, RealClock
-from table_io.profile import PROFILES, BadInput, Rig, Specimen, load
+from table_io.profile import Specimen
+from table_io.rig import Rig
 
 RIG = load(PROFILES / "rigs" / "simulated.toml", Rig, "machine card")[0]
 SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})

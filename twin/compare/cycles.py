@@ -11,8 +11,8 @@ from functools import cached_property
 import numpy as np
 
 from table_io.block import Float1D, Label
-from table_io.profile import GRAVITY_M_S2
 from table_io.records import Cycle, Extremes, Point, Quantities, Step
+from table_io.units import GRAVITY_M_S2
 from twin.model.parameters import Parameters
 
 HARMONICS = 10

@@ -4,7 +4,8 @@ from typing import Any
 
 from pydantic import Field, field_validator, model_validator
 
-from table_io.profile import BadInput, Card, NonNegative, Positive, Specimen
+from table_io.card import BadInput, Card, NonNegative, Positive
+from table_io.profile import Specimen
 from twin.model.effects import find_effect
 from twin.model.effects.effect import Effect
 from twin.model.model import Active, Model

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from table_io.block import Float1D, Float2D
-from table_io.profile import BadInput
+from table_io.card import BadInput
 from twin.model import exact, laws
 from twin.model.effects import bumper_hardening, cubic_stiffness
 from twin.model.integrate import (

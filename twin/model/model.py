@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
-from table_io.profile import BadInput
+from table_io.card import BadInput
 from twin.model.effects import find_effect
 from twin.model.effects.effect import Effect
 from twin.model.parameters import Parameters

@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 
-from table_io.profile import BadInput
+from table_io.card import BadInput
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,11 +7,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from table_io.card import find, load, parse
 from table_io.clock import today
 from table_io.drive import Drive, plan
 from table_io.limits import Margin, margins, refuse
-from table_io.profile import Profile, Rig, find, load, parse
+from table_io.profile import Profile
 from table_io.records import RunStart, Step
+from table_io.rig import Rig
 from table_io.session import Setup as SessionSetup
 from twin.model.card import ModelCard
 from twin.model.model import Model

@@ -156,7 +156,7 @@ def main() -> None:
         try:
             app()
         except ValueError as error:
-            from table_io.profile import BadInput
+            from table_io.card import BadInput
 
             if not isinstance(error, BadInput):
                 raise

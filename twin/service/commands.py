@@ -8,9 +8,9 @@ from pathlib import Path
 
 from rich.console import Console
 
+from table_io.card import BadInput
 from table_io.clock import ManualClock, RealClock
 from table_io.limits import warnings
-from table_io.profile import BadInput
 from table_io.records import Comparison
 from twin.service import summary as summaries
 from twin.service.bundle import Bundle, from_texts, read_bundle, read_model, run_id, warm

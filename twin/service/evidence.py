@@ -15,8 +15,9 @@ from scipy.signal import savgol_filter
 
 from table_io.block import Block, Float1D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS, contact_forces, rel_disp
-from table_io.profile import GRAVITY_M_S2, ComparisonCard, Specimen
+from table_io.profile import ComparisonCard, Specimen
 from table_io.records import Comparison, Params
+from table_io.units import GRAVITY_M_S2
 from twin.model.card import ModelCard
 from twin.model.model import Model
 from twin.stream.mcap_log import Recording

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.table import Table
 
 from table_io.limits import warnings
-from table_io.profile import GRAVITY_M_S2
+from table_io.units import GRAVITY_M_S2
 from twin.service.bundle import Bundle
 from twin.service.summary import Json
 

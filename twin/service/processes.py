@@ -18,8 +18,8 @@ from pathlib import Path
 
 from table_io.backends import open_backend
 from table_io.block import Block
+from table_io.card import BadInput
 from table_io.clock import RealClock
-from table_io.profile import BadInput
 from table_io.records import Event, Fault, RunStart, RunStop, Timing
 from table_io.session import Punctuality, play
 from twin.service.bundle import Bundle, from_texts, warm

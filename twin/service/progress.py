@@ -5,8 +5,8 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from table_io.profile import GRAVITY_M_S2
 from table_io.records import Comparison, Event, Fault, Gap, Point, Quantities, Timing
+from table_io.units import GRAVITY_M_S2
 from twin.stream.wire import Item
 
 HEAD = (

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from table_io.profile import BadInput
+from table_io.card import BadInput
 from table_io.records import Event, Fault, Gap, Params, Timing
 from twin.service.evidence import Run, Summary, cards, gather, quantity
 from twin.service.figures import Picture, draw_all

@@ -10,8 +10,8 @@ import numpy as np
 
 from table_io.backends import open_backend
 from table_io.block import Block
+from table_io.card import BadInput
 from table_io.clock import ManualClock
-from table_io.profile import BadInput
 from table_io.records import (
     Comparison,
     Cycle,

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from table_io.card import parse
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
-from table_io.profile import Profile, parse
+from table_io.profile import Profile
 from table_io.records import Comparison, Fault, Gap, Point, Quantities, Timing
 from twin.compare import COMPARED
 from twin.compare.curves import branches

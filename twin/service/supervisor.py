@@ -11,8 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from table_io.card import BadInput
 from table_io.clock import Clock
-from table_io.profile import BadInput, OnDeath
+from table_io.profile import OnDeath
 from table_io.records import Comparison, Event, Fault, RunStop, Timing
 from twin.service.processes import Spec, token
 from twin.stream.mcap_log import merge, messages

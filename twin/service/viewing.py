@@ -6,8 +6,8 @@ from pathlib import Path
 
 from rich.console import Console
 
+from table_io.card import BadInput
 from table_io.clock import RealClock
-from table_io.profile import BadInput
 from table_io.records import RunStart, RunStop
 from twin.stream.mcap_log import read
 from twin.stream.rerun_view import RerunView, open_viewer, screenshot, write_rrd

@@ -14,8 +14,8 @@ from mcap.reader import NonSeekingReader
 from mcap.writer import Writer
 
 from table_io.block import Block, join
+from table_io.card import BadInput
 from table_io.clock import wall_ns
-from table_io.profile import BadInput
 from table_io.records import Record, RunStart, RunStop
 from twin.stream.wire import (
     BLOCK_TOPICS,

@@ -20,8 +20,9 @@ import rerun.blueprint as rrb
 from rerun.experimental import ViewerClient
 
 from table_io.block import Block, Float1D, Float2D, Int1D
+from table_io.card import BadInput, parse
 from table_io.channels import BY_NAME
-from table_io.profile import BadInput, Profile, parse
+from table_io.profile import Profile
 from table_io.records import Comparison, Cycle, Point, Record, RunStart, Timing
 from twin.stream.mcap_log import Recording
 from twin.stream.rerun_layout import (

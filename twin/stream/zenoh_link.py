@@ -29,7 +29,7 @@ from typing import Any
 
 import zenoh
 
-from table_io.profile import BadInput
+from table_io.card import BadInput
 from twin.stream.resend import (
     ASK_EVERY_S,
     BEGINS,

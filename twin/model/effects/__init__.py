@@ -6,7 +6,7 @@ Other packages add theirs by an entry point of the group `shaketwin.effects` tha
 import difflib
 from importlib import metadata
 
-from table_io.profile import BadInput
+from table_io.card import BadInput
 from twin.model.effects.bouc_wen import BOUC_WEN
 from twin.model.effects.bumper_asymmetry import BUMPER_ASYMMETRY
 from twin.model.effects.bumper_hardening import BUMPER_HARDENING

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from table_io.profile import BadInput
+from table_io.card import BadInput
 
 if TYPE_CHECKING:
     from twin.model.parameters import Parameters

@@ -12,8 +12,10 @@ from functools import cached_property
 import numpy as np
 
 from table_io.block import Float1D
-from table_io.profile import GRAVITY_M_S2, Profile, find, load
+from table_io.card import find, load
+from table_io.profile import Profile
 from table_io.records import Point, Quantities, Step
+from table_io.units import GRAVITY_M_S2
 from twin.compare.curves import Hysteresis, Jump, branches
 from twin.model import exact
 from twin.model.card import ModelCard

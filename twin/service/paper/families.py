@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from table_io.profile import GRAVITY_M_S2
 from table_io.records import Point
+from table_io.units import GRAVITY_M_S2
 from twin.model.parameters import resonance
 from twin.service.figures import OFFSET
 from twin.service.paper.cases import Case, curve

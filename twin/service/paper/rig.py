@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from table_io.block import Label
-from table_io.profile import BadInput
+from table_io.card import BadInput
 from table_io.records import Point
 from twin.service import evidence
 from twin.service.commands import log_path, recorded_bundle
