@@ -23,9 +23,10 @@ class Label(IntEnum):
 
     REST = 0  # no motion commanded
     BLEND = 1  # soft start, soft stop, or change of step: never measured
-    SETTLE = 2  # held cycle before the measured ones
+    SETTLE = 2  # held at the step, not measured: before the measured cycles, tuning, holding
     MEASURE = 3  # held cycle that enters the PRC point
     STOP = 4  # decay to rest after a stop or a trip
+    CHECK = 5  # held cycle of the loop check, at low level, before the sweep
 
 
 @dataclass(frozen=True, slots=True, eq=False)

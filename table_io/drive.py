@@ -9,6 +9,8 @@ In a segment, with s(x) = 6x^5 - 15x^4 + 10x^3 over its length,
     f = f0 + (f1 - f0) s,   level = l0 + (l1 - l0) s,   theta = 2 pi (phase0 + integral f dt)
     displacement = -level / (2 pi f)^2 sin(theta), so that in a held segment the acceleration is
     level sin(theta).
+The command is that of a corrected level, level * correction, which blends like the level itself;
+`shape` adds what cancels harmonics: sin(theta) + sum over k >= 2 of Im(shape_k exp(i k theta)).
 """
 
 import math
@@ -19,10 +21,8 @@ from functools import cached_property
 import numpy as np
 
 from table_io.block import Float1D, Int1D, Label
-from table_io.profile import Profile
 from table_io.records import Step
 
-PEAK_RATIO = 1.05  # of the level: the most acceleration that a blend may ask for
 RAMP_CYCLES = 2.0  # a soft start over one cycle would peak at 1.12, over two at 1.02
 RAMP_S = 0.5
 
@@ -42,6 +42,10 @@ class Segment:
     phase0: float
     cycles: int = 0  # held cycles, 0 in a blend
     settle: int = 0  # the first of them that are not measured
+    correction0: float = 1.0  # of the command
+    correction1: float = 1.0
+    shape0: tuple[complex, ...] = ()  # orders 2, 3, ... of the command, relative
+    shape1: tuple[complex, ...] = ()
 
     @property
     def end(self) -> int:
@@ -62,20 +66,37 @@ def displacement(segment: Segment, x: Float1D, rate_hz: float) -> Float1D:
     """Commanded displacement in m at the fractions x of a segment."""
     s = smoothstep(x)
     f = segment.f0 + (segment.f1 - segment.f0) * s
-    level = segment.level0 + (segment.level1 - segment.level0) * s
-    return -level / (2 * math.pi * f) ** 2 * np.sin(2 * math.pi * segment.phase(x, rate_hz))
+    low, high = _corrected(segment)
+    theta = 2 * math.pi * segment.phase(x, rate_hz)
+    wave = np.sin(theta)
+    for k in range(max(len(segment.shape0), len(segment.shape1))):
+        before, after = _order(segment.shape0, k), _order(segment.shape1, k)
+        wave += np.imag((before + (after - before) * s) * np.exp(1j * (k + 2) * theta))
+    return -(low + (high - low) * s) / (2 * math.pi * f) ** 2 * wave
+
+
+def _corrected(segment: Segment) -> tuple[float, float]:
+    """Level of the command in m/s2 at the ends of a segment."""
+    return segment.level0 * segment.correction0, segment.level1 * segment.correction1
+
+
+def _order(shape: tuple[complex, ...], k: int) -> complex:
+    return shape[k] if k < len(shape) else 0j
 
 
 def _quadratures(
-    segment: Segment, x: Float1D, rate_hz: float
+    segment: Segment, x: Float1D, rate_hz: float, levels: tuple[float, float]
 ) -> tuple[Float1D, Float1D, Float1D, Float1D]:
-    """(v_sin, v_cos, a_sin, a_cos): velocity = v_sin sin + v_cos cos, acceleration likewise."""
+    """(v_sin, v_cos, a_sin, a_cos): velocity = v_sin sin + v_cos cos, acceleration likewise.
+
+    `levels` in m/s2 at the ends of the segment: the demanded ones, or those of the command.
+    """
     duration = segment.count / rate_hz
     s = smoothstep(x)
     ds = 30 * x**2 * (1 - x) ** 2 / duration
     dds = 60 * x * (1 - x) * (1 - 2 * x) / duration**2
-    df, dl = segment.f1 - segment.f0, segment.level1 - segment.level0
-    f, level = segment.f0 + df * s, segment.level0 + dl * s
+    df, dl = segment.f1 - segment.f0, levels[1] - levels[0]
+    f, level = segment.f0 + df * s, levels[0] + dl * s
     w = 2 * math.pi * f
     g = level / w**2
     dg = (dl * ds - 2 * level * df * ds / f) / w**2
@@ -91,22 +112,34 @@ def _quadratures(
 
 def motion(segment: Segment, x: Float1D, rate_hz: float) -> tuple[Float1D, Float1D]:
     """(velocity in m/s, acceleration in m/s2) of the ideal table at the fractions x."""
-    v_sin, v_cos, a_sin, a_cos = _quadratures(segment, x, rate_hz)
+    levels = (segment.level0, segment.level1)
+    v_sin, v_cos, a_sin, a_cos = _quadratures(segment, x, rate_hz, levels)
     theta = 2 * math.pi * segment.phase(x, rate_hz)
     sin, cos = np.sin(theta), np.cos(theta)
     return v_sin * sin + v_cos * cos, a_sin * sin + a_cos * cos
 
 
-def worst_acceleration(segment: Segment, rate_hz: float) -> float:
-    """Largest acceleration in m/s2 that the segment can ask for at its worst phase."""
+def worst_ratio(segment: Segment, rate_hz: float) -> float:
+    """Largest acceleration that the segment can ask for at its worst phase, over the larger level.
+
+    The larger of two ratios: of the demanded motion to the demanded level, and of the corrected
+    command to the corrected level.
+    """
     x = np.linspace(0.0, 1.0, 401)
-    _, _, a_sin, a_cos = _quadratures(segment, x, rate_hz)
-    return float(np.hypot(a_sin, a_cos).max())
+    ratios = []
+    for levels in ((segment.level0, segment.level1), _corrected(segment)):
+        _, _, a_sin, a_cos = _quadratures(segment, x, rate_hz, levels)
+        ratios.append(float(np.hypot(a_sin, a_cos).max()) / max(levels))
+    return max(ratios)
 
 
 @dataclass(frozen=True)
 class Drive:
-    """The whole command; from sample `decay_at` on, if set, it is multiplied down to rest."""
+    """The command as far as it is known: it always ends at rest.
+
+    Where segments overlap the later one holds: so a hold is cut short. From sample `decay_at` on,
+    if set, all is multiplied down to rest.
+    """
 
     rate_hz: float
     segments: tuple[Segment, ...]
@@ -157,10 +190,7 @@ class Drive:
         out = np.zeros(count)
         for segment, window, x in self._pieces(first, count):
             out[window] = displacement(segment, x, self.rate_hz)
-        if self.decay_at is not None:
-            x = (np.arange(first, first + count) - self.decay_at) / self.decay_samples
-            out *= 1.0 - smoothstep(np.clip(x, 0.0, 1.0))
-        return out
+        return out * self._left(first, count)
 
     def acceleration(self, first: int, count: int) -> Float1D:
         """Acceleration in m/s2 of an ideal table on the undecayed drive, (count,)."""
@@ -168,6 +198,28 @@ class Drive:
         for segment, window, x in self._pieces(first, count):
             out[window] = motion(segment, x, self.rate_hz)[1]
         return out
+
+    def phase(self, first: int, count: int) -> Float1D:
+        """Phase in cycles of each sample, (count,); 0 outside the drive."""
+        out = np.zeros(count)
+        for segment, window, x in self._pieces(first, count):
+            out[window] = segment.phase(x, self.rate_hz)
+        return out
+
+    def level(self, first: int, count: int) -> Float1D:
+        """Demanded peak acceleration in m/s2 at each sample, (count,), the decay included."""
+        out = np.zeros(count)
+        for segment, window, x in self._pieces(first, count):
+            low, high = segment.level0, segment.level1
+            out[window] = low + (high - low) * smoothstep(x)
+        return out * self._left(first, count)
+
+    def _left(self, first: int, count: int) -> Float1D:
+        """What a decay has left of the command at each sample, 1 before it, (count,)."""
+        if self.decay_at is None:
+            return np.ones(count)
+        x = (np.arange(first, first + count) - self.decay_at) / self.decay_samples
+        return 1.0 - smoothstep(np.clip(x, 0.0, 1.0))
 
     def labels(self, first: int, count: int) -> tuple[Int1D, Int1D, Int1D]:
         """(step, label, held cycle) of each sample, (count,) each; -1 outside the sweep."""
@@ -207,72 +259,3 @@ class Drive:
                 x = (np.arange(lo, hi) - segment.start) / segment.count
                 pieces.append((segment, slice(lo - first, hi - first), x))
         return pieces
-
-
-def plan(profile: Profile) -> Drive:
-    """The drive of a test profile: rest, soft start, the steps with blends between, soft stop."""
-    rate, sweep = profile.acquisition.rate_hz, profile.sweep
-    steps = sweep.steps
-    segments: list[Segment] = []
-    at, phase = math.ceil(profile.acquisition.rest_s * rate), 0.0
-
-    def add(segment: Segment) -> None:
-        nonlocal at, phase
-        segments.append(segment)
-        at = segment.end
-        phase = float(segment.phase(np.ones(1), rate)[0]) % 1.0
-
-    before = Step(-1, "forward", steps[0].frequency_hz, 0.0)
-    for step in steps:
-        if (before.frequency_hz, before.acceleration_m_s2) != (
-            step.frequency_hz,
-            step.acceleration_m_s2,
-        ):
-            add(_blend(before, step, step.index, at, phase, sweep.blend_cycles, rate))
-        count = math.ceil(sweep.cycles * rate / step.frequency_hz)
-        level, f = step.acceleration_m_s2, step.frequency_hz
-        settle = sweep.cycles - sweep.measured_cycles
-        add(
-            Segment(
-                at,
-                count,
-                Label.MEASURE,
-                step.index,
-                f,
-                f,
-                level,
-                level,
-                phase,
-                sweep.cycles,
-                settle,
-            )
-        )
-        before = step
-    rest = replace(before, acceleration_m_s2=0.0)
-    add(_blend(before, rest, before.index, at, phase, sweep.blend_cycles, rate))
-    return Drive(rate, tuple(segments), steps)
-
-
-def _blend(
-    a: Step, b: Step, step: int, at: int, phase: float, cycles: float, rate_hz: float
-) -> Segment:
-    """The shortest blend from a to b that asks for no more than 1.05 of the larger level."""
-    level = max(a.acceleration_m_s2, b.acceleration_m_s2)
-    ramp = min(a.acceleration_m_s2, b.acceleration_m_s2) == 0.0
-    mean_hz = 0.5 * (a.frequency_hz + b.frequency_hz)
-    seconds = max(RAMP_CYCLES / mean_hz, RAMP_S) if ramp else cycles / mean_hz
-    while True:
-        segment = Segment(
-            at,
-            math.ceil(seconds * rate_hz),
-            Label.BLEND,
-            step,
-            a.frequency_hz,
-            b.frequency_hz,
-            a.acceleration_m_s2,
-            b.acceleration_m_s2,
-            phase,
-        )
-        if worst_acceleration(segment, rate_hz) <= PEAK_RATIO * level:
-            return segment
-        seconds += 0.25 / mean_hz

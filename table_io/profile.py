@@ -153,6 +153,40 @@ class OnDeath(Card):
     supervisor: Literal["continue", "stop"] = "stop"
 
 
+class LoopCheck(Card):
+    """The loop check at low level that comes before every run, and the rest after it."""
+
+    enabled: bool = True
+    level: Number = Field(0.1, gt=0, le=0.1, description="Of the test's acceleration.")
+    cycles: Count = Field(5, ge=3, le=50, description="Held cycles at each frequency.")
+    frequencies_hz: tuple[Positive, ...] = Field(
+        (), max_length=10, description="None: three between the sweep's ends."
+    )
+    rest_s: Number = Field(5.0, ge=5.0, le=60, description="Of rest after it.")
+
+
+class Control(Card):
+    """How the demanded level is reached: the command is corrected before the measured cycles."""
+
+    enabled: bool = True
+    tolerance: Number = Field(0.02, ge=0.002, le=0.1, description="Of the demanded level.")
+    updates: Count = Field(3, ge=1, le=10, description="At a step, at most.")
+    gain: Number = Field(0.8, ge=0.1, le=1.0, description="Share of an error that is corrected.")
+    clamp_db: Number = Field(2.0, gt=0, le=6.0, description="Most that one update may change.")
+    harmonics: bool = Field(False, description="Cancel the table's harmonics 2 to 5.")
+    harmonic_updates: Count = Field(5, ge=1, le=10)
+
+
+class Protection(Card):
+    """Tracked bands and what a broken sensor does; the machine card holds the limits."""
+
+    alarm: Number = Field(0.1, gt=0, le=1.0, description="Of the level: an alarm beyond it.")
+    abort_db: Number = Field(6.0, gt=0, le=12.0, description="From the level: beyond it a stop.")
+    sensor: Literal["stop", "warn"] = Field(
+        "stop", description="At a fault of a sensor that the controller does not need."
+    )
+
+
 class Profile(Card):
     """A test: specimen, sweep, acquisition, comparison."""
 
@@ -165,6 +199,9 @@ class Profile(Card):
     sweep: Sweep
     acquisition: Acquisition = Field(Acquisition(), validate_default=True)
     comparison: ComparisonCard = ComparisonCard()
+    loop_check: LoopCheck = LoopCheck()
+    control: Control = Control()
+    protection: Protection = Protection()
     on_death: OnDeath = OnDeath()
 
     @field_validator("acquisition")

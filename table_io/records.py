@@ -179,6 +179,80 @@ class Timing:
 
 
 @dataclass(frozen=True, slots=True)
+class Check:
+    """One line of the loop check: `value` has to lie in low .. high."""
+
+    index: int
+    name: str
+    channel: str
+    value: float
+    low: float
+    high: float
+    unit: str
+    passed: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Response:
+    """The table's acceleration over its command, identified at low level, at `frequencies_hz`.
+
+    `gain` is a ratio, `phase_rad` negative where the table lags.
+    """
+
+    index: int
+    frequencies_hz: tuple[float, ...]
+    gain: tuple[float, ...]
+    phase_rad: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """One look at the table's level at a step, on whole cycles that end before sample `index`.
+
+    Fundamental of the measured table acceleration beside the demanded one; `correction` is what the
+    command was multiplied with, `update` how often it was changed at this step, `accepted` that it
+    now stays for the measured cycles. `harmonics` are those of orders 2 to 5, m/s2.
+    """
+
+    index: int
+    step: int
+    demanded_m_s2: float
+    measured_m_s2: float
+    correction: float
+    update: int
+    accepted: bool
+    harmonics_m_s2: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Decided:
+    """A step that was decided on during the test, not planned before it (track, refine)."""
+
+    index: int
+    step: int
+    direction: str
+    frequency_hz: float
+    acceleration_m_s2: float
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Trip:
+    """Protection: what was seen in `channel` at sample `index`; latched, the table decays to rest.
+
+    `decided` is the sample up to which the session had looked when it saw this.
+    """
+
+    index: int
+    decided: int
+    kind: str  # one word: stroke, velocity, acceleration, force, lost, stuck, level, ...
+    channel: str
+    value: float
+    limit: float
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class RunStop:
     """The end: `index` samples were acquired; verdict complete, stopped, aborted or halted."""
 
@@ -188,7 +262,24 @@ class RunStop:
     states: tuple[str, ...] = field(default=())
 
 
-Record = RunStart | Params | Comparison | Cycle | Point | Event | Gap | Fault | Timing | RunStop
+Record = (
+    RunStart
+    | Params
+    | Comparison
+    | Cycle
+    | Point
+    | Event
+    | Gap
+    | Fault
+    | Timing
+    | Check
+    | Response
+    | Level
+    | Decided
+    | Trip
+    | RunStop
+)
 RECORDS: tuple[type, ...] = (
-    RunStart, Params, Comparison, Cycle, Point, Event, Gap, Fault, Timing, RunStop,
+    RunStart, Params, Comparison, Cycle, Point, Event, Gap, Fault, Timing,
+    Check, Response, Level, Decided, Trip, RunStop,
 )  # fmt: skip

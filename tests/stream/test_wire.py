@@ -42,6 +42,7 @@ def anything_like(hint: Any) -> st.SearchStrategy[Any]:
     return {
         NoneType: st.none(),
         int: st.integers(0, 2**63 - 1),
+        bool: st.booleans(),
         float: st.one_of(st.sampled_from(ODD), st.floats()),
         str: st.text(max_size=20),
     }[hint]
@@ -166,6 +167,7 @@ def found(field: FieldDescriptor) -> tuple[str, str]:
         FieldDescriptor.CPPTYPE_INT64: "int",
         FieldDescriptor.CPPTYPE_UINT64: "int",
         FieldDescriptor.CPPTYPE_DOUBLE: "float",
+        FieldDescriptor.CPPTYPE_BOOL: "bool",
         FieldDescriptor.CPPTYPE_STRING: "str",
     }
     if field.message_type is None:

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from table_io.block import Float1D, Label
 from table_io.card import PROFILES, load
-from table_io.drive import Drive, Segment, motion, plan
+from table_io.course import plan
+from table_io.drive import Drive, Segment, motion
 from table_io.profile import Profile
 from table_io.units import GRAVITY_M_S2
 

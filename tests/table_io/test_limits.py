@@ -8,7 +8,7 @@ import pytest
 
 from table_io.block import Block
 from table_io.card import PROFILES, BadInput, load
-from table_io.drive import plan
+from table_io.course import plan
 from table_io.limits import Margin, margins, refuse, tripped, warnings
 from table_io.profile import Profile
 from table_io.rig import Rig

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from table_io.card import PROFILES, find, load
-from table_io.drive import plan
+from table_io.course import plan
 from table_io.limits import margins, refuse, warnings
 from table_io.profile import Profile
 from table_io.rig import Rig

@@ -13,7 +13,8 @@ from table_io.block import Block, Float1D, Float2D, Label, join
 from table_io.calibration import command_to_si, to_volts
 from table_io.card import PROFILES, BadInput, load
 from table_io.clock import ManualClock
-from table_io.drive import Drive, plan
+from table_io.course import plan
+from table_io.drive import Drive
 from table_io.profile import Profile
 from table_io.records import Event, Gap, Record, RunStart, RunStop
 from table_io.rig import Rig

@@ -11,7 +11,7 @@ Source of the formula: Dormand and Prince 1980, J. Comput. Appl. Math. 6(1), the
 import math
 
 from table_io.block import Float1D, Float2D
-from twin.model.compiled import compiled, revision
+from twin.model.compiled import inner, revision
 from twin.model.laws import (
     BASE,
     C_L,
@@ -55,7 +55,7 @@ TURN_GUARD = 2  # the guard that is not a side's
 Moved = tuple[Point, Point]  # a point and its rates
 
 
-@compiled(inlined=True)
+@inner(inlined=True)
 def add(x: Point, h: float, k: Point) -> Point:
     """x + h k."""
     return (
@@ -64,7 +64,7 @@ def add(x: Point, h: float, k: Point) -> Point:
     )  # fmt: skip
 
 
-@compiled()
+@inner()
 def runge_kutta(
     t: float, x: Point, k1: Point, frame: Frame, con: Constants, mode: int, way: float, extra: Extra
 ) -> Point:
@@ -85,7 +85,7 @@ def runge_kutta(
     return add(add(add(y, t * 125 / 192, k4), t * -2187 / 6784, k5), t * 11 / 84, k6)
 
 
-@compiled()
+@inner()
 def linear(t: float, x: Point, frame: Frame, con: Constants, maps: Float2D, mode: int) -> Point:
     """The point t s after x of a linear model: the tabled map over a whole step, else the series.
 
@@ -109,7 +109,7 @@ def linear(t: float, x: Point, frame: Frame, con: Constants, maps: Float2D, mode
     return x
 
 
-@compiled()
+@inner()
 def times(
     maps: Float2D, row: int, x: Point, base: float, slope: float, right: float, left: float,
     one: float,
@@ -126,7 +126,7 @@ def times(
     )
 
 
-@compiled(inlined=True)
+@inner(inlined=True)
 def product(
     m: Float1D, x: Point, base: float, slope: float, right: float, left: float, one: float
 ) -> float:
@@ -137,7 +137,7 @@ def product(
     )
 
 
-@compiled()
+@inner()
 def flow(
     t: float, x: Point, k1: Point, frame: Frame, con: Constants, maps: Float2D, mode: int,
     way: float, extra: Extra,
@@ -154,7 +154,7 @@ def flow(
     return y, rates(y, frame, con, mode, way, t, extra)
 
 
-@compiled(inlined=True)
+@inner(inlined=True)
 def guard(
     t: float,
     at: Moved,
@@ -185,7 +185,7 @@ def guard(
     return bumper(con, which, d, dd, b), slope
 
 
-@compiled()
+@inner()
 def root(
     lo: float, hi: float, order: int, x: Point, k1: Point, frame: Frame, con: Constants,
     maps: Float2D, mode: int, way: float, extra: Extra, which: int,
@@ -221,7 +221,7 @@ def root(
     return t
 
 
-@compiled()
+@inner()
 def crossing(
     h: float, x: Point, k1: Point, end: Moved, frame: Frame, con: Constants, maps: Float2D,
     mode: int, way: float, extra: Extra, which: int,
@@ -258,7 +258,7 @@ def crossing(
     return 0.0
 
 
-@compiled()
+@inner()
 def leap(
     h: float, x: Point, frame: Frame, con: Constants, maps: Float2D, mode: int, way: float,
     extra: Extra, search: bool,

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from numba import float64, types
 
 from table_io.block import Float1D, Float2D
-from twin.model.compiled import compiled, revision
+from twin.model.compiled import compiled, inner, revision
 from twin.model.events import REVISION as EVENTS_REVISION
 from twin.model.events import TURN_GUARD, Moved, leap
 from twin.model.laws import (
@@ -57,7 +57,7 @@ DENORMAL = 1e-30  # m, N, 1: what is this near to zero is zero
 MOST_EVENTS = 60  # in one step; only rounding can come near it
 
 
-@compiled(inlined=True)
+@inner(inlined=True)
 def later(frame: Frame, x: Point, t: float, way: float, con: Constants) -> Frame:
     """The frame of a step that begins where the motion is at x, t s into this one."""
     z = frame[Z_0]
@@ -68,7 +68,7 @@ def later(frame: Frame, x: Point, t: float, way: float, con: Constants) -> Frame
     return x[U], z, right + opened, left + opened, base + slope * t, slope, peak, w, phase + w * t
 
 
-@compiled()
+@inner()
 def event(
     found: int, x: Point, frame: Frame, con: Constants, mode: int, way: float, extra: Extra
 ) -> tuple[Point, int, float]:
@@ -98,13 +98,13 @@ def event(
     return (u, v, right, left, f, b_r, b_l), mode, way
 
 
-@compiled(inlined=True)
+@inner(inlined=True)
 def flushed(q: float, sign: float, b: float) -> float:
     """u_j of a free face: zero where it has decayed, or overshot with no branch that drives it."""
     return 0.0 if abs(q) < DENORMAL or (sign * q < 0.0 and b == 0.0) else q
 
 
-@compiled()
+@inner()
 def onward(
     h: float, x: Point, frame: Frame, con: Constants, maps: Float2D, mode: int, way: float,
     extra: Extra,
@@ -128,7 +128,7 @@ def onward(
     return ((u, v, right, left, f, b_r, b_l), at[1]), frame, mode, way
 
 
-@compiled(inlined=True)
+@inner(inlined=True)
 def placed(
     x: Point, frame: Frame, con: Constants, mode: int, time: float, base: float, slope: float
 ) -> tuple[Point, Frame]:
@@ -139,7 +139,7 @@ def placed(
     return x, (u, frame[Z_0], right, left, base, slope, frame[6], frame[7], frame[8])
 
 
-@compiled(inlined=True)
+@inner(inlined=True)
 def push(x: Point, frame: Frame, con: Constants, mode: int, side: int) -> float:
     """F_R >= 0 or F_L <= 0 in N at the start of a frame."""
     if not (mode >> side) & 1:

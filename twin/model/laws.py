@@ -17,7 +17,7 @@ from typing import Any
 
 from numba import float64, types
 
-from twin.model.compiled import compiled, revision
+from twin.model.compiled import compiled, inner, revision
 from twin.model.effects import (
     bouc_wen,
     bumper_hardening,
@@ -52,12 +52,12 @@ FORCE = float64(float64, float64, types.UniTuple(float64, EXTRAS))
 EXTRA_TYPE = types.FunctionType(FORCE)
 Extra = Callable[[float, float, Constants], float]
 
-cubic = compiled(inlined=True)(cubic_stiffness.force)
-quadratic = compiled(inlined=True)(quadratic_damping.force)
-coulomb = compiled(inlined=True)(coulomb_friction.force)
-hysteretic = compiled()(bouc_wen.hysteretic)
-hardening = compiled(inlined=True)(bumper_hardening.force)
-crossley = compiled(inlined=True)(hunt_crossley.damping)
+cubic = inner(inlined=True)(cubic_stiffness.force)
+quadratic = inner(inlined=True)(quadratic_damping.force)
+coulomb = inner(inlined=True)(coulomb_friction.force)
+hysteretic = inner()(bouc_wen.hysteretic)
+hardening = inner(inlined=True)(bumper_hardening.force)
+crossley = inner(inlined=True)(hunt_crossley.damping)
 
 
 @compiled(FORCE, cache=True)
@@ -66,14 +66,14 @@ def no_extra(u: float, v: float, c: Constants) -> float:
     return 0.0
 
 
-@compiled(inlined=True)
+@inner(inlined=True)
 def bumper(con: Constants, side: int, d: float, dd: float, b: float) -> float:
     """Push of a bumper in N; deformation d, its rate dd and branch force b > 0 in compression."""
     k, c = (con[K_R], con[C_R]) if side == 0 else (con[K_L], con[C_L])
     return k * d + (c + crossley(d, con[CH])) * dd + hardening(d, con[K2]) + b
 
 
-@compiled(inlined=True)
+@inner(inlined=True)
 def recovery(con: Constants, side: int, d: float, b: float) -> float:
     """Rate in m/s of the deformation d of a bumper that nobody touches; b as in `bumper`.
 
@@ -90,7 +90,7 @@ def recovery(con: Constants, side: int, d: float, b: float) -> float:
     return b * con[RATE_B] / (k + 2 * con[K2] * abs(d) + con[KB])
 
 
-@compiled(inlined=True)
+@inner(inlined=True)
 def face(
     x: Point, frame: Frame, con: Constants, mode: int, side: int, t: float
 ) -> tuple[float, float, float]:
@@ -105,7 +105,7 @@ def face(
     return d, recovery(con, side, d, b), b
 
 
-@compiled(inlined=True)
+@inner(inlined=True)
 def resistance(
     x: Point, frame: Frame, con: Constants, mode: int, way: float, t: float, extra: Extra
 ) -> float:
@@ -131,7 +131,7 @@ def resistance(
     return force
 
 
-@compiled(inlined=True)
+@inner(inlined=True)
 def drive(frame: Frame, t: float) -> float:
     """Table acceleration in m/s2, t s into the step."""
     base = frame[BASE] + frame[SLOPE] * t
@@ -140,7 +140,7 @@ def drive(frame: Frame, t: float) -> float:
     return base
 
 
-@compiled(inlined=True)
+@inner(inlined=True)
 def rates(
     x: Point, frame: Frame, con: Constants, mode: int, way: float, t: float, extra: Extra
 ) -> Point:
@@ -157,7 +157,7 @@ def rates(
     )  # fmt: skip
 
 
-@compiled(inlined=True)
+@inner(inlined=True)
 def hold(x: Point, frame: Frame, con: Constants, mode: int, t: float, extra: Extra) -> float:
     """Friction in N that it takes to keep the mass in place."""
     force = resistance(x, frame, con, mode, 0.0, t, extra)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from numba import float64, int64, types
 
 from table_io.block import Float1D, Float2D
-from twin.model.compiled import compiled
+from twin.model.compiled import compiled, inner
 from twin.model.exact import parameter_constants, restart, substeps
 from twin.model.parameters import Parameters
 from twin.model.phase import (
@@ -42,7 +42,7 @@ MOST_ONSETS = 40  # a cycle and side that `onsets` makes room for
 EXACT = 1e-13  # m: a state that comes back this near is periodic
 
 
-@compiled()
+@inner()
 def carry(variations: Float2D, con: Float1D, mode: int, dt: float, side: int, onset: bool) -> None:
     """Moves `variations` (4, n) through dt s of a mode and the event on `side` at its end."""
     b = MODES + mode * MODE_SIZE

@@ -11,7 +11,7 @@ only event times need a root. A guard is a quantity that stays positive until an
 import math
 
 from table_io.block import Float1D
-from twin.model.compiled import compiled, revision
+from twin.model.compiled import inner, revision
 
 Wave = tuple[float, float, float]  # peak in m/s2, angular frequency in 1/s, phase of a sinusoid
 Motion = tuple[float, float, float, float, float, float, Wave, float, float]  # made by `motion`
@@ -31,7 +31,7 @@ DENORMAL = 1e-30  # m: a bumper this near to relaxed is relaxed
 MOST_EVENTS = 40  # in one step; only rounding at a graze can come near it
 
 
-@compiled(cache=True)
+@inner()
 def flow(t: float, a: float, w2: float) -> tuple[float, float, float, float]:
     """Matrix over t s that takes (y, y') of y'' + 2 a y' + w2 y = 0 onwards, row by row.
 
@@ -52,7 +52,7 @@ def flow(t: float, a: float, w2: float) -> tuple[float, float, float, float]:
     return c + a * s, s, -w2 * s, c - a * s
 
 
-@compiled()
+@inner()
 def motion(
     con: Float1D, mode: int, u: float, v: float, base: float, slope: float, wave: Wave
 ) -> tuple[Motion, Point]:
@@ -80,7 +80,7 @@ def motion(
     return (a, w2, y, z, q0, q1, wave, alpha, beta), start
 
 
-@compiled()
+@inner()
 def motion_at(t: float, m: Motion) -> Point:
     """(u, u', u'', third derivative) of a motion at t s."""
     a, w2, y0, z0, q0, q1, (peak, w, phase), alpha, beta = m
@@ -95,7 +95,7 @@ def motion_at(t: float, m: Motion) -> Point:
     return u, v, d, j
 
 
-@compiled()
+@inner()
 def value(t: float, x: Point, q: Quantity) -> tuple[float, float, float]:
     """(q, q', q'') at t s, where the motion is at x."""
     u, v, d, j = x
@@ -104,7 +104,7 @@ def value(t: float, x: Point, q: Quantity) -> tuple[float, float, float]:
     return q0 + qu * u + qv * v + e, qu * v + qv * d - r * e, qu * d + qv * j + r * r * e
 
 
-@compiled()
+@inner()
 def guard(con: Float1D, mode: int, side: int, uj: float) -> Quantity:
     """Clearance in m (flight) or push in N (contact) of side 0 = right, 1 = left."""
     k, c, gap = con[K_R + side], con[C_R + side], con[G_R + side]
@@ -114,7 +114,7 @@ def guard(con: Float1D, mode: int, side: int, uj: float) -> Quantity:
     return gap, -right, 0.0, right * uj, con[R_R + side]
 
 
-@compiled()
+@inner()
 def root(
     lo: float, hi: float, guess: float, sign: float, m: Motion, q: Quantity, order: int
 ) -> float:
@@ -142,7 +142,7 @@ def root(
     return t
 
 
-@compiled()
+@inner()
 def crossing(h: float, m: Motion, q: Quantity, x0: Point, x1: Point) -> float:
     """First time in s in [0, h] at which the guard q turns negative, else inf; x at both ends."""
     g0, d0, _ = value(0.0, x0, q)
@@ -169,7 +169,7 @@ def crossing(h: float, m: Motion, q: Quantity, x0: Point, x1: Point) -> float:
     return 0.0
 
 
-@compiled()
+@inner()
 def leap(
     state: Float1D, con: Float1D, h: float, base: float, slope: float, wave: Wave, search: bool
 ) -> tuple[float, int, Motion, Point, Point]:

@@ -5,7 +5,7 @@ import math
 from numba import float64, int64, types
 
 from table_io.block import Float1D, Float2D
-from twin.model.compiled import compiled
+from twin.model.compiled import compiled, inner
 from twin.model.phase import (
     BASE,
     C_L,
@@ -38,7 +38,7 @@ from twin.model.phase import (
 )  # fmt: skip
 
 
-@compiled()
+@inner()
 def impulses(
     state: Float1D, con: Float1D, mode: int, t: float, du: float, dv: float, base: float
 ) -> None:
@@ -51,7 +51,7 @@ def impulses(
         state[IMPULSE_L] += con[C_L] * du + con[K_L] * (area + con[G_L] * t)
 
 
-@compiled()
+@inner()
 def record(state: Float1D, con: Float1D, t: float, side: int, log: Float2D, count: int) -> int:
     """Writes the event at `state` into row `count` of `log` if there is one; the new count."""
     right, onset = 1.0 - 2.0 * side, state[CONTACT_R + side]
@@ -63,7 +63,7 @@ def record(state: Float1D, con: Float1D, t: float, side: int, log: Float2D, coun
     return count + 1
 
 
-@compiled()
+@inner()
 def eventful(
     state: Float1D, con: Float1D, start: float, slope: float, log: Float2D, count: int
 ) -> int:

@@ -7,7 +7,7 @@ import numpy.typing as npt
 from numba import float64, int64, types
 
 from table_io.block import Float1D, Float2D, Int1D
-from twin.model.compiled import compiled
+from twin.model.compiled import compiled, inner
 from twin.model.phase import (
     C_L,
     C_R,
@@ -46,14 +46,14 @@ from twin.model.phase import (
 Float3D = npt.NDArray[np.float64]
 
 
-@compiled()
+@inner()
 def summit(h: float, m: Motion, q: Quantity, slope0: float, slope1: float) -> float:
     """Value of q where its slope changes sign within a phase of h s; the slopes at both ends."""
     t = root(0.0, h, h * slope0 / (slope0 - slope1), slope1, m, q, 1)
     return value(t, motion_at(t, m), q)[0]
 
 
-@compiled()
+@inner()
 def span(h: float, m: Motion, q: Quantity, x0: Point, x1: Point) -> tuple[float, float]:
     """(least, greatest) q over a phase of h s, from the root of its slope; x at both ends."""
     a, da, _ = value(0.0, x0, q)
@@ -65,14 +65,14 @@ def span(h: float, m: Motion, q: Quantity, x0: Point, x1: Point) -> tuple[float,
     return lo, hi
 
 
-@compiled()
+@inner()
 def total(con: Float1D, mode: int) -> Quantity:
     """Total acceleration in m/s2: (f0 - k u - c u')/M."""
     b, mass = MODES + mode * MODE_SIZE, con[MASS]
     return con[b + 2] / mass, -con[b] / mass, -con[b + 1] / mass, 0.0, 0.0
 
 
-@compiled()
+@inner()
 def widen(
     extremes: Float1D, con: Float1D, mode: int, h: float, m: Motion, x0: Point, x1: Point
 ) -> None:
@@ -87,7 +87,7 @@ def widen(
         extremes[5] = min(extremes[5], -span(h, m, guard(con, mode, 1, 0.0), x0, x1)[1])
 
 
-@compiled()
+@inner()
 def eventful(
     state: Float1D, con: Float1D, h: float, peak: float, w: float, phase: float, row: Float1D
 ) -> None:
@@ -104,7 +104,7 @@ def eventful(
         row[6 + side] += state[CONTACT_R + side]
 
 
-@compiled()
+@inner()
 def tune(
     con: Float1D, table: Float2D, particular: Float2D, peak: float, w: float, steps: int
 ) -> None:
@@ -127,7 +127,7 @@ def tune(
         particular[mode, 1], particular[mode, 2] = -re * scale, im * scale
 
 
-@compiled()
+@inner()
 def begin(row: Float1D, state: Float1D, con: Float1D) -> None:
     """The extremes of a cycle before its first step: where it starts."""
     u, v, mode = state[U], state[V], int(state[CONTACT_R] > 0) + 2 * int(state[CONTACT_L] > 0)
@@ -139,7 +139,7 @@ def begin(row: Float1D, state: Float1D, con: Float1D) -> None:
     row[6] = row[7] = 0.0
 
 
-@compiled()
+@inner()
 def cycle_of(
     state: Float1D, con: Float1D, table: Float2D, particular: Float2D,
     peak: float, w: float, steps: int, row: Float1D,
@@ -223,4 +223,6 @@ def stepped(
         for cycle in range(cycles):
             row = extremes[i, cycle]
             cycle_of(state, con, table, particular, peaks[i], w[i], steps[i], row)
-        ends[i] = state
+        # Entry by entry: to copy a row numba compiles an error message for unequal lengths.
+        for place in range(state.size):
+            ends[i, place] = state[place]

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 from table_io.card import find, load, parse
 from table_io.clock import today
-from table_io.drive import Drive, plan
+from table_io.course import plan
+from table_io.drive import Drive
 from table_io.limits import Margin, margins, refuse
 from table_io.profile import Profile
 from table_io.records import RunStart, Step

@@ -20,15 +20,10 @@ from table_io.profile import Profile
 from table_io.records import (
     Comparison,
     Cycle,
-    Event,
     Extremes,
-    Fault,
-    Gap,
-    Params,
     Point,
     Quantities,
     RunStart,
-    RunStop,
 )
 
 Float3D = npt.NDArray[np.float64]
@@ -494,29 +489,3 @@ def cycle_table(cycle: Cycle) -> str:
     rows = zip(names, cells(cycle.measured), cells(cycle.twin), strict=True)
     lines = (f"| {name} | {measured} | {twin} |" for name, measured, twin in rows)
     return "| | measured | twin |\n|---|---|---|\n" + "\n".join(lines)
-
-
-LEVELS = {
-    "ERROR": {"trip", "fault", "abort", "aborted", "protection", "halt", "halted", "error"},
-    "WARN": {"warning", "warn", "limit", "late", "stop", "stopped"},
-}
-
-
-Told = Event | Gap | Fault | Params | RunStop
-
-
-def sentence(record: Told, rate_hz: float) -> tuple[str, str]:
-    """(level, text) of a record as a person reads it in the event list."""
-    match record:
-        case Event(kind=kind, text=text):
-            level = next((one for one, kinds in LEVELS.items() if kind in kinds), "INFO")
-            return level, f"{kind}: {text}"
-        case Gap(count=count, channel=channel, reason=reason):
-            return "WARN", f"gap: {count} samples of {channel or 'all channels'} {reason}"
-        case Fault(component=component, from_index=first, to_index=last, reason=reason):
-            span = f"{first / rate_hz:.3f} s to {last / rate_hz:.3f} s"
-            return "ERROR", f"{component} failed, nothing from {span}: {reason}"
-        case Params(reason=reason):
-            return "INFO", f"parameters of the twin: {reason}"
-        case RunStop(verdict=verdict, reason=reason):
-            return ("INFO" if verdict == "complete" else "WARN"), f"{verdict}: {reason}"

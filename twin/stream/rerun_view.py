@@ -24,6 +24,7 @@ from table_io.card import BadInput, parse
 from table_io.channels import BY_NAME
 from table_io.profile import Profile
 from table_io.records import Comparison, Cycle, Point, Record, RunStart, Timing
+from table_io.words import sentence
 from twin.stream.mcap_log import Recording
 from twin.stream.rerun_layout import (
     CONTACT,
@@ -47,7 +48,6 @@ from twin.stream.rerun_layout import (
     motion,
     pieces,
     point_table,
-    sentence,
     status,
     track,
 )
@@ -227,9 +227,9 @@ class RerunView:
             case RunStart():
                 pass
             case _:
-                level, text = sentence(item, self._start.rate_hz)
-                log = rr.TextLog.columns(text=[text], level=[level])
-                self._send("events", [item.index], log)
+                if told := sentence(item, self._start.rate_hz):
+                    log = rr.TextLog.columns(text=[told[1]], level=[told[0]])
+                    self._send("events", [item.index], log)
 
     def _point(self, point: Point) -> None:
         """The PRC so far, and the numbers of its newest point."""

@@ -1,10 +1,8 @@
-from collections.abc import Iterable as _Iterable
-from collections.abc import Mapping as _Mapping
-from typing import ClassVar as _ClassVar
-
+from google.protobuf.internal import containers as _containers
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
-from google.protobuf.internal import containers as _containers
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 
 DESCRIPTOR: _descriptor.FileDescriptor
 
@@ -14,10 +12,10 @@ class Channel(_message.Message):
     VALUES_FIELD_NUMBER: _ClassVar[int]
     name: str
     values: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, name: str | None = ..., values: _Iterable[float] | None = ...) -> None: ...
+    def __init__(self, name: _Optional[str] = ..., values: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Block(_message.Message):
-    __slots__ = ("channels", "cycle", "index", "label", "rate_hz", "run", "step", "stream")
+    __slots__ = ("run", "stream", "index", "rate_hz", "channels", "step", "label", "cycle")
     RUN_FIELD_NUMBER: _ClassVar[int]
     STREAM_FIELD_NUMBER: _ClassVar[int]
     INDEX_FIELD_NUMBER: _ClassVar[int]
@@ -34,10 +32,10 @@ class Block(_message.Message):
     step: _containers.RepeatedScalarFieldContainer[int]
     label: _containers.RepeatedScalarFieldContainer[int]
     cycle: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, run: str | None = ..., stream: str | None = ..., index: int | None = ..., rate_hz: float | None = ..., channels: _Iterable[Channel | _Mapping] | None = ..., step: _Iterable[int] | None = ..., label: _Iterable[int] | None = ..., cycle: _Iterable[int] | None = ...) -> None: ...
+    def __init__(self, run: _Optional[str] = ..., stream: _Optional[str] = ..., index: _Optional[int] = ..., rate_hz: _Optional[float] = ..., channels: _Optional[_Iterable[_Union[Channel, _Mapping]]] = ..., step: _Optional[_Iterable[int]] = ..., label: _Optional[_Iterable[int]] = ..., cycle: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class Step(_message.Message):
-    __slots__ = ("acceleration_m_s2", "direction", "frequency_hz", "index")
+    __slots__ = ("index", "direction", "frequency_hz", "acceleration_m_s2")
     INDEX_FIELD_NUMBER: _ClassVar[int]
     DIRECTION_FIELD_NUMBER: _ClassVar[int]
     FREQUENCY_HZ_FIELD_NUMBER: _ClassVar[int]
@@ -46,24 +44,24 @@ class Step(_message.Message):
     direction: str
     frequency_hz: float
     acceleration_m_s2: float
-    def __init__(self, index: int | None = ..., direction: str | None = ..., frequency_hz: float | None = ..., acceleration_m_s2: float | None = ...) -> None: ...
+    def __init__(self, index: _Optional[int] = ..., direction: _Optional[str] = ..., frequency_hz: _Optional[float] = ..., acceleration_m_s2: _Optional[float] = ...) -> None: ...
 
 class RunStart(_message.Message):
-    __slots__ = ("block_samples", "channels", "epoch_s", "host", "index", "model_toml", "name", "planned_samples", "profile_toml", "rate_hz", "rig_toml", "run", "source", "started_at", "steps", "tare", "versions")
+    __slots__ = ("index", "run", "name", "source", "profile_toml", "rig_toml", "model_toml", "rate_hz", "block_samples", "channels", "steps", "planned_samples", "tare", "versions", "host", "started_at", "epoch_s")
     class TareEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
         VALUE_FIELD_NUMBER: _ClassVar[int]
         key: str
         value: float
-        def __init__(self, key: str | None = ..., value: float | None = ...) -> None: ...
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
     class VersionsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
         VALUE_FIELD_NUMBER: _ClassVar[int]
         key: str
         value: str
-        def __init__(self, key: str | None = ..., value: str | None = ...) -> None: ...
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
     INDEX_FIELD_NUMBER: _ClassVar[int]
     RUN_FIELD_NUMBER: _ClassVar[int]
     NAME_FIELD_NUMBER: _ClassVar[int]
@@ -98,17 +96,17 @@ class RunStart(_message.Message):
     host: str
     started_at: str
     epoch_s: float
-    def __init__(self, index: int | None = ..., run: str | None = ..., name: str | None = ..., source: str | None = ..., profile_toml: str | None = ..., rig_toml: str | None = ..., model_toml: str | None = ..., rate_hz: float | None = ..., block_samples: int | None = ..., channels: _Iterable[str] | None = ..., steps: _Iterable[Step | _Mapping] | None = ..., planned_samples: int | None = ..., tare: _Mapping[str, float] | None = ..., versions: _Mapping[str, str] | None = ..., host: str | None = ..., started_at: str | None = ..., epoch_s: float | None = ...) -> None: ...
+    def __init__(self, index: _Optional[int] = ..., run: _Optional[str] = ..., name: _Optional[str] = ..., source: _Optional[str] = ..., profile_toml: _Optional[str] = ..., rig_toml: _Optional[str] = ..., model_toml: _Optional[str] = ..., rate_hz: _Optional[float] = ..., block_samples: _Optional[int] = ..., channels: _Optional[_Iterable[str]] = ..., steps: _Optional[_Iterable[_Union[Step, _Mapping]]] = ..., planned_samples: _Optional[int] = ..., tare: _Optional[_Mapping[str, float]] = ..., versions: _Optional[_Mapping[str, str]] = ..., host: _Optional[str] = ..., started_at: _Optional[str] = ..., epoch_s: _Optional[float] = ...) -> None: ...
 
 class Params(_message.Message):
-    __slots__ = ("index", "reason", "run", "values")
+    __slots__ = ("index", "values", "reason", "run")
     class ValuesEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
         VALUE_FIELD_NUMBER: _ClassVar[int]
         key: str
         value: float
-        def __init__(self, key: str | None = ..., value: float | None = ...) -> None: ...
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
     INDEX_FIELD_NUMBER: _ClassVar[int]
     VALUES_FIELD_NUMBER: _ClassVar[int]
     REASON_FIELD_NUMBER: _ClassVar[int]
@@ -117,10 +115,10 @@ class Params(_message.Message):
     values: _containers.ScalarMap[str, float]
     reason: str
     run: str
-    def __init__(self, index: int | None = ..., values: _Mapping[str, float] | None = ..., reason: str | None = ..., run: str | None = ...) -> None: ...
+    def __init__(self, index: _Optional[int] = ..., values: _Optional[_Mapping[str, float]] = ..., reason: _Optional[str] = ..., run: _Optional[str] = ...) -> None: ...
 
 class Comparison(_message.Message):
-    __slots__ = ("channels", "count", "free_error_ss", "index", "measured_ss", "run", "window_error_ss")
+    __slots__ = ("index", "count", "channels", "measured_ss", "free_error_ss", "window_error_ss", "run")
     INDEX_FIELD_NUMBER: _ClassVar[int]
     COUNT_FIELD_NUMBER: _ClassVar[int]
     CHANNELS_FIELD_NUMBER: _ClassVar[int]
@@ -135,10 +133,10 @@ class Comparison(_message.Message):
     free_error_ss: _containers.RepeatedScalarFieldContainer[float]
     window_error_ss: _containers.RepeatedScalarFieldContainer[float]
     run: str
-    def __init__(self, index: int | None = ..., count: int | None = ..., channels: _Iterable[str] | None = ..., measured_ss: _Iterable[float] | None = ..., free_error_ss: _Iterable[float] | None = ..., window_error_ss: _Iterable[float] | None = ..., run: str | None = ...) -> None: ...
+    def __init__(self, index: _Optional[int] = ..., count: _Optional[int] = ..., channels: _Optional[_Iterable[str]] = ..., measured_ss: _Optional[_Iterable[float]] = ..., free_error_ss: _Optional[_Iterable[float]] = ..., window_error_ss: _Optional[_Iterable[float]] = ..., run: _Optional[str] = ...) -> None: ...
 
 class Extremes(_message.Message):
-    __slots__ = ("a_max", "a_min", "force_l", "force_r", "onsets_l", "onsets_r", "u_max", "u_min")
+    __slots__ = ("u_max", "u_min", "a_max", "a_min", "force_r", "force_l", "onsets_r", "onsets_l")
     U_MAX_FIELD_NUMBER: _ClassVar[int]
     U_MIN_FIELD_NUMBER: _ClassVar[int]
     A_MAX_FIELD_NUMBER: _ClassVar[int]
@@ -155,10 +153,10 @@ class Extremes(_message.Message):
     force_l: float
     onsets_r: _containers.RepeatedScalarFieldContainer[int]
     onsets_l: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, u_max: float | None = ..., u_min: float | None = ..., a_max: float | None = ..., a_min: float | None = ..., force_r: float | None = ..., force_l: float | None = ..., onsets_r: _Iterable[int] | None = ..., onsets_l: _Iterable[int] | None = ...) -> None: ...
+    def __init__(self, u_max: _Optional[float] = ..., u_min: _Optional[float] = ..., a_max: _Optional[float] = ..., a_min: _Optional[float] = ..., force_r: _Optional[float] = ..., force_l: _Optional[float] = ..., onsets_r: _Optional[_Iterable[int]] = ..., onsets_l: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class Cycle(_message.Message):
-    __slots__ = ("count", "cycle", "index", "label", "measured", "run", "step", "twin")
+    __slots__ = ("index", "step", "cycle", "count", "measured", "twin", "run", "label")
     INDEX_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     CYCLE_FIELD_NUMBER: _ClassVar[int]
@@ -175,10 +173,10 @@ class Cycle(_message.Message):
     twin: Extremes
     run: str
     label: int
-    def __init__(self, index: int | None = ..., step: int | None = ..., cycle: int | None = ..., count: int | None = ..., measured: Extremes | _Mapping | None = ..., twin: Extremes | _Mapping | None = ..., run: str | None = ..., label: int | None = ...) -> None: ...
+    def __init__(self, index: _Optional[int] = ..., step: _Optional[int] = ..., cycle: _Optional[int] = ..., count: _Optional[int] = ..., measured: _Optional[_Union[Extremes, _Mapping]] = ..., twin: _Optional[_Union[Extremes, _Mapping]] = ..., run: _Optional[str] = ..., label: _Optional[int] = ...) -> None: ...
 
 class Quantities(_message.Message):
-    __slots__ = ("drift", "eta_a", "eta_d", "eta_l", "eta_r", "impacts_left", "impacts_right", "r_l", "r_r", "spread")
+    __slots__ = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l", "impacts_right", "impacts_left", "drift", "spread")
     ETA_D_FIELD_NUMBER: _ClassVar[int]
     ETA_A_FIELD_NUMBER: _ClassVar[int]
     ETA_R_FIELD_NUMBER: _ClassVar[int]
@@ -199,10 +197,10 @@ class Quantities(_message.Message):
     impacts_left: _containers.RepeatedScalarFieldContainer[int]
     drift: float
     spread: float
-    def __init__(self, eta_d: float | None = ..., eta_a: float | None = ..., eta_r: float | None = ..., eta_l: float | None = ..., r_r: float | None = ..., r_l: float | None = ..., impacts_right: _Iterable[int] | None = ..., impacts_left: _Iterable[int] | None = ..., drift: float | None = ..., spread: float | None = ...) -> None: ...
+    def __init__(self, eta_d: _Optional[float] = ..., eta_a: _Optional[float] = ..., eta_r: _Optional[float] = ..., eta_l: _Optional[float] = ..., r_r: _Optional[float] = ..., r_l: _Optional[float] = ..., impacts_right: _Optional[_Iterable[int]] = ..., impacts_left: _Optional[_Iterable[int]] = ..., drift: _Optional[float] = ..., spread: _Optional[float] = ...) -> None: ...
 
 class Point(_message.Message):
-    __slots__ = ("direction", "frequency_hz", "index", "measured", "run", "step", "table_acc_fundamental_m_s2", "table_acc_peak_m_s2", "thd", "twin")
+    __slots__ = ("index", "step", "direction", "frequency_hz", "measured", "twin", "table_acc_peak_m_s2", "table_acc_fundamental_m_s2", "thd", "run")
     INDEX_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     DIRECTION_FIELD_NUMBER: _ClassVar[int]
@@ -223,10 +221,10 @@ class Point(_message.Message):
     table_acc_fundamental_m_s2: float
     thd: float
     run: str
-    def __init__(self, index: int | None = ..., step: int | None = ..., direction: str | None = ..., frequency_hz: float | None = ..., measured: Quantities | _Mapping | None = ..., twin: Quantities | _Mapping | None = ..., table_acc_peak_m_s2: float | None = ..., table_acc_fundamental_m_s2: float | None = ..., thd: float | None = ..., run: str | None = ...) -> None: ...
+    def __init__(self, index: _Optional[int] = ..., step: _Optional[int] = ..., direction: _Optional[str] = ..., frequency_hz: _Optional[float] = ..., measured: _Optional[_Union[Quantities, _Mapping]] = ..., twin: _Optional[_Union[Quantities, _Mapping]] = ..., table_acc_peak_m_s2: _Optional[float] = ..., table_acc_fundamental_m_s2: _Optional[float] = ..., thd: _Optional[float] = ..., run: _Optional[str] = ...) -> None: ...
 
 class Event(_message.Message):
-    __slots__ = ("index", "kind", "run", "text")
+    __slots__ = ("index", "kind", "text", "run")
     INDEX_FIELD_NUMBER: _ClassVar[int]
     KIND_FIELD_NUMBER: _ClassVar[int]
     TEXT_FIELD_NUMBER: _ClassVar[int]
@@ -235,10 +233,10 @@ class Event(_message.Message):
     kind: str
     text: str
     run: str
-    def __init__(self, index: int | None = ..., kind: str | None = ..., text: str | None = ..., run: str | None = ...) -> None: ...
+    def __init__(self, index: _Optional[int] = ..., kind: _Optional[str] = ..., text: _Optional[str] = ..., run: _Optional[str] = ...) -> None: ...
 
 class Gap(_message.Message):
-    __slots__ = ("channel", "count", "index", "reason", "run")
+    __slots__ = ("index", "count", "channel", "reason", "run")
     INDEX_FIELD_NUMBER: _ClassVar[int]
     COUNT_FIELD_NUMBER: _ClassVar[int]
     CHANNEL_FIELD_NUMBER: _ClassVar[int]
@@ -249,10 +247,10 @@ class Gap(_message.Message):
     channel: str
     reason: str
     run: str
-    def __init__(self, index: int | None = ..., count: int | None = ..., channel: str | None = ..., reason: str | None = ..., run: str | None = ...) -> None: ...
+    def __init__(self, index: _Optional[int] = ..., count: _Optional[int] = ..., channel: _Optional[str] = ..., reason: _Optional[str] = ..., run: _Optional[str] = ...) -> None: ...
 
 class Fault(_message.Message):
-    __slots__ = ("component", "from_index", "index", "reason", "run", "to_index")
+    __slots__ = ("index", "component", "from_index", "to_index", "reason", "run")
     INDEX_FIELD_NUMBER: _ClassVar[int]
     COMPONENT_FIELD_NUMBER: _ClassVar[int]
     FROM_INDEX_FIELD_NUMBER: _ClassVar[int]
@@ -265,10 +263,10 @@ class Fault(_message.Message):
     to_index: int
     reason: str
     run: str
-    def __init__(self, index: int | None = ..., component: str | None = ..., from_index: int | None = ..., to_index: int | None = ..., reason: str | None = ..., run: str | None = ...) -> None: ...
+    def __init__(self, index: _Optional[int] = ..., component: _Optional[str] = ..., from_index: _Optional[int] = ..., to_index: _Optional[int] = ..., reason: _Optional[str] = ..., run: _Optional[str] = ...) -> None: ...
 
 class Timing(_message.Message):
-    __slots__ = ("blocks", "component", "cpu_share", "index", "max_ms", "missed", "p50_ms", "p99_ms", "run", "scheduler")
+    __slots__ = ("index", "component", "p50_ms", "p99_ms", "max_ms", "missed", "blocks", "cpu_share", "scheduler", "run")
     INDEX_FIELD_NUMBER: _ClassVar[int]
     COMPONENT_FIELD_NUMBER: _ClassVar[int]
     P50_MS_FIELD_NUMBER: _ClassVar[int]
@@ -289,10 +287,10 @@ class Timing(_message.Message):
     cpu_share: float
     scheduler: str
     run: str
-    def __init__(self, index: int | None = ..., component: str | None = ..., p50_ms: float | None = ..., p99_ms: float | None = ..., max_ms: float | None = ..., missed: int | None = ..., blocks: int | None = ..., cpu_share: float | None = ..., scheduler: str | None = ..., run: str | None = ...) -> None: ...
+    def __init__(self, index: _Optional[int] = ..., component: _Optional[str] = ..., p50_ms: _Optional[float] = ..., p99_ms: _Optional[float] = ..., max_ms: _Optional[float] = ..., missed: _Optional[int] = ..., blocks: _Optional[int] = ..., cpu_share: _Optional[float] = ..., scheduler: _Optional[str] = ..., run: _Optional[str] = ...) -> None: ...
 
 class RunStop(_message.Message):
-    __slots__ = ("index", "reason", "run", "states", "verdict")
+    __slots__ = ("index", "verdict", "reason", "states", "run")
     INDEX_FIELD_NUMBER: _ClassVar[int]
     VERDICT_FIELD_NUMBER: _ClassVar[int]
     REASON_FIELD_NUMBER: _ClassVar[int]
@@ -303,4 +301,100 @@ class RunStop(_message.Message):
     reason: str
     states: _containers.RepeatedScalarFieldContainer[str]
     run: str
-    def __init__(self, index: int | None = ..., verdict: str | None = ..., reason: str | None = ..., states: _Iterable[str] | None = ..., run: str | None = ...) -> None: ...
+    def __init__(self, index: _Optional[int] = ..., verdict: _Optional[str] = ..., reason: _Optional[str] = ..., states: _Optional[_Iterable[str]] = ..., run: _Optional[str] = ...) -> None: ...
+
+class Check(_message.Message):
+    __slots__ = ("index", "name", "channel", "value", "low", "high", "unit", "passed", "run")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    CHANNEL_FIELD_NUMBER: _ClassVar[int]
+    VALUE_FIELD_NUMBER: _ClassVar[int]
+    LOW_FIELD_NUMBER: _ClassVar[int]
+    HIGH_FIELD_NUMBER: _ClassVar[int]
+    UNIT_FIELD_NUMBER: _ClassVar[int]
+    PASSED_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    name: str
+    channel: str
+    value: float
+    low: float
+    high: float
+    unit: str
+    passed: bool
+    run: str
+    def __init__(self, index: _Optional[int] = ..., name: _Optional[str] = ..., channel: _Optional[str] = ..., value: _Optional[float] = ..., low: _Optional[float] = ..., high: _Optional[float] = ..., unit: _Optional[str] = ..., passed: _Optional[bool] = ..., run: _Optional[str] = ...) -> None: ...
+
+class Response(_message.Message):
+    __slots__ = ("index", "frequencies_hz", "gain", "phase_rad", "run")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    FREQUENCIES_HZ_FIELD_NUMBER: _ClassVar[int]
+    GAIN_FIELD_NUMBER: _ClassVar[int]
+    PHASE_RAD_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    frequencies_hz: _containers.RepeatedScalarFieldContainer[float]
+    gain: _containers.RepeatedScalarFieldContainer[float]
+    phase_rad: _containers.RepeatedScalarFieldContainer[float]
+    run: str
+    def __init__(self, index: _Optional[int] = ..., frequencies_hz: _Optional[_Iterable[float]] = ..., gain: _Optional[_Iterable[float]] = ..., phase_rad: _Optional[_Iterable[float]] = ..., run: _Optional[str] = ...) -> None: ...
+
+class Level(_message.Message):
+    __slots__ = ("index", "step", "demanded_m_s2", "measured_m_s2", "correction", "update", "accepted", "harmonics_m_s2", "run")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    DEMANDED_M_S2_FIELD_NUMBER: _ClassVar[int]
+    MEASURED_M_S2_FIELD_NUMBER: _ClassVar[int]
+    CORRECTION_FIELD_NUMBER: _ClassVar[int]
+    UPDATE_FIELD_NUMBER: _ClassVar[int]
+    ACCEPTED_FIELD_NUMBER: _ClassVar[int]
+    HARMONICS_M_S2_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    step: int
+    demanded_m_s2: float
+    measured_m_s2: float
+    correction: float
+    update: int
+    accepted: bool
+    harmonics_m_s2: _containers.RepeatedScalarFieldContainer[float]
+    run: str
+    def __init__(self, index: _Optional[int] = ..., step: _Optional[int] = ..., demanded_m_s2: _Optional[float] = ..., measured_m_s2: _Optional[float] = ..., correction: _Optional[float] = ..., update: _Optional[int] = ..., accepted: _Optional[bool] = ..., harmonics_m_s2: _Optional[_Iterable[float]] = ..., run: _Optional[str] = ...) -> None: ...
+
+class Decided(_message.Message):
+    __slots__ = ("index", "step", "direction", "frequency_hz", "acceleration_m_s2", "reason", "run")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    DIRECTION_FIELD_NUMBER: _ClassVar[int]
+    FREQUENCY_HZ_FIELD_NUMBER: _ClassVar[int]
+    ACCELERATION_M_S2_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    step: int
+    direction: str
+    frequency_hz: float
+    acceleration_m_s2: float
+    reason: str
+    run: str
+    def __init__(self, index: _Optional[int] = ..., step: _Optional[int] = ..., direction: _Optional[str] = ..., frequency_hz: _Optional[float] = ..., acceleration_m_s2: _Optional[float] = ..., reason: _Optional[str] = ..., run: _Optional[str] = ...) -> None: ...
+
+class Trip(_message.Message):
+    __slots__ = ("index", "decided", "kind", "channel", "value", "limit", "text", "run")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    DECIDED_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    CHANNEL_FIELD_NUMBER: _ClassVar[int]
+    VALUE_FIELD_NUMBER: _ClassVar[int]
+    LIMIT_FIELD_NUMBER: _ClassVar[int]
+    TEXT_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    decided: int
+    kind: str
+    channel: str
+    value: float
+    limit: float
+    text: str
+    run: str
+    def __init__(self, index: _Optional[int] = ..., decided: _Optional[int] = ..., kind: _Optional[str] = ..., channel: _Optional[str] = ..., value: _Optional[float] = ..., limit: _Optional[float] = ..., text: _Optional[str] = ..., run: _Optional[str] = ...) -> None: ...

@@ -19,17 +19,22 @@ from google.protobuf.message import DecodeError
 from table_io.block import Block
 from table_io.records import (
     RECORDS,
+    Check,
     Comparison,
     Cycle,
+    Decided,
     Event,
     Fault,
     Gap,
+    Level,
     Params,
     Point,
     Record,
+    Response,
     RunStart,
     RunStop,
     Timing,
+    Trip,
 )
 from twin.stream import shaketwin_pb2 as pb
 
@@ -46,6 +51,11 @@ RECORD_TOPICS: dict[type, str] = {
     Event: "/run/event",
     Fault: "/run/fault",
     Gap: "/rig/gap",
+    Check: "/rig/check",
+    Response: "/rig/response",
+    Level: "/rig/level",
+    Decided: "/rig/decided",
+    Trip: "/rig/trip",
     Params: "/twin/params",
     Comparison: COMPARED,
     Cycle: "/twin/cycle",
