@@ -45,3 +45,14 @@ def tare_from(volts: Float2D, sensors: tuple[Sensor, ...]) -> dict[str, float]:
         for sensor, samples in zip(sensors, to_si(volts, sensors, {}), strict=True)
         if sensor.channel != "drive_disp_m"
     }
+
+
+def noise_from(volts: Float2D, sensors: tuple[Sensor, ...]) -> dict[str, tuple[float, int]]:
+    """(rms in SI, longest run of equal samples) of each channel at rest; lost samples left out."""
+    noise = {}
+    for sensor, samples in zip(sensors, to_si(volts, sensors, {}), strict=True):
+        known = samples[~np.isnan(samples)]
+        if known.size:
+            edges = np.flatnonzero(np.diff(known, prepend=np.nan, append=np.nan))
+            noise[sensor.channel] = (float(known.std()), int(np.diff(edges).max()))
+    return noise

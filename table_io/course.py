@@ -153,7 +153,7 @@ def cycles_of(step: Step, cycles: int, rate_hz: float) -> int:
 def plan(profile: Profile) -> Drive:
     """The sweep alone on an ideal table: rest, soft start, the steps with blends, soft stop."""
     sweep, course = profile.sweep, begin(profile)
-    for step in sweep.steps:
+    for step in sweep.steps[profile.first_step :]:
         aim = Aim(step.frequency_hz, step.acceleration_m_s2)
         course = course.blended(aim, step.index, sweep.blend_cycles, Label.BLEND)
         course = course.held(

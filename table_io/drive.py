@@ -157,7 +157,7 @@ class Drive:
     @property
     def planned_end(self) -> int:
         """Index from which the drive would be at rest if it were not stopped."""
-        return self.segments[-1].end
+        return self.segments[-1].end if self.segments else 0
 
     @cached_property
     def decay_samples(self) -> int:
@@ -167,7 +167,7 @@ class Drive:
         """
         if self.decay_at is None:
             return 0
-        if self.decay_at < self.segments[0].start:
+        if not self.segments or self.decay_at < self.segments[0].start:
             return 1
         segment = self.segment_at(self.decay_at)
         x = np.clip(np.array([(self.decay_at - segment.start) / segment.count]), 0.0, 1.0)

@@ -10,6 +10,7 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from table_io.card import Card, Count, Finite, Number, Positive
 from table_io.records import Step
+from table_io.tool_cards import Dwell, Grid, Refine, Track
 from table_io.units import GRAVITY_M_S2
 
 
@@ -187,6 +188,25 @@ class Protection(Card):
     )
 
 
+class SetUp(Card):
+    """What an operator was asked to do before a run, and who said that it was done."""
+
+    campaign: str
+    label: str
+    asked: str
+    answer: str
+    who: str
+    at: str  # ISO 8601
+    notes: str = ""
+
+
+class Resume(Card):
+    """Where a test that was interrupted goes on, in a recording of its own."""
+
+    first_step: Count = Field(ge=0, description="The first that is driven; steps keep their index.")
+    of: str = Field(description="The run that was interrupted.")
+
+
 class Profile(Card):
     """A test: specimen, sweep, acquisition, comparison."""
 
@@ -203,6 +223,40 @@ class Profile(Card):
     control: Control = Control()
     protection: Protection = Protection()
     on_death: OnDeath = OnDeath()
+    dwell: Dwell | None = None
+    track: Track | None = None
+    refine: Refine | None = None
+    set_up: SetUp | None = None
+    resume: Resume | None = None
+
+    @property
+    def first_step(self) -> int:
+        """Place of the first step that is driven."""
+        return self.resume.first_step if self.resume is not None else 0
+
+    @field_validator("dwell", "track", "refine")
+    @classmethod
+    def _one_tool(
+        cls, tool: Dwell | Track | Refine | None, info: ValidationInfo
+    ) -> Dwell | Track | Refine | None:
+        others = [name for name in ("dwell", "track") if info.data.get(name) is not None]
+        if tool is not None and others:
+            raise ValueError(f"[{others[0]}] is there too; allowed: one of dwell, track, refine")
+        sweep = info.data.get("sweep")
+        if tool is not None and sweep is not None:
+            tool.fits(Grid(sweep.start_hz, sweep.stop_hz, sweep.step_hz))
+        return tool
+
+    @field_validator("resume")
+    @classmethod
+    def _within(cls, resume: Resume | None, info: ValidationInfo) -> Resume | None:
+        sweep = info.data.get("sweep")
+        if resume is not None and sweep is not None and resume.first_step >= len(sweep.steps):
+            raise ValueError(
+                f"first_step {resume.first_step} is beyond the last step; allowed: 0 to "
+                f"{len(sweep.steps) - 1}"
+            )
+        return resume
 
     @field_validator("acquisition")
     @classmethod

@@ -4,7 +4,7 @@ Human units stand in the key names here (`span_mm`, `lead_s`); the properties ha
 """
 
 import difflib
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from pydantic import Field, ValidationInfo, field_validator
 
@@ -99,6 +99,72 @@ class Output(Card):
         return 2 * self.span_mm * 1e-3 / 2**self.bits
 
 
+class FaultKind(NamedTuple):
+    """What a card of this kind says: a channel or not, a size or not ("": none), how it lasts."""
+
+    channel: bool
+    size: str
+    lasts: Literal["must", "may", "no"]  # for_s is needed, allowed (none: for ever), not allowed
+
+
+FAULT_KINDS = {
+    "dropped": FaultKind(False, "", "must"),
+    "repeated": FaultKind(False, "", "must"),
+    "replayed": FaultKind(False, "", "must"),
+    "late": FaultKind(False, "seconds", "no"),
+    "stall": FaultKind(False, "", "no"),
+    "stuck": FaultKind(True, "", "may"),
+    "cable_off": FaultKind(True, "", "may"),
+    "gain": FaultKind(True, "relative error, 0.1 reads a tenth too much", "may"),
+    "polarity": FaultKind(True, "", "may"),
+    "rail": FaultKind(True, "", "may"),
+    "drift": FaultKind(True, "units of the sensor a second", "may"),
+    "spike": FaultKind(True, "units of the sensor", "no"),
+    "nan": FaultKind(True, "", "may"),
+    "power_loss": FaultKind(False, "", "no"),
+    "oil_loss": FaultKind(False, "share of the servo's bandwidth that is left", "no"),
+}
+
+
+class PlantedFault(Card):
+    """Something that goes wrong in the simulated machine; `backends/faults.py` says what each is.
+
+    The keys that a kind does not use are left out.
+    """
+
+    at_s: NonNegative = Field(description="From the start of the run.")
+    for_s: Positive | None = None
+    channel: str | None = None
+    size: Finite | None = None
+    kind: str = Field(description="Last: the others are judged by it.")
+
+    @field_validator("kind")
+    @classmethod
+    def _complete(cls, kind: str, info: ValidationInfo) -> str:
+        if kind not in FAULT_KINDS:
+            near = difflib.get_close_matches(kind, FAULT_KINDS, 1, 0.4)
+            raise ValueError(
+                f"kind {kind!r} is unknown"
+                + (f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(FAULT_KINDS)}")
+            )
+        needs = FAULT_KINDS[kind]
+        keys = (
+            ("channel", needs.channel, needs.channel, "one of the rig's sensors"),
+            ("size", bool(needs.size), bool(needs.size), needs.size),
+            ("for_s", needs.lasts == "must", needs.lasts != "no", "seconds"),
+        )
+        for key, must, may, what in keys:
+            given = info.data.get(key) is not None
+            if must and key in info.data and not given:
+                raise ValueError(f"kind {kind!r} needs {key} ({what}); add it")
+            if given and not may:
+                raise ValueError(f"kind {kind!r} has no {key}; leave it out")
+        size = info.data.get("size")
+        if kind in ("late", "oil_loss") and size is not None and size <= 0:
+            raise ValueError(f"kind {kind!r} has size {size:g}; allowed: above 0 ({needs.size})")
+        return kind
+
+
 class SimulatedTable(Card):
     """The simulated machine: servo, payload reaction and the true specimen on it."""
 
@@ -111,6 +177,13 @@ class SimulatedTable(Card):
     damper_damping_n_s_m: NonNegative
     bumper_stiffness_n_m: Positive
     bumper_damping_n_s_m: Positive
+    faults: tuple[PlantedFault, ...] = ()
+
+
+class Machine(Card):
+    """A machine in a process of its own: `shaketwin table` plays its [simulated] table."""
+
+    endpoint: str = Field(description="tcp/127.0.0.1:PORT or unix/PATH; this computer only.")
 
 
 class Rig(Card):
@@ -118,13 +191,14 @@ class Rig(Card):
 
     name: str = Field(pattern=r"^[a-z0-9_]+$")
     title: str
-    backend: Literal["simulated"]
+    backend: Literal["simulated", "machine"]
     rates_hz: tuple[Positive, ...] = Field(min_length=1)
     moving_mass_kg: Positive = Field(description="Table without payload, for the force margin.")
     limits: Limits
     output: Output
     sensors: tuple[Sensor, ...] = Field(min_length=1)
     simulated: SimulatedTable | None = Field(None, validate_default=True)
+    machine: Machine | None = Field(None, validate_default=True)
 
     @field_validator("sensors")
     @classmethod
@@ -151,7 +225,27 @@ class Rig(Card):
             raise ValueError(
                 "backend 'simulated' needs a [simulated] table with servo and specimen"
             )
+        names = [sensor.channel for sensor in info.data.get("sensors", ())]
+        for fault in simulated.faults if simulated and names else ():
+            if fault.channel is not None and fault.channel not in names:
+                near = difflib.get_close_matches(fault.channel, names, 1, 0.4)
+                raise ValueError(
+                    f"fault {fault.kind!r}: the rig has no sensor {fault.channel!r}"
+                    + (f"; did you mean {near[0]!r}?" if near else f"; it has: {', '.join(names)}")
+                )
         return simulated
+
+    @field_validator("machine")
+    @classmethod
+    def _reached(cls, machine: Machine | None, info: ValidationInfo) -> Machine | None:
+        if machine is None and info.data.get("backend") == "machine":
+            raise ValueError("backend 'machine' needs a [machine] table with its endpoint")
+        return machine
+
+    @property
+    def any_speed(self) -> bool:
+        """True where any clock may pace the machine: it is simulated in the rig's own process."""
+        return self.backend == "simulated"
 
     @property
     def channels(self) -> tuple[str, ...]:

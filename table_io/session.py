@@ -1,28 +1,28 @@
-"""The rig's loop: a generator that plays a drive on a backend and yields Blocks and records.
+"""The rig's loop: a generator that plays a test on a backend and yields Blocks and records.
 
-States: idle, checking, armed, running, stopping, at rest, fault. Every way to end decays the
-command to rest: it is always queued to end there, so the decay also plays if this process dies.
+States: idle, checking, armed, running, holding, stopping, at rest, fault. Every way to end decays
+the command to rest: it is always queued to end there, so the decay also plays if this process dies.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from table_io.backends import Backend
+from table_io import conductor as conducting
+from table_io import protection
+from table_io.backends import Backend, MachineLost
 from table_io.block import Block, Bool2D
-from table_io.calibration import command_to_volts, tare_from, to_si
+from table_io.calibration import noise_from, tare_from, to_si
 from table_io.clock import Clock
-from table_io.drive import Drive
-from table_io.limits import tripped
+from table_io.player import Player, Starved
 from table_io.profile import Profile
-from table_io.records import Event, Gap, Record, RunStart, RunStop
+from table_io.records import Event, Gap, Record, Response, RunStart, RunStop, Trip
 from table_io.rig import Rig
 
 TARE_S = 1.0
-# From the newest sample to the start of a decay. At most 50 ms may pass from the decision to the
-# first changed sample, and the first samples of a C2 decay hardly differ from the drive.
-DECISION_S = 0.04
+ORDER_S = 0.1  # beyond the first sample that could change: hold and resume are not urgent
+LATE_S = 0.1  # after its schedule a block is late
 TAIL_FACTOR = 0.999  # of a sensor's range: beyond it a sample counts as clipped
 
 
@@ -32,7 +32,14 @@ class Setup:
 
     profile: Profile
     rig: Rig
-    drive: Drive
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What a person, or who watches for one, asks of a session."""
+
+    name: str  # hold, resume, stop, abort
+    why: str
 
 
 @dataclass(slots=True)
@@ -43,7 +50,9 @@ class Punctuality:
 
 
 Describe = Callable[[dict[str, float], float], RunStart]  # (tare, epoch_s) -> start record
-Commands = Callable[[], str | None]  # why to stop, or None; must not wait
+Commands = Callable[[], Order | None]  # must not wait
+Said = Iterator[Block | Record]
+ORDERS = ("hold", "resume", "stop", "abort")
 
 
 def play(
@@ -53,132 +62,193 @@ def play(
     describe: Describe,
     commands: Commands,
     punctuality: Punctuality | None = None,
-) -> Iterator[Block | Record]:
+) -> Said:
     """RunStart, then every Block with the records that belong to it, then RunStop.
 
     Closing the generator early also brings the table to rest before the machine is released.
     """
-    states = ["idle", "checking"]
-    run = _Run(setup, backend)
+    run = _Run(setup, backend, clock)
     try:
-        backend.open()
-        tare = tare_from(backend.tare(int(TARE_S * setup.drive.rate_hz)), setup.rig.sensors)
-        states.append("armed")
-        run.feed()
-        run.start()
-        states.append("running")
+        tare = run.begin()
         yield describe(tare, backend.scheduled(0))
-        verdict, reason = "complete", "the whole drive was played"
-        while run.acquired < run.end:
+        yield from run.told()
+        while not run.over:
             block, clipped = run.acquire(tare)
+            late_s = clock.now() - backend.scheduled(block.end - 1)
             if punctuality is not None:
-                punctuality.late_s.append(clock.now() - backend.scheduled(block.end - 1))
+                punctuality.late_s.append(late_s)
             yield block
             yield from _gaps(block, clipped)
-            if states[-1] == "running":
-                trip = tripped(block, setup.rig)
-                asked = commands()
-                if trip or asked:
-                    verdict = "aborted" if trip else "stopped"
-                    reason = trip or asked or ""
-                    states.append("stopping")
-                    run.stop()
-                    yield Event(block.end, "stop", f"{reason}; decaying to rest")
+            run.late(late_s)
+            run.protect(block, clipped)
+            run.conduct(block)
+            run.obey(commands())
             run.feed()
-        states.append("at rest")
-        yield RunStop(run.acquired, verdict, reason, tuple(states))
+            yield from run.told()
+        yield from run.finish()
+    except MachineLost as error:
+        yield from run.lost(str(error))
     finally:
         try:
-            run.to_rest(clock)
+            run.player.to_rest()
         finally:
             backend.close()
 
 
 class _Run:
-    """The moving part of a session: what has been queued, what has been acquired."""
+    """The moving part of a session: its player, its conductor, its guard, its state."""
 
-    def __init__(self, setup: Setup, backend: Backend) -> None:
+    def __init__(self, setup: Setup, backend: Backend, clock: Clock) -> None:
+        profile = setup.profile
         self.setup = setup
-        self.backend = backend
-        self.drive = setup.drive
-        self.acquired = 0
-        self._playing = False
-        self._queued = 0  # samples of the true drive that are queued; a decay follows them
-        self._at_rest = 0  # index at which what is queued has come to rest
-        self._rest = round(setup.profile.acquisition.rest_s * self.drive.rate_hz)
+        self.rate_hz = profile.acquisition.rate_hz
+        score = conducting.score(profile, setup.rig, backend.replace_after)
+        self._now = conducting.start(score)
+        block = profile.acquisition.block_samples
+        self.player = Player(backend, clock, setup.rig.output, self._now.drive, block)
+        self.states = ["idle"]
+        self.verdict, self.reason = "complete", "the whole drive was played"
+        self._rest = round(profile.acquisition.rest_s * self.rate_hz)
+        self._full = np.array([abs(s.range_si * s.volts_per_si) for s in setup.rig.sensors])
+        self._said: list[Record] = []
+        self._was_late = False
 
     @property
-    def end(self) -> int:
-        """Index at which the recording ends: the drive at rest, the servo too."""
-        return self.drive.rest_from + self._rest
+    def end(self) -> int | None:
+        """Sample at which the recording ends, the servo at rest too; None while it is not known."""
+        known = self._now.over or self._now.stage.kind == "open" or self.player.decaying
+        return self.player.drive.rest_from + self._rest if known else None
 
-    def start(self) -> None:
-        """Start the machine; from here on the table has to be brought to rest."""
-        self.backend.start()
-        self._playing = True
+    @property
+    def over(self) -> bool:
+        return self.end is not None and self.player.acquired >= self.end
 
-    def _queue(self, first: int, drive: Drive) -> None:
-        """Queue a drive from sample `first` to its rest."""
-        metres = drive.command(first, drive.rest_from + 1 - first)
-        self.backend.queue(first, command_to_volts(metres, self.setup.rig.output))
-        self._at_rest = drive.rest_from
+    def begin(self) -> dict[str, float]:
+        """Open, tare, start the machine; the tare in SI."""
+        self._to("checking")
+        backend, sensors = self.player.backend, self.setup.rig.sensors
+        backend.open()
+        volts = backend.tare(int(TARE_S * self.rate_hz))
+        noise = noise_from(volts, sensors)
+        self._guard = protection.begin(self.setup.profile, self.setup.rig, noise)
+        self._now = replace(self._now, noise={name: rms for name, (rms, _) in noise.items()})
+        if self._now.stage.kind != "check":
+            self._to("armed")
+        self.player.start()
+        return tare_from(volts, sensors)
 
-    def feed(self) -> None:
-        """Keep `lead_s` of checked command queued beyond the next block, then a decay to rest."""
-        lead = max(
-            round(self.setup.rig.output.lead_s * self.drive.rate_hz), self.backend.replace_after
-        )
-        lead += self.setup.profile.acquisition.block_samples
-        if self._queued - self.acquired >= lead or self._queued >= self.drive.rest_from:
-            return
-        first, last = self._queued, self.acquired + 2 * lead
-        self._queue(first, self.drive.decayed(last))
-        self._queued = last
+    def told(self) -> Iterator[Record]:
+        """What has been said since this was asked last."""
+        said, self._said = self._said, []
+        yield from said
 
-    def stop(self) -> None:
-        """Replace what is queued by a decay from the first sample that can still be changed."""
-        room = max(round(DECISION_S * self.drive.rate_hz), self.backend.replace_after)
-        at = self.acquired + room
-        if at >= self.drive.rest_from:
-            return
-        self.drive = self.drive.decayed(at)
-        self._queue(at, self.drive)
-        self._queued = self.drive.rest_from
+    def _say(self, kind: str, text: str) -> None:
+        self._said.append(Event(self.player.acquired, kind, text))
+
+    def _to(self, state: str) -> None:
+        if state != self.states[-1]:
+            self.states.append(state)
+            self._say("state", state)
 
     def acquire(self, tare: dict[str, float]) -> tuple[Block, Bool2D]:
         """(the next block in SI, True where a sample lies at its sensor's range)."""
-        rig = self.setup.rig
-        count = min(self.setup.profile.acquisition.block_samples, self.end - self.acquired)
-        volts = self.backend.read(count)
-        full = np.array([abs(one.range_si * one.volts_per_si) for one in rig.sensors])
-        step, label, cycle = self.drive.labels(self.acquired, count)
-        block = Block(
-            "meas",
-            self.acquired,
-            self.drive.rate_hz,
-            rig.channels,
-            to_si(volts, rig.sensors, tare),
-            step,
-            label,
-            cycle,
-        )
-        self.acquired += count
-        return block, np.abs(volts) >= TAIL_FACTOR * full[:, None]
+        rig, first = self.setup.rig, self.player.acquired
+        count = self.setup.profile.acquisition.block_samples
+        if self.end is not None:
+            count = min(count, self.end - first)
+        volts = self.player.backend.read(count)
+        labels = self.player.drive.labels(first, count)
+        values = to_si(volts, rig.sensors, tare)
+        self.player.acquired += count
+        block = Block("meas", first, self.rate_hz, rig.channels, values, *labels)
+        return block, np.abs(volts) >= TAIL_FACTOR * self._full[:, None]
 
-    def to_rest(self, clock: Clock) -> None:
-        """Decay and wait for rest where the session ends before the table is at rest."""
-        if not self._playing or self.acquired >= self.drive.rest_from:
+    def late(self, late_s: float) -> None:
+        """Say where a block came late; it is no fault while the table has its command."""
+        if late_s > LATE_S and not self._was_late:
+            end = self.player.acquired
+            self._say("late", f"the block that ends at sample {end} came {late_s:.3f} s late")
+        self._was_late = late_s > LATE_S
+
+    def protect(self, block: Block, clipped: Bool2D) -> None:
+        """Look at a block; the first finding that must stop the table is latched."""
+        seen = protection.Seen.of(block, clipped, self.player.drive)
+        self._guard, findings = protection.inspect(self._guard, seen)
+        for one in findings:
+            if not one.stop:
+                self._said.append(one.event())
+            elif not self.player.decaying:
+                self._said.append(one.trip(block.end))
+                self.stop("aborted", one.text)
+
+    def conduct(self, block: Block) -> None:
+        """Let the conductor look; what it changes in the drive is queued in its time."""
+        if self.player.decaying:
             return
+        before = self._now
+        self._now, said = conducting.advance(before, block)
+        self._said.extend(said)
+        for record in said:
+            if isinstance(record, Response):
+                self._guard = protection.identified(self._guard, record)
+        if self._now.drive is not before.drive:
+            self.player.change(self._now.drive, self._now.changed)
+        if self._now.refused:
+            self.verdict, self.reason = "aborted", self._now.refused
+        elif before.stage.kind == "check" != self._now.stage.kind:
+            self._to("armed")
+        if self.states[-1] == "armed" and block.step[-1] >= 0:
+            self._to("running")
+
+    def obey(self, order: Order | None) -> None:
+        """Do what was asked, where the state allows it."""
+        if order is None or self.player.decaying:
+            return
+        if order.name in ("stop", "abort"):
+            self.stop("stopped" if order.name == "stop" else "aborted", order.why)
+            return
+        before, at = self._now, self.player.changeable() + round(ORDER_S * self.rate_hz)
+        change = {"hold": conducting.hold, "resume": conducting.resume}[order.name]
+        self._now = change(before, at)
+        if self._now is before:
+            self._say("refused", f"{order.name} does not apply now ({self.states[-1]})")
+            return
+        self.player.change(self._now.drive, self._now.changed)
+        self._to("holding" if order.name == "hold" else "running")
+
+    def stop(self, verdict: str, reason: str) -> None:
+        """Bring the table to rest, for good."""
+        self.verdict, self.reason = verdict, reason
+        self._to("stopping")
+        self._say("stop", f"{reason}; decaying to rest")
+        self.player.decay()
+
+    def feed(self) -> None:
+        """Keep the machine fed; where that came too late, say so: the table stops by itself."""
         try:
-            self.stop()
-            while self.acquired < self.drive.rest_from:
-                count = min(200, self.drive.rest_from - self.acquired)
-                self.backend.read(count)
-                self.acquired += count
-        except BaseException:
-            # The machine no longer answers. What is queued ends at rest: let it play to there.
-            clock.wait_until(self.backend.scheduled(self._at_rest))
-            raise
+            self.player.feed()
+        except Starved as error:
+            at = self.player.drive.decay_at or 0
+            self._said.append(Trip(at, self.player.acquired, "late", "", 0.0, 0.0, f"{error}"))
+            self.verdict, self.reason = "aborted", str(error)
+            self._to("stopping")
+
+    def finish(self) -> Iterator[Record]:
+        """The last records of a session that came to rest."""
+        if self._now.stage.kind == "open" and not self.player.decaying:
+            self.verdict, self.reason = "stopped", "held for an hour without a word"
+        self._to("at rest")
+        yield from self.told()
+        yield RunStop(self.player.acquired, self.verdict, self.reason, tuple(self.states))
+
+    def lost(self, why: str) -> Iterator[Record]:
+        """The last records of a session whose machine no longer answers."""
+        self._to("fault")
+        at = self.player.acquired
+        self._said.append(Trip(at, at, "machine", "", 0.0, 0.0, why))
+        yield from self.told()
+        self.player.wait_out()
+        yield RunStop(at, "halted", why, tuple(self.states))
 
 
 def _gaps(block: Block, clipped: Bool2D) -> Iterator[Gap]:

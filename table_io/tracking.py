@@ -71,9 +71,11 @@ def _solve(basis: Float1D, values: Float1D, harmonics: int) -> Tracked:
     columns = basis.shape[1]
     if columns < 3 or values.size < 2 * columns or not np.isfinite(values).all():
         return NOTHING
-    found = np.linalg.solve(basis.T @ basis, basis.T @ values)
+    # Not by the matrix library: on a busy machine its threads wait seconds for one another.
+    normal, right = np.einsum("ij,ik->jk", basis, basis), np.einsum("ij,i->j", basis, values)
+    found = np.linalg.solve(normal, right)
     amplitudes = np.zeros(harmonics, dtype=np.complex128)
     # a sin + b cos = Im((a + i b) exp(i theta))
     amplitudes[: columns // 2] = found[1::2] + 1j * found[2::2]
-    rms = float(np.sqrt(np.mean((values - basis @ found) ** 2)))
+    rms = float(np.sqrt(np.mean((values - np.einsum("ij,j->i", basis, found)) ** 2)))
     return Tracked(float(found[0]), amplitudes, rms)

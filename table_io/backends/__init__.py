@@ -3,28 +3,50 @@
 A backend owns one machine: an analogue output (the displacement command) and analogue inputs (the
 sensors), on one sample clock. It speaks volts and sample indices; it knows nothing of sweeps.
 
-Life, in this order, all calls from one thread:
-1. `open()` claims the machine. Nothing moves. Errors are BadInput: what is missing,
-   what to do.
-2. `tare(samples)` returns the inputs at rest, before bumpers are precompressed.
+One object is one life of the machine: these calls in this order, all from one thread. A call out of
+order is RuntimeError.
+1. `open()` claims the machine, and waits where it still comes to rest after its last life. Nothing
+   moves. Errors are BadInput: what is missing (also a sample rate), what to do.
+2. `tare(samples)` returns the inputs at rest, before bumpers are precompressed, as often as asked.
 3. `queue(0, volts)` hands over the first command.
-4. `start()` starts output and input together: output sample i leaves when input sample i is taken.
-5. `read(samples)` waits until the next samples are taken and returns them in order. A sample that
-   was lost is NaN in every lost channel: it keeps its place, none is ever invented.
-6. `queue(index, volts)` at any time replaces everything queued from `index` on. After the last
-   queued sample the output holds its value. The session always queues a command that ends at rest,
-   so whatever dies, a table in motion comes to rest smoothly.
-   `index` must lie at least `replace_after` samples after the newest acquired one: what comes
-   earlier is in the device and plays as it was queued. ValueError otherwise.
-7. `close()` releases the machine; safe to call twice and after any error.
+4. `start()` starts output and input together, now: output sample i leaves when input sample i is
+   taken, at `scheduled(i)` = scheduled(0) + i / rate_hz of the session's clock. The command is
+   acquired back as `drive_disp_m`: what was queued, to a step of the output and of the input.
+5. `read(samples)` waits until the next samples are taken and returns them in order, each once, from
+   sample 0 on, however reads are cut. A sample that was lost is NaN in every lost channel: it keeps
+   its place, none is ever invented. MachineLost where they have not come PATIENCE_S after the
+   schedule of the last of them: what is queued plays on, and it ends at rest.
+6. `queue(index, volts)` at any time replaces everything queued from `index` on, exactly there.
+   After the last queued sample the output holds its value, also up to an `index` that lies beyond
+   it. The session always queues a command that ends at rest, so whatever dies, a table in motion
+   comes to rest smoothly; a machine that can brings one that ends in motion to its mean by itself.
+   `index` must lie at least `replace_after` samples after the newest one that the machine has taken
+   by now, read or not: what comes earlier is in the device and plays as it was queued. ValueError
+   otherwise, as for NaN and inf, and nothing is changed.
+7. `close()` releases the machine, which plays what is queued; safe at any time, twice, after any
+   error.
+
+A machine that watches its rig takes a silence of HEARTBEAT_S between start and close for its death,
+and goes on without it, to rest. Every call is a sign of life; one that waits gives more while it
+waits. The next call of a rig that was only slow is MachineLost.
+
+`tests/table_io/conformance.py` holds every backend to this, clause by clause.
 """
 
+from collections.abc import Callable
 from typing import Protocol
 
 from table_io.block import Float1D, Float2D
 from table_io.clock import Clock
-from table_io.profile import Profile
+from table_io.profile import Profile, Specimen
 from table_io.rig import Rig
+
+PATIENCE_S = 0.5  # after its schedule a sample that has not come is not coming
+HEARTBEAT_S = 0.3  # without a word from its rig a machine that watches goes on alone
+
+
+class MachineLost(RuntimeError):
+    """The machine does not answer; what is queued in it plays to rest."""
 
 
 class Backend(Protocol):
@@ -58,7 +80,11 @@ class Backend(Protocol):
 
 def open_backend(rig: Rig, profile: Profile, clock: Clock) -> Backend:
     """The backend that the machine card names. Adding a backend = one file and one line here."""
+    from table_io.backends.machine import MachineBackend
     from table_io.backends.simulated import SimulatedBackend
 
-    kinds = {"simulated": SimulatedBackend}
+    kinds: dict[str, Callable[[Rig, Specimen, float, Clock], Backend]] = {
+        "simulated": SimulatedBackend,
+        "machine": MachineBackend,
+    }
     return kinds[rig.backend](rig, profile.specimen, profile.acquisition.rate_hz, clock)

@@ -1,11 +1,18 @@
 """The simulated machine: converters and sensors round the plant, paced by any clock.
 
 Nothing in the samples depends on the clock or on how reads are cut: real time, as fast as possible
-and a test see the same run to the bit.
+and a test see the same run to the bit. What is planted to go wrong is in `faults.py`.
 """
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
+from table_io.backends import PATIENCE_S, MachineLost
+from table_io.backends.faults import planted
 from table_io.backends.plant import SIGNALS, Plant
 from table_io.block import Float1D, Float2D
 from table_io.card import BadInput
@@ -85,16 +92,21 @@ class SimulatedBackend:
         self._rig = rig
         self._clock = clock
         self._plant = plant_on(rig.simulated, specimen, rate_hz)
+        self._softened = lru_cache(2)(self._soften)
+        self._faults = planted(rig.simulated.faults, rig, rate_hz, rig.simulated.seed)
         self._state = self._plant.rest()
         self._digitiser = Digitiser(rig.sensors)
         self._noise = np.random.default_rng([rig.simulated.seed, 0])
         self._tare_noise = np.random.default_rng([rig.simulated.seed, 1])
         # Played command in m from sample `_origin` on; before sample 0 the output stands at 0 V.
-        self._command = np.zeros(self._plant.history)
-        self._origin = -self._plant.history
+        self._past = self._plant.history + self._faults.reach
+        self._command = np.zeros(self._past)
+        self._origin = -self._past
         self._next = 0
         self._epoch: float | None = None
         self._is_open = False
+        # Told the truth of what is taken: (first sample, command in m, SIGNALS in SI).
+        self.witness: Callable[[int, Float1D, Float2D], None] | None = None
 
     def open(self) -> None:
         """Checks the rate and compiles the plant, so that the first read is not late."""
@@ -116,15 +128,15 @@ class SimulatedBackend:
     def queue(self, index: int, volts: Float1D) -> None:
         """Replace the command from sample `index` on, (sample,); the last value is held."""
         self._demand(self._is_open, "open() comes first")
-        earliest = 0 if self._epoch is None else self._next - 1 + self.replace_after
+        earliest = 0 if self._epoch is None else self._newest() + self.replace_after
         if index < earliest:
             raise ValueError(
                 f"the command from sample {index} on is already in the device; allowed: from "
-                f"{earliest} on ({self.replace_after} after the newest acquired sample)"
+                f"{earliest} on ({self.replace_after} after the newest sample taken)"
             )
         if not np.isfinite(volts).all():
             raise ValueError(f"the command from sample {index} on holds NaN or inf; send volts")
-        oldest = self._next - self._plant.history
+        oldest = self._next - self._past
         kept = self._commanded(oldest, index)
         self._command = np.concatenate([kept, played(volts, self._rig.output)])
         self._origin = oldest
@@ -138,14 +150,32 @@ class SimulatedBackend:
     def read(self, samples: int) -> Float2D:
         """Volts of the next samples, (channel, sample), when they have been taken."""
         self._demand(self._is_open, "it is closed")
-        self._clock.wait_until(self.scheduled(self._next + samples - 1))
+        self._wait(self._next, self._next + samples)
+        return self.take(samples)
+
+    def late_s(self, first: int, last: int) -> float:
+        """How long after their schedule samples first .. last - 1 are handed over; inf: never."""
+        return self._faults.late_s(first, last)
+
+    def take(self, samples: int) -> Float2D:
+        """The same without waiting: for a machine that keeps its own time."""
         first = self._next
-        command = self._commanded(first - self._plant.history, first + samples)
+        known = self._commanded(first - self._past, first + samples)
+        drive = self._faults.output(first - self._past, known)[self._faults.reach :]
+        command = self._faults.servo(first - self._plant.history, drive)
         signals = np.empty((len(SIGNALS), samples))
-        self._plant.advance(self._state, command, signals)
+        done = 0
+        for count, share in self._faults.bandwidth(first, samples):
+            until = done + count
+            span = command[done : self._plant.history + until]
+            self._softened(share).advance(self._state, span, signals[:, done:until])
+            done = until
         self._next += samples
-        values = self._values(command[self._plant.history :], signals)
-        return self._digitiser.volts(values, self._noise)
+        played_m = drive[self._plant.history :]
+        if self.witness is not None:
+            self.witness(first, played_m, signals)
+        values = self._values(played_m, signals)
+        return self._faults.inputs(first, self._digitiser.volts(values, self._noise))
 
     def scheduled(self, index: int) -> float:
         """Time on the session's clock at which sample `index` is taken, in s."""
@@ -156,6 +186,27 @@ class SimulatedBackend:
     def close(self) -> None:
         """Release the machine; safe to call twice."""
         self._is_open = False
+
+    def _wait(self, first: int, last: int) -> None:
+        """Until samples first .. last - 1 have come; MachineLost where they do not in time."""
+        due, late_s = self.scheduled(last - 1), self.late_s(first, last)
+        self._clock.wait_until(due + min(late_s, PATIENCE_S))
+        if late_s > PATIENCE_S:
+            raise MachineLost(
+                f"the simulated table has not sent the samples up to {last - 1}, {PATIENCE_S:g} s "
+                "after their schedule; what is queued plays to rest. Look after the machine, then "
+                "start anew"
+            )
+
+    def _newest(self) -> int:
+        """The newest sample that the machine has taken by now, read or not."""
+        since = self._clock.now() - self.scheduled(0)
+        return max(self._next - 1, math.floor(since * self.rate_hz + 1e-6))
+
+    def _soften(self, share: float) -> Plant:
+        """The plant with this share of its servo's bandwidth."""
+        bandwidth = share * self._plant.servo_bandwidth_hz
+        return self._plant if share == 1.0 else replace(self._plant, servo_bandwidth_hz=bandwidth)
 
     def _demand(self, condition: bool, remedy: str) -> None:
         if not condition:

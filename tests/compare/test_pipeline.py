@@ -14,8 +14,8 @@ from table_io.backends import open_backend
 from table_io.block import Block, Label, join, recut
 from table_io.card import PROFILES
 from table_io.clock import ManualClock
-from table_io.records import Comparison, Cycle, Event, Params, Point
-from table_io.session import play
+from table_io.records import Comparison, Cycle, Decided, Event, Params, Point
+from table_io.session import Order, play
 from twin.compare import pipeline
 from twin.service.bundle import Bundle, from_texts
 from twin.stream.wire import Item, encode
@@ -56,7 +56,10 @@ def measured(bundle: Bundle) -> Block:
 def table(bundle: Bundle, stop_at: int | None = None) -> Block:
     clock, seen = ManualClock(), 0
     blocks = []
-    order = lambda: "stop" if stop_at is not None and seen >= stop_at else None  # noqa: E731
+
+    def order() -> Order | None:
+        return Order("stop", "enough") if stop_at is not None and seen >= stop_at else None
+
     backend = open_backend(bundle.rig, bundle.profile, clock)
     for item in play(bundle.session, backend, clock, bundle.describe("r", "table"), order):
         if isinstance(item, Block):
@@ -278,3 +281,60 @@ def test_a_leap_is_an_event(setup: pipeline.Setup, measured: Block) -> None:
     events = of(said(setup, [measured]), Event)
     assert {one.kind for one in events} == {"jump"}
     assert "forward: eta_d falls" in events[0].text
+
+
+# Steps that are decided on while the test runs
+
+
+@pytest.fixture(scope="module")
+def decided(bundle: Bundle) -> list[Decided]:
+    """The test's steps but the first, as if a tool had decided on them."""
+    return [
+        Decided(0, one.index, one.direction, one.frequency_hz, one.acceleration_m_s2, "because")
+        for one in bundle.steps[1:]
+    ]
+
+
+@pytest.fixture(scope="module")
+def first_only(bundle: Bundle) -> pipeline.Setup:
+    return pipeline.prepare(bundle.profile, bundle.model, bundle.steps[:1])
+
+
+def but_events(items: Sequence[Item]) -> list[tuple[type, bytes]]:
+    return records([one for one in items if not isinstance(one, Event)])
+
+
+def test_a_decided_step_has_its_cycles_and_its_point_but_no_leap(
+    setup: pipeline.Setup, first_only: pipeline.Setup, measured: Block, decided: list[Decided]
+) -> None:
+    """Visits come at odd frequencies, on either branch: what differs there is no jump."""
+    whole = said(setup, [measured])
+    items = said(pipeline.knowing(first_only, *decided), [measured])
+    assert but_events(items) == but_events(whole)
+    assert of(whole, Event)
+    assert not of(items, Event)
+
+
+def test_it_does_not_matter_when_and_how_often_a_step_is_told_of(
+    first_only: pipeline.Setup, measured: Block, decided: list[Decided]
+) -> None:
+    at_once = said(pipeline.knowing(first_only, *decided), recut([measured], 250))
+    one_by_one, setup = [], first_only
+    state, _ = pipeline.start(setup)
+    begins = {one.step: int(np.flatnonzero(measured.step == one.step)[0]) for one in decided}
+    for block in recut([measured], 250):
+        for one in decided:
+            if begins[one.step] < block.end + 250:
+                setup = pipeline.knowing(setup, one)
+        state, made = pipeline.step(setup, state, block)
+        one_by_one.extend(made)
+    assert len(setup.decided) == len(decided)
+    assert records(one_by_one) == records(at_once)
+
+
+def test_a_step_that_nobody_told_of_is_passed_over(
+    setup: pipeline.Setup, first_only: pipeline.Setup, measured: Block
+) -> None:
+    items = said(first_only, [measured])
+    assert {one.step for one in (*of(items, Cycle), *of(items, Point))} == {0}
+    assert predicted(items).identical(predicted(said(setup, [measured])))

@@ -57,31 +57,9 @@ def guards(p: Parameters, contact: list[bool]):
     return right, left
 
 
-def reference(
-    p: Parameters, x0, contact, base: Callable[[float], float], times, tolerance=1e-12, dt=2e-3
-):
-    """(u, v, u_R, u_L) at `times` (4, n) and the events [(t, side)], from x0 at t = 0."""
-    contact, x, t, end = list(contact), list(x0), 0.0, times[-1]
-    states = np.full((4, len(times)), np.nan)
-    events = []
-    while t < end:
-        solution = solve_ivp(
-            right_hand_side(p, contact, base), (t, end), x, method="DOP853", dense_output=True,
-            rtol=tolerance, atol=tolerance, max_step=dt, events=guards(p, contact),
-        )  # fmt: skip
-        inside = (times >= t) & (times <= solution.t[-1])
-        if inside.any():
-            states[:, inside] = solution.sol(times[inside])
-        t, x = solution.t[-1], list(solution.y[:, -1])
-        if t >= end:
-            break
-        side = 0 if solution.t_events[0].size else 1
-        contact[side] = not contact[side]
-        x[2 + side] = x[0] - p.gap_r if side == 0 else x[0] + p.gap_l
-        events.append((t, side))
-        # scipy sees the guard at zero at the start of the phase and would end it there.
-        t, x = small_step(p, contact, base, t, x)
-    return states, events
+def linear_between(times, values) -> Callable[[float], float]:
+    """The drive that is linear between its values at these times."""
+    return lambda t: float(np.interp(t, times, values))
 
 
 def small_step(p, contact, base, t, x, step=1e-7):
@@ -92,3 +70,57 @@ def small_step(p, contact, base, t, x, step=1e-7):
     k3 = np.array(rhs(t + step / 2, x + step / 2 * k2))
     k4 = np.array(rhs(t + step, x + step * k3))
     return t + step, list(x + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
+
+
+def reference(p, x0, contact, base: Callable[[float], float], knots, tolerance=1e-13, dt=1e-3):
+    """(u, v, u_R, u_L) at the knots (4, n) and the events [(t, side, onset)], from x0 at the first.
+
+    No step crosses a knot, where the drive may have a kink, and event times are not those of
+    scipy's interpolant, which is less accurate than its steps.
+    """
+    contact, events, states = list(contact), [], [x0]
+    t, x = small_step(p, contact, base, knots[0], x0)  # from a release, as below
+    if min(guard(t, x) for guard in guards(p, contact)) < 0:
+        t, x = knots[0], list(x0)  # it starts at touch, on the way in
+    for end in knots[1:]:
+        while t < end:
+            rhs, guard = right_hand_side(p, contact, base), guards(p, contact)
+            solution = solve_ivp(
+                rhs, (t, end), x, method="DOP853", rtol=tolerance, atol=tolerance * 1e-3,
+                max_step=dt, events=guard,
+            )  # fmt: skip
+            if solution.status != 1:
+                t, x = end, list(solution.y[:, -1])
+                break
+            side = 0 if solution.t_events[0].size else 1
+            begin, x0 = solution.t[-2], solution.y[:, -2]
+            t, x = polished(rhs, guard[side], begin, x0, solution.t[-1], tolerance)
+            contact[side] = not contact[side]
+            x[2 + side] = x[0] - p.gap_r if side == 0 else x[0] + p.gap_l
+            events.append((t, side, contact[side]))
+            # scipy sees the guard at zero at the start of the phase and would end it there.
+            t, x = small_step(p, contact, base, t, x)
+        states.append(x)
+    return np.array(states).T, np.array(events).reshape(-1, 3)
+
+
+def polished(rhs, guard, begin, x0, t, tolerance) -> tuple[float, list[float]]:
+    """(time, state) where the guard is zero, by secants near t; each try is a fresh integration."""
+
+    def at(time):
+        return solve_ivp(
+            rhs, (begin, time), x0, method="DOP853", rtol=tolerance, atol=tolerance * 1e-3
+        ).y[:, -1]
+
+    before = t - 1e-3 * (t - begin)
+    g_before, x = guard(before, at(before)), at(t)
+    for _ in range(8):
+        g = guard(t, x)
+        if g == g_before:
+            break
+        step = -g * (t - before) / (g - g_before)
+        before, g_before, t = t, g, t + step
+        x = at(t)
+        if abs(step) < 1e-15:
+            break
+    return t, list(x)

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -38,7 +39,10 @@ def test_revision_is_the_same_in_every_process():
         "from twin.model import integrate;"
         "print(revision({'f': nested}), integrate.REVISION)"
     )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True)
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, check=True, text=True,
+        cwd=Path(__file__).parents[2],
+    )  # fmt: skip
     from twin.model import integrate
 
     assert found.stdout.split() == [str(revision({"f": nested})), str(integrate.REVISION)]

@@ -72,6 +72,7 @@ def test_a_plug_in_adds_a_force(monkeypatch):
     assert np.abs(p.mass * out[2] + force).max() < 1e-9 * np.abs(force).max()
     plain = drive(Model(snm()), noisy(0.5))[1]
     assert np.abs(out[0] - plain[0]).max() > 1e-5
+    assert model.prepare(RATE).extra is model.prepare(2 * RATE).extra  # compiled once
     with pytest.raises(BadInput, match="did you mean 'quintic_spring'"):
         find_effect("quintic_sprin")
 
@@ -174,6 +175,23 @@ def test_a_rate_too_low_for_the_bumper_is_refused():
         stiff.prepare(2000.0)
 
 
+@pytest.mark.parametrize("rate", [math.nan, math.inf, 0.0, -1.0])
+def test_a_rate_that_is_none_is_refused(rate):
+    with pytest.raises(BadInput, match=r"rate_hz = .*allowed: above 0 Hz, finite"):
+        Model(snm(math.inf)).prepare(rate)
+
+
+@pytest.mark.parametrize("model", [Model(snm()), having(find_effect("cubic_stiffness"))])
+def test_too_little_room_is_refused_before_anything_is_written(model):
+    solver, base = model.prepare(RATE), np.ones(9)
+    out = np.zeros((7, 8))
+    for state, room in ((solver.rest(), out), (solver.rest()[:6], np.zeros((7, 9))),
+                        (solver.rest(), np.zeros((6, 9)))):  # fmt: skip
+        with pytest.raises(ValueError, match="too small"):
+            solver.advance(state, base, base, room)
+        assert not room.any()
+
+
 def test_relaxing_face_without_viscous_damping_is_refused():
     bare = snm(bumper_damping_r=0.0, bumper_damping_l=0.0)
     model = Model(bare).with_effect("hunt_crossley", ch=1e5)
@@ -220,6 +238,15 @@ def test_sampled_sweep_of_a_model_is_near_the_closed_one(effect):
     assert got.extremes.shape == want.extremes.shape
     assert np.array_equal(got.extremes[..., 6:], want.extremes[..., 6:])
     assert got.extremes[..., :4] == pytest.approx(want.extremes[..., :4], rel=1e-4)
+
+
+def test_a_sampled_sweep_takes_as_many_samples_as_a_hard_bumper_needs():
+    hard = snm(bumper_stiffness_r=5e8, bumper_stiffness_l=5e8)
+    model = Model(hard).with_effect("cubic_stiffness", k3=1e-9)
+    got, want = (swept(one, [1.4], AG, 1).extremes for one in (model, Model(hard)))
+    assert model.least_rate_hz > 1000 * 1.4
+    assert got[..., :2] == pytest.approx(want[..., :2], rel=1e-4)
+    assert got[..., 6:].tolist() == want[..., 6:].tolist()
 
 
 def test_every_built_in_effect_is_on_a_path():

@@ -5,10 +5,16 @@ import math
 import numpy as np
 import pytest
 
+from table_io.card import BadInput
 from twin.model import exact
+from twin.model.ideal import swept
+from twin.model.model import Model
+from twin.model.orbit import events
 from twin.model.sweep import EXTREMES, LEAST_STEPS, stepped_sine
 
 from .reference import AG, reference, snm
+
+EVENT_S = 1e-12
 
 
 def grid(start: float, stop: float, step: float) -> np.ndarray:
@@ -30,14 +36,26 @@ def test_sweep_at_g4_ends_where_it_must_on_any_grid(steps):
 
 @pytest.mark.parametrize("frequency", [2.0, 3.4])
 def test_agrees_with_dop853_over_ten_cycles(frequency):
+    """State and event times; the reference moves by far less when its steps are halved."""
     p, w = snm(), 2 * math.pi * frequency
     start = exact.restart(0.0, 0.1, 0.0, 0.0, False, False, 0.0, p)
-    times = np.array([10 / frequency])
-    want, events = reference(p, start[:4], (False, False), lambda t: AG * math.sin(w * t), times)
+    knots = np.array([0.0, 10 / frequency])
+    (want, contacts), (finer, again) = (
+        reference(p, start[:4], (False, False), lambda t: AG * math.sin(w * t), knots, dt=dt)
+        for dt in (1e-3, 5e-4)
+    )
+    assert np.abs(want - finer).max() < 1e-14
+    assert np.abs(contacts[:, 0] - again[:, 0]).max() < EVENT_S / 10
     sweep = stepped_sine(p, [frequency], AG, 10, state=start)
-    assert np.abs(sweep.states[0, :4] - want[:, 0]).max() < 1e-12
-    onsets = sweep.column("onsets_r").sum() + sweep.column("onsets_l").sum()
-    assert onsets == math.ceil(len(events) / 2)
+    assert np.abs(sweep.states[0, :4] - want[:, -1])[[0, 2, 3]].max() < 1e-13
+    found, state = events(p, frequency, AG, start, 10)
+    assert found[:, 1:].tolist() == contacts[:, 1:].tolist()
+    assert np.abs(found[:, 0] / frequency - contacts[:, 0]).max() < EVENT_S
+    assert np.abs(state[:4] - sweep.states[0, :4]).max() < 1e-14
+    for side, name in enumerate(("onsets_r", "onsets_l")):
+        onsets = found[(found[:, 1] == side) & (found[:, 2] == 1), 0]
+        counts = np.histogram(onsets, np.arange(11))[0]
+        assert counts.tolist() == sweep.column(name)[0].tolist()
     assert (start == exact.restart(0.0, 0.1, 0.0, 0.0, False, False, 0.0, p)).all()
 
 
@@ -152,5 +170,26 @@ def test_resonance_is_the_free_flight_maximum():
 
 
 def test_too_few_steps_are_refused():
-    with pytest.raises(ValueError, match=f"{LEAST_STEPS} or more"):
+    with pytest.raises(BadInput, match=f"{LEAST_STEPS} or more"):
         stepped_sine(snm(), [2.0], AG, 1, 4)
+
+
+@pytest.mark.parametrize(
+    "frequencies, peak, cycles, says",
+    [
+        ([2.0, math.nan], AG, 1, r"frequencies_hz\[1\] = nan: allowed: above 0 Hz, finite"),
+        ([0.0], AG, 1, r"frequencies_hz\[0\] = 0"),
+        ([-1.0], AG, 1, r"frequencies_hz\[0\] = -1"),
+        ([math.inf], AG, 1, r"frequencies_hz\[0\] = inf"),
+        ([2.0], math.nan, 1, "acceleration = nan: allowed: a finite number"),
+        ([2.0], AG, 0, "cycles = 0: allowed: 1 or more"),
+    ],
+)
+def test_a_drive_that_is_none_is_refused(frequencies, peak, cycles, says):
+    """By the closed form, the sampled way and the map of a cycle."""
+    with pytest.raises(BadInput, match=says):
+        stepped_sine(snm(), frequencies, peak, cycles)
+    with pytest.raises(BadInput, match=says):
+        swept(Model(snm()).with_effect("cubic_stiffness", k3=1e6), frequencies, peak, cycles)
+    with pytest.raises(BadInput, match=says.replace("[1", "[0")):
+        events(snm(), frequencies[-1], peak, exact.rest(snm()), cycles)

@@ -1,16 +1,17 @@
-"""Pre-flight margins against closed forms, refusals that name step and limit, limits of a block."""
+"""Pre-flight margins against closed forms, and refusals that name step and limit."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 
-from table_io.block import Block
 from table_io.card import PROFILES, BadInput, load
+from table_io.conductor import rehearsed, score
 from table_io.course import plan
-from table_io.limits import Margin, margins, refuse, tripped, warnings
+from table_io.limits import Margin, doubts, margins, recheck, refuse, warnings
 from table_io.profile import Profile
+from table_io.records import Response
 from table_io.rig import Rig
 from table_io.units import GRAVITY_M_S2
 
@@ -25,16 +26,12 @@ def rig(table: str = "limits", **changes: float) -> Rig:
     return Rig.model_validate(raw)
 
 
-def profile(start_hz: float = 0.5, stop_hz: float = 10.0, **acquisition: Any) -> Profile:
-    """A test of two steps, up and down."""
+def profile(start_hz: float = 0.5, stop_hz: float = 10.0, **tables: Any) -> Profile:
+    """A test of two steps, up and down, with other tables."""
     sweep = {"start_hz": start_hz, "stop_hz": stop_hz, "step_hz": stop_hz - start_hz, "cycles": 3}
+    specimen = {"mass_kg": 550.0, "gap_mm": 4.0}
     return Profile.model_validate(
-        {
-            "title": "limits",
-            "specimen": {"mass_kg": 550.0, "gap_mm": 4.0},
-            "sweep": sweep,
-            "acquisition": acquisition,
-        }
+        {"title": "limits", "specimen": specimen, "sweep": sweep} | tables
     )
 
 
@@ -48,21 +45,6 @@ def refusal(test: Profile, card: Rig) -> list[str]:
     head, *faults = str(caught.value).splitlines()
     assert head == "a.toml: the table 'simulated' cannot do this test; nothing was started"
     return [fault.strip() for fault in faults]
-
-
-def block(**rows_si: Any) -> Block:
-    """Ten samples from 100 on; every channel that is not given rests."""
-    values = np.zeros((len(RIG.channels), 10))
-    for name, samples in rows_si.items():
-        values[RIG.channels.index(name)] = samples
-    nothing = np.full(10, -1, dtype=np.int64)
-    return Block("meas", 100, 2000.0, RIG.channels, values, nothing, nothing + 1, nothing)
-
-
-def at(place: int, value: float) -> np.ndarray:
-    samples = np.zeros(10)
-    samples[place] = value
-    return samples
 
 
 def test_margins_agree_with_closed_forms() -> None:
@@ -118,13 +100,13 @@ def test_a_refusal_names_the_step_and_the_limit(
 
 
 def test_a_rate_that_the_card_does_not_have_is_refused() -> None:
-    (fault,) = refusal(profile(rate_hz=1500.0), RIG)
+    (fault,) = refusal(profile(acquisition={"rate_hz": 1500.0}), RIG)
     assert fault == "acquisition.rate_hz 1500 Hz; allowed: 1000, 2000, 4000"
 
 
 def test_all_limits_that_are_exceeded_stand_in_one_refusal() -> None:
     card = rig(stroke_mm=1.0, velocity_mm_s=1.0, acceleration_g=0.01, force_kn=0.1)
-    faults = refusal(profile(rate_hz=1500.0), card)
+    faults = refusal(profile(acquisition={"rate_hz": 1500.0}), card)
     assert len(faults) == 5
 
 
@@ -137,26 +119,120 @@ def test_what_is_just_allowed_is_not_refused() -> None:
     refuse(rows(profile(), card), profile(), card, "a.toml")
 
 
-def test_a_quiet_block_does_not_trip() -> None:
-    assert tripped(block(table_disp_m=0.0599, table_acc_m_s2=-9.8), RIG) is None
-    # What the specimen does is not the table's business.
-    assert tripped(block(mass_disp_m=5.0, mass_acc_m_s2=np.nan), RIG) is None
+def with_check(test: Profile, card: Rig = RIG) -> tuple[Margin, ...]:
+    """Margins of the drive as it is played, loop check and tuning included."""
+    return margins(rehearsed(score(test, card)), test, card)
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_trip_names_channel_sample_value_and_limit(sign: float) -> None:
-    reason = tripped(block(table_disp_m=at(3, sign * 0.0612)), RIG)
-    assert reason == "table_disp_m = 61.2 mm at sample 103 exceeds 60 mm"
-    reason = tripped(block(table_acc_m_s2=at(9, sign * 1.25 * GRAVITY_M_S2)), RIG)
-    assert reason == "table_acc_m_s2 = 1.25 g at sample 109 exceeds 1 g"
+def test_the_loop_check_has_rows_of_its_own_before_the_steps() -> None:
+    found = with_check(profile())
+    assert [row.step for row in found] == [-1, -1, -1, 0, 1, 2, 3]
+    assert [row.name for row in found[:1]] == ["loop check (1 Hz)"]
+    for row, f in zip(found, (1.0, math.sqrt(10.0), 10.0), strict=False):
+        assert row.frequency_hz == pytest.approx(f)
+        assert row.acceleration_m_s2 == pytest.approx(0.1 * A, rel=0.06)
+        assert row.lsb == pytest.approx(0.1 * A / (2 * math.pi * f) ** 2 / RIG.output.lsb_m)
+    # The smallest amplitude of the check has 27 DAC steps: neither refused nor warned of.
+    assert found[2].lsb < RIG.output.warn_lsb
+    refuse(found, profile(), RIG, "a.toml")
+    refuse((replace(found[0], lsb=5.0), *found[1:]), profile(), RIG, "a.toml")
+    assert warnings(found, RIG) == []
 
 
-@pytest.mark.parametrize("name", ["table_disp_m", "table_acc_m_s2"])
-def test_a_table_sensor_that_is_lost_trips(name: str) -> None:
-    assert tripped(block(**{name: np.nan}), RIG) == f"{name} is lost from sample 100 on"
+def test_a_loop_check_that_the_table_cannot_do_is_refused_by_name() -> None:
+    test = profile(loop_check={"frequencies_hz": (0.05, 30.0)})
+    with pytest.raises(BadInput) as caught:
+        refuse(with_check(test), test, RIG, "a.toml")
+    text = str(caught.value)
+    assert "loop_check.frequencies_hz 30 Hz; allowed: at most 20" in text
+    assert "loop check (0.05 Hz) and 1 more: displacement 496" in text
+    assert "Raise loop_check.frequencies_hz or lower loop_check.level" in text
 
 
-def test_one_lost_sample_neither_trips_nor_hides_the_next() -> None:
-    assert tripped(block(table_disp_m=at(2, np.nan)), RIG) is None
-    both = at(2, np.nan) + at(5, 0.07)
-    assert "at sample 105" in str(tripped(block(table_disp_m=both), RIG))
+@pytest.mark.parametrize(
+    ("channel", "full", "words"),
+    [
+        ("table_disp_m", 40.0, "step 0 (0.5 Hz forward): table_disp_m 49.6"),
+        ("drive_disp_m", 40.0, "step 0 (0.5 Hz forward): drive_disp_m 49.6"),
+        ("table_acc_m_s2", 0.05, "step 1 (10 Hz forward): table_acc_m_s2 0.05"),
+    ],
+)
+def test_a_sensor_of_the_table_that_would_clip_is_refused(
+    channel: str, full: float, words: str
+) -> None:
+    sensors = [
+        {**one.model_dump(), "range": full if one.channel == channel else one.range}
+        for one in RIG.sensors
+    ]
+    card = Rig.model_validate(RIG.model_dump() | {"sensors": sensors})
+    (fault,) = refusal(profile(), card)
+    assert fault.startswith(words)
+    assert f"at most its range, {full:g}" in fault
+    # What the specimen does to its sensors is not known before the test.
+    mass = [
+        {**one.model_dump(), "range": 0.1 if "mass" in one.channel else one.range}
+        for one in RIG.sensors
+    ]
+    card = Rig.model_validate(RIG.model_dump() | {"sensors": mass})
+    refuse(rows(profile(), card), profile(), card, "a.toml")
+
+
+def test_a_command_without_room_for_a_correction_is_worth_a_warning() -> None:
+    asked = rows(profile())
+    assert warnings(asked, RIG) == []  # 49.7 mm of 60 mm: 20 % more are 59.6 mm
+    (said,) = warnings(asked, rig(stroke_mm=59.0))
+    assert said.startswith("step 0 (0.5 Hz forward): 49.6")
+    assert "leave no room to correct the command by 20 %" in said
+
+
+@pytest.mark.parametrize(
+    ("tables", "words"),
+    [
+        ({"specimen": {"mass_kg": 5.5, "gap_mm": 4.0}}, "is it in kg?"),
+        ({"specimen": {"mass_kg": 550e3, "gap_mm": 4.0}}, "is it in kg?"),
+        ({"specimen": {"mass_kg": 550.0, "gap_mm": 4000.0}}, "is it in mm?"),
+        ({"acquisition": {"block_samples": 500}}, "fewer than four blocks"),
+    ],
+)
+def test_what_hardly_fits_the_machine_is_doubted(tables: dict[str, Any], words: str) -> None:
+    (said,) = doubts(profile(**tables), RIG)
+    assert words in said
+
+
+def test_a_plain_test_is_not_doubted() -> None:
+    for gap_mm in (math.inf, 30.0, 0.0, -10.0):
+        specimen = {"mass_kg": 550.0, "gap_mm": gap_mm}
+        assert doubts(profile(specimen=specimen), RIG) == []
+
+
+def test_a_loop_check_that_ends_below_the_sweep_is_said() -> None:
+    (said,) = doubts(profile(), rig("output", span_mm=100.0, bits=16))
+    assert said.startswith(
+        "the loop check ends at 4.51 Hz: at 10 Hz a tenth of the level has fewer"
+    )
+    off = profile(loop_check={"enabled": False})
+    assert doubts(off, rig("output", span_mm=100.0, bits=16)) == []
+
+
+def response(gain: float) -> Response:
+    """A flat response up to 1 Hz that has fallen to `gain` at 10 Hz."""
+    return Response(5, (1.0, 3.0, 10.0), (1.0, 1.0, gain), (0.0, 0.0, 0.0))
+
+
+def test_the_corrected_command_is_held_against_the_card() -> None:
+    steps = profile().sweep.steps
+    assert recheck(steps, response(0.9), RIG) == []
+    flat = Response(5, (1.0,), (0.8,), (0.0,))
+    (said,) = recheck(steps, flat, RIG)
+    assert "step 0 (0.5 Hz forward) and 1 more: displacement 62.1 mm" in said
+    assert "allowed: at most 60 mm" in said
+    assert said.startswith("corrected for the table's response")
+    # 0.05 g at 10 Hz asked of a table that gives 0.6 of it.
+    (said,) = recheck(steps, response(0.6), rig(acceleration_g=0.08))
+    assert "(10 Hz forward) and 1 more: acceleration 0.08333 g" in said
+
+
+def test_a_correction_beyond_what_control_may_do_is_said_before_the_sweep() -> None:
+    (said,) = recheck(profile().sweep.steps, response(0.4), RIG)
+    assert said.startswith("step 1 (10 Hz forward): the table follows with a gain of 0.4")
+    assert "2.5 times as large; allowed: at most 2" in said

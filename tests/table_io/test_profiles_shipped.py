@@ -26,6 +26,7 @@ PAPER = {
     "gm2": (-2.0, TALL),
     "gm10": (-10.0, TALL),
 }
+TOOLS = {"dwell", "track", "refine_g4"}
 
 
 def read(path: Path) -> Profile:
@@ -71,7 +72,7 @@ def test_the_files_that_users_script_against_are_there(name: str) -> None:
 
 
 def test_no_shipped_test_goes_unmentioned() -> None:
-    assert {path.stem for path in SHIPPED} == {*PAPER, "quickstart"}
+    assert {path.stem for path in SHIPPED} == {*PAPER, "quickstart", *TOOLS}
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)

@@ -12,7 +12,7 @@ import numpy as np
 from table_io.block import Block, Float1D, Label, join
 from table_io.channels import contact_forces, rel_disp
 from table_io.profile import Profile
-from table_io.records import Cycle, Event, Params, Point, Record, Step
+from table_io.records import Cycle, Decided, Event, Params, Point, Record, Step
 from twin.compare.curves import sudden
 from twin.compare.cycles import UNKNOWN, Motion, Scale, Touching, extremes, point
 from twin.compare.windows import Tracks, TwinSetup, begin, follow
@@ -25,12 +25,22 @@ SHORT = 3  # samples by which a held cycle may miss its length and still be whol
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """All that a twin needs to know of a run."""
+    """All that a twin needs to know of a run: the planned steps, and those decided on so far.
+
+    Only planned steps make the curves; the others are visits, at odd frequencies and repeated.
+    """
 
     twin: TwinSetup
     scale: Scale
     steps: tuple[Step, ...]
     measured_cycles: int
+    decided: tuple[Step, ...] = ()
+
+    def step(self, index: int) -> Step | None:
+        """The step of this index; None where nobody told of it."""
+        if 0 <= index < len(self.steps):
+            return self.steps[index]
+        return next((one for one in self.decided if one.index == index), None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +80,18 @@ def prepare(
     )
     scale = Scale(model.parameters, rate, contact_n, u_star, a_star, profile.specimen.gaps_m)
     return Setup(twin, scale, steps, profile.sweep.measured_cycles)
+
+
+def knowing(setup: Setup, *decided: Decided) -> Setup:
+    """The setup with steps that were decided on; to be told of each before its first sample.
+
+    More than is known at a time changes nothing, nor does telling twice.
+    """
+    for one in decided:
+        if setup.step(one.step) is None:
+            step = Step(one.step, one.direction, one.frequency_hz, one.acceleration_m_s2)
+            setup = replace(setup, decided=(*setup.decided, step))
+    return setup
 
 
 def start(setup: Setup, index: int = 0) -> tuple[State, list[Record]]:
@@ -154,11 +176,11 @@ def _motions(held: tuple[Piece, ...]) -> tuple[Motion, Motion]:
 
 
 def _cycle(setup: Setup, state: State, step: int, number: int) -> tuple[State, list[Record]]:
-    """The finished cycle, unless it was cut short by a stop."""
+    """The finished cycle, unless it was cut short by a stop or belongs to a step unheard of."""
     first, end = state.first, state.held[-1][0].end
-    length = setup.twin.rate_hz / setup.steps[step].frequency_hz
     held, state = state.held, replace(state, held=())
-    if end - first < length - SHORT:
+    known = setup.step(step)
+    if known is None or end - first < setup.twin.rate_hz / known.frequency_hz - SHORT:
         return state, []
     measured, twin = _motions(held)
     lead = first - held[0][0].index
@@ -180,15 +202,12 @@ def _point(setup: Setup, state: State) -> tuple[State, list[Record]]:
     items: list[Record] = []
     last = state.last_point
     seen = sum(cycle.label == Label.MEASURE for cycle in state.cycles)
-    if seen == setup.measured_cycles:
-        last = point(
-            setup.steps[state.cycles[-1].step],
-            list(state.cycles),
-            np.concatenate(state.base_acc),
-            setup.scale,
-        )
+    step = setup.step(state.cycles[-1].step)
+    if step is not None and seen == setup.measured_cycles:
+        base_acc = np.concatenate(state.base_acc)
+        last = point(step, list(state.cycles), base_acc, setup.scale)
         items.append(last)
-        if hint := sudden(state.last_point, last):
+        if step not in setup.decided and (hint := sudden(state.last_point, last)):
             items.append(Event(last.index, "jump", hint))
     # The contact state is not followed through the blend to the next step.
     return replace(

@@ -212,12 +212,13 @@ def root(
             lo = t
         df = slope if order == 0 and slope != 0.0 else chord
         new = t - f / df if df != 0.0 else lo
+        if df != 0.0 and abs(new - t) <= 1e-12 * hi:
+            return min(max(new, lo), hi)
         if not lo < new < hi:
             new = 0.5 * (lo + hi)
-        moved = abs(new - t)
+            if not lo < new < hi:
+                break
         t = new
-        if moved <= 1e-12 * hi:
-            break
     return t
 
 

@@ -62,6 +62,8 @@ def rest(parameters: Parameters) -> Float1D:
     kr, kl = parameters.bumper_stiffness_r, parameters.bumper_stiffness_l
     for right, left in ((False, False), (True, False), (False, True), (True, True)):
         push = (kr * gap_r if right else 0.0) - (kl * gap_l if left else 0.0)
+        if not math.isfinite(push):
+            continue
         u = push / (k + kr * right + kl * left)
         if (u - gap_r > 0) == right and (-u - gap_l > 0) == left:
             state[U], state[CONTACT_R], state[CONTACT_L] = u, right, left

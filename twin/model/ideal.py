@@ -8,9 +8,9 @@ import numpy as np
 from table_io.block import Float1D, Float2D
 from twin.model.model import Model
 from twin.model.solver import OUTPUTS
-from twin.model.sweep import EXTREMES, SteppedSine, stepped_sine
+from twin.model.sweep import EXTREMES, SteppedSine, held, stepped_sine
 
-SAMPLES = 1000  # a cycle, where it is sampled: extremes then lack at most 5e-6 of themselves
+SAMPLES = 1000  # a cycle, least, where it is sampled: extremes then lack at most 5e-6 of themselves
 
 
 def swept(
@@ -19,18 +19,20 @@ def swept(
     """Whole `cycles` of A = acceleration sin(2 pi f t) at each frequency, from rest, carried on.
 
     As `stepped_sine`, which does it where every effect only changes parameters. Else the drive is
-    linear between `SAMPLES` a cycle and extremes are those of the samples; the table's displacement
-    is -A / w^2. Sensors are not applied: this is the motion.
+    linear between `SAMPLES` a cycle (a multiple, where a contact needs it) and extremes are those
+    of the samples; the table's displacement is -A / w^2. Sensors are not applied: this is the
+    motion.
     """
     if all(one.effect.acts in ("parameters", "sensor") for one in model.present):
         return stepped_sine(model.parameters, frequencies_hz, acceleration, cycles)
-    frequencies = np.asarray(frequencies_hz, dtype=np.float64)
-    wave = np.sin(2 * math.pi * np.arange(1, SAMPLES * cycles + 1) / SAMPLES)
+    frequencies = held(frequencies_hz, acceleration, cycles)
     extremes = np.empty((frequencies.size, cycles, len(EXTREMES)))
-    ends, state, out = [], None, np.empty((OUTPUTS, wave.size))
+    ends, state = [], None
     time, touching = 0.0, (False, False)
     for place, hz in enumerate(frequencies.tolist()):
-        rate = SAMPLES * hz
+        samples = SAMPLES * max(1, math.ceil(model.least_rate_hz / (SAMPLES * hz)))
+        wave = np.sin(2 * math.pi * np.arange(1, samples * cycles + 1) / samples)
+        rate, out = samples * hz, np.empty((OUTPUTS, wave.size))
         solver = model.prepare(rate)
         if state is None:
             state = solver.rest()
@@ -46,13 +48,13 @@ def swept(
 
 def _extremes(out: Float2D, cycles: int, touching: tuple[bool, bool]) -> Float2D:
     """`EXTREMES` of each cycle, (cycle, 8); `touching` before the first sample."""
-    rows = out.reshape(OUTPUTS, cycles, SAMPLES)
+    rows = out.reshape(OUTPUTS, cycles, -1)
     u, a, right, left = rows[0], rows[2], rows[3], rows[4]
     onsets = []
     for force, before in ((out[3], touching[0]), (-out[4], touching[1])):
         contact = np.concatenate([[before], force > 0])
         begins = contact[1:] & ~contact[:-1]
-        onsets.append(begins.reshape(cycles, SAMPLES).sum(axis=1).astype(np.float64))
+        onsets.append(begins.reshape(cycles, -1).sum(axis=1).astype(np.float64))
     return np.stack(
         [
             u.max(axis=1), u.min(axis=1), a.max(axis=1), a.min(axis=1), right.max(axis=1),

@@ -51,6 +51,7 @@ from twin.model.laws import (
     hold,
     hysteretic,
 )  # fmt: skip
+from twin.model.solver import OUTPUTS
 
 CONTACT_R, CONTACT_L, AT_BASE, AT_F, AT_B_R, AT_B_L, AT_Z, WAY, CLOCK, STATE_SIZE = range(4, 14)
 DENORMAL = 1e-30  # m, N, 1: what is this near to zero is zero
@@ -170,6 +171,8 @@ def _sampled(revision: int) -> Callable[..., None]:
         """
         if revision < 0:
             return
+        if state.size < STATE_SIZE or out.shape[0] < OUTPUTS or out.shape[1] < base_acc.size:
+            raise ValueError("state or out is too small for these samples; see Solver.advance")
         parts, h = int(con[PARTS]), con[STEP]
         x = (state[U], state[V], state[U_R], state[U_L], state[AT_F], state[AT_B_R], state[AT_B_L])
         mode = int(state[CONTACT_R] > 0) + 2 * int(state[CONTACT_L] > 0)

@@ -142,7 +142,9 @@ def coefficients(model: "Model") -> tuple[Float1D, laws.Extra]:
     con[laws.TURNS] = float(con[[laws.C2, laws.FC, laws.FY, laws.EXTRA]].any())
     smooth = con[[laws.K3, laws.K2, laws.CH]].any() or con[laws.TURNS]
     con[laws.LINEAR] = float(not smooth)
-    forces = [(force, len(one.effect.parameters)) for one in plugins if (force := one.effect.force)]
+    forces = tuple(
+        (force, len(one.effect.parameters)) for one in plugins if (force := one.effect.force)
+    )
     return con, laws.together(forces) if forces else laws.no_extra
 
 

@@ -13,6 +13,7 @@ u', 0 where the mass sticks.
 
 import math
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 from numba import float64, types
@@ -164,10 +165,11 @@ def hold(x: Point, frame: Frame, con: Constants, mode: int, t: float, extra: Ext
     return -(con[MASS] * drive(frame, t) + force)
 
 
-def together(forces: list[tuple[Callable[..., float], int]]) -> Extra:
+@cache
+def together(forces: tuple[tuple[Callable[..., float], int], ...]) -> Extra:
     """One compiled `Extra` from plug-ins: (plain Python force, its number of parameters) each.
 
-    Compiled here and now, never cached: numba does not see when a plug-in changes.
+    Compiled once a process, and in each: numba's own cache does not see when a plug-in changes.
     """
     total: Any = no_extra
     first = 0

@@ -162,13 +162,20 @@ class Model:
 
     def fits(self, rate_hz: float) -> None:
         """BadInput where this sampling rate is too low to follow a contact."""
-        fastest = self._fastest()
-        least = SAMPLES_PER_CONTACT * fastest / math.pi
-        if not rate_hz >= least:
+        if not (math.isfinite(rate_hz) and rate_hz > 0):
+            raise BadInput(f"rate_hz = {rate_hz:g}: allowed: above 0 Hz, finite")
+        least = self.least_rate_hz
+        if rate_hz < least:
+            lasts = SAMPLES_PER_CONTACT / least
             raise BadInput(
                 f"rate_hz {rate_hz:g}: too low for the bumper: a contact of this model lasts "
-                f"{1e3 * math.pi / fastest:.3g} ms; allowed: {least:.4g} Hz or more; raise rate_hz"
+                f"{1e3 * lasts:.3g} ms; allowed: {least:.4g} Hz or more; raise rate_hz"
             )
+
+    @property
+    def least_rate_hz(self) -> float:
+        """The sampling rate that has `SAMPLES_PER_CONTACT` in half a period of any phase."""
+        return SAMPLES_PER_CONTACT * self._fastest() / math.pi
 
     def _fastest(self) -> float:
         """The highest angular frequency of any phase in 1/s, without nonlinear terms."""

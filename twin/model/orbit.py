@@ -33,7 +33,7 @@ from twin.model.phase import (
     flow,
     leap,
 )  # fmt: skip
-from twin.model.sweep import stepped_sine
+from twin.model.sweep import held, stepped_sine
 
 Complex1D = npt.NDArray[np.complex128]
 
@@ -70,10 +70,11 @@ def turns(
     state: Float1D, con: Float1D, peak: float, w: float, steps: int, cycles: int,
     variations: Float2D, growth: Float1D, log: Float2D, revision: int = REVISION,
 ) -> int:  # fmt: skip
-    """Moves `state` and `variations` (4, n) through whole cycles; the number of onsets.
+    """Moves `state` and `variations` (4, n) through whole cycles; the number of events.
 
-    log (m, 2): time in cycles and side (0 right, 1 left) of each onset. growth (cycles,), where it
-    has room: logarithm of the growth of variation 0 over each cycle, which is then made 1 m long.
+    log (m, 3): time in cycles, side (0 right, 1 left) and onset 1 or release 0 of each. growth
+    (cycles,), where it has room: logarithm of the growth of variation 0 over each cycle, which is
+    then made 1 m long.
     """
     h, turn, count = 2 * math.pi / (w * steps), 2 * math.pi / steps, 0
     for cycle in range(cycles):
@@ -87,12 +88,12 @@ def turns(
                 onset = side >= 0 and state[CONTACT_R + side] > 0
                 if variations.shape[1]:
                     carry(variations, con, mode, dt, side, onset)
-                if onset:
-                    if count < log.shape[0]:
-                        log[count, 0], log[count, 1] = cycle + (k + t / h) / steps, side
-                    count += 1
                 if side < 0:
                     break
+                if count < log.shape[0]:
+                    log[count, 0] = cycle + (k + t / h) / steps
+                    log[count, 1], log[count, 2] = side, state[CONTACT_R + side]
+                count += 1
         if growth.size:
             size = 0.0
             for j in range(4):
@@ -114,7 +115,8 @@ def _turn(
     growth: Float1D,
     log: Float2D,
 ) -> tuple[Float1D, int]:
-    """(the state `cycles` later, the number of onsets)."""
+    """(the state `cycles` later, the number of events)."""
+    held([frequency_hz], acceleration, cycles)
     con, moved = parameter_constants(parameters), state.copy()
     moved[BASE] = 0.0
     steps = LEAST_STEPS * substeps(con, 1 / (frequency_hz * LEAST_STEPS))
@@ -123,7 +125,7 @@ def _turn(
     return moved, int(count)
 
 
-_NONE, _NO_LOG = np.empty(0), np.empty((0, 2))
+_NONE, _NO_LOG = np.empty(0), np.empty((0, 3))
 
 
 def period_map(
@@ -150,16 +152,27 @@ def lyapunov(
     return float(growth.mean()), moved
 
 
+def events(
+    parameters: Parameters, frequency_hz: float, acceleration: float, state: Float1D, cycles: int
+) -> tuple[Float2D, Float1D]:
+    """(contacts in the order of time, the state `cycles` later).
+
+    Each contact event (n, 3): time in cycles, side 0 right or 1 left, onset 1 or release 0.
+    """
+    log = np.empty((4 * MOST_ONSETS * cycles, 3))
+    moved, count = _turn(
+        parameters, frequency_hz, acceleration, state, cycles, np.empty((4, 0)), _NONE, log
+    )
+    return log[:count], moved
+
+
 def onsets(
     parameters: Parameters, frequency_hz: float, acceleration: float, state: Float1D, cycles: int
 ) -> tuple[Float1D, Float1D, Float1D]:
     """(right, left: times in cycles at which contact begins; the state `cycles` later)."""
-    log = np.empty((2 * MOST_ONSETS * cycles, 2))
-    moved, count = _turn(
-        parameters, frequency_hz, acceleration, state, cycles, np.empty((4, 0)), _NONE, log
-    )
-    seen = log[:count]
-    return seen[seen[:, 1] == 0, 0], seen[seen[:, 1] == 1, 0], moved
+    seen, moved = events(parameters, frequency_hz, acceleration, state, cycles)
+    right, left = (seen[(seen[:, 1] == side) & (seen[:, 2] == 1), 0] for side in (0, 1))
+    return right, left, moved
 
 
 @dataclass(frozen=True, slots=True, eq=False)

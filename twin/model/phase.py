@@ -120,8 +120,9 @@ def root(
 ) -> float:
     """Time in s between lo and hi at which q (order 0) or q' (order 1) takes on `sign`.
 
-    Newton from `guess`, kept in the bracket. It stops where one more step could not move the time
-    (order 0) or the value there (order 1, an extreme) by what a float holds.
+    Newton from `guess`, kept in the bracket. Its last step is so short that its square could not
+    move the time (order 0) or the value there (order 1, an extreme) by what a float holds; a
+    halving of the bracket promises nothing, however short.
     """
     enough = (1e-6 if order else 1e-8) * hi
     t = guess if lo < guess < hi else hi
@@ -133,12 +134,13 @@ def root(
         else:
             lo = t
         new = t - f / df if df != 0.0 else lo
+        if df != 0.0 and abs(new - t) <= enough:
+            return min(max(new, lo), hi)
         if not lo < new < hi:
             new = 0.5 * (lo + hi)
-        moved = abs(new - t)
+            if not lo < new < hi:
+                break
         t = new
-        if moved <= enough:
-            break
     return t
 
 

@@ -28,6 +28,7 @@ from twin.model.phase import (
     R_L,
     R_R,
     REVISION,
+    STATE_SIZE,
     STEP,
     SUBSTEPS,
     U_L,
@@ -36,6 +37,7 @@ from twin.model.phase import (
     V,
     leap,
 )  # fmt: skip
+from twin.model.solver import OUTPUTS
 
 
 @inner()
@@ -102,6 +104,8 @@ def march(  # noqa: PLR0915
     negative (or are NaN) is done again in `eventful`: within a substep a guard's slope s turns at
     most once, so only from - to + can it hide a minimum, and not if the guard g begins high enough.
     """
+    if state.size < STATE_SIZE or out.shape[0] < OUTPUTS or out.shape[1] < base_acc.size:
+        raise ValueError("state or out is too small for these samples; see exact.advance")
     h, parts, mass, count = con[STEP], int(con[SUBSTEPS]), con[MASS], 0
     u, v, ur, ul, base = state[U], state[V], state[U_R], state[U_L], state[BASE]
     mode = int(state[CONTACT_R] > 0) + 2 * int(state[CONTACT_L] > 0)

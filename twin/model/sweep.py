@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from table_io.block import Float1D, Float2D
+from table_io.card import BadInput
 from twin.model.exact import parameter_constants, rest, substeps
 from twin.model.parameters import Parameters
 from twin.model.phase import BASE, STATE_SIZE
@@ -32,6 +33,22 @@ class SteppedSine:
         return self.extremes[:, :, EXTREMES.index(name)]
 
 
+def held(frequencies_hz: Sequence[float] | Float1D, acceleration: float, cycles: int) -> Float1D:
+    """The frequencies in Hz that a sweep holds, (n,); BadInput where it cannot be driven."""
+    frequencies = np.asarray(frequencies_hz, dtype=np.float64)
+    fine = np.isfinite(frequencies) & (frequencies > 0)
+    if not fine.all():
+        first = int(np.argmin(fine))
+        raise BadInput(
+            f"frequencies_hz[{first}] = {frequencies[first]:g}: allowed: above 0 Hz, finite"
+        )
+    if not math.isfinite(acceleration):
+        raise BadInput(f"acceleration = {acceleration}: allowed: a finite number of m/s2")
+    if cycles < 1:
+        raise BadInput(f"cycles = {cycles}: allowed: 1 or more")
+    return frequencies
+
+
 def stepped_sine(
     parameters: Parameters,
     frequencies_hz: Sequence[float] | Float1D,
@@ -45,11 +62,11 @@ def stepped_sine(
     Starts from `state` (left as it is) or from rest. A is continuous at a change of frequency; the
     velocity of the table is not, so this is the ideal sweep, which no table can drive.
     `steps_per_cycle` is raised where a contact turns more than `exact.TURN` in a step; the result
-    does not depend on it where the motion is not chaotic.
+    does not depend on it where the motion is not chaotic. BadInput names what cannot be driven.
     """
-    frequencies = np.asarray(frequencies_hz, dtype=np.float64)
+    frequencies = held(frequencies_hz, acceleration, cycles)
     if steps_per_cycle < LEAST_STEPS:
-        raise ValueError(f"steps_per_cycle {steps_per_cycle}: allowed: {LEAST_STEPS} or more")
+        raise BadInput(f"steps_per_cycle {steps_per_cycle}: allowed: {LEAST_STEPS} or more")
     con = parameter_constants(parameters)
     steps = np.array(
         [steps_per_cycle * substeps(con, 1 / (f * steps_per_cycle)) for f in frequencies],

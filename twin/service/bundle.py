@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from table_io.card import find, load, parse
 from table_io.clock import today
+from table_io.conductor import rehearsed, score
 from table_io.course import plan
 from table_io.drive import Drive
 from table_io.limits import Margin, margins, refuse
@@ -28,7 +29,10 @@ LIBRARIES = ("shaketwin", "numpy", "scipy", "numba", "protobuf", "eclipse-zenoh"
 
 @dataclass(frozen=True)
 class Bundle:
-    """All that a run needs, as texts and as what they mean."""
+    """All that a run needs, as texts and as what they mean.
+
+    `drive` is what will be played if the loop check passes and no level needs a correction.
+    """
 
     name: str
     profile: Profile
@@ -42,7 +46,7 @@ class Bundle:
 
     @property
     def session(self) -> SessionSetup:
-        return SessionSetup(self.profile, self.rig, self.drive)
+        return SessionSetup(self.profile, self.rig)
 
     def twin(self, from_rest: bool = False) -> "Setup":
         """The twin's setup; importing it compiles its kernels where they are not cached."""
@@ -51,6 +55,11 @@ class Bundle:
         setup = pipeline.prepare(self.profile, self.model, self.steps, from_rest)
         setup.twin.solver  # noqa: B018  compiled now, not at the first sample
         return setup
+
+    @property
+    def ideal(self) -> Drive:
+        """The sweep alone, as an ideal table plays it: no loop check, nothing to tune."""
+        return plan(self.profile)
 
     @property
     def parameters(self) -> Parameters:
@@ -95,7 +104,7 @@ def from_texts(name: str, profile_toml: str, rig_toml: str, model_toml: str, whe
     profile = parse(profile_toml, Profile, where)
     rig = parse(rig_toml, Rig, f"machine card of {where}")
     card = parse(model_toml, ModelCard, f"model of {where}")
-    drive = plan(profile)
+    drive = rehearsed(score(profile, rig))
     model = card.model(profile.specimen)
     model.fits(profile.acquisition.rate_hz)
     return Bundle(

@@ -41,7 +41,7 @@ def check(
     ] = None,
 ) -> None:
     """Pre-flight only: the plan, the margins against the machine card, a drawing of the drive."""
-    from twin.service.commands import check as command
+    from twin.service.driving import check as command
 
     command(profile, table, out)
 
@@ -63,22 +63,83 @@ def run(
     ] = "tcp/127.0.0.1:7447",
 ) -> None:
     """Drive the table, acquire, run the twin beside it, publish, record, report."""
-    from twin.service.commands import run as command
+    from twin.service.driving import run as command
 
     raise typer.Exit(command(profile, out, speed is Speed.max, model, table, view, listen))
 
 
 @app.command(rich_help_panel=DRIVE)
+def campaign(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Campaign, a .toml file.")],
+    out: Out = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the campaign in --out DIR.")
+    ] = False,
+    speed: Annotated[
+        Speed, typer.Option("--speed", help="max, unattended, needs a simulated table.")
+    ] = Speed.realtime,
+    model: Model = None,
+    table: Annotated[str | None, typer.Option("--table", help="Machine card instead.")] = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Unattended: nobody is asked between the runs.")
+    ] = False,
+    listen: Annotated[
+        str, typer.Option("--listen", help="Endpoint of the bus of its runs.")
+    ] = "tcp/127.0.0.1:7447",
+) -> None:
+    """A list of runs with set-up changes between them; one report; resumes where it stopped."""
+    from twin.service.campaign.flow import Asked
+    from twin.service.campaign.flow import campaign as command
+
+    asked = Asked(file, out, resume, speed is Speed.max, model, table, yes, listen)
+    raise typer.Exit(command(asked))
+
+
+@app.command(rich_help_panel=DRIVE)
+def table(
+    rig: Annotated[str, typer.Option("--rig", help="Machine card.")] = "machine",
+    listen: Annotated[
+        str | None,
+        typer.Option("--listen", help="tcp/127.0.0.1:PORT or unix/PATH, not the card's endpoint."),
+    ] = None,
+    log: Annotated[
+        Path | None, typer.Option("--log", help="New file for the black box: every sample.")
+    ] = None,
+    time_scale: Annotated[
+        float, typer.Option("--time-scale", help="Times as fast as the clock, for tests.")
+    ] = 1.0,
+) -> None:
+    """The simulated table as a machine of its own, for `run PROFILE --table machine`."""
+    from rich.console import Console
+
+    from twin.service.table import table as command
+
+    command(rig, listen, log, time_scale, Console())
+
+
+@app.command(rich_help_panel=DRIVE)
 def simulate(
     profile: TestProfile,
-    model: Model = None,
+    model: Annotated[
+        list[str] | None,
+        typer.Option("--model", help="Model: a name or a .toml file; may be repeated."),
+    ] = None,
+    gap: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--gap", metavar="MM", help="Total gap: mm, inf or FROM:TO:STEP; may be repeated."
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", help="Cores for many models or gaps; else all.")
+    ] = None,
     out: Out = None,
     view: Annotated[bool, typer.Option("--view", help="Also write view.rrd.")] = False,
 ) -> None:
-    """The model alone on the ideal drive: no table, no noise."""
-    from twin.service.commands import simulate as command
+    """The model alone on the ideal drive: no table, no noise; or many models and gaps at once."""
+    from twin.service.computing import simulate as command
 
-    raise typer.Exit(command(profile, model, out, view))
+    raise typer.Exit(command(profile, model or [], gap or [], workers, out, view))
 
 
 @app.command(rich_help_panel=LOOK)
@@ -90,7 +151,7 @@ def replay(
     view: Annotated[bool, typer.Option("--view", help="Also write view.rrd.")] = False,
 ) -> None:
     """The same pipeline on a recording; with the recorded model equal to the bit."""
-    from twin.service.commands import replay as command
+    from twin.service.reading import replay as command
 
     raise typer.Exit(command(log, model, out, speed, view))
 
@@ -101,7 +162,7 @@ def prc(
     json: Annotated[bool, typer.Option("--json", help="As JSON on standard output.")] = False,
 ) -> None:
     """Pseudo-resonance curves, jumps, hysteresis, impacts per cycle."""
-    from twin.service.commands import prc as command
+    from twin.service.reading import prc as command
 
     command(log, json)
 
@@ -122,10 +183,10 @@ def paper(
 
 @app.command(rich_help_panel=LOOK)
 def report(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run or campaign.")],
 ) -> None:
-    """One self-contained HTML file of a run."""
-    from twin.service.commands import report as command
+    """One self-contained HTML file of a run or of a campaign."""
+    from twin.service.reading import report as command
 
     command(folder)
 
@@ -145,7 +206,7 @@ def view(
     rig: Annotated[str, typer.Option("--rig", help="Name of the running rig.")] = "simulated",
 ) -> None:
     """Rerun with the project's layout, on a recording or on a running test."""
-    from twin.service.commands import view as command
+    from twin.service.viewing import show as command
 
     command(log, save, picture, connect, rig)
 

@@ -259,7 +259,8 @@ def _overview(run: Run) -> Drawn:
 
 
 def _shade_steps(run: Run, ax: Axes, pieces: tuple[Block, ...], numbered: bool) -> None:
-    direction = {step["index"]: step for step in run.steps}
+    visits = run.summary.get("visits") or []
+    direction = {step["index"]: step for step in (*run.steps, *visits)}
     total = pieces[-1].time_s[-1] - pieces[0].time_s[0]
     free_from = 0.0
     for piece in pieces:

@@ -1,92 +1,205 @@
 """What `check` and `prc` print: the plan with its margins, and the curves as a table."""
 
-from pathlib import Path
+import math
+from dataclasses import replace
 
-import numpy as np
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from table_io.limits import warnings
+from table_io.backends import open_backend
+from table_io.block import Label
+from table_io.clock import ManualClock
+from table_io.drive import Drive
+from table_io.limits import ROOM, Limit, Margin, doubts, limits_of, warnings
+from table_io.loop_check import aims
+from table_io.policies import words_of
 from table_io.units import GRAVITY_M_S2
 from twin.service.bundle import Bundle
+from twin.service.drive_figure import draw_drive
+from twin.service.foreseen import Foreseen, clipped, foreseen
 from twin.service.summary import Json
+
+__all__ = ["draw_drive", "print_plan", "print_prc"]
+
+ROWS = 12  # frequencies in the table of steps
 
 
 def print_plan(console: Console, bundle: Bundle) -> None:
-    """The plan of a test: steps, duration, amplitudes, and margins against the machine card."""
-    profile, rig, drive = bundle.profile, bundle.rig, bundle.drive
-    sweep = profile.sweep
-    right, left = profile.specimen.gaps_m
-    console.print(f"[bold]{profile.title}[/bold]", highlight=False)
-    console.print(
-        f"  specimen  {profile.specimen.mass_kg:g} kg, gap right {right * 1e3:g} mm, "
-        f"left {left * 1e3:g} mm\n"
-        f"  sweep     {sweep.start_hz:g} to {sweep.stop_hz:g} Hz by {sweep.step_hz:g}, "
-        f"{' then '.join(sweep.directions)}, {sweep.cycles} cycles a step, "
-        f"the last {sweep.measured_cycles} measured\n"
-        f"  level     {sweep.acceleration_g:g} g peak table acceleration\n"
-        f"  duration  {drive.planned_end / drive.rate_hz:.1f} s, {len(bundle.steps)} steps, "
-        f"{profile.acquisition.rate_hz:g} Hz sampling\n"
-        f"  table     {rig.title}",
-        highlight=False,
-        soft_wrap=True,
-    )
-    limits = rig.limits
-    table = Table("asks of the table", "most", "at", "allowed", "used")
-    for label, unit, scale, allowed, name in (
-        ("displacement", "mm", 1e3, min(limits.stroke_mm, rig.output.span_mm), "displacement_m"),
-        ("velocity", "mm/s", 1e3, limits.velocity_mm_s, "velocity_m_s"),
-        ("acceleration", "g", 1 / GRAVITY_M_S2, limits.acceleration_g, "acceleration_m_s2"),
-        ("force", "kN", 1e-3, limits.force_kn, "force_n"),
-    ):
-        worst = max(bundle.margins, key=lambda row, name=name: float(getattr(row, name)))  # type: ignore[misc]
-        value = getattr(worst, name) * scale
-        table.add_row(
-            f"{label}, {unit}",
-            f"{value:.4g}",
-            f"{worst.frequency_hz:g} Hz {worst.direction}",
-            f"{allowed:g}",
-            f"{100 * value / allowed:.0f} %",
-        )
-    coarse = min(bundle.margins, key=lambda row: row.lsb)
-    table.add_row(
-        "amplitude in DAC steps",
-        f"{coarse.lsb:.0f} (least)",
-        f"{coarse.frequency_hz:g} Hz",
-        f">= {rig.output.least_lsb}",
-        "",
-    )
-    console.print(table)
-    for sentence in warnings(bundle.margins, rig):
-        console.print(f"warning: {sentence}", highlight=False)
+    """The plan of a test: steps, duration, buffer, and margins against the machine card."""
+    console.print(f"[bold]{bundle.profile.title}[/bold]", highlight=False)
+    for name, text in _plan(bundle):
+        console.print(f"  {name:<11}{text}", highlight=False, soft_wrap=True)
+    sensors = foreseen(bundle)
+    console.print(_steps(bundle))
+    console.print(_sensors(bundle, sensors))
+    said = [
+        *warnings(bundle.margins, bundle.rig),
+        *doubts(bundle.profile, bundle.rig),
+        *clipped(sensors, bundle.rig),
+    ]
+    for sentence in said:
+        console.print(f"warning: {sentence}", highlight=False, soft_wrap=True)
     console.print("ready: nothing exceeds the machine card", highlight=False)
 
 
-def draw_drive(bundle: Bundle, out: Path) -> Path:
-    """A picture of the drive: displacement and acceleration over time, in `out`."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+def _plan(bundle: Bundle) -> list[tuple[str, str]]:
+    """(name, text) of each line above the tables."""
+    profile, rig = bundle.profile, bundle.rig
+    sweep, rate = profile.sweep, bundle.drive.rate_hz
+    right, left = (f"{gap * 1e3:g} mm" for gap in profile.specimen.gaps_m)
+    bumpers = f"gap right {right}, left {left}" if "inf mm" not in (right, left) else "no bumpers"
+    replace_after = open_backend(rig, profile, ManualClock()).replace_after
+    block = profile.acquisition.block_samples
+    lead = max(round(rig.output.lead_s * rate), replace_after)
+    check = "none"
+    if profile.loop_check.enabled:
+        motions = aims(profile, rig)
+        levels = sorted({f"{aim.level_m_s2 / GRAVITY_M_S2:.3g}" for aim in motions})
+        check = (
+            f"{', '.join(f'{aim.frequency_hz:.3g}' for aim in motions)} Hz at "
+            f"{' to '.join(levels)} g, then {profile.loop_check.rest_s:g} s of rest"
+        )
+    return [
+        ("specimen", f"{profile.specimen.mass_kg:g} kg, {bumpers}"),
+        (
+            "sweep",
+            f"{sweep.start_hz:g} to {sweep.stop_hz:g} Hz by {sweep.step_hz:g}, "
+            f"{' then '.join(sweep.directions)}, {sweep.cycles} cycles a step, "
+            f"the last {sweep.measured_cycles} measured",
+        ),
+        *([("then", words_of(profile))] if words_of(profile) else []),
+        ("level", f"{sweep.acceleration_g:g} g peak table acceleration"),
+        ("loop check", check),
+        ("duration", _duration(bundle)),
+        (
+            "buffer",
+            f"{lead / rate:g} s of command queued ahead, {lead / block:.3g} blocks of {block} "
+            f"samples; {1e3 * replace_after / rate:g} ms of it can no longer be changed",
+        ),
+        ("sampling", f"{rate:g} Hz"),
+        ("table", rig.title),
+    ]
 
+
+def _duration(bundle: Bundle) -> str:
+    """How long the test lasts if no level needs a second look, and what takes how much of it.
+
+    A test that finds its way lasts longer: what follows its sweep only the test tells.
+    """
     drive = bundle.drive
-    every = max(drive.planned_end // 400_000, 1)
-    time_s = np.arange(0, drive.planned_end, every) / drive.rate_hz
-    figure = Figure(figsize=(10, 5), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(2, 1, sharex=True)
-    level = bundle.profile.sweep.acceleration_g
-    for axis, values, label in (
-        (axes[0], drive.command(0, drive.planned_end) * 1e3, "displacement [mm]"),
-        (axes[1], drive.acceleration(0, drive.planned_end) / GRAVITY_M_S2, "acceleration [g]"),
-    ):
-        axis.plot(time_s, values[::every], lw=0.4, color="#1f4e79")
-        axis.set_ylabel(label)
-        axis.grid(alpha=0.3)
-    for sign in (-1, 1):
-        axes[1].axhline(1.05 * sign * level, color="#b22222", lw=0.8, ls="--")
-    axes[0].set_title(f"{bundle.profile.title}: command; dashed: 1.05 of the level")
-    axes[1].set_xlabel("time [s]")
-    figure.savefig(out, dpi=120)
-    return out
+    parts = parts_s(drive)
+    text = ", ".join(f"{name} {_time(seconds)}" for name, seconds in parts.items() if seconds)
+    whole = _time(drive.planned_end / drive.rate_hz)
+    least = "at least " if words_of(bundle.profile) else ""
+    return f"{least}{whole} for {len(bundle.steps)} steps: {text}"
+
+
+def parts_s(drive: Drive) -> dict[str, float]:
+    """Seconds of a drive: loop check, held cycles, tuning, blends, rest."""
+    parts = dict.fromkeys(("loop check", "held cycles", "tuning", "blends"), 0.0)
+    for segment in drive.segments:
+        if segment.step < 0:
+            part = "loop check"
+        elif segment.cycles:
+            part = "held cycles"
+        else:
+            part = "blends" if segment.label == Label.BLEND else "tuning"
+        parts[part] += segment.count / drive.rate_hz
+    return parts | {"rest": drive.planned_end / drive.rate_hz - sum(parts.values())}
+
+
+def _time(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes else f"{seconds:.1f} s"
+
+
+def _steps(bundle: Bundle) -> Table:
+    """What the drive asks of the table at the loop check and at chosen frequencies.
+
+    "used" is the largest share of any limit, the last column that of the stroke after a correction.
+    """
+    limits = limits_of(bundle.rig)
+    every = by_frequency([row for row in bundle.margins if row.step >= 0])
+    rows = chosen(every, limits)
+    title = "peaks of the drive, blends included"
+    if len(rows) < len(every):
+        title += f": {len(rows)} of {len(every)} frequencies"
+    table = Table(title=title, box=SIMPLE_HEAD, title_justify="left")
+    heads = (
+        "Hz",
+        *(limit.unit for limit in limits),
+        "DAC steps",
+        "used",
+        f"+{100 * (ROOM - 1):.0f} %",
+    )
+    for head in heads:
+        table.add_column(head, justify="right", no_wrap=True)
+    check = [row for row in bundle.margins if row.step < 0]
+    for row in (*check, *rows):
+        used = [limit.used(row) / limit.allowed for limit in limits]
+        table.add_row(
+            f"check {row.frequency_hz:.3g}" if row.step < 0 else f"{row.frequency_hz:g}",
+            *(f"{limit.used(row):.4g}" for limit in limits),
+            f"{row.lsb:.0f}",
+            _percent(max(used)),
+            _percent(ROOM * used[0]),
+            end_section=bool(check) and row is check[-1],
+        )
+    table.add_section()
+    card = bundle.rig.output
+    table.add_row("allowed", *(f"{limit.allowed:g}" for limit in limits), f">= {card.least_lsb}")
+    most = [max(map(limit.used, every)) / limit.allowed for limit in limits]
+    table.add_row("used", *map(_percent, most), "", _percent(max(most)), _percent(ROOM * most[0]))
+    return table
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"
+
+
+def by_frequency(rows: list[Margin]) -> list[Margin]:
+    """One row a frequency, upwards: the most that any of its steps asks."""
+    worst: dict[float, Margin] = {}
+    for row in rows:
+        other = worst.get(row.frequency_hz)
+        worst[row.frequency_hz] = row if other is None else _larger(row, other)
+    return [worst[f] for f in sorted(worst)]
+
+
+def _larger(one: Margin, other: Margin) -> Margin:
+    """The larger of each demand of two rows."""
+    names = ("displacement_m", "velocity_m_s", "acceleration_m_s2", "force_n")
+    return replace(one, **{name: max(getattr(one, name), getattr(other, name)) for name in names})
+
+
+def chosen(rows: list[Margin], limits: tuple[Limit, ...]) -> list[Margin]:
+    """At most ROWS and a few: the ends, the worst of each limit, and some in equal ratios."""
+    if len(rows) <= ROWS:
+        return rows
+    first, last = rows[0].frequency_hz, rows[-1].frequency_hz
+    wanted = [first * (last / first) ** (k / (ROWS - 1)) for k in range(ROWS)]
+    near = [min(rows, key=lambda row: abs(math.log(row.frequency_hz / f))) for f in wanted]
+    worst = [max(rows, key=limit.used) for limit in limits]
+    keep = {row.frequency_hz for row in (*near, *worst)}
+    return [row for row in rows if row.frequency_hz in keep]
+
+
+def _sensors(bundle: Bundle, rows: tuple[Foreseen, ...]) -> Table:
+    """What every sensor should see, by the model."""
+    title = "sensors, as the model foresees them"
+    table = Table(title=title, box=SIMPLE_HEAD, title_justify="left")
+    for head in ("sensor", "most", "at", "range", "used"):
+        table.add_column(head, justify="left" if head in ("sensor", "at") else "right")
+    for row in rows:
+        table.add_row(
+            row.sensor.channel,
+            f"{row.peak:.4g} {row.sensor.unit}",
+            f"{row.frequency_hz:g} Hz {row.direction}" if row.peak else "",
+            f"{row.sensor.range:g} {row.sensor.unit}",
+            _percent(row.used),
+        )
+    return table
 
 
 def print_prc(console: Console, found: Json) -> None:
@@ -104,6 +217,8 @@ def print_prc(console: Console, found: Json) -> None:
             cells.append(f"{_mean(measured.get(key))} | {_mean(twin.get(key))}")
         table.add_row(step["direction"], f"{step['frequency_hz']:.3f}", *cells)
     console.print(table)
+    for text in found.get("found", ()):
+        console.print(text, highlight=False, soft_wrap=True)
     for interval in found["hysteresis"]:
         console.print(
             f"{interval['kind']} hysteresis from {interval['from_hz']:g} to "

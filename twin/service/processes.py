@@ -6,7 +6,6 @@ that the supervisor is gone.
 """
 
 import fcntl
-import gc
 import json
 import os
 import select
@@ -20,9 +19,10 @@ from table_io.backends import open_backend
 from table_io.block import Block
 from table_io.card import BadInput
 from table_io.clock import RealClock
-from table_io.records import Event, Fault, RunStart, RunStop, Timing
-from table_io.session import Punctuality, play
+from table_io.records import Decided, Event, Fault, RunStart, RunStop, Timing
+from table_io.session import ORDERS, Order, Punctuality, play
 from twin.service.bundle import Bundle, from_texts, warm
+from twin.service.scheduling import urgent
 from twin.service.stopwatch import Stopwatch
 from twin.stream.resend import Inbox
 from twin.stream.wire import (
@@ -43,8 +43,14 @@ SYNC_S = 5.0
 QUIET_S = 3.0  # after which a recorder stops waiting for the twin's last word
 TIMING_BLOCKS = 100
 CAPACITY = 50_000
-CONTROL = ("/run/start", "/run/stop")
-RIG_TOPICS = (MEASURED, "/rig/gap", "/run/start", "/run/stop", "/run/event", "/run/timing")
+CONTROL = ("/run/start", "/run/stop", "/rig/decided")
+RIG_TOPICS = (
+    *(name for name in TOPIC_TYPES if name.startswith("/rig/")),
+    "/run/start",
+    "/run/stop",
+    "/run/event",
+    "/run/timing",
+)
 TWIN_TOPICS = (
     *(name for name in TOPIC_TYPES if name.startswith("/twin/")),
     "/run/fault",
@@ -88,28 +94,12 @@ def _orphaned() -> bool:
     return bool(ready) and not os.read(sys.stdin.fileno(), 64)
 
 
-def _urgent(priority: int) -> str:
-    """Ask for real-time scheduling; what was granted.
-
-    Asked before the link opens, so that the threads in which it sends and receives inherit it.
-    What the imports made is taken out of the garbage collector's sight: a full collection of it
-    costs 15 ms in the middle of a run.
-    """
-    gc.collect()
-    gc.freeze()
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    except (AttributeError, OSError):
-        return "normal"
-    return f"fifo {priority}"
-
-
 def rig(spec: Spec, _: str) -> None:
     """Drives the table and publishes; opens the hub. No other Python threads."""
     bundle = spec.bundle()
     warm("plant")
     clock = RealClock()
-    scheduler = _urgent(RIG_PRIORITY)
+    scheduler = urgent(RIG_PRIORITY)
     link = open_hub(bundle.rig.name, spec.endpoint)
     link.declare(RIG_TOPICS)
     orders = link.commands()
@@ -122,15 +112,16 @@ def rig(spec: Spec, _: str) -> None:
         if order is None:
             return None
         run, _, why = order.text.partition("\n")
-        known = run == spec.run and order.name in ("start", "stop")
+        known = run == spec.run and order.name in ("start", *ORDERS)
         order.reply("yes" if known else f"refused: this is run {spec.run}")
         return (order.name, why) if known else None
 
-    def commands() -> str | None:
+    def commands() -> Order | None:
         order = ordered()
-        if order is not None and order[0] == "stop":
-            return order[1] or "asked to stop"
-        return "the supervisor is gone" if stop_if_orphan and _orphaned() else None
+        if order is not None and order[0] in ORDERS:
+            return Order(order[0], order[1] or f"asked to {order[0]}")
+        orphaned = stop_if_orphan and _orphaned()
+        return Order("stop", "the supervisor is gone") if orphaned else None
 
     while (order := ordered()) is None or order[0] != "start":
         if _orphaned():
@@ -179,10 +170,10 @@ def twin(spec: Spec, missed_from: str) -> None:
     warm("twin")
     setup = bundle.twin()
     clock = RealClock()
-    scheduler = _urgent(TWIN_PRIORITY)
+    scheduler = urgent(TWIN_PRIORITY)
     link = open_spoke(bundle.rig.name, spec.endpoint, CONNECT_S)
     link.declare(TWIN_TOPICS)
-    control = link.subscribe(CONTROL, history=True, capacity=16)
+    control = link.subscribe(CONTROL, history=True, capacity=CAPACITY)
     blocks = link.subscribe((MEASURED,), history=not missed_from, capacity=CAPACITY)
     link.alive(token(spec, "twin"))
 
@@ -198,6 +189,8 @@ def twin(spec: Spec, missed_from: str) -> None:
         for record in _told(control, spec.run):
             epoch_s = record.epoch_s if isinstance(record, RunStart) else epoch_s
             end = record.index if isinstance(record, RunStop) else end
+            if isinstance(record, Decided):
+                setup = pipeline.knowing(setup, record)
         arrived = blocks.get(0.2)
         if arrived is None:
             if _orphaned() and clock.now() - heard > QUIET_S:

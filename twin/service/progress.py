@@ -5,7 +5,7 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from table_io.records import Comparison, Event, Fault, Gap, Point, Quantities, Timing
+from table_io.records import Comparison, Decided, Event, Fault, Gap, Point, Quantities, Timing
 from table_io.units import GRAVITY_M_S2
 from twin.stream.wire import Item
 
@@ -57,6 +57,8 @@ class RunProgress:
             self._latency_ms = item.p99_ms
         elif isinstance(item, Point):
             self._point(item)
+        elif isinstance(item, Decided):
+            self._steps = max(self._steps, item.step + 1)
         elif isinstance(item, Event):
             self.say(f"{'':>7}  {item.kind}: {item.text}")
         elif isinstance(item, Gap):

@@ -103,6 +103,7 @@ def headline(run: Run) -> str:
         f"{one['kind']} hysteresis {one['from_hz']:g} to {one['to_hz']:g} Hz"
         for one in run.summary.get("hysteresis") or []
     ] or ["no hysteresis"]
+    said += run.summary.get("found") or []
     sizes = np.nan_to_num([quantity(step, run.who, "eta_d") for step in run.steps])
     if sizes.any():
         best = run.steps[int(np.argmax(sizes))]

@@ -15,6 +15,7 @@ from table_io.clock import ManualClock
 from table_io.records import (
     Comparison,
     Cycle,
+    Decided,
     Event,
     Fault,
     Params,
@@ -24,7 +25,7 @@ from table_io.records import (
     RunStop,
     Timing,
 )
-from table_io.session import play
+from table_io.session import Order, play
 from twin.compare import COMPARED, pipeline
 from twin.service.bundle import Bundle
 from twin.stream.mcap_log import LogWriter, Recording
@@ -72,7 +73,9 @@ def _beside(source: Iterator[Block | Record], setup: pipeline.Setup) -> Iterator
     state = None
     for item in source:
         yield item
-        if isinstance(item, RunStart):
+        if isinstance(item, Decided):
+            setup = pipeline.knowing(setup, item)
+        elif isinstance(item, RunStart):
             state, begun = pipeline.start(setup)
             yield from begun
         elif isinstance(item, Block) and state is not None:
@@ -81,15 +84,19 @@ def _beside(source: Iterator[Block | Record], setup: pipeline.Setup) -> Iterator
 
 
 def play_unpaced(
-    bundle: Bundle, run: str, path: Path, commands: Callable[[], str | None], watch: Watch
+    bundle: Bundle, run: str, path: Path, asked: Callable[[], str | None], watch: Watch
 ) -> None:
     """The whole test on a simulated table as fast as it goes, recorded to `path`."""
-    if bundle.rig.simulated is None:
+    if not bundle.rig.any_speed:
         raise BadInput(
-            f"--speed max: table {bundle.rig.name!r} is not simulated; use --speed realtime"
+            f"--speed max: table {bundle.rig.name!r} keeps its own time; use --speed realtime"
         )
     clock = ManualClock()
     backend = open_backend(bundle.rig, bundle.profile, clock)
+
+    def commands() -> Order | None:
+        return Order("stop", why) if (why := asked()) else None
+
     source = play(bundle.session, backend, clock, bundle.describe(run, "table"), commands)
     _record(_beside(source, bundle.twin()), path, run, bundle.drive.rate_hz, watch)
 
@@ -102,7 +109,7 @@ def simulate(bundle: Bundle, run: str, path: Path, watch: Watch) -> None:
 
 def _ideal(bundle: Bundle, run: str) -> Iterator[Item]:
     """The stream of an ideal table: it does what the drive says."""
-    drive = bundle.drive
+    drive = bundle.ideal
     start = bundle.describe(run, "model")({}, 0.0)
     yield start
     end = drive.planned_end + math.ceil(bundle.profile.acquisition.rest_s * drive.rate_hz)
@@ -168,6 +175,7 @@ def _differ(identity: Identity, old: Comparison, new: Comparison) -> None:
 
 def _again(recording: Recording, setup: pipeline.Setup, run: str, bundle: Bundle) -> Iterator[Item]:
     """What the rig recorded, with a twin beside it that respects the recorded faults."""
+    setup = pipeline.knowing(setup, *recording.of(Decided))
     faults = [fault for fault in recording.of(Fault) if fault.component == "twin"]
     yield replace(recording.start, run=run, model_toml=bundle.model_toml)
     state, begun = pipeline.start(setup)

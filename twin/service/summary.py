@@ -11,7 +11,7 @@ import numpy as np
 from table_io.card import parse
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.profile import Profile
-from table_io.records import Comparison, Fault, Gap, Point, Quantities, Timing
+from table_io.records import Comparison, Decided, Event, Fault, Gap, Point, Quantities, Timing
 from twin.compare import COMPARED
 from twin.compare.curves import branches
 from twin.model.model import Model
@@ -29,8 +29,10 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
     u_star, a_star, peak_hz = resonance(parameters, level)
     points = _points(recording, parameters, profile)
     source = "twin" if start.source == "model" else "measured"
-    jumps, intervals = branches(points, source)
-    twin_jumps, twin_intervals = branches(points, "twin")
+    reasons = {one.step: one.reason for one in recording.of(Decided)}
+    planned = [point for point in points if point.step not in reasons]
+    jumps, intervals = branches(planned, source)
+    twin_jumps, twin_intervals = branches(planned, "twin")
     stop = recording.stop
     samples = stop.index if stop else max((one.end for one in recording.blocks("meas")), default=0)
     return {
@@ -57,7 +59,14 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         "faults": [asdict(fault) for fault in recording.of(Fault)],
         "u_star_m": u_star,
         "a_star_m_s2": a_star,
-        "steps": [_step(point) for point in points],
+        "steps": [_step(point) for point in planned],
+        # What a test decided on as it went: no points of a curve.
+        "visits": [
+            {**_step(point), "reason": reasons[point.step]}
+            for point in points
+            if point.step in reasons
+        ],
+        "found": [event.text for event in recording.of(Event) if event.kind == "found"],
         "jumps": [asdict(jump) for jump in jumps],
         "hysteresis": [asdict(interval) for interval in intervals],
         "twin_jumps": [asdict(jump) for jump in twin_jumps],
@@ -74,6 +83,7 @@ def _points(recording: Recording, parameters: Parameters, profile: Profile) -> t
         from twin.compare import pipeline
 
         setup = pipeline.prepare(profile, Model(parameters), recording.start.steps)
+        setup = pipeline.knowing(setup, *recording.of(Decided))
         state, _ = pipeline.start(setup)
         for block in recording.pieces("meas"):
             state, items = pipeline.step(setup, state, block)
@@ -153,6 +163,9 @@ def nrmse(comparisons: tuple[Comparison, ...], parameters: Parameters) -> Json:
 def sentence(found: Json) -> str:
     """What happened in a run, in one line."""
     parts = [f"{found['verdict']}: {len(found['steps'])} steps"]
+    if found.get("visits"):
+        parts.append(f"{len(found['visits'])} visits decided on as it went")
+    parts += found.get("found", [])
     for interval in found["hysteresis"]:
         parts.append(
             f"{interval['kind']} hysteresis {interval['from_hz']:g} to {interval['to_hz']:g} Hz"

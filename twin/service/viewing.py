@@ -4,11 +4,12 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from rich.console import Console
-
 from table_io.card import BadInput
 from table_io.clock import RealClock
 from table_io.records import RunStart, RunStop
+from twin.service.driving import VIEW_ADDRESS
+from twin.service.recordings import log_path
+from twin.service.terminal import say
 from twin.stream.mcap_log import read
 from twin.stream.rerun_view import RerunView, open_viewer, screenshot, write_rrd
 from twin.stream.wire import TOPIC_TYPES, Item, decode
@@ -19,7 +20,15 @@ CAPACITY = 5000  # what does not fit is dropped: a viewer never slows a test
 ANSWER_S = 2.0
 
 
-def view_log(log: Path, save: Path | None, picture: Path | None, console: Console) -> None:
+def show(log: Path | None, save: Path | None, picture: Path | None, connect: str, rig: str) -> None:
+    """The command: a recording, or without one a running test."""
+    if log is None:
+        view_live(connect, rig, VIEW_ADDRESS)
+    else:
+        view_log(log_path(log), save, picture)
+
+
+def view_log(log: Path, save: Path | None, picture: Path | None) -> None:
     """Opens a recording; with `save` or `picture` it only writes these."""
     for new in (save, picture):
         if new is not None and not new.absolute().parent.is_dir():
@@ -28,7 +37,7 @@ def view_log(log: Path, save: Path | None, picture: Path | None, console: Consol
     if save is None and picture is None:
         rrd = Path(tempfile.mkdtemp(prefix="shaketwin-")) / "view.rrd"
         write_rrd(recording, rrd)
-        console.print(open_viewer(rrd), soft_wrap=True, highlight=False)
+        say(open_viewer(rrd))
         return
     with tempfile.TemporaryDirectory() as folder:
         rrd = save if save is not None else Path(folder) / "view.rrd"
@@ -37,17 +46,17 @@ def view_log(log: Path, save: Path | None, picture: Path | None, console: Consol
             screenshot(rrd, picture)
     for written in (save, picture):
         if written is not None:
-            console.print(f"{written}", soft_wrap=True, highlight=False)
+            say(f"{written}")
 
 
-def view_live(endpoint: str, rig: str, address: str, console: Console) -> None:
+def view_live(endpoint: str, rig: str, address: str) -> None:
     """Serves a running test to Rerun until it ends or Ctrl-C."""
     link = open_spoke(rig, endpoint, ANSWER_S)
-    console.print(f"live view: rerun rerun+http://{address}/proxy", soft_wrap=True)
+    say(f"live view: rerun rerun+http://{address}/proxy")
     try:
         serve(link, address, lambda: False)
     except KeyboardInterrupt:
-        console.print("view closed; the test goes on")
+        say("view closed; the test goes on")
     finally:
         link.close()
 

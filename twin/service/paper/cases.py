@@ -16,9 +16,10 @@ from table_io.card import find, load
 from table_io.profile import Profile
 from table_io.records import Point, Quantities, Step
 from table_io.units import GRAVITY_M_S2
-from twin.compare.curves import Hysteresis, Jump, branches
 from twin.model import exact
 from twin.model.card import ModelCard
+from twin.model.ideal import swept
+from twin.model.model import Model
 from twin.model.orbit import onsets
 from twin.model.parameters import Parameters, resonance
 from twin.model.sinusoid import Float3D
@@ -75,6 +76,13 @@ class Test:
     name: str
     profile: Profile
     parameters: Parameters
+    effects: Model | None = None  # where it is more than its linear parts
+    stars: tuple[float, float] | None = None  # u*, a* to divide by; None: the model's own
+
+    @cached_property
+    def scale(self) -> tuple[float, float]:
+        """(u* in m, a* in m/s2), by which every curve is divided."""
+        return self.stars or resonance(self.parameters, self.acceleration)[:2]
 
     @cached_property
     def steps(self) -> tuple[Step, ...]:
@@ -87,15 +95,14 @@ class Test:
     @cached_property
     def played(self) -> SteppedSine:
         frequencies = [step.frequency_hz for step in self.steps]
-        return stepped_sine(
-            self.parameters, frequencies, self.acceleration, self.profile.sweep.cycles
-        )
+        model = self.effects or Model(self.parameters)
+        return swept(model, frequencies, self.acceleration, self.profile.sweep.cycles)
 
     @cached_property
     def points(self) -> tuple[Point, ...]:
         """The PRC point of every step, as `twin`."""
         kept = self.played.extremes[:, -self.profile.sweep.measured_cycles :]
-        u_star, a_star, _ = resonance(self.parameters, self.acceleration)
+        u_star, a_star = self.scale
         return tuple(
             Point(
                 0, step.index, step.direction, step.frequency_hz, None,
@@ -165,11 +172,6 @@ class Case:
             found += [one for one in test.points if from_hz < one.frequency_hz <= to_hz + 1e-9]
             from_hz = to_hz + 1e-9
         return tuple(found)
-
-    @cached_property
-    def marks(self) -> tuple[list[Jump], list[Hysteresis]]:
-        """Jumps and hysteresis intervals on the paper's grid."""
-        return branches(self.points, "twin")
 
     def motion(self, frequency_hz: float, direction: str, cycles: int) -> Motion:
         """The last `cycles` of the step at this frequency."""

@@ -5,17 +5,19 @@ from pathlib import Path
 from rich.console import Console
 
 from twin.service.bundle import run_id
-from twin.service.commands import console, new_folder
+from twin.service.folders import new_folder
 from twin.service.paper.page import draw_all, write_json, write_page
 from twin.service.paper.rig import Rig, measured
 from twin.service.paper.study import study
 from twin.service.paper.table import DEPARTS, table
+from twin.service.terminal import console
 
 
 def paper(out: Path | None, campaign: list[Path]) -> None:
     """The command: a new folder, and everything in it."""
     rig = measured(campaign) if campaign else None
-    write_paper(new_folder(out, run_id("paper")), rig, console)
+    folder = new_folder(out, run_id("paper"))
+    write_paper(folder, rig, console)
 
 
 def write_paper(folder: Path, rig: Rig | None, console: Console) -> None:

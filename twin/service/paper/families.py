@@ -1,6 +1,7 @@
 """PRC families of all gaps (Fig. 2) and from positive to negative gaps (Fig. 5)."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -8,9 +9,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from table_io.block import Float1D
 from table_io.records import Point
 from table_io.units import GRAVITY_M_S2
-from twin.model.parameters import resonance
+from twin.compare.curves import Jump, branches
 from twin.service.figures import OFFSET
 from twin.service.paper.cases import Case, curve
 from twin.service.paper.look import (
@@ -49,11 +51,12 @@ SIZES = (7.6, 6.8, 6.0, 5.3, 4.7, 4.2, 3.7, 3.2, 2.8)  # of the dots, G infinite
 
 def draw(found: Study, rig: Rig | None) -> Drawings:
     """Figs. 2 and 5; with a rig its measured points on the model's lines."""
-    yield _all_gaps(found, rig)
-    yield _transition(found, rig)
+    yield all_gaps(found.cases, rig)
+    yield transition(found.cases, rig)
 
 
-def _frame() -> tuple[Figure, list[Axes]]:
+def _frame(cases: Mapping[str, Case]) -> tuple[Figure, list[Axes]]:
+    top_hz = max(one.profile.sweep.stop_hz for case in cases.values() for one in case.tests)
     figure = Figure(figsize=(11, 8.2))
     axes = list(figure.subplots(2, 2, sharex=True).flat)
     for ax, (which, label, names) in zip(axes, PANELS, strict=True):
@@ -66,40 +69,40 @@ def _frame() -> tuple[Figure, list[Axes]]:
                 ax.text(0.99, y, text, transform=ax.transAxes, ha="right", va=va, color=GUIDE)
     for ax in axes[2:]:
         ax.set_xlabel("$f$ in Hz")
-        ax.set_xlim(0, 10)
+        ax.set_xlim(0, math.ceil(top_hz))
     return figure, axes
 
 
-def _all_gaps(found: Study, rig: Rig | None) -> Drawing:
-    figure, axes = _frame()
+def all_gaps(cases: Mapping[str, Case], rig: Rig | None) -> Drawing:
+    """Fig. 2: every gap by its name, the largest first."""
+    figure, axes = _frame(cases)
     measured = rig.points if rig else {}
-    for place, (name, case) in enumerate(found.cases.items()):
-        size = SIZES[place]
+    sizes = np.interp(np.linspace(0, 8, max(len(cases), 2)), range(9), SIZES)
+    for (name, case), size in zip(cases.items(), sizes, strict=False):
         for ax, (_, _, names) in zip(axes, PANELS, strict=True):
             if name == "G∞" and len(names) == 2:
                 continue
             for quantity, sign in names.items():
                 _family_line(ax, name, case.points, quantity, sign, size, dots=rig is None)
                 _dots(ax, measured.get(name, ()), quantity, sign, 0.8 * size)
+    highlighted = {}
     for name, kind in HIGHLIGHTED.items():
-        for ax, (_, _, names) in zip(axes, PANELS, strict=True):
-            for one in found.cases[name].marks[1]:
-                if one.kind == kind and one.to_hz > 2:
-                    ax.axvspan(one.from_hz, one.to_hz, color=BAND[kind], lw=0, zorder=0.4)
-            for quantity, sign in names.items():
-                _arrows(ax, found.cases[name], quantity, sign)
-    _peaks(found, axes)
-    axes[0].set_ylim(0, 1.06)
+        seen = measured.get(name)
+        points = seen or (cases[name].points if name in cases else ())
+        if _highlight(axes, points, "measured" if seen else "twin", kind):
+            highlighted[name] = kind
+    _peaks(cases, axes)
+    axes[0].set_ylim(0, max(1.06, 1.05 * axes[0].dataLim.y1))
     axes[1].set_ylim(bottom=0)
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=OF_GAP["G∞"] if name == "G∞" else "#555555", marker="o",
                ms=size, lw=0.32 * size, label=minus(name))
-        for name, size in zip(found.cases, SIZES, strict=True)
+        for name, size in zip(cases, sizes, strict=False)
     ]  # fmt: skip
     handles += [Line2D([], [], color=COLOUR[one], lw=2, label=one) for one in DIRECTIONS]
     handles += [
         Patch(color=BAND[kind], label=f"{kind} hysteresis, {minus(name)}")
-        for name, kind in HIGHLIGHTED.items()
+        for name, kind in highlighted.items()
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=7)
     return Drawing(
@@ -108,7 +111,9 @@ def _all_gaps(found: Study, rig: Rig | None) -> Drawing:
         "is green. Dots and lines grow smaller with the gap. "
         + ("Dots: measured; lines: model. " if rig else "")
         + "Yellow: the primary right hysteresis of G4; cyan: the left hysteresis of G−1 "
-        "(first to last grid frequency at which the directions differ); arrows: their jumps.",
+        "(first to last grid frequency at which the directions differ"
+        + (", measured" if rig else "")
+        + "); arrows: their jumps.",
         figure,
     )  # fmt: skip
 
@@ -131,21 +136,31 @@ def _dots(ax: Axes, points: Sequence[Point], quantity: str, sign: int, size: flo
         ax.plot(f, sign * y, "o", color=COLOUR[one], ms=size * share, mew=0, zorder=3)
 
 
-def _arrows(ax: Axes, case: Case, quantity: str, sign: int) -> None:
-    for jump in case.marks[0]:
-        if max(jump.from_hz, jump.to_hz) < 2:
-            continue
-        f, y = curve(case.points, "twin", jump.direction, quantity)
-        start, stop = (sign * float(y[np.isclose(f, hz)][0]) for hz in (jump.from_hz, jump.to_hz))
-        x = (jump.from_hz + jump.to_hz) / 2
-        style = {"arrowstyle": "-|>", "color": COLOUR[jump.direction], "lw": 1.7,
-                 "shrinkA": 0, "shrinkB": 0}  # fmt: skip
-        ax.annotate("", (x, stop), (x, start), arrowprops=style, zorder=4)
+def _highlight(axes: list[Axes], points: Sequence[Point], who: str, kind: str) -> bool:
+    """The primary hysteresis as a band, its jumps as arrows; False where there is none."""
+    jumps, intervals = branches(points, who)
+    found = [one for one in intervals if one.kind == kind and one.to_hz > 2]
+    for ax, (_, _, names) in zip(axes, PANELS, strict=True):
+        for one in found:
+            ax.axvspan(one.from_hz, one.to_hz, color=BAND[kind], lw=0, zorder=0.4)
+        for jump in jumps:
+            if max(jump.from_hz, jump.to_hz) > 2:
+                for quantity, sign in names.items():
+                    _arrow(ax, jump, *curve(points, who, jump.direction, quantity), sign)
+    return bool(found)
 
 
-def _peaks(found: Study, axes: list[Axes]) -> None:
+def _arrow(ax: Axes, jump: Jump, f: Float1D, y: Float1D, sign: int) -> None:
+    start, stop = (sign * float(y[np.isclose(f, hz)][0]) for hz in (jump.from_hz, jump.to_hz))
+    x = (jump.from_hz + jump.to_hz) / 2
+    style = {"arrowstyle": "-|>", "color": COLOUR[jump.direction], "lw": 1.7,
+             "shrinkA": 0, "shrinkB": 0}  # fmt: skip
+    ax.annotate("", (x, stop), (x, start), arrowprops=style, zorder=4)
+
+
+def _peaks(cases: Mapping[str, Case], axes: list[Axes]) -> None:
     """Each gap's name at its primary resonance."""
-    for name, case in found.cases.items():
+    for name, case in cases.items():
         for ax, quantity in zip(axes[:2], ("eta_d", "eta_a"), strict=True):
             sizes = {one: curve(case.points, "twin", one, quantity) for one in DIRECTIONS}
             best = max(sizes, key=lambda one: float(sizes[one][1].max()))
@@ -159,11 +174,13 @@ def _peaks(found: Study, axes: list[Axes]) -> None:
             )  # fmt: skip
 
 
-def _transition(found: Study, rig: Rig | None) -> Drawing:
-    figure, axes = _frame()
+def transition(cases: Mapping[str, Case], rig: Rig | None) -> Drawing:
+    """Fig. 5: those of its gaps that are among `cases`."""
+    figure, axes = _frame(cases)
     measured = rig.points if rig else {}
-    for name, colour in TRANSITION.items():
-        case = found.cases[name]
+    colours = {name: colour for name, colour in TRANSITION.items() if name in cases}
+    for name, colour in colours.items():
+        case = cases[name]
         for ax, (_, _, names) in zip(axes, PANELS, strict=True):
             for quantity, sign in names.items():
                 at_rest = sign * _prestress(case).get(quantity, 0.0)
@@ -179,7 +196,7 @@ def _transition(found: Study, rig: Rig | None) -> Drawing:
                     ax.plot(f, sign * y, "o", mec=colour, mfc=face, ms=3.6, mew=0.9)
     for ax in axes[:2]:
         ax.set_ylim(bottom=0)
-    handles = [Line2D([], [], color=c, lw=1.6, label=minus(n)) for n, c in TRANSITION.items()]
+    handles = [Line2D([], [], color=c, lw=1.6, label=minus(n)) for n, c in colours.items()]
     handles += [Line2D([], [], color=GUIDE, ls=DASH[one], label=one) for one in DIRECTIONS]
     handles += [Line2D([], [], **AT_REST, label="pre-strain, pre-stress at rest")]
     figure.legend(handles=handles, loc="outside upper center", ncols=8)
@@ -201,6 +218,6 @@ def _prestress(case: Case) -> dict[str, float]:
     pressed = -p.gap_r
     if pressed <= 0:
         return {}
-    u_star, _, _ = resonance(p, case.acceleration)
+    u_star, _ = case.tests[0].scale
     eta, r = pressed / u_star, p.bumper_stiffness_r * pressed / (p.mass * GRAVITY_M_S2)
     return {"eta_r": eta, "eta_l": eta, "r_r": r, "r_l": r}

@@ -7,11 +7,11 @@ import numpy as np
 
 from table_io.block import Label
 from table_io.card import BadInput
-from table_io.records import Point
+from table_io.records import Decided, Point
 from twin.service import evidence
-from twin.service.commands import log_path, recorded_bundle
 from twin.service.evidence import Run, gather
 from twin.service.paper.cases import GAPS, Motion
+from twin.service.recordings import log_path, recorded_bundle
 from twin.service.summary import summarise
 from twin.stream.mcap_log import read
 
@@ -92,7 +92,9 @@ def measured(paths: list[Path]) -> Rig:
         if run.who != "measured":
             raise BadInput(f"{path}: the model alone, nothing measured; give runs on a table")
         rig.runs.setdefault(name, []).append(run)
-        rig.points.setdefault(name, []).extend(recording.of(Point))
+        visits = {one.step for one in recording.of(Decided)}  # no points of a curve
+        points = [point for point in recording.of(Point) if point.step not in visits]
+        rig.points.setdefault(name, []).extend(points)
     return rig
 
 

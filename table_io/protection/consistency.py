@@ -1,0 +1,137 @@
+"""Whether displacement, acceleration and forces of one and the same body still fit together.
+
+Nothing here knows a force law: what is compared holds for any motion, chaotic ones too.
+
+Weak form: integral phi'' x dt = integral phi a dt, for phi that vanishes with its slope at both
+ends of a window. phi = sin^4(pi t / T) exp(-i k (w t + theta)) at the drive's own frequency (k = 1,
+2), so that no noise is differentiated and offsets of x drop out; with k = 0 an offset of a is left.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from table_io.block import Float1D, Float2D
+
+ORDERS = (0, 1, 2)
+SIGMAS = 6.0
+Complex1D = npt.NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Weak:
+    """What a displacement and an acceleration say of the same motion, m/s2, over one window.
+
+    Amplitudes at once and twice the drive's frequency, (2,), from either, and the standard error of
+    their differences; `offset` is what the acceleration has too much on average, with its standard
+    error, and `average` the larger of the two averages: what a wrong gain would have a share of.
+    """
+
+    displacement: Complex1D
+    acceleration: Complex1D
+    sigma: Float1D
+    offset: float
+    sigma_offset: float
+    average: float
+
+    @property
+    def size(self) -> float:
+        """The largest of the amplitudes, m/s2."""
+        return float(max(np.abs(self.displacement).max(), np.abs(self.acceleration).max()))
+
+    @property
+    def apart(self) -> float:
+        """The largest difference, m/s2, that noise cannot explain: beyond six standard errors."""
+        off = np.abs(self.displacement - self.acceleration)
+        return float(max((off - SIGMAS * self.sigma).max(), 0.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """phi and phi'' of one window for the orders 0, 1, 2: complex (order, sample)."""
+
+    phi: npt.NDArray[np.complex128]
+    curved: npt.NDArray[np.complex128]
+
+
+def window(samples: int, turns: float, middle: float, rate_hz: float) -> Window:
+    """The window over `samples`, in which the drive turns `turns` cycles, at phase `middle` in
+    the middle of it. Scaled so that a tone of amplitude 1 gives amplitude 1.
+    """
+    t = (np.arange(samples) + 0.5) / samples
+    length = samples / rate_hz
+    sin, cos = np.sin(np.pi * t), np.cos(np.pi * t)
+    bell = sin**4
+    slope = 4 * math.pi / length * sin**3 * cos
+    curve = (math.pi / length) ** 2 * (12 * sin**2 * cos**2 - 4 * sin**4)
+    omega = 2 * math.pi * turns / length
+    tone = np.exp(-2j * np.pi * (middle + turns * (t - 0.5)))
+    total = float(bell.sum())
+    phi = np.empty((len(ORDERS), samples), dtype=np.complex128)
+    curved = np.empty_like(phi)
+    wave = np.ones_like(tone)
+    for k in ORDERS:
+        scale = (2.0 if k else 1.0) / total
+        phi[k] = scale * bell * wave
+        curved[k] = scale * (curve - 2j * k * omega * slope - (k * omega) ** 2 * bell) * wave
+        wave = wave * tone
+    return Window(phi, curved)
+
+
+def weak(one: Window, x: Float1D, a: Float1D, noise: tuple[float, float]) -> Weak:
+    """Displacement x in m against acceleration a in m/s2, (sample,); `noise` is the rms of each."""
+    twice, once = one.curved @ x, one.phi @ a
+    errors = np.hypot(
+        noise[0] * np.linalg.norm(one.curved, axis=1), noise[1] * np.linalg.norm(one.phi, axis=1)
+    )
+    return Weak(
+        twice[1:],
+        once[1:],
+        errors[1:],
+        float((once[0] - twice[0]).real),
+        float(errors[0]),
+        float(max(abs(twice[0].real), abs(once[0].real))),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Shared:
+    """How two cells share a force: `angle` in degrees (45: equally; 0: the first alone; -45: one
+    is reversed), `apart` in N, the distance of the mean from the line through 0 at this angle, with
+    its standard error, and `swing`, the rms along it.
+    """
+
+    angle: float
+    apart: float
+    swing: float
+    sigma: float
+
+
+def shared(first: Float1D, second: Float1D, noise: float) -> Shared:
+    """The principal axis of two cells' forces in N, (sample,); `noise` is the rms of both."""
+    means = float(first.mean()), float(second.mean())
+    a, b = first - means[0], second - means[1]
+    aa, bb, ab = float(a @ a), float(b @ b), float(a @ b)
+    theta = 0.5 * math.atan2(2 * ab, aa - bb)
+    if theta < -math.pi / 4 - 1e-9 and ab >= 0:
+        theta += math.pi
+    major = 0.5 * (aa + bb + math.hypot(aa - bb, 2 * ab))
+    apart = means[1] * math.cos(theta) - means[0] * math.sin(theta)
+    swing = math.sqrt(major / first.size)
+    # The angle is known to noise / (swing sqrt n), and the mean force turns with it.
+    arm = math.hypot(1.0, math.hypot(*means) / swing) if swing else 1.0
+    sigma = noise * arm / math.sqrt(first.size)
+    return Shared(math.degrees(theta), apart, swing, sigma)
+
+
+def despiked(values: Float2D, limit: Float2D) -> Float2D:
+    """Samples, (channel, sample), with those replaced that lie further than `limit`, (channel, 1),
+    from the median with their neighbours.
+    """
+    left, middle, right = values[:, :-2], values[:, 1:-1], values[:, 2:]
+    median = np.maximum(np.minimum(left, middle), np.minimum(np.maximum(left, middle), right))
+    clean = values.copy()
+    clean[:, 1:-1] = np.where(np.abs(middle - median) > limit, median, middle)
+    return clean

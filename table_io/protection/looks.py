@@ -1,0 +1,287 @@
+"""What one look at a whole cycle finds: level, response, drift, and whether the sensors fit.
+
+Each function yields doubts; a doubt that stays for some looks in a row becomes a finding.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from table_io.block import Float1D, Float2D, Label
+from table_io.profile import Profile
+from table_io.protection.consistency import Weak, despiked, weak, window
+from table_io.rig import Rig
+from table_io.tracking import Tracked, track_all
+
+# The first and the last of three looks, half a cycle apart, have no sample in common.
+LOOKS = 3
+HARMONICS = 5  # told apart from the fundamental of the table's motion
+MATCH = 0.12  # of the motion: a little more than what the loop check lets pass
+OFFSET_RANGE = 1e-3  # of a sensor's range
+OFFSET_LEVEL = 0.02  # of the table's motion
+GAIN = 0.2  # of the identified response
+LAG_MORE, LAG_S = 0.5, 0.003  # of the identified lag, and at least
+AVERAGED = 20  # looks, ten cycles: a transient is over by then
+ASYMMETRY = 0.35  # of the swing of the mass: twice what a chaotic G4 has
+PAIRS = (
+    (("table_disp_m",), "table_acc_m_s2"),
+    (("mass_disp_m",), "mass_acc_m_s2"),
+    (("rel_disp_m", "table_disp_m"), "mass_acc_m_s2"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """What one look has found, SI; `severity`: "stop", "alarm", or "sensor": as for its channel."""
+
+    kind: str
+    channel: str
+    value: float
+    limit: float
+    text: str
+    severity: str = "sensor"
+    looks: int = LOOKS
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """The test, the machine, and the noise of its sensors: rms, and what counts as a spike."""
+
+    profile: Profile
+    rig: Rig
+    sigma: Float1D  # (channel,)
+    spike: Float1D
+
+    @property
+    def rate_hz(self) -> float:
+        return self.profile.acquisition.rate_hz
+
+    def range_si(self, name: str) -> float:
+        return self.rig.sensors[self.rig.channels.index(name)].range_si
+
+
+@dataclass(frozen=True, eq=False)
+class Cycle:
+    """About one cycle of the drive: values (channel, sample), the rest (sample,); phase unwrapped.
+
+    `level` and `label` are those of its last sample.
+    """
+
+    bench: Bench
+    values: Float2D
+    command: Float1D
+    phase: Float1D
+    level: float
+    label: int
+
+    @cached_property
+    def _clean(self) -> Float2D:
+        return despiked(self.values, self.bench.spike[:, None])
+
+    @cached_property
+    def _known(self) -> frozenset[str]:
+        whole = np.flatnonzero(~np.isnan(self.values).any(axis=1)).tolist()
+        return frozenset(self.bench.rig.channels[row] for row in whole)
+
+    @cached_property
+    def tones(self) -> dict[str, Tracked]:
+        """Harmonics of the table's displacement and acceleration and of the command."""
+        names = ("table_disp_m", "table_acc_m_s2")
+        rows = [*(self.clean(name) for name in names), self.command]
+        found = track_all(np.array(rows), self.phase, HARMONICS)
+        return dict(zip((*names, "command"), found, strict=True))
+
+    def has(self, *names: str) -> bool:
+        """True where the rig has these channels and no sample of them is lost."""
+        return self._known.issuperset(names)
+
+    def clean(self, name: str) -> Float1D:
+        """A channel without single samples that are no motion, (sample,)."""
+        row: Float1D = self._clean[self.bench.rig.channels.index(name)]
+        return row
+
+    @property
+    def turns(self) -> float:
+        count = self.phase.size
+        return float(self.phase[-1] - self.phase[0]) * count / (count - 1)
+
+    @property
+    def omega(self) -> float:
+        """Angular frequency, rad/s."""
+        return 2 * math.pi * self.turns * self.bench.rate_hz / self.phase.size
+
+    def sigma(self, *names: str) -> float:
+        """Noise of a sum of channels, rms."""
+        return math.hypot(*(self.bench.sigma[self.bench.rig.channels.index(one)] for one in names))
+
+    def relative(self) -> Float1D | None:
+        """u in m, right positive; None where it is not measured."""
+        if self.has("rel_disp_m"):
+            return self.clean("rel_disp_m")
+        if self.has("mass_disp_m", "table_disp_m"):
+            return self.clean("mass_disp_m") - self.clean("table_disp_m")
+        return None
+
+
+def fit(cycle: Cycle) -> Iterator[tuple[tuple[str, ...], str, Weak]]:
+    """(displacements, acceleration, what they say) of every pair that the rig measures."""
+    pairs = [pair for pair in PAIRS if cycle.has(*pair[0], pair[1])]
+    if not pairs:
+        return
+    count = cycle.phase.size
+    middle = 0.5 * float(cycle.phase[0] + cycle.phase[-1])
+    one = window(count, cycle.turns, middle, cycle.bench.rate_hz)
+    for names, acceleration in pairs:
+        x = np.sum([cycle.clean(name) for name in names], axis=0)
+        noise = cycle.sigma(*names), cycle.sigma(acceleration)
+        yield names, acceleration, weak(one, x, cycle.clean(acceleration), noise)
+
+
+def misfit(
+    names: tuple[str, ...], acceleration: str, seen: Weak, good: Weak | None
+) -> Iterator[Doubt]:
+    """A displacement and an acceleration that do not belong to one motion.
+
+    Accused is the one that is further from the last look that was good.
+    """
+    if seen.apart <= MATCH * seen.size:
+        return
+    accused, other = names[0], acceleration
+    if good is not None:
+        moved = float(np.abs(seen.displacement - good.displacement).max())
+        if float(np.abs(seen.acceleration - good.acceleration).max()) > moved:
+            accused, other = acceleration, names[0]
+    share = seen.apart / seen.size
+    text = f"{accused} does not fit {other}: {100 * share:.0f} % of the motion apart"
+    text += f"; allowed: {100 * MATCH:.0f} %"
+    yield Doubt("consistency", accused, share, MATCH, text)
+
+
+def offset(cycle: Cycle, acceleration: str, seen: Weak) -> Iterator[Doubt]:
+    """An accelerometer that shows more than the motion has on average, and a gain would explain."""
+    limit = OFFSET_RANGE * cycle.bench.range_si(acceleration) + MATCH * seen.average
+    limit += 6.0 * seen.sigma_offset
+    if abs(seen.offset) > limit:
+        yield drifted(acceleration, seen.offset, limit, "m/s2")
+
+
+def spoken(value: float, unit: str) -> str:
+    """A value in SI as people say it."""
+    return f"{1e3 * value:.4g} mm" if unit == "m" else f"{value:.4g} {unit}".strip()
+
+
+def drifted(channel: str, value: float, limit: float, unit: str) -> Doubt:
+    text = f"{channel} has drifted by {spoken(value, unit)}; allowed: {spoken(limit, unit)}"
+    return Doubt("drift", channel, value, limit, text)
+
+
+def table_mean(cycle: Cycle) -> Iterator[Doubt]:
+    """The mean of the table's displacement over a held cycle: it must be that at rest."""
+    if not cycle.has("table_disp_m"):
+        return
+    table = cycle.tones["table_disp_m"]
+    limit = OFFSET_RANGE * cycle.bench.range_si("table_disp_m")
+    limit += OFFSET_LEVEL * table.fundamental + cycle.sigma("table_disp_m")
+    if abs(table.offset) > limit:
+        yield drifted("table_disp_m", table.offset, limit, "m")
+
+
+@dataclass(frozen=True, slots=True)
+class Swing:
+    """Mean and half the range of u in m, averaged over about AVERAGED looks."""
+
+    mean: float = 0.0
+    half: float = 0.0
+    looks: int = 0
+
+
+def swung(cycle: Cycle, before: Swing) -> Swing:
+    """The average after one more cycle; as it was where u is not measured."""
+    u = cycle.relative()
+    if u is None:
+        return before
+    part = 1.0 / min(before.looks + 1, AVERAGED)
+    mean, half = float(u.mean()), 0.5 * float(np.ptp(u))
+    return Swing(
+        before.mean + part * (mean - before.mean),
+        before.half + part * (half - before.half),
+        before.looks + 1,
+    )
+
+
+def mass_mean(cycle: Cycle, swing: Swing) -> Iterator[Doubt]:
+    """The mass may be thrown aside for a while; on average it swings about the middle.
+
+    How far from it, impacts on one side more than on the other decide, and unequal gaps.
+    """
+    right, left = cycle.bench.profile.specimen.gaps_m
+    aside = abs(right - left) / 2 if right != left else 0.0
+    name = "rel_disp_m" if "rel_disp_m" in cycle.bench.rig.channels else "mass_disp_m"
+    if swing.looks < AVERAGED or name not in cycle.bench.rig.channels:
+        return
+    limit = OFFSET_RANGE * cycle.bench.range_si(name) + ASYMMETRY * swing.half + aside
+    if abs(swing.mean) > limit:
+        yield drifted(name, swing.mean, limit, "m")
+
+
+def level(cycle: Cycle) -> Iterator[Doubt]:
+    """The fundamental of the table's acceleration against the demanded level."""
+    if not cycle.has("table_acc_m_s2"):
+        return
+    card, seen = cycle.bench.profile.protection, cycle.tones["table_acc_m_s2"].fundamental
+    off = seen / cycle.level - 1.0
+    words = f"table at {seen:.4g} m/s2, demanded {cycle.level:.4g} m/s2"
+    # Before the measured cycles a level may still be on its way to what is demanded.
+    if abs(off) > card.alarm and cycle.label == Label.MEASURE:
+        limit = math.copysign(card.alarm, off)
+        text = f"{words}: {100 * off:+.1f} %; allowed: +-{100 * card.alarm:g} %"
+        yield Doubt("level", "table_acc_m_s2", seen, (1 + limit) * cycle.level, text, "alarm", 1)
+    off_db = 20 * math.log10(max(seen / cycle.level, 1e-9))
+    if abs(off_db) > card.abort_db:
+        limit = math.copysign(card.abort_db, off_db)
+        text = f"{words}: {off_db:+.1f} dB; allowed: +-{card.abort_db:g} dB"
+        bound = 10 ** (limit / 20) * cycle.level
+        yield Doubt("level", "table_acc_m_s2", seen, bound, text, "stop")
+
+
+def transfer(cycle: Cycle) -> tuple[complex, complex]:
+    """(table displacement, table acceleration) over the command, complex; NaN where lost."""
+    command = complex(cycle.tones["command"].amplitudes[0])
+    found = []
+    for name, scale in (("table_disp_m", 1.0), ("table_acc_m_s2", -(cycle.omega**-2))):
+        known = cycle.has(name) and abs(command) > 0
+        tone = complex(cycle.tones[name].amplitudes[0]) if known else complex("nan")
+        found.append(scale * tone / command)
+    return found[0], found[1]
+
+
+def response(cycle: Cycle, seen: tuple[complex, complex], known: complex) -> Iterator[Doubt]:
+    """The table's response to its command against the one that is known.
+
+    A servo whose oil pressure falls lags more and more before it loses amplitude.
+    """
+    ratios = [one / known for one in seen]
+    if not all(math.isfinite(abs(one)) and one for one in ratios):
+        return
+    gain = min((abs(one) for one in ratios), key=lambda one: abs(one - 1.0))
+    # Both sensors have to agree: what only one of them shows is a fault of that sensor.
+    if abs(gain - 1.0) > GAIN:
+        text = f"the table follows {gain:.2f} times as far as it did; allowed: +-{100 * GAIN:g} %"
+        yield Doubt("response", "table_acc_m_s2", gain, 1 + math.copysign(GAIN, gain - 1), text)
+    lag_s = lag(known, cycle.omega)
+    late_s = min((-np.angle(one) / cycle.omega for one in ratios), key=abs)
+    limit = max(LAG_MORE * lag_s, LAG_S)
+    if abs(late_s) > limit:
+        text = (
+            f"the table lags {1e3 * (lag_s + late_s):.1f} ms behind its command, "
+            f"{1e3 * lag_s:.1f} ms before; allowed: {1e3 * (lag_s + limit):.1f} ms"
+        )
+        yield Doubt("response", "table_disp_m", lag_s + late_s, lag_s + limit, text)
+
+
+def lag(ratio: complex, omega: float) -> float:
+    """Time in s by which a response is behind."""
+    return float(-np.angle(ratio)) / omega

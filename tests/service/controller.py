@@ -1,0 +1,66 @@
+"""A rig on the machine backend, to be killed: CARD PROFILE PACE.
+
+Says "started EPOCH" once the table plays, then what happens, and at last "over SAMPLES VERDICT". A
+line on its standard input is an order to the session, or a way to misbehave.
+"""
+
+import os
+import select
+import sys
+from pathlib import Path
+
+from table_io.backends import open_backend
+from table_io.backends.machine import MachineBackend
+from table_io.block import Block
+from table_io.card import load
+from table_io.clock import RealClock
+from table_io.profile import Profile
+from table_io.records import Event, RunStop
+from table_io.rig import Rig
+from table_io.session import Order, Setup, play
+from twin.service.bundle import warm
+from twin.service.scheduling import urgent
+
+
+def asked() -> str:
+    """The line that waits on standard input, or nothing."""
+    ready, _, _ = select.select([sys.stdin], [], [], 0.0)
+    return os.read(sys.stdin.fileno(), 64).decode().strip() if ready else ""
+
+
+def main() -> None:
+    card, test, pace = sys.argv[1:]
+    rig = load(Path(card), Rig, "machine card")[0]
+    profile = load(Path(test), Profile, "test profile")[0]
+    clock = RealClock(float(pace))
+    backend = open_backend(rig, profile, clock)
+    assert isinstance(backend, MachineBackend)
+
+    def commands() -> Order | None:
+        word = asked()
+        if word == "garbage":
+            backend._alive().sendall(b"GET / HTTP/1.1\r\nHost: table\r\n\r\n")
+        elif word == "drop":
+            backend._alive().close()
+        elif word:
+            return Order(word, "asked to")
+        return None
+
+    def describe(_: dict[str, float], epoch_s: float) -> Event:
+        return Event(0, "started", repr(epoch_s))
+
+    warm("plant")  # as the rig does: what compiles must not do so in motion
+    urgent(50)
+    acquired = 0
+    for item in play(Setup(profile, rig), backend, clock, describe, commands):  # type: ignore[arg-type]
+        if isinstance(item, Block):
+            acquired = item.end
+        elif isinstance(item, RunStop):
+            print("over", acquired, item.verdict, item.reason, flush=True)
+        else:
+            text = item.text if isinstance(item, Event) else repr(item)
+            print(getattr(item, "kind", "record"), text, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,664 @@
+"""The machine as a process of its own: what it says, how it watches, how it comes to rest."""
+
+import json
+import math
+import re
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from table_io.backends import HEARTBEAT_S, PATIENCE_S, MachineLost
+from table_io.backends.machine import MachineBackend
+from table_io.block import Float1D
+from table_io.card import PROFILES, BadInput, parse
+from table_io.clock import RealClock
+from table_io.machine import server
+from table_io.machine.blackbox import BlackBox, read_box
+from table_io.machine.endpoint import Endpoint, endpoint, listening
+from table_io.machine.queued import Queued, is_still, landing
+from table_io.machine.table import Table
+from table_io.machine.wire import (
+    HEADER,
+    MOST_BYTES,
+    Garbage,
+    Kind,
+    Message,
+    Parser,
+    Refusal,
+    carry,
+    encode,
+    say,
+)
+from table_io.profile import Specimen
+from table_io.rig import Machine, Rig
+
+RATE = 2000.0
+TEXT = (PROFILES / "rigs" / "machine.toml").read_text()
+RIG = parse(TEXT, Rig, "machine")
+SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
+SCALE = RIG.output.volts_per_m
+TICK_S = 0.005
+LATE = """
+[[simulated.faults]]
+kind = "late"
+at_s = 0.2
+size = 0.1
+"""
+STALL = """
+[[simulated.faults]]
+kind = "stall"
+at_s = 0.2
+"""
+
+OIL_LOSS = """
+[[simulated.faults]]
+kind = "oil_loss"
+at_s = 0.5
+size = 0.05
+"""
+
+
+def claim(rig: Rig = RIG, rate_hz: float = RATE, **changes: object) -> Message:
+    """What a controller says first."""
+    told = {
+        "rate_hz": rate_hz,
+        "specimen": SPECIMEN.model_dump(),
+        "output": rig.output.model_dump(),
+        "sensors": [sensor.model_dump() for sensor in rig.sensors],
+    }
+    return say(Kind.CLAIM, json.dumps(told | changes))
+
+
+def sine(seconds: float, amplitude_m: float = 5e-3, f: float = 2.0) -> Float1D:
+    """Volts of a motion that grows smoothly and goes on: its end is in motion."""
+    t = np.arange(round(seconds * RATE)) / RATE
+    x = np.clip(t / 0.5, 0.0, 1.0)
+    grows = x**3 * (10.0 + x * (-15.0 + 6.0 * x))
+    metres: Float1D = amplitude_m * grows * np.sin(2 * np.pi * f * t)
+    return metres * SCALE
+
+
+def acceleration(metres: Float1D) -> float:
+    """Largest acceleration of a command in m/s2, rest before it included."""
+    return float(np.abs(np.diff(np.concatenate([np.zeros(2), metres]), 2)).max() * RATE**2)
+
+
+@dataclass
+class Desk:
+    """A table and its controller in time that passes when it is told to."""
+
+    folder: Path
+    card: str = TEXT
+    now: float = 100.0
+    told: list[str] = field(default_factory=list)
+    heard: list[Message] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.box = BlackBox(self.folder / "box", self.told.append)
+        self.table = Table(parse(self.card, Rig, "card"), self.told.append, self.box)
+
+    def say(self, *messages: Message) -> list[Message]:
+        """The answers."""
+        return [answer for one in messages for answer in self.table.hear(one, self.now)]
+
+    def drive(self, volts: Float1D) -> None:
+        """Claim, queue, start."""
+        kinds = [one.kind for one in self.say(claim(), carry(Kind.QUEUE, volts))]
+        assert kinds == [Kind.GRANTED, Kind.QUEUED]
+        assert self.say(Message(Kind.START))[0].values.tolist() == [self.now]
+
+    def wait(self, seconds: float, beats: bool = True) -> None:
+        """Time passes."""
+        for _ in range(round(seconds / TICK_S)):
+            self.now += TICK_S
+            if beats:
+                self.say(Message(Kind.BEAT))
+            self.heard += self.table.tick(self.now)
+
+    def rest(self) -> None:
+        """Time passes without a controller until the table is free; it has ten seconds."""
+        for _ in range(2000):
+            if not self.table.claimed:
+                return
+            self.wait(TICK_S, beats=False)
+        raise AssertionError("it did not come to rest")
+
+    def kinds(self) -> list[Kind]:
+        return [one.kind for one in self.heard]
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Desk:
+    return Desk(tmp_path)
+
+
+def test_it_plays_and_hands_over_every_sample_once(desk: Desk) -> None:
+    desk.drive(sine(0.5))
+    desk.wait(0.3)
+    assert set(desk.kinds()) == {Kind.TAKEN}
+    counts = [one.values.size // len(RIG.sensors) for one in desk.heard]
+    assert [one.index for one in desk.heard] == np.cumsum([0, *counts[:-1]]).tolist()
+    assert sum(counts) == 601  # sample 0 is that of the start
+
+
+def test_a_silent_controller_is_lost_in_time_and_what_is_queued_plays_to_rest(desk: Desk) -> None:
+    volts = sine(1.0)
+    desk.drive(volts)
+    desk.wait(0.5)
+    desk.wait(HEARTBEAT_S - TICK_S, beats=False)
+    assert not desk.table.latched
+    desk.wait(3 * TICK_S, beats=False)
+    assert "no word from the controller for 0.3 s" in desk.table.latched
+    assert desk.heard[-1].kind is Kind.LOST
+    desk.rest()
+    assert "controller lost" in desk.told[-1]
+    assert "at rest" in desk.told[-1]
+    (life,) = read_box(desk.folder / "box")
+    command = life.command_m
+    np.testing.assert_array_equal(command[: volts.size], volts / SCALE)
+    assert life.missing == 0
+    assert command[-1] == 0.0
+    assert acceleration(command) <= 1.05 * acceleration(volts / SCALE)
+    assert np.abs(life.row("command_m") - command).max() <= 0.501 * RIG.output.lsb_m
+    assert np.abs(life.row("table_disp")[-100:]).max() < 1e-4
+    assert np.abs(life.row("table_disp")).max() > 3e-3
+
+
+def test_signs_of_life_keep_it(desk: Desk) -> None:
+    desk.drive(sine(0.2))
+    for _ in range(10):
+        desk.wait(HEARTBEAT_S - TICK_S, beats=False)
+        desk.say(Message(Kind.BEAT))
+    assert not desk.table.latched
+
+
+def test_a_queue_that_ends_in_motion_is_brought_home_and_replaced_in_time(desk: Desk) -> None:
+    volts = sine(1.0)
+    desk.drive(volts[:1200])
+    desk.wait(0.5)
+    assert desk.say(carry(Kind.QUEUE, volts[1200:], 1200))[0].kind is Kind.QUEUED
+    desk.wait(3.0)
+    desk.table.lost("it is over", desk.now)
+    desk.rest()
+    (life,) = read_box(desk.folder / "box")
+    np.testing.assert_array_equal(life.command_m[:2000], volts / SCALE)
+    assert acceleration(life.command_m) <= 1.05 * acceleration(volts / SCALE)
+
+
+def test_what_is_held_off_the_mean_goes_home_once_nobody_holds_it(desk: Desk) -> None:
+    x = np.linspace(0.0, 1.0, 1000)
+    desk.drive(np.append(x**3 * (10.0 + x * (-15.0 + 6.0 * x)), 1.0))
+    desk.wait(1.0)
+    desk.say(Message(Kind.RELEASE))
+    desk.rest()
+    (life,) = read_box(desk.folder / "box")
+    assert life.command_m[2000] == pytest.approx(1.0 / SCALE)
+    assert life.command_m[-1] == 0.0
+    assert acceleration(life.command_m) < 0.55
+
+
+def test_a_table_that_stands_still_in_the_middle_of_its_queue_is_not_at_rest(desk: Desk) -> None:
+    x = np.clip(np.arange(1000) / 998, 0.0, 1.0)
+    volts = np.concatenate([np.zeros(1500), 64.0 * (x * (1.0 - x)) ** 3])
+    desk.drive(volts)
+    desk.wait(0.1)
+    desk.table.lost("gone", desk.now)
+    desk.rest()
+    (life,) = read_box(desk.folder / "box")
+    np.testing.assert_array_equal(life.command_m[:2500], volts / SCALE)
+    assert life.notes[-1][0] >= 2500 + 0.2 * RATE
+
+
+def test_a_table_without_oil_pressure_is_given_the_time_that_it_needs(tmp_path: Path) -> None:
+    desk = Desk(tmp_path, TEXT + OIL_LOSS)
+    desk.drive(sine(4.0, f=1.0))
+    desk.wait(4.0)
+    desk.table.lost("gone", desk.now)
+    desk.rest()
+    (life,) = read_box(desk.folder / "box")
+    quiet = life.row("table_disp")[-400:]
+    assert np.ptp(quiet) <= 1e-4
+    late = np.flatnonzero(np.abs(life.row("table_disp")) > 1e-4)[-1]
+    assert late > np.flatnonzero(life.command_m)[-1] + 0.2 * RATE  # or this shows nothing
+
+
+def test_time_that_passed_without_a_tick_is_past(desk: Desk) -> None:
+    desk.drive(sine(1.0))
+    desk.wait(0.1)
+    desk.now += 0.05
+    (answer,) = desk.say(carry(Kind.QUEUE, np.zeros(9), 201 + 60))
+    assert (answer.kind, answer.index) == (Kind.REFUSED, Refusal.VALUE)
+
+
+def test_nobody_else_gets_a_table_that_moves(desk: Desk) -> None:
+    assert desk.table.busy() is None
+    desk.drive(sine(1.0))
+    busy = desk.table.busy()
+    assert busy is not None
+    assert (busy.index, "has a controller already" in busy.text) == (Refusal.INPUT, True)
+    desk.wait(0.6)
+    desk.table.lost("gone", desk.now)
+    busy = desk.table.busy()
+    assert busy is not None
+    assert (busy.index, "still coming to rest" in busy.text) == (Refusal.RESTING, True)
+    desk.rest()
+    assert desk.table.busy() is None
+    desk.drive(sine(0.5, f=3.0))
+    assert not desk.table.latched
+    desk.wait(0.2)
+    lives = read_box(desk.folder / "box")
+    assert [life.missing for life in lives] == [0, 0]
+    np.testing.assert_array_equal(lives[1].command_m[:400], sine(0.2, f=3.0) / SCALE)
+    assert lives[1].notes[0] == (0, "claimed; controller lost at sample 1201: gone")
+
+
+def test_who_goes_before_the_start_leaves_it_free(desk: Desk) -> None:
+    desk.say(claim(), carry(Kind.QUEUE, sine(1.0)))
+    desk.wait(29.0, beats=False)
+    assert desk.table.claimed
+    desk.wait(2.0, beats=False)
+    assert not desk.table.claimed
+    desk.say(claim(), Message(Kind.RELEASE))
+    assert not desk.table.claimed
+    assert not desk.table.latched
+
+
+@pytest.mark.parametrize(
+    ("message", "why"),
+    [
+        (claim(RIG.model_copy(update={"sensors": RIG.sensors[:3]})), "sensors.* differs"),
+        (claim(parse(TEXT.replace("bits = 18", "bits = 16"), Rig, "")), "output.* differs"),
+        (claim(rate_hz=1234.0), "1234"),
+    ],
+)
+def test_a_claim_that_does_not_fit_is_refused(desk: Desk, message: Message, why: str) -> None:
+    (answer,) = desk.say(message)
+    assert (answer.kind, answer.index) == (Kind.REFUSED, Refusal.INPUT)
+    assert re.search(why, answer.text)
+    assert not desk.table.claimed
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        Message(Kind.START),
+        Message(Kind.GRANTED),
+        say(Kind.CLAIM, "{}"),
+        say(Kind.CLAIM, "["),
+        Message(Kind.CLAIM, 0, b"\xff"),
+        claim(rate_hz=math.nan),
+        claim(specimen={"mass_kg": -1.0, "gap_mm": 4.0}),
+        claim(sensors=[]),
+    ],
+)
+def test_a_claim_that_is_none_is_garbage(desk: Desk, message: Message) -> None:
+    with pytest.raises(Garbage):
+        desk.say(message)
+    assert not desk.table.claimed
+
+
+@pytest.mark.parametrize(
+    ("message", "refusal"),
+    [
+        (Message(Kind.QUEUE, 5000, b"1234567"), None),
+        (Message(Kind.TAKEN, 0), None),
+        (Message(Kind.PLAYED, 0), None),
+        (claim(), None),
+        (Message(Kind.QUEUE, 5000), Refusal.VALUE),
+        (carry(Kind.QUEUE, np.array([np.nan]), 5000), Refusal.VALUE),
+        (carry(Kind.QUEUE, np.array([0.0]), -(2**62)), Refusal.VALUE),
+        (carry(Kind.QUEUE, np.array([0.0]), 10), Refusal.VALUE),
+        (Message(Kind.TARE, -1), Refusal.VALUE),
+        (Message(Kind.TARE, 2**40), Refusal.VALUE),
+        (Message(Kind.START), Refusal.ORDER),
+    ],
+)
+def test_nonsense_does_not_reach_the_table(
+    desk: Desk, message: Message, refusal: Refusal | None
+) -> None:
+    volts = sine(1.0)
+    desk.drive(volts)
+    desk.wait(0.2)
+    if refusal is None:
+        with pytest.raises(Garbage):
+            desk.say(message)
+    else:
+        (answer,) = desk.say(message)
+        assert (answer.kind, answer.index) == (Kind.REFUSED, refusal)
+    desk.wait(0.2)
+    desk.table.lost("enough", desk.now)
+    desk.rest()
+    (life,) = read_box(desk.folder / "box")
+    np.testing.assert_array_equal(life.command_m[: volts.size], volts / SCALE)
+
+
+def test_a_command_far_ahead_does_not_fill_the_memory(desk: Desk) -> None:
+    desk.drive(sine(1.0))
+    (answer,) = desk.say(carry(Kind.QUEUE, np.zeros(2), 2**62))
+    assert (answer.kind, answer.index) == (Kind.REFUSED, Refusal.VALUE)
+    assert "at most" in answer.text
+
+
+def test_late_samples_are_handed_over_late_and_in_order(tmp_path: Path) -> None:
+    desk = Desk(tmp_path, TEXT + LATE)
+    desk.drive(sine(1.0))
+    came: list[tuple[int, float]] = []
+    for _ in range(100):
+        desk.heard.clear()
+        desk.wait(TICK_S)
+        came += [(one.index, desk.now) for one in desk.heard]
+    indices = [index for index, _ in came]
+    assert indices == sorted(indices)
+    at = next(now for index, now in came if index + 10 > 400)
+    assert at - 100.2 == pytest.approx(0.1, abs=2 * TICK_S)
+    after = next(now for index, now in came if index > 800)
+    assert after - 100.0 - 801 / RATE < 2 * TICK_S
+
+
+def test_a_machine_that_stalls_still_plays_and_remembers(tmp_path: Path) -> None:
+    desk = Desk(tmp_path, TEXT + STALL)
+    desk.drive(sine(1.0))
+    desk.wait(0.6)
+    assert sum(one.values.size for one in desk.heard) // len(RIG.sensors) <= 400
+    desk.table.lost("it heard nothing", desk.now)
+    desk.rest()
+    (life,) = read_box(desk.folder / "box")
+    assert life.missing == 0
+    assert life.samples.shape[1] > 2000
+    assert life.command_m[-1] == 0.0
+
+
+def test_a_black_box_that_is_cut_off_is_readable(desk: Desk) -> None:
+    desk.drive(sine(1.0))
+    desk.wait(0.5)
+    path = desk.folder / "box"
+    whole = read_box(path)[0].samples
+    path.write_bytes(path.read_bytes()[:-100])
+    (life,) = read_box(path)
+    assert life.missing == 0
+    count = life.samples.shape[1]
+    assert whole.shape[1] - 20 <= count < whole.shape[1]
+    np.testing.assert_array_equal(life.samples, whole[:, :count])
+
+
+def test_a_black_box_overwrites_nothing_and_names_what_is_none(tmp_path: Path) -> None:
+    path = tmp_path / "box"
+    path.write_text("something else, long enough for a header")
+    with pytest.raises(BadInput, match="nothing is overwritten"):
+        BlackBox(path, print)
+    with pytest.raises(BadInput, match="no black box"):
+        read_box(path)
+    with pytest.raises(BadInput, match="cannot write"):
+        BlackBox(tmp_path / "none" / "box", print)
+
+
+@given(st.lists(st.binary(max_size=40), max_size=5), st.integers(1, 30))
+def test_messages_survive_any_cut(payloads: list[bytes], cut: int) -> None:
+    sent = [Message(Kind.NOTE, k - 2, payload) for k, payload in enumerate(payloads)]
+    stream = b"".join(encode(one) for one in sent)
+    parser = Parser()
+    pieces = [stream[i : i + cut] for i in range(0, len(stream), cut)]
+    assert [one for piece in pieces for one in parser.feed(piece)] == sent
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"GET / HTTP/1.1\r\nHost: table\r\n\r\n",
+        HEADER.pack(b"STM1", 99, 0, 0),
+        HEADER.pack(b"STM1", Kind.QUEUE, MOST_BYTES + 1, 0),
+        b"\0" * 20,
+        HEADER.pack(b"STM2", Kind.BEAT, 0, 0),
+    ],
+)
+def test_what_is_no_message_is_garbage_at_once(data: bytes) -> None:
+    with pytest.raises(Garbage):
+        Parser().feed(data)
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 60), st.lists(st.floats(-9, 9), min_size=1, max_size=20)),
+        max_size=6,
+    )
+)
+def test_what_is_queued_is_what_was_put_last(puts: list[tuple[int, list[float]]]) -> None:
+    queued, plain = Queued(), np.zeros(200)
+    for index, values in puts:
+        queued.put(index, np.array(values))
+        plain[index:] = [*values, *[values[-1]] * 200][: 200 - index]
+        before = plain[max(index - 1, 0)] if index else 0.0
+        assert queued.take(index - 1, index)[0] == before
+        assert queued.end == index + len(values)
+    np.testing.assert_array_equal(queued.take(-5, 200), np.pad(plain, (5, 0)))
+    queued.forget(50)
+    np.testing.assert_array_equal(queued.take(50, 200), plain[50:])
+
+
+@pytest.mark.parametrize("f", [0.5, 1.3, 4.0, 10.0])
+@pytest.mark.parametrize("turn", np.arange(8) / 8)
+def test_a_landing_goes_on_smoothly_and_ends_at_rest(f: float, turn: float) -> None:
+    a = 0.4903
+    t = turn / f + np.arange(-400, 1) / RATE
+    motion = a / (2 * np.pi * f) ** 2 * np.sin(2 * np.pi * f * t)
+    landed = landing(motion[-3:], RATE)
+    whole = np.concatenate([motion, landed, np.zeros(3)])
+    assert np.abs(np.diff(whole, 2)).max() * RATE**2 <= 1.06 * max(a, 0.5)
+    jerk = np.abs(np.diff(whole, 3)).max() * RATE**3
+    assert jerk <= 60 * a * max(f, 1.0)  # no jump: one of 1 % of a would be 10 A a millisecond
+    assert is_still(whole[-5:-3], RATE)
+    assert np.abs(whole).max() <= 1.6 * a / (2 * np.pi * f) ** 2 + 0.05 * a
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("tcp/0.0.0.0:7450", "other computers"),
+        ("tcp/192.168.1.5:7450", "other computers"),
+        ("tcp/:7450", "other computers"),
+        ("tcp/127.0.0.1", "allowed: tcp/127.0.0.1:PORT"),
+        ("tcp/127.0.0.1:99999", "allowed"),
+        ("udp/127.0.0.1:1", "allowed"),
+        ("unix/", "allowed"),
+    ],
+)
+def test_an_endpoint_stays_on_this_computer(text: str, part: str) -> None:
+    with pytest.raises(BadInput, match=part):
+        endpoint(text)
+
+
+def at(where: str) -> Rig:
+    return RIG.model_copy(update={"machine": Machine(endpoint=where)})
+
+
+def controller(where: str) -> MachineBackend:
+    return MachineBackend(at(where), SPECIMEN, RATE, RealClock())
+
+
+@dataclass
+class Served:
+    """A machine that runs beside the test."""
+
+    where: str
+    told: list[str]
+    table: Table
+
+
+@contextmanager
+def served(where: Endpoint, box: BlackBox | None = None) -> Iterator[Served]:
+    told: list[str] = []
+    table = Table(RIG, told.append, box)
+    listener = listening(where)
+    text = where.text
+    if where.family is socket.AF_INET:
+        text = f"tcp/127.0.0.1:{listener.getsockname()[1]}"
+    going = [True]
+    thread = threading.Thread(
+        target=server.serve, args=(listener, table, RealClock(), lambda: bool(going))
+    )
+    thread.start()
+    try:
+        yield Served(text, told, table)
+    finally:
+        going.clear()
+        thread.join()
+
+
+@pytest.fixture
+def machine() -> Iterator[Served]:
+    with served(endpoint("tcp/127.0.0.1:0")) as one:
+        yield one
+
+
+def driving(where: str) -> MachineBackend:
+    """A controller whose table moves for a little, to rest."""
+    backend = controller(where)
+    backend.open()
+    x = np.clip(np.arange(600) / 598, 0.0, 1.0)
+    backend.queue(0, 0.1 * 64 * (x * (1 - x)) ** 3)
+    backend.start()
+    backend.read(20)
+    return backend
+
+
+def test_nobody_there_says_how_to_start_it(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match=r"no table answers.*shaketwin table --rig machine"):
+        controller(f"unix/{tmp_path / 'none'}").open()
+
+
+def test_what_is_no_machine_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("table_io.backends.machine.ANSWER_S", 0.05)
+    with closing(socket.create_server(("127.0.0.1", 0))) as mute:
+        where = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
+        with pytest.raises(BadInput, match=r"is no table.*shaketwin table"):
+            controller(where).open()
+
+
+def test_one_controller_at_a_time(machine: Served) -> None:
+    first = driving(machine.where)
+    with pytest.raises(BadInput, match="has a controller already"):
+        controller(machine.where).open()
+    first.read(200)
+    first.close()
+
+
+def test_a_machine_that_is_switched_off_says_so_and_ends_at_rest(tmp_path: Path) -> None:
+    box = BlackBox(tmp_path / "box", print)
+    with served(endpoint(f"unix/{tmp_path / 'table'}"), box) as one:
+        backend = driving(one.where)
+    with pytest.raises(MachineLost, match="switched off"):
+        backend.read(20000)
+    (life,) = read_box(tmp_path / "box")
+    assert life.command_m[-1] == 0.0
+    assert life.samples.shape[1] >= 600
+    assert "switched off" in life.notes[-2][1]
+    assert life.notes[-1][1] == "at rest"
+
+
+@pytest.mark.parametrize(
+    "data", [b"GET / HTTP/1.1\r\n\r\n", encode(claim()), encode(Message(Kind.QUEUE, 9, b"1"))]
+)
+def test_garbage_loses_the_controller_and_not_the_machine(machine: Served, data: bytes) -> None:
+    backend = driving(machine.where)
+    backend._alive().sendall(data)
+    with pytest.raises(MachineLost, match="no controller says"):
+        backend.read(20000)
+    with pytest.raises(MachineLost, match="no controller says"):
+        backend.queue(5000, np.zeros(2))
+    backend.close()
+    again = controller(machine.where)
+    again.open()  # waits for the rest
+    assert "at rest" in machine.told[-1]
+    again.close()
+
+
+def test_what_has_come_is_handed_out_before_the_loss_is_told(machine: Served) -> None:
+    backend = driving(machine.where)
+    while backend._come < 200:
+        backend._listen()
+    backend._alive().shutdown(socket.SHUT_RDWR)
+    assert np.isfinite(backend.read(100)).all()
+    with pytest.raises(MachineLost, match="connection"):
+        backend.read(4000)
+    assert backend.scheduled(2000) > backend.scheduled(0)
+    again = controller(machine.where)
+    again.open()  # waits for the rest
+    again.close()
+    assert "the connection closed" in machine.told[-1]
+
+
+def test_strangers_at_the_door_do_not_disturb(machine: Served) -> None:
+    backend = driving(machine.where)
+    host, port = "127.0.0.1", int(machine.where.rpartition(":")[2])
+    for data in (b"", b"\0" * 5000, encode(claim()), b"STM1"):
+        with closing(socket.create_connection((host, port))) as stranger:
+            stranger.sendall(data)
+    assert backend.read(400).shape == (len(RIG.sensors), 400)
+    backend.close()
+
+
+def test_samples_that_do_not_come_are_a_lost_machine(tmp_path: Path) -> None:
+    """A machine that answers and then hands over nothing: patience, then MachineLost."""
+    path = str(tmp_path / "mute")
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(path)
+    listener.listen()
+
+    def answer() -> None:
+        connection, _ = listener.accept()
+        parser, answers = Parser(), 0
+        replies = [
+            Message(Kind.GRANTED, 60),
+            Message(Kind.QUEUED),
+            carry(Kind.STARTED, np.array([RealClock().now()])),
+        ]
+        while data := connection.recv(1 << 16):
+            for one in parser.feed(data):
+                if one.kind is not Kind.BEAT and answers < 3:
+                    connection.sendall(encode(replies[answers]))
+                    answers += 1
+        connection.close()
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    backend = controller(f"unix/{path}")
+    backend.open()
+    backend.queue(0, np.zeros(2))
+    backend.start()
+    with pytest.raises(MachineLost, match=f"{PATIENCE_S:g} s after their schedule"):
+        backend.read(20)
+    assert RealClock().now() >= backend.scheduled(19) + PATIENCE_S
+    thread.join()
+    listener.close()
+
+
+def test_an_endpoint_in_use_is_refused_and_a_dead_one_taken_over(tmp_path: Path) -> None:
+    where = endpoint(f"unix/{tmp_path / 'table'}")
+    with closing(listening(where)), pytest.raises(BadInput, match="another table listens"):
+        listening(where)
+    listening(where).close()  # its file was left behind
+    with closing(listening(endpoint("tcp/127.0.0.1:0"))) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(BadInput, match="is another table there"):
+            listening(endpoint(f"tcp/127.0.0.1:{port}"))
+
+
+@pytest.mark.parametrize("missing", [("machine", "[machine]"), ("simulated", "[simulated]")])
+def test_a_card_without_its_table_is_refused(missing: tuple[str, str]) -> None:
+    key, name = missing
+    rig = RIG.model_copy(update={key: None})
+    make: Callable[[], object] = (
+        (lambda: MachineBackend(rig, SPECIMEN, RATE, RealClock()))
+        if key == "machine"
+        else (lambda: Table(rig, print))
+    )
+    with pytest.raises(BadInput, match=name.replace("[", r"\[").replace("]", r"\]")):
+        make()

@@ -1,0 +1,35 @@
+"""Recordings as a person names them, and what they were made with."""
+
+from pathlib import Path
+
+from rich.console import Console
+
+from twin.service.bundle import Bundle, from_texts, read_model
+from twin.stream.mcap_log import Recording, read
+
+
+def log_path(log: Path) -> Path:
+    """The log itself, of a log or of a run's folder."""
+    return log / "run.mcap" if log.is_dir() else log
+
+
+def open_log(log: Path) -> Recording:
+    """The recording in a log or a run's folder; says so where the file is not whole."""
+    recording = read(log_path(log))
+    if not recording.whole:
+        end = recording.pieces("meas")[-1].end if recording.pieces("meas") else 0
+        Console(stderr=True).print(
+            f"warning: {recording.path} is cut off or damaged; it is readable to sample {end}",
+            highlight=False,
+            soft_wrap=True,
+        )
+    return recording
+
+
+def recorded_bundle(recording: Recording, model: str | None = None) -> Bundle:
+    """The bundle that a recording was made with, or with another model in it."""
+    start = recording.start
+    model_toml = read_model(model)[1] if model else start.model_toml
+    return from_texts(
+        start.name, start.profile_toml, start.rig_toml, model_toml, str(recording.path)
+    )

@@ -1,0 +1,27 @@
+"""`shaketwin tell`: hold, resume, stop or abort a test that runs in another terminal."""
+
+from rich.console import Console
+
+from table_io.card import BadInput
+from twin.stream.zenoh_link import open_spoke
+
+CONNECT_S = 3.0
+ANSWER_S = 2.0
+
+
+def tell(order: str, why: str, connect: str, rig: str, console: Console) -> None:
+    """Hand an order to the rig that runs at the endpoint; BadInput where it does not take it."""
+    link = open_spoke(rig, connect, CONNECT_S)
+    try:
+        runs = [name.removesuffix(".rig") for name in link.components() if name.endswith(".rig")]
+        if not runs:
+            raise BadInput(f"endpoint {connect}: no test runs there; `shaketwin run` starts one")
+        answer = link.request(order, f"{runs[0]}\n{why}", ANSWER_S)
+    finally:
+        link.close()
+    if answer != "yes":
+        raise BadInput(
+            f"{order}: {answer or f'the rig did not answer within {ANSWER_S:g} s'}; "
+            "in need use the machine's own emergency stop"
+        )
+    console.print(f"{runs[0]}: told to {order}", highlight=False)
