@@ -24,6 +24,7 @@ from table_io.channels import rel_disp
 from table_io.control import Tuning, updated, within
 from table_io.course import Aim, Course, begin, cycles_of
 from table_io.drive import Drive
+from table_io.limits import recheck
 from table_io.policies import Decision, Policy, Result, policy_of
 from table_io.policies.result import swing
 from table_io.profile import Profile
@@ -224,8 +225,11 @@ def _checked(now: Conductor) -> Conductor:
     failed = [check for check in checks if not check.passed]
     if response is not None:
         said.append(replace(response, index=index))
-    if failed:
-        why = f"the loop check failed: {'; '.join(_line(check) for check in failed)}"
+    why = "; ".join(_line(check) for check in failed)
+    if not failed and response is not None and one.profile.control.enabled:
+        why = "; ".join(recheck(now.steps, response, one.rig))
+    if why:
+        why = f"the loop check failed: {why}"
         return replace(now, stage=Stage("end"), refused=why, records=(*now.records, *said))
     tuning = Tuning(response)
     now = replace(now, tuning=tuning, records=(*now.records, *said))
@@ -233,7 +237,8 @@ def _checked(now: Conductor) -> Conductor:
 
 
 def _line(check: Check) -> str:
-    return f"{check.name} of {check.channel} is {check.value:.4g} {check.unit}"
+    value = f"{check.value:.4g} {check.unit}".rstrip()
+    return f"{check.name} of {check.channel} is {value} ({loop_check.remedy(check)})"
 
 
 def _looked(now: Conductor) -> Conductor:

@@ -1,5 +1,7 @@
 """A record as one sentence for people: the same words on a terminal, in a view and in a report."""
 
+import math
+
 from table_io.records import (
     Check,
     Decided,
@@ -54,10 +56,10 @@ def sentence(record: Record, rate_hz: float) -> tuple[str, str] | None:
 
 def _check(check: Check) -> str:
     how = "pass" if check.passed else "FAIL"
-    return (
-        f"check {how}: {check.name}, {check.channel}: {check.value:.4g} {check.unit} "
-        f"(allowed {check.low:.4g} to {check.high:.4g})"
-    )
+    value = f"{check.value:.4g} {check.unit}".rstrip()
+    limited = math.isfinite(check.low) or math.isfinite(check.high)
+    allowed = f" (allowed {check.low:.4g} to {check.high:.4g})" if limited else ""
+    return f"check {how}: {check.name}, {check.channel}: {value}{allowed}"
 
 
 def _level(level: Level) -> str:

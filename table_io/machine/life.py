@@ -64,9 +64,10 @@ class Life:
         """Replace the command from sample `index` on; ValueError where it cannot be."""
         if not volts.size:
             raise ValueError("an empty command; send at least one value")
-        if index + volts.size > self.taken + MOST_AHEAD:
+        if not 0 <= index <= self.taken + MOST_AHEAD - volts.size:
             raise ValueError(
-                f"a command up to sample {index + volts.size}; at most {MOST_AHEAD} ahead"
+                f"a command of samples {index} to {index + volts.size}; allowed: from 0 on, at "
+                f"most {MOST_AHEAD} ahead"
             )
         scale, rate = self._output.volts_per_m, self.plant.rate_hz
         end = np.concatenate([self._queued.take(index - 3, index), volts])[-3:] / scale

@@ -8,13 +8,14 @@ from dataclasses import dataclass, field
 
 from table_io.clock import Clock
 from table_io.machine.table import Table
-from table_io.machine.wire import Garbage, Kind, Message, Parser, Refusal, encode, say
+from table_io.machine.wire import Kind, Message, Parser, Refusal, encode, say
 
 TICK_S = 0.005  # of real time, between two looks at the plant
 IDLE_S = 0.1  # the same where nothing moves
 CLAIM_S = 2.0  # who has connected must say what for
 PARTING_S = 1.0  # that a last word may take to be read
 RECEIVED_BYTES = 1 << 16
+MOST_CALLERS = 32
 MOST_WAITING_BYTES = 4 << 20  # a controller that reads so much too little is no controller
 
 
@@ -85,6 +86,9 @@ class _Server:
             connection, _ = self._listener.accept()
         except OSError:
             return  # it went away again
+        if len(self._callers) >= MOST_CALLERS:
+            connection.close()
+            return
         connection.setblocking(False)
         with contextlib.suppress(OSError):
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -121,7 +125,7 @@ class _Server:
                     self._part(one)
                     self._controller = None
                     return
-        except Garbage as error:
+        except Exception as error:  # whatever it said: the machine plays on
             self._leave(one, f"it said what no controller says ({error})")
 
     def _tell(self, message: Message) -> None:

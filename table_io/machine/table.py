@@ -142,6 +142,10 @@ class Table:
                     "with the card of this run"
                 )
                 return say(Kind.REFUSED, text, Refusal.INPUT)
+        if claim.rate_hz not in self.rig.rates_hz:
+            rates = ", ".join(f"{rate:g}" for rate in self.rig.rates_hz)
+            text = f"the table does not sample at {claim.rate_hz:g} Hz; allowed: {rates}"
+            return say(Kind.REFUSED, text, Refusal.INPUT)
         try:
             self._life = Life(self.rig, claim.specimen, claim.rate_hz, self._box)
         except BadInput as error:

@@ -31,9 +31,9 @@ class Way:
     step: float
 
     def from_to(self, at: float, to: float) -> float:
-        """The next frequency on the way."""
+        """The next frequency on the way; from outside of the range it comes in step by step."""
         near = min(max(to, at - self.step), at + self.step)
-        return round(min(max(near, self.low), self.high), 9)
+        return round(min(max(near, min(self.low, at)), max(self.high, at)), 9)
 
 
 def words(card: Track, profile: Profile) -> str:
@@ -202,8 +202,8 @@ def crossed(points: Points, target: float, apart: float) -> float | None:
 
     From the newest points that lie at least `apart` from each other. The frequency is interpolated
     over the phase, not the phase over the frequency: it is single-valued and smooth even where a
-    branch turns back in a fold, which a Newton step over frequency would always overshoot. None
-    too where the target lies beyond the fold, on the part that nobody can stay on.
+    branch turns back in a fold, which a Newton step over frequency would always overshoot. Where
+    the target lies beyond the fold, on the part that nobody can stay on, it is extrapolated.
     """
     chosen: list[tuple[float, float]] = []
     for f, phase in reversed(points):
@@ -213,7 +213,8 @@ def crossed(points: Points, target: float, apart: float) -> float | None:
         some = chosen[:count]
         if len(some) == count and all(b[1] < a[1] for a, b in pairwise(sorted(some))):
             f, slope = _interpolated(some, target)
-            return f if slope < 0.0 else None
+            if slope < 0.0:
+                return f
     return None
 
 

@@ -1,7 +1,7 @@
 """Two-speed protection: what must stop the table, and what a person should hear of.
 
 Per sample (`watch.py`): limits, lost and broken sensors, command and table against what was
-queued. Once every half cycle, over the last whole one (`cycles.py`, `looks.py`): level, response,
+queued. Once every half cycle, over the last whole one (`tracks.py`, `looks.py`): level, response,
 drift, and whether displacement, acceleration and forces still fit together.
 
     guard = begin(profile, rig, noise_from(tare_volts, rig.sensors))
@@ -19,10 +19,10 @@ import numpy as np
 from table_io.block import Block, Bool2D, Float1D, Float2D
 from table_io.drive import Drive
 from table_io.profile import Profile
-from table_io.protection.cycles import HOLDS, Stretch, Tracks, look
+from table_io.protection.cycle import Bench
 from table_io.protection.findings import Finding, confirmed, worded
 from table_io.protection.law import Law, Memory, law, nothing
-from table_io.protection.looks import Bench
+from table_io.protection.tracks import HOLDS, Stretch, Tracks, look
 from table_io.protection.watch import CHECKING, GAIN, HALF, LAG, watch
 from table_io.records import Response
 from table_io.response import transfer_at
@@ -78,7 +78,18 @@ def begin(profile: Profile, rig: Rig, noise: Mapping[str, tuple[float, int]]) ->
     sigma = np.array([noise[name][0] if name in noise else 0.0 for name in rig.channels])
     channels = len(rig.channels)
     past = np.full((channels, one.past), np.nan), np.zeros(one.past), np.zeros(one.past)
-    return Guard(Bench(profile, rig, sigma, one.spike), one, nothing(channels), 0, past)
+    guard = Guard(Bench(profile, rig, sigma, one.spike), one, nothing(channels), 0, past)
+    _compile(guard)
+    return guard
+
+
+def _compile(guard: Guard) -> None:
+    """Has the pass over the samples compiled, so that the first block is not late."""
+    flags, empty = np.zeros((guard.past[0].shape[0], 0), dtype=np.bool_), np.zeros(0)
+    found = np.empty((MOST_FOUND, 5))
+    watch(
+        *guard.past[:1], flags, *guard.past[1:], empty, empty, 0, 0, guard.law, guard.memory, found
+    )
 
 
 def identified(guard: Guard, response: Response) -> Guard:
@@ -94,21 +105,21 @@ def inspect(guard: Guard, seen: Seen) -> tuple[Guard, tuple[Finding, ...]]:
     block, past = seen.block, guard.law.past
     if block.index != guard.index:
         raise ValueError(f"samples from {guard.index} on are next, not from {block.index}")
-    values = np.concatenate([guard.past[0], block.values], axis=1)
+    values = np.ascontiguousarray(np.concatenate([guard.past[0], block.values], axis=1))
     command = np.concatenate([guard.past[1], seen.command_m])
     phase = np.concatenate([guard.past[2], seen.phase])
+    clipped, level = np.ascontiguousarray(seen.clipped), np.ascontiguousarray(seen.level_m_s2)
     keys = _keys(block)
     old = guard.memory
-    memory = Memory(old.per.copy(), old.one.copy(), old.told.copy())
-    guard = replace(guard, memory=memory)
+    guard = replace(guard, memory=Memory(old.per.copy(), old.one.copy(), old.told.copy()))
     found = np.empty((MOST_FOUND, 5))
     findings: list[Finding] = []
     at = 0
     while at < len(block):
         first = at
         at, mark, count = watch(
-            values, seen.clipped, command, phase, seen.level_m_s2, keys, block.index, at,
-            guard.law, memory, found,
+            values, clipped, command, phase, level, keys, block.index, at,
+            guard.law, guard.memory, found,
         )  # fmt: skip
         for index, code, row, value, limit in found[:count].tolist():
             channel = block.channels[int(row)]
@@ -117,7 +128,7 @@ def inspect(guard: Guard, seen: Seen) -> tuple[Guard, tuple[Finding, ...]]:
         if at > first:
             span = slice(past + first, past + at)
             part = values[:, span], command[span], phase[span]
-            end = float(seen.level_m_s2[at - 1]), int(block.label[at - 1]), int(keys[at - 1])
+            end = float(level[at - 1]), int(block.label[at - 1]), int(keys[at - 1])
             guard = replace(guard, open=(*guard.open, part), at_end=end)
         if mark:
             guard, told = _closed(guard, mark == HALF, block.index + at)

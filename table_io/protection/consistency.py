@@ -17,6 +17,7 @@ from table_io.block import Float1D, Float2D
 
 ORDERS = (0, 1, 2)
 SIGMAS = 6.0
+CLEAR, CLEAR_SIZE = 20.0, 0.3  # an amplitude over its error, and of the motion, that tells
 Complex1D = npt.NDArray[np.complex128]
 
 
@@ -46,6 +47,18 @@ class Weak:
         """The largest difference, m/s2, that noise cannot explain: beyond six standard errors."""
         off = np.abs(self.displacement - self.acceleration)
         return float(max((off - SIGMAS * self.sigma).max(), 0.0))
+
+    @property
+    def ratio(self) -> complex:
+        """Acceleration over displacement at the drive's frequency; NaN where that tells little."""
+        clear = max(CLEAR * float(self.sigma[0]), CLEAR_SIZE * self.size)
+        known = abs(self.displacement[0]) > clear
+        return complex(self.acceleration[0] / self.displacement[0]) if known else complex("nan")
+
+    def changed(self, ratio: complex) -> float:
+        """Difference, m/s2, beyond six standard errors, from sensors of this ratio."""
+        off = abs(ratio * self.displacement[0] - self.acceleration[0])
+        return float(max(off - SIGMAS * self.sigma[0], 0.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,7 +128,7 @@ def shared(first: Float1D, second: Float1D, noise: float) -> Shared:
     a, b = first - means[0], second - means[1]
     aa, bb, ab = float(a @ a), float(b @ b), float(a @ b)
     theta = 0.5 * math.atan2(2 * ab, aa - bb)
-    if theta < -math.pi / 4 - 1e-9 and ab >= 0:
+    if theta < -math.pi / 4 - 1e-3:
         theta += math.pi
     major = 0.5 * (aa + bb + math.hypot(aa - bb, 2 * ab))
     apart = means[1] * math.cos(theta) - means[0] * math.sin(theta)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 from table_io.channels import BY_NAME
 from table_io.profile import Profile
 from table_io.protection import watch
-from table_io.protection.looks import Doubt, spoken
+from table_io.protection.cycle import Doubt, spoken
 from table_io.records import Event, Trip
 from table_io.units import GRAVITY_M_S2
 

@@ -6,20 +6,16 @@ Each function yields doubts; a doubt that stays for some looks in a row becomes 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
-from table_io.block import Float1D, Float2D, Label
-from table_io.profile import Profile
-from table_io.protection.consistency import Weak, despiked, weak, window
-from table_io.rig import Rig
-from table_io.tracking import Tracked, track_all
+from table_io.block import Label
+from table_io.protection.consistency import Weak, weak, window
+from table_io.protection.cycle import Cycle, Doubt, drifted
 
-# The first and the last of three looks, half a cycle apart, have no sample in common.
-LOOKS = 3
-HARMONICS = 5  # told apart from the fundamental of the table's motion
 MATCH = 0.12  # of the motion: a little more than what the loop check lets pass
+CHANGE = 0.05  # of the motion, from what the same sensors said over the last ten cycles
+KNOWN = 6  # looks after which that is known
 OFFSET_RANGE = 1e-3  # of a sensor's range
 OFFSET_LEVEL = 0.02  # of the table's motion
 GAIN = 0.2  # of the identified response
@@ -31,99 +27,6 @@ PAIRS = (
     (("mass_disp_m",), "mass_acc_m_s2"),
     (("rel_disp_m", "table_disp_m"), "mass_acc_m_s2"),
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Doubt:
-    """What one look has found, SI; `severity`: "stop", "alarm", or "sensor": as for its channel."""
-
-    kind: str
-    channel: str
-    value: float
-    limit: float
-    text: str
-    severity: str = "sensor"
-    looks: int = LOOKS
-
-
-@dataclass(frozen=True, eq=False)
-class Bench:
-    """The test, the machine, and the noise of its sensors: rms, and what counts as a spike."""
-
-    profile: Profile
-    rig: Rig
-    sigma: Float1D  # (channel,)
-    spike: Float1D
-
-    @property
-    def rate_hz(self) -> float:
-        return self.profile.acquisition.rate_hz
-
-    def range_si(self, name: str) -> float:
-        return self.rig.sensors[self.rig.channels.index(name)].range_si
-
-
-@dataclass(frozen=True, eq=False)
-class Cycle:
-    """About one cycle of the drive: values (channel, sample), the rest (sample,); phase unwrapped.
-
-    `level` and `label` are those of its last sample.
-    """
-
-    bench: Bench
-    values: Float2D
-    command: Float1D
-    phase: Float1D
-    level: float
-    label: int
-
-    @cached_property
-    def _clean(self) -> Float2D:
-        return despiked(self.values, self.bench.spike[:, None])
-
-    @cached_property
-    def _known(self) -> frozenset[str]:
-        whole = np.flatnonzero(~np.isnan(self.values).any(axis=1)).tolist()
-        return frozenset(self.bench.rig.channels[row] for row in whole)
-
-    @cached_property
-    def tones(self) -> dict[str, Tracked]:
-        """Harmonics of the table's displacement and acceleration and of the command."""
-        names = ("table_disp_m", "table_acc_m_s2")
-        rows = [*(self.clean(name) for name in names), self.command]
-        found = track_all(np.array(rows), self.phase, HARMONICS)
-        return dict(zip((*names, "command"), found, strict=True))
-
-    def has(self, *names: str) -> bool:
-        """True where the rig has these channels and no sample of them is lost."""
-        return self._known.issuperset(names)
-
-    def clean(self, name: str) -> Float1D:
-        """A channel without single samples that are no motion, (sample,)."""
-        row: Float1D = self._clean[self.bench.rig.channels.index(name)]
-        return row
-
-    @property
-    def turns(self) -> float:
-        count = self.phase.size
-        return float(self.phase[-1] - self.phase[0]) * count / (count - 1)
-
-    @property
-    def omega(self) -> float:
-        """Angular frequency, rad/s."""
-        return 2 * math.pi * self.turns * self.bench.rate_hz / self.phase.size
-
-    def sigma(self, *names: str) -> float:
-        """Noise of a sum of channels, rms."""
-        return math.hypot(*(self.bench.sigma[self.bench.rig.channels.index(one)] for one in names))
-
-    def relative(self) -> Float1D | None:
-        """u in m, right positive; None where it is not measured."""
-        if self.has("rel_disp_m"):
-            return self.clean("rel_disp_m")
-        if self.has("mass_disp_m", "table_disp_m"):
-            return self.clean("mass_disp_m") - self.clean("table_disp_m")
-        return None
 
 
 def fit(cycle: Cycle) -> Iterator[tuple[tuple[str, ...], str, Weak]]:
@@ -140,24 +43,43 @@ def fit(cycle: Cycle) -> Iterator[tuple[tuple[str, ...], str, Weak]]:
         yield names, acceleration, weak(one, x, cycle.clean(acceleration), noise)
 
 
+@dataclass(frozen=True, slots=True)
+class Usual:
+    """How a pair of sensors has fitted so far: the last good look, their ratio over some looks."""
+
+    last: Weak
+    ratio: complex = complex("nan")
+    looks: int = 0
+
+    def after(self, seen: Weak) -> "Usual":
+        """With one more good look."""
+        if not math.isfinite(abs(seen.ratio)):
+            return Usual(seen, self.ratio, self.looks)
+        if not self.looks:
+            return Usual(seen, seen.ratio, 1)
+        part = 1.0 / min(self.looks + 1, AVERAGED)
+        return Usual(seen, self.ratio + part * (seen.ratio - self.ratio), self.looks + 1)
+
+
 def misfit(
-    names: tuple[str, ...], acceleration: str, seen: Weak, good: Weak | None
+    names: tuple[str, ...], acceleration: str, seen: Weak, usual: Usual | None
 ) -> Iterator[Doubt]:
-    """A displacement and an acceleration that do not belong to one motion.
+    """A displacement and an acceleration that do not belong to one motion, or no longer do.
 
     Accused is the one that is further from the last look that was good.
     """
-    if seen.apart <= MATCH * seen.size:
+    share, limit, how = seen.apart / seen.size if seen.size else 0.0, MATCH, "does not fit"
+    if share <= MATCH and usual is not None and usual.looks >= KNOWN:
+        share, limit, how = seen.changed(usual.ratio) / seen.size, CHANGE, "no longer fits"
+    if share <= limit:
         return
     accused, other = names[0], acceleration
-    if good is not None:
-        moved = float(np.abs(seen.displacement - good.displacement).max())
-        if float(np.abs(seen.acceleration - good.acceleration).max()) > moved:
+    if usual is not None:
+        moved = float(np.abs(seen.displacement - usual.last.displacement).max())
+        if float(np.abs(seen.acceleration - usual.last.acceleration).max()) > moved:
             accused, other = acceleration, names[0]
-    share = seen.apart / seen.size
-    text = f"{accused} does not fit {other}: {100 * share:.0f} % of the motion apart"
-    text += f"; allowed: {100 * MATCH:.0f} %"
-    yield Doubt("consistency", accused, share, MATCH, text)
+    text = f"{accused} {how} {other}: {100 * share:.0f} % of the motion apart; "
+    yield Doubt("consistency", accused, share, limit, f"{text}allowed: {100 * limit:.0f} %")
 
 
 def offset(cycle: Cycle, acceleration: str, seen: Weak) -> Iterator[Doubt]:
@@ -166,16 +88,6 @@ def offset(cycle: Cycle, acceleration: str, seen: Weak) -> Iterator[Doubt]:
     limit += 6.0 * seen.sigma_offset
     if abs(seen.offset) > limit:
         yield drifted(acceleration, seen.offset, limit, "m/s2")
-
-
-def spoken(value: float, unit: str) -> str:
-    """A value in SI as people say it."""
-    return f"{1e3 * value:.4g} mm" if unit == "m" else f"{value:.4g} {unit}".strip()
-
-
-def drifted(channel: str, value: float, limit: float, unit: str) -> Doubt:
-    text = f"{channel} has drifted by {spoken(value, unit)}; allowed: {spoken(limit, unit)}"
-    return Doubt("drift", channel, value, limit, text)
 
 
 def table_mean(cycle: Cycle) -> Iterator[Doubt]:

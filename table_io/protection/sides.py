@@ -10,10 +10,10 @@ import numpy.typing as npt
 
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.protection.consistency import Shared, shared
-from table_io.protection.looks import Cycle, Doubt, drifted, spoken
+from table_io.protection.cycle import Cycle, Doubt, drifted, spoken
 
 SWING = 50.0  # times the noise: a force that tells how it is shared
-ANGLE = 5.0  # degrees: a fifth more or less force on one of two cells
+ANGLE = 3.0  # degrees: a tenth more or less force on one of two cells
 UNEVEN = 25.0  # degrees off equal shares where nothing was seen before: one bears a quarter
 CELL_OFFSET = 0.5  # of the force that counts as contact
 

@@ -28,6 +28,8 @@ stop_hz = 4.4
 step_hz = 1.0
 cycles = 4
 measured_cycles = 2
+[loop_check]
+enabled = false
 [acquisition]
 rate_hz = 1000.0
 """

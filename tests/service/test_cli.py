@@ -146,6 +146,32 @@ def test_prc_says_the_numbers_of_the_summary(recorded: Path) -> None:
     assert f"{found['steps'][0]['measured']['eta_d']:.3f}" in table
 
 
+def test_prc_fits_a_narrow_terminal_and_a_file_is_not_cut(recorded: Path) -> None:
+    command = [SHAKETWIN, "prc", str(recorded)]
+    bare = {key: value for key, value in os.environ.items() if key != "COLUMNS"}
+    narrow, file = (
+        subprocess.run(command, capture_output=True, text=True, check=True, env=env).stdout
+        for env in ({**bare, "COLUMNS": "40"}, bare)
+    )
+    assert max(map(len, narrow.splitlines()[:9])) <= 40
+    assert "3.400" in narrow
+    assert "impacts L" in file
+    assert "…" not in file + narrow
+
+
+def test_help_is_quick() -> None:
+    """What is slow to import is imported by the command that needs it."""
+    slow = "numpy numba scipy pydantic matplotlib mcap zenoh rerun"
+    code = (
+        "import sys; from twin.service.cli import app; "
+        f"print([one for one in {slow.split()} if one in sys.modules])"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == "[]"
+
+
 def test_replay_with_another_model_differs_and_says_by_how_much(
     recorded: Path, tmp_path: Path
 ) -> None:

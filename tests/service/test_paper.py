@@ -18,8 +18,9 @@ from twin.service.paper import command, page
 from twin.service.paper.cases import curve
 from twin.service.paper.findings import bands, per_cycle
 from twin.service.paper.rig import measured
+from twin.service.paper.rows import Row
 from twin.service.paper.study import CHAOS_HZ, Study, study
-from twin.service.paper.table import Row, table
+from twin.service.paper.table import table
 
 from .conftest import BARE, COARSE
 
@@ -129,7 +130,7 @@ def test_impacts_are_cut_where_they_are_rare():
 def draft(monkeypatch: pytest.MonkeyPatch, found: Study) -> None:
     """Every picture, but coarse; the study of this module."""
     monkeypatch.setattr(page, "PAPER_STYLE", {**page.PAPER_STYLE, **COARSE, **BARE})
-    monkeypatch.setattr(command, "study", lambda: found)
+    monkeypatch.setattr(command, "study", lambda *_: found)
 
 
 def test_the_command_leaves_figures_page_and_json(draft, tmp_path: Path):
@@ -154,7 +155,7 @@ def test_the_command_leaves_figures_page_and_json(draft, tmp_path: Path):
 def test_an_existing_folder_with_content_is_refused(tmp_path: Path):
     (tmp_path / "mine").write_text("x")
     with pytest.raises(BadInput, match="exists and has content"):
-        command.paper(tmp_path, [])
+        command.paper(tmp_path, [], None)
 
 
 def test_a_campaign_without_recordings_is_refused(tmp_path: Path):

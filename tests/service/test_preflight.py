@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +42,7 @@ def shipped(name: str) -> Bundle:
 
 
 def said(one: Bundle) -> str:
-    console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console = Console(width=80, record=True, file=StringIO())
     print_plan(console, one)
     return console.export_text()
 
@@ -114,6 +115,10 @@ def test_what_the_sensors_should_see_in_free_flight_is_the_closed_form() -> None
     assert rows["mass_disp_m"].peak == pytest.approx(u_mm + table_mm, rel=1e-3)
     assert rows["force_r1_n"].peak == 0.0
     assert rows["table_acc_m_s2"].used == pytest.approx(0.05 / 2.0)
+    # A sweep begins softly, so its first step has no transient of an abrupt start (2.5 times this).
+    sweep = bundle(TEST.replace("gap_mm = 4.0", "gap_mm = inf"))
+    (mass,) = (row for row in foreseen(sweep) if row.sensor.channel == "mass_acc_m_s2")
+    assert 0.05 * abs(ratio) < mass.peak < 1.7 * 0.05 * abs(ratio)
 
 
 def test_a_load_cell_bears_half_of_its_side_and_the_preload() -> None:
@@ -153,5 +158,7 @@ def test_the_drawing_shows_every_kind_of_drive(test: str, tmp_path: Path) -> Non
     assert picture.shape[0] > 1000
     assert picture.shape[1] > 1000
     inked = (picture[:, :, :3].min(axis=2) < 0.9).mean(axis=1)
-    thirds = np.array_split(inked, 4)  # four panels, each with something in it
-    assert min(float(part.mean()) for part in thirds) > 0.005
+    panels = np.array_split(inked, 4)  # each with something in it
+    assert min(float(part.mean()) for part in panels) > 0.005
+    settling = np.array([0x5C, 0x8F, 0xC2]) / 255
+    assert (np.abs(picture[:, :, :3] - settling).max(axis=2) < 0.02).mean() > 0.004

@@ -122,6 +122,7 @@ class Group:
                 self.outcomes = [self._one(case) for case in self.cases]
             finally:
                 machine.terminate()
+        assert machine.returncode == 0
         return self
 
     def _one(self, case: Case) -> Outcome:
@@ -263,10 +264,18 @@ def test_two_hundred_random_deaths(tmp_path: Path) -> None:
             seconds.setdefault(outcome.case.deed, []).append(proven(group, life, outcome))
             if not group.fault:
                 check_told(group, life, outcome)
+    ends = Counter(end(outcome) for group in groups for outcome in group.outcomes)
     every = np.concatenate([np.array(one) for one in seconds.values()])
     assert every.size == 200
     print(f"\n{every.size} deaths, {samples} samples, none missing, none jumped")
     print(f"seconds to rest: median {np.median(every):.2f}, worst {every.max():.2f}")
-    for deed, count in Counter({deed: len(one) for deed, one in seconds.items()}).most_common():
-        of = np.array(seconds[deed])
-        print(f"  {deed:22} {count:4}  median {np.median(of):.2f}  worst {of.max():.2f}")
+    for deed, of in seconds.items():
+        print(f"  {deed:22} {len(of):4}  median {np.median(of):.2f}  worst {max(of):.2f}")
+    print(f"what the rigs said last: {dict(ends)}")
+
+
+def end(outcome: Outcome) -> str:
+    """How a rig ended: its verdict, an error, or without a word."""
+    over = re.search(r"^over \d+ (\w+)", outcome.said, re.MULTILINE)
+    error = re.search(r"^(?:[\w.]+\.)?(\w+(?:Error|Lost|Interrupt))\b.*\Z", outcome.said, re.M)
+    return over[1] if over else error[1] if error else "nothing"

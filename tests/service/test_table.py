@@ -1,5 +1,6 @@
 """`shaketwin table` and `run --table machine`, as a user meets them."""
 
+import contextlib
 import io
 import os
 import subprocess
@@ -8,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from table_io.backends.machine import MachineBackend
 from table_io.card import PROFILES, BadInput, parse
@@ -45,7 +45,7 @@ def test_what_is_wrong_is_said_before_anything_listens(
     rig: str, listen: str | None, scale: float, part: str
 ) -> None:
     with pytest.raises(BadInput, match=part):
-        table(rig, listen, None, scale, Console(file=io.StringIO()))
+        table(rig, listen, None, scale, io.StringIO())
 
 
 def test_a_run_without_its_table_says_how_to_start_it_and_leaves_nothing(tmp_path: Path) -> None:
@@ -57,20 +57,19 @@ def test_a_run_without_its_table_says_how_to_start_it_and_leaves_nothing(tmp_pat
     assert not (tmp_path / "out").exists()
 
 
-def test_a_terminal_that_is_held_does_not_hold_the_machine(tmp_path: Path) -> None:
-    """Nobody reads what it says, and its pipe is full: it plays on."""
+@pytest.mark.parametrize("gone", [False, True])
+def test_a_terminal_that_is_held_or_gone_does_not_hold_the_machine(
+    tmp_path: Path, gone: bool
+) -> None:
     path = card(tmp_path)
     ours, its = os.pipe()
     command = [SHAKETWIN, "table", "--rig", path, "--log", tmp_path / "box"]
     with subprocess.Popen(command, stdout=its) as machine:
         assert b"waiting at" in os.read(ours, 4096)
-        os.set_blocking(its, False)
-        while True:
-            try:
-                os.write(its, b"." * 1024)
-            except BlockingIOError:
-                break
-        os.set_blocking(its, True)
+        if gone:
+            os.close(ours)
+        else:
+            fill(its)
         rig = parse(path.read_text(), Rig, "card")
         for _ in range(2):
             backend = MachineBackend(rig, SPECIMEN, 2000.0, RealClock())
@@ -80,7 +79,18 @@ def test_a_terminal_that_is_held_does_not_hold_the_machine(tmp_path: Path) -> No
             assert backend.read(100).shape == (len(rig.sensors), 100)
             backend.close()
         machine.terminate()
-    os.close(ours)
     os.close(its)
+    if not gone:
+        os.close(ours)
+    assert machine.returncode == 0
     lives = read_box(tmp_path / "box")
     assert [life.notes[-1][1] for life in lives] == ["at rest", "at rest"]
+
+
+def fill(pipe: int) -> None:
+    """Nobody reads it, and there is no room for another line."""
+    os.set_blocking(pipe, False)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            os.write(pipe, b"." * 1024)
+    os.set_blocking(pipe, True)

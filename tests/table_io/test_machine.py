@@ -1,5 +1,6 @@
 """The machine as a process of its own: what it says, how it watches, how it comes to rest."""
 
+import contextlib
 import json
 import math
 import re
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from table_io.backends import HEARTBEAT_S, PATIENCE_S, MachineLost
@@ -277,6 +278,7 @@ def test_who_goes_before_the_start_leaves_it_free(desk: Desk) -> None:
         (claim(RIG.model_copy(update={"sensors": RIG.sensors[:3]})), "sensors.* differs"),
         (claim(parse(TEXT.replace("bits = 18", "bits = 16"), Rig, "")), "output.* differs"),
         (claim(rate_hz=1234.0), "1234"),
+        (claim(rate_hz=1e300), "allowed: 1000, 2000, 4000"),
     ],
 )
 def test_a_claim_that_does_not_fit_is_refused(desk: Desk, message: Message, why: str) -> None:
@@ -338,6 +340,25 @@ def test_nonsense_does_not_reach_the_table(
     desk.rest()
     (life,) = read_box(desk.folder / "box")
     np.testing.assert_array_equal(life.command_m[: volts.size], volts / SCALE)
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.sampled_from([*Kind]),
+    st.integers(-(2**63), 2**63 - 1),
+    st.one_of(st.binary(max_size=64), st.floats().map(lambda x: np.array([x]).tobytes())),
+)
+def test_whatever_is_said_the_table_answers_or_calls_it_garbage(
+    tmp_path_factory: pytest.TempPathFactory, kind: Kind, index: int, payload: bytes
+) -> None:
+    desk = Desk(tmp_path_factory.mktemp("desk"))
+    for drives in (False, True):
+        if drives:
+            desk.drive(sine(0.1))
+        with contextlib.suppress(Garbage):
+            desk.say(Message(kind, index, payload))
+        if desk.table.claimed:
+            desk.wait(0.02)
 
 
 def test_a_command_far_ahead_does_not_fill_the_memory(desk: Desk) -> None:

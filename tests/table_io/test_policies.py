@@ -102,14 +102,14 @@ def driven(test: Profile, specimen: Specimen) -> Driven:
 
 
 @pytest.mark.parametrize(
-    "card, visits", [({"cycles": 20}, 4), ({"cycles": 21}, 5), ({"seconds": 10.0}, 4)]
+    "card, visits", [({"cycles": 20}, 4), ({"cycles": 21}, 5), ({"seconds": 12.5}, 4)]
 )
 def test_dwell_stays_at_the_last_step_for_as_long_as_asked(
     card: dict[str, Any], visits: int
 ) -> None:
-    one = driven(profile("dwell", card, stop_hz=2.0), lambda step: result(step, 1e-3 + 0j))
-    assert len(one.results) == 11 + visits
-    assert {(step.frequency_hz, step.direction) for step in one.visits} == {(2.0, "forward")}
+    one = driven(profile("dwell", card), lambda step: result(step, 1e-3 + 0j))
+    assert len(one.results) == 7 + visits
+    assert {(step.frequency_hz, step.direction) for step in one.visits} == {(1.6, "forward")}
     assert f"{5 * visits} cycles held in {visits} visits" in one.found
 
 
@@ -235,10 +235,31 @@ def test_no_resonance_in_the_sweep_ends_with_the_sweep(by: str) -> None:
     assert not one.visits
 
 
+@pytest.mark.parametrize("by", ["phase", "peak"])
+def test_no_visit_moves_by_more_than_the_step(by: str) -> None:
+    """A small step costs visits on the way, and is kept from the last step of the sweep on."""
+    card = tracking(by, step_hz=0.01, visits=60)
+    test = profile("track", {**card, "lowest_hz": 1.21})  # the sweep is left before, at 1.2
+    one = driven(test, lambda step: result(step, linear(step.frequency_hz, 1.25)))
+    first = len(one.results) - len(one.visits) - 1
+    moves = np.abs(np.diff([r.step.frequency_hz for r in one.results[first:]]))
+    assert moves.max() <= 0.01 + 1e-9
+    assert len(moves) >= 5
+    assert at(one.found) == pytest.approx(1.25 if by == "phase" else 1.231, abs=0.003)
+
+
 def test_the_range_is_kept_and_the_visits_are_counted() -> None:
     test = profile("track", tracking("phase", lowest_hz=1.0, highest_hz=1.25))
     one = driven(test, lambda step: result(step, linear(step.frequency_hz)))
     assert "was not met" in one.found
+    stiffer = itertools.count()
+
+    def rising(step: Step) -> Result:
+        return result(step, linear(step.frequency_hz, 1.25 + 0.005 * next(stiffer)))
+
+    one = driven(profile("track", tracking("phase", highest_hz=1.31, follow=50)), rising)
+    assert max(step.frequency_hz for step in one.visits) == 1.31
+    assert "at 1.31 Hz the phase is still" in one.found
     runs_away = itertools.count()
 
     def elusive(step: Step) -> Result:
@@ -255,6 +276,14 @@ def test_without_u_there_is_nothing_to_go_by(tool: str, card: dict[str, Any] | N
     one = driven(test, lambda step: result(step, complex("nan"), math.nan))
     assert "was not measured at 1 Hz" in one.found
     assert not one.visits
+
+
+def test_a_phase_near_180_degrees_does_not_flip_its_sign() -> None:
+    """Far below a resonance u lies against A: noise makes it 179 or 181, never -179."""
+    step = Step(0, "forward", 0.5, A)
+    for phase in (179.0, 181.0, 90.0, 0.0, -5.0):
+        u = cmath.rect(1e-3, math.radians(phase))
+        assert result(step, u).phase_deg == pytest.approx(phase, abs=1e-9)
 
 
 def test_a_crossing_is_interpolated_over_the_phase() -> None:
@@ -390,6 +419,42 @@ def test_a_jump_that_comes_late_is_found_earlier_the_longer_a_frequency_is_held(
     assert "20 held cycles a frequency" in long.found
 
 
+def test_a_jump_that_takes_two_steps_of_the_sweep_is_one() -> None:
+    """The first visit after the fold is passed finds the motion half way down."""
+    specimen, before = Bistable(2.7912, 4.0274), []
+
+    def falling(step: Step) -> Result:
+        seen = specimen(step)
+        before.append(seen.swing_m)
+        if len(before) > 1 and before[-1] < 0.5 * before[-2]:
+            return replace(seen, swing_m=math.sqrt(0.99 * before[-1] * before[-2]))
+        return seen
+
+    forward = WIDE | {"directions": ["forward"]}
+    one = driven(profile("refine", refining(), **forward), falling)
+    assert one.found.count("down-jump") == 1
+    good, bad = intervals(one.found)["down-jump forward"]
+    assert good <= 4.0274 <= bad <= good + 0.0125 + 1e-9
+
+
+def test_a_fold_that_drifts_under_way_is_found_where_it_is_last() -> None:
+    """What was good before is no longer: the interval moves back with it."""
+    specimen = Bistable(2.7912, 4.0274)
+
+    def drifting(step: Step) -> Result:
+        was = specimen.large
+        seen = specimen(step)
+        if was and not specimen.large:
+            specimen.falls_hz -= 0.025
+        return seen
+
+    forward = WIDE | {"directions": ["forward"]}
+    one = driven(profile("refine", refining(resolution_hz=0.004), **forward), drifting)
+    good, bad = intervals(one.found)["down-jump forward"]
+    assert bad - good <= 0.004 + 1e-9
+    assert good <= specimen.falls_hz + 0.025 <= bad
+
+
 @pytest.mark.parametrize("cycles", [5, 60, 150, 400])
 def test_the_cycles_allowed_are_never_exceeded(cycles: int) -> None:
     test = profile("refine", refining(cycles=cycles, resolution_hz=0.002), **WIDE)
@@ -518,9 +583,14 @@ def test_a_rehearsal_plays_the_sweep_and_ends() -> None:
     assert len([segment for segment in drive.segments if segment.cycles]) == 2
 
 
-def test_a_person_may_hold_a_decided_step_and_go_on() -> None:
+@pytest.mark.parametrize("after", [0, 2000])
+def test_a_person_may_hold_a_decided_step_and_go_on(after: int) -> None:
+    """Also between a decision and its step: the step before is then measured anew."""
     table = Table(start(score(dwelling(enabled=False), RIG, 40)))
-    said = table.play(20, until=12_000)
+    said: list[Record] = []
+    while not [one for one in said if isinstance(one, Decided) and one.step == 3]:
+        said += table.play(20, until=table.at + 20)
+    said += table.play(20, until=table.at + after)
     held = int(table.now.drive.labels(table.at, 1)[0][0])
     assert held >= 2, "the case must lie in a decided step"
     table.now = hold(table.now, table.at + 100)
@@ -528,7 +598,8 @@ def test_a_person_may_hold_a_decided_step_and_go_on() -> None:
     said += table.play(20, until=table.at + 6000)
     table.now = resume(table.now, table.at + 100)
     said += table.play(20)
-    assert [one.step.index for one in table.now.results] == [0, 1, 2, 3, 4]
+    measured = [one.step.index for one in table.now.results]
+    assert measured == ([0, 1, 2, 3, 4] if after else [0, 1, 2, 4, 5])
     assert [one.kind for one in said if isinstance(one, Event)] == ["found"]
 
 

@@ -61,10 +61,7 @@ def test_the_quickstart_covers_the_primary_resonance_of_g4_both_ways() -> None:
         *(f"tests/{name}" for name in [*PAPER, "quickstart"]),
         "models/snm",
         "rigs/simulated",
-        pytest.param(
-            "campaigns/paper",
-            marks=pytest.mark.xfail(reason="campaigns are not written yet", strict=True),
-        ),
+        "campaigns/paper",
     ],
 )
 def test_the_files_that_users_script_against_are_there(name: str) -> None:

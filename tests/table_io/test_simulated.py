@@ -233,6 +233,25 @@ def test_what_is_in_the_device_cannot_be_replaced(rate_hz: float) -> None:
     machine.queue(earliest, np.zeros(10))
 
 
+@pytest.mark.parametrize("away_s", [0.0, 0.001, 0.3])
+def test_the_machine_plays_on_while_nobody_reads(away_s: float) -> None:
+    clock = ManualClock()
+    machine = backend(clock=clock)
+    machine.queue(0, command(1.0))
+    machine.start()
+    machine.read(100)
+    clock.wait_until(clock.now() + away_s)
+    newest = 99 + round(away_s * RATE)
+    earliest = newest + machine.replace_after
+    with pytest.raises(ValueError, match=f"allowed: from {earliest} on"):
+        machine.queue(earliest - 1, np.zeros(10))
+    machine.queue(earliest, np.zeros(10))
+    volts = command(1.0)
+    volts[earliest:] = 0.0
+    behind = machine.read(900)
+    assert behind.tobytes() == played(volts, [100, 900])[:, 100:].tobytes()
+
+
 def test_a_command_that_is_no_number_is_refused() -> None:
     with pytest.raises(ValueError, match="NaN"):
         backend().queue(0, np.array([0.0, np.nan]))

@@ -20,6 +20,7 @@ from twin.model.model import Model
 from twin.model.parameters import resonance
 
 Piece = tuple[Block, Block]  # the same samples measured and predicted
+DIVERGED, AGREES = 0.10, 0.05  # error of the restarted twin's u over a cycle, over its amplitude
 SHORT = 3  # samples by which a held cycle may miss its length and still be whole
 
 
@@ -59,6 +60,7 @@ class State:
     base_acc: tuple[Float1D, ...] = ()  # of its measured cycles
     touching: tuple[Touching, Touching] = (UNKNOWN, UNKNOWN)  # measured, twin
     last_point: Point | None = None
+    diverged: bool = False  # the restarted twin has left the measurement, and that was said
 
 
 def prepare(
@@ -192,9 +194,31 @@ def _cycle(setup: Setup, state: State, step: int, number: int) -> tuple[State, l
     if label == Label.MEASURE:
         table = np.concatenate([block.channel("table_acc_m_s2") for block, _ in held])
         base_acc = (*base_acc, table[lead:])
+    state, said = _divergence(state, held, end)
     return replace(
         state, cycles=(*state.cycles, cycle), base_acc=base_acc, touching=(touch_m, touch_t)
-    ), [cycle]
+    ), [cycle, *said]
+
+
+def _divergence(state: State, held: tuple[Piece, ...], end: int) -> tuple[State, list[Record]]:
+    """A warning where even the twin that restarts from the measured state leaves it.
+
+    Said once, and again only after the two have agreed in between. It never stops a table.
+    """
+    measured = np.concatenate([rel_disp(block) for block, _ in held])
+    twin = np.concatenate([one.channel("window/rel_disp_m") for _, one in held])
+    amplitude = 0.5 * float(np.ptp(measured))
+    error = float(np.sqrt(np.mean((measured - twin) ** 2)))
+    if not (np.isfinite(error) and amplitude > 0.0):
+        return state, []
+    share = error / amplitude
+    if state.diverged or share <= DIVERGED:
+        return replace(state, diverged=state.diverged and share > AGREES), []
+    text = (
+        f"the twin has left the measurement: u is off by {100 * share:.0f} % of its amplitude "
+        f"within a window ({1e3 * error:.3g} mm rms)"
+    )
+    return replace(state, diverged=True), [Event(end, "divergence", text)]
 
 
 def _point(setup: Setup, state: State) -> tuple[State, list[Record]]:

@@ -2,11 +2,16 @@
 
 import contextlib
 import enum
+import os
 import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+# Matrices are small here; on a busy machine the threads of a BLAS stall what they should speed up,
+# a run's own processes included. Set before numpy is imported, and inherited.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -23,6 +28,15 @@ TestProfile = Annotated[Path, typer.Argument(metavar="PROFILE", help="Test profi
 Log = Annotated[Path, typer.Argument(metavar="LOG", help="A run.mcap, or the folder of a run.")]
 Out = Annotated[Path | None, typer.Option("--out", help="Folder for the results; must be new.")]
 Model = Annotated[str | None, typer.Option("--model", help="Model: a name or a .toml file.")]
+
+
+class Told(enum.StrEnum):
+    """What can be asked of a running test."""
+
+    hold = "hold"
+    resume = "resume"
+    stop = "stop"
+    abort = "abort"
 
 
 class Speed(enum.StrEnum):
@@ -110,11 +124,9 @@ def table(
     ] = 1.0,
 ) -> None:
     """The simulated table as a machine of its own, for `run PROFILE --table machine`."""
-    from rich.console import Console
-
     from twin.service.table import table as command
 
-    command(rig, listen, log, time_scale, Console())
+    command(rig, listen, log, time_scale, sys.stdout)
 
 
 @app.command(rich_help_panel=DRIVE)
@@ -169,16 +181,17 @@ def prc(
 
 @app.command(rich_help_panel=LOOK)
 def paper(
+    model: Model = None,
     out: Out = None,
     campaign: Annotated[
         list[Path] | None,
         typer.Option("--campaign", help="A recording, or a folder of them; may be repeated."),
     ] = None,
 ) -> None:
-    """Every figure of the paper by the model, and where the two agree or depart."""
+    """Every figure of the paper by its model or another, and where the two agree or depart."""
     from twin.service.paper.command import paper as command
 
-    command(out, campaign or [])
+    command(out, campaign or [], model)
 
 
 @app.command(rich_help_panel=LOOK)
@@ -209,6 +222,21 @@ def view(
     from twin.service.viewing import show as command
 
     command(log, save, picture, connect, rig)
+
+
+@app.command(rich_help_panel=DRIVE)
+def tell(
+    order: Annotated[Told, typer.Argument(help="What the running test should do.")],
+    why: Annotated[str, typer.Option("--why", help="Recorded with the order.")] = "",
+    connect: Annotated[
+        str, typer.Option("--connect", help="Bus of the running test.")
+    ] = "tcp/127.0.0.1:7447",
+    rig: Annotated[str, typer.Option("--rig", help="Name of the running rig.")] = "simulated",
+) -> None:
+    """Hold a running test at its step, resume it, stop or abort it; always smoothly."""
+    from twin.service.tell import tell as command
+
+    command(order.value, why, connect, rig)
 
 
 def main() -> None:

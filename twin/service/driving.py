@@ -7,7 +7,7 @@ from pathlib import Path
 from table_io.backends.machine import answers
 from table_io.card import BadInput
 from table_io.clock import RealClock
-from table_io.limits import warnings
+from table_io.limits import doubts, warnings
 from twin.service.bundle import Bundle, read_bundle, run_id
 from twin.service.folders import new_folder, new_run
 from twin.service.kernels import ready
@@ -47,7 +47,7 @@ def run(
         real_time(bundle, profile)
     ready(bundle, table=True)
     folder, run_name = new_run(out, bundle.name)
-    for sentence in warnings(bundle.margins, bundle.rig):
+    for sentence in (*warnings(bundle.margins, bundle.rig), *doubts(bundle.profile, bundle.rig)):
         say(f"warning: {sentence}")
     say(
         f"{bundle.profile.title}: {len(bundle.steps)} steps, "

@@ -31,6 +31,7 @@ from twin.service.close_ups import (
     key,
 )
 from twin.service.evidence import DIRECTIONS, SIDES, Run, curve, envelopes, prestress, step_errors
+from twin.service.level_figure import levels
 
 MARKER = {"forward": 4.6, "backward": 2.6}  # both show where they coincide
 BAND = {"right": "#fff0a8", "left": "#b9f0f4"}
@@ -61,7 +62,7 @@ def draw_all(run: Run, folder: Path) -> list[Picture]:
         stale.unlink()
     pictures = []
     with mpl.rc_context(STYLE):
-        for draw in (_curves, _impacts, histories, cycles, _errors, _overview):
+        for draw in (_curves, _impacts, histories, cycles, _errors, _overview, levels):
             for name, title, caption, figure in draw(run):
                 figure.savefig(folder / f"{name}.png")
                 pictures.append(Picture(folder / f"{name}.png", title, caption))

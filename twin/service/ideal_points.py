@@ -13,14 +13,18 @@ from twin.model.sweep import SteppedSine
 
 
 def points(
-    model: Model, steps: Sequence[Step], played: SteppedSine, measured_cycles: int
+    model: Model,
+    steps: Sequence[Step],
+    played: SteppedSine,
+    measured_cycles: int,
+    stars: tuple[float, float] | None = None,
 ) -> tuple[Point, ...]:
     """The PRC point of every step as `twin`, means over its last cycles.
 
-    u* and a* are those of the model's linear part, as in a run.
+    u* and a* are those of the model's linear part, as in a run, unless `stars` gives others.
     """
     p, held = model.parameters, played.extremes.shape[1]
-    u_star, a_star, _ = resonance(p, max(step.acceleration_m_s2 for step in steps))
+    u_star, a_star = stars or resonance(p, max(step.acceleration_m_s2 for step in steps))[:2]
     frequency = np.array([step.frequency_hz for step in steps])
     begins = np.concatenate([[0.0], np.cumsum(held / frequency)[:-1]])[:, None]
     ends_s = begins + np.arange(1, held + 1) / frequency[:, None]

@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.table import Table
 
 from twin.service.summary import Json
-from twin.service.terminal import has_room
+from twin.service.terminal import has_room, print_table
 
 Cell = Callable[[Json], str]  # of a step's "measured" or "twin"
 
@@ -44,31 +44,20 @@ FORMS = (ALL, ("eta_d", "eta_a", "impacts R/L"), ("eta_d", "impacts R/L"), ("eta
 def print_prc(console: Console, found: Json) -> None:
     """The curves of a summary, measured | twin, then jumps and hysteresis."""
     names = _form(console, found)
-    if names:
-        console.print(_table(found, names))
-    else:
-        console.print(f"{found['run']['title']}: eta_d measured | twin", highlight=False)
-        for step in found["steps"]:
-            console.print(
-                f"{step['direction'][:1]} {step['frequency_hz']:.3f} {_pair(step, 'eta_d')}",
-                highlight=False, soft_wrap=True,
-            )  # fmt: skip
+    print_table(console, _table(found, names))
     if names != ALL:
         console.print(
             f"{console.width} columns are not enough for all of it: --json has it, and so has a "
             "wider terminal",
             highlight=False,
         )
-    for text in _branches(found):
+    for text in (*found.get("found", ()), *_branches(found)):
         console.print(text, highlight=False, soft_wrap=True)
 
 
 def _form(console: Console, found: Json) -> tuple[str, ...]:
-    """The most columns for which there is room; none where not even one has."""
-    for names in FORMS:
-        if has_room(console, _table(found, names)):
-            return names
-    return ()
+    """The most columns for which there is room; the fewest where not even they have."""
+    return next((one for one in FORMS if has_room(console, _table(found, one))), FORMS[-1])
 
 
 def _table(found: Json, names: tuple[str, ...]) -> Table:

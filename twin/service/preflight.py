@@ -1,4 +1,4 @@
-"""What `check` and `prc` print: the plan with its margins, and the curves as a table."""
+"""What `check` prints: the plan with its margins, and what the sensors should see."""
 
 import math
 from dataclasses import replace
@@ -18,9 +18,9 @@ from table_io.units import GRAVITY_M_S2
 from twin.service.bundle import Bundle
 from twin.service.drive_figure import draw_drive
 from twin.service.foreseen import Foreseen, clipped, foreseen
-from twin.service.summary import Json
+from twin.service.terminal import print_table
 
-__all__ = ["draw_drive", "print_plan", "print_prc"]
+__all__ = ["draw_drive", "print_plan"]
 
 ROWS = 12  # frequencies in the table of steps
 
@@ -31,8 +31,8 @@ def print_plan(console: Console, bundle: Bundle) -> None:
     for name, text in _plan(bundle):
         console.print(f"  {name:<11}{text}", highlight=False, soft_wrap=True)
     sensors = foreseen(bundle)
-    console.print(_steps(bundle))
-    console.print(_sensors(bundle, sensors))
+    print_table(console, _steps(bundle))
+    print_table(console, _sensors(bundle, sensors))
     said = [
         *warnings(bundle.margins, bundle.rig),
         *doubts(bundle.profile, bundle.rig),
@@ -200,44 +200,3 @@ def _sensors(bundle: Bundle, rows: tuple[Foreseen, ...]) -> Table:
             _percent(row.used),
         )
     return table
-
-
-def print_prc(console: Console, found: Json) -> None:
-    """The curves of a summary as a table, then jumps and hysteresis."""
-    table = Table(title=f"{found['run']['title']}: measured | twin")
-    heads = ("f [Hz]", "eta_d", "eta_a", "eta_R", "eta_L", "r_R", "r_L", "impacts R", "impacts L")
-    table.add_column("direction")
-    for head in heads:
-        table.add_column(head, justify="right")
-    keys = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l")
-    for step in found["steps"]:
-        measured, twin = step["measured"] or {}, step["twin"] or {}
-        cells = [f"{_number(measured.get(key))} | {_number(twin.get(key))}" for key in keys]
-        for key in ("impacts_right", "impacts_left"):
-            cells.append(f"{_mean(measured.get(key))} | {_mean(twin.get(key))}")
-        table.add_row(step["direction"], f"{step['frequency_hz']:.3f}", *cells)
-    console.print(table)
-    for text in found.get("found", ()):
-        console.print(text, highlight=False, soft_wrap=True)
-    for interval in found["hysteresis"]:
-        console.print(
-            f"{interval['kind']} hysteresis from {interval['from_hz']:g} to "
-            f"{interval['to_hz']:g} Hz",
-            highlight=False,
-        )
-    for jump in found["jumps"]:
-        console.print(
-            f"jump {jump['kind']}, {jump['direction']}, between {jump['from_hz']:g} and "
-            f"{jump['to_hz']:g} Hz",
-            highlight=False,
-        )
-    if not found["hysteresis"]:
-        console.print("no hysteresis on this grid", highlight=False)
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
-
-
-def _mean(values: list[int] | tuple[int, ...] | None) -> str:
-    return "-" if not values else f"{sum(values) / len(values):.3g}"

@@ -5,8 +5,20 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from table_io.records import Comparison, Decided, Event, Fault, Gap, Point, Quantities, Timing
+from table_io.records import (
+    Check,
+    Comparison,
+    Decided,
+    Event,
+    Fault,
+    Gap,
+    Point,
+    Quantities,
+    Timing,
+    Trip,
+)
 from table_io.units import GRAVITY_M_S2
+from table_io.words import sentence
 from twin.stream.wire import Item
 
 HEAD = (
@@ -64,6 +76,9 @@ class RunProgress:
         elif isinstance(item, Gap):
             name = item.channel or "all channels"
             self.say(f"{'':>7}  gap: {item.count} samples of {name} {item.reason}")
+        elif isinstance(item, Trip) or (isinstance(item, Check) and not item.passed):
+            told = sentence(item, 1.0)
+            self.say(f"{'':>7}  {told[1] if told else ''}")
         elif isinstance(item, Fault):
             self.say(
                 f"{'':>7}  fault: {item.component} missing for samples {item.from_index} to "

@@ -14,7 +14,7 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from table_io.card import BadInput
-from table_io.records import Event, Fault, Gap, Params, Timing
+from table_io.records import Check, Event, Fault, Gap, Level, Params, Response, Timing, Trip
 from twin.service.evidence import Run, Summary, cards, gather, quantity
 from twin.service.figures import Picture, draw_all
 from twin.stream.mcap_log import Recording, read
@@ -88,11 +88,29 @@ def render(run: Run, pictures: list[Picture]) -> str:
         timings={one.component: one for one in recording.of(Timing)},
         gaps=recording.of(Gap),
         faults=recording.of(Fault),
-        events=recording.of(Event),
+        events=[one for one in recording.of(Event) if one.kind != "state"],
+        states=recording.stop.states if recording.stop else (),
+        checks=recording.of(Check),
+        trips=recording.of(Trip),
+        response=next(iter(recording.of(Response)), None),
+        level=worst_level(run),
         parameters=recording.of(Params),
         most_rows=MOST_ROWS,
         quantity=quantity,
     )
+
+
+def worst_level(run: Run) -> dict[str, float] | None:
+    """Largest errors of the level over all steps, with and without control, and most updates."""
+    found = [step["level"] for step in run.steps if step.get("level")]
+    if not found:
+        return None
+    return {
+        "controlled": max(abs(one["error"]) for one in found),
+        "uncontrolled": max(abs(one["error_uncorrected"]) for one in found),
+        "updates": max(one.update for one in run.recording.of(Level)),
+        "steps": len(found),
+    }
 
 
 def headline(run: Run) -> str:

@@ -196,7 +196,7 @@ def _again(recording: Recording, setup: pipeline.Setup, run: str, bundle: Bundle
 def _of_the_rig(item: Item) -> bool:
     """True for what a replay repeats; what the twin said is said anew."""
     if isinstance(item, Event):
-        return item.kind != "jump"
+        return item.kind not in ("jump", "divergence")
     return not isinstance(item, (Block, RunStart, Timing, *TWIN_RECORDS))
 
 

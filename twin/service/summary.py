@@ -11,7 +11,19 @@ import numpy as np
 from table_io.card import parse
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.profile import Profile
-from table_io.records import Comparison, Decided, Event, Fault, Gap, Point, Quantities, Timing
+from table_io.records import (
+    Check,
+    Comparison,
+    Decided,
+    Event,
+    Fault,
+    Gap,
+    Level,
+    Point,
+    Quantities,
+    Timing,
+    Trip,
+)
 from twin.compare import COMPARED
 from twin.compare.curves import branches
 from twin.model.model import Model
@@ -33,6 +45,7 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
     planned = [point for point in points if point.step not in reasons]
     jumps, intervals = branches(planned, source)
     twin_jumps, twin_intervals = branches(planned, "twin")
+    looks = recording.of(Level)
     stop = recording.stop
     samples = stop.index if stop else max((one.end for one in recording.blocks("meas")), default=0)
     return {
@@ -59,7 +72,9 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         "faults": [asdict(fault) for fault in recording.of(Fault)],
         "u_star_m": u_star,
         "a_star_m_s2": a_star,
-        "steps": [_step(point) for point in planned],
+        "checks": [asdict(check) for check in recording.of(Check)],
+        "trips": [asdict(trip) for trip in recording.of(Trip)],
+        "steps": [_step(point) | _level(point, looks) for point in planned],
         # What a test decided on as it went: no points of a curve.
         "visits": [
             {**_step(point), "reason": reasons[point.step]}
@@ -106,6 +121,25 @@ def _step(point: Point) -> Json:
         "table_acc_peak_m_s2": point.table_acc_peak_m_s2,
         "table_acc_fundamental_m_s2": point.table_acc_fundamental_m_s2,
         "thd": point.thd,
+    }
+
+
+def _level(point: Point, looks: tuple[Level, ...]) -> Json:
+    """How the level of a step was reached; empty where nobody looked."""
+    own = [one for one in looks if one.step == point.step]
+    if not own:
+        return {}
+    last = own[-1]
+    reached = point.table_acc_fundamental_m_s2
+    return {
+        "level": {
+            "demanded_m_s2": last.demanded_m_s2,
+            "error": reached / last.demanded_m_s2 - 1,
+            "error_uncorrected": reached / last.correction / last.demanded_m_s2 - 1,
+            "correction": last.correction,
+            "updates": last.update,
+            "accepted": last.accepted,
+        }
     }
 
 

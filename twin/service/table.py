@@ -4,8 +4,7 @@ import contextlib
 import select
 import signal
 from pathlib import Path
-
-from rich.console import Console
+from typing import TextIO
 
 from table_io.card import BadInput, find, load
 from table_io.clock import RealClock
@@ -21,7 +20,7 @@ FASTEST = 20.0
 
 
 def table(
-    rig_name: str, listen: str | None, log: Path | None, time_scale: float, console: Console
+    rig_name: str, listen: str | None, log: Path | None, time_scale: float, out: TextIO
 ) -> None:
     """Be the machine of a card until told to end; it ends at rest."""
     rig, _ = load(find(rig_name, "rigs"), Rig, "machine card")
@@ -32,11 +31,9 @@ def table(
     where = endpoint(listen or (rig.machine.endpoint if rig.machine else ""))
 
     def tell(text: str) -> None:
-        if _free(console):
+        if _free(out):
             with contextlib.suppress(OSError):
-                console.print(
-                    f"table {rig.name}: {text}", highlight=False, soft_wrap=True, markup=False
-                )
+                print(f"table {rig.name}: {text}", file=out, flush=True)
 
     with contextlib.closing(listening(where)) as listener:
         box = BlackBox(log, tell) if log is not None else None
@@ -52,9 +49,9 @@ def table(
         tell("switched off at rest")
 
 
-def _free(console: Console) -> bool:
+def _free(out: TextIO) -> bool:
     """True where a line can be shown at once: a terminal that is held must not hold the machine."""
     try:
-        return bool(select.select([], [console.file], [], 0.0)[1])
+        return bool(select.select([], [out], [], 0.0)[1])
     except (OSError, ValueError):
         return True  # no file of the system's: nothing to wait for

@@ -1,15 +1,14 @@
 """`shaketwin tell`: hold, resume, stop or abort a test that runs in another terminal."""
 
-from rich.console import Console
-
 from table_io.card import BadInput
+from twin.service.terminal import say
 from twin.stream.zenoh_link import open_spoke
 
 CONNECT_S = 3.0
 ANSWER_S = 2.0
 
 
-def tell(order: str, why: str, connect: str, rig: str, console: Console) -> None:
+def tell(order: str, why: str, connect: str, rig: str) -> None:
     """Hand an order to the rig that runs at the endpoint; BadInput where it does not take it."""
     link = open_spoke(rig, connect, CONNECT_S)
     try:
@@ -24,4 +23,4 @@ def tell(order: str, why: str, connect: str, rig: str, console: Console) -> None
             f"{order}: {answer or f'the rig did not answer within {ANSWER_S:g} s'}; "
             "in need use the machine's own emergency stop"
         )
-    console.print(f"{runs[0]}: told to {order}", highlight=False)
+    say(f"{runs[0]}: told to {order}")

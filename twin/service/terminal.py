@@ -33,6 +33,20 @@ def has_room(on: Console, table: Table) -> bool:
     return on.measure(table, options=on.options.update(width=WIDE)).maximum <= on.width
 
 
+def print_table(on: Console, table: Table) -> None:
+    """The table, or where it has no room a line for each of its rows."""
+    if has_room(on, table):
+        on.print(table)
+        return
+    if table.title:
+        on.print(table.title, highlight=False, soft_wrap=True)
+    first, *rest = table.columns
+    for place, name in enumerate(map(str, first.cells)):
+        cells = [(str(one.header), str([*one.cells][place])) for one in rest]
+        text = ", ".join(f"{head} {cell}" for head, cell in cells if cell)
+        on.print(f"  {first.header} {name}: {text}", highlight=False, soft_wrap=True)
+
+
 @contextmanager
 def interruptible(
     sentence: str = "stopping: the table decays to rest",

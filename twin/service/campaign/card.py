@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, ValidationError, field_validator
 
 from table_io.card import PROFILES, BadInput, Card, Count, find, parse, read_text
 from table_io.limits import warnings as coarse
@@ -47,10 +47,6 @@ class CampaignCard(Card):
     def _some(cls, runs: tuple[RunCard, ...]) -> tuple[RunCard, ...]:
         if not runs:
             raise ValueError('no run in it; add at least one [[runs]] with profile = "..."')
-        labels = [label for run in runs for label in run.labels]
-        twice = sorted({label for label in labels if labels.count(label) > 1})
-        if twice:
-            raise ValueError(f"label {', '.join(map(repr, twice))} stands twice; give each its own")
         return runs
 
 
@@ -90,14 +86,19 @@ def read_plan(path: Path, table: str | None, model: str | None, allowed: Allowed
     text = read_text(path, "campaign")
     faults: dict[str, list[str]] = {}
     bundles: dict[str, Bundle] = {}
-    for name in dict.fromkeys(_profiles(text)):
+    entries = _entries(text)
+    for name in dict.fromkeys(run.profile for run in entries):
         place = path
         try:
             place = _place(name, path)
             bundles[name] = read_bundle(place, table, model)
+            _free_of_ours(bundles[name])
             allowed(bundles[name], place)
         except BadInput as error:
             faults.setdefault(str(error).removeprefix(f"{place}: "), []).append(name)
+    labels = [label for run in entries for label in run.labels]
+    if twice := sorted({label for label in labels if labels.count(label) > 1}):
+        faults[f"label {', '.join(map(repr, twice))} stands twice; give each its own"] = ["runs"]
     try:
         card = parse(text, CampaignCard, str(path))
     except BadInput as error:
@@ -112,15 +113,20 @@ def read_plan(path: Path, table: str | None, model: str | None, allowed: Allowed
     return Plan(path, card, text, tuple(Planned(n, *one) for n, one in enumerate(runs, 1)))
 
 
-def _profiles(text: str) -> list[str]:
-    """The profiles that a campaign's text names, as far as it can be read at all."""
+def _entries(text: str) -> list[RunCard]:
+    """The runs that a campaign's text lists, unchecked, as far as it can be read at all."""
     try:
         runs: Any = tomllib.loads(text).get("runs")
     except tomllib.TOMLDecodeError:
         return []
-    entries = runs if isinstance(runs, list) else []
-    names = [one.get("profile") for one in entries if isinstance(one, dict)]
-    return [name for name in names if isinstance(name, str)]
+    found = []
+    for one in runs if isinstance(runs, list) else []:
+        try:
+            known = {name: one[name] for name in ("profile", "label", "repeat") if name in one}
+            found.append(RunCard.model_validate(known))
+        except (ValidationError, TypeError):
+            continue  # the card says what is wrong
+    return found
 
 
 def _place(name: str, path: Path) -> Path:
@@ -134,6 +140,12 @@ def _place(name: str, path: Path) -> Path:
     ours = sorted(one.stem for one in (PROFILES / "tests").glob("*.toml"))
     hint = f"did you mean {near[0]!r}?" if near else f"ours, by name: {', '.join(ours)}"
     raise BadInput(f"{name}: no such test profile in {beside.parent}; {hint}")
+
+
+def _free_of_ours(bundle: Bundle) -> None:
+    for name in ("resume", "set_up"):
+        if getattr(bundle.profile, name) is not None:
+            raise BadInput(f"[{name}]: a campaign writes it itself; take it out of the profile")
 
 
 def _told(faults: dict[str, list[str]]) -> list[str]:

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from twin.service.paper.cases import Case, Motion, curve
+from twin.service.paper.cases import Case, curve
 from twin.service.paper.look import (
     AT_REST,
     COLOUR,
@@ -24,6 +24,7 @@ from twin.service.paper.look import (
     pen,
     portrait,
 )
+from twin.service.paper.players import Motion
 from twin.service.paper.rig import Rig
 from twin.service.paper.study import CLOSE_HZ, Study
 
@@ -70,7 +71,7 @@ def _frequencies(case: Case, rig: Rig | None) -> Drawing:
         if not ax.lines:
             ax.text(0.5, 0.7, "not measured", transform=ax.transAxes, ha="center", color=GUIDE)
         letter(ax, LETTERS[place], f"{CLOSE_HZ[column_]:g} Hz, {who[row % 2]}")
-        obstacles(case.parameters.gap_r, ax.axvline)
+        obstacles(case.parameters, ax.axvline)
         ax.axhline(0, color=GUIDE, lw=0.5, zorder=0.6)
         ax.set_xlabel("$u$ in mm" if row == 3 else "")
         if column_ == 0:
@@ -84,8 +85,8 @@ def _frequencies(case: Case, rig: Rig | None) -> Drawing:
         "cycles of the step. "
         + ("Red and blue: rig, forward and backward; black: model. " if rig else
            "Solid: forward; dashed: backward, in the row below. ")
-        + "Vertical dashed lines: the gap. From 0.53 to 1.4 Hz the motion is chaotic: its kind and "
-        "its extent compare, not the single cycle.",
+        + "Vertical dashed lines: the gap. Where the motion is chaotic, its kind and its extent "
+        "compare, not the single cycle.",
         figure,
     )  # fmt: skip
 
@@ -138,7 +139,7 @@ def _histories(case: Case, rig: Rig | None) -> Drawing:
             for ax in column if one == "forward" else ():
                 contact_bands(ax, motion, TWIN, alpha=0.07)
         letter(column[0], "abc"[number], f"$f$ = {hz:g} Hz")
-        obstacles(case.parameters.gap_r, column[0].axhline)
+        obstacles(case.parameters, column[0].axhline)
         column[-1].set_xlabel("$t$ in s")
         column[-1].set_xlim(0, (CYCLES - (rig is not None)) / hz)
     for ax, label in zip(axes[:, 0], ("$u$ in mm", "$a$ in m/s²", "$F_j$ in kN"), strict=True):
@@ -149,8 +150,8 @@ def _histories(case: Case, rig: Rig | None) -> Drawing:
         "Relative displacement, total acceleration and contact forces over the last three cycles "
         "of the step at a 0.53 Hz, b 1.4 Hz, c 3.4 Hz, from a zero upcrossing of the table's "
         "acceleration. Black: model" + ("; red and blue: rig" if rig else "") + ". Grey bands: "
-        "contacts of the model, forward. Dashed in the first row: the gap. In chaos (a, b) no two "
-        "records agree cycle by cycle, and at 1.4 Hz history picks the side that is hit twice.",
+        "contacts of the model, forward. Dashed in the first row: the gap. In chaos no two records "
+        "agree cycle by cycle, and at 1.4 Hz history picks the side that is hit twice.",
         figure,
     )  # fmt: skip
 

@@ -12,18 +12,17 @@ from functools import cached_property
 import numpy as np
 
 from table_io.block import Float1D
-from table_io.card import find, load
+from table_io.card import BadInput, find, load
 from table_io.profile import Profile
-from table_io.records import Point, Quantities, Step
+from table_io.records import Point, Step
 from table_io.units import GRAVITY_M_S2
-from twin.model import exact
-from twin.model.card import ModelCard
 from twin.model.ideal import swept
 from twin.model.model import Model
-from twin.model.orbit import onsets
 from twin.model.parameters import Parameters, resonance
-from twin.model.sinusoid import Float3D
-from twin.model.sweep import EXTREMES, SteppedSine, stepped_sine
+from twin.model.sweep import SteppedSine
+from twin.service import ideal_points
+from twin.service.bundle import read_model
+from twin.service.paper.players import Motion, Player, player
 
 GAPS: dict[str, tuple[str, ...]] = {
     "G∞": ("ginf",), "G30": ("g30",), "G16": ("g16",), "G10": ("g10",),
@@ -31,40 +30,6 @@ GAPS: dict[str, tuple[str, ...]] = {
     "G-10": ("gm10",),
 }  # fmt: skip
 UNTIL_HZ = {"g4_ss1": 0.79, "g4_ss2": 1.6}  # G4: up to here this sweep, above it the next
-SAMPLES = 2000  # a cycle, of the motions in the pictures
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Motion:
-    """Motion over some cycles, SI, right positive, (sample,); v_r, v_l: positions of the bumpers.
-
-    A bumper without force stands still there or relaxes; a measured one is NaN out of contact.
-    """
-
-    time: Float1D
-    u: Float1D
-    v: Float1D
-    a: Float1D
-    force_r: Float1D
-    force_l: Float1D
-    v_r: Float1D
-    v_l: Float1D
-
-
-def sample(
-    parameters: Parameters, frequency_hz: float, acceleration: float, state: Float1D, cycles: int
-) -> Motion:
-    """The motion from a state at a zero upcrossing of A, `SAMPLES` a cycle."""
-    count, rate = cycles * SAMPLES, frequency_hz * SAMPLES
-    number = np.arange(count + 1)
-    base = acceleration * np.sin(2 * math.pi * number / SAMPLES)
-    out = np.empty((len(exact.OUTPUTS), count))
-    exact.advance(state.copy(), exact.constants(parameters, rate), base[1:], out)
-    u, v, a, force_r, force_l, u_r, u_l = out
-    return Motion(
-        number[:-1] / rate, u, v, a, force_r, force_l,
-        u_r + parameters.gap_r, u_l - parameters.gap_l,
-    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,58 +58,30 @@ class Test:
         return self.profile.sweep.acceleration_g * GRAVITY_M_S2
 
     @cached_property
+    def model(self) -> Model:
+        return self.effects or Model(self.parameters)
+
+    @cached_property
+    def player(self) -> Player:
+        return player(self.model)
+
+    @cached_property
     def played(self) -> SteppedSine:
         frequencies = [step.frequency_hz for step in self.steps]
-        model = self.effects or Model(self.parameters)
-        return swept(model, frequencies, self.acceleration, self.profile.sweep.cycles)
+        return swept(self.model, frequencies, self.acceleration, self.profile.sweep.cycles)
 
     @cached_property
     def points(self) -> tuple[Point, ...]:
         """The PRC point of every step, as `twin`."""
-        kept = self.played.extremes[:, -self.profile.sweep.measured_cycles :]
-        u_star, a_star = self.scale
-        return tuple(
-            Point(
-                0, step.index, step.direction, step.frequency_hz, None,
-                quantities(self.parameters, kept[step.index : step.index + 1], u_star, a_star),
-                step.acceleration_m_s2, step.acceleration_m_s2, 0.0,
-            )
-            for step in self.steps
-        )  # fmt: skip
+        measured = self.profile.sweep.measured_cycles
+        return ideal_points.points(self.model, self.steps, self.played, measured, self.scale)
 
     def state(self, place: int, cycles: int) -> Float1D:
         """The state `cycles` before the end of a step."""
-        before = self.played.states[place - 1] if place else exact.rest(self.parameters)
         held = self.profile.sweep.cycles - cycles
+        before = self.played.states[place - 1] if place else None
         frequency = self.steps[place].frequency_hz
-        return stepped_sine(
-            self.parameters, [frequency], self.acceleration, held, state=before
-        ).states[0]
-
-
-def quantities(
-    parameters: Parameters, extremes: Float3D, u_star: float, a_star: float
-) -> Quantities:
-    """The ratios of Eq. 1, means over the cycles of `extremes` (1, cycle, 8)."""
-    u_max, u_min, a_max, a_min, f_r, f_l, hits_r, hits_l = (
-        extremes[0, :, place] for place in range(len(EXTREMES))
-    )
-    weight = parameters.mass * GRAVITY_M_S2
-    eta = (u_max - u_min) / (2 * u_star)
-    depth_r = np.where(f_r > 0, u_max - parameters.gap_r, 0.0)
-    depth_l = np.where(f_l < 0, -u_min - parameters.gap_l, 0.0)
-    return Quantities(
-        eta_d=float(eta.mean()),
-        eta_a=float((a_max - a_min).mean() / (2 * a_star)),
-        eta_r=float(np.maximum(depth_r, 0).mean() / u_star),
-        eta_l=float(np.maximum(depth_l, 0).mean() / u_star),
-        r_r=float(f_r.mean() / weight),
-        r_l=float(-f_l.mean() / weight),
-        impacts_right=tuple(int(n) for n in hits_r),
-        impacts_left=tuple(int(n) for n in hits_l),
-        drift=float((eta[-1] - eta[0]) / eta.mean()),
-        spread=float(np.ptp(eta) / eta.mean()),
-    )
+        return self.player.sweep([frequency], self.acceleration, held, before).states[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +94,14 @@ class Case:
     @property
     def parameters(self) -> Parameters:
         return self.tests[0].parameters
+
+    @property
+    def player(self) -> Player:
+        return self.tests[0].player
+
+    @property
+    def scale(self) -> tuple[float, float]:
+        return self.tests[0].scale
 
     @property
     def acceleration(self) -> float:
@@ -177,13 +122,13 @@ class Case:
         """The last `cycles` of the step at this frequency."""
         test, place = self._step(frequency_hz, direction)
         state = test.state(place, cycles)
-        return sample(self.parameters, frequency_hz, self.acceleration, state, cycles)
+        return self.player.motion(frequency_hz, self.acceleration, state, cycles)
 
     def contacts(self, frequency_hz: float, direction: str, cycles: int) -> tuple[Float1D, Float1D]:
         """(right, left: times in cycles at which contact begins) over the last of the step."""
         test, place = self._step(frequency_hz, direction)
         state = test.state(place, cycles)
-        return onsets(self.parameters, frequency_hz, self.acceleration, state, cycles)[:2]
+        return self.player.onsets(frequency_hz, self.acceleration, state, cycles)[:2]
 
     def _step(self, frequency_hz: float, direction: str) -> tuple[Test, int]:
         for test in self.tests:
@@ -206,14 +151,28 @@ def curve(
     return table[:, 0], table[:, 1]
 
 
-def cases() -> dict[str, Case]:
-    """Every gap of the paper by its name, from the shipped profiles."""
+def cases(model: str | None = None, stars: tuple[float, float] | None = None) -> dict[str, Case]:
+    """Every gap of the paper by its name, from the shipped profiles; with another model in them.
+
+    `stars`: u*, a* to divide by, instead of the model's own.
+    """
     found = {}
     for gap, names in GAPS.items():
         tests = []
         for name in names:
             profile, _ = load(find(name, "tests"), Profile, "test profile")
-            card, _ = load(find(profile.model, "models"), ModelCard, "model")
-            tests.append(Test(name, profile, card.model(profile.specimen).parameters))
+            card, _ = read_model(model or profile.model)
+            whole = card.model(profile.specimen)
+            _steady(whole, model or profile.model)
+            tests.append(Test(name, profile, whole.parameters, whole, stars))
         found[gap] = Case(gap, tuple(tests))
     return found
+
+
+def _steady(model: Model, name: str) -> None:
+    """BadInput where the model has no steady motions to draw."""
+    if any(one.effect.id == "gap_drift" for one in model.present):
+        raise BadInput(
+            f"--model {name}: effect 'gap_drift': the paper's motions are steady, and with gaps "
+            "that move there are none; leave it out of the model"
+        )

@@ -46,7 +46,7 @@ def draw(found: Study, rig: Rig | None) -> Drawings:
 def _shares(ax: Axes, found: Study, hz: float) -> None:
     shares = found.impacts[hz].shares[:MOST]
     names = [f"{right}/{left}" for (right, left), _ in shares]
-    ax.set_ylim(0, 92)
+    ax.set_ylim(0, max(92, 115 * shares[0][1]))
     bars = ax.bar(names, [100 * share for _, share in shares], color="#8b929c", width=0.6)
     ax.bar_label(bars, fmt="%.0f", size=8)
     ax.set_xlabel("impacts right/left")

@@ -2,108 +2,62 @@
 
 import math
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
 from table_io.block import Float1D
 from twin.model.branch import between, follow, settled
-from twin.model.exact import rest
-from twin.model.orbit import Orbit, lyapunov, onsets
-from twin.model.parameters import Parameters, resonance
-from twin.model.sweep import stepped_sine
+from twin.model.orbit import Orbit
+from twin.model.parameters import resonance
 from twin.service.paper.cases import Case
+from twin.service.paper.passage import CLOSE, SAME, Slow, effort
 
-FINE_HZ, FINE_CYCLES = 0.01, 40  # of the slow sweep that stands for continuous frequency
+DEEPEST_MM, NEAR_MM = -40.0, 0.005  # of the search for permanent contact
 BRANCH_HZ = 0.02  # first step of a continuation
-SAME = 0.02  # of eta_d: the two directions of the slow sweep are one curve within this
-TRANSIENT, WATCHED = 300, 3000  # cycles, in chaos
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Slow:
-    """Slow passage through all frequencies: eta_d and the state after each, in both directions."""
-
-    frequency: Float1D
-    eta_d: dict[str, Float1D]
-    eta_a: dict[str, Float1D]
-    states: dict[str, Float1D]
-
-    @property
-    def peak(self) -> tuple[int, str]:
-        """(place, direction) of the primary resonance, the largest eta_d."""
-        best = max(self.eta_d, key=lambda one: float(self.eta_d[one].max()))
-        return int(self.eta_d[best].argmax()), best
-
-    @property
-    def peak_hz(self) -> float:
-        return float(self.frequency[self.peak[0]])
-
-    @property
-    def difference(self) -> float:
-        """Largest difference between the directions above 2 Hz, relative to eta_d there."""
-        one, other = self.eta_d["forward"], self.eta_d["backward"]
-        high = self.frequency > 2
-        return float((np.abs(one - other) / np.maximum(one, other))[high].max())
-
-    def state(self, frequency_hz: float, direction: str) -> Float1D:
-        place = int(np.abs(self.frequency - frequency_hz).argmin())
-        return np.asarray(self.states[direction][place])
-
-
-def slow(case: Case) -> Slow:
-    """The slow sweep of a gap over the range of its tests."""
-    p, a = case.parameters, case.acceleration
-    grid = [step.frequency_hz for test in case.tests for step in test.steps]
-    count = round((max(grid) - min(grid)) / FINE_HZ) + 1
-    up = np.linspace(min(grid), max(grid), count)
-    u_star, a_star, _ = resonance(p, a)
-    eta_d, eta_a, states = {}, {}, {}
-    state = rest(p)
-    for direction, way in (("forward", 1), ("backward", -1)):
-        sweep = stepped_sine(p, up[::way], a, FINE_CYCLES, state=state)
-        state = sweep.states[-1]
-        last = {name: sweep.column(name)[:, -1] for name in ("u_max", "u_min", "a_max", "a_min")}
-        eta_d[direction] = ((last["u_max"] - last["u_min"]) / (2 * u_star))[::way]
-        eta_a[direction] = ((last["a_max"] - last["a_min"]) / (2 * a_star))[::way]
-        states[direction] = sweep.states[::way]
-    return Slow(up, eta_d, eta_a, states)
+SETTLE = 400  # cycles to a steady motion
 
 
 @dataclass(frozen=True, slots=True)
 class Folds:
-    """Where the two branches of a hysteresis end, in Hz: the forward one above, the other below."""
+    """Where the two branches of a hysteresis end, in Hz: the forward one above, the other below.
+
+    `how` they were found: "folds", or "slow passage", which is a little later.
+    """
 
     forward_hz: float
     backward_hz: float
     kind: str  # "right": the forward branch is the larger one
+    how: str = "folds"
 
 
 def folds(case: Case, sweep: Slow) -> Folds | None:
     """The folds of the primary hysteresis, by continuation; None where there is none.
 
-    Each branch is followed from outside the interval, where it is the only motion.
+    Each branch is followed from outside the interval, where it is the only motion. A model that
+    has no one-period map in closed form is taken at its word in slow passage.
     """
-    p, a = case.parameters, case.acceleration
-    eta = sweep.eta_d
+    eta, f = sweep.eta_d, sweep.frequency
     apart = np.abs(eta["forward"] - eta["backward"]) > SAME * np.maximum(*eta.values())
-    apart &= sweep.frequency > _chaos_ends(case)
+    apart &= f > _chaos_ends(case)
     if not apart.any():
         return None
-    low, high = max(bands(sweep.frequency, apart.astype(float)), key=lambda one: one[1] - one[0])
-    low_hz, high_hz = low - 5 * FINE_HZ, high + 5 * FINE_HZ
+    low, high = max(bands(f, apart.astype(float)), key=lambda one: one[1] - one[0])
+    middle = int(np.abs(f - (low + high) / 2).argmin())
+    kind = "right" if eta["forward"][middle] > eta["backward"][middle] else "left"
+    if not case.player.exact:
+        wide = high - low > 2 * effort(case).fine_hz
+        return Folds(high, low, kind, "slow passage") if wide else None
+    p, a = case.parameters, case.acceleration
+    low_hz, high_hz = low - 5 * CLOSE.fine_hz, high + 5 * CLOSE.fine_hz
     up = settled(p, low_hz, a, sweep.state(low_hz, "forward"))
     down = settled(p, high_hz, a, sweep.state(high_hz, "backward"))
     if up is None or down is None:
         return None
     top = follow(p, a, up, high_hz + 0.5, BRANCH_HZ).end_hz
     bottom = follow(p, a, down, low_hz - 0.5, BRANCH_HZ).end_hz
-    if top is None or bottom is None:
-        return None
-    middle = int(np.abs(sweep.frequency - (low + high) / 2).argmin())
-    larger = eta["forward"][middle] > eta["backward"][middle]
-    return Folds(float(top), float(bottom), "right" if larger else "left")
+    return None if top is None or bottom is None else Folds(float(top), float(bottom), kind)
 
 
 def _chaos_ends(case: Case) -> float:
@@ -111,35 +65,67 @@ def _chaos_ends(case: Case) -> float:
     return 1.42 if case.parameters.gap_r > 0 else 2.0
 
 
-def graze_hz(case: Case) -> float:
-    """Where the flight motion first touches a bumper, from above: a/|w0^2 - w^2 + 2 i z w0 w|."""
+def graze_hz(case: Case, sweep: Slow) -> float:
+    """Where the flight motion first touches a bumper, from above: a/|w0^2 - w^2 + 2 i z w0 w|,
+    where flight is linear; else where slow passage down does."""
     p, a = case.parameters, case.acceleration
+    if not case.player.exact:
+        hit = sweep.frequency[sweep.touched["backward"]]
+        return float(hit.max()) if hit.size else math.nan
 
     def short_of(hz: float) -> float:
         w = 2 * math.pi * hz
-        return a / abs(p.stiffness / p.mass - w * w + 1j * w * p.damping / p.mass) - p.gap_r
+        flight = a / abs(p.stiffness / p.mass - w * w + 1j * w * p.damping / p.mass)
+        return flight - min(p.gap_r, p.gap_l)
 
     return float(brentq(short_of, resonance(p, a)[2], 20.0))
 
 
-def coexisting(case: Case, sweep: Slow, frequency_hz: float) -> tuple[Orbit, Orbit, Orbit] | None:
-    """(forward, backward, the unstable one between them) inside a hysteresis."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Coexisting:
+    """Largest u in m of the forward and the backward motion, and the unstable one between them.
+
+    None: it can be found only where the one-period map is known in closed form.
+    """
+
+    forward_m: float
+    backward_m: float
+    unstable: Orbit | None
+
+
+def coexisting(case: Case, sweep: Slow, frequency_hz: float) -> Coexisting | None:
+    """The two motions inside a hysteresis; None where both directions lead to one."""
     p, a = case.parameters, case.acceleration
-    up = settled(p, frequency_hz, a, sweep.state(frequency_hz, "forward"))
-    down = settled(p, frequency_hz, a, sweep.state(frequency_hz, "backward"))
+    begin = {one: sweep.state(frequency_hz, one) for one in ("forward", "backward")}
+    if not case.player.exact:
+        top, bottom = (steady_m(case, sweep, frequency_hz, one) for one in begin)
+        return None if abs(top - bottom) < SAME * top else Coexisting(top, bottom, None)
+    up = settled(p, frequency_hz, a, begin["forward"])
+    down = settled(p, frequency_hz, a, begin["backward"])
     if up is None or down is None or abs(up.u_max - down.u_max) < SAME * up.u_max:
         return None
     unstable = between(p, a, up, down)
-    return None if unstable is None else (up, down, unstable)
+    return None if unstable is None else Coexisting(up.u_max, down.u_max, unstable)
+
+
+def steady_m(case: Case, sweep: Slow, frequency_hz: float, direction: str) -> float:
+    """Largest u in m of the steady motion that one direction leads to."""
+    begin = sweep.state(frequency_hz, direction)
+    steady = case.player.sweep([frequency_hz], case.acceleration, SETTLE, begin)
+    return float(steady.column("u_max")[0, -1])
 
 
 def permanent_contact_mm(case: Case) -> float:
     """Total gap below which the mass never leaves a bumper, at any frequency; negative.
 
     Both in contact the motion U is linear; a bumper is left where (K_j + i w C_j) U reaches K_j p.
+    Where it is not, or the sides differ, by halving; NaN beyond `DEEPEST_MM`.
     """
     p, a = case.parameters, case.acceleration
     kj, cj = p.bumper_stiffness_r, p.bumper_damping_r
+    alike = (kj, cj, p.gap_r) == (p.bumper_stiffness_l, p.bumper_damping_l, p.gap_l)
+    if not (case.player.exact and alike):
+        return _halved(case)
 
     def release(hz: float) -> float:
         w = 2 * math.pi * hz
@@ -150,10 +136,25 @@ def permanent_contact_mm(case: Case) -> float:
     return float(2e3 * found.fun)
 
 
+def _halved(case: Case) -> float:
+    left, held = 0.0, DEEPEST_MM
+    if detaches(case, held) or not detaches(case, left):
+        return math.nan
+    while left - held > NEAR_MM:
+        half = (left + held) / 2
+        left, held = (half, held) if detaches(case, half) else (left, half)
+    return held
+
+
 def detaches(case: Case, gap_mm: float) -> bool:
     """Whether a slow sweep at this total gap sees the mass leave a bumper."""
-    p = replace(case.parameters, gap_r=gap_mm / 2e3, gap_l=gap_mm / 2e3)
-    swept = stepped_sine(p, np.arange(600, 801) / 100, case.acceleration, 20)
+    exact = case.player.exact
+    grid = np.arange(600, 801) / 100 if exact else np.arange(80, 241) / 20
+    if exact:  # round the resonance with both bumpers in contact
+        p = case.parameters
+        stiffness = p.stiffness + p.bumper_stiffness_r + p.bumper_stiffness_l
+        grid += math.sqrt(stiffness / p.mass) / (2 * math.pi) - 6.95
+    swept = case.player.at_gap(gap_mm).sweep(grid, case.acceleration, 20)
     return bool(swept.column("onsets_r").sum() + swept.column("onsets_l").sum())
 
 
@@ -175,11 +176,12 @@ class Impacts:
         return self.shares[0][0]
 
 
-def impacts(parameters: Parameters, frequency_hz: float, acceleration: float) -> Impacts:
+def impacts(case: Case, frequency_hz: float) -> Impacts:
     """Impacts per forcing cycle and side as a distribution, from rest, transient left out."""
-    settled_ = stepped_sine(parameters, [frequency_hz], acceleration, TRANSIENT).states[0]
-    right, left, _ = onsets(parameters, frequency_hz, acceleration, settled_, WATCHED)
-    pairs = zip(per_cycle(right, WATCHED), per_cycle(left, WATCHED), strict=True)
+    taken, a = effort(case), case.acceleration
+    begin = case.player.sweep([frequency_hz], a, taken.transient).states[0]
+    right, left, _ = case.player.onsets(frequency_hz, a, begin, taken.watched)
+    pairs = zip(per_cycle(right, taken.watched), per_cycle(left, taken.watched), strict=True)
     counted = Counter((int(r), int(l_)) for r, l_ in pairs)
     total = sum(counted.values())
     return Impacts(tuple((pair, n / total) for pair, n in counted.most_common()))
@@ -197,11 +199,12 @@ def per_cycle(times: Float1D, cycles: int) -> Float1D:
     return np.histogram(times, bins=cut + np.arange(cycles))[0].astype(float)
 
 
-def exponent(case: Case, frequency_hz: float, cycles: int = WATCHED) -> float:
+def exponent(case: Case, frequency_hz: float, cycles: int | None = None) -> float:
     """Largest Lyapunov exponent per cycle, from rest, transient left out."""
-    p, a = case.parameters, case.acceleration
-    state = stepped_sine(p, [frequency_hz], a, TRANSIENT).states[0]
-    return lyapunov(p, frequency_hz, a, state, cycles)[0]
+    taken, a = effort(case), case.acceleration
+    state = case.player.sweep([frequency_hz], a, taken.transient).states[0]
+    followed = min(cycles or taken.followed, taken.followed)
+    return case.player.exponent(frequency_hz, a, state, followed)
 
 
 def bands(frequency: Float1D, exponents: Float1D, chaotic: float = 0.05) -> list[list[float]]:
@@ -217,12 +220,12 @@ def bands(frequency: Float1D, exponents: Float1D, chaotic: float = 0.05) -> list
 
 
 def twice_a_side_mm(case: Case, frequency_hz: float) -> float:
-    """Largest total gap in mm, on 0.05 mm, at which a forward sweep arrives at 2/2 impacts."""
-    up = np.linspace(frequency_hz - 0.2, frequency_hz, 21)
-    for gap_mm in np.arange(4.0, 0.0, -0.05):
-        p = replace(case.parameters, gap_r=gap_mm / 2e3, gap_l=gap_mm / 2e3)
-        state = stepped_sine(p, up, case.acceleration, 60).states[-1]
-        right, left, _ = onsets(p, frequency_hz, case.acceleration, state, 200)
+    """Largest total gap in mm, on a grid, at which a forward sweep arrives at 2/2 impacts."""
+    up, a = np.linspace(frequency_hz - 0.2, frequency_hz, 21), case.acceleration
+    for gap_mm in np.arange(4.0, 0.0, -effort(case).gap_mm).tolist():
+        there = case.player.at_gap(gap_mm)
+        state = there.sweep(up, a, 60).states[-1]
+        right, left, _ = there.onsets(frequency_hz, a, state, 200)
         if min(per_cycle(right, 200).min(), per_cycle(left, 200).min()) >= 2:
-            return round(float(gap_mm), 2)
+            return round(gap_mm, 2)
     return math.nan

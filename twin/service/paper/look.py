@@ -10,9 +10,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from table_io.block import Float1D
+from twin.model.parameters import Parameters
 from twin.service.close_ups import AT_REST, COLOUR, DASH, GUIDE, TWIN
 from twin.service.figures import BAND, STYLE
-from twin.service.paper.cases import Motion
+from twin.service.paper.players import Motion
 
 __all__ = ["AT_REST", "BAND", "COLOUR", "DASH", "DIRECTIONS", "GUIDE", "TWIN"]
 
@@ -90,10 +91,10 @@ def bumper_loops(ax: Axes, motion: Motion, ring: bool, **look: Any) -> None:
         ax.plot(*((closed(x), closed(y)) if ring else (x, y)), **look)
 
 
-def obstacles(gap_m: float, draw: Callable[..., Any]) -> None:
+def obstacles(parameters: Parameters, draw: Callable[..., Any], **look: Any) -> None:
     """Dashed lines where the bumpers stand at rest, or where a precompressed one would let go."""
-    for side in (1, -1):
-        draw(side * abs(gap_m) * 1e3, **AT_REST)
+    for side, gap_m in ((1, parameters.gap_r), (-1, parameters.gap_l)):
+        draw(side * abs(gap_m) * 1e3, **{**AT_REST, **look})
 
 
 def contact_bands(

@@ -7,8 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from twin.model.sweep import stepped_sine
-from twin.service.paper.cases import Case, Motion, sample
+from twin.service.paper.cases import Case
 from twin.service.paper.findings import coexisting
 from twin.service.paper.look import (
     AT_REST,
@@ -28,6 +27,7 @@ from twin.service.paper.look import (
     obstacles,
     pen,
 )
+from twin.service.paper.players import Motion
 from twin.service.paper.rig import Rig
 from twin.service.paper.study import COEXISTING_HZ, Study
 
@@ -67,9 +67,9 @@ def steady(found: Study, name: str, hz: float, direction: str, cycles: int) -> M
     """The steady motion that slow passage in this direction leads to."""
     case = found.cases[name]
     begin = found.slow[name].state(hz, direction)
-    p, a = case.parameters, case.acceleration
-    state = stepped_sine(p, [hz], a, SETTLE, state=begin).states[0]
-    return sample(p, hz, a, state, cycles)
+    a = case.acceleration
+    state = case.player.sweep([hz], a, SETTLE, begin).states[0]
+    return case.player.motion(hz, a, state, cycles)
 
 
 def _resonant(found: Study, name: str) -> Resonant:
@@ -109,13 +109,9 @@ def _all_gaps(found: Study) -> Drawing:
                 continue
             bumper_loops(ax, motion, True, **look)
             if case.parameters.gap_r > 0:
-                for side in (1, -1):
-                    ax.axvline(side * 1e3 * case.parameters.gap_r, **{**AT_REST, **look, "lw": 0.8})
+                obstacles(case.parameters, ax.axvline, **{**look, "lw": 0.8})
         if 0 < case.parameters.gap_r < 1:
-            for side in (1, -1):
-                mass_ax.axvline(
-                    side * 1e3 * case.parameters.gap_r, **{**AT_REST, **look, "lw": 0.8}
-                )
+            obstacles(case.parameters, mass_ax.axvline, **{**look, "lw": 0.8})
     for inset in insets:
         inset.set_xlim(-ZOOM_MM, ZOOM_MM)
         inset.set_ylim(-3.9, 3.9)
@@ -156,27 +152,39 @@ def _pairs(found: Study, shown: list[Resonant], names: tuple[str, str]) -> Drawi
             motion, look = _once(one.motions[direction]), pen(direction, 1.6)
             mass_loop(top, motion, p.mass, True, **look)
             bumper_loops(bottom, motion, True, **look)
-        orbits = coexisting(one.case, found.slow[one.case.name], one.hz)
-        if orbits is not None:
-            motion = sample(p, one.hz, one.case.acceleration, orbits[2].state, 1)
+        both = coexisting(one.case, found.slow[one.case.name], one.hz)
+        if both is not None and both.unstable is not None:
+            state = both.unstable.state
+            motion = one.case.player.motion(one.hz, one.case.acceleration, state, 1)
             mass_loop(top, motion, p.mass, True, **UNSTABLE)
             bumper_loops(bottom, motion, True, **UNSTABLE)
         if p.gap_r > 0:
-            obstacles(p.gap_r, top.axvline)
-            obstacles(p.gap_r, bottom.axvline)
+            obstacles(p, top.axvline)
+            obstacles(p, bottom.axvline)
         _label(top, "$u$ in mm", "$F_I$ in kN" if place == 0 else "")
         _label(bottom, "$v_j$ in mm", "$F_j$ in kN" if place == 0 else "")
-    handles = [*directions_key(pen), Line2D([], [], **UNSTABLE, label="unstable, between the two")]
+    handles = directions_key(pen)
+    if found.exact:
+        handles.append(Line2D([], [], **UNSTABLE, label="unstable, between the two"))
     figure.legend(handles=handles, loc="outside upper center", ncols=3)
     which = ", ".join(minus(one.case.name) for one in shown)
     return Drawing(
         names[1], names[0], f"Loops in resonance: {which}",
         "Force-displacement cycles in steady resonance, forward (red) and backward (blue): top mass"
-        ", bottom bumpers. Dotted: the unstable motion between two stable ones, which no experiment"
-        " can hold. Where the model's resonance lies elsewhere than the experiment's, it is drawn "
+        ", bottom bumpers. "
+        + ("Dotted: the unstable motion between two stable ones, which no experiment can hold. "
+           if found.exact else "")
+        + "Where the model's resonance lies elsewhere than the experiment's, it is drawn "
         "at its own frequency and the paper's is named.",
         figure,
     )  # fmt: skip
+
+
+def _held(shown: list[Resonant]) -> str:
+    """What the forward motion of G-1 does, from its forces."""
+    forward = next(one for one in shown if one.case.name == "G-1").motions["forward"]
+    lets_go = not ((forward.force_r > 0) & (forward.force_l < 0)).all()
+    return "exceeds it, and leaves a bumper for a moment" if lets_go else "does so too"
 
 
 def _histories(shown: list[Resonant]) -> Drawing:
@@ -188,7 +196,7 @@ def _histories(shown: list[Resonant]) -> Drawing:
             ax.plot(motion.time, motion.u * 1e3, **pen(direction, 1.8))
             contact_bands(ax, motion, COLOUR[direction], alpha=0.13)
         if one.case.parameters.gap_r:
-            obstacles(one.case.parameters.gap_r, ax.axhline)
+            obstacles(one.case.parameters, ax.axhline)
         else:
             ax.axhline(0, **AT_REST)
         ax.set_xlim(0, HISTORY_CYCLES / one.hz)
@@ -201,7 +209,7 @@ def _histories(shown: list[Resonant]) -> Drawing:
         "Time histories of u in steady condition: a G4 in the right hysteresis, b G0, c G−1 in the "
         "left hysteresis. Dashed: a, b the initial gap, c the pre-strain of the bumpers. Vertical "
         "bands: contact with each bumper, red forward, blue backward, darker where both touch. In "
-        "the paper's c the forward motion stays within the pre-strain; the model's exceeds it, and "
-        "leaves a bumper for a moment.",
+        "the paper's c the forward motion stays within the pre-strain; the model's "
+        f"{_held(shown)}.",
         figure,
     )  # fmt: skip

@@ -1,23 +1,25 @@
 """Pictures, page and paper.json of the whole paper in one folder."""
 
 import base64
-import json
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from twin.model.card import ModelCard
+from twin.service.bundle import read_model
 from twin.service.figures import Picture
 from twin.service.paper import against, extra, families, loops, secondary
 from twin.service.paper.look import PAPER_STYLE, Drawing
 from twin.service.paper.rig import Rig
+from twin.service.paper.rows import Row
 from twin.service.paper.study import Study
-from twin.service.paper.table import Row
 from twin.service.summary import dumps
 
+PAPER_MODEL = "snm"
 ORDER = ("2", "3", "5", "6", "7", "8", "9", "11", "12", "")
 Progress = Callable[[str], None]
 
@@ -40,9 +42,25 @@ def draw_all(found: Study, rig: Rig | None, folder: Path, say: Progress) -> list
     return pictures
 
 
-def write_json(rows: list[Row], found: Study, pictures: list[Picture], path: Path) -> None:
+@dataclass(frozen=True, slots=True)
+class Told:
+    """The model as a person named it, its card and the text of that."""
+
+    asked: str
+    card: ModelCard
+    text: str
+
+    @property
+    def name(self) -> str:
+        return Path(self.asked).stem if self.asked.endswith(".toml") else self.asked
+
+
+def write_json(
+    rows: list[Row], found: Study, model: Told, pictures: list[Picture], path: Path
+) -> None:
     """The table, the PRC points and the impacts as strict JSON."""
     told: dict[str, Any] = {
+        "model": {"name": model.name, "title": model.card.title, "toml": model.text},
         "table": [asdict(row) for row in rows],
         "prc": {
             name: [
@@ -62,7 +80,7 @@ def write_json(rows: list[Row], found: Study, pictures: list[Picture], path: Pat
 
 
 def write_page(
-    rows: list[Row], sets: list[tuple[str, list[Picture]]], models: dict[str, Any], path: Path
+    rows: list[Row], found: Study, told: Told, sets: list[tuple[str, list[Picture]]], path: Path
 ) -> None:
     """One self-contained HTML file: the table, then each set of pictures."""
     environment = Environment(
@@ -76,6 +94,8 @@ def write_page(
     counts = {verdict: sum(row.verdict == verdict for row in rows) for verdict in
               ("agrees", "agrees in kind", "departs")}  # fmt: skip
     page = environment.get_template("paper.html").render(
-        rows=rows, sets=images, counts=counts, models=json.loads(json.dumps(models))
-    )
+        rows=rows, sets=images, counts=counts, told=told, exact=found.exact,
+        models={name: case.player.model.flat() for name, case in found.cases.items()},
+        paper_model=told.text == read_model(PAPER_MODEL)[1],
+    )  # fmt: skip
     path.write_text(page, encoding="utf-8")

@@ -10,7 +10,8 @@ from table_io.card import BadInput
 from table_io.records import Decided, Point
 from twin.service import evidence
 from twin.service.evidence import Run, gather
-from twin.service.paper.cases import GAPS, Motion
+from twin.service.paper.cases import GAPS
+from twin.service.paper.players import Motion
 from twin.service.recordings import log_path, recorded_bundle
 from twin.service.summary import summarise
 from twin.stream.mcap_log import read
@@ -22,6 +23,13 @@ class Rig:
 
     points: dict[str, list[Point]] = field(default_factory=dict)
     runs: dict[str, list[Run]] = field(default_factory=dict)
+
+    @property
+    def stars(self) -> tuple[float, float] | None:
+        """(u* in m, a* in m/s2) by which the measured points are divided."""
+        for run in (run for runs in self.runs.values() for run in runs):
+            return run.summary["u_star_m"], run.summary["a_star_m_s2"]
+        return None
 
     def motion(
         self, name: str, frequency_hz: float, direction: str, cycles: int

@@ -5,7 +5,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from twin.service.paper.cases import Case, Motion, curve
+from twin.service.paper.cases import Case, curve
 from twin.service.paper.look import (
     COLOUR,
     DIRECTIONS,
@@ -20,6 +20,7 @@ from twin.service.paper.look import (
     pen,
     portrait,
 )
+from twin.service.paper.players import Motion
 from twin.service.paper.rig import Rig
 from twin.service.paper.study import SECONDARY_HZ, Study
 
@@ -54,9 +55,17 @@ def draw(found: Study, rig: Rig | None) -> Drawings:
         "b–d phase portraits, e–g inertia force against u, h–j contact force against bumper "
         f"position, over the {CYCLES} measured cycles; k–m u, n–p total acceleration, q–s contact "
         "forces over time. Red bands: the contacts within one forcing cycle of the forward sweep. "
-        "Dashed: the gap. The model is chaotic at all three: cycles differ, and so do directions.",
+        f"Dashed: the gap. {_chaos(found)}",
         figure,
     )  # fmt: skip
+
+
+def _chaos(found: Study) -> str:
+    chaotic = [f"{hz:g}" for hz in SECONDARY_HZ if found.chaotic(hz)]
+    if not chaotic:
+        return "The model is chaotic at none of the three."
+    where = "all three" if len(chaotic) == len(SECONDARY_HZ) else f"{' and '.join(chaotic)} Hz"
+    return f"The model is chaotic at {where}: there cycles differ, and so do directions."
 
 
 def _curve(ax: Axes, case: Case) -> None:
@@ -96,7 +105,7 @@ def _loops(rows: list[Axes], pair: dict[str, Motion], case: Case, column: int) -
     for ax, which, (x, y) in zip(rows, names, labels, strict=True):
         title = f"$f_{column + 1}$ = {SECONDARY_HZ[column]:g} Hz" if which == "bcd" else ""
         letter(ax, which[column], title)
-        obstacles(p.gap_r, ax.axvline)
+        obstacles(p, ax.axvline)
         ax.axhline(0, color=GUIDE, lw=0.5, zorder=0.6)
         ax.set_xlabel(x)
         ax.set_ylabel(y if column == 0 else "")
@@ -121,7 +130,7 @@ def _histories(axes: Any, pair: dict[str, Motion], case: Case, column: int) -> N
             )  # fmt: skip
         letter(ax, which[column], f"$f_{column + 1}$ = {hz:g} Hz" if which == "klm" else "")
         ax.set_xlim(0, SHOWN / hz)
-    obstacles(case.parameters.gap_r, axes[0].axhline)
+    obstacles(case.parameters, axes[0].axhline)
     axes[2].set_xlabel("$t$ in s")
     if column == 0:
         for ax, label in zip(axes, ("$u$ in mm", "$a$ in m/s²", "$F_j$ in kN"), strict=True):

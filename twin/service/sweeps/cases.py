@@ -8,7 +8,7 @@ from pathlib import Path
 from table_io.card import BadInput, find
 from table_io.profile import Profile, Specimen
 from twin.model.card import ModelCard
-from twin.model.ideal import SAMPLES
+from twin.model.ideal import swept
 from twin.model.model import Model
 from twin.model.parameters import resonance
 from twin.service.batch import at_gaps
@@ -130,30 +130,14 @@ def _at(
 
 
 def _follows(case: Case, profile: Profile, where: str) -> None:
-    """BadInput where the sampling, or the slowest step of the sweep, cannot follow this model.
+    """BadInput where the profile's sampling, or the sweep, cannot follow this model.
 
-    What is not in closed form goes through the sweep at `SAMPLES` a cycle.
+    A cycle at the slowest frequency is played: what must be compiled is compiled now.
     """
-    model, grid = case.model, profile.sweep.frequencies_hz
+    model, slowest = case.model, profile.sweep.frequencies_hz[0]
     try:
         resonance(model.parameters, 1.0)
         model.fits(profile.acquisition.rate_hz)
+        swept(model, [slowest], 0.0, 1)
     except BadInput as error:
         raise BadInput(f"{where}: {case.name}: {error}") from None
-    if all(one.effect.acts in ("parameters", "sensor") for one in model.present):
-        return
-    slowest = next((hz for hz in grid if _prepares(model, SAMPLES * hz)), None)
-    if slowest != grid[0]:
-        allowed = "no frequency of this sweep" if slowest is None else f"{slowest:g} Hz or more"
-        raise BadInput(
-            f"{where}: sweep.start_hz = {grid[0]:g}: {SAMPLES} samples a cycle are too few for "
-            f"{case.name}, whose effects are integrated; allowed: {allowed}; raise start_hz"
-        )
-
-
-def _prepares(model: Model, rate_hz: float) -> bool:
-    try:
-        model.prepare(rate_hz)
-    except BadInput:
-        return False
-    return True

@@ -11,7 +11,7 @@ import numpy as np
 
 from table_io.block import Float1D
 from table_io.channels import BY_NAME, LEFT_CELLS, RIGHT_CELLS
-from table_io.heard import Complex1D, Heard, mismatch
+from table_io.loop_check.heard import Complex1D, Heard, mismatch
 from table_io.records import Check
 
 TABLE = ("table_disp_m", "table_acc_m_s2")

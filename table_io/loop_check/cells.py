@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS, contact_forces, rel_disp
-from table_io.check_lines import lag, line, mean
-from table_io.heard import Heard
+from table_io.loop_check.heard import Heard
+from table_io.loop_check.lines import lag, line, mean
 from table_io.records import Check
 
 CELLS = RIGHT_CELLS + LEFT_CELLS

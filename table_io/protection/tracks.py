@@ -14,8 +14,9 @@ import numpy as np
 
 from table_io.block import Float1D, Float2D
 from table_io.protection import looks, sides
-from table_io.protection.consistency import Shared, Weak
-from table_io.protection.looks import Bench, Cycle, Doubt, Swing
+from table_io.protection.consistency import Shared
+from table_io.protection.cycle import Bench, Cycle, Doubt
+from table_io.protection.looks import Swing, Usual
 from table_io.records import Response
 from table_io.response import transfer_at
 
@@ -29,8 +30,8 @@ CLOSE = 0.1  # change of the response from look to look that is no fault
 class Stretch:
     """Samples between two marks: values (channel, sample), the rest (sample,).
 
-    `level` and `label` are those at its end, `key` tells motions apart (0 is rest, below it the loop check), `whole` says
-    that it is half a cycle from end to end.
+    `level` and `label` are those at its end, `key` tells motions apart (0 is rest, below it the
+    loop check), `whole` says that it is half a cycle from end to end.
     """
 
     values: Float2D
@@ -53,7 +54,7 @@ class Tracks:
     stretches: tuple[Stretch, ...] = ()
     response: Response | None = None
     visits: Mapping[float, complex] = field(default_factory=_empty)
-    good: Mapping[str, Weak] = field(default_factory=_empty)
+    usual: Mapping[str, Usual] = field(default_factory=_empty)
     shares: Mapping[str, Shared] = field(default_factory=_empty)
     streaks: Mapping[tuple[str, str, str], int] = field(default_factory=_empty)
     swing: Swing = field(default_factory=Swing)
@@ -96,15 +97,16 @@ def look(bench: Bench, tracks: Tracks, stretch: Stretch) -> tuple[Tracks, tuple[
 def _moving(tracks: Tracks, cycle: Cycle) -> tuple[Tracks, list[Doubt]]:
     """What holds for any motion."""
     doubts: list[Doubt] = []
-    good = dict(tracks.good)
+    usual = dict(tracks.usual)
     for names, acceleration, seen in looks.fit(cycle):
-        found = list(looks.misfit(names, acceleration, seen, good.get(names[0])))
+        before = usual.get(names[0])
+        found = list(looks.misfit(names, acceleration, seen, before))
         if not found:
-            good[names[0]] = seen
+            usual[names[0]] = (before or Usual(seen)).after(seen)
             found = list(looks.offset(cycle, acceleration, seen))
         doubts += found
     uneven, shares = sides.cells(cycle, tracks.shares)
-    return replace(tracks, good=good, shares=shares), doubts + uneven
+    return replace(tracks, usual=usual, shares=shares), doubts + uneven
 
 
 def _held(tracks: Tracks, cycle: Cycle) -> tuple[Tracks, list[Doubt]]:

@@ -13,8 +13,11 @@ import math
 import numpy as np
 
 from table_io.block import Block
-from table_io.cell_lines import cells
-from table_io.check_lines import (
+from table_io.course import Aim
+from table_io.drive import Drive
+from table_io.loop_check.cells import cells
+from table_io.loop_check.heard import Heard
+from table_io.loop_check.lines import (
     alive,
     at_rest,
     consistent,
@@ -25,9 +28,6 @@ from table_io.check_lines import (
     table,
     unwrapped,
 )
-from table_io.course import Aim
-from table_io.drive import Drive
-from table_io.heard import Heard
 from table_io.profile import Profile
 from table_io.records import Check, Response
 from table_io.response import gain_at, transfer_at

@@ -1,0 +1,197 @@
+"""A campaign from its file to its end: order, refusals, what a resume keeps."""
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from table_io.card import BadInput
+from table_io.profile import SetUp
+from twin.service.bundle import Bundle
+from twin.service.campaign import flow
+from twin.service.campaign.book import appended
+from twin.service.campaign.flow import campaign
+from twin.service.campaign.state import LOCK, locked, read_state, write_state
+
+from .campaigns import LISTED, Players, asked, files, prepared, statuses
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    return prepared(tmp_path, monkeypatch)
+
+
+def test_the_runs_are_played_in_order_each_in_a_folder_of_its_own(folder: Path) -> None:
+    assert campaign(asked(folder)) == 0
+    assert [Path(one.folder).name for one in Players.given] == ["01-free", "02-g4", "03-again"]
+    assert [one.name for one in Players.given] == ["free", "g4", "g4"]
+    assert statuses(folder) == ["complete"] * 3
+    assert (folder / "out" / "campaign.toml").read_text() == LISTED
+
+
+def test_a_recording_says_what_was_asked_before_it_and_who_answered(folder: Path) -> None:
+    campaign(asked(folder))
+    noted = [tomllib.loads(one.profile_toml)["set_up"] for one in Players.given]
+    assert [one["asked"] for one in noted] == ["Take the bumpers away", "Set 4 mm", ""]
+    assert [one["answer"] for one in noted] == ["unattended", "unattended", "not asked"]
+    assert noted[1]["notes"] == "look at the bolts"
+    assert noted[0]["campaign"] == "Three gaps"
+    told = read_state(folder / "out").runs[1].set_up[0]
+    assert (told.who, told.at) == (noted[1]["who"], noted[1]["at"])
+    assert told.who
+    assert told.at.startswith("20")
+
+
+def test_any_text_of_an_operator_is_kept_as_it_is(folder: Path) -> None:
+    wild = 'a "quote" \\ back\nline\ttab \x7f \u2212 \U0001f600'
+    card = SetUp(campaign=wild, label="l", asked=wild, answer="done", who="w", at="now")
+    text = appended((folder / "g4.toml").read_text(), {"set_up": card})
+    assert tomllib.loads(text)["set_up"]["asked"] == wild
+
+
+def test_after_a_protection_no_run_begins_and_it_says_how_to_go_on(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Players.ends["g4"] = ("aborted", 2)
+    assert campaign(asked(folder)) == 3
+    assert statuses(folder) == ["complete", "interrupted", "planned"]
+    said = capsys.readouterr().out
+    assert "left: g4, again" in said
+    again = f"shaketwin campaign {folder}/c.toml --out {folder}/out --resume --speed max"
+    assert again in said.replace("\n", "")
+
+
+def test_a_resume_keeps_what_is_complete_and_goes_on_with_the_rest(folder: Path) -> None:
+    Players.ends["g4"] = ("aborted", 2)
+    campaign(asked(folder))
+    kept = files(folder / "out")
+    Players.given.clear()
+    Players.ends.clear()
+    assert campaign(asked(folder, resume=True)) == 0
+    assert [Path(one.folder).name for one in Players.given] == ["02-g4-2", "03-again"]
+    assert statuses(folder) == ["complete"] * 3
+    assert {name: files(folder / "out")[name] for name in kept} == kept
+    assert "resume" not in tomllib.loads(Players.given[0].profile_toml)  # forward began anew
+
+
+def test_a_run_goes_on_at_the_direction_that_was_interrupted(folder: Path) -> None:
+    Players.ends["g4"] = ("stopped", 5)  # three forward, two of three backward
+    campaign(asked(folder))
+    first = read_state(folder / "out").runs[1].parts[0].run
+    Players.given.clear()
+    Players.ends.clear()
+    campaign(asked(folder, resume=True))
+    assert tomllib.loads(Players.given[0].profile_toml)["resume"] == {"first_step": 3, "of": first}
+    assert [part.first_step for part in read_state(folder / "out").runs[1].parts] == [0, 3]
+
+
+def test_a_complete_campaign_is_resumed_by_doing_nothing(folder: Path) -> None:
+    campaign(asked(folder))
+    before = files(folder / "out")
+    Players.given.clear()
+    assert campaign(asked(folder, resume=True)) == 0
+    assert Players.given == []
+    assert files(folder / "out") == before
+
+
+def test_what_was_recorded_and_is_no_longer_so_is_measured_anew(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    campaign(asked(folder))
+    (folder / "out" / "01-free" / "run.mcap").write_bytes(b"damaged")
+    Players.given.clear()
+    assert campaign(asked(folder, resume=True)) == 0
+    assert [Path(one.folder).name for one in Players.given] == ["01-free-2"]
+    assert (folder / "out" / "01-free" / "run.mcap").read_bytes() == b"damaged"
+    assert "free: 01-free/run.mcap is missing or not what was recorded" in (
+        capsys.readouterr().out.replace("\n", "")
+    )
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "said"),
+    [
+        ("c.toml", "Set 4 mm", "Set 5 mm", '-prompt = "Set 4 mm"'),
+        ("g4.toml", "cycles = 4", "cycles = 6", "+cycles = 6"),
+    ],
+)
+def test_another_campaign_is_not_resumed(
+    folder: Path, file: str, old: str, new: str, said: str
+) -> None:
+    Players.ends["free"] = ("aborted", 2)
+    campaign(asked(folder))
+    before = files(folder / "out")
+    path = folder / file
+    path.write_text(path.read_text().replace(old, new))
+    Players.given.clear()
+    with pytest.raises(BadInput) as error:
+        campaign(asked(folder, resume=True))
+    assert "not what began here" in str(error.value)
+    assert said in str(error.value)
+    assert Players.given == []
+    assert files(folder / "out") == before
+
+
+def test_a_folder_with_content_is_refused_unless_it_is_resumed(folder: Path) -> None:
+    campaign(asked(folder))
+    with pytest.raises(BadInput, match=r"has content.*--resume"):
+        campaign(asked(folder))
+    with pytest.raises(BadInput, match="say with --out"):
+        campaign(asked(folder, resume=True, out=None))
+    with pytest.raises(BadInput, match="no such folder"):
+        campaign(asked(folder, resume=True, out=folder / "nowhere"))
+    (folder / "other").mkdir()
+    (folder / "other" / "mine.txt").write_text("mine")
+    with pytest.raises(BadInput, match="no campaign began"):
+        campaign(asked(folder, resume=True, out=folder / "other"))
+
+
+def test_a_table_that_keeps_its_own_time_is_refused_at_full_speed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("table_io.rig.Rig.any_speed", property(lambda _: False))
+    with pytest.raises(BadInput, match="keeps its own time"):
+        campaign(asked(folder))
+    assert not (folder / "out").exists()
+
+
+def test_two_campaigns_do_not_work_in_one_folder(folder: Path) -> None:
+    Players.ends["free"] = ("aborted", 2)
+    campaign(asked(folder))
+    with (
+        locked(folder / "out" / LOCK),
+        pytest.raises(BadInput, match="still going on in this folder"),
+    ):
+        campaign(asked(folder, resume=True))
+
+
+def test_a_state_that_cannot_be_written_leaves_the_old_one(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    campaign(asked(folder))
+    before = read_state(folder / "out")
+
+    def full(_: int) -> None:
+        raise OSError("no space left")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="no space"):
+        write_state(folder / "out", before.model_copy(update={"runs": ()}))
+    assert read_state(folder / "out") == before
+
+
+def test_every_test_is_judged_before_the_first_one_moves(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged = []
+
+    def judge(bundle: Bundle, _: Path) -> None:
+        judged.append(bundle.name)
+        if bundle.name == "g4":
+            raise BadInput("the machine does not answer")
+
+    monkeypatch.setattr(flow, "_any_speed", judge)
+    with pytest.raises(BadInput, match="does not answer"):
+        campaign(asked(folder))
+    assert judged == ["free", "g4"]
+    assert not (folder / "out").exists()

@@ -1,0 +1,228 @@
+"""A campaign on the simulated table, whole, and killed at a random point and resumed."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from twin.service import reading
+from twin.service.campaign import parts, report
+from twin.service.campaign.flow import Asked, campaign
+from twin.service.campaign.pictures import families
+from twin.service.campaign.whole import read_whole
+from twin.service.processes import Spec
+from twin.service.runs import play_unpaced
+from twin.stream.mcap_log import read
+
+from .campaigns import Players
+
+SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
+LISTED = """
+title = "Free flight and G4 <i>"
+[[runs]]
+profile = "free.toml"
+prompt = "Take the bumpers away"
+[[runs]]
+profile = "g4.toml"
+prompt = "Set 4 mm"
+"""
+TEST = """
+title = "{title}"
+[specimen]
+mass_kg = 550.0
+gap_mm = {gap}
+[sweep]
+start_hz = {start}
+stop_hz = {stop}
+step_hz = {step}
+cycles = {cycles}
+measured_cycles = 2
+[loop_check]
+cycles = 3
+"""
+EQUAL = 0.025  # of a curve: the level is only held within 2 %, and noise goes on elsewhere
+
+
+class Here(Players):
+    """Plays what it is given at once, in this process, and draws nothing."""
+
+    def give(self, run: str, spec: Spec) -> None:
+        self.playing.append(run)
+        log = Path(spec.folder) / "run.mcap"
+        play_unpaced(spec.bundle(), spec.run, log, lambda: None, lambda _: None)
+        parts.finish(log.parent)
+
+
+@dataclass(frozen=True)
+class Both:
+    """Folders of the same campaign: played in one go, and killed and resumed."""
+
+    whole: Path
+    killed: Path
+    share: float  # of the second recording, when it was killed
+    left: dict[str, bytes]  # what the killed one had recorded by then
+    said: str  # by the resumed one
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
+    folder = tmp_path_factory.mktemp("campaigns")
+    told = {"title": "free", "gap": "inf", "start": 1.0, "stop": 1.6, "step": 0.3, "cycles": 3}
+    (folder / "free.toml").write_text(TEST.format(**told))
+    told = {"title": "g4", "gap": 4.0, "start": 2.6, "stop": 4.4, "step": 0.6, "cycles": 6}
+    (folder / "g4.toml").write_text(TEST.format(**told))
+    (folder / "c.toml").write_text(LISTED)
+    whole, killed = folder / "whole", folder / "killed"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("twin.service.campaign.unpaced.Crew", Here)
+        patch.setattr(parts, "write_report", lambda *_: None)
+        patch.setattr(report, "draw_all", lambda *_: [])
+        assert campaign(Asked(folder / "c.toml", whole, False, True, None, None, False, "")) == 0
+    share = random.uniform(0.2, 0.95)
+    size = (whole / "02-g4" / "run.mcap").stat().st_size
+    command = [SHAKETWIN, "campaign", str(folder / "c.toml"), "--speed", "max", "--out", killed]
+    _kill(command, killed / "02-g4" / "run.mcap", share * size)
+    left = {one.parent.name: one.read_bytes() for one in killed.rglob("run.mcap")}
+    done = subprocess.run([*command, "--resume"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return Both(whole, killed, share, left, done.stdout)
+
+
+def _kill(command: list[Any], log: Path, size: float) -> None:
+    """Start a campaign, and kill it and all that it started once the log is so large."""
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    while process.poll() is None and not (log.exists() and log.stat().st_size >= size):
+        time.sleep(0.01)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    for one in (process.pid, *map(int, children)):
+        os.kill(one, signal.SIGKILL)
+    process.wait()
+
+
+def summary(folder: Path) -> dict[str, Any]:
+    return dict(json.loads((folder / "summary.json").read_text()))
+
+
+def test_a_campaign_measures_u_and_a_in_free_flight_and_divides_by_them(both: Both) -> None:
+    found = summary(both.whole)
+    free = found["free_flight"]
+    # physics.md: 29.95 mm at 1.3 Hz on the grid of 0.1 Hz; three cycles do not quite reach it
+    assert free["u_star_m"] == pytest.approx(29.95e-3, rel=0.03)
+    assert free["model_u_star_m"] == pytest.approx(30.537e-3, rel=1e-3)
+    assert free["model_a_star_m_s2"] == pytest.approx(2.057, rel=1e-3)
+    peaks = found["runs"][0]["peak"]
+    assert (peaks["eta_d"]["value"], peaks["eta_d"]["frequency_hz"]) == (pytest.approx(1.0), 1.3)
+    assert peaks["eta_a"]["value"] == pytest.approx(1.0)
+    assert "free measured in free flight" in found["campaign"]["normalisation"]
+    alone = summary(both.whole / "02-g4")
+    for step, was in zip(found["runs"][1]["steps"], alone["steps"], strict=True):
+        by = free["model_u_star_m"] / free["u_star_m"]
+        assert step["measured"]["eta_d"] == pytest.approx(by * was["measured"]["eta_d"])
+
+
+def test_a_campaign_finds_what_its_runs_found(both: Both) -> None:
+    found = summary(both.whole)
+    assert (found["verdict"], found["reason"]) == ("complete", "2 of 2 runs complete")
+    free, g4 = found["runs"]
+    assert (free["jumps"], free["gap_mm"], g4["gap_mm"]) == ([], None, 4.0)
+    assert g4["hysteresis"] == [{"kind": "right", "from_hz": 3.2, "to_hz": 3.8}]
+    assert g4["checks"] > 0
+    assert not g4["checks_failed"]
+    assert g4["trips"] == []
+    assert abs(g4["level_error"]) < 0.02
+
+
+def test_a_campaign_that_was_killed_and_resumed_has_the_same_result(both: Both) -> None:
+    one, other = summary(both.whole), summary(both.killed)
+    assert other["verdict"] == "complete"
+    assert other["u_star_m"] == pytest.approx(one["u_star_m"], rel=EQUAL)
+    for a, b in zip(one["runs"], other["runs"], strict=True):
+        assert b["jumps"] == a["jumps"], both.share
+        assert b["hysteresis"] == a["hysteresis"], both.share
+        assert [step["index"] for step in b["steps"]] == [step["index"] for step in a["steps"]]
+        for x, y in zip(a["steps"], b["steps"], strict=True):
+            for name in ("eta_d", "eta_a", "r_r"):
+                want = pytest.approx(x["measured"][name], rel=EQUAL, abs=2e-3)
+                assert y["measured"][name] == want, (both.share, x["index"], name)
+            assert y["measured"]["impacts_right"] == x["measured"]["impacts_right"]
+
+
+def test_what_was_interrupted_is_kept_as_it_was(both: Both) -> None:
+    for name, content in both.left.items():
+        assert (both.killed / name / "run.mcap").read_bytes() == content, name
+    assert "02-g4" in both.left
+    assert "2 of 2 runs complete" in both.said
+
+
+def test_what_goes_on_says_of_what_and_from_where(both: Both) -> None:
+    (run,) = [run for run in summary(both.killed)["runs"] if run["run"]["label"] == "g4"]
+    used = {piece["part"] for branch in run["branches"] for piece in branch["pieces"]}
+    assert len(run["parts"]) == 2
+    assert run["parts"][1]["folder"] == "02-g4-2"
+    assert run["parts"][1]["first_step"] in {0, 4}  # from the beginning of a direction
+    assert {branch["history"] for branch in run["branches"]} <= {"whole", "begun anew from rest"}
+    if run["parts"][1]["first_step"]:
+        assert used == {"02-g4", "02-g4-2"}
+        start = read(both.killed / "02-g4-2" / "run.mcap").start
+        assert f'of = "{run["parts"][0]["run"]}"' in start.profile_toml
+        assert len(start.steps) == 8
+    else:
+        assert used == {"02-g4-2"}
+
+
+def test_the_report_of_a_campaign_has_every_run(both: Both) -> None:
+    page = (both.killed / "report.html").read_text()
+    for name in ("01-free", "02-g4", "02-g4-2"):
+        assert f'href="{name}/report.html"' in page
+        assert (both.killed / name / "report.html").is_file()
+    assert "every eta, measured and model&#39;s, is divided by the u* and a*" in page
+    assert "right 3.2–3.8" in page
+    assert "Free flight and G4 &lt;i&gt;" in page
+    assert page.count("data:image/png;base64,") == 2
+    assert "http://" not in page
+    assert "https://" not in page
+
+
+def test_lines_and_points_of_the_pictures_are_divided_by_the_same(both: Both) -> None:
+    cases, rig = families(read_whole(both.killed))
+    found = summary(both.killed)
+    assert list(cases) == ["G∞", "G4"]
+    by = found["free_flight"]["model_u_star_m"] / found["u_star_m"]
+    for name, run in zip(cases, found["runs"], strict=True):
+        (test,) = cases[name].tests
+        bare = replace(test, stars=None)
+        for line, own in zip(test.points, bare.points, strict=True):
+            assert line.twin is not None
+            assert own.twin is not None
+            assert line.twin.eta_d == pytest.approx(by * own.twin.eta_d)
+            assert line.twin.r_r == own.twin.r_r
+        seen = [point.measured.eta_d for point in rig.points[name] if point.measured]
+        assert seen == [step["measured"]["eta_d"] for step in run["steps"]]
+
+
+def test_the_report_is_written_anew_from_the_folder_alone(
+    both: Both, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = summary(both.killed)
+    (both.killed / "summary.json").unlink()
+    monkeypatch.setattr(report, "draw_all", lambda *_: [])
+    reading.report(both.killed)
+    assert summary(both.killed) == before
+
+
+def test_the_curves_of_a_campaign_are_those_of_its_joined_runs(
+    both: Both, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reading.prc(both.killed, True)
+    runs = json.loads(capsys.readouterr().out)["runs"]
+    found = summary(both.killed)["runs"]
+    assert [run["hysteresis"] for run in runs] == [run["hysteresis"] for run in found]
+    assert [run["steps"] for run in runs] == [run["steps"] for run in found]
