@@ -28,6 +28,12 @@ class Doubt:
     text: str
     severity: str = "sensor"
     looks: int = LOOKS
+    about: str = ""  # what doubts that follow one another have in common, if not the channel
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """The same for the same doubt at the next look."""
+        return self.kind, self.about or self.channel, self.severity
 
 
 @dataclass(frozen=True, eq=False)

@@ -75,11 +75,12 @@ def misfit(
         return
     accused, other = names[0], acceleration
     if usual is not None:
-        moved = float(np.abs(seen.displacement - usual.last.displacement).max())
-        if float(np.abs(seen.acceleration - usual.last.acceleration).max()) > moved:
+        moved = abs(seen.displacement[0] - usual.last.displacement[0])
+        if abs(seen.acceleration[0] - usual.last.acceleration[0]) > moved:
             accused, other = acceleration, names[0]
     text = f"{accused} {how} {other}: {100 * share:.0f} % of the motion apart; "
-    yield Doubt("consistency", accused, share, limit, f"{text}allowed: {100 * limit:.0f} %")
+    text += f"allowed: {100 * limit:.0f} %"
+    yield Doubt("consistency", accused, share, limit, text, about=names[0])
 
 
 def offset(cycle: Cycle, acceleration: str, seen: Weak) -> Iterator[Doubt]:

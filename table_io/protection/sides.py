@@ -12,7 +12,7 @@ from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.protection.consistency import Shared, shared
 from table_io.protection.cycle import Cycle, Doubt, drifted, spoken
 
-SWING = 50.0  # times the noise: a force that tells how it is shared
+SWING = 20.0  # times the noise: a force that tells how it is shared
 ANGLE = 3.0  # degrees: a tenth more or less force on one of two cells
 UNEVEN = 25.0  # degrees off equal shares where nothing was seen before: one bears a quarter
 CELL_OFFSET = 0.5  # of the force that counts as contact
@@ -76,7 +76,8 @@ def _uneven(
             f"{side[0]} and {side[1]} share their force at {seen.angle:.0f} degrees, "
             f"{usual:.0f} expected; allowed: +-{most:g}"
         )
-        yield Doubt("share", channel, seen.angle, usual + math.copysign(most, off), text)
+        limit = usual + math.copysign(most, off)
+        yield Doubt("share", channel, seen.angle, limit, text, about=side[0])
     apart = seen.apart - (0.0 if before is None else before.apart)
     limit = 2 * CELL_OFFSET * cycle.bench.profile.comparison.contact_n
     if before is not None and abs(apart) > limit + 6.0 * (seen.sigma + before.sigma):

@@ -88,9 +88,8 @@ def look(bench: Bench, tracks: Tracks, stretch: Stretch) -> tuple[Tracks, tuple[
     if len(last) == 2 and steady:
         tracks, found = _held(tracks, _joined(bench, last))
         doubts += found
-    names = [(one.kind, one.channel, one.severity) for one in doubts]
-    streaks = {name: tracks.streaks.get(name, 0) + 1 for name in names}
-    told = [one for one, name in zip(doubts, names, strict=True) if streaks[name] == one.looks]
+    streaks = {one.key: tracks.streaks.get(one.key, 0) + 1 for one in doubts}
+    told = [one for one in doubts if streaks[one.key] == one.looks]
     return replace(tracks, streaks=MappingProxyType(streaks)), tuple(told)
 
 

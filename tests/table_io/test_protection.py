@@ -312,8 +312,7 @@ def test_a_cable_that_is_off_is_told_by_the_noise_it_lacks(row: int) -> None:
     found = first(shaken(put(row, AT, noise, 4000)), "silent")
     assert found.channel == NAMES[row]
     assert found.index - AT < 0.15 * RATE
-    louder = 2.0 * noise * 5
-    assert "silent" not in kinds(shaken(put(R1, AT, louder, 4000)))
+    assert "silent" not in kinds(shaken(put(row, AT, 6.0 * noise, 4000)))
 
 
 @pytest.mark.parametrize("row", [DRIVE, TABLE, ACC, MASS, MASS_ACC, R1, L2])
@@ -446,7 +445,7 @@ def test_without_a_loop_check_the_same_frequency_must_be_met_as_before() -> None
 
 @pytest.mark.parametrize(("row", "size"), [(TABLE, 3e-4), (ACC, 0.1), (MASS_ACC, 0.15), (R1, 8.0)])
 def test_what_drifts_is_told(row: int, size: float) -> None:
-    found = shaken(add(row, AT, size))[0]
+    found = next(one for one in shaken(add(row, AT, size)) if one.kind != "level")
     assert found.kind in ("drift", "consistency")
     assert found.channel == NAMES[row]
     assert found.index - AT < 2.6 * CYCLE
@@ -464,10 +463,10 @@ def test_a_mass_that_swings_about_another_place_is_told_after_ten_cycles() -> No
 @pytest.mark.parametrize("row", [TABLE, ACC, MASS, MASS_ACC])
 @pytest.mark.parametrize("factor", [0.9, 1.1, -1.0])
 def test_a_sensor_that_no_longer_fits_its_partner_is_told(row: int, factor: float) -> None:
-    found = [one for one in shaken(scaled(row, 8000, factor)) if one.kind == "consistency"]
+    found = [one for one in shaken(scaled(row, AT, factor)) if one.kind == "consistency"]
     assert found[0].channel == NAMES[row]
-    assert found[0].index - 8000 < 2.6 * CYCLE
-    assert shaken(scaled(row, 8000, 1.03)) == ()
+    assert found[0].index - AT < 2.6 * CYCLE
+    assert shaken(scaled(row, AT, 1.03)) == ()
 
 
 @pytest.mark.parametrize("row", [MASS, MASS_ACC])
@@ -477,10 +476,10 @@ def test_nor_one_that_never_did(row: int) -> None:
 
 
 def test_a_sensor_that_the_controller_does_not_need_warns_if_so_asked() -> None:
-    warned = shaken(scaled(MASS_ACC, 8000, -1.0), profile("warn"))
+    warned = shaken(scaled(MASS_ACC, AT, -1.0), profile("warn"))
     assert kinds(warned, stop=True) == []
     assert first(warned, "consistency").event().kind == "sensor"
-    assert kinds(shaken(scaled(ACC, 8000, -1.0), profile("warn")), stop=True) != []
+    assert kinds(shaken(scaled(ACC, AT, -1.0), profile("warn")), stop=True) != []
 
 
 # Load cells
@@ -506,10 +505,9 @@ def impacts(share: float, change: Change | None = None) -> tuple[Finding, ...]:
 @pytest.mark.parametrize("share", [0.5, 0.35, 0.6])
 def test_cells_may_share_a_force_as_they_like_but_always_so(share: float) -> None:
     assert impacts(share) == ()
-    for row, factor in ((R1, 1.3), (R2, 0.7), (R1, -1.0), (R2, 0.0)):
-        found = impacts(share, scaled(row, 8000, factor))
-        assert "share" in kinds(found), (row, factor)
-        assert first(found, "share").index - 8000 < 3.1 * CYCLE
+    for row, factor in ((R1, 1.3), (R2, 0.7), (R1, -1.0), (R2, 0.1)):
+        found = first(impacts(share, scaled(row, AT, factor)), "share")
+        assert found.index - AT < 3.1 * CYCLE, (row, factor)
 
 
 def test_a_cell_that_never_bore_a_thing_beside_one_that_does_is_told() -> None:
@@ -518,7 +516,7 @@ def test_a_cell_that_never_bore_a_thing_beside_one_that_does_is_told() -> None:
 
 
 def test_where_both_cells_bear_beyond_the_gap_the_gap_is_elsewhere() -> None:
-    found = first(impacts(0.5, add(MASS, 8000, -4e-3)), "drift")
+    found = first(impacts(0.5, add(MASS, AT, -4e-3)), "drift")
     assert found.channel == "mass_disp_m"
     assert "other side of the gap" in found.text
 
