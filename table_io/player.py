@@ -17,6 +17,9 @@ from table_io.rig import Output
 DECISION_S = 0.005
 
 
+TRIES = 5
+
+
 class Starved(Exception):
     """The lead ran out: this process was away, and the machine plays the decay behind it."""
 
@@ -69,27 +72,48 @@ class Player:
             return
         reached = self.reached()
         if self._started and self._queued < reached + self.backend.replace_after:
-            behind = (reached - self.acquired) / self.drive.rate_hz
-            self._decaying(self._queued)
-            raise Starved(
-                f"the rig was {behind:.2f} s behind: its queue ended at sample "
-                f"{self.drive.decay_at}, and the table decayed to rest by itself"
-            )
+            raise self._starved()
         lead = max(round(self._output.lead_s * self.drive.rate_hz), self.backend.replace_after)
         lead += self._block
         if self._queued - reached >= lead:
             return
         last = min(reached + 2 * lead, rest_from)
-        self._queue(self._queued, self.drive.decayed(last) if last < rest_from else self.drive)
+        try:
+            self._queue(self._queued, self.drive.decayed(last) if last < rest_from else self.drive)
+        except ValueError:
+            if not self._started:
+                raise
+            # the machine's clock ran on while this was on its way
+            raise self._starved() from None
         self._queued = last
 
+    def _starved(self) -> Starved:
+        """What to raise once the machine plays the decay behind the lead."""
+        behind = (self.reached() - self.acquired) / self.drive.rate_hz
+        self._decaying(self._queued)
+        return Starved(
+            f"the rig was {behind:.2f} s behind: its queue ended at sample "
+            f"{self.drive.decay_at}, and the table decayed to rest by itself"
+        )
+
     def decay(self) -> None:
-        """Replace what is queued by a decay from the first sample that can still be changed."""
-        at = min(self.changeable(), self.drive.rest_from)
-        begins = at < self.drive.rest_from
-        self._decaying(at)
-        if begins:
-            self._queue(at, self.drive)
+        """Replace what is queued by a decay from the first sample that can still be changed.
+
+        Where the machine's clock runs on while that is on its way, once more from then on; where it
+        always does, the decay that is queued behind the lead has to do.
+        """
+        for _ in range(TRIES):
+            at = self.changeable()
+            if at >= self.drive.rest_from:
+                self._decaying(self.drive.rest_from)
+                return
+            try:
+                self._queue(at, self.drive.decayed(at))
+            except ValueError:
+                continue
+            self._decaying(at)
+            return
+        self._decaying(min(self._queued, self.drive.rest_from))
 
     def _decaying(self, at: int) -> None:
         self.drive = self.drive.decayed(at)

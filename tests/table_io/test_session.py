@@ -466,6 +466,54 @@ def test_a_machine_that_stops_answering_plays_its_tail_and_is_released(
     assert subject.clock.now() >= subject.scheduled(subject.moved_until - 1)
 
 
+@dataclass
+class Hasty(Machine):
+    """A machine whose clock runs on while a command is on its way: `refused` queues come late."""
+
+    refused: int = 0
+    after: int = 6000
+
+    def queue(self, index: int, volts: Float1D) -> None:
+        if self.next >= self.after and self.refused > 0:
+            self.refused -= 1
+            self.stopping = True  # from here on less than the lead may be queued
+            raise ValueError("already in the device")
+        super().queue(index, volts)
+
+
+def test_a_stop_that_comes_too_late_for_its_sample_is_given_again() -> None:
+    # After block 310 nothing is fed until the stop, so that the stop's own queue is refused.
+    subject = Hasty(plan(profile()), ManualClock(), refused=3, after=6180)
+    items = list(session(subject, Stop(310)))
+    assert subject.refused == 0
+    assert stop_record(items).verdict == "stopped"
+    assert subject.changed[0] - (310 * 20 - 1) <= ALLOWED_DECISION * RATE
+    assert subject.command[-1] == 0.0
+
+
+@pytest.mark.parametrize("after", [2000, 6000, 9000])
+def test_a_feed_that_comes_too_late_lets_the_queued_decay_play(after: int) -> None:
+    subject = Hasty(plan(profile()), ManualClock(), refused=1, after=after)
+    items = list(session(subject, Stop()))
+    stop = stop_record(items)
+    assert stop.verdict == "aborted"
+    (trip,) = (item for item in items if isinstance(item, Trip))
+    assert trip.kind == "late"
+    assert subject.command[-1] == 0.0
+    assert subject.peak_acceleration() <= TAIL_PEAK
+    whole = join(blocks(items))
+    # What is said to have been played is what was played.
+    np.testing.assert_allclose(
+        whole.channel("drive_disp_m"),
+        subject.played(0, len(whole)),
+        rtol=0,
+        atol=ROUNDING_M,
+    )
+    stopping = np.flatnonzero(whole.label == Label.STOP)
+    assert stopping.size
+    assert stop.index >= subject.moved_until
+
+
 def test_a_failing_operator_link_ends_in_rest_too() -> None:
     subject = machine()
 
