@@ -34,6 +34,7 @@ from table_io.rig import Machine, Rig
 BEAT_S = 0.03  # between heartbeats
 ANSWER_S = 2.0  # that the machine may take for an answer
 RESTING_S = 30.0  # that a machine may still need to come to rest after its last controller
+FAREWELL_S = 0.2  # that it may take to hear of the end
 RECEIVED_BYTES = 1 << 18
 
 
@@ -158,6 +159,9 @@ class MachineBackend:
             return
         try:
             self._socket.sendall(encode(Message(Kind.RELEASE)))
+            self._socket.settimeout(FAREWELL_S)
+            while self._socket.recv(RECEIVED_BYTES):
+                pass  # closing on unread samples could take the last word back
         except OSError:
             pass  # it sees by itself that nobody is there
         finally:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from table_io.block import Block, Bool2D, Float1D, Float2D
+from table_io.block import Block, Bool2D, Float1D, Float2D, Label
 from table_io.drive import Drive
 from table_io.profile import Profile
 from table_io.protection.cycle import Bench
@@ -31,7 +31,8 @@ from table_io.rig import Rig
 __all__ = ["Finding", "Guard", "Seen", "begin", "identified", "inspect"]
 
 MOST_FOUND = 256  # by one call
-_KEYS = np.array([0.0, 1.0, HOLDS, HOLDS, 1.0, HOLDS])  # by Label
+HELD = (Label.SETTLE, Label.MEASURE, Label.CHECK)
+_KEYS = np.array([float(HOLDS if one in HELD else one != Label.REST) for one in Label])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,8 +56,8 @@ class Seen:
 class Guard:
     """The protection and where it stands before sample `index`.
 
-    `past` are the samples before it: values (channel, sample), command and phase (sample,). `open`
-    are those since the last mark, in parts, with the level and the label at their end.
+    `past` are the samples before it: values (channel, sample), command and phase (sample,). `parts`
+    are those since the last mark, with the level and the label at their end.
     """
 
     bench: Bench
@@ -64,7 +65,7 @@ class Guard:
     memory: Memory
     index: int
     past: tuple[Float2D, Float1D, Float1D]
-    open: tuple[tuple[Float2D, Float1D, Float1D], ...] = ()
+    parts: tuple[tuple[Float2D, Float1D, Float1D], ...] = ()
     at_end: tuple[float, int, int] = (0.0, 0, 0)  # level, label, key of the newest sample
     tracks: Tracks = field(default_factory=Tracks)
 
@@ -87,17 +88,15 @@ def _compile(guard: Guard) -> None:
     """Has the pass over the samples compiled, so that the first block is not late."""
     flags, empty = np.zeros((guard.past[0].shape[0], 0), dtype=np.bool_), np.zeros(0)
     found = np.empty((MOST_FOUND, 5))
-    watch(
-        *guard.past[:1], flags, *guard.past[1:], empty, empty, 0, 0, guard.law, guard.memory, found
-    )
+    values, *past = guard.past
+    watch(values, flags, *past, empty, empty, 0, 0, guard.law, guard.memory, found)
 
 
 def identified(guard: Guard, response: Response) -> Guard:
     """A guard that from now on compares the table with the response of the loop check."""
     f = guard.bench.profile.sweep.steps[0].frequency_hz
-    return _followed(
-        guard, replace(guard.tracks, response=response).following(transfer_at(response, f), f)
-    )
+    tracks = replace(guard.tracks, response=response)
+    return _followed(guard, tracks.following(transfer_at(response, f), f))
 
 
 def inspect(guard: Guard, seen: Seen) -> tuple[Guard, tuple[Finding, ...]]:
@@ -129,7 +128,7 @@ def inspect(guard: Guard, seen: Seen) -> tuple[Guard, tuple[Finding, ...]]:
             span = slice(past + first, past + at)
             part = values[:, span], command[span], phase[span]
             end = float(level[at - 1]), int(block.label[at - 1]), int(keys[at - 1])
-            guard = replace(guard, open=(*guard.open, part), at_end=end)
+            guard = replace(guard, parts=(*guard.parts, part), at_end=end)
         if mark:
             guard, told = _closed(guard, mark == HALF, block.index + at)
             findings += told
@@ -141,13 +140,13 @@ def inspect(guard: Guard, seen: Seen) -> tuple[Guard, tuple[Finding, ...]]:
 def _closed(guard: Guard, half: bool, index: int) -> tuple[Guard, list[Finding]]:
     """The guard after the open stretch has ended before sample `index`: a look at it."""
     tracks, findings = guard.tracks, []
-    if guard.open:
-        values = np.concatenate([one[0] for one in guard.open], axis=1)
-        command, phase = (np.concatenate([one[k] for one in guard.open]) for k in (1, 2))
+    if guard.parts:
+        values = np.concatenate([one[0] for one in guard.parts], axis=1)
+        command, phase = (np.concatenate([one[k] for one in guard.parts]) for k in (1, 2))
         stretch = Stretch(values, command, phase, *guard.at_end, half)
         tracks, doubts = look(guard.bench, tracks, stretch)
         findings = [confirmed(one, index, guard.bench.profile) for one in doubts]
-    return replace(_followed(guard, tracks), open=()), findings
+    return replace(_followed(guard, tracks), parts=()), findings
 
 
 def _followed(guard: Guard, tracks: Tracks) -> Guard:

@@ -9,6 +9,7 @@ ends of a window. phi = sin^4(pi t / T) exp(-i k (w t + theta)) at the drive's o
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -21,44 +22,70 @@ CLEAR, CLEAR_SIZE = 20.0, 0.3  # an amplitude over its error, and of the motion,
 Complex1D = npt.NDArray[np.complex128]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Weak:
-    """What a displacement and an acceleration say of the same motion, m/s2, over one window.
+    """What a displacement and an acceleration say of the same motion over one window, m/s2.
 
-    Amplitudes at once and twice the drive's frequency, (2,), from either, and the standard error of
-    their differences; `offset` is what the acceleration has too much on average, with its standard
-    error, and `average` the larger of the two averages: what a wrong gain would have a share of.
+    At 0, 1 and 2 times the drive's frequency, (3,): amplitudes from either, what a constant of
+    1 m/s2 leaves there, and the standard error of the difference of the amplitudes.
     """
 
     displacement: Complex1D
     acceleration: Complex1D
+    constant: Complex1D
     sigma: Float1D
-    offset: float
-    sigma_offset: float
-    average: float
 
-    @property
+    @cached_property
     def size(self) -> float:
-        """The largest of the amplitudes, m/s2."""
-        return float(max(np.abs(self.displacement).max(), np.abs(self.acceleration).max()))
+        """The largest of the amplitudes of the motion."""
+        pair = self.displacement[1:], self.acceleration[1:]
+        return float(max(np.abs(one).max() for one in pair))
+
+    @cached_property
+    def average(self) -> float:
+        """The larger of the two averages: a wrong gain would have a share of it."""
+        return float(max(abs(self.displacement[0].real), abs(self.acceleration[0].real)))
+
+    @cached_property
+    def apart(self) -> float:
+        """The largest difference that noise cannot explain: beyond six standard errors."""
+        return self._beyond_noise(self.acceleration - self.displacement)
+
+    @cached_property
+    def offset(self) -> float:
+        """The constant that explains the differences best: what the acceleration has too much."""
+        off = self.acceleration - self.displacement
+        return float((self.constant.conj() @ off).real / self._weight)
 
     @property
-    def apart(self) -> float:
-        """The largest difference, m/s2, that noise cannot explain: beyond six standard errors."""
-        off = np.abs(self.displacement - self.acceleration)
-        return float(max((off - SIGMAS * self.sigma).max(), 0.0))
+    def sigma_offset(self) -> float:
+        """Its standard error."""
+        return float(np.linalg.norm(np.abs(self.constant) * self.sigma)) / self._weight
+
+    @property
+    def apart_but_offset(self) -> float:
+        """What is left of `apart` when that constant is taken away."""
+        off = self.acceleration - self.displacement
+        return self._beyond_noise(off - self.offset * self.constant)
 
     @property
     def ratio(self) -> complex:
         """Acceleration over displacement at the drive's frequency; NaN where that tells little."""
-        clear = max(CLEAR * float(self.sigma[0]), CLEAR_SIZE * self.size)
-        known = abs(self.displacement[0]) > clear
-        return complex(self.acceleration[0] / self.displacement[0]) if known else complex("nan")
+        clear = max(CLEAR * float(self.sigma[1]), CLEAR_SIZE * self.size)
+        known = abs(self.displacement[1]) > clear
+        return complex(self.acceleration[1] / self.displacement[1]) if known else complex("nan")
 
     def changed(self, ratio: complex) -> float:
-        """Difference, m/s2, beyond six standard errors, from sensors of this ratio."""
-        off = abs(ratio * self.displacement[0] - self.acceleration[0])
-        return float(max(off - SIGMAS * self.sigma[0], 0.0))
+        """Difference at the drive's frequency, beyond noise, from sensors of this ratio."""
+        off = abs(ratio * self.displacement[1] - self.acceleration[1])
+        return float(max(off - SIGMAS * self.sigma[1], 0.0))
+
+    def _beyond_noise(self, off: Complex1D) -> float:
+        return float(max((np.abs(off) - SIGMAS * self.sigma)[1:].max(), 0.0))
+
+    @property
+    def _weight(self) -> float:
+        return float(np.sum(np.abs(self.constant) ** 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,18 +122,10 @@ def window(samples: int, turns: float, middle: float, rate_hz: float) -> Window:
 
 def weak(one: Window, x: Float1D, a: Float1D, noise: tuple[float, float]) -> Weak:
     """Displacement x in m against acceleration a in m/s2, (sample,); `noise` is the rms of each."""
-    twice, once = one.curved @ x, one.phi @ a
     errors = np.hypot(
         noise[0] * np.linalg.norm(one.curved, axis=1), noise[1] * np.linalg.norm(one.phi, axis=1)
     )
-    return Weak(
-        twice[1:],
-        once[1:],
-        errors[1:],
-        float((once[0] - twice[0]).real),
-        float(errors[0]),
-        float(max(abs(twice[0].real), abs(once[0].real))),
-    )
+    return Weak(one.curved @ x, one.phi @ a, one.phi.sum(axis=1), errors)
 
 
 @dataclass(frozen=True, slots=True)

@@ -50,6 +50,7 @@ class Bench:
         return self.profile.acquisition.rate_hz
 
     def range_si(self, name: str) -> float:
+        """Range of a sensor either side, SI."""
         return self.rig.sensors[self.rig.channels.index(name)].range_si
 
 
@@ -95,6 +96,7 @@ class Cycle:
 
     @property
     def turns(self) -> float:
+        """Cycles that the drive turns, the last sample's step included."""
         count = self.phase.size
         return float(self.phase[-1] - self.phase[0]) * count / (count - 1)
 
@@ -122,5 +124,6 @@ def spoken(value: float, unit: str) -> str:
 
 
 def drifted(channel: str, value: float, limit: float, unit: str) -> Doubt:
+    """The doubt of a sensor that shows `value` where it showed nothing at rest."""
     text = f"{channel} has drifted by {spoken(value, unit)}; allowed: {spoken(limit, unit)}"
     return Doubt("drift", channel, value, limit, text)

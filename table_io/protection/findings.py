@@ -50,10 +50,22 @@ class Wording(NamedTuple):
 _BEYOND = "{channel}: {value} at sample {at} exceeds {limit}"
 WORDINGS = {
     watch.STROKE: Wording("stroke", "stop", _BEYOND, "mm", 1e3),
-    watch.VELOCITY: Wording("velocity", "stop", _BEYOND, "mm/s", 1e3),
+    watch.VELOCITY: Wording(
+        "velocity",
+        "stop",
+        "the table moves at {value} at sample {at}; allowed: {limit}",
+        "mm/s",
+        1e3,
+    ),
     watch.ACCELERATION: Wording("acceleration", "stop", _BEYOND, "g", 1 / GRAVITY_M_S2),
-    watch.FORCE: Wording("force", "stop", _BEYOND, "kN", 1e-3),
-    watch.RAIL: Wording("rail", "sensor", "{channel} is at its range from sample {at} on"),
+    watch.FORCE: Wording(
+        "force",
+        "stop",
+        "the actuator has to push with {value} at sample {at}; allowed: {limit}",
+        "kN",
+        1e-3,
+    ),
+    watch.RAIL: Wording("rail", "sensor", "{channel} is at its range, {limit}, at sample {at}"),
     watch.LOST: Wording("lost", "alarm", "{channel} is lost at sample {at}"),
     watch.DROPPED: Wording("lost", "alarm", "all channels are lost at sample {at}"),
     watch.BLIND: Wording(

@@ -34,8 +34,9 @@ WRONG = 8  # samples in a row off the command: more than SAME, so a repetition i
 READ_GAIN = 0.01  # of a command that is read back
 READ_RANGE = 5e-4
 UNSEEN = 0.25  # of the amplitude, off the command: gain within +-20 %, as the loop check allows
-FOLLOWING = 0.15  # of the amplitude, off what a table does whose gain and lag were seen a cycle ago
-GROSS = 2.5  # while the loop check runs: more than a sensor of the wrong sign shows
+FOLLOWING = 0.15  # of the amplitude, off what the table did a cycle ago
+# Before the sweep a loop check is to judge: more than a sensor of the wrong sign or offset shows.
+GROSS, GROSS_STROKE = 2.5, 0.02
 FOLLOWING_STROKE = 1e-3
 
 
@@ -56,6 +57,7 @@ class Law(NamedTuple):
     table_kg: float
     mass_kg: float
     span: int  # over which a displacement becomes a velocity
+    full: Float1D  # range of the sensors
     spike: Float1D
     stuck: Float1D  # inf where the noise does not tell
     moves: Float1D  # expected movement that must show; inf where it need not
@@ -65,6 +67,7 @@ class Law(NamedTuple):
     lagging: int  # the longest that the table may be behind before it was looked at
     read_back: float  # m, of the command
     astray: float  # m, of the table
+    rough: float  # m, of both before the sweep
     railed: int = RAILED
     same: int = SAME
     wrong: int = WRONG
@@ -117,6 +120,7 @@ def law(profile: Profile, rig: Rig, noise: Mapping[str, tuple[float, int]]) -> L
         rig.moving_mass_kg,
         profile.specimen.mass_kg,
         math.ceil(VELOCITY_S * rate),
+        full,
         np.maximum(SPIKE_SIGMA * sigma, SPIKE_RANGE * full),
         np.where(tells, np.maximum(STUCK_S * rate, STUCK_RUNS * runs), math.inf),
         np.where(np.isin(names, needed), MOVED_LSB * steps, math.inf),
@@ -126,6 +130,7 @@ def law(profile: Profile, rig: Rig, noise: Mapping[str, tuple[float, int]]) -> L
         math.ceil(LAG_S * rate),
         READ_RANGE * full[drive] + 3 * (lsb[drive] + rig.output.lsb_m) + 10 * sigma[drive],
         FOLLOWING_STROKE * limits.stroke_mm * 1e-3 + 10 * sigma[table],
+        GROSS_STROKE * limits.stroke_mm * 1e-3,
     )
 
 

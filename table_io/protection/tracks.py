@@ -99,10 +99,9 @@ def _moving(tracks: Tracks, cycle: Cycle) -> tuple[Tracks, list[Doubt]]:
     usual = dict(tracks.usual)
     for names, acceleration, seen in looks.fit(cycle):
         before = usual.get(names[0])
-        found = list(looks.misfit(names, acceleration, seen, before))
+        found = list(looks.misfit(cycle, names, acceleration, seen, before))
         if not found:
             usual[names[0]] = (before or Usual(seen)).after(seen)
-            found = list(looks.offset(cycle, acceleration, seen))
         doubts += found
     uneven, shares = sides.cells(cycle, tracks.shares)
     return replace(tracks, usual=usual, shares=shares), doubts + uneven

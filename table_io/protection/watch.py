@@ -15,10 +15,11 @@ STUCK, SILENT, SPIKE, REPEATED, COMMAND, FOLLOWING, DROPPED = range(7, 14)
 CODES = 14
 # Rows of what is remembered of each channel, and places of what is remembered once.
 RUN, ORIGIN, MOVED, POWER, REST_POWER, REST_COUNT, LOSSES, AT_RANGE = range(8)
-PEAK, TURNED, KEY, BEGUN, GAIN, LAG, BEHIND, SAMES, OFF, ASTRAY, MARKED = range(11)
-PER, ONCE = 8, 11
+PEAK, TURNED, KEY, BEGUN, GAIN, LAG, BEHIND, SAMES, OFF, ASTRAY, MARKED, PUSH = range(12)
+PER, ONCE = 8, 12
 UNKNOWN = -1.0  # lag of a table that has not been looked at yet
-CHECKING = -1.0  # key of a loop check: only what is grossly wrong stops it
+CHECKING = -1.0  # key of a loop check
+SWEEPING = 1.0  # BEGUN from the first step on; before it only what is grossly wrong stops
 HALF, OTHER = 1, 2  # marks: half a cycle is complete, another motion begins
 
 
@@ -55,7 +56,7 @@ def _delivered(values, railed, i, index, repeated, law, memory, found, count):  
         x = values[c, i]
         per[AT_RANGE, c] = per[AT_RANGE, c] + 1.0 if railed[c] else 0.0
         if per[AT_RANGE, c] >= law.railed:
-            count = _tell(memory, found, count, index, RAIL, c, x, 0.0, law)
+            count = _tell(memory, found, count, index, RAIL, c, x, law.full[c], law)
         lost = math.isnan(x)
         if lost and not dropped:
             count = _tell(memory, found, count, index, LOST, c, x, 0.0, law)
@@ -165,31 +166,52 @@ def _repeated(values, i, law, one):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _commanded(values, command, i, index, law, memory, found, count):  # type: ignore[no-untyped-def]
     """The command that was read back, and the table, against what was queued."""
-    one, before = memory.one, command[i - 1]
+    one, before, gross = memory.one, command[i - 1], memory.one[BEGUN] < SWEEPING
     off = _median(values[law.drive], i) - before
-    share = law.gross if one[KEY] == CHECKING else law.read_gain
+    share = law.gross if gross else law.read_gain
     limit = law.read_back + share * one[PEAK] + 2.0 * abs(before - command[i - 2])
+    limit += law.rough if gross else 0.0
     one[OFF] = one[OFF] + 1.0 if abs(off) > limit else 0.0
     if one[OFF] >= law.wrong:
         count = _tell(memory, found, count, index, COMMAND, law.drive, off, limit, law)
-    at = _median(values[law.table], i)
-    if one[LAG] == UNKNOWN:
-        low, high = before, before
-        for back in range(2, law.lagging + 1):
-            low, high = min(low, command[i - back]), max(high, command[i - back])
-        astray, share = max(low - at, at - high, 0.0), law.unseen
-    else:
-        ago = min(one[LAG] * law.rate, law.lagging) + 1.0
-        whole = int(ago)
-        part = ago - whole
-        then = (1.0 - part) * command[i - whole] + part * command[i - whole - 1]
-        astray, share = abs(at - one[GAIN] * then), law.following
-    share = law.gross if one[KEY] == CHECKING else share
-    limit = law.astray + share * one[PEAK]
+    astray = _astray(_median(values[law.table], i), command, i, law, one)
+    share = law.unseen if one[LAG] == UNKNOWN else law.following
+    limit = law.astray + (law.gross if gross else share) * one[PEAK]
+    limit += law.rough if gross else _pushed(values, i, law, one)
     one[ASTRAY] = one[ASTRAY] + 1.0 if astray > limit else 0.0
     if one[ASTRAY] >= law.wrong:
         count = _tell(memory, found, count, index, FOLLOWING, law.table, astray, limit, law)
     return count
+
+
+@njit(cache=True, nogil=True)
+def _astray(at, command, i, law, one):  # type: ignore[no-untyped-def]
+    """How far the table is from where its command asks it to be, m.
+
+    Until its gain and lag are known it may be anywhere that the command has been lately.
+    """
+    if one[LAG] == UNKNOWN:
+        low, high = command[i - 1], command[i - 1]
+        for back in range(2, law.lagging + 1):
+            low, high = min(low, command[i - back]), max(high, command[i - back])
+        return max(low - at, at - high, 0.0)
+    ago = min(one[LAG] * law.rate, law.lagging) + 1.0
+    whole = int(ago)
+    part = ago - whole
+    return abs(at - one[GAIN] * ((1.0 - part) * command[i - whole] + part * command[i - whole - 1]))
+
+
+@njit(cache=True, nogil=True)
+def _pushed(values, i, law, one):  # type: ignore[no-untyped-def]
+    """How far the specimen can push the table aside, m: M / m a / p^2, with the pole p = 2 / lag
+    of a servo of two equal ones, and a the largest of about the last cycle.
+    """
+    if law.mass < 0 or one[LAG] == UNKNOWN:
+        return 0.0
+    a = _median(values[law.mass], i)
+    if not math.isnan(a):
+        one[PUSH] = max(abs(a), one[PUSH] * (1.0 - 1.0 / law.episode))
+    return law.mass_kg / law.table_kg * one[PUSH] * (0.5 * one[LAG]) ** 2
 
 
 @njit(cache=True, nogil=True)
@@ -203,7 +225,7 @@ def _turn(command, phase, i, key, one, law):  # type: ignore[no-untyped-def]
     one[PEAK] = max(abs(command[i]), one[PEAK] * math.exp(-max(abs(turned), 1.0 / law.rate)))
     if key != one[KEY]:
         one[KEY], one[TURNED] = key, 0.0
-        one[BEGUN] = max(one[BEGUN], abs(key))
+        one[BEGUN] = max(one[BEGUN], SWEEPING if key > 0.0 else 0.5 if key < 0.0 else 0.0)
         return OTHER
     one[TURNED] += turned
     if one[TURNED] >= 0.5:

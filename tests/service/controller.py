@@ -6,6 +6,7 @@ line on its standard input is an order to the session, or a way to misbehave.
 
 import os
 import select
+import socket
 import sys
 from pathlib import Path
 
@@ -18,7 +19,6 @@ from table_io.profile import Profile
 from table_io.records import Event, RunStop
 from table_io.rig import Rig
 from table_io.session import Order, Setup, play
-from twin.service.bundle import warm
 from twin.service.scheduling import urgent
 
 
@@ -41,7 +41,7 @@ def main() -> None:
         if word == "garbage":
             backend._alive().sendall(b"GET / HTTP/1.1\r\nHost: table\r\n\r\n")
         elif word == "drop":
-            backend._alive().close()
+            backend._alive().shutdown(socket.SHUT_RDWR)
         elif word:
             return Order(word, "asked to")
         return None
@@ -49,7 +49,6 @@ def main() -> None:
     def describe(_: dict[str, float], epoch_s: float) -> Event:
         return Event(0, "started", repr(epoch_s))
 
-    warm("plant")  # as the rig does: what compiles must not do so in motion
     urgent(50)
     acquired = 0
     for item in play(Setup(profile, rig), backend, clock, describe, commands):  # type: ignore[arg-type]

@@ -48,6 +48,10 @@ measured_cycles = 2
 [loop_check]
 cycles = 3
 """
+COARSE = """
+from twin.service import figures
+figures.STYLE.update({"savefig.dpi": 30, "figure.constrained_layout.use": False})
+"""  # in every process of it: pictures are not what is tried here
 EQUAL = 0.025  # of a curve: the level is only held within 2 %, and noise goes on elsewhere
 
 
@@ -75,10 +79,17 @@ class Both:
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
     folder = tmp_path_factory.mktemp("campaigns")
-    told = {"title": "free", "gap": "inf", "start": 1.0, "stop": 1.6, "step": 0.3, "cycles": 3}
-    (folder / "free.toml").write_text(TEST.format(**told))
-    told = {"title": "g4", "gap": 4.0, "start": 2.6, "stop": 4.4, "step": 0.6, "cycles": 6}
-    (folder / "g4.toml").write_text(TEST.format(**told))
+    card: dict[str, Any] = {
+        "title": "free",
+        "gap": "inf",
+        "start": 1.0,
+        "stop": 1.6,
+        "step": 0.3,
+        "cycles": 3,
+    }
+    (folder / "free.toml").write_text(TEST.format(**card))
+    card = {"title": "g4", "gap": 4.0, "start": 2.6, "stop": 4.4, "step": 0.6, "cycles": 6}
+    (folder / "g4.toml").write_text(TEST.format(**card))
     (folder / "c.toml").write_text(LISTED)
     whole, killed = folder / "whole", folder / "killed"
     with pytest.MonkeyPatch.context() as patch:
@@ -88,17 +99,21 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
         assert campaign(Asked(folder / "c.toml", whole, False, True, None, None, False, "")) == 0
     share = random.uniform(0.2, 0.95)
     size = (whole / "02-g4" / "run.mcap").stat().st_size
+    (folder / "sitecustomize.py").write_text(COARSE)
+    told = {**os.environ, "PYTHONPATH": str(folder)}
     command = [SHAKETWIN, "campaign", str(folder / "c.toml"), "--speed", "max", "--out", killed]
-    _kill(command, killed / "02-g4" / "run.mcap", share * size)
+    _kill(command, told, killed / "02-g4" / "run.mcap", share * size)
     left = {one.parent.name: one.read_bytes() for one in killed.rglob("run.mcap")}
-    done = subprocess.run([*command, "--resume"], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [*command, "--resume"], env=told, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     return Both(whole, killed, share, left, done.stdout)
 
 
-def _kill(command: list[Any], log: Path, size: float) -> None:
+def _kill(command: list[Any], told: dict[str, str], log: Path, size: float) -> None:
     """Start a campaign, and kill it and all that it started once the log is so large."""
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(command, env=told, stdout=subprocess.DEVNULL)
     while process.poll() is None and not (log.exists() and log.stat().st_size >= size):
         time.sleep(0.01)
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
@@ -134,8 +149,8 @@ def test_a_campaign_finds_what_its_runs_found(both: Both) -> None:
     free, g4 = found["runs"]
     assert (free["jumps"], free["gap_mm"], g4["gap_mm"]) == ([], None, 4.0)
     assert g4["hysteresis"] == [{"kind": "right", "from_hz": 3.2, "to_hz": 3.8}]
-    assert g4["checks"] > 0
-    assert not g4["checks_failed"]
+    assert all(check["passed"] for check in g4["checks"])
+    assert len(g4["checks"]) > 30
     assert g4["trips"] == []
     assert abs(g4["level_error"]) < 0.02
 

@@ -49,15 +49,17 @@ enabled = {check}
 [control]
 enabled = {check}
 """
-# Each is done to the rig at a random time of its test.
+CLOSED, SILENT = "the connection closed", "no word from the controller"
+# Each is done to the rig at a random time of its test, and the machine sees one of these. A process
+# that dies on a busy computer may be silent for longer than its connection stays open.
 LOSSES = {
-    "kill -9": "the connection closed",
-    "terminate": "the connection closed",
-    "freeze": "no word from the controller",
-    "drop": "the connection closed",
-    "garbage": "no controller says",
-    "long pause": "no word from the controller",
-    "short pause, kill -9": "the connection closed",
+    "kill -9": (CLOSED, SILENT),
+    "terminate": (CLOSED, SILENT),
+    "freeze": (SILENT,),
+    "drop": (CLOSED, SILENT),
+    "garbage": ("no controller says",),
+    "long pause": (SILENT,),
+    "short pause, kill -9": (CLOSED, SILENT),
 }
 ORDERS = ("interrupt", "stop", "abort")
 FAULTS = (
@@ -204,30 +206,27 @@ def proven(group: Group, life: Life, outcome: Outcome) -> float:
     return max(after_s, 0.0)
 
 
-def check_told(group: Group, life: Life, outcome: Outcome) -> None:
+def check_told(life: Life, outcome: Outcome) -> None:
     """The machine knows how it lost its controller, or that it was given back."""
-    why, deed = life.notes[-2][1], outcome.case.deed
-    over = re.search(r"^over", outcome.said, re.MULTILINE) is not None
-    if deed in LOSSES and not over:
-        assert LOSSES[deed] in why, (deed, life.notes, outcome.said)
-    elif deed in ORDERS or over:
-        assert "released" in why or "lost" in why, (deed, life.notes, outcome.said)
+    why, where = life.notes[-2][1], f"{outcome.case} {life.notes}\n{outcome.said}"
+    if outcome.case.deed in ORDERS or re.search(r"^over", outcome.said, re.MULTILINE):
+        assert "released" in why or "lost" in why, where
+    else:
+        assert any(one in why for one in LOSSES[outcome.case.deed]), where
 
 
 def test_a_rig_that_dies_leaves_a_table_that_comes_to_rest(tmp_path: Path) -> None:
-    """Three ways to die, one after another on one machine; the last life is a whole test."""
-    deeds = [("kill -9", 1.7), ("freeze", 1.3), ("long pause", 2.2), ("stop", 0.9)]
+    """Three ways to die, one after another on one machine."""
+    deeds = [("kill -9", 1.7), ("freeze", 1.3), ("long pause", 2.2)]
     cases = [Case(deed, after, 1.0) for deed, after in deeds]
     group = Group(tmp_path / "machine", cases, pace=2.0).run()
     lives = group.lives()
     assert len(lives) == len(cases)
     for life, outcome in zip(lives, group.outcomes, strict=True):
         proven(group, life, outcome)
-        check_told(group, life, outcome)
+        check_told(life, outcome)
         assert np.abs(life.command_m).max() > 1e-4  # it did move
-    assert "over" in group.outcomes[2].said
-    assert "halted" in group.outcomes[2].said
-    assert re.search(r"over \d+ stopped", group.outcomes[3].said)
+    assert re.search(r"over \d+ halted", group.outcomes[2].said)  # it was told when it came back
 
 
 def cases_of(seed: int, count: int, most_s: float) -> list[Case]:
@@ -255,27 +254,34 @@ def test_two_hundred_random_deaths(tmp_path: Path) -> None:
     with ThreadPoolExecutor(3) as pool:
         groups = list(pool.map(Group.run, groups))
     seconds: dict[str, list[float]] = {}
-    samples = 0
+    samples, broken = 0, []
     for group in groups:
         lives = group.lives()
         assert len(lives) == len(group.cases)
         for life, outcome in zip(lives, group.outcomes, strict=True):
             samples += life.samples.shape[1]
-            seconds.setdefault(outcome.case.deed, []).append(proven(group, life, outcome))
-            if not group.fault:
-                check_told(group, life, outcome)
+            try:
+                seconds.setdefault(outcome.case.deed, []).append(proven(group, life, outcome))
+                if not group.fault:
+                    check_told(life, outcome)
+            except AssertionError as error:
+                broken.append(str(error))
     ends = Counter(end(outcome) for group in groups for outcome in group.outcomes)
     every = np.concatenate([np.array(one) for one in seconds.values()])
-    assert every.size == 200
-    print(f"\n{every.size} deaths, {samples} samples, none missing, none jumped")
-    print(f"seconds to rest: median {np.median(every):.2f}, worst {every.max():.2f}")
+    print(f"\n{every.size} deaths, {samples} samples, {len(broken)} that broke the law")
+    moved = every[every > 0.0]
+    print(f"{moved.size} tables in motion: median {np.median(moved):.2f} s to rest, worst", end=" ")
+    print(f"{moved.max():.2f} s")
     for deed, of in seconds.items():
-        print(f"  {deed:22} {len(of):4}  median {np.median(of):.2f}  worst {max(of):.2f}")
+        print(f"  {deed:22} {len(of):4}  worst {max(of):.2f} s")
     print(f"what the rigs said last: {dict(ends)}")
+    assert not broken, "\n\n".join(broken)
+    assert every.size == 200
 
 
 def end(outcome: Outcome) -> str:
     """How a rig ended: its verdict, an error, or without a word."""
     over = re.search(r"^over \d+ (\w+)", outcome.said, re.MULTILINE)
-    error = re.search(r"^(?:[\w.]+\.)?(\w+(?:Error|Lost|Interrupt))\b.*\Z", outcome.said, re.M)
+    last = outcome.said.strip().rpartition("\n")[2]
+    error = re.match(r"(?:[\w.]+\.)?(\w+(?:Error|Lost|Interrupt))\b", last)
     return over[1] if over else error[1] if error else "nothing"

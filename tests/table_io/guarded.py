@@ -5,15 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from table_io.backends import MachineLost
 from table_io.backends.simulated import SimulatedBackend
 from table_io.block import Block
 from table_io.calibration import command_to_volts, noise_from, tare_from, to_si
 from table_io.card import PROFILES, load
 from table_io.clock import ManualClock
-from table_io.drive import Drive
+from table_io.course import plan
 from table_io.profile import Profile
-from table_io.protection import Finding, Guard, Seen, begin, identified, inspect
+from table_io.protection import Finding, Seen, begin, identified, inspect
 from table_io.records import Response
 from table_io.rig import Rig
 
@@ -32,31 +31,28 @@ def machine(faults: tuple[dict[str, Any], ...] = (), noise: float = 1.0, **simul
 
 @dataclass
 class Played:
-    """What came of it: findings, the sample at which each was known, and how it ended."""
+    """What came of it: the findings, and the sample up to which was read when each was known."""
 
-    drive: Drive
-    findings: list[Finding] = field(default_factory=list)
-    known_at: list[int] = field(default_factory=list)
-    lost_at: int | None = None
-    guard: Guard | None = None
-    table_m: list[float] = field(default_factory=list)
+    samples: int = 0
+    findings: list[tuple[int, Finding]] = field(default_factory=list)
 
-    @property
-    def stop(self) -> Finding | None:
-        return next((one for one in self.findings if one.stop), None)
+    def since(self, sample: int) -> list[tuple[int, Finding]]:
+        return [one for one in self.findings if one[0] > sample]
 
 
 def play(
     profile: Profile,
     rig: Rig,
-    drive: Drive,
-    block: int = 20,
     response: Response | None = None,
     until: int | None = None,
+    stop_after: int | None = None,
 ) -> Played:
-    """Plays a drive; the first finding that must stop decays it to rest."""
-    rate, clock = drive.rate_hz, ManualClock()
-    backend = SimulatedBackend(rig, profile.specimen, rate, clock)
+    """The uncorrected sweep, whatever is found; up to sample `until`, or to the first finding that
+    is known after sample `stop_after`.
+    """
+    drive = plan(profile)
+    rate, block = drive.rate_hz, profile.acquisition.block_samples
+    backend = SimulatedBackend(rig, profile.specimen, rate, ManualClock())
     backend.open()
     volts = backend.tare(int(rate))
     tare = tare_from(volts, rig.sensors)
@@ -64,29 +60,16 @@ def play(
     if response is not None:
         guard = identified(guard, response)
     full = np.array([[abs(one.range_si * one.volts_per_si)] for one in rig.sensors])
-    metres = drive.command(0, drive.rest_from + 1)
-    backend.queue(0, command_to_volts(metres, rig.output))
+    backend.queue(0, command_to_volts(drive.command(0, drive.rest_from + 1), rig.output))
     backend.start()
-    out, at, rest = Played(drive), 0, round(0.3 * rate)
-    while at < min(out.drive.rest_from + rest, until or 2**62):
-        try:
-            volts = backend.read(block)
-        except MachineLost:
-            out.lost_at = at
-            break
-        labels = out.drive.labels(at, block)
+    out = Played()
+    while out.samples < (until or drive.rest_from + round(0.3 * rate)):
+        volts, at = backend.read(block), out.samples
         values = to_si(volts, rig.sensors, tare)
-        seen = Block("meas", at, rate, rig.channels, values, *labels)
-        guard, found = inspect(guard, Seen.of(seen, np.abs(volts) >= RANGE * full, out.drive))
-        at += block
-        for one in found:
-            if one.stop and out.stop is None:
-                taken = round((clock.now() - backend.scheduled(0)) * rate)
-                first = max(at, taken) + backend.replace_after + round(0.005 * rate)
-                out.drive = out.drive.decayed(first)
-                metres = out.drive.command(first, max(out.drive.rest_from + 1 - first, 1))
-                backend.queue(first, command_to_volts(metres, rig.output))
-            out.findings.append(one)
-            out.known_at.append(at)
-    out.guard = guard
+        seen = Block("meas", at, rate, rig.channels, values, *drive.labels(at, block))
+        guard, found = inspect(guard, Seen.of(seen, np.abs(volts) >= RANGE * full, drive))
+        out.samples += block
+        out.findings += [(out.samples, one) for one in found]
+        if stop_after is not None and out.since(stop_after):
+            break
     return out

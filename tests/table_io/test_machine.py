@@ -4,10 +4,6 @@ import contextlib
 import json
 import math
 import re
-import socket
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,30 +12,21 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from table_io.backends import HEARTBEAT_S, PATIENCE_S, MachineLost
-from table_io.backends.machine import MachineBackend
+from table_io.backends import HEARTBEAT_S
 from table_io.block import Float1D
 from table_io.card import PROFILES, BadInput, parse
-from table_io.clock import RealClock
-from table_io.machine import server
 from table_io.machine.blackbox import BlackBox, read_box
-from table_io.machine.endpoint import Endpoint, endpoint, listening
-from table_io.machine.queued import Queued, is_still, landing
 from table_io.machine.table import Table
 from table_io.machine.wire import (
-    HEADER,
-    MOST_BYTES,
     Garbage,
     Kind,
     Message,
-    Parser,
     Refusal,
     carry,
-    encode,
     say,
 )
 from table_io.profile import Specimen
-from table_io.rig import Machine, Rig
+from table_io.rig import Rig
 
 RATE = 2000.0
 TEXT = (PROFILES / "rigs" / "machine.toml").read_text()
@@ -139,6 +126,12 @@ class Desk:
 @pytest.fixture
 def desk(tmp_path: Path) -> Desk:
     return Desk(tmp_path)
+
+
+def test_the_shipped_machine_is_the_simulated_one_in_a_process_of_its_own() -> None:
+    own = {"name", "title", "backend", "machine"}
+    simulated = parse((PROFILES / "rigs" / "simulated.toml").read_text(), Rig, "simulated")
+    assert RIG.model_dump(exclude=own) == simulated.model_dump(exclude=own)
 
 
 def test_it_plays_and_hands_over_every_sample_once(desk: Desk) -> None:
@@ -419,267 +412,3 @@ def test_a_black_box_overwrites_nothing_and_names_what_is_none(tmp_path: Path) -
         read_box(path)
     with pytest.raises(BadInput, match="cannot write"):
         BlackBox(tmp_path / "none" / "box", print)
-
-
-@given(st.lists(st.binary(max_size=40), max_size=5), st.integers(1, 30))
-def test_messages_survive_any_cut(payloads: list[bytes], cut: int) -> None:
-    sent = [Message(Kind.NOTE, k - 2, payload) for k, payload in enumerate(payloads)]
-    stream = b"".join(encode(one) for one in sent)
-    parser = Parser()
-    pieces = [stream[i : i + cut] for i in range(0, len(stream), cut)]
-    assert [one for piece in pieces for one in parser.feed(piece)] == sent
-
-
-@pytest.mark.parametrize(
-    "data",
-    [
-        b"GET / HTTP/1.1\r\nHost: table\r\n\r\n",
-        HEADER.pack(b"STM1", 99, 0, 0),
-        HEADER.pack(b"STM1", Kind.QUEUE, MOST_BYTES + 1, 0),
-        b"\0" * 20,
-        HEADER.pack(b"STM2", Kind.BEAT, 0, 0),
-    ],
-)
-def test_what_is_no_message_is_garbage_at_once(data: bytes) -> None:
-    with pytest.raises(Garbage):
-        Parser().feed(data)
-
-
-@given(
-    st.lists(
-        st.tuples(st.integers(0, 60), st.lists(st.floats(-9, 9), min_size=1, max_size=20)),
-        max_size=6,
-    )
-)
-def test_what_is_queued_is_what_was_put_last(puts: list[tuple[int, list[float]]]) -> None:
-    queued, plain = Queued(), np.zeros(200)
-    for index, values in puts:
-        queued.put(index, np.array(values))
-        plain[index:] = [*values, *[values[-1]] * 200][: 200 - index]
-        before = plain[max(index - 1, 0)] if index else 0.0
-        assert queued.take(index - 1, index)[0] == before
-        assert queued.end == index + len(values)
-    np.testing.assert_array_equal(queued.take(-5, 200), np.pad(plain, (5, 0)))
-    queued.forget(50)
-    np.testing.assert_array_equal(queued.take(50, 200), plain[50:])
-
-
-@pytest.mark.parametrize("f", [0.5, 1.3, 4.0, 10.0])
-@pytest.mark.parametrize("turn", np.arange(8) / 8)
-def test_a_landing_goes_on_smoothly_and_ends_at_rest(f: float, turn: float) -> None:
-    a = 0.4903
-    t = turn / f + np.arange(-400, 1) / RATE
-    motion = a / (2 * np.pi * f) ** 2 * np.sin(2 * np.pi * f * t)
-    landed = landing(motion[-3:], RATE)
-    whole = np.concatenate([motion, landed, np.zeros(3)])
-    assert np.abs(np.diff(whole, 2)).max() * RATE**2 <= 1.06 * max(a, 0.5)
-    jerk = np.abs(np.diff(whole, 3)).max() * RATE**3
-    assert jerk <= 60 * a * max(f, 1.0)  # no jump: one of 1 % of a would be 10 A a millisecond
-    assert is_still(whole[-5:-3], RATE)
-    assert np.abs(whole).max() <= 1.6 * a / (2 * np.pi * f) ** 2 + 0.05 * a
-
-
-@pytest.mark.parametrize(
-    ("text", "part"),
-    [
-        ("tcp/0.0.0.0:7450", "other computers"),
-        ("tcp/192.168.1.5:7450", "other computers"),
-        ("tcp/:7450", "other computers"),
-        ("tcp/127.0.0.1", "allowed: tcp/127.0.0.1:PORT"),
-        ("tcp/127.0.0.1:99999", "allowed"),
-        ("udp/127.0.0.1:1", "allowed"),
-        ("unix/", "allowed"),
-    ],
-)
-def test_an_endpoint_stays_on_this_computer(text: str, part: str) -> None:
-    with pytest.raises(BadInput, match=part):
-        endpoint(text)
-
-
-def at(where: str) -> Rig:
-    return RIG.model_copy(update={"machine": Machine(endpoint=where)})
-
-
-def controller(where: str) -> MachineBackend:
-    return MachineBackend(at(where), SPECIMEN, RATE, RealClock())
-
-
-@dataclass
-class Served:
-    """A machine that runs beside the test."""
-
-    where: str
-    told: list[str]
-    table: Table
-
-
-@contextmanager
-def served(where: Endpoint, box: BlackBox | None = None) -> Iterator[Served]:
-    told: list[str] = []
-    table = Table(RIG, told.append, box)
-    listener = listening(where)
-    text = where.text
-    if where.family is socket.AF_INET:
-        text = f"tcp/127.0.0.1:{listener.getsockname()[1]}"
-    going = [True]
-    thread = threading.Thread(
-        target=server.serve, args=(listener, table, RealClock(), lambda: bool(going))
-    )
-    thread.start()
-    try:
-        yield Served(text, told, table)
-    finally:
-        going.clear()
-        thread.join()
-
-
-@pytest.fixture
-def machine() -> Iterator[Served]:
-    with served(endpoint("tcp/127.0.0.1:0")) as one:
-        yield one
-
-
-def driving(where: str) -> MachineBackend:
-    """A controller whose table moves for a little, to rest."""
-    backend = controller(where)
-    backend.open()
-    x = np.clip(np.arange(600) / 598, 0.0, 1.0)
-    backend.queue(0, 0.1 * 64 * (x * (1 - x)) ** 3)
-    backend.start()
-    backend.read(20)
-    return backend
-
-
-def test_nobody_there_says_how_to_start_it(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match=r"no table answers.*shaketwin table --rig machine"):
-        controller(f"unix/{tmp_path / 'none'}").open()
-
-
-def test_what_is_no_machine_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("table_io.backends.machine.ANSWER_S", 0.05)
-    with closing(socket.create_server(("127.0.0.1", 0))) as mute:
-        where = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
-        with pytest.raises(BadInput, match=r"is no table.*shaketwin table"):
-            controller(where).open()
-
-
-def test_one_controller_at_a_time(machine: Served) -> None:
-    first = driving(machine.where)
-    with pytest.raises(BadInput, match="has a controller already"):
-        controller(machine.where).open()
-    first.read(200)
-    first.close()
-
-
-def test_a_machine_that_is_switched_off_says_so_and_ends_at_rest(tmp_path: Path) -> None:
-    box = BlackBox(tmp_path / "box", print)
-    with served(endpoint(f"unix/{tmp_path / 'table'}"), box) as one:
-        backend = driving(one.where)
-    with pytest.raises(MachineLost, match="switched off"):
-        backend.read(20000)
-    (life,) = read_box(tmp_path / "box")
-    assert life.command_m[-1] == 0.0
-    assert life.samples.shape[1] >= 600
-    assert "switched off" in life.notes[-2][1]
-    assert life.notes[-1][1] == "at rest"
-
-
-@pytest.mark.parametrize(
-    "data", [b"GET / HTTP/1.1\r\n\r\n", encode(claim()), encode(Message(Kind.QUEUE, 9, b"1"))]
-)
-def test_garbage_loses_the_controller_and_not_the_machine(machine: Served, data: bytes) -> None:
-    backend = driving(machine.where)
-    backend._alive().sendall(data)
-    with pytest.raises(MachineLost, match="no controller says"):
-        backend.read(20000)
-    with pytest.raises(MachineLost, match="no controller says"):
-        backend.queue(5000, np.zeros(2))
-    backend.close()
-    again = controller(machine.where)
-    again.open()  # waits for the rest
-    assert "at rest" in machine.told[-1]
-    again.close()
-
-
-def test_what_has_come_is_handed_out_before_the_loss_is_told(machine: Served) -> None:
-    backend = driving(machine.where)
-    while backend._come < 200:
-        backend._listen()
-    backend._alive().shutdown(socket.SHUT_RDWR)
-    assert np.isfinite(backend.read(100)).all()
-    with pytest.raises(MachineLost, match="connection"):
-        backend.read(4000)
-    assert backend.scheduled(2000) > backend.scheduled(0)
-    again = controller(machine.where)
-    again.open()  # waits for the rest
-    again.close()
-    assert "the connection closed" in machine.told[-1]
-
-
-def test_strangers_at_the_door_do_not_disturb(machine: Served) -> None:
-    backend = driving(machine.where)
-    host, port = "127.0.0.1", int(machine.where.rpartition(":")[2])
-    for data in (b"", b"\0" * 5000, encode(claim()), b"STM1"):
-        with closing(socket.create_connection((host, port))) as stranger:
-            stranger.sendall(data)
-    assert backend.read(400).shape == (len(RIG.sensors), 400)
-    backend.close()
-
-
-def test_samples_that_do_not_come_are_a_lost_machine(tmp_path: Path) -> None:
-    """A machine that answers and then hands over nothing: patience, then MachineLost."""
-    path = str(tmp_path / "mute")
-    listener = socket.socket(socket.AF_UNIX)
-    listener.bind(path)
-    listener.listen()
-
-    def answer() -> None:
-        connection, _ = listener.accept()
-        parser, answers = Parser(), 0
-        replies = [
-            Message(Kind.GRANTED, 60),
-            Message(Kind.QUEUED),
-            carry(Kind.STARTED, np.array([RealClock().now()])),
-        ]
-        while data := connection.recv(1 << 16):
-            for one in parser.feed(data):
-                if one.kind is not Kind.BEAT and answers < 3:
-                    connection.sendall(encode(replies[answers]))
-                    answers += 1
-        connection.close()
-
-    thread = threading.Thread(target=answer)
-    thread.start()
-    backend = controller(f"unix/{path}")
-    backend.open()
-    backend.queue(0, np.zeros(2))
-    backend.start()
-    with pytest.raises(MachineLost, match=f"{PATIENCE_S:g} s after their schedule"):
-        backend.read(20)
-    assert RealClock().now() >= backend.scheduled(19) + PATIENCE_S
-    thread.join()
-    listener.close()
-
-
-def test_an_endpoint_in_use_is_refused_and_a_dead_one_taken_over(tmp_path: Path) -> None:
-    where = endpoint(f"unix/{tmp_path / 'table'}")
-    with closing(listening(where)), pytest.raises(BadInput, match="another table listens"):
-        listening(where)
-    listening(where).close()  # its file was left behind
-    with closing(listening(endpoint("tcp/127.0.0.1:0"))) as taken:
-        port = taken.getsockname()[1]
-        with pytest.raises(BadInput, match="is another table there"):
-            listening(endpoint(f"tcp/127.0.0.1:{port}"))
-
-
-@pytest.mark.parametrize("missing", [("machine", "[machine]"), ("simulated", "[simulated]")])
-def test_a_card_without_its_table_is_refused(missing: tuple[str, str]) -> None:
-    key, name = missing
-    rig = RIG.model_copy(update={key: None})
-    make: Callable[[], object] = (
-        (lambda: MachineBackend(rig, SPECIMEN, RATE, RealClock()))
-        if key == "machine"
-        else (lambda: Table(rig, print))
-    )
-    with pytest.raises(BadInput, match=name.replace("[", r"\[").replace("]", r"\]")):
-        make()

@@ -114,26 +114,25 @@ def _branch(run: RunState, profile: Profile, steps: list[Json], direction: str) 
 
 def _quality(profile: Profile, steps: list[Json], found: Sequence[Json]) -> Json:
     """What a laboratory asks of a run before it believes it."""
-    level = profile.sweep.acceleration_g * GRAVITY_M_S2
-    errors = [(_number(one["table_acc_fundamental_m_s2"]) / level - 1, one) for one in steps]
-    worst = max(errors, key=lambda one: abs(one[0]), default=None)
-    told = [one.get("campaign") or {} for one in found]
+    demanded = profile.sweep.acceleration_g * GRAVITY_M_S2
+    errors = [_number(one["table_acc_fundamental_m_s2"]) / demanded - 1 for one in steps]
+    worst = max(range(len(steps)), key=lambda k: abs(errors[k]), default=None)
+    levels = [one["level"] for one in steps if one.get("level")]
     latencies = [(one.get("timing") or {}).get("latency_ms") or {} for one in found]
-    checks = [check for one in told for check in one.get("checks", ())]
     return {
-        "level_error": worst[0] if worst else None,
-        "level_error_hz": worst[1]["frequency_hz"] if worst else None,
-        "level_error_direction": worst[1]["direction"] if worst else None,
-        "updates": max((one.get("updates", 0) for one in told), default=0),
-        "checks": len(checks),
-        "checks_failed": [check for check in checks if not check["passed"]],
-        "trips": [trip for one in told for trip in one.get("trips", ())],
+        "level_error": None if worst is None else errors[worst],
+        "level_error_hz": None if worst is None else steps[worst]["frequency_hz"],
+        "level_error_direction": None if worst is None else steps[worst]["direction"],
+        "level_error_uncorrected": max(
+            (one["error_uncorrected"] for one in levels), key=abs, default=None
+        ),
+        "updates": max((one["updates"] for one in levels), default=0),
+        **{
+            name: [one for several in found for one in several.get(name, ())]
+            for name in ("checks", "trips", "faults")
+        },
         "latency_p99_ms": max((one["p99"] for one in latencies if one.get("p99")), default=None),
         "gaps": sum(one.get("gaps", 0) for one in found),
-        "faults": [fault for one in found for fault in one.get("faults", ())],
-        "twin_nrmse": (found[-1]["comparison"].get("rel_disp_m") or {}).get("nrmse")
-        if found and found[-1].get("comparison")
-        else None,
     }
 
 

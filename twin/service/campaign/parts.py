@@ -1,12 +1,10 @@
 """The recordings of a run: what stands in them, whether it is whole, and where to go on."""
 
-from dataclasses import asdict
 from pathlib import Path
 
 from table_io.card import BadInput
 from table_io.policies import policy_of
 from table_io.profile import Profile
-from table_io.records import Check, Level, Trip
 from twin.service import summary as summaries
 from twin.service.campaign.card import Mode
 from twin.service.campaign.state import Part, RunState, digest, locked
@@ -14,7 +12,7 @@ from twin.service.recordings import recorded_bundle
 from twin.service.report import write_report
 from twin.service.summary import Json
 from twin.service.supervisor import LOCK, PARTS, gather
-from twin.stream.mcap_log import Recording, read
+from twin.stream.mcap_log import read
 
 LOG = "run.mcap"
 
@@ -22,23 +20,11 @@ LOG = "run.mcap"
 def finish(folder: Path) -> Json:
     """The summary of a run's recording, written with its report into the run's folder."""
     recording = read(folder / LOG)
-    bundle = recorded_bundle(recording)
-    found = summaries.summarise(recording, bundle.parameters)
-    found["campaign"] = facts(recording, bundle.profile)
+    found = summaries.summarise(recording, recorded_bundle(recording).parameters)
+    found["sha256"] = digest(recording.path)
     summaries.write(found, folder / "summary.json")
     write_report(folder, recording)
     return found
-
-
-def facts(recording: Recording, profile: Profile) -> Json:
-    """What a campaign says of a run beyond its summary."""
-    return {
-        "first_step": profile.first_step,
-        "checks": [asdict(one) for one in recording.of(Check)],
-        "trips": [asdict(one) for one in recording.of(Trip)],
-        "updates": max((one.update for one in recording.of(Level)), default=0),
-        "sha256": digest(recording.path),
-    }
 
 
 def told(part: Part, found: Json) -> Part:
@@ -49,7 +35,7 @@ def told(part: Part, found: Json) -> Part:
             "reason": found["reason"],
             "measured": tuple(step["index"] for step in found["steps"] if step["measured"]),
             "gaps": found["gaps"],
-            "sha256": found["campaign"]["sha256"],
+            "sha256": found["sha256"],
         }
     )
 

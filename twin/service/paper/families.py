@@ -24,6 +24,7 @@ from twin.service.paper.look import (
     GUIDE,
     OF_GAP,
     TRANSITION,
+    TWIN,
     Drawing,
     Drawings,
     letter,
@@ -83,8 +84,11 @@ def all_gaps(cases: Mapping[str, Case], rig: Rig | None) -> Drawing:
             if name == "G∞" and len(names) == 2:
                 continue
             for quantity, sign in names.items():
-                _family_line(ax, name, case.points, quantity, sign, size, dots=rig is None)
-                _dots(ax, measured.get(name, ()), quantity, sign, 0.8 * size)
+                if rig is None:
+                    _family_line(ax, name, case.points, quantity, sign, size)
+                else:
+                    _model_line(ax, case.points, quantity, sign)
+                    _dots(ax, name, measured.get(name, ()), quantity, sign, 0.8 * size)
     highlighted = {}
     for name, kind in HIGHLIGHTED.items():
         seen = measured.get(name)
@@ -100,6 +104,11 @@ def all_gaps(cases: Mapping[str, Case], rig: Rig | None) -> Drawing:
         for name, size in zip(cases, sizes, strict=False)
     ]  # fmt: skip
     handles += [Line2D([], [], color=COLOUR[one], lw=2, label=one) for one in DIRECTIONS]
+    if rig is not None:
+        handles += [
+            Line2D([], [], color=TWIN, ls=DASH[one], lw=0.8, label=f"model, {one}")
+            for one in DIRECTIONS
+        ]
     handles += [
         Patch(color=BAND[kind], label=f"{kind} hysteresis, {minus(name)}")
         for name, kind in highlighted.items()
@@ -119,21 +128,34 @@ def all_gaps(cases: Mapping[str, Case], rig: Rig | None) -> Drawing:
 
 
 def _family_line(
-    ax: Axes, name: str, points: Sequence[Point], quantity: str, sign: int, size: float, dots: bool
+    ax: Axes, name: str, points: Sequence[Point], quantity: str, sign: int, size: float
 ) -> None:
     """Both directions; the backward one slimmer, so that both are seen where they coincide."""
     for one, share in (("forward", 1.0), ("backward", 0.5)):
         f, y = curve(points, "twin", one, quantity)
         ax.plot(
-            f, sign * y, "o-" if dots else "-", color=OF_GAP[name] if name == "G∞" else COLOUR[one],
-            lw=0.3 * size * share, ms=0.62 * size * share, mew=0,
+            f, sign * y, "o-", color=_colour(name, one), lw=0.3 * size * share,
+            ms=0.62 * size * share, mew=0,
         )  # fmt: skip
 
 
-def _dots(ax: Axes, points: Sequence[Point], quantity: str, sign: int, size: float) -> None:
+def _model_line(ax: Axes, points: Sequence[Point], quantity: str, sign: int) -> None:
+    """Both directions, in the ink of a model beside measured dots."""
+    for one in DIRECTIONS:
+        f, y = curve(points, "twin", one, quantity)
+        ax.plot(f, sign * y, color=TWIN, ls=DASH[one], lw=0.8)
+
+
+def _dots(
+    ax: Axes, name: str, points: Sequence[Point], quantity: str, sign: int, size: float
+) -> None:
     for one, share in (("forward", 1.0), ("backward", 0.6)):
         f, y = curve(points, "measured", one, quantity)
-        ax.plot(f, sign * y, "o", color=COLOUR[one], ms=size * share, mew=0, zorder=3)
+        ax.plot(f, sign * y, "o", color=_colour(name, one), ms=size * share, mew=0, zorder=3)
+
+
+def _colour(name: str, direction: str) -> str:
+    return OF_GAP[name] if name == "G∞" else COLOUR[direction]
 
 
 def _highlight(axes: list[Axes], points: Sequence[Point], who: str, kind: str) -> bool:

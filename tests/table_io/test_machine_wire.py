@@ -1,0 +1,88 @@
+"""What the machine is made of: messages, the queue, landings, endpoints."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from table_io.card import BadInput
+from table_io.machine.endpoint import endpoint
+from table_io.machine.queued import Queued, is_still, landing
+from table_io.machine.wire import HEADER, MOST_BYTES, Garbage, Kind, Message, Parser, encode
+
+RATE = 2000.0
+
+
+@given(st.lists(st.binary(max_size=40), max_size=5), st.integers(1, 30))
+def test_messages_survive_any_cut(payloads: list[bytes], cut: int) -> None:
+    sent = [Message(Kind.NOTE, k - 2, payload) for k, payload in enumerate(payloads)]
+    stream = b"".join(encode(one) for one in sent)
+    parser = Parser()
+    pieces = [stream[i : i + cut] for i in range(0, len(stream), cut)]
+    assert [one for piece in pieces for one in parser.feed(piece)] == sent
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"GET / HTTP/1.1\r\nHost: table\r\n\r\n",
+        HEADER.pack(b"STM1", 99, 0, 0),
+        HEADER.pack(b"STM1", Kind.QUEUE, MOST_BYTES + 1, 0),
+        b"\0" * 20,
+        HEADER.pack(b"STM2", Kind.BEAT, 0, 0),
+    ],
+)
+def test_what_is_no_message_is_garbage_at_once(data: bytes) -> None:
+    with pytest.raises(Garbage):
+        Parser().feed(data)
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 60), st.lists(st.floats(-9, 9), min_size=1, max_size=20)),
+        max_size=6,
+    )
+)
+def test_what_is_queued_is_what_was_put_last(puts: list[tuple[int, list[float]]]) -> None:
+    queued, plain = Queued(), np.zeros(200)
+    for index, values in puts:
+        queued.put(index, np.array(values))
+        plain[index:] = [*values, *[values[-1]] * 200][: 200 - index]
+        before = plain[max(index - 1, 0)] if index else 0.0
+        assert queued.take(index - 1, index)[0] == before
+        assert queued.end == index + len(values)
+    np.testing.assert_array_equal(queued.take(-5, 200), np.pad(plain, (5, 0)))
+    queued.forget(50)
+    np.testing.assert_array_equal(queued.take(50, 200), plain[50:])
+
+
+@pytest.mark.parametrize("f", [0.5, 1.3, 4.0, 10.0])
+@pytest.mark.parametrize("turn", np.arange(8) / 8)
+def test_a_landing_goes_on_smoothly_and_ends_at_rest(f: float, turn: float) -> None:
+    a = 0.4903
+    t = turn / f + np.arange(-400, 1) / RATE
+    motion = a / (2 * np.pi * f) ** 2 * np.sin(2 * np.pi * f * t)
+    landed = landing(motion[-3:], RATE)
+    whole = np.concatenate([motion, landed, np.zeros(3)])
+    assert np.abs(np.diff(whole, 2)).max() * RATE**2 <= 1.06 * max(a, 0.5)
+    jerk = np.abs(np.diff(whole, 3)).max() * RATE**3
+    assert jerk <= 60 * a * max(f, 1.0)  # no jump: one of 1 % of a would be 10 A a millisecond
+    assert is_still(whole[-5:-3], RATE)
+    assert np.abs(whole).max() <= 1.6 * a / (2 * np.pi * f) ** 2 + 0.05 * a
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("tcp/0.0.0.0:7450", "other computers"),
+        ("tcp/192.168.1.5:7450", "other computers"),
+        ("tcp/:7450", "other computers"),
+        ("tcp/127.0.0.1", "allowed: tcp/127.0.0.1:PORT"),
+        ("tcp/127.0.0.1:99999", "allowed"),
+        ("udp/127.0.0.1:1", "allowed"),
+        ("unix/", "allowed"),
+    ],
+)
+def test_an_endpoint_stays_on_this_computer(text: str, part: str) -> None:
+    with pytest.raises(BadInput, match=part):
+        endpoint(text)
