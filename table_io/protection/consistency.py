@@ -130,32 +130,29 @@ def weak(one: Window, x: Float1D, a: Float1D, noise: tuple[float, float]) -> Wea
 
 @dataclass(frozen=True, slots=True)
 class Shared:
-    """How two cells share a force: `angle` in degrees (45: equally; 0: the first alone; -45: one
-    is reversed), `apart` in N, the distance of the mean from the line through 0 at this angle, with
-    its standard error, and `swing`, the rms along it.
+    """How two cells share a force: `angle` in rad of the line on which their forces move (pi/4:
+    equally, 0: the first alone, -pi/4: one is reversed), `swing`, the rms along it, and the `means`
+    of both, N. `sigma_angle` and `sigma` are the standard errors of angle and means.
     """
 
     angle: float
-    apart: float
+    means: tuple[float, float]
     swing: float
+    sigma_angle: float
     sigma: float
 
 
 def shared(first: Float1D, second: Float1D, noise: float) -> Shared:
-    """The principal axis of two cells' forces in N, (sample,); `noise` is the rms of both."""
+    """The principal axis of two cells' forces in N, (sample,); `noise` is the rms of either."""
     means = float(first.mean()), float(second.mean())
     a, b = first - means[0], second - means[1]
     aa, bb, ab = float(a @ a), float(b @ b), float(a @ b)
-    theta = 0.5 * math.atan2(2 * ab, aa - bb)
-    if theta < -math.pi / 4 - 1e-3:
-        theta += math.pi
-    major = 0.5 * (aa + bb + math.hypot(aa - bb, 2 * ab))
-    apart = means[1] * math.cos(theta) - means[0] * math.sin(theta)
-    swing = math.sqrt(major / first.size)
-    # The angle is known to noise / (swing sqrt n), and the mean force turns with it.
-    arm = math.hypot(1.0, math.hypot(*means) / swing) if swing else 1.0
-    sigma = noise * arm / math.sqrt(first.size)
-    return Shared(math.degrees(theta), apart, swing, sigma)
+    angle = 0.5 * math.atan2(2 * ab, aa - bb)
+    if angle < -math.pi / 4 - 1e-3:
+        angle += math.pi
+    swing = math.sqrt(0.5 * (aa + bb + math.hypot(aa - bb, 2 * ab)) / first.size)
+    sigma = noise / math.sqrt(first.size)
+    return Shared(angle, means, swing, sigma / swing if swing else math.inf, sigma)
 
 
 def despiked(values: Float2D, limit: Float2D) -> Float2D:

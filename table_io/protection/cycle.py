@@ -79,8 +79,8 @@ class Cycle:
 
     @cached_property
     def tones(self) -> dict[str, Tracked]:
-        """Harmonics of the table's displacement and acceleration and of the command."""
-        names = ("table_disp_m", "table_acc_m_s2")
+        """Harmonics of the command ("command"), as read back, and of the table's two channels."""
+        names = ("drive_disp_m", "table_disp_m", "table_acc_m_s2")
         rows = [*(self.clean(name) for name in names), self.command]
         found = track_all(np.array(rows), self.phase, HARMONICS)
         return dict(zip((*names, "command"), found, strict=True))

@@ -29,6 +29,7 @@ TELLING_S = 0.1  # the longest run at rest from which something can be told of a
 MOVED_LSB = 20.0  # expected movement in which a sensor without noise must have changed
 SPIKE_SIGMA = 10.0  # white noise: once in 1e14 samples
 SPIKE_RANGE = 1e-3
+JERK_S = 1e-3  # of half the least lag: a table so stiff shows every step of its output
 SAME = 5  # samples in a row that are all equal to earlier ones: noise never repeats itself
 WRONG = 8  # samples in a row off the command: more than SAME, so a repetition is told as such
 READ_GAIN = 0.01  # of a command that is read back
@@ -103,6 +104,8 @@ def law(profile: Profile, rig: Rig, noise: Mapping[str, tuple[float, int]]) -> L
     tells = (rms > 0) & (runs < TELLING_S * rate)
     needed = ("drive_disp_m", "table_disp_m", "table_acc_m_s2")
     drive, table, acc = (names.index(name) for name in needed)
+    spike = np.maximum(SPIKE_SIGMA * sigma, SPIKE_RANGE * full)
+    spike[acc] += rig.output.lsb_m / JERK_S**2
     steps = lsb.copy()
     steps[[drive, table]] = np.maximum(lsb[[drive, table]], rig.output.lsb_m)
     return Law(
@@ -121,7 +124,7 @@ def law(profile: Profile, rig: Rig, noise: Mapping[str, tuple[float, int]]) -> L
         profile.specimen.mass_kg,
         math.ceil(VELOCITY_S * rate),
         full,
-        np.maximum(SPIKE_SIGMA * sigma, SPIKE_RANGE * full),
+        spike,
         np.where(tells, np.maximum(STUCK_S * rate, STUCK_RUNS * runs), math.inf),
         np.where(np.isin(names, needed), MOVED_LSB * steps, math.inf),
         STUCK_S * rate,

@@ -20,6 +20,7 @@ KNOWN = 6  # looks after which that is known
 OFFSET_RANGE = 1e-3  # of a sensor's range
 BY_OFFSET = 0.3  # of a difference: so little is left where an offset explains it
 OFFSET_LEVEL = 0.02  # of the table's motion
+READ_BACK = 0.02  # of the command
 GAIN = 0.2  # of the identified response
 LAG_MORE, LAG_S = 0.5, 0.003  # of the identified lag, and at least
 AVERAGED = 20  # looks, ten cycles: a transient is over by then
@@ -160,6 +161,20 @@ def level(cycle: Cycle) -> Iterator[Doubt]:
         text = f"{words}: {off_db:+.1f} dB; allowed: +-{card.abort_db:g} dB"
         bound = 10 ** (limit / 20) * cycle.level
         yield Doubt("level", "table_acc_m_s2", seen, bound, text, "stop")
+
+
+def read_back(cycle: Cycle) -> Iterator[Doubt]:
+    """The command as read back against the command as queued, where it is too small for a look at
+    every sample.
+    """
+    asked = cycle.tones["command"].fundamental
+    if not cycle.has("drive_disp_m") or asked == 0.0:
+        return
+    limit = READ_BACK + cycle.bench.rig.output.lsb_m / asked
+    gain = cycle.tones["drive_disp_m"].fundamental / asked
+    if abs(gain - 1.0) > limit:
+        text = f"the command read back is {gain:.3f} of what was queued; allowed: +-{limit:.3f}"
+        yield Doubt("command", "drive_disp_m", gain, 1 + math.copysign(limit, gain - 1), text)
 
 
 def transfer(cycle: Cycle) -> tuple[complex, complex]:

@@ -14,9 +14,9 @@ import numpy as np
 
 from table_io.block import Float1D, Float2D
 from table_io.protection import looks, sides
-from table_io.protection.consistency import Shared
 from table_io.protection.cycle import Bench, Cycle, Doubt
 from table_io.protection.looks import Swing, Usual
+from table_io.protection.sides import Share
 from table_io.records import Response
 from table_io.response import transfer_at
 
@@ -55,7 +55,7 @@ class Tracks:
     response: Response | None = None
     visits: Mapping[float, complex] = field(default_factory=_empty)
     usual: Mapping[str, Usual] = field(default_factory=_empty)
-    shares: Mapping[str, Shared] = field(default_factory=_empty)
+    shares: Mapping[str, Share] = field(default_factory=_empty)
     streaks: Mapping[tuple[str, str, str], int] = field(default_factory=_empty)
     swing: Swing = field(default_factory=Swing)
     gain: float = 1.0
@@ -111,7 +111,8 @@ def _held(tracks: Tracks, cycle: Cycle) -> tuple[Tracks, list[Doubt]]:
     """What holds at a constant frequency and level."""
     swing = looks.swung(cycle, tracks.swing)
     tracks = replace(tracks, swing=swing)
-    doubts = [*looks.level(cycle), *looks.table_mean(cycle), *looks.mass_mean(cycle, swing)]
+    doubts = [*looks.level(cycle), *looks.read_back(cycle)]
+    doubts += [*looks.table_mean(cycle), *looks.mass_mean(cycle, swing)]
     seen = looks.transfer(cycle)
     f = round(cycle.omega / (2 * math.pi), 3)
     known = tracks.visits.get(f)

@@ -35,7 +35,7 @@ profile = "g4.toml"
 prompt = "Set 4 mm"
 """
 TEST = """
-title = "{title}"
+title = "{name}"
 [specimen]
 mass_kg = 550.0
 gap_mm = {gap}
@@ -45,9 +45,16 @@ stop_hz = {stop}
 step_hz = {step}
 cycles = {cycles}
 measured_cycles = 2
+directions = {directions}
 [loop_check]
 cycles = 3
 """
+TESTS = {
+    "free": {"gap": "inf", "start": 1.0, "stop": 1.6, "step": 0.3, "cycles": 3,
+             "directions": ["forward"]},
+    "g4": {"gap": "4.0", "start": 2.6, "stop": 4.4, "step": 0.6, "cycles": 6,
+           "directions": ["forward", "backward"]},
+}  # fmt: skip
 COARSE = """
 from twin.service import figures
 figures.STYLE.update({"savefig.dpi": 30, "figure.constrained_layout.use": False})
@@ -79,17 +86,8 @@ class Both:
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
     folder = tmp_path_factory.mktemp("campaigns")
-    card: dict[str, Any] = {
-        "title": "free",
-        "gap": "inf",
-        "start": 1.0,
-        "stop": 1.6,
-        "step": 0.3,
-        "cycles": 3,
-    }
-    (folder / "free.toml").write_text(TEST.format(**card))
-    card = {"title": "g4", "gap": 4.0, "start": 2.6, "stop": 4.4, "step": 0.6, "cycles": 6}
-    (folder / "g4.toml").write_text(TEST.format(**card))
+    for name, told in TESTS.items():
+        (folder / f"{name}.toml").write_text(TEST.format(name=name, **told))
     (folder / "c.toml").write_text(LISTED)
     whole, killed = folder / "whole", folder / "killed"
     with pytest.MonkeyPatch.context() as patch:
@@ -100,20 +98,20 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
     share = random.uniform(0.2, 0.95)
     size = (whole / "02-g4" / "run.mcap").stat().st_size
     (folder / "sitecustomize.py").write_text(COARSE)
-    told = {**os.environ, "PYTHONPATH": str(folder)}
+    environment = {**os.environ, "PYTHONPATH": str(folder)}
     command = [SHAKETWIN, "campaign", str(folder / "c.toml"), "--speed", "max", "--out", killed]
-    _kill(command, told, killed / "02-g4" / "run.mcap", share * size)
+    _kill(command, environment, killed / "02-g4" / "run.mcap", share * size)
     left = {one.parent.name: one.read_bytes() for one in killed.rglob("run.mcap")}
     done = subprocess.run(
-        [*command, "--resume"], env=told, capture_output=True, text=True, check=False
+        [*command, "--resume"], env=environment, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return Both(whole, killed, share, left, done.stdout)
 
 
-def _kill(command: list[Any], told: dict[str, str], log: Path, size: float) -> None:
+def _kill(command: list[Any], environment: dict[str, str], log: Path, size: float) -> None:
     """Start a campaign, and kill it and all that it started once the log is so large."""
-    process = subprocess.Popen(command, env=told, stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
     while process.poll() is None and not (log.exists() and log.stat().st_size >= size):
         time.sleep(0.01)
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
@@ -189,6 +187,8 @@ def test_what_goes_on_says_of_what_and_from_where(both: Both) -> None:
         start = read(both.killed / "02-g4-2" / "run.mcap").start
         assert f'of = "{run["parts"][0]["run"]}"' in start.profile_toml
         assert len(start.steps) == 8
+        page = (both.killed / "02-g4-2" / "report.html").read_text()
+        assert f"run {run['parts'][0]['run']}, interrupted; from step 5 on" in page
     else:
         assert used == {"02-g4-2"}
 
@@ -198,6 +198,7 @@ def test_the_report_of_a_campaign_has_every_run(both: Both) -> None:
     for name in ("01-free", "02-g4", "02-g4-2"):
         assert f'href="{name}/report.html"' in page
         assert (both.killed / name / "report.html").is_file()
+        assert "Set-up: " in (both.killed / name / "report.html").read_text()
     assert "every eta, measured and model&#39;s, is divided by the u* and a*" in page
     assert "right 3.2–3.8" in page
     assert "Free flight and G4 &lt;i&gt;" in page

@@ -136,7 +136,7 @@ class Group:
         ) as rig:
             assert rig.stdout is not None
             first = rig.stdout.readline()
-            assert first.startswith("started"), first + rig.stdout.read()
+            assert first.startswith("started"), f"{first}{rig.stdout.read()} ({rig.wait()})"
             time.sleep(case.after_s / self.pace)
             done_s = self._do(case, rig)
             said, _ = rig.communicate(timeout=120)

@@ -234,6 +234,12 @@ def test_force_counts_the_mass_only_where_it_is_measured() -> None:
     table_alone = 30e3 / 2000.0 - 550.0 / 2000.0 * A
     assert "force" in kinds(shaken(put(ACC, AT, table_alone + 0.2)))
 
+    def both(values: Float2D) -> None:
+        values[MASS_ACC, AT:] = np.nan
+        values[ACC, AT:] = 30e3 / 2000.0 + 0.1
+
+    assert "force" in kinds(shaken(both))
+
 
 # Sensors, sample by sample
 
@@ -326,6 +332,7 @@ def test_a_cable_that_is_off_is_told_by_the_noise_it_lacks(row: int) -> None:
 def test_a_spike_is_told_and_only_that(row: int) -> None:
     sensor = RIG.sensors[row]
     limit = max(10 * sensor.noise_rms, 1e-3 * sensor.range) * sensor.si_per_unit
+    limit += RIG.output.lsb_m * 1e6 if row == ACC else 0.0
     (found,) = shaken(add(row, AT, 1.7 * limit, 1))
     assert (found.kind, found.channel, found.index, found.stop) == ("spike", NAMES[row], AT, False)
     assert shaken(add(row, AT, 0.4 * limit, 1)) == ()
@@ -368,6 +375,14 @@ def test_a_converter_may_be_a_sample_late_and_a_little_off() -> None:
         values[DRIVE] = 1.005 * np.roll(values[DRIVE], 1)
 
     assert shaken(change) == ()
+
+
+def test_a_small_command_is_read_back_over_whole_cycles() -> None:
+    small = profile(acceleration_g=0.002)
+    drive = plan(small)
+    found = shaken(scaled(DRIVE, AT, 1.05), small, drive)
+    assert {one.kind for one in found if one.channel == "drive_disp_m"} == {"command"}
+    assert "command" not in kinds(shaken(scaled(DRIVE, AT, 1.01), small, drive))
 
 
 def test_a_table_that_stays_where_it_is_stops() -> None:

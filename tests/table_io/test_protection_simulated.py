@@ -51,6 +51,19 @@ def test_a_sound_table_is_left_alone(rate_hz: float, noise: float, gap_mm: float
     assert play(profile(gap_mm, rate_hz), rig, identified()).findings == []
 
 
+@pytest.mark.parametrize(
+    "servo",
+    [
+        {"servo_bandwidth_hz": 7.0},
+        {"servo_bandwidth_hz": 100.0, "servo_delay_ms": 1.0},
+        {"servo_bandwidth_hz": 15.0, "servo_delay_ms": 30.0},
+    ],
+)
+def test_whatever_servo_a_sound_table_has(servo: dict[str, float]) -> None:
+    found = [one for _, one in play(profile(), machine(**servo)).findings]
+    assert {(one.kind, one.stop) for one in found} <= {("level", False)}
+
+
 def test_fast_and_small_motions_are_left_alone_too() -> None:
     for gap_mm in (4.0, -10.0):
         fast = profile(gap_mm, start_hz=7.0, stop_hz=10.0, step_hz=1.5, cycles=20)

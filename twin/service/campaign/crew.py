@@ -14,8 +14,6 @@ from typing import Any
 from twin.service.processes import Spec
 
 MOST = 2  # each holds a whole recording in memory while it writes the report
-# Threads of linear algebra wait for each other awake: on busy cores a solve takes 200 times longer.
-ALONE = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
 @dataclass(slots=True)
@@ -106,7 +104,6 @@ class Crew:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             pass_fds=(self._lock,),
-            env={**os.environ, **ALONE},
             start_new_session=True,
         )
         self._players.append(Player(process))

@@ -53,6 +53,8 @@ def campaign(asked: Asked) -> int:
         raise BadInput("no terminal to ask the operator between the runs; give --yes")
     folder = _folder(asked)
     with locked(folder / LOCK) as lock:
+        if asked.resume:
+            say(f"reading what is recorded in {folder}")
         book, found = reopened(folder, plan) if asked.resume else (begun(folder, plan), [])
         for one in (*found, *doubts(plan)):
             say(f"warning: {one}")

@@ -184,9 +184,8 @@ def _peaks(cases: Mapping[str, Case], axes: list[Axes]) -> None:
     """Each gap's name at its primary resonance."""
     for name, case in cases.items():
         for ax, quantity in zip(axes[:2], ("eta_d", "eta_a"), strict=True):
-            sizes = {one: curve(case.points, "twin", one, quantity) for one in DIRECTIONS}
-            best = max(sizes, key=lambda one: float(sizes[one][1].max()))
-            f, y = sizes[best]
+            curves = [curve(case.points, "twin", one, quantity) for one in DIRECTIONS]
+            f, y = max(curves, key=lambda one: float(one[1].max(initial=0.0)))
             ax.annotate(
                 minus(name), (f[y.argmax()], y.max()), LABEL_AT.get(name, (0, 5)),
                 textcoords="offset points",

@@ -1,0 +1,1 @@
+"""What explains the difference between model and measurement: identify, discover."""

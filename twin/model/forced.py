@@ -1,0 +1,127 @@
+"""The forces of a model along a motion that was measured: no motion is computed, so none diverges.
+
+    damper  D = K u + C u' + every force law that acts in flight too
+    bumpers F_R >= 0 and F_L <= 0 where contact was measured
+
+Hidden states (hysteresis, relaxation) are carried along the measured motion from rest. Where nobody
+measured contact the model's own is taken: a face is touched while its force pushes. Along the
+motion every force is a smooth function of the parameters, whatever the chaos of the trajectories:
+that is what makes a fit converge (see `learn`).
+"""
+
+import math
+
+import numpy as np
+
+from table_io.block import Bool2D, Float1D, Float2D
+from twin.model import laws
+from twin.model.compiled import compiled, inner
+from twin.model.integrated import coefficients
+from twin.model.laws import (
+    C2,
+    DRIFT,
+    EXTRA,
+    EXTRA_FIRST,
+    FAR,
+    FC,
+    FY,
+    G_L,
+    G_R,
+    K1,
+    K3,
+    KB,
+    RATE_1,
+    RATE_B,
+    UY,
+    C,
+    Constants,
+    K,
+    bumper,
+    coulomb,
+    cubic,
+    hysteretic,
+    quadratic,
+)
+from twin.model.model import Model
+from twin.model.solver import GRAVITY_M_S2
+
+ROWS = ("damper", "right", "left")
+UNKNOWN, FREE, TOUCHED = -1, 0, 1  # what was measured of a contact
+
+
+@inner()
+def relaxing(branch: float, rate: float, stiffness: float, travelled: float, h: float) -> float:
+    """A Maxwell branch h s on, while its end travels at one speed: f' = k v - f / tau."""
+    if rate == 0.0:
+        return branch + stiffness * travelled
+    left = math.exp(-rate * h)
+    return branch * left + stiffness * travelled * (1.0 - left) / (rate * h)
+
+
+@compiled(cache=True)
+def _along(
+    u: Float1D,
+    v: Float1D,
+    time: Float1D,
+    touched: Float2D,
+    con: Constants,
+    extra: laws.Extra,
+    out: Float2D,
+    version: int = laws.REVISION,
+) -> None:
+    """Fills `out` (3, sample): D, F_R, F_L in N. `touched` (2, sample) as in `UNKNOWN` ..."""
+    z, f, b_r, b_l = 0.0, 0.0, 0.0, 0.0
+    on_r, on_l = False, False
+    for k in range(u.size):
+        h = time[k] - time[k - 1] if k else 0.0
+        if k:
+            du = u[k] - u[k - 1]
+            if con[FY] > 0.0 and du != 0.0:
+                z = hysteretic(z, du, math.copysign(1.0, du), con[UY])
+            if con[K1] > 0.0 or f != 0.0:
+                f = relaxing(f, con[RATE_1], con[K1], du, h)
+            if con[KB] > 0.0:
+                b_r = relaxing(b_r, con[RATE_B], con[KB], du if on_r else 0.0, h)
+                b_l = relaxing(b_l, con[RATE_B], con[KB], -du if on_l else 0.0, h)
+        way = 1.0 if v[k] > 0.0 else -1.0
+        damper = con[K] * u[k] + con[C] * v[k] + cubic(u[k], con[K3])
+        damper += quadratic(v[k], way, con[C2]) + coulomb(way, con[FC]) + con[FY] * z + f
+        if con[EXTRA] > 0.0:
+            damper += extra(u[k], v[k], con[EXTRA_FIRST:])
+        opened = con[DRIFT] * time[k]
+        out[0, k] = damper
+        for side in range(2):
+            right = 1.0 if side == 0 else -1.0
+            gap = (con[G_R] if side == 0 else con[G_L]) + opened
+            d, dd = right * u[k] - gap, right * v[k] - con[DRIFT]
+            b = b_r if side == 0 else b_l
+            push = bumper(con, side, d, dd, b) if d > -0.5 * FAR else 0.0
+            if touched[side, k] < -0.5:
+                was = on_r if side == 0 else on_l
+                on = push > 0.0 and (was or d > 0.0)
+            else:
+                on = touched[side, k] > 0.5
+            if side == 0:
+                on_r = on
+            else:
+                on_l = on
+            out[1 + side, k] = right * push if on else 0.0
+
+
+def along(model: Model, u: Float1D, v: Float1D, time_s: Float1D, touched: Bool2D) -> Float2D:
+    """D, F_R >= 0 and F_L <= 0 in N, (3, sample), of a model along a motion.
+
+    u in m and v in m/s, (sample,), at times `time_s` in s since the start of the run; `touched`
+    (2, sample) right and left: TOUCHED, FREE, or UNKNOWN where the model decides. Effects on the
+    base acceleration and on sensors have no place here: see `tilting`.
+    """
+    con, extra = coefficients(model)
+    out = np.empty((3, u.size))
+    _along(u, v, time_s, touched.astype(np.float64), tuple(con.tolist()), extra, out)
+    return out
+
+
+def tilting(model: Model, table_disp: Float1D) -> Float1D:
+    """Force in N on the mass of a table that rocks, M g tilt x, on the left side; (sample,)."""
+    tilt = model.value("table_tilt", "tilt") or 0.0
+    return model.parameters.mass * GRAVITY_M_S2 * tilt * table_disp
