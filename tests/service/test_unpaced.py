@@ -217,7 +217,7 @@ def test_a_stop_ends_at_rest_with_what_was_measured(tmp_path: Path) -> None:
 
 
 def test_with_loop_check_and_control_every_step_has_its_level(tmp_path: Path) -> None:
-    """The same test as the controller drives it by default: within 2 % where the servo lost 1.4 %."""
+    """As the controller drives it by default: within 2 % where the servo alone lost 1.4 %."""
     short = QUICK.replace("enabled = false", "enabled = true").replace("= 4.4", "= 3.0")
     bundle, log = played(tmp_path, short)
     recording = read(log)
