@@ -38,8 +38,8 @@ def _known_keys(card: type[BaseModel], where: tuple[int | str, ...]) -> list[str
     """Keys allowed at the table that holds the last key of `where`."""
     current: Any = card
     for key in where[:-1]:
-        if isinstance(key, int):
-            continue
+        if isinstance(key, int) or key not in current.model_fields:
+            continue  # a place in a list, or a name that a table gives freely
         annotation: Any = current.model_fields[key].annotation
         stack = [annotation]
         while stack:

@@ -178,6 +178,15 @@ class SimulatedTable(Card):
     bumper_stiffness_n_m: Positive
     bumper_damping_n_s_m: Positive
     faults: tuple[PlantedFault, ...] = ()
+    truth: str | None = Field(None, description="Path of a sealed file: `backends/truth.py`.")
+    truth_sha256: str | None = Field(None, pattern=r"^[0-9a-fA-F]{64}$", validate_default=True)
+
+    @field_validator("truth_sha256")
+    @classmethod
+    def _sealed(cls, sha256: str | None, info: ValidationInfo) -> str | None:
+        if "truth" in info.data and (info.data["truth"] is None) != (sha256 is None):
+            raise ValueError("truth and truth_sha256 go together; give both or neither")
+        return sha256
 
 
 class Machine(Card):

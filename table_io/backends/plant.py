@@ -20,7 +20,7 @@ sub-step is not seen (less than 0.2 N with the paper's rig).
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -235,6 +235,7 @@ class Plant:
     payload_reaction: bool
     rate_hz: float
     substep_s: float = SUBSTEP_S
+    signals: ClassVar[tuple[str, ...]] = SIGNALS
 
     def __post_init__(self) -> None:
         least = self.bumper_stiffness_n_m / (RELAXATION * MOST_SUBSTEPS * self.rate_hz)

@@ -8,12 +8,15 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 
 from table_io.backends import PATIENCE_S, MachineLost
 from table_io.backends.faults import planted
 from table_io.backends.plant import SIGNALS, Plant
+from table_io.backends.truth import Truth, unsealed
+from table_io.backends.truth_applied import Misread, hidden_plant
 from table_io.block import Float1D, Float2D
 from table_io.card import BadInput
 from table_io.clock import Clock
@@ -40,6 +43,20 @@ def plant_on(table: SimulatedTable, specimen: Specimen, rate_hz: float) -> Plant
         payload_reaction=table.payload_reaction,
         rate_hz=rate_hz,
     )
+
+
+def truth_of(table: SimulatedTable) -> Truth | None:
+    """What a machine card hides, None where it says nothing of a truth; BadInput tells why not."""
+    if table.truth is None:
+        return None
+    try:
+        raw = Path(table.truth).read_bytes()
+    except OSError as error:
+        raise BadInput(
+            f"simulated.truth = {table.truth!r}: cannot read this sealed truth: {error}; give its "
+            "path, absolute or from the working directory"
+        ) from None
+    return unsealed(raw, str(table.truth_sha256), table.truth)
 
 
 def played(volts: Float1D, output: Output) -> Float1D:
@@ -92,6 +109,10 @@ class SimulatedBackend:
         self._rig = rig
         self._clock = clock
         self._plant = plant_on(rig.simulated, specimen, rate_hz)
+        self._misread: Misread | None = None
+        if truth := truth_of(rig.simulated):
+            self._plant = hidden_plant(self._plant, truth)
+            self._misread = Misread(truth, rig.channels, rate_hz)
         self._softened = lru_cache(2)(self._soften)
         self._faults = planted(rig.simulated.faults, rig, rate_hz, rig.simulated.seed)
         self._state = self._plant.rest()
@@ -116,7 +137,7 @@ class SimulatedBackend:
                 f"acquisition.rate_hz = {self.rate_hz:g}: rig {self._rig.name} does not sample so; "
                 f"allowed: {allowed}"
             )
-        nothing = np.empty((len(SIGNALS), 0))
+        nothing = np.empty((len(self._plant.signals), 0))
         self._plant.advance(self._plant.rest(), np.zeros(self._plant.history), nothing)
         self._is_open = True
 
@@ -163,7 +184,7 @@ class SimulatedBackend:
         known = self._commanded(first - self._past, first + samples)
         drive = self._faults.output(first - self._past, known)[self._faults.reach :]
         command = self._faults.servo(first - self._plant.history, drive)
-        signals = np.empty((len(SIGNALS), samples))
+        signals = np.empty((len(self._plant.signals), samples))
         done = 0
         for count, share in self._faults.bandwidth(first, samples):
             until = done + count
@@ -173,8 +194,10 @@ class SimulatedBackend:
         self._next += samples
         played_m = drive[self._plant.history :]
         if self.witness is not None:
-            self.witness(first, played_m, signals)
+            self.witness(first, played_m, signals[: len(SIGNALS)])
         values = self._values(played_m, signals)
+        if self._misread is not None:
+            values = self._misread.of(values)
         return self._faults.inputs(first, self._digitiser.volts(values, self._noise))
 
     def scheduled(self, index: int) -> float:
@@ -223,7 +246,8 @@ class SimulatedBackend:
 
     def _values(self, drive: Float1D, signals: Float2D) -> Float2D:
         """True values in SI, (channel, sample); the two cells of a side share its force."""
-        y, y_acc, x, x_acc, right, left = signals
+        y, y_acc, x, x_acc, right, left, *hidden = signals
+        balance = -self._plant.mass_kg * x_acc - right - left
         true = {
             "drive_disp_m": drive,
             "table_disp_m": y,
@@ -234,7 +258,7 @@ class SimulatedBackend:
             "force_r2_n": 0.5 * right,
             "force_l1_n": -0.5 * left,
             "force_l2_n": -0.5 * left,
-            "damper_force_n": -self._plant.mass_kg * x_acc - right - left,
+            "damper_force_n": hidden[0] if hidden else balance,
             "rel_disp_m": x - y,
         }
         return np.array([true[name] for name in self.channels])

@@ -12,8 +12,9 @@ that is what makes a fit converge (see `learn`).
 import math
 
 import numpy as np
+import numpy.typing as npt
 
-from table_io.block import Bool2D, Float1D, Float2D
+from table_io.block import Float1D, Float2D
 from twin.model import laws
 from twin.model.compiled import compiled, inner
 from twin.model.integrated import coefficients
@@ -108,7 +109,9 @@ def _along(
             out[1 + side, k] = right * push if on else 0.0
 
 
-def along(model: Model, u: Float1D, v: Float1D, time_s: Float1D, touched: Bool2D) -> Float2D:
+def along(
+    model: Model, u: Float1D, v: Float1D, time_s: Float1D, touched: npt.NDArray[np.int8]
+) -> Float2D:
     """D, F_R >= 0 and F_L <= 0 in N, (3, sample), of a model along a motion.
 
     u in m and v in m/s, (sample,), at times `time_s` in s since the start of the run; `touched`

@@ -9,6 +9,8 @@ from typing import Annotated
 
 import typer
 
+from twin.service.cli_learning import learning
+
 # Matrices are small here; on a busy machine the threads of a BLAS stall what they should speed up,
 # a run's own processes included. Set before numpy is imported, and inherited.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -237,6 +239,9 @@ def tell(
     from twin.service.tell import tell as command
 
     command(order.value, why, connect, rig)
+
+
+app.add_typer(learning)
 
 
 def main() -> None:

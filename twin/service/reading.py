@@ -26,6 +26,11 @@ def replay(log: Path, model: str | None, out: Path | None, speed: str, view: boo
     from twin.service.runs import replay as play
 
     recording = open_log(log)
+    if "table_acc_m_s2" not in recording.start.channels:
+        raise BadInput(
+            f"{recording.path}: no table_acc_m_s2, which drives the twin; there: "
+            f"{', '.join(recording.start.channels)}; import the table's acceleration too"
+        )
     bundle = recorded_bundle(recording, model)
     factor = _factor(speed)
     ready(bundle)

@@ -1,5 +1,6 @@
 """Recordings as a person names them, and what they were made with."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -30,6 +31,8 @@ def recorded_bundle(recording: Recording, model: str | None = None) -> Bundle:
     """The bundle that a recording was made with, or with another model in it."""
     start = recording.start
     model_toml = read_model(model)[1] if model else start.model_toml
-    return from_texts(
+    bundle = from_texts(
         start.name, start.profile_toml, start.rig_toml, model_toml, str(recording.path)
     )
+    # In an imported recording the steps are those that were found, not the profile's.
+    return replace(bundle, drive=replace(bundle.drive, steps=start.steps))

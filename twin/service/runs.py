@@ -55,7 +55,7 @@ class _Log:
         self.watch(item)
 
 
-def _record(items: Iterator[Item], path: Path, run: str, rate_hz: float, watch: Watch) -> None:
+def record(items: Iterator[Item], path: Path, run: str, rate_hz: float, watch: Watch) -> None:
     """Write every item to a new log at `path`; the log is closed whatever happens."""
     writer = LogWriter(path, rate_hz)
     log = _Log(writer, run, rate_hz, watch)
@@ -68,7 +68,7 @@ def _record(items: Iterator[Item], path: Path, run: str, rate_hz: float, watch: 
         writer.close()
 
 
-def _beside(source: Iterator[Block | Record], setup: pipeline.Setup) -> Iterator[Item]:
+def beside(source: Iterator[Block | Record], setup: pipeline.Setup) -> Iterator[Item]:
     """Every item of a source, each followed by what the twin says about it."""
     state = None
     for item in source:
@@ -98,13 +98,13 @@ def play_unpaced(
         return Order("stop", why) if (why := asked()) else None
 
     source = play(bundle.session, backend, clock, bundle.describe(run, "table"), commands)
-    _record(_beside(source, bundle.twin()), path, run, bundle.drive.rate_hz, watch)
+    record(beside(source, bundle.twin()), path, run, bundle.drive.rate_hz, watch)
 
 
 def simulate(bundle: Bundle, run: str, path: Path, watch: Watch) -> None:
     """The model alone on the ideal drive: no table, no noise."""
-    items = _beside(_ideal(bundle, run), bundle.twin(from_rest=True))
-    _record(items, path, run, bundle.drive.rate_hz, watch)
+    items = beside(_ideal(bundle, run), bundle.twin(from_rest=True))
+    record(items, path, run, bundle.drive.rate_hz, watch)
 
 
 def _ideal(bundle: Bundle, run: str) -> Iterator[Item]:
@@ -157,7 +157,7 @@ def replay(recording: Recording, bundle: Bundle, path: Path, run: str, watch: Wa
             yield item
         identity.missing = len(recorded) - len(seen)
 
-    _record(compared(), path, run, recording.start.rate_hz, watch)
+    record(compared(), path, run, recording.start.rate_hz, watch)
     return identity
 
 

@@ -1,0 +1,220 @@
+"""A table of samples becomes a log: what our own run says of itself comes out of its CSV again."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from table_io.block import Block, Label
+from table_io.card import BadInput
+from table_io.records import Comparison, Event, Gap, Point
+from twin.service.importing import take_in
+from twin.service.reading import prc, replay
+from twin.service.recordings import recorded_bundle
+from twin.service.summary import summarise
+from twin.stream.mcap_log import Recording, read
+
+from .tables_out import write_csv
+from .test_unpaced import QUICK, played
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+SHORT = QUICK.replace("start_hz = 2.6", "start_hz = 3.6")
+SILVERBOX = """
+rate_hz = 610.35
+[columns]
+table_acc_m_s2 = { column = "V1", gain = -1.0 }
+rel_disp_m = { column = "V2" }
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Recording]:
+    """A folder with quick.toml and table.csv of an unpaced run, and the run itself."""
+    folder = tmp_path_factory.mktemp("ours")
+    recording = read(played(folder, SHORT)[1])
+    write_csv(recording, folder / "table.csv")
+    return folder, recording
+
+
+@pytest.fixture(scope="module")
+def imported(run: tuple[Path, Recording]) -> Recording:
+    folder, _ = run
+    log = folder / "imported" / "run.mcap"
+    assert take_in(folder / "table.csv", log, folder / "quick.toml", None, None) == 0
+    return read(log)
+
+
+def whole(recording: Recording) -> Block:
+    (piece,) = recording.pieces("meas")
+    return piece
+
+
+def steps(recording: Recording) -> list[dict[str, Any]]:
+    return summarise(recording, recorded_bundle(recording).parameters)["steps"]
+
+
+def said(recording: Recording) -> str:
+    return "\n".join(event.text for event in recording.of(Event))
+
+
+def test_the_samples_are_those_of_the_run(run: tuple[Path, Recording], imported: Recording) -> None:
+    ours, theirs = whole(run[1]), whole(imported)
+    assert (theirs.rate_hz, theirs.channels) == (ours.rate_hz, ours.channels)
+    np.testing.assert_allclose(theirs.values, ours.values, rtol=1e-8)
+
+
+def test_steps_and_measured_cycles_are_found_where_they_were_driven(
+    run: tuple[Path, Recording], imported: Recording
+) -> None:
+    ours, theirs = whole(run[1]), whole(imported)
+    assert imported.start.steps == run[1].start.steps
+    for step in imported.start.steps:
+        true, found = (
+            np.flatnonzero((one.step == step.index) & (one.label == Label.MEASURE))
+            for one in (ours, theirs)
+        )
+        length = ours.rate_hz / step.frequency_hz
+        assert abs(true[0] - found[0]) < 0.02 * length
+        assert abs(true[-1] - found[-1]) < 0.02 * length
+        held = (ours.step == step.index) & (ours.cycle >= 0) & (theirs.cycle >= 0)
+        assert (ours.cycle == theirs.cycle)[held].mean() > 0.98
+
+
+def test_the_prc_is_that_of_the_run(run: tuple[Path, Recording], imported: Recording) -> None:
+    for ours, theirs in zip(steps(run[1]), steps(imported), strict=True):
+        assert ours["frequency_hz"] == theirs["frequency_hz"]
+        assert ours["direction"] == theirs["direction"]
+        # At the jump the motion is no steady one, and a sample earlier is another motion.
+        near = 5e-3 if ours["measured"]["spread"] > 0.02 else 1e-3
+        for key in ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l"):
+            assert theirs["measured"][key] == pytest.approx(ours["measured"][key], rel=near)
+        assert ours["measured"]["impacts_right"] == theirs["measured"]["impacts_right"]
+
+
+def test_prc_and_replay_take_it_as_one_of_ours(
+    imported: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str], draft: None
+) -> None:
+    prc(imported.path, True)
+    assert '"frequency_hz": 3.6' in capsys.readouterr().out
+    assert replay(imported.path, None, tmp_path / "again", "max", False) == 0
+    assert len(read(tmp_path / "again" / "run.mcap").of(Point)) == len(imported.start.steps)
+    assert (tmp_path / "again" / "report.html").stat().st_size > 10_000
+
+
+def test_a_sweep_that_is_another_changes_no_step(
+    run: tuple[Path, Recording], tmp_path: Path, draft: None
+) -> None:
+    profile = tmp_path / "other.toml"
+    profile.write_text(SHORT.replace("start_hz = 3.6", "start_hz = 1.0").replace("0.2", "1.7"))
+    log = tmp_path / "other.mcap"
+    take_in(run[0] / "table.csv", log, profile, None, None)
+    recording = read(log)
+    driven = [(one.direction, one.frequency_hz) for one in run[1].start.steps]
+    found = [(one.direction, one.frequency_hz) for one in recording.start.steps]
+    assert [way for way, _ in found] == [way for way, _ in driven]
+    np.testing.assert_allclose([hz for _, hz in found], [hz for _, hz in driven], rtol=2e-3)
+    assert replay(log, None, tmp_path / "again", "max", False) == 0
+    again = read(tmp_path / "again" / "run.mcap").of(Point)
+    assert [one.frequency_hz for one in again] == [hz for _, hz in found]
+
+
+def rows(run: tuple[Path, Recording]) -> list[str]:
+    """Header and rows of the first second of the sweep."""
+    return (run[0] / "table.csv").read_text().splitlines()[:6001]
+
+
+def test_a_hole_is_a_gap_between_two_blocks(run: tuple[Path, Recording], tmp_path: Path) -> None:
+    lines = rows(run)
+    del lines[2001:2051]
+    (tmp_path / "holed.csv").write_text("\n".join(lines))
+    log = tmp_path / "run.mcap"
+    assert take_in(tmp_path / "holed.csv", log, run[0] / "quick.toml", None, None) == 4
+    recording = read(log)
+    assert recording.of(Gap) == (Gap(2000, 50, "", "lost"),)
+    assert [(one.index, one.end) for one in recording.pieces("meas")] == [(0, 2000), (2050, 6000)]
+    assert recording.missing_samples == 50
+
+
+def test_lost_cells_and_lost_sensors_stay_lost(run: tuple[Path, Recording], tmp_path: Path) -> None:
+    table = [line.split(",") for line in rows(run)]
+    place = table[0].index("force_r1_n")
+    other = table[0].index("mass_acc_m_s2")
+    for line in table[1:]:
+        line[place] = ""
+    table[101][other] = "NaN"
+    (tmp_path / "lost.csv").write_text("\n".join(map(",".join, table)))
+    assert take_in(tmp_path / "lost.csv", tmp_path / "l.mcap", run[0] / "quick.toml", None, None)
+    recording = read(tmp_path / "l.mcap")
+    assert np.isnan(whole(recording).channel("force_r1_n")).all()
+    assert np.flatnonzero(np.isnan(whole(recording).channel("mass_acc_m_s2"))).tolist() == [100]
+    assert set(recording.of(Gap)) == {
+        Gap(0, 6000, "force_r1_n", "lost"),
+        Gap(100, 1, "mass_acc_m_s2", "lost"),
+    }
+    assert "force_r1_n: all lost" in said(recording)
+
+
+def test_the_profile_holds_at_another_rate(run: tuple[Path, Recording], tmp_path: Path) -> None:
+    lines = rows(run)
+    (tmp_path / "half.csv").write_text("\n".join([lines[0], *lines[1::2]]))
+    profile = tmp_path / "half.toml"
+    profile.write_text(SHORT + "[acquisition]\nblock_samples = 10 # ten\nrate_hz = 2000.0\n")
+    take_in(tmp_path / "half.csv", tmp_path / "half.mcap", profile, None, None)
+    found = recorded_bundle(read(tmp_path / "half.mcap")).profile
+    assert found.acquisition.rate_hz == 1000.0
+    assert found.acquisition.block_samples == 10
+    assert found.specimen.gap_mm == 4.0
+    (tmp_path / "slow.csv").write_text("\n".join([lines[0], *lines[1::10]]))
+    with pytest.raises(BadInput, match=r"200 Hz of .*slow.csv(.|\n)*at least 440"):
+        take_in(tmp_path / "slow.csv", tmp_path / "slow.mcap", profile, None, None)
+
+
+def test_a_component_test_without_a_table_is_a_log_that_is_not_replayed(tmp_path: Path) -> None:
+    time = np.arange(4000) / 200
+    u = 0.01 * np.sin(2 * np.pi * time)
+    table = np.array([time, u, 36e3 * u]).T
+    file, log = tmp_path / "component.csv", tmp_path / "component.mcap"
+    np.savetxt(file, table, delimiter=",", header="time_s,rel_disp_m,damper_force_n", comments="")
+    assert take_in(file, log, None, None, None) == 0
+    recording = read(log)
+    assert recording.start.channels == ("damper_force_n", "rel_disp_m")
+    assert not recording.of(Comparison)
+    assert recording.start.steps[0].frequency_hz == pytest.approx(1.0, rel=1e-3)
+    with pytest.raises(BadInput, match="no table_acc_m_s2"):
+        replay(log, None, tmp_path / "out", "max", False)
+    with pytest.raises(BadInput, match="exists already"):
+        take_in(file, log, None, None, None)
+
+
+def there(name: str) -> Path:
+    path = DATA / name
+    if not path.is_file():
+        pytest.skip("the measured data of others are not here")
+    return path
+
+
+def test_a_building_under_an_earthquake(tmp_path: Path, draft: None) -> None:
+    log = tmp_path / "b" / "run.mcap"
+    assert take_in(there("bncs/CNP100.csv"), log, None, None, None) == 0
+    recording = read(log)
+    block = whole(recording)
+    assert block.rate_hz == 200.0
+    assert block.channel("rel_disp_m")[0] == -9.43853e-05
+    assert set(block.step) == {-1}
+    assert set(block.label) == {Label.REST, Label.SETTLE}
+    assert "no stepped sine" in said(recording)
+    assert replay(log, None, tmp_path / "again", "max", False) == 0
+
+
+def test_the_silverbox_by_a_map(tmp_path: Path) -> None:
+    (tmp_path / "map.toml").write_text(SILVERBOX)
+    file, log = tmp_path / "s.csv", tmp_path / "s.mcap"
+    lines = there("silverbox/SNLS80mV.csv").read_text().splitlines(keepends=True)
+    file.write_text("".join(lines[:20_001]))
+    assert take_in(file, log, None, None, tmp_path / "map.toml") == 0
+    block = whole(read(log))
+    assert (block.rate_hz, len(block)) == (610.35, 20_000)
+    assert block.channel("table_acc_m_s2")[0] == -0.0057756
+    assert block.channel("rel_disp_m")[0] == 0.0093978
+    assert set(block.step) == {-1}

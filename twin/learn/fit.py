@@ -1,0 +1,157 @@
+"""Levenberg-Marquardt on the sheets of several logs, with spreads that coloured residuals bear."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from table_io.block import Bool2D, Float1D, Float2D
+from twin.learn.guess import Free, Guess
+from twin.learn.sheet import Sheet
+
+MOST_STEPS = 40
+CLOSE = 1e-6  # of the cost: what an iteration must gain to be followed by another
+STEP = 1e-4  # of a parameter's scale, for slopes
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The best parameters of a guess on some samples, and how well they are known."""
+
+    guess: Guess
+    free: tuple[Free, ...]
+    values: Mapping[str, float]
+    spread: Mapping[str, float]  # standard deviation, robust against coloured residuals
+    correlation: Float2D
+    cost: float  # mean square of the residual over its noise, on the samples fitted
+    converged: bool
+    at_bound: tuple[str, ...]
+
+
+def fit(
+    sheets: Sequence[Sheet],
+    guess: Guess,
+    free: Sequence[Free],
+    train: Sequence[Bool2D] | None = None,
+) -> Fit:
+    """The guess moved to least squares over the entries where `train`, (entry,) each, is True."""
+    return _Search(sheets, guess, tuple(free), train).run()
+
+
+def slopes(
+    sheets: Sequence[Sheet], guess: Guess, one: Free, before: Sequence[Float1D]
+) -> list[Float1D]:
+    """d residual / d parameter, (entry,) of each sheet, in the fit's own measure of it."""
+    x = one.inside(guess.values[one.keys[0]])
+    step = STEP * (1.0 if one.logarithmic else one.scale)
+    if (math.exp(x + step) if one.logarithmic else x + step) > one.high:
+        step = -step
+    moved = guess.moved(dict.fromkeys(one.keys, one.outside(x + step)))
+    return [(sheet.residual(moved) - was) / step for sheet, was in zip(sheets, before, strict=True)]
+
+
+class _Search:
+    """One search; x are the free values, logarithms where they are shapes."""
+
+    def __init__(
+        self,
+        sheets: Sequence[Sheet],
+        guess: Guess,
+        free: tuple[Free, ...],
+        train: Sequence[Bool2D] | None,
+    ) -> None:
+        self.sheets, self.guess, self.free = sheets, guess, free
+        self.train = train or [np.ones(sheet.row_of.size, dtype=bool) for sheet in sheets]
+        self.count = max(sum(int(one.sum()) for one in self.train), 1)
+        low = [-math.inf if f.low == -math.inf else f.inside(f.low) for f in free]
+        self.low = np.array(low)
+        self.high = np.array([math.inf if f.high == math.inf else f.inside(f.high) for f in free])
+
+    def at(self, x: Float1D) -> Guess:
+        values: dict[str, float] = {}
+        for one, value in zip(self.free, x, strict=True):
+            values |= dict.fromkeys(one.keys, one.outside(float(value)))
+        return self.guess.moved(values)
+
+    def residuals(self, guess: Guess) -> list[Float1D]:
+        return [sheet.residual(guess) for sheet in self.sheets]
+
+    def chosen(self, entries: Sequence[Float1D]) -> Float1D:
+        return np.concatenate([row[mask] for row, mask in zip(entries, self.train, strict=True)])
+
+    def jacobian(self, guess: Guess, whole: list[Float1D]) -> Float2D:
+        columns = [self.chosen(slopes(self.sheets, guess, f, whole)) for f in self.free]
+        return np.array(columns).reshape(len(self.free), -1)
+
+    def run(self) -> Fit:
+        x = np.array([f.inside(self.guess.values[f.keys[0]]) for f in self.free])
+        x = np.clip(x, self.low, self.high)
+        whole = self.residuals(self.at(x))
+        r = self.chosen(whole)
+        cost, damping, converged = float(r @ r), 1e-4, not self.free
+        for _ in range(0 if converged else MOST_STEPS):
+            jacobian = self.jacobian(self.at(x), whole)
+            hessian, gradient = jacobian @ jacobian.T, jacobian @ r
+            gained = 0.0
+            for _ in range(8):
+                trial = np.clip(x - solved(hessian, damping, gradient), self.low, self.high)
+                after = self.residuals(self.at(trial))
+                there = self.chosen(after)
+                new = float(there @ there)
+                if new < cost:
+                    gained = (cost - new) / max(cost, 1e-300)
+                    x, whole, r, cost = trial, after, there, new
+                    damping = max(damping / 10, 1e-9)
+                    break
+                damping *= 10
+            if gained < CLOSE:
+                converged = True
+                break
+        return self._fit(x, whole, cost, converged)
+
+    def _fit(self, x: Float1D, whole: list[Float1D], cost: float, converged: bool) -> Fit:
+        """Values, and spreads from the scatter of the blocks' gradients (a sandwich)."""
+        guess = self.at(x)
+        jacobian = self.jacobian(guess, whole)
+        hessian = jacobian @ jacobian.T
+        size = _sizes(hessian)
+        inverse = np.linalg.pinv(hessian / np.outer(size, size), hermitian=True)
+        inverse /= np.outer(size, size)
+        gradients = jacobian * self.chosen(whole)
+        first, middle = 0, np.zeros_like(inverse)
+        for sheet, mask in zip(self.sheets, self.train, strict=True):
+            blocks = sheet.block_of[mask]
+            of_blocks = np.array(
+                [np.bincount(blocks, weights=row[first : first + blocks.size]) for row in gradients]
+            )
+            middle += of_blocks @ of_blocks.T
+            first += blocks.size
+        covariance = inverse @ middle @ inverse
+        sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        scale = np.where(sd > 0, sd, 1.0)
+        values, spread, stuck = {}, {}, []
+        for i, free in enumerate(self.free):
+            values[free.name] = free.outside(float(x[i]))
+            spread[free.name] = float(sd[i] * (values[free.name] if free.logarithmic else 1.0))
+            if x[i] in (self.low[i], self.high[i]):
+                stuck.append(free.name)
+        correlation = covariance / np.outer(scale, scale)
+        return Fit(
+            guess, self.free, values, spread, correlation, cost / self.count, converged,
+            tuple(stuck),
+        )  # fmt: skip
+
+
+def _sizes(hessian: Float2D) -> Float1D:
+    """What makes the parameters comparable: the root of their own curvature."""
+    curvature = np.sqrt(np.diag(hessian))
+    return np.where(curvature > 0, curvature, 1.0)
+
+
+def solved(hessian: Float2D, damping: float, gradient: Float1D) -> Float1D:
+    """The damped Newton step, well scaled."""
+    size = _sizes(hessian)
+    scaled = hessian / np.outer(size, size) + damping * np.eye(size.size)
+    step: Float1D = np.linalg.lstsq(scaled, gradient / size, rcond=1e-14)[0] / size
+    return step

@@ -1,0 +1,200 @@
+"""Which effects are missing: forward selection with swaps, judged on what was held out.
+
+Each round is: all candidates by linear algebra about what is known so far (`search`), the best few
+refitted whole, each on two thirds of the steps and judged on the third, in turn.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from table_io.block import Float1D
+from twin.learn.fit import Fit, fit
+from twin.learn.guess import Free, Guess
+from twin.learn.library import Candidate, general
+from twin.learn.search import FOLDS, Finding, folds_of, nothing, products, subsets
+from twin.learn.sheet import Sheet
+
+MOST_EFFECTS = 3
+REFITTED, REFITTED_GENERAL = 5, 2  # of the candidates of a round
+LEAST_REFITTED, HOPELESS = 2, 1.5  # a cost so many times that of the best is not refitted
+WORTH_A_FIT = 0.003  # of what is left: candidates that promise less are not refitted
+MINOR = 0.02  # of the first gap: what a second or third effect must close at least
+SIGNIFICANT = 4.0  # standard errors that a gain must have
+PRACTICAL = 0.03  # of what is left, over all or in one row: less is not worth a name
+LEAST_ROW = 0.01  # of all entries: a row with fewer does not speak for itself
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """A set of effects with its best parameters, and what it leaves where it was not fitted."""
+
+    effects: tuple[Candidate, ...]
+    fit: Fit
+    left: tuple[Float1D, ...]  # per log, (entry,) held-out residual over noise
+    converged: bool
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(one.name for one in self.effects)
+
+    @property
+    def cost(self) -> float:
+        """Mean square of what is left, over the noise."""
+        return mean_square(self.left)
+
+
+def mean_square(left: Sequence[Float1D]) -> float:
+    """Of the entries of all logs."""
+    return float(sum(one @ one for one in left) / max(sum(one.size for one in left), 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """The logs, and what is fitted whatever the effects."""
+
+    sheets: tuple[Sheet, ...]
+    base: tuple[Free, ...]
+    library: tuple[Candidate, ...]
+
+    def explain(self, guess: Guess, effects: Sequence[Candidate]) -> Explained:
+        """The effects with the base, fitted on everything and held out fold by fold."""
+        free = (*self.base, *(one for effect in effects for one in effect.free))
+        whole = fit(self.sheets, guess, free)
+        folds = [folds_of(sheet) for sheet in self.sheets]
+        left = [np.empty(fold.size) for fold in folds]
+        converged = whole.converged
+        for k in range(FOLDS):
+            train = [fold != k for fold in folds]
+            if not any(one.any() for one in train):
+                continue
+            part = fit(self.sheets, whole.guess, free, train)
+            converged &= part.converged
+            for mine, fold, sheet in zip(left, folds, self.sheets, strict=True):
+                out = fold == k
+                if out.any():
+                    mine[out] = sheet.residual(part.guess)[out]
+        return Explained(tuple(effects), whole, tuple(left), converged)
+
+    def gain(self, before: Explained, after: Explained) -> tuple[float, float, float]:
+        """(share of the squares that is gained, the most in one row, standard errors of it).
+
+        With d what the second takes from the residual and b what it leaves, the gain is the sum of
+        d^2 + 2 d b; chance is in the second term, and blocks know how much.
+        """
+        gained, chance = 0.0, 0.0
+        rows: dict[str, list[float]] = {}
+        for a, b, sheet in zip(before.left, after.left, self.sheets, strict=True):
+            gained += float(a @ a - b @ b)
+            chance += float((np.bincount(sheet.block_of, weights=2 * (a - b) * b) ** 2).sum())
+            for number, name in enumerate((*sheet.rows, "rest")):
+                mine = sheet.row_of == number
+                if mine.sum() > LEAST_ROW * mine.size:
+                    row = rows.setdefault(name, [0.0, 0.0])
+                    row[0] += float(a[mine] @ a[mine] - b[mine] @ b[mine])
+                    row[1] += float(a[mine] @ a[mine])
+        total = before.cost * sum(a.size for a in before.left)
+        share = gained / max(total, 1e-300)
+        most = max((part / whole for part, whole in rows.values() if whole > 0), default=share)
+        return share, max(most, share), gained / max(math.sqrt(chance), 1e-300)
+
+    def worth(self, before: Explained, after: Explained) -> bool:
+        """True where the second is better by more than chance, and by enough to matter."""
+        share, row, errors = self.gain(before, after)
+        return share > 0 and row > PRACTICAL and errors > SIGNIFICANT
+
+
+@dataclass(frozen=True, eq=False)
+class Named:
+    """The outcome of a selection: the null, what was found, and every set that was refitted."""
+
+    null: Explained
+    best: Explained
+    tried: tuple[Explained, ...] = field(default=())
+    outside: tuple[Explained, ...] = field(default=())  # with a general term in it
+
+
+def named(bench: Bench, guess: Guess, tell: Tell = lambda text: None) -> Named:
+    """Forward selection from the base alone, with swaps of what was taken before."""
+    null = current = bench.explain(guess, ())
+    tried: list[Explained] = []
+    while len(current.effects) < MOST_EFFECTS:
+        round_ = _refitted(bench, current, current.effects, tell)
+        tried += round_
+        best = min(round_, key=lambda one: one.cost, default=current)
+        minor = current.effects and current.cost - best.cost < MINOR * (null.cost - best.cost)
+        if minor or not bench.worth(current, best):
+            break
+        null = _null_again(bench, null, best)
+        current = best
+        for member in current.effects[:-1]:
+            others = tuple(one for one in current.effects if one is not member)
+            swapped = _refitted(bench, current, others, tell, member)
+            tried += swapped
+            best = min(swapped, key=lambda one: one.cost, default=current)
+            if bench.worth(current, best):
+                current = best
+    return Named(null, current, tuple(tried), _outside(bench, null, current, tell))
+
+
+def _outside(bench: Bench, null: Explained, best: Explained, tell: Tell) -> tuple[Explained, ...]:
+    """What general terms do: alone, beside what was found, and in the place of each of it."""
+    library = general(any((sheet.touched > 0).any() for sheet in bench.sheets))
+    found = _refitted(bench, null, (), tell, None, library)
+    if best.effects:
+        found += _refitted(bench, best, best.effects, tell, None, library)
+    if len(best.effects) > 1:
+        for member in best.effects:
+            others = tuple(one for one in best.effects if one is not member)
+            found += _refitted(bench, best, others, tell, member, library)
+    return tuple(found)
+
+
+def _null_again(bench: Bench, null: Explained, winner: Explained) -> Explained:
+    """The null from the winner's parameters too: one that has not converged raises false alarms."""
+    guess = winner.fit.guess
+    for effect in winner.effects:
+        guess = guess.without(effect.name)
+    again = bench.explain(guess, ())
+    return again if again.cost < null.cost else null
+
+
+def _refitted(
+    bench: Bench,
+    current: Explained,
+    kept: tuple[Candidate, ...],
+    tell: Tell,
+    dropped: Candidate | None = None,
+    library: Sequence[Candidate] | None = None,
+) -> list[Explained]:
+    """The best additions to the kept effects, refitted whole."""
+    guess = current.fit.guess
+    if dropped is not None:
+        guess = guess.without(dropped.name)
+        guess = bench.explain(guess, kept).fit.guess
+    free = (*bench.base, *(one for effect in kept for one in effect.free))
+    taken = {one.name for one in kept}
+    general_terms = library is not None
+    if library is None:
+        library = [one for one in bench.library if one.name not in taken and one is not dropped]
+    if not library:
+        return []
+    found = products(bench.sheets, guess, free, library)
+    outcome = []
+    without = nothing(found).cost
+    ranked = subsets(found, 1, REFITTED_GENERAL if general_terms else REFITTED)
+    for place, one in enumerate(ranked):
+        hopeless = place >= LEAST_REFITTED and one.cost > HOPELESS * ranked[0].cost
+        if hopeless or one.cost > (1.0 - WORTH_A_FIT) * without:
+            break
+        tell(" + ".join((*(k.name for k in kept), *one.names)))
+        outcome.append(bench.explain(one.put(guess), (*kept, *_of(one))))
+    return outcome
+
+
+def _of(found: Finding) -> tuple[Candidate, ...]:
+    return tuple(one.candidate for one in found.variants)

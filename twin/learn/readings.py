@@ -1,0 +1,356 @@
+"""The channels of a log as spectra; a motion is made from them for any belief about the sensors.
+
+Gain, lag and offset of a sensor are plain factors on its spectrum, so that a fit may try them.
+"""
+
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
+from scipy.signal import welch
+
+from table_io.block import Block, Bool2D, Float1D, Int1D, Label, join
+from table_io.card import BadInput
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from twin.learn.motion import Motion, Noise, Surprise
+from twin.model.model import Sensor
+
+RATE_HZ = 500.0  # contacts last 0.1 s: fifty samples; noise beyond is thrown away
+ROLL_OFF = 0.8  # of the new Nyquist frequency: from here on the low pass falls
+PAD_S = 2.0
+SEGMENT, BANDS = 1024, 8  # samples of a spectrum that is averaged; the quietest band is noise
+LEAST_NOISE = 1e-4  # of a channel's rms: no sensor is better
+EDGE_S = 0.02  # next to a lost sample nothing is believed
+OPEN_END_S = 0.5  # a record that does not begin or end at rest is not believed so long
+Spectrum = npt.NDArray[np.complex128]
+BODIES = (("mass", "mass_disp_m", "mass_acc_m_s2"), ("table", "table_disp_m", "table_acc_m_s2"))
+USED = (
+    "rel_disp_m", "mass_disp_m", "table_disp_m", "mass_acc_m_s2", "table_acc_m_s2",
+    *RIGHT_CELLS, *LEFT_CELLS, "damper_force_n",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Samples in time, frequencies up to the new rate, and the low pass between the two."""
+
+    size: int
+    rate_hz: float
+
+    @property
+    def every(self) -> int:
+        return max(int(self.rate_hz // RATE_HZ), 1)
+
+    @property
+    def padded(self) -> int:
+        pad = round(PAD_S * self.rate_hz)
+        return self.every * next_fast_len(-(-(self.size + pad) // self.every), real=True)
+
+    @property
+    def kept(self) -> int:
+        return self.padded // self.every // 2 + 1
+
+    @property
+    def w(self) -> Float1D:
+        """(frequency,) in 1/s."""
+        return 2 * np.pi * rfftfreq(self.padded, 1.0 / self.rate_hz)[: self.kept]
+
+    @property
+    def low(self) -> Float1D:
+        """(frequency,) the low pass; one everywhere where no sample is left out."""
+        if self.every == 1:
+            return np.ones(self.kept)
+        x = self.w * self.every / (np.pi * self.rate_hz)
+        low: Float1D = 0.5 + 0.5 * np.cos(np.pi * np.clip((x - ROLL_OFF) / (1 - ROLL_OFF), 0, 1))
+        return low
+
+    def spectrum(self, values: Float1D) -> Spectrum:
+        """(frequency,) of (sample,) at the old rate."""
+        return rfft(_whole(values), self.padded)[: self.kept]
+
+    def filtered(self, values: Float1D, gain: Float1D) -> Float1D:
+        """(sample,) at the new rate through a gain, (frequency,)."""
+        spectrum = rfft(values, self.padded // self.every)
+        found: Float1D = irfft(spectrum * gain, self.padded // self.every)[: values.size]
+        return found
+
+    def back(self, spectrum: Spectrum) -> Float1D:
+        """(sample,) at the new rate."""
+        count = -(-self.size // self.every)
+        found: Float1D = irfft(spectrum, self.padded // self.every)[:count] / self.every
+        return found
+
+    @property
+    def neighbours(self) -> float:
+        """Correlation of the noise of two neighbouring samples at the new rate."""
+        power = self.low**2
+        return float(np.sum(power * np.cos(self.w * self.every / self.rate_hz)) / power.sum())
+
+    def rms(self, density: Float1D) -> float:
+        """Of what white noise of rms 1 at the old rate becomes through a gain, (frequency,)."""
+        return float(np.sqrt(np.sum(density**2) / (self.padded / 2 + 1)))
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """A log made ready: `spectra` and raw `noise` rms of each channel, what it is, its labels."""
+
+    name: str
+    mass_kg: float
+    gaps_m: tuple[float, float]
+    grid: Grid
+    w: Float1D
+    low: Float1D
+    ones: Spectrum
+    spectra: Mapping[str, Spectrum]
+    noise: Mapping[str, float]
+    rest: Mapping[str, tuple[float, float]]  # (mean, its deviation) before anything moved, SI
+    time_s: Float1D
+    step: Int1D
+    label: Int1D
+    cycle: Int1D
+    good: Bool2D
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        return tuple(self.spectra)
+
+    def whitening(self, stiffness: float, damping: float) -> Float1D:
+        """(frequency,) gain per kg that makes the balance's noise white and of rms 1, where the
+        acceleration of the mass comes from its displacement.
+
+        The noise of u then enters as -w^2 u'' and as K u + C u' alike: for a stiffness in N/(m kg)
+        and a damping in N s/(m kg) it is s_u |K - w^2 + i w C|, small where the signal is large.
+        """
+        displacement = "rel_disp_m" if "rel_disp_m" in self.noise else "mass_disp_m"
+        s_u = self.noise[displacement] * np.abs(stiffness - self.w**2 + 1j * self.w * damping)
+        gain: Float1D = self.low / np.hypot(s_u, self.noise["table_acc_m_s2"])
+        return gain / self.grid.rms(self.low)
+
+    def motion(self, sensors: Sequence[Sensor] = ()) -> Motion:
+        """The motion, where these sensors read gain x value(t - lag) + offset."""
+        believed = dict(self.spectra)
+        for one in sensors:
+            if one.channel in believed:
+                there = believed[one.channel] - one.offset * self.ones
+                believed[one.channel] = there * np.exp(1j * self.w * one.lag) / one.gain
+        return _Fusion(self, believed).motion()
+
+
+def derives_acc(channels: Container[str]) -> bool:
+    """True where the mass has no accelerometer and its displacement must do."""
+    return "mass_acc_m_s2" not in channels and "table_acc_m_s2" in channels
+
+
+class _Fusion:
+    """One motion in the making."""
+
+    def __init__(self, readings: Readings, spectra: Mapping[str, Spectrum]) -> None:
+        self.r, self.spectra = readings, spectra
+        self.grid, self.w, self.low = readings.grid, readings.w, readings.low
+        self.nothing = np.full(readings.time_s.size, np.nan)
+
+    def motion(self) -> Motion:
+        r = self.r
+        position, noise_u, noise_v, surprises = self._relative()
+        right, noise_right = self._total(RIGHT_CELLS)
+        left, noise_left = self._total(LEFT_CELLS)
+        keep = self.grid.rms(self.low)
+        acc, noise_acc = self._channel("mass_acc_m_s2"), self._rms("mass_acc_m_s2") * keep
+        if derives_acc(self.spectra):
+            acc = self.grid.back((self.spectra["table_acc_m_s2"] - self.w**2 * position) * self.low)
+        noise = Noise(
+            noise_u, noise_v, noise_acc, noise_right * keep, noise_left * keep,
+            self._rms("damper_force_n") * keep,
+        )  # fmt: skip
+        surprises += self._shares()
+        damper = self._channel("damper_force_n") if "damper_force_n" in self.spectra else None
+        return Motion(
+            r.name, self.grid.rate_hz / self.grid.every, r.mass_kg, r.gaps_m, r.time_s,
+            self.grid.back(position * self.low), self.grid.back(1j * self.w * position * self.low),
+            acc, self._channel("table_acc_m_s2"), self._channel("table_disp_m"), right, left,
+            r.step, r.label, r.cycle, r.good, noise, surprises, damper,
+        )  # fmt: skip
+
+    def _relative(self) -> tuple[Spectrum, float, float, tuple[Surprise, ...]]:
+        """(spectrum of u, noise of u, of v, the surprises)."""
+        there = self.spectra
+        if {"mass_disp_m", "table_disp_m"} <= there.keys():
+            pairs = [self._fused(*body) for body in BODIES]
+            noises = np.hypot(pairs[0][1], pairs[1][1])
+            found = tuple(pair[2] for pair in pairs if pair[2] is not None)
+            return pairs[0][0] - pairs[1][0], self._u(noises), self._v(noises), found
+        acc, noise = None, 0.0
+        if {"mass_acc_m_s2", "table_acc_m_s2"} <= there.keys():
+            acc = there["mass_acc_m_s2"] - there["table_acc_m_s2"]
+            noise = float(np.hypot(self._rms("mass_acc_m_s2"), self._rms("table_acc_m_s2")))
+        spectrum, noises, surprise = self._fuse(
+            "mass against table", there["rel_disp_m"], self._rms("rel_disp_m"), acc, noise
+        )
+        return spectrum, self._u(noises), self._v(noises), (surprise,) if surprise else ()
+
+    def _fused(self, body: str, laser: str, meter: str) -> tuple[Spectrum, Float1D, Any]:
+        acc = self.spectra.get(meter)
+        return self._fuse(body, self.spectra[laser], self._rms(laser), acc, self._rms(meter))
+
+    def _fuse(
+        self, body: str, position: Spectrum, s_x: float, acc: Spectrum | None, s_a: float
+    ) -> tuple[Spectrum, Float1D, Surprise | None]:
+        """(spectrum, its noise per frequency over white, what the two do not agree on)."""
+        if acc is None:
+            return position, np.full(self.w.size, s_x), None
+        w2 = self.w**2
+        both = s_a**2 + w2**2 * s_x**2
+        fused = (s_a**2 * position - w2 * s_x**2 * acc) / both
+        odd = self.grid.back((acc + w2 * position) / np.sqrt(both) * self.low)
+        surprise = Surprise(body, odd / self.grid.rms(self.low))
+        return fused, s_a * s_x / np.sqrt(both), surprise
+
+    def _shares(self) -> tuple[Surprise, ...]:
+        """Where two load cells of a side do not bear the same, over their noise."""
+        found = []
+        for side, (one, other) in (("right cells", RIGHT_CELLS), ("left cells", LEFT_CELLS)):
+            if {one, other} <= self.spectra.keys():
+                odd = self._channel(one) - self._channel(other)
+                noise = np.hypot(self._rms(one), self._rms(other)) * self.grid.rms(self.low)
+                found.append(Surprise(side, odd / noise))
+        return tuple(found)
+
+    def _u(self, noises: Float1D) -> float:
+        return self.grid.rms(noises * self.low)
+
+    def _v(self, noises: Float1D) -> float:
+        return self.grid.rms(self.w * noises * self.low)
+
+    def _channel(self, name: str) -> Float1D:
+        return (
+            self.grid.back(self.spectra[name] * self.low) if name in self.spectra else self.nothing
+        )
+
+    def _rms(self, name: str) -> float:
+        return self.r.noise.get(name, float("nan"))
+
+    def _total(self, cells: tuple[str, ...]) -> tuple[Float1D, float]:
+        """(force of the cells of a side, its raw noise)."""
+        present = [name for name in cells if name in self.spectra]
+        if not present:
+            return self.nothing, float("nan")
+        total = np.sum([self.spectra[name] for name in present], axis=0)
+        return self.grid.back(total * self.low), float(np.hypot.reduce([*map(self._rms, present)]))
+
+
+def readings_of(
+    blocks: tuple[Block, ...], name: str, mass_kg: float, gaps_m: tuple[float, float]
+) -> Readings:
+    """The readings in measured blocks; BadInput where nobody measured the displacement."""
+    whole = _filled(blocks, name)
+    columns = {
+        key: whole.channel(key)
+        for key in USED
+        if key in whole.channels and np.isfinite(whole.channel(key)).any()
+    }
+    if "rel_disp_m" not in columns and not {"mass_disp_m", "table_disp_m"} <= columns.keys():
+        raise BadInput(
+            f"{name}: no displacement of the mass against the table; needed: rel_disp_m, or "
+            "mass_disp_m and table_disp_m; nothing can be learned without"
+        )
+    rest = _at_rest(whole)
+    good = np.logical_and.reduce([np.isfinite(values) for values in columns.values()])
+    grid = Grid(len(whole), whole.rate_hz)
+    believed = _believed(good, round(EDGE_S * whole.rate_hz))
+    margin = round(OPEN_END_S * whole.rate_hz)
+    if whole.label[0] != Label.REST:
+        believed[:margin] = False
+    if whole.label[-1] != Label.REST:
+        believed[-margin:] = False
+    size = -(-len(whole) // grid.every)
+    noise = {key: _rms(values, rest) for key, values in columns.items()}
+    return Readings(
+        name, mass_kg, gaps_m, grid, grid.w, grid.low, grid.spectrum(np.ones(len(whole))),
+        {key: grid.spectrum(values) for key, values in columns.items()},
+        noise,
+        _rest(columns, rest, noise),
+        (whole.index + grid.every * np.arange(size)) / whole.rate_hz,
+        whole.step[:: grid.every], whole.label[:: grid.every], whole.cycle[:: grid.every],
+        believed[:: grid.every],
+    )  # fmt: skip
+
+
+def _filled(blocks: tuple[Block, ...], name: str) -> Block:
+    """One block from pieces; samples that are missing between them are NaN."""
+    if not blocks:
+        raise BadInput(f"{name}: holds no measured samples")
+    parts: list[Block] = []
+    for block in blocks:
+        if parts and parts[-1].end < block.index:
+            parts.append(_nothing(parts[-1], block.index))
+        parts.append(block)
+    return join(parts)
+
+
+def _nothing(before: Block, until: int) -> Block:
+    count = until - before.end
+    outside = np.full(count, -1, dtype=np.int64)
+    values = np.full((len(before.channels), count), np.nan)
+    label = np.zeros(count, dtype=np.int64)
+    return Block(
+        before.stream, before.end, before.rate_hz, before.channels, values, outside, label, outside
+    )
+
+
+def _at_rest(block: Block) -> Bool2D:
+    """Samples of the rest before anything moved: there all that is measured is noise."""
+    moved = np.flatnonzero(block.label != Label.REST)
+    rest = np.zeros(len(block), dtype=bool)
+    rest[: moved[0] if moved.size else 0] = True
+    return rest
+
+
+def _rest(
+    columns: Mapping[str, Float1D], rest: Bool2D, noise: Mapping[str, float]
+) -> dict[str, tuple[float, float]]:
+    """What the channels read at rest, to be zero after a tare; the tare is no better known."""
+    found = {}
+    for key, values in columns.items():
+        known = values[rest & np.isfinite(values)]
+        if known.size >= 100:
+            found[key] = float(known.mean()), noise[key] * float(np.sqrt(2.0 / known.size))
+    return found
+
+
+def _rms(values: Float1D, rest: Bool2D) -> float:
+    """Noise of a channel, taken for white: its scatter at rest, else the floor of its spectrum.
+
+    Where the two agree within what a short rest can tell, the floor is the more exact one.
+    """
+    known = values[rest & np.isfinite(values)]
+    every = values[np.isfinite(values)]
+    _, density = welch(every, 1.0, nperseg=min(SEGMENT, every.size))
+    bands = np.array_split(density[1:-1], BANDS)
+    found = float(np.sqrt(0.5 * min(float(np.median(band)) for band in bands)))
+    if known.size >= 100:
+        scatter = float(known.std())
+        if abs(found - scatter) > 3.0 * scatter / np.sqrt(2.0 * known.size):
+            found = scatter
+    return max(found, LEAST_NOISE * float(every.std()), 1e-300)
+
+
+def _whole(values: Float1D) -> Float1D:
+    """The channel with lost samples bridged by straight lines; what they say is not believed."""
+    known = np.isfinite(values)
+    if known.all():
+        return values
+    places = np.arange(values.size)
+    return np.interp(places, places[known], values[known])
+
+
+def _believed(good: Bool2D, margin: int) -> Bool2D:
+    """Good samples that have no lost one within `margin`."""
+    if good.all():
+        return good.copy()
+    spread = np.convolve(~good, np.ones(2 * margin + 1), "same") > 0
+    believed: Bool2D = ~spread
+    return believed

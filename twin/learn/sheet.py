@@ -1,0 +1,215 @@
+"""What a guess leaves of the measured forces, along the measured motion.
+
+    damper          -M a - F_R - F_L - D     (the damper's force from the balance, or measured)
+    right, left     F_R - model's, -(F_L - model's), where contact was measured
+    mass, table     the kinematic gates, see `readings`; right and left cells: do they agree
+    rest            what each channel reads before anything moves; one entry a channel
+each divided by its noise. Without load cells the damper row holds all forces, and the model says
+where it touches. Nothing is simulated, so a fit converges from far and in chaos.
+
+Residuals of real rigs are coloured: statistics are taken over blocks, never over samples.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from table_io.block import Bool2D, Float1D, Float2D, Int1D
+from twin.learn.general import GENERAL, Scale, forces
+from twin.learn.guess import Guess
+from twin.learn.motion import Motion
+from twin.learn.readings import Readings, derives_acc
+from twin.model.forced import along, tilting
+from twin.model.model import Model, Sensor
+
+CONTACT_NOISES = 8.0  # a load cell above so many of its noise bears something
+EDGE_S = 0.012  # next to a measured touch or release the low pass smears the jump
+BLOCK_S = 1.0  # of a block where there are no forcing cycles
+FORCES = ("damper", "right", "left")
+KEPT = 3  # motions of other beliefs that are remembered
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """A log prepared for fits: which samples count in which row, and in which block they lie.
+
+    `number` is its place among the logs; `reference` gives the stiffnesses by which errors of the
+    motion become errors of forces.
+    """
+
+    number: int
+    readings: Readings
+    contact_n: float
+    reference: Model
+    scale: Scale
+    weight: float = 1.0  # of the noise: above 1 where the model's error, not noise, is the limit
+    _motions: dict[tuple[Sensor, ...], Motion] = field(default_factory=dict)
+
+    def motion(self, sensors: tuple[Sensor, ...] = ()) -> Motion:
+        """The motion for a belief about the sensors; the last few are remembered."""
+        if sensors not in self._motions:
+            while len(self._motions) > KEPT:
+                self._motions.pop(next(key for key in self._motions if key))
+            self._motions[sensors] = self.readings.motion(sensors)
+        return self._motions[sensors]
+
+    @cached_property
+    def touched(self) -> npt.NDArray[np.int8]:
+        """(2, sample): 1 where a side was measured to bear, 0 where not, -1 where nobody knows."""
+        m = self.motion()
+        if not m.cells:
+            known = -1 if any(math.isfinite(gap) for gap in m.gaps_m) else 0
+            return np.full((2, m.u.size), known, dtype=np.int8)
+        sides = []
+        for push, rms, gap in (
+            (m.right, m.noise.right, m.gaps_m[0]),
+            (m.left, m.noise.left, m.gaps_m[1]),
+        ):
+            idle = float(np.median(push[~m.moving])) if gap > 0 and (~m.moving).any() else 0.0
+            sides.append(push - idle > max(self.contact_n, CONTACT_NOISES * rms))
+        return np.array(sides, dtype=np.int8)
+
+    @cached_property
+    def used(self) -> Bool2D:
+        """(row, sample): what counts in the rows."""
+        m = self.motion()
+        used = np.zeros((len(self.rows), m.u.size), dtype=bool)
+        used[0] = m.moving & np.isfinite(self._measured(m, m.mass_kg)[0])
+        margin = max(round(EDGE_S * m.rate_hz), 1)
+        window = np.ones(2 * margin + 1)
+        if m.cells and m.damper is None:
+            for row in range(2):
+                touched = self.touched[row] > 0
+                used[1 + row] = m.moving & touched & (np.convolve(~touched, window, "same") == 0)
+        change = np.abs(np.diff(self.touched, axis=1, prepend=self.touched[:, :1])).any(axis=0)
+        smooth = np.convolve(change, window, "same") == 0
+        for row, name in enumerate(self.rows):
+            if row >= len(FORCES):
+                side = {"right cells": 0, "left cells": 1}.get(name)
+                used[row] = m.moving & smooth if side is None else used[1 + side]
+        return used
+
+    @cached_property
+    def resting(self) -> tuple[str, ...]:
+        """The channels of which it is known that they should read nothing at rest."""
+        if min(self.readings.gaps_m) <= 0:  # pressed in: what is read then is real
+            return ()
+        return tuple(self.readings.rest)
+
+    @cached_property
+    def rows(self) -> tuple[str, ...]:
+        """The names of the rows that have samples; the one after them is that of the rest."""
+        return (*FORCES, *(one.body for one in self.motion().surprises))
+
+    @cached_property
+    def row_of(self) -> Int1D:
+        """(entry,) row of each entry of a residual."""
+        rows = np.repeat(np.arange(len(self.rows)), self.used.sum(axis=1))
+        return np.concatenate([rows, np.full(len(self.resting), len(self.rows))])
+
+    @cached_property
+    def sample_of(self) -> Int1D:
+        """(entry,) sample of each entry of a residual."""
+        samples = [np.flatnonzero(row) for row in self.used]
+        return np.concatenate([*samples, np.zeros(len(self.resting), dtype=np.int64)])
+
+    @cached_property
+    def block_of(self) -> Int1D:
+        """(entry,) block of each entry of a residual."""
+        return self.blocks[self.sample_of]
+
+    def _measured(self, m: Motion, mass_kg: float) -> Float2D:
+        """(3, sample): damper force from the balance of a mass, F_R, -F_L in N."""
+        if m.damper is not None:
+            nothing = np.full(m.u.size, np.nan)
+            return np.array([m.damper, nothing, nothing])
+        inertia = -mass_kg * m.acc
+        if not m.cells:
+            return np.array([inertia, m.right, m.left])
+        return np.array([inertia - m.right + m.left, m.right, m.left])
+
+    @cached_property
+    def noise(self) -> Float1D:
+        """(3,) rms of the force rows in N, from the sensors alone."""
+        m, p = self.motion(), self.reference.parameters
+        n = m.noise
+        motion = math.hypot(p.stiffness * n.u, p.damping * n.v)
+        sides = [
+            math.hypot(cells, k * n.u, c * n.v)
+            for cells, k, c in (
+                (n.right, p.bumper_stiffness_r, p.bumper_damping_r),
+                (n.left, p.bumper_stiffness_l, p.bumper_damping_l),
+            )
+        ]
+        if m.damper is not None:
+            return np.array([math.hypot(n.force, motion), np.nan, np.nan])
+        inertia = m.mass_kg * n.acc
+        cells = (n.right, n.left) if m.cells else ()
+        if self.whitening is not None:
+            return np.array([m.mass_kg, *sides])
+        return np.array([math.hypot(inertia, motion, *cells), *sides])
+
+    @cached_property
+    def whitening(self) -> Float1D | None:
+        """(frequency,) the filter of the damper row where the mass has no accelerometer."""
+        if not derives_acc(self.readings.channels) or self.motion().damper is not None:
+            return None
+        p = self.reference.parameters
+        return self.readings.whitening(p.stiffness / p.mass, p.damping / p.mass)
+
+    @cached_property
+    def blocks(self) -> Int1D:
+        """(sample,) number of the block that a sample lies in: a forcing cycle, else a second."""
+        m = self.motion()
+        seconds = (m.time_s / BLOCK_S).astype(np.int64)
+        loose = np.where(m.cycle >= 0, 0, seconds)
+        key = np.stack([m.step, m.cycle, loose])
+        change = np.any(np.diff(key, axis=1) != 0, axis=0)
+        numbers: Int1D = np.concatenate([[0], np.cumsum(change)])
+        return numbers
+
+    def residual(self, guess: Guess) -> Float1D:
+        """(entry,) measured minus model over noise, row after row, where a row counts."""
+        m = self.motion(guess.sensors())
+        model = guess.local(self.number, m)
+        d, right, left = along(model, m.u, m.v, m.time_s, self.touched)
+        if not m.cells and m.damper is None:
+            d = d + right + left
+        if model.value("table_tilt", "tilt"):
+            d = d + tilting(model, m.table_disp)
+        expected = np.array([d, right, -left])
+        if any(name.startswith(GENERAL) for name in guess.values):
+            p = model.parameters
+            more = forces(guess.values, m, (p.gap_r, p.gap_l), self.touched, self.scale)
+            expected += more
+        rows = (self._measured(m, model.parameters.mass) - expected) / self.noise[:, None]
+        if self.whitening is not None:
+            rows[0] = self.readings.grid.filtered(rows[0], self.whitening)
+        everything = [*rows, *(one.values for one in m.surprises)]
+        samples = [row[used] for row, used in zip(everything, self.used, strict=True)]
+        return np.concatenate([*samples, self._at_rest(guess.sensors())]) / self.weight
+
+    def _at_rest(self, sensors: tuple[Sensor, ...]) -> Float1D:
+        offset = {one.channel: one.offset for one in sensors}
+        known = [(self.readings.rest[name], offset.get(name, 0.0)) for name in self.resting]
+        return np.array([(mean - there) / sd for (mean, sd), there in known])
+
+
+def sheets_of(
+    logs: Sequence[tuple[Readings, float]], reference: Model, weights: Sequence[float] = ()
+) -> tuple[Sheet, ...]:
+    """The sheets of several logs, (readings, contact threshold in N) each, on one scale."""
+    motions = [readings.motion() for readings, _ in logs]
+    u = max(float(np.abs(m.u[m.moving]).max(initial=0.0)) for m in motions) or 1.0
+    v = max(float(np.abs(m.v[m.moving]).max(initial=0.0)) for m in motions) or 1.0
+    gaps = [gap for m in motions for gap in m.gaps_m if math.isfinite(gap)]
+    depth = max(u - min(gaps), 1e-2 * u) if gaps else u
+    scale = Scale(u, v, depth)
+    return tuple(
+        Sheet(number, readings, contact_n, reference, scale, weights[number] if weights else 1.0)
+        for number, (readings, contact_n) in enumerate(logs)
+    )

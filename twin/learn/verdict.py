@@ -1,0 +1,138 @@
+"""The verdict: none, named, ambiguous or unexplained, and how sure it is.
+
+Excess is the held-out mean square over the noise, less the floor.
+    none         nothing is left that chance does not explain
+    named        the effects close the gap, no others do as well, and no general term does better
+    ambiguous    other effects do as well: the data cannot tell
+    unexplained  something is left, or a general term explains it much better than any name
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from twin.learn.naming import Bench, Explained, Named
+
+AS_GOOD = 3.5  # standard errors by which others must be worse, else the data cannot tell
+LEFT = 0.06  # of the gap's excess: more than this left and not all is explained
+OUTSIDE = 0.012  # of the gap's excess: a general term in place of a name that closes more is better
+VISIBLE = 0.05  # excess in parts of the floor from which on there is a gap at all
+PARTIAL = 0.5  # of the gap's excess: what closes less is no name
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """The word, what stands for it, and the numbers behind it (mean squares over the noise)."""
+
+    word: str
+    best: Explained
+    confidence: float
+    others: tuple[Explained, ...]  # as good as the best, where the word is ambiguous
+    general: Explained | None  # the general term that does better, or alone does something
+    floor: float
+    remainder: bool  # more is left than the floor and the form of the law explain
+    why: str
+
+
+def judge(bench: Bench, named: Named, floor: float) -> Verdict:
+    """What the outcome of a selection is worth; `floor` is a mean square over the noise."""
+    null, best = named.null, named.best
+    gap = max(null.cost - floor, 1e-9)
+    general = _better(bench, named, floor)
+    if not best.effects:
+        return _nothing_named(bench, named, floor, general)
+    left = max(best.cost - floor, 0.0)
+    others = _as_good(bench, named)
+    remainder = left > LEFT * gap and left > VISIBLE * floor
+    sure = _confidence(bench, named, left / gap)
+    if general is not None:
+        why = f"{general.names[-1]} explains what {' + '.join(best.names)} cannot"
+        return Verdict("unexplained", best, min(sure, 0.3), (), general, floor, True, why)
+    if remainder and (null.cost - best.cost) < PARTIAL * gap:
+        why = "the best effects close less than half of the gap"
+        return Verdict("unexplained", best, min(sure, 0.3), (), None, floor, True, why)
+    if others:
+        names = "; ".join(" + ".join(one.names) for one in others)
+        why = f"as good as {' + '.join(best.names)}: {names}"
+        share = sure / (1 + len(others))
+        return Verdict("ambiguous", best, share, others, None, floor, remainder, why)
+    why = "more is left than noise" if remainder else "what is left is noise"
+    return Verdict("named", best, sure, (), None, floor, remainder, why)
+
+
+def _nothing_named(bench: Bench, named: Named, floor: float, general: Explained | None) -> Verdict:
+    null = named.null
+    if general is not None and bench.worth(null, general):
+        why = f"no effect of the library, but {general.names[-1]} explains something"
+        return Verdict("unexplained", null, 0.9, (), general, floor, True, why)
+    if null.cost > (1 + 2 * VISIBLE) * floor:
+        why = "more is left than noise, and nothing explains it"
+        return Verdict("unexplained", null, 0.8, (), None, floor, True, why)
+    return Verdict("none", null, 0.95, (), None, floor, False, "what is left is noise")
+
+
+def _better(bench: Bench, named: Named, floor: float) -> Explained | None:
+    """The set with a general term that does much better than the best one without."""
+    best, gap = named.best, max(named.null.cost - floor, 1e-9)
+    for one in sorted(named.outside, key=lambda one: one.cost):
+        gain = best.cost - one.cost
+        beside = len(one.effects) > len(best.effects) > 0
+        if gain > (LEFT if beside else OUTSIDE) * gap and bench.gain(best, one)[2] > AS_GOOD:
+            return one
+        if len(one.effects) < len(best.effects) and gain > -OUTSIDE * gap:
+            return one  # one term does what several effects do
+    return None
+
+
+def _as_good(bench: Bench, named: Named) -> tuple[Explained, ...]:
+    """The sets of other effects, as many, that are not worse by more than chance."""
+    best = named.best
+    found: dict[frozenset[str], Explained] = {}
+    for one in named.tried:
+        names = frozenset(one.names)
+        if len(one.effects) != len(best.effects) or names == frozenset(best.names):
+            continue
+        if one.cost <= best.cost or bench.gain(one, best)[2] < AS_GOOD:
+            found.setdefault(names, one)
+    return tuple(found.values())
+
+
+def _confidence(bench: Bench, named: Named, left: float) -> float:
+    """Between 0 and 1: how much better than the next, and how little is left."""
+    best = named.best
+    rivals = [
+        bench.gain(one, best)[2]
+        for one in named.tried
+        if len(one.effects) == len(best.effects) and frozenset(one.names) != frozenset(best.names)
+    ]
+    margin = min(rivals, default=10.0)
+    apart = 1.0 / (1.0 + math.exp(-(margin - 2.0)))
+    whole = 1.0 / (1.0 + math.exp((left - 0.15) / 0.03)) if left > 0 else 1.0
+    whole = 0.5 + 0.5 * whole
+    held = 1.0 if best.converged and not best.fit.at_bound else 0.6
+    return 0.98 * apart * whole * held
+
+
+def closed_fraction(before: float, after: float, floor: float) -> float:
+    """(before - after) / (before - floor) of the roots of mean squares."""
+    b, a, f = (math.sqrt(max(x, 0.0)) for x in (before, after, floor))
+    return (b - a) / (b - f) if b > f else 0.0
+
+
+def next_run(word: str, best: Sequence[str], others: Sequence[Sequence[str]]) -> str:
+    """The test that would decide or confirm."""
+    names = {one.split(".")[0] for some in (best, *others) for one in some}
+    if word == "none":
+        return "none is needed; a sweep at another amplitude would confirm"
+    if names & {"bouc_wen", "maxwell_damper", "coulomb_friction", "quadratic_damping"}:
+        return (
+            "the same sweep at half and at twice the amplitude: hysteresis and friction change "
+            "with amplitude, relaxation only with frequency"
+        )
+    if any(one.startswith("sensor_") for one in names):
+        return "a calibration of the channels named, and the same sweep after it"
+    if names & {"gap_offset", "gap_drift", "bumper_asymmetry"}:
+        return "the same sweep once more without touching the set-up, then with another gap"
+    if names & {"bumper_hardening", "hunt_crossley", "bumper_maxwell"}:
+        return "a sweep at twice the amplitude: deeper contact, faster touch"
+    return "the same sweep at another amplitude and, where there are bumpers, another gap"

@@ -1,0 +1,225 @@
+"""Where model and measurement disagree: a map over steps, phases and rows, against the noise.
+
+A cell's excess is its mean square over the noise, less the floor; its significance comes from the
+scatter of the blocks in it. The floor is what repeated periods do not repeat, at least the noise.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from table_io.block import Float1D, Int1D, Label
+from twin.learn.sheet import Sheet
+
+PHASES = ("flight", "contact_right", "contact_left", "contact_both")
+MOST = 0.8  # of the excess: what is said to lie somewhere lies there so far
+NOTABLE = 0.15  # of the excess: a row or harmonic with less is not mentioned
+HARMONICS = 7
+CHANNELS = {
+    "damper": ("mass_acc_m_s2",), "right": ("force_r1_n", "force_r2_n"),
+    "left": ("force_l1_n", "force_l2_n"), "mass": ("mass_disp_m", "mass_acc_m_s2"),
+    "table": ("table_disp_m", "table_acc_m_s2"),
+    "mass against table": ("rel_disp_m", "mass_acc_m_s2", "table_acc_m_s2"),
+    "right cells": ("force_r1_n", "force_r2_n"), "left cells": ("force_l1_n", "force_l2_n"),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One place: a log, a step, a phase, a row; `excess` is its mean square over the floor's."""
+
+    log: int
+    step: int
+    phase: str
+    row: str
+    count: int
+    mean_square: float
+    excess: float
+    errors: float  # standard errors by which the excess differs from none
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What the recording says of a step: number, frequency in Hz, direction."""
+
+    index: int
+    frequency_hz: float
+    direction: str
+
+
+@dataclass(frozen=True, slots=True)
+class Where:
+    """Where most of the excess lies; empty or None where there is none."""
+
+    frequency_hz: tuple[float, float] | None
+    direction: str
+    phase: str
+    channels: tuple[str, ...]
+    harmonics: tuple[int, ...]
+
+
+def phase_of(sheet: Sheet) -> Int1D:
+    """(entry,) place in `PHASES`."""
+    touched = (sheet.touched > 0).astype(np.int64)
+    found: Int1D = (touched[0] + 2 * touched[1])[sheet.sample_of]
+    return found
+
+
+def cells(sheets: Sequence[Sheet], left: Sequence[Float1D], floor: float) -> tuple[Cell, ...]:
+    """The map of a residual over the noise, (entry,) a log; `floor` is a mean square."""
+    found = []
+    for sheet, r in zip(sheets, left, strict=True):
+        step = sheet.readings.step[sheet.sample_of]
+        phase = phase_of(sheet)
+        for row, name in enumerate(sheet.rows):
+            for number in np.unique(step[(sheet.row_of == row) & (step >= 0)]):
+                for k, label in enumerate(PHASES):
+                    mine = (sheet.row_of == row) & (step == number) & (phase == k)
+                    if mine.any():
+                        found.append(_cell(sheet, r, mine, int(number), label, name, floor))
+    return tuple(found)
+
+
+def _cell(
+    sheet: Sheet, r: Float1D, mine: Int1D, step: int, phase: str, row: str, floor: float
+) -> Cell:
+    squares = r[mine] ** 2
+    blocks = np.unique(sheet.block_of[mine], return_inverse=True)[1]
+    sums = np.bincount(blocks, weights=squares - floor)
+    # noise alone scatters the mean square by sqrt(2 / n); blocks that differ scatter it more
+    chance = max(2.0 * floor**2 * squares.size, float(((sums - sums.mean()) ** 2).sum()))
+    excess = float(sums.sum())
+    return Cell(
+        sheet.number, step, phase, row, squares.size, float(squares.mean()),
+        excess / squares.size, excess / math.sqrt(chance),
+    )  # fmt: skip
+
+
+def repeated(sheets: Sequence[Sheet], left: Sequence[Float1D]) -> float:
+    """Mean square over the noise of what does not repeat from one held cycle to the next.
+
+    Of a residual over the noise. A model's error is the same in every period of a periodic motion,
+    noise is not. The lower quartile over the steps: in chaotic ones nothing repeats, and after a
+    jump a transient is left. 1 where nothing is held, and for rows that only some samples have.
+    """
+    found, share = [], []
+    for sheet, r in zip(sheets, left, strict=True):
+        mine = sheet.row_of == 0
+        samples, values = sheet.sample_of[mine], r[mine]
+        whole = np.full(sheet.readings.step.size, np.nan)
+        whole[samples] = values
+        for number in np.unique(sheet.readings.step[sheet.readings.step >= 0]):
+            here = (sheet.readings.step == number) & (sheet.readings.label == Label.MEASURE)
+            likeness = sheet.readings.grid.neighbours
+            one = _unrepeated(whole, sheet.readings.cycle, np.flatnonzero(here), likeness)
+            if math.isfinite(one):
+                found.append(one)
+        share.append(float(mine.mean()))
+    if not found:
+        return 1.0
+    part = float(np.mean(share))
+    return part * max(1.0, float(np.percentile(found, 25))) + 1.0 - part
+
+
+def _unrepeated(whole: Float1D, cycle: Int1D, here: Int1D, likeness: float) -> float:
+    """Variance of what two periods do not share, of the values at the samples `here`.
+
+    `likeness` is the correlation of the noise of neighbours.
+    """
+    if here.size < 4:
+        return math.nan
+    numbers = cycle[here]
+    count = int(np.unique(numbers).size)
+    if count < 2:
+        return math.nan
+    period = here.size / count
+    later = here[here + math.ceil(period) < here[-1]]
+    if later.size < 8:
+        return math.nan
+    shift, part = math.floor(period), period - math.floor(period)
+    # straight lines between samples halve the noise where part = 1/2
+    next_ = (1 - part) * whole[later + shift] + part * whole[later + shift + 1]
+    share = 1.0 + (1 - part) ** 2 + part**2 + 2 * part * (1 - part) * likeness
+    return float(np.nanmean((whole[later] - next_) ** 2) / share)
+
+
+def where(
+    map_: Sequence[Cell], steps: Sequence[Sequence[Step]], harmonics: tuple[int, ...]
+) -> Where:
+    """In words: the frequencies, direction, phase and rows that hold most of the excess."""
+    sure = [one for one in map_ if one.errors > 3.0 and one.excess > 0]
+    total = sum(one.excess * one.count for one in sure)
+    if total <= 0:
+        return Where(None, "both", "all", (), ())
+
+    def shares(keys: Sequence[object]) -> dict[object, float]:
+        sums: dict[object, float] = {}
+        for key, one in zip(keys, sure, strict=True):
+            sums[key] = sums.get(key, 0.0) + one.excess * one.count / total
+        return sums
+
+    known = [{one.index: one for one in log} for log in steps]
+    at = [known[one.log].get(one.step) for one in sure]
+    frequency = shares([one.frequency_hz if one else None for one in at])
+    direction = shares([one.direction if one else None for one in at])
+    phase = shares([one.phase for one in sure])
+    rows = shares([one.row for one in sure])
+    channels = [c for row, s in rows.items() if s > NOTABLE for c in CHANNELS.get(str(row), ())]
+    return Where(
+        _band(frequency),
+        next((str(k) for k, s in direction.items() if s > MOST and k), "both"),
+        _phase(phase),
+        tuple(dict.fromkeys(channels)),
+        harmonics,
+    )
+
+
+def _band(shares: dict[object, float]) -> tuple[float, float] | None:
+    """The frequencies of the steps that hold most, the largest first, as one interval."""
+    ranked = sorted(((s, k) for k, s in shares.items() if isinstance(k, float)), reverse=True)
+    held, chosen = 0.0, []
+    for share, hz in ranked:
+        chosen.append(hz)
+        held += share
+        if held > MOST:
+            break
+    return (min(chosen), max(chosen)) if chosen else None
+
+
+def _phase(shares: dict[object, float]) -> str:
+    right, left = shares.get("contact_right", 0.0), shares.get("contact_left", 0.0)
+    both = right + left + shares.get("contact_both", 0.0)
+    if shares.get("flight", 0.0) > MOST:
+        return "flight"
+    for name, share in (("contact_right", right), ("contact_left", left), ("contact_both", both)):
+        if share > MOST:
+            return name
+    return "all"
+
+
+def harmonics_of(
+    sheets: Sequence[Sheet], left: Sequence[Float1D], steps: Sequence[Sequence[Step]]
+) -> tuple[int, ...]:
+    """The harmonics of the drive that make a notable part of the damper row; 0 is its mean."""
+    power = np.zeros(HARMONICS + 1)
+    for sheet, r, log in zip(sheets, left, steps, strict=True):
+        mine = sheet.row_of == 0
+        samples, values = sheet.sample_of[mine], r[mine]
+        for one in log:
+            here = (sheet.readings.step[samples] == one.index) & (
+                sheet.readings.cycle[samples] >= 0
+            )
+            if here.sum() < 4 * HARMONICS:
+                continue
+            t = sheet.readings.time_s[samples[here]]
+            angle = 2 * np.pi * one.frequency_hz * t[:, None] * np.arange(1, HARMONICS + 1)
+            design = np.hstack([np.ones((t.size, 1)), np.cos(angle), np.sin(angle)])
+            x = np.linalg.lstsq(design, values[here], rcond=None)[0]
+            power[0] += x[0] ** 2 * t.size
+            power[1:] += 0.5 * (x[1 : HARMONICS + 1] ** 2 + x[HARMONICS + 1 :] ** 2) * t.size
+            power -= 3.0 * np.array([1.0, *[1.0] * HARMONICS])  # what noise would give, generously
+    power = np.maximum(power, 0.0)
+    total = power.sum()
+    return tuple(int(k) for k in np.flatnonzero(power > NOTABLE * total)) if total > 0 else ()

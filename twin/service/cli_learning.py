@@ -1,0 +1,54 @@
+"""The commands that take data in and learn from it; heavy imports stand inside them."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from twin.service.study.cli import study
+
+LEARN = "Learn from what was recorded"
+Logs = Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs, or folders of runs.")]
+
+
+learning = typer.Typer()
+
+
+@learning.command(rich_help_panel=LEARN)
+def discover(
+    logs: Logs,
+    model: Annotated[str, typer.Option("--model", help="Model: a name or a .toml file.")] = "snm",
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for the results; must be new.")
+    ] = None,
+    without: Annotated[
+        list[str] | None,
+        typer.Option("--without", help="Leave this effect out of the library; may be repeated."),
+    ] = None,
+) -> None:
+    """Where model and measurement disagree, the effect that is missing, the gap with it added."""
+    from twin.service.learning.command import discover_command as command
+
+    raise typer.Exit(command(logs, model, out, without or []))
+
+
+@learning.command("import", rich_help_panel=LEARN)
+def import_(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV; columns named as channels.")],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="LOG", help="New log, a .mcap file.")],
+    profile: Annotated[
+        Path | None, typer.Option("--profile", help="Specimen, gaps and sweep, a .toml file.")
+    ] = None,
+    rig: Annotated[str | None, typer.Option("--rig", help="Machine card.")] = None,
+    columns: Annotated[
+        Path | None,
+        typer.Option("--columns", metavar="MAP", help="Which columns are which, a .toml file."),
+    ] = None,
+) -> None:
+    """Other people's data: a table of samples as a log; its steps are found in its motion."""
+    from twin.service.importing import take_in as command
+
+    raise typer.Exit(command(file, out, profile, rig, columns))
+
+
+learning.add_typer(study, name="study", rich_help_panel=LEARN)

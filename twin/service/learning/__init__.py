@@ -1,0 +1,1 @@
+"""`identify` and `discover` on files: recordings in, models, verdicts, figures and pages out."""

@@ -1,0 +1,66 @@
+"""One case from its number to its row: made, judged blind, scored against the sealed truth."""
+
+import contextlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from table_io.clock import RealClock
+from twin.service.study.asking import discovered, true_structure
+from twin.service.study.cells import case_of
+from twin.service.study.making import Places, make
+from twin.service.study.scoring import score
+from twin.service.summary import dumps
+
+Json = dict[str, Any]
+Method = Callable[[Path], Json]  # folder of a case -> verdict as in verdict.json
+# Other methods on the same files: each gives a verdict, scored the same, beside ours in the row.
+RIVALS: dict[str, Method] = {}
+
+
+def judge(root: Path, number: int, method: Method = discovered) -> Json:
+    """The row of a case; one whose verdict fails says why under `failed`, and is a miss.
+
+    One that has not the size of its cell, or was stopped on the table, is not judged.
+    """
+    case = case_of(number)
+    clock = RealClock()
+    began = clock.now()
+    try:
+        places = make(case, root)
+    except Exception as error:
+        return {"number": number, "cell": case.cell.name, "failed": _said(error)}
+    about = json.loads(places.about.read_text(encoding="utf-8"))
+    made = clock.now()
+    if not about["sized"]:
+        keys = ("number", "cell", "kind", "noise", "size", "reached", "ended", "sized")
+        return {key: about[key] for key in keys} | {"label": case.label, "made_in": made - began}
+    verdict, why = _asked(method, places.shown)
+    judged = clock.now()
+    places.verdict.write_text(dumps(verdict), encoding="utf-8")
+    row = score(verdict, about, None if why else _oracle(places, about))
+    rivals = {name: score(_asked(rival, places.shown)[0], about) for name, rival in RIVALS.items()}
+    row |= {"label": case.label, "seconds": judged - made, "made_in": made - began}
+    return row | ({"failed": why} if why else {}) | ({"rivals": rivals} if rivals else {})
+
+
+def _asked(method: Method, shown: Path) -> tuple[Json, str]:
+    """(verdict, why there is none): a method that fails ends one case, not the study."""
+    try:
+        return method(shown), ""
+    except Exception as error:
+        return {"verdict": "failed", "reason": _said(error)}, _said(error)
+
+
+def _oracle(places: Places, about: Json) -> float | None:
+    """Held-out error of the true structure; None where no model of the library has it."""
+    if about["kind"] == "unknown":
+        return None
+    with contextlib.suppress(Exception):  # whatever it is, the verdict stands without
+        return true_structure(places.shown, [one["name"] for one in about["effects"]])
+    return None
+
+
+def _said(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
