@@ -71,7 +71,7 @@ def test_a_pair_is_two_effects_of_the_library() -> None:
 
 
 @pytest.mark.parametrize(
-    "cell", ["unknown/bumper_cubic/10/1%", "sensor/sensor_gain.mass_acc_m_s2/1.5/0.2%"]
+    "cell", ["single/mass_error/3/1%", "sensor/sensor_gain.mass_acc_m_s2/1.5/0.2%"]
 )
 def test_sizes_land_where_they_were_asked(cell: str) -> None:
     """The residual of a refitted baseline over the noise, from signals with that noise on."""

@@ -9,7 +9,7 @@ import numpy as np
 from table_io.block import Float1D
 from table_io.card import BadInput
 from twin.learn.fit import Fit, fit
-from twin.learn.guess import INPUT_GAIN, INPUT_OFFSET, Free, Guess, base_free, effects_of
+from twin.learn.guess import INPUT_GAIN, INPUT_OFFSET, ZERO, Free, Guess, base_free, effects_of
 from twin.learn.library import Candidate, candidates
 from twin.learn.naming import Bench, Explained, Named, Tell, named
 from twin.learn.readings import Readings, derives_acc
@@ -96,7 +96,11 @@ def start(sheets: Sequence[Sheet], model: Model) -> tuple[Guess, tuple[Free, ...
     guess = Guess.of(model, len(sheets))
     if own:
         guess = guess.moved({INPUT_GAIN: _input_gain(sheets[0], model), INPUT_OFFSET: 0.0})
-    return guess, (*base_free(model, touched, own), *effects_of(model))
+    doubt = [
+        {what: one.readings.at_rest(what)[1] for what in one.readings.zeros} for one in sheets
+    ]
+    guess = guess.moved({f"{ZERO}{k}.{what}": 0.0 for k, log in enumerate(doubt) for what in log})
+    return guess, (*base_free(model, touched, own, doubt), *effects_of(model))
 
 
 def _input_gain(sheet: Sheet, model: Model) -> float:

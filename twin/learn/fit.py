@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from table_io.block import Bool2D, Float1D, Float2D
+from table_io.block import Bool2D, Float1D, Float2D, Int1D
 from twin.learn.guess import Free, Guess
 from twin.learn.sheet import Sheet
 
@@ -121,11 +121,15 @@ class _Search:
         gradients = jacobian * self.chosen(whole)
         first, middle = 0, np.zeros_like(inverse)
         for sheet, mask in zip(self.sheets, self.train, strict=True):
-            blocks = sheet.block_of[mask]
-            of_blocks = np.array(
-                [np.bincount(blocks, weights=row[first : first + blocks.size]) for row in gradients]
+            blocks = whole_contacts(sheet)[mask]
+            here = slice(first, first + blocks.size)
+            rest = (sheet.row_of == len(sheet.rows))[mask]
+            moving = np.array(
+                [np.bincount(blocks[~rest], weights=row[here][~rest]) for row in gradients]
             )
-            middle += of_blocks @ of_blocks.T
+            # of what was read at rest there is one number each: its deviation is what is known
+            still = jacobian[:, here][:, rest] / sheet.weight
+            middle += moving @ moving.T + still @ still.T
             first += blocks.size
         covariance = inverse @ middle @ inverse
         sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -141,6 +145,19 @@ class _Search:
             guess, self.free, values, spread, correlation, cost / self.count, converged,
             tuple(stuck),
         )  # fmt: skip
+
+
+def whole_contacts(sheet: Sheet) -> Int1D:
+    """(entry,) block of each entry, a contact that reaches into the next block with the first.
+
+    Slow errors of u pull C_j one way while the mass goes in and back again while it comes out; cut
+    in two, a contact would look like two strong pulls. A lasting contact is cut all the same.
+    """
+    free = (sheet.touched <= 0).all(axis=0)
+    before = np.maximum.accumulate(np.where(free, np.arange(free.size), 0))
+    began = sheet.blocks[before]
+    blocks: Int1D = np.where(sheet.blocks - began <= 1, began, sheet.blocks)
+    return blocks[sheet.sample_of]
 
 
 def _sizes(hessian: Float2D) -> Float1D:

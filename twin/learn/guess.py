@@ -13,6 +13,8 @@ from twin.model.effects.effect import Effect
 from twin.model.model import Model, Sensor
 
 GAP = "gap"  # + number of the log: m by which both gaps of that log are wider than it says
+ZERO = "zero"  # + number of the log + what: SI that it reads at rest, as far as a tare can err
+DOUBT = 4.0  # deviations that a tare may be off; more is an error of a sensor
 SENSOR = "sensor_"
 INPUT_GAIN = "sensor_gain.table_acc_m_s2.gain"
 INPUT_OFFSET = "sensor_offset.table_acc_m_s2.offset"
@@ -56,6 +58,10 @@ class Guess:
         base = replace(model.base, mass=motion.mass_kg, gap_r=right, gap_l=left)
         return Model(base, model.effects)
 
+    def zero(self, log: int, what: str) -> float:
+        """By how much the tare of u, acc, right or left of a log is off, SI."""
+        return self.values.get(f"{ZERO}{log}.{what}", 0.0)
+
     def moved(self, values: Mapping[str, float]) -> "Guess":
         """With other numbers, or with more of them."""
         return Guess({**self.values, **values})
@@ -66,7 +72,7 @@ class Guess:
 
 
 def _of_a_log(name: str) -> bool:
-    return name.startswith(GAP) and name[len(GAP) :].isdigit()
+    return any(name.startswith(one) and name[len(one) :][:1].isdigit() for one in (GAP, ZERO))
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,9 +104,15 @@ BASE = (
 )
 
 
-def base_free(model: Model, touched: Sequence[bool], own_input: bool = False) -> tuple[Free, ...]:
+def base_free(
+    model: Model,
+    touched: Sequence[bool],
+    own_input: bool = False,
+    doubts: Sequence[Mapping[str, float]] = (),
+) -> tuple[Free, ...]:
     """The parameters of the SNM; those of the bumpers, and the gap, only of logs that touch.
 
+    `doubts`: of each log, the deviations of its zeros, SI.
     `own_input`: gain and offset of the input too, where no other channel can check them.
     """
     flat = model.flat()
@@ -113,6 +125,11 @@ def base_free(model: Model, touched: Sequence[bool], own_input: bool = False) ->
         for k, one in enumerate(touched)
         if one
     ]
+    for k, log in enumerate(doubts):
+        for what, sd in log.items():
+            name = f"{ZERO}{k}.{what}"
+            unit = {"u": "m", "acc": "m/s2"}.get(what, "N")
+            free.append(Free(name, (name,), -DOUBT * sd, DOUBT * sd, sd, unit))
     if own_input:
         free.append(Free(INPUT_GAIN, (INPUT_GAIN,), 1e-12, 1e12, 1.0, "", logarithmic=True))
         free.append(Free(INPUT_OFFSET, (INPUT_OFFSET,), -1e9, 1e9, 1.0, "m/s2"))

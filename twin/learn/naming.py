@@ -14,7 +14,7 @@ from table_io.block import Float1D
 from twin.learn.fit import Fit, fit
 from twin.learn.guess import Free, Guess
 from twin.learn.library import Candidate, general
-from twin.learn.search import FOLDS, Finding, folds_of, nothing, products, subsets
+from twin.learn.search import FOLDS, NEVER, Finding, folds_of, nothing, products, subsets
 from twin.learn.sheet import Sheet
 
 MOST_EFFECTS = 3
@@ -75,7 +75,7 @@ class Bench:
             part = fit(self.sheets, whole.guess, free, train)
             converged &= part.converged
             for mine, fold, sheet in zip(left, folds, self.sheets, strict=True):
-                out = fold == k
+                out = (fold == k) | (fold == NEVER)
                 if out.any():
                     mine[out] = sheet.residual(part.guess)[out]
         return Explained(tuple(effects), whole, tuple(left), converged)

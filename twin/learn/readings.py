@@ -118,6 +118,33 @@ class Readings:
     def channels(self) -> tuple[str, ...]:
         return tuple(self.spectra)
 
+    @property
+    def zeros(self) -> dict[str, tuple[tuple[str, float], ...]]:
+        """Of u, acc, right, left: the channels that make it, each with its sign.
+
+        Only what should read zero at rest: it was tared, and no pressed-in bumper holds it off.
+        """
+        lasers = (("mass_disp_m", 1.0), ("table_disp_m", -1.0))
+        made = {
+            "u": lasers if "mass_disp_m" in self.spectra else (("rel_disp_m", 1.0),),
+            "acc": (("mass_acc_m_s2", 1.0),),
+            "right": tuple((one, 1.0) for one in RIGHT_CELLS if one in self.spectra),
+            "left": tuple((one, 1.0) for one in LEFT_CELLS if one in self.spectra),
+        }
+        if min(self.gaps_m) <= 0:
+            return {}
+        return {
+            name: channels
+            for name, channels in made.items()
+            if channels and {one for one, _ in channels} <= self.rest.keys()
+        }
+
+    def at_rest(self, name: str) -> tuple[float, float]:
+        """(mean of u, acc, right or left at rest, its deviation), SI."""
+        known = [(sign, *self.rest[one]) for one, sign in self.zeros[name]]
+        mean = sum(sign * mean for sign, mean, _ in known)
+        return mean, float(np.hypot.reduce([sd for _, _, sd in known])) / float(np.sqrt(2.0))
+
     def whitening(self, stiffness: float, damping: float) -> Float1D:
         """(frequency,) gain per kg that makes the balance's noise white and of rms 1, where the
         acceleration of the mass comes from its displacement.
@@ -137,7 +164,11 @@ class Readings:
             if one.channel in believed:
                 there = believed[one.channel] - one.offset * self.ones
                 believed[one.channel] = there * np.exp(1j * self.w * one.lag) / one.gain
-        return _Fusion(self, believed).motion()
+        noise = dict(self.noise)
+        for one in sensors:
+            if one.channel in noise:
+                noise[one.channel] /= abs(one.gain)
+        return _Fusion(self, believed, noise).motion()
 
 
 def derives_acc(channels: Container[str]) -> bool:
@@ -148,8 +179,10 @@ def derives_acc(channels: Container[str]) -> bool:
 class _Fusion:
     """One motion in the making."""
 
-    def __init__(self, readings: Readings, spectra: Mapping[str, Spectrum]) -> None:
-        self.r, self.spectra = readings, spectra
+    def __init__(
+        self, readings: Readings, spectra: Mapping[str, Spectrum], noise: Mapping[str, float]
+    ) -> None:
+        self.r, self.spectra, self.noise = readings, spectra, noise
         self.grid, self.w, self.low = readings.grid, readings.w, readings.low
         self.nothing = np.full(readings.time_s.size, np.nan)
 
@@ -231,7 +264,7 @@ class _Fusion:
         )
 
     def _rms(self, name: str) -> float:
-        return self.r.noise.get(name, float("nan"))
+        return self.noise.get(name, float("nan"))
 
     def _total(self, cells: tuple[str, ...]) -> tuple[Float1D, float]:
         """(force of the cells of a side, its raw noise)."""

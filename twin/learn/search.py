@@ -17,7 +17,7 @@ from twin.learn.guess import Free, Guess
 from twin.learn.library import Candidate
 from twin.learn.sheet import Sheet
 
-FOLDS = 3
+FOLDS, NEVER = 3, -1
 LEAST_UNITS = 6  # fewer steps than this and blocks are held out instead
 
 
@@ -58,11 +58,14 @@ class Products:
             left[out] = self.square[out] + 2 * gradient[out] @ x + hessian[out] @ x @ x
             steps.append(x)
         mean = np.mean(steps, axis=0)
+        out = self.fold == NEVER
+        left[out] = self.square[out] + 2 * gradient[out] @ mean + hessian[out] @ mean @ mean
         return left, mean[self.base :]
 
 
 def units_of(sheet: Sheet) -> Int1D:
-    """(entry,) the unit of each entry: the step it lies in, else its block, in order."""
+    """(entry,) the unit of each entry: the step it lies in, else its block, in order; last the
+    rest."""
     step = sheet.readings.step[sheet.sample_of]
     held = np.unique(step[step >= 0])
     if held.size >= LEAST_UNITS:
@@ -70,14 +73,17 @@ def units_of(sheet: Sheet) -> Int1D:
         whole = sheet.readings.step
         last = np.maximum.accumulate(np.where(whole >= 0, np.arange(whole.size), 0))
         step = whole[last][sheet.sample_of]
-        return np.unique(step, return_inverse=True)[1]
-    return np.unique(sheet.block_of, return_inverse=True)[1]
+    else:
+        step = sheet.block_of
+    rest = sheet.row_of == len(sheet.rows)
+    number = np.unique(step, return_inverse=True)[1]
+    return np.where(rest, number.max() + 1, number)
 
 
 def folds_of(sheet: Sheet) -> Int1D:
-    """(entry,) in which of the `FOLDS` folds each entry is held out."""
-    found: Int1D = units_of(sheet) % FOLDS
-    return found
+    """(entry,) in which of the `FOLDS` folds each entry is held out; what was at rest in none."""
+    rest = sheet.row_of == len(sheet.rows)
+    return np.where(rest, NEVER, units_of(sheet) % FOLDS)
 
 
 def products(
@@ -102,12 +108,13 @@ def products(
         edges = np.searchsorted(unit[order], np.arange(unit.max() + 2))
         rows = np.array([column[k] for column in columns], dtype=np.float32)[:, order]
         left = before[k][order].astype(np.float32)
+        rest = bool((sheet.row_of == len(sheet.rows)).any())
         for u, (first, last) in enumerate(pairwise(edges)):
             part, r = rows[:, first:last], left[first:last]
             hessians.append((part @ part.T).astype(np.float64))
             gradients.append((part @ r).astype(np.float64))
             squares.append(float(r @ r))
-            folds.append(u % FOLDS)
+            folds.append(NEVER if rest and last == unit.size else u % FOLDS)
     hessian = np.array(hessians)
     size = np.sqrt(np.maximum(np.einsum("upp->p", hessian), 1e-300))
     return Products(

@@ -3,7 +3,7 @@
     damper          -M a - F_R - F_L - D     (the damper's force from the balance, or measured)
     right, left     F_R - model's, -(F_L - model's), where contact was measured
     mass, table     the kinematic gates, see `readings`; right and left cells: do they agree
-    rest            what each channel reads before anything moves; one entry a channel
+    rest            what each channel reads before anything moves, and u; one entry each
 each divided by its noise. Without load cells the damper row holds all forces, and the model says
 where it touches. Nothing is simulated, so a fit converges from far and in chaos.
 
@@ -30,6 +30,7 @@ CONTACT_NOISES = 8.0  # a load cell above so many of its noise bears something
 EDGE_S = 0.012  # next to a measured touch or release the low pass smears the jump
 BLOCK_S = 1.0  # of a block where there are no forcing cycles
 FORCES = ("damper", "right", "left")
+TARED = ("acc", "right", "left")
 KEPT = 3  # motions of other beliefs that are remembered
 
 
@@ -109,34 +110,42 @@ class Sheet:
     def row_of(self) -> Int1D:
         """(entry,) row of each entry of a residual."""
         rows = np.repeat(np.arange(len(self.rows)), self.used.sum(axis=1))
-        return np.concatenate([rows, np.full(len(self.resting), len(self.rows))])
+        return np.concatenate([rows, np.full(self._last, len(self.rows))])
+
+    @property
+    def _last(self) -> int:
+        """Entries of a residual that are of the rest and of the zero."""
+        return len(self.resting) + len(self.readings.zeros)
 
     @cached_property
     def sample_of(self) -> Int1D:
         """(entry,) sample of each entry of a residual."""
         samples = [np.flatnonzero(row) for row in self.used]
-        return np.concatenate([*samples, np.zeros(len(self.resting), dtype=np.int64)])
+        return np.concatenate([*samples, np.zeros(self._last, dtype=np.int64)])
 
     @cached_property
     def block_of(self) -> Int1D:
         """(entry,) block of each entry of a residual."""
         return self.blocks[self.sample_of]
 
-    def _measured(self, m: Motion, mass_kg: float) -> Float2D:
+    def _measured(self, m: Motion, mass_kg: float, guess: Guess | None = None) -> Float2D:
         """(3, sample): damper force from the balance of a mass, F_R, -F_L in N."""
+        off = {what: guess.zero(self.number, what) if guess else 0.0 for what in TARED}
         if m.damper is not None:
             nothing = np.full(m.u.size, np.nan)
             return np.array([m.damper, nothing, nothing])
-        inertia = -mass_kg * m.acc
-        if not m.cells:
-            return np.array([inertia, m.right, m.left])
-        return np.array([inertia - m.right + m.left, m.right, m.left])
+        inertia, right, left = (
+            -mass_kg * (m.acc - off["acc"]), m.right - off["right"], m.left - off["left"]
+        )  # fmt: skip
+        return np.array([inertia - right + left if m.cells else inertia, right, left])
 
-    @cached_property
-    def noise(self) -> Float1D:
-        """(3,) rms of the force rows in N, from the sensors alone."""
-        m, p = self.motion(), self.reference.parameters
-        n = m.noise
+    def noise(self, m: Motion, mass_kg: float) -> Float1D:
+        """(3,) rms of the force rows in N, from the sensors alone, for a belief about them.
+
+        With the mass and the gains that are believed: else a smaller mass would seem to fit
+        better, for no reason but that it makes less of the accelerometer's noise.
+        """
+        n, p = m.noise, self.reference.parameters
         motion = math.hypot(p.stiffness * n.u, p.damping * n.v)
         sides = [
             math.hypot(cells, k * n.u, c * n.v)
@@ -147,11 +156,10 @@ class Sheet:
         ]
         if m.damper is not None:
             return np.array([math.hypot(n.force, motion), np.nan, np.nan])
-        inertia = m.mass_kg * n.acc
         cells = (n.right, n.left) if m.cells else ()
         if self.whitening is not None:
-            return np.array([m.mass_kg, *sides])
-        return np.array([math.hypot(inertia, motion, *cells), *sides])
+            return np.array([mass_kg, *sides])
+        return np.array([math.hypot(mass_kg * n.acc, motion, *cells), *sides])
 
     @cached_property
     def whitening(self) -> Float1D | None:
@@ -176,7 +184,8 @@ class Sheet:
         """(entry,) measured minus model over noise, row after row, where a row counts."""
         m = self.motion(guess.sensors())
         model = guess.local(self.number, m)
-        d, right, left = along(model, m.u, m.v, m.time_s, self.touched)
+        u = m.u - guess.zero(self.number, "u")
+        d, right, left = along(model, u, m.v, m.time_s, self.touched)
         if not m.cells and m.damper is None:
             d = d + right + left
         if model.value("table_tilt", "tilt"):
@@ -186,17 +195,25 @@ class Sheet:
             p = model.parameters
             more = forces(guess.values, m, (p.gap_r, p.gap_l), self.touched, self.scale)
             expected += more
-        rows = (self._measured(m, model.parameters.mass) - expected) / self.noise[:, None]
+        mass = model.parameters.mass
+        rows = self._measured(m, mass, guess) - expected
+        rows /= self.noise(m, mass)[:, None]
         if self.whitening is not None:
             rows[0] = self.readings.grid.filtered(rows[0], self.whitening)
         everything = [*rows, *(one.values for one in m.surprises)]
         samples = [row[used] for row, used in zip(everything, self.used, strict=True)]
-        return np.concatenate([*samples, self._at_rest(guess.sensors())]) / self.weight
+        return np.concatenate([*samples, self._at_rest(guess)]) / self.weight
 
-    def _at_rest(self, sensors: tuple[Sensor, ...]) -> Float1D:
-        offset = {one.channel: one.offset for one in sensors}
+    def _at_rest(self, guess: Guess) -> Float1D:
+        """What is read at rest beyond the sensors' own offsets, and beyond the doubt of a tare."""
+        offset = {one.channel: one.offset for one in guess.sensors()}
         known = [(self.readings.rest[name], offset.get(name, 0.0)) for name in self.resting]
-        return np.array([(mean - there) / sd for (mean, sd), there in known])
+        entries = [(mean - there) / sd for (mean, sd), there in known]
+        for what, channels in self.readings.zeros.items():
+            mean, sd = self.readings.at_rest(what)
+            own = sum(sign * offset.get(name, 0.0) for name, sign in channels)
+            entries.append((mean - own - guess.zero(self.number, what)) / sd)
+        return np.array(entries)
 
 
 def sheets_of(

@@ -10,6 +10,7 @@ that is what makes a fit converge (see `learn`).
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
@@ -59,54 +60,63 @@ def relaxing(branch: float, rate: float, stiffness: float, travelled: float, h: 
     return branch * left + stiffness * travelled * (1.0 - left) / (rate * h)
 
 
-@compiled(cache=True)
-def _along(
-    u: Float1D,
-    v: Float1D,
-    time: Float1D,
-    touched: Float2D,
-    con: Constants,
-    extra: laws.Extra,
-    out: Float2D,
-    version: int = laws.REVISION,
-) -> None:
-    """Fills `out` (3, sample): D, F_R, F_L in N. `touched` (2, sample) as in `UNKNOWN` ..."""
-    z, f, b_r, b_l = 0.0, 0.0, 0.0, 0.0
-    on_r, on_l = False, False
-    for k in range(u.size):
-        h = time[k] - time[k - 1] if k else 0.0
-        if k:
-            du = u[k] - u[k - 1]
-            if con[FY] > 0.0 and du != 0.0:
-                z = hysteretic(z, du, math.copysign(1.0, du), con[UY])
-            if con[K1] > 0.0 or f != 0.0:
-                f = relaxing(f, con[RATE_1], con[K1], du, h)
-            if con[KB] > 0.0:
-                b_r = relaxing(b_r, con[RATE_B], con[KB], du if on_r else 0.0, h)
-                b_l = relaxing(b_l, con[RATE_B], con[KB], -du if on_l else 0.0, h)
-        way = 1.0 if v[k] > 0.0 else -1.0
-        damper = con[K] * u[k] + con[C] * v[k] + cubic(u[k], con[K3])
-        damper += quadratic(v[k], way, con[C2]) + coulomb(way, con[FC]) + con[FY] * z + f
-        if con[EXTRA] > 0.0:
-            damper += extra(u[k], v[k], con[EXTRA_FIRST:])
-        opened = con[DRIFT] * time[k]
-        out[0, k] = damper
-        for side in range(2):
-            right = 1.0 if side == 0 else -1.0
-            gap = (con[G_R] if side == 0 else con[G_L]) + opened
-            d, dd = right * u[k] - gap, right * v[k] - con[DRIFT]
-            b = b_r if side == 0 else b_l
-            push = bumper(con, side, d, dd, b) if d > -0.5 * FAR else 0.0
-            if touched[side, k] < -0.5:
-                was = on_r if side == 0 else on_l
-                on = push > 0.0 and (was or d > 0.0)
-            else:
-                on = touched[side, k] > 0.5
-            if side == 0:
-                on_r = on
-            else:
-                on_l = on
-            out[1 + side, k] = right * push if on else 0.0
+def _kernel(revision: int) -> Callable[..., None]:
+    """The kernel; the revision is a free variable of it, and so in the key of numba's cache."""
+
+    @compiled(cache=True)
+    def kernel(
+        u: Float1D,
+        v: Float1D,
+        time: Float1D,
+        touched: Float2D,
+        con: Constants,
+        extra: laws.Extra,
+        out: Float2D,
+    ) -> None:
+        """Fills `out` (3, sample): D, F_R, F_L in N. `touched` (2, sample) as in `UNKNOWN` ..."""
+        if revision < 0:
+            return
+        z, f, b_r, b_l = 0.0, 0.0, 0.0, 0.0
+        on_r, on_l = False, False
+        for k in range(u.size):
+            h = time[k] - time[k - 1] if k else 0.0
+            if k:
+                du = u[k] - u[k - 1]
+                if con[FY] > 0.0 and du != 0.0:
+                    z = hysteretic(z, du, math.copysign(1.0, du), con[UY])
+                if con[K1] > 0.0 or f != 0.0:
+                    f = relaxing(f, con[RATE_1], con[K1], du, h)
+                if con[KB] > 0.0:
+                    b_r = relaxing(b_r, con[RATE_B], con[KB], du if on_r else 0.0, h)
+                    b_l = relaxing(b_l, con[RATE_B], con[KB], -du if on_l else 0.0, h)
+            way = 1.0 if v[k] > 0.0 else -1.0
+            damper = con[K] * u[k] + con[C] * v[k] + cubic(u[k], con[K3])
+            damper += quadratic(v[k], way, con[C2]) + coulomb(way, con[FC]) + con[FY] * z + f
+            if con[EXTRA] > 0.0:
+                damper += extra(u[k], v[k], con[EXTRA_FIRST:])
+            opened = con[DRIFT] * time[k]
+            out[0, k] = damper
+            for side in range(2):
+                right = 1.0 if side == 0 else -1.0
+                gap = (con[G_R] if side == 0 else con[G_L]) + opened
+                d, dd = right * u[k] - gap, right * v[k] - con[DRIFT]
+                b = b_r if side == 0 else b_l
+                push = bumper(con, side, d, dd, b) if d > -0.5 * FAR else 0.0
+                if touched[side, k] < -0.5:
+                    was = on_r if side == 0 else on_l
+                    on = push > 0.0 and (was or d > 0.0)
+                else:
+                    on = touched[side, k] > 0.5
+                if side == 0:
+                    on_r = on
+                else:
+                    on_l = on
+                out[1 + side, k] = right * push if on else 0.0
+
+    return kernel
+
+
+_along = _kernel(laws.REVISION)
 
 
 def along(

@@ -12,6 +12,7 @@ from twin.model.model import Model
 from twin.service.bundle import read_model
 from twin.service.folders import new_run
 from twin.service.learning.logs import logs_of
+from twin.service.learning.page import write_page
 from twin.service.learning.told import Json, model_toml, verdict_json
 from twin.service.summary import dumps
 from twin.service.terminal import console, say
@@ -51,6 +52,7 @@ def leave(folder: Path, found: Discovery, card: ModelCard, logs: Sequence[Log], 
     told["notes"] += left_out
     (folder / "model.toml").write_text(text, encoding="utf-8")
     (folder / "verdict.json").write_text(dumps(told), encoding="utf-8")
+    write_page(folder, found, logs, told)
 
 
 def say_verdict(told: Json) -> None:

@@ -1,0 +1,268 @@
+"""What the pictures of a discovery show, looked up in it: forces, close-ups, free runs, gates.
+
+Before is the model alone, refitted; after is what the verdict stands for. Both as they are on what
+was held out of their fits.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from table_io.block import Block, Float1D, Int1D, Label
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from table_io.records import Point
+from table_io.records import Step as Driven
+from twin.compare.cycles import Scale
+from twin.compare.pipeline import Setup, start, step
+from twin.compare.windows import TwinSetup
+from twin.learn.discover import Discovery, Log
+from twin.learn.guess import Guess
+from twin.learn.motion import Motion
+from twin.learn.naming import Explained
+from twin.learn.sheet import FORCES, Sheet
+from twin.learn.where import PHASES, Step, phase_of
+from twin.model.parameters import resonance
+
+LEAST_ENTRIES = 20  # of a step in a row, to be looked at
+CYCLES = 2  # of a step in a close-up
+SPAN_S = 3.0  # of a close-up where there are no steps
+REPEATS = 0.1  # of the rms of u: a motion that differs more from period to period does not repeat
+WINDOW_S = 0.5
+FAILS, SURE = 0.1, 4.0  # excess over the noise, and its standard errors, that fail a gate
+Pair = tuple[Explained, Explained]
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """A stretch of a log to be looked at closely: what it is, and its samples, (sample,)."""
+
+    title: str
+    direction: str
+    samples: Int1D
+
+
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """A check without any force law: mean square or value over the noise, before and after."""
+
+    log: str
+    what: str
+    before: float
+    after: float
+    passed: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A discovery, its logs, and what is looked up again and again."""
+
+    found: Discovery
+    logs: Sequence[Log]
+
+    @property
+    def sheets(self) -> tuple[Sheet, ...]:
+        return self.found.prepared.bench.sheets
+
+    @property
+    def pair(self) -> Pair:
+        """(before, after)."""
+        return self.found.named.null, self.found.verdict.best
+
+    @property
+    def law(self) -> Explained | None:
+        """What was found: the effects, or where no name does, the general term."""
+        v = self.found.verdict
+        return v.general or (v.best if v.best.effects else None)
+
+    @property
+    def law_name(self) -> str:
+        """Of the effects whose force is drawn."""
+        v = self.found.verdict
+        names = v.general.names[-1:] if v.general else v.best.names
+        return " + ".join(names)
+
+    @cached_property
+    def worst(self) -> int:
+        """The log with most above the noise before; of it the close-ups are."""
+        squares = [float(one @ one) / max(one.size, 1) for one in self.pair[0].left]
+        return int(np.argmax(squares))
+
+    @cached_property
+    def delivered(self) -> tuple[Float1D, Float1D, Float1D] | None:
+        """(what the law has to deliver, what it delivers, what it leaves), (entry,) over the noise.
+
+        Of the worst log; the first is measured minus the model with the law taken out of it.
+        """
+        if self.law is None:
+            return None
+        sheet, guess = self.sheets[self.worst], self.law.fit.guess
+        bare = guess
+        for effect in self.law.effects:
+            if self.found.verdict.general is None or effect is self.law.effects[-1]:
+                bare = bare.without(effect.name)
+        wanted, left = sheet.residual(bare), sheet.residual(guess)
+        return wanted, wanted - left, left
+
+
+def spread(sheet: Sheet, row: int, entries: Float1D, guess: Guess) -> Float1D:
+    """(sample,) of the entries of one row, in N where the row is a force; NaN where none counts.
+
+    The noise that the entries are over is that of the guess that left them.
+    """
+    mine = sheet.row_of == row
+    out = np.full(sheet.readings.time_s.size, np.nan)
+    out[sheet.sample_of[mine]] = entries[mine] * sheet.weight
+    if not is_force(sheet, row):
+        return out
+    m, mass = _believed(sheet, guess)
+    return out * float(sheet.noise(m, mass)[row])
+
+
+def _believed(sheet: Sheet, guess: Guess) -> tuple[Motion, float]:
+    """(motion, mass in kg) as a guess has them: sensors and mass may be its findings."""
+    m = sheet.motion(guess.sensors())
+    return m, guess.local(sheet.number, m).parameters.mass
+
+
+def is_force(sheet: Sheet, row: int) -> bool:
+    """False where a row is whitened or no force at all: then it is in parts of its noise."""
+    return row < len(FORCES) and not (row == 0 and sheet.whitening is not None)
+
+
+def measured_forces(sheet: Sheet, guess: Guess) -> list[Float1D]:
+    """Damper, F_R and -F_L as measured, N, (sample,) each, with the mass and sensors of a guess."""
+    m, mass = _believed(sheet, guess)
+    if m.damper is not None:
+        return [m.damper, m.right, m.left]
+    borne = m.right - m.left if m.cells else 0.0
+    return [-mass * m.acc - borne, m.right, m.left]
+
+
+def looks(sheet: Sheet, steps: Sequence[Step], row: int) -> list[Look]:
+    """Close-ups with samples in a row: the lowest, the largest and the highest of the steps.
+
+    Without steps: stretches of small, middling and large motion.
+    """
+    m, used = sheet.motion(), sheet.used[row]
+    sizes: dict[int, float] = {}
+    for one in steps:
+        mine = used & (m.step == one.index) & (m.label == Label.MEASURE)
+        if mine.sum() >= LEAST_ENTRIES:
+            sizes[one.index] = float(np.abs(m.u[mine]).max())
+    if not sizes:
+        return [] if steps else _stretches(sheet, row)
+    known = sorted((one for one in steps if one.index in sizes), key=lambda one: one.frequency_hz)
+    largest = max(known, key=lambda one: sizes[one.index])
+    picked = {one.index: one for one in (known[0], largest, known[-1])}
+    return [
+        Look(f"{one.frequency_hz:g} Hz {one.direction}", one.direction, _last(sheet, one.index))
+        for one in sorted(picked.values(), key=lambda one: one.frequency_hz)
+    ]
+
+
+def _last(sheet: Sheet, index: int) -> Int1D:
+    """The samples of the last cycles of a step."""
+    m = sheet.motion()
+    held = (m.step == index) & (m.cycle >= 0)
+    found: Int1D = np.flatnonzero(held & (m.cycle > m.cycle[held].max() - CYCLES))
+    return found
+
+
+def _stretches(sheet: Sheet, row: int) -> list[Look]:
+    m, used = sheet.motion(), sheet.used[row]
+    width = max(round(SPAN_S * m.rate_hz), 1)
+    starts = [k for k in range(0, used.size, width) if used[k : k + width].sum() >= LEAST_ENTRIES]
+    ranked = sorted(starts, key=lambda k: float(np.abs(m.u[k : k + width]).max()))
+    places = dict.fromkeys((len(ranked) // 2, 4 * len(ranked) // 5, len(ranked) - 1))
+    return [
+        Look(
+            f"{m.time_s[ranked[p]]:.0f} s on",
+            "forward",
+            np.arange(ranked[p], min(ranked[p] + width, used.size)),
+        )
+        for p in places
+        if 0 <= p < len(ranked)
+    ]
+
+
+def repeats(sheet: Sheet, one: Step) -> bool:
+    """False where u over the measured cycles differs from period to period: chaos, or a passage."""
+    m = sheet.motion()
+    here = np.flatnonzero((m.step == one.index) & (m.label == Label.MEASURE))
+    if here.size < m.rate_hz / one.frequency_hz * 1.5:
+        return True
+    t, u = m.time_s[here], m.u[here]
+    later = t + 1.0 / one.frequency_hz <= t[-1]
+    change = np.interp(t[later] + 1.0 / one.frequency_hz, t, u) - u[later]
+    return float(change.std()) <= REPEATS * float(u.std())
+
+
+def free_run(sheet: Sheet, steps: Sequence[Step], one: Explained) -> list[Point]:
+    """The PRC points of a log, measured and by the model running free on the measured table.
+
+    None where the table's acceleration or the steps are not known. Sensors that are known to err
+    are read as the explanation has them.
+    """
+    guess = one.fit.guess
+    m = sheet.motion(guess.sensors())
+    if not steps or not np.isfinite(m.table_acc).all() or not np.isfinite(m.acc).all():
+        return []
+    held = m.label == Label.MEASURE
+    cycles = [np.unique(m.cycle[held & (m.step == s.index)]).size for s in steps]
+    level = math.sqrt(2.0) * float(m.table_acc[held].std()) if held.any() else 0.0
+    if level == 0.0 or max(cycles) == 0:
+        return []
+    columns = {"rel_disp_m": m.u, "table_disp_m": m.table_disp, "table_acc_m_s2": m.table_acc}
+    columns["mass_acc_m_s2"] = m.acc
+    if m.cells:
+        columns |= dict.fromkeys(RIGHT_CELLS, 0.5 * m.right) | dict.fromkeys(
+            LEFT_CELLS, 0.5 * m.left
+        )
+    first = round(m.time_s[0] * m.rate_hz)
+    block = Block(
+        "meas", first, m.rate_hz, tuple(columns), np.array([*columns.values()]),
+        m.step.copy(), m.label.copy(), m.cycle.copy(),
+    )  # fmt: skip
+    model = guess.local(sheet.number, m)
+    window = round(WINDOW_S * m.rate_hz)
+    twin = TwinSetup(model, m.rate_hz, window, window, sheet.contact_n)
+    u_star, a_star, _ = resonance(sheet.reference.parameters, level)
+    gaps = model.parameters.gap_r, model.parameters.gap_l
+    scale = Scale(model.parameters, m.rate_hz, sheet.contact_n, u_star, a_star, gaps)
+    driven = tuple(Driven(s.index, s.direction, s.frequency_hz, level) for s in steps)
+    setup = Setup(twin, scale, driven, max(cycles))
+    state, _ = start(setup, first)
+    _, items = step(setup, state, block)
+    return [item for item in items if isinstance(item, Point)]
+
+
+def gates(shown: Shown) -> list[Gate]:
+    """The instrument gates of every log: sensors that contradict each other, and rest values."""
+    found = []
+    for sheet, *left in zip(shown.sheets, *(one.left for one in shown.pair), strict=True):
+        name = sheet.readings.name
+        for row, what in enumerate(sheet.rows):
+            mine = sheet.row_of == row
+            if row < len(FORCES) or not mine.any():
+                continue
+            squares = [(r[mine] * sheet.weight) ** 2 for r in left]
+            blocks = np.unique(sheet.block_of[mine], return_inverse=True)[1]
+            sums = np.bincount(blocks, weights=squares[0] - 1.0)
+            errors = sums.sum() / max(math.sqrt(float(sums @ sums)), 1e-300)
+            before, after = (float(one.mean()) for one in squares)
+            found.append(Gate(name, what, before, after, before < 1 + FAILS or errors < SURE))
+        at_rest = sheet.row_of == len(sheet.rows)
+        read = (r[at_rest][: len(sheet.resting)] * sheet.weight for r in left)
+        values = zip(sheet.resting, *read, strict=True)
+        for channel, before, after in values:
+            told = f"{channel} at rest"
+            found.append(Gate(name, told, float(before), float(after), abs(before) < SURE))
+    return found
+
+
+def phases_of(sheet: Sheet, row: int) -> list[str]:
+    """The phases in which a row has entries."""
+    return [PHASES[k] for k in np.unique(phase_of(sheet)[sheet.row_of == row])]

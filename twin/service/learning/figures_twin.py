@@ -1,0 +1,86 @@
+"""The twin running free before and after, beside the measurement: PRCs and impacts per cycle."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from table_io.block import Float1D
+from table_io.records import Point
+from twin.service.close_ups import COLOUR, DASH, TWIN, WIDTH, Drawn
+from twin.service.evidence import DIRECTIONS
+from twin.service.learning.figures_evidence import Shown, free_run
+
+LABELS = {
+    "eta_d": r"$\eta_d$, displacement", "eta_a": r"$\eta_a$, acceleration",
+    "impacts_right": "impacts right", "impacts_left": "impacts left",
+}  # fmt: skip
+Runs = tuple[list[Point], list[Point]]
+
+
+def curves(shown: Shown) -> Drawn:
+    """PRCs and impacts of the worst log, before left, after right."""
+    sheet, steps = shown.sheets[shown.worst], shown.logs[shown.worst].steps
+    before, after = (free_run(sheet, steps, one) for one in shown.pair)
+    if not before or not after:
+        return
+    caption = (
+        "Per step, on its steady cycles. The twin runs freely from the first sample on, on the "
+        "measured table acceleration, with the parameters fitted on all steps. In chaotic bands "
+        "neither can follow the other's trajectory; sizes compare, samples do not."
+    )
+    names = ["eta_d", "eta_a"]
+    figure = _figure((before, after), names)
+    yield "prc", "Pseudo-resonance curves, measured and by the twin", caption, figure
+    names = ["impacts_right", "impacts_left"]
+    if any(_curve(before, "measured", way, name)[1].any() for way in DIRECTIONS for name in names):
+        caption = "Mean over the steady cycles of a step, from the load cells, and by the twin."
+        yield "impacts", "Impacts per forcing cycle", caption, _figure((before, after), names)
+
+
+def _curve(points: Sequence[Point], who: str, direction: str, name: str) -> tuple[Float1D, Float1D]:
+    """(frequency in Hz, quantity) of one direction, upwards."""
+    found = []
+    for one in points:
+        known = getattr(one, who)
+        value = getattr(known, name) if known is not None else np.nan
+        if one.direction == direction:
+            found.append((one.frequency_hz, float(np.mean(value)) if np.size(value) else np.nan))
+    table = np.array(sorted(found), dtype=np.float64).reshape(-1, 2)
+    return table[:, 0], np.nan_to_num(table[:, 1]) if "impacts" in name else table[:, 1]
+
+
+def _figure(runs: Runs, names: list[str]) -> Figure:
+    figure = Figure(figsize=(WIDTH, 2.6 * len(names) + 0.6))
+    axes = figure.subplots(len(names), 2, sharex=True, sharey="row", squeeze=False)
+    for column, (points, title) in enumerate(zip(runs, ("before", "after"), strict=True)):
+        for ax, name in zip(axes[:, column], names, strict=True):
+            _lines(ax, points, name)
+            ax.set_ylabel(LABELS[name] if column == 0 else "")
+        axes[0, column].set_title(title)
+        axes[-1, column].set_xlabel("frequency in Hz")
+    driven = [one for one in DIRECTIONS if any(p.direction == one for p in runs[0])]
+    handles = [
+        Line2D([], [], color=COLOUR[one], marker="o", lw=2.2, label=f"measured {one}")
+        for one in driven
+    ]
+    handles += [
+        Line2D([], [], color=TWIN, ls=DASH[one], marker="o", mfc="none", ms=6, lw=0.8,
+               label=f"twin {one}")
+        for one in driven
+    ]  # fmt: skip
+    figure.legend(handles=handles, loc="outside upper center", ncols=4)
+    return figure
+
+
+def _lines(ax: Axes, points: Sequence[Point], name: str) -> None:
+    for one in DIRECTIONS:
+        look: dict[str, Any] = {"color": COLOUR[one], "lw": 2.2, "ms": 4}
+        ax.plot(*_curve(points, "measured", one, name), "o-", **look)
+    for one in DIRECTIONS:
+        twin: dict[str, Any] = {"color": TWIN, "ls": DASH[one], "lw": 0.8, "ms": 6, "mfc": "none"}
+        ax.plot(*_curve(points, "twin", one, name), marker="o", **twin)
+    ax.set_ylim(bottom=0)

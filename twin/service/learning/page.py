@@ -1,0 +1,94 @@
+"""One HTML file that tells a discovery: what differs, what it is, how the gap shrank.
+
+Numbers are those of verdict.json; the file refers to nothing outside itself.
+"""
+
+import base64
+from collections.abc import Sequence
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from twin.learn.discover import Discovery, Log
+from twin.service.learning.figures import draw_all
+from twin.service.learning.figures_evidence import Shown, gates
+from twin.service.learning.told import Json
+from twin.service.report import significant
+
+HERE = Path(__file__).parent
+WORDS = {
+    "none": "Model and measurement agree to within the noise.",
+    "named": "The model lacks {names}.",
+    "ambiguous": "The model lacks something, and these recordings cannot tell which: {names}.",
+    "unexplained": "The model lacks something that no effect of the library explains.",
+}
+SECTIONS = {
+    "where": "Where they disagree", "candidates": "What was tried", "gates": "The instruments",
+    "forces": "The force that is missing", "histories": "Before and after, on the measured motion",
+    "twin": "Before and after, running free", "time": "Over the test",
+}  # fmt: skip
+
+
+def write_page(folder: Path, found: Discovery, logs: Sequence[Log], told: Json) -> Path:
+    """Path of folder/report.html, with its figures in folder/figures."""
+    shown = Shown(found, logs)
+    pictures = draw_all(shown, told, folder / "figures")
+    environment = Environment(
+        loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    environment.filters["sig"] = significant
+    environment.filters["title"] = titled
+    text = environment.get_template("page.html").render(
+        told=told,
+        sentence=sentence(told),
+        held_out=held_out(shown),
+        logs=[_facts(log) for log in logs],
+        sections=SECTIONS,
+        gates=gates(shown),
+        images={
+            section: [(one, base64.b64encode(one.path.read_bytes()).decode()) for one in some]
+            for section, some in pictures.items()
+        },
+        model=(folder / "model.toml").read_text(encoding="utf-8"),
+    )
+    page = folder / "report.html"
+    page.write_text(text, encoding="utf-8")
+    return page
+
+
+def titled(effect: Json) -> str:
+    """What a person calls an effect of the verdict: its id, and the channel of a sensor's."""
+    return f"{effect['id']} of {effect['channel']}" if effect.get("channel") else effect["id"]
+
+
+def sentence(told: Json) -> str:
+    """The verdict in one sentence."""
+    names = " and ".join(titled(one) for one in told["effects"])
+    if told["ambiguous"]:
+        names = ", or ".join(" with ".join(some) for some in told["ambiguous"])
+    text = WORDS[told["verdict"]].format(names=names)
+    if told["verdict"] == "unexplained" and names:
+        text += f" The nearest is {names}."
+    return text
+
+
+def held_out(shown: Shown) -> str:
+    """How the fits were judged, in a sentence."""
+    stepped = all(log.steps for log in shown.logs)
+    what = "steps" if stepped else "cycles or seconds"
+    names = ", ".join(sheet.readings.name for sheet in shown.sheets)
+    return (
+        f"{names}: fitted on two thirds of the {what}, judged on the third that was left out, "
+        "each third in turn. Parameters are those of a last fit on everything."
+    )
+
+
+def _facts(log: Log) -> Json:
+    r = log.readings
+    gaps = [f"{1e3 * gap:g}" for gap in r.gaps_m]
+    return {
+        "name": r.name, "seconds": float(r.time_s[-1] - r.time_s[0]), "steps": len(log.steps),
+        "mass": r.mass_kg, "channels": r.channels,
+        "gaps": "no bumpers" if gaps[0] == "inf" else f"gaps {gaps[0]} and {gaps[1]} mm",
+    }  # fmt: skip
