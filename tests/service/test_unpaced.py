@@ -223,14 +223,16 @@ def test_with_loop_check_and_control_every_step_has_its_level(tmp_path: Path) ->
     recording = read(log)
     summary = summarise(recording, bundle.parameters)
     assert summary["verdict"] == "complete"
-    assert summary["checks"] and all(one["passed"] for one in summary["checks"])
+    assert summary["checks"]
+    assert all(one["passed"] for one in summary["checks"])
     assert len(summary["steps"]) == 6
     for step in summary["steps"]:
         assert step["table_acc_fundamental_m_s2"] == pytest.approx(LEVEL, rel=0.02)
         assert step["level"]["updates"] <= 3
     label = recording.pieces("meas")[0].label
     checked = np.flatnonzero(label == Label.CHECK)
-    assert len(checked) and checked[-1] < np.flatnonzero(label == Label.MEASURE)[0]
+    assert checked.size
+    assert checked[-1] < np.flatnonzero(label == Label.MEASURE)[0]
 
 
 def test_free_flight_has_no_bumpers_anywhere(tmp_path: Path) -> None:

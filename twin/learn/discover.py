@@ -9,7 +9,16 @@ import numpy as np
 from table_io.block import Float1D
 from table_io.card import BadInput
 from twin.learn.fit import Fit, fit
-from twin.learn.guess import INPUT_GAIN, INPUT_OFFSET, ZERO, Free, Guess, base_free, effects_of
+from twin.learn.guess import (
+    INPUT_GAIN,
+    INPUT_OFFSET,
+    SENSOR,
+    ZERO,
+    Free,
+    Guess,
+    base_free,
+    effects_of,
+)
 from twin.learn.library import Candidate, candidates
 from twin.learn.naming import Bench, Explained, Named, Tell, named
 from twin.learn.readings import Readings, derives_acc
@@ -96,9 +105,7 @@ def start(sheets: Sequence[Sheet], model: Model) -> tuple[Guess, tuple[Free, ...
     guess = Guess.of(model, len(sheets))
     if own:
         guess = guess.moved({INPUT_GAIN: _input_gain(sheets[0], model), INPUT_OFFSET: 0.0})
-    doubt = [
-        {what: one.readings.at_rest(what)[1] for what in one.readings.zeros} for one in sheets
-    ]
+    doubt = [{what: one.readings.at_rest(what)[1] for what in one.readings.zeros} for one in sheets]
     guess = guess.moved({f"{ZERO}{k}.{what}": 0.0 for k, log in enumerate(doubt) for what in log})
     return guess, (*base_free(model, touched, own, doubt), *effects_of(model))
 
@@ -154,7 +161,8 @@ def discover(
     found = named(bench, prepared.guess, tell)
     steps = [log.steps for log in logs]
     least = min(one.weight for one in bench.sheets) ** -2
-    floor = least * repeated(bench.sheets, found.best.left)
+    # what is left cannot be less than the noise: where it is, the noise was overrated
+    floor = min(least * repeated(bench.sheets, found.best.left), found.best.cost)
     verdict = judge(bench, found, floor)
     before = cells(bench.sheets, found.null.left, floor)
     seen = where(before, steps, harmonics_of(bench.sheets, found.null.left, steps))
@@ -188,3 +196,18 @@ def structured(logs: Sequence[Log], model: Model, effects: Sequence[str]) -> Exp
 def _little(one: Candidate) -> float:
     free = one.amplitude
     return min(max(one.vanishing + 1e-3 * free.scale, free.low), free.high)
+
+
+def transferred(log: Log, found: Explained) -> float:
+    """NRMSE of the damper's force on a log that nothing was fitted on, gaps as that log says."""
+    guess = found.fit.guess
+    own = Guess.of(guess.model(), 1).moved(
+        {name: value for name, value in guess.values.items() if name.startswith(SENSOR)}
+    )
+    (sheet,) = sheets_of([(log.readings, log.contact_n)], guess.model())
+    motion = sheet.motion(own.sensors())
+    mass = own.local(0, motion).parameters.mass
+    damper = sheet.row_of == 0
+    left = sheet.residual(own)[damper] * sheet.noise(motion, mass)[0]
+    there = sheet.measured(motion, mass)[0][sheet.sample_of[damper]]
+    return float(left.std() / there.std())

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from table_io.block import Bool2D, Float1D, Float2D, Int1D
-from twin.learn.guess import Free, Guess
+from twin.learn.guess import Free, Guess, log_of
 from twin.learn.sheet import Sheet
 
 MOST_STEPS = 40
@@ -27,6 +27,7 @@ class Fit:
     cost: float  # mean square of the residual over its noise, on the samples fitted
     converged: bool
     at_bound: tuple[str, ...]
+    left: tuple[Float1D, ...] = ()  # per log, (entry,) residual where it was held out
 
 
 def fit(
@@ -34,9 +35,14 @@ def fit(
     guess: Guess,
     free: Sequence[Free],
     train: Sequence[Bool2D] | None = None,
+    folds: Sequence[Int1D] = (),
 ) -> Fit:
-    """The guess moved to least squares over the entries where `train`, (entry,) each, is True."""
-    return _Search(sheets, guess, tuple(free), train).run()
+    """The guess moved to least squares over the entries where `train`, (entry,) each, is True.
+
+    With `folds`, (entry,) a log: what is left in each fold by a fit to all the others, one
+    Gauss-Newton step away from the whole one. Below zero: never held out.
+    """
+    return _Search(sheets, guess, tuple(free), train, folds).run()
 
 
 def slopes(
@@ -48,7 +54,13 @@ def slopes(
     if (math.exp(x + step) if one.logarithmic else x + step) > one.high:
         step = -step
     moved = guess.moved(dict.fromkeys(one.keys, one.outside(x + step)))
-    return [(sheet.residual(moved) - was) / step for sheet, was in zip(sheets, before, strict=True)]
+    own = log_of(one.name)
+    return [
+        (sheet.residual(moved) - was) / step
+        if own in (None, sheet.number)
+        else np.zeros(was.size)  # a number of another log
+        for sheet, was in zip(sheets, before, strict=True)
+    ]
 
 
 class _Search:
@@ -60,8 +72,9 @@ class _Search:
         guess: Guess,
         free: tuple[Free, ...],
         train: Sequence[Bool2D] | None,
+        folds: Sequence[Int1D],
     ) -> None:
-        self.sheets, self.guess, self.free = sheets, guess, free
+        self.sheets, self.guess, self.free, self.folds = sheets, guess, free, folds
         self.train = train or [np.ones(sheet.row_of.size, dtype=bool) for sheet in sheets]
         self.count = max(sum(int(one.sum()) for one in self.train), 1)
         low = [-math.inf if f.low == -math.inf else f.inside(f.low) for f in free]
@@ -119,7 +132,8 @@ class _Search:
         inverse = np.linalg.pinv(hessian / np.outer(size, size), hermitian=True)
         inverse /= np.outer(size, size)
         gradients = jacobian * self.chosen(whole)
-        first, middle = 0, np.zeros_like(inverse)
+        first, count = 0, 0
+        scatter, known = np.zeros_like(inverse), np.zeros_like(inverse)
         for sheet, mask in zip(self.sheets, self.train, strict=True):
             blocks = whole_contacts(sheet)[mask]
             here = slice(first, first + blocks.size)
@@ -129,9 +143,13 @@ class _Search:
             )
             # of what was read at rest there is one number each: its deviation is what is known
             still = jacobian[:, here][:, rest] / sheet.weight
-            middle += moving @ moving.T + still @ still.T
+            scatter += moving @ moving.T
+            known += still @ still.T
             first += blocks.size
-        covariance = inverse @ middle @ inverse
+            count += np.unique(blocks[~rest]).size
+        # the fit has taken part of the scatter away: a block's worth for each number it found
+        scatter *= count / max(count - len(self.free), 1)
+        covariance = inverse @ (scatter + known) @ inverse
         sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         scale = np.where(sd > 0, sd, 1.0)
         values, spread, stuck = {}, {}, []
@@ -143,8 +161,23 @@ class _Search:
         correlation = covariance / np.outer(scale, scale)
         return Fit(
             guess, self.free, values, spread, correlation, cost / self.count, converged,
-            tuple(stuck),
+            tuple(stuck), self._held_out(x, whole, jacobian),
         )  # fmt: skip
+
+    def _held_out(self, x: Float1D, whole: list[Float1D], jacobian: Float2D) -> tuple[Float1D, ...]:
+        """(entry,) a log, what fits without each fold leave in it; nothing without folds."""
+        if not self.folds:
+            return ()
+        fold, r = np.concatenate(self.folds), np.concatenate(whole)
+        left = [one.copy() for one in whole]
+        for k in np.unique(fold[fold >= 0]):
+            others = fold != k
+            part = jacobian[:, others]
+            step = solved(part @ part.T, 1e-9, part @ r[others])
+            there = self.residuals(self.at(np.clip(x - step, self.low, self.high)))
+            for mine, one, own in zip(left, there, self.folds, strict=True):
+                mine[own == k] = one[own == k]
+        return tuple(left)
 
 
 def whole_contacts(sheet: Sheet) -> Int1D:

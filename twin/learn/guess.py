@@ -36,7 +36,7 @@ class Guess:
         own = {
             name: value
             for name, value in self.values.items()
-            if not name.startswith((SENSOR, "general.")) and not _of_a_log(name)
+            if not name.startswith((SENSOR, "general.")) and log_of(name) is None
         }
         return Model.from_flat(own)
 
@@ -71,8 +71,13 @@ class Guess:
         return Guess({k: v for k, v in self.values.items() if not k.startswith(f"{prefix}.")})
 
 
-def _of_a_log(name: str) -> bool:
-    return any(name.startswith(one) and name[len(one) :][:1].isdigit() for one in (GAP, ZERO))
+def log_of(name: str) -> int | None:
+    """The log that a flat name belongs to; None where it belongs to all."""
+    for prefix in (GAP, ZERO):
+        number = name[len(prefix) :].partition(".")[0]
+        if name.startswith(prefix) and number.isdigit():
+            return int(number)
+    return None
 
 
 @dataclass(frozen=True, slots=True)

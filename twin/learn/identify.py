@@ -19,7 +19,7 @@ from twin.compare import PREDICTED
 from twin.compare.windows import TwinSetup, begin, follow
 from twin.learn.discover import Log, prepare
 from twin.learn.fit import Fit, fit, slopes
-from twin.learn.guess import Free, Guess, effect_free
+from twin.learn.guess import ZERO, Free, Guess, effect_free
 from twin.learn.naming import Bench
 from twin.learn.onsets import Onsets, onsets
 from twin.learn.parts import (
@@ -59,12 +59,12 @@ class Identified:
     @property
     def tied(self) -> tuple[tuple[str, str, float], ...]:
         """Pairs of parameters that are hard to tell apart, with their correlation."""
-        c, free = self.fit.correlation, self.fit.free
+        c, names = self.fit.correlation, [one.name for one in self.fit.free]
         return tuple(
-            (free[i].name, free[k].name, float(c[i, k]))
-            for i in range(len(free))
+            (names[i], names[k], float(c[i, k]))
+            for i in range(len(names))
             for k in range(i)
-            if abs(c[i, k]) > TIED
+            if abs(c[i, k]) > TIED and not names[i].startswith(ZERO)
         )
 
 

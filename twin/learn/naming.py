@@ -6,7 +6,7 @@ refitted whole, each on two thirds of the steps and judged on the third, in turn
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from table_io.block import Float1D
 from twin.learn.fit import Fit, fit
 from twin.learn.guess import Free, Guess
 from twin.learn.library import Candidate, general
-from twin.learn.search import FOLDS, NEVER, Finding, folds_of, nothing, products, subsets
+from twin.learn.search import Finding, folds_of, nothing, products, subsets
 from twin.learn.sheet import Sheet
 
 MOST_EFFECTS = 3
@@ -64,21 +64,8 @@ class Bench:
     def explain(self, guess: Guess, effects: Sequence[Candidate]) -> Explained:
         """The effects with the base, fitted on everything and held out fold by fold."""
         free = (*self.base, *(one for effect in effects for one in effect.free))
-        whole = fit(self.sheets, guess, free)
-        folds = [folds_of(sheet) for sheet in self.sheets]
-        left = [np.empty(fold.size) for fold in folds]
-        converged = whole.converged
-        for k in range(FOLDS):
-            train = [fold != k for fold in folds]
-            if not any(one.any() for one in train):
-                continue
-            part = fit(self.sheets, whole.guess, free, train)
-            converged &= part.converged
-            for mine, fold, sheet in zip(left, folds, self.sheets, strict=True):
-                out = (fold == k) | (fold == NEVER)
-                if out.any():
-                    mine[out] = sheet.residual(part.guess)[out]
-        return Explained(tuple(effects), whole, tuple(left), converged)
+        found = fit(self.sheets, guess, free, folds=[folds_of(one) for one in self.sheets])
+        return Explained(tuple(effects), found, found.left, found.converged)
 
     def gain(self, before: Explained, after: Explained) -> tuple[float, float, float]:
         """(share of the squares that is gained, the most in one row, standard errors of it).
@@ -116,29 +103,51 @@ class Named:
     best: Explained
     tried: tuple[Explained, ...] = field(default=())
     outside: tuple[Explained, ...] = field(default=())  # with a general term in it
+    whole: bool = True  # False where somebody had enough before the end
+
+
+class Enough(Exception):
+    """Raised by whoever is told, to end the search with what was found."""
 
 
 def named(bench: Bench, guess: Guess, tell: Tell = lambda text: None) -> Named:
     """Forward selection from the base alone, with swaps of what was taken before."""
-    null = current = bench.explain(guess, ())
-    tried: list[Explained] = []
-    while len(current.effects) < MOST_EFFECTS:
-        round_ = _refitted(bench, current, current.effects, tell)
-        tried += round_
-        best = min(round_, key=lambda one: one.cost, default=current)
-        minor = current.effects and current.cost - best.cost < MINOR * (null.cost - best.cost)
-        if minor or not bench.worth(current, best):
-            break
-        null = _null_again(bench, null, best)
-        current = best
-        for member in current.effects[:-1]:
-            others = tuple(one for one in current.effects if one is not member)
-            swapped = _refitted(bench, current, others, tell, member)
-            tried += swapped
-            best = min(swapped, key=lambda one: one.cost, default=current)
-            if bench.worth(current, best):
-                current = best
-    return Named(null, current, tuple(tried), _outside(bench, null, current, tell))
+    null = bench.explain(guess, ())
+    state = Named(null, null)
+    try:
+        while len(state.best.effects) < MOST_EFFECTS:
+            after = _swapped(bench, _added(bench, state, tell), tell)
+            if after.best is state.best:
+                state = after
+                break
+            state = replace(after, null=_null_again(bench, after.null, after.best))
+        return replace(state, outside=_outside(bench, state.null, state.best, tell))
+    except Enough:
+        return replace(state, whole=False)
+
+
+def _added(bench: Bench, state: Named, tell: Tell) -> Named:
+    """With the best further effect, if one is worth it."""
+    current = state.best
+    round_ = _refitted(bench, current, current.effects, tell)
+    tried = (*state.tried, *round_)
+    best = min(round_, key=lambda one: one.cost, default=current)
+    minor = current.effects and current.cost - best.cost < MINOR * (state.null.cost - best.cost)
+    if minor or not bench.worth(current, best):
+        best = current
+    return replace(state, best=best, tried=tried)
+
+
+def _swapped(bench: Bench, state: Named, tell: Tell) -> Named:
+    """With each earlier effect replaced by a better one, if there is one."""
+    for member in state.best.effects[:-1]:
+        others = tuple(one for one in state.best.effects if one is not member)
+        found = _refitted(bench, state.best, others, tell, member)
+        state = replace(state, tried=(*state.tried, *found))
+        best = min(found, key=lambda one: one.cost, default=state.best)
+        if bench.worth(state.best, best):
+            state = replace(state, best=best)
+    return state
 
 
 def _outside(bench: Bench, null: Explained, best: Explained, tell: Tell) -> tuple[Explained, ...]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from table_io.block import Block, Float1D, Int1D
 from table_io.channels import contact_forces
-from twin.learn.guess import ZERO, Guess
+from twin.learn.guess import Guess
 from twin.learn.sheet import CONTACT_NOISES, Sheet
 
 SURELY_S = 0.005  # free for so long before an onset, and bearing most of so long after it
@@ -69,7 +69,7 @@ def onsets(
     if not m.cells:
         return ()
     found = []
-    position = m.u - guess.values.get(f"{ZERO}{sheet.number}", 0.0)
+    position = m.u - guess.zero(sheet.number, "u")
     for side, law in enumerate(laws):
         sign = 1.0 if side == 0 else -1.0
         rms = (m.noise.right, m.noise.left)[side]

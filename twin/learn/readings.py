@@ -122,7 +122,7 @@ class Readings:
     def zeros(self) -> dict[str, tuple[tuple[str, float], ...]]:
         """Of u, acc, right, left: the channels that make it, each with its sign.
 
-        Only what should read zero at rest: it was tared, and no pressed-in bumper holds it off.
+        Only what was tared: what reads something at rest, before anything moves.
         """
         lasers = (("mass_disp_m", 1.0), ("table_disp_m", -1.0))
         made = {
@@ -131,8 +131,6 @@ class Readings:
             "right": tuple((one, 1.0) for one in RIGHT_CELLS if one in self.spectra),
             "left": tuple((one, 1.0) for one in LEFT_CELLS if one in self.spectra),
         }
-        if min(self.gaps_m) <= 0:
-            return {}
         return {
             name: channels
             for name, channels in made.items()
@@ -140,9 +138,14 @@ class Readings:
         }
 
     def at_rest(self, name: str) -> tuple[float, float]:
-        """(mean of u, acc, right or left at rest, its deviation), SI."""
+        """(mean of u, acc, right or left at rest, its deviation), SI.
+
+        What pressed-in bumpers make it read then is real: of the tare nothing is known but its
+        deviation.
+        """
         known = [(sign, *self.rest[one]) for one, sign in self.zeros[name]]
-        mean = sum(sign * mean for sign, mean, _ in known)
+        pressed = min(self.gaps_m) <= 0
+        mean = 0.0 if pressed else sum(sign * mean for sign, mean, _ in known)
         return mean, float(np.hypot.reduce([sd for _, _, sd in known])) / float(np.sqrt(2.0))
 
     def whitening(self, stiffness: float, damping: float) -> Float1D:
@@ -283,7 +286,7 @@ def readings_of(
     columns = {
         key: whole.channel(key)
         for key in USED
-        if key in whole.channels and np.isfinite(whole.channel(key)).any()
+        if key in whole.channels and alive(whole.channel(key))
     }
     if "rel_disp_m" not in columns and not {"mass_disp_m", "table_disp_m"} <= columns.keys():
         raise BadInput(
@@ -310,6 +313,12 @@ def readings_of(
         whole.step[:: grid.every], whole.label[:: grid.every], whole.cycle[:: grid.every],
         believed[:: grid.every],
     )  # fmt: skip
+
+
+def alive(values: Float1D) -> bool:
+    """False where nothing was measured, or always the same: a dead channel."""
+    known = values[np.isfinite(values)]
+    return bool(known.size and np.ptp(known) > 0.0)
 
 
 def _filled(blocks: tuple[Block, ...], name: str) -> Block:

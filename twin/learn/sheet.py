@@ -79,7 +79,7 @@ class Sheet:
         """(row, sample): what counts in the rows."""
         m = self.motion()
         used = np.zeros((len(self.rows), m.u.size), dtype=bool)
-        used[0] = m.moving & np.isfinite(self._measured(m, m.mass_kg)[0])
+        used[0] = m.moving & np.isfinite(self.measured(m, m.mass_kg)[0])
         margin = max(round(EDGE_S * m.rate_hz), 1)
         window = np.ones(2 * margin + 1)
         if m.cells and m.damper is None:
@@ -128,7 +128,7 @@ class Sheet:
         """(entry,) block of each entry of a residual."""
         return self.blocks[self.sample_of]
 
-    def _measured(self, m: Motion, mass_kg: float, guess: Guess | None = None) -> Float2D:
+    def measured(self, m: Motion, mass_kg: float, guess: Guess | None = None) -> Float2D:
         """(3, sample): damper force from the balance of a mass, F_R, -F_L in N."""
         off = {what: guess.zero(self.number, what) if guess else 0.0 for what in TARED}
         if m.damper is not None:
@@ -196,7 +196,7 @@ class Sheet:
             more = forces(guess.values, m, (p.gap_r, p.gap_l), self.touched, self.scale)
             expected += more
         mass = model.parameters.mass
-        rows = self._measured(m, mass, guess) - expected
+        rows = self.measured(m, mass, guess) - expected
         rows /= self.noise(m, mass)[:, None]
         if self.whitening is not None:
             rows[0] = self.readings.grid.filtered(rows[0], self.whitening)

@@ -24,6 +24,7 @@ GRID_SHARE = 0.01  # a frequency this near to the profile's grid is the grid's
 LEVEL_SHARE = 0.1  # likewise of the level
 LOW_LEVEL = 0.2  # of the largest: a burst of less is a loop check, no part of the sweep
 HELD_SHARE = 0.4  # of the time that it moves, in a stepped sine
+HELD_LEAST = 0.15  # of all motion, whatever was taken for a loop check
 BEYOND = 1.5  # cycles that a hold may reach beyond where its phase was seen to be straight
 RAMP_CYCLES, RAMP_S = 2.0, 0.5  # soft start and stop; an abrupt one only loses these edges
 
@@ -64,7 +65,8 @@ def find_steps(
     for burst, track in enumerate(tracks(signal, moving, rate_hz)):
         holds += [replace(hold, burst=burst) for hold in _holds(track, rate_hz, sweep, is_acc)]
     holds, said, begins = _without_check(holds, rate_hz)
-    if sum(hold.end - hold.start for hold in holds) < HELD_SHARE * moving[begins:].sum():
+    held = sum(hold.end - hold.start for hold in holds)
+    if held < max(HELD_SHARE * moving[begins:].sum(), HELD_LEAST * moving.sum()):
         holds = []
     if on_grid:
         holds = [_nominal(hold, sweep) for hold in holds]

@@ -39,13 +39,14 @@ def judge(bench: Bench, named: Named, floor: float) -> Verdict:
     null, best = named.null, named.best
     gap = max(null.cost - floor, 1e-9)
     general = _better(bench, named, floor)
+    beside = general is not None and _adds(named, general, gap)
     if not best.effects:
         return _nothing_named(bench, named, floor, general)
     left = max(best.cost - floor, 0.0)
     others = _as_good(bench, named)
     remainder = left > LEFT * gap and left > VISIBLE * floor
     sure = _confidence(bench, named, left / gap)
-    if general is not None:
+    if general is not None and not beside:
         why = f"{general.names[-1]} explains what {' + '.join(best.names)} cannot"
         return Verdict("unexplained", best, min(sure, 0.3), (), general, floor, True, why)
     if remainder and (null.cost - best.cost) < PARTIAL * gap:
@@ -55,9 +56,14 @@ def judge(bench: Bench, named: Named, floor: float) -> Verdict:
         names = "; ".join(" + ".join(one.names) for one in others)
         why = f"as good as {' + '.join(best.names)}: {names}"
         share = sure / (1 + len(others))
-        return Verdict("ambiguous", best, share, others, None, floor, remainder, why)
-    why = "more is left than noise" if remainder else "what is left is noise"
-    return Verdict("named", best, sure, (), None, floor, remainder, why)
+        return Verdict("ambiguous", best, share, others, general, floor, remainder, why)
+    why = "what is left is noise"
+    if general is not None:
+        why = f"more is left, unexplained; it looks like {general.names[-1]}"
+        sure, remainder = 0.8 * sure, True
+    elif remainder:
+        why = "more is left, unexplained"
+    return Verdict("named", best, sure, (), general, floor, remainder, why)
 
 
 def _nothing_named(bench: Bench, named: Named, floor: float, general: Explained | None) -> Verdict:
@@ -82,6 +88,14 @@ def _better(bench: Bench, named: Named, floor: float) -> Explained | None:
         if len(one.effects) < len(best.effects) and gain > -OUTSIDE * gap:
             return one  # one term does what several effects do
     return None
+
+
+def _adds(named: Named, general: Explained, gap: float) -> bool:
+    """True where the named effects are needed beside the general term: it alone does much worse."""
+    if len(general.effects) <= len(named.best.effects):
+        return False
+    alone = [one.cost for one in named.outside if len(one.effects) == 1]
+    return min(alone, default=math.inf) - general.cost > LEFT * gap
 
 
 def _as_good(bench: Bench, named: Named) -> tuple[Explained, ...]:

@@ -14,6 +14,7 @@ from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
+from numba import float64, types
 
 from table_io.block import Float1D, Float2D
 from twin.model import laws
@@ -21,9 +22,11 @@ from twin.model.compiled import compiled, inner
 from twin.model.integrated import coefficients
 from twin.model.laws import (
     C2,
+    CONSTANTS_SIZE,
     DRIFT,
     EXTRA,
     EXTRA_FIRST,
+    EXTRA_TYPE,
     FAR,
     FC,
     FY,
@@ -48,6 +51,12 @@ from twin.model.model import Model
 from twin.model.solver import GRAVITY_M_S2
 
 ROWS = ("damper", "right", "left")
+# One signature: a kernel that is specialised to the very function of an effect is never cached.
+_READ = types.Array(float64, 1, "A", readonly=True)
+_KERNEL = types.void(
+    _READ, _READ, _READ, float64[:, ::1], types.UniTuple(float64, CONSTANTS_SIZE), EXTRA_TYPE,
+    float64[:, ::1],
+)  # fmt: skip
 UNKNOWN, FREE, TOUCHED = -1, 0, 1  # what was measured of a contact
 
 
@@ -63,7 +72,7 @@ def relaxing(branch: float, rate: float, stiffness: float, travelled: float, h: 
 def _kernel(revision: int) -> Callable[..., None]:
     """The kernel; the revision is a free variable of it, and so in the key of numba's cache."""
 
-    @compiled(cache=True)
+    @compiled(_KERNEL, cache=True)
     def kernel(
         u: Float1D,
         v: Float1D,

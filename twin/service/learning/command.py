@@ -1,21 +1,25 @@
 """`shaketwin discover`: the shell round `twin.learn.discover`."""
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from table_io.card import parse
 from table_io.clock import RealClock
 from table_io.profile import Specimen
-from twin.learn.discover import Discovery, Log, discover
+from twin.learn.discover import Discovery, Log, discover, transferred
+from twin.learn.naming import Enough, Tell
 from twin.model.card import ModelCard
+from twin.model.effects import find_effect
 from twin.model.model import Model
 from twin.service.bundle import read_model
 from twin.service.folders import new_run
 from twin.service.learning.logs import logs_of
 from twin.service.learning.page import write_page
 from twin.service.learning.told import Json, model_toml, verdict_json
+from twin.service.outcome import EXIT_INTERRUPTED
 from twin.service.summary import dumps
-from twin.service.terminal import console, say
+from twin.service.terminal import console, interruptible, say
 
 
 def model_of(name: str) -> tuple[Model, ModelCard]:
@@ -26,21 +30,52 @@ def model_of(name: str) -> tuple[Model, ModelCard]:
 
 
 def discover_command(
-    paths: Sequence[Path], model: str, out: Path | None, without: Sequence[str]
+    paths: Sequence[Path],
+    model: str,
+    out: Path | None,
+    without: Sequence[str] = (),
+    held_out: Sequence[Path] = (),
 ) -> int:
     """Find, name, add, show; the exit code."""
     clock = RealClock()
     began = clock.now()
     start, card = model_of(model)
+    for name in without:
+        find_effect(name)
     logs, notes = logs_of(paths)
+    apart = logs_of(held_out)[0] if held_out else ()
     folder, _ = new_run(out, "discover")
-    with console.status("the model as it is") as status:
-        found = discover(logs, start, lambda text: status.update(f"trying {text}"), without)
+    with interruptible("stopping: what was found is kept") as stop, searching() as show:
+
+        def tell(text: str) -> None:
+            if stop():
+                raise Enough
+            show(text)
+
+        found = discover(logs, start, tell, without)
     told = verdict_json(found, clock.now() - began, notes)
+    told["held_out_logs"] = [
+        {
+            "log": log.readings.name,
+            "nrmse_before": transferred(log, found.named.null),
+            "nrmse_after": transferred(log, found.verdict.best),
+        }
+        for log in apart
+    ]
     leave(folder, found, card, logs, told)
     say_verdict(told)
     say(f"{folder}")
-    return 0
+    return 0 if found.named.whole else EXIT_INTERRUPTED
+
+
+@contextlib.contextmanager
+def searching() -> Iterator[Tell]:
+    """What is being tried: a moving line on a terminal, plain lines elsewhere."""
+    if not console.is_terminal:
+        yield lambda text: say(f"  trying {text}")
+        return
+    with console.status("the model as it is") as status:
+        yield lambda text: status.update(f"trying {text}")
 
 
 def leave(folder: Path, found: Discovery, card: ModelCard, logs: Sequence[Log], told: Json) -> None:
@@ -71,6 +106,11 @@ def say_verdict(told: Json) -> None:
         for name, value in one["parameters"].items():
             half = 0.5 * (value["high"] - value["low"])
             say(f"  {one['id']} {name} = {value['value']:.5g} +- {half:.2g} {value['unit']}")
+    for one in told.get("held_out_logs", []):
+        say(
+            f"  {one['log']}, not fitted on: NRMSE of the damper force "
+            f"{one['nrmse_before']:.3g} -> {one['nrmse_after']:.3g}"
+        )
     for note in told["notes"]:
         say(f"  note: {note}")
     say(f"  next: {told['next_run']}")

@@ -16,6 +16,7 @@ from matplotlib.patches import Patch
 
 from table_io.block import Float1D, Float2D
 from twin.learn.general import GENERAL
+from twin.learn.guess import ZERO
 from twin.learn.sheet import FORCES, Sheet
 from twin.learn.where import Cell, Step
 from twin.service.close_ups import COLOUR, GUIDE, WIDTH, Drawn
@@ -27,6 +28,7 @@ from twin.service.learning.told import Json
 
 MOST_LOGS, MOST_BARS, MOST_TICKS = 4, 24, 24
 LEAST_EXCESS = 0.1  # of the noise: where the colours begin
+LEAST_TOP = 10.0  # where they end at least: what is but noise stays pale
 SIGNIFICANT = 3.0  # standard errors: a cell with more is marked
 SHORT = {
     "flight": "flight", "contact_right": "right", "contact_left": "left", "contact_both": "both",
@@ -67,7 +69,7 @@ def named_log(shown: Shown, number: int) -> str:
 def _maps(shown: Shown) -> Drawn:
     """The map before and after, a picture a log."""
     for number in chosen_logs(shown):
-        sheet, steps = shown.sheets[number], shown.logs[number].steps
+        sheet, steps = shown.sheets[number], shown.steps(number)
         mine = [
             [one for one in cells if one.log == number]
             for cells in (shown.found.map_before, shown.found.map_after)
@@ -90,10 +92,8 @@ def _map(sheet: Sheet, steps: Sequence[Step], maps: list[list[Cell]]) -> Figure:
     rows = {name: phases_of(sheet, k) for k, name in enumerate(sheet.rows) if name in present}
     heights = [len(phases) + 0.4 for phases in rows.values()]
     figure = Figure(figsize=(WIDTH, 0.21 * sum(heights) + 0.22 * len(rows) + 1.3))
-    axes = figure.subplots(
-        len(rows), 2, sharex=True, sharey="row", squeeze=False, height_ratios=heights
-    )
-    top = max([one.excess for cells in maps for one in cells] + [10 * LEAST_EXCESS])
+    axes = figure.subplots(len(rows), 2, sharey="row", squeeze=False, height_ratios=heights)
+    top = max([one.excess for cells in maps for one in cells] + [LEAST_TOP])
     norm = LogNorm(LEAST_EXCESS, top, clip=True)
     image = None
     for column, cells in enumerate(maps):
@@ -142,6 +142,7 @@ def _map_axes(ax: Axes, sheet: Sheet, steps: Sequence[Step], phases: list[str]) 
     ax.grid(visible=False)
     ax.set_facecolor("#f3f4f6")
     ax.set_yticks(range(len(phases)), [SHORT[one] for one in phases], size=7.5)
+    ax.set_xticks([])
     ax.tick_params(length=0)
     for k, one in enumerate(steps):
         if k and one.direction != steps[k - 1].direction:
@@ -173,16 +174,15 @@ def _candidates(told: Json) -> Drawn:
     far = sets[-1]["held_out_error"] > 8 * min(best, floor)
     for y, one in enumerate(sets):
         ax.barh(y, one["held_out_error"], color=_bar(one, null, added), height=0.68)
-        doubts = "" if one["converged"] else ", not converged"
-        doubts += f", {', '.join(one['at_bound'])} at its bound" if one.get("at_bound") else ""
         ax.annotate(
-            f"{one['held_out_error']:.3g}{doubts}", (one["held_out_error"], y), (4, 0),
+            f"{one['held_out_error']:.3g}{_doubts(one)}", (one["held_out_error"], y), (4, 0),
             textcoords="offset points", va="center", size=7.5, color=GUIDE,
         )  # fmt: skip
     ax.set_yticks(range(len(sets)), [one["id"].replace(f"{GENERAL}.", "") for one in sets], size=8)
     ax.set_ylim(len(sets) - 0.4, -0.6)
     if far:
         ax.set_xscale("log")
+        ax.xaxis.set_major_formatter("{x:g}")
         ax.set_xlim(0.7 * min(best, floor), 2 * sets[-1]["held_out_error"])
     else:
         ax.set_xlim(0, 1.15 * max(sets[-1]["held_out_error"], floor))
@@ -204,6 +204,13 @@ def _candidates(told: Json) -> Drawn:
     yield "candidates", "What was tried", caption, figure
 
 
+def _doubts(one: Json) -> str:
+    """What speaks against a fit; that a tare is at the end of its doubt does not."""
+    stuck = [name for name in one.get("at_bound", ()) if not name.startswith(ZERO)]
+    found = "" if one["converged"] else ", not converged"
+    return f"{found}, {stuck[0].removeprefix(f'{GENERAL}.')} at its bound" if stuck else found
+
+
 def _bar(one: Json, null: Json, added: set[str]) -> str:
     if one is null:
         return BEFORE
@@ -220,17 +227,21 @@ def _time(shown: Shown) -> Drawn:
         rows = {k: v for k, v in rows.items() if np.isin(sheet.row_of, v).any()}
         figure = Figure(figsize=(WIDTH, 1.8 * len(rows) + 0.6))
         axes = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
-        looks = zip(shown.pair, (BEFORE, AFTER), ("before", "after"), strict=True)
-        for one, colour, _ in looks:
+        for one, colour in zip(shown.pair, (BEFORE, AFTER), strict=True):
             for ax, mine in zip(axes, rows.values(), strict=True):
                 t, squares = _blocks(sheet, one.left[number], mine)
-                ax.semilogy(t, squares, "o", color=colour, ms=3 if colour == BEFORE else 2.4)
+                look = {"ms": 4.5, "mfc": "none"} if colour == BEFORE else {"ms": 2.6}
+                ax.semilogy(t, squares, "o", color=colour, **look)
+                ax.yaxis.set_major_formatter("{x:g}")
+                ax.yaxis.set_minor_formatter("")
         for ax, name in zip(axes, rows, strict=True):
-            ax.axhline(shown.found.verdict.floor, color="#111111", ls="--", lw=0.9)
+            floor, (low, high) = shown.found.verdict.floor, ax.get_ylim()
+            ax.axhline(floor, color="#111111", ls="--", lw=0.9)
+            ax.set_ylim(min(low, 0.08 * floor), max(high, 12 * floor))
             ax.set_ylabel(name)
         axes[-1].set_xlabel("time in s")
         handles = [
-            Line2D([], [], color=BEFORE, marker="o", ls="", label="before"),
+            Line2D([], [], color=BEFORE, marker="o", mfc="none", ls="", label="before"),
             Line2D([], [], color=AFTER, marker="o", ls="", label="after"),
             Line2D([], [], color="#111111", ls="--", label="noise floor"),
         ]

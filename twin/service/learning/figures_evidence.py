@@ -6,7 +6,7 @@ was held out of their fits.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -27,9 +27,10 @@ from twin.learn.where import PHASES, Step, phase_of
 from twin.model.parameters import resonance
 
 LEAST_ENTRIES = 20  # of a step in a row, to be looked at
+STEPPED = 0.4  # of the time that it moves: less in steps is no stepped sine
 CYCLES = 2  # of a step in a close-up
 SPAN_S = 3.0  # of a close-up where there are no steps
-REPEATS = 0.1  # of the rms of u: a motion that differs more from period to period does not repeat
+REPEATS = 0.3  # of the rms of u: a motion that differs more from period to period does not repeat
 WINDOW_S = 0.5
 FAILS, SURE = 0.1, 4.0  # excess over the noise, and its standard errors, that fail a gate
 Pair = tuple[Explained, Explained]
@@ -83,6 +84,13 @@ class Shown:
         v = self.found.verdict
         names = v.general.names[-1:] if v.general else v.best.names
         return " + ".join(names)
+
+    def steps(self, number: int) -> tuple[Step, ...]:
+        """The steps of a log; none where they are but spots of a motion that is no stepped sine."""
+        sheet = self.sheets[number]
+        moving = sheet.motion().moving
+        held = (sheet.readings.step >= 0) & moving
+        return tuple(self.logs[number].steps) if held.sum() > STEPPED * moving.sum() else ()
 
     @cached_property
     def worst(self) -> int:
@@ -142,7 +150,7 @@ def measured_forces(sheet: Sheet, guess: Guess) -> list[Float1D]:
 
 
 def looks(sheet: Sheet, steps: Sequence[Step], row: int) -> list[Look]:
-    """Close-ups with samples in a row: the lowest, the largest and the highest of the steps.
+    """Close-ups with samples in a row: the lowest step, the highest, the largest between the two.
 
     Without steps: stretches of small, middling and large motion.
     """
@@ -154,12 +162,16 @@ def looks(sheet: Sheet, steps: Sequence[Step], row: int) -> list[Look]:
             sizes[one.index] = float(np.abs(m.u[mine]).max())
     if not sizes:
         return [] if steps else _stretches(sheet, row)
-    known = sorted((one for one in steps if one.index in sizes), key=lambda one: one.frequency_hz)
-    largest = max(known, key=lambda one: sizes[one.index])
+    ways = [one.direction for one in steps if one.index in sizes]
+    way = max(ways, key=ways.count)  # forward where both are as many
+    known = [one for one in steps if one.index in sizes and one.direction == way]
+    known.sort(key=lambda one: one.frequency_hz)
+    inner = known[1:-1] or known
+    largest = max(inner, key=lambda one: sizes[one.index])
     picked = {one.index: one for one in (known[0], largest, known[-1])}
     return [
         Look(f"{one.frequency_hz:g} Hz {one.direction}", one.direction, _last(sheet, one.index))
-        for one in sorted(picked.values(), key=lambda one: one.frequency_hz)
+        for one in picked.values()
     ]
 
 
@@ -179,7 +191,7 @@ def _stretches(sheet: Sheet, row: int) -> list[Look]:
     places = dict.fromkeys((len(ranked) // 2, 4 * len(ranked) // 5, len(ranked) - 1))
     return [
         Look(
-            f"{m.time_s[ranked[p]]:.0f} s on",
+            f"from {m.time_s[ranked[p]]:.0f} s on",
             "forward",
             np.arange(ranked[p], min(ranked[p] + width, used.size)),
         )
@@ -229,7 +241,7 @@ def free_run(sheet: Sheet, steps: Sequence[Step], one: Explained) -> list[Point]
     model = guess.local(sheet.number, m)
     window = round(WINDOW_S * m.rate_hz)
     twin = TwinSetup(model, m.rate_hz, window, window, sheet.contact_n)
-    u_star, a_star, _ = resonance(sheet.reference.parameters, level)
+    u_star, a_star, _ = resonance(replace(sheet.reference.parameters, mass=m.mass_kg), level)
     gaps = model.parameters.gap_r, model.parameters.gap_l
     scale = Scale(model.parameters, m.rate_hz, sheet.contact_n, u_star, a_star, gaps)
     driven = tuple(Driven(s.index, s.direction, s.frequency_hz, level) for s in steps)
@@ -253,7 +265,8 @@ def gates(shown: Shown) -> list[Gate]:
             sums = np.bincount(blocks, weights=squares[0] - 1.0)
             errors = sums.sum() / max(math.sqrt(float(sums @ sums)), 1e-300)
             before, after = (float(one.mean()) for one in squares)
-            found.append(Gate(name, what, before, after, before < 1 + FAILS or errors < SURE))
+            told = f"{what}: {'the same force' if 'cells' in what else 'the same motion'}"
+            found.append(Gate(name, told, before, after, before < 1 + FAILS or errors < SURE))
         at_rest = sheet.row_of == len(sheet.rows)
         read = (r[at_rest][: len(sheet.resting)] * sheet.weight for r in left)
         values = zip(sheet.resting, *read, strict=True)

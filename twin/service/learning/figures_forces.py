@@ -29,12 +29,15 @@ Curve = tuple[Float1D, Float1D]
 
 def forces(shown: Shown) -> Drawn:
     """Residual damper force over u and u', residual bumper forces over depth, before and after."""
-    sheet, steps = shown.sheets[shown.worst], shown.logs[shown.worst].steps
-    yield from _damper(shown, sheet, looks(sheet, steps, 0))
+    sheet, steps = shown.sheets[shown.worst], shown.steps(shown.worst)
+    damper = _damper(shown, sheet, looks(sheet, steps, 0))
     sides = [row for row in (1, 2) if (sheet.row_of == row).any()]
-    if sides:
-        stretches = {one.title: one for row in sides for one in looks(sheet, steps, row)}
-        yield from _bumpers(shown, sheet, sides, list(stretches.values())[:4])
+    stretches = {one.title: one for row in sides for one in looks(sheet, steps, row)}
+    bumpers = _bumpers(shown, sheet, sides, list(stretches.values())[:4])
+    missing = np.nan_to_num(_entries(shown)[1]) ** 2
+    there = missing[sheet.row_of == 0].sum() < missing[np.isin(sheet.row_of, sides)].sum()
+    for drawn in (bumpers, damper) if there else (damper, bumpers):
+        yield from drawn
 
 
 def _entries(shown: Shown) -> tuple[Float1D, Float1D, Float1D]:
@@ -72,19 +75,22 @@ def _damper(shown: Shown, sheet: Sheet, stretches: list[Look]) -> Drawn:
     figure = Figure(figsize=(WIDTH, 2.2 * len(stretches) + 0.6))
     axes = figure.subplots(len(stretches), 4, sharey="row", squeeze=False)
     for line, look in zip(axes, stretches, strict=True):
-        for ax, (label, x, y, drawn) in zip(line, columns, strict=True):
+        for ax, (_, x, y, drawn) in zip(line, columns, strict=True):
             _loop(ax, (x[look.samples], y[look.samples]), COLOUR[look.direction])
-            ax.plot(x[look.samples], drawn[look.samples], color=TWIN, lw=1.0)
-            ax.set_xlabel(label if line is axes[-1] else "")
+            ax.plot(x[look.samples], drawn[look.samples], color=TWIN, lw=0.8)
         line[0].set_title(look.title)
         line[0].set_ylabel(_unit(sheet, "damper"))
     for ax, text in zip(axes[0], ("before", "after", "before", "after"), strict=True):
         ax.set_title(text, loc="right", color=GUIDE)
+    for ax, (label, *_) in zip(axes[-1], columns, strict=True):
+        ax.set_xlabel(label)
     _legend(figure, shown, [("measured less model", COLOUR["forward"])])
-    yield "damper_force", "What the damper does beyond the model", _caption(shown), figure
+    yield "damper_force", "Damper force, measured less model", _caption(shown), figure
 
 
 def _bumpers(shown: Shown, sheet: Sheet, sides: list[int], stretches: list[Look]) -> Drawn:
+    if not stretches:
+        return
     m, entries, guess = sheet.motion(), _entries(shown), _guess(shown)
     figure = Figure(figsize=(WIDTH, 2.2 * (2 if len(stretches) > 2 else 1) + 0.6))
     axes = figure.subplots(-(-len(stretches) // 2), 4, sharey="row", squeeze=False)
@@ -99,7 +105,7 @@ def _bumpers(shown: Shown, sheet: Sheet, sides: list[int], stretches: list[Look]
             x = depth[look.samples]
             for ax, y in zip(pair, (wanted, left), strict=True):
                 _loop(ax, (x, y), colour)
-            pair[0].plot(x, law, color=TWIN, lw=1.0, ls="-" if row == 1 else "--")
+            pair[0].plot(x, law, color=TWIN, lw=0.8, ls="-" if row == 1 else "--")
         pair[0].set_title(look.title)
         pair[0].set_ylabel("force in N")
         for ax, text in zip(pair, ("before", "after"), strict=True):
@@ -108,12 +114,12 @@ def _bumpers(shown: Shown, sheet: Sheet, sides: list[int], stretches: list[Look]
     names = [("right bumper", COLOUR["forward"]), ("left bumper", LEFT_SIDE)]
     _legend(figure, shown, [names[row - 1] for row in sides])
     caption = f"{_caption(shown)} Depth: u beyond the gap that the log states."
-    yield "bumper_force", "What the bumpers do beyond the model", caption, figure
+    yield "bumper_force", "Bumper forces, measured less model", caption, figure
 
 
 def _loop(ax: Axes, curve: Curve, colour: str) -> None:
     ax.axhline(0, color=GUIDE, lw=0.6)
-    ax.plot(*curve, ".", color=colour, ms=2.2, alpha=0.75, mew=0)
+    ax.plot(*curve, ".", color=colour, ms=3.2, alpha=0.6, mew=0)
 
 
 def _unit(sheet: Sheet, row: str) -> str:
@@ -167,7 +173,7 @@ def histories(shown: Shown) -> Drawn:
 
 def _worst_look(shown: Shown, sheet: Sheet) -> Look | None:
     """Of the close-ups of all force rows the one with the largest gain, else the largest rest."""
-    steps = shown.logs[shown.worst].steps
+    steps = shown.steps(shown.worst)
     every = [look for row in range(3) if sheet.used[row].any() for look in looks(sheet, steps, row)]
     before, after = (one.left[shown.worst] for one in shown.pair)
     gain = before**2 - after**2 if shown.pair[1].effects else before**2

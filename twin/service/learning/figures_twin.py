@@ -23,7 +23,7 @@ Runs = tuple[list[Point], list[Point]]
 
 def curves(shown: Shown) -> Drawn:
     """PRCs and impacts of the worst log, before left, after right."""
-    sheet, steps = shown.sheets[shown.worst], shown.logs[shown.worst].steps
+    sheet, steps = shown.sheets[shown.worst], shown.steps(shown.worst)
     before, after = (free_run(sheet, steps, one) for one in shown.pair)
     if not before or not after:
         return
@@ -62,6 +62,8 @@ def _figure(runs: Runs, names: list[str]) -> Figure:
             ax.set_ylabel(LABELS[name] if column == 0 else "")
         axes[0, column].set_title(title)
         axes[-1, column].set_xlabel("frequency in Hz")
+    for ax in axes[:, 0]:
+        ax.set_ylim(0, 1.06 * ax.get_ylim()[1])
     driven = [one for one in DIRECTIONS if any(p.direction == one for p in runs[0])]
     handles = [
         Line2D([], [], color=COLOUR[one], marker="o", lw=2.2, label=f"measured {one}")
@@ -83,4 +85,3 @@ def _lines(ax: Axes, points: Sequence[Point], name: str) -> None:
     for one in DIRECTIONS:
         twin: dict[str, Any] = {"color": TWIN, "ls": DASH[one], "lw": 0.8, "ms": 6, "mfc": "none"}
         ax.plot(*_curve(points, "twin", one, name), marker="o", **twin)
-    ax.set_ylim(bottom=0)

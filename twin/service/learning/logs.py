@@ -9,7 +9,7 @@ from table_io.block import Block
 from table_io.card import BadInput, parse
 from table_io.profile import Profile
 from twin.learn.discover import Log
-from twin.learn.readings import readings_of
+from twin.learn.readings import alive, readings_of
 from twin.learn.where import Step
 from twin.service.recordings import log_path, open_log
 from twin.stream.mcap_log import Recording
@@ -58,8 +58,8 @@ def notes_on(recording: Recording) -> list[str]:
     for channel in blocks[0].channels if blocks else ():
         if _clipped(blocks, channel):
             notes.append(f"{name}: {channel} stands at its extreme for a while: clipped?")
-        elif not any(np.isfinite(block.channel(channel)).any() for block in blocks):
-            notes.append(f"{name}: {channel} holds no number; effects that need it fall away")
+        elif not any(alive(block.channel(channel)) for block in blocks):
+            notes.append(f"{name}: {channel} is dead; effects that need it fall away")
     return notes
 
 

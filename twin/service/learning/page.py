@@ -4,12 +4,16 @@ Numbers are those of verdict.json; the file refers to nothing outside itself.
 """
 
 import base64
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from twin.learn.discover import Discovery, Log
+from twin.learn.guess import GAP
+from twin.learn.search import LEAST_UNITS
 from twin.service.learning.figures import draw_all
 from twin.service.learning.figures_evidence import Shown, gates
 from twin.service.learning.told import Json
@@ -24,7 +28,7 @@ WORDS = {
 }
 SECTIONS = {
     "where": "Where they disagree", "candidates": "What was tried", "gates": "The instruments",
-    "forces": "The force that is missing", "histories": "Before and after, on the measured motion",
+    "forces": "The force beyond the model", "histories": "Before and after, on the measured motion",
     "twin": "Before and after, running free", "time": "Over the test",
 }  # fmt: skip
 
@@ -38,13 +42,14 @@ def write_page(folder: Path, found: Discovery, logs: Sequence[Log], told: Json) 
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     environment.filters["sig"] = significant
-    environment.filters["title"] = titled
     text = environment.get_template("page.html").render(
         told=told,
         sentence=sentence(told),
         held_out=held_out(shown),
+        rows=rows(told, [log.readings.name for log in logs]),
         logs=[_facts(log) for log in logs],
         sections=SECTIONS,
+        whole=found.named.whole,
         gates=gates(shown),
         images={
             section: [(one, base64.b64encode(one.path.read_bytes()).decode()) for one in some]
@@ -67,16 +72,45 @@ def sentence(told: Json) -> str:
     names = " and ".join(titled(one) for one in told["effects"])
     if told["ambiguous"]:
         names = ", or ".join(" with ".join(some) for some in told["ambiguous"])
+    if told["verdict"] == "named" and all(one.get("channel") for one in told["effects"]):
+        return f"The model lacks nothing; a sensor errs: {names}."
     text = WORDS[told["verdict"]].format(names=names)
     if told["verdict"] == "unexplained" and names:
-        text += f" The nearest is {names}."
+        text += f" The nearest is {names}, and it is not enough."
     return text
+
+
+def rows(told: Json, names: Sequence[str]) -> list[tuple[str, str, list[str], str]]:
+    """(what, parameter, [value, low, high], unit) of all that was fitted, lengths in mm."""
+    term = told["remainder"]["evidence"]
+    groups = [(titled(one), one["parameters"]) for one in told["effects"]]
+    groups += [(f"a term without a name, {term['term']}", term["parameters"])] if term else []
+    base = {_gap(name, names): value for name, value in told["base"].items()}
+    found = []
+    for what, parameters in (*groups, ("the model's own, refitted", base)):
+        for k, (name, value) in enumerate(parameters.items()):
+            factor, unit = (1e3, "mm") if value["unit"] == "m" else (1.0, value["unit"] or "–")
+            numbers = [rounded(factor * value[key]) for key in ("value", "low", "high")]
+            found.append(("" if k else what, name, numbers, unit))
+    return found
+
+
+def _gap(name: str, logs: Sequence[str]) -> str:
+    number = name.removeprefix(GAP)
+    return f"each gap wider, {logs[int(number)]}" if number.isdigit() else name
+
+
+def rounded(value: float) -> str:
+    """Four significant digits, thousands apart."""
+    if math.isfinite(value) and abs(value) >= 1e4:
+        return f"{float(f'{value:.4g}'):,.0f}".replace(",", "\u2009").replace("-", "−")
+    return significant(value, 4)
 
 
 def held_out(shown: Shown) -> str:
     """How the fits were judged, in a sentence."""
-    stepped = all(log.steps for log in shown.logs)
-    what = "steps" if stepped else "cycles or seconds"
+    counts = [np.unique(one.readings.step[one.readings.step >= 0]).size for one in shown.sheets]
+    what = "steps" if min(counts) >= LEAST_UNITS else "cycles or seconds"
     names = ", ".join(sheet.readings.name for sheet in shown.sheets)
     return (
         f"{names}: fitted on two thirds of the {what}, judged on the third that was left out, "

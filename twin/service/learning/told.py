@@ -6,7 +6,7 @@ from typing import Any
 
 from twin.learn.discover import Discovery
 from twin.learn.fit import Fit
-from twin.learn.guess import GAP, SENSOR
+from twin.learn.guess import GAP, ZERO
 from twin.learn.library import Candidate
 from twin.learn.naming import Explained
 from twin.learn.verdict import closed_fraction, next_run
@@ -80,11 +80,8 @@ def number(fit: Fit, name: str, unit: str) -> Json:
 
 def base_json(fit: Fit) -> Json:
     """The base's parameters, and by how much the gaps of each log are off what it says."""
-    taken = (SENSOR,)
     return {
-        free.name: number(fit, free.name, free.unit)
-        for free in fit.free
-        if "." not in free.name and not free.name.startswith(taken)
+        free.name: number(fit, free.name, free.unit) for free in fit.free if "." not in free.name
     }
 
 
@@ -138,7 +135,7 @@ def model_toml(fit: Fit, title: str, citation: str, fitted_on: str) -> tuple[str
     left_out = []
     effects: dict[str, dict[str, float]] = {}
     for name, value in fit.guess.values.items():
-        if "." in name and not name.startswith("general."):
+        if "." in name and not name.startswith(("general.", ZERO)):
             effect, parameter = name.rsplit(".", 1)
             effects.setdefault(effect, {})[parameter] = value
     for effect, values in effects.items():

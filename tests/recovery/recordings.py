@@ -1,0 +1,103 @@
+"""Short recordings of a simulated rig whose truth is known, with any noise."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from table_io.backends.simulated import SimulatedBackend
+from table_io.block import Block, Float2D
+from table_io.card import PROFILES, load
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from table_io.clock import ManualClock
+from table_io.course import plan
+from table_io.profile import Profile
+from table_io.rig import Rig
+from twin.learn.discover import Log
+from twin.learn.readings import readings_of
+from twin.learn.where import Step
+from twin.model.model import Model
+from twin.model.parameters import Parameters
+
+RIG = load(PROFILES / "rigs" / "simulated.toml", Rig, "machine card")[0]
+TRUTH = {"stiffness": 31e3, "damping": 1500.0, "bumper_stiffness": 420e3, "bumper_damping": 1300.0}
+CHANNELS = (
+    "table_disp_m", "table_acc_m_s2", "mass_disp_m", "mass_acc_m_s2", *RIGHT_CELLS, *LEFT_CELLS,
+)  # fmt: skip
+FAR = Model(Parameters(1.0, 60e3, 600.0, 900e3, 300.0, 900e3, 300.0, np.inf, np.inf))
+
+
+def card(right_mm: float, left_mm: float) -> dict[str, Any]:
+    """Up and back through four frequencies, 25 s, with these gaps."""
+    return {
+        "title": "short", "loop_check": {"enabled": False}, "control": {"enabled": False},
+        "specimen": {
+            "mass_kg": 550.0, "gap_mm": right_mm + left_mm, "gap_right_mm": right_mm,
+            "gap_left_mm": left_mm,
+        },
+        "sweep": {
+            "start_hz": 1.6, "stop_hz": 3.4, "step_hz": 0.6, "cycles": 4, "acceleration_g": 0.05,
+        },
+        "acquisition": {"rate_hz": 1000.0, "block_samples": 50, "rest_s": 1.0},
+    }  # fmt: skip
+
+
+@cache
+def profile(right_mm: float, left_mm: float) -> Profile:
+    """That test, validated."""
+    return Profile.model_validate(card(right_mm, left_mm))
+
+
+@cache
+def clean(right_mm: float, left_mm: float) -> Float2D:
+    """(channel, sample) what truly happened, in SI."""
+    assert RIG.simulated is not None
+    table = RIG.simulated.model_copy(
+        update={
+            "damper_stiffness_n_m": TRUTH["stiffness"],
+            "damper_damping_n_s_m": TRUTH["damping"],
+            "bumper_stiffness_n_m": TRUTH["bumper_stiffness"],
+            "bumper_damping_n_s_m": TRUTH["bumper_damping"],
+        }
+    )
+    test = profile(right_mm, left_mm)
+    drive = plan(test)
+    count = drive.planned_end + 6000  # until the mass is at rest again
+    rig = RIG.model_copy(update={"simulated": table})
+    backend = SimulatedBackend(rig, test.specimen, 1000.0, ManualClock())
+    seen: list[Float2D] = []
+    backend.witness = lambda first, command, signals: seen.append(signals.copy())
+    backend.open()
+    backend.queue(0, drive.command(0, count) * RIG.output.volts_per_m)
+    backend.start()
+    backend.take(count)
+    y, y_acc, x, x_acc, right, left = seen[0]
+    return np.array([y, y_acc, x, x_acc, right / 2, right / 2, -left / 2, -left / 2])
+
+
+def recorded(
+    noise: float, seed: int = 0, gaps_mm: tuple[float, float] = (2.0, 2.0),
+    channels: tuple[str, ...] = CHANNELS,
+) -> tuple[Block, ...]:  # fmt: skip
+    """The measured blocks, each channel with noise of so much of its rms."""
+    true, drive = clean(*gaps_mm), plan(profile(*gaps_mm))
+    draw = np.random.default_rng(seed).standard_normal(true.shape)
+    rms = np.maximum(true.std(axis=1), [0, 0, 0, 0, 9, 9, 9, 9])  # idle load cells are noisy too
+    values = true + noise * rms[:, None] * draw
+    known = dict(zip(CHANNELS, values, strict=True))
+    known["rel_disp_m"] = known["mass_disp_m"] - known["table_disp_m"]
+    bumpers = known["force_r1_n"] + known["force_r2_n"] - known["force_l1_n"] - known["force_l2_n"]
+    known["damper_force_n"] = -550.0 * known["mass_acc_m_s2"] - bumpers
+    chosen = np.array([known[name] for name in channels])
+    return (Block("meas", 0, 1000.0, channels, chosen, *drive.labels(0, true.shape[1])),)
+
+
+def logged(
+    blocks: tuple[Block, ...], gaps_mm: tuple[float, float] = (2.0, 2.0), name: str = "short"
+) -> Log:
+    """The recording as a log that states these gaps."""
+    steps = tuple(
+        Step(one.index, one.frequency_hz, one.direction) for one in plan(profile(2.0, 2.0)).steps
+    )
+    gaps = (1e-3 * gaps_mm[0], 1e-3 * gaps_mm[1])
+    return Log(readings_of(blocks, name, 550.0, gaps), 10.0, steps)

@@ -1,0 +1,97 @@
+"""`shaketwin identify` on a log: a model that a run takes, its evidence, and what it refuses."""
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from recovery.recordings import CHANNELS, TRUTH, card, recorded
+from table_io.card import PROFILES
+from table_io.records import RunStop
+from twin.model.card import ModelCard
+from twin.service.bundle import from_texts, read_model
+from twin.service.cli import app
+from twin.service.study.bench import toml
+from twin.stream.mcap_log import write_items
+
+GAPS = (2.0, 2.0)
+
+
+@cache
+def recording(folder: Path) -> Path:
+    """A log as a run leaves it."""
+    rig = (PROFILES / "rigs" / "simulated.toml").read_text(encoding="utf-8")
+    snm = (PROFILES / "models" / "snm.toml").read_text(encoding="utf-8")
+    bundle = from_texts("short", toml(card(*GAPS)), rig, snm, "test")
+    start = replace(bundle.describe("short", "table")({}, 0.0), channels=CHANNELS)
+    (block,) = recorded(0.01, 3, GAPS)
+    path = folder / "short.mcap"
+    write_items(path, [start, block, RunStop(block.end, "complete", "")], start)
+    return path
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """(where the model lies, what the terminal said)."""
+    folder = tmp_path_factory.mktemp("identify")
+    out = folder / "found.toml"
+    outcome = CliRunner().invoke(app, ["identify", str(recording(folder)), "--out", str(out)])
+    assert outcome.exit_code == 0, outcome.output
+    return out, outcome.output
+
+
+def test_the_model_that_is_left_is_one_that_a_run_takes(done: tuple[Path, str]) -> None:
+    found, _ = read_model(str(done[0]))
+    assert isinstance(found, ModelCard)
+    assert found.base.stiffness_n_m == pytest.approx(TRUTH["stiffness"], rel=0.003)
+    assert found.base.bumper_damping_n_s_m == pytest.approx(TRUTH["bumper_damping"], rel=0.01)
+    assert found.effects == ()
+    assert found.fitted_on == "short"
+
+
+def test_the_evidence_lies_beside_it(done: tuple[Path, str]) -> None:
+    folder = done[0].with_suffix("")
+    told = json.loads((folder / "identify.json").read_text(encoding="utf-8"))
+    one = told["parameters"]["stiffness"]
+    assert one["low"] < TRUTH["stiffness"] < one["high"]
+    assert one["start"] == 36000.0
+    assert one["deviations"] < -10
+    gap = told["gaps"]["short"]
+    assert gap["low"] < 4e-3 < gap["high"]
+    assert told["windows"][0]["nrmse_identified"] < 0.5 * told["windows"][0]["nrmse_start"]
+    pictures = {path.name for path in folder.glob("*.png") if path.stat().st_size > 20_000}
+    assert pictures == {"laws0.png", "correlation.png", "sources.png"}
+
+
+def test_the_terminal_says_it_all(done: tuple[Path, str]) -> None:
+    for text in ("K_j", "gap of short", "free flight", "contact left", "onsets", "windows of 1 s"):
+        assert text in done[1]
+
+
+@pytest.mark.parametrize(
+    "more, word",
+    [
+        (["--out", "found.json"], "a model is a .toml file"),
+        (["--out", "there.toml"], "nothing is ever overwritten"),
+        (["--model", "nothing"], "nothing"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_the_log_is_read(
+    more: list[str], word: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there.toml").write_text("title = 'mine'", encoding="utf-8")
+    outcome = CliRunner().invoke(app, ["identify", "no.mcap", *more])
+    assert outcome.exit_code != 0
+    assert word in f"{outcome.output}{outcome.exception}"
+    assert (tmp_path / "there.toml").read_text(encoding="utf-8") == "title = 'mine'"
+
+
+def test_a_log_given_twice_is_refused(done: tuple[Path, str], tmp_path: Path) -> None:
+    log = str(recording(done[0].parent))
+    outcome = CliRunner().invoke(app, ["identify", log, log, "--out", str(tmp_path / "m.toml")])
+    assert "given twice" in f"{outcome.output}{outcome.exception}"
+    assert not [*tmp_path.iterdir()]
