@@ -15,7 +15,9 @@ from twin.model.model import Model, Sensor
 GAP = "gap"  # + number of the log: m by which both gaps of that log are wider than it says
 ZERO = "zero"  # + number of the log + what: SI that it reads at rest, as far as a tare can err
 DOUBT = 4.0  # deviations that a tare may be off; more is an error of a sensor
+LEAST_SHARE = 1e-6  # of a parameter's start: what may not vanish
 SENSOR = "sensor_"
+SLIP = "slip"  # m/s below which friction is less than whole: its form, which no model holds
 INPUT_GAIN = "sensor_gain.table_acc_m_s2.gain"
 INPUT_OFFSET = "sensor_offset.table_acc_m_s2.offset"
 
@@ -36,7 +38,7 @@ class Guess:
         own = {
             name: value
             for name, value in self.values.items()
-            if not name.startswith((SENSOR, "general.")) and log_of(name) is None
+            if not name.startswith((SENSOR, SLIP, "general.")) and log_of(name) is None
         }
         return Model.from_flat(own)
 
@@ -68,7 +70,9 @@ class Guess:
 
     def without(self, prefix: str) -> "Guess":
         """Less every number of an effect."""
-        return Guess({k: v for k, v in self.values.items() if not k.startswith(f"{prefix}.")})
+        forms = (SLIP,) if prefix == "coulomb_friction" else ()
+        kept = {k: v for k, v in self.values.items() if not k.startswith((f"{prefix}.", *forms))}
+        return Guess(kept)
 
 
 def log_of(name: str) -> int | None:
@@ -121,10 +125,12 @@ def base_free(
     `own_input`: gain and offset of the input too, where no other channel can check them.
     """
     flat = model.flat()
-    free = [
-        Free(name, keys, 0.0 if "damping" in name else 1e-9, math.inf, flat[keys[0]] or 1.0, unit)
-        for name, keys, unit in (BASE if any(touched) else BASE[:2])
-    ]
+    free = []
+    for name, keys, unit in BASE if any(touched) else BASE[:2]:
+        scale = flat[keys[0]] or 1.0
+        # a bumper without any dashpot has no face that relaxes, which some effects need
+        least = 0.0 if name == "damping" else LEAST_SHARE * scale
+        free.append(Free(name, keys, least, math.inf, scale, unit))
     free += [
         Free(f"{GAP}{k}", (f"{GAP}{k}",), -0.05, 0.05, 1e-3, "m")
         for k, one in enumerate(touched)

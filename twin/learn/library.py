@@ -12,12 +12,13 @@ import numpy as np
 
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from twin.learn.general import GENERAL, free_of, terms
-from twin.learn.guess import Free, Guess, effect_free
+from twin.learn.guess import SLIP, Free, Guess, effect_free
 from twin.learn.sheet import Sheet
 from twin.model.effects import EFFECTS, plugins
 from twin.model.effects.effect import Effect
 
 RUNGS = 9
+SLIPS = (1e-5, 3e-4, 1e-3, 3e-3)  # m/s; every rig has its own way through a standstill
 BUMPERS = frozenset({
     "bumper_hardening", "hunt_crossley", "bumper_maxwell", "bumper_asymmetry", "gap_offset",
     "gap_drift",
@@ -47,7 +48,11 @@ class Candidate:
         index = next(i for i, p in enumerate(effect.parameters) if p.vanishing is not None)
         vanishing = float(effect.parameters[index].vanishing or 0.0)
         name = f"{effect.id}.{channel}" if channel else effect.id
-        return cls(name, free, free[index], vanishing, shapes, effect, channel)
+        amplitude = free[index]
+        if effect.id == "coulomb_friction":
+            slip = Free(SLIP, (SLIP,), SLIPS[0], 3.0 * SLIPS[-1], SLIPS[0], "m/s", logarithmic=True)
+            free, shapes = (*free, slip), tuple((speed,) for speed in SLIPS)
+        return cls(name, free, amplitude, vanishing, shapes, effect, channel)
 
     def put(self, guess: Guess, shape: Sequence[float], amplitude: float | None = None) -> Guess:
         """The guess with this; without an amplitude, at its vanishing value."""

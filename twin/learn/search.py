@@ -89,7 +89,8 @@ def folds_of(sheet: Sheet) -> Int1D:
 def products(
     sheets: Sequence[Sheet], guess: Guess, free: Sequence[Free], library: Sequence[Candidate]
 ) -> Products:
-    """The products at a guess, over all logs."""
+    """The products at a guess, over all logs. What stands at a bound is taken to stay there."""
+    free = [one for one in free if one.low < guess.values[one.keys[0]] < one.high]
     before = [sheet.residual(guess) for sheet in sheets]
     columns = [[*slopes(sheets, guess, one, before)] for one in free]
     variants = []

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from table_io.block import Bool2D, Float1D, Float2D, Int1D
 from twin.learn.general import GENERAL, Scale, forces
-from twin.learn.guess import Guess
+from twin.learn.guess import SLIP, Guess
 from twin.learn.motion import Motion
 from twin.learn.readings import Readings, derives_acc
 from twin.model.forced import along, tilting
@@ -186,6 +186,9 @@ class Sheet:
         model = guess.local(self.number, m)
         u = m.u - guess.zero(self.number, "u")
         d, right, left = along(model, u, m.v, m.time_s, self.touched)
+        if SLIP in guess.values:
+            fc = model.value("coulomb_friction", "fc") or 0.0
+            d = d + fc * (np.tanh(m.v / guess.values[SLIP]) - np.where(m.v > 0, 1.0, -1.0))
         if not m.cells and m.damper is None:
             d = d + right + left
         if model.value("table_tilt", "tilt"):

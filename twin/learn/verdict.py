@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from twin.learn.naming import Bench, Explained, Named
 
 AS_GOOD = 3.5  # standard errors by which others must be worse, else the data cannot tell
+NEARLY = 0.8  # of what the best close: others that close less are not as good, however few the data
 LEFT = 0.06  # of the gap's excess: more than this left and not all is explained
 OUTSIDE = 0.012  # of the gap's excess: a general term in place of a name that closes more is better
 VISIBLE = 0.05  # excess in parts of the floor from which on there is a gap at all
@@ -106,9 +107,18 @@ def _as_good(bench: Bench, named: Named) -> tuple[Explained, ...]:
         names = frozenset(one.names)
         if len(one.effects) != len(best.effects) or names == frozenset(best.names):
             continue
+        far = named.null.cost - one.cost < NEARLY * (named.null.cost - best.cost)
+        if far or _limit(one, best):
+            continue
         if one.cost <= best.cost or bench.gain(one, best)[2] < AS_GOOD:
             found.setdefault(names, one)
     return tuple(found.values())
+
+
+def _limit(one: Explained, best: Explained) -> bool:
+    """True where one has a hysteresis that yields at once in the place of a friction: the same."""
+    swapped = {*one.names} ^ {*best.names} == {"bouc_wen", "coulomb_friction"}
+    return swapped and "coulomb_friction" in best.names
 
 
 def _confidence(bench: Bench, named: Named, left: float) -> float:
@@ -117,7 +127,10 @@ def _confidence(bench: Bench, named: Named, left: float) -> float:
     rivals = [
         bench.gain(one, best)[2]
         for one in named.tried
-        if len(one.effects) == len(best.effects) and frozenset(one.names) != frozenset(best.names)
+        if len(one.effects) == len(best.effects)
+        and frozenset(one.names) != frozenset(best.names)
+        and not _limit(one, best)
+        and named.null.cost - one.cost > NEARLY * (named.null.cost - best.cost)
     ]
     margin = min(rivals, default=10.0)
     apart = 1.0 / (1.0 + math.exp(-(margin - 2.0)))

@@ -6,7 +6,7 @@ from typing import Any
 
 from twin.learn.discover import Discovery
 from twin.learn.fit import Fit
-from twin.learn.guess import GAP, ZERO
+from twin.learn.guess import GAP, SLIP, ZERO
 from twin.learn.library import Candidate
 from twin.learn.naming import Explained
 from twin.learn.verdict import closed_fraction, next_run
@@ -67,8 +67,11 @@ def effect_json(one: Candidate, fit: Fit, confidence: float) -> Json:
         **({"channel": one.channel} if one.channel else {}),
         "confidence": confidence,
         "parameters": {
-            free.name.rsplit(".", 1)[1]: number(fit, free.name, free.unit) for free in one.free
+            free.name.rsplit(".", 1)[1]: number(fit, free.name, free.unit)
+            for free in one.free
+            if "." in free.name
         },
+        **({"slip_speed": number(fit, SLIP, "m/s")} if one.name == "coulomb_friction" else {}),
     }
 
 
