@@ -1,0 +1,140 @@
+"""Find, name, add, show: what is hidden in the simulated rig, in its own form, is named.
+
+The whole study is `shaketwin study discovery`; here stands one case of each kind of verdict.
+"""
+
+import numpy as np
+import pytest
+
+from tests.learn.played import SNM, hidden, log
+from twin.learn.discover import discover, prepare, structured
+from twin.learn.naming import Enough
+from twin.learn.search import folds_of, nothing, products, subsets
+from twin.learn.verdict import closed_fraction
+
+
+def test_where_nothing_is_hidden_nothing_is_named() -> None:
+    found = discover([log()], SNM)
+    assert found.verdict.word == "none"
+    assert found.verdict.best.effects == ()
+    assert found.named.null.cost == pytest.approx(1.0, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("truth", "name", "parameter", "value"),
+    [
+        (hidden("bumper_hardening", k2=3e7), "bumper_hardening", "k2", 3e7),
+        (hidden("coulomb_friction", fc=30.0), "coulomb_friction", "fc", 30.0),
+        (hidden("maxwell_damper", k1=8e3, tau=0.05), "maxwell_damper", "k1", 8e3),
+        (hidden("gap_offset", offset=8e-5), "gap_offset", "offset", 8e-5),
+        (
+            hidden("sensor_gain", "mass_acc_m_s2", gain=1.04),
+            "sensor_gain.mass_acc_m_s2", "gain", 1.04,
+        ),
+    ],
+)  # fmt: skip
+def test_an_effect_is_named_with_its_parameter(
+    truth: str, name: str, parameter: str, value: float
+) -> None:
+    found = discover([log(truth)], SNM)
+    verdict = found.verdict
+    assert verdict.word == "named", verdict.why
+    assert verdict.best.names == (name,)
+    assert verdict.confidence > 0.9
+    assert verdict.best.fit.values[f"{name}.{parameter}"] == pytest.approx(value, rel=0.05)
+    gap = closed_fraction(found.named.null.cost, verdict.best.cost, verdict.floor)
+    assert gap > 0.95
+
+
+def test_two_effects_are_both_named() -> None:
+    truth = hidden("bumper_hardening", k2=3e7) + hidden("coulomb_friction", fc=30.0)
+    verdict = discover([log(truth)], SNM).verdict
+    assert verdict.word == "named"
+    assert {*verdict.best.names} == {"bumper_hardening", "coulomb_friction"}
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [
+        hidden("cubic_damping", c3=3e4),
+        hidden("bumper_cubic", kc=2e9),
+        hidden("appendage", mass=5.0, frequency=6.0),
+    ],
+)
+def test_what_is_not_in_the_library_is_unexplained(truth: str) -> None:
+    found = discover([log(truth)], SNM)
+    assert found.verdict.word == "unexplained"
+    assert found.verdict.confidence <= 0.3 or not found.verdict.best.effects
+    assert found.verdict.general is not None
+
+
+def test_without_the_truth_in_the_library_nothing_is_named_with_confidence() -> None:
+    one = log(hidden("coulomb_friction", fc=30.0))
+    found = discover([one], SNM, without=("coulomb_friction", "bouc_wen"))
+    assert found.verdict.word == "unexplained"
+
+
+def test_the_place_of_the_disagreement() -> None:
+    found = discover([log(hidden("bumper_hardening", k2=3e7))], SNM)
+    assert found.where.phase == "contact_both"
+    assert "force_r1_n" in found.where.channels
+    one_sided = discover([log(hidden("sensor_gain", "force_l1_n", gain=1.1))], SNM)
+    assert one_sided.where.phase == "contact_left"
+    assert sum(cell.excess * cell.count for cell in found.map_after) < 0.1 * sum(
+        cell.excess * cell.count for cell in found.map_before
+    )
+
+
+def test_several_logs_count_together() -> None:
+    truth = hidden("bumper_hardening", k2=1e7)
+    both = discover([log(truth), log(truth, gap_mm=2.0)], SNM).verdict
+    alone = discover([log(truth)], SNM).verdict
+    assert both.best.names == alone.best.names == ("bumper_hardening",)
+    name = "bumper_hardening.k2"
+    assert both.best.fit.spread[name] < alone.best.fit.spread[name]
+
+
+def test_linear_algebra_foresees_what_a_refit_finds() -> None:
+    prepared = prepare([log(hidden("coulomb_friction", fc=5.0))], SNM)
+    bench = prepared.bench
+    found = products(bench.sheets, prepared.guess, bench.base, bench.library)
+    best = subsets(found, 1, 1)[0]
+    assert best.names == ("coulomb_friction",)
+    refitted = bench.explain(best.put(prepared.guess), [best.variants[0].candidate])
+    entries = sum(one.size for one in refitted.left)
+    assert best.cost / entries == pytest.approx(refitted.cost, rel=0.02)
+    assert nothing(found).cost / entries == pytest.approx(
+        bench.explain(prepared.guess, ()).cost, rel=1e-3
+    )
+
+
+def test_no_step_is_judged_by_a_fit_that_saw_it() -> None:
+    """A fold's fit does not change with the samples that it holds out."""
+    prepared = prepare([log()], SNM)
+    (sheet,) = prepared.bench.sheets
+    fold = folds_of(sheet)
+    steps = sheet.readings.step[sheet.sample_of]
+    held = steps >= 0
+    for number in np.unique(steps[held]):
+        assert np.unique(fold[held & (steps == number) & (fold >= 0)]).size == 1
+
+
+def test_the_oracle_is_not_far_better() -> None:
+    one = log(hidden("maxwell_damper", k1=8e3, tau=0.05))
+    oracle = structured([one], SNM, ["maxwell_damper"])
+    assert oracle is not None
+    assert discover([one], SNM).verdict.best.cost <= 1.05 * oracle.cost
+
+
+def test_whoever_has_enough_keeps_what_was_found() -> None:
+    said: list[str] = []
+
+    def tell(text: str) -> None:
+        said.append(text)
+        if len(said) > 4:
+            raise Enough
+
+    truth = hidden("bumper_hardening", k2=3e7) + hidden("coulomb_friction", fc=30.0)
+    found = discover([log(truth)], SNM, tell)
+    assert not found.named.whole
+    assert found.named.null.cost > found.verdict.best.cost or not found.verdict.best.effects

@@ -1,0 +1,105 @@
+"""Real measurements made by others: an electronic oscillator and a building on rubber bearings.
+
+They lie beside the repository, not in it; see the README of that folder.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import resample_poly
+
+from table_io.block import Block, Label
+from twin.learn.discover import Log, discover, transferred
+from twin.learn.guess import INPUT_GAIN, INPUT_OFFSET
+from twin.learn.readings import readings_of
+from twin.model.model import Model
+from twin.model.parameters import Parameters
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+INF = float("inf")
+SILVERBOX_HZ = 1e7 / 2**14
+ARROW, FIRST_SINE = slice(1000, 40500), 41000  # the growing part; the multisines after it
+
+
+def oscillator(stiffness: float, damping: float) -> Model:
+    """Per unit mass, without bumpers, to start from."""
+    return Model(Parameters(1.0, stiffness, damping, 1.0, 1.0, 1.0, 1.0, INF, INF))
+
+
+def log(name: str, rate_hz: float, columns: dict[str, np.ndarray]) -> Log:
+    """Columns as a log that moves all the time."""
+    values = np.array(list(columns.values()))
+    label = np.full(values.shape[1], int(Label.SETTLE), dtype=np.int64)
+    outside = np.full(values.shape[1], -1, dtype=np.int64)
+    block = Block("meas", 0, rate_hz, tuple(columns), values, outside, label, outside.copy())
+    return Log(readings_of((block,), name, 1.0, (INF, INF)), 1.0)
+
+
+def table(path: Path, *columns: int) -> np.ndarray:
+    if not path.is_file():
+        pytest.skip(f"{path} is not there: these measurements are not part of the repository")
+    return np.genfromtxt(path, delimiter=",", skip_header=1, usecols=columns)
+
+
+def simulated(model: Model, acceleration: np.ndarray, rate_hz: float) -> np.ndarray:
+    """u at the samples of an input that is band-limited: Runge-Kutta between them."""
+    p, k3 = model.parameters, model.value("cubic_stiffness", "k3") or 0.0
+    parts = 8
+    a, h = resample_poly(acceleration, parts, 1), 1.0 / rate_hz / parts
+
+    def rate(u: float, v: float, a: float) -> tuple[float, float]:
+        return v, -a - p.damping * v - p.stiffness * u - k3 * u**3
+
+    u, v, out = 0.0, 0.0, np.empty(a.size - 1)
+    for i in range(a.size - 1):
+        out[i] = u
+        middle = 0.5 * (a[i] + a[i + 1])
+        k1 = rate(u, v, a[i])
+        k2 = rate(u + 0.5 * h * k1[0], v + 0.5 * h * k1[1], middle)
+        k3_ = rate(u + 0.5 * h * k2[0], v + 0.5 * h * k2[1], middle)
+        k4 = rate(u + h * k3_[0], v + h * k3_[1], a[i + 1])
+        u += h / 6 * (k1[0] + 2 * k2[0] + 2 * k3_[0] + k4[0])
+        v += h / 6 * (k1[1] + 2 * k2[1] + 2 * k3_[1] + k4[1])
+    return out[::parts]
+
+
+def test_silverbox_has_a_cubic_spring() -> None:
+    """Named on multisines, judged by simulation on the growing noise that goes beyond them.
+
+    The linear model misses by 14 mV there; to beat: 1.0 mV.
+    """
+    voltage = table(DATA / "silverbox" / "SNLS80mV.csv", 0, 1)
+    part = voltage[FIRST_SINE : FIRST_SINE + 26000]
+    one = log("silverbox", SILVERBOX_HZ, {"table_acc_m_s2": -part[:, 0], "rel_disp_m": part[:, 1]})
+    found = discover([one], oscillator(1.5e5, 50.0))
+    assert found.verdict.best.names[0] == "cubic_stiffness"
+    assert found.verdict.word == "named"
+
+    def missed_mv(named: bool) -> float:
+        guess = (found.verdict.best if named else found.named.null).fit.guess
+        gain, offset = guess.values[INPUT_GAIN], guess.values[INPUT_OFFSET]
+        u = simulated(guess.model(), (-voltage[:45000, 0] - offset) / gain, SILVERBOX_HZ)
+        return float(1e3 * (voltage[ARROW, 1] - u[ARROW]).std())
+
+    assert missed_mv(named=False) > 10.0
+    assert missed_mv(named=True) < 1.0
+
+
+def test_rubber_bearings_have_hysteresis_and_more() -> None:
+    """Trained on one motion at 50 and 140 %, judged on another: spring and dashpot 0.479 there."""
+
+    def bearing(name: str) -> Log:
+        rows = table(DATA / "bncs" / f"{name}.csv", 1, 2, 3, 4)
+        names = ("rel_disp_m", "damper_force_n", "table_acc_m_s2", "mass_acc_m_s2")
+        return log(name, 200.0, dict(zip(names, rows.T, strict=True)))
+
+    found = discover([bearing("ICA50"), bearing("ICA140")], oscillator(5.0, 0.5))
+    verdict = found.verdict
+    assert verdict.best.names[0] == "bouc_wen"
+    assert verdict.remainder  # the storeys above bend: no effect of ours is that
+    before, after = found.named.null.cost, verdict.best.cost
+    assert np.sqrt(after) < 0.7 * np.sqrt(before)
+    apart = bearing("CNP100")
+    assert transferred(apart, verdict.best) < 0.7 * 0.479
+    assert transferred(apart, verdict.best) < transferred(apart, found.named.null)
