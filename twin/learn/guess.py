@@ -61,7 +61,7 @@ class Guess:
         return Model(base, model.effects)
 
     def zero(self, log: int, what: str) -> float:
-        """By how much the tare of u, acc, right or left of a log is off, SI."""
+        """By how much the tare of u, acc, table, right or left of a log is off, SI."""
         return self.values.get(f"{ZERO}{log}.{what}", 0.0)
 
     def moved(self, values: Mapping[str, float]) -> "Guess":
@@ -139,7 +139,7 @@ def base_free(
     for k, log in enumerate(doubts):
         for what, sd in log.items():
             name = f"{ZERO}{k}.{what}"
-            unit = {"u": "m", "acc": "m/s2"}.get(what, "N")
+            unit = {"u": "m", "acc": "m/s2", "table": "m/s2"}.get(what, "N")
             free.append(Free(name, (name,), -DOUBT * sd, DOUBT * sd, sd, unit))
     if own_input:
         free.append(Free(INPUT_GAIN, (INPUT_GAIN,), 1e-12, 1e12, 1.0, "", logarithmic=True))

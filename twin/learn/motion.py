@@ -38,6 +38,7 @@ class Surprise:
 
     body: str
     values: Float1D
+    per_acc: float = 0.0  # by how much one m/s2 more of the accelerometer, all the time, moves it
 
 
 @dataclass(frozen=True, eq=False)

@@ -120,7 +120,7 @@ class Readings:
 
     @property
     def zeros(self) -> dict[str, tuple[tuple[str, float], ...]]:
-        """Of u, acc, right, left: the channels that make it, each with its sign.
+        """Of u, acc, table (its acc), right, left: the channels that make it, with their signs.
 
         Only what was tared: what reads something at rest, before anything moves.
         """
@@ -128,6 +128,7 @@ class Readings:
         made = {
             "u": lasers if "mass_disp_m" in self.spectra else (("rel_disp_m", 1.0),),
             "acc": (("mass_acc_m_s2", 1.0),),
+            "table": (("table_acc_m_s2", 1.0),),
             "right": tuple((one, 1.0) for one in RIGHT_CELLS if one in self.spectra),
             "left": tuple((one, 1.0) for one in LEFT_CELLS if one in self.spectra),
         }
@@ -138,7 +139,7 @@ class Readings:
         }
 
     def at_rest(self, name: str) -> tuple[float, float]:
-        """(mean of u, acc, right or left at rest, its deviation), SI.
+        """(mean of one of `zeros` at rest, its deviation), SI.
 
         What pressed-in bumpers make it read then is real: of the tare nothing is known but its
         deviation.
@@ -242,7 +243,8 @@ class _Fusion:
         both = s_a**2 + w2**2 * s_x**2
         fused = (s_a**2 * position - w2 * s_x**2 * acc) / both
         odd = self.grid.back((acc + w2 * position) / np.sqrt(both) * self.low)
-        surprise = Surprise(body, odd / self.grid.rms(self.low))
+        whole = self.grid.rms(self.low)
+        surprise = Surprise(body, odd / whole, 1.0 / (s_a * whole))
         return fused, s_a * s_x / np.sqrt(both), surprise
 
     def _shares(self) -> tuple[Surprise, ...]:

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from table_io.block import Bool2D, Float1D, Float2D, Int1D
 from twin.learn.general import GENERAL, Scale, forces
 from twin.learn.guess import SLIP, Guess
-from twin.learn.motion import Motion
+from twin.learn.motion import Motion, Surprise
 from twin.learn.readings import Readings, derives_acc
 from twin.model.forced import along, tilting
 from twin.model.model import Model, Sensor
@@ -203,9 +203,16 @@ class Sheet:
         rows /= self.noise(m, mass)[:, None]
         if self.whitening is not None:
             rows[0] = self.readings.grid.filtered(rows[0], self.whitening)
-        everything = [*rows, *(one.values for one in m.surprises)]
+        everything = [*rows, *(self._surprise(one, guess) for one in m.surprises)]
         samples = [row[used] for row, used in zip(everything, self.used, strict=True)]
         return np.concatenate([*samples, self._at_rest(guess)]) / self.weight
+
+    def _surprise(self, one: Surprise, guess: Guess) -> Float1D:
+        """A surprise as far as the tares of the accelerometers do not make it."""
+        parts = {"mass": (1, 0), "table": (0, 1), "mass against table": (1, -1)}
+        mass, table = parts.get(one.body, (0, 0))
+        off = mass * guess.zero(self.number, "acc") + table * guess.zero(self.number, "table")
+        return one.values - one.per_acc * off if off else one.values
 
     def _at_rest(self, guess: Guess) -> Float1D:
         """What is read at rest beyond the sensors' own offsets, and beyond the doubt of a tare."""
