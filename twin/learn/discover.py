@@ -10,6 +10,7 @@ from table_io.block import Float1D
 from table_io.card import BadInput
 from twin.learn.fit import Fit, fit
 from twin.learn.guess import (
+    GAP,
     INPUT_GAIN,
     INPUT_OFFSET,
     SENSOR,
@@ -18,6 +19,7 @@ from twin.learn.guess import (
     Guess,
     base_free,
     effects_of,
+    log_of,
 )
 from twin.learn.library import Candidate, candidates
 from twin.learn.naming import Bench, Explained, Named, Tell, named
@@ -139,7 +141,7 @@ def _far(model: Model, found: Fit) -> list[str]:
                 f"{one.name}: the recording says {now:.4g} {one.unit}, the model {was:.4g}; is "
                 "this the model of this specimen, and its mass right?"
             )
-        if one.unit == "m" and abs(now) > 1e-3:
+        if one.name.startswith(GAP) and log_of(one.name) is not None and abs(now) > 1e-3:
             notes.append(f"{one.name}: each gap is {1e3 * now:+.2f} mm off what the log says")
     return notes
 

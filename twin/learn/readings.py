@@ -8,90 +8,21 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
-from scipy.signal import welch
 
 from table_io.block import Block, Bool2D, Float1D, Int1D, Label, join
 from table_io.card import BadInput
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from twin.learn.motion import Motion, Noise, Surprise
+from twin.learn.spectra import Grid, Spectrum, believed, white_noise
 from twin.model.model import Sensor
 
-RATE_HZ = 500.0  # contacts last 0.1 s: fifty samples; noise beyond is thrown away
-ROLL_OFF = 0.8  # of the new Nyquist frequency: from here on the low pass falls
-PAD_S = 2.0
-SEGMENT, BANDS = 1024, 8  # samples of a spectrum that is averaged; the quietest band is noise
-LEAST_NOISE = 1e-4  # of a channel's rms: no sensor is better
 EDGE_S = 0.02  # next to a lost sample nothing is believed
 OPEN_END_S = 0.5  # a record that does not begin or end at rest is not believed so long
-Spectrum = npt.NDArray[np.complex128]
 BODIES = (("mass", "mass_disp_m", "mass_acc_m_s2"), ("table", "table_disp_m", "table_acc_m_s2"))
 USED = (
     "rel_disp_m", "mass_disp_m", "table_disp_m", "mass_acc_m_s2", "table_acc_m_s2",
     *RIGHT_CELLS, *LEFT_CELLS, "damper_force_n",
 )  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class Grid:
-    """Samples in time, frequencies up to the new rate, and the low pass between the two."""
-
-    size: int
-    rate_hz: float
-
-    @property
-    def every(self) -> int:
-        return max(int(self.rate_hz // RATE_HZ), 1)
-
-    @property
-    def padded(self) -> int:
-        pad = round(PAD_S * self.rate_hz)
-        return self.every * next_fast_len(-(-(self.size + pad) // self.every), real=True)
-
-    @property
-    def kept(self) -> int:
-        return self.padded // self.every // 2 + 1
-
-    @property
-    def w(self) -> Float1D:
-        """(frequency,) in 1/s."""
-        return 2 * np.pi * rfftfreq(self.padded, 1.0 / self.rate_hz)[: self.kept]
-
-    @property
-    def low(self) -> Float1D:
-        """(frequency,) the low pass; one everywhere where no sample is left out."""
-        if self.every == 1:
-            return np.ones(self.kept)
-        x = self.w * self.every / (np.pi * self.rate_hz)
-        low: Float1D = 0.5 + 0.5 * np.cos(np.pi * np.clip((x - ROLL_OFF) / (1 - ROLL_OFF), 0, 1))
-        return low
-
-    def spectrum(self, values: Float1D) -> Spectrum:
-        """(frequency,) of (sample,) at the old rate."""
-        return rfft(_whole(values), self.padded)[: self.kept]
-
-    def filtered(self, values: Float1D, gain: Float1D) -> Float1D:
-        """(sample,) at the new rate through a gain, (frequency,)."""
-        spectrum = rfft(values, self.padded // self.every)
-        found: Float1D = irfft(spectrum * gain, self.padded // self.every)[: values.size]
-        return found
-
-    def back(self, spectrum: Spectrum) -> Float1D:
-        """(sample,) at the new rate."""
-        count = -(-self.size // self.every)
-        found: Float1D = irfft(spectrum, self.padded // self.every)[:count] / self.every
-        return found
-
-    @property
-    def neighbours(self) -> float:
-        """Correlation of the noise of two neighbouring samples at the new rate."""
-        power = self.low**2
-        return float(np.sum(power * np.cos(self.w * self.every / self.rate_hz)) / power.sum())
-
-    def rms(self, density: Float1D) -> float:
-        """Of what white noise of rms 1 at the old rate becomes through a gain, (frequency,)."""
-        return float(np.sqrt(np.sum(density**2) / (self.padded / 2 + 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,14 +229,14 @@ def readings_of(
     rest = _at_rest(whole)
     good = np.logical_and.reduce([np.isfinite(values) for values in columns.values()])
     grid = Grid(len(whole), whole.rate_hz)
-    believed = _believed(good, round(EDGE_S * whole.rate_hz))
+    sure = believed(good, round(EDGE_S * whole.rate_hz))
     margin = round(OPEN_END_S * whole.rate_hz)
     if whole.label[0] != Label.REST:
-        believed[:margin] = False
+        sure[:margin] = False
     if whole.label[-1] != Label.REST:
-        believed[-margin:] = False
+        sure[-margin:] = False
     size = -(-len(whole) // grid.every)
-    noise = {key: _rms(values, rest) for key, values in columns.items()}
+    noise = {key: white_noise(values, rest) for key, values in columns.items()}
     return Readings(
         name, mass_kg, gaps_m, grid, grid.w, grid.low, grid.spectrum(np.ones(len(whole))),
         {key: grid.spectrum(values) for key, values in columns.items()},
@@ -313,7 +244,7 @@ def readings_of(
         _rest(columns, rest, noise),
         (whole.index + grid.every * np.arange(size)) / whole.rate_hz,
         whole.step[:: grid.every], whole.label[:: grid.every], whole.cycle[:: grid.every],
-        believed[:: grid.every],
+        sure[:: grid.every],
     )  # fmt: skip
 
 
@@ -363,38 +294,3 @@ def _rest(
         if known.size >= 100:
             found[key] = float(known.mean()), noise[key] * float(np.sqrt(2.0 / known.size))
     return found
-
-
-def _rms(values: Float1D, rest: Bool2D) -> float:
-    """Noise of a channel, taken for white: its scatter at rest, else the floor of its spectrum.
-
-    Where the two agree within what a short rest can tell, the floor is the more exact one.
-    """
-    known = values[rest & np.isfinite(values)]
-    every = values[np.isfinite(values)]
-    _, density = welch(every, 1.0, nperseg=min(SEGMENT, every.size))
-    bands = np.array_split(density[1:-1], BANDS)
-    found = float(np.sqrt(0.5 * min(float(np.median(band)) for band in bands)))
-    if known.size >= 100:
-        scatter = float(known.std())
-        if abs(found - scatter) > 3.0 * scatter / np.sqrt(2.0 * known.size):
-            found = scatter
-    return max(found, LEAST_NOISE * float(every.std()), 1e-300)
-
-
-def _whole(values: Float1D) -> Float1D:
-    """The channel with lost samples bridged by straight lines; what they say is not believed."""
-    known = np.isfinite(values)
-    if known.all():
-        return values
-    places = np.arange(values.size)
-    return np.interp(places, places[known], values[known])
-
-
-def _believed(good: Bool2D, margin: int) -> Bool2D:
-    """Good samples that have no lost one within `margin`."""
-    if good.all():
-        return good.copy()
-    spread = np.convolve(~good, np.ones(2 * margin + 1), "same") > 0
-    believed: Bool2D = ~spread
-    return believed
