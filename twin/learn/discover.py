@@ -165,7 +165,7 @@ def discover(
     least = min(one.weight for one in bench.sheets) ** -2
     # what is left cannot be less than the noise: where it is, the noise was overrated
     floor = min(least * repeated(bench.sheets, found.best.left), found.best.cost)
-    verdict = judge(bench, found, floor)
+    verdict = judge(bench, found, floor, model.flat())
     before = cells(bench.sheets, found.null.left, floor)
     seen = where(before, steps, harmonics_of(bench.sheets, found.null.left, steps))
     after = cells(bench.sheets, verdict.best.left, floor)

@@ -89,7 +89,7 @@ def candidates(
         for channel in sorted(_readable(channels)) if effect.acts == "sensor" else ("",):
             one = Candidate.of(effect, channel, _shapes(effect, sheets))
             taken = {free.name for free in one.free} & known.values.keys()
-            if not taken and not _blind(one, channels):
+            if not taken and not _blind(one, channels) and not _idle(one, sheets):
                 found.append(one)
     return tuple(found), away
 
@@ -120,6 +120,15 @@ def _blind(one: Candidate, channels: set[str]) -> bool:
         return gain
     unchecked = "mass_acc_m_s2" not in channels
     return unchecked and gain and one.channel in ("table_acc_m_s2", "rel_disp_m")
+
+
+def _idle(one: Candidate, sheets: Sequence[Sheet]) -> bool:
+    """True for gain or lag of a load cell that bore nothing: it would only scale the noise."""
+    sides = [side for side, cells in enumerate((RIGHT_CELLS, LEFT_CELLS)) if one.channel in cells]
+    offset = one.name.startswith("sensor_offset.")
+    return not offset and any(
+        not any((sheet.touched[side] > 0).any() for sheet in sheets) for side in sides
+    )
 
 
 def _shapes(effect: Effect, sheets: Sequence[Sheet]) -> tuple[tuple[float, ...], ...]:

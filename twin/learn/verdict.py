@@ -8,7 +8,7 @@ Excess is the held-out mean square over the noise, less the floor.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from twin.learn.naming import Bench, Explained, Named
@@ -18,6 +18,8 @@ NEARLY = 0.8  # of what the best close: others that close less are not as good, 
 LEFT = 0.06  # of the gap's excess: more than this left and not all is explained
 OUTSIDE = 0.012  # of the gap's excess: a general term in place of a name that closes more is better
 VISIBLE = 0.05  # excess in parts of the floor from which on there is a gap at all
+APART = 1.6  # a factor: a base parameter so far off both start and null has given way to a name
+ALIKE = 1.2  # a factor: start and null so near say the same, and the start is no second opinion
 PARTIAL = 0.5  # of the gap's excess: what closes less is no name
 
 
@@ -35,8 +37,13 @@ class Verdict:
     why: str
 
 
-def judge(bench: Bench, named: Named, floor: float) -> Verdict:
-    """What the outcome of a selection is worth; `floor` is a mean square over the noise."""
+def judge(
+    bench: Bench, named: Named, floor: float, start: Mapping[str, float] | None = None
+) -> Verdict:
+    """What the outcome of a selection is worth; `floor` is a mean square over the noise.
+
+    `start` are the base's parameters of the model that was given: a second opinion on them.
+    """
     null, best = named.null, named.best
     gap = max(null.cost - floor, 1e-9)
     general = _better(bench, named, floor)
@@ -49,6 +56,10 @@ def judge(bench: Bench, named: Named, floor: float) -> Verdict:
     sure = _confidence(bench, named, left / gap)
     if general is not None and not beside:
         why = f"{general.names[-1]} explains what {' + '.join(best.names)} cannot"
+        return Verdict("unexplained", best, min(sure, 0.3), (), general, floor, True, why)
+    bent = _gave_way(named, start or {})
+    if bent:
+        why = f"{' + '.join(best.names)} would close the gap only if {bent}"
         return Verdict("unexplained", best, min(sure, 0.3), (), general, floor, True, why)
     if remainder and (null.cost - best.cost) < PARTIAL * gap:
         why = "the best effects close less than half of the gap"
@@ -97,6 +108,22 @@ def _adds(named: Named, general: Explained, gap: float) -> bool:
         return False
     alone = [one.cost for one in named.outside if len(one.effects) == 1]
     return min(alone, default=math.inf) - general.cost > LEFT * gap
+
+
+def _gave_way(named: Named, start: Mapping[str, float]) -> str:
+    """The damper's spring or dashpot that had to become another one for the names to fit."""
+    for name in ("stiffness", "damping"):
+        was = start.get(name, 0.0)
+        null, best = (one.fit.values.get(name, 0.0) for one in (named.null, named.best))
+        if min(was, null) <= 0 or _factor(was, null) < ALIKE:
+            continue
+        if best <= 0 or min(_factor(best, was), _factor(best, null)) > APART:
+            return f"the {name} were {best:.4g}, not {was:.4g} as the model says"
+    return ""
+
+
+def _factor(a: float, b: float) -> float:
+    return max(a / b, b / a)
 
 
 def _as_good(bench: Bench, named: Named) -> tuple[Explained, ...]:
