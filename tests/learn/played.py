@@ -42,9 +42,7 @@ def profile(gap_mm: float = 4.0, start_hz: float = 1.4, stop_hz: float = 4.4) ->
 @cache
 def blocks(truth: str = "", noise: float = 1.0, gap_mm: float = 4.0) -> tuple[Block, ...]:
     """Measured blocks of a rig that hides a truth, with so many times the card's noise."""
-    sensors = [
-        one.model_copy(update={"noise_rms": one.noise_rms * noise}) for one in RIG.sensors
-    ]
+    sensors = [one.model_copy(update={"noise_rms": one.noise_rms * noise}) for one in RIG.sensors]
     simulated = RIG.simulated
     assert simulated is not None
     with tempfile.TemporaryDirectory() as folder:

@@ -93,9 +93,15 @@ def test_a_dead_channel_is_no_channel() -> None:
         values[one.channels.index("force_r1_n")] = 0.0
         dead.append(
             Block(
-                one.stream, one.index, one.rate_hz, one.channels, values, one.step, one.label,
+                one.stream,
+                one.index,
+                one.rate_hz,
+                one.channels,
+                values,
+                one.step,
+                one.label,
                 one.cycle,
-            )  # fmt: skip
+            )
         )
     assert "force_r1_n" not in readings_of(tuple(dead), "dead", 550.0, (0.002, 0.002)).channels
 

@@ -93,5 +93,5 @@ def test_what_cannot_be_is_refused_before_the_log_is_read(
 def test_a_log_given_twice_is_refused(done: tuple[Path, str], tmp_path: Path) -> None:
     log = str(recording(done[0].parent))
     outcome = CliRunner().invoke(app, ["identify", log, log, "--out", str(tmp_path / "m.toml")])
-    assert "given twice" in f"{outcome.output}{outcome.exception}"
+    assert "the same log" in f"{outcome.output}{outcome.exception}"
     assert not [*tmp_path.iterdir()]

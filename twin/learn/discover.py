@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,12 +45,16 @@ class Log:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """The bench of a set of logs, where its fits start, what fell away, what to say beforehand."""
+    """The bench of a set of logs, the first fit on it, what fell away, what to say."""
 
     bench: Bench
-    guess: Guess
+    first: Fit
     away: dict[str, str]
     notes: tuple[str, ...]
+
+    @property
+    def guess(self) -> Guess:
+        return self.first.guess
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +98,7 @@ def prepare(logs: Sequence[Log], model: Model, without: Sequence[str] = ()) -> P
             "same, whatever its noise"
         )
     library, away = candidates(sheets, guess, without)
-    return Prepared(Bench(sheets, free, library), first.guess, away, tuple(notes))
+    return Prepared(Bench(sheets, free, library), first, away, tuple(notes))
 
 
 def start(sheets: Sequence[Sheet], model: Model) -> tuple[Guess, tuple[Free, ...]]:
@@ -165,7 +169,11 @@ def discover(
     least = min(one.weight for one in bench.sheets) ** -2
     # what is left cannot be less than the noise: where it is, the noise was overrated
     floor = min(least * repeated(bench.sheets, found.best.left), found.best.cost)
-    verdict = judge(bench, found, floor, model.flat())
+    verdict = judge(bench, found, floor, model.flat(), least)
+    # with the effects found the base may be the specimen's again: say what is far off then
+    others = [note for note in prepared.notes if note not in _far(model, prepared.first)]
+    notes = (*others, *_far(model, verdict.best.fit))
+    prepared = replace(prepared, notes=notes)
     before = cells(bench.sheets, found.null.left, floor)
     seen = where(before, steps, harmonics_of(bench.sheets, found.null.left, steps))
     after = cells(bench.sheets, verdict.best.left, floor)

@@ -16,7 +16,7 @@ from twin.learn.motion import Motion, Noise, Surprise
 from twin.learn.spectra import Grid, Spectrum, believed, white_noise
 from twin.model.model import Sensor
 
-EDGE_S = 0.02  # next to a lost sample nothing is believed
+EDGE_S = 0.3  # next to a lost sample nothing is believed: the bridge spreads in the fusion
 OPEN_END_S = 0.5  # a record that does not begin or end at rest is not believed so long
 BODIES = (("mass", "mass_disp_m", "mass_acc_m_s2"), ("table", "table_disp_m", "table_acc_m_s2"))
 USED = (

@@ -20,6 +20,7 @@ OUTSIDE = 0.012  # of the gap's excess: a general term in place of a name that c
 VISIBLE = 0.05  # excess in parts of the floor from which on there is a gap at all
 APART = 1.6  # a factor: a base parameter so far off both start and null has given way to a name
 ALIKE = 1.2  # a factor: start and null so near say the same, and the start is no second opinion
+NEVER_AT_BOUND = ("stiffness", "damping", "bumper_stiffness")  # of a real specimen
 PARTIAL = 0.5  # of the gap's excess: what closes less is no name
 
 
@@ -38,16 +39,24 @@ class Verdict:
 
 
 def judge(
-    bench: Bench, named: Named, floor: float, start: Mapping[str, float] | None = None
+    bench: Bench,
+    named: Named,
+    floor: float,
+    start: Mapping[str, float] | None = None,
+    noise: float = 1.0,
 ) -> Verdict:
     """What the outcome of a selection is worth; `floor` is a mean square over the noise.
 
     `start` are the base's parameters of the model that was given: a second opinion on them.
+    `noise` is what the sensors' noise alone would leave: below it there is nothing to name.
     """
     null, best = named.null, named.best
     gap = max(null.cost - floor, 1e-9)
     general = _better(bench, named, floor)
     beside = general is not None and _adds(named, general, gap)
+    if null.cost < noise and null.cost < (1 + 2 * VISIBLE) * best.cost:
+        why = "the model leaves less than the noise that the sensors have"
+        return Verdict("none", null, 0.9, (), None, floor, False, why)
     if not best.effects:
         return _nothing_named(bench, named, floor, general)
     left = max(best.cost - floor, 0.0)
@@ -64,6 +73,10 @@ def judge(
     if remainder and (null.cost - best.cost) < PARTIAL * gap:
         why = "the best effects close less than half of the gap"
         return Verdict("unexplained", best, min(sure, 0.3), (), None, floor, True, why)
+    stuck = [one.amplitude.name for one in best.effects if one.amplitude.name in best.fit.at_bound]
+    if remainder and stuck:
+        why = f"{', '.join(stuck)} stands at its bound, and more is left"
+        return Verdict("unexplained", best, min(sure, 0.3), (), general, floor, True, why)
     if others:
         names = "; ".join(" + ".join(one.names) for one in others)
         why = f"as good as {' + '.join(best.names)}: {names}"
@@ -85,6 +98,9 @@ def _nothing_named(bench: Bench, named: Named, floor: float, general: Explained 
         return Verdict("unexplained", null, 0.9, (), general, floor, True, why)
     if null.cost > (1 + 2 * VISIBLE) * floor:
         why = "more is left than noise, and nothing explains it"
+        return Verdict("unexplained", null, 0.8, (), None, floor, True, why)
+    if stuck := [name for name in NEVER_AT_BOUND if name in null.fit.at_bound]:
+        why = f"only with {', '.join(stuck)} at its bound is what is left noise: no such specimen"
         return Verdict("unexplained", null, 0.8, (), None, floor, True, why)
     return Verdict("none", null, 0.95, (), None, floor, False, "what is left is noise")
 

@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from table_io.card import parse
+from table_io.card import BadInput, parse
 from table_io.clock import RealClock
 from table_io.profile import Specimen
 from twin.learn.discover import Discovery, Log, discover, transferred
@@ -42,17 +42,24 @@ def discover_command(
     start, card = model_of(model)
     for name in without:
         find_effect(name)
-    logs, notes = logs_of(paths)
-    apart = logs_of(held_out)[0] if held_out else ()
     folder, _ = new_run(out, "discover")
-    with interruptible("stopping: what was found is kept") as stop, searching() as show:
+    try:
+        with interruptible("stopping: what was found is kept") as stop, searching() as show:
 
-        def tell(text: str) -> None:
-            if stop():
-                raise Enough
-            show(text)
+            def tell(text: str) -> None:
+                if stop():
+                    raise Enough
+                show(text)
 
-        found = discover(logs, start, tell, without)
+            logs, notes = logs_of(paths)
+            apart = logs_of(held_out)[0] if held_out else ()
+            found = discover(logs, start, tell, without)
+    except (BadInput, Enough) as error:
+        folder.rmdir()  # nothing is left of a failure
+        if isinstance(error, BadInput):
+            raise
+        say("interrupted before anything was found")
+        return EXIT_INTERRUPTED
     told = verdict_json(found, clock.now() - began, notes)
     told["held_out_logs"] = [
         {

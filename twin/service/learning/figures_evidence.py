@@ -225,7 +225,7 @@ def free_run(sheet: Sheet, steps: Sequence[Step], one: Explained) -> list[Point]
     held = m.label == Label.MEASURE
     cycles = [np.unique(m.cycle[held & (m.step == s.index)]).size for s in steps]
     level = math.sqrt(2.0) * float(m.table_acc[held].std()) if held.any() else 0.0
-    if level == 0.0 or max(cycles) == 0:
+    if level == 0.0 or max(cycles) == 0 or sheet.reference.parameters.damping == 0:
         return []
     columns = {"rel_disp_m": m.u, "table_disp_m": m.table_disp, "table_acc_m_s2": m.table_acc}
     columns["mass_acc_m_s2"] = m.acc

@@ -12,14 +12,14 @@ from table_io.card import BadInput
 from table_io.clock import RealClock
 from twin.learn.discover import Log
 from twin.learn.fit import Fit
-from twin.learn.guess import GAP, ZERO, Guess
+from twin.learn.guess import GAP, ZERO, Guess, log_of
 from twin.learn.identify import WINDOW_S, Identified, identify
 from twin.learn.parts import local_gap
 from twin.service.folders import new_folder, new_run
 from twin.service.learning.command import model_of
-from twin.service.learning.logs import log_of, notes_on
+from twin.service.learning.logs import log_of as made_ready
+from twin.service.learning.logs import notes_on, opened
 from twin.service.learning.told import SURE, Json, model_toml, number
-from twin.service.recordings import open_log
 from twin.service.summary import dumps
 from twin.service.terminal import console, print_table, say
 
@@ -72,15 +72,12 @@ def _target(out: Path | None) -> Path:
 
 def _read(paths: Sequence[Path]) -> tuple[list[Log], list[tuple[Block, ...]], list[str]]:
     """(the logs, their measured blocks, what to say of them)."""
-    if len({path.resolve() for path in paths}) < len(paths):
-        raise BadInput("a log is given twice; give each once")
     logs: list[Log] = []
     blocks: list[tuple[Block, ...]] = []
     notes: list[str] = []
-    for path in paths:
-        with console.status(f"reading {path}"):
-            recording = open_log(path)
-            logs.append(log_of(recording))
+    with console.status("reading"):
+        for recording in opened(paths):
+            logs.append(made_ready(recording))
             blocks.append(recording.pieces("meas"))
             notes += notes_on(recording)
     return logs, blocks, notes
@@ -89,7 +86,7 @@ def _read(paths: Sequence[Path]) -> tuple[list[Log], list[tuple[Block, ...]], li
 def _lean(fit: Fit) -> Fit:
     """Without what belongs to each log and to no model: the zeros of its sensors, its gaps."""
     kept = {key: value for key, value in fit.guess.values.items() if not key.startswith(ZERO)}
-    values = {key: value for key, value in fit.values.items() if not key.startswith((GAP, ZERO))}
+    values = {key: value for key, value in fit.values.items() if log_of(key) is None}
     return replace(fit, guess=Guess(kept), values=values)
 
 
@@ -104,7 +101,7 @@ def told_json(found: Identified, notes: Sequence[str]) -> Json:
         "parameters": {
             one.name: number(fit, one.name, one.unit) | _from_start(found, one.name, one.keys[0])
             for one in fit.free
-            if not one.name.startswith((GAP, ZERO))
+            if log_of(one.name) is None
         },
         "gaps": {name: _gap(found, k) for k, name in enumerate(names)},
         "zeros": {

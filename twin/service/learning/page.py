@@ -16,7 +16,7 @@ from twin.learn.guess import GAP
 from twin.learn.search import LEAST_UNITS
 from twin.service.learning.figures import draw_all
 from twin.service.learning.figures_evidence import Shown, gates
-from twin.service.learning.told import Json
+from twin.service.learning.told import REFITTED, Json
 from twin.service.report import significant
 
 HERE = Path(__file__).parent
@@ -75,6 +75,8 @@ def sentence(told: Json) -> str:
     if told["verdict"] == "named" and all(one.get("channel") for one in told["effects"]):
         return f"The model lacks nothing; a sensor errs: {names}."
     text = WORDS[told["verdict"]].format(names=names)
+    if told["verdict"] == "none" and told["why"].endswith(REFITTED):
+        text = "Nothing is missing, but the model agrees only with other parameters than it has."
     if told["verdict"] == "unexplained" and names:
         text += f" The nearest is {names}, and it is not enough."
     return text

@@ -6,17 +6,21 @@ from typing import Any
 
 from twin.learn.discover import Discovery
 from twin.learn.fit import Fit
-from twin.learn.guess import GAP, SLIP, ZERO
+from twin.learn.guess import GAP, SENSOR, SLIP, ZERO, Free, log_of
 from twin.learn.library import Candidate
 from twin.learn.naming import Explained
 from twin.learn.verdict import closed_fraction, next_run
+from twin.model.effects import find_effect
 from twin.model.model import CHANNELS
 
 Json = dict[str, Any]
+LEAST_GAP_M = 1e-6  # by which a gap may be off without a word
 METRIC = (
     "rms of measured minus model forces along the measured motion, over the noise of the sensors, "
     "on steps that were not fitted"
 )
+STOPPED = "stopped before the end: not everything was tried, so other names may do better"
+REFITTED = ", with other parameters than the model has: see the notes"
 SURE = 1.96  # standard deviations either side: 95 %
 
 
@@ -28,7 +32,7 @@ def verdict_json(found: Discovery, seconds: float = 0.0, notes: Sequence[str] = 
     names, others = best.names, [one.names for one in v.others]
     return {
         "verdict": v.word,
-        "why": v.why,
+        "why": _why(found),
         "effects": [effect_json(one, best.fit, v.confidence) for one in best.effects],
         "ambiguous": [[*names], *([*one] for one in others)] if others else [],
         "candidates": candidates_json(named.null, (*named.tried, *named.outside)),
@@ -52,9 +56,14 @@ def verdict_json(found: Discovery, seconds: float = 0.0, notes: Sequence[str] = 
             "unexplained": v.remainder,
             "evidence": evidence(v.general),
         },
-        "base": base_json(best.fit),
+        "base": base_json(best),
         "fell_away": dict(found.prepared.away),
-        "notes": [*notes, *found.prepared.notes],
+        "notes": [
+            *notes,
+            *found.prepared.notes,
+            *suspicious(best),
+            *([] if named.whole else [STOPPED]),
+        ],
         "next_run": next_run(v.word, names, others),
         "seconds": seconds,
     }
@@ -81,11 +90,46 @@ def number(fit: Fit, name: str, unit: str) -> Json:
     return {"value": value, "low": value - SURE * sd, "high": value + SURE * sd, "unit": unit}
 
 
-def base_json(fit: Fit) -> Json:
-    """The base's parameters, and by how much the gaps of each log are off what it says."""
-    return {
-        free.name: number(fit, free.name, free.unit) for free in fit.free if "." not in free.name
-    }
+def base_json(one: Explained) -> Json:
+    """The model's own parameters, refitted, and by how much the gaps of each log are off."""
+    fit = one.fit
+    return {free.name: number(fit, free.name, free.unit) for free in _own(one)}
+
+
+def _own(one: Explained) -> list[Free]:
+    """What was fitted beside the effects that were found, less zeros and gains of the input."""
+    added = {free.name for effect in one.effects for free in effect.free}
+    return [
+        free
+        for free in one.fit.free
+        if free.name not in added and not free.name.startswith((ZERO, SENSOR))
+    ]
+
+
+def suspicious(one: Explained) -> list[str]:
+    """What speaks against a fit: numbers at their bounds, effects of the model that vanish."""
+    fit, notes = one.fit, []
+    stuck = [name for name in fit.at_bound if not name.startswith((ZERO, SLIP))]
+    notes += [
+        f"{name} = {fit.values[name]:.4g} stands at its bound: do not trust it" for name in stuck
+    ]
+    for free in _own(one):
+        identity, _, parameter = free.name.rpartition(".")
+        if not identity:
+            continue
+        vanishing = next(
+            p for p in find_effect(identity).parameters if p.name == parameter
+        ).vanishing
+        off = math.inf if vanishing is None else abs(fit.values[free.name] - vanishing)
+        if off < SURE * fit.spread[free.name]:
+            notes.append(f"{identity} of the model vanishes in these recordings; leave it out")
+    return notes
+
+
+def _why(found: Discovery) -> str:
+    """The reason of the verdict; that a model only agrees with other numbers is no agreement."""
+    other = found.verdict.word == "none" and found.prepared.notes
+    return f"{found.verdict.why}{REFITTED if other else ''}"
 
 
 def candidates_json(null: Explained, tried: Sequence[Explained]) -> list[Json]:
@@ -156,8 +200,8 @@ def model_toml(fit: Fit, title: str, citation: str, fitted_on: str) -> tuple[str
             f"id = {_text(identity)}",
             f"parameters = {{ {', '.join(numbers)} }}",
         ]
-    gaps = {k: v for k, v in fit.values.items() if k.startswith(GAP) and abs(v) > 0}
-    if gaps:
+    gaps = {k: v for k, v in fit.values.items() if k.startswith(GAP) and log_of(k) is not None}
+    if any(abs(v) > max(SURE * fit.spread[k], LEAST_GAP_M) for k, v in gaps.items()):
         told = ", ".join(f"{1e3 * v:+.3f} mm" for v in gaps.values())
         left_out.append(f"gaps stand in the test profile: each side is {told} off what it says")
     return "\n".join(lines) + "\n", left_out

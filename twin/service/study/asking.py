@@ -14,18 +14,18 @@ from twin.service.learning.told import verdict_json
 
 def discovered(shown: Path) -> dict[str, Any]:
     """The verdict on the recording in a case's folder, as in verdict.json."""
-    logs, notes, model = _opened(shown)
+    logs, notes, model = opened(shown)
     return verdict_json(discover(logs, model), notes=notes)
 
 
 def true_structure(shown: Path, effects: Sequence[str]) -> float | None:
     """Held-out rms over the noise with exactly these effects, fitted; None: not to be had."""
-    logs, _, model = _opened(shown)
+    logs, _, model = opened(shown)
     found = structured(logs, model, effects)
     return math.sqrt(found.cost) if found is not None else None
 
 
-def _opened(shown: Path) -> tuple[Sequence[Log], Sequence[str], Model]:
+def opened(shown: Path) -> tuple[Sequence[Log], Sequence[str], Model]:
     """The recording, what is to say of it, and the model to start from."""
     logs, notes = logs_of([shown / "log.mcap"])
     return logs, notes, model_of(str(shown / "model.toml"))[0]

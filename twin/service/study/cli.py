@@ -33,8 +33,15 @@ def discovery(
     ] = None,
     workers: Annotated[int | None, typer.Option("--workers", help="Processes; else all.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with what is in --out.")] = False,
+    controls: Annotated[
+        bool,
+        typer.Option(
+            "--controls",
+            help="Also what must fail, on single/*/3/1%: time reversed, truth not in the library.",
+        ),
+    ] = False,
 ) -> None:
     """Blind cases with a sealed truth, judged and scored: how good discovery is."""
     from twin.service.study.command import discovery as command
 
-    raise typer.Exit(command(out, seeds, cells or [], workers, resume))
+    raise typer.Exit(command(out, seeds, cells or [], workers, resume, controls))

@@ -13,10 +13,13 @@ from table_io.card import BadInput
 from table_io.clock import RealClock
 from twin.service.folders import new_folder
 from twin.service.outcome import EXIT_INTERRUPTED
+from twin.service.study.beside import WAYS
 from twin.service.study.cells import case_of, cases
+from twin.service.study.controls import CELLS, control
 from twin.service.study.crew import Work, by_crew
 from twin.service.study.judging import judge
-from twin.service.study.pages import RESULTS, read_rows, said, write_pages
+from twin.service.study.pages import CONTROLS, RESULTS, read_rows, said, write_pages
+from twin.service.study.rivals import missing
 from twin.service.terminal import console, interruptible, say
 
 Json = dict[str, Any]
@@ -25,25 +28,39 @@ STOPPING = "stopping: the cases under way are finished first"
 
 
 def discovery(
-    out: Path | None, seeds: int, patterns: Sequence[str], workers: int | None, resume: bool
+    out: Path | None,
+    seeds: int,
+    patterns: Sequence[str],
+    workers: int | None,
+    resume: bool,
+    controls: bool = False,
 ) -> int:
-    """Every case that was asked for and is not done; the exit code."""
+    """Every case that was asked for and is not done, then the controls; the exit code."""
     if workers is not None and workers < 1:
         raise BadInput(f"--workers {workers}: allowed: 1 or more; without it all cores")
     asked = _asked(seeds, patterns)
     folder = _folder(out, resume)
-    return run(folder, asked, workers or len(os.sched_getaffinity(0)), partial(judge, folder))
+    if missing():
+        say(missing())
+    hands = workers or len(os.sched_getaffinity(0))
+    code = run(folder, asked, hands, partial(judge, folder))
+    if controls and code == 0:
+        say(f"controls that must fail, on {CELLS}")
+        return run(folder, cases(seeds, [CELLS]), hands, partial(control, folder), CONTROLS)
+    return code
 
 
-def run(folder: Path, asked: Sequence[int], workers: int, work: Work) -> int:
-    """The cases that have no verdict yet, on so many processes; then the pages."""
-    rows = {row["number"]: row for row in read_rows(folder / RESULTS)}
+def run(
+    folder: Path, asked: Sequence[int], workers: int, work: Work, results: str = RESULTS
+) -> int:
+    """The cases that have no row in `results` yet, on so many processes; then the pages."""
+    rows = {row["number"]: row for row in read_rows(folder / results)}
     todo = [number for number in asked if number not in rows or rows[number].get("failed")]
     say(f"{len(todo)} of {len(asked)} cases to do on {workers} processes -> {folder}")
     clock = RealClock()
     began = clock.now()
-    with interruptible(STOPPING) as stop, (folder / RESULTS).open("a", encoding="utf-8") as file:
-        _mend(folder / RESULTS, file)
+    with interruptible(STOPPING) as stop, (folder / results).open("a", encoding="utf-8") as file:
+        _mend(folder / results, file)
         done = sum(1 for _ in _judged(todo, workers, work, stop, file))
         why = stop()
     page = write_pages(folder)
@@ -75,6 +92,9 @@ def _sentence(row: Json) -> str:
     if not row["sized"]:
         return f"{row['cell']}: left out: {row['ended']}"
     mark = "right" if row["right"] else "MISSED"
+    if "said" not in row:
+        told = (f"{way}: {row[way]['said']} {' + '.join(row[way]['named'])}" for way in WAYS)
+        return f"{row['cell']}: {'; '.join(told)}: {mark}"
     sure = "" if row["confidence"] is None else f" ({row['confidence']:.2f})"
     seconds = "" if row.get("seconds") is None else f", {row['seconds']:.1f} s"
     return f"{row['cell']}: {said(row)}{sure}: {mark}{seconds}"

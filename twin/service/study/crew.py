@@ -34,7 +34,7 @@ def by_crew(
 
     Once `stop()` is true none is begun any more; those under way are finished and handed out.
     """
-    os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     waiting, clock = deque(numbers), RealClock()
     hands: list[_Hand] = []
     try:

@@ -10,13 +10,14 @@ from table_io.clock import RealClock
 from twin.service.study.asking import discovered, true_structure
 from twin.service.study.cells import case_of
 from twin.service.study.making import Places, make
+from twin.service.study.rivals import installed
 from twin.service.study.scoring import score
 from twin.service.summary import dumps
 
 Json = dict[str, Any]
 Method = Callable[[Path], Json]  # folder of a case -> verdict as in verdict.json
 # Other methods on the same files: each gives a verdict, scored the same, beside ours in the row.
-RIVALS: dict[str, Method] = {}
+RIVALS: dict[str, Method] = installed()
 
 
 def judge(root: Path, number: int, method: Method = discovered) -> Json:
@@ -39,10 +40,20 @@ def judge(root: Path, number: int, method: Method = discovered) -> Json:
     verdict, why = _asked(method, places.shown)
     judged = clock.now()
     places.verdict.write_text(dumps(verdict), encoding="utf-8")
-    row = score(verdict, about, None if why else _oracle(places, about))
-    rivals = {name: score(_asked(rival, places.shown)[0], about) for name, rival in RIVALS.items()}
+    row = _scored(verdict, about, None if why else _oracle(places, about))
+    told = {name: _asked(rival, places.shown) for name, rival in RIVALS.items()}
+    rivals = {
+        name: _scored(found, about) | ({"failed": why_not} if why_not else {})
+        for name, (found, why_not) in told.items()
+    }
     row |= {"label": case.label, "seconds": judged - made, "made_in": made - began}
     return row | ({"failed": why} if why else {}) | ({"rivals": rivals} if rivals else {})
+
+
+def _scored(verdict: Json, about: Json, oracle: float | None = None) -> Json:
+    """The score, and the held-out error itself, rms over the noise, to lay beside a rival's."""
+    gap = verdict.get("gap") or {}
+    return score(verdict, about, oracle) | {"held_out": gap.get("held_out_after")}
 
 
 def _asked(method: Method, shown: Path) -> tuple[Json, str]:

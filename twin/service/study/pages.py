@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from twin.service.study.beside import compared, controlled
 from twin.service.study.rates import Figure, Rate, calibration, figures, latest, table, usable
 from twin.service.study.scoring import worst
 
 Json = dict[str, Any]
-RESULTS, TABLE, CONFUSION = "results.jsonl", "table.md", "confusion.png"
+RESULTS, CONTROLS = "results.jsonl", "controls.jsonl"
+TABLE, CONFUSION = "table.md", "confusion.png"
 OTHERS = ("none", "ambiguous", "unexplained", "failed")
 NOTHING = "(nothing)"
 TABLES = (
@@ -46,7 +48,8 @@ def write_pages(folder: Path) -> Path:
 
         draw(*confusion(good), folder / CONFUSION)
     path = folder / TABLE
-    path.write_text("\n".join(_page(rows, good)) + "\n", encoding="utf-8")
+    lines = [*_page(rows, good), *compared(good), *controlled(read_rows(folder / CONTROLS), good)]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
 
 
