@@ -16,6 +16,8 @@ OWNERS = {
     "rerun": {"twin/stream/rerun_view.py"},
     "google": {"twin/stream/wire.py", "twin/stream/shaketwin_pb2.py"},
     "time": {"table_io/clock.py"},
+    "pysindy": {"twin/service/study/rivals_sindy.py"},
+    "sklearn": {"twin/service/study/rivals_blackbox.py"},
 }
 VIOLATIONS = {
     "arrows point down": ("twin/model/parameters.py", "import twin.stream.wire"),

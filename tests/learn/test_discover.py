@@ -6,7 +6,7 @@ The whole study is `shaketwin study discovery`; here stands one case of each kin
 import numpy as np
 import pytest
 
-from tests.learn.played import SNM, hidden, log
+from learn.played import SNM, hidden, log
 from twin.learn.discover import discover, prepare, structured
 from twin.learn.naming import Enough
 from twin.learn.search import folds_of, nothing, products, subsets

@@ -5,7 +5,7 @@ import pytest
 
 from table_io.block import Block
 from table_io.card import BadInput
-from tests.learn.played import TRUE, blocks, hidden, log
+from learn.played import TRUE, blocks, hidden, log
 from twin.learn.readings import readings_of
 from twin.model.forced import along
 from twin.model.model import Model, Sensor

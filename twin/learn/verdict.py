@@ -177,8 +177,8 @@ def _confidence(bench: Bench, named: Named, left: float) -> float:
     ]
     margin = min(rivals, default=10.0)
     apart = 1.0 / (1.0 + math.exp(-(margin - 2.0)))
-    whole = 1.0 / (1.0 + math.exp((left - 0.15) / 0.03)) if left > 0 else 1.0
-    whole = 0.5 + 0.5 * whole
+    # in parts of the gap's rms: the form of a law may leave a sixth, half is another law
+    whole = 0.4 + 0.6 / (1.0 + math.exp((math.sqrt(max(left, 0.0)) - 0.27) / 0.04))
     held = 1.0 if best.converged and not best.fit.at_bound else 0.6
     return 0.98 * apart * whole * held
 
