@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from learn.played import TRUE, blocks, hidden, log
 from table_io.block import Block
 from table_io.card import BadInput
-from learn.played import TRUE, blocks, hidden, log
 from twin.learn.readings import readings_of
 from twin.model.forced import along
 from twin.model.model import Model, Sensor
