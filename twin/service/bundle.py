@@ -24,6 +24,7 @@ from twin.model.parameters import Parameters
 if TYPE_CHECKING:
     from twin.compare.pipeline import Setup
 
+WARM_ITEMS = 3000  # of a session: thirty seconds, through the loop check into the sweep
 LIBRARIES = ("shaketwin", "numpy", "scipy", "numba", "protobuf", "eclipse-zenoh", "mcap")
 
 
@@ -142,23 +143,25 @@ def run_id(name: str) -> str:
 
 def warm(kernels: str) -> None:
     """Compile or load the kernels of "plant" or "twin" by running them once on a few samples."""
-    import numpy as np
-
     if kernels == "twin":
+        import numpy as np
+
         from twin.model.exact import advance, constants, rest
 
         parameters = Parameters(550.0, 36e3, 1.1e3, 510e3, 900.0, 510e3, 900.0, 0.002, 0.002)
         state = rest(parameters)
         advance(state, constants(parameters, 2000.0), np.zeros(4), np.empty((7, 4)))
         return
+    from itertools import islice
+
     from table_io.backends import open_backend
     from table_io.clock import ManualClock
+    from table_io.session import play
 
-    path = find("quickstart", "tests")
-    bundle = read_bundle(path)
-    backend = open_backend(bundle.rig, bundle.profile, ManualClock())
-    backend.open()
-    backend.queue(0, np.zeros(4))
-    backend.start()
-    backend.read(2)
+    # The beginning of a real session: whatever the rig computes with, protection too, is run.
+    bundle, clock = read_bundle(find("quickstart", "tests")), ManualClock()
+    backend = open_backend(bundle.rig, bundle.profile, clock)
+    session = play(bundle.session, backend, clock, bundle.describe("warm", "table"), lambda: None)
+    for _ in islice(session, WARM_ITEMS):
+        pass
     backend.close()
