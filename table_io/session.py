@@ -4,7 +4,7 @@ States: idle, checking, armed, running, holding, stopping, at rest, fault. Every
 the command to rest: it is always queued to end there, so the decay also plays if this process dies.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -51,7 +51,7 @@ class Punctuality:
 
 Describe = Callable[[dict[str, float], float], RunStart]  # (tare, epoch_s) -> start record
 Commands = Callable[[], Order | None]  # must not wait
-Said = Iterator[Block | Record]
+Said = Generator[Block | Record, None, None]
 ORDERS = ("hold", "resume", "stop", "abort")
 
 

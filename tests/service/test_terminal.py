@@ -99,9 +99,10 @@ def test_only_a_long_wait_is_told(
 def test_every_kernel_of_a_command_is_had_before_it_begins(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the cache holds: a part of it is not the whole."""
     warmed: list[str] = []
-    monkeypatch.setattr(kernels, "warm", warmed.append)
+    monkeypatch.setattr(kernels, "warm_twin", lambda: warmed.append("twin"))
+    monkeypatch.setattr(kernels, "warm_rig", lambda bundle: warmed.append("rig"))
     bundle = read_bundle(find("quickstart", "tests"))
     kernels.ready(bundle)
     assert warmed == ["twin"]
     kernels.ready(bundle, table=True)
-    assert warmed == ["twin", "plant", "twin"]
+    assert warmed == ["twin", "rig", "twin"]

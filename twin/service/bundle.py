@@ -24,7 +24,7 @@ from twin.model.parameters import Parameters
 if TYPE_CHECKING:
     from twin.compare.pipeline import Setup
 
-WARM_ITEMS = 3000  # of a session: thirty seconds, through the loop check into the sweep
+WARM_ITEMS = 100  # of a session: one second; each kernel runs from the first blocks on
 LIBRARIES = ("shaketwin", "numpy", "scipy", "numba", "protobuf", "eclipse-zenoh", "mcap")
 
 
@@ -141,27 +141,36 @@ def run_id(name: str) -> str:
     return f"{today():%Y%m%d-%H%M%S}-{name}"
 
 
-def warm(kernels: str) -> None:
-    """Compile or load the kernels of "plant" or "twin" by running them once on a few samples."""
-    if kernels == "twin":
-        import numpy as np
+def warm_twin() -> None:
+    """Compile or load the kernels of the exact solver by running them once on a few samples."""
+    import numpy as np
 
-        from twin.model.exact import advance, constants, rest
+    from twin.model.exact import advance, constants, rest
 
-        parameters = Parameters(550.0, 36e3, 1.1e3, 510e3, 900.0, 510e3, 900.0, 0.002, 0.002)
-        state = rest(parameters)
-        advance(state, constants(parameters, 2000.0), np.zeros(4), np.empty((7, 4)))
-        return
+    parameters = Parameters(550.0, 36e3, 1.1e3, 510e3, 900.0, 510e3, 900.0, 0.002, 0.002)
+    state = rest(parameters)
+    advance(state, constants(parameters, 2000.0), np.zeros(4), np.empty((7, 4)))
+
+
+def warm_rig(bundle: Bundle) -> None:
+    """Compile or load what the rig computes with, protection too, and its simulated table.
+
+    The beginning of a real session is played: nothing can be forgotten here.
+    """
+    from contextlib import closing
     from itertools import islice
 
-    from table_io.backends import open_backend
+    from table_io.backends.simulated import SimulatedBackend
     from table_io.clock import ManualClock
     from table_io.session import play
 
-    # The beginning of a real session: whatever the rig computes with, protection too, is run.
-    bundle, clock = read_bundle(find("quickstart", "tests")), ManualClock()
-    backend = open_backend(bundle.rig, bundle.profile, clock)
+    if bundle.rig.simulated is None:
+        bundle = read_bundle(find("quickstart", "tests"))
+    clock = ManualClock()
+    backend = SimulatedBackend(
+        bundle.rig, bundle.profile.specimen, bundle.profile.acquisition.rate_hz, clock
+    )
     session = play(bundle.session, backend, clock, bundle.describe("warm", "table"), lambda: None)
-    for _ in islice(session, WARM_ITEMS):
-        pass
-    backend.close()
+    with closing(session):  # which closes the backend too
+        for _ in islice(session, WARM_ITEMS):
+            pass

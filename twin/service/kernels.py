@@ -3,7 +3,7 @@
 Whether they are cached is not asked: only numba knows, and it knows by loading them.
 """
 
-from twin.service.bundle import Bundle, warm
+from twin.service.bundle import Bundle, warm_rig, warm_twin
 from twin.service.terminal import said_if_long
 
 COMPILING = "compiling the kernels: once, the next start finds them"
@@ -15,7 +15,7 @@ def ready(bundle: Bundle, table: bool = False) -> None:
     Called before anything is made or moved: who interrupts it leaves nothing behind.
     """
     with said_if_long(COMPILING):
-        if table and bundle.rig.simulated is not None:
-            warm("plant")
-        warm("twin")
+        if table:
+            warm_rig(bundle)
+        warm_twin()
         bundle.twin()

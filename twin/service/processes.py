@@ -21,7 +21,7 @@ from table_io.card import BadInput
 from table_io.clock import RealClock
 from table_io.records import Decided, Event, Fault, RunStart, RunStop, Timing
 from table_io.session import ORDERS, Order, Punctuality, play
-from twin.service.bundle import Bundle, from_texts, warm
+from twin.service.bundle import Bundle, from_texts, warm_rig, warm_twin
 from twin.service.scheduling import urgent
 from twin.service.stopwatch import Stopwatch
 from twin.stream.resend import Inbox
@@ -97,7 +97,7 @@ def _orphaned() -> bool:
 def rig(spec: Spec, _: str) -> None:
     """Drives the table and publishes; opens the hub. No other Python threads."""
     bundle = spec.bundle()
-    warm("plant")
+    warm_rig(bundle)
     clock = RealClock()
     scheduler = urgent(RIG_PRIORITY)
     link = open_hub(bundle.rig.name, spec.endpoint)
@@ -167,7 +167,7 @@ def twin(spec: Spec, missed_from: str) -> None:
     from twin.compare import pipeline
 
     bundle = spec.bundle()
-    warm("twin")
+    warm_twin()
     setup = bundle.twin()
     clock = RealClock()
     scheduler = urgent(TWIN_PRIORITY)
