@@ -15,7 +15,6 @@ from table_io.rig import Rig
 from table_io.session import Setup, play
 from twin.learn.discover import Log
 from twin.learn.readings import readings_of
-from twin.learn.where import Step
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 
@@ -69,8 +68,7 @@ def log(truth: str = "", noise: float = 1.0, gap_mm: float = 4.0) -> Log:
     """The same, made ready."""
     test = profile(gap_mm)
     readings = readings_of(blocks(truth, noise, gap_mm), "short", 550.0, test.specimen.gaps_m)
-    steps = tuple(Step(s.index, s.frequency_hz, s.direction) for s in test.sweep.steps)
-    return Log(readings, test.comparison.contact_n, steps)
+    return Log(readings, test.comparison.contact_n, test.sweep.steps)
 
 
 def hidden(effect: str, channel: str = "", form: str = "", **parameters: float) -> str:

@@ -9,7 +9,7 @@ import pytest
 from learn.played import SNM, hidden, log
 from twin.learn.discover import discover, prepare, structured
 from twin.learn.naming import Enough
-from twin.learn.search import folds_of, nothing, products, subsets
+from twin.learn.search import folds_of, products, ranked
 from twin.learn.verdict import closed_fraction
 
 
@@ -98,12 +98,12 @@ def test_linear_algebra_foresees_what_a_refit_finds() -> None:
     prepared = prepare([log(hidden("coulomb_friction", fc=5.0))], SNM)
     bench = prepared.bench
     found = products(bench.sheets, prepared.guess, bench.base, bench.library)
-    best = subsets(found, 1, 1)[0]
-    assert best.names == ("coulomb_friction",)
-    refitted = bench.explain(best.put(prepared.guess), [best.variants[0].candidate])
+    (best,) = ranked(found, 1)
+    assert best.candidate.name == "coulomb_friction"
+    refitted = bench.explain(best.put(prepared.guess), [best.candidate])
     entries = sum(one.size for one in refitted.left)
     assert best.cost / entries == pytest.approx(refitted.cost, rel=0.02)
-    assert nothing(found).cost / entries == pytest.approx(
+    assert found.without / entries == pytest.approx(
         bench.explain(prepared.guess, ()).cost, rel=1e-3
     )
 

@@ -15,7 +15,6 @@ from table_io.profile import Profile
 from table_io.rig import Rig
 from twin.learn.discover import Log
 from twin.learn.readings import readings_of
-from twin.learn.where import Step
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 
@@ -96,8 +95,5 @@ def logged(
     blocks: tuple[Block, ...], gaps_mm: tuple[float, float] = (2.0, 2.0), name: str = "short"
 ) -> Log:
     """The recording as a log that states these gaps."""
-    steps = tuple(
-        Step(one.index, one.frequency_hz, one.direction) for one in plan(profile(2.0, 2.0)).steps
-    )
     gaps = (1e-3 * gaps_mm[0], 1e-3 * gaps_mm[1])
-    return Log(readings_of(blocks, name, 550.0, gaps), 10.0, steps)
+    return Log(readings_of(blocks, name, 550.0, gaps), 10.0, plan(profile(2.0, 2.0)).steps)

@@ -242,7 +242,7 @@ def test_the_gates_pass_where_no_sensor_errs_and_fail_where_one_does(
     mass = sheet.row_of == sheet.rows.index("mass")
     at_rest = sheet.row_of == len(sheet.rows)
     wrong = np.where(mass, 2.0, np.where(at_rest, 9.0, null.left[0]))
-    broken = replace(one.found.named, null=replace(null, left=(wrong,)))
+    broken = replace(one.found.named, null=replace(null, fit=replace(null.fit, left=(wrong,))))
     failed = [gate.what for gate in gates(Shown(replace(one.found, named=broken), one.logs))
               if not gate.passed]  # fmt: skip
     assert failed[0] == "mass: the same motion"

@@ -12,7 +12,8 @@ from table_io.block import Block
 from table_io.card import BadInput
 from table_io.records import Comparison, Event, Fault, Gap, RunStop, Timing
 from twin.service.evidence import gather
-from twin.service.report import render, significant, write_report
+from twin.service.page import significant
+from twin.service.report import render, write_report
 from twin.stream.mcap_log import read, write_items
 from twin.stream.wire import Item
 

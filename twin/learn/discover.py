@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from table_io.block import Float1D
 from table_io.card import BadInput
+from table_io.records import Step
 from twin.learn.fit import Fit, fit
 from twin.learn.guess import (
     GAP,
@@ -26,7 +27,7 @@ from twin.learn.naming import Bench, Explained, Named, Tell, named
 from twin.learn.readings import Readings, derives_acc
 from twin.learn.sheet import Sheet, sheets_of
 from twin.learn.verdict import Verdict, judge
-from twin.learn.where import Cell, Step, Where, cells, harmonics_of, repeated, where
+from twin.learn.where import Cell, Where, cells, harmonics_of, repeated, where
 from twin.model.model import Model
 
 LEAST_ENTRIES, LEAST_BLOCKS = 1000, 9
@@ -67,6 +68,7 @@ class Discovery:
     where: Where
     map_before: tuple[Cell, ...]
     map_after: tuple[Cell, ...]
+    notes: tuple[str, ...]
 
     @property
     def model(self) -> Model:
@@ -90,7 +92,7 @@ def prepare(logs: Sequence[Log], model: Model, without: Sequence[str] = ()) -> P
     sheets = sheets_of(pairs, first.guess.model())
     first = fit(sheets, first.guess, free)
     rms = [_rms(sheet.residual(first.guess)) for sheet in sheets]
-    notes = list(_far(model, first))
+    notes = []
     if min(rms) > MODEL_LIMITED:
         sheets = sheets_of(pairs, first.guess.model(), rms)
         notes.append(
@@ -134,7 +136,7 @@ def _enough(sheet: Sheet) -> None:
         )
 
 
-def _far(model: Model, found: Fit) -> list[str]:
+def far(model: Model, found: Fit) -> list[str]:
     """Sentences about parameters that are not those of the same specimen."""
     flat, notes = model.flat(), []
     for one in found.free:
@@ -170,14 +172,12 @@ def discover(
     # what is left cannot be less than the noise: where it is, the noise was overrated
     floor = min(least * repeated(bench.sheets, found.best.left), found.best.cost)
     verdict = judge(bench, found, floor, model.flat(), least)
-    # with the effects found the base may be the specimen's again: say what is far off then
-    others = [note for note in prepared.notes if note not in _far(model, prepared.first)]
-    notes = (*others, *_far(model, verdict.best.fit))
-    prepared = replace(prepared, notes=notes)
+    # with the effects found the base may be the specimen's again: what is far off then is said
+    notes = (*prepared.notes, *far(model, verdict.best.fit))
     before = cells(bench.sheets, found.null.left, floor)
     seen = where(before, steps, harmonics_of(bench.sheets, found.null.left, steps))
     after = cells(bench.sheets, verdict.best.left, floor)
-    return Discovery(prepared, found, verdict, seen, before, after)
+    return Discovery(prepared, found, verdict, seen, before, after, notes)
 
 
 def structured(logs: Sequence[Log], model: Model, effects: Sequence[str]) -> Explained | None:
@@ -193,11 +193,7 @@ def structured(logs: Sequence[Log], model: Model, effects: Sequence[str]) -> Exp
         for one in chosen:
             shape = one.shapes[min(rung, len(one.shapes) - 1)]
             guess = one.put(guess, shape, _little(one))
-        found = fit(
-            prepared.bench.sheets,
-            guess,
-            (*prepared.bench.base, *(f for c in chosen for f in c.free)),
-        )
+        found = fit(prepared.bench.sheets, guess, prepared.bench.free(chosen))
         if best is None or found.cost < best.cost:
             best = found
     return prepared.bench.explain(best.guess, chosen) if best else None

@@ -135,7 +135,7 @@ class _Search:
         first, count = 0, 0
         scatter, known = np.zeros_like(inverse), np.zeros_like(inverse)
         for sheet, mask in zip(self.sheets, self.train, strict=True):
-            blocks = whole_contacts(sheet)[mask]
+            blocks = sheet.whole_contacts[mask]
             here = slice(first, first + blocks.size)
             rest = (sheet.row_of == len(sheet.rows))[mask]
             moving = np.array(
@@ -178,19 +178,6 @@ class _Search:
             for mine, one, own in zip(left, there, self.folds, strict=True):
                 mine[own == k] = one[own == k]
         return tuple(left)
-
-
-def whole_contacts(sheet: Sheet) -> Int1D:
-    """(entry,) block of each entry, a contact that reaches into the next block with the first.
-
-    Slow errors of u pull C_j one way while the mass goes in and back again while it comes out; cut
-    in two, a contact would look like two strong pulls. A lasting contact is cut all the same.
-    """
-    free = (sheet.touched <= 0).all(axis=0)
-    before = np.maximum.accumulate(np.where(free, np.arange(free.size), 0))
-    began = sheet.blocks[before]
-    blocks: Int1D = np.where(sheet.blocks - began <= 1, began, sheet.blocks)
-    return blocks[sheet.sample_of]
 
 
 def _sizes(hessian: Float2D) -> Float1D:

@@ -17,7 +17,7 @@ from table_io.block import Block, Label
 from table_io.channels import rel_disp
 from twin.compare import PREDICTED
 from twin.compare.windows import TwinSetup, begin, follow
-from twin.learn.discover import Log, prepare
+from twin.learn.discover import Log, far, prepare
 from twin.learn.fit import Fit, fit, slopes
 from twin.learn.guess import ZERO, Free, Guess, effect_free
 from twin.learn.naming import Bench
@@ -97,7 +97,16 @@ def identify(logs: Sequence[Log], blocks: Sequence[Sequence[Block]], model: Mode
         *misplaced(sheets, joint, crossed),
     )  # fmt: skip
     return Identified(
-        bench, began, joint, fixed, parts, asymmetry, crossed, windows, warnings, prepared.notes
+        bench,
+        began,
+        joint,
+        fixed,
+        parts,
+        asymmetry,
+        crossed,
+        windows,
+        warnings,
+        (*prepared.notes, *far(model, joint)),
     )
 
 

@@ -1,20 +1,22 @@
 """Which effects are missing: forward selection with swaps, judged on what was held out.
 
 Each round is: all candidates by linear algebra about what is known so far (`search`), the best few
-refitted whole, each on two thirds of the steps and judged on the third, in turn.
+refitted whole on everything, and judged on each third of the steps by a fit to the other two
+that is one Gauss-Newton step away.
 """
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
-from table_io.block import Float1D
+from table_io.block import Float1D, Int1D
 from twin.learn.fit import Fit, fit
 from twin.learn.guess import Free, Guess
 from twin.learn.library import Candidate, general
-from twin.learn.search import Finding, folds_of, nothing, products, subsets
+from twin.learn.search import folds_of, products, ranked
 from twin.learn.sheet import Sheet
 
 MOST_EFFECTS = 3
@@ -35,12 +37,15 @@ class Explained:
 
     effects: tuple[Candidate, ...]
     fit: Fit
-    left: tuple[Float1D, ...]  # per log, (entry,) held-out residual over noise
-    converged: bool
 
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(one.name for one in self.effects)
+
+    @property
+    def left(self) -> tuple[Float1D, ...]:
+        """Per log, (entry,) residual over the noise where it was held out."""
+        return self.fit.left
 
     @property
     def cost(self) -> float:
@@ -63,9 +68,17 @@ class Bench:
 
     def explain(self, guess: Guess, effects: Sequence[Candidate]) -> Explained:
         """The effects with the base, fitted on everything and held out fold by fold."""
-        free = (*self.base, *(one for effect in effects for one in effect.free))
-        found = fit(self.sheets, guess, free, folds=[folds_of(one) for one in self.sheets])
-        return Explained(tuple(effects), found, found.left, found.converged)
+        found = fit(self.sheets, guess, self.free(effects), folds=self.folds)
+        return Explained(tuple(effects), found)
+
+    def free(self, effects: Sequence[Candidate]) -> tuple[Free, ...]:
+        """What a fit moves: the base and the effects' own."""
+        return (*self.base, *(one for effect in effects for one in effect.free))
+
+    @cached_property
+    def folds(self) -> tuple[Int1D, ...]:
+        """Per log, (entry,) in which fold each entry is held out."""
+        return tuple(folds_of(one) for one in self.sheets)
 
     def gain(self, before: Explained, after: Explained) -> tuple[float, float, float]:
         """(share of the squares that is gained, the most in one row, standard errors of it).
@@ -185,25 +198,20 @@ def _refitted(
     if dropped is not None:
         guess = guess.without(dropped.name)
         guess = bench.explain(guess, kept).fit.guess
-    free = (*bench.base, *(one for effect in kept for one in effect.free))
     taken = {one.name for one in kept}
     general_terms = library is not None
     if library is None:
         library = [one for one in bench.library if one.name not in taken and one is not dropped]
     if not library:
         return []
-    found = products(bench.sheets, guess, free, library)
+    found = products(bench.sheets, guess, bench.free(kept), library)
+    best = ranked(found, REFITTED_GENERAL if general_terms else REFITTED)
     outcome = []
-    without = nothing(found).cost
-    ranked = subsets(found, 1, REFITTED_GENERAL if general_terms else REFITTED)
-    for place, one in enumerate(ranked):
-        hopeless = place >= LEAST_REFITTED and one.cost > HOPELESS * ranked[0].cost
-        if hopeless or one.cost > (1.0 - WORTH_A_FIT) * without:
+    for place, one in enumerate(best):
+        hopeless = place >= LEAST_REFITTED and one.cost > HOPELESS * best[0].cost
+        if hopeless or one.cost > (1.0 - WORTH_A_FIT) * found.without:
             break
-        tell(" + ".join((*(k.name for k in kept), *one.names)))
-        outcome.append(bench.explain(one.put(guess), (*kept, *_of(one))))
+        effects = (*kept, one.candidate)
+        tell(" + ".join(k.name for k in effects))
+        outcome.append(bench.explain(one.put(guess), effects))
     return outcome
-
-
-def _of(found: Finding) -> tuple[Candidate, ...]:
-    return tuple(one.candidate for one in found.variants)

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from table_io.block import Bool2D
+from table_io.records import Step
 from twin.learn.fit import Fit, fit, slopes
 from twin.learn.guess import GAP, ZERO, Free, Guess
 from twin.learn.onsets import Onsets
 from twin.learn.sheet import Sheet
-from twin.learn.where import Step
 
 LEAST_BLOCKS = 6  # in a part: fewer and its spread is not known
 APART = 4.0  # standard deviations at which two estimates disagree: some thirty are compared

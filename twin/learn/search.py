@@ -1,13 +1,13 @@
-"""Which effects explain what a guess leaves: all subsets at once, by linear algebra.
+"""Which effects explain what a guess leaves: all candidates at once, by linear algebra.
 
 About a fitted guess the residual is linear in the base's parameters and in the amplitude of every
 candidate. One pass makes the products of all slopes, summed over every unit (a step of the sweep);
-after that any subset is fitted on some units and judged on the others without the data.
+after that any candidate is fitted on some units and judged on the others without the data.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import pairwise
 
 import numpy as np
 
@@ -44,7 +44,12 @@ class Products:
     variants: tuple[Variant, ...]
     scale: Float1D
 
-    def held_out(self, chosen: Sequence[int]) -> tuple[Float1D, Float1D] | None:
+    @property
+    def without(self) -> float:
+        """Squares that the base alone leaves where it was not fitted."""
+        return float(self.held_out(())[0].sum())
+
+    def held_out(self, chosen: Sequence[int]) -> tuple[Float1D, Float1D]:
         """((unit,) squares left on units that were not fitted, (p,) mean step of the chosen)."""
         places = [*range(self.base), *chosen]
         hessian = self.hessian[:, places][:, :, places]
@@ -126,64 +131,40 @@ def products(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Finding:
-    """A subset and what it leaves on the units that were not used to fit it."""
+    """A candidate at one rung, and what it leaves on the units that were not used to fit it."""
 
-    variants: tuple[Variant, ...]
+    variant: Variant
     left: Float1D  # (unit,) sums of squares
-    amplitudes: tuple[float, ...]
+    amplitude: float
+
+    @property
+    def candidate(self) -> Candidate:
+        return self.variant.candidate
 
     @property
     def cost(self) -> float:
         return float(self.left.sum())
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(one.candidate.name for one in self.variants)
-
     def put(self, guess: Guess) -> Guess:
-        """The guess with these effects at their first estimates."""
-        for one, amplitude in zip(self.variants, self.amplitudes, strict=True):
-            free = one.candidate.amplitude
-            start = one.candidate.vanishing + amplitude
-            inside = min(max(start, free.low), free.high)
-            guess = one.candidate.put(guess, one.shape, inside)
-        return guess
+        """The guess with this candidate at its first estimate."""
+        free = self.candidate.amplitude
+        start = self.candidate.vanishing + self.amplitude
+        return self.candidate.put(guess, self.variant.shape, min(max(start, free.low), free.high))
 
 
-def subsets(found: Products, size: int, most: int) -> tuple[Finding, ...]:
-    """The best subsets of so many candidates, the best of each set of names, best first."""
-    best: dict[tuple[str, ...], Finding] = {}
-    for variants in _sets(found.variants, size):
-        one = _tried(found, variants)
-        if one is None:
-            continue
-        names = tuple(sorted(one.names))
-        if names not in best or one.cost < best[names].cost:
-            best[names] = one
+def ranked(found: Products, most: int) -> tuple[Finding, ...]:
+    """The best candidates, each at its best rung, best first."""
+    best: dict[str, Finding] = {}
+    for variant in found.variants:
+        one = _tried(found, variant)
+        if one is not None:
+            name = one.candidate.name
+            best[name] = min(best.get(name, one), one, key=lambda finding: finding.cost)
     return tuple(sorted(best.values(), key=lambda one: one.cost)[:most])
 
 
-def nothing(found: Products) -> Finding:
-    """What the base alone leaves."""
-    one = _tried(found, ())
-    assert one is not None
-    return one
-
-
-def _sets(variants: tuple[Variant, ...], size: int) -> Iterator[tuple[Variant, ...]]:
-    for some in combinations(variants, size):
-        if len({one.candidate.name for one in some}) == size:
-            yield some
-
-
-def _tried(found: Products, variants: tuple[Variant, ...]) -> Finding | None:
-    """None where an amplitude comes out with a sign that it cannot have."""
-    places = [one.place for one in variants]
-    outcome = found.held_out(places)
-    if outcome is None:
-        return None
-    left, scaled = outcome
-    amplitudes = scaled / found.scale[places]
-    if any(one.sign * a < 0 for one, a in zip(variants, amplitudes, strict=True)):
-        return None
-    return Finding(variants, left, tuple(float(a) for a in amplitudes))
+def _tried(found: Products, variant: Variant) -> Finding | None:
+    """None where the amplitude comes out with a sign that it cannot have."""
+    left, scaled = found.held_out([variant.place])
+    amplitude = float(scaled[0] / found.scale[variant.place])
+    return Finding(variant, left, amplitude) if variant.sign * amplitude >= 0 else None

@@ -128,6 +128,20 @@ class Sheet:
         """(entry,) block of each entry of a residual."""
         return self.blocks[self.sample_of]
 
+    @cached_property
+    def whole_contacts(self) -> Int1D:
+        """(entry,) block of each entry, a contact that reaches into the next block with the first.
+
+        Slow errors of u pull C_j one way while the mass goes in and back again while it comes out;
+        cut in two, a contact would look like two strong pulls. A lasting contact is cut all the
+        same.
+        """
+        free = (self.touched <= 0).all(axis=0)
+        before = np.maximum.accumulate(np.where(free, np.arange(free.size), 0))
+        began = self.blocks[before]
+        whole: Int1D = np.where(self.blocks - began <= 1, began, self.blocks)
+        return whole[self.sample_of]
+
     def measured(self, m: Motion, mass_kg: float, guess: Guess | None = None) -> Float2D:
         """(3, sample): damper force from the balance of a mass, F_R, -F_L in N."""
         off = {what: guess.zero(self.number, what) if guess else 0.0 for what in TARED}

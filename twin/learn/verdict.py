@@ -60,23 +60,13 @@ def judge(
     if not best.effects:
         return _nothing_named(bench, named, floor, general)
     left = max(best.cost - floor, 0.0)
-    others = _as_good(bench, named)
+    rivals = _rivals(bench, named)
+    as_good = [one for one, errors in rivals if one.cost <= best.cost or errors < AS_GOOD]
+    others = tuple({frozenset(one.names): one for one in reversed(as_good)}.values())
     remainder = left > LEFT * gap and left > VISIBLE * floor
-    sure = _confidence(bench, named, left / gap)
-    if general is not None and not beside:
-        why = f"{general.names[-1]} explains what {' + '.join(best.names)} cannot"
-        return Verdict("unexplained", best, min(sure, 0.3), (), general, floor, True, why)
-    bent = _gave_way(named, start or {})
-    if bent:
-        why = f"{' + '.join(best.names)} would close the gap only if {bent}"
-        return Verdict("unexplained", best, min(sure, 0.3), (), general, floor, True, why)
-    if remainder and (null.cost - best.cost) < PARTIAL * gap:
-        why = "the best effects close less than half of the gap"
-        return Verdict("unexplained", best, min(sure, 0.3), (), None, floor, True, why)
-    stuck = [one.amplitude.name for one in best.effects if one.amplitude.name in best.fit.at_bound]
-    if remainder and stuck:
-        why = f"{', '.join(stuck)} stands at its bound, and more is left"
-        return Verdict("unexplained", best, min(sure, 0.3), (), general, floor, True, why)
+    sure = _confidence(named, rivals, left / gap)
+    if doubt := _doubt(named, None if beside else general, start or {}, remainder, gap):
+        return Verdict("unexplained", best, min(sure, 0.3), (), general, floor, True, doubt)
     if others:
         names = "; ".join(" + ".join(one.names) for one in others)
         why = f"as good as {' + '.join(best.names)}: {names}"
@@ -89,6 +79,28 @@ def judge(
     elif remainder:
         why = "more is left, unexplained"
     return Verdict("named", best, sure, (), general, floor, remainder, why)
+
+
+def _doubt(
+    named: Named,
+    general: Explained | None,
+    start: Mapping[str, float],
+    remainder: bool,
+    gap: float,
+) -> str:
+    """Why the best effects are no names after all; empty where they are."""
+    best = named.best
+    names = " + ".join(best.names)
+    if general is not None:
+        return f"{general.names[-1]} explains what {names} cannot"
+    if bent := _gave_way(named, start):
+        return f"{names} would close the gap only if {bent}"
+    if remainder and (named.null.cost - best.cost) < PARTIAL * gap:
+        return "the best effects close less than half of the gap"
+    stuck = [one.amplitude.name for one in best.effects if one.amplitude.name in best.fit.at_bound]
+    return (
+        f"{', '.join(stuck)} stands at its bound, and more is left" if remainder and stuck else ""
+    )
 
 
 def _nothing_named(bench: Bench, named: Named, floor: float, general: Explained | None) -> Verdict:
@@ -142,20 +154,18 @@ def _factor(a: float, b: float) -> float:
     return max(a / b, b / a)
 
 
-def _as_good(bench: Bench, named: Named) -> tuple[Explained, ...]:
-    """The sets of other effects, as many, that are not worse by more than chance."""
+def _rivals(bench: Bench, named: Named) -> list[tuple[Explained, float]]:
+    """(a set of other effects, as many, that closes nearly as much; standard errors by which it is
+    worse)."""
     best = named.best
-    found: dict[frozenset[str], Explained] = {}
-    for one in named.tried:
-        names = frozenset(one.names)
-        if len(one.effects) != len(best.effects) or names == frozenset(best.names):
-            continue
-        far = named.null.cost - one.cost < NEARLY * (named.null.cost - best.cost)
-        if far or _limit(one, best):
-            continue
-        if one.cost <= best.cost or bench.gain(one, best)[2] < AS_GOOD:
-            found.setdefault(names, one)
-    return tuple(found.values())
+    return [
+        (one, bench.gain(one, best)[2])
+        for one in named.tried
+        if len(one.effects) == len(best.effects)
+        and frozenset(one.names) != frozenset(best.names)
+        and named.null.cost - one.cost >= NEARLY * (named.null.cost - best.cost)
+        and not _limit(one, best)
+    ]
 
 
 def _limit(one: Explained, best: Explained) -> bool:
@@ -164,22 +174,14 @@ def _limit(one: Explained, best: Explained) -> bool:
     return swapped and "coulomb_friction" in best.names
 
 
-def _confidence(bench: Bench, named: Named, left: float) -> float:
+def _confidence(named: Named, rivals: Sequence[tuple[Explained, float]], left: float) -> float:
     """Between 0 and 1: how much better than the next, and how little is left."""
     best = named.best
-    rivals = [
-        bench.gain(one, best)[2]
-        for one in named.tried
-        if len(one.effects) == len(best.effects)
-        and frozenset(one.names) != frozenset(best.names)
-        and not _limit(one, best)
-        and named.null.cost - one.cost > NEARLY * (named.null.cost - best.cost)
-    ]
-    margin = min(rivals, default=10.0)
+    margin = min((errors for _, errors in rivals), default=10.0)
     apart = 1.0 / (1.0 + math.exp(-(margin - 2.0)))
     # in parts of the gap's rms: the form of a law may leave a sixth, half is another law
     whole = 0.4 + 0.6 / (1.0 + math.exp((math.sqrt(max(left, 0.0)) - 0.27) / 0.04))
-    held = 1.0 if best.converged and not best.fit.at_bound else 0.6
+    held = 1.0 if best.fit.converged and not best.fit.at_bound else 0.6
     return 0.98 * apart * whole * held
 
 

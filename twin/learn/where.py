@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from table_io.block import Float1D, Int1D, Label
+from table_io.records import Step
 from twin.learn.sheet import Sheet
 
 PHASES = ("flight", "contact_right", "contact_left", "contact_both")
@@ -38,15 +39,6 @@ class Cell:
     mean_square: float
     excess: float
     errors: float  # standard errors by which the excess differs from none
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """What the recording says of a step: number, frequency in Hz, direction."""
-
-    index: int
-    frequency_hz: float
-    direction: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,7 +211,7 @@ def harmonics_of(
             x = np.linalg.lstsq(design, values[here], rcond=None)[0]
             power[0] += x[0] ** 2 * t.size
             power[1:] += 0.5 * (x[1 : HARMONICS + 1] ** 2 + x[HARMONICS + 1 :] ** 2) * t.size
-            power -= 3.0 * np.array([1.0, *[1.0] * HARMONICS])  # what noise would give, generously
+            power -= 3.0  # what noise would give, generously
     power = np.maximum(power, 0.0)
     total = power.sum()
     return tuple(int(k) for k in np.flatnonzero(power > NOTABLE * total)) if total > 0 else ()

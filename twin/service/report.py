@@ -3,20 +3,17 @@
 What the summary states is shown as it stands there; the file refers to nothing outside itself.
 """
 
-import base64
 import json
-import math
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from table_io.card import BadInput
 from table_io.records import Check, Event, Fault, Gap, Level, Params, Response, Timing, Trip
 from twin.service.evidence import Run, Summary, cards, gather, quantity
 from twin.service.figures import Picture, draw_all
+from twin.service.page import HERE, inside, page, significant
 from twin.stream.mcap_log import Recording, read
 
 MOST_ROWS = 200
@@ -29,9 +26,9 @@ def write_report(folder: Path, recording: Recording | None = None) -> Path:
     """
     summary = _summary(folder / "summary.json")
     run = gather(recording or read(folder / "run.mcap"), summary)
-    page = folder / "report.html"
-    page.write_text(render(run, draw_all(run, folder / "figures")), encoding="utf-8")
-    return page
+    path = folder / "report.html"
+    path.write_text(render(run, draw_all(run, folder / "figures")), encoding="utf-8")
+    return path
 
 
 def _summary(path: Path) -> Summary:
@@ -51,38 +48,18 @@ def _summary(path: Path) -> Summary:
     return dict(summary)
 
 
-def significant(value: Any, digits: int = 3) -> str:
-    """A number with that many significant digits, never in E notation; a dash for none."""
-    if not isinstance(value, int | float) or not math.isfinite(value):
-        return "–"
-    if value == 0:
-        return "0"
-    decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
-    if decimals > 9:
-        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
-        return f"{mantissa}·10^{int(exponent)}".replace("-", "−")
-    return f"{value:.{decimals}f}".replace("-", "−")
-
-
 def render(run: Run, pictures: list[Picture]) -> str:
     """The page, with every picture inside it."""
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["sig"] = significant
     start, recording = run.recording.start, run.recording
     texts = {name: getattr(start, f"{name}_toml") for name in ("profile", "rig", "model")}
-    return environment.get_template("report.html").render(
+    return page(
+        HERE / "report.html",
         run=run,
         summary=run.summary,
         start=start,
         headline=headline(run),
         cards={name: cards(text) for name, text in texts.items()},
-        images=[(one, base64.b64encode(one.path.read_bytes()).decode()) for one in pictures],
+        images=inside(pictures),
         demand={step.index: step.acceleration_m_s2 for step in start.steps},
         texts=[(name, sha256(text.encode()).hexdigest(), text) for name, text in texts.items()],
         timings={one.component: one for one in recording.of(Timing)},

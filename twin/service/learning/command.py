@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from table_io.card import BadInput, parse
+from table_io.card import BadInput
 from table_io.clock import RealClock
 from table_io.profile import Specimen
 from twin.learn.discover import Discovery, Log, discover, transferred
@@ -24,8 +24,7 @@ from twin.service.terminal import console, interruptible, say
 
 def model_of(name: str) -> tuple[Model, ModelCard]:
     """(the model of a card, the card): mass and gaps come with each log."""
-    card, text = read_model(name)
-    card = parse(text, ModelCard, name)
+    card, _ = read_model(name)
     return card.model(Specimen(mass_kg=1.0, gap_mm=float("inf"))), card
 
 

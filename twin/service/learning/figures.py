@@ -15,10 +15,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from table_io.block import Float1D, Float2D
+from table_io.records import Step
 from twin.learn.general import GENERAL
 from twin.learn.guess import ZERO
 from twin.learn.sheet import FORCES, Sheet
-from twin.learn.where import Cell, Step
+from twin.learn.where import Cell
 from twin.service.close_ups import COLOUR, GUIDE, WIDTH, Drawn
 from twin.service.figures import STYLE, Picture
 from twin.service.learning.figures_evidence import Shown, phases_of, repeats

@@ -13,8 +13,7 @@ import numpy as np
 
 from table_io.block import Block, Float1D, Int1D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
-from table_io.records import Point
-from table_io.records import Step as Driven
+from table_io.records import Point, Step
 from twin.compare.cycles import Scale
 from twin.compare.pipeline import Setup, start, step
 from twin.compare.windows import TwinSetup
@@ -23,7 +22,7 @@ from twin.learn.guess import Guess
 from twin.learn.motion import Motion
 from twin.learn.naming import Explained
 from twin.learn.sheet import FORCES, Sheet
-from twin.learn.where import PHASES, Step, phase_of
+from twin.learn.where import PHASES, phase_of
 from twin.model.parameters import resonance
 
 LEAST_ENTRIES = 20  # of a step in a row, to be looked at
@@ -244,7 +243,7 @@ def free_run(sheet: Sheet, steps: Sequence[Step], one: Explained) -> list[Point]
     u_star, a_star, _ = resonance(replace(sheet.reference.parameters, mass=m.mass_kg), level)
     gaps = model.parameters.gap_r, model.parameters.gap_l
     scale = Scale(model.parameters, m.rate_hz, sheet.contact_n, u_star, a_star, gaps)
-    driven = tuple(Driven(s.index, s.direction, s.frequency_hz, level) for s in steps)
+    driven = tuple(replace(one, acceleration_m_s2=level) for one in steps)
     setup = Setup(twin, scale, driven, max(cycles))
     state, _ = start(setup, first)
     _, items = step(setup, state, block)

@@ -7,18 +7,15 @@ from pathlib import Path
 
 from rich.table import Table
 
-from table_io.block import Block
 from table_io.card import BadInput
 from table_io.clock import RealClock
-from twin.learn.discover import Log
 from twin.learn.fit import Fit
 from twin.learn.guess import GAP, ZERO, Guess, log_of
 from twin.learn.identify import WINDOW_S, Identified, identify
 from twin.learn.parts import local_gap
 from twin.service.folders import new_folder, new_run
 from twin.service.learning.command import model_of
-from twin.service.learning.logs import log_of as made_ready
-from twin.service.learning.logs import notes_on, opened
+from twin.service.learning.logs import taken
 from twin.service.learning.told import SURE, Json, model_toml, number
 from twin.service.summary import dumps
 from twin.service.terminal import console, print_table, say
@@ -39,12 +36,15 @@ def identify_command(paths: Sequence[Path], model: str, out: Path | None) -> int
     began = clock.now()
     target = _target(out)
     start, card = model_of(model)
-    logs, blocks, notes = _read(paths)
+    with console.status("reading"):
+        read = [*taken(paths)]
     with console.status("fitting the forces along the measured motion"):
-        found = identify(logs, blocks, start)
-    names = ", ".join(log.readings.name for log in logs)
+        found = identify([one.log for one in read], [one.blocks for one in read], start)
+    names = ", ".join(one.log.readings.name for one in read)
     text, left_out = model_toml(_lean(found.fit), f"{card.title}; identified", METHOD, names)
-    told = told_json(found, [*notes, *found.notes, *left_out, GAPS])
+    told = told_json(
+        found, [*(note for one in read for note in one.notes), *found.notes, *left_out, GAPS]
+    )
     told["start"] = model
     told["seconds"] = clock.now() - began
     folder = new_folder(target.with_suffix(""), "")
@@ -68,19 +68,6 @@ def _target(out: Path | None) -> Path:
         raise BadInput(f"--out {out}: exists; nothing is ever overwritten. Give a new name")
     new_folder(out.with_suffix(""), "").rmdir()  # made at the end: nothing is left of a failure
     return out
-
-
-def _read(paths: Sequence[Path]) -> tuple[list[Log], list[tuple[Block, ...]], list[str]]:
-    """(the logs, their measured blocks, what to say of them)."""
-    logs: list[Log] = []
-    blocks: list[tuple[Block, ...]] = []
-    notes: list[str] = []
-    with console.status("reading"):
-        for recording in opened(paths):
-            logs.append(made_ready(recording))
-            blocks.append(recording.pieces("meas"))
-            notes += notes_on(recording)
-    return logs, blocks, notes
 
 
 def _lean(fit: Fit) -> Fit:

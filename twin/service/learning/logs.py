@@ -2,8 +2,8 @@
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,6 @@ from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.profile import Profile
 from twin.learn.discover import Log
 from twin.learn.readings import alive, readings_of
-from twin.learn.where import Step
 from twin.service.recordings import log_path, open_log
 from twin.stream.mcap_log import Recording
 
@@ -24,16 +23,22 @@ MUCH = 5.0  # times the threshold of contact, or the opposite sign: surely borne
 CLIPPED = 10  # samples in a row at a channel's very extreme
 
 
+@dataclass(frozen=True, eq=False)
+class Taken:
+    """A recording made ready: what can be learned from, its measured blocks, what to say of it."""
+
+    log: Log
+    blocks: tuple[Block, ...]
+    notes: tuple[str, ...]
+
+
 def logs_of(paths: Sequence[Path]) -> tuple[tuple[Log, ...], tuple[str, ...]]:
     """(the logs, what to say of them); BadInput names a log that nothing can be learned from."""
-    logs, notes = [], []
-    for recording in opened(paths):
-        logs.append(log_of(recording))
-        notes += notes_on(recording)
-    return tuple(logs), tuple(notes)
+    ready = [*taken(paths)]
+    return tuple(one.log for one in ready), tuple(note for one in ready for note in one.notes)
 
 
-def opened(paths: Sequence[Path]) -> Iterator[Recording]:
+def taken(paths: Sequence[Path]) -> Iterator[Taken]:
     """The recordings, one by one; BadInput where one is given twice, whatever its name."""
     seen: dict[bytes, Path] = {}
     for path in paths:
@@ -43,47 +48,45 @@ def opened(paths: Sequence[Path]) -> Iterator[Recording]:
         if content in seen:
             raise BadInput(f"{path}: the same log as {seen[content]}; give each log once")
         seen[content] = path
-        yield recording
+        yield take(recording)
 
 
-def log_of(recording: Recording) -> Log:
+def take(recording: Recording) -> Taken:
     """One recording made ready."""
     start, where = recording.start, str(recording.path)
     if start.source == "model":
         raise BadInput(f"{where}: holds a model alone, nothing measured; give a recorded test")
     profile = parse(start.profile_toml, Profile, where)
-    specimen = profile.specimen
-    blocks = tuple(map(_whole_sides(recording), recording.pieces("meas")))
-    readings = readings_of(blocks, named(recording), specimen.mass_kg, specimen.gaps_m)
+    specimen, blocks = profile.specimen, recording.pieces("meas")
+    dead = _dead(blocks)
+    readings = readings_of(
+        _whole_sides(blocks, dead), named(recording), specimen.mass_kg, specimen.gaps_m
+    )
     if not {*readings.channels} & {*ACCELERATIONS}:
         raise BadInput(
             f"{where}: no force can be told; needed: mass_acc_m_s2 or table_acc_m_s2 for that of "
             "the mass, or damper_force_n"
         )
-    steps = tuple(Step(one.index, one.frequency_hz, one.direction) for one in start.steps)
-    return Log(readings, profile.comparison.contact_n, steps)
+    log = Log(readings, profile.comparison.contact_n, start.steps)
+    return Taken(log, blocks, tuple(_notes(recording, profile, blocks, dead)))
 
 
-def dead(recording: Recording) -> tuple[str, ...]:
+def _dead(blocks: Sequence[Block]) -> frozenset[str]:
     """The channels that say nothing from beginning to end."""
-    blocks = recording.pieces("meas")
     names = blocks[0].channels if blocks else ()
-    return tuple(name for name in names if not any(alive(block.channel(name)) for block in blocks))
+    return frozenset(n for n in names if not any(alive(block.channel(n)) for block in blocks))
 
 
-def _whole_sides(recording: Recording) -> Callable[[Block], Block]:
-    """What takes the load cells out of a block where one is dead: half a force is worse than none.
+def _whole_sides(blocks: tuple[Block, ...], dead: frozenset[str]) -> tuple[Block, ...]:
+    """Without the load cells where one is dead: half a force is worse than none.
 
     The inertia of the mass still gives the sum of all forces.
     """
-    gone = {*CELLS} if {*CELLS} & {*dead(recording)} else set()
-
-    def kept(block: Block) -> Block:
-        rows = [k for k, name in enumerate(block.channels) if name not in gone]
-        names = tuple(block.channels[k] for k in rows)
-        return replace(block, channels=names, values=block.values[rows])
-
-    return kept if gone else lambda block: block
+    if not dead & {*CELLS}:
+        return blocks
+    rows = [k for k, name in enumerate(blocks[0].channels) if name not in CELLS]
+    names = tuple(blocks[0].channels[k] for k in rows)
+    return tuple(replace(block, channels=names, values=block.values[rows]) for block in blocks)
 
 
 def named(recording: Recording) -> str:
@@ -92,37 +95,36 @@ def named(recording: Recording) -> str:
     return path.parent.name if path.name == "run.mcap" else path.stem
 
 
-def notes_on(recording: Recording) -> list[str]:
+def _notes(
+    recording: Recording, profile: Profile, blocks: Sequence[Block], dead: frozenset[str]
+) -> Iterator[str]:
     """What a reader of the verdict should know of the recording."""
-    name, notes = named(recording), []
-    blocks, silent = recording.pieces("meas"), dead(recording)
+    name = named(recording)
     if recording.missing_samples:
-        notes.append(f"{name}: {recording.missing_samples} samples are missing; none is invented")
+        yield f"{name}: {recording.missing_samples} samples are missing; none is invented"
     if len({one.frequency_hz for one in recording.start.steps}) == 1:
-        notes.append(
-            f"{name}: one frequency only; there damping, lag, relaxation and hysteresis look alike"
-        )
-    notes += _bearing(recording)
+        alike = "damping, lag, relaxation and hysteresis look alike"
+        yield f"{name}: one frequency only; there {alike}"
+    yield from _bearing(recording, profile, blocks, dead)
     for channel in blocks[0].channels if blocks else ():
         if _clipped(blocks, channel):
-            notes.append(f"{name}: {channel} stands at its extreme for a while: clipped?")
+            yield f"{name}: {channel} stands at its extreme for a while: clipped?"
         elif lost := sum(int(np.isnan(block.channel(channel)).sum()) for block in blocks):
-            notes.append(f"{name}: {lost} samples of {channel} are lost; none is invented")
-        if channel in silent:
+            yield f"{name}: {lost} samples of {channel} are lost; none is invented"
+        if channel in dead:
             fallen = "the load cells, all of which" if channel in CELLS else "it"
-            notes.append(f"{name}: {channel} is dead; effects that need {fallen} fall away")
-    return notes
+            yield f"{name}: {channel} is dead; effects that need {fallen} fall away"
 
 
-def _bearing(recording: Recording) -> list[str]:
+def _bearing(
+    recording: Recording, profile: Profile, blocks: Sequence[Block], dead: frozenset[str]
+) -> Iterator[str]:
     """What load cells read that the profile does not allow; BadInput where one has no sense."""
-    profile = parse(recording.start.profile_toml, Profile, str(recording.path))
-    least, found = MUCH * profile.comparison.contact_n, []
-    blocks = recording.pieces("meas")
+    least = MUCH * profile.comparison.contact_n
     sides = ("right", RIGHT_CELLS), ("left", LEFT_CELLS)
     for (side, cells), gap in zip(sides, profile.specimen.gaps_m, strict=True):
         for cell in cells:
-            if not blocks or cell not in blocks[0].channels or cell in dead(recording):
+            if not blocks or cell not in blocks[0].channels or cell in dead:
                 continue
             push, pull = _extremes(blocks, cell)
             if pull > max(least, MUCH * push):
@@ -131,11 +133,10 @@ def _bearing(recording: Recording) -> list[str]:
                     "positive: import it with gain = -1"
                 )
             if math.isinf(gap) and push > least:
-                found.append(
+                yield (
                     f"{named(recording)}: {cell} bears up to {push:.0f} N, but the profile says "
                     f"that there is no {side} bumper: give the gap"
                 )
-    return found
 
 
 def _extremes(blocks: Sequence[Block], channel: str) -> tuple[float, float]:

@@ -3,13 +3,11 @@
 Numbers are those of verdict.json; the file refers to nothing outside itself.
 """
 
-import base64
 import math
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from twin.learn.discover import Discovery, Log
 from twin.learn.guess import GAP
@@ -17,9 +15,8 @@ from twin.learn.search import LEAST_UNITS
 from twin.service.learning.figures import draw_all
 from twin.service.learning.figures_evidence import Shown, gates
 from twin.service.learning.told import REFITTED, Json
-from twin.service.report import significant
+from twin.service.page import inside, page, significant
 
-HERE = Path(__file__).parent
 WORDS = {
     "none": "Model and measurement agree to within the noise.",
     "named": "The model lacks {names}.",
@@ -37,12 +34,8 @@ def write_page(folder: Path, found: Discovery, logs: Sequence[Log], told: Json) 
     """Path of folder/report.html, with its figures in folder/figures."""
     shown = Shown(found, logs)
     pictures = draw_all(shown, told, folder / "figures")
-    environment = Environment(
-        loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    environment.filters["sig"] = significant
-    text = environment.get_template("page.html").render(
+    text = page(
+        Path(__file__).with_name("page.html"),
         told=told,
         sentence=sentence(told),
         held_out=held_out(shown),
@@ -51,15 +44,12 @@ def write_page(folder: Path, found: Discovery, logs: Sequence[Log], told: Json) 
         sections=SECTIONS,
         whole=found.named.whole,
         gates=gates(shown),
-        images={
-            section: [(one, base64.b64encode(one.path.read_bytes()).decode()) for one in some]
-            for section, some in pictures.items()
-        },
+        images={section: inside(some) for section, some in pictures.items()},
         model=(folder / "model.toml").read_text(encoding="utf-8"),
     )
-    page = folder / "report.html"
-    page.write_text(text, encoding="utf-8")
-    return page
+    path = folder / "report.html"
+    path.write_text(text, encoding="utf-8")
+    return path
 
 
 def titled(effect: Json) -> str:

@@ -60,7 +60,7 @@ def verdict_json(found: Discovery, seconds: float = 0.0, notes: Sequence[str] = 
         "fell_away": dict(found.prepared.away),
         "notes": [
             *notes,
-            *found.prepared.notes,
+            *found.notes,
             *suspicious(best),
             *([] if named.whole else [STOPPED]),
         ],
@@ -128,7 +128,7 @@ def suspicious(one: Explained) -> list[str]:
 
 def _why(found: Discovery) -> str:
     """The reason of the verdict; that a model only agrees with other numbers is no agreement."""
-    other = found.verdict.word == "none" and found.prepared.notes
+    other = found.verdict.word == "none" and found.notes
     return f"{found.verdict.why}{REFITTED if other else ''}"
 
 
@@ -143,7 +143,7 @@ def candidates_json(null: Explained, tried: Sequence[Explained]) -> list[Json]:
         {
             "id": " + ".join(one.names) or "nothing added",
             "held_out_error": math.sqrt(one.cost),
-            "converged": one.converged,
+            "converged": one.fit.converged,
             **({"at_bound": list(one.fit.at_bound)} if one.fit.at_bound else {}),
         }
         for one in sorted(best.values(), key=lambda one: one.cost)

@@ -1,17 +1,16 @@
 """Pictures, page and paper.json of the whole paper in one folder."""
 
-import base64
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from twin.model.card import ModelCard
 from twin.service.bundle import read_model
 from twin.service.figures import Picture
+from twin.service.page import inside, page
 from twin.service.paper import against, extra, families, loops, secondary
 from twin.service.paper.look import PAPER_STYLE, Drawing
 from twin.service.paper.rig import Rig
@@ -83,19 +82,13 @@ def write_page(
     rows: list[Row], found: Study, told: Told, sets: list[tuple[str, list[Picture]]], path: Path
 ) -> None:
     """One self-contained HTML file: the table, then each set of pictures."""
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    images = [
-        (title, [(one, base64.b64encode(one.path.read_bytes()).decode()) for one in pictures])
-        for title, pictures in sets
-    ]
+    images = [(title, inside(pictures)) for title, pictures in sets]
     counts = {verdict: sum(row.verdict == verdict for row in rows) for verdict in
               ("agrees", "agrees in kind", "departs")}  # fmt: skip
-    page = environment.get_template("paper.html").render(
+    text = page(
+        Path(__file__).with_name("paper.html"),
         rows=rows, sets=images, counts=counts, told=told, exact=found.exact,
         models={name: case.player.model.flat() for name, case in found.cases.items()},
         paper_model=told.text == read_model(PAPER_MODEL)[1],
     )  # fmt: skip
-    path.write_text(page, encoding="utf-8")
+    path.write_text(text, encoding="utf-8")

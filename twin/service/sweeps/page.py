@@ -1,14 +1,11 @@
 """The page of a batch, from its table and its summary alone."""
 
-import base64
 import json
 import math
 from pathlib import Path
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
 from table_io.card import BadInput
-from twin.service.report import significant
+from twin.service.page import inside, page
 from twin.service.summary import Json
 from twin.service.sweeps import TABLE
 from twin.service.sweeps.cases import gap_name
@@ -21,17 +18,15 @@ def write_page(folder: Path) -> Path:
 
     summary = _summary(folder / "summary.json")
     pictures = draw_all(read_rows(folder / TABLE), summary, folder / "figures")
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    environment.filters["sig"] = significant
-    environment.filters["gap"] = lambda gap: gap_name(math.inf if gap == "inf" else gap)
-    images = [(one, base64.b64encode(one.path.read_bytes()).decode()) for one in pictures]
-    page = folder / "report.html"
-    text = environment.get_template("batch.html").render(summary=summary, images=images)
-    page.write_text(text, encoding="utf-8")
-    return page
+    path = folder / "report.html"
+    text = page(
+        Path(__file__).with_name("batch.html"),
+        summary=summary,
+        images=inside(pictures),
+        gap=lambda gap: gap_name(math.inf if gap == "inf" else gap),
+    )
+    path.write_text(text, encoding="utf-8")
+    return path
 
 
 def _summary(path: Path) -> Json:
