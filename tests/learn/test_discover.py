@@ -68,6 +68,28 @@ def test_what_is_not_in_the_library_is_unexplained(truth: str) -> None:
     assert found.verdict.general is not None
 
 
+def test_friction_that_falls_with_speed_is_not_made_of_two_names() -> None:
+    """Coulomb friction and quadratic damping on a smaller dashpot come near it."""
+    truth = hidden("coulomb_friction", form="stribeck", fc=10.0, fs=60.0, stribeck_speed=0.02)
+    found = discover([log(truth)], SNM)
+    assert found.verdict.word == "unexplained", found.verdict.why
+    assert found.verdict.confidence <= 0.3
+    assert found.verdict.general is not None
+    assert "sign(v)" in found.verdict.general.names[-1]
+
+
+def test_a_bumper_that_pulls_is_seen_though_it_acts_for_milliseconds() -> None:
+    found = discover([log(hidden("adhesion", force=60.0))], SNM)
+    assert found.verdict.word == "unexplained", found.verdict.why
+    assert {"force_r1_n", "force_l1_n"} <= {*found.where.channels}
+    assert found.where.phase == "contact_both"
+    assert sum("pulls after it lets go" in note for note in found.notes) == 2
+    one = found.prepared.bench.sheets[0]
+    rows = one.row_of, found.named.null.left[0]
+    for name in ("right pull", "left pull"):
+        assert np.mean(rows[1][rows[0] == one.rows.index(name)] ** 2) > 10.0
+
+
 def test_without_the_truth_in_the_library_nothing_is_named_with_confidence() -> None:
     one = log(hidden("coulomb_friction", fc=30.0))
     found = discover([one], SNM, without=("coulomb_friction", "bouc_wen"))

@@ -27,7 +27,7 @@ from twin.learn.naming import Bench, Explained, Named, Tell, named
 from twin.learn.readings import Readings, derives_acc
 from twin.learn.sheet import Sheet, sheets_of
 from twin.learn.verdict import Verdict, judge
-from twin.learn.where import Cell, Where, cells, harmonics_of, repeated, where
+from twin.learn.where import Cell, Where, cells, harmonics_of, pulling, repeated, where
 from twin.model.model import Model
 
 LEAST_ENTRIES, LEAST_BLOCKS = 1000, 9
@@ -173,7 +173,8 @@ def discover(
     floor = min(least * repeated(bench.sheets, found.best.left), found.best.cost)
     verdict = judge(bench, found, floor, model.flat(), least)
     # with the effects found the base may be the specimen's again: what is far off then is said
-    notes = (*prepared.notes, *far(model, verdict.best.fit))
+    pulls = pulling(bench.sheets, verdict.best.left)
+    notes = (*prepared.notes, *far(model, verdict.best.fit), *pulls)
     before = cells(bench.sheets, found.null.left, floor)
     seen = where(before, steps, harmonics_of(bench.sheets, found.null.left, steps))
     after = cells(bench.sheets, verdict.best.left, floor)

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy.signal import lfilter
 
 from table_io.block import Float1D, Float2D
-from twin.learn.guess import Free
+from twin.learn.guess import SLIP, Free
 from twin.learn.motion import Motion
 
 GENERAL = "general"
@@ -101,15 +101,18 @@ def forces(
         name = key[len(GENERAL) + 1 : -len(".force")]
         width = values.get(f"{GENERAL}.{name}.width", 1.0)
         place, shape = name.split(" ", 1)
+        # dry friction passes through a standstill in one way, whatever its law above it
+        way = np.tanh(m.v / values[SLIP]) * np.where(m.v > 0, 1.0, -1.0) if SLIP in values else 1.0
         if shape == "resonator":
             out[0] += force * _resonator(m, width)
         elif place == "damper":
             column = DAMPER.get(shape) or DAMPER_WIDE[shape]
-            out[0] += force * column(m.u / scale.u, m.v / scale.v, width)
+            dry = way if "sign(v)" in shape else 1.0
+            out[0] += force * dry * column(m.u / scale.u, m.v / scale.v, width)
         else:
-            for side, (way, gap) in enumerate(zip((1.0, -1.0), gaps_m, strict=True)):
-                d = np.clip((way * m.u - gap) / scale.d, 0.0, None)
-                push = BUMPERS[shape](d, way * m.v / scale.v, width)
+            for side, (right, gap) in enumerate(zip((1.0, -1.0), gaps_m, strict=True)):
+                d = np.clip((right * m.u - gap) / scale.d, 0.0, None)
+                push = BUMPERS[shape](d, right * m.v / scale.v, width)
                 out[1 + side] += force * np.where(touched[side] > 0, push, 0.0)
     return out
 

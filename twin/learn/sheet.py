@@ -3,6 +3,7 @@
     damper          -M a - F_R - F_L - D     (the damper's force from the balance, or measured)
     right, left     F_R - model's, -(F_L - model's), where contact was measured
     mass, table     the kinematic gates, see `readings`; right and left cells: do they agree
+    right, left pull  what a side pulls just after it let go, where every law of ours has no force
     rest            what each channel reads before anything moves, and u; one entry each
 each divided by its noise. Without load cells the damper row holds all forces, and the model says
 where it touches. Nothing is simulated, so a fit converges from far and in chaos.
@@ -31,6 +32,8 @@ EDGE_S = 0.012  # next to a measured touch or release the low pass smears the ju
 BLOCK_S = 1.0  # of a block where there are no forcing cycles
 FORCES = ("damper", "right", "left")
 TARED = ("acc", "right", "left")
+PULLS = ("right pull", "left pull")
+SWING = 0.005  # of the largest push: by so much the low pass swings through zero after a release
 KEPT = 3  # motions of other beliefs that are remembered
 
 
@@ -86,10 +89,14 @@ class Sheet:
             for row in range(2):
                 touched = self.touched[row] > 0
                 used[1 + row] = m.moving & touched & (np.convolve(~touched, window, "same") == 0)
+        recent = np.concatenate([np.zeros(margin), np.ones(margin + 1)])
         change = np.abs(np.diff(self.touched, axis=1, prepend=self.touched[:, :1])).any(axis=0)
         smooth = np.convolve(change, window, "same") == 0
         for row, name in enumerate(self.rows):
-            if row >= len(FORCES):
+            if name in PULLS:
+                touched = self.touched[PULLS.index(name)] > 0
+                used[row] = m.moving & ~touched & (np.convolve(touched, recent, "same") > 0)
+            elif row >= len(FORCES):
                 side = {"right cells": 0, "left cells": 1}.get(name)
                 used[row] = m.moving & smooth if side is None else used[1 + side]
         return used
@@ -104,7 +111,9 @@ class Sheet:
     @cached_property
     def rows(self) -> tuple[str, ...]:
         """The names of the rows that have samples; the one after them is that of the rest."""
-        return (*FORCES, *(one.body for one in self.motion().surprises))
+        m = self.motion()
+        pulls = PULLS if m.cells and m.damper is None else ()
+        return (*FORCES, *(one.body for one in m.surprises), *pulls)
 
     @cached_property
     def row_of(self) -> Int1D:
@@ -218,6 +227,8 @@ class Sheet:
         if self.whitening is not None:
             rows[0] = self.readings.grid.filtered(rows[0], self.whitening)
         everything = [*rows, *(self._surprise(one, guess) for one in m.surprises)]
+        if m.cells and m.damper is None:
+            everything += [*self._pulls(m, guess)]
         samples = [row[used] for row, used in zip(everything, self.used, strict=True)]
         return np.concatenate([*samples, self._at_rest(guess)]) / self.weight
 
@@ -227,6 +238,19 @@ class Sheet:
         mass, table = parts.get(one.body, (0, 0))
         off = mass * guess.zero(self.number, "acc") + table * guess.zero(self.number, "table")
         return one.values - one.per_acc * off if off else one.values
+
+    def _pulls(self, m: Motion, guess: Guess) -> Float2D:
+        """(2, sample) pull of each side over the noise of its cells; what it pushes is no pull.
+
+        Of mean square 1 at the most where there is noise alone: half of it counts. The low pass
+        swings through zero by a small part of the push that ended; that is no pull either.
+        """
+        sides = (m.right, "right", m.noise.right), (m.left, "left", m.noise.left)
+        return np.array([
+            np.minimum(push - guess.zero(self.number, name) + SWING * np.nanmax(push), 0.0)
+            * math.sqrt(2.0) / rms
+            for push, name, rms in sides
+        ])  # fmt: skip
 
     def _at_rest(self, guess: Guess) -> Float1D:
         """What is read at rest beyond the sensors' own offsets, and beyond the doubt of a tare."""

@@ -17,6 +17,7 @@ AS_GOOD = 3.5  # standard errors by which others must be worse, else the data ca
 NEARLY = 0.8  # of what the best close: others that close less are not as good, however few the data
 LEFT = 0.06  # of the gap's excess: more than this left and not all is explained
 OUTSIDE = 0.012  # of the gap's excess: a general term in place of a name that closes more is better
+IN_PLACE = 0.001  # of the gap's excess: the same for one of several names, the others kept
 VISIBLE = 0.05  # excess in parts of the floor from which on there is a gap at all
 APART = 1.6  # a factor: a base parameter so far off both start and null has given way to a name
 ALIKE = 1.2  # a factor: start and null so near say the same, and the start is no second opinion
@@ -124,6 +125,9 @@ def _better(bench: Bench, named: Named, floor: float) -> Explained | None:
         gain = best.cost - one.cost
         beside = len(one.effects) > len(best.effects) > 0
         if gain > (LEFT if beside else OUTSIDE) * gap and bench.gain(best, one)[2] > AS_GOOD:
+            return one
+        in_place = len(one.effects) == len(best.effects) > 1
+        if in_place and gain > IN_PLACE * gap and bench.gain(best, one)[2] > AS_GOOD:
             return one
         if len(one.effects) < len(best.effects) and gain > -OUTSIDE * gap:
             return one  # one term does what several effects do

@@ -12,18 +12,20 @@ import numpy as np
 
 from table_io.block import Float1D, Int1D, Label
 from table_io.records import Step
-from twin.learn.sheet import Sheet
+from twin.learn.sheet import PULLS, Sheet
 
 PHASES = ("flight", "contact_right", "contact_left", "contact_both")
 MOST = 0.8  # of the excess: what is said to lie somewhere lies there so far
 NOTABLE = 0.15  # of the excess: a row or harmonic with less is not mentioned
 HARMONICS = 7
+PULLED = 3.0  # mean square over the noise from which on a side is said to pull
 CHANNELS = {
     "damper": ("mass_acc_m_s2",), "right": ("force_r1_n", "force_r2_n"),
     "left": ("force_l1_n", "force_l2_n"), "mass": ("mass_disp_m", "mass_acc_m_s2"),
     "table": ("table_disp_m", "table_acc_m_s2"),
     "mass against table": ("rel_disp_m", "mass_acc_m_s2", "table_acc_m_s2"),
     "right cells": ("force_r1_n", "force_r2_n"), "left cells": ("force_l1_n", "force_l2_n"),
+    "right pull": ("force_r1_n", "force_r2_n"), "left pull": ("force_l1_n", "force_l2_n"),
 }  # fmt: skip
 
 
@@ -53,9 +55,12 @@ class Where:
 
 
 def phase_of(sheet: Sheet) -> Int1D:
-    """(entry,) place in `PHASES`."""
+    """(entry,) place in `PHASES`; a side that pulls is in contact."""
     touched = (sheet.touched > 0).astype(np.int64)
     found: Int1D = (touched[0] + 2 * touched[1])[sheet.sample_of]
+    for side, name in enumerate(PULLS):
+        if name in sheet.rows:
+            found[sheet.row_of == sheet.rows.index(name)] |= 1 + side
     return found
 
 
@@ -87,6 +92,21 @@ def _cell(
         sheet.number, step, phase, row, squares.size, float(squares.mean()),
         excess / squares.size, excess / math.sqrt(chance),
     )  # fmt: skip
+
+
+def pulling(sheets: Sequence[Sheet], left: Sequence[Float1D]) -> tuple[str, ...]:
+    """Sentences about bumpers that pull: no law that pushes only can leave that."""
+    found = []
+    for sheet, r in zip(sheets, left, strict=True):
+        for name in PULLS:
+            mine = sheet.row_of == sheet.rows.index(name) if name in sheet.rows else None
+            if mine is not None and mine.any() and np.mean(r[mine] ** 2) > PULLED:
+                side = name.split()[0]
+                found.append(
+                    f"{sheet.readings.name}: the {side} bumper pulls after it lets go, as if it "
+                    "stuck to the mass; no law of the library does"
+                )
+    return tuple(found)
 
 
 def repeated(sheets: Sequence[Sheet], left: Sequence[Float1D]) -> float:

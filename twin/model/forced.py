@@ -22,6 +22,8 @@ from twin.model.compiled import compiled, inner
 from twin.model.integrated import coefficients
 from twin.model.laws import (
     C2,
+    C_L,
+    C_R,
     CONSTANTS_SIZE,
     DRIFT,
     EXTRA,
@@ -34,6 +36,8 @@ from twin.model.laws import (
     G_R,
     K1,
     K3,
+    K_L,
+    K_R,
     KB,
     RATE_1,
     RATE_B,
@@ -69,6 +73,50 @@ def relaxing(branch: float, rate: float, stiffness: float, travelled: float, h: 
     return branch * left + stiffness * travelled * (1.0 - left) / (rate * h)
 
 
+@inner()
+def recovering(con: Constants, side: int, d: float, b: float, h: float) -> tuple[float, float]:
+    """(deformation, branch force) of a bumper h s on that nobody touches.
+
+    Of d' = -(K_j d + b) / C_j and b' = kb d' - b / tau in closed form: two real rates, never equal
+    while kb > 0. Without a dashpot K_j d + b = 0 at every time.
+    """
+    k, c = (con[K_R], con[C_R]) if side == 0 else (con[K_L], con[C_L])
+    kb, rate = con[KB], con[RATE_B]
+    if c <= 0.0:
+        b = b * math.exp(-h * rate / (1.0 + kb / k))
+        return -b / k, b
+    half = 0.5 * ((k + kb) / c + rate)
+    root = math.sqrt(half * half - k * rate / c)
+    fast, slow = math.exp(-(half + root) * h), math.exp(-(half - root) * h)
+    mean, part = 0.5 * (slow + fast), 0.5 * (slow - fast) / root
+    d_rate = -(k * d + b) / c
+    b_rate = kb * d_rate - rate * b
+    return mean * d + part * (half * d + d_rate), mean * b + part * (half * b + b_rate)
+
+
+@inner()
+def followed(
+    con: Constants,
+    side: int,
+    d: float,
+    stands: float,
+    b: float,
+    was: bool,
+    touched: float,
+    h: float,
+) -> tuple[float, float]:
+    """(where the face stands in m, branch force in N) h s on; the mass is at d, `was` it there?
+
+    A face that is met in between jumps to the mass; at the very start it has long relaxed there.
+    """
+    if was:
+        return d, relaxing(b, con[RATE_B], con[KB], d - stands, h)
+    stands, b = recovering(con, side, stands, b, h)
+    if touched > 0.5 or (touched < -0.5 and d > stands):
+        return d, b + (con[KB] * (d - stands) if h > 0.0 else 0.0)
+    return stands, b
+
+
 def _kernel(revision: int) -> Callable[..., None]:
     """The kernel; the revision is a free variable of it, and so in the key of numba's cache."""
 
@@ -86,6 +134,7 @@ def _kernel(revision: int) -> Callable[..., None]:
         if revision < 0:
             return
         z, f, b_r, b_l = 0.0, 0.0, 0.0, 0.0
+        face_r, face_l = 0.0, 0.0  # where the faces stand, followed only for what relaxes
         on_r, on_l = False, False
         for k in range(u.size):
             h = time[k] - time[k - 1] if k else 0.0
@@ -95,9 +144,6 @@ def _kernel(revision: int) -> Callable[..., None]:
                     z = hysteretic(z, du, math.copysign(1.0, du), con[UY])
                 if con[K1] > 0.0 or f != 0.0:
                     f = relaxing(f, con[RATE_1], con[K1], du, h)
-                if con[KB] > 0.0:
-                    b_r = relaxing(b_r, con[RATE_B], con[KB], du if on_r else 0.0, h)
-                    b_l = relaxing(b_l, con[RATE_B], con[KB], -du if on_l else 0.0, h)
             way = 1.0 if v[k] > 0.0 else -1.0
             damper = con[K] * u[k] + con[C] * v[k] + cubic(u[k], con[K3])
             damper += quadratic(v[k], way, con[C2]) + coulomb(way, con[FC]) + con[FY] * z + f
@@ -109,17 +155,18 @@ def _kernel(revision: int) -> Callable[..., None]:
                 right = 1.0 if side == 0 else -1.0
                 gap = (con[G_R] if side == 0 else con[G_L]) + opened
                 d, dd = right * u[k] - gap, right * v[k] - con[DRIFT]
-                b = b_r if side == 0 else b_l
+                b, stands, was = (b_r, face_r, on_r) if side == 0 else (b_l, face_l, on_l)
+                if con[KB] > 0.0:
+                    stands, b = followed(con, side, d, stands, b, was, touched[side, k], h)
                 push = bumper(con, side, d, dd, b) if d > -0.5 * FAR else 0.0
                 if touched[side, k] < -0.5:
-                    was = on_r if side == 0 else on_l
-                    on = push > 0.0 and (was or d > 0.0)
+                    on = push > 0.0 and (was or d >= stands)
                 else:
                     on = touched[side, k] > 0.5
                 if side == 0:
-                    on_r = on
+                    b_r, face_r, on_r = b, stands, on
                 else:
-                    on_l = on
+                    b_l, face_l, on_l = b, stands, on
                 out[1 + side, k] = right * push if on else 0.0
 
     return kernel
