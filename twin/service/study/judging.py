@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from table_io.clock import RealClock
+from table_io.clock import cpu_seconds
 from twin.service.study.asking import discovered, true_structure
 from twin.service.study.cells import case_of
 from twin.service.study.making import Places, make
@@ -26,19 +26,18 @@ def judge(root: Path, number: int, method: Method = discovered) -> Json:
     One that has not the size of its cell, or was stopped on the table, is not judged.
     """
     case = case_of(number)
-    clock = RealClock()
-    began = clock.now()
+    began = cpu_seconds()  # of this process: what else the machine does is not counted
     try:
         places = make(case, root)
     except Exception as error:
         return {"number": number, "cell": case.cell.name, "failed": _said(error)}
     about = json.loads(places.about.read_text(encoding="utf-8"))
-    made = clock.now()
+    made = cpu_seconds()
     if not about["sized"]:
         keys = ("number", "cell", "kind", "noise", "size", "reached", "ended", "sized")
         return {key: about[key] for key in keys} | {"label": case.label, "made_in": made - began}
     verdict, why = _asked(method, places.shown)
-    judged = clock.now()
+    judged = cpu_seconds()
     places.verdict.write_text(dumps(verdict), encoding="utf-8")
     row = _scored(verdict, about, None if why else _oracle(places, about))
     told = {name: _asked(rival, places.shown) for name, rival in RIVALS.items()}

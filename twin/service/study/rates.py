@@ -119,7 +119,7 @@ def figures(rows: Sequence[Json]) -> list[Figure]:
         _least("gap closed >= 0.95, size >= 3",
                _within([one for one in large if one["right"]], "closed", 0.95, above=True), None),
         *_parameters([one for one in single if abs(one["noise"] - 0.01) < 1e-9]),
-        _median("seconds a case", good, "seconds", 10.0),
+        _median("seconds of processor time a case", good, "seconds", 10.0),
     ]  # fmt: skip
     return found
 
