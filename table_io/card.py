@@ -74,6 +74,8 @@ def parse(text: str, card: type[C], where: str) -> C:
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise BadInput(f"{where}: not valid TOML: {error}. Mend the line it names.") from None
+    except RecursionError:
+        raise BadInput(f"{where}: brackets within brackets without end; take them out") from None
     try:
         return card.model_validate(raw)
     except ValidationError as error:

@@ -13,9 +13,16 @@ SOURCES = ("table_io", "twin", "pyproject.toml", "README.md")
 OWNERS = {
     "zenoh": {"twin/stream/zenoh_link.py"},
     "mcap": {"twin/stream/mcap_log.py"},
+    "zstandard": {"twin/stream/framing.py"},
+    "lz4": {"twin/stream/framing.py"},
     "rerun": {"twin/stream/rerun_view.py"},
     "google": {"twin/stream/wire.py", "twin/stream/shaketwin_pb2.py"},
     "time": {"table_io/clock.py"},
+    "h5py": {"twin/stream/table_hdf5.py"},
+    "nptdms": {"twin/stream/table_tdms.py"},
+    "pyarrow": {"twin/stream/table_parquet.py"},
+    "pyuff": {"twin/stream/table_uff.py"},
+    "xarray": {"twin/log_xarray.py"},
     "pysindy": {"twin/service/study/rivals_sindy.py"},
     "sklearn": {"twin/service/study/rivals_blackbox.py"},
 }

@@ -1,6 +1,6 @@
 """Speed of the model beside scipy's on the same motion; the ratio is printed, nothing is asserted.
 
-Run with: pytest tests/bench/test_bench_model.py --benchmark-enable
+Run with: pytest tests/bench/test_bench_model.py -n 0 --benchmark-enable
 """
 
 import math

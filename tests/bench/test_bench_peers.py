@@ -1,11 +1,11 @@
 """The stepped-sine driver beside solve_ivp and diffrax on the same sweep of G4, in one run.
 
-Always: they agree. With --benchmark-enable: how many times faster, on the sweep from 1.8 to 5 Hz
+Always: they agree. With -n 0 --benchmark-enable: how many times faster, on the sweep from 1.8 to 5 Hz
 and back, where the motion is not chaotic and agreement can be checked. With -m slow also on the
 whole SS3 sweep. diffrax is the optional extra `bench`.
 
-    pytest tests/bench/test_bench_peers.py --benchmark-enable -s
-    pytest tests/bench/test_bench_peers.py --benchmark-enable -m slow -s
+    pytest tests/bench/test_bench_peers.py -n 0 --benchmark-enable -s
+    pytest tests/bench/test_bench_peers.py -n 0 --benchmark-enable -m slow -s
 """
 
 import time

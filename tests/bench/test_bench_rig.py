@@ -1,6 +1,6 @@
 """What a block of 10 ms costs on its way: the simulated table, the twin beside it, the encoder.
 
-Run with: pytest tests/bench/test_bench_rig.py --benchmark-enable
+Run with: pytest tests/bench/test_bench_rig.py -n 0 --benchmark-enable
 """
 
 from itertools import cycle

@@ -2,7 +2,7 @@
 
 The first process finds an empty cache and compiles; the benchmark is what every later one takes.
 
-    pytest tests/bench/test_bench_start.py --benchmark-enable -s
+    pytest tests/bench/test_bench_start.py -n 0 --benchmark-enable -s
 """
 
 import os

@@ -12,9 +12,11 @@ from table_io.block import Block
 from table_io.records import Comparison, Event, Fault, Params, Point, Record, RunStart, RunStop
 from twin.compare import pipeline
 from twin.service.bundle import Bundle, from_texts, read_bundle
-from twin.service.runs import Identity, play_unpaced, replay, simulate
+from twin.service.replaying import Identity, Recorded, replay
+from twin.service.runs import play_unpaced, simulate
 from twin.service.summary import dumps, summarise
-from twin.stream.mcap_log import Recording, read, write_items
+from twin.stream.mcap_log import write_items
+from twin.stream.recording import Recording, read
 from twin.stream.wire import Item, encode
 
 PROFILE = """
@@ -56,7 +58,7 @@ def recording(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Recor
 def again(recording: Recording, bundle: Bundle, folder: Path) -> tuple[Identity, Recording]:
     """What a replay found, and the log that it wrote."""
     path = folder / f"again-{len(list(folder.iterdir()))}.mcap"
-    identity = replay(recording, bundle, path, "again", silent)
+    identity = replay(Recorded.of(recording), bundle, path, "again", silent)
     return identity, read(path)
 
 

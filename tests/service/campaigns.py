@@ -11,7 +11,7 @@ import pytest
 from twin.service.campaign import flow, paced, state, unpaced
 from twin.service.campaign.flow import Asked
 from twin.service.campaign.state import read_state
-from twin.service.processes import Spec
+from twin.service.spec import Spec
 
 TEST = """
 title = "{name}"

@@ -11,7 +11,8 @@ import pytest
 from twin.service import figures
 from twin.service.evidence import gather
 from twin.service.report import render
-from twin.stream.mcap_log import read, write_items
+from twin.stream.mcap_log import write_items
+from twin.stream.recording import read
 from twin.stream.wire import Item
 
 from .recordings import blocks, start_record, summary

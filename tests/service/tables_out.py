@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from twin.stream.mcap_log import Recording
+from twin.stream.recording import Recording
 
 
 def write_csv(recording: Recording, path: Path, names: tuple[str, ...] = ()) -> np.ndarray:

@@ -18,9 +18,9 @@ from twin.service.campaign import parts, report
 from twin.service.campaign.flow import Asked, campaign
 from twin.service.campaign.pictures import families
 from twin.service.campaign.whole import read_whole
-from twin.service.processes import Spec
 from twin.service.runs import play_unpaced
-from twin.stream.mcap_log import read
+from twin.service.spec import Spec
+from twin.stream.recording import read
 
 from .campaigns import Players
 

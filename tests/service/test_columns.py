@@ -7,8 +7,9 @@ import pytest
 
 from table_io.block import Float1D
 from table_io.card import BadInput
-from twin.service.columns import Samples, holes, read_map, samples
-from twin.stream.tables import Table
+from twin.service.columns import Samples, read_map, samples
+from twin.service.sampling import holes
+from twin.stream.tables import Table, in_memory
 
 TIME = np.arange(400) / 200.0
 
@@ -18,7 +19,10 @@ def taken(folder: Path, card: str | None = None, **columns: Float1D) -> Samples:
     path = folder / "map.toml"
     if card is not None:
         path.write_text(card)
-    table = Table(folder / "table.csv", columns, (), 2)
+    file = folder / "table.csv"
+    file.touch()
+    held = {name: in_memory(values) for name, values in columns.items()}
+    table = Table(file, held, first_row=2)
     return samples(table, read_map(path if card is not None else None))
 
 
@@ -67,6 +71,10 @@ def test_a_rate_stands_in_for_time(tmp_path: Path) -> None:
         ("rate_hz = 5.0\n[columns]\ntime_s = {column = 't'}", ["keep one"]),
         ("[columns]\nrel_disp_m = {column = 'b'}", ["no column time_s", "rate_hz"]),
         ("rate_hz = 5.0", ["no channel in it"]),
+        (
+            "rate_hz = 5.0\n[columns]\nrel_disp_m = {column = 'b', gain = 1e308, offset = 1e308}",
+            ["rel_disp_m", "'b'", "infinite"],
+        ),
     ],
 )
 def test_maps_that_cannot_be(tmp_path: Path, card: str, words: list[str]) -> None:

@@ -26,7 +26,7 @@ from twin.service.learning.logs import logs_of
 from twin.service.learning.page import sentence
 from twin.service.outcome import EXIT_INTERRUPTED
 from twin.service.runs import play_unpaced
-from twin.stream.mcap_log import read
+from twin.stream.recording import read
 
 PROFILE = """
 title = "short"

@@ -9,11 +9,13 @@ import pytest
 from table_io.block import Block, Label
 from table_io.card import BadInput
 from table_io.records import Comparison, Event, Gap, Point
-from twin.service.importing import take_in
-from twin.service.reading import prc, replay
+from twin.service.exporting import give_out
+from twin.service.importing import contents, take_in
+from twin.service.reading import prc
 from twin.service.recordings import recorded_bundle
+from twin.service.replay import Asked, replay_command
 from twin.service.summary import summarise
-from twin.stream.mcap_log import Recording, read
+from twin.stream.recording import Recording, read
 
 from .tables_out import write_csv
 from .test_unpaced import QUICK, played
@@ -97,7 +99,7 @@ def test_prc_and_replay_take_it_as_one_of_ours(
 ) -> None:
     prc(imported.path, True)
     assert '"frequency_hz": 3.6' in capsys.readouterr().out
-    assert replay(imported.path, None, tmp_path / "again", "max", False) == 0
+    assert replay_command(Asked([imported.path], [], tmp_path / "again")) == 0
     assert len(read(tmp_path / "again" / "run.mcap").of(Point)) == len(imported.start.steps)
     assert (tmp_path / "again" / "report.html").stat().st_size > 10_000
 
@@ -114,7 +116,7 @@ def test_a_sweep_that_is_another_changes_no_step(
     found = [(one.direction, one.frequency_hz) for one in recording.start.steps]
     assert [way for way, _ in found] == [way for way, _ in driven]
     np.testing.assert_allclose([hz for _, hz in found], [hz for _, hz in driven], rtol=2e-3)
-    assert replay(log, None, tmp_path / "again", "max", False) == 0
+    assert replay_command(Asked([log], [], tmp_path / "again")) == 0
     again = read(tmp_path / "again" / "run.mcap").of(Point)
     assert [one.frequency_hz for one in again] == [hz for _, hz in found]
 
@@ -170,6 +172,58 @@ def test_the_profile_holds_at_another_rate(run: tuple[Path, Recording], tmp_path
         take_in(tmp_path / "slow.csv", tmp_path / "slow.mcap", profile, None, None)
 
 
+def test_our_own_export_is_the_same_run_again(
+    run: tuple[Path, Recording], tmp_path: Path, draft: None
+) -> None:
+    assert give_out(run[1].path, ["parquet"], tmp_path / "out", (), None) == 0
+    assert take_in(tmp_path / "out.parquet", tmp_path / "again.mcap", None, None, None) == 0
+    again = read(tmp_path / "again.mcap")
+    assert whole(again).identical(whole(run[1]))
+    for name in ("steps", "profile_toml", "rig_toml", "model_toml"):
+        assert getattr(again.start, name) == getattr(run[1].start, name)
+    (ours,), (theirs,) = (one.pieces("pred") for one in (run[1], again))
+    assert theirs.identical(ours)
+    assert again.of(Point) == run[1].of(Point)
+    assert "labels and cycles are the file's own" in said(again)
+
+
+def test_labels_of_a_table_stand_before_what_its_motion_tells(
+    run: tuple[Path, Recording], tmp_path: Path
+) -> None:
+    """One that is not all of them is none."""
+    assert give_out(run[1].path, ["csv"], tmp_path / "out", ("table_acc_m_s2",), (1, 2)) == 0
+    take_in(tmp_path / "out.csv", tmp_path / "a.mcap", run[0] / "quick.toml", None, None)
+    steps = read(tmp_path / "a.mcap").start.steps
+    assert [one.frequency_hz for one in steps] == [
+        one.frequency_hz for one in run[1].start.steps[1:3]
+    ]
+    lines = (tmp_path / "out.csv").read_text().splitlines()
+    kept = [k for k, name in enumerate(lines[0].split(",")) if name != "cycle"]
+    rows = [",".join(line.split(",")[k] for k in kept) for line in lines]
+    (tmp_path / "less.csv").write_text("\n".join(rows))
+    take_in(tmp_path / "less.csv", tmp_path / "b.mcap", run[0] / "quick.toml", None, None)
+    assert "left out: step, label, direction" in said(read(tmp_path / "b.mcap"))
+
+
+def test_a_shaking_table_of_others(tmp_path: Path) -> None:
+    card = tmp_path / "map.toml"
+    card.write_text(
+        '[columns]\ntime_s = { column = "timepos:1" }\n'
+        'table_disp_m = { column = "timepos:2", gain = 0.01 }\n'
+    )
+    file = there("shaking_table/SineA5F2.npz")
+    assert take_in(file, tmp_path / "a.mcap", None, None, card) == 0
+    recording = read(tmp_path / "a.mcap")
+    assert (whole(recording).rate_hz, len(whole(recording))) == (200.0, 4001)
+    (step,) = recording.start.steps
+    assert step.frequency_hz == pytest.approx(2.0, rel=1e-3)
+
+
+def test_what_a_file_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    contents(there("bncs/CNP100.csv"), None)
+    assert "rel_disp_m: " in capsys.readouterr().out
+
+
 def test_a_component_test_without_a_table_is_a_log_that_is_not_replayed(tmp_path: Path) -> None:
     time = np.arange(4000) / 200
     u = 0.01 * np.sin(2 * np.pi * time)
@@ -182,7 +236,7 @@ def test_a_component_test_without_a_table_is_a_log_that_is_not_replayed(tmp_path
     assert not recording.of(Comparison)
     assert recording.start.steps[0].frequency_hz == pytest.approx(1.0, rel=1e-3)
     with pytest.raises(BadInput, match="no table_acc_m_s2"):
-        replay(log, None, tmp_path / "out", "max", False)
+        replay_command(Asked([log], [], tmp_path / "out"))
     with pytest.raises(BadInput, match="exists already"):
         take_in(file, log, None, None, None)
 
@@ -204,7 +258,7 @@ def test_a_building_under_an_earthquake(tmp_path: Path, draft: None) -> None:
     assert set(block.step) == {-1}
     assert set(block.label) == {Label.REST, Label.SETTLE}
     assert "no stepped sine" in said(recording)
-    assert replay(log, None, tmp_path / "again", "max", False) == 0
+    assert replay_command(Asked([log], [], tmp_path / "again")) == 0
 
 
 def test_the_silverbox_by_a_map(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from table_io.records import Fault
-from twin.stream.mcap_log import Recording, read
+from twin.stream.recording import Recording, read
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
 PROFILE = """

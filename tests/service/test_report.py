@@ -14,7 +14,8 @@ from table_io.records import Comparison, Event, Fault, Gap, RunStop, Timing
 from twin.service.evidence import gather
 from twin.service.page import significant
 from twin.service.report import render, write_report
-from twin.stream.mcap_log import read, write_items
+from twin.stream.mcap_log import write_items
+from twin.stream.recording import read
 from twin.stream.wire import Item
 
 from .conftest import Drawn, Maker

@@ -12,7 +12,7 @@ from table_io.records import Params
 from twin.model.parameters import Parameters
 from twin.service.evidence import Run, chosen, gather, motion, prestress, step_errors
 from twin.service.figures import OFFSET, draw_all
-from twin.stream.mcap_log import read
+from twin.stream.recording import read
 
 from .conftest import Drawn, Maker
 from .recordings import STEPS, blocks, one_step, signals, summary

@@ -18,7 +18,7 @@ from twin.service.study.cells import CELLS, PER_CELL, Case, case_of, cases
 from twin.service.study.judging import judge
 from twin.service.study.making import Places, make
 from twin.service.study.sizing import Residual, departed, farthest, read, residual, sized
-from twin.stream.mcap_log import read as read_log
+from twin.stream.recording import read as read_log
 
 
 def case_in(cell: str, place: int = 0) -> Case:

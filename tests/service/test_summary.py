@@ -27,7 +27,8 @@ from twin.compare import COMPARED
 from twin.service.bundle import Bundle, read_bundle
 from twin.service.runs import play_unpaced
 from twin.service.summary import dumps, summarise, write
-from twin.stream.mcap_log import Recording, read, write_items
+from twin.stream.mcap_log import write_items
+from twin.stream.recording import Recording, read
 from twin.stream.wire import Item
 
 PROFILE = """
@@ -325,9 +326,8 @@ def test_points_of_a_lost_sensor_are_null_not_zero(
     assert step["twin"] is None
 
 
-def test_the_start_record_must_be_there(recording: Recording, tmp_path: Path) -> None:
-    from table_io.card import BadInput
-
+def test_a_lost_start_record_is_taken_from_its_copy(recording: Recording, tmp_path: Path) -> None:
     write_items(tmp_path / "run.mcap", without(recording, RunStart), recording.start)
-    with pytest.raises(BadInput, match="no start record"):
-        read(tmp_path / "run.mcap")
+    again = read(tmp_path / "run.mcap")
+    assert again.start == recording.start
+    assert [one.reason for one in again.damage] == ["/run/start: lost; its copy is taken"]

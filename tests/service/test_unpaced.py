@@ -15,7 +15,7 @@ from twin.compare.windows import HISTORY_S
 from twin.service.bundle import Bundle, read_bundle
 from twin.service.runs import play_unpaced
 from twin.service.summary import summarise
-from twin.stream.mcap_log import Recording, read
+from twin.stream.recording import Recording, read
 from twin.stream.wire import Item
 
 LEVEL = 0.05 * 9.80665

@@ -10,10 +10,11 @@ from table_io.card import PROFILES
 from table_io.records import Comparison, Decided, Event, Fault, Point
 from twin.service.bundle import Bundle, from_texts
 from twin.service.evidence import curve, gather
+from twin.service.replaying import Recorded, replay
 from twin.service.report import headline
-from twin.service.runs import play_unpaced, replay
+from twin.service.runs import play_unpaced
 from twin.service.summary import sentence, summarise
-from twin.stream.mcap_log import Recording, read
+from twin.stream.recording import Recording, read
 from twin.stream.wire import encode
 
 PROFILE = """
@@ -67,7 +68,8 @@ def test_visits_stand_beside_the_steps_with_their_reasons(run: tuple) -> None:
 
 def test_a_replay_says_of_the_visits_what_was_said_to_the_bit(run: tuple, tmp_path: Path) -> None:
     bundle, recording, summary = run
-    identity = replay(recording, bundle, tmp_path / "run.mcap", "again", lambda item: None)
+    made = tmp_path / "run.mcap"
+    identity = replay(Recorded.of(recording), bundle, made, "again", lambda item: None)
     assert identity.identical
     again = read(tmp_path / "run.mcap")
     for kind in (Comparison, Point, Decided, Event):

@@ -2,76 +2,26 @@
 
 import os
 import random
-from itertools import permutations
+from hashlib import sha256
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.reader import make_reader
+from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import Writer
 
-from table_io.block import Block, join
+from table_io.block import join
 from table_io.card import BadInput
-from table_io.records import Comparison, Event, Gap, RunStart, RunStop, Step, Timing
-from twin.stream.mcap_log import LogWriter, Recording, merge, messages, read, topics, write_items
-from twin.stream.wire import TOPIC_TYPES, Item, encode, topic
+from table_io.records import Event, Gap, RunStart, RunStop
+from twin.stream.content import attachments
+from twin.stream.mcap_log import LogWriter, topics, write_items
+from twin.stream.merging import merge, verified
+from twin.stream.recording import Recording, messages, read
+from twin.stream.salvage import salvage
+from twin.stream.wire import TOPIC_TYPES, decode, encode
 
-RATE = 2000.0
-SIZE = 20  # samples a block
-BLOCKS = 30
-START = RunStart(
-    index=0, run="2026-run", name="log", source="table", profile_toml='title = "größe"\n',
-    rig_toml="r = 1\n", model_toml="m = 1\n", rate_hz=RATE, block_samples=SIZE,
-    channels=("drive_disp_m", "table_disp_m"), steps=(Step(0, "forward", 2.0, 0.49),),
-    planned_samples=BLOCKS * SIZE, tare={"table_disp_m": 1e-4}, versions={"shaketwin": "0.1.0"},
-    host="here", started_at="2026-11-21T04:00:00+00:00", epoch_s=12.5,
-)  # fmt: skip
-
-
-def block(index: int, stream: str = "meas", samples: int = SIZE) -> Block:
-    """A block whose samples depend on nothing but their index; some are lost."""
-    at = np.arange(index, index + samples)
-    values = np.array([np.sin(at / 7.0), np.cos(at / 9.0)])
-    values[1, at % 41 == 0] = np.nan
-    return Block(stream, index, RATE, START.channels, values, at // 100, at % 5, at % 3)
-
-
-def run(missing: frozenset[int] = frozenset()) -> list[Item]:
-    """A whole run as it is published; blocks with these numbers are missing."""
-    items: list[Item] = [START]
-    for number in set(range(BLOCKS)) - missing:
-        index = number * SIZE
-        items += [block(index), block(index, "pred")]
-        sums = (float(number), -0.0)
-        items.append(Comparison(index, SIZE, START.channels, sums, sums, (np.nan, 0.1)))
-        if number % 10 == 3:  # several items of one kind at one sample: nothing else orders them
-            items += [Event(index, "jump", "up"), Event(index, "trip", "b"), Event(index, "a", "c")]
-            items += [Gap(index, 1, name, "lost") for name in reversed(START.channels)]
-            items.append(Timing(index, "rig", 0.1, 0.2, 0.3, 0, number, 0.5, "fifo"))
-    end = BLOCKS * SIZE
-    return [*items, Event(end, "end", "done"), RunStop(end, "complete", "all played", ("idle",))]
-
-
-def payloads(items: tuple[Item, ...] | list[Item]) -> list[bytes]:
-    return [encode(item, START.run) for item in items]
-
-
-def write(path: Path, items: list[Item], flush_every: int = 0, close: bool = True) -> list[int]:
-    """A log of the items; returns the size of the file after each flush."""
-    writer, sizes = LogWriter(path, RATE), []
-    writer.describe(START)
-    for number, item in enumerate(items, 1):
-        writer.write(topic(item), encode(item, START.run), item.index)
-        if flush_every and number % flush_every == 0:
-            writer.flush()
-            sizes.append(path.stat().st_size)
-    if close:
-        writer.close()
-    else:
-        writer.flush()  # the file stays as a killed recorder leaves it
-    return sizes
+from .written import BLOCKS, RATE, SIZE, START, block, payloads, run, write
 
 
 @pytest.fixture
@@ -100,22 +50,50 @@ def test_what_was_written_is_read_back_to_the_bit(log: Path) -> None:
 def test_the_log_carries_texts_versions_schemas_and_times(log: Path) -> None:
     with log.open("rb") as stream:
         reader = make_reader(stream)
-        texts = {one.name: one.data.decode() for one in reader.iter_attachments()}
-        (about,) = reader.iter_metadata()
+        texts = {one.name: one.data for one in reader.iter_attachments()}
+        about = {one.name: one.metadata for one in reader.iter_metadata()}
         times = {}
         for schema, channel, message in reader.iter_messages():
             assert schema is not None
             assert (schema.encoding, channel.message_encoding) == ("protobuf", "protobuf")
             assert schema.name == f"shaketwin.{TOPIC_TYPES[channel.topic].__name__}"
             times.setdefault(channel.topic, []).append((message.sequence, message.log_time))
-    assert texts == {
-        "profile.toml": START.profile_toml,
-        "rig.toml": START.rig_toml,
-        "model.toml": START.model_toml,
-    }
-    assert about.metadata == {"id": START.run, "schema": "1", "host": "here", "shaketwin": "0.1.0"}
+    assert texts == attachments(START)
+    assert texts["profile.toml"] == START.profile_toml.encode()
+    assert decode("/run/start", texts["start.pb"]) == (START.run, START)
+    assert about["attachments"] == {k: sha256(v).hexdigest() for k, v in texts.items()}
+    assert about["run"] == {
+        "id": START.run, "schema": "2", "host": "here", "started_at": START.started_at,
+        "shaketwin": "0.1.0",
+    }  # fmt: skip
+    counted = {name: str(len(found)) for name, found in times.items()}
+    hashed = {name: about["content"].pop(name) for name in ("sha256", "messages")}
+    assert about["content"] == counted
+    assert hashed["messages"] == str(len(run()))
+    assert hashed["sha256"] == content_by_hand(log)
     # The sample index, not the wall clock, is the time of a message: 20 samples are 10 ms.
     assert times["/rig/meas"] == [(number, number * 10_000_000) for number in range(BLOCKS)]
+
+
+def content_by_hand(path: Path) -> str:
+    """The hash of a log's content as LOG.md describes it, by the library of others."""
+    digest = sha256()
+    with path.open("rb") as stream:
+        for _, channel, one in NonSeekingReader(stream).iter_messages(log_time_order=False):
+            digest.update(f"{channel.topic} {one.log_time} {len(one.data)}\n".encode() + one.data)
+    return digest.hexdigest()
+
+
+def test_a_killed_log_has_its_texts_and_no_hash(tmp_path: Path) -> None:
+    write(tmp_path / "killed.mcap", run(), flush_every=7, close=False)
+    content = (tmp_path / "killed.mcap").read_bytes()
+    first = content.index(b"zstd")  # what stands before the first chunk
+    (tmp_path / "cut.mcap").write_bytes(content[: first - 41])
+    for name in ("killed.mcap", "cut.mcap"):
+        found = salvage(tmp_path / name)
+        assert found.attachments == attachments(START)
+        assert set(found.metadata) == {"run", "attachments"}
+        assert not verified(tmp_path / name)
 
 
 def test_every_topic_can_stand_in_a_log() -> None:
@@ -162,6 +140,8 @@ def test_a_cut_log_still_gives_every_complete_chunk(tmp_path: Path) -> None:
             recording = read(cut)
             assert not recording.whole
             assert recording.start == START
+        elif salvage(cut).attachments.keys() >= {"start.pb"}:
+            assert read(cut).start == START
         else:
             with pytest.raises(BadInput, match=r"cut.mcap: holds no start record"):
                 read(cut)
@@ -246,50 +226,6 @@ def foreign(path: Path, name: str, data: bytes) -> None:
         channel = writer.register_channel(name, "json", 0)
         writer.add_message(channel, 0, data, 0)
         writer.finish()
-
-
-def test_parts_in_any_order_make_the_original_to_the_bit(tmp_path: Path) -> None:
-    items = run()
-    third = len(items) // 3
-    write(tmp_path / "whole.mcap", items)
-    # The second recorder hears the start again; the third was cut off; the last wrote nothing.
-    write(tmp_path / "a.mcap", items[: third + 15])
-    write(tmp_path / "b.mcap", [items[0], *items[third - 9 : 2 * third + 9]])
-    sizes = write(tmp_path / "c.mcap", [items[0], *items[2 * third :]], flush_every=5)
-    assert sizes
-    killed = (tmp_path / "b.mcap").read_bytes()
-    (tmp_path / "d.mcap").write_bytes(killed[: len(killed) // 2])
-    (tmp_path / "e.mcap").write_bytes(killed[:5])
-    (tmp_path / "f.mcap").write_bytes(b"")
-    parts = [tmp_path / f"{name}.mcap" for name in "abcdef"]
-    before = [part.read_bytes() for part in parts]
-    expected = payloads(read(tmp_path / "whole.mcap").items)
-    orders = [parts, parts[::-1], *random.Random(1).sample(list(permutations(parts)), 10)]
-    for number, order in enumerate(orders):
-        out = tmp_path / f"out-{number}.mcap"
-        assert merge(list(order), out) == len(items)
-        merged = read(out)
-        assert merged.whole
-        assert payloads(merged.items) == expected
-        assert [one.payload for one in messages(out)[0]] == expected  # in the file itself too
-        assert merged.missing_samples == 0
-    assert [part.read_bytes() for part in parts] == before
-
-
-def test_merging_keeps_texts_and_times(tmp_path: Path, log: Path) -> None:
-    merge([log, log], tmp_path / "out.mcap")
-    with (tmp_path / "out.mcap").open("rb") as stream:
-        names = [one.name for one in make_reader(stream).iter_attachments()]
-    assert sorted(names) == ["model.toml", "profile.toml", "rig.toml"]
-    was = sorted((one.log_time, one.payload) for one in messages(log)[0])
-    assert sorted((one.log_time, one.payload) for one in messages(tmp_path / "out.mcap")[0]) == was
-
-
-def test_parts_without_a_start_are_kept_and_not_merged(tmp_path: Path) -> None:
-    write(tmp_path / "part.mcap", run()[5:])
-    with pytest.raises(BadInput, match=r"part.mcap: holds no start record; the parts are kept"):
-        merge([tmp_path / "part.mcap"], tmp_path / "out.mcap")
-    assert not (tmp_path / "out.mcap").exists()
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ from table_io.records import (
 )
 from twin.compare import PREDICTED
 from twin.stream import rerun_view
-from twin.stream.mcap_log import Recording
+from twin.stream.recording import Recording
 from twin.stream.rerun_layout import Axes, Reach, Scene, Trail, motion, pieces
 from twin.stream.rerun_view import RerunView, open_viewer, screenshot, write_rrd
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from table_io.card import BadInput
-from twin.stream.tables import LONGEST_LINE, Table, read_table
+from twin.stream.table_csv import LONGEST_LINE
+from twin.stream.tables import Table, read_table
 
 GOOD = "time_s,table_acc_m_s2\n0,1.5\n0.1,-2e-3\n0.2,3\n"
 
@@ -36,8 +37,8 @@ def read(folder: Path, content: str | bytes) -> Table:
 def test_the_same_table_in_other_clothes(tmp_path: Path, content: str) -> None:
     table = read(tmp_path, content)
     assert list(table.columns) == ["time_s", "table_acc_m_s2"]
-    assert table.columns["time_s"].tolist() == [0.0, 0.1, 0.2]
-    assert table.columns["table_acc_m_s2"].tolist() == [1.5, -2e-3, 3.0]
+    assert table.read("time_s").tolist() == [0.0, 0.1, 0.2]
+    assert table.read("table_acc_m_s2").tolist() == [1.5, -2e-3, 3.0]
 
 
 def test_another_delimiter_is_said(tmp_path: Path) -> None:
@@ -47,10 +48,10 @@ def test_another_delimiter_is_said(tmp_path: Path) -> None:
 
 
 def test_an_empty_cell_is_a_lost_sample(tmp_path: Path) -> None:
-    found = read(tmp_path, "a,b,c\n1,,3\n4,NaN,\n").columns
-    assert np.isnan(found["b"]).all()
-    assert found["a"].tolist() == [1.0, 4.0]
-    assert np.isnan(found["c"]).tolist() == [False, True]
+    found = read(tmp_path, "a,b,c\n1,,3\n4,NaN,\n").read
+    assert np.isnan(found("b")).all()
+    assert found("a").tolist() == [1.0, 4.0]
+    assert np.isnan(found("c")).tolist() == [False, True]
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,7 @@ def anything_like(hint: Any) -> st.SearchStrategy[Any]:
         return st.builds(hint, **{one.name: anything_like(hints[one.name]) for one in fields(hint)})
     return {
         NoneType: st.none(),
-        int: st.integers(0, 2**63 - 1),
+        int: st.integers(0, wire.LAST_INDEX),
         bool: st.booleans(),
         float: st.one_of(st.sampled_from(ODD), st.floats()),
         str: st.text(max_size=20),
@@ -59,7 +59,7 @@ def any_block(draw: st.DrawFn) -> Block:
     labels = [np.array(draw(whole), dtype=np.int64) for _ in range(3)]
     return Block(
         draw(st.sampled_from(sorted(wire.BLOCK_TOPICS))),
-        draw(st.integers(0, 2**63 - 1)),
+        draw(st.integers(0, wire.LAST_INDEX - samples)),
         draw(st.floats(1.0, 1e6)),
         channels,
         np.array(values, dtype=np.float64).reshape(len(channels), samples),

@@ -21,7 +21,7 @@ from twin.model.effects import EFFECTS
 from twin.service.bundle import read_bundle
 from twin.service.recordings import recorded_bundle
 from twin.service.runs import play_unpaced
-from twin.stream.mcap_log import messages, read
+from twin.stream.recording import messages, read
 
 CARD, CARD_TOML = load(PROFILES / "rigs" / "simulated.toml", Rig, "machine card")
 SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})

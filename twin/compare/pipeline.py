@@ -96,6 +96,13 @@ def knowing(setup: Setup, *decided: Decided) -> Setup:
     return setup
 
 
+def adopting(setup: Setup, params: Params) -> Setup:
+    """The setup whose model has these values from now on; u* and a* stay those of the run."""
+    model = Model.from_flat(params.values)
+    scale = replace(setup.scale, parameters=model.parameters)
+    return replace(setup, twin=replace(setup.twin, model=model), scale=scale)
+
+
 def start(setup: Setup, index: int = 0) -> tuple[State, list[Record]]:
     """The state of a twin that starts at sample `index`, and the parameters it starts with."""
     params = Params(index, setup.twin.model.flat(), "start")

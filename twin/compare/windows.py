@@ -275,11 +275,15 @@ def _compare(
     new = np.array([measured**2, free**2, window**2])
     squares = np.concatenate([pending, new], axis=2)
     # the first cell may begin in the middle of the grid, where the twin was started there
-    first = block.end - squares.shape[2]
-    comparisons = []
-    while squares.shape[2] and (size := setup.grid - first % setup.grid) <= squares.shape[2]:
-        sums = np.add.reduce(np.ascontiguousarray(squares[:, :, :size]), axis=2)
-        m, f, w = (tuple(row) for row in sums.tolist())
-        comparisons.append(Comparison(first, size, COMPARED, m, f, w))
-        squares, first = squares[:, :, size:], first + size
+    first, comparisons = block.end - squares.shape[2], []
+    for size, most in ((-first % setup.grid, 1), (setup.grid, block.end)):
+        cells = min(squares.shape[2] // size, most) if size else 0
+        if not cells:
+            continue
+        used = np.ascontiguousarray(squares[:, :, : cells * size])
+        sums = np.add.reduce(used.reshape(*used.shape[:2], cells, size), axis=3)
+        for m, f, w in sums.transpose(2, 0, 1).tolist():
+            comparisons.append(Comparison(first, size, COMPARED, tuple(m), tuple(f), tuple(w)))
+            first += size
+        squares = squares[:, :, cells * size :]
     return squares, comparisons

@@ -25,6 +25,7 @@ LEVEL_SHARE = 0.1  # likewise of the level
 LOW_LEVEL = 0.2  # of the largest: a burst of less is a loop check, no part of the sweep
 HELD_SHARE = 0.4  # of the time that it moves, in a stepped sine
 HELD_LEAST = 0.15  # of all motion, whatever was taken for a loop check
+LEAST_TUNED, NEAR = 0.5, 3  # cycles; steps to either side
 BEYOND = 1.5  # cycles that a hold may reach beyond where its phase was seen to be straight
 RAMP_CYCLES, RAMP_S = 2.0, 0.5  # soft start and stop; an abrupt one only loses these edges
 
@@ -184,8 +185,12 @@ def _split_turns(holds: Sequence[Hold], rate_hz: float, sweep: Sweep, on_grid: b
             < 0
         )
         end = on_grid and hold.frequency_hz in (sweep.start_hz, sweep.stop_hz)
-        if turn and end and cycles[place] > 2 * sweep.cycles - 0.2:
-            middle = hold.end - sweep.cycles * rate_hz / hold.frequency_hz
+        # Where a level is tuned, a step is held before its held cycles too: as long as those near.
+        near = cycles[max(place - NEAR, 0) : place] + cycles[place + 1 : place + 1 + NEAR]
+        tuned = min(near, default=0.0) - sweep.cycles
+        before = tuned + 0.5 * sweep.blend_cycles if tuned > LEAST_TUNED else 0.0
+        if turn and end and cycles[place] > 2 * sweep.cycles + before - 0.2:
+            middle = hold.end - (sweep.cycles + before) * rate_hz / hold.frequency_hz
         elif turn and cycles[place] > 1.6 * max(cycles[place - 1], cycles[place + 1]):
             middle = 0.5 * (hold.start + hold.end)
         else:

@@ -3,11 +3,10 @@
 import platform
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from table_io.card import find, load, parse
+from table_io.card import BadInput, find, load, parse
 from table_io.clock import today
 from table_io.conductor import rehearsed, score
 from table_io.course import plan
@@ -20,12 +19,12 @@ from table_io.session import Setup as SessionSetup
 from twin.model.card import ModelCard
 from twin.model.model import Model
 from twin.model.parameters import Parameters
+from twin.service.versions import installed
 
 if TYPE_CHECKING:
     from twin.compare.pipeline import Setup
 
 WARM_ITEMS = 100  # of a session: one second; each kernel runs from the first blocks on
-LIBRARIES = ("shaketwin", "numpy", "scipy", "numba", "protobuf", "eclipse-zenoh", "mcap")
 
 
 @dataclass(frozen=True)
@@ -90,8 +89,7 @@ class Bundle:
                 steps=self.steps,
                 planned_samples=self.drive.planned_end,
                 tare=tare,
-                versions={name: version(name) for name in LIBRARIES}
-                | {"python": platform.python_version()},
+                versions=dict(installed()),
                 host=platform.node(),
                 started_at=today().isoformat(timespec="seconds"),
                 epoch_s=epoch_s,
@@ -105,7 +103,12 @@ def from_texts(name: str, profile_toml: str, rig_toml: str, model_toml: str, whe
     profile = parse(profile_toml, Profile, where)
     rig = parse(rig_toml, Rig, f"machine card of {where}")
     card = parse(model_toml, ModelCard, f"model of {where}")
-    drive = rehearsed(score(profile, rig))
+    try:
+        drive = rehearsed(score(profile, rig))
+    except ArithmeticError as error:
+        raise BadInput(
+            f"{where}: no drive follows from these numbers ({error}); look for a wrong power of ten"
+        ) from None
     model = card.model(profile.specimen)
     model.fits(profile.acquisition.rate_hz)
     return Bundle(

@@ -9,6 +9,8 @@ from typing import Annotated
 
 import typer
 
+from twin.service.cli_files import files
+from twin.service.cli_formats import formats
 from twin.service.cli_learning import learning
 
 # Matrices are small here; on a busy machine the threads of a BLAS stall what they should speed up,
@@ -158,16 +160,34 @@ def simulate(
 
 @app.command(rich_help_panel=LOOK)
 def replay(
-    log: Log,
-    model: Model = None,
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs, folders of runs.")],
+    model: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--model", help="What if: a name, a .toml file, or `recorded`; may be repeated."
+        ),
+    ] = None,
     out: Out = None,
     speed: Annotated[str, typer.Option("--speed", help="Times real time, or max.")] = "max",
+    steps: Annotated[
+        str | None, typer.Option("--steps", metavar="A:B", help="From step A to step B only.")
+    ] = None,
+    publish: Annotated[
+        bool, typer.Option("--publish", help="On the bus too: whoever listens takes it for live.")
+    ] = False,
+    listen: Annotated[
+        str, typer.Option("--listen", help="Endpoint of the bus, with --publish.")
+    ] = "tcp/127.0.0.1:7447",
     view: Annotated[bool, typer.Option("--view", help="Also write view.rrd.")] = False,
 ) -> None:
-    """The same pipeline on a recording; with the recorded model equal to the bit."""
-    from twin.service.reading import replay as command
+    """The same pipeline on recordings; with the recorded model equal to the bit.
 
-    raise typer.Exit(command(log, model, out, speed, view))
+    Several logs or models give one table of how far each model is from each recording.
+    """
+    from twin.service.replay import Asked, replay_command
+
+    asked = Asked(logs, model or [], out, speed, view, listen if publish else None, steps)
+    raise typer.Exit(replay_command(asked))
 
 
 @app.command(rich_help_panel=LOOK)
@@ -242,6 +262,8 @@ def tell(
 
 
 app.add_typer(learning)
+app.add_typer(files)
+app.add_typer(formats)
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""The commands that take data in and learn from it; heavy imports stand inside them."""
+"""The commands that learn from data; heavy imports stand inside them."""
 
 from pathlib import Path
 from typing import Annotated
@@ -48,25 +48,6 @@ def identify(
     from twin.service.learning.identify import identify_command as command
 
     raise typer.Exit(command(logs, model, out))
-
-
-@learning.command("import", rich_help_panel=LEARN)
-def import_(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="CSV; columns named as channels.")],
-    out: Annotated[Path, typer.Option("-o", "--out", metavar="LOG", help="New log, a .mcap file.")],
-    profile: Annotated[
-        Path | None, typer.Option("--profile", help="Specimen, gaps and sweep, a .toml file.")
-    ] = None,
-    rig: Annotated[str | None, typer.Option("--rig", help="Machine card.")] = None,
-    columns: Annotated[
-        Path | None,
-        typer.Option("--columns", metavar="MAP", help="Which columns are which, a .toml file."),
-    ] = None,
-) -> None:
-    """Other people's data: a table of samples as a log; its steps are found in its motion."""
-    from twin.service.importing import take_in as command
-
-    raise typer.Exit(command(file, out, profile, rig, columns))
 
 
 learning.add_typer(study, name="study", rich_help_panel=LEARN)

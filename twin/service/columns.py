@@ -4,7 +4,7 @@ Conversion is declared, never guessed; a unit that looks wrong is only pointed o
 """
 
 import difflib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +14,19 @@ from table_io.block import Float1D, Int1D
 from table_io.card import BadInput, Card, Finite, Positive, load
 from table_io.channels import BY_NAME
 from table_io.units import GRAVITY_M_S2, UNITS
-from twin.stream.tables import Table
+from twin.service.sampling import stated_rate, uniform
+from twin.stream.rows import LABELS, TIME, TWIN
+from twin.stream.tables import MOST_NAMED, Table, bounded
 
-TIME = "time_s"
+KNOWN = (TIME, *BY_NAME, *LABELS)
+BY_UNIT = {TIME: "s", **{name: one.unit for name, one in BY_NAME.items()}, **LABELS}
+SPELLINGS = {
+    "meter": "m", "meters": "m", "metre": "m", "metres": "m",
+    "millimeter": "mm", "millimetre": "mm",
+    "m/s/s": "m/s2", "ms-2": "m/s2", "m*s-2": "m/s2", "gn": "g", "newton": "N", "newtons": "N",
+    "n": "N", "kn": "kN", "sec": "s", "second": "s", "seconds": "s", "hz": "Hz",
+}  # fmt: skip
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
-UNEVEN = 0.2  # rms of a sample's time off the grid, in samples: half a sample at the most
 SUSPECT = {1e3: "1000", 1e-3: "1/1000", GRAVITY_M_S2: "g", 1 / GRAVITY_M_S2: "1/g"}
 RELATIVE_ACC = "mass_acc_m_s2 - table_acc_m_s2"
 PAIRS = (
@@ -29,10 +37,15 @@ PAIRS = (
 
 
 class Column(Card):
-    """Where a channel comes from: value in SI = column * gain * unit + offset (in SI)."""
+    """Where a channel comes from: value in SI = column * gain * unit + offset (in SI).
+
+    What the file itself says of the column's unit has to be `unit`; where a gain makes that of it,
+    or the file is wrong, `file_unit` repeats what it says.
+    """
 
     column: str
     unit: str = ""
+    file_unit: str | None = None
     gain: Finite = 1.0
     offset: Finite = 0.0
 
@@ -43,10 +56,20 @@ class Column(Card):
             raise ValueError("gain is 0, so the channel would be silent; allowed: not 0")
         return gain
 
+    def si(self, name: str, values: Float1D) -> Float1D:
+        """The channel's values, (row,), in SI; without gain and offset to the bit as they are."""
+        with np.errstate(all="ignore"):  # a NaN of another kind is a NaN too
+            scaled = self.gain * _units(name).get(self.unit, 1.0) * values
+            scaled = scaled + self.offset if self.offset else scaled
+        if np.isinf(scaled).any():
+            raise BadInput(f"{name}: {self.column!r} becomes infinite; mend its gain and offset")
+        return scaled
+
 
 class Map(Card):
     """A --columns file."""
 
+    group: str = Field("", description="The group, structure or folder inside the file.")
     rate_hz: Positive | None = Field(None, description="Where there is no column of time.")
     columns: dict[str, Column] = Field(default_factory=dict)
 
@@ -54,12 +77,13 @@ class Map(Card):
     @classmethod
     def _known(cls, columns: dict[str, Column], info: ValidationInfo) -> dict[str, Column]:
         for name, column in columns.items():
-            if name != TIME and name not in BY_NAME:
+            if name not in KNOWN:
                 raise ValueError(f"{name!r} is no channel; {_nearest(name)}")
             allowed = _units(name)
             if column.unit and column.unit not in allowed:
                 raise ValueError(
-                    f"{name}: unit {column.unit!r} does not fit; allowed: {', '.join(allowed)}"
+                    f"{name}: unit {column.unit!r} does not fit; "
+                    f"allowed: {', '.join(allowed) or 'none'}"
                 )
         if TIME in columns and info.data.get("rate_hz") is not None:
             raise ValueError(f"{TIME} and rate_hz both say when samples were taken; keep one")
@@ -67,56 +91,70 @@ class Map(Card):
 
 
 def _nearest(name: str) -> str:
-    known = [TIME, *BY_NAME]
-    near = difflib.get_close_matches(name, known, 1, 0.5)
-    return f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
+    near = difflib.get_close_matches(name, KNOWN, 1, 0.5)
+    return f"did you mean {near[0]!r}?" if near else f"known: {', '.join(KNOWN)}"
 
 
 def _units(name: str) -> dict[str, float]:
     """The units that a column may be in, and each in SI."""
     if name == TIME:
         return TIME_UNITS
-    return {unit: factor for unit, (si, factor) in UNITS.items() if si == BY_NAME[name].unit}
+    si = BY_NAME[name].unit if name in BY_NAME else LABELS[name]
+    return {unit: factor for unit, (of, factor) in UNITS.items() if of == si} or (
+        {si: 1.0} if si else {}
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Channels in SI, (row,) each, and the sample index of each row, rising."""
+    """Channels in SI, (row,) each, and the sample index of each row, rising.
+
+    `labels` are the columns of LABELS, all of them or none.
+    """
 
     rate_hz: float
     index: Int1D
     channels: dict[str, Float1D]
     said: tuple[str, ...]
+    labels: dict[str, Float1D] = field(default_factory=dict)
 
 
 def samples(table: Table, card: Map | None) -> Samples:
     """The table as samples; BadInput where a column is unknown or time is not uniform."""
     chosen, said = _chosen(table, card)
-    values = {
-        name: column.gain * _units(name).get(column.unit, 1.0) * table.columns[column.column]
-        + column.offset
-        for name, column in chosen.items()
-    }
-    time = values.pop(TIME, None)
+    for name, column in chosen.items():
+        _agrees(table, name, column)
+    _as_long(table, chosen)
+    values = {name: column.si(name, table.read(column.column)) for name, column in chosen.items()}
+    time = values.pop(TIME, _own_time(table, chosen, card))
     order = [name for name in BY_NAME if name in values]
     channels = {name: values[name] for name in order}
-    if not channels:
-        raise BadInput(f"{table.path}: no channel in it but time; known: {', '.join(BY_NAME)}")
-    if time is None:
-        rate = card.rate_hz if card is not None else None
-        if rate is None:
-            raise BadInput(
-                f"{table.path}: no column {TIME}; add one, or state `rate_hz = ...` in a --columns "
-                "file"
-            )
-        index = np.arange(next(iter(channels.values())).size)
+    if time is not None:
+        rate, index, told = uniform(time, table)
+        said += told
     else:
-        rate, index, told = _grid(time, table)
+        held = [table.columns[column.column] for column in chosen.values()]
+        rate, told = stated_rate(table, held, card.rate_hz if card is not None else None)
+        index = np.arange(held[0].size)
         said += told
     missing = [name for name in BY_NAME if name not in channels]
     said.append(f"not in the file: {', '.join(missing)}")
     said += [f"{name}: all lost" for name in order if np.isnan(channels[name]).all()]
-    return Samples(rate, index, channels, (*table.said, *said, *_suspects(channels, rate)))
+    labels = {name: values[name] for name in LABELS if name in values}
+    return Samples(rate, index, channels, (*table.said, *said, *_suspects(channels, rate)), labels)
+
+
+def _own_time(table: Table, chosen: dict[str, Column], card: Map | None) -> Float1D | None:
+    """The times in s, (row,), that the file keeps for its columns, where the map has no rate."""
+    clocks = {table.columns[column.column].clock for column in chosen.values()}
+    if "" in clocks or TIME in chosen or (card is not None and card.rate_hz is not None):
+        return None
+    first, *rest = (table.read(clock) for clock in sorted(clocks))
+    if any(not np.array_equal(first, other) for other in rest):
+        raise BadInput(
+            f"{table.path}: columns that were not sampled at the same times; import them one by one"
+        )
+    return first
 
 
 def _chosen(table: Table, card: Map | None) -> tuple[dict[str, Column], list[str]]:
@@ -124,79 +162,88 @@ def _chosen(table: Table, card: Map | None) -> tuple[dict[str, Column], list[str
     mapped = dict(card.columns) if card is not None else {}
     for name, column in mapped.items():
         if column.column not in table.columns:
-            near = difflib.get_close_matches(column.column, table.columns, 1, 0.4)
-            hint = f"did you mean {near[0]!r}? " if near else ""
-            raise BadInput(
-                f"{table.path}: no column {column.column!r} for {name}; {hint}"
-                f"there: {', '.join(table.columns)}"
-            )
+            raise _not_there(table, name, column.column)
     taken = {column.column for column in mapped.values()}
-    left = []
+    left, twins = [], 0
     for name in table.columns:
         if name in taken or name in mapped:
             continue
-        if name in BY_NAME or (name == TIME and (card is None or card.rate_hz is None)):
+        if name.startswith(TWIN):
+            twins += 1
+        elif name in KNOWN and (name != TIME or card is None or card.rate_hz is None):
             mapped[name] = Column(column=name)
         elif card is None:
             raise BadInput(
-                f"{table.path}: row 1: column {name!r} is unknown; {_nearest(name)} Rename it, or "
+                f"{table.path}: column {name!r} is unknown; {_nearest(name)}; rename it, or "
                 "say by --columns MAP which columns are which (the others are left out)"
             )
         else:
             left.append(name)
+    some = [name for name in LABELS if name in mapped]
+    if len(some) < len(LABELS):
+        left += [mapped.pop(name).column for name in some]
+    if not mapped.keys() & BY_NAME.keys():
+        raise BadInput(
+            f"{table.path}: no channel in it but time; there: {_few([*table.columns])}; "
+            f"known: {', '.join(BY_NAME)}"
+        )
     said = [f"{name} = column {one.column!r}" for name, one in mapped.items() if one.column != name]
-    return mapped, [*said, *([f"left out: {', '.join(left)}"] if left else [])]
+    said += [f"left out: {_few(left)}"] if left else []
+    said += [f"left out: {twins} columns of a twin; it is computed anew"] if twins else []
+    return mapped, said
 
 
-def _grid(time: Float1D, table: Table) -> tuple[float, Int1D, list[str]]:
-    """(rate in Hz, index of each row, what a person is told) of times in s, (row,)."""
-
-    def row(place: int) -> str:
-        return f"{table.path}: row {place + table.first_row}, {TIME}"
-
-    if np.isnan(time).any():
-        raise BadInput(f"{row(int(np.argmax(np.isnan(time))))}: empty; every sample needs its time")
-    if time.size < 3:
-        raise BadInput(f"{table.path}: {time.size} samples; allowed: three or more")
-    gaps = np.diff(time)
-    if (gaps <= 0).any():
-        at = int(np.argmax(gaps <= 0)) + 1
-        raise BadInput(
-            f"{row(at)}: {time[at]:.9g} s after {time[at - 1]:.9g} s; time must rise; sort the "
-            "rows or take out the doubled ones"
+def _not_there(table: Table, name: str, column: str) -> BadInput:
+    if column in table.others:
+        return BadInput(
+            f"{table.path}: {column!r}, meant for {name}, is no column: {table.others[column]}"
         )
-    near = gaps < 1.5 * np.median(gaps)
-    index = np.concatenate([[0.0], np.cumsum(np.rint(gaps / gaps[near].mean()))])
-    period, start = np.polyfit(index, time, 1)
-    exact = (time - start) / period
-    index = np.rint(exact).astype(np.int64)
-    index -= index[0]
-    off = exact - exact[0] - index
-    off -= off.mean()
-    doubled = np.diff(index) <= 0
-    if doubled.any() or off.std() > UNEVEN:
-        at = int(np.argmax(doubled if doubled.any() else np.abs(off)))
+    near = difflib.get_close_matches(column, table.columns, 1, 0.4)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    return BadInput(
+        f"{table.path}: no column {column!r} for {name}; {hint}there: {_few([*table.columns])}"
+    )
+
+
+def _few(names: list[str]) -> str:
+    more = f" and {len(names) - MOST_NAMED} more (all: --list)" if len(names) > MOST_NAMED else ""
+    return ", ".join(names[:MOST_NAMED]) + more
+
+
+def _agrees(table: Table, name: str, column: Column) -> None:
+    """BadInput where the file's own unit is another than the map's, both named."""
+    says = table.columns[column.column].unit
+    if not says or (column.file_unit is not None and column.file_unit == says):
+        return
+    stated = column.file_unit or column.unit or BY_UNIT.get(name, "")
+    if _plain(says) == stated:
+        return
+    who = "the map" if column.file_unit or column.unit else "its name"
+    raise BadInput(
+        f"{table.path}: column {column.column!r} is in {says!r} by the file, {name} in {stated!r} "
+        f"by {who}; allowed: that they agree; state unit = ... in a --columns file, or file_unit = "
+        f"{says!r} where a gain converts it"
+    )
+
+
+def _plain(unit: str) -> str:
+    """The unit in our spelling, where it is one of ours."""
+    text = unit.strip().replace("²", "2").replace("µ", "u").replace("μ", "u")
+    for mark in ("^", "**", " ", "(", ")", "[", "]"):
+        text = text.replace(mark, "")
+    return SPELLINGS.get(text.lower(), text)
+
+
+def _as_long(table: Table, chosen: dict[str, Column]) -> None:
+    """BadInput where the columns are not equally long, or larger than they can be."""
+    sizes = {column.column: table.columns[column.column].size for column in chosen.values()}
+    if len(set(sizes.values())) > 1:
+        told = _few([f"{name}: {size}" for name, size in sizes.items()])
         raise BadInput(
-            f"{row(at)}: {time[at]:.9g} s lies half a sample or more off a uniform "
-            f"{1 / period:.6g} Hz; resample the table to a uniform rate"
+            f"{table.path}: columns of different length ({told}); take those of one recording, "
+            "by `group` in a --columns file or one by one"
         )
-    rate = _round(1 / period, int(index[-1]))
-    said = [f"sampled at {rate:.9g} Hz"]
-    worst = float(np.abs(off).max())
-    if worst > 0.01:
-        said.append(f"time jitters by up to {worst:.2g} of a sample; taken as uniform")
-    if abs(time[0]) > 0.5 / rate:
-        said.append(f"time begins at {time[0]:.9g} s; sample 0 is there")
-    return rate, index, said
-
-
-def _round(rate_hz: float, last: int) -> float:
-    """The roundest rate that is off by less than a tenth of a sample at the end of the record."""
-    for digits in range(1, 15):
-        rounded = float(f"{rate_hz:.{digits}g}")
-        if abs(rounded / rate_hz - 1) * last < 0.1:
-            return rounded
-    return rate_hz
+    bounded(table, [*sizes])
 
 
 def _suspects(channels: dict[str, Float1D], rate_hz: float) -> list[str]:
@@ -231,9 +278,3 @@ def _suspects(channels: dict[str, Float1D], rate_hz: float) -> list[str]:
 def read_map(path: Path | None) -> Map | None:
     """The --columns file; BadInput with every fault of it."""
     return None if path is None else load(path, Map, "map of columns")[0]
-
-
-def holes(index: Int1D) -> list[tuple[int, int]]:
-    """(first missing sample, how many) of every hole between the rows."""
-    places = np.flatnonzero(np.diff(index) > 1)
-    return [(int(index[k]) + 1, int(index[k + 1] - index[k]) - 1) for k in places]

@@ -9,7 +9,8 @@ from table_io.card import BadInput
 from table_io.clock import RealClock
 from table_io.limits import doubts, warnings
 from twin.service.bundle import Bundle, read_bundle, run_id
-from twin.service.folders import new_folder, new_run
+from twin.service.disk import refuse_full
+from twin.service.folders import RUNS, new_folder, new_run
 from twin.service.kernels import ready
 from twin.service.outcome import EXIT_ABORTED, EXIT_INTERRUPTED, close
 from twin.service.progress import RunProgress
@@ -46,6 +47,7 @@ def run(
     if not unpaced:
         real_time(bundle, profile)
     ready(bundle, table=True)
+    refuse_full([bundle], out or RUNS)
     folder, run_name = new_run(out, bundle.name)
     for sentence in (*warnings(bundle.margins, bundle.rig), *doubts(bundle.profile, bundle.rig)):
         say(f"warning: {sentence}")
@@ -98,8 +100,9 @@ def _run_live(
     listen: str,
 ) -> bool:
     """True where the run began; a person may have stopped it before."""
-    from twin.service.processes import Spec
-    from twin.service.supervisor import Supervisor, gather
+    from twin.service.parts import gather
+    from twin.service.spec import Spec
+    from twin.service.supervisor import Supervisor
 
     spec = Spec(
         run_name,

@@ -20,7 +20,7 @@ from table_io.records import Comparison, Params
 from table_io.units import GRAVITY_M_S2
 from twin.model.card import ModelCard
 from twin.model.model import Model
-from twin.stream.mcap_log import Recording
+from twin.stream.recording import Recording
 
 Summary = dict[str, Any]
 Envelope = tuple[Float1D, Float1D, Float1D]

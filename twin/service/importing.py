@@ -9,19 +9,21 @@ from pathlib import Path
 import numpy as np
 
 from table_io.block import Block, Float1D, Float2D
-from table_io.card import BadInput, find, load
+from table_io.card import BadInput, find, load, parse
 from table_io.profile import Profile
 from table_io.records import Event, Gap, RunStart, RunStop, Step
 from table_io.rig import Rig
 from twin.learn.steps import Found, find_steps
 from twin.service.bundle import Bundle, from_texts, read_model, run_id
-from twin.service.columns import Samples, holes, read_map, samples
+from twin.service.columns import Samples, read_map, samples
 from twin.service.kernels import ready
+from twin.service.labels import found_labels
 from twin.service.outcome import EXIT_GAPS
 from twin.service.progress import RunProgress
 from twin.service.runs import SIMULATED_BLOCK, beside, record
+from twin.service.sampling import holes
 from twin.service.terminal import console, say
-from twin.stream.tables import read_table
+from twin.stream.tables import TEXTS, Table, read_table
 from twin.stream.wire import Item
 
 MOTIONS = ("drive_disp_m", "table_disp_m", "table_acc_m_s2", "rel_disp_m")  # the first tells steps
@@ -80,16 +82,22 @@ def take_in(
     """The table in `file` as a new log at `out`; the exit code."""
     if out.exists():
         raise BadInput(f"{out}: exists already; nothing recorded is ever overwritten")
+    if out.suffix != ".mcap":
+        raise BadInput(f"{out}: a log is a file that ends in .mcap; name it so")
     card = read_map(columns)
     if profile is not None:
         load(profile, Profile, "test profile")  # said now, not after a long table
-    found = samples(read_table(file), card)
-    bundle = _bundle(file, profile, rig, found.rate_hz)
+    table = read_table(file, card.group if card is not None else "")
+    found = samples(table, card)
+    bundle = _bundle(table, profile, rig, found.rate_hz)
     grid = _grid(file, found)
-    signal, is_acc = _motion(grid)
-    labels = find_steps(
-        signal, found.rate_hz, bundle.profile.sweep, is_acc=is_acc, on_grid=profile is not None
-    )
+    if found.labels:
+        labels = found_labels(table, found)
+    else:
+        signal, is_acc = _motion(grid)
+        labels = find_steps(
+            signal, found.rate_hz, bundle.profile.sweep, is_acc=is_acc, on_grid=profile is not None
+        )
     steps = labels.steps or bundle.steps
     bundle = replace(bundle, drive=replace(bundle.drive, steps=steps))
     said = (*found.said, *labels.said, _of_steps(labels.steps))
@@ -117,8 +125,24 @@ def take_in(
     return EXIT_GAPS if gaps else 0
 
 
-def _bundle(file: Path, profile: Path | None, rig: str | None, rate_hz: float) -> Bundle:
+def contents(file: Path, columns: Path | None) -> None:
+    """Says what a file holds, a line each."""
+    card = read_map(columns)
+    for line in read_table(file, card.group if card is not None else "").contents:
+        say(line)
+
+
+def _bundle(table: Table, profile: Path | None, rig: str | None, rate_hz: float) -> Bundle:
     """What the log will say of specimen, machine and model, at the file's rate."""
+    file = table.path
+    if profile is None and len(table.texts) == len(TEXTS):
+        profile_toml, rig_toml, model_toml = (table.texts[name] for name in TEXTS)
+        own = parse(profile_toml, Profile, f"profile in {file}")
+        if own.acquisition.rate_hz != rate_hz:
+            profile_toml = _at_rate(profile_toml, rate_hz)
+        if rig is not None:
+            rig_toml = load(find(rig, "rigs"), Rig, "machine card")[1]
+        return from_texts(file.stem, profile_toml, rig_toml, model_toml, f"what {file} brings")
     if profile is None:
         hz = min(1.0, rate_hz / 100)  # nobody's sweep, but one that a profile allows
         text = PLAIN_PROFILE.format(

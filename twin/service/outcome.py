@@ -5,7 +5,7 @@ from pathlib import Path
 from twin.service import summary as summaries
 from twin.service.bundle import Bundle
 from twin.service.terminal import say
-from twin.stream.mcap_log import read
+from twin.stream.recording import read
 
 EXIT_ABORTED, EXIT_GAPS, EXIT_NOT_IDENTICAL, EXIT_INTERRUPTED = 3, 4, 5, 130
 

@@ -16,6 +16,7 @@ from table_io.loop_check import aims
 from table_io.policies import words_of
 from table_io.units import GRAVITY_M_S2
 from twin.service.bundle import Bundle
+from twin.service.disk import planned_bytes
 from twin.service.drive_figure import draw_drive
 from twin.service.foreseen import Foreseen, clipped, foreseen
 from twin.service.terminal import print_table
@@ -78,6 +79,7 @@ def _plan(bundle: Bundle) -> list[tuple[str, str]]:
             f"samples; {1e3 * replace_after / rate:g} ms of it can no longer be changed",
         ),
         ("sampling", f"{rate:g} Hz"),
+        ("recording", f"at most {planned_bytes(bundle) / 1e6:.0f} MB"),
         ("table", rig.title),
     ]
 

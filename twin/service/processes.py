@@ -5,24 +5,21 @@ of its own so that Ctrl-C reaches only the supervisor; its standard input is a p
 that the supervisor is gone.
 """
 
-import fcntl
-import json
-import os
-import select
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from table_io.backends import open_backend
 from table_io.block import Block
 from table_io.card import BadInput
 from table_io.clock import RealClock
-from table_io.records import Decided, Event, Fault, RunStart, RunStop, Timing
+from table_io.records import Decided, Fault, RunStart, RunStop
 from table_io.session import ORDERS, Order, Punctuality, play
-from twin.service.bundle import Bundle, from_texts, warm_rig, warm_twin
+from twin.service.bundle import warm_rig, warm_twin
+from twin.service.recorder import recorder
 from twin.service.scheduling import urgent
+from twin.service.spec import CAPACITY, CONNECT_S, QUIET_S, Spec, orphaned, token
 from twin.service.stopwatch import Stopwatch
 from twin.stream.resend import Inbox
 from twin.stream.wire import (
@@ -35,14 +32,9 @@ from twin.stream.wire import (
 )
 from twin.stream.zenoh_link import open_hub, open_spoke
 
-CONNECT_S = 15.0
 RIG_PRIORITY, TWIN_PRIORITY = 50, 40  # of real-time scheduling, where it is permitted
 LINGER_S = 10.0  # that the hub stays up after the run, so that late readers can recover
-FLUSH_S = 0.25
-SYNC_S = 5.0
-QUIET_S = 3.0  # after which a recorder stops waiting for the twin's last word
 TIMING_BLOCKS = 100
-CAPACITY = 50_000
 CONTROL = ("/run/start", "/run/stop", "/rig/decided")
 RIG_TOPICS = (
     *(name for name in TOPIC_TYPES if name.startswith("/rig/")),
@@ -57,41 +49,6 @@ TWIN_TOPICS = (
     "/run/timing",
     "/run/event",
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Spec:
-    """What every process of a run is told. `folder` is the run's; the texts are TOML."""
-
-    run: str
-    name: str
-    folder: str
-    endpoint: str
-    profile_toml: str
-    rig_toml: str
-    model_toml: str
-    serve_view: str = ""  # address of the live Rerun view, if one is wanted
-
-    def write(self, path: Path) -> None:
-        path.write_text(json.dumps(asdict(self)))
-
-    @staticmethod
-    def read(path: Path) -> "Spec":
-        return Spec(**json.loads(path.read_text()))
-
-    def bundle(self) -> Bundle:
-        return from_texts(self.name, self.profile_toml, self.rig_toml, self.model_toml, self.name)
-
-
-def token(spec: Spec, component: str) -> str:
-    """Under which a process of this run is alive on the bus; another run's are others."""
-    return f"{spec.run}.{component}"
-
-
-def _orphaned() -> bool:
-    """True once the supervisor's end of our standard input is closed."""
-    ready, _, _ = select.select([sys.stdin], [], [], 0.0)
-    return bool(ready) and not os.read(sys.stdin.fileno(), 64)
 
 
 def rig(spec: Spec, _: str) -> None:
@@ -120,11 +77,11 @@ def rig(spec: Spec, _: str) -> None:
         order = ordered()
         if order is not None and order[0] in ORDERS:
             return Order(order[0], order[1] or f"asked to {order[0]}")
-        orphaned = stop_if_orphan and _orphaned()
-        return Order("stop", "the supervisor is gone") if orphaned else None
+        alone = stop_if_orphan and orphaned()
+        return Order("stop", "the supervisor is gone") if alone else None
 
     while (order := ordered()) is None or order[0] != "start":
-        if _orphaned():
+        if orphaned():
             return
         clock.wait_until(clock.now() + 0.01)
     seconds = bundle.profile.acquisition.block_samples / bundle.drive.rate_hz
@@ -138,7 +95,7 @@ def rig(spec: Spec, _: str) -> None:
     for item in _timed(source, watch, punctual):
         link.publish(topic(item), encode(item, spec.run))
     until = clock.now() + LINGER_S
-    while clock.now() < until and not _orphaned():
+    while clock.now() < until and not orphaned():
         orders.poll()  # serves those who still ask for what this process holds
         clock.wait_until(clock.now() + 0.005)
     link.close()
@@ -193,7 +150,7 @@ def twin(spec: Spec, missed_from: str) -> None:
                 setup = pipeline.knowing(setup, record)
         arrived = blocks.get(0.2)
         if arrived is None:
-            if _orphaned() and clock.now() - heard > QUIET_S:
+            if orphaned() and clock.now() - heard > QUIET_S:
                 break
             continue
         heard = clock.now()
@@ -215,7 +172,7 @@ def twin(spec: Spec, missed_from: str) -> None:
             say([watch.record(block.end)])
     say([watch.record(end or 0)])
     until = clock.now() + LINGER_S
-    while clock.now() < until and not _orphaned():
+    while clock.now() < until and not orphaned():
         control.get(0.02)  # serves those who still ask for what this process holds
     link.close()
 
@@ -228,84 +185,13 @@ def _told(control: Inbox, run: str) -> Iterator[Item]:
             yield record
 
 
-def recorder(spec: Spec, part: str) -> None:
-    """Writes everything on the bus to a part file, from the beginning if it is a successor."""
-    from twin.stream.mcap_log import LogWriter
-
-    bundle = spec.bundle()
-    clock = RealClock()
-    link = open_spoke(bundle.rig.name, spec.endpoint, CONNECT_S)
-    link.declare(("/run/timing", "/run/event"))
-    inbox = link.subscribe(tuple(TOPIC_TYPES), history=True, capacity=CAPACITY)
-    lock = Path(part).with_name("lock").open("a")
-    fcntl.flock(lock, fcntl.LOCK_SH)  # until this process ends: nobody takes the parts away
-    writer = LogWriter(Path(part), bundle.drive.rate_hz)
-    link.alive(token(spec, "recorder"))
-    watch = Stopwatch("recorder", clock, 1.0)
-    watch.begin()
-    flushed = synced = heard = clock.now()
-    waiting = _Awaited()
-    while not waiting.over or clock.now() - heard < 0.3:
-        arrived = inbox.get(0.05)
-        now = clock.now()
-        if arrived is not None:
-            heard = now
-            name, payload = arrived
-            run, item = decode(name, payload)
-            if run != spec.run:
-                continue
-            if isinstance(item, RunStart):
-                writer.describe(item)
-            writer.write(name, payload, item.index)
-            waiting.heard(item)
-        elif (waiting.end is not None and now - heard > QUIET_S) or (
-            now - heard > QUIET_S and _orphaned()
-        ):
-            break
-        if now - flushed > FLUSH_S:
-            writer.flush()
-            flushed = now
-        if now - synced > SYNC_S:
-            os.fsync(writer.fileno())
-            synced = now
-    last = watch.record(waiting.end or 0)
-    writer.write("/run/timing", encode(last, spec.run), last.index)
-    if inbox.missed or inbox.dropped:
-        text = f"recorder: {inbox.missed} messages missed, {inbox.dropped} dropped"
-        event = Event(waiting.end or 0, "recorder", text)
-        writer.write("/run/event", encode(event, spec.run), event.index)
-    writer.close()
-    link.close()
-
-
-@dataclass(slots=True)
-class _Awaited:
-    """What a recorder waits for: the end, every measured block, and the twin's last word."""
-
-    end: int | None = None
-    block_end: int = 0
-    twin_done: bool = False
-
-    def heard(self, item: Item) -> None:
-        if isinstance(item, RunStop):
-            self.end = item.index
-        elif isinstance(item, Block) and item.stream == "meas":
-            self.block_end = max(self.block_end, item.end)
-        elif isinstance(item, Timing) and item.component == "twin":
-            self.twin_done = self.end is not None and item.index >= self.end
-
-    @property
-    def over(self) -> bool:
-        return self.end is not None and self.block_end >= self.end and self.twin_done
-
-
 def viewer(spec: Spec, _: str) -> None:
     """Feeds Rerun; a courtesy, it may be slow or die."""
     from twin.service.viewing import serve
 
     link = open_spoke(spec.bundle().rig.name, spec.endpoint, CONNECT_S)
     link.alive(token(spec, "viewer"))
-    serve(link, spec.serve_view, _orphaned)
+    serve(link, spec.serve_view, orphaned)
     link.close()
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 from rich.console import Console
 
 from twin.service.bundle import Bundle, from_texts, read_model
-from twin.stream.mcap_log import Recording, read
+from twin.service.parts import PARTS
+from twin.stream.recording import Recording, read
 
 
 def log_path(log: Path) -> Path:
@@ -14,17 +15,29 @@ def log_path(log: Path) -> Path:
     return log / "run.mcap" if log.is_dir() else log
 
 
+def parts_of(log: Path) -> list[Path]:
+    """The log of a run's folder, or the parts that its recorder left; or the log itself."""
+    parts = sorted((log / PARTS).glob("part-*.mcap")) if log.is_dir() else []
+    return [log_path(log)] if log_path(log).exists() or not parts else parts
+
+
 def open_log(log: Path) -> Recording:
     """The recording in a log or a run's folder; says so where the file is not whole."""
     recording = read(log_path(log))
+    warned(recording)
+    return recording
+
+
+def warned(recording: Recording) -> None:
+    """Says so where a file is not whole."""
     if not recording.whole:
         end = recording.pieces("meas")[-1].end if recording.pieces("meas") else 0
         Console(stderr=True).print(
-            f"warning: {recording.path} is cut off or damaged; it is readable to sample {end}",
+            f"warning: {recording.path} is cut off or damaged; it is readable to sample {end}; "
+            f"`shaketwin verify {recording.path}` says what is lost",
             highlight=False,
             soft_wrap=True,
         )
-    return recording
 
 
 def recorded_bundle(recording: Recording, model: str | None = None) -> Bundle:

@@ -14,7 +14,7 @@ from table_io.records import Check, Event, Fault, Gap, Level, Params, Response, 
 from twin.service.evidence import Run, Summary, cards, gather, quantity
 from twin.service.figures import Picture, draw_all
 from twin.service.page import HERE, inside, page, significant
-from twin.stream.mcap_log import Recording, read
+from twin.stream.recording import Recording, read
 
 MOST_ROWS = 200
 

@@ -28,7 +28,7 @@ from twin.compare import COMPARED
 from twin.compare.curves import branches
 from twin.model.model import Model
 from twin.model.parameters import Parameters, resonance
-from twin.stream.mcap_log import Recording
+from twin.stream.recording import Recording
 
 Json = dict[str, Any]
 
@@ -47,7 +47,8 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
     twin_jumps, twin_intervals = branches(planned, "twin")
     looks = recording.of(Level)
     stop = recording.stop
-    samples = stop.index if stop else max((one.end for one in recording.blocks("meas")), default=0)
+    end = stop.index if stop else max((one.end for one in recording.blocks("meas")), default=0)
+    samples = max(end - start.index, 0)
     return {
         "run": {
             "id": start.run,
@@ -173,6 +174,7 @@ def nrmse(comparisons: tuple[Comparison, ...], parameters: Parameters) -> Json:
         for cell in cells
         if math.isinf(gap)
     }
+    comparisons = tuple(one for one in comparisons if one.channels == COMPARED)
     if not comparisons:
         return {}
     measured, free, window = (

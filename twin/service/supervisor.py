@@ -15,8 +15,8 @@ from table_io.card import BadInput
 from table_io.clock import Clock
 from table_io.profile import OnDeath
 from table_io.records import Comparison, Event, Fault, RunStop, Timing
-from twin.service.processes import Spec, token
-from twin.stream.mcap_log import merge, messages
+from twin.service.parts import LOCK, PARTS
+from twin.service.spec import Spec, token
 from twin.stream.resend import Inbox
 from twin.stream.wire import RECORD_TOPICS, Item, decode, encode, topic
 from twin.stream.zenoh_link import Link, open_spoke
@@ -24,10 +24,9 @@ from twin.stream.zenoh_link import Link, open_spoke
 READY_S = 30.0
 END_S = 15.0  # after the last sample, for everybody to finish
 SILENT_S = 5.0  # the rig reports every second; after this it hangs
+DEAF_S = 10.0  # so does the recorder; twice this is well before the bus forgets
 DRAIN_S = 0.1  # after a death, for what the dead one had still sent
 RESTARTS = 5
-PARTS = ".parts"
-LOCK = "lock"  # shared by supervisor and recorder while they live
 WATCHED = tuple(RECORD_TOPICS.values())
 
 
@@ -53,10 +52,11 @@ class Supervisor:
     say: Callable[[str], None]
     children: dict[str, Child] = field(default_factory=dict)
     compared_to: int = 0
-    heard: float = 0.0  # when the rig last spoke
+    heard: dict[str, float] = field(default_factory=dict)  # when a component last spoke
     twin_missing: bool = False  # a twin died and its successor has not said so yet
     stop: RunStop | None = None
     _parts: int = 0
+    _deaf: int = 0  # recorders that hung
 
     @property
     def parts(self) -> Path:
@@ -93,7 +93,7 @@ class Supervisor:
         self._start("rig")
         link = self._connect(self.spec.bundle().rig.name)
         self._ready(link)  # the rig that answers is ours, not another run's at the same endpoint
-        for component in ("twin", "recorder", *self._views()):
+        for component in ("twin", "recorder", *["viewer"] * bool(self.spec.serve_view)):
             self._start(component)
         self._ready(link)
         inbox = link.subscribe(WATCHED, history=True, capacity=5000)
@@ -111,9 +111,6 @@ class Supervisor:
         shutil.rmtree(self.parts)
         with contextlib.suppress(OSError):
             self.parts.parent.rmdir()
-
-    def _views(self) -> tuple[str, ...]:
-        return ("viewer",) if self.spec.serve_view else ()
 
     def _start(self, component: str, argument: str = "") -> None:
         """Start or restart a process in a session of its own, so that Ctrl-C passes it by."""
@@ -171,16 +168,15 @@ class Supervisor:
     def _attend(self, link: Link, inbox: Inbox) -> None:
         """Until the rig has ended: show what happens, pass a stop on, restart what died."""
         stopping = False
-        self.heard = self.clock.now()
+        self.heard = dict.fromkeys(("rig", "recorder"), self.clock.now())
         while self.stop is None:
             self._listen(inbox, 0.1)
             if not stopping and (why := self.asked()):
                 stopping = self._order(link, "stop", why) == "yes"
-            if self.clock.now() - self.heard > SILENT_S:
-                raise _RigDiedError(
-                    f"the rig has been silent for {SILENT_S:g} s: if the table still moves, use "
-                    "its own stop"
-                )
+            if self._silent_s("rig") > SILENT_S:
+                text = f"the rig has been silent for {SILENT_S:g} s: if the table still moves, "
+                raise _RigDiedError(f"{text}use its own stop")
+            stopping = self._unrecorded(link) or stopping
             for component in list(self.children):
                 if self._died(component) and self.stop is None:
                     self._listen(inbox, DRAIN_S)
@@ -188,6 +184,20 @@ class Supervisor:
                         self._bury(component, link)
         if self.twin_missing:
             self._fault(link, self.stop.index)
+
+    def _silent_s(self, component: str) -> float:
+        return self.clock.now() - self.heard[component]
+
+    def _unrecorded(self, link: Link) -> bool:
+        """End a recorder that hangs; True where the table was stopped, at the second one."""
+        silent = self._silent_s("recorder")
+        if "recorder" not in self.children or silent < DEAF_S:
+            return False
+        self.say(f"the recorder has been silent for {silent:.0f} s; ending it")
+        os.killpg(self.children["recorder"].process.pid, signal.SIGKILL)
+        self.heard["recorder"] = self.clock.now()  # its successor has as long
+        self._deaf += 1
+        return self._deaf > 1 and self._order(link, "stop", "the recorder hangs") == "yes"
 
     def _listen(self, inbox: Inbox, seconds: float) -> None:
         until = self.clock.now() + seconds
@@ -200,8 +210,8 @@ class Supervisor:
                 continue
             if isinstance(item, Comparison):
                 self.compared_to = max(self.compared_to, item.index + item.count)
-            elif isinstance(item, Timing) and item.component == "rig":
-                self.heard = self.clock.now()
+            elif isinstance(item, Timing):
+                self.heard[item.component] = self.clock.now()
             elif isinstance(item, Fault) and item.component == "twin":
                 self.twin_missing = False
             elif isinstance(item, RunStop):
@@ -260,7 +270,8 @@ class Supervisor:
 
     def _await(self, component: str, seconds: float) -> None:
         try:
-            self.children[component].process.wait(seconds)
+            if self.children[component].process.wait(seconds):
+                self.say(f"the {component} failed: {self._words(component)}")
         except subprocess.TimeoutExpired:
             self.say(f"{component} does not finish; ending it")
 
@@ -286,35 +297,3 @@ class _RigDiedError(Exception):
 
 def _how(code: int) -> str:
     return signal.Signals(-code).name if code < 0 else f"exit {code}"
-
-
-def gather(folder: Path) -> Path:
-    """run.mcap from the parts of a recording; they go only when it has been read back whole."""
-    held = folder / PARTS
-    out = folder / "run.mcap"
-    with (held / LOCK).open("a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise BadInput(f"{folder}: a run is still going on in this folder; wait") from None
-        parts = sorted(held.glob("part-*.mcap"))
-        if not parts:
-            raise BadInput(f"{folder}: the recorder wrote nothing")
-        if not out.exists():
-            _merged(parts, out)
-        shutil.rmtree(held)
-    return out
-
-
-def _merged(parts: list[Path], out: Path) -> None:
-    """The parts as one whole log, which takes its name only when it has been read back."""
-    if len(parts) == 1 and messages(parts[0])[1]:
-        parts[0].rename(out)
-        return
-    new = out.with_suffix(".new")
-    new.unlink(missing_ok=True)
-    count = merge(parts, new)
-    back, whole = messages(new)
-    if not whole or len(back) != count:
-        raise BadInput(f"{new}: differs from its parts, which are kept in {parts[0].parent}")
-    new.rename(out)

@@ -1,230 +1,156 @@
 """The log: MCAP files whose messages are the bytes of the wire. The only file that knows mcap.
 
-Layout: one topic a kind (see `wire.TOPIC_TYPES`), protobuf schemas inside, log_time from the sample
-index, publish_time the wall clock. Profile, machine card and model stand in it as attachments from
-the first moment, so that a killed recording explains itself.
+`LOG.md` beside this file is the page of the format. Profile, machine card, model and calibration
+stand in a log from the first moment, so that a killed recording explains itself.
 """
 
+import contextlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import BinaryIO, NamedTuple
 
-from mcap.reader import NonSeekingReader
+from mcap.exceptions import McapError
+from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import Writer
 
-from table_io.block import Block, join
-from table_io.card import BadInput
 from table_io.clock import wall_ns
-from table_io.records import Record, RunStart, RunStop
+from table_io.records import RunStart
+from twin.stream.content import SCHEMA_VERSION, Content, Metadata, attachments, hashes
+from twin.stream.newfile import NewFile
+from twin.stream.salvage import salvage
 from twin.stream.wire import (
     BLOCK_TOPICS,
     RECORD_TOPICS,
     TOPIC_TYPES,
     Item,
-    WireError,
-    decode,
     encode,
     schema,
 )
 
-SCHEMA_VERSION = "1"
-MAGIC = b"\x89MCAP0\r\n"
-# Which of the items of one sample index comes first: the start, then as the table of topics has
-# it, the stop last; so a recording reads the same in whatever order its parts were written.
-ORDER = {topic: place for place, topic in enumerate(TOPIC_TYPES)}
-ORDER |= {RECORD_TOPICS[RunStart]: -1, RECORD_TOPICS[RunStop]: len(TOPIC_TYPES)}
-R = TypeVar("R", bound=Record)
+MEDIA = {".toml": "toml", ".json": "json", ".pb": "protobuf"}
+CHUNK_BYTES = 2**20  # at most that is compressed at once
+DRAIN_BYTES = 2**20  # at most that a writer lets wait between two flushes
 
 
 class LogWriter:
-    """Writes items to a new MCAP file; refuses a file that exists."""
+    """Writes items to a new MCAP file; refuses a file that exists.
 
-    def __init__(self, path: Path, rate_hz: float) -> None:
+    Whatever raises OSError (a full disk, a dying one) may be called again and loses nothing.
+    """
+
+    def __init__(self, path: Path, rate_hz: float, chunk_bytes: int = CHUNK_BYTES) -> None:
         self.path = path
         self._rate_hz = rate_hz
-        try:
-            self._file = path.open("xb")
-        except FileExistsError:
-            raise BadInput(
-                f"{path}: exists already; nothing recorded is ever overwritten"
-            ) from None
-        except OSError as error:
-            raise BadInput(f"{path}: cannot write here: {error.strerror}") from None
+        self._file = NewFile(path)
         # With a checksum over everything, a record that is lost inside the file cannot go unseen.
-        self._writer = Writer(self._file, enable_data_crcs=True)
+        self._writer = Writer(self._file, chunk_bytes, enable_data_crcs=True)
         self._writer.start(profile="shaketwin", library="shaketwin")
         self._channels: dict[str, int] = {}
         self._sequence: dict[str, int] = {}
+        self._content = Content()
+        self._finished = False
 
-    def write(self, topic: str, payload: bytes, index: int) -> None:
-        """Append the bytes of one item that holds from sample `index`."""
+    @property
+    def size(self) -> int:
+        """Bytes of the file, those that wait for the disk included."""
+        return self._file.tell()
+
+    def write(
+        self, topic: str, payload: bytes, index: int, publish_time: int | None = None
+    ) -> None:
+        """Append the bytes of one item that holds from sample `index`; `publish_time` in ns."""
         if topic not in self._channels:
             name, data = schema(TOPIC_TYPES[topic])
             schema_id = self._writer.register_schema(name, "protobuf", data)
             self._channels[topic] = self._writer.register_channel(topic, "protobuf", schema_id)
         sequence = self._sequence.get(topic, 0)
         self._sequence[topic] = sequence + 1
+        log_time = round(index * 1e9 / self._rate_hz)
+        self._content.add(topic, log_time, payload)
         self._writer.add_message(
             self._channels[topic],
-            log_time=round(index * 1e9 / self._rate_hz),
+            log_time=log_time,
             data=payload,
-            publish_time=wall_ns(),
+            publish_time=wall_ns() if publish_time is None else publish_time,
             sequence=sequence % 2**32,
         )
+        if self._file.waiting > DRAIN_BYTES:
+            self._file.drain()
 
     def describe(self, start: RunStart) -> None:
         """Put the texts and versions of the run into the file, before its first message."""
-        for name, text in (
-            ("profile.toml", start.profile_toml),
-            ("rig.toml", start.rig_toml),
-            ("model.toml", start.model_toml),
-        ):
-            self._writer.add_attachment(wall_ns(), 0, name, "application/toml", text.encode())
-        self._writer.add_metadata(
-            "run", {"id": start.run, "schema": SCHEMA_VERSION, "host": start.host, **start.versions}
-        )
+        texts = attachments(start)
+        about = {"id": start.run, "schema": str(SCHEMA_VERSION), "host": start.host}
+        self.note("run", {**about, "started_at": start.started_at, **start.versions})
+        self.note("attachments", hashes(texts))
+        for name, data in texts.items():
+            media = f"application/{MEDIA[Path(name).suffix]}"
+            self._writer.add_attachment(wall_ns(), 0, name, media, data)
+
+    def note(self, name: str, values: dict[str, str]) -> None:
+        """Put a metadata record into the file."""
+        self._writer.add_metadata(name, values)
 
     def flush(self) -> None:
         """Close the chunk: what was written so far survives the death of this process."""
         self._writer.flush()
-        self._file.flush()
+        self._file.drain()
 
-    def fileno(self) -> int:
-        """Descriptor of the file, for a sync to disk."""
-        return self._file.fileno()
+    def sync(self) -> None:
+        """Wait until what was flushed is on the disk: it survives the death of the machine."""
+        self._file.sync()
 
     def close(self) -> None:
-        """Finish the file."""
-        if not self._file.closed:
+        """Finish the file with the hash of its content; may be called again."""
+        if not self._finished:
+            self._finished = True
+            self._writer.flush()
+            self.note("content", self._content.record())
             self._writer.finish()
-            self._file.close()
+        self._file.close()
 
 
-@dataclass(frozen=True, slots=True)
-class Message:
-    """One message of a log, still as bytes."""
+class Stamped(NamedTuple):
+    """One message of a log, still as bytes; times in ns, `publish_time` of the wall clock."""
 
     topic: str
     log_time: int
     payload: bytes
+    publish_time: int
 
 
-def messages(path: Path) -> tuple[list[Message], bool]:
-    """(every complete message in file order, True if the file ends as it should).
-
-    A file that was cut off before its first message has none; BadInput where it is no MCAP file.
-    """
-    found: list[Message] = []
-    try:
-        with path.open("rb") as stream:
-            if not MAGIC.startswith(stream.read(len(MAGIC))):
-                raise BadInput(f"{path}: not an MCAP file; give the run.mcap of a run")
-            stream.seek(0)
-            reader = NonSeekingReader(stream, validate_crcs=True)
-            try:
-                for _, channel, message in reader.iter_messages(log_time_order=False):
-                    found.append(Message(channel.topic, message.log_time, message.data))
-            except Exception:
-                # Where a file is cut or damaged, the parser and its decompressor fail in any way.
-                return found, False
-    except OSError as error:
-        raise BadInput(f"{path}: cannot read this log: {error.strerror}") from None
-    return found, True
+def each(path: Path) -> Iterator[Stamped]:
+    """The messages in file order, a chunk in memory at a time; all of it where it is damaged."""
+    count = 0
+    with path.open("rb") as stream:
+        reader = NonSeekingReader(stream, validate_crcs=True)
+        # Where a file is cut or damaged, the parser and its decompressor fail in any way.
+        with contextlib.suppress(Exception):
+            for _, channel, one in reader.iter_messages(log_time_order=False):
+                count += 1
+                yield Stamped(channel.topic, one.log_time, one.data, one.publish_time)
+        if stream.tell() == path.stat().st_size:
+            return
+    for found in salvage(path).messages[count:]:  # what stands after the damage is not given up
+        yield Stamped(found.topic, found.log_time, found.payload, found.publish_time)
 
 
-@dataclass(frozen=True, slots=True)
-class Recording:
-    """A whole log in memory. `whole` is False where the file was cut off."""
-
-    path: Path
-    run: str
-    start: RunStart
-    items: tuple[Item, ...]
-    whole: bool
-
-    def of(self, kind: type[R]) -> tuple[R, ...]:
-        """All records of one kind, in order of sample index."""
-        return tuple(item for item in self.items if isinstance(item, kind))
-
-    def blocks(self, stream: str) -> tuple[Block, ...]:
-        """All blocks of stream "meas" or "pred", in order of sample index."""
-        return tuple(
-            item for item in self.items if isinstance(item, Block) and item.stream == stream
-        )
-
-    def pieces(self, stream: str) -> tuple[Block, ...]:
-        """The stream joined into as few blocks as its gaps allow."""
-        runs: list[list[Block]] = []
-        for block in self.blocks(stream):
-            if runs and runs[-1][-1].end == block.index:
-                runs[-1].append(block)
-            else:
-                runs.append([block])
-        return tuple(join(run) for run in runs)
-
-    @property
-    def stop(self) -> RunStop | None:
-        stops = self.of(RunStop)
-        return stops[-1] if stops else None
-
-    @property
-    def missing_samples(self) -> int:
-        """Measured samples between the first and the last index that are not in the file."""
-        pieces = self.pieces("meas")
-        end = self.stop.index if self.stop else (pieces[-1].end if pieces else 0)
-        return end - sum(len(piece) for piece in pieces)
+def metadata(path: Path) -> Metadata:
+    """The metadata records of a whole log by name; none of one that was cut off or damaged."""
+    with path.open("rb") as stream:
+        try:
+            return {one.name: one.metadata for one in make_reader(stream).iter_metadata()}
+        except (McapError, ValueError, EOFError):
+            return {}
 
 
-def read(path: Path) -> Recording:
-    """The recording in `path`; BadInput where it is no log of ours."""
-    raw, whole = messages(path)
-    foreign = sorted({message.topic for message in raw} - set(TOPIC_TYPES))
-    if foreign and not {message.topic for message in raw} & set(TOPIC_TYPES):
-        raise BadInput(
-            f"{path}: an MCAP file, but not a shaketwin log (topics: {', '.join(foreign[:5])}); "
-            "give the run.mcap of a run"
-        )
-    try:
-        decoded = [
-            (*decode(one.topic, one.payload), (ORDER[one.topic], one.payload))
-            for one in raw
-            if one.topic in TOPIC_TYPES
-        ]
-    except WireError as error:
-        raise BadInput(f"{path}: damaged or foreign: {error}") from None
-    starts = [(run, item) for run, item, _ in decoded if isinstance(item, RunStart)]
-    if not starts:
-        raise BadInput(f"{path}: holds no start record, so profile and model are unknown")
-    run, start = starts[0]
-    assert isinstance(start, RunStart)
-    decoded.sort(key=lambda entry: (entry[1].index, entry[2]))
-    return Recording(path, run, start, tuple(item for _, item, _ in decoded), whole)
-
-
-def merge(parts: list[Path], out: Path) -> int:
-    """Write the messages of all parts to `out` by sample index, duplicates dropped.
-
-    Returns the number of messages. The parts stay as they are.
-    """
-    seen: set[tuple[str, bytes]] = set()
-    unique: list[Message] = []
-    for part in parts:
-        for message in messages(part)[0]:
-            key = (message.topic, message.payload)
-            if key not in seen:
-                seen.add(key)
-                unique.append(message)
-    starts = [decode(one.topic, one.payload)[1] for one in unique if one.topic == "/run/start"]
-    if not starts or not isinstance(starts[0], RunStart):
-        raise BadInput(f"{parts[0]}: holds no start record; the parts are kept as they are")
-    start = starts[0]
-    writer = LogWriter(out, start.rate_hz)
-    writer.describe(start)
-    for message in sorted(unique, key=lambda one: (one.log_time, ORDER[one.topic], one.payload)):
-        writer.write(message.topic, message.payload, round(message.log_time * start.rate_hz / 1e9))
-    writer.close()
-    return len(unique)
+@contextlib.contextmanager
+def foreign_log(file: BinaryIO) -> Iterator[Writer]:
+    """A new MCAP file for messages in the schemas of others; finished at the end."""
+    writer = Writer(file)
+    writer.start(library="shaketwin")
+    yield writer
+    writer.finish()
 
 
 def topics() -> Iterator[str]:

@@ -25,7 +25,7 @@ from table_io.channels import BY_NAME
 from table_io.profile import Profile
 from table_io.records import Comparison, Cycle, Point, Record, RunStart, Timing
 from table_io.words import sentence
-from twin.stream.mcap_log import Recording
+from twin.stream.recording import Recording
 from twin.stream.rerun_layout import (
     CONTACT,
     DIM,

@@ -5,10 +5,12 @@ finds one missing asks for the rest, a chunk at a time, and takes nothing newer 
 """
 
 import json
+import secrets
 import struct
 import threading
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, Protocol
 
@@ -71,6 +73,43 @@ class Shelf:
 
 
 @dataclass(slots=True)
+class Listeners:
+    """How far those who listen to a publisher have come, by their questions; for one who can wait.
+
+    Of each: when it asked last, and the number of the next piece that it needs by topic.
+    """
+
+    name: str  # the publisher's
+    heard: dict[str, tuple[float, dict[str, int]]] = field(default_factory=dict)
+
+    def note(self, question: dict[str, Any], shelves: Mapping[str, Shelf]) -> None:
+        """Take in a question; who does not want history begins where the shelf ends."""
+        begin = {topic: 0 if question["history"] else shelves[topic].end for topic in shelves}
+        before = self.heard.get(str(question.get("who")), (0.0, begin))[1]
+        asked = {
+            topic: int(known.get(self.name, before.get(topic, 0)))
+            for topic, known in question["next"].items()
+            if topic in shelves
+        }
+        now = CLOCK.now()
+        self.heard = {who: one for who, one in self.heard.items() if now - one[0] < GIVE_UP_S}
+        self.heard[str(question.get("who"))] = now, asked
+
+    def behind(self, shelves: Mapping[str, Shelf]) -> int:
+        """The most pieces that anybody lacks who asked within `GIVE_UP_S`; 0 where nobody did."""
+        since = CLOCK.now() - GIVE_UP_S
+        return max(
+            (
+                shelves[topic].end - next_one
+                for when, asked in self.heard.values()
+                if when > since
+                for topic, next_one in asked.items()
+            ),
+            default=0,
+        )
+
+
+@dataclass(slots=True)
 class Source:
     """How far an inbox has come with one topic of one publisher; `next` is None before it began."""
 
@@ -119,6 +158,7 @@ class Inbox:
         self._skipped: dict[tuple[str, str], int] = {}
         self._ready: deque[tuple[str, bytes]] = deque()
         self._sources: dict[tuple[str, str], Source] = {}
+        self._who = secrets.token_hex(8)
         self._asked_at = float("-inf")
         self._answered = False
 
@@ -209,4 +249,4 @@ class Inbox:
             for (topic, name), one in self._sources.items():
                 if one.next is not None:
                     known[topic][name] = one.next
-            self._link.ask({"history": self._history, "next": known}, self)
+            self._link.ask({"who": self._who, "history": self._history, "next": known}, self)

@@ -1,149 +1,191 @@
-"""Text tables of samples: a CSV file -> its columns, as numbers and nothing else.
+"""Somebody's file as columns: their names, lengths and units first, their numbers when asked for.
 
-The delimiter (comma, semicolon or tab) is that of the header. An empty cell and "NaN" are a lost
-sample. Whatever else is no finite number is refused, with file, row, column and what to do.
+A format is one file beside this one, `table_<format>.py`. What a foreign library makes of a damaged
+file stays in a process of its own and comes out as one sentence.
 """
 
-import csv
-from array import array
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
-from typing import TextIO
+from typing import Any
 
 import numpy as np
 
 from table_io.block import Float1D
 from table_io.card import BadInput
+from twin.stream.apart import apart
 
-DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs"}
-LONGEST_LINE = 1_000_000  # characters
-SNIFFED = 4096
+FORMATS = {
+    ".parquet": "parquet",
+    ".mat": "mat",
+    ".uff": "uff", ".unv": "uff", ".uf": "uff", ".u58": "uff", ".58": "uff",
+    ".tdms": "tdms",
+    ".h5": "hdf5", ".hdf5": "hdf5", ".hdf": "hdf5",
+    ".npz": "npz",
+}  # fmt: skip
+TEXTS = ("profile_toml", "rig_toml", "model_toml")  # what our own exports carry beside the samples
+MOST_ROWS = 2**27  # of a column: 18 h at 2 kHz
+MOST_BYTES = 2**32  # of all columns that are taken, as float64
+MOST_TIMES = 200  # what is in a file may be so much larger than the file, and 64 MiB
+MOST_COLUMNS = 64  # of an array of two dimensions
+MOST_NAMED = 20  # columns in a message
+EXACT = 2**53  # integers up to here are the same as float64
+KINDS = {"c": "complex", "O": "objects", "S": "text", "U": "text", "M": "dates", "V": "records"}
+Key = tuple[str | int, ...]  # how a reader finds a column again
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """A column of `size` rows, still in its file; unit, rate and begin as the file has it.
+
+    `clock` is the column with its times, where the file has such a one for it. `values` are its
+    numbers where they were read at once.
+    """
+
+    size: int
+    key: Key = ()
+    unit: str = ""
+    rate_hz: float | None = None
+    start_s: float = 0.0
+    clock: str = ""
+    values: Float1D | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Columns by their name in the file, (row,) each; NaN where a cell is empty."""
+    """What a file holds: columns by name, and what cannot be a column with the reason."""
 
     path: Path
-    columns: dict[str, Float1D]
-    said: tuple[str, ...]
-    first_row: int  # number in the file of the first row of numbers
+    columns: dict[str, Held] = field(default_factory=dict)
+    said: tuple[str, ...] = ()
+    first_row: int = 1  # number in the file of the first row of numbers
+    others: dict[str, str] = field(default_factory=dict)
+    texts: dict[str, str] = field(default_factory=dict)  # of TEXTS
+
+    def read(self, name: str) -> Float1D:
+        """The numbers of a column, (row,), float64; NaN where a sample is lost."""
+        where, held = f"{self.path}: column {name!r}", self.columns[name]
+        if held.values is not None:
+            values = held.values
+        else:
+            load = _reader(self.path).load
+            values = np.asarray(apart(self.path, lambda: load(self.path, held.key)))
+        if values.dtype.kind not in "fiub" or values.shape != (held.size,):
+            what = KINDS.get(values.dtype.kind, f"{values.shape} of {values.dtype}")
+            raise BadInput(f"{where}: {what}; allowed: real numbers, one a sample")
+        if values.dtype.kind in "iu" and max(-int(values.min()), int(values.max())) > EXACT:
+            raise BadInput(f"{where}: integers beyond 2^53; subtract the first, export it again")
+        numbers = np.ascontiguousarray(values, dtype=np.float64)
+        if np.isinf(numbers).any():
+            row = int(np.argmax(np.isinf(numbers))) + self.first_row
+            raise BadInput(
+                f"{self.path}: row {row}, column {name!r}: infinite; leave lost samples empty"
+            )
+        return numbers
+
+    @property
+    def contents(self) -> tuple[str, ...]:
+        """A line for everything in the file."""
+        lines = []
+        for name, held in self.columns.items():
+            unit = f", in {held.unit!r}" if held.unit else ""
+            rate = f", {held.rate_hz:.9g} Hz" if held.rate_hz else ""
+            lines.append(f"{name}: {held.size} rows{unit}{rate}")
+        return (*lines, *(f"{name}: no column: {why}" for name, why in self.others.items()))
 
 
-def read_table(path: Path) -> Table:
-    """The table in a file; BadInput names the row and column that is wrong.
-
-    The one place for another format: by `path.suffix`, its own file beside this one.
-    """
+def read_table(path: Path, group: str = "") -> Table:
+    """The table in a file, or in one group of it; BadInput where it is none."""
+    read = _reader(path).read
     try:
-        with path.open("rb") as raw:
-            start = raw.read(SNIFFED)
-        if not start.strip():
-            raise BadInput(f"{path}: empty; give a table with a header and a row a sample")
-        if b"\0" in start:
-            raise BadInput(f"{path}: a binary file; give a text table (CSV, UTF-8)")
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            return _read(file, path)
+        path.open("rb").close()
+        table = apart(path, lambda: read(path)) if path.suffix.lower() in FORMATS else read(path)
     except OSError as error:
         raise BadInput(f"{path}: cannot read this table: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise BadInput(f"{path}: not UTF-8 text; export it as CSV in UTF-8") from None
+    if not table.columns:
+        what = [f"{name} ({why})" for name, why in table.others.items()][:MOST_NAMED]
+        raise BadInput(
+            f"{path}: no column of numbers in it; there: {', '.join(what) or 'nothing'}; "
+            "is it what its name says?"
+        )
+    return _within(table, group.strip("/"))
 
 
-def _read(file: TextIO, path: Path) -> Table:
-    lines = _lines(file, path)
-    head = next(lines)
-    delimiter = max(DELIMITERS, key=head.count)
-    names = _header(head, delimiter, path)
-    reader = csv.reader(lines, delimiter=delimiter)
-    width, values = len(names), array("d")
-    row, blank = 1, 0
+def _reader(path: Path) -> Any:
+    """The file beside this one that reads a format: `read(path)` gives a Table, `load(path, key)`
+    a column."""
+    kind = FORMATS.get(path.suffix.lower(), "csv")
     try:
-        for row, cells in enumerate(reader, start=2):
-            if not cells:
-                blank = blank or row
-                continue
-            if blank:
-                raise BadInput(f"{path}: row {blank} is empty, with more below it; take it out")
-            if len(cells) == width + 1 and not cells[-1].strip():
-                cells.pop()
-            if len(cells) != width:
-                raise _wrong_width(path, row, len(cells), names)
-            try:
-                values.extend([float(cell) for cell in cells])
-            except ValueError:
-                values.extend(
-                    _number(cell, f"{path}: row {row}, column {name!r}")
-                    for cell, name in zip(cells, names, strict=True)
-                )
-    except csv.Error as error:
-        raise BadInput(f"{path}: row {row + 1}: {error}; look for an open quote") from None
-    if not values:
-        raise BadInput(f"{path}: a header and no samples below it; export the data too")
-    table = np.frombuffer(values).reshape(-1, width)
-    for name, column in zip(names, table.T, strict=True):
-        if np.isinf(column).any():
-            at = int(np.flatnonzero(np.isinf(column))[0]) + 2
-            raise BadInput(f"{path}: row {at}, column {name!r}: infinite; leave lost samples empty")
-    said = () if delimiter == "," else (f"cells are separated by {DELIMITERS[delimiter]}",)
-    columns = {
-        name: np.ascontiguousarray(column) for name, column in zip(names, table.T, strict=True)
+        return import_module(f"twin.stream.table_{kind}")
+    except ModuleNotFoundError as error:
+        raise BadInput(
+            f"{path}: {error.name} is not installed; pip install shaketwin[formats]"
+        ) from None
+
+
+def in_memory(values: Float1D, unit: str = "") -> Held:
+    """A column that is read already."""
+    return Held(values.size, unit=unit, values=values)
+
+
+def put(
+    table: Table, name: str, shape: tuple[int, ...], kind: str, key: Key, unit: str = ""
+) -> None:
+    """Add an array of a file to its table: one column, or those of a matrix as `name:1`, `name:2`.
+
+    `kind` is numpy's (dtype.kind). The samples of a matrix lie along its longer side. A column's
+    key is the array's and its number, which `part` undoes.
+    """
+    long = [int(length) for length in shape if length != 1]
+    if kind not in "fiub":
+        table.others[name] = KINDS.get(kind, "no numbers")
+    elif not long or 0 in shape:
+        table.others[name] = "empty" if 0 in shape else "a single value"
+    elif len(long) > 2 or (len(long) == 2 and min(long) > MOST_COLUMNS):
+        table.others[name] = f"{' x '.join(map(str, shape))} values; allowed: a few columns"
+    elif len(long) == 1:
+        table.columns[name] = Held(long[0], (*key, 0), unit)
+    else:
+        for k in range(min(long)):
+            table.columns[f"{name}:{k + 1}"] = Held(max(long), (*key, k), unit)
+
+
+def part(array: Any, k: int) -> Any:
+    """Column `k` of an array that `put` has seen, (row,)."""
+    array = np.asarray(array)
+    array = array.reshape([length for length in array.shape if length != 1])
+    return array.reshape(max(array.shape), -1)[:, k] if _tall(array) else array[k]
+
+
+def _tall(array: Any) -> bool:
+    return array.ndim < 2 or array.shape[0] >= array.shape[1]
+
+
+def bounded(table: Table, names: list[str]) -> None:
+    """BadInput where the columns to be taken are larger than such a file can mean."""
+    at_most = min(MOST_BYTES, 2**26 + MOST_TIMES * table.path.stat().st_size)
+    rows = [table.columns[name].size for name in names]
+    if max(rows, default=0) > MOST_ROWS or 8 * sum(rows) > at_most:
+        raise BadInput(
+            f"{table.path}: says that it holds {sum(rows)} numbers in {table.path.stat().st_size} "
+            f"bytes; allowed: {at_most // 8}; it is damaged, or import its parts one by one"
+        )
+
+
+def _within(table: Table, group: str) -> Table:
+    """The columns inside a group, without its name; without one, what all have in common goes."""
+    names = [*table.columns]
+    if not group:
+        heads = {name.rpartition("/")[0] for name in names}
+        group = heads.pop() if len(heads) == 1 else ""
+    elif not any(name.startswith(f"{group}/") for name in names):
+        groups = sorted({name.rpartition("/")[0] for name in names} - {""})
+        raise BadInput(f"{table.path}: no group {group!r}; there: {', '.join(groups) or 'none'}")
+    if not group:
+        return table
+    inside = {
+        name.removeprefix(f"{group}/"): replace(held, clock=held.clock.removeprefix(f"{group}/"))
+        for name, held in table.columns.items()
+        if name.startswith(f"{group}/")
     }
-    return Table(path, columns, said, 2)
-
-
-def _lines(file: TextIO, path: Path) -> Iterator[str]:
-    """The file line by line, none of them endless."""
-    while line := file.readline(LONGEST_LINE):
-        if len(line) == LONGEST_LINE:
-            raise BadInput(
-                f"{path}: a line of more than {LONGEST_LINE} characters; give a row a sample"
-            )
-        yield line
-
-
-def _header(line: str, delimiter: str, path: Path) -> list[str]:
-    """Names of the columns; a delimiter at the end of the line is no column."""
-    names = [name.strip() for name in next(csv.reader([line], delimiter=delimiter), [])]
-    if names and not names[-1]:
-        names.pop()
-    if not names or all(_is_number(name) for name in names):
-        raise BadInput(f"{path}: row 1 names no columns; put their names there, as in `--help`")
-    if "" in names:
-        raise BadInput(f"{path}: row 1: column {names.index('') + 1} has no name; give it one")
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise BadInput(f"{path}: row 1 names {', '.join(twice)} more than once; keep one of each")
-    return names
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def _number(cell: str, where: str) -> float:
-    """The number in a cell, NaN of an empty one."""
-    text = cell.strip()
-    if not text:
-        return float("nan")
-    if _is_number(text):
-        return float(text)
-    if _is_number(text.replace(",", ".", 1)):
-        raise BadInput(f"{where}: {text!r} has a decimal comma; allowed: a point; export it so")
-    raise BadInput(
-        f"{where}: {text[:40]!r} is no number; leave a lost sample empty, put units into the "
-        "header or into --columns"
-    )
-
-
-def _wrong_width(path: Path, row: int, count: int, names: list[str]) -> BadInput:
-    hint = "; are its decimal commas? export it with points" if count == 2 * len(names) else ""
-    return BadInput(
-        f"{path}: row {row} has {count} cells, the header {len(names)} columns; give every row as "
-        f"many cells{hint}"
-    )
+    return replace(table, columns=inside)

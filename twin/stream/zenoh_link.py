@@ -38,6 +38,7 @@ from twin.stream.resend import (
     PIECE_BYTES,
     STAMP,
     Inbox,
+    Listeners,
     Shelf,
 )
 from twin.stream.wire import BLOCK_TOPICS, COMPARED
@@ -103,6 +104,7 @@ class Link:
         self._shelves: dict[str, Shelf] = {}
         self._open: list[Any] = []
         self._questions: Any = None
+        self.listeners = Listeners(self._name.hex())
 
     def declare(self, topics: tuple[str, ...]) -> None:
         """Make ready to publish `topics`, so that the first one costs no more than the others."""
@@ -141,6 +143,7 @@ class Link:
             try:
                 question = json.loads(query.payload.to_bytes())
                 topics, body = self._answer(question["next"], bool(question["history"]))
+                self.listeners.note(question, self._shelves)
             except (ValueError, TypeError, KeyError, AttributeError):
                 return  # not one of ours: nothing to say
             if topics:
@@ -166,6 +169,11 @@ class Link:
             if known is None or first < shelf.end:
                 topics[topic] = [first, shelf.end, [(place, len(piece)) for place, piece in taken]]
         return topics, b"".join(chunk)
+
+    @property
+    def behind(self) -> int:
+        """The most pieces of a topic that anybody lacks who listens to this process."""
+        return self.listeners.behind(self._shelves)
 
     def ask(self, question: dict[str, Any], inbox: Inbox) -> None:
         """Ask all publishers for what they hold; answers arrive in the inbox. Never waits."""

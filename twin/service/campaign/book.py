@@ -21,7 +21,7 @@ from twin.service.campaign.state import (
     unchanged,
     write_state,
 )
-from twin.service.processes import Spec
+from twin.service.spec import Spec
 
 
 @dataclass(slots=True)

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from types import TracebackType
 from typing import Any
 
-from twin.service.processes import Spec
+from twin.service.spec import Spec
 
 MOST = 2  # each holds a whole recording in memory while it writes the report
 

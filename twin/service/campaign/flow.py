@@ -13,8 +13,9 @@ from twin.service.campaign.paced import paced
 from twin.service.campaign.report import write_whole
 from twin.service.campaign.state import LOCK, locked
 from twin.service.campaign.unpaced import unpaced
+from twin.service.disk import refuse_full
 from twin.service.driving import real_time
-from twin.service.folders import new_folder
+from twin.service.folders import RUNS, new_folder
 from twin.service.kernels import ready
 from twin.service.outcome import EXIT_GAPS
 from twin.service.terminal import say
@@ -51,6 +52,8 @@ def campaign(asked: Asked) -> int:
     asks = not (asked.unpaced or asked.unattended)
     if asks and not sys.stdin.isatty():
         raise BadInput("no terminal to ask the operator between the runs; give --yes")
+    if not asked.resume:
+        refuse_full([run.bundle for run in plan.runs], asked.out or RUNS)
     folder = _folder(asked)
     with locked(folder / LOCK) as lock:
         if asked.resume:
@@ -58,6 +61,7 @@ def campaign(asked: Asked) -> int:
         book, found = reopened(folder, plan) if asked.resume else (begun(folder, plan), [])
         for one in (*found, *doubts(plan)):
             say(f"warning: {one}")
+        refuse_full([run.bundle for run in book.pending()], folder)
         _announce(book)
         try:
             code = unpaced(book, lock) if asked.unpaced else paced(book, asks, asked.listen)

@@ -11,8 +11,9 @@ from twin.service.campaign.report import write_whole
 from twin.service.campaign.state import Answer
 from twin.service.campaign.words import ask, ended, head, name, unattended
 from twin.service.outcome import EXIT_ABORTED, EXIT_INTERRUPTED
+from twin.service.parts import gather
 from twin.service.progress import RunProgress
-from twin.service.supervisor import Supervisor, gather
+from twin.service.supervisor import Supervisor
 from twin.service.terminal import console, interruptible, say
 
 

@@ -8,11 +8,11 @@ from table_io.profile import Profile
 from twin.service import summary as summaries
 from twin.service.campaign.card import Mode
 from twin.service.campaign.state import Part, RunState, digest, locked
+from twin.service.parts import LOCK, PARTS, gather
 from twin.service.recordings import recorded_bundle
 from twin.service.report import write_report
 from twin.service.summary import Json
-from twin.service.supervisor import LOCK, PARTS, gather
-from twin.stream.mcap_log import read
+from twin.stream.recording import read
 
 LOG = "run.mcap"
 

@@ -13,8 +13,8 @@ from pathlib import Path
 from table_io.card import BadInput
 from table_io.records import Point
 from twin.service.campaign.parts import finish
-from twin.service.processes import Spec
 from twin.service.runs import play_unpaced
+from twin.service.spec import Spec
 from twin.stream.wire import Item
 
 

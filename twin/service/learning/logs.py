@@ -15,7 +15,7 @@ from table_io.profile import Profile
 from twin.learn.discover import Log
 from twin.learn.readings import alive, readings_of
 from twin.service.recordings import log_path, open_log
-from twin.stream.mcap_log import Recording
+from twin.stream.recording import Recording
 
 CELLS = (*RIGHT_CELLS, *LEFT_CELLS)
 ACCELERATIONS = ("mass_acc_m_s2", "table_acc_m_s2", "damper_force_n")

@@ -14,7 +14,7 @@ from twin.service.paper.cases import GAPS
 from twin.service.paper.players import Motion
 from twin.service.recordings import log_path, recorded_bundle
 from twin.service.summary import summarise
-from twin.stream.mcap_log import read
+from twin.stream.recording import read
 
 
 @dataclass(slots=True)

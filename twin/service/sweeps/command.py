@@ -17,7 +17,7 @@ from twin.compare.curves import branches
 from twin.model.parameters import resonance
 from twin.service import ideal_points
 from twin.service.batch import one_by_one
-from twin.service.bundle import LIBRARIES, Bundle, read_bundle
+from twin.service.bundle import Bundle, read_bundle
 from twin.service.folders import new_run
 from twin.service.kernels import COMPILING
 from twin.service.outcome import EXIT_INTERRUPTED
@@ -27,6 +27,7 @@ from twin.service.sweeps.cases import Case, cases, gaps_mm, models
 from twin.service.sweeps.page import write_page
 from twin.service.sweeps.rows import Table, rows
 from twin.service.terminal import console, interruptible, said_if_long, say
+from twin.service.versions import LIBRARIES
 
 
 def simulate_all(

@@ -1,0 +1,78 @@
+"""Speed of a replay, in CPU time beside real time and beside reading by protobuf alone; shown only.
+
+pytest tests/bench/test_bench_replay.py -n 0 --benchmark-enable -s
+"""
+
+import time
+from pathlib import Path
+
+import pytest
+
+from table_io.card import find
+from twin.log import open_log
+from twin.service.bundle import Bundle, read_bundle
+from twin.service.replaying import Recorded, replay
+from twin.service.runs import play_unpaced
+from twin.stream import shaketwin_pb2 as pb
+from twin.stream.recording import messages
+
+
+@pytest.fixture(scope="module")
+def bundle() -> Bundle:
+    return read_bundle(find("quickstart", "tests"))
+
+
+@pytest.fixture(scope="module")
+def log(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("bench") / "run.mcap"
+    play_unpaced(bundle, "bench", path, lambda: None, lambda _: None)
+    return path
+
+
+def read_by_protobuf(log: Path) -> int:
+    """Every message parsed and its values listed, one by one: what a reader has to do at least."""
+    count = 0
+    kinds = {"/rig/meas": pb.Block, "/twin/pred": pb.Block, "/twin/cmp": pb.Comparison}
+    for one in messages(log)[0]:
+        if kind := kinds.get(one.topic):
+            message = kind.FromString(one.payload)
+            if kind is pb.Block:
+                count += sum(len(list(channel.values)) for channel in message.channels)
+    return count
+
+
+def cpu_s(work, *given: object) -> float:
+    begin = time.process_time()
+    work(*given)
+    return time.process_time() - begin
+
+
+@pytest.mark.benchmark(group="replay")
+def test_replay_beside_reading(benchmark, bundle: Bundle, log: Path, tmp_path: Path) -> None:
+    """Opening, twin, comparison and writing, against parsing the recording and nothing more."""
+    number = 0
+
+    def replayed() -> None:
+        nonlocal number
+        number += 1
+        recorded = Recorded.open(log)
+        made = tmp_path / f"{number}.mcap"
+        assert replay(recorded, bundle, made, "again", lambda _: None).identical
+
+    benchmark.pedantic(cpu_s, (replayed,), rounds=3)
+    if benchmark.stats is None:
+        return
+    ours = min(cpu_s(replayed) for _ in range(3))
+    reading = min(cpu_s(read_by_protobuf, log) for _ in range(3))
+    stop = open_log(log).stop
+    assert stop is not None
+    seconds = stop.index / bundle.drive.rate_hz
+    benchmark.extra_info["times_real_time"] = round(seconds / ours)
+    benchmark.extra_info["over_reading"] = round(ours / reading, 2)
+    print(f"\nreplay {seconds / ours:.0f} times real time, {ours / reading:.2f} times reading")
+
+
+@pytest.mark.benchmark(group="replay")
+def test_one_channel_of_a_log(benchmark, log: Path) -> None:
+    """The first look at a channel through the Python door, file and all."""
+    benchmark.pedantic(lambda: open_log(log)["mass_disp_m"], rounds=3)

@@ -1,0 +1,111 @@
+"""Several recordings and models in one go: one table, as JSON, as CSV and on the terminal."""
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from table_io.card import BadInput
+from twin.service.bundle import read_bundle
+from twin.service.outcome import EXIT_NOT_IDENTICAL
+from twin.service.replay import Asked, replay_command
+from twin.service.runs import play_unpaced
+from twin.stream.mcap_log import write_items
+from twin.stream.recording import read
+
+from .test_replaying import PROFILE, silent
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two runs, of a 4 mm gap and of free flight."""
+    folder = tmp_path_factory.mktemp("table")
+    made = []
+    for name, gap in (("g4", "4.0"), ("ginf", "inf")):
+        (folder / f"{name}.toml").write_text(PROFILE.replace("gap_mm = 4.0", f"gap_mm = {gap}"))
+        path = folder / name / "run.mcap"
+        path.parent.mkdir()
+        bundle = read_bundle(folder / f"{name}.toml")
+        play_unpaced(bundle, name, path, lambda: None, silent)
+        made.append(path.parent)
+    (folder / "stiff.toml").write_text(bundle.model_toml.replace("36000.0", "37800.0"))
+    return made
+
+
+@pytest.fixture(scope="module")
+def table(logs: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("compared") / "out"
+    models = ["recorded", str(logs[0].parent / "stiff.toml")]
+    assert replay_command(Asked(logs, models, out)) == 0
+    return out
+
+
+def test_every_log_with_every_model_has_a_row_and_a_folder(table: Path) -> None:
+    rows = json.loads((table / "comparison.json").read_text())["replays"]
+    assert [(row["log"], Path(row["model"]).stem) for row in rows] == [
+        ("g4", "recorded"), ("g4", "stiff"), ("ginf", "recorded"), ("ginf", "stiff"),
+    ]  # fmt: skip
+    assert [row["identical"] for row in rows] == [True, False, True, False]
+    for row in rows:
+        own = table / f"{row['log']}-{Path(row['model']).stem}"
+        found = json.loads((own / "summary.json").read_text())
+        assert row["nrmse rel_disp_m"] == found["comparison"]["rel_disp_m"]["nrmse"]
+        assert (own / "run.mcap").is_file()
+    # the stiffer model is worse in everything that there is
+    for right, wrong in (rows[:2], rows[2:]):
+        for name in ("nrmse rel_disp_m", "free_nrmse rel_disp_m", "prc eta_d", "prc eta_a"):
+            assert wrong[name] > 2 * right[name] > 0
+    assert rows[2]["nrmse force_r1_n"] is None  # no bumper, nothing to compare
+    assert rows[0]["twin_jumps"] == rows[0]["jumps"]
+    assert (rows[0]["steps"], rows[0]["steps_with_the_same_impacts"]) == (6, 6)
+
+
+def test_the_error_of_a_curve_is_its_rms_over_the_curve(table: Path) -> None:
+    row = json.loads((table / "comparison.json").read_text())["replays"][1]
+    steps = json.loads((table / "g4-stiff" / "summary.json").read_text())["steps"]
+    rig = [step["measured"]["eta_d"] for step in steps]
+    twin = [step["twin"]["eta_d"] for step in steps]
+    error = math.sqrt(sum((a - b) ** 2 for a, b in zip(rig, twin, strict=True)))
+    assert row["prc eta_d"] == pytest.approx(error / math.hypot(*rig), rel=1e-12)
+
+
+def test_the_csv_is_the_json(table: Path) -> None:
+    rows = json.loads((table / "comparison.json").read_text())["replays"]
+    with (table / "comparison.csv").open(newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert len(lines) == len(rows)
+    for line, row in zip(lines, rows, strict=True):
+        assert line["jumps"] == row["jumps"]
+        for name in ("nrmse rel_disp_m", "prc eta_d"):
+            assert float(line[name]) == row[name]
+
+
+def test_one_that_is_not_identical_is_told_by_the_exit_code(
+    logs: list[Path], tmp_path: Path
+) -> None:
+    recording = read(logs[0] / "run.mcap")
+    items = list(recording.items)
+    place = max(k for k, one in enumerate(items) if type(one).__name__ == "Comparison")
+    items[place] = type(items[place])(  # one error sum, by one unit in the last place
+        *(getattr(items[place], name) for name in ("index", "count", "channels", "measured_ss")),
+        tuple(math.nextafter(one, 1e9) for one in items[place].free_error_ss),  # type: ignore[union-attr]
+        items[place].window_error_ss,  # type: ignore[union-attr]
+    )
+    write_items(tmp_path / "bent.mcap", items, recording.start)
+    out = tmp_path / "out"
+    asked = Asked([logs[1], tmp_path / "bent.mcap"], [], out)
+    assert replay_command(asked) == EXIT_NOT_IDENTICAL
+    rows = json.loads((out / "comparison.json").read_text())["replays"]
+    assert [row["identical"] for row in rows] == [True, False]
+
+
+@pytest.mark.parametrize(
+    "more", [{"view": True}, {"publish": "tcp/127.0.0.1:7563"}, {"speed": "2"}]
+)
+def test_what_shows_one_replay_is_refused_for_many(
+    logs: list[Path], tmp_path: Path, more: dict[str, str]
+) -> None:
+    with pytest.raises(BadInput, match=r"one log|leave it away"):
+        replay_command(Asked(logs, [], tmp_path / "out", **more))  # type: ignore[arg-type]

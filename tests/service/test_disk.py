@@ -1,0 +1,87 @@
+"""Room for a recording: refused before a run, foreseen during it, kept in reserve for its end."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from table_io.card import PROFILES, BadInput
+from twin.service import disk, driving
+from twin.service.bundle import Bundle, read_bundle
+from twin.service.campaign.flow import Asked, campaign
+from twin.service.disk import Reserve, Room, bytes_per_s, free_bytes, planned_bytes, refuse_full
+
+QUICK = PROFILES / "tests" / "quickstart.toml"
+ENDPOINT = "tcp/127.0.0.1:7447"
+
+
+@pytest.fixture(scope="module")
+def bundle() -> Bundle:
+    return read_bundle(QUICK)
+
+
+def test_the_estimate_is_what_is_written_unpacked(bundle: Bundle) -> None:
+    # 9 measured channels and 16 of the twin's, 8 bytes each, 2000 times a second
+    assert bytes_per_s(bundle) == 2000 * 8 * (9 + 16)
+    seconds = bundle.drive.planned_end / 2000
+    assert planned_bytes(bundle) == pytest.approx(400_000 * (seconds + 60) + 50e6)
+
+
+def test_tests_that_do_not_fit_together_are_refused(
+    bundle: Bundle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    needed = planned_bytes(bundle)
+    monkeypatch.setattr(disk, "free_bytes", lambda _: 3 * needed - 1)
+    refuse_full([bundle] * 2, Path("runs/a"))
+    with pytest.raises(BadInput, match=r"runs/a: .* free on its disk, but the recording takes up"):
+        refuse_full([bundle] * 3, Path("runs/a"))
+
+
+def test_free_room_is_that_of_the_folder_to_be_made(tmp_path: Path) -> None:
+    assert 0 < free_bytes(tmp_path / "not" / "yet") == pytest.approx(free_bytes(tmp_path), rel=0.1)
+    assert free_bytes(Path("/proc/none")) > 1e15  # no disk: that nothing is written there is said
+
+
+def test_a_full_disk_refuses_run_and_campaign_and_nothing_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(disk, "free_bytes", lambda _: 10_000_000)
+    listed = tmp_path / "campaign.toml"
+    listed.write_text(f'title = "One"\n[[runs]]\nprofile = "{QUICK}"\n')
+    out = tmp_path / "out"
+    for unpaced in (True, False):
+        with pytest.raises(BadInput, match=r"10 MB free on its disk.*nothing was started"):
+            driving.run(QUICK, out, unpaced, None, None, False, ENDPOINT)
+    asked = Asked(listed, out, False, True, None, None, True, ENDPOINT)
+    with pytest.raises(BadInput, match=r"10 MB free on its disk.*nothing was started"):
+        campaign(asked)
+    assert not out.exists()
+    out.mkdir()
+    (out / "campaign.toml").write_text(listed.read_text())  # one that began
+    with pytest.raises(BadInput, match=r"10 MB free on its disk.*nothing was started"):
+        campaign(replace(asked, resume=True))
+
+
+def test_a_disk_that_fills_up_is_told_twice_in_time() -> None:
+    room, rate = Room(1000.0), 250_000
+    assert room.look(0, 0.0, 1) is None  # nothing is known yet
+    assert room.look(10 * rate, 10.0, 991 * rate) is None
+    said = room.look(10 * rate, 10.0, 600 * rate)
+    assert said is not None
+    assert "150 MB left on the disk: room for 600 s of recording, the test needs 990 s" in said
+    assert room.look(20 * rate, 20.0, 500 * rate) is None  # said once
+    said = room.look(400 * rate, 400.0, 119 * rate)
+    assert said is not None
+    assert "room for 119 s" in said
+    assert room.look(410 * rate, 410.0, 50 * rate) is None
+    assert Room(100.0).look(100 * rate, 100.0, 0) is None  # it is over
+
+
+def test_a_reserve_holds_room_and_gives_it_back(tmp_path: Path) -> None:
+    reserve = Reserve(tmp_path / "reserve", 1_000_000)
+    assert (tmp_path / "reserve").stat().st_blocks * 512 >= 1_000_000
+    Reserve(tmp_path / "reserve", 1_000_000)  # of a successor: the same one
+    reserve.release()
+    assert not (tmp_path / "reserve").exists()
+    reserve.release()
+    Reserve(tmp_path / "missing" / "reserve", 10).release()  # what cannot be had is done without

@@ -1,0 +1,122 @@
+"""Parts become run.mcap only when the whole has been read back; until then they are kept."""
+
+import errno
+import fcntl
+from pathlib import Path
+
+import pytest
+
+from table_io.card import BadInput
+from twin.service import parts
+from twin.service.parts import LOCK, PARTS, gather
+from twin.stream.mcap_log import LogWriter, each
+from twin.stream.merging import verified
+from twin.stream.wire import encode, topic
+
+from .recordings import blocks, start_record
+
+ITEMS = [start_record(), *blocks()[:60]]
+RATE = start_record().rate_hz
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """The folder of a run whose parts are still there, none of them."""
+    (tmp_path / PARTS).mkdir()
+    (tmp_path / PARTS / LOCK).touch()
+    return tmp_path
+
+
+def part(run: Path, number: int, first: int, last: int, killed: bool) -> Path:
+    """A part with some of the items; of a killed recorder it has no end."""
+    path = run / PARTS / f"part-{number:03d}.mcap"
+    writer, start = LogWriter(path, RATE), start_record()
+    writer.describe(start)
+    for item in (start, *ITEMS[max(first, 1) : last]):
+        writer.write(topic(item), encode(item, start.run), item.index)
+    if killed:
+        writer.flush()
+    else:
+        writer.close()
+    return path
+
+
+def found(path: Path) -> list[bytes]:
+    return sorted(one.payload for one in each(path))
+
+
+def expected() -> list[bytes]:
+    return sorted(encode(item, ITEMS[0].run) for item in ITEMS)
+
+
+def test_one_whole_part_is_the_log_as_it_is(run: Path) -> None:
+    before = part(run, 1, 0, 61, killed=False).read_bytes()
+    assert gather(run).read_bytes() == before
+    assert [one.name for one in run.iterdir()] == ["run.mcap"]
+
+
+@pytest.mark.parametrize("killed", [(True,), (True, False), (False, True), (True, True)])
+def test_parts_of_killed_recorders_become_one_whole_log(run: Path, killed: tuple[bool]) -> None:
+    edges = [(0, 61)] if len(killed) == 1 else [(0, 35), (20, 61)]
+    for number, (edge, one) in enumerate(zip(edges, killed, strict=True), 1):
+        part(run, number, *edge, killed=one)
+    out = gather(run)
+    assert verified(out)
+    assert found(out) == expected()
+    assert [one.name for one in run.iterdir()] == ["run.mcap"]
+
+
+def test_a_whole_that_is_not_what_was_written_leaves_the_parts(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = part(run, 1, 0, 61, killed=True)
+    before = kept.read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(parts, "verified", lambda _: False)
+        with pytest.raises(BadInput, match="not what was written; the parts are kept beside it"):
+            gather(run)
+    assert not (run / "run.mcap").exists()
+    assert kept.read_bytes() == before
+    assert found(gather(run)) == expected()  # once that is mended
+
+
+def test_a_disk_that_fails_while_merging_leaves_the_parts(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", "a/run.mcap")
+
+    kept = part(run, 1, 0, 61, killed=True)
+    before = kept.read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(LogWriter, "close", full)
+        with pytest.raises(BadInput, match=r"a/run.mcap: No space left .* kept in .*\.parts"):
+            gather(run)
+    assert [one.name for one in run.iterdir()] == [PARTS]
+    assert kept.read_bytes() == before
+    assert found(gather(run)) == expected()
+
+
+def test_parts_of_a_run_that_goes_on_are_not_touched(run: Path) -> None:
+    part(run, 1, 0, 61, killed=False)
+    with (run / PARTS / LOCK).open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_SH)
+        with pytest.raises(BadInput, match="a run is still going on in this folder; wait"):
+            gather(run)
+    gather(run)
+
+
+def test_a_run_without_a_recording_says_so(run: Path) -> None:
+    with pytest.raises(BadInput, match="the recorder wrote nothing"):
+        gather(run)
+
+
+def test_a_log_that_is_there_already_is_never_replaced(run: Path) -> None:
+    kept = part(run, 1, 0, 61, killed=False)
+    (run / "run.mcap").write_text("somebody's")
+    with pytest.raises(BadInput, match="not a whole log; move it away, the parts are in"):
+        gather(run)
+    assert (run / "run.mcap").read_text() == "somebody's"
+    (run / "run.mcap").write_bytes(kept.read_bytes())  # died after the parts had become it
+    gather(run)
+    assert [one.name for one in run.iterdir()] == ["run.mcap"]

@@ -1,0 +1,97 @@
+"""Logs of every schema version stay readable to the bit; a newer one is refused by its number.
+
+`golden/vN.mcap` was written by the code of version N: three steps of a sweep, 0.1 MB. A golden file
+is never renewed; a new version adds its own.
+"""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from table_io.card import BadInput
+from table_io.records import Point
+from twin.stream import mcap_log
+from twin.stream.content import SCHEMA_VERSION, Content, altered, schema_version
+from twin.stream.mcap_log import each, write_items
+from twin.stream.merging import merge, verified
+from twin.stream.recording import read
+from twin.stream.salvage import salvage
+
+from .written import START, run
+
+GOLDEN = Path(__file__).parent / "golden"
+WRITTEN = {  # version: (sha256 of the content, messages, measured eta_d of each step)
+    1: (
+        "70ddf2c37d0a880db963d2f8aab209570f5333f5126c8bf431f5744aa9656648",
+        129,
+        (0.10615427913608139, 0.0819036788347143, 0.09453897270552923),
+    ),
+    2: (
+        "4a1f4de8363cdc392e72b809a3de64bfc9bed7b66b659ad69224f525696b4725",
+        129,
+        (0.10615427913608139, 0.0819036788347143, 0.09453897270552923),
+    ),
+}
+
+
+def content(path: Path) -> dict[str, str]:
+    """The hash and the counts of what a log holds."""
+    found = Content()
+    for one in each(path):
+        found.add(one.topic, one.log_time, one.payload)
+    return found.record()
+
+
+def test_every_version_has_its_golden_file() -> None:
+    assert set(WRITTEN) == set(range(1, SCHEMA_VERSION + 1))
+    assert {path.name for path in GOLDEN.iterdir()} == {f"v{number}.mcap" for number in WRITTEN}
+
+
+@pytest.mark.parametrize("version", WRITTEN)
+def test_a_log_of_any_version_is_read_to_the_bit(version: int) -> None:
+    path = GOLDEN / f"v{version}.mcap"
+    digest, messages, eta_d = WRITTEN[version]
+    found, recording = salvage(path), read(path)
+    assert found.whole
+    assert schema_version(path, found.metadata) == version
+    assert (content(path)["sha256"], len(recording.items)) == (digest, messages)
+    points = [one.measured.eta_d for one in recording.of(Point) if one.measured]
+    assert tuple(points) == eta_d
+    assert recording.whole
+    assert recording.missing_samples == 0
+    assert [step.frequency_hz for step in recording.start.steps] == pytest.approx([3.8, 3.9, 4.0])
+    assert altered(found.metadata, found.attachments) == []
+
+
+@pytest.mark.parametrize("version", WRITTEN)
+def test_a_log_says_its_hash_since_version_2(version: int) -> None:
+    path = GOLDEN / f"v{version}.mcap"
+    assert verified(path) is (version >= 2)
+    assert salvage(path).metadata.get("content") == (content(path) if version >= 2 else None)
+
+
+@pytest.mark.parametrize("version", WRITTEN)
+def test_merging_brings_a_log_to_the_newest_version(version: int, tmp_path: Path) -> None:
+    part, out = tmp_path / "part.mcap", tmp_path / "out.mcap"
+    shutil.copy(GOLDEN / f"v{version}.mcap", part)
+    merge([part], out)
+    assert schema_version(out, salvage(out).metadata) == SCHEMA_VERSION
+    assert verified(out)
+    assert [one.index for one in read(out).items] == [one.index for one in read(part).items]
+    assert sorted(one.payload for one in each(out)) == sorted(one.payload for one in each(part))
+
+
+def test_a_newer_version_is_refused_by_its_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mcap_log, "SCHEMA_VERSION", SCHEMA_VERSION + 1)
+    write_items(tmp_path / "new.mcap", run(), START)
+    with pytest.raises(BadInput, match=r"new.mcap: written in schema version 3; .* reads 1 to 2"):
+        read(tmp_path / "new.mcap")
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "two", "9" * 5000, "1.0", ""])
+def test_a_version_that_is_none_is_refused(text: str) -> None:
+    with pytest.raises(BadInput, match="written in schema version"):
+        schema_version(Path("a.mcap"), {"run": {"schema": text}})

@@ -1,0 +1,330 @@
+"""Damaged logs: one accident costs what it hit and no more, and no file costs more than it may."""
+
+import random
+import re
+import struct
+import tracemalloc
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import CompressionType, Writer
+from service.mutants import BOMBS, bomb, spans, written
+
+from stream.test_mcap_log import START, payloads, run, write
+from stream.test_wire import any_block
+from table_io.block import Block
+from table_io.card import BadInput
+from table_io.records import Comparison, Decided, Fault, Response, RunStop, Step
+from twin.stream.blocks import decode_blocks
+from twin.stream.framing import CHUNK, FRAME, LARGEST_BYTES, MAGIC
+from twin.stream.merging import merge
+from twin.stream.recording import messages, read
+from twin.stream.salvage import salvage
+from twin.stream.wire import Item, WireError, decode, encode, topic
+
+EVERY = 7  # messages in a chunk
+COST = 2**24  # that a small file may cost here
+
+
+@pytest.fixture(scope="module")
+def content(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A whole log of many chunks."""
+    path = tmp_path_factory.mktemp("log") / "run.mcap"
+    write(path, run(), flush_every=EVERY)
+    return path.read_bytes()
+
+
+def chunks(content: bytes) -> list[tuple[int, int]]:
+    return [(first, end) for opcode, first, end in spans(content) if opcode == CHUNK]
+
+
+def kept(path: Path, content: bytes) -> list[bytes]:
+    """Payloads of what is found in a file, in file order."""
+    path.write_bytes(content)
+    return [one.payload for one in salvage(path).messages]
+
+
+def without(number: int) -> list[bytes]:
+    """The payloads of the whole log but for those of one chunk."""
+    all_of_them = payloads(run())
+    return all_of_them[: number * EVERY] + all_of_them[(number + 1) * EVERY :]
+
+
+def flipped(content: bytes, first: int, end: int) -> bytes:
+    at = (first + end) // 2 + 20
+    return content[:at] + bytes([content[at] ^ 16]) + content[at + 1 :]
+
+
+def zeroed(content: bytes, first: int, end: int) -> bytes:
+    return content[: first + 60] + bytes(end - first - 60) + content[end:]
+
+
+def gnawed(content: bytes, first: int, end: int) -> bytes:
+    return content[: first + 70] + content[end - 30 :]
+
+
+def stuffed(content: bytes, first: int, end: int) -> bytes:
+    return content[: first + 70] + b"\x06garbage\x00\x00" * 50 + content[first + 70 :]
+
+
+def stretched(content: bytes, first: int, end: int) -> bytes:
+    return content[: first + 1] + struct.pack("<Q", end - first + 40) + content[first + 9 :]
+
+
+def endless(content: bytes, first: int, end: int) -> bytes:
+    return content[: first + 1] + struct.pack("<Q", 2**63) + content[first + 9 :]
+
+
+def renamed(content: bytes, first: int, end: int) -> bytes:
+    return content[:first] + b"\x07" + content[first + 1 :]
+
+
+def missing(content: bytes, first: int, end: int) -> bytes:
+    return content[:first] + content[end:]
+
+
+Accident = Callable[[bytes, int, int], bytes]
+
+
+@pytest.mark.parametrize(
+    "accident", [flipped, zeroed, gnawed, stuffed, stretched, endless, renamed, missing]
+)
+def test_an_accident_costs_one_chunk(accident: Accident, content: bytes, tmp_path: Path) -> None:
+    places = chunks(content)
+    assert len(places) > 10
+    for number in (0, len(places) // 2, len(places) - 1):
+        bad = accident(content, *places[number])
+        assert kept(tmp_path / "bad.mcap", bad) == without(number)
+        recording = read(tmp_path / "bad.mcap")
+        assert not recording.whole
+        assert recording.damage
+        assert recording.start == START  # of the first chunk too: it stands there twice
+        lost = payloads(run())[number * EVERY : (number + 1) * EVERY]
+        assert not set(payloads(recording.items)) & (set(lost) - {payloads([START])[0]})
+
+
+def test_the_damage_is_told_by_its_place(content: bytes, tmp_path: Path) -> None:
+    first, end = chunks(content)[3]
+    (tmp_path / "bad.mcap").write_bytes(flipped(content, first, end))
+    damage = salvage(tmp_path / "bad.mcap").damage
+    assert [(one.at, one.size) for one in damage] == [(first, end - first)]
+
+
+def test_several_accidents_cost_several_chunks(content: bytes, tmp_path: Path) -> None:
+    places = chunks(content)
+    bad = endless(flipped(content, *places[2]), *places[6])
+    expected = [one for one in payloads(run()) if one in without(2) and one in without(6)]
+    assert kept(tmp_path / "bad.mcap", bad) == expected
+
+
+def test_a_killed_recorder_without_its_first_chunk_has_not_written_for_nothing(
+    content: bytes, tmp_path: Path
+) -> None:
+    places = chunks(content)
+    path = tmp_path / "bad.mcap"
+    path.write_bytes(flipped(content, *places[0])[: places[-1][1]])
+    recording = read(path)
+    assert sorted(payloads(recording.items)) == sorted([*without(0), encode(START, START.run)])
+
+
+def test_a_bad_sector_costs_the_chunk_on_it(
+    content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, end = chunks(content)[4]
+
+    class Dying(BytesIO):
+        def read(self, size: int | None = -1) -> bytes:
+            at = self.tell()
+            if at < end - 20 and at + (size or 0) > first + 50:
+                raise OSError(5, "Input/output error")
+            return super().read(size)
+
+    (tmp_path / "a.mcap").write_bytes(content)
+    monkeypatch.setattr(Path, "open", lambda *_: Dying(content))
+    found = salvage(tmp_path / "a.mcap")
+    assert [one.payload for one in found.messages] == without(4)
+    assert [(one.at, one.size) for one in found.damage] == [(first, end - first)]
+
+
+def test_merging_gives_up_nothing_that_stands_after_damage(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "part.mcap").write_bytes(flipped(content, *chunks(content)[3]))
+    merge([tmp_path / "part.mcap"], tmp_path / "out.mcap")
+    assert sorted(payloads(read(tmp_path / "out.mcap").items)) == sorted(without(3))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_order_and_copies_of_chunks_change_nothing_but_are_seen(
+    seed: int, content: bytes, tmp_path: Path
+) -> None:
+    chance, found = random.Random(seed), spans(content)
+    body = [content[first:end] for opcode, first, end in found if opcode == CHUNK]
+    rest = [content[first:end] for opcode, first, end in found if opcode not in (CHUNK, 7)]
+    mixed = [*body, *chance.sample(body, 3)]
+    chance.shuffle(mixed)
+    path = tmp_path / "mixed.mcap"
+    path.write_bytes(MAGIC + rest[0] + b"".join(mixed) + b"".join(rest[1:]) + MAGIC)
+    recording = read(path)
+    assert sorted(payloads(recording.items)) == sorted(payloads(run()))
+    assert [item.index for item in recording.items] == sorted(one.index for one in run())
+    assert not recording.whole
+    assert recording.missing_samples == 0
+
+
+def test_a_lost_beginning_costs_what_stood_there(content: bytes, tmp_path: Path) -> None:
+    (_, _), (first, _) = chunks(content)[:2]
+    for lost in (MAGIC[1:5], content[:20], content[: first + 30]):
+        found = kept(tmp_path / "bad.mcap", bytes(len(lost)) + content[len(lost) :])
+        expected = payloads(run())
+        assert found in (expected, expected[2 * EVERY :], expected[EVERY:])
+
+
+@pytest.mark.parametrize("packing", list(CompressionType))
+def test_every_packing_of_the_format_is_read(packing: CompressionType, tmp_path: Path) -> None:
+    stream = BytesIO()
+    writer = Writer(stream, compression=packing)
+    writer.start()
+    channel = writer.register_channel("/run/start", "protobuf", 0)
+    writer.add_message(channel, 0, encode(START, START.run), 7, 3)
+    writer.finish()
+    (tmp_path / "a.mcap").write_bytes(stream.getvalue())
+    (one,) = messages(tmp_path / "a.mcap")[0]
+    assert (one.topic, one.sequence, one.publish_time) == ("/run/start", 3, 7)
+    assert read(tmp_path / "a.mcap").start == START
+
+
+@pytest.mark.parametrize("kind", range(len(BOMBS)))
+def test_no_bomb_goes_off(kind: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("twin.stream.salvage.LEAST_COST", COST)
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(bomb(kind))
+    tracemalloc.start()
+    try:
+        found = salvage(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert found.damage
+    assert not found.whole
+    assert peak < 3 * LARGEST_BYTES + 2 * COST
+    with pytest.raises(BadInput, match=r"holds no start record|not a shaketwin log"):
+        read(path)
+
+
+@given(blocks=st.lists(any_block(), max_size=4), copies=st.integers(1, 5))
+@settings(max_examples=30, deadline=None)
+def test_many_blocks_at_once_are_those_one_by_one(blocks: list[Block], copies: int) -> None:
+    for name in ("/rig/meas", "/twin/pred"):
+        some = [one for one in blocks if topic(one) == name]
+        raw = [
+            encode(replace(one, index=(one.index + 50 * k) % 2**40), "r")
+            for one in some
+            for k in range(copies)
+        ]
+        raw += [b"\xff\xff", *(payload[:-1] for payload in raw)]
+        for payload, result in zip(raw, decode_blocks(name, raw), strict=True):
+            if isinstance(result, WireError):
+                with pytest.raises(WireError, match=re.escape(str(result))):
+                    decode(name, payload)
+                continue
+            run_id, block = decode(name, payload)
+            assert result[0] == run_id
+            assert isinstance(result[1], Block)
+            assert isinstance(block, Block)
+            assert result[1].identical(block)
+
+
+def blocks_of(items: list[Item]) -> list[Block]:
+    return [one for one in items if isinstance(one, Block) and one.stream == "meas"]
+
+
+RUN = run()
+ONE = blocks_of(RUN)[9]
+SUMS = (1.0, 2.0)
+LIES: dict[str, Item] = {
+    "at another rate": replace(ONE, rate_hz=1000.0),
+    "with other channels than the run's": replace(ONE, channels=("drive_disp_m", "force_r1_n")),
+    "samples that are there": replace(ONE, index=ONE.index - 5),
+    "labels that no drive": replace(ONE, label=np.full(len(ONE), 77)),
+    "unequal lengths": Comparison(180, 20, START.channels, SUMS, SUMS, (*SUMS, 3.0)),
+    "squares below zero": Comparison(180, 20, START.channels, SUMS, SUMS, (-1.0, 1.0)),
+    "/rig/response: of unequal": Response(180, (1.0, 2.0), (1.0,), (0.0, 0.0)),
+    "direction = 'sideways'": Decided(180, 3, "sideways", 2.0, 1.0, "x"),
+    "frequency_hz = nan": Decided(180, 3, "forward", float("nan"), 1.0, "x"),
+    "ends before it begins": Fault(180, "twin", 100, 50, "x"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("words", LIES)
+def test_what_cannot_be_is_left_out_and_told(words: str, tmp_path: Path) -> None:
+    lie = LIES[words]
+    items = [one for one in RUN if one is not ONE or not isinstance(lie, Block)]
+    told = [(topic(one), encode(one, START.run), one.index) for one in [*items, lie]]
+    recording = read(written(tmp_path / "lie.mcap", told, START))
+    left = [
+        one
+        for one in items
+        if not (isinstance(lie, Block) and encode(one, START.run) == encode(ONE, START.run))
+    ]
+    assert sorted(payloads(recording.items)) == sorted(payloads(left))
+    assert not recording.whole
+    assert any(words in one.reason for one in recording.damage), recording.damage
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"rate_hz": float("nan")}, "rate_hz = nan"),
+        ({"rate_hz": -2000.0}, "rate_hz = -2000"),
+        ({"channels": ("a", "a")}, "one of them twice"),
+        ({"block_samples": 0}, "block_samples = 0"),
+        ({"planned_samples": 2**52}, "planned_samples"),
+        ({"steps": ()}, "no steps"),
+        ({"steps": (Step(0, "up", 2.0, 0.5),)}, "a step that no sweep has"),
+        ({"steps": (Step(0, "forward", float("inf"), 0.5),)}, "a step that no sweep has"),
+        ({"steps": (Step(1, "forward", 2.0, 0.5), Step(0, "forward", 3.0, 0.5))}, "out of order"),
+    ],
+)
+def test_a_start_that_cannot_be_is_refused(
+    changed: dict[str, object], words: str, tmp_path: Path
+) -> None:
+    start = replace(START, **changed)
+    path = tmp_path / "run.mcap"
+    written(path, [("/run/start", encode(start, start.run), 0)], replace(start, rate_hz=2000.0))
+    stripped = [one for one in spans(path.read_bytes()) if one[0] != 9]  # without its copy
+    raw = path.read_bytes()
+    path.write_bytes(MAGIC + b"".join(raw[first:end] for _, first, end in stripped) + MAGIC)
+    with pytest.raises(BadInput, match=words):
+        read(path)
+
+
+def test_messages_of_another_run_are_left_out(tmp_path: Path) -> None:
+    stop = RunStop(600, "complete", "x", ())
+    told = [(topic(one), encode(one, START.run), one.index) for one in run()]
+    path = written(tmp_path / "a.mcap", [*told, ("/run/stop", encode(stop, "other"), 600)], START)
+    recording = read(path)
+    assert payloads([recording.stop] if recording.stop else []) == payloads(run()[-1:])
+    assert [one.reason for one in recording.damage] == ["/run/stop: of another run"]
+
+
+def test_only_the_topics_asked_for_are_read(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(content)
+    recording = read(tmp_path / "a.mcap", ["/rig/gap"])
+    wanted = [one for one in run() if topic(one) in ("/rig/gap", "/run/start")]
+    assert sorted(payloads(recording.items)) == sorted(payloads(wanted))
+    assert recording.whole
+
+
+def test_a_wrong_checksum_of_the_whole_is_told(content: bytes, tmp_path: Path) -> None:
+    first, end = next((first, end) for opcode, first, end in spans(content) if opcode == 15)
+    assert end - first == FRAME.size + 4
+    wrong = struct.pack("<I", zlib.crc32(b"another"))
+    assert kept(tmp_path / "a.mcap", content[: end - 4] + wrong + content[end:]) == payloads(run())
+    (one,) = salvage(tmp_path / "a.mcap").damage
+    assert one.reason == "the data are not those that were written"

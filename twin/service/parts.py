@@ -1,0 +1,60 @@
+"""The parts of a live recording become one log; they go only when it has been read back whole."""
+
+import fcntl
+import os
+import shutil
+from pathlib import Path
+
+from table_io.card import BadInput
+from twin.stream.merging import merge, verified
+
+PARTS = ".parts"
+LOCK = "lock"  # shared by supervisor and recorder while they live
+
+
+def gather(folder: Path) -> Path:
+    """run.mcap from the parts of a recording; they are kept until it is whole and on the disk."""
+    held = folder / PARTS
+    out = folder / "run.mcap"
+    try:
+        with (held / LOCK).open("a") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            parts = sorted(held.glob("part-*.mcap"))
+            if not parts:
+                raise BadInput(f"{folder}: the recorder wrote nothing")
+            if not out.exists():
+                _whole(parts, held / "run.mcap").rename(out)
+                _sync(folder)
+            elif not verified(out):
+                raise BadInput(f"{out}: not a whole log; move it away, the parts are in {held}")
+            shutil.rmtree(held)
+    except BlockingIOError:
+        raise BadInput(f"{folder}: a run is still going on in this folder; wait") from None
+    except OSError as error:
+        raise BadInput(
+            f"{error.filename or folder}: {error.strerror}; what was recorded is kept in {held} "
+            f"and readable. Once this is mended: shaketwin report {folder}"
+        ) from None
+    return out
+
+
+def _whole(parts: list[Path], new: Path) -> Path:
+    """One whole log with everything in the parts, read back by its hash and on the disk."""
+    if len(parts) == 1 and verified(parts[0]):
+        new = parts[0]
+    else:
+        new.unlink(missing_ok=True)  # of an earlier attempt
+        merge(parts, new)
+        if not verified(new):
+            raise BadInput(f"{new}: not what was written; the parts are kept beside it")
+    _sync(new)
+    return new
+
+
+def _sync(path: Path) -> None:
+    """Wait until a file, or what a folder lists, is on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
