@@ -1,6 +1,6 @@
 """The stepped-sine driver beside solve_ivp and diffrax on the same sweep of G4, in one run.
 
-Always: they agree. With -n 0 --benchmark-enable: how many times faster, on the sweep from 1.8 to 5 Hz
+Always: they agree. With -n 0 --benchmark-enable: how many times faster, from 1.8 to 5 Hz
 and back, where the motion is not chaotic and agreement can be checked. With -m slow also on the
 whole SS3 sweep. diffrax is the optional extra `bench`.
 

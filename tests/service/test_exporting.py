@@ -176,7 +176,7 @@ def test_nothing_is_overwritten_and_no_half_file_left(
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("twin.stream.table_mat.savemat", full)
+    monkeypatch.setattr("twin.stream.tables.mat.savemat", full)
     with pytest.raises(OSError, match="No space"):
         give_out(log, ["mat"], tmp_path / "y", (), None)
     assert not (tmp_path / "y.mat").exists()

@@ -14,8 +14,8 @@ from scipy.io import savemat
 
 from table_io.card import BadInput
 from twin.service.columns import Map, samples
-from twin.stream import apart, tables
-from twin.stream.tables import read_table
+from twin.stream import tables
+from twin.stream.tables import read_table, sandbox
 
 from .test_table_formats import uff
 
@@ -133,7 +133,7 @@ def spin() -> None:
 def test_a_reader_that_dies_does_not_take_us_along(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, work: Callable[[], Any], words: str
 ) -> None:
-    monkeypatch.setattr(apart, "MOST_CPU_S", 1)
+    monkeypatch.setattr(sandbox, "MOST_CPU_S", 1)
     (tmp_path / "x").touch()
     with pytest.raises(BadInput, match=words):
-        apart.apart(tmp_path / "x", work)
+        sandbox.apart(tmp_path / "x", work)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from table_io.card import BadInput
-from twin.stream.table_csv import LONGEST_LINE
 from twin.stream.tables import Table, read_table
+from twin.stream.tables.csv import LONGEST_LINE
 
 GOOD = "time_s,table_acc_m_s2\n0,1.5\n0.1,-2e-3\n0.2,3\n"
 

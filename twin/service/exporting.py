@@ -63,7 +63,7 @@ def give_out(
 def _write(kind: str, rows: Rows, place: Path) -> None:
     """One file; a heavy library is looked for here."""
     if kind == "csv":
-        from twin.stream.table_csv import write as write_csv
+        from twin.stream.tables.csv import write as write_csv
 
         with _new(place, "x", encoding="utf-8", newline="") as text:
             write_csv(rows, text)
@@ -83,7 +83,7 @@ def _write(kind: str, rows: Rows, place: Path) -> None:
 def _writer(kind: str) -> Callable[[Rows, Any], None]:
     """What writes a binary format."""
     if kind == "mat":
-        from twin.stream.table_mat import write as write_mat
+        from twin.stream.tables.mat import write as write_mat
 
         return write_mat
     if kind == "foxglove":
@@ -91,7 +91,7 @@ def _writer(kind: str) -> Callable[[Rows, Any], None]:
 
         return write_foxglove
     try:
-        from twin.stream.table_parquet import write as write_parquet
+        from twin.stream.tables.parquet import write as write_parquet
     except ModuleNotFoundError as error:
         raise BadInput(
             f"--{kind}: {error.name} is not installed; pip install shaketwin[formats]"

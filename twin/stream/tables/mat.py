@@ -22,7 +22,7 @@ INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32
 def read(path: Path) -> Table:
     """The variables of a file; structures are read now, the rest when it is asked for."""
     if _is_hdf5(path):
-        from twin.stream.table_hdf5 import read as read_hdf5
+        from twin.stream.tables.hdf5 import read as read_hdf5
 
         return read_hdf5(path)
     _no_bomb(path)
@@ -41,7 +41,7 @@ def read(path: Path) -> Table:
 def load(path: Path, key: Key) -> Any:
     """A column's numbers, (row,)."""
     if _is_hdf5(path):
-        from twin.stream.table_hdf5 import load as load_hdf5
+        from twin.stream.tables.hdf5 import load as load_hdf5
 
         return load_hdf5(path, key)
     name, *fields, k = key

@@ -46,7 +46,7 @@ from table_io.records import (
 )
 from table_io.rig import Rig
 from twin.compare import PREDICTED
-from twin.log_parts import UNKNOWN, Part, Track, unit
+from twin.log.parts import UNKNOWN, Part, Track, unit
 from twin.model.card import ModelCard
 from twin.model.model import Model
 from twin.stream.mcap_log import each
@@ -55,7 +55,7 @@ from twin.stream.wire import MEASURED, RECORD_TOPICS, WireError, decode
 from twin.stream.wire import PREDICTED as PREDICTIONS
 
 if TYPE_CHECKING:
-    from twin.log_xarray import Dataset
+    from twin.log.dataset import Dataset
 
 RECORDS = [RECORD_TOPICS[kind] for kind in (RunStop, Cycle, Decided, Event, Fault, Gap, Point)]
 
@@ -247,7 +247,7 @@ class Log:
 
         `step`, `label` and `cycle` are coordinates; units and meanings are attributes.
         """
-        from twin.log_xarray import dataset
+        from twin.log.dataset import dataset
 
         return dataset(self)
 

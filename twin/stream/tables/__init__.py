@@ -1,6 +1,6 @@
 """Somebody's file as columns: their names, lengths and units first, their numbers when asked for.
 
-A format is one file beside this one, `table_<format>.py`. What a foreign library makes of a damaged
+A format is one file beside this one, `<format>.py`. What a foreign library makes of a damaged
 file stays in a process of its own and comes out as one sentence.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from table_io.block import Float1D
 from table_io.card import BadInput
-from twin.stream.apart import apart
+from twin.stream.tables.sandbox import apart
 
 FORMATS = {
     ".parquet": "parquet",
@@ -116,7 +116,7 @@ def _reader(path: Path) -> Any:
     a column."""
     kind = FORMATS.get(path.suffix.lower(), "csv")
     try:
-        return import_module(f"twin.stream.table_{kind}")
+        return import_module(f"twin.stream.tables.{kind}")
     except ModuleNotFoundError as error:
         raise BadInput(
             f"{path}: {error.name} is not installed; pip install shaketwin[formats]"

@@ -12,7 +12,7 @@ from table_io.records import Cycle, Point, Step
 
 if TYPE_CHECKING:
     from twin.log import Log
-    from twin.log_xarray import Dataset
+    from twin.log.dataset import Dataset
 
 UNKNOWN = -1  # step, label and cycle of a sample that was not recorded
 
