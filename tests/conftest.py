@@ -1,5 +1,59 @@
-"""Before anything is imported: one thread for matrices, as in a run."""
+"""One thread for matrices, as in a run; and a short run with a jump, for who needs a recording."""
 
 import os
+from pathlib import Path
+from typing import TYPE_CHECKING
 
+import pytest
+
+# Before anything is imported that computes; so whatever does is imported where it is needed.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+if TYPE_CHECKING:
+    from twin.service.bundle import Bundle
+    from twin.stream.recording import Recording
+
+PROFILE = """
+title = "Across the down-jump and back"
+[specimen]
+mass_kg = 550.0
+gap_mm = 4.0
+[sweep]
+start_hz = 2.4
+stop_hz = 4.4
+step_hz = 1.0
+cycles = 4
+measured_cycles = 2
+[loop_check]
+enabled = false
+[acquisition]
+rate_hz = 1000.0
+"""
+
+
+@pytest.fixture(scope="session")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> "Bundle":
+    """Six steps across the down-jump and back."""
+    from twin.service.bundle import read_bundle
+
+    path = tmp_path_factory.mktemp("across") / "across.toml"
+    path.write_text(PROFILE)
+    return read_bundle(path)
+
+
+@pytest.fixture(scope="session")
+def log_file(bundle: "Bundle", tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The recording of a run of it, alone in its folder."""
+    from twin.service.runs import play_unpaced
+
+    path = tmp_path_factory.mktemp("across") / "first" / "run.mcap"
+    path.parent.mkdir()
+    play_unpaced(bundle, "first", path, lambda: None, lambda _: None)
+    return path
+
+
+@pytest.fixture(scope="session")
+def recording(log_file: Path) -> "Recording":
+    from twin.stream.recording import read
+
+    return read(log_file)

@@ -13,48 +13,15 @@ from table_io.block import Block, Label
 from table_io.card import BadInput
 from table_io.channels import rel_disp
 from table_io.records import Cycle, Decided, Event, Point
-from twin.log import Log, open_log
-from twin.service.bundle import Bundle, read_bundle
-from twin.service.runs import play_unpaced
+from twin.log import Log, Track, open_log
+from twin.service.bundle import Bundle
 from twin.stream.mcap_log import write_items
 from twin.stream.recording import Recording, read
 
-PROFILE = """
-title = "Across the down-jump and back"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 2.4
-stop_hz = 4.4
-step_hz = 1.0
-cycles = 4
-measured_cycles = 2
-[loop_check]
-enabled = false
-[acquisition]
-rate_hz = 1000.0
-"""
-
 
 @pytest.fixture(scope="module")
-def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
-    path = tmp_path_factory.mktemp("door") / "across.toml"
-    path.write_text(PROFILE)
-    return read_bundle(path)
-
-
-@pytest.fixture(scope="module")
-def folder(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("door") / "across"
-    path.mkdir()
-    play_unpaced(bundle, "first", path / "run.mcap", lambda: None, lambda _: None)
-    return path
-
-
-@pytest.fixture(scope="module")
-def recording(folder: Path) -> Recording:
-    return read(folder / "run.mcap")
+def folder(log_file: Path) -> Path:
+    return log_file.parent
 
 
 @pytest.fixture(scope="module")
@@ -88,23 +55,47 @@ def test_a_step_is_its_samples(log: Log, recording: Recording) -> None:
     assert np.array_equal(one.time_s, meas.time_s[inside])
     assert len(one.twin["rel_disp_m"]) == len(one) == inside.sum()
     held = inside & (meas.label == Label.MEASURE)
-    assert np.array_equal(one.measured["mass_disp_m"], meas.channel("mass_disp_m")[held])
-    assert set(one.measured.cycle.tolist()) == {2, 3}
+    assert np.array_equal(one.held["mass_disp_m"], meas.channel("mass_disp_m")[held])
+    assert set(one.held.cycle.tolist()) == {2, 3}
     assert one.point == recording.of(Point)[3]
     assert one.cycles == tuple(c for c in recording.of(Cycle) if c.step == 3)
     with pytest.raises(KeyError, match="no samples of a step 6; there: 0 to 5"):
         log.step(6)
 
 
-def test_the_measured_cycles_give_the_recorded_point(log: Log) -> None:
+def test_a_log_and_a_step_are_walked_as_a_dict_of_channels(log: Log) -> None:
+    step = log.step(1)
+    for one in (log, step, step.held, log.measured, step.measured, step.twin):
+        assert "mass_disp_m" in one
+        assert "no_such_channel" not in one
+        assert 0 not in one
+        assert list(one) == list(one.keys())
+    assert list(log) == list(log.keys()) == list(step) == list(log.channels)
+    assert dict(log).keys() == set(log.channels)
+    assert {name: len(values) for name, values in dict(step).items()} == dict.fromkeys(
+        log.channels, len(step)
+    )
+
+
+def test_a_track_of_a_step_is_that_of_the_log(log: Log) -> None:
+    """Whatever source it is of: `measured` means the same for both."""
+    step = log.step(3)
+    for name in ("measured", "twin", "window"):
+        whole, part = getattr(log, name), getattr(step, name)
+        assert type(part) is type(whole) is Track
+        values = whole["mass_disp_m"][step.samples]
+        assert np.array_equal(part["mass_disp_m"], values, equal_nan=True)
+
+
+def test_the_held_cycles_give_the_recorded_point(log: Log) -> None:
     """eta_d from the arrays alone: half the peak-to-peak of u, cycle by cycle, over u*."""
-    part = log.step(1).measured
+    part = log.step(1).held
     u = part["mass_disp_m"] - part["table_disp_m"]
     peaks = [np.ptp(u[part.cycle == cycle]) for cycle in np.unique(part.cycle)]
     assert part.point is not None
     assert part.point.measured is not None
     ratio = np.mean(peaks) / 2 / part.point.measured.eta_d
-    other = log.step(4).measured
+    other = log.step(4).held
     u = other["mass_disp_m"] - other["table_disp_m"]
     peaks = [np.ptp(u[other.cycle == cycle]) for cycle in np.unique(other.cycle)]
     assert other.point is not None

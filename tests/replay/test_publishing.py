@@ -11,25 +11,13 @@ import pytest
 from table_io.card import BadInput
 from table_io.records import RunStart, RunStop
 from twin.service import publishing
-from twin.service.bundle import read_bundle
 from twin.service.replay import Asked, replay_command
-from twin.service.runs import play_unpaced
 from twin.stream import resend
-from twin.stream.recording import messages
+from twin.stream.salvage import salvage
 from twin.stream.wire import TOPIC_TYPES, decode
 from twin.stream.zenoh_link import open_hub, open_spoke
 
-from .test_replaying import PROFILE, silent
-
 PATIENCE_S = 60.0
-
-
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("publishing")
-    (folder / "g4.toml").write_text(PROFILE)
-    play_unpaced(read_bundle(folder / "g4.toml"), "g4", folder / "g4.mcap", lambda: None, silent)
-    return folder / "g4.mcap"
 
 
 @pytest.fixture
@@ -76,10 +64,12 @@ class Listener(threading.Thread):
         link.close()
 
 
-def published(log: Path, endpoint: str, out: Path, stall_s: float, speed: str = "max") -> Listener:
+def published(
+    log_file: Path, endpoint: str, out: Path, stall_s: float, speed: str = "max"
+) -> Listener:
     listener = Listener(endpoint, stall_s)
     listener.start()
-    replay_command(Asked([log], [], out, speed, publish=endpoint))
+    replay_command(Asked([log_file], [], out, speed, publish=endpoint))
     listener.join(PATIENCE_S)
     assert not listener.is_alive()
     return listener
@@ -87,11 +77,11 @@ def published(log: Path, endpoint: str, out: Path, stall_s: float, speed: str = 
 
 @pytest.mark.parametrize("speed", ["max", "4"])
 def test_what_is_heard_is_what_is_recorded(
-    log: Path, endpoint: str, tmp_path: Path, speed: str
+    log_file: Path, endpoint: str, tmp_path: Path, speed: str
 ) -> None:
     """Both streams, byte for byte, in the order of the test; rig and twin are alive."""
-    listener = published(log, endpoint, tmp_path / "out", 0.0, speed)
-    made = messages(tmp_path / "out" / "run.mcap")[0]
+    listener = published(log_file, endpoint, tmp_path / "out", 0.0, speed)
+    made = salvage(tmp_path / "out" / "run.mcap").messages
     assert listener.missed == 0
     assert Counter(listener.heard) == Counter((one.topic, one.payload) for one in made)
     for topic in ("/rig/meas", "/twin/pred", "/twin/cmp"):
@@ -106,26 +96,26 @@ def test_what_is_heard_is_what_is_recorded(
 
 @pytest.mark.parametrize("waits", [True, False])
 def test_who_is_slow_is_waited_for(
-    log: Path, endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, waits: bool
+    log_file: Path, endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, waits: bool
 ) -> None:
     """A publisher that holds little loses nothing for one who does not listen for a second;
     one that does not wait would."""
     monkeypatch.setattr(resend, "HELD_PIECES", 100)
     monkeypatch.setattr(publishing, "AHEAD", 80 if waits else 10**9)
-    listener = published(log, endpoint, tmp_path / "out", 1.0)
+    listener = published(log_file, endpoint, tmp_path / "out", 1.0)
     if not waits:
         assert listener.missed > 0
         return
-    made = messages(tmp_path / "out" / "run.mcap")[0]
+    made = salvage(tmp_path / "out" / "run.mcap").messages
     assert listener.missed == 0
     assert Counter(listener.heard) == Counter((one.topic, one.payload) for one in made)
 
 
-def test_a_bus_that_is_taken_is_refused(log: Path, endpoint: str, tmp_path: Path) -> None:
+def test_a_bus_that_is_taken_is_refused(log_file: Path, endpoint: str, tmp_path: Path) -> None:
     hub = open_hub("simulated", endpoint)
     try:
         with pytest.raises(BadInput, match="cannot listen there"):
-            replay_command(Asked([log], [], tmp_path / "out", publish=endpoint))
+            replay_command(Asked([log_file], [], tmp_path / "out", publish=endpoint))
     finally:
         hub.close()
     assert not (tmp_path / "out").exists()

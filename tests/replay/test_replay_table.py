@@ -3,33 +3,36 @@
 import csv
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from table_io.card import BadInput
-from twin.service.bundle import read_bundle
+from twin.service.bundle import Bundle, read_bundle
 from twin.service.outcome import EXIT_NOT_IDENTICAL
 from twin.service.replay import Asked, replay_command
 from twin.service.runs import play_unpaced
 from twin.stream.mcap_log import write_items
 from twin.stream.recording import read
 
-from .test_replaying import PROFILE, silent
-
 
 @pytest.fixture(scope="module")
-def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Two runs, of a 4 mm gap and of free flight."""
+def logs(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Runs of a 4 mm gap and of free flight; beside them one that tells nothing of the table."""
     folder = tmp_path_factory.mktemp("table")
     made = []
     for name, gap in (("g4", "4.0"), ("ginf", "inf")):
-        (folder / f"{name}.toml").write_text(PROFILE.replace("gap_mm = 4.0", f"gap_mm = {gap}"))
+        profile = bundle.profile_toml.replace("gap_mm = 4.0", f"gap_mm = {gap}")
+        (folder / f"{name}.toml").write_text(profile)
         path = folder / name / "run.mcap"
         path.parent.mkdir()
-        bundle = read_bundle(folder / f"{name}.toml")
-        play_unpaced(bundle, name, path, lambda: None, silent)
+        own = read_bundle(folder / f"{name}.toml")
+        play_unpaced(own, name, path, lambda: None, lambda _: None)
         made.append(path.parent)
+    still = replace(read(path).start, channels=("mass_disp_m",))
+    (folder / "still").mkdir()
+    write_items(folder / "still" / "run.mcap", [still], still)
     (folder / "stiff.toml").write_text(bundle.model_toml.replace("36000.0", "37800.0"))
     return made
 
@@ -99,6 +102,29 @@ def test_one_that_is_not_identical_is_told_by_the_exit_code(
     assert replay_command(asked) == EXIT_NOT_IDENTICAL
     rows = json.loads((out / "comparison.json").read_text())["replays"]
     assert [row["identical"] for row in rows] == [True, False]
+
+
+@pytest.mark.parametrize(
+    "logs_of, models, steps, said",
+    [
+        (["g4"], ["recorded", "nosuch"], None, "nosuch"),
+        (["g4", "nosuch"], ["recorded"], None, "nosuch"),
+        (["g4"], ["recorded", "stiff.toml", "stiff.toml"], None, "give each model once"),
+        (["g4"], ["stiff.toml", "g4/stiff.toml"], None, "two of one name under other names"),
+        (["g4", "ginf"], ["recorded"], "6:9", "no such steps"),
+        (["g4", "still"], ["recorded"], None, "no table_acc_m_s2"),
+    ],
+)
+def test_what_cannot_be_is_said_before_the_first_replay(
+    logs: list[Path], tmp_path: Path, logs_of: list[str], models: list[str], steps: str | None,
+    said: str,
+) -> None:  # fmt: skip
+    """Nothing is made, so that the corrected command is not refused."""
+    home, out = logs[0].parent, tmp_path / "out"
+    given = [str(home / one) if one.endswith(".toml") else one for one in models]
+    with pytest.raises(BadInput, match=said):
+        replay_command(Asked([home / one for one in logs_of], given, out, steps=steps))
+    assert not out.exists()
 
 
 @pytest.mark.parametrize(

@@ -11,61 +11,22 @@ from table_io.block import Block
 from table_io.card import BadInput
 from table_io.records import Comparison, Cycle, Params, Point, RunStart, RunStop
 from twin.compare import pipeline, windows
-from twin.service.bundle import Bundle, read_bundle
+from twin.service.bundle import Bundle
 from twin.service.outcome import EXIT_NOT_IDENTICAL
-from twin.service.replay import Asked, replay_command, step_range
+from twin.service.replay import Asked, replay_command
 from twin.service.replaying import Identity, Recorded, Span, replay
-from twin.service.runs import play_unpaced
+from twin.service.step_range import step_range
 from twin.stream.mcap_log import write_items
 from twin.stream.recording import Recording, read
 from twin.stream.wire import Item, encode
 
-PROFILE = """
-title = "Across the down-jump and back"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 2.4
-stop_hz = 4.4
-step_hz = 1.0
-cycles = 4
-measured_cycles = 2
-[loop_check]
-enabled = false
-[acquisition]
-rate_hz = 1000.0
-"""
-
-
-def silent(item: Item) -> None:
-    """Nobody watches."""
-
-
-@pytest.fixture(scope="module")
-def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
-    path = tmp_path_factory.mktemp("replaying") / "across.toml"
-    path.write_text(PROFILE)
-    return read_bundle(path)
-
-
-@pytest.fixture(scope="module")
-def log(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("replaying") / "first" / "run.mcap"
-    path.parent.mkdir()
-    play_unpaced(bundle, "first", path, lambda: None, silent)
-    return path
-
-
-@pytest.fixture(scope="module")
-def recording(log: Path) -> Recording:
-    return read(log)
+from .recorded import recorded_in
 
 
 def again(
     recorded: Recorded, bundle: Bundle, path: Path, span: Span | None = None, cut: int = 0
 ) -> tuple[Identity, Recording]:
-    identity = replay(recorded, bundle, path, "again", silent, span, cut)
+    identity = replay(recorded, bundle, path, "again", lambda _: None, span, cut)
     return identity, read(path)
 
 
@@ -85,7 +46,7 @@ def with_values(items: tuple[Item, ...], old: Item, new: Item) -> list[Item]:
 def test_however_it_is_cut_the_result_is_the_same(
     recording: Recording, bundle: Bundle, tmp_path: Path, cut: int
 ) -> None:
-    identity, made = again(Recorded.of(recording), bundle, tmp_path / "run.mcap", cut=cut)
+    identity, made = again(recorded_in(recording), bundle, tmp_path / "run.mcap", cut=cut)
     assert identity.identical
     assert identity.compared == len(recording.of(Comparison)) > 300
     kinds = (Comparison, Cycle, Point, Params, RunStop)
@@ -94,8 +55,8 @@ def test_however_it_is_cut_the_result_is_the_same(
         assert made.pieces(stream)[0].identical(recording.pieces(stream)[0])
 
 
-def test_read_for_a_replay_is_the_same_as_read_whole(log: Path, recording: Recording) -> None:
-    quick, whole = Recorded.open(log), Recorded.of(recording)
+def test_read_for_a_replay_is_the_same_as_read_whole(log_file: Path, recording: Recording) -> None:
+    quick, whole = Recorded.open(log_file), recorded_in(recording)
     assert quick.comparisons == whole.comparisons
     assert not quick.recording.of(Comparison)
     assert not quick.recording.blocks("pred")
@@ -114,7 +75,7 @@ def test_steps_are_equal_to_the_recorded_ones_for_both_twins(
     assert set(piece.cut(span.first, span.last).step.tolist()) == {2, 3}
     assert piece.step[span.first - 1] != 2
     assert piece.step[span.last] != 3
-    identity, made = again(Recorded.of(recording), bundle, tmp_path / "run.mcap", span)
+    identity, made = again(recorded_in(recording), bundle, tmp_path / "run.mcap", span)
     assert identity.identical
     whole = [
         one for one in recording.of(Comparison)
@@ -141,7 +102,7 @@ def test_the_last_step_ends_with_the_run(
 ) -> None:
     last = len(recording.start.steps) - 1
     span = Span.of_steps(recording, last, last)
-    identity, made = again(Recorded.of(recording), bundle, tmp_path / "run.mcap", span)
+    identity, made = again(recorded_in(recording), bundle, tmp_path / "run.mcap", span)
     assert identity.identical
     assert told(made, Point) == [encode(recording.of(Point)[-1], "")]
 
@@ -153,7 +114,7 @@ def test_steps_that_are_not_there_are_refused(recording: Recording) -> None:
 
 @pytest.mark.parametrize("text", ["5:3", "a:b", "", "1:2:3", "-1:2"])
 def test_a_range_that_is_none_is_refused(text: str) -> None:
-    with pytest.raises(BadInput, match="allowed: A:B"):
+    with pytest.raises(BadInput, match="allowed: FIRST:LAST"):
         step_range(text)
     assert step_range("4") == (4, 4)
     assert step_range("3:12") == (3, 12)
@@ -191,14 +152,14 @@ def test_parameters_that_changed_are_changed_again(
     recording: Recording, bundle: Bundle, tmp_path: Path, index: int
 ) -> None:
     other = changed(recording, bundle, index, tmp_path / "changed.mcap")
-    identity, made = again(Recorded.of(other), bundle, tmp_path / "run.mcap")
+    identity, made = again(recorded_in(other), bundle, tmp_path / "run.mcap")
     assert identity.identical
     assert told(made, Params, Point) == told(other, Params, Point)
     # without the change the twin goes another way from there on
     ignored = replace(other, items=tuple(
         one for one in other.items if not (isinstance(one, Params) and one.reason == "identified")
     ))  # fmt: skip
-    identity, _ = again(Recorded.of(ignored), bundle, tmp_path / "ignored.mcap")
+    identity, _ = again(recorded_in(ignored), bundle, tmp_path / "ignored.mcap")
     assert identity.first_difference is not None
     assert index - 20 < identity.first_difference < index + 250
 
@@ -210,7 +171,7 @@ def test_steps_after_a_change_say_what_holds(
     other = changed(recording, bundle, 2013, tmp_path / "changed.mcap")
     span = Span.of_steps(other, 4, 4)
     assert span.first > 2013
-    identity, made = again(Recorded.of(other), bundle, tmp_path / "run.mcap", span)
+    identity, made = again(recorded_in(other), bundle, tmp_path / "run.mcap", span)
     assert identity.identical
     assert [one.index for one in made.of(Params)] == [span.first, span.first]
     assert made.of(Params)[-1].reason == "identified"
@@ -223,7 +184,7 @@ def test_a_change_within_a_gap_holds_after_it(
     holed = replace(other, items=tuple(
         one for one in other.items if not isinstance(one, Block) or not 2000 <= one.index < 2100
     ))  # fmt: skip
-    _, made = again(Recorded.of(holed), bundle, tmp_path / "run.mcap")
+    _, made = again(recorded_in(holed), bundle, tmp_path / "run.mcap")
     assert [one.reason for one in made.of(Params)] == ["start", "identified"]
     assert made.of(Params)[-1].index == 2013
 
@@ -232,7 +193,7 @@ def test_a_damaged_comparison_is_one_that_differs(
     recording: Recording, bundle: Bundle, tmp_path: Path
 ) -> None:
     """Told, in a range of steps too, and nothing else happens."""
-    recorded = Recorded.of(recording)
+    recorded = recorded_in(recording)
     span = Span.of_steps(recording, 2, 2)
     last = max(index for index in recorded.comparisons if index < span.last - 20)
     broken = Recorded(recording, {**recorded.comparisons, last: b"\x80"})
@@ -244,9 +205,9 @@ def test_a_damaged_comparison_is_one_that_differs(
 # What differs, and how much
 
 
-def planted(log: Path, folder: Path, **versions: str) -> Path:
+def planted(log_file: Path, folder: Path, **versions: str) -> Path:
     """The log as if it had been recorded with other versions."""
-    recording = read(log)
+    recording = read(log_file)
     start = replace(recording.start, versions={**recording.start.versions, **versions})
     path = folder / "planted.mcap"
     write_items(path, with_values(recording.items, recording.start, start), start)
@@ -267,23 +228,23 @@ def found(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 
 def test_another_version_alone_makes_no_difference(
-    log: Path, tmp_path: Path, found: dict[str, Any]
+    log_file: Path, tmp_path: Path, found: dict[str, Any]
 ) -> None:
-    path = planted(log, tmp_path, numpy="0.1")
+    path = planted(log_file, tmp_path, numpy="0.1")
     assert replay_command(Asked([path], [], tmp_path / "out")) == 0
     assert found["identical"] is True
     assert set(found["versions_differing"]) == {"numpy"}
 
 
 def test_another_kernel_is_told_with_versions_and_size(
-    log: Path,
+    log_file: Path,
     tmp_path: Path,
     found: dict[str, Any],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """A constant of the restart changed by a millionth, as a new library might."""
-    path = planted(log, tmp_path, numpy="0.1", kernels="0123456789ab")
+    path = planted(log_file, tmp_path, numpy="0.1", kernels="0123456789ab")
     exact = windows.measured_state
 
     def other(*given: object) -> tuple[float, float]:
@@ -305,11 +266,11 @@ def test_another_kernel_is_told_with_versions_and_size(
 
 
 def test_the_size_is_the_rms_of_the_difference_over_the_signal(
-    recording: Recording, bundle: Bundle, log: Path, tmp_path: Path, found: dict[str, Any]
+    recording: Recording, bundle: Bundle, log_file: Path, tmp_path: Path, found: dict[str, Any]
 ) -> None:
     stiff = tmp_path / "stiff.toml"
     stiff.write_text(bundle.model_toml.replace("36000.0", "37800.0"))
-    replay_command(Asked([log], [str(stiff)], tmp_path / "out"))
+    replay_command(Asked([log_file], [str(stiff)], tmp_path / "out"))
     (old,), (new,) = recording.pieces("pred"), read(tmp_path / "out" / "run.mcap").pieces("pred")
     sizes = found["relative_difference"]
     for name in ("free/rel_disp_m", "window/force_r1_n"):

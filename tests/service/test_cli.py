@@ -8,6 +8,11 @@ from pathlib import Path
 
 import pytest
 from mcap.writer import Writer
+from typer.core import TyperGroup
+from typer.main import get_command
+
+from twin.service import cli
+from twin.service.cli import app
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
 ROOT = Path(__file__).resolve().parents[2]
@@ -170,6 +175,33 @@ def test_help_is_quick() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert result.stdout.strip() == "[]"
+
+
+def test_export_and_replay_say_steps_in_the_same_words() -> None:
+    group = get_command(app)
+    assert isinstance(group, TyperGroup)
+    found = []
+    for name in ("export", "replay"):
+        (option,) = (one for one in group.commands[name].params if one.name == "steps")
+        found.append((option.metavar, getattr(option, "help", None)))
+    assert found[0] == found[1]
+    assert found[0][0] == "FIRST:LAST"
+
+
+@pytest.mark.parametrize(("command", "kept"), [("run", True), ("campaign", True), ("prc", False)])
+def test_only_what_records_says_that_the_recording_is_kept(
+    command: str, kept: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full() -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(cli, "app", full)
+    monkeypatch.setattr(sys, "argv", ["shaketwin", command, "x"])
+    with pytest.raises(SystemExit, match="2"):
+        cli.main()
+    told = capsys.readouterr().err
+    assert "No space left on device" in told
+    assert ("what was recorded is kept" in told) == kept
 
 
 def test_replay_with_another_model_differs_and_says_by_how_much(

@@ -85,3 +85,13 @@ def test_a_reserve_holds_room_and_gives_it_back(tmp_path: Path) -> None:
     assert not (tmp_path / "reserve").exists()
     reserve.release()
     Reserve(tmp_path / "missing" / "reserve", 10).release()  # what cannot be had is done without
+
+
+def test_a_successor_foresees_as_its_predecessor_would() -> None:
+    """It has written little itself, in a run that is old."""
+    whole, successor, rate, free = Room(7200.0), Room(7200.0), 250_000, 200_000_000
+    whole.look(0, 0.0, 10**12)
+    successor.look(1000, 3540.0, 10**12)
+    told = whole.look(3600 * rate, 3600.0, free)
+    assert told is not None
+    assert successor.look(1000 + 60 * rate, 3600.0, free) == told

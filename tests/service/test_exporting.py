@@ -1,5 +1,6 @@
 """What goes out to other tools comes back to the bit, with its gaps, its NaN and its labels."""
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -149,13 +150,14 @@ def test_steps_that_were_decided_on_in_the_test_are_known(tmp_path: Path) -> Non
         (["csv"], ("mass_dsp_m",), None, ["mass_dsp_m", "mass_disp_m"]),
         (["csv"], (), (90, 91), ["no sample in steps 90 to 91"]),
         (["rrd"], ("mass_disp_m",), None, ["--rrd"]),
+        (["csv", "rrd"], (), (1, 2), ["--rrd"]),
     ],
 )
 def test_what_cannot_be_exported(
     log: Path, tmp_path: Path, kinds: list[str], channels: Any, steps: Any, words: list[str]
 ) -> None:
     with pytest.raises(BadInput) as caught:
-        give_out(log, kinds, tmp_path / "x", channels, steps)
+        give_out(log, kinds, tmp_path / "new" / "x", channels, steps)
     for word in words:
         assert word in str(caught.value)
     assert not list(tmp_path.iterdir())
@@ -180,6 +182,41 @@ def test_nothing_is_overwritten_and_no_half_file_left(
     with pytest.raises(OSError, match="No space"):
         give_out(log, ["mat"], tmp_path / "y", (), None)
     assert not (tmp_path / "y.mat").exists()
+
+
+def test_a_library_that_is_missing_is_said_before_anything_is_written(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    monkeypatch.delitem(sys.modules, "twin.stream.tables.parquet", raising=False)
+    with pytest.raises(BadInput, match=r"--parquet: pyarrow is not installed; pip install"):
+        give_out(log, ["csv", "parquet"], tmp_path / "new" / "x", (), None)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_a_call_wrote_goes_with_what_it_could_not_write(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And nothing else does: not a file that came to stand there meanwhile."""
+    there = tmp_path / "x.foxglove.layout.json"
+
+    def slow(*_: Any) -> None:
+        there.write_text("mine")
+
+    monkeypatch.setattr("twin.stream.foxglove.write", slow)
+    with pytest.raises(BadInput, match=r"layout.json: exists already"):
+        give_out(log, ["csv", "foxglove"], tmp_path / "x", ("mass_disp_m",), None)
+    assert [*tmp_path.iterdir()] == [there]
+    assert there.read_text() == "mine"
+
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("twin.stream.tables.mat.savemat", full)
+    with pytest.raises(OSError, match="No space"):
+        give_out(log, ["csv", "mat"], tmp_path / "a" / "b" / "y", ("mass_disp_m",), None)
+    assert [*tmp_path.iterdir()] == [there]
+    assert "rows of" not in capsys.readouterr().out
 
 
 def test_a_log_without_its_end_is_said_to_be_so(
@@ -231,6 +268,8 @@ def test_the_commands(log: Path, tmp_path: Path) -> None:
     told = run.invoke(app, ["import", str(new), "--list"])
     assert "mass_disp_m: " in told.output
     assert isinstance(run.invoke(app, ["import", str(new)]).exception, BadInput)
+    both = run.invoke(app, ["import", str(new), "--list", "-o", str(tmp_path / "b.mcap")])
+    assert "leave -o out" in str(both.exception)
     assert run.invoke(app, ["import", str(new), "-o", str(tmp_path / "a.mcap")]).exit_code == 4
     assert len(read(tmp_path / "a.mcap").start.steps) == 2  # and lost samples, hence the 4
 

@@ -28,7 +28,7 @@ def test_a_hostile_file_is_refused_or_read(
 
 
 def test_a_crash_would_be_seen(trials: Trials, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twin.service.verifying.examine", lambda paths: paths[7])
+    monkeypatch.setattr("twin.service.verifying.examine", lambda paths, _: paths[7])
     code, error = called(("verify", trials.folder / "whole.mcap"), report=False)
     assert code == "crashed"
     assert "IndexError" in error

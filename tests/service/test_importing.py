@@ -184,7 +184,24 @@ def test_our_own_export_is_the_same_run_again(
     (ours,), (theirs,) = (one.pieces("pred") for one in (run[1], again))
     assert theirs.identical(ours)
     assert again.of(Point) == run[1].of(Point)
+    assert "no --profile" not in said(again)
     assert "labels and cycles are the file's own" in said(again)
+
+
+def test_a_table_without_a_profile_says_so_and_has_its_curve(
+    run: tuple[Path, Recording], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its labels tell how many cycles were held and measured, 6 and 2 here."""
+    assert give_out(run[1].path, ["csv"], tmp_path / "out", (), None) == 0
+    assert take_in(tmp_path / "out.csv", tmp_path / "bare.mcap", None, None, None) == 0
+    bare = read(tmp_path / "bare.mcap")
+    assert len(bare.of(Point)) == len(run[1].start.steps)
+    sweep = recorded_bundle(bare).profile.sweep
+    assert (sweep.cycles, sweep.measured_cycles) == (6, 2)
+    (warning,) = (one for one in bare.of(Event) if one.kind == "warning")
+    assert warning.text.startswith("no --profile: unit mass, no bumpers, a 1 Hz placeholder model")
+    assert warning.text in capsys.readouterr().out
+    assert "no --profile" not in said(run[1])
 
 
 def test_labels_of_a_table_stand_before_what_its_motion_tells(
@@ -234,6 +251,7 @@ def test_a_component_test_without_a_table_is_a_log_that_is_not_replayed(tmp_path
     recording = read(log)
     assert recording.start.channels == ("damper_force_n", "rel_disp_m")
     assert not recording.of(Comparison)
+    assert "no --profile" in said(recording)
     assert recording.start.steps[0].frequency_hz == pytest.approx(1.0, rel=1e-3)
     with pytest.raises(BadInput, match="no table_acc_m_s2"):
         replay_command(Asked([log], [], tmp_path / "out"))

@@ -120,3 +120,41 @@ def test_a_log_that_is_there_already_is_never_replaced(run: Path) -> None:
     (run / "run.mcap").write_bytes(kept.read_bytes())  # died after the parts had become it
     gather(run)
     assert [one.name for one in run.iterdir()] == ["run.mcap"]
+
+
+@pytest.mark.parametrize("bit", [0, 6])
+def test_parts_that_a_disk_has_damaged_inside_are_kept(run: Path, bit: int) -> None:
+    """What stands behind the damage is in the log; what does not is not thrown away."""
+    path = part(run, 1, 0, 40, killed=True)
+    edge = path.stat().st_size  # a second chunk begins here, its length a byte later
+    part(run, 2, 40, 61, killed=True)
+    raw = bytearray(path.read_bytes() + b"\x06" + (2**40).to_bytes(8, "little") + bytes(500))
+    raw[edge - 700] ^= 1 << bit
+    path.write_bytes(raw)
+    out = gather(run)
+    assert verified(out)
+    behind = {encode(item, ITEMS[0].run) for item in ITEMS[40:]}
+    assert behind <= {*found(out)}
+    assert sorted(one.name for one in run.iterdir()) == ["damaged", "run.mcap"]
+    assert [one.read_bytes() for one in (run / "damaged").iterdir()] == [bytes(raw)]
+
+
+def test_a_length_that_was_damaged_hides_nothing_behind_it(run: Path) -> None:
+    path = run / PARTS / "part-001.mcap"
+    writer, start, edges = LogWriter(path, RATE), start_record(), []
+    writer.describe(start)
+    for item in (start, *ITEMS[1:]):
+        writer.write(topic(item), encode(item, start.run), item.index)
+        writer.flush()
+        edges.append(path.stat().st_size)
+    raw = bytearray(path.read_bytes())
+    raw[edges[9] + 3] ^= 0x40  # of the eleventh chunk's length: it reaches beyond the file
+    path.write_bytes(raw)
+    assert len(found(gather(run))) == len(ITEMS) - 1
+    assert (run / "damaged" / "part-001.mcap").read_bytes() == bytes(raw)
+
+
+def test_a_death_between_the_log_and_its_parts_loses_nothing(run: Path) -> None:
+    part(run, 1, 0, 61, killed=False).rename(run / "run.mcap")
+    assert found(gather(run)) == expected()
+    assert [one.name for one in run.iterdir()] == ["run.mcap"]

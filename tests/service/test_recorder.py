@@ -229,3 +229,26 @@ def test_what_another_run_says_is_not_recorded(
     assert not [one for one in each(tmp_path / "part.mcap") if b"stray" in one.payload]
     (lost,) = [one for one in read(tmp_path / "part.mcap").of(Event) if one.kind == "recorder"]
     assert lost.text == "recorder: 4 messages missed, 0 dropped"
+
+
+def test_a_sync_that_failed_is_not_believed_to_be_mended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk tells once what it lost; the syncs after it succeed."""
+    recorder, bus = at_work(tmp_path)
+    calls: list[int] = []
+
+    def sync(writer: LogWriter) -> None:
+        calls.append(1)
+        if len(calls) == 1:
+            raise OSError(errno.EIO, "Input/output error", "part.mcap")
+
+    monkeypatch.setattr(module, "SYNC_S", 0.2)
+    monkeypatch.setattr(module.LogWriter, "sync", sync)
+    monkeypatch.setattr(module, "orphaned", lambda: False)
+    recorder.run()
+    recorder.end()
+    assert len(calls) > 3
+    assert len(told(bus, "disk")) == 1
+    assert "Input/output error" in told(bus, "disk")[0]
+    assert len(bus.orders) == 1

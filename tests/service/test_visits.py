@@ -69,13 +69,12 @@ def test_visits_stand_beside_the_steps_with_their_reasons(run: tuple) -> None:
 def test_a_replay_says_of_the_visits_what_was_said_to_the_bit(run: tuple, tmp_path: Path) -> None:
     bundle, recording, summary = run
     made = tmp_path / "run.mcap"
-    identity = replay(Recorded.of(recording), bundle, made, "again", lambda item: None)
+    identity = replay(Recorded.open(recording.path), bundle, made, "again", lambda item: None)
     assert identity.identical
     again = read(tmp_path / "run.mcap")
     for kind in (Comparison, Point, Decided, Event):
-        assert [encode(one, "") for one in again.of(kind)] == [
-            encode(one, "") for one in recording.of(kind)
-        ]
+        said = [one for one in again.of(kind) if getattr(one, "kind", "") != "replay"]
+        assert [encode(one, "") for one in said] == [encode(one, "") for one in recording.of(kind)]
     assert len(again.of(Point)) == 4
     assert summarise(again, bundle.parameters)["visits"] == summary["visits"]
 

@@ -36,7 +36,7 @@ from twin.stream import resend
 from twin.stream.mcap_log import each
 from twin.stream.merging import merge, verified
 from twin.stream.salvage import salvage
-from twin.stream.wire import MEASURED, Item, encode, topic
+from twin.stream.wire import MEAS_TOPIC, Item, encode, topic
 
 SECONDS = 60.0
 HELD = 2500  # blocks
@@ -169,7 +169,7 @@ def judged(chain: Chain, times: np.ndarray) -> dict[str, list[float]]:
             continue
         if not math.isnan(died):
             lost.append(died - max(awake, found[-1].publish_time / 1e9))
-        blocks = [one.log_time for one in found if one.topic == MEASURED]
+        blocks = [one.log_time for one in found if one.topic == MEAS_TOPIC]
         numbers = [round(at / 1e9 / BLOCK_S) for at in blocks]
         own = [number for number in numbers if times[number + 1] > born]
         holes += own != list(range(own[0], own[-1] + 1)) if own else 0
@@ -225,7 +225,7 @@ def told(lines: list[Chain], times: np.ndarray, blocks: int) -> dict[str, object
     for chain in lines:
         whole = chain.folder / "whole.mcap"
         merge([part for part in chain.parts if part.exists()], whole)
-        found = {one.log_time for one in each(whole) if one.topic == MEASURED}
+        found = {one.log_time for one in each(whole) if one.topic == MEAS_TOPIC}
         after.append(blocks - len(found) if verified(whole) else blocks)
     line: dict[str, object] = {
         key: [value for one in judgements for value in one[key]] for key in judgements[0]

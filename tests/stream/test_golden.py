@@ -5,17 +5,20 @@ is never renewed; a new version adds its own.
 """
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from table_io.card import BadInput
 from table_io.records import Point
+from twin.log import open_log
 from twin.stream import mcap_log
 from twin.stream.content import SCHEMA_VERSION, Content, altered, schema_version
 from twin.stream.mcap_log import each, write_items
 from twin.stream.merging import merge, verified
 from twin.stream.recording import read
+from twin.stream.rows import batches, gather
 from twin.stream.salvage import salvage
 
 from .written import START, run
@@ -82,13 +85,30 @@ def test_merging_brings_a_log_to_the_newest_version(version: int, tmp_path: Path
     assert sorted(one.payload for one in each(out)) == sorted(one.payload for one in each(part))
 
 
+def merged(path: Path) -> None:
+    merge([path], path.with_name("out.mcap"))
+
+
+def merged_of_a_killed_recorder(path: Path) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    merged(path)
+
+
+@pytest.mark.parametrize(
+    "reader",
+    [read, gather, lambda path: batches(path, 9), open_log, merged, merged_of_a_killed_recorder],
+    ids=["read", "gather", "batches", "open_log", "merge", "merge_killed"],
+)
 def test_a_newer_version_is_refused_by_its_number(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    reader: Callable[[Path], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mcap_log, "SCHEMA_VERSION", SCHEMA_VERSION + 1)
-    write_items(tmp_path / "new.mcap", run(), START)
+    with monkeypatch.context() as newer:
+        newer.setattr(mcap_log, "SCHEMA_VERSION", SCHEMA_VERSION + 1)
+        write_items(tmp_path / "new.mcap", run(), START)
     with pytest.raises(BadInput, match=r"new.mcap: written in schema version 3; .* reads 1 to 2"):
-        read(tmp_path / "new.mcap")
+        reader(tmp_path / "new.mcap")
+    assert not (tmp_path / "out.mcap").exists()
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "two", "9" * 5000, "1.0", ""])

@@ -13,7 +13,8 @@ from table_io.records import Event
 from twin.stream.content import attachments
 from twin.stream.mcap_log import LogWriter, each
 from twin.stream.merging import merge, verified
-from twin.stream.recording import messages, read
+from twin.stream.recording import read
+from twin.stream.salvage import salvage
 from twin.stream.wire import encode
 
 from .written import RATE, START, payloads, run, write
@@ -48,7 +49,7 @@ def test_parts_in_any_order_make_the_original_to_the_bit(tmp_path: Path) -> None
         merged = read(out)
         assert merged.whole
         assert payloads(merged.items) == expected
-        assert [one.payload for one in messages(out)[0]] == expected  # in the file itself too
+        assert [one.payload for one in salvage(out).messages] == expected  # in the file itself too
         assert merged.missing_samples == 0
     assert [part.read_bytes() for part in parts] == before
 
@@ -64,7 +65,16 @@ def test_merging_keeps_texts_and_times(tmp_path: Path, log: Path) -> None:
     assert was == sorted((one.log_time, one.topic, one.payload, one.publish_time) for one in merged)
 
 
-def test_parts_without_a_start_are_kept_and_not_merged(tmp_path: Path) -> None:
+def test_a_start_that_was_lost_is_taken_from_its_copy(tmp_path: Path) -> None:
+    write(tmp_path / "part.mcap", run()[5:])
+    merge([tmp_path / "part.mcap"], tmp_path / "out.mcap")
+    assert read(tmp_path / "out.mcap").start == START
+
+
+def test_parts_without_a_start_are_kept_and_not_merged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(LogWriter, "describe", lambda *_: None)
     write(tmp_path / "part.mcap", run()[5:])
     with pytest.raises(BadInput, match=r"part.mcap: holds no start record; the parts are kept"):
         merge([tmp_path / "part.mcap"], tmp_path / "out.mcap")

@@ -23,9 +23,10 @@ from table_io.block import Block
 from table_io.card import BadInput
 from table_io.records import Comparison, Decided, Fault, Response, RunStop, Step
 from twin.stream.blocks import decode_blocks
+from twin.stream.budget import work
 from twin.stream.framing import CHUNK, FRAME, LARGEST_BYTES, MAGIC
 from twin.stream.merging import merge
-from twin.stream.recording import messages, read
+from twin.stream.recording import read
 from twin.stream.salvage import salvage
 from twin.stream.wire import Item, WireError, decode, encode, topic
 
@@ -194,14 +195,14 @@ def test_every_packing_of_the_format_is_read(packing: CompressionType, tmp_path:
     writer.add_message(channel, 0, encode(START, START.run), 7, 3)
     writer.finish()
     (tmp_path / "a.mcap").write_bytes(stream.getvalue())
-    (one,) = messages(tmp_path / "a.mcap")[0]
+    (one,) = salvage(tmp_path / "a.mcap").messages
     assert (one.topic, one.sequence, one.publish_time) == ("/run/start", 3, 7)
     assert read(tmp_path / "a.mcap").start == START
 
 
 @pytest.mark.parametrize("kind", range(len(BOMBS)))
 def test_no_bomb_goes_off(kind: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twin.stream.salvage.LEAST_COST", COST)
+    monkeypatch.setattr("twin.stream.budget.LEAST_COST", COST)
     path = tmp_path / "bomb.mcap"
     path.write_bytes(bomb(kind))
     tracemalloc.start()
@@ -215,6 +216,40 @@ def test_no_bomb_goes_off(kind: int, tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert peak < 3 * LARGEST_BYTES + 2 * COST
     with pytest.raises(BadInput, match=r"holds no start record|not a shaketwin log"):
         read(path)
+
+
+def test_a_sound_file_is_read_whole_however_long_it_is(
+    content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Work is limited by the size of the file alone, and a sound one needs a small part of it."""
+    path = tmp_path / "a.mcap"
+    path.write_bytes(content)
+    monkeypatch.setattr("twin.stream.budget.LEAST_COST", 0)
+    assert salvage(path).whole
+    monkeypatch.setattr("twin.stream.budget.COST_PER_BYTE", 100)
+    assert salvage(path).whole
+    assert work(2**50) == 2**50 * 100
+
+
+def test_what_does_not_fit_into_memory_is_refused_and_is_no_damage(
+    content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Charged is what is kept: of other topics nothing, of empty messages what they cost."""
+    path, small = tmp_path / "a.mcap", 50_000
+    path.write_bytes(content)
+    monkeypatch.setattr("twin.stream.salvage.memory", lambda: small)
+    assert salvage(path, frozenset(("/rig/gap",))).whole
+    with pytest.raises(BadInput, match="needs more memory than there is"):
+        salvage(path)
+    path.write_bytes(bomb(2))  # of messages without a payload
+    tracemalloc.start()
+    try:
+        with pytest.raises(BadInput, match="needs more memory than there is"):
+            salvage(path)
+        held = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert held < 3 * LARGEST_BYTES + small
 
 
 @given(blocks=st.lists(any_block(), max_size=4), copies=st.integers(1, 5))

@@ -186,6 +186,30 @@ def test_uff_with_times_of_its_own(tmp_path: Path) -> None:
     assert taken(read_table(tmp_path / "b.uff", "rig"), "uff binary").rate_hz == RATE
 
 
+@pytest.mark.parametrize("kind", ["csv", "parquet", "npz", "uff", "h5", "tdms"])
+def test_a_slash_in_a_unit_is_no_group(tmp_path: Path, kind: str) -> None:
+    names = ["Acc [m/s2] mass", "Acc [m/s2] table"]
+    columns: dict[str, Any] = dict.fromkeys(names, DISP)
+    path = tmp_path / f"a.{kind}"
+    if kind == "csv":
+        path.write_text(",".join(names) + "\n1,2\n3,4\n")
+    elif kind == "parquet":
+        pq.write_table(pa.table(columns), path)
+    elif kind == "npz":
+        np.savez(path, **columns)
+    elif kind == "uff":
+        uff(tmp_path / "b.uff", 1)
+        for one, name in zip(pyuff.UFF(str(tmp_path / "b.uff")).read_sets(), names, strict=True):
+            pyuff.UFF(str(path)).write_sets({**one, "id1": name}, "add")
+    elif kind == "h5":  # no name of a dataset has a slash, that of a field may
+        with h5py.File(path, "w") as file:
+            file["run/table"] = np.zeros(N, [(name, float) for name in names])
+    else:
+        with nptdms.TdmsWriter(str(path)) as file:
+            file.write_segment([nptdms.ChannelObject("run", name, DISP) for name in names])
+    assert [*read_table(path).columns] == names
+
+
 @pytest.mark.parametrize("shape", [(N, 2), (2, N), (1, N, 2), (2, 1, N)])
 def test_the_columns_of_a_matrix(tmp_path: Path, shape: tuple[int, ...]) -> None:
     rows = np.array([DISP, FORCE])

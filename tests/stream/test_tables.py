@@ -62,7 +62,7 @@ def test_an_empty_cell_is_a_lost_sample(tmp_path: Path) -> None:
         (b"\x89PNG\r\n\x1a\n\0\0", ["binary"]),
         (b"a,b\n1,\xff\n", ["not UTF-8"]),
         ("a,b\n", ["no samples"]),
-        ("1,2\n3,4\n", ["row 1", "names no columns"]),
+        ("1,2\n3,4\n", ["row 1", "names no columns", "time_s, drive_disp_m, ", "--columns"]),
         ("a,,c\n1,2,3\n", ["row 1", "column 2", "no name"]),
         ("a,b,a\n1,2,3\n", ["row 1", "a more than once"]),
         ("a,b\n1,2\n3\n", ["row 3", "1 cells", "2 columns"]),

@@ -228,7 +228,7 @@ def test_bytes_on_the_wrong_topic_are_refused() -> None:
     labels = np.zeros(2, dtype=np.int64)
     block = Block("meas", 0, 2e3, ("a",), np.ones((1, 2)), labels, labels, labels)
     with pytest.raises(WireError, match=r"/twin/pred: not a Block: it holds the stream 'meas'"):
-        decode(wire.PREDICTED, encode(block, "run"))
+        decode(wire.PRED_TOPIC, encode(block, "run"))
     with pytest.raises(WireError, match=r"/rig/nothing: unknown topic; known: /rig/meas"):
         decode("/rig/nothing", encode(Gap(0, 1, "", "lost"), "run"))
 
@@ -244,10 +244,10 @@ def test_a_block_with_unequal_lengths_is_refused(cut: str) -> None:
         label=[0, 0],
         cycle=[0, 0],
     )
-    assert len(decode(wire.MEASURED, message.SerializeToString())[1]) == 2  # type: ignore[arg-type]
+    assert len(decode(wire.MEAS_TOPIC, message.SerializeToString())[1]) == 2  # type: ignore[arg-type]
     del (message.channels[1].values if cut == "values" else message.step)[-1:]
     with pytest.raises(WireError, match="not a Block"):
-        decode(wire.MEASURED, message.SerializeToString())
+        decode(wire.MEAS_TOPIC, message.SerializeToString())
 
 
 def test_a_record_that_the_schema_does_not_know_cannot_slip_through() -> None:

@@ -18,7 +18,7 @@ import pytest
 from table_io.card import BadInput
 from twin.stream import resend
 from twin.stream.resend import HELD_PIECES, LARGEST_BYTES, PIECE_BYTES, Inbox, Shelf
-from twin.stream.wire import COMPARED, MEASURED, PREDICTED, TOPIC_TYPES
+from twin.stream.wire import CMP_TOPIC, MEAS_TOPIC, PRED_TOPIC, TOPIC_TYPES
 from twin.stream.zenoh_link import Link, key, open_hub, open_spoke
 
 BLOCK = bytes(2500)
@@ -134,7 +134,7 @@ def publish_at_100_hz(link: Link, topic: str, span: range) -> list[float]:
     return took
 
 
-def timed(link: Link, number: int, rest: bytes, topic: str = MEASURED) -> float:
+def timed(link: Link, number: int, rest: bytes, topic: str = MEAS_TOPIC) -> float:
     """Seconds that one publish() took."""
     before = time.monotonic()
     link.publish(topic, struct.pack("<q", number) + rest)
@@ -160,7 +160,7 @@ def heard(process: "subprocess.Popen[str]", count: int, link: Link) -> list[list
 def test_every_topic_has_a_key_of_its_own() -> None:
     keys = {topic: key("rig", topic) for topic in TOPIC_TYPES}
     assert len(set(keys.values())) == len(TOPIC_TYPES)
-    assert keys[MEASURED] == "shaketwin/rig/stream/rig/meas"
+    assert keys[MEAS_TOPIC] == "shaketwin/rig/stream/rig/meas"
     assert keys["/run/start"] == "shaketwin/rig/event/run/start"
 
 
@@ -205,42 +205,42 @@ def test_only_the_given_endpoint_is_open(hub: Link, spoke: Link, endpoint: str) 
 def test_spokes_hear_hub_and_each_other_without_loss(
     hub: Link, spoke: Link, endpoint: str, start: Start
 ) -> None:
-    inbox = spoke.subscribe((MEASURED, PREDICTED, COMPARED), history=True, capacity=1000)
-    start(SPEAKER, endpoint, "100", PREDICTED, COMPARED)
-    hub.declare((MEASURED,))
-    publish_at_100_hz(hub, MEASURED, range(100))
+    inbox = spoke.subscribe((MEAS_TOPIC, PRED_TOPIC, CMP_TOPIC), history=True, capacity=1000)
+    start(SPEAKER, endpoint, "100", PRED_TOPIC, CMP_TOPIC)
+    hub.declare((MEAS_TOPIC,))
+    publish_at_100_hz(hub, MEAS_TOPIC, range(100))
     messages = fetch(inbox, 300, hub)
-    for topic in (MEASURED, PREDICTED, COMPARED):
+    for topic in (MEAS_TOPIC, PRED_TOPIC, CMP_TOPIC):
         assert numbers(messages, topic) == list(range(100))
     assert (inbox.missed, inbox.dropped, inbox.ignored) == (0, 0, 0)
 
 
 def test_a_late_joiner_gets_what_is_held_while_publishing_goes_on(hub: Link, endpoint: str) -> None:
-    hub.declare((MEASURED, "/run/start"))
+    hub.declare((MEAS_TOPIC, "/run/start"))
     hub.publish("/run/start", numbered(7))
     for number in range(2000):
-        hub.publish(MEASURED, numbered(number))
+        hub.publish(MEAS_TOPIC, numbered(number))
     late = open_spoke("rig", endpoint, 5.0)
-    inbox = late.subscribe((MEASURED, "/run/start"), history=True, capacity=100)
+    inbox = late.subscribe((MEAS_TOPIC, "/run/start"), history=True, capacity=100)
     messages = []
     for number in range(2000, 2100):
-        publish_at_100_hz(hub, MEASURED, range(number, number + 1))
+        publish_at_100_hz(hub, MEAS_TOPIC, range(number, number + 1))
         messages += fetch(inbox, 10**6, hub, limit_s=0.004)
     messages += fetch(inbox, 2101 - len(messages), hub)
     late.close()
-    assert numbers(messages, MEASURED) == list(range(2100))
+    assert numbers(messages, MEAS_TOPIC) == list(range(2100))
     assert messages[0][0] == "/run/start"
     assert inbox.missed == 0
 
 
 def test_without_history_it_begins_now(hub: Link, spoke: Link) -> None:
-    hub.declare((MEASURED, "/run/stop"))
+    hub.declare((MEAS_TOPIC, "/run/stop"))
     hub.publish("/run/stop", numbered(0))
-    publish_at_100_hz(hub, MEASURED, range(10))
-    inbox = spoke.subscribe((MEASURED, "/run/stop"), history=False, capacity=100)
+    publish_at_100_hz(hub, MEAS_TOPIC, range(10))
+    inbox = spoke.subscribe((MEAS_TOPIC, "/run/stop"), history=False, capacity=100)
     assert fetch(inbox, 1, hub, limit_s=0.7) == []
-    publish_at_100_hz(hub, MEASURED, range(10, 20))
-    assert numbers(fetch(inbox, 10, hub), MEASURED) == list(range(10, 20))
+    publish_at_100_hz(hub, MEAS_TOPIC, range(10, 20))
+    assert numbers(fetch(inbox, 10, hub), MEAS_TOPIC) == list(range(10, 20))
 
 
 @pytest.mark.parametrize("history", [True, False])
@@ -254,15 +254,15 @@ def test_what_is_lost_on_the_way_is_recovered_in_order(
         if chance.random() < 0.7:
             arrive(self, *what)  # type: ignore[arg-type]
 
-    inbox = spoke.subscribe((MEASURED,), history=history, capacity=1000)
-    hub.declare((MEASURED,))
+    inbox = spoke.subscribe((MEAS_TOPIC,), history=history, capacity=1000)
+    hub.declare((MEAS_TOPIC,))
     time.sleep(SETTLED_S)
-    hub.publish(MEASURED, numbered(0))
+    hub.publish(MEAS_TOPIC, numbered(0))
     messages = fetch(inbox, 1, hub)
     monkeypatch.setattr(Inbox, "arrive", lossy)
-    publish_at_100_hz(hub, MEASURED, range(1, 100))
+    publish_at_100_hz(hub, MEAS_TOPIC, range(1, 100))
     messages += fetch(inbox, 99, hub)
-    assert numbers(messages, MEASURED) == list(range(100))
+    assert numbers(messages, MEAS_TOPIC) == list(range(100))
     assert inbox.missed == 0
 
 
@@ -289,20 +289,20 @@ def test_a_large_payload_arrives_whole_and_a_larger_one_is_refused(hub: Link, sp
 
 
 def test_a_full_courtesy_inbox_drops_the_oldest_and_counts(hub: Link, spoke: Link) -> None:
-    inbox = spoke.subscribe((MEASURED,), history=False, capacity=10)
-    hub.declare((MEASURED,))
+    inbox = spoke.subscribe((MEAS_TOPIC,), history=False, capacity=10)
+    hub.declare((MEAS_TOPIC,))
     time.sleep(SETTLED_S)
-    publish_at_100_hz(hub, MEASURED, range(50))
+    publish_at_100_hz(hub, MEAS_TOPIC, range(50))
     time.sleep(0.1)
-    assert numbers(fetch(inbox, 50, hub, limit_s=0.7), MEASURED) == list(range(40, 50))
+    assert numbers(fetch(inbox, 50, hub, limit_s=0.7), MEAS_TOPIC) == list(range(40, 50))
     assert (inbox.dropped, inbox.missed) == (40, 0)
 
 
 def test_a_full_inbox_with_history_loses_nothing(hub: Link, spoke: Link) -> None:
-    inbox = spoke.subscribe((MEASURED,), history=True, capacity=10)
-    hub.declare((MEASURED,))
-    publish_at_100_hz(hub, MEASURED, range(50))
-    assert numbers(fetch(inbox, 50, hub), MEASURED) == list(range(50))
+    inbox = spoke.subscribe((MEAS_TOPIC,), history=True, capacity=10)
+    hub.declare((MEAS_TOPIC,))
+    publish_at_100_hz(hub, MEAS_TOPIC, range(50))
+    assert numbers(fetch(inbox, 50, hub), MEAS_TOPIC) == list(range(50))
     assert (inbox.dropped, inbox.missed) == (0, 0)
 
 
@@ -310,22 +310,22 @@ def test_what_is_held_no_more_is_counted_as_missed(
     hub: Link, spoke: Link, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(resend, "HELD_PIECES", 20)
-    inbox = spoke.subscribe((MEASURED,), history=True, capacity=5)
-    hub.declare((MEASURED,))
-    hub.publish(MEASURED, numbered(0))
+    inbox = spoke.subscribe((MEAS_TOPIC,), history=True, capacity=5)
+    hub.declare((MEAS_TOPIC,))
+    hub.publish(MEAS_TOPIC, numbered(0))
     fetch(inbox, 1, hub)
-    publish_at_100_hz(hub, MEASURED, range(1, 51))
-    assert numbers(fetch(inbox, 20, hub), MEASURED) == list(range(31, 51))
+    publish_at_100_hz(hub, MEAS_TOPIC, range(1, 51))
+    assert numbers(fetch(inbox, 20, hub), MEAS_TOPIC) == list(range(31, 51))
     assert inbox.missed == 30
 
 
 def test_a_stopped_listener_slows_nobody_and_gets_everything_afterwards(
     hub: Link, endpoint: str, start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    listener = start(LISTENER, endpoint, "history", MEASURED)
+    listener = start(LISTENER, endpoint, "history", MEAS_TOPIC)
     assert heard(listener, 1, hub) == [["ready"]]
-    hub.declare((MEASURED,))
-    publish_at_100_hz(hub, MEASURED, range(20))
+    hub.declare((MEAS_TOPIC,))
+    publish_at_100_hz(hub, MEAS_TOPIC, range(20))
     with monkeypatch.context() as later:
         later.setattr(hub, "serve", lambda: None)  # so that a question of it is open
         time.sleep(resend.ASK_EVERY_S)
@@ -333,9 +333,9 @@ def test_a_stopped_listener_slows_nobody_and_gets_everything_afterwards(
         took = [
             timed(hub, number, bytes(40_000)) for number in range(20, 520)
         ]  # 20 MB: all is full
-    took += publish_at_100_hz(hub, MEASURED, range(520, 620))
+    took += publish_at_100_hz(hub, MEAS_TOPIC, range(520, 620))
     listener.send_signal(signal.SIGCONT)
-    took += publish_at_100_hz(hub, MEASURED, range(620, 640))
+    took += publish_at_100_hz(hub, MEAS_TOPIC, range(620, 640))
     said = heard(listener, 640, hub)
     assert [int(number) for _, number, _ in said] == list(range(640))
     assert {missed for *_, missed in said} == {"0"}
@@ -345,30 +345,30 @@ def test_a_stopped_listener_slows_nobody_and_gets_everything_afterwards(
 def test_a_listener_stopped_while_it_fetches_history_slows_nobody(
     hub: Link, endpoint: str, start: Start
 ) -> None:
-    hub.declare((MEASURED,))
+    hub.declare((MEAS_TOPIC,))
     for number in range(HELD_PIECES):
-        hub.publish(MEASURED, numbered(number))
-    listener = start(LISTENER, endpoint, "history", MEASURED)
+        hub.publish(MEAS_TOPIC, numbered(number))
+    listener = start(LISTENER, endpoint, "history", MEAS_TOPIC)
     assert len(heard(listener, 100, hub)) >= 100
     listener.send_signal(signal.SIGSTOP)
-    assert max(publish_at_100_hz(hub, MEASURED, range(HELD_PIECES, HELD_PIECES + 150))) < 0.1
+    assert max(publish_at_100_hz(hub, MEAS_TOPIC, range(HELD_PIECES, HELD_PIECES + 150))) < 0.1
 
 
 def test_a_killed_listener_is_seen_and_its_successor_gets_everything(
     hub: Link, spoke: Link, endpoint: str, start: Start
 ) -> None:
-    hub.declare((MEASURED,))
-    first = start(LISTENER, endpoint, "history", MEASURED)
+    hub.declare((MEAS_TOPIC,))
+    first = start(LISTENER, endpoint, "history", MEAS_TOPIC)
     assert heard(first, 1, hub) == [["ready"]]
-    publish_at_100_hz(hub, MEASURED, range(30))
+    publish_at_100_hz(hub, MEAS_TOPIC, range(30))
     assert spoke.components() == hub.components() == {"listener"}
     first.kill()
     end = time.monotonic() + 1.0
     while spoke.components() and time.monotonic() < end:
         time.sleep(0.005)
     assert spoke.components() == hub.components() == set()
-    second = start(LISTENER, endpoint, "history", MEASURED)
-    publish_at_100_hz(hub, MEASURED, range(30, 130))
+    second = start(LISTENER, endpoint, "history", MEAS_TOPIC)
+    publish_at_100_hz(hub, MEAS_TOPIC, range(30, 130))
     said = heard(second, 131, hub)[1:]
     assert [int(number) for _, number, _ in said] == list(range(130))
 
@@ -407,16 +407,16 @@ def test_an_unreadable_command_is_ignored_and_counted(hub: Link, spoke: Link) ->
 
 
 def test_foreign_questions_and_messages_do_no_harm(hub: Link, spoke: Link) -> None:
-    hub.declare((MEASURED,))
-    inbox = spoke.subscribe((MEASURED,), history=True, capacity=10)
+    hub.declare((MEAS_TOPIC,))
+    inbox = spoke.subscribe((MEAS_TOPIC,), history=True, capacity=10)
     time.sleep(SETTLED_S)
     session = spoke._session
     for text in (b"\xff", b"{}", b"[]", b'{"next": {"/rig/meas": 3}, "history": 1}'):
         session.get("shaketwin/rig/state/held", payload=text, timeout=0.1)
-    hub._session.put(key("rig", MEASURED), b"no stamp")
-    hub._session.put(key("rig", MEASURED), b"odd", attachment=b"stamp")
-    hub.publish(MEASURED, numbered(0))
-    assert numbers(fetch(inbox, 1, hub), MEASURED) == [0]
+    hub._session.put(key("rig", MEAS_TOPIC), b"no stamp")
+    hub._session.put(key("rig", MEAS_TOPIC), b"odd", attachment=b"stamp")
+    hub.publish(MEAS_TOPIC, numbered(0))
+    assert numbers(fetch(inbox, 1, hub), MEAS_TOPIC) == [0]
     assert inbox.ignored == 2
 
 
@@ -437,8 +437,8 @@ print(threading.active_count(), flush=True)
 {ending}
 """
     process = start(code, endpoint)
-    hub.declare((MEASURED,))
-    hub.publish(MEASURED, numbered(0))
+    hub.declare((MEAS_TOPIC,))
+    hub.publish(MEAS_TOPIC, numbered(0))
     assert heard(process, 1, hub) == [["1"]]
     assert process.wait(timeout=2.0) == 0
 

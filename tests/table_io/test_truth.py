@@ -21,7 +21,8 @@ from twin.model.effects import EFFECTS
 from twin.service.bundle import read_bundle
 from twin.service.recordings import recorded_bundle
 from twin.service.runs import play_unpaced
-from twin.stream.recording import messages, read
+from twin.stream.recording import read
+from twin.stream.salvage import salvage
 
 CARD, CARD_TOML = load(PROFILES / "rigs" / "simulated.toml", Rig, "machine card")
 SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
@@ -264,7 +265,7 @@ def test_a_recording_holds_the_hash_and_nothing_else_of_the_truth(tmp_path: Path
     assert again.rig.simulated is not None
     assert again.rig.simulated.truth_sha256 == keys["truth_sha256"]
     log = tmp_path / "run.mcap"
-    held = b"".join([log.read_bytes(), *(one.payload for one in messages(log)[0])])
+    held = b"".join([log.read_bytes(), *(one.payload for one in salvage(log).messages)])
     truth = parse(PHYSICS, Truth, "truth")
     (rubber, drift), stiffness = truth.effects, truth.base.damper_stiffness_n_m
     assert stiffness is not None

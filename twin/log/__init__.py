@@ -11,7 +11,7 @@
 | `log.window["mass_disp_m"]` | the twin that restarts from the measured state every window |
 | `log.time_s`, `log.step_index`, `log.label`, `log.cycle` | the one axis, and what the drive did |
 | `log.steps`, `log.step(12)` | the steps (by `index`, as in summary.json); samples of one |
-| `log.step(12).measured["mass_acc_m_s2"]` | the cycles alone that enter its PRC point |
+| `log.step(12).held["mass_acc_m_s2"]` | the cycles alone that enter its PRC point |
 | `log.prc`, `log.points` | the pseudo-resonance curves as arrays, and as records |
 | `log.events`, `log.gaps`, `log.faults`, `log.stop` | what happened |
 | `log.start`, `log.profile`, `log.rig`, `log.model` | what the run was made with |
@@ -23,6 +23,7 @@ Arrays are float64 to the bit as recorded, and read-only: copy what you want to 
 reads the start only; the first look at a stream reads that stream, the next ones cost nothing.
 """
 
+from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -46,13 +47,13 @@ from table_io.records import (
 )
 from table_io.rig import Rig
 from twin.compare import PREDICTED
-from twin.log.parts import UNKNOWN, Part, Track, unit
+from twin.log.parts import UNKNOWN, StepView, Track
 from twin.model.card import ModelCard
 from twin.model.model import Model
-from twin.stream.mcap_log import each
-from twin.stream.recording import START, Recording, read
-from twin.stream.wire import MEASURED, RECORD_TOPICS, WireError, decode
-from twin.stream.wire import PREDICTED as PREDICTIONS
+from twin.stream.folder import log_path
+from twin.stream.recording import Recording, read, start_of
+from twin.stream.rows import all_steps, unit
+from twin.stream.wire import MEAS_TOPIC, PRED_TOPIC, RECORD_TOPICS
 
 if TYPE_CHECKING:
     from twin.log.dataset import Dataset
@@ -65,18 +66,10 @@ def open_log(path: str | Path) -> "Log":
 
     A log that was cut off opens too, with what is left of it: `log.whole` says so.
     """
-    place = Path(path)
-    place = place / "run.mcap" if place.is_dir() else place
+    place = log_path(Path(path))
     if not place.is_file():
         raise BadInput(f"{place}: no such log; give a run.mcap or the folder of a run")
-    try:
-        first = next((one for one in each(place) if one.topic == START), None)
-        start = decode(START, first.payload)[1] if first else None
-    except WireError:
-        start = None
-    if not isinstance(start, RunStart):
-        start = read(place, ()).start
-    return Log(place, start)
+    return Log(place, start_of(place))
 
 
 class Log:
@@ -89,6 +82,17 @@ class Log:
     def __getitem__(self, name: str) -> Float1D:
         """A measured channel in SI, (sample,)."""
         return self.measured[name]
+
+    # Without these Python takes a log for a sequence, and asks for the channels 0, 1, 2.
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.channels)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.channels
+
+    def keys(self) -> tuple[str, ...]:
+        """The names of the measured channels."""
+        return self.channels
 
     def __repr__(self) -> str:
         one = self.start
@@ -125,12 +129,16 @@ class Log:
 
     @cached_property
     def _blocks(self) -> tuple[Block, ...]:
-        return read(self.path, (MEASURED,)).pieces("meas")
+        return read(self.path, (MEAS_TOPIC,)).pieces("meas")
 
-    @property
+    @cached_property
     def whole(self) -> bool:
-        """False where the file was cut off or damaged."""
-        return self._records.whole
+        """True where the file is undamaged, and each of its messages can be of this run.
+
+        All topics are read for it, once. A test that was stopped early has a whole file too: how
+        far it came is told by `stop`, what is missing in it by `gaps`.
+        """
+        return read(self.path).whole
 
     @property
     def stop(self) -> RunStop | None:
@@ -170,7 +178,7 @@ class Log:
     @cached_property
     def predicted(self) -> Float2D:
         """Both twins on the time axis, rows as in `twin.compare.PREDICTED`, (channel, sample)."""
-        return self._placed(read(self.path, (PREDICTIONS,)).pieces("pred"), PREDICTED)
+        return self._placed(read(self.path, (PRED_TOPIC,)).pieces("pred"), PREDICTED)
 
     @cached_property
     def twin(self) -> Track:
@@ -200,16 +208,9 @@ class Log:
     @cached_property
     def steps(self) -> tuple[Step, ...]:
         """The planned steps, then those that were decided on during the test."""
-        decided = {one.step: one for one in self._records.of(Decided)}
-        return (
-            *self.start.steps,
-            *(
-                Step(one.step, one.direction, one.frequency_hz, one.acceleration_m_s2)
-                for one in decided.values()
-            ),
-        )
+        return tuple(all_steps(self.start, self._records.items).values())
 
-    def step(self, index: int) -> Part:
+    def step(self, index: int) -> StepView:
         """The samples of a step, blends included; KeyError where there is none of this index."""
         step = next((one for one in self.steps if one.index == index), None)
         inside = np.flatnonzero(self.step_index == index)
@@ -219,7 +220,7 @@ class Log:
             raise KeyError(f"no samples of a step {index}; there: {there}")
         point = next((one for one in self.points if one.step == index), None)
         cycles = tuple(one for one in self._records.of(Cycle) if one.step == index)
-        return Part(step, point, cycles, self, slice(int(inside[0]), int(inside[-1]) + 1))
+        return StepView(step, point, cycles, self, slice(int(inside[0]), int(inside[-1]) + 1))
 
     @cached_property
     def prc(self) -> dict[str, Any]:

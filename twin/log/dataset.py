@@ -6,7 +6,7 @@ from table_io.block import Label
 from table_io.card import BadInput
 from table_io.channels import BY_NAME
 from twin.compare import PREDICTED
-from twin.log.parts import unit
+from twin.stream.rows import unit
 
 if TYPE_CHECKING:
     from xarray import Dataset as Dataset  # noqa: PLC0414

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from table_io.block import Float1D, Float2D, Int1D, Label
-from table_io.channels import BY_NAME
 from table_io.records import Cycle, Point, Step
 
 if TYPE_CHECKING:
@@ -15,11 +14,6 @@ if TYPE_CHECKING:
     from twin.log.dataset import Dataset
 
 UNKNOWN = -1  # step, label and cycle of a sample that was not recorded
-
-
-def unit(name: str) -> str:
-    """SI unit of a channel; "" of one that the table of channels does not know."""
-    return BY_NAME[name].unit if name in BY_NAME else {"rel_vel_m_s": "m/s"}.get(name, "")
 
 
 class Track(Mapping[str, Float1D]):
@@ -47,8 +41,8 @@ class Track(Mapping[str, Float1D]):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Part:
-    """The samples of one step, or of its measured cycles; `step` as planned, `point` its result."""
+class StepView:
+    """The samples of one step, or of its held cycles; `step` as planned, `point` its result."""
 
     step: Step
     point: Point | None
@@ -57,7 +51,20 @@ class Part:
     samples: slice
 
     def __getitem__(self, name: str) -> Float1D:
-        return self.log[name][self.samples]
+        return self.measured[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.log)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.log
+
+    def keys(self) -> tuple[str, ...]:
+        return self.log.keys()
+
+    @property
+    def measured(self) -> Track:
+        return self.log.measured.cut(self.samples)
 
     @property
     def twin(self) -> Track:
@@ -80,13 +87,13 @@ class Part:
         return self.log.cycle[self.samples]
 
     @property
-    def measured(self) -> "Part":
-        """The held cycles that enter the PRC point; empty where the step has none."""
+    def held(self) -> "StepView":
+        """The cycles alone that enter the PRC point; empty where the step has none."""
         inside = np.flatnonzero(self.label == Label.MEASURE)
         first, last = (inside[0], inside[-1] + 1) if inside.size else (0, 0)
         base = self.samples.start
         cut = slice(base + int(first), base + int(last))
-        return Part(self.step, self.point, self.cycles, self.log, cut)
+        return StepView(self.step, self.point, self.cycles, self.log, cut)
 
     def to_xarray(self) -> "Dataset":
         """As `Log.to_xarray`, of these samples."""

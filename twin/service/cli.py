@@ -9,8 +9,7 @@ from typing import Annotated
 
 import typer
 
-from twin.service.cli_files import files
-from twin.service.cli_formats import formats
+from twin.service.cli_files import Steps, files
 from twin.service.cli_learning import learning
 
 # Matrices are small here; on a busy machine the threads of a BLAS stall what they should speed up,
@@ -169,9 +168,7 @@ def replay(
     ] = None,
     out: Out = None,
     speed: Annotated[str, typer.Option("--speed", help="Times real time, or max.")] = "max",
-    steps: Annotated[
-        str | None, typer.Option("--steps", metavar="A:B", help="From step A to step B only.")
-    ] = None,
+    steps: Steps = None,
     publish: Annotated[
         bool, typer.Option("--publish", help="On the bus too: whoever listens takes it for live.")
     ] = False,
@@ -263,7 +260,6 @@ def tell(
 
 app.add_typer(learning)
 app.add_typer(files)
-app.add_typer(formats)
 
 
 def main() -> None:
@@ -281,9 +277,8 @@ def main() -> None:
         except OSError as error:
             if isinstance(error, BrokenPipeError):
                 raise
-            print(
-                f"shaketwin: {error}; what was recorded is kept: `shaketwin report DIR` once this "
-                "is mended",
-                file=sys.stderr,
-            )
+            kept = ""
+            if sys.argv[1:2] in (["run"], ["campaign"]):  # the others record nothing
+                kept = "; what was recorded is kept: `shaketwin report DIR` once this is mended"
+            print(f"shaketwin: {error}{kept}", file=sys.stderr)
             raise SystemExit(2) from None

@@ -9,7 +9,7 @@ from table_io.block import Block
 from twin.compare import PREDICTED
 from twin.service.summary import Json
 from twin.stream.recording import read
-from twin.stream.wire import PREDICTED as TOPIC
+from twin.stream.wire import PRED_TOPIC
 
 
 def deviation(old: Path, new: Path) -> Json:
@@ -17,7 +17,7 @@ def deviation(old: Path, new: Path) -> Json:
 
     None too where one of the two predicts nothing.
     """
-    before, after = (read(path, (TOPIC,)).pieces("pred") for path in (old, new))
+    before, after = (read(path, (PRED_TOPIC,)).pieces("pred") for path in (old, new))
     squares = np.zeros((2, len(PREDICTED)))
     for a in before:
         for b in after:

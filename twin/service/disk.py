@@ -51,11 +51,15 @@ class Room:
     """Foresees a full disk from how fast the recording grows; `look` says what is new."""
 
     planned_s: float
+    _first: tuple[int, float] | None = None  # of this part: bytes, seconds of the run
     _said: set[str] = field(default_factory=set)
 
     def look(self, written: int, recorded_s: float, free: int) -> str | None:
         """A warning, each kind once, from bytes written in so many seconds and bytes free."""
-        rate = written / recorded_s if recorded_s > 0 else 0.0
+        self._first = self._first or (written, recorded_s)
+        bytes_before, s_before = self._first  # a successor begins with what the run had recorded
+        seen_s = recorded_s - s_before
+        rate = (written - bytes_before) / seen_s if seen_s > 0 else 0.0
         left_s = self.planned_s - recorded_s
         if rate <= 0 or left_s <= 0 or free > rate * left_s:
             return None

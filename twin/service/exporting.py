@@ -1,7 +1,7 @@
 """`export`: a log in the formats of other people's tools."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from rich.console import Console
 
 from table_io.card import BadInput
 from table_io.records import RunStart
-from twin.service.recordings import log_path, open_log
+from twin.service.recordings import log_path, recording_of
 from twin.service.terminal import say
 from twin.stream.rows import Rows, batches, gather
 
@@ -43,45 +43,78 @@ def give_out(
         for new in (place, _layout(place)) if kind == "foxglove" else (place,):
             if new.exists():
                 raise BadInput(f"{new}: exists already; nothing is ever overwritten")
-            new.absolute().parent.mkdir(parents=True, exist_ok=True)
-    if "rrd" in places:
-        if channels or steps:
-            raise BadInput("--rrd shows a whole run; leave --channel and --steps out")
-        _view(path, places.pop("rrd"))
-    if places:
-        rows = gather(path).chosen(channels, steps)
-        if not rows.size:
-            raise BadInput(f"{path}: no measured samples in it; there is nothing to export")
-        if not rows.whole:
-            told = f"warning: {path} has no end; `shaketwin verify` says what is missing"
-            Console(stderr=True).print(told, highlight=False, soft_wrap=True)
-        for kind, place in places.items():
-            _write(kind, rows, place)
+    if "rrd" in places and (channels or steps):
+        raise BadInput("--rrd shows a whole run; leave --channel and --steps out")
+    # What can be refused is refused before the first file: a second call would find that one there.
+    writers = {kind: _writer(kind) for kind in places if kind != "rrd"}
+    rows = _rows(path, channels, steps) if writers else None
+    with ExitStack() as undo:
+        _make_folder(places[kinds[0]].absolute().parent, undo)
+        told: list[str] = []
+        if "rrd" in places:
+            _view(path, places["rrd"])
+            undo.callback(places["rrd"].unlink, missing_ok=True)
+            told.append(f"{places['rrd']}")
+        if rows is not None:
+            for kind, write in writers.items():
+                told += _write(kind, write, rows, places[kind], undo)
+        undo.pop_all()  # all is there
+    for line in told:
+        say(line)
     return 0
 
 
-def _write(kind: str, rows: Rows, place: Path) -> None:
-    """One file; a heavy library is looked for here."""
-    if kind == "csv":
-        from twin.stream.tables.csv import write as write_csv
+def _rows(path: Path, channels: tuple[str, ...], steps: tuple[int, int] | None) -> Rows:
+    """The rows that go out; a log that is cut off is said to be so."""
+    rows = gather(path).chosen(channels, steps)
+    if not rows.size:
+        raise BadInput(f"{path}: no measured samples in it; there is nothing to export")
+    if not rows.whole:
+        told = (
+            f"warning: {path} has no end, or holds what is not of its run; "
+            f"`shaketwin verify {path}` says what is missing"
+        )
+        Console(stderr=True).print(told, highlight=False, soft_wrap=True)
+    return rows
 
-        with _new(place, "x", encoding="utf-8", newline="") as text:
-            write_csv(rows, text)
-    else:
-        write = _writer(kind)
-        with _new(place, "xb") as file:
-            write(rows, file)
+
+def _make_folder(folder: Path, undo: ExitStack) -> None:
+    """The folder and what is above it; what is new of them goes again if it is empty."""
+    for one in reversed([one for one in (folder, *folder.parents) if not one.exists()]):
+        one.mkdir(exist_ok=True)
+        undo.callback(_unless_used, one)
+
+
+def _unless_used(folder: Path) -> None:
+    with suppress(OSError):
+        folder.rmdir()
+
+
+def _write(
+    kind: str, write: Callable[[Rows, Any], None], rows: Rows, place: Path, undo: ExitStack
+) -> list[str]:
+    """The files of one format; what is to be said of them."""
+    text = {"encoding": "utf-8", "newline": ""}
+    with _new(place, "x", **text) if kind == "csv" else _new(place, "xb") as file:
+        write(rows, file)
+    undo.callback(place.unlink, missing_ok=True)
+    told = [f"{rows.size} rows of {len(rows.units)} columns -> {place}"]
     if kind == "foxglove":
         from twin.stream.foxglove import layout
 
-        with _new(_layout(place), "x", encoding="utf-8") as text:
-            text.write(layout(rows))
-        say(f"{_layout(place)}")
-    say(f"{rows.size} rows of {len(rows.units)} columns -> {place}")
+        with _new(_layout(place), "x", encoding="utf-8") as file:
+            file.write(layout(rows))
+        undo.callback(_layout(place).unlink, missing_ok=True)
+        told.append(f"{_layout(place)}")
+    return told
 
 
 def _writer(kind: str) -> Callable[[Rows, Any], None]:
-    """What writes a binary format."""
+    """What writes a format; a heavy library is looked for here."""
+    if kind == "csv":
+        from twin.stream.tables.csv import write as write_csv
+
+        return write_csv
     if kind == "mat":
         from twin.stream.tables.mat import write as write_mat
 
@@ -103,21 +136,21 @@ def _view(path: Path, place: Path) -> None:
     """Rerun's file, fed batch by batch; a log out of order has to fit into memory."""
     from twin.stream.rerun_view import BATCH, RerunView, write_rrd
 
-    fed = batches(path, BATCH)
-    first = next(fed, None) if fed is not None else None
-    if fed is None or first is None or not isinstance(first[0], RunStart):
-        write_rrd(open_log(path), place)
-    else:
+    try:
+        fed = batches(path, BATCH)
+        first = next(fed, None) if fed is not None else None
+        if fed is None or first is None or not isinstance(first[0], RunStart):
+            write_rrd(recording_of(path), place)
+            return
         view = RerunView(first[0], save=place)
         try:
             for items in chain([first], fed):
                 view.feed(items)
-        except BaseException:
-            place.unlink(missing_ok=True)
-            raise
         finally:
             view.close()
-    say(f"{place}")
+    except BaseException:
+        place.unlink(missing_ok=True)
+        raise
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from twin.learn.steps import Found, find_steps
 from twin.service.bundle import Bundle, from_texts, read_model, run_id
 from twin.service.columns import Samples, read_map, samples
 from twin.service.kernels import ready
-from twin.service.labels import found_labels
+from twin.service.labels import found_labels, held_cycles
 from twin.service.outcome import EXIT_GAPS
 from twin.service.progress import RunProgress
 from twin.service.runs import SIMULATED_BLOCK, beside, record
@@ -26,6 +26,10 @@ from twin.service.terminal import console, say
 from twin.stream.tables import TEXTS, Table, read_table
 from twin.stream.wire import Item
 
+NO_PROFILE = (
+    "warning: no --profile: unit mass, no bumpers, a 1 Hz placeholder model; PRC and twin mean "
+    "nothing, give --profile"
+)
 MOTIONS = ("drive_disp_m", "table_disp_m", "table_acc_m_s2", "rel_disp_m")  # the first tells steps
 MOST_GAPS = 1000  # a channel: beyond, its lost samples are only counted
 SPARSE = 10  # samples a row, on the average, at most: else the file is no one recording
@@ -42,7 +46,8 @@ rate_hz = {rate_hz!r}
 start_hz = {hz!r}
 stop_hz = {hz!r}
 step_hz = {hz!r}
-cycles = 3
+cycles = {cycles}
+measured_cycles = {measured}
 """
 PLAIN_MODEL = """\
 title = "Placeholder: 1 Hz, 5 % damping; nothing was said of the specimen, give --model"
@@ -89,10 +94,11 @@ def take_in(
         load(profile, Profile, "test profile")  # said now, not after a long table
     table = read_table(file, card.group if card is not None else "")
     found = samples(table, card)
-    bundle = _bundle(table, profile, rig, found.rate_hz)
+    own = found_labels(table, found) if found.labels else None
+    bundle = _bundle(table, profile, rig, found.rate_hz, own)
     grid = _grid(file, found)
-    if found.labels:
-        labels = found_labels(table, found)
+    if own is not None:
+        labels = own
     else:
         signal, is_acc = _motion(grid)
         labels = find_steps(
@@ -100,7 +106,8 @@ def take_in(
         )
     steps = labels.steps or bundle.steps
     bundle = replace(bundle, drive=replace(bundle.drive, steps=steps))
-    said = (*found.said, *labels.said, _of_steps(labels.steps))
+    bare = (NO_PROFILE,) if profile is None and not _brings_texts(table) else ()
+    said = (*bare, *found.said, *labels.said, _of_steps(labels.steps))
     gaps = 0
     with RunProgress(console, len(steps), grid.size) as progress:
 
@@ -132,10 +139,17 @@ def contents(file: Path, columns: Path | None) -> None:
         say(line)
 
 
-def _bundle(table: Table, profile: Path | None, rig: str | None, rate_hz: float) -> Bundle:
+def _brings_texts(table: Table) -> bool:
+    """Whether profile, machine card and model came with the samples, as out of our own export."""
+    return len(table.texts) == len(TEXTS)
+
+
+def _bundle(
+    table: Table, profile: Path | None, rig: str | None, rate_hz: float, labels: Found | None
+) -> Bundle:
     """What the log will say of specimen, machine and model, at the file's rate."""
     file = table.path
-    if profile is None and len(table.texts) == len(TEXTS):
+    if profile is None and _brings_texts(table):
         profile_toml, rig_toml, model_toml = (table.texts[name] for name in TEXTS)
         own = parse(profile_toml, Profile, f"profile in {file}")
         if own.acquisition.rate_hz != rate_hz:
@@ -145,11 +159,14 @@ def _bundle(table: Table, profile: Path | None, rig: str | None, rate_hz: float)
         return from_texts(file.stem, profile_toml, rig_toml, model_toml, f"what {file} brings")
     if profile is None:
         hz = min(1.0, rate_hz / 100)  # nobody's sweep, but one that a profile allows
+        cycles, measured = held_cycles(labels) if labels is not None else (3, 3)
         text = PLAIN_PROFILE.format(
             title=json.dumps(f"Imported: {file.name}"),
             rig=json.dumps(rig or "simulated"),
             rate_hz=rate_hz,
             hz=hz,
+            cycles=cycles,
+            measured=measured,
         )
         rig_toml = load(find(rig or "simulated", "rigs"), Rig, "machine card")[1]
         return from_texts(file.stem, text, rig_toml, PLAIN_MODEL, f"{file} without a profile")

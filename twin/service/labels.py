@@ -1,6 +1,7 @@
 """The labels that a table brings itself: step, label, cycle and the step's plan of every sample."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from table_io.block import Float1D, Int1D, Label
 from table_io.card import BadInput
@@ -11,6 +12,7 @@ from twin.stream.rows import WAYS
 from twin.stream.tables import Table
 
 MOST = 10**6  # of steps, and of cycles in one
+MOST_HELD = 1000  # cycles a step, that a profile may say
 
 
 def found_labels(table: Table, taken: Samples) -> Found:
@@ -59,6 +61,23 @@ def found_labels(table: Table, taken: Samples) -> Found:
         tuple(steps),
         tuple(said),
     )
+
+
+def held_cycles(found: Found) -> tuple[int, int]:
+    """(held, measured) cycles a step: those of most steps, as a profile of them would say.
+
+    A step that was cut off, or held longer, is another; a curve needs the number of most.
+    """
+    measured = _most(found, found.label == Label.MEASURE) or 3
+    return max(_most(found, found.cycle >= 0), measured, 2), measured
+
+
+def _most(found: Found, among: NDArray[np.bool_]) -> int:
+    """How many cycles most steps have among these samples; 0 where none has any."""
+    inside = among & (found.step >= 0) & (found.cycle >= 0)
+    pairs = np.unique(found.step[inside] * (MOST + 1) + found.cycle[inside])
+    counts = np.bincount(np.unique(pairs // (MOST + 1), return_counts=True)[1], minlength=1)
+    return min(int(counts.size - 1 - np.argmax(counts[::-1])), MOST_HELD) if pairs.size else 0
 
 
 def _whole(table: Table, columns: dict[str, Float1D], name: str, low: int, high: int) -> Int1D:

@@ -6,9 +6,11 @@ import shutil
 from pathlib import Path
 
 from table_io.card import BadInput
+from twin.service.terminal import say
+from twin.stream.folder import PARTS as PARTS  # noqa: PLC0414
 from twin.stream.merging import merge, verified
+from twin.stream.salvage import UNFINISHED, salvage
 
-PARTS = ".parts"
 LOCK = "lock"  # shared by supervisor and recorder while they live
 
 
@@ -20,13 +22,17 @@ def gather(folder: Path) -> Path:
         with (held / LOCK).open("a") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             parts = sorted(held.glob("part-*.mcap"))
-            if not parts:
+            if out.exists():  # of a call that ended before the parts were away
+                if not verified(out):
+                    raise BadInput(f"{out}: not a whole log; move it away, the parts are in {held}")
+            elif not parts:
                 raise BadInput(f"{folder}: the recorder wrote nothing")
-            if not out.exists():
+            else:
+                damaged = [one for one in parts if _damaged(one)]
                 _whole(parts, held / "run.mcap").rename(out)
+                if damaged:
+                    _keep(damaged, folder)
                 _sync(folder)
-            elif not verified(out):
-                raise BadInput(f"{out}: not a whole log; move it away, the parts are in {held}")
             shutil.rmtree(held)
     except BlockingIOError:
         raise BadInput(f"{folder}: a run is still going on in this folder; wait") from None
@@ -36,6 +42,25 @@ def gather(folder: Path) -> Path:
             f"and readable. Once this is mended: shaketwin report {folder}"
         ) from None
     return out
+
+
+def _damaged(part: Path) -> bool:
+    """True where more than the end of a part is missing: a disk lost something inside it."""
+    if verified(part):
+        return False
+    lost = salvage(part).damage
+    return any(one.at + one.size < part.stat().st_size for one in lost) or any(
+        one.size == 0 and one.reason != UNFINISHED for one in lost
+    )
+
+
+def _keep(damaged: list[Path], folder: Path) -> None:
+    """Parts of which something is lost are not thrown away: another tool may read more of them."""
+    kept = folder / "damaged"
+    kept.mkdir()
+    for one in damaged:
+        shutil.copy2(one, kept)
+    say(f"{len(damaged)} parts of the recording are damaged; they are kept in {kept}: see verify")
 
 
 def _whole(parts: list[Path], new: Path) -> Path:

@@ -23,7 +23,7 @@ from twin.service.spec import CAPACITY, CONNECT_S, QUIET_S, Spec, orphaned, toke
 from twin.service.stopwatch import Stopwatch
 from twin.stream.resend import Inbox
 from twin.stream.wire import (
-    MEASURED,
+    MEAS_TOPIC,
     TOPIC_TYPES,
     Item,
     decode,
@@ -131,7 +131,7 @@ def twin(spec: Spec, missed_from: str) -> None:
     link = open_spoke(bundle.rig.name, spec.endpoint, CONNECT_S)
     link.declare(TWIN_TOPICS)
     control = link.subscribe(CONTROL, history=True, capacity=CAPACITY)
-    blocks = link.subscribe((MEASURED,), history=not missed_from, capacity=CAPACITY)
+    blocks = link.subscribe((MEAS_TOPIC,), history=not missed_from, capacity=CAPACITY)
     link.alive(token(spec, "twin"))
 
     def say(items: list[Item]) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 from table_io.card import BadInput
 from twin.service import summary as summaries
 from twin.service.campaign.state import STATE
-from twin.service.recordings import open_log, recorded_bundle
+from twin.service.recordings import recorded_bundle, recording_of
 from twin.service.sweeps import TABLE
 from twin.service.terminal import console, say
 
@@ -24,7 +24,7 @@ def prc(log: Path, as_json: bool) -> None:
         for run in runs if not as_json else ():
             print_prc(console, run)
         return
-    recording = open_log(log)
+    recording = recording_of(log)
     found = summaries.summarise(recording, recorded_bundle(recording).parameters)
     if as_json:
         print(summaries.dumps({key: found[key] for key in keys}))
@@ -52,7 +52,7 @@ def report(folder: Path) -> None:
 
         say(f"{write_page(folder)}")
         return
-    recording = open_log(folder)
+    recording = recording_of(folder)
     if not (folder / "summary.json").exists():
         found = summaries.summarise(recording, recorded_bundle(recording).parameters)
         summaries.write(found, folder / "summary.json")

@@ -81,6 +81,7 @@ class _Recorder:
     trouble: str = ""
     stop: str = ""
     stopping: bool = False
+    lost: bool = False  # a sync failed: what the disk took since the one before is in doubt
     busy_s: float = 0.0  # since the last measured block
 
     def run(self) -> None:
@@ -126,14 +127,22 @@ class _Recorder:
         try:
             self.writer.flush()
             if sync and self.syncing.done():
-                self.syncing.result()  # OSError of the one before
-                self.syncing = self.thread.submit(self.writer.sync)
+                self._synced(self.thread.submit(self.writer.sync))
         except OSError as error:
             self._troubled(error)
         else:
-            if self.trouble:
+            if self.trouble and not self.lost:
                 self._say("the disk takes the recording again; what waited is written")
-            self.trouble = ""
+                self.trouble = ""
+
+    def _synced(self, following: Future[None]) -> None:
+        """OSError of the last sync: a disk says once what it lost, and then seems well again."""
+        before, self.syncing = self.syncing, following
+        try:
+            before.result()
+        except OSError:
+            self.lost = True
+            raise
 
     def _troubled(self, error: OSError) -> None:
         """Stop the table; what cannot be written waits in memory."""
@@ -181,6 +190,10 @@ class _Recorder:
             words.append(Event(end, "recorder", text))
         self.reserve.release()
         self.thread.shutdown()
+        try:
+            self._synced(_done())
+        except OSError as error:
+            self._troubled(error)
         for _ in range(LAST_TRIES):
             try:
                 while words:

@@ -6,22 +6,18 @@ from pathlib import Path
 from rich.console import Console
 
 from twin.service.bundle import Bundle, from_texts, read_model
-from twin.service.parts import PARTS
+from twin.stream.folder import PARTS, apart
+from twin.stream.folder import log_path as log_path  # noqa: PLC0414
 from twin.stream.recording import Recording, read
-
-
-def log_path(log: Path) -> Path:
-    """The log itself, of a log or of a run's folder."""
-    return log / "run.mcap" if log.is_dir() else log
 
 
 def parts_of(log: Path) -> list[Path]:
     """The log of a run's folder, or the parts that its recorder left; or the log itself."""
-    parts = sorted((log / PARTS).glob("part-*.mcap")) if log.is_dir() else []
-    return [log_path(log)] if log_path(log).exists() or not parts else parts
+    parts = sorted((log / PARTS).glob("part-*.mcap")) if apart(log) else []
+    return parts or [log_path(log)]
 
 
-def open_log(log: Path) -> Recording:
+def recording_of(log: Path) -> Recording:
     """The recording in a log or a run's folder; says so where the file is not whole."""
     recording = read(log_path(log))
     warned(recording)

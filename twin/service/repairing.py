@@ -27,11 +27,15 @@ def repaired(verified: Verified, paths: list[Path], new: Path) -> str:
         writer.note("repaired", _origin(verified, paths))
         for index, name, payload, at in sorted(entries, key=lambda entry: entry[0]):
             writer.write(name, payload, index, at or None)
-    finally:
         writer.close()
-    again = examine([new])
-    if again.found["damage"] or len(again.messages) != len(entries):
-        raise BadInput(f"{new}: differs from what was read; keep {paths[0]} and try another disk")
+        again = examine([new])
+        if again.found["damage"] or len(again.messages) != len(entries):
+            raise BadInput(
+                f"{new}: differs from what was read; keep {paths[0]} and try another disk"
+            )
+    except BaseException:
+        new.unlink()  # this call made it; half a file would refuse the next try
+        raise
     return f"{len(entries)} messages, {sum(count for _, count in lost)} samples marked as lost"
 
 

@@ -1,6 +1,5 @@
 """`replay`: recordings through the pipeline again; one with its report, or many in one table."""
 
-import re
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,17 +18,18 @@ from twin.service.progress import RunProgress
 from twin.service.publishing import publishing
 from twin.service.recordings import log_path, recorded_bundle, warned
 from twin.service.replaying import Identity, Recorded, Span, replay
+from twin.service.step_range import step_range
 from twin.service.terminal import console, say
-from twin.service.versions import differing
-from twin.stream.recording import read
-from twin.stream.wire import COMPARED, Item
+from twin.service.versions import changes, differing
+from twin.stream.recording import Recording, read
+from twin.stream.wire import CMP_TOPIC, Item
 
 RECORDED = "recorded"  # as a model: the one in the log
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """The options of the command; `publish` is an endpoint, `steps` "A:B" of step indices."""
+    """The options of the command; `publish` is an endpoint, `steps` as step_range has it."""
 
     logs: list[Path]
     models: list[str]
@@ -61,32 +61,39 @@ def open_recorded(log: Path) -> Recorded:
     """A log to be replayed; BadInput where nothing in it drives a twin."""
     recorded = Recorded.open(log_path(log))
     warned(recorded.recording)
-    if "table_acc_m_s2" not in recorded.start.channels:
-        raise BadInput(
-            f"{recorded.recording.path}: no table_acc_m_s2, which drives the twin; there: "
-            f"{', '.join(recorded.start.channels)}; import the table's acceleration too"
-        )
+    driven(recorded.recording)
     return recorded
 
 
-def bundle_with(recorded: Recorded, model: str | None) -> Bundle:
-    """The bundle of a log, with another model in it where one is named."""
-    bundle = recorded_bundle(recorded.recording, None if model in (None, RECORDED) else model)
+def driven(recording: Recording) -> None:
+    """BadInput where nothing in a recording drives a twin."""
+    channels = recording.start.channels
+    if "table_acc_m_s2" not in channels:
+        raise BadInput(
+            f"{recording.path}: no table_acc_m_s2, which drives the twin; there: "
+            f"{', '.join(channels)}; import the table's acceleration too"
+        )
+
+
+def bundle_with(recording: Recording, model: str | None) -> Bundle:
+    """The bundle of a recording, with another model in it where one is named."""
+    bundle = recorded_bundle(recording, None if model in (None, RECORDED) else model)
     ready(bundle)
     return bundle
 
 
-def span_of(recorded: Recorded, steps: str | None) -> Span:
+def span_of(recording: Recording, steps: str | None) -> Span:
     """The samples that were asked for."""
     if steps is None:
-        return Span.whole(recorded.recording)
-    return Span.of_steps(recorded.recording, *step_range(steps))
+        return Span.whole(recording)
+    return Span.of_steps(recording, *step_range(steps))
 
 
 def _one(asked: Asked) -> int:
     recorded = open_recorded(asked.logs[0])
     model = asked.models[0] if asked.models else None
-    bundle, span = bundle_with(recorded, model), span_of(recorded, asked.steps)
+    recording = recorded.recording
+    bundle, span = bundle_with(recording, model), span_of(recording, asked.steps)
     pace, rate = factor(asked.speed), recorded.start.rate_hz
     watched = pace is not None or asked.publish is not None
     cut = recorded.start.block_samples if watched else 0
@@ -121,12 +128,13 @@ def about(
     """How a replay relates to its recording, as `replay` in its summary.json."""
     recording = recorded.recording
     same = bundle.model_toml == recording.start.model_toml
-    before = read(recording.path, (COMPARED,)).of(Comparison)
+    before = read(recording.path, (CMP_TOPIC,)).of(Comparison)
     return {
         "of": str(recording.path),
         "run": recording.run,
         "model": RECORDED if same else model,
         "identical": identity.identical,
+        "beginning": identity.beginning or None,
         "comparisons": identity.recorded,
         "compared": identity.compared,
         "differing": identity.differing,
@@ -135,10 +143,7 @@ def about(
         "first_difference_index": identity.first_difference,
         "largest_difference_of_error_sums": identity.largest,
         "relative_difference": deviation(recording.path, made) if identity.differing else {},
-        "versions_differing": {
-            name: {"recorded": then, "installed": now}
-            for name, (then, now) in differing(recording.start.versions).items()
-        },
+        "versions_differing": differing(recording.start.versions),
         "recorded_comparison": summaries.nrmse(before, bundle.parameters),
     }
 
@@ -147,18 +152,18 @@ def said(identity: Identity, told: summaries.Json) -> str:
     """One line: identical, or what differs, by how much, and what may be why."""
     if identity.identical:
         return f"{identity.compared} comparisons, identical to the bit"
-    if not identity.differs:
-        return "no comparisons were recorded, and none are made"
-    parts = [
+    if not identity.recorded:
+        return f"no comparisons were recorded; {identity.made} are made"
+    parts = [f"its beginning is in {identity.beginning}"] if identity.beginning else []
+    parts += [
         f"{identity.differing} of {identity.recorded} comparisons differ, "
         f"{identity.missing} missing, {identity.unrecorded} never recorded"
     ]
     if told["relative_difference"]:
         parts.append(sentence(told["relative_difference"]))
     if told["model"] == RECORDED:
-        versions = told["versions_differing"]
-        changed = (f"{k} {v['recorded']} -> {v['installed']}" for k, v in versions.items())
-        parts.append(f"versions: {', '.join(changed) or 'all that were recorded are the same'}")
+        changed = changes(told["versions_differing"])
+        parts.append(f"versions: {changed or 'all that were recorded are the same'}")
     return "; ".join([*parts, "see summary.json, replay"])
 
 
@@ -173,15 +178,3 @@ def factor(speed: str) -> float | None:
     if not 0 < number < 1e6:
         raise BadInput(f"--speed {speed}: allowed: max, or a number above 0 (times real time)")
     return number
-
-
-def step_range(steps: str) -> tuple[int, int]:
-    """(first, last) index of "A:B" or "A"."""
-    match = re.fullmatch(r"(\d{1,9})(?::(\d{1,9}))?", steps)
-    first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
-    if last < first:
-        raise BadInput(
-            f"--steps {steps}: allowed: A:B, from step A to step B, both included, as `index` in "
-            "summary.json; 12:20"
-        )
-    return first, last

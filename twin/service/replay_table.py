@@ -2,6 +2,7 @@
 
 import csv
 import math
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from twin.service.replay import (
     Asked,
     about,
     bundle_with,
+    driven,
     factor,
     open_recorded,
     said,
@@ -25,7 +27,7 @@ from twin.service.replay import (
 from twin.service.replaying import replay
 from twin.service.terminal import console, print_table, say
 from twin.stream.recording import read
-from twin.stream.wire import PREDICTED, TOPIC_TYPES
+from twin.stream.wire import MEAS_TOPIC, PRED_TOPIC, TOPIC_TYPES
 
 Row = dict[str, Any]
 QUANTITIES = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l")
@@ -39,22 +41,22 @@ def replay_all(asked: Asked) -> int:
     """Every log with every model into a folder each; comparison.json and .csv beside; exit code."""
     if factor(asked.speed) is not None:
         raise BadInput(f"--speed {asked.speed}: several replays go at full speed; leave it away")
+    models, names = asked.models or [RECORDED], _names(asked.logs)
+    _possible(asked, models, names)
     folder, _ = new_run(asked.out, "replays")
     rows: list[Row] = []
-    for log, name in zip(asked.logs, _names(asked.logs), strict=True):
+    for log, name in zip(asked.logs, names, strict=True):
         recorded = open_recorded(log)
-        span = span_of(recorded, asked.steps)
-        for model in asked.models or [RECORDED]:
-            bundle = bundle_with(recorded, model)
-            where = folder / f"{name}-{Path(model).stem}"
-            if where.exists():
-                raise BadInput(f"--model {model}: there twice; give each model once")
+        span = span_of(recorded.recording, asked.steps)
+        for model in models:
+            bundle = bundle_with(recorded.recording, model)
+            where = folder / _place(name, model)
             where.mkdir()
             made = where / "run.mcap"
             identity = replay(recorded, bundle, made, where.name, lambda _: None, span)
             told = about(recorded, bundle, model, identity, made)
             found = summaries.summarise(
-                read(made, TOPIC_TYPES.keys() - {PREDICTED}), bundle.parameters
+                read(made, TOPIC_TYPES.keys() - {PRED_TOPIC}), bundle.parameters
             )
             summaries.write({**found, "replay": told}, where / "summary.json")
             say(f"{where.name}: {said(identity, told)}")
@@ -66,6 +68,31 @@ def replay_all(asked: Asked) -> int:
     if any(row["same_model"] and row["identical"] is False for row in rows):
         return EXIT_NOT_IDENTICAL
     return EXIT_GAPS if any(row["gaps"] for row in rows) else 0
+
+
+def _possible(asked: Asked, models: list[str], names: list[str]) -> None:
+    """BadInput where one of the replays cannot be: said before the first, which may take hours."""
+    taken: dict[str, str] = {}
+    for model, name in product(models, names):
+        place = _place(name, model)
+        if place in taken:
+            raise BadInput(
+                f"--model {model}: its results would be {place}, as those of {taken[place]}; "
+                "give each model once, and two of one name under other names"
+            )
+        taken[place] = model
+    for log in asked.logs:
+        # Only what says whether it can be: whole recordings are opened when their turn comes.
+        recording = read(log_path(log), () if asked.steps is None else (MEAS_TOPIC,))
+        driven(recording)
+        span_of(recording, asked.steps)
+        for model in models:
+            bundle_with(recording, model)
+
+
+def _place(name: str, model: str) -> str:
+    """Folder of a replay."""
+    return f"{name}-{Path(model).stem}"
 
 
 def _names(logs: list[Path]) -> list[str]:
@@ -93,7 +120,7 @@ def _row(found: summaries.Json, told: summaries.Json) -> Row:
     ]
     return {
         "same_model": told["model"] == RECORDED,
-        "identical": told["identical"] if told["comparisons"] else None,
+        "identical": told["identical"],
         "gaps": found["gaps"],
         **nrmse,
         **{f"prc {name}": _prc_error(pairs, name) for name in QUANTITIES},

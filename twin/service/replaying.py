@@ -27,25 +27,25 @@ from table_io.records import (
 )
 from twin.compare import COMPARED, pipeline
 from twin.service.bundle import Bundle
+from twin.service.origin import beginning, begun
 from twin.service.runs import Watch, record
 from twin.stream.recording import Recording, understood
 from twin.stream.salvage import salvage
-from twin.stream.wire import COMPARED as COMPARISONS
 from twin.stream.wire import (
-    PREDICTED,
+    CMP_TOPIC,
+    PRED_TOPIC,
     RECORD_TOPICS,
     TOPIC_TYPES,
     Item,
     WireError,
     decode,
-    encode,
     unsigned,
 )
 
 LONGEST_CELL = 10_000  # samples that a comparison may cover
 LONG_BLOCK_S = 1.0  # where nobody watches the time; the result is the same however it is cut
 TWIN_RECORDS = (Comparison, Params, Cycle, Point)
-TWIN_TOPICS = {PREDICTED, *(RECORD_TOPICS[kind] for kind in (Comparison, Cycle, Point, Timing))}
+TWIN_TOPICS = {PRED_TOPIC, *(RECORD_TOPICS[kind] for kind in (Comparison, Cycle, Point, Timing))}
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,17 +59,11 @@ class Recorded:
     comparisons: dict[int, bytes]
 
     @classmethod
-    def of(cls, recording: Recording) -> "Recorded":
-        """Of a recording that was read as a whole."""
-        compared = recording.of(Comparison)
-        return cls(recording, {one.index: encode(one, recording.run) for one in compared})
-
-    @classmethod
     def open(cls, path: Path) -> "Recorded":
         """Of a log, of which only what a replay needs is read."""
-        found = salvage(path, frozenset(TOPIC_TYPES.keys() - TWIN_TOPICS | {COMPARISONS}))
-        compared = [one for one in found.messages if one.topic == COMPARISONS]
-        found.messages = [one for one in found.messages if one.topic != COMPARISONS]
+        found = salvage(path, frozenset(TOPIC_TYPES.keys() - TWIN_TOPICS | {CMP_TOPIC}))
+        compared = [one for one in found.messages if one.topic == CMP_TOPIC]
+        found.messages = [one for one in found.messages if one.topic != CMP_TOPIC]
         recording = understood(path, found)[0]
         rate = recording.start.rate_hz
         return cls(recording, {round(one.log_time * rate / 1e9): one.payload for one in compared})
@@ -141,17 +135,22 @@ class Identity:
     differing: int = 0
     missing: int = 0
     unrecorded: int = 0  # that the recording should have and has not
+    made: int = 0
+    beginning: str = ""  # the run that holds what the recording lacks before its first sample
     first_difference: int | None = None
     largest: dict[str, float] = field(default_factory=dict)  # of |difference| of error sums, SI^2
 
     @property
     def differs(self) -> bool:
-        return bool(self.differing or self.missing or self.unrecorded)
+        """True where all should be equal and is not."""
+        return self.identical is False
 
     @property
-    def identical(self) -> bool:
-        """True where there was something to compare, all of it equal."""
-        return self.compared == self.recorded > 0 and not self.differs
+    def identical(self) -> bool | None:
+        """True where all is equal; None where nothing was recorded, or the beginning is missing."""
+        if not self.recorded or self.beginning:
+            return None
+        return not (self.differing or self.missing or self.unrecorded)
 
 
 def replay(
@@ -170,6 +169,7 @@ def replay(
     recording = recorded.recording
     span = span or Span.whole(recording)
     identity = Identity(largest=dict.fromkeys(COMPARED, 0.0))
+    identity.beginning = beginning(recording)
     identity.recorded = sum(span.holds(one) for one in recorded.comparisons.items())
     cut = cut or round(LONG_BLOCK_S * recording.start.rate_hz)
 
@@ -184,6 +184,7 @@ def _compare(identity: Identity, recorded: Recorded, run: str, new: Item, payloa
     """Take in what the replay `run` has made, if it is a comparison, and its bytes."""
     if not isinstance(new, Comparison):
         return
+    identity.made += 1
     old = recorded.comparisons.get(new.index)
     if old is None:
         # A recording that was cut off may lack its last ones.
@@ -206,7 +207,7 @@ def _compare(identity: Identity, recorded: Recorded, run: str, new: Item, payloa
 def _comparison(payload: bytes) -> Comparison | None:
     """A recorded comparison; None where it is damaged."""
     try:
-        item = decode(COMPARISONS, payload)[1]
+        item = decode(CMP_TOPIC, payload)[1]
     except WireError:
         return None
     return item if isinstance(item, Comparison) else None
@@ -220,10 +221,9 @@ def again(recording: Recording, bundle: Bundle, run: str, span: Span, cut: int) 
     changes = _changes(recording, bundle)
     edges = {span.first, span.last, *(one.index for one in changes)}
     edges |= {edge for fault in faults for edge in (fault.from_index, fault.to_index)}
-    start = replace(recording.start, index=span.first, run=run, model_toml=bundle.model_toml)
-    yield start
-    state, begun = pipeline.start(setup, recording.start.index)
-    yield from (replace(one, index=span.first) for one in begun)
+    yield from begun(recording, run, bundle.model_toml, span.first)
+    state, said_first = pipeline.start(setup, recording.start.index)
+    yield from (replace(one, index=span.first) for one in said_first)
     for item in _source(recording, cut, sorted(edges)):
         if isinstance(item, Block):
             if item.index > span.last:
@@ -235,8 +235,8 @@ def again(recording: Recording, bundle: Bundle, run: str, span: Span, cut: int) 
                 said.append(replace(change, index=max(change.index, span.first)))
             if not any(fault.from_index <= item.index < fault.to_index for fault in faults):
                 if any(fault.to_index == item.index for fault in faults):
-                    state, begun = pipeline.start(setup, item.index)
-                    said.extend(begun)
+                    state, said_first = pipeline.start(setup, item.index)
+                    said.extend(said_first)
                 state, made = pipeline.step(setup, state, item)
                 said.extend(made)
             yield from (one for one in said if span.shows(one))

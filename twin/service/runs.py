@@ -1,9 +1,7 @@
 """Runs in one process: `--speed max`, `simulate`: the same steps, other sources."""
 
 import math
-from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +24,7 @@ from twin.stream.wire import Item, encode, topic
 
 Watch = Callable[[Item], None]
 Heard = Callable[[Item, bytes], None]
-BATCH_BYTES = 2**20  # handed over at once for writing
-MOST_BATCHES = 8  # that wait to be written
+FLUSH_SAMPLES_S = 5.0  # of recorded time between flushes where nothing is live
 SIMULATED_BLOCK = 500
 
 
@@ -44,38 +41,20 @@ def record(
     `heard` takes the bytes of each item before they are written, `watch` the item afterwards.
     """
     writer = LogWriter(path, rate_hz)
-    # Half of the work of writing is compression, which another core can do meanwhile.
-    pool = ThreadPoolExecutor(1)
-    begun: deque[Future[None]] = deque()
-    batch: list[tuple[str, bytes, int]] = []
-    size = 0
+    flushed = 0
     try:
         for item in items:
             if isinstance(item, RunStart):
-                begun.append(pool.submit(writer.describe, item))
+                writer.describe(item)
             payload = encode(item, run)
             heard(item, payload)
-            batch.append((topic(item), payload, item.index))
-            size += len(payload)
-            if size > BATCH_BYTES:
-                begun.append(pool.submit(_write, writer, batch))
-                batch, size = [], 0
-            if len(begun) > MOST_BATCHES:
-                begun.popleft().result()
+            writer.write(topic(item), payload, item.index)
+            if item.index - flushed > FLUSH_SAMPLES_S * rate_hz:
+                writer.flush()
+                flushed = item.index
             watch(item)
     finally:
-        begun.append(pool.submit(_write, writer, batch))
-        pool.shutdown()
         writer.close()
-    for one in begun:
-        one.result()
-
-
-def _write(writer: LogWriter, batch: list[tuple[str, bytes, int]]) -> None:
-    """Write messages and flush: what is in the file survives the death of this process."""
-    for name, payload, index in batch:
-        writer.write(name, payload, index)
-    writer.flush()
 
 
 def beside(source: Iterator[Block | Record], setup: pipeline.Setup) -> Iterator[Item]:

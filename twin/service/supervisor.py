@@ -173,7 +173,7 @@ class Supervisor:
             self._listen(inbox, 0.1)
             if not stopping and (why := self.asked()):
                 stopping = self._order(link, "stop", why) == "yes"
-            if self._silent_s("rig") > SILENT_S:
+            if self.clock.now() - self.heard["rig"] > SILENT_S:
                 text = f"the rig has been silent for {SILENT_S:g} s: if the table still moves, "
                 raise _RigDiedError(f"{text}use its own stop")
             stopping = self._unrecorded(link) or stopping
@@ -185,12 +185,9 @@ class Supervisor:
         if self.twin_missing:
             self._fault(link, self.stop.index)
 
-    def _silent_s(self, component: str) -> float:
-        return self.clock.now() - self.heard[component]
-
     def _unrecorded(self, link: Link) -> bool:
         """End a recorder that hangs; True where the table was stopped, at the second one."""
-        silent = self._silent_s("recorder")
+        silent = self.clock.now() - self.heard["recorder"]
         if "recorder" not in self.children or silent < DEAF_S:
             return False
         self.say(f"the recorder has been silent for {silent:.0f} s; ending it")
@@ -243,6 +240,7 @@ class Supervisor:
             del self.children[component]
             return
         child.restarts += 1
+        self.heard[component] = self.clock.now()
         self._start(component, str(self.compared_to) if component == "twin" else "")
 
     def _fault(self, link: Link, end: int) -> None:
@@ -284,7 +282,8 @@ class Supervisor:
                 child.process.wait(5.0 if child.component != "rig" else 10.0)
             except subprocess.TimeoutExpired:
                 os.killpg(child.process.pid, signal.SIGKILL)
-                child.process.wait()
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    child.process.wait(5.0)  # more, and it waits for a dead disk
 
 
 class _NeverBeganError(Exception):

@@ -8,8 +8,8 @@ from twin.service.verifying import Json
 SHOWN = 10  # of a list that may be long
 
 
-def print_verified(found: Json) -> None:
-    """A few lines and a table of the topics."""
+def print_verified(found: Json, advise: bool = True) -> None:
+    """A few lines and a table of the topics; with advice where something can be done."""
     samples, rate = found["samples"], found["samples"]["rate_hz"]
     seconds = samples["acquired"] / rate
     end = samples["stopped"] or "without an end"
@@ -34,8 +34,15 @@ def print_verified(found: Json) -> None:
         say("can be replayed, to the bit")
     else:
         say(f"can be replayed, but perhaps not to the bit{reason}")
-    if found["damage"] or found["altered"]:
-        say("damaged; `--repair NEW` writes what is left as a whole file")
+    if found["repaired"]:
+        names = (name for key, name in found["repaired"].items() if key.startswith("from_"))
+        say(f"repaired: from {', '.join(names)}: {found['repaired'].get('damage', '')}")
+    if found["apart"]:
+        for sentence in found["apart"]:
+            say(sentence)
+    elif found["damage"] or found["altered"]:
+        advice = "; `--repair NEW` writes what is left as a whole file" if advise else ""
+        say(f"damaged{advice}")
     else:
         say("whole" if found["sound"] else "the file is whole, the recording has gaps")
 
@@ -56,6 +63,8 @@ def _damage(one: Json) -> str:
 def _gap(one: Json, rate: float) -> str:
     first, count = one["first"], one["count"]
     where = f" of {one['channel']}" if one["channel"] else ""
+    if not count:
+        return f"from sample {first}{where} (at {first / rate:.3f} s): {one['reason']}"
     return (
         f"samples {first} to {first + count - 1}{where} (at {first / rate:.3f} s, "
         f"{count / rate:.4g} s): {one['reason']}"

@@ -1,16 +1,19 @@
 """`verify`: whether a recording is whole, and what of it is lost, and where."""
 
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from table_io.card import BadInput
 from table_io.records import Comparison, Gap
+from twin.service.origin import beginning
 from twin.service.outcome import EXIT_GAPS
 from twin.service.recordings import parts_of, recorded_bundle
-from twin.service.versions import installed
+from twin.service.versions import beside_installed, changes, differing
 from twin.stream.content import Content, altered, schema_version
+from twin.stream.folder import apart as scattered
 from twin.stream.recording import Recording, understood
 from twin.stream.salvage import Damage, Message, Salvaged, salvage
 
@@ -33,11 +36,11 @@ def verify(logs: list[Path], as_json: bool, repair: Path | None) -> int:
     from twin.service.verified_table import print_verified
 
     paths = [part for log in logs for part in parts_of(log)]
-    verified = examine(paths)
+    verified = examine(paths, [why for log in logs if (why := scattered(log))])
     if as_json:
         print(dumps(verified.found))
     else:
-        print_verified(verified.found)
+        print_verified(verified.found, advise=repair is None)
     if repair is not None:
         from twin.service.repairing import repaired
 
@@ -47,8 +50,11 @@ def verify(logs: list[Path], as_json: bool, repair: Path | None) -> int:
     return 0 if verified.found["sound"] else EXIT_GAPS
 
 
-def examine(paths: list[Path]) -> Verified:
-    """What is in a log, or in several parts of one; BadInput where there is none."""
+def examine(paths: list[Path], apart: Sequence[str] = ()) -> Verified:
+    """What is in a log, or in several parts of one; BadInput where there is none.
+
+    `apart`: a sentence for each folder whose parts were not put together.
+    """
     parts = [salvage(path) for path in paths]
     recording, messages = understood(paths[0], _joined(paths, parts))
     start = recording.start
@@ -62,7 +68,7 @@ def examine(paths: list[Path]) -> Verified:
         "schema": _schema(paths[0], recording),
         "content": _content(parts),
         "altered": altered(recording.metadata, recording.attachments),
-        "versions": versions(start.versions),
+        "versions": beside_installed(start.versions),
         "topics": topics(parts),
         "samples": {
             "rate_hz": start.rate_hz,
@@ -74,18 +80,22 @@ def examine(paths: list[Path]) -> Verified:
         "gaps": [
             *({"first": first, "count": count, "channel": "", "reason": "missing in this file"}
               for first, count in lost),
+            *({"first": first, "count": count, "channel": "", "reason": "no end was recorded"}
+              for first, count in endless(recording)),
             *({"first": gap.index, "count": gap.count, "channel": gap.channel,
                "reason": gap.reason} for gap in recording.of(Gap)),
         ],
         "damage": [
             {"byte": one.at, "bytes": one.size, "reason": one.reason} for one in recording.damage
         ],
+        "repaired": recording.metadata.get("repaired", {}),
+        "apart": list(apart),
     }  # fmt: skip
     if found["content"] == "differs":
         found["damage"].append(
             {"byte": 0, "bytes": 0, "reason": "the messages are not those that were written"}
         )
-    found["sound"] = not (found["damage"] or found["gaps"] or found["altered"])
+    found["sound"] = not any(found[what] for what in ("damage", "gaps", "altered", "apart"))
     found["replay"] = replayable(recording)
     return Verified(recording, messages, found)
 
@@ -97,7 +107,8 @@ def holes(recording: Recording) -> list[tuple[int, int]]:
     }
     pieces = recording.pieces("meas")
     last = recording.stop.index if recording.stop else (pieces[-1].end if pieces else 0)
-    edges = [0, *(edge for piece in pieces for edge in (piece.index, piece.end)), last]
+    inside = (edge for piece in pieces for edge in (piece.index, piece.end))
+    edges = [recording.start.index, *inside, last]
     found = [
         (first, end - first) for first, end in zip(edges[::2], edges[1::2], strict=True)
         if end > first
@@ -105,13 +116,16 @@ def holes(recording: Recording) -> list[tuple[int, int]]:
     return [hole for hole in found if hole not in gaps]
 
 
-def versions(recorded: dict[str, str]) -> Json:
-    """What can change a result, by name: recorded and installed, None where there is none."""
-    here = installed()
-    return {
-        name: {"recorded": recorded.get(name), "installed": here.get(name)}
-        for name in sorted({*recorded, *here})
-    }
+def endless(recording: Recording) -> list[tuple[int, int]]:
+    """(first, count) of the planned samples that may be lost: a log that has no end was longer.
+
+    Without a stop record nobody knows whether the test was; so it is a gap even of no samples.
+    """
+    if recording.stop is not None:
+        return []
+    pieces = recording.pieces("meas")
+    end = pieces[-1].end if pieces else recording.start.index
+    return [(end, max(recording.start.planned_samples - end, 0))]
 
 
 def topics(parts: list[Salvaged]) -> Json:
@@ -148,13 +162,10 @@ def replayable(recording: Recording) -> Json:
         return {"possible": False, "identical": False, "because": [str(error)]}
     if recording.missing_samples:
         but.append(f"{recording.missing_samples} samples are missing")
-    differing = [
-        f"{name} {one['recorded']} -> {one['installed']}"
-        for name, one in versions(recording.start.versions).items()
-        if one["recorded"] and one["recorded"] != one["installed"]
-    ]
-    if differing:
-        but.append(f"versions differ: {', '.join(differing)}")
+    if before := beginning(recording):
+        but.append(f"its beginning is in {before}")
+    if changed := changes(differing(recording.start.versions)):
+        but.append(f"versions differ: {changed}")
     if not recording.of(Comparison):
         but.append("no comparisons were recorded")
     elif not recording.whole:

@@ -28,14 +28,33 @@ def installed() -> dict[str, str]:
     }
 
 
-def differing(recorded: dict[str, str]) -> dict[str, tuple[str, str]]:
-    """(recorded, installed) version of all that was recorded and is another one now."""
+Pairs = dict[str, dict[str, str | None]]
+
+
+def beside_installed(recorded: dict[str, str]) -> Pairs:
+    """What can change a result, by name: recorded and installed, None where there is none."""
     here = installed()
     return {
-        name: (then, here.get(name, "none"))
-        for name, then in recorded.items()
-        if here.get(name, "none") != then
+        name: {"recorded": recorded.get(name), "installed": here.get(name)}
+        for name in sorted({*recorded, *here})
     }
+
+
+def differing(recorded: dict[str, str]) -> Pairs:
+    """All that was recorded and is another one now."""
+    return {
+        name: pair
+        for name, pair in beside_installed(recorded).items()
+        if pair["recorded"] not in (None, pair["installed"])
+    }
+
+
+def changes(differing: Pairs) -> str:
+    """What differs in a few words; "" for nothing."""
+    return ", ".join(
+        f"{name} {pair['recorded']} -> {pair['installed'] or 'none'}"
+        for name, pair in differing.items()
+    )
 
 
 def _code() -> str:

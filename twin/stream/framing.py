@@ -10,6 +10,7 @@ import zlib
 from collections.abc import Iterator
 
 import lz4.frame
+import numpy as np
 import zstandard
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -67,6 +68,16 @@ def records(data: bytes) -> Iterator[tuple[int, int, int]]:
         if at > size or length < LEAST_LENGTHS.get(opcode, 0):
             raise NotARecordError("a chunk with half a record")
         yield opcode, body, at
+
+
+def beginnings(window: bytes) -> list[int]:
+    """Where in these bytes a whole frame stands that may be a record's; mostly it is none."""
+    there = np.frombuffer(window, np.uint8)
+    count = max(len(there) - FRAME.size + 1, 0)
+    maybe = (there[:count] > 0) & (there[:count] <= DATA_END)
+    for place in range(5, 9):  # no record is of 4 GiB
+        maybe &= there[place : place + count] == 0
+    return [int(place) for place in np.flatnonzero(maybe)]
 
 
 def _unpack(packing: str, packed: bytes, size: int) -> bytes:

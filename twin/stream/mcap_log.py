@@ -11,6 +11,9 @@ from typing import BinaryIO, NamedTuple
 
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader, make_reader
+from mcap.records import Chunk, DataEnd, Message
+from mcap.records import Metadata as MetadataRecord
+from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
 from table_io.clock import wall_ns
@@ -19,8 +22,6 @@ from twin.stream.content import SCHEMA_VERSION, Content, Metadata, attachments, 
 from twin.stream.newfile import NewFile
 from twin.stream.salvage import salvage
 from twin.stream.wire import (
-    BLOCK_TOPICS,
-    RECORD_TOPICS,
     TOPIC_TYPES,
     Item,
     encode,
@@ -124,13 +125,15 @@ def each(path: Path) -> Iterator[Stamped]:
     count = 0
     with path.open("rb") as stream:
         reader = NonSeekingReader(stream, validate_crcs=True)
-        # Where a file is cut or damaged, the parser and its decompressor fail in any way.
-        with contextlib.suppress(Exception):
+        try:
             for _, channel, one in reader.iter_messages(log_time_order=False):
                 count += 1
                 yield Stamped(channel.topic, one.log_time, one.data, one.publish_time)
-        if stream.tell() == path.stat().st_size:
             return
+        except OSError:
+            raise
+        except Exception:
+            pass  # where a file is cut or damaged, the parser and its decompressor fail in any way
     for found in salvage(path).messages[count:]:  # what stands after the damage is not given up
         yield Stamped(found.topic, found.log_time, found.payload, found.publish_time)
 
@@ -144,6 +147,23 @@ def metadata(path: Path) -> Metadata:
             return {}
 
 
+def heading(path: Path) -> Metadata:
+    """The metadata records before the first message, by name; of a log that was cut off too."""
+    found: Metadata = {}
+    with path.open("rb") as stream:
+        try:
+            for one in StreamReader(stream, emit_chunks=True).records:
+                if isinstance(one, (Chunk, Message, DataEnd)):
+                    break
+                if isinstance(one, MetadataRecord):
+                    found.setdefault(one.name, one.metadata)
+        except OSError:
+            raise
+        except Exception:
+            pass  # as in `each`; who reads on finds out, and says so
+    return found
+
+
 @contextlib.contextmanager
 def foreign_log(file: BinaryIO) -> Iterator[Writer]:
     """A new MCAP file for messages in the schemas of others; finished at the end."""
@@ -151,11 +171,6 @@ def foreign_log(file: BinaryIO) -> Iterator[Writer]:
     writer.start(library="shaketwin")
     yield writer
     writer.finish()
-
-
-def topics() -> Iterator[str]:
-    """Every topic that a log can hold."""
-    yield from (*BLOCK_TOPICS.values(), *RECORD_TOPICS.values())
 
 
 def write_items(path: Path, items: list[Item], start: RunStart) -> None:

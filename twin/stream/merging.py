@@ -1,5 +1,6 @@
 """One log from the parts of a recording; memory stays bounded however long it was."""
 
+import contextlib
 import heapq
 from collections.abc import Iterable, Iterator
 from itertools import chain
@@ -8,10 +9,11 @@ from tempfile import TemporaryDirectory
 
 from table_io.card import BadInput
 from table_io.records import RunStart
-from twin.stream.content import Content
-from twin.stream.mcap_log import LogWriter, Stamped, each, metadata
-from twin.stream.recording import ORDER
-from twin.stream.wire import RECORD_TOPICS, decode
+from twin.stream.content import Content, schema_version
+from twin.stream.mcap_log import LogWriter, Stamped, each, heading, metadata
+from twin.stream.recording import ORDER, START, START_COPY
+from twin.stream.salvage import salvage
+from twin.stream.wire import WireError, decode
 
 RUN_BYTES = 32 * 2**20  # sorted at once
 CHUNK_BYTES = 2**16  # held of each piece while they are joined
@@ -22,8 +24,11 @@ def merge(parts: list[Path], out: Path, run_bytes: int = RUN_BYTES) -> int:
     """Write the messages of all parts to `out` by sample index, duplicates dropped.
 
     Returns the number of messages. The parts stay as they are. What does not fit into `run_bytes`
-    is sorted in pieces, which stand beside `out` meanwhile; BadInput where `out` exists.
+    is sorted in pieces, which stand beside `out` meanwhile; BadInput where `out` exists, or a part
+    is of a newer schema version, whose bytes `out` would call those of this one.
     """
+    for part in parts:
+        schema_version(part, heading(part))
     start = _start(parts)
     writer = LogWriter(out, start.rate_hz)
     try:
@@ -50,12 +55,21 @@ def verified(path: Path) -> bool:
 
 
 def _start(parts: list[Path]) -> RunStart:
-    for one in chain.from_iterable(map(each, parts)):
-        if one.topic == RECORD_TOPICS[RunStart]:
-            start = decode(one.topic, one.payload)[1]
+    for one in chain.from_iterable(map(_starts, parts)):
+        with contextlib.suppress(WireError):
+            start = decode(START, one)[1]
             assert isinstance(start, RunStart)
             return start
-    raise BadInput(f"{parts[0]}: holds no start record; the parts are kept as they are")
+    raise BadInput(
+        f"{parts[0]}: holds no start record; the parts are kept as they are, see "
+        f"`shaketwin verify {parts[0].parent.parent}`"
+    )
+
+
+def _starts(part: Path) -> Iterator[bytes]:
+    """The start record of a part, and its copy where the chunk with it was lost."""
+    yield from (one.payload for one in each(part) if one.topic == START)
+    yield from filter(None, [salvage(part, frozenset({START})).attachments.get(START_COPY)])
 
 
 def _place(one: Stamped) -> tuple[int, int, bytes]:

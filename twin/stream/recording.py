@@ -1,7 +1,7 @@
 """A log, read: everything in it that can be had, in order of sample index, and what could not."""
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -11,6 +11,7 @@ from table_io.card import BadInput
 from table_io.records import Record, RunStart, RunStop
 from twin.stream.blocks import decode_blocks
 from twin.stream.content import schema_version
+from twin.stream.mcap_log import each, heading
 from twin.stream.salvage import NAMELESS, Damage, Message, Salvaged, salvage
 from twin.stream.soundness import misfit, mislabelled, unsound, unsound_start
 from twin.stream.wire import (
@@ -34,7 +35,11 @@ R = TypeVar("R", bound=Record)
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """A whole log in memory. `whole` is False where the file was cut off or damaged."""
+    """A whole log in memory.
+
+    `whole` is of the file: True where it is undamaged, and every message of the topics that were
+    read can be of its run. Whether the test is whole is told by `stop` and `missing_samples`.
+    """
 
     path: Path
     run: str
@@ -79,15 +84,6 @@ class Recording:
         pieces = self.pieces("meas")
         end = self.stop.index if self.stop else (pieces[-1].end if pieces else 0)
         return end - self.start.index - sum(len(piece) for piece in pieces)
-
-
-def messages(path: Path) -> tuple[list[Message], bool]:
-    """(every message that is still there, in file order, True if the file is whole).
-
-    A file that was cut off before its first message has none; BadInput where it is no MCAP file.
-    """
-    found = salvage(path)
-    return found.messages, found.whole
 
 
 def read(path: Path, topics: Iterable[str] = TOPIC_TYPES) -> Recording:
@@ -150,6 +146,46 @@ def _is_of(topic: str, payload: bytes, run: str) -> bool:
     except WireError:
         return False
     return of == run != "" and encode(item, run) == payload
+
+
+def start_of(path: Path) -> RunStart:
+    """The start record of a log, without reading on; where it is not sound, as `read` finds it.
+
+    BadInput where there is none, or where the log is of a newer schema version.
+    """
+    try:
+        schema_version(path, heading(path))
+        first = next((one for one in each(path) if one.topic == START), None)
+        start = decode(START, first.payload)[1] if first else None
+    except (BadInput, OSError, WireError):
+        start = None
+    sound = isinstance(start, RunStart) and not unsound_start(start)
+    return start if isinstance(start, RunStart) and sound else read(path, ()).start
+
+
+def fitting(
+    topic: str, payloads: Iterable[bytes], start: RunStart, odd: list[str]
+) -> Iterator[Item]:
+    """The items of a topic that can be in the run of `start`, and not the start itself.
+
+    By the rules of `read`, for who reads message by message; `odd` gets why others cannot. In
+    whatever order they come: which of two that hold the same samples is taken is the caller's.
+    """
+    entries, faults = _decoded([Message(topic, 0, one) for one in payloads])
+    odd += faults
+    odd += _unlabelled(entries)
+    for _, item, run in entries:
+        if why := _foreign(item, run, None, start):
+            odd.append(f"{topic}: {why}")
+        elif not isinstance(item, RunStart):
+            yield item
+
+
+def _foreign(item: Item, run: str, before: Block | None, start: RunStart) -> str:
+    """Why an item cannot be in the run of `start`, after `before` of its stream."""
+    if run != start.run:
+        return "of another run"
+    return misfit(item, before, start) if isinstance(item, Block) else unsound(item, start)
 
 
 Entry = tuple[Message, Item, str]  # as it stands in the file, what it is, of which run
@@ -221,9 +257,6 @@ def _fitting(
     heads: dict[str, Block] = {}
     seen: set[tuple[str, int, bytes]] = set()
     for message, item, run in entries:
-        if run != start.run:
-            odd.append(f"{message.topic}: of another run")
-            continue
         if not whole:  # where a chunk stands twice, each of its messages does
             key = (message.topic, message.sequence, message.payload)
             if key in seen:
@@ -231,7 +264,7 @@ def _fitting(
                 continue
             seen.add(key)
         before = heads.get(item.stream) if isinstance(item, Block) else None
-        why = misfit(item, before, start) if isinstance(item, Block) else unsound(item, start)
+        why = _foreign(item, run, before, start)
         if item is not start and (why or isinstance(item, RunStart)):
             odd.append(f"{message.topic}: {why or 'there twice'}")
             continue

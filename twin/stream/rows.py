@@ -2,10 +2,11 @@
 
 The samples lie in scratch files, so that memory does not grow with the recording, and in whatever
 order and however often they were recorded, each has one row, in the order of its index. A gap has
-no rows; where the twin said nothing its columns are NaN.
+no rows; where the twin said nothing its columns are NaN. What cannot be in the run is left out, by
+the rules of `recording.read`.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -18,18 +19,15 @@ from table_io.block import Block, Float1D, Float2D, Int1D
 from table_io.card import BadInput
 from table_io.channels import BY_NAME
 from table_io.records import Decided, Event, Point, Record, RunStart, RunStop, Step
-from twin.stream.blocks import BATCH, decode_blocks
-from twin.stream.framing import MAGIC
+from twin.stream.blocks import BATCH
 from twin.stream.mcap_log import each
+from twin.stream.recording import START, fitting, start_of
 from twin.stream.wire import (
     BLOCK_TOPICS,
-    MEASURED,
-    PREDICTED,
-    RECORD_TOPICS,
+    MEAS_TOPIC,
+    PRED_TOPIC,
     TOPIC_TYPES,
     Item,
-    WireError,
-    decode,
 )
 
 # What is said of every sample beside its channels, and its unit.
@@ -41,8 +39,7 @@ WAYS = {"forward": 1, "backward": -1}
 TIME = "time_s"
 TWIN = "twin_"
 MARKS = ("index", "step", "label", "cycle")  # of every sample, before its channels
-KEPT = (RunStart, RunStop, Event, Point, Decided)
-STARTS = RECORD_TOPICS[RunStart]
+KEPT = (RunStop, Event, Point, Decided)
 SLACK_S = 1.0
 WINDOW = 2**14  # rows at once
 Columns = dict[str, Any]  # arrays (row,), float64 or int64
@@ -56,16 +53,8 @@ class _Scratch:
     size: int = 0  # samples
     file: Any = field(default_factory=TemporaryFile)
 
-    def add(self, topic: str, payloads: list[bytes], path: Path) -> None:
-        """Append the blocks of some messages."""
-        for found in decode_blocks(topic, payloads):
-            if isinstance(found, WireError):
-                raise found
-            assert isinstance(found[1], Block)
-            self._append(found[1], path)
-        payloads.clear()
-
-    def _append(self, block: Block, path: Path) -> None:
+    def add(self, block: Block, path: Path) -> None:
+        """Append the samples of a block."""
         if not self.size:
             self.names = block.channels
         if block.channels != self.names:
@@ -100,7 +89,7 @@ class Rows:
     units: dict[str, str]
     steps: dict[int, Step]
     records: tuple[Record, ...]  # events and points
-    whole: bool  # it has its end
+    whole: bool  # it has its end, and nothing had to be left out
     measured: Float2D  # scratch (sample, MARKS and channels)
     predicted: Float2D
     places: Int1D  # (2, row): in `measured`, and in `predicted` or -1
@@ -159,30 +148,32 @@ class Rows:
 
 def gather(path: Path) -> Rows:
     """The rows of a log; BadInput where it is none, or its start is missing."""
-    with path.open("rb") as file:
-        if file.read(len(MAGIC)) != MAGIC:
-            raise BadInput(f"{path}: not an MCAP file; give the run.mcap of a run")
+    start = start_of(path)
     streams = {topic: _Scratch() for topic in BLOCK_TOPICS.values()}
     waiting: dict[str, list[bytes]] = {topic: [] for topic in streams}
     records: dict[bytes, Record] = {}
-    try:
-        for message in each(path):
-            payloads = waiting.get(message.topic)
-            if payloads is not None:
-                payloads.append(message.payload)
-                if len(payloads) == BATCH:
-                    streams[message.topic].add(message.topic, payloads, path)
-            elif issubclass(TOPIC_TYPES.get(message.topic, object), KEPT):
-                records[message.payload] = decode(message.topic, message.payload)[1]  # type: ignore[assignment]
-        for topic, payloads in waiting.items():
-            streams[topic].add(topic, payloads, path)
-    except WireError as error:
-        raise BadInput(f"{path}: damaged or foreign: {error}") from None
-    starts = [one for one in records.values() if isinstance(one, RunStart)]
-    if not starts:
-        raise BadInput(f"{path}: holds no start record, so profile and model are unknown")
+    odd: list[str] = []
+
+    def take(topic: str, payloads: list[bytes]) -> None:
+        for block in fitting(topic, payloads, start, odd):
+            assert isinstance(block, Block)
+            streams[topic].add(block, path)
+        payloads.clear()
+
+    for message in each(path):
+        payloads = waiting.get(message.topic)
+        if payloads is not None:
+            payloads.append(message.payload)
+            if len(payloads) == BATCH:
+                take(message.topic, payloads)
+        elif issubclass(TOPIC_TYPES.get(message.topic, object), KEPT):
+            for one in fitting(message.topic, [message.payload], start, odd):
+                records[message.payload] = one  # type: ignore[assignment]
+    for topic, payloads in waiting.items():
+        take(topic, payloads)
     told = sorted(records.values(), key=lambda one: one.index)
-    return _joined(starts[0], told, streams[MEASURED], streams[PREDICTED])
+    found = _joined(start, told, streams[MEAS_TOPIC], streams[PRED_TOPIC])
+    return replace(found, whole=found.whole and not odd)
 
 
 def batches(path: Path, count: int) -> Iterator[list[Item]] | None:
@@ -190,23 +181,23 @@ def batches(path: Path, count: int) -> Iterator[list[Item]] | None:
 
     The order is that of a recording: the start first, the rest no later than SLACK_S by its index.
     """
+    start = start_of(path)
     latest = 0
     for place, message in enumerate(each(path)):
-        if (message.topic == STARTS) != (place == 0) or message.log_time < latest - 1e9 * SLACK_S:
+        if (message.topic == START) != (place == 0) or message.log_time < latest - 1e9 * SLACK_S:
             return None
         latest = max(latest, message.log_time)
-    return _batches(path, count)
+    return _batches(path, count, start)
 
 
-def _batches(path: Path, count: int) -> Iterator[list[Item]]:
+def _batches(path: Path, count: int, start: RunStart) -> Iterator[list[Item]]:
+    yield [start]
     messages = (one for one in each(path) if one.topic in TOPIC_TYPES)
     while batch := list(islice(messages, count)):
         found: list[Item] = []
         for topic in dict.fromkeys(one.topic for one in batch):
-            for one in decode_blocks(topic, [one.payload for one in batch if one.topic == topic]):
-                if isinstance(one, WireError):
-                    raise BadInput(f"{path}: damaged or foreign: {one}")
-                found.append(one[1])
+            payloads = [one.payload for one in batch if one.topic == topic]
+            found += fitting(topic, payloads, start, [])
         yield sorted(found, key=lambda item: item.index)
 
 
@@ -218,16 +209,12 @@ def _joined(start: RunStart, records: list[Record], meas: _Scratch, pred: _Scrat
         at = np.minimum(np.searchsorted(told, index), told.size - 1)
         beside = np.where(told[at] == index, twin_places[at], -1)
     twins = tuple(TWIN + name.replace("/", "_") for name in pred.names)
-    units = {TIME: "s", **dict(zip(meas.names, map(_unit, meas.names), strict=True)), **LABELS}
-    units |= dict(zip(twins, map(_unit, pred.names), strict=True))
-    steps = {one.index: one for one in start.steps}
-    for one in records:
-        if isinstance(one, Decided):
-            steps[one.step] = Step(one.step, one.direction, one.frequency_hz, one.acceleration_m_s2)
+    units = {TIME: "s", **dict(zip(meas.names, map(unit, meas.names), strict=True)), **LABELS}
+    units |= dict(zip(twins, map(unit, pred.names), strict=True))
     return Rows(
         start,
         units,
-        steps,
+        all_steps(start, records),
         tuple(one for one in records if isinstance(one, (Event, Point))),
         any(isinstance(one, RunStop) for one in records),
         measured,
@@ -237,8 +224,17 @@ def _joined(start: RunStart, records: list[Record], meas: _Scratch, pred: _Scrat
     )
 
 
-def _unit(name: str) -> str:
-    """SI unit of a channel, of the twin's too."""
+def all_steps(start: RunStart, items: Iterable[Item]) -> dict[int, Step]:
+    """By index, the planned steps, then those that `items` say were decided on during the test."""
+    steps = {one.index: one for one in start.steps}
+    for one in items:
+        if isinstance(one, Decided):
+            steps[one.step] = Step(one.step, one.direction, one.frequency_hz, one.acceleration_m_s2)
+    return steps
+
+
+def unit(name: str) -> str:
+    """SI unit of a channel, of the twin's too; "" of one that nobody knows."""
     plain = name.rpartition("/")[2]
     return BY_NAME[plain].unit if plain in BY_NAME else {"rel_vel_m_s": "m/s"}.get(plain, "")
 

@@ -2,7 +2,7 @@
 
 Where a record is not what it says, it is left out, and reading goes on at the next that is: after a
 chunk that was hit, at the end it declares; after bytes that are no record, wherever one begins
-again. What that may cost is limited before it begins.
+again. What that may cost, and what may be held, is limited before it begins.
 """
 
 import zlib
@@ -10,9 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-import numpy as np
-
 from table_io.card import BadInput
+from twin.stream.budget import COST_OF_RECORD, HELD_BESIDE, memory, work
 from twin.stream.framing import (
     ATTACHMENT,
     CHANNEL,
@@ -33,6 +32,7 @@ from twin.stream.framing import (
     WORD,
     NotARecordError,
     attachment,
+    beginnings,
     mapping,
     records,
     text,
@@ -40,14 +40,8 @@ from twin.stream.framing import (
     unpacked_size,
 )
 
-# What reading a file may cost, in bytes read again, unpacked or held, so that no bomb goes off:
-# a sound recording of dead channels unpacks to some 60 times its size.
-COST_PER_BYTE, LEAST_COST, MOST_COST = 250, 256 * 2**20, 8 * 2**30
-COST_OF_RECORD = 512  # at least
 UNFINISHED = "the file was never finished: its recorder was killed, or still writes"
 WINDOW = 2**20  # bytes looked through at once for the next record
-
-
 NAMELESS = "?"  # begins the topic of messages of which no channel says what they are
 
 
@@ -115,7 +109,8 @@ class _Scanner:
     raw: list[Raw] = field(default_factory=list)
     skipped: set[int] = field(default_factory=set)  # channels of topics that are not wanted
     crc: int = 0  # of all since the start, or since the end of the data
-    left: int = 0  # of the cost
+    left: int = 0  # of the work
+    room: int = 0  # of the memory
 
     def is_mcap(self) -> bool:
         """By its beginning, its end, or the record that stands first."""
@@ -126,7 +121,7 @@ class _Scanner:
 
     def run(self) -> Salvaged:
         """Read to the end, over whatever is damaged."""
-        self.left = min(max(LEAST_COST, COST_PER_BYTE * self.size), MOST_COST)
+        self.left, self.room = work(self.size), memory()
         self.crc, closed = zlib.crc32(MAGIC), False
         at = len(MAGIC)
         if self._at(0, at) != MAGIC:
@@ -161,7 +156,13 @@ class _Scanner:
         except OSError:
             return bytes(min(count, self.size - at))
 
+    def _hold(self, size: int) -> None:
+        self.room -= HELD_BESIDE + size
+        if self.room < 0:
+            raise MemoryError
+
     def _note(self, at: int, size: int, reason: str) -> None:
+        self._hold(0)
         self.found.damage.append(Damage(at, size, reason))
 
     def _length(self, at: int) -> tuple[int, int]:
@@ -203,9 +204,11 @@ class _Scanner:
             self._check(content, crc, at, "the summary is not that which was written")
         elif opcode == ATTACHMENT:
             name, data = attachment(content)
+            self._hold(len(content))
             self.found.attachments.setdefault(name, data)
         elif opcode == METADATA:
             name, end = text(content, 0)
+            self._hold(16 * len(content))  # pairs of short texts
             self.found.metadata.setdefault(name, mapping(content, end))
         else:
             self.raw += self._messages(FRAME.pack(opcode, len(content)) + content)
@@ -226,10 +229,14 @@ class _Scanner:
             if opcode == MESSAGE:
                 stamp = STAMP.unpack_from(data, body)
                 if stamp[0] not in self.skipped:
+                    self._hold(end - body)
                     messages.append((*stamp, data[body + STAMP.size : end]))
             elif opcode == CHANNEL:
                 channel = int.from_bytes(data[body : body + 2], "little")
-                topic = self.topics.setdefault(channel, text(data[body:end], 4)[0])
+                if channel not in self.topics:
+                    self.topics[channel] = text(data[body:end], 4)[0]
+                    self._hold(end - body)
+                topic = self.topics[channel]
                 if self.wanted is not None and topic not in self.wanted:
                     self.skipped.add(channel)
         self.left -= COST_OF_RECORD * count
@@ -250,17 +257,10 @@ class _Scanner:
             pass
         at += 1
         while at < self.size and self.left >= 0:
-            window = np.frombuffer(self._at(at, WINDOW + FRAME.size), np.uint8)
-            count = len(window) - FRAME.size + 1
-            if count <= 0:
-                break
-            maybe = (window[:count] > 0) & (window[:count] <= DATA_END)
-            for place in range(5, 9):  # no record is of 4 GiB
-                maybe &= window[place : place + count] == 0
-            for candidate in np.flatnonzero(maybe).tolist():
+            for candidate in beginnings(self._at(at, WINDOW + FRAME.size)):
                 if self._begins(at + candidate):
-                    return at + int(candidate)
-            at += count
+                    return at + candidate
+            at += WINDOW + 1
         return self.size
 
     def _begins(self, at: int) -> bool:

@@ -49,10 +49,10 @@ from twin.stream.packed import encode_block
 Item = Block | Record
 
 # The table of topics is the diagram of the stream.
-MEASURED = "/rig/meas"
-PREDICTED = "/twin/pred"
-COMPARED = "/twin/cmp"
-BLOCK_TOPICS = {"meas": MEASURED, "pred": PREDICTED}
+MEAS_TOPIC = "/rig/meas"
+PRED_TOPIC = "/twin/pred"
+CMP_TOPIC = "/twin/cmp"
+BLOCK_TOPICS = {"meas": MEAS_TOPIC, "pred": PRED_TOPIC}
 RECORD_TOPICS: dict[type, str] = {
     RunStart: "/run/start",
     RunStop: "/run/stop",
@@ -65,7 +65,7 @@ RECORD_TOPICS: dict[type, str] = {
     Decided: "/rig/decided",
     Trip: "/rig/trip",
     Params: "/twin/params",
-    Comparison: COMPARED,
+    Comparison: CMP_TOPIC,
     Cycle: "/twin/cycle",
     Point: "/twin/point",
     Timing: "/run/timing",

@@ -41,11 +41,11 @@ from twin.stream.resend import (
     Listeners,
     Shelf,
 )
-from twin.stream.wire import BLOCK_TOPICS, COMPARED
+from twin.stream.wire import BLOCK_TOPICS, CMP_TOPIC
 
 QUESTIONS_WAITING = 16
 
-STREAMS = frozenset((*BLOCK_TOPICS.values(), COMPARED))
+STREAMS = frozenset((*BLOCK_TOPICS.values(), CMP_TOPIC))
 
 
 def key(rig: str, topic: str) -> str:

@@ -14,7 +14,7 @@ from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.profile import Profile
 from twin.learn.discover import Log
 from twin.learn.readings import alive, readings_of
-from twin.service.recordings import log_path, open_log
+from twin.service.recordings import log_path, recording_of
 from twin.stream.recording import Recording
 
 CELLS = (*RIGHT_CELLS, *LEFT_CELLS)
@@ -42,7 +42,7 @@ def taken(paths: Sequence[Path]) -> Iterator[Taken]:
     """The recordings, one by one; BadInput where one is given twice, whatever its name."""
     seen: dict[bytes, Path] = {}
     for path in paths:
-        recording = open_log(path)
+        recording = recording_of(path)
         with recording.path.open("rb") as file:
             content = hashlib.file_digest(file, "sha256").digest()
         if content in seen:

@@ -39,7 +39,8 @@ class Held:
     """A column of `size` rows, still in its file; unit, rate and begin as the file has it.
 
     `clock` is the column with its times, where the file has such a one for it. `values` are its
-    numbers where they were read at once.
+    numbers where they were read at once. `group` is the group, structure or table that its name
+    begins with: a "/" alone is none, it may stand in a unit.
     """
 
     size: int
@@ -48,6 +49,7 @@ class Held:
     rate_hz: float | None = None
     start_s: float = 0.0
     clock: str = ""
+    group: str = ""
     values: Float1D | None = None
 
 
@@ -129,7 +131,13 @@ def in_memory(values: Float1D, unit: str = "") -> Held:
 
 
 def put(
-    table: Table, name: str, shape: tuple[int, ...], kind: str, key: Key, unit: str = ""
+    table: Table,
+    name: str,
+    shape: tuple[int, ...],
+    kind: str,
+    key: Key,
+    unit: str = "",
+    group: str = "",
 ) -> None:
     """Add an array of a file to its table: one column, or those of a matrix as `name:1`, `name:2`.
 
@@ -144,10 +152,10 @@ def put(
     elif len(long) > 2 or (len(long) == 2 and min(long) > MOST_COLUMNS):
         table.others[name] = f"{' x '.join(map(str, shape))} values; allowed: a few columns"
     elif len(long) == 1:
-        table.columns[name] = Held(long[0], (*key, 0), unit)
+        table.columns[name] = Held(long[0], (*key, 0), unit, group=group)
     else:
         for k in range(min(long)):
-            table.columns[f"{name}:{k + 1}"] = Held(max(long), (*key, k), unit)
+            table.columns[f"{name}:{k + 1}"] = Held(max(long), (*key, k), unit, group=group)
 
 
 def part(array: Any, k: int) -> Any:
@@ -173,13 +181,12 @@ def bounded(table: Table, names: list[str]) -> None:
 
 
 def _within(table: Table, group: str) -> Table:
-    """The columns inside a group, without its name; without one, what all have in common goes."""
-    names = [*table.columns]
+    """The columns inside a group, without its name; without one, the group that all are in goes."""
+    groups = sorted({held.group for held in table.columns.values()})
     if not group:
-        heads = {name.rpartition("/")[0] for name in names}
-        group = heads.pop() if len(heads) == 1 else ""
-    elif not any(name.startswith(f"{group}/") for name in names):
-        groups = sorted({name.rpartition("/")[0] for name in names} - {""})
+        group = groups[0] if len(groups) == 1 else ""
+    elif not any(name.startswith(f"{group}/") for name in table.columns):
+        groups = [one for one in groups if one]
         raise BadInput(f"{table.path}: no group {group!r}; there: {', '.join(groups) or 'none'}")
     if not group:
         return table

@@ -13,7 +13,8 @@ from typing import TextIO
 import numpy as np
 
 from table_io.card import BadInput
-from twin.stream.rows import Rows
+from table_io.channels import BY_NAME
+from twin.stream.rows import TIME, Rows
 from twin.stream.tables import FORMATS, Table, in_memory
 
 DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs"}
@@ -106,7 +107,10 @@ def _header(line: str, delimiter: str, path: Path) -> list[str]:
     if names and not names[-1]:
         names.pop()
     if not names or all(_is_number(name) for name in names):
-        raise BadInput(f"{path}: row 1 names no columns; put their names there, as in `--help`")
+        raise BadInput(
+            f"{path}: row 1 names no columns; put their names there, of "
+            f"{', '.join((TIME, *BY_NAME))}; or others, and say by --columns MAP which are which"
+        )
     if "" in names:
         raise BadInput(f"{path}: row 1: column {names.index('') + 1} has no name; give it one")
     twice = sorted({name for name in names if names.count(name) > 1})

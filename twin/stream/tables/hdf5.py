@@ -48,10 +48,10 @@ def _dataset(table: Table, name: str, item: Any) -> None:
     elif item.dtype.names:
         for one in item.dtype.names:
             kind = item.dtype[one].kind if not item.dtype[one].shape else "V"
-            put(table, f"{name}/{one}", item.shape, kind, (name, one))
+            put(table, f"{name}/{one}", item.shape, kind, (name, one), group=name)
     else:
         unit = next((_word(item.attrs[key]) for key in UNITS if key in item.attrs), "")
-        put(table, name, item.shape, item.dtype.kind, (name, ""), unit)
+        put(table, name, item.shape, item.dtype.kind, (name, ""), unit, name.rpartition("/")[0])
 
 
 def _chunk_bytes(item: Any) -> int:

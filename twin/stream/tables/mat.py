@@ -68,7 +68,7 @@ def _structure(table: Table, key: Key, value: Any) -> None:
     """Add the fields of a structure, at any depth."""
     name = "/".join(map(str, key))
     if value.dtype.names is None:
-        put(table, name, value.shape, value.dtype.kind, key)
+        put(table, name, value.shape, value.dtype.kind, key, group=name.rpartition("/")[0])
     elif value.size != 1 or len(key) > DEEPEST:
         table.others[name] = "an array of structures"
     else:

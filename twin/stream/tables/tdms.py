@@ -28,6 +28,7 @@ def read(path: Path) -> Table:
                     str(said.get("unit_string", "")),
                     1.0 / step if step > 0 else None,
                     float(said.get("wf_start_offset", 0.0)),
+                    group=group.name,
                 )
     return table
 
