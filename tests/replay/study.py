@@ -19,9 +19,10 @@ from table_io.card import PROFILES
 from twin.service.bundle import read_bundle
 from twin.service.driving import run
 from twin.service.kernels import ready
-from twin.service.recordings import log_path, recorded_bundle
+from twin.service.recordings import recorded_bundle
 from twin.service.replaying import Recorded, replay
 from twin.service.runs import play_unpaced
+from twin.stream.folder import log_path
 
 COLUMNS = (
     "log", "how", "samples", "compared", "differing", "missing", "identical", "open_s", "replay_s",

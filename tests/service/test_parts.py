@@ -8,7 +8,8 @@ import pytest
 
 from table_io.card import BadInput
 from twin.service import parts
-from twin.service.parts import LOCK, PARTS, gather
+from twin.service.parts import LOCK, gather
+from twin.stream.folder import PARTS
 from twin.stream.mcap_log import LogWriter, each
 from twin.stream.merging import verified
 from twin.stream.wire import encode, topic
@@ -158,3 +159,28 @@ def test_a_death_between_the_log_and_its_parts_loses_nothing(run: Path) -> None:
     part(run, 1, 0, 61, killed=False).rename(run / "run.mcap")
     assert found(gather(run)) == expected()
     assert [one.name for one in run.iterdir()] == ["run.mcap"]
+
+
+def test_what_is_damaged_is_safe_before_the_log_has_its_name(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever finds the log afterwards takes the parts away."""
+    path = part(run, 1, 0, 40, killed=True)
+    raw = bytearray(path.read_bytes())
+    edge = len(raw)
+    part(run, 2, 40, 61, killed=True)
+    raw[edge - 700] ^= 1
+    path.write_bytes(raw + bytes(600))
+
+    def died(*_: object) -> None:
+        raise OSError(errno.EIO, "died", "run.mcap")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", died)
+        with pytest.raises(BadInput, match="died"):
+            gather(run)
+    kept = run / "damaged" / "part-001.mcap"
+    assert kept.read_bytes() == path.read_bytes()
+    gather(run)
+    assert kept.read_bytes() == bytes(raw) + bytes(600)
+    assert sorted(one.name for one in run.iterdir()) == ["damaged", "run.mcap"]

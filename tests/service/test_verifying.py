@@ -21,9 +21,9 @@ from table_io.records import Gap, RunStart, RunStop
 from table_io.session import play
 from twin.service.bundle import read_bundle
 from twin.service.cli import app
-from twin.service.parts import PARTS
 from twin.service.runs import beside
 from twin.service.verifying import examine
+from twin.stream.folder import PARTS
 from twin.stream.framing import ATTACHMENT, CHUNK
 from twin.stream.mcap_log import LogWriter, write_items
 from twin.stream.recording import Recording, read

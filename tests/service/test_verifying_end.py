@@ -13,9 +13,8 @@ from table_io.records import Gap, RunStop
 from twin.log import open_log
 from twin.service.cli import app
 from twin.service.exporting import give_out
-from twin.service.parts import PARTS
-from twin.service.recordings import log_path
 from twin.service.verifying import endless
+from twin.stream.folder import PARTS, log_path
 from twin.stream.recording import read
 
 PLANNED = START.planned_samples

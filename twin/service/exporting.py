@@ -10,8 +10,9 @@ from rich.console import Console
 
 from table_io.card import BadInput
 from table_io.records import RunStart
-from twin.service.recordings import log_path, recording_of
+from twin.service.recordings import recording_of
 from twin.service.terminal import say
+from twin.stream.folder import log_path
 from twin.stream.rows import Rows, batches, gather
 
 # Format, and how its file's name ends. Foxglove's layout stands beside its file.

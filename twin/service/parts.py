@@ -7,7 +7,7 @@ from pathlib import Path
 
 from table_io.card import BadInput
 from twin.service.terminal import say
-from twin.stream.folder import PARTS as PARTS  # noqa: PLC0414
+from twin.stream.folder import PARTS
 from twin.stream.merging import merge, verified
 from twin.stream.salvage import UNFINISHED, salvage
 
@@ -28,10 +28,7 @@ def gather(folder: Path) -> Path:
             elif not parts:
                 raise BadInput(f"{folder}: the recorder wrote nothing")
             else:
-                damaged = [one for one in parts if _damaged(one)]
-                _whole(parts, held / "run.mcap").rename(out)
-                if damaged:
-                    _keep(damaged, folder)
+                _whole(parts, held / "run.mcap", folder).rename(out)
                 _sync(folder)
             shutil.rmtree(held)
     except BlockingIOError:
@@ -44,36 +41,40 @@ def gather(folder: Path) -> Path:
     return out
 
 
-def _damaged(part: Path) -> bool:
-    """True where more than the end of a part is missing: a disk lost something inside it."""
-    if verified(part):
-        return False
-    lost = salvage(part).damage
-    return any(one.at + one.size < part.stat().st_size for one in lost) or any(
-        one.size == 0 and one.reason != UNFINISHED for one in lost
-    )
-
-
-def _keep(damaged: list[Path], folder: Path) -> None:
-    """Parts of which something is lost are not thrown away: another tool may read more of them."""
-    kept = folder / "damaged"
-    kept.mkdir()
-    for one in damaged:
-        shutil.copy2(one, kept)
-    say(f"{len(damaged)} parts of the recording are damaged; they are kept in {kept}: see verify")
-
-
-def _whole(parts: list[Path], new: Path) -> Path:
+def _whole(parts: list[Path], new: Path, folder: Path) -> Path:
     """One whole log with everything in the parts, read back by its hash and on the disk."""
-    if len(parts) == 1 and verified(parts[0]):
+    sound = [one for one in parts if verified(one)]
+    if len(parts) == 1 and sound:
         new = parts[0]
     else:
         new.unlink(missing_ok=True)  # of an earlier attempt
         merge(parts, new)
         if not verified(new):
             raise BadInput(f"{new}: not what was written; the parts are kept beside it")
+        # before the log has its name: whoever finds it takes the parts away
+        _keep([one for one in parts if one not in sound and _damaged(one)], folder / "damaged")
     _sync(new)
     return new
+
+
+def _damaged(part: Path) -> bool:
+    """True where more than the end of a part is missing: a disk lost something inside it."""
+    size = part.stat().st_size
+    return any(
+        one.reason != UNFINISHED if one.size == 0 else one.at + one.size < size
+        for one in salvage(part).damage
+    )
+
+
+def _keep(damaged: list[Path], kept: Path) -> None:
+    """Parts of which something is lost are not thrown away: another tool may read more of them."""
+    if not damaged:
+        return
+    kept.mkdir(exist_ok=True)  # of an earlier attempt
+    for one in damaged:
+        shutil.copy2(one, kept)
+        _sync(kept / one.name)
+    say(f"{len(damaged)} parts of the recording are damaged; they are kept in {kept}: see verify")
 
 
 def _sync(path: Path) -> None:

@@ -37,8 +37,9 @@ def report(folder: Path) -> None:
     its table."""
     if not folder.is_dir():
         raise BadInput(f"{folder}: no such folder; give the folder of a run or a batch")
-    from twin.service.parts import PARTS, gather
+    from twin.service.parts import gather
     from twin.service.report import write_report
+    from twin.stream.folder import PARTS
 
     if (folder / PARTS).is_dir():
         gather(folder)

@@ -6,8 +6,7 @@ from pathlib import Path
 from rich.console import Console
 
 from twin.service.bundle import Bundle, from_texts, read_model
-from twin.stream.folder import PARTS, apart
-from twin.stream.folder import log_path as log_path  # noqa: PLC0414
+from twin.stream.folder import PARTS, apart, log_path
 from twin.stream.recording import Recording, read
 
 

@@ -16,12 +16,13 @@ from twin.service.kernels import ready
 from twin.service.outcome import EXIT_INTERRUPTED, EXIT_NOT_IDENTICAL, close
 from twin.service.progress import RunProgress
 from twin.service.publishing import publishing
-from twin.service.recordings import log_path, recorded_bundle, warned
+from twin.service.recordings import recorded_bundle, warned
 from twin.service.replaying import Identity, Recorded, Span, replay
 from twin.service.step_range import step_range
 from twin.service.terminal import console, say
 from twin.service.versions import changes, differing
-from twin.stream.recording import Recording, read
+from twin.stream.folder import log_path
+from twin.stream.recording import Recording, fitting
 from twin.stream.wire import CMP_TOPIC, Item
 
 RECORDED = "recorded"  # as a model: the one in the log
@@ -128,7 +129,8 @@ def about(
     """How a replay relates to its recording, as `replay` in its summary.json."""
     recording = recorded.recording
     same = bundle.model_toml == recording.start.model_toml
-    before = read(recording.path, (CMP_TOPIC,)).of(Comparison)
+    compared = [payload for _, payload in sorted(recorded.comparisons.items())]
+    before = [*fitting(CMP_TOPIC, compared, recording.start, [])]
     return {
         "of": str(recording.path),
         "run": recording.run,
@@ -144,7 +146,9 @@ def about(
         "largest_difference_of_error_sums": identity.largest,
         "relative_difference": deviation(recording.path, made) if identity.differing else {},
         "versions_differing": differing(recording.start.versions),
-        "recorded_comparison": summaries.nrmse(before, bundle.parameters),
+        "recorded_comparison": summaries.nrmse(
+            tuple(one for one in before if isinstance(one, Comparison)), bundle.parameters
+        ),
     }
 
 

@@ -12,7 +12,6 @@ from table_io.card import BadInput
 from twin.service import summary as summaries
 from twin.service.folders import new_run
 from twin.service.outcome import EXIT_GAPS, EXIT_NOT_IDENTICAL
-from twin.service.recordings import log_path
 from twin.service.replay import (
     RECORDED,
     Asked,
@@ -26,6 +25,7 @@ from twin.service.replay import (
 )
 from twin.service.replaying import replay
 from twin.service.terminal import console, print_table, say
+from twin.stream.folder import log_path
 from twin.stream.recording import read
 from twin.stream.wire import MEAS_TOPIC, PRED_TOPIC, TOPIC_TYPES
 

@@ -15,8 +15,9 @@ from table_io.card import BadInput
 from table_io.clock import Clock
 from table_io.profile import OnDeath
 from table_io.records import Comparison, Event, Fault, RunStop, Timing
-from twin.service.parts import LOCK, PARTS
+from twin.service.parts import LOCK
 from twin.service.spec import Spec, token
+from twin.stream.folder import PARTS
 from twin.stream.resend import Inbox
 from twin.stream.wire import RECORD_TOPICS, Item, decode, encode, topic
 from twin.stream.zenoh_link import Link, open_spoke

@@ -8,8 +8,8 @@ from table_io.card import BadInput
 from table_io.clock import RealClock
 from table_io.records import RunStart, RunStop
 from twin.service.driving import VIEW_ADDRESS
-from twin.service.recordings import log_path
 from twin.service.terminal import say
+from twin.stream.folder import log_path
 from twin.stream.recording import read
 from twin.stream.rerun_view import RerunView, open_viewer, screenshot, write_rrd
 from twin.stream.wire import TOPIC_TYPES, Item, decode

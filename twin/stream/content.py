@@ -15,6 +15,7 @@ from table_io.records import RunStart
 from twin.stream.wire import encode
 
 SCHEMA_VERSION = 2
+START_COPY = "start.pb"
 Metadata = dict[str, dict[str, str]]  # by the name of its record, by key
 
 
@@ -56,14 +57,14 @@ def schema_version(path: Path, metadata: Metadata) -> int:
 def attachments(start: RunStart) -> dict[str, bytes]:
     """What a log of this run carries beside its messages, by name.
 
-    "start.pb" is the start record once more: it outlives the chunk in which the first one stands.
+    START_COPY is the start record once more: it outlives the chunk in which the first one stands.
     """
     return {
         "profile.toml": start.profile_toml.encode(),
         "rig.toml": start.rig_toml.encode(),
         "model.toml": start.model_toml.encode(),
         "calibration.json": calibration(start).encode(),
-        "start.pb": encode(start, start.run),
+        START_COPY: encode(start, start.run),
     }
 
 

@@ -7,11 +7,12 @@ stand in a log from the first moment, so that a killed recording explains itself
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader, make_reader
-from mcap.records import Chunk, DataEnd, Message
+from mcap.records import Chunk, DataEnd
+from mcap.records import Message as MessageRecord
 from mcap.records import Metadata as MetadataRecord
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
@@ -20,7 +21,7 @@ from table_io.clock import wall_ns
 from table_io.records import RunStart
 from twin.stream.content import SCHEMA_VERSION, Content, Metadata, attachments, hashes
 from twin.stream.newfile import NewFile
-from twin.stream.salvage import salvage
+from twin.stream.salvage import Message, salvage
 from twin.stream.wire import (
     TOPIC_TYPES,
     Item,
@@ -111,16 +112,7 @@ class LogWriter:
         self._file.close()
 
 
-class Stamped(NamedTuple):
-    """One message of a log, still as bytes; times in ns, `publish_time` of the wall clock."""
-
-    topic: str
-    log_time: int
-    payload: bytes
-    publish_time: int
-
-
-def each(path: Path) -> Iterator[Stamped]:
+def each(path: Path) -> Iterator[Message]:
     """The messages in file order, a chunk in memory at a time; all of it where it is damaged."""
     count = 0
     with path.open("rb") as stream:
@@ -128,14 +120,13 @@ def each(path: Path) -> Iterator[Stamped]:
         try:
             for _, channel, one in reader.iter_messages(log_time_order=False):
                 count += 1
-                yield Stamped(channel.topic, one.log_time, one.data, one.publish_time)
+                yield Message(channel.topic, one.log_time, one.data, one.sequence, one.publish_time)
             return
         except OSError:
             raise
         except Exception:
             pass  # where a file is cut or damaged, the parser and its decompressor fail in any way
-    for found in salvage(path).messages[count:]:  # what stands after the damage is not given up
-        yield Stamped(found.topic, found.log_time, found.payload, found.publish_time)
+    yield from salvage(path).messages[count:]  # what stands after the damage is not given up
 
 
 def metadata(path: Path) -> Metadata:
@@ -153,7 +144,7 @@ def heading(path: Path) -> Metadata:
     with path.open("rb") as stream:
         try:
             for one in StreamReader(stream, emit_chunks=True).records:
-                if isinstance(one, (Chunk, Message, DataEnd)):
+                if isinstance(one, (Chunk, MessageRecord, DataEnd)):
                     break
                 if isinstance(one, MetadataRecord):
                     found.setdefault(one.name, one.metadata)

@@ -9,10 +9,10 @@ from tempfile import TemporaryDirectory
 
 from table_io.card import BadInput
 from table_io.records import RunStart
-from twin.stream.content import Content, schema_version
-from twin.stream.mcap_log import LogWriter, Stamped, each, heading, metadata
-from twin.stream.recording import ORDER, START, START_COPY
-from twin.stream.salvage import salvage
+from twin.stream.content import START_COPY, Content, schema_version
+from twin.stream.mcap_log import LogWriter, each, heading, metadata
+from twin.stream.recording import ORDER, START
+from twin.stream.salvage import Message, salvage
 from twin.stream.wire import WireError, decode
 
 RUN_BYTES = 32 * 2**20  # sorted at once
@@ -72,15 +72,15 @@ def _starts(part: Path) -> Iterator[bytes]:
     yield from filter(None, [salvage(part, frozenset({START})).attachments.get(START_COPY)])
 
 
-def _place(one: Stamped) -> tuple[int, int, bytes]:
+def _place(one: Message) -> tuple[int, int, bytes]:
     return one.log_time, ORDER[one.topic], one.payload
 
 
 def _runs(
     parts: list[Path], folder: Path, rate_hz: float, run_bytes: int
-) -> Iterator[Iterable[Stamped]]:
+) -> Iterator[Iterable[Message]]:
     """Everything in all parts as sorted runs: the last one in memory, the others in files."""
-    held: list[Stamped] = []
+    held: list[Message] = []
     size = 0
     for one in chain.from_iterable(map(each, parts)):
         if one.topic not in ORDER:
@@ -97,7 +97,7 @@ def _runs(
     yield sorted(held, key=_place)
 
 
-def _unique(messages: Iterable[Stamped]) -> Iterator[Stamped]:
+def _unique(messages: Iterable[Message]) -> Iterator[Message]:
     """Each message once, of sorted ones; what two recorders wrote differs in publish_time."""
     last = None
     for one in messages:
@@ -106,7 +106,7 @@ def _unique(messages: Iterable[Stamped]) -> Iterator[Stamped]:
         last = one
 
 
-def _write(writer: LogWriter, messages: Iterable[Stamped], rate_hz: float) -> int:
+def _write(writer: LogWriter, messages: Iterable[Message], rate_hz: float) -> int:
     count = 0
     for one in messages:
         index = round(one.log_time * rate_hz / 1e9)

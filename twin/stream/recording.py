@@ -10,7 +10,7 @@ from table_io.block import Block, join
 from table_io.card import BadInput
 from table_io.records import Record, RunStart, RunStop
 from twin.stream.blocks import decode_blocks
-from twin.stream.content import schema_version
+from twin.stream.content import START_COPY, schema_version
 from twin.stream.mcap_log import each, heading
 from twin.stream.salvage import NAMELESS, Damage, Message, Salvaged, salvage
 from twin.stream.soundness import misfit, mislabelled, unsound, unsound_start
@@ -25,7 +25,6 @@ from twin.stream.wire import (
 )
 
 START = RECORD_TOPICS[RunStart]
-START_COPY = "start.pb"  # an attachment: the start record outlives the chunk that it stands in
 # Which of the items of one sample index comes first: the start, then as the table of topics has
 # it, the stop last; so a recording reads the same in whatever order its parts were written.
 ORDER = {topic: place for place, topic in enumerate(TOPIC_TYPES)}

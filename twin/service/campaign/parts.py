@@ -8,10 +8,11 @@ from table_io.profile import Profile
 from twin.service import summary as summaries
 from twin.service.campaign.card import Mode
 from twin.service.campaign.state import Part, RunState, digest, locked
-from twin.service.parts import LOCK, PARTS, gather
+from twin.service.parts import LOCK, gather
 from twin.service.recordings import recorded_bundle
 from twin.service.report import write_report
 from twin.service.summary import Json
+from twin.stream.folder import PARTS
 from twin.stream.recording import read
 
 LOG = "run.mcap"

@@ -14,7 +14,8 @@ from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.profile import Profile
 from twin.learn.discover import Log
 from twin.learn.readings import alive, readings_of
-from twin.service.recordings import log_path, recording_of
+from twin.service.recordings import recording_of
+from twin.stream.folder import log_path
 from twin.stream.recording import Recording
 
 CELLS = (*RIGHT_CELLS, *LEFT_CELLS)

@@ -12,8 +12,9 @@ from twin.service import evidence
 from twin.service.evidence import Run, gather
 from twin.service.paper.cases import GAPS
 from twin.service.paper.players import Motion
-from twin.service.recordings import log_path, recorded_bundle
+from twin.service.recordings import recorded_bundle
 from twin.service.summary import summarise
+from twin.stream.folder import log_path
 from twin.stream.recording import read
 
 
