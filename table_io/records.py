@@ -128,6 +128,62 @@ class Point:
 
 
 @dataclass(frozen=True, slots=True)
+class Agreement:
+    """How far the restarted twin was from the measurement over a held cycle ending before `index`.
+
+    Per channel, SI: rms of the error, the band within which noise and what the model may be off
+    keep it, and the error by phase: in flight, in contact right, in contact left. NaN where there
+    is nothing to compare.
+    """
+
+    index: int
+    step: int
+    cycle: int
+    count: int
+    channels: tuple[str, ...]
+    error: tuple[float, ...]
+    band: tuple[float, ...]
+    flight: tuple[float, ...]
+    right: tuple[float, ...]
+    left: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """The specimen as identified from the samples before `index`, recursively, SI.
+
+    `names` are parameters (stiffness, damping, gap_r, gap_l), `sd` standard deviations; `drift` is
+    the change since the first estimate that the trend over the test gives, with `drift_sd`.
+    """
+
+    index: int
+    step: int
+    names: tuple[str, ...]
+    values: tuple[float, ...]
+    sd: tuple[float, ...]
+    drift: tuple[float, ...]
+    drift_sd: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Ahead:
+    """The next jump on the way of the sweep by the model's branch, as known at sample `index`.
+
+    `kind` is "up", "down", or "" where none is ahead; it lies at `jump_hz`, within `low_hz` to
+    `high_hz` as far as the parameters are known.
+    """
+
+    index: int
+    step: int
+    direction: str
+    frequency_hz: float
+    kind: str
+    jump_hz: float
+    low_hz: float
+    high_hz: float
+
+
+@dataclass(frozen=True, slots=True)
 class Event:
     """Something a person should read: `kind` is one word."""
 
@@ -277,9 +333,12 @@ Record = (
     | Level
     | Decided
     | Trip
+    | Agreement
+    | Estimate
+    | Ahead
     | RunStop
 )
 RECORDS: tuple[type, ...] = (
     RunStart, Params, Comparison, Cycle, Point, Event, Gap, Fault, Timing,
-    Check, Response, Level, Decided, Trip, RunStop,
+    Check, Response, Level, Decided, Trip, Agreement, Estimate, Ahead, RunStop,
 )  # fmt: skip

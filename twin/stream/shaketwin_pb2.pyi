@@ -398,3 +398,71 @@ class Trip(_message.Message):
     text: str
     run: str
     def __init__(self, index: _Optional[int] = ..., decided: _Optional[int] = ..., kind: _Optional[str] = ..., channel: _Optional[str] = ..., value: _Optional[float] = ..., limit: _Optional[float] = ..., text: _Optional[str] = ..., run: _Optional[str] = ...) -> None: ...
+
+class Agreement(_message.Message):
+    __slots__ = ("index", "step", "cycle", "count", "channels", "error", "band", "flight", "right", "left", "run")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    CYCLE_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    CHANNELS_FIELD_NUMBER: _ClassVar[int]
+    ERROR_FIELD_NUMBER: _ClassVar[int]
+    BAND_FIELD_NUMBER: _ClassVar[int]
+    FLIGHT_FIELD_NUMBER: _ClassVar[int]
+    RIGHT_FIELD_NUMBER: _ClassVar[int]
+    LEFT_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    step: int
+    cycle: int
+    count: int
+    channels: _containers.RepeatedScalarFieldContainer[str]
+    error: _containers.RepeatedScalarFieldContainer[float]
+    band: _containers.RepeatedScalarFieldContainer[float]
+    flight: _containers.RepeatedScalarFieldContainer[float]
+    right: _containers.RepeatedScalarFieldContainer[float]
+    left: _containers.RepeatedScalarFieldContainer[float]
+    run: str
+    def __init__(self, index: _Optional[int] = ..., step: _Optional[int] = ..., cycle: _Optional[int] = ..., count: _Optional[int] = ..., channels: _Optional[_Iterable[str]] = ..., error: _Optional[_Iterable[float]] = ..., band: _Optional[_Iterable[float]] = ..., flight: _Optional[_Iterable[float]] = ..., right: _Optional[_Iterable[float]] = ..., left: _Optional[_Iterable[float]] = ..., run: _Optional[str] = ...) -> None: ...
+
+class Estimate(_message.Message):
+    __slots__ = ("index", "step", "names", "values", "sd", "drift", "drift_sd", "run")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    NAMES_FIELD_NUMBER: _ClassVar[int]
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    SD_FIELD_NUMBER: _ClassVar[int]
+    DRIFT_FIELD_NUMBER: _ClassVar[int]
+    DRIFT_SD_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    step: int
+    names: _containers.RepeatedScalarFieldContainer[str]
+    values: _containers.RepeatedScalarFieldContainer[float]
+    sd: _containers.RepeatedScalarFieldContainer[float]
+    drift: _containers.RepeatedScalarFieldContainer[float]
+    drift_sd: _containers.RepeatedScalarFieldContainer[float]
+    run: str
+    def __init__(self, index: _Optional[int] = ..., step: _Optional[int] = ..., names: _Optional[_Iterable[str]] = ..., values: _Optional[_Iterable[float]] = ..., sd: _Optional[_Iterable[float]] = ..., drift: _Optional[_Iterable[float]] = ..., drift_sd: _Optional[_Iterable[float]] = ..., run: _Optional[str] = ...) -> None: ...
+
+class Ahead(_message.Message):
+    __slots__ = ("index", "step", "direction", "frequency_hz", "kind", "jump_hz", "low_hz", "high_hz", "run")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    DIRECTION_FIELD_NUMBER: _ClassVar[int]
+    FREQUENCY_HZ_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    JUMP_HZ_FIELD_NUMBER: _ClassVar[int]
+    LOW_HZ_FIELD_NUMBER: _ClassVar[int]
+    HIGH_HZ_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    step: int
+    direction: str
+    frequency_hz: float
+    kind: str
+    jump_hz: float
+    low_hz: float
+    high_hz: float
+    run: str
+    def __init__(self, index: _Optional[int] = ..., step: _Optional[int] = ..., direction: _Optional[str] = ..., frequency_hz: _Optional[float] = ..., kind: _Optional[str] = ..., jump_hz: _Optional[float] = ..., low_hz: _Optional[float] = ..., high_hz: _Optional[float] = ..., run: _Optional[str] = ...) -> None: ...

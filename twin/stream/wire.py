@@ -26,10 +26,13 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from table_io.block import Block
 from table_io.records import (
     RECORDS,
+    Agreement,
+    Ahead,
     Check,
     Comparison,
     Cycle,
     Decided,
+    Estimate,
     Event,
     Fault,
     Gap,
@@ -68,6 +71,9 @@ RECORD_TOPICS: dict[type, str] = {
     Comparison: CMP_TOPIC,
     Cycle: "/twin/cycle",
     Point: "/twin/point",
+    Agreement: "/twin/agreement",
+    Estimate: "/twin/estimate",
+    Ahead: "/twin/ahead",
     Timing: "/run/timing",
 }
 TOPIC_TYPES: dict[str, type] = {
