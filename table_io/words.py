@@ -19,8 +19,11 @@ from table_io.units import GRAVITY_M_S2
 
 LEVELS = {
     "ERROR": {"fault", "halted", "error", "died"},
-    "WARN": {"warning", "alarm", "divergence", "late", "stop", "stopped", "sensor"},
-}
+    "WARN": {
+        "warning", "alarm", "divergence", "late", "stop", "stopped", "sensor", "disagreement",
+        "drift", "no jump", "attractor", "instrument", "refused",
+    },
+}  # fmt: skip
 
 
 def sentence(record: Record, rate_hz: float) -> tuple[str, str] | None:

@@ -61,6 +61,7 @@ class Hidden(NamedTuple):
     tau_b: float = 1.0
     pull: float = 0.0
     drift: float = 0.0
+    warm: float = 0.0
     tilt: float = 0.0
     stiff: tuple[float, float] = (1.0, 1.0)  # K_R and K_L over the mean
     m2: float = 0.0
@@ -82,10 +83,10 @@ class Hidden(NamedTuple):
 
 
 @inner
-def _spring(u, law, hid):  # type: ignore[no-untyped-def]
-    """Elastic force of the damper in N, u in m."""
+def _spring(u, t, law, hid):  # type: ignore[no-untyped-def]
+    """Elastic force of the damper in N, u in m, t in s."""
     u2 = u * u
-    force = u * (law.k + hid.k5 * u2 * u2) + hid.ke * u2
+    force = u * (law.k * (1.0 + hid.warm * t) + hid.k5 * u2 * u2) + hid.ke * u2
     if hid.k3 != 0.0:
         force += hid.k3 * u * u2 / math.sqrt(1.0 + u2 / STRETCH**2)
     if hid.dead > 0.0:
@@ -98,7 +99,7 @@ def _damper(s, law, hid):  # type: ignore[no-untyped-def]
     """Force of the damper in N: springs, dashpots, dry friction, hysteresis, relaxation."""
     u, v = s[X] - s[Y], s[VX] - s[VY]
     viscous = law.c + hid.c2 * math.sqrt(v * v + SLOW**2) + hid.c3 * v * v + hid.cu * u * u
-    force = _spring(u, law, hid) + viscous * v + hid.fy * s[Z] + s[F]
+    force = _spring(u, s[T], law, hid) + viscous * v + hid.fy * s[Z] + s[F]
     if hid.fc > 0.0 or hid.fs > 0.0:
         dry = hid.fc + (hid.fs - hid.fc) * math.exp(-((v / hid.vs) ** 2))
         force += dry * math.tanh(v / hid.v0)
@@ -273,7 +274,7 @@ class HiddenPlant(Plant):
             right, left = (
                 _bumper.py_func(d, 0.0, j, law, self.hidden)[0] for j, d in enumerate(pressed(u))
             )
-            return float(_spring.py_func(u, law, self.hidden) + right - left)
+            return float(_spring.py_func(u, 0.0, law, self.hidden) + right - left)
 
         low, high = -0.05, 0.05
         for _ in range(80 if force(0.0) != 0.0 else 0):

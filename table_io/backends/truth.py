@@ -106,6 +106,8 @@ ALL: tuple[Kind, ...] = (
     Kind("even_stiffness", "u2", False, (Q("ke", "N/m2", -1e7, 1e7, 0.0, 3e5),), "ke u^2"),
     Kind("cubic_damping", "v3", False, (Q("c3", "N s3/m3", 0.0, 1e7, 0.0, 2e4),), "c3 u'^3"),
     Kind("position_damping", "u2v", False, (Q("cu", "N s/m3", 0.0, 1e9, 0.0, 3e6),), "cu u^2 u'"),
+    Kind("stiffness_drift", "linear", False, (Q("rate", "1/s", -1e-2, 1e-2, 0.0, 1e-4),),
+         "the damper's spring K (1 + rate t), t from sample 0"),
     Kind("dead_band", "tanh", False, (Q("width", "m", 0.0, 0.02, 0.0, 1e-3),),
          "the damper's spring K is missing within +-width: -K width tanh(u / width)"),
     Kind("adhesion", "pull", False, (Q("force", "N", 0.0, 1e4, 0.0, 100.0),),

@@ -21,6 +21,7 @@ COEFFICIENTS = {
     "bouc_wen": {"force": "fy", "yield_displacement": "uy", "exponent": "n"},
     "bumper_maxwell": {"tau": "tau_b"},
     "gap_drift": {"rate": "drift"},
+    "stiffness_drift": {"rate": "warm"},
     "dead_band": {"width": "dead"},
     "adhesion": {"force": "pull"},
     "appendage": {"mass": "m2", "frequency": "w2", "damping_ratio": "z2"},

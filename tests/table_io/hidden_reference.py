@@ -69,6 +69,7 @@ class Reference:
         (right, right_rate), (left, left_rate) = self.face(s, 0, on), self.face(s, 1, on)
         force = K * u + C * v + right - left
         force += self.law(u, v, s[6:], p) if self.law else 0.0
+        force += K * u * p["rate"] * (t - H) if self.kind.id == "stiffness_drift" else 0.0
         q, swing = [0.0, 0.0], 0.0
         match self.kind.id:
             case "table_tilt":

@@ -23,6 +23,7 @@ SIZES = {
     "cubic_stiffness": {"k3": 3e8},
     "table_tilt": {"tilt": 0.5},
     "gap_drift": {"rate": 1e-4},
+    "stiffness_drift": {"rate": 1e-2},
     "adhesion": {"force": 300.0},
 }
 

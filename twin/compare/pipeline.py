@@ -4,7 +4,7 @@ Pure: the same samples give the same items to the bit, however they are cut into
 replay and `--speed max` call this same function.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,15 +12,18 @@ import numpy as np
 from table_io.block import Block, Float1D, Label, join
 from table_io.channels import contact_forces, rel_disp
 from table_io.profile import Profile
-from table_io.records import Cycle, Decided, Event, Params, Point, Record, Step
-from twin.compare.curves import sudden
+from table_io.records import Cycle, Decided, Params, Record, Step
+from twin.compare import watch
 from twin.compare.cycles import UNKNOWN, Motion, Scale, Touching, extremes, point
+from twin.compare.sensors import corrected
+from twin.compare.watch import Watch
+from twin.compare.watch.held import Held, WatchSetup
+from twin.compare.watch.jumps import Foreseen, foreseen
 from twin.compare.windows import Tracks, TwinSetup, begin, follow
 from twin.model.model import Model
 from twin.model.parameters import resonance
 
 Piece = tuple[Block, Block]  # the same samples measured and predicted
-DIVERGED, AGREES = 0.10, 0.05  # error of the restarted twin's u over a cycle, over its amplitude
 SHORT = 3  # samples by which a held cycle may miss its length and still be whole
 
 
@@ -35,7 +38,14 @@ class Setup:
     scale: Scale
     steps: tuple[Step, ...]
     measured_cycles: int
+    foreseen: Foreseen = field(default_factory=Foreseen)
     decided: tuple[Step, ...] = ()
+
+    @property
+    def watched(self) -> WatchSetup:
+        """What the watch is told."""
+        twin = self.twin
+        return WatchSetup(twin.model, twin.rate_hz, twin.contact_n, self.scale.gaps_m)
 
     def step(self, index: int) -> Step | None:
         """The step of this index; None where nobody told of it."""
@@ -59,8 +69,7 @@ class State:
     cycles: tuple[Cycle, ...] = ()  # of the step under way
     base_acc: tuple[Float1D, ...] = ()  # of its measured cycles
     touching: tuple[Touching, Touching] = (UNKNOWN, UNKNOWN)  # measured, twin
-    last_point: Point | None = None
-    diverged: bool = False  # the restarted twin has left the measurement, and that was said
+    watch: Watch = field(default_factory=Watch)
 
 
 def prepare(
@@ -81,7 +90,8 @@ def prepare(
         from_rest,
     )
     scale = Scale(model.parameters, rate, contact_n, u_star, a_star, profile.specimen.gaps_m)
-    return Setup(twin, scale, steps, profile.sweep.measured_cycles)
+    known = foreseen(profile, model, steps)
+    return Setup(twin, scale, steps, profile.sweep.measured_cycles, known)
 
 
 def knowing(setup: Setup, *decided: Decided) -> Setup:
@@ -106,16 +116,16 @@ def adopting(setup: Setup, params: Params) -> Setup:
 def start(setup: Setup, index: int = 0) -> tuple[State, list[Record]]:
     """The state of a twin that starts at sample `index`, and the parameters it starts with."""
     params = Params(index, setup.twin.model.flat(), "start")
-    return State(begin(setup.twin, index)), [params]
+    return State(begin(setup.twin, index), watch=watch.begin(setup.foreseen)), [params]
 
 
 def step(setup: Setup, state: State, block: Block) -> tuple[State, list[Block | Record]]:
     """State after the block; predicted Block, Comparisons, Cycles, Points, Events it completes."""
     if block.index != state.tracks.index:
-        state = State(begin(setup.twin, block.index), last_point=state.last_point)
+        state = State(begin(setup.twin, block.index), watch=state.watch)
     tracks, predicted, comparisons = follow(setup.twin, state.tracks, block)
     items: list[Block | Record] = [predicted, *comparisons]
-    state = replace(state, tracks=tracks)
+    state = replace(state, tracks=tracks, watch=watch.rested(state.watch, block))
     known = _joined(state.recent, (block, predicted))
     changes = np.flatnonzero(np.diff(block.step) | np.diff(block.cycle)) + 1
     edges = [0, *changes.tolist(), len(block)]
@@ -201,46 +211,33 @@ def _cycle(setup: Setup, state: State, step: int, number: int) -> tuple[State, l
     if label == Label.MEASURE:
         table = np.concatenate([block.channel("table_acc_m_s2") for block, _ in held])
         base_acc = (*base_acc, table[lead:])
-    state, said = _divergence(state, held, end)
+    whole, predicted = (join([pair[k] for pair in held]).cut(first, end) for k in range(2))
+    true = corrected(setup.twin.model.sensors, whole)
+    one = Held(known, number, whole, true, predicted)
+    watching, said = watch.looked(setup.watched, state.watch, one)
     return replace(
-        state, cycles=(*state.cycles, cycle), base_acc=base_acc, touching=(touch_m, touch_t)
+        state,
+        cycles=(*state.cycles, cycle),
+        base_acc=base_acc,
+        touching=(touch_m, touch_t),
+        watch=watching,
     ), [cycle, *said]
 
 
-def _divergence(state: State, held: tuple[Piece, ...], end: int) -> tuple[State, list[Record]]:
-    """A warning where even the twin that restarts from the measured state leaves it.
-
-    Said once, and again only after the two have agreed in between. It never stops a table.
-    """
-    measured = np.concatenate([rel_disp(block) for block, _ in held])
-    twin = np.concatenate([one.channel("window/rel_disp_m") for _, one in held])
-    amplitude = 0.5 * float(np.ptp(measured))
-    error = float(np.sqrt(np.mean((measured - twin) ** 2)))
-    if not (np.isfinite(error) and amplitude > 0.0):
-        return state, []
-    share = error / amplitude
-    if state.diverged or share <= DIVERGED:
-        return replace(state, diverged=state.diverged and share > AGREES), []
-    text = (
-        f"the twin has left the measurement: u is off by {100 * share:.0f} % of its amplitude "
-        f"within a window ({1e3 * error:.3g} mm rms)"
-    )
-    return replace(state, diverged=True), [Event(end, "divergence", text)]
-
-
 def _point(setup: Setup, state: State) -> tuple[State, list[Record]]:
-    """The step's PRC point, where all its measured cycles were seen, and a hint of a jump."""
+    """The step's PRC point, where all its measured cycles were seen, and what it says of jumps."""
     items: list[Record] = []
-    last = state.last_point
+    watching = state.watch
     seen = sum(cycle.label == Label.MEASURE for cycle in state.cycles)
     step = setup.step(state.cycles[-1].step)
     if step is not None and seen == setup.measured_cycles:
         base_acc = np.concatenate(state.base_acc)
-        last = point(step, list(state.cycles), base_acc, setup.scale)
-        items.append(last)
-        if step not in setup.decided and (hint := sudden(state.last_point, last)):
-            items.append(Event(last.index, "jump", hint))
+        made = point(step, list(state.cycles), base_acc, setup.scale)
+        items.append(made)
+        if step not in setup.decided:
+            watching, said = watch.passed(watching, made)
+            items.extend(said)
     # The contact state is not followed through the blend to the next step.
     return replace(
-        state, cycles=(), base_acc=(), touching=(UNKNOWN, UNKNOWN), last_point=last
+        state, cycles=(), base_acc=(), touching=(UNKNOWN, UNKNOWN), watch=watching
     ), items

@@ -256,8 +256,8 @@ def _read(setup: TwinSetup, block: Block, values: Float2D, late: Float2D) -> Flo
     return readings
 
 
-def _measured(block: Block) -> Float2D:
-    """The compared channels of a measured block, NaN rows where one is missing."""
+def compared(block: Block) -> Float2D:
+    """The compared channels of a measured block, (channel, sample); NaN where one is missing."""
     return np.array(
         [rel_disp(block) if name == "rel_disp_m" else _column(block, name) for name in COMPARED]
     )
@@ -270,7 +270,7 @@ def _compare(
     setup: TwinSetup, pending: Float2D, block: Block, predicted: Block
 ) -> tuple[Float2D, list[Comparison]]:
     """(squares of the cell that is not full yet, Comparisons of the full ones)."""
-    measured = _measured(block)
+    measured = compared(block)
     free, window = (measured - predicted.values[rows] for rows in _ROWS)
     new = np.array([measured**2, free**2, window**2])
     squares = np.concatenate([pending, new], axis=2)

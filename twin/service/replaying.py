@@ -13,9 +13,12 @@ import numpy as np
 from table_io.block import Block
 from table_io.card import BadInput
 from table_io.records import (
+    Agreement,
+    Ahead,
     Comparison,
     Cycle,
     Decided,
+    Estimate,
     Event,
     Fault,
     Params,
@@ -25,7 +28,7 @@ from table_io.records import (
     RunStop,
     Timing,
 )
-from twin.compare import COMPARED, pipeline
+from twin.compare import COMPARED, pipeline, watch
 from twin.service.bundle import Bundle
 from twin.service.origin import beginning, begun
 from twin.service.runs import Watch, record
@@ -44,8 +47,9 @@ from twin.stream.wire import (
 
 LONGEST_CELL = 10_000  # samples that a comparison may cover
 LONG_BLOCK_S = 1.0  # where nobody watches the time; the result is the same however it is cut
-TWIN_RECORDS = (Comparison, Params, Cycle, Point)
-TWIN_TOPICS = {PRED_TOPIC, *(RECORD_TOPICS[kind] for kind in (Comparison, Cycle, Point, Timing))}
+AT_END = (Cycle, Point, Agreement, Estimate, Ahead)  # stand at the end of what they are about
+TWIN_RECORDS = (Comparison, Params, *AT_END)
+TWIN_TOPICS = {PRED_TOPIC, *(RECORD_TOPICS[kind] for kind in (Comparison, *AT_END, Timing))}
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +125,7 @@ class Span:
             return self.first <= item.index and item.end <= self.last
         if isinstance(item, Comparison):
             return self.first <= item.index and item.index + item.count <= self.last
-        if isinstance(item, (Cycle, Point)) or (isinstance(item, Event) and not _of_the_rig(item)):
+        if isinstance(item, AT_END) or (isinstance(item, Event) and not _of_the_rig(item)):
             return self.first < item.index <= self.last
         return self.first <= item.index <= self.last
 
@@ -271,5 +275,5 @@ def _source(recording: Recording, cut: int, edges: list[int]) -> Iterator[Item]:
 def _of_the_rig(item: Item) -> bool:
     """True for what a replay repeats; what the twin said is said anew."""
     if isinstance(item, Event):
-        return item.kind not in ("jump", "divergence")
+        return item.kind not in (*watch.KINDS, "divergence")  # as it was once called
     return not isinstance(item, (Block, RunStart, Timing, *TWIN_RECORDS))

@@ -16,6 +16,7 @@ import numpy as np
 
 from table_io.block import Int1D
 from table_io.records import Event, Point, Quantities, Record
+from table_io.words import sentence
 from twin.stream.mcap_log import foreign_log
 from twin.stream.rows import LABELS, TIME, TWIN, WAYS, WINDOW, Columns, Rows
 from twin.stream.wire import flat_schema
@@ -24,7 +25,6 @@ MEASURED, PREDICTED, CURVES, EVENTS = "/measured", "/twin", "/prc", "/events"
 Fields = list[tuple[str, str]]  # name, protobuf type; the timestamp before them is number 1
 LOG: Fields = [("level", "int32"), ("message", "string"), ("name", "string")]
 WARNING, INFO = 3, 2  # levels of foxglove.Log
-WARNS = ("warning", "fault", "alarm", "divergence")
 RATIOS = [one.name for one in fields(Quantities) if one.type in (float, "float")]
 MOST_PLOTS = 5
 FOLLOWING_S = 10.0
@@ -94,7 +94,8 @@ def _told(record: Record, rate_hz: float) -> Message:
     """An event as Foxglove's Log, or a point of the curves."""
     stamp = _time(record.index, rate_hz)
     if isinstance(record, Event):
-        level = WARNING if record.kind in WARNS else INFO
+        told = sentence(record, rate_hz)
+        level = WARNING if told and told[0] != "INFO" else INFO
         payload = stamp + _varint(2 << 3) + _varint(level)
         return EVENTS, record.index, payload + _text(3, record.text) + _text(4, record.kind)
     assert isinstance(record, Point)
