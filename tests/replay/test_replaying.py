@@ -9,8 +9,20 @@ import pytest
 
 from table_io.block import Block
 from table_io.card import BadInput
-from table_io.records import Comparison, Cycle, Params, Point, RunStart, RunStop
+from table_io.records import (
+    Agreement,
+    Ahead,
+    Comparison,
+    Cycle,
+    Estimate,
+    Event,
+    Params,
+    Point,
+    RunStart,
+    RunStop,
+)
 from twin.compare import pipeline, windows
+from twin.compare.watch import KINDS
 from twin.service.bundle import Bundle
 from twin.service.outcome import EXIT_NOT_IDENTICAL
 from twin.service.replay import Asked, replay_command
@@ -49,8 +61,10 @@ def test_however_it_is_cut_the_result_is_the_same(
     identity, made = again(recorded_in(recording), bundle, tmp_path / "run.mcap", cut=cut)
     assert identity.identical
     assert identity.compared == len(recording.of(Comparison)) > 300
-    kinds = (Comparison, Cycle, Point, Params, RunStop)
-    assert told(made, *kinds) == told(recording, *kinds)
+    for kind in (Comparison, Cycle, Point, Agreement, Estimate, Ahead, Params, RunStop):
+        assert told(made, kind) == told(recording, kind) != [], kind
+    warnings = [[one for one in log.of(Event) if one.kind in KINDS] for log in (made, recording)]
+    assert warnings[0] == warnings[1] != []
     for stream in ("meas", "pred"):
         assert made.pieces(stream)[0].identical(recording.pieces(stream)[0])
 
@@ -85,6 +99,9 @@ def test_steps_are_equal_to_the_recorded_ones_for_both_twins(
     assert told(made, Comparison) == [encode(one, "") for one in whole]
     assert [one.step for one in made.of(Point)] == [2, 3]
     assert told(made, Point) == [encode(one, "") for one in recording.of(Point)[2:4]]
+    for kind in (Agreement, Estimate):
+        inside = [one for one in recording.of(kind) if one.step in (2, 3)]
+        assert told(made, kind) == [encode(one, "") for one in inside], kind
     assert [(one.step, one.cycle) for one in made.of(Cycle)] == [
         (one.step, one.cycle) for one in recording.of(Cycle) if one.step in (2, 3)
     ]

@@ -11,6 +11,7 @@ import numpy as np
 
 from table_io.card import BadInput
 from table_io.records import Check, Event, Fault, Gap, Level, Params, Response, Timing, Trip
+from twin.compare.watch import KINDS as WATCHED
 from twin.service.evidence import Run, Summary, cards, gather, quantity
 from twin.service.figures import Picture, draw_all
 from twin.service.page import HERE, inside, page, significant
@@ -65,7 +66,7 @@ def render(run: Run, pictures: list[Picture]) -> str:
         timings={one.component: one for one in recording.of(Timing)},
         gaps=recording.of(Gap),
         faults=recording.of(Fault),
-        events=[one for one in recording.of(Event) if one.kind != "state"],
+        events=[one for one in recording.of(Event) if one.kind not in ("state", *WATCHED)],
         states=recording.stop.states if recording.stop else (),
         checks=recording.of(Check),
         trips=recording.of(Trip),

@@ -15,6 +15,7 @@ from table_io.records import (
     Check,
     Comparison,
     Decided,
+    Estimate,
     Event,
     Fault,
     Gap,
@@ -26,11 +27,13 @@ from table_io.records import (
 )
 from twin.compare import COMPARED
 from twin.compare.curves import branches
+from twin.compare.watch import KINDS as WATCHED
 from twin.model.model import Model
 from twin.model.parameters import Parameters, resonance
 from twin.stream.recording import Recording
 
 Json = dict[str, Any]
+ESTIMATED = ("value", "sd", "drift", "drift_sd")
 
 
 def summarise(recording: Recording, parameters: Parameters) -> Json:
@@ -89,7 +92,22 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         "twin_hysteresis": [asdict(interval) for interval in twin_intervals],
         "timing": _timing(recording.of(Timing)),
         "comparison": nrmse(recording.of(Comparison), parameters),
+        "estimates": _estimates(recording.of(Estimate)),
+        "warnings": [
+            {"at_s": event.index / start.rate_hz, "kind": event.kind, "text": event.text}
+            for event in recording.of(Event)
+            if event.kind in WATCHED
+        ],
     }
+
+
+def _estimates(told: tuple[Estimate, ...]) -> Json:
+    """The specimen as last identified while the test ran, SI; `drift` since the start."""
+    if not told:
+        return {}
+    last = told[-1]
+    rows = zip(last.names, last.values, last.sd, last.drift, last.drift_sd, strict=True)
+    return {name: dict(zip(ESTIMATED, row, strict=True)) for name, *row in rows}
 
 
 def _points(recording: Recording, parameters: Parameters, profile: Profile) -> tuple[Point, ...]:

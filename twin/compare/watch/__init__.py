@@ -45,7 +45,7 @@ def rested(watch: Watch, block: Block) -> Watch:
 def looked(setup: WatchSetup, watch: Watch, held: Held) -> tuple[Watch, list[Record]]:
     """After a held cycle."""
     told, agreed = agreement(setup, watch.told, watch.noise, held)
-    identified, estimates = identify(setup, watch.identified, watch.noise, held)
+    identified, estimates = identify(setup, watch.identified, watch.noise, held, not told.ever)
     steady, changed = steadied(watch.steady, held)
     doubts, sensors = doubted(setup, watch.doubts, watch.noise, held)
     after = replace(watch, told=told, identified=identified, steady=steady, doubts=doubts)

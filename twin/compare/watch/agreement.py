@@ -30,6 +30,7 @@ class Told:
     """Cycles in a row with a channel beyond its band, or `SAID` until all agree again."""
 
     cycles: int = 0
+    ever: bool = False  # said at all
 
 
 def agreement(setup: WatchSetup, told: Told, noise: Noise, held: Held) -> tuple[Told, list[Record]]:
@@ -55,11 +56,14 @@ def agreement(setup: WatchSetup, told: Told, noise: Noise, held: Held) -> tuple[
         for e, b in zip(record.error, record.band, strict=True)
     ]
     if told.cycles == SAID:
-        return Told(SAID if max(shares) > AGREES else 0), [record]
+        return Told(SAID if max(shares) > AGREES else 0, True), [record]
     cycles = told.cycles + 1 if max(shares) > 1 else 0
     if cycles < CYCLES:
-        return Told(cycles), [record]
-    return Told(SAID), [record, Event(held.end, "disagreement", _sentence(held, record, shares))]
+        return Told(cycles, told.ever), [record]
+    return Told(SAID, True), [
+        record,
+        Event(held.end, "disagreement", _sentence(held, record, shares)),
+    ]
 
 
 def _sentence(held: Held, record: Agreement, shares: list[float]) -> str:

@@ -19,11 +19,13 @@ from twin.compare.watch.held import Held, Noise, WatchSetup
 
 FULL_S, FEWEST = 1.0, 3  # of held cycles of one step that make a chunk, and cycles at least
 RECENT_S = 30.0  # of the test, whose chunks make the present value
-LEAST = 6  # chunks before a drift is told
+LEAST = 8  # chunks before a drift is told
 OFF = 0.01  # of a contact force: what the gain of load cells may be off all the time
 SURE = 4.0  # standard deviations of a drift
-NOTICED = 0.004  # of a stiffness; for a gap, of the deepest deformation: less concerns nobody
-BENDS = 0.1  # of a stiffness per e-fold of the amplitude: what a law may bend
+NOTICED = 0.003  # of a stiffness; for a gap, of the deepest deformation: less concerns nobody
+# Of a stiffness per e-fold of the amplitude: what a law may bend beyond the model's, while the twin
+# has stayed within its band, and once it has left it.
+BENDS, BENDS_MORE = 0.003, 0.1
 TINY, STILL_M = 1e-300, 1e-9
 MOST = 256  # chunks of a law that are kept apart; then neighbours are put together
 NAMES = (
@@ -64,9 +66,12 @@ class Identified:
 
 
 def identify(
-    setup: WatchSetup, known: Identified, noise: Noise, held: Held
+    setup: WatchSetup, known: Identified, noise: Noise, held: Held, trusted: bool
 ) -> tuple[Identified, list[Record]]:
-    """With one more cycle; the Estimate where a chunk is full."""
+    """With one more cycle; the Estimate where a chunk is full.
+
+    `trusted`: the twin has stayed within its band so far, so its laws hold.
+    """
     new = equations(setup, noise, held)
     chunks = tuple(
         mine if one is None else _grown(mine, held, setup.rate_hz, *one)
@@ -74,7 +79,9 @@ def identify(
     )
     known = replace(known, chunks=chunks, deepest=max(known.deepest, _depth(setup, held)))
     grown = [mine for mine, one in zip(chunks, new, strict=True) if one is not None]
-    return _told(setup, known, held) if any(mine[-1].full for mine in grown) else (known, [])
+    if not any(mine[-1].full for mine in grown):
+        return known, []
+    return _told(setup, known, held, BENDS if trusted else BENDS_MORE)
 
 
 def _grown(
@@ -126,14 +133,16 @@ def _depth(setup: WatchSetup, held: Held) -> float:
     return max(0.0, *(r - g for r, g in zip(reach, setup.gaps_m, strict=True)))
 
 
-def _told(setup: WatchSetup, known: Identified, held: Held) -> tuple[Identified, list[Record]]:
+def _told(
+    setup: WatchSetup, known: Identified, held: Held, bends: float
+) -> tuple[Identified, list[Record]]:
     """The Estimate, and an Event for what has begun to drift."""
     p = setup.model.parameters
     bumper = max(p.bumper_stiffness_r, p.bumper_stiffness_l)
     names: list[str] = []
     columns: list[tuple[float, float, float, float]] = []
     for law, (two, mine) in enumerate(zip(NAMES, known.chunks, strict=True)):
-        found = _values(mine, law, BENDS * (p.stiffness if law == 0 else bumper * known.deepest))
+        found = _values(mine, law, bends * (p.stiffness if law == 0 else bumper * known.deepest))
         names += two if found else ()
         columns += found
     if not names:
@@ -199,7 +208,7 @@ def _solved(chunks: list[Chunk], trend: int | None, bends: float) -> tuple[Float
     """(numbers, covariance) by least squares over the chunks.
 
     With a trend of one of them, two more follow: per e-fold of the amplitude, and per s. The
-    covariance is the larger of noise's and the chunks' own scatter; None where they say nothing.
+    covariance is noise's, larger where the chunks scatter more; None where they say nothing.
     """
     each = np.array([one.matrix for one in chunks])
     wanted = np.array([one.right for one in chunks])
@@ -225,4 +234,5 @@ def _solved(chunks: list[Chunk], trend: int | None, bends: float) -> tuple[Float
     left = (into.mT @ (wanted - (each @ into) @ x)[:, :, None])[:, :, 0]
     spare = len(chunks) / max(len(chunks) - x.size, 1)
     scatter = spare * inverse @ (left.T @ left) @ inverse
-    return x, scatter if np.trace(scatter * matrix) > np.trace(inverse * matrix) else inverse
+    more = np.sqrt(np.maximum(np.diag(scatter) / np.diag(inverse), 1.0))
+    return x, inverse * np.outer(more, more)

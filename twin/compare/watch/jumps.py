@@ -1,12 +1,12 @@
 """Where the model jumps on the way of the sweep, and whether the specimen does.
 
-The model alone is driven through the same steps; where its two directions part (`curves`) lie its
-jumps, each between two neighbouring steps. Measured, a jump has come where eta_d changes in the
+The model alone is driven slowly up and down; where its two directions part (`curves`) lie its
+jumps. Measured, a jump has come where eta_d changes in the
 same sense by at least half of the model's change (as logarithms).
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -15,15 +15,14 @@ import numpy as np
 from table_io.block import Float1D
 from table_io.profile import Profile
 from table_io.records import Ahead, Event, Point, Quantities, Record, Step
-from twin.compare.curves import branches, sudden
+from twin.compare.curves import Jump, branches, sudden
 from twin.model.ideal import swept
 from twin.model.model import Model
-from twin.model.sweep import SteppedSine, stepped_sine
 
+LEAST = 0.15  # of log eta_d: smaller changes of the model are no jumps that a person would see
 PART = 0.5  # of the model's change: so much of it, and it is the same jump
-FINE, HOLD = 20, 30  # frequencies between two steps, and cycles at each, where it is driven slowly
+FINE_HZ, HOLD, LAST = 0.02, 20, 5  # of the slow drive: step, cycles at each, cycles that count
 NEAR = 3  # steps about a jump in which the model's own course is no guide
-EARLIER, LATER = 3, 1  # steps from before the jump to behind it that are driven so
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,68 +59,57 @@ class Passing:
 
 
 def foreseen(profile: Profile, model: Model, steps: tuple[Step, ...]) -> Foreseen:
-    """What the model does on the ideal sweep."""
-    frequencies = np.array([step.frequency_hz for step in steps])
+    """What the model does up and down the sweep's range, driven slowly.
+
+    In steps of at most `FINE_HZ`; in those of the test where effects make every cycle dear.
+    """
+    grid = np.array(profile.sweep.frequencies_hz)
+    closed = all(one.effect.acts in ("parameters", "sensor") for one in model.present)
+    parts = max(1, math.ceil(profile.sweep.step_hz / FINE_HZ)) if closed else 1
+    up = np.interp(np.arange((grid.size - 1) * parts + 1) / parts, np.arange(grid.size), grid)
+    way = np.concatenate([up, up[::-1]])
     level = max(step.acceleration_m_s2 for step in steps)
-    motion = swept(model, frequencies, level, profile.sweep.cycles)
-    used = slice(-profile.sweep.measured_cycles, None)
-    reach = 0.5 * (motion.column("u_max") - motion.column("u_min"))[:, used]
-    points = [_point(step, one) for step, one in zip(steps, reach, strict=True)]
+    motion = swept(model, way, level, HOLD if closed else profile.sweep.cycles)
+    reach = 0.5 * (motion.column("u_max") - motion.column("u_min"))[:, -LAST:]
+    ways = ["forward"] * up.size + ["backward"] * up.size
+    points = [_point(*one) for one in zip(ways, way.tolist(), reach, strict=True)]
     found = [
-        (after, _expected(model, motion, steps, before, after, level))
-        for jump in branches(points, "measured")[0]
-        for before, after in pairwise(range(len(steps)))
-        if (steps[before].direction, steps[after].direction) == (jump.direction, jump.direction)
-        and (steps[before].frequency_hz, steps[after].frequency_hz) == (jump.from_hz, jump.to_hz)
-    ]
-    jumps = tuple(one for _, one in sorted(found, key=lambda one: one[0]))
-    logs = np.log(reach.mean(axis=1)).tolist()
-    return Foreseen(jumps, {step.index: one for step, one in zip(steps, logs, strict=True)})
+        one for jump in branches(points, "measured")[0]
+        if (one := _between_steps(jump, points, steps)) is not None
+    ]  # fmt: skip
+    sizes = {(one.direction, one.frequency_hz): one.measured for one in points}
+    known = {step.index: sizes.get((step.direction, step.frequency_hz)) for step in steps}
+    return Foreseen(
+        tuple(sorted(found, key=lambda one: one.after.index)),
+        {index: math.log(own.eta_d) for index, own in known.items() if own is not None},
+    )
 
 
-def _point(step: Step, reach: Float1D) -> Point:
-    """A point of the model: half of its u from peak to peak over the measured cycles, as eta_d."""
+def _point(direction: str, frequency_hz: float, reach: Float1D) -> Point:
+    """A point of the model: half of its u from peak to peak over the last cycles, as eta_d."""
     nothing, mean = float("nan"), float(reach.mean())
     own = Quantities(
         mean, nothing, nothing, nothing, nothing, nothing, (), (), nothing,
         float(np.ptp(reach)) / mean,
     )  # fmt: skip
-    return Point(
-        0, step.index, step.direction, step.frequency_hz, own, None, nothing, nothing, nothing
-    )
+    return Point(0, 0, direction, frequency_hz, own, None, nothing, nothing, nothing)
 
 
-def _expected(
-    model: Model,
-    motion: SteppedSine,
-    steps: tuple[Step, ...],
-    before: int,
-    after: int,
-    level: float,
-) -> Expected:
-    """The jump near two neighbouring steps, as the model leaves its branch when driven slowly.
-
-    Where it cannot be carried on from a state: in the middle between them.
-    """
-    one, other = steps[before].frequency_hz, steps[after].frequency_hz
-    reach = motion.column("u_max")[:, -1] - motion.column("u_min")[:, -1]
-    change = float(np.log(reach[after] / reach[before]))
-    if not all(one.effect.acts in ("parameters", "sensor") for one in model.present):
-        return Expected(steps[before], steps[after], change, 0.5 * (one + other))
-    same = [i for i, step in enumerate(steps) if step.direction == steps[after].direction]
-    first = max(before - EARLIER, same[0])
-    last = min(after + LATER, same[-1])
-    way = np.linspace(
-        steps[first].frequency_hz, steps[last].frequency_hz, FINE * (last - first) + 1
-    )
-    slow = stepped_sine(model.parameters, way, level, HOLD, state=motion.states[first])
-    size = np.log((slow.column("u_max") - slow.column("u_min"))[:, -1])
-    place = int(np.argmax(np.diff(size) * np.sign(change)))
-    at_hz = float(0.5 * (way[place] + way[place + 1]))
-    passed = [i for i in range(first, last) if (steps[i].frequency_hz - at_hz) * (other - one) < 0]
-    before = passed[-1] if passed else first
-    change = float(size[place + 1] - size[place])
-    return Expected(steps[before], steps[before + 1], change, at_hz)
+def _between_steps(jump: Jump, points: Sequence[Point], steps: tuple[Step, ...]) -> Expected | None:
+    """The jump between the two steps of the test where it lies; None where there are none."""
+    at_hz = 0.5 * (jump.from_hz + jump.to_hz)
+    sense = 1.0 if jump.to_hz > jump.from_hz else -1.0
+    for before, after in pairwise(steps):
+        here = before.direction == after.direction == jump.direction
+        if here and sense * before.frequency_hz < sense * at_hz <= sense * after.frequency_hz:
+            ends = {
+                one.frequency_hz: one.measured.eta_d
+                for one in points
+                if one.direction == jump.direction and one.measured is not None
+            }
+            change = math.log(ends[jump.to_hz] / ends[jump.from_hz])
+            return Expected(before, after, change, at_hz) if abs(change) > LEAST else None
+    return None
 
 
 def begin(known: Foreseen) -> Passing:
