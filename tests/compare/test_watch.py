@@ -21,7 +21,7 @@ from table_io.session import play
 from twin.compare import COMPARED, pipeline
 from twin.compare.watch import KINDS
 from twin.compare.watch.held import Held, Noise, against, functions
-from twin.compare.watch.jumps import Expected, Passing, foreseen, passed
+from twin.compare.watch.jumps import FINE_HZ, Expected, Passing, foreseen, passed
 from twin.compare.watch.steady import Steady, steadied
 from twin.model.branch import follow, settled
 from twin.service.bundle import Bundle, from_texts
@@ -192,7 +192,7 @@ def test_the_jumps_of_the_model_lie_at_the_folds_of_its_branches() -> None:
         assert start is not None
         fold = follow(bundle.parameters, level, start, to_hz, 0.05).end_hz
         assert fold is not None
-        assert abs(jump.at_hz - fold) < 0.02
+        assert abs(jump.at_hz - fold) < 1.5 * FINE_HZ
         ends = sorted((jump.before.frequency_hz, jump.after.frequency_hz))
         assert ends[0] <= fold <= ends[1]
 
