@@ -12,10 +12,12 @@ ROOT = Path(__file__).resolve().parents[2]
 SOURCES = ("table_io", "twin", "pyproject.toml", "README.md")
 OWNERS = {
     "zenoh": {"twin/stream/zenoh_link.py"},
+    "cryptography": {"twin/service/authority.py"},
     "mcap": {"twin/stream/mcap_log.py"},
     "zstandard": {"twin/stream/framing.py"},
     "lz4": {"twin/stream/framing.py"},
-    "rerun": {"twin/stream/rerun_view.py"},
+    # a package of its own: what is sent, how it is laid out, the viewer's window
+    "rerun": {f"twin/stream/rerun/{name}.py" for name in ("sink", "blueprint", "window")},
     "google": {"twin/stream/wire.py", "twin/stream/shaketwin_pb2.py"},
     "time": {"table_io/clock.py"},
     "h5py": {"twin/stream/tables/hdf5.py"},

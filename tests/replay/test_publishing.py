@@ -12,7 +12,7 @@ from table_io.card import BadInput
 from table_io.records import RunStart, RunStop
 from twin.service import publishing
 from twin.service.replay import Asked, replay_command
-from twin.stream import resend
+from twin.stream import shelf
 from twin.stream.salvage import salvage
 from twin.stream.wire import TOPIC_TYPES, decode
 from twin.stream.zenoh_link import open_hub, open_spoke
@@ -100,7 +100,7 @@ def test_who_is_slow_is_waited_for(
 ) -> None:
     """A publisher that holds little loses nothing for one who does not listen for a second;
     one that does not wait would."""
-    monkeypatch.setattr(resend, "HELD_PIECES", 100)
+    monkeypatch.setattr(shelf, "HELD_PIECES", 100)
     monkeypatch.setattr(publishing, "AHEAD", 80 if waits else 10**9)
     listener = published(log_file, endpoint, tmp_path / "out", 1.0)
     if not waits:

@@ -281,7 +281,7 @@ def test_half_a_view_is_taken_away(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("twin.stream.rerun_view.RerunView.feed", full)
+    monkeypatch.setattr("twin.stream.rerun.view.RerunView.feed", full)
     with pytest.raises(OSError, match="No space"):
         give_out(tmp_path, ["rrd"], None, (), None)
     assert not (tmp_path / "run.rrd").exists()

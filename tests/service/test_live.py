@@ -303,4 +303,4 @@ def test_the_bus_never_listens_to_the_network(tmp_path: Path) -> None:
     process = start(tmp_path, "--listen", "tcp/0.0.0.0:7447")
     said, _ = process.communicate(timeout=60)
     assert process.returncode == 2
-    assert "would listen to the network" in said
+    assert "would go over the network" in said

@@ -32,7 +32,7 @@ from table_io.records import RunStop, Timing
 from twin.service.bundle import Bundle, read_bundle
 from twin.service.recorder import recorder
 from twin.service.spec import Spec, orphaned
-from twin.stream import resend
+from twin.stream import shelf
 from twin.stream.mcap_log import each
 from twin.stream.merging import merge, verified
 from twin.stream.salvage import salvage
@@ -136,7 +136,7 @@ def publish(turns: list[list[tuple[str, bytes]]], endpoint: str, rig: str, times
     """The rig: a block each 10 ms, then whatever is still asked for."""
     from twin.stream.zenoh_link import open_hub
 
-    resend.HELD_PIECES = HELD
+    shelf.HELD_PIECES = HELD
     link = open_hub(rig, endpoint)
     link.declare(tuple({name for turn in turns for name, _ in turn}))
     begin = time.monotonic() + 2.0
@@ -192,7 +192,7 @@ def one_run(number: int, chains: int, bundle: Bundle, folder: Path) -> dict[str,
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     texts = (bundle.profile_toml, bundle.rig_toml, bundle.model_toml)
-    spec = Spec(f"kill-{number}", bundle.name, str(folder), endpoint, *texts)
+    spec = Spec(f"kill-{number}", bundle.name, str(folder), "", *texts, endpoint=endpoint)
     Spec.bundle = lambda _: bundle  # type: ignore[method-assign]
     turns = run_items(bundle, spec.run)
     pipe = os.pipe()

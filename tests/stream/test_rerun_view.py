@@ -1,139 +1,29 @@
 """The view shows the samples that were sent, at their times, however they were cut."""
 
-from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from rerun.chunk import RrdReader
 
-from table_io.block import Block, Label
-from table_io.card import PROFILES, BadInput
-from table_io.channels import BY_NAME
-from table_io.records import (
-    Comparison,
-    Cycle,
-    Event,
-    Extremes,
-    Fault,
-    Gap,
-    Params,
-    Point,
-    Quantities,
-    Record,
-    RunStart,
-    RunStop,
-    Step,
-    Timing,
+from table_io.block import Block
+from table_io.card import BadInput
+from table_io.records import Point
+from twin.stream.rerun.plots import Curves
+from twin.stream.rerun.view import RerunView, write_rrd
+
+from .shown import (
+    RATE,
+    SAMPLES,
+    STEPS,
+    blocks,
+    content,
+    recording,
+    records,
+    samples,
+    scalars,
+    start,
 )
-from twin.compare import PREDICTED
-from twin.stream import rerun_view
-from twin.stream.recording import Recording
-from twin.stream.rerun_layout import Axes, Reach, Scene, Trail, motion, pieces
-from twin.stream.rerun_view import RerunView, open_viewer, screenshot, write_rrd
-
-RATE = 2000.0
-SAMPLES = 12000
-STEPS = (
-    Step(0, "forward", 2.0, 0.49),
-    Step(1, "forward", 2.5, 0.49),
-    Step(2, "backward", 2.0, 0.49),
-)
-MEASURED = tuple(BY_NAME)[:9]
-
-
-def start(gap_mm: str = "4.0") -> RunStart:
-    profile = (
-        (PROFILES / "tests/g4_ss3.toml").read_text().replace("gap_mm = 4.0", f"gap_mm = {gap_mm}")
-    )
-    return RunStart(
-        index=0, run="r1", name="synthetic", source="table", profile_toml=profile, rig_toml="",
-        model_toml="", rate_hz=RATE, block_samples=20, channels=MEASURED, steps=STEPS,
-        planned_samples=SAMPLES, tare={}, versions={}, host="here", started_at="", epoch_s=0.0,
-    )  # fmt: skip
-
-
-def samples() -> tuple[Any, Any]:
-    """(measured, predicted) values (channel, sample): sines, and a force beyond the gap."""
-    t = np.arange(SAMPLES) / RATE
-    table, u = 2e-3 * np.sin(4 * np.pi * t), 4e-3 * np.sin(4 * np.pi * t + 1)
-    right, left = 5e5 * np.clip(u - 2e-3, 0, None), 5e5 * np.clip(-u - 2e-3, 0, None)
-    acc, v = -2.0 * np.sin(4 * np.pi * t + 1), np.gradient(u) * RATE
-    cells = [right / 2, right / 2, left / 2, left / 2]
-    measured = np.stack([table, table, 0.49 * np.sin(4 * np.pi * t), table + u, acc, *cells])
-    track = np.stack([u, v, table + u, acc, *cells])
-    return measured, np.concatenate([1.1 * track, track])
-
-
-def blocks(size: int = 20, skip: Sequence[int] = ()) -> list[Block]:
-    """Both streams, block by block; `skip` are the numbers of lost measured blocks."""
-    measured, predicted = samples()
-    step = np.minimum(np.arange(SAMPLES) * len(STEPS) // SAMPLES, len(STEPS) - 1)
-    label = np.full(SAMPLES, Label.MEASURE, dtype=np.int64)
-    found = []
-    for number, first in enumerate(range(0, SAMPLES, size)):
-        part = slice(first, first + size)
-        labels = (step[part].copy(), label[part].copy(), np.zeros_like(step[part]))
-        for name, names, values in (("meas", MEASURED, measured), ("pred", PREDICTED, predicted)):
-            if name == "pred" or number not in skip:
-                found.append(Block(name, first, RATE, names, values[:, part].copy(), *labels))
-    return found
-
-
-def records() -> list[Record]:
-    nan = float("nan")
-    extremes = Extremes(4e-3, -4e-3, 2.0, -2.0, 1000.0, 1000.0, (100,), (600, 700))
-    found: list[Record] = [
-        Event(10, "step", "2 Hz"),
-        Gap(400, 20, "", "late"),
-        Params(5, {}, "start"),
-    ]
-    for step in STEPS:
-        end = (step.index + 1) * SAMPLES // len(STEPS)
-        eta = 0.2 + 0.1 * step.index
-        quantities = Quantities(eta, eta, eta, eta, eta, nan, (1, 1), (), 0.0, 0.0)
-        twin = None if step.index == 1 else quantities
-        point = (step.index, step.direction, step.frequency_hz, quantities, twin, 0.49, 0.49, 0.01)
-        found += [Point(end, *point), Cycle(end, step.index, 0, 3, 1000, extremes, None)]
-    found += [
-        Comparison(k, 20, ("rel_disp_m",), (4.0,), (1.0,), (0.04,)) for k in range(0, SAMPLES, 20)
-    ]
-    found += [
-        Fault(900, "twin", 900, 1000, "killed"),
-        Timing(0, "a b/c", 1, 2, 3, 0, 9, 0.1, "other"),
-    ]
-    return [*found, RunStop(SAMPLES, "complete", "played")]
-
-
-def recording(items: Sequence[Block | Record], begin: RunStart | None = None) -> Recording:
-    begin = begin or start()
-    ordered = sorted(items, key=lambda item: item.index)
-    return Recording(Path("run.mcap"), "r1", begin, (begin, *ordered), True)
-
-
-def content(path: Path) -> dict[str, dict[str, tuple[Any, Any]]]:
-    """{entity: {component: (times in ns, rows as lists)}} of what changes over time."""
-    found: dict[str, dict[str, list[tuple[int, Any]]]] = {}
-    for chunk in RrdReader(path).stream():
-        if chunk.is_static:
-            continue
-        batch = chunk.to_record_batch()
-        times = batch.column("time").cast("int64").to_pylist()
-        for name in batch.schema.names:
-            if ":" in name:
-                rows = found.setdefault(chunk.entity_path, {}).setdefault(name, [])
-                rows.extend(zip(times, batch.column(name).to_pylist(), strict=True))
-    return {
-        entity: {name: tuple(zip(*rows, strict=True)) for name, rows in columns.items()}
-        for entity, columns in found.items()
-    }
-
-
-def scalars(path: Path, entity: str) -> tuple[Any, Any]:
-    """(times in s (row,), values (row, series)) of an entity."""
-    times, rows = content(path)[entity]["Scalars:scalars"]
-    return np.array(times) / 1e9, np.array(rows, dtype=np.float64)
 
 
 @pytest.fixture(scope="module")
@@ -166,10 +56,10 @@ def test_values_and_times_are_those_of_the_blocks(whole: Path) -> None:
 def test_every_record_is_shown(whole: Path) -> None:
     found = content(whole)
     texts = [row[0] for row in found["/events"]["TextLog:text"][1]]
-    assert len(texts) == 5
+    assert len(texts) == 7  # the warning once, though it was said twice
     assert any("20 samples of all channels late" in text for text in texts)
     assert any("0.450 s to 0.500 s: killed" in text for text in texts)
-    assert "complete: played" in texts
+    assert "    6.0 s  complete: played" in texts
     assert scalars(whole, "/latency/a\\ b\\/c")[1].tolist() == [[1.0, 2.0, 3.0]]
     counts = scalars(whole, "/impacts")[1]
     assert counts[:, :2].tolist() == [[1, 2]] * 3
@@ -178,6 +68,73 @@ def test_every_record_is_shown(whole: Path) -> None:
     assert len(found["/status"]["TextDocument:text"][1]) == len(STEPS)
     assert "-4.00 … 4.00 | - |" in found["/cycle"]["TextDocument:text"][1][0][0]
     assert "η_d" in found["/point"]["TextDocument:text"][1][0][0]
+
+
+def test_disagreement_estimates_and_the_jump_ahead(whole: Path) -> None:
+    found = content(whole)
+    assert scalars(whole, "/disagreement/F\\ right")[1].tolist() == [[1.5], [2.0]]  # worse cell
+    assert np.isnan(scalars(whole, "/disagreement/a")[1]).all()
+    assert "/disagreement/u" not in found  # no band, nothing to say
+    assert scalars(whole, "/disagreement/band")[1].tolist() == [[1.0], [1.0]]
+    assert scalars(whole, "/disagreement/warnings")[0].tolist() == [0.2, 0.45, 3.0]
+    assert (
+        "| force_r1_n | 2 | 1 | 2.00 | contact left |"
+        in (found["/agreement"]["TextDocument:text"][1][1][0])
+    )
+    assert scalars(whole, "/drift/stiffness")[1] == pytest.approx(np.array([[1.0, 1.4, 0.6]]))
+    assert scalars(whole, "/drift/damping")[1] == pytest.approx(np.array([[0.0, 2.0, -2.0]]))
+    assert scalars(whole, "/gaps/gap_r")[1] == pytest.approx(np.array([[0.02, 0.04, 0.0]]))
+    marks = found["/prc/ahead"]["LineStrips2D:strips"][1]
+    assert [len(row) for row in marks] == [2, 0]  # the end at 9 Hz is off the axes
+    axes = Curves(0.5, 5.0).axes
+    places = [axes.origin[0] + axes.scale[0] * hz for hz in (2.3, 2.4)]
+    assert [strip[0][0] for strip in marks[0]] == pytest.approx(places, rel=1e-5)
+    told = found["/ahead"]["TextDocument:text"][1]
+    assert "down at 2.4 Hz" in told[1][0]
+    assert "0.4 Hz ahead" in told[1][0]
+    assert told[2][0].startswith("none on the way forward")
+    assert "u left its band" in found["/warning"]["TextDocument:text"][1][-1][0]
+
+
+def test_what_a_bus_says_twice_is_drawn_once(tmp_path: Path) -> None:
+    items = recording([*blocks(), *records()]).items
+    again = [one for one in items if isinstance(one, Point)]
+    for name, fed in (("once", items), ("twice", [*items[:300], *items, *again])):
+        view = RerunView(start(), save=tmp_path / f"{name}.rrd")
+        for first in range(0, len(fed), 100):
+            view.feed(fed[first : first + 100])
+        view.close()
+    for entity in ("/u/measured", "/a/twin", "/error", "/u/scale"):
+        for one, two in zip(
+            scalars(tmp_path / "once.rrd", entity),
+            scalars(tmp_path / "twice.rrd", entity),
+            strict=True,
+        ):
+            assert np.array_equal(one, two, equal_nan=True), entity
+    curves = content(tmp_path / "twice.rrd")["/prc/data/measured"]["LineStrips2D:strips"][1]
+    assert [len(strip) for strip in curves[-1]] == [2, 1]
+
+
+def test_component_test_shows_the_force_on_the_motion(tmp_path: Path) -> None:
+    labels = tuple(np.zeros(400, dtype=np.int64) for _ in range(3))
+    t = np.arange(400) / RATE
+    u, acc = 1e-3 * np.sin(20 * t), np.cos(20 * t)
+    names = ("rel_disp_m", "table_disp_m", "damper_force_n")
+    begin = replace(start("inf"), channels=(*names, "oil_c"))
+    view = RerunView(begin, save=tmp_path / "v.rrd")
+    view.feed([Block("meas", 0, RATE, names, np.stack([u, 0 * u, 40 * t]), *labels)])
+    cells = (f"{track}/force_{side}1_n" for track in ("free", "window") for side in "rl")
+    channels = ("free/mass_acc_m_s2", "window/mass_acc_m_s2", "window/rel_disp_m", *cells)
+    zero = 0 * u
+    twin = np.stack([2 * acc, acc, u, zero, zero, zero, zero])
+    view.feed([Block("pred", 0, RATE, channels, twin, *labels)])
+    view.close()
+    assert scalars(tmp_path / "v.rrd", "/damper/measured")[1][:, 0] == pytest.approx(0.04 * t)
+    forces = scalars(tmp_path / "v.rrd", "/damper/twin")[1]
+    assert forces == pytest.approx(np.stack([-0.55 * 2 * acc, -0.55 * acc], axis=1))
+    strip = content(tmp_path / "v.rrd")["/loop/data/measured"]["LineStrips2D:strips"][1][0][0]
+    assert np.allclose(strip, np.stack([1e3 * u, 0.04 * t], axis=1)[0:101:5], atol=1e-6)
+    assert len(content(tmp_path / "v.rrd")["/rig/bodies"]["Boxes3D:centers"][1][0]) == 2
 
 
 def test_prc_grows_point_by_point(whole: Path) -> None:
@@ -254,101 +211,3 @@ def test_nothing_is_overwritten_and_nothing_leaves_this_machine(tmp_path: Path) 
         with pytest.raises(BadInput, match="this machine only"):
             RerunView(start(), save=tmp_path / "new.rrd", serve=address)
     assert not (tmp_path / "new.rrd").exists()
-
-
-def free_port() -> int:
-    with rerun_view.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def test_file_and_server_at_once(tmp_path: Path) -> None:
-    port = free_port()
-    view = RerunView(start(), save=tmp_path / "v.rrd", serve=f"127.0.0.1:{port}")
-    with pytest.raises(BadInput, match="taken"):
-        RerunView(start(), serve=f"127.0.0.1:{port}")
-    view.feed(blocks()[:20])
-    view.close()
-    assert scalars(tmp_path / "v.rrd", "/u/measured")[0].size == 200
-
-
-def test_without_a_display_it_says_what_to_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(rerun_view.sys, "platform", "linux")
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    assert "--bind 127.0.0.1" in open_viewer("rerun+http://127.0.0.1:9876/proxy")
-    with pytest.raises(BadInput, match="no such file"):
-        open_viewer(tmp_path / "none.rrd")
-    monkeypatch.setattr(rerun_view, "find_spec", lambda _: None)
-    with pytest.raises(BadInput, match="pip install rerun-sdk"):
-        open_viewer("rerun+http://127.0.0.1:9876/proxy")
-
-
-def test_the_picture(whole: Path, tmp_path: Path) -> None:
-    image = pytest.importorskip("PIL.Image")
-    try:
-        complaints = screenshot(whole, tmp_path / "view.png", 4.0)
-    except BadInput as error:
-        pytest.skip(str(error))
-    assert complaints == []
-    picture = np.asarray(image.open(tmp_path / "view.png").convert("RGB")).astype(int)
-    height, width = picture.shape[:2]
-    red = (picture[..., 0] > 200) & (picture[..., 1] < 140) & (picture[..., 2] < 140)
-    for rows in np.array_split(np.arange(int(0.8 * height)), 3):
-        assert red[rows][:, width // 2 :].sum() > 100  # u, acceleration, force
-    assert red[height // 3 :, : width // 3].sum() > 100  # PRC and phase plane
-    assert np.unique(picture[: height // 3, : width // 3].reshape(-1, 3), axis=0).shape[0] > 50
-
-
-def test_trail_is_the_same_for_any_cut_and_knows_the_slope() -> None:
-    trails = []
-    for size in (20, 7, 500):
-        trail = Trail(100, 5, 10)
-        whole = [one for one in blocks(size) if one.stream == "meas"]
-        trails.append([strip for one in whole for strip in trail.add(motion(one), RATE)])
-    assert len(trails[0]) == SAMPLES // 100 - 2
-    for other in trails[1:]:
-        for (end, strip), (same_end, same) in zip(trails[0], other, strict=True):
-            assert end == same_end
-            assert np.array_equal(strip, same)
-    index = np.arange(100, 201, 5)
-    v = 16e-3 * np.pi * np.cos(4 * np.pi * index / RATE + 1)
-    assert trails[0][0][1][:, 1] == pytest.approx(1e3 * v, rel=1e-3, abs=0.1)
-    assert np.array_equal(trails[0][0][1][-1], trails[0][1][1][0])
-
-
-def test_scene_keeps_contact_true_in_the_picture() -> None:
-    scene = Scene((2e-3, 1e-3), 10.0, 5.0, 20.0)
-    values = np.array([[0, 0, 0], [-3e-3, 0, 5e-3], [0, 0, 100.0], [50.0, 0, 0]])
-    labels = tuple(np.zeros(3, dtype=np.int64) for _ in range(3))
-    names = ("table_disp_m", "mass_disp_m", "force_r1_n", "force_l1_n")
-    boxes = scene.bodies(motion(Block("meas", 0, RATE, names, values, *labels)))
-    mass, right, left = (boxes.centres[:, box, 0] for box in (1, 2, 3))
-    half = boxes.halves[:, :, 0]
-    room_right = right - half[:, 2] - (mass + half[:, 1])
-    room_left = mass - half[:, 1] - (left + half[:, 3])
-    assert room_right == pytest.approx([20 * 5e-3, 20 * 2e-3, 0])
-    assert room_left == pytest.approx([0, 20 * 1e-3, 20 * 6e-3])
-
-
-def test_axes_and_reach() -> None:
-    axes = Axes((-2.0, 2.0), (0.0, 0.4), "x", "y")
-    assert axes.ticks(0.0, 0.4) == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
-    (places, texts), (sx, sy), (ox, oy) = axes.labels(), axes.scale, axes.origin
-    assert texts[:5] == ["-2", "-1", "0", "1", "2"]
-    assert (ox + sx * -2.0, oy + sy * 0.4) == pytest.approx((0.0, 0.0))
-    assert (ox + sx * 2.0, oy) == pytest.approx((axes.WIDTH, axes.HEIGHT))
-    assert len(places) == len(texts)
-    assert len(axes.uprights([0.0, 3.0, float("inf")])) == 1
-    reach = Reach(1.0, 3)
-    assert [reach.see(peak) for peak in (0.5, 4.0, 4.0, 0.5, 0.5, 0.5)] == [False, True] + [
-        False
-    ] * 3 + [True]
-    assert reach.value == 1.0
-
-
-def test_pieces_end_where_samples_are_missing() -> None:
-    kept = [one for one in blocks(skip=[3]) if one.stream == "meas"]
-    assert [(one.index, one.end) for one in pieces(kept)] == [(0, 60), (80, SAMPLES)]

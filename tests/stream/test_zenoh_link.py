@@ -16,10 +16,12 @@ from pathlib import Path
 import pytest
 
 from table_io.card import BadInput
-from twin.stream import resend
-from twin.stream.resend import HELD_PIECES, LARGEST_BYTES, PIECE_BYTES, Inbox, Shelf
+from twin.stream import resend, shelf
+from twin.stream.endpoint import key
+from twin.stream.resend import Inbox
+from twin.stream.shelf import HELD_PIECES, LARGEST_BYTES, PIECE_BYTES, Shelf
 from twin.stream.wire import CMP_TOPIC, MEAS_TOPIC, PRED_TOPIC, TOPIC_TYPES
-from twin.stream.zenoh_link import Link, key, open_hub, open_spoke
+from twin.stream.zenoh_link import Link, open_hub, open_spoke
 
 BLOCK = bytes(2500)
 SETTLED_S = 0.05  # in which a subscription has reached the hub
@@ -309,7 +311,7 @@ def test_a_full_inbox_with_history_loses_nothing(hub: Link, spoke: Link) -> None
 def test_what_is_held_no_more_is_counted_as_missed(
     hub: Link, spoke: Link, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(resend, "HELD_PIECES", 20)
+    monkeypatch.setattr(shelf, "HELD_PIECES", 20)
     inbox = spoke.subscribe((MEAS_TOPIC,), history=True, capacity=5)
     hub.declare((MEAS_TOPIC,))
     hub.publish(MEAS_TOPIC, numbered(0))
@@ -444,10 +446,12 @@ print(threading.active_count(), flush=True)
 
 
 def test_a_shelf_holds_the_newest_and_hands_out_what_fits() -> None:
-    shelf = Shelf(None)
+    held = Shelf()
     for number in range(HELD_PIECES + 10):
-        shelf.add(3, bytes([number % 256]) * 1000)
-    assert (shelf.first, shelf.end) == (10, HELD_PIECES + 10)
-    assert [piece[0] for _, piece in shelf.take(20, 3500)] == [20, 21, 22]
-    assert shelf.take(shelf.end, PIECE_BYTES) == []
-    assert shelf.take(20, 0) == []
+        held.add(number, 3, bytes([number % 256]) * 1000)
+    assert (held.first, held.end) == (10, HELD_PIECES + 10)
+    assert [piece[0] for _, piece in held.take(20, 3500)] == [20, 21, 22]
+    assert held.take(held.end, PIECE_BYTES) == []
+    assert held.take(20, 0) == []
+    held.add(held.end + 5, 3, b"after a gap")
+    assert held.first == held.end - 1

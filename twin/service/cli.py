@@ -9,8 +9,11 @@ from typing import Annotated
 
 import typer
 
+from twin.service.cli_attend import attending
 from twin.service.cli_files import Steps, files
+from twin.service.cli_keys import WithKeys, keys_app, read_given
 from twin.service.cli_learning import learning
+from twin.service.cli_monitor import watching
 
 # Matrices are small here; on a busy machine the threads of a BLAS stall what they should speed up,
 # a run's own processes included. Set before numpy is imported, and inherited.
@@ -31,15 +34,8 @@ TestProfile = Annotated[Path, typer.Argument(metavar="PROFILE", help="Test profi
 Log = Annotated[Path, typer.Argument(metavar="LOG", help="A run.mcap, or the folder of a run.")]
 Out = Annotated[Path | None, typer.Option("--out", help="Folder for the results; must be new.")]
 Model = Annotated[str | None, typer.Option("--model", help="Model: a name or a .toml file.")]
-
-
-class Told(enum.StrEnum):
-    """What can be asked of a running test."""
-
-    hold = "hold"
-    resume = "resume"
-    stop = "stop"
-    abort = "abort"
+Listen = Annotated[str, typer.Option("--listen", help="Endpoint at which others find the test.")]
+HERE = "tcp/127.0.0.1:7447"
 
 
 class Speed(enum.StrEnum):
@@ -75,14 +71,21 @@ def run(
     view: Annotated[
         bool, typer.Option("--view", help="Serve a Rerun view and leave view.rrd.")
     ] = False,
-    listen: Annotated[
-        str, typer.Option("--listen", help="Endpoint of the run's bus.")
-    ] = "tcp/127.0.0.1:7447",
+    listen: Listen = HERE,
+    keys: WithKeys = None,
+    router: Annotated[
+        str, typer.Option("--router", help="Endpoint of a zenoh router to be reached through too.")
+    ] = "",
+    remote_twin: Annotated[
+        bool, typer.Option("--remote-twin", help="No twin here: `attend twin` elsewhere is it.")
+    ] = False,
 ) -> None:
     """Drive the table, acquire, run the twin beside it, publish, record, report."""
     from twin.service.driving import run as command
 
-    raise typer.Exit(command(profile, out, speed is Speed.max, model, table, view, listen))
+    unpaced, given = speed is Speed.max, read_given(keys, rig=True)
+    code = command(profile, out, unpaced, model, table, view, listen, given, router, remote_twin)
+    raise typer.Exit(code)
 
 
 @app.command(rich_help_panel=DRIVE)
@@ -100,15 +103,15 @@ def campaign(
     yes: Annotated[
         bool, typer.Option("--yes", help="Unattended: nobody is asked between the runs.")
     ] = False,
-    listen: Annotated[
-        str, typer.Option("--listen", help="Endpoint of the bus of its runs.")
-    ] = "tcp/127.0.0.1:7447",
+    listen: Listen = HERE,
+    keys: WithKeys = None,
 ) -> None:
     """A list of runs with set-up changes between them; one report; resumes where it stopped."""
     from twin.service.campaign.flow import Asked
     from twin.service.campaign.flow import campaign as command
 
-    asked = Asked(file, out, resume, speed is Speed.max, model, table, yes, listen)
+    unpaced, given = speed is Speed.max, read_given(keys, rig=True)
+    asked = Asked(file, out, resume, unpaced, model, table, yes, listen, given)
     raise typer.Exit(command(asked))
 
 
@@ -172,9 +175,8 @@ def replay(
     publish: Annotated[
         bool, typer.Option("--publish", help="On the bus too: whoever listens takes it for live.")
     ] = False,
-    listen: Annotated[
-        str, typer.Option("--listen", help="Endpoint of the bus, with --publish.")
-    ] = "tcp/127.0.0.1:7447",
+    listen: Listen = HERE,
+    keys: WithKeys = None,
     view: Annotated[bool, typer.Option("--view", help="Also write view.rrd.")] = False,
 ) -> None:
     """The same pipeline on recordings; with the recorded model equal to the bit.
@@ -183,7 +185,8 @@ def replay(
     """
     from twin.service.replay import Asked, replay_command
 
-    asked = Asked(logs, model or [], out, speed, view, listen if publish else None, steps)
+    given = read_given(keys, rig=True)
+    asked = Asked(logs, model or [], out, speed, view, listen if publish else None, steps, given)
     raise typer.Exit(replay_command(asked))
 
 
@@ -236,30 +239,19 @@ def view(
         str, typer.Option("--connect", help="Bus of a running test, without LOG.")
     ] = "tcp/127.0.0.1:7447",
     rig: Annotated[str, typer.Option("--rig", help="Name of the running rig.")] = "simulated",
+    keys: WithKeys = None,
 ) -> None:
     """Rerun with the project's layout, on a recording or on a running test."""
     from twin.service.viewing import show as command
 
-    command(log, save, picture, connect, rig)
+    command(log, save, picture, connect, rig, read_given(keys))
 
 
-@app.command(rich_help_panel=DRIVE)
-def tell(
-    order: Annotated[Told, typer.Argument(help="What the running test should do.")],
-    why: Annotated[str, typer.Option("--why", help="Recorded with the order.")] = "",
-    connect: Annotated[
-        str, typer.Option("--connect", help="Bus of the running test.")
-    ] = "tcp/127.0.0.1:7447",
-    rig: Annotated[str, typer.Option("--rig", help="Name of the running rig.")] = "simulated",
-) -> None:
-    """Hold a running test at its step, resume it, stop or abort it; always smoothly."""
-    from twin.service.tell import tell as command
-
-    command(order.value, why, connect, rig)
-
-
+app.add_typer(watching)
+app.add_typer(attending)
 app.add_typer(learning)
 app.add_typer(files)
+app.add_typer(keys_app, name="keys", rich_help_panel=PLAN)
 
 
 def main() -> None:

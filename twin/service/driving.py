@@ -15,8 +15,9 @@ from twin.service.kernels import ready
 from twin.service.outcome import EXIT_ABORTED, EXIT_INTERRUPTED, close
 from twin.service.progress import RunProgress
 from twin.service.terminal import console, interruptible, say
+from twin.stream.keys import Keys, folder_of
+from twin.stream.rerun.address import VIEW_ADDRESS, live_view, next_free
 
-VIEW_ADDRESS = "127.0.0.1:9876"
 SHORTEST_BLOCK_S, LONGEST_BLOCK_S = 0.002, 0.05  # protection looks once a block
 
 
@@ -39,6 +40,9 @@ def run(
     table: str | None,
     view: bool,
     listen: str,
+    keys: Keys | None = None,
+    router: str = "",
+    remote_twin: bool = False,
 ) -> int:
     """A test on the table, live or as fast as it goes; the exit code."""
     bundle = read_bundle(profile, table, model)
@@ -60,7 +64,8 @@ def run(
         if unpaced:
             _run_unpaced(bundle, run_name, folder, asked)
         else:
-            began = _run_live(bundle, run_name, folder, asked, view, listen)
+            outside = (listen, keys, router, remote_twin)
+            began = _run_live(bundle, run_name, folder, asked, view, *outside)
             if not began:
                 return EXIT_INTERRUPTED
     code = close(folder, bundle, view)
@@ -98,6 +103,9 @@ def _run_live(
     asked: Callable[[], str | None],
     view: bool,
     listen: str,
+    keys: Keys | None,
+    router: str,
+    remote_twin: bool,
 ) -> bool:
     """True where the run began; a person may have stopped it before."""
     from twin.service.parts import gather
@@ -112,14 +120,17 @@ def _run_live(
         bundle.profile_toml,
         bundle.rig_toml,
         bundle.model_toml,
-        serve_view=VIEW_ADDRESS if view else "",
+        serve_view=next_free(VIEW_ADDRESS) if view else "",
+        keys=folder_of(keys),
+        router=router,
+        remote_twin=remote_twin,
     )
     with RunProgress(console, len(bundle.steps), bundle.drive.planned_end) as progress:
         supervisor = Supervisor(
             spec, bundle.profile.on_death, RealClock(), progress, asked, progress.say
         )
         if view:
-            progress.say(f"live view: rerun rerun+http://{VIEW_ADDRESS}/proxy")
+            progress.say(live_view(spec.serve_view))
         began = supervisor.run()
     if began:
         gather(folder)

@@ -135,7 +135,7 @@ def _writer(kind: str) -> Callable[[Rows, Any], None]:
 
 def _view(path: Path, place: Path) -> None:
     """Rerun's file, fed batch by batch; a log out of order has to fit into memory."""
-    from twin.stream.rerun_view import BATCH, RerunView, write_rrd
+    from twin.stream.rerun.view import BATCH, RerunView, write_rrd
 
     try:
         fed = batches(path, BATCH)

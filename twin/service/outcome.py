@@ -22,7 +22,7 @@ def close(
     summaries.write(found, folder / "summary.json")
     write_report(folder, recording)
     if view:
-        from twin.stream.rerun_view import write_rrd
+        from twin.stream.rerun.view import write_rrd
 
         write_rrd(recording, folder / "view.rrd")
     what = f"{summaries.sentence(found)} -> {folder / 'report.html'}"

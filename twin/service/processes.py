@@ -5,6 +5,9 @@ of its own so that Ctrl-C reaches only the supervisor; its standard input is a p
 that the supervisor is gone.
 """
 
+import contextlib
+import os
+import platform
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -13,14 +16,16 @@ from pathlib import Path
 from table_io.backends import open_backend
 from table_io.block import Block
 from table_io.card import BadInput
-from table_io.clock import RealClock
+from table_io.clock import Clock, RealClock
 from table_io.records import Decided, Fault, RunStart, RunStop
 from table_io.session import ORDERS, Order, Punctuality, play
 from twin.service.bundle import warm_rig, warm_twin
+from twin.service.gate import NICENESS, gate
 from twin.service.recorder import recorder
 from twin.service.scheduling import urgent
 from twin.service.spec import CAPACITY, CONNECT_S, QUIET_S, Spec, orphaned, token
 from twin.service.stopwatch import Stopwatch
+from twin.stream.endpoint import INSIDE
 from twin.stream.resend import Inbox
 from twin.stream.wire import (
     MEAS_TOPIC,
@@ -30,7 +35,7 @@ from twin.stream.wire import (
     encode,
     topic,
 )
-from twin.stream.zenoh_link import open_hub, open_spoke
+from twin.stream.zenoh_link import Link, open_hub, open_spoke
 
 RIG_PRIORITY, TWIN_PRIORITY = 50, 40  # of real-time scheduling, where it is permitted
 LINGER_S = 10.0  # that the hub stays up after the run, so that late readers can recover
@@ -52,7 +57,7 @@ TWIN_TOPICS = (
 
 
 def rig(spec: Spec, _: str) -> None:
-    """Drives the table and publishes; opens the hub. No other Python threads."""
+    """Drives the table and publishes; opens the hub inside. No other Python threads."""
     bundle = spec.bundle()
     warm_rig(bundle)
     clock = RealClock()
@@ -99,6 +104,8 @@ def rig(spec: Spec, _: str) -> None:
         orders.poll()  # serves those who still ask for what this process holds
         clock.wait_until(clock.now() + 0.005)
     link.close()
+    with contextlib.suppress(OSError):  # the supervisor did, unless it is dead
+        Path(spec.endpoint.removeprefix(INSIDE)).parent.rmdir()
 
 
 def _timed(source: Iterator[Item], watch: Stopwatch, punctual: Punctuality) -> Iterator[Item]:
@@ -115,11 +122,11 @@ def _timed(source: Iterator[Item], watch: Stopwatch, punctual: Punctuality) -> I
                 yield watch.record(item.end)
 
 
-def twin(spec: Spec, missed_from: str) -> None:
+def twin(spec: Spec, missed_from: str, joined: Link | None = None) -> None:
     """Steps the model beside the measured blocks; publishes predictions and comparisons.
 
     `missed_from` is set where this is the successor of a twin that died: the sample from which its
-    comparisons are missing.
+    comparisons are missing. On another machine it has `joined` the run through the gate.
     """
     from twin.compare import pipeline
 
@@ -128,11 +135,12 @@ def twin(spec: Spec, missed_from: str) -> None:
     setup = bundle.twin()
     clock = RealClock()
     scheduler = urgent(TWIN_PRIORITY)
-    link = open_spoke(bundle.rig.name, spec.endpoint, CONNECT_S)
+    link = joined or open_spoke(bundle.rig.name, spec.endpoint, CONNECT_S)
     link.declare(TWIN_TOPICS)
     control = link.subscribe(CONTROL, history=True, capacity=CAPACITY)
     blocks = link.subscribe((MEAS_TOPIC,), history=not missed_from, capacity=CAPACITY)
-    link.alive(token(spec, "twin"))
+    if joined is None:
+        link.alive(token(spec, "twin"))
 
     def say(items: list[Item]) -> None:
         for item in items:
@@ -144,7 +152,7 @@ def twin(spec: Spec, missed_from: str) -> None:
     epoch_s, end, heard = None, None, clock.now()
     while end is None or state is None or state.tracks.index < end:
         for record in _told(control, spec.run):
-            epoch_s = record.epoch_s if isinstance(record, RunStart) else epoch_s
+            epoch_s = _epoch(record) or epoch_s
             end = record.index if isinstance(record, RunStop) else end
             if isinstance(record, Decided):
                 setup = pipeline.knowing(setup, record)
@@ -171,10 +179,22 @@ def twin(spec: Spec, missed_from: str) -> None:
         if block.index // len(block) % TIMING_BLOCKS == TIMING_BLOCKS - 1:
             say([watch.record(block.end)])
     say([watch.record(end or 0)])
+    _linger(control, clock)
+    link.close()
+
+
+def _linger(control: Inbox, clock: Clock) -> None:
+    """Serve those who still ask for what this process holds."""
     until = clock.now() + LINGER_S
     while clock.now() < until and not orphaned():
-        control.get(0.02)  # serves those who still ask for what this process holds
-    link.close()
+        control.get(0.02)
+
+
+def _epoch(record: Item) -> float | None:
+    """When a run began by the clock of this machine; None for what is no start here."""
+    if isinstance(record, RunStart) and record.host == platform.node():
+        return record.epoch_s
+    return None
 
 
 def _told(control: Inbox, run: str) -> Iterator[Item]:
@@ -189,6 +209,7 @@ def viewer(spec: Spec, _: str) -> None:
     """Feeds Rerun; a courtesy, it may be slow or die."""
     from twin.service.viewing import serve
 
+    os.nice(NICENESS)
     link = open_spoke(spec.bundle().rig.name, spec.endpoint, CONNECT_S)
     link.alive(token(spec, "viewer"))
     serve(link, spec.serve_view, orphaned)
@@ -200,6 +221,7 @@ PROCESSES: dict[str, Callable[[Spec, str], None]] = {
     "twin": twin,
     "recorder": recorder,
     "viewer": viewer,
+    "gate": gate,
 }
 
 

@@ -29,7 +29,7 @@ LAST_TRY_S = 0.25
 
 
 @dataclass(slots=True)
-class _Awaited:
+class Awaited:
     """What a recorder waits for: the end, every measured block, and the twin's last word."""
 
     begun: bool = False
@@ -77,7 +77,7 @@ class _Recorder:
     # A disk takes up to 0.2 s for it; meanwhile what comes is flushed all the same.
     thread: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1))
     syncing: Future[None] = field(default_factory=_done)
-    waiting: _Awaited = field(default_factory=_Awaited)
+    waiting: Awaited = field(default_factory=Awaited)
     trouble: str = ""
     stop: str = ""
     stopping: bool = False

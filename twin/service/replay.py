@@ -22,6 +22,7 @@ from twin.service.step_range import step_range
 from twin.service.terminal import console, say
 from twin.service.versions import changes, differing
 from twin.stream.folder import log_path
+from twin.stream.keys import Keys
 from twin.stream.recording import Recording, fitting
 from twin.stream.wire import CMP_TOPIC, Item
 
@@ -39,6 +40,7 @@ class Asked:
     view: bool = False
     publish: str | None = None
     steps: str | None = None
+    keys: Keys | None = None
 
 
 def replay_command(asked: Asked) -> int:
@@ -98,7 +100,7 @@ def _one(asked: Asked) -> int:
     pace, rate = factor(asked.speed), recorded.start.rate_hz
     watched = pace is not None or asked.publish is not None
     cut = recorded.start.block_samples if watched else 0
-    link = publishing(bundle, asked.publish) if asked.publish else nullcontext()
+    link = publishing(bundle, asked.publish, asked.keys) if asked.publish else nullcontext()
     clock = RealClock()
     samples = min(bundle.drive.planned_end, span.last)
     with link as bus, RunProgress(console, len(bundle.steps), samples) as progress:

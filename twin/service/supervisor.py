@@ -2,21 +2,20 @@
 
 import contextlib
 import fcntl
-import os
 import shutil
-import signal
 import subprocess
-import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from table_io.card import BadInput
 from table_io.clock import Clock
 from table_io.profile import OnDeath
 from table_io.records import Comparison, Event, Fault, RunStop, Timing
+from twin.service.child import Child, begin
 from twin.service.parts import LOCK
-from twin.service.spec import Spec, token
+from twin.service.spec import Spec, private_folder, token
+from twin.stream.endpoint import INSIDE, refuse_taken
 from twin.stream.folder import PARTS
 from twin.stream.resend import Inbox
 from twin.stream.wire import RECORD_TOPICS, Item, decode, encode, topic
@@ -29,16 +28,6 @@ DEAF_S = 10.0  # so does the recorder; twice this is well before the bus forgets
 DRAIN_S = 0.1  # after a death, for what the dead one had still sent
 RESTARTS = 5
 WATCHED = tuple(RECORD_TOPICS.values())
-
-
-@dataclass(slots=True)
-class Child:
-    """A process of the run: its output goes to a file in the run's folder."""
-
-    component: str
-    process: subprocess.Popen[bytes]
-    log: Path
-    restarts: int = 0
 
 
 @dataclass(slots=True)
@@ -69,6 +58,8 @@ class Supervisor:
         BadInput where it cannot begin. A run that did not begin leaves nothing behind.
         """
         self.parts.mkdir(parents=True)
+        room = private_folder()
+        self.spec = replace(self.spec, endpoint=f"{INSIDE}{room / 'bus'}")
         self.spec.write(self.parts / "spec.json")
         lock = (self.parts / LOCK).open("a")
         fcntl.flock(lock, fcntl.LOCK_SH)
@@ -85,16 +76,18 @@ class Supervisor:
         finally:
             self._reap()
             lock.close()
+            shutil.rmtree(room, ignore_errors=True)
             if not moved:
                 self._clear()
         return moved
 
     def _begin(self) -> tuple[Link, Inbox]:
         """Start everybody, wait until all are there, and set the rig going."""
+        refuse_taken(self.spec.rig, self.spec.listen, bool(self.spec.keys))
         self._start("rig")
-        link = self._connect(self.spec.bundle().rig.name)
-        self._ready(link)  # the rig that answers is ours, not another run's at the same endpoint
-        for component in ("twin", "recorder", *["viewer"] * bool(self.spec.serve_view)):
+        link = self._connect(self.spec.rig)
+        self._ready(link)
+        for component in self._beside():
             self._start(component)
         self._ready(link)
         inbox = link.subscribe(WATCHED, history=True, capacity=5000)
@@ -102,6 +95,11 @@ class Supervisor:
         if self._order(link, "start") != "yes":
             raise BadInput("the rig does not answer; nothing moved")
         return link, inbox
+
+    def _beside(self) -> tuple[str, ...]:
+        """Who is started beside the rig."""
+        wanted = {"twin": not self.spec.remote_twin, "viewer": bool(self.spec.serve_view)}
+        return tuple(one for one in ("gate", "twin", "recorder", "viewer") if wanted.get(one, True))
 
     def _order(self, link: Link, name: str, why: str = "") -> str | None:
         """The rig's answer to a command of this run."""
@@ -114,39 +112,24 @@ class Supervisor:
             self.parts.parent.rmdir()
 
     def _start(self, component: str, argument: str = "") -> None:
-        """Start or restart a process in a session of its own, so that Ctrl-C passes it by."""
+        """Start or restart a process."""
         if component == "recorder":
             self._parts += 1
             argument = str(self.parts / f"part-{self._parts:03d}.mcap")
-        log = self.parts / f"{component}.log"
-        command = [sys.executable, "-m", "twin.service.processes", component]
-        command += [str(self.parts / "spec.json"), argument]
-        with log.open("ab") as out:
-            process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=out, stderr=out, start_new_session=True
-            )
-        if component in self.children:
-            self.children[component].process = process
-        else:
-            self.children[component] = Child(component, process, log)
-
-    def _words(self, component: str) -> str:
-        """The last words of a process."""
-        lines = self.children[component].log.read_text(errors="replace").strip().splitlines()
-        return lines[-1] if lines else "it said nothing"
-
-    def _died(self, component: str) -> bool:
-        return self.children[component].process.poll() is not None
+        before = self.children.get(component)
+        self.children[component] = begin(component, self.parts, argument)
+        if before is not None:
+            self.children[component].restarts = before.restarts + 1
 
     def _connect(self, rig: str) -> Link:
         until = self.clock.now() + READY_S
-        while self.clock.now() < until and not self._died("rig"):
+        while self.clock.now() < until and not self.children["rig"].died:
             self._unless_asked()
             try:
                 return open_spoke(rig, self.spec.endpoint, 0.3)
             except BadInput:
                 continue
-        raise BadInput(f"the rig did not start: {self._words('rig')}")
+        raise BadInput(f"the rig did not start: {self.children['rig'].words}")
 
     def _unless_asked(self) -> None:
         if self.asked():
@@ -158,9 +141,9 @@ class Supervisor:
         wanted = {token(self.spec, component) for component in self.children}
         while not wanted <= link.components():
             self._unless_asked()
-            for component in self.children:
-                if self._died(component):
-                    raise BadInput(f"the {component} did not start: {self._words(component)}")
+            for component, child in self.children.items():
+                if child.died:
+                    raise BadInput(f"the {component} did not start: {child.words}")
             if self.clock.now() > until:
                 missing = ", ".join(sorted(wanted - link.components()))
                 raise BadInput(f"not ready after {READY_S:g} s: {missing}")
@@ -178,8 +161,8 @@ class Supervisor:
                 text = f"the rig has been silent for {SILENT_S:g} s: if the table still moves, "
                 raise _RigDiedError(f"{text}use its own stop")
             stopping = self._unrecorded(link) or stopping
-            for component in list(self.children):
-                if self._died(component) and self.stop is None:
+            for component, child in list(self.children.items()):
+                if child.died and self.stop is None:
                     self._listen(inbox, DRAIN_S)
                     if self.stop is None:
                         self._bury(component, link)
@@ -192,7 +175,7 @@ class Supervisor:
         if "recorder" not in self.children or silent < DEAF_S:
             return False
         self.say(f"the recorder has been silent for {silent:.0f} s; ending it")
-        os.killpg(self.children["recorder"].process.pid, signal.SIGKILL)
+        self.children["recorder"].kill()
         self.heard["recorder"] = self.clock.now()  # its successor has as long
         self._deaf += 1
         return self._deaf > 1 and self._order(link, "stop", "the recorder hangs") == "yes"
@@ -219,20 +202,19 @@ class Supervisor:
     def _bury(self, component: str, link: Link) -> None:
         """Say what died and why, start a successor, stop the table where it must not go on."""
         child = self.children[component]
-        how = f"{component} died ({_how(child.process.returncode)})"
+        how = f"{component} died ({child.how})"
         if component == "rig":
-            raise _RigDiedError(
-                f"the rig process died ({_how(child.process.returncode)}): {self._words('rig')}"
-            )
+            raise _RigDiedError(f"the rig process died ({child.how}): {child.words}")
         event = Event(self.compared_to, "died", how)
         link.publish(topic(event), encode(event, self.spec.run))
         given_up = child.restarts >= RESTARTS
         # unrecorded motion is worthless: without a recorder the table does not go on
-        stop = getattr(self.on_death, component) == "stop" or (given_up and component == "recorder")
+        stop = getattr(self.on_death, component, "") == "stop"
+        stop = stop or (given_up and component == "recorder")
         fate = f"it stays down after {RESTARTS} restarts" if given_up else "restarting it"
         self.say(f"{how}; {fate}, the table {'stops' if stop else 'goes on'}")
         if child.process.returncode > 0:
-            self.say(f"  its last words: {self._words(component)}")
+            self.say(f"  its last words: {child.words}")
         if stop:
             self._order(link, "stop", how)
         if component == "twin":
@@ -240,7 +222,6 @@ class Supervisor:
         if given_up:
             del self.children[component]
             return
-        child.restarts += 1
         self.heard[component] = self.clock.now()
         self._start(component, str(self.compared_to) if component == "twin" else "")
 
@@ -254,35 +235,29 @@ class Supervisor:
     def _finish(self, link: Link) -> None:
         """Let everybody finish in order: those who listen, then those whom they still ask."""
         until = self.clock.now() + END_S
-        for component in ("recorder", "viewer", "twin", "rig"):
+        for component in ("recorder", "viewer", "gate", "twin", "rig"):
             if component in self.children:
-                if component in ("twin", "rig"):
-                    self._dismiss(component)
+                if component in ("gate", "twin", "rig"):
+                    self.children[component].dismiss()
                 self._await(component, max(until - self.clock.now(), 0.1))
         link.close()
-
-    def _dismiss(self, component: str) -> None:
-        """Close a process's input: it is free to end."""
-        stdin = self.children[component].process.stdin
-        if stdin is not None and not stdin.closed:
-            stdin.close()
 
     def _await(self, component: str, seconds: float) -> None:
         try:
             if self.children[component].process.wait(seconds):
-                self.say(f"the {component} failed: {self._words(component)}")
+                self.say(f"the {component} failed: {self.children[component].words}")
         except subprocess.TimeoutExpired:
             self.say(f"{component} does not finish; ending it")
 
     def _reap(self) -> None:
         """End whatever still runs: first its input, then a signal."""
-        for component in self.children:
-            self._dismiss(component)
+        for child in self.children.values():
+            child.dismiss()
         for child in self.children.values():
             try:
                 child.process.wait(5.0 if child.component != "rig" else 10.0)
             except subprocess.TimeoutExpired:
-                os.killpg(child.process.pid, signal.SIGKILL)
+                child.kill()
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     child.process.wait(5.0)  # more, and it waits for a dead disk
 
@@ -293,7 +268,3 @@ class _NeverBeganError(Exception):
 
 class _RigDiedError(Exception):
     """The rig is gone; what was recorded is kept."""
-
-
-def _how(code: int) -> str:
-    return signal.Signals(-code).name if code < 0 else f"exit {code}"

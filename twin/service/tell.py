@@ -1,21 +1,31 @@
 """`shaketwin tell`: hold, resume, stop or abort a test that runs in another terminal."""
 
+import getpass
+import re
+
 from table_io.card import BadInput
 from twin.service.terminal import say
+from twin.stream.keys import Keys
 from twin.stream.zenoh_link import open_spoke
 
 CONNECT_S = 3.0
 ANSWER_S = 2.0
 
 
-def tell(order: str, why: str, connect: str, rig: str) -> None:
+def person() -> str:
+    """Under which name whoever uses this machine gives orders where there are no keys."""
+    return re.sub(r"[^A-Za-z0-9_.-]", "_", getpass.getuser())[:64] or "somebody"
+
+
+def tell(order: str, why: str, connect: str, rig: str, keys: Keys | None = None) -> None:
     """Hand an order to the rig that runs at the endpoint; BadInput where it does not take it."""
-    link = open_spoke(rig, connect, CONNECT_S)
+    link = open_spoke(rig, connect, CONNECT_S, keys)
     try:
         runs = [name.removesuffix(".rig") for name in link.components() if name.endswith(".rig")]
         if not runs:
             raise BadInput(f"endpoint {connect}: no test runs there; `shaketwin run` starts one")
-        answer = link.request(order, f"{runs[0]}\n{why}", ANSWER_S)
+        who = person() if keys is None else keys.name
+        answer = link.request(f"{order}/{who}", f"{runs[0]}\n{why}", ANSWER_S)
     finally:
         link.close()
     if answer != "yes":

@@ -2,111 +2,36 @@
 
 Every publisher numbers its pieces and holds the newest of each topic on a `Shelf`. An `Inbox` that
 finds one missing asks for the rest, a chunk at a time, and takes nothing newer until it has it.
+Who passes pieces on keeps name and numbers of their publisher, and holds them as well: so whoever
+listens may get a piece from either, and takes it once.
 """
 
 import json
 import secrets
-import struct
 import threading
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from itertools import islice
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 from table_io.clock import RealClock
+from twin.stream.shelf import BEGINS, ENDS, GIVE_UP_S, LARGEST_BYTES, PIECE_BYTES, STAMP, Piece
 
-LARGEST_BYTES = 4 * 2**20  # of one payload
-HELD_PIECES = 5000  # per topic and publisher: 50 s of blocks
-HELD_BYTES = 64 * 2**20
-PIECE_BYTES = 48 * 2**10  # of one message on the bus: less than a batch of zenoh, 64 kB
 ASK_EVERY_S = 0.5  # in case the last message of a topic was lost
-ASK_AGAIN_S = 0.2  # in case question or answer was lost
-ASK_MORE_S = 0.002
-GIVE_UP_S = 10.0  # zenoh's lease: then a silent publisher counts as dead
+ASK_AGAIN_S = 0.1  # in case question or answer was lost
+ASK_MORE_S = 0.003
+LAST_NUMBER = 2**63  # of a piece
 TURN_S = 0.02  # while waiting, others are answered this often
-STAMP = struct.Struct("<8sQB")  # publisher, number of the piece within its topic, its place
-BEGINS, ENDS = 1, 2  # the place of a piece in its payload
 CLOCK = RealClock()
 
 
 class Asker(Protocol):
     """What an inbox needs of its link."""
 
-    def serve(self) -> None:
+    def serve(self) -> bool:
         """Answer somebody else's question, if there is one."""
 
     def ask(self, question: dict[str, Any], inbox: "Inbox") -> None:
         """Put a question to all publishers; answers arrive in the inbox."""
-
-
-class Shelf:
-    """The newest pieces published on a topic; they are numbered `first` to `end` - 1."""
-
-    def __init__(self, publisher: Any) -> None:
-        self.publisher = publisher
-        self.end = 0
-        self._held: deque[tuple[int, bytes]] = deque()
-        self._bytes = 0
-
-    @property
-    def first(self) -> int:
-        return self.end - len(self._held)
-
-    def add(self, place: int, piece: bytes) -> None:
-        """Hold one more; the oldest give way."""
-        self._held.append((place, piece))
-        self._bytes += len(piece)
-        self.end += 1
-        while len(self._held) > HELD_PIECES or self._bytes > HELD_BYTES:
-            self._bytes -= len(self._held.popleft()[1])
-
-    def take(self, first: int, room: int) -> list[tuple[int, bytes]]:
-        """(place, piece) from number `first` on, as many as fit into `room` bytes."""
-        taken = []
-        for place, piece in islice(self._held, first - self.first, None):
-            room -= len(piece)
-            if room < 0:
-                break
-            taken.append((place, piece))
-        return taken
-
-
-@dataclass(slots=True)
-class Listeners:
-    """How far those who listen to a publisher have come, by their questions; for one who can wait.
-
-    Of each: when it asked last, and the number of the next piece that it needs by topic.
-    """
-
-    name: str  # the publisher's
-    heard: dict[str, tuple[float, dict[str, int]]] = field(default_factory=dict)
-
-    def note(self, question: dict[str, Any], shelves: Mapping[str, Shelf]) -> None:
-        """Take in a question; who does not want history begins where the shelf ends."""
-        begin = {topic: 0 if question["history"] else shelves[topic].end for topic in shelves}
-        before = self.heard.get(str(question.get("who")), (0.0, begin))[1]
-        asked = {
-            topic: int(known.get(self.name, before.get(topic, 0)))
-            for topic, known in question["next"].items()
-            if topic in shelves
-        }
-        now = CLOCK.now()
-        self.heard = {who: one for who, one in self.heard.items() if now - one[0] < GIVE_UP_S}
-        self.heard[str(question.get("who"))] = now, asked
-
-    def behind(self, shelves: Mapping[str, Shelf]) -> int:
-        """The most pieces that anybody lacks who asked within `GIVE_UP_S`; 0 where nobody did."""
-        since = CLOCK.now() - GIVE_UP_S
-        return max(
-            (
-                shelves[topic].end - next_one
-                for when, asked in self.heard.values()
-                if when > since
-                for topic, next_one in asked.items()
-            ),
-            default=0,
-        )
 
 
 @dataclass(slots=True)
@@ -116,26 +41,32 @@ class Source:
     next: int | None
     seen: int = 0
     behind_since: float | None = None
-    pieces: list[bytes] | None = None  # of a payload whose end has not come yet
 
     def advance(self, number: int) -> int:
         """Go on at `number`; the count of pieces left out."""
         left_out = 0 if self.next is None else max(0, number - self.next)
-        if left_out:
-            self.pieces = None
         self.next = number if self.next is None else max(number, self.next)
         return left_out
 
-    def accept(self, place: int, piece: bytes) -> bytes | None:
-        """Take the piece numbered `next`; the whole payload if this ends it."""
-        assert self.next is not None
-        self.next += 1
-        if place & BEGINS:
-            self.pieces = []
-        if self.pieces is None or len(self.pieces) * PIECE_BYTES > LARGEST_BYTES:
+
+@dataclass(slots=True)
+class Parcel:
+    """A payload of a topic and publisher whose end has not come yet."""
+
+    number: int = 0  # of the next piece
+    bodies: list[bytes] | None = None
+
+    def add(self, piece: Piece) -> bytes | None:
+        """The whole payload if this piece ends it; without one between, nothing of it is left."""
+        if piece.place & BEGINS:
+            self.bodies = []
+        elif piece.number != self.number:
+            self.bodies = None
+        self.number = piece.number + 1
+        if self.bodies is None or len(self.bodies) * PIECE_BYTES > LARGEST_BYTES:
             return None
-        self.pieces.append(piece)
-        return b"".join(self.pieces) if place & ENDS else None
+        self.bodies.append(piece.body)
+        return b"".join(self.bodies) if piece.place & ENDS else None
 
 
 class Inbox:
@@ -156,14 +87,28 @@ class Inbox:
         self._arrived: deque[tuple[str, bytes, bytes]] = deque()  # topic "" = an answer
         self._filled = threading.Condition()
         self._skipped: dict[tuple[str, str], int] = {}
-        self._ready: deque[tuple[str, bytes]] = deque()
+        self._ready: deque[Piece] = deque()
         self._sources: dict[tuple[str, str], Source] = {}
+        self._parcels: dict[tuple[str, str], Parcel] = {}
         self._who = secrets.token_hex(8)
         self._asked_at = float("-inf")
         self._answered = False
 
     def get(self, timeout_s: float) -> tuple[str, bytes] | None:
         """The next (topic, payload); None when there is none within `timeout_s`."""
+        deadline = CLOCK.now() + timeout_s
+        while (piece := self.piece(deadline - CLOCK.now())) is not None:
+            whole = self.whole(piece)
+            if whole is not None:
+                return piece.topic, whole
+        return None
+
+    def whole(self, piece: Piece) -> bytes | None:
+        """The payload that this piece ends."""
+        return self._parcels.setdefault(piece[:2], Parcel()).add(piece)
+
+    def piece(self, timeout_s: float) -> Piece | None:
+        """The next piece, for one who passes it on; use this, or `get`."""
         deadline = CLOCK.now() + timeout_s
         while not self._ready:
             self._link.serve()
@@ -212,28 +157,34 @@ class Inbox:
             source.advance(self._skipped.pop(where))
         source.seen = max(source.seen, number)
         if number == source.next:
-            self._accept(topic, source, place, body)
+            self._accept(source, Piece(topic, name.hex(), number, place, body))
         elif (source.next is None or number > source.next) and source.behind_since is None:
             source.behind_since = CLOCK.now()
 
-    def _take(self, stamp: bytes, body: bytes) -> None:
+    def _take(self, stamp: bytes, chunk: bytes) -> None:
         """Move the pieces of an answer to `_ready`; count those that their publisher lacks."""
         self._answered = True
-        header = json.loads(stamp)
+        try:
+            said = [_checked(*one) for one in json.loads(stamp)]
+        except (ValueError, TypeError):
+            self.ignored += 1
+            return
         at = 0
-        for topic, (first, end, sizes) in header["topics"].items():
-            source = self._sources.setdefault((topic, header["source"]), Source(None))
+        for topic, name, first, end, sizes in said:
+            begun, at = at, at + sum(size for _, size in sizes)
+            if topic not in self._topics:
+                continue
+            source = self._sources.setdefault((topic, name), Source(None))
             self.missed += source.advance(first)
             for number, (place, size) in enumerate(sizes, first):
+                body, begun = chunk[begun : begun + size], begun + size
                 if number == source.next:
-                    self._accept(topic, source, place, body[at : at + size])
-                at += size
+                    self._accept(source, Piece(topic, name, number, place, body))
             source.behind_since = CLOCK.now() if (source.next or 0) < end else None
 
-    def _accept(self, topic: str, source: Source, place: int, piece: bytes) -> None:
-        whole = source.accept(place, piece)
-        if whole is not None:
-            self._ready.append((topic, whole))
+    def _accept(self, source: Source, piece: Piece) -> None:
+        source.next = piece.number + 1
+        self._ready.append(piece)
 
     def _ask_if_due(self, now: float) -> None:
         """Ask for what is missing, and now and then for what may be."""
@@ -250,3 +201,13 @@ class Inbox:
                 if one.next is not None:
                     known[topic][name] = one.next
             self._link.ask({"who": self._who, "history": self._history, "next": known}, self)
+
+
+def _checked(
+    topic: str, name: str, first: int, end: int, sizes: list[tuple[int, int]]
+) -> tuple[str, str, int, int, list[tuple[int, int]]]:
+    """What an answer says of a topic; ValueError or TypeError where it cannot be."""
+    if not 0 <= int(first) <= int(end) < LAST_NUMBER:
+        raise ValueError(f"numbers from {first} to {end}")
+    held = [(int(place) & (BEGINS | ENDS), int(size)) for place, size in sizes]
+    return str(topic), bytes.fromhex(name).hex(), int(first), int(end), held

@@ -10,9 +10,11 @@ import numpy as np
 
 from table_io.block import Block, Label
 from table_io.records import (
+    Agreement,
     Comparison,
     Cycle,
     Decided,
+    Estimate,
     Fault,
     Level,
     Point,
@@ -88,17 +90,31 @@ def unsound(record: Record, start: RunStart) -> str:
     return "after the end of any run" if late else _inconsistent(record)
 
 
+def _uneven(record: Record) -> bool:
+    """True where columns of a table are not equally long."""
+    match record:
+        case Comparison():
+            columns = record.measured_ss, record.free_error_ss, record.window_error_ss
+            return any(len(one) != len(record.channels) for one in columns)
+        case Agreement():
+            parts = record.error, record.band, record.flight, record.right, record.left
+            return any(len(one) != len(record.channels) for one in parts)
+        case Estimate():
+            known = record.values, record.sd, record.drift, record.drift_sd
+            return any(len(one) != len(record.names) for one in known)
+        case Response():
+            return not len(record.frequencies_hz) == len(record.gain) == len(record.phase_rad)
+    return False
+
+
 def _inconsistent(record: Record) -> str:
+    if _uneven(record):
+        return "of unequal lengths"
     match record:
         case Comparison():
             sums = record.measured_ss, record.free_error_ss, record.window_error_ss
-            if any(len(one) != len(record.channels) for one in sums):
-                return "of unequal lengths"
             if any(one < 0 for some in sums for one in some):
                 return "of squares below zero"
-        case Response():
-            if not len(record.frequencies_hz) == len(record.gain) == len(record.phase_rad):
-                return "of unequal lengths"
         case Cycle() | Level():
             if record.step > MOST_STEPS:
                 return f"step = {record.step}"

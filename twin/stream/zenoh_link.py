@@ -9,6 +9,7 @@ spokes through the hub. Keys, with <topic> as in `wire.TOPIC_TYPES`:
 | shaketwin/<rig>/event<topic>      | every other record, when it happens   | publish()         |
 | shaketwin/<rig>/state/held        | question: what do you hold from n on? | Inbox.get()       |
 | shaketwin/<rig>/cmd/<name>        | a command to the rig, and its answer  | request()         |
+| shaketwin/<rig>/cmd/<name>/<who>  | the same to the gate, from outside    | request()         |
 | shaketwin/<rig>/alive/<component> | nothing; is there as long as it lives | alive()           |
 
 so /rig/meas travels on shaketwin/<rig>/stream/rig/meas and /run/start on .../event/run/start.
@@ -24,70 +25,39 @@ subscriber loses, without a word, the history of a publisher that goes on publis
 import json
 import re
 import secrets
-from dataclasses import dataclass, field
 from typing import Any
 
 import zenoh
 
 from table_io.card import BadInput
-from twin.stream.resend import (
-    ASK_EVERY_S,
-    BEGINS,
-    ENDS,
-    LARGEST_BYTES,
-    PIECE_BYTES,
-    STAMP,
-    Inbox,
-    Listeners,
-    Shelf,
+from twin.stream.endpoint import (
+    INSIDE,
+    Settings,
+    cannot_listen,
+    check,
+    host_and_port,
+    key,
+    merged,
+    safe,
+    settings,
 )
-from twin.stream.wire import BLOCK_TOPICS, CMP_TOPIC
+from twin.stream.keys import Keys
+from twin.stream.questions import Question, Questions
+from twin.stream.refusal import refusal, unlisted
+from twin.stream.resend import ASK_EVERY_S, Inbox
+from twin.stream.shelf import (
+    GIVE_UP_S,
+    LARGEST_BYTES,
+    Listeners,
+    Piece,
+    Shelf,
+    Shelves,
+    answer,
+    pieces,
+)
 
-QUESTIONS_WAITING = 16
-
-STREAMS = frozenset((*BLOCK_TOPICS.values(), CMP_TOPIC))
-
-
-def key(rig: str, topic: str) -> str:
-    """Key on the bus of a wire topic."""
-    return f"shaketwin/{rig}/{'stream' if topic in STREAMS else 'event'}{topic}"
-
-
-@dataclass(frozen=True, slots=True)
-class Command:
-    """A command that waits for `reply`; whoever sent it gets nothing if that is never called."""
-
-    name: str
-    text: str
-    _query: Any = field(repr=False)
-
-    def reply(self, text: str) -> None:
-        """Answer, once."""
-        with self._query as query:
-            query.reply(query.key_expr, text)
-
-
-class Commands:
-    """Commands to this process. No thread: they wait in zenoh, where the oldest gives way."""
-
-    def __init__(self, link: "Link", queryable: Any) -> None:
-        self.ignored = 0
-        self._link = link
-        self._queryable = queryable
-
-    def poll(self) -> Command | None:
-        """The next command, or None at once."""
-        self._link.serve()
-        while (query := self._queryable.try_recv()) is not None:
-            payload = b"" if query.payload is None else query.payload.to_bytes()
-            try:
-                if len(payload) <= LARGEST_BYTES:
-                    return Command(str(query.key_expr).rsplit("/", 1)[1], payload.decode(), query)
-            except UnicodeDecodeError:
-                pass
-            self.ignored += 1
-            query.drop()
-        return None
+QUESTIONS_WAITING = 64
+MOST_PRESENT = 256
 
 
 class Link:
@@ -100,20 +70,22 @@ class Link:
         self.refused = 0
         self._rig = rig
         self._session = session
-        self._name = secrets.token_bytes(8)
-        self._shelves: dict[str, Shelf] = {}
+        self._name = secrets.token_hex(8)
+        self._publishers: dict[str, Any] = {}
+        self._shelves: Shelves = {}
+        self._tokens: dict[str, Any] = {}
         self._open: list[Any] = []
         self._questions: Any = None
-        self.listeners = Listeners(self._name.hex())
+        self.listeners = Listeners()
 
     def declare(self, topics: tuple[str, ...]) -> None:
         """Make ready to publish `topics`, so that the first one costs no more than the others."""
         for topic in topics:
-            if topic not in self._shelves:
-                publisher = self._session.declare_publisher(
+            if topic not in self._publishers:
+                self._publishers[topic] = self._session.declare_publisher(
                     key(self._rig, topic), congestion_control=zenoh.CongestionControl.DROP
                 )
-                self._shelves[topic] = Shelf(publisher)
+                self._shelves[topic, self._name] = Shelf()
         if self._questions is None:
             self._questions = self._queryable("state/held")
 
@@ -122,15 +94,22 @@ class Link:
         if len(payload) > LARGEST_BYTES:
             self.refused += 1
             return
-        shelf = self._shelves[topic]
-        for at in range(0, max(len(payload), 1), PIECE_BYTES):
-            piece = payload[at : at + PIECE_BYTES]
-            place = BEGINS * (at == 0) | ENDS * (at + PIECE_BYTES >= len(payload))
-            shelf.publisher.put(piece, attachment=STAMP.pack(self._name, shelf.end, place))
-            shelf.add(place, piece)
+        end = self._shelves[topic, self._name].end
+        for piece in pieces(topic, self._name, end, payload):
+            self.relay(piece)
         self.serve()
 
-    def serve(self) -> None:
+    def relay(self, piece: Piece) -> None:
+        """Send a piece, which may be another publisher's, and hold it. Never waits."""
+        self._publishers[piece.topic].put(piece.body, attachment=piece.stamp)
+        self.hold(piece)
+
+    def hold(self, piece: Piece) -> None:
+        """Hold a piece that another publisher has sent."""
+        shelf = self._shelves.setdefault((piece.topic, piece.source), Shelf())
+        shelf.add(piece.number, piece.place, piece.body)
+
+    def serve(self) -> bool:
         """Answer one question for held messages if there is one, with at most a chunk.
 
         Everything one does with a link does this too; a publisher that does nothing for long must
@@ -138,42 +117,21 @@ class Link:
         """
         query = self._questions.try_recv() if self._questions is not None else None
         if query is None:
-            return
+            return False
         with query:
             try:
                 question = json.loads(query.payload.to_bytes())
-                topics, body = self._answer(question["next"], bool(question["history"]))
+                said, chunk = answer(self._shelves, question["next"], bool(question["history"]))
                 self.listeners.note(question, self._shelves)
             except (ValueError, TypeError, KeyError, AttributeError):
-                return  # not one of ours: nothing to say
-            if topics:
-                header = json.dumps({"source": self._name.hex(), "topics": topics})
-                query.reply(query.key_expr, body, attachment=header)
+                return True  # not one of ours: nothing to say
+            if said:
+                query.reply(query.key_expr, chunk, attachment=json.dumps(said))
+        return True
 
-    def _answer(
-        self, asked: dict[str, dict[str, int]], history: bool
-    ) -> tuple[dict[str, Any], bytes]:
-        """({topic: [first, end, [(place, size)]]}, pieces in a row): a chunk of what is asked."""
-        topics: dict[str, Any] = {}
-        chunk: list[bytes] = []
-        room = PIECE_BYTES
-        # Rare topics first, so that the start of a run comes before its blocks.
-        for topic in sorted(self._shelves.keys() & asked, key=lambda one: self._shelves[one].end):
-            shelf = self._shelves[topic]
-            known = asked[topic].get(self._name.hex())
-            first = (shelf.first if history else shelf.end) if known is None else int(known)
-            first = max(first, shelf.first)
-            taken = shelf.take(first, room)
-            room -= sum(len(piece) for _, piece in taken)
-            chunk += [piece for _, piece in taken]
-            if known is None or first < shelf.end:
-                topics[topic] = [first, shelf.end, [(place, len(piece)) for place, piece in taken]]
-        return topics, b"".join(chunk)
-
-    @property
-    def behind(self) -> int:
-        """The most pieces of a topic that anybody lacks who listens to this process."""
-        return self.listeners.behind(self._shelves)
+    def behind(self, within_s: float = GIVE_UP_S) -> int:
+        """The most pieces of a topic that anybody lacks who asked this process of late."""
+        return self.listeners.behind(self._shelves, within_s)
 
     def ask(self, question: dict[str, Any], inbox: Inbox) -> None:
         """Ask all publishers for what they hold; answers arrive in the inbox. Never waits."""
@@ -211,81 +169,123 @@ class Link:
             self._open.append(self._session.declare_subscriber(key(self._rig, topic), callback))
         return inbox
 
-    def commands(self) -> Commands:
-        """The commands that others send to this process."""
-        return Commands(self, self._queryable("cmd/*"))
+    def questions(self, *paths: str) -> Questions:
+        """The questions that others ask under these paths, in which * stands for any part."""
+        root = f"shaketwin/{self._rig}/"
+        return Questions(self, root, {path: self._queryable(path) for path in paths})
 
-    def _queryable(self, what: str) -> Any:
-        where = f"shaketwin/{self._rig}/{what}"
+    def commands(self) -> Questions:
+        """The commands that others send to this process."""
+        return self.questions("cmd/*")
+
+    def _queryable(self, path: str) -> Any:
         waiting: Any = zenoh.handlers.RingChannel(QUESTIONS_WAITING)
+        where = f"shaketwin/{self._rig}/{path}"
         self._open.append(self._session.declare_queryable(where, waiting))
         return self._open[-1]
 
-    def request(self, command: str, text: str = "", timeout_s: float = 1.0) -> str | None:
-        """The rig's answer to a command; None if there is none within `timeout_s`."""
-        where = f"shaketwin/{self._rig}/cmd/{command}"
+    def inquire(self, path: str, text: str = "", timeout_s: float = 1.0) -> bytes | None:
+        """The answer to a question; None if there is none within `timeout_s`."""
+        where = f"shaketwin/{self._rig}/{path}"
         for reply in self._session.get(where, payload=text, timeout=timeout_s):
             if reply.ok is not None:
-                return str(reply.ok.payload.to_string())
+                return bytes(reply.ok.payload.to_bytes())
         return None
 
+    def request(self, command: str, text: str = "", timeout_s: float = 1.0) -> str | None:
+        """The answer to a command, to the gate as <name>/<who>; None as above."""
+        answer = self.inquire(f"cmd/{command}", text, timeout_s)
+        return None if answer is None else answer.decode(errors="replace")
+
+    def pass_on(self, command: str, text: str, question: Question, timeout_s: float) -> None:
+        """Answer a question by what the rig says to a command. Never waits."""
+
+        def answered(reply: Any) -> None:
+            if reply.ok is not None:
+                question.reply(reply.ok.payload.to_bytes())
+
+        callback = zenoh.handlers.Callback(answered, indirect=False)
+        where = f"shaketwin/{self._rig}/cmd/{command}"
+        self._session.get(where, callback, payload=text, timeout=timeout_s)
+
     def alive(self, component: str) -> None:
-        """Be among everybody's `components()` until this process ends."""
+        """Be among everybody's `components()` until this process ends, or `gone`."""
         where = f"shaketwin/{self._rig}/alive/{component}"
-        self._open.append(self._session.liveliness().declare_token(where))
+        self._tokens[component] = self._session.liveliness().declare_token(where)
+
+    def gone(self, component: str) -> None:
+        """Be among them no more."""
+        self._tokens.pop(component).undeclare()
 
     def components(self) -> set[str]:
         """Names of the components whose processes are connected."""
         self.serve()
         replies = self._session.liveliness().get(f"shaketwin/{self._rig}/alive/*", timeout=1.0)
-        return {str(one.ok.key_expr).rsplit("/", 1)[1] for one in replies if one.ok is not None}
+        found = (str(one.ok.key_expr) for one in replies if one.ok is not None)
+        return {safe(one.rsplit("/", 1)[1]) for one in found}
+
+    def presence(self) -> set[str]:
+        """The same as a set that zenoh's thread keeps up to date; copy it before you look."""
+        names: set[str] = set()
+
+        def changed(sample: Any) -> None:
+            name = safe(str(sample.key_expr).rsplit("/", 1)[1])
+            if sample.kind != zenoh.SampleKind.PUT:
+                names.discard(name)
+            elif len(names) < MOST_PRESENT:
+                names.add(name)
+
+        callback = zenoh.handlers.Callback(changed, indirect=False)
+        where = f"shaketwin/{self._rig}/alive/*"
+        alive = self._session.liveliness()
+        self._open.append(alive.declare_subscriber(where, callback, history=True))
+        return names
 
     def close(self) -> None:
         """Leave the star; may be called again."""
-        for one in (*self._open, *(shelf.publisher for shelf in self._shelves.values())):
+        for one in (*self._open, *self._publishers.values(), *self._tokens.values()):
             one.undeclare()
-        self._open, self._shelves, self._questions = [], {}, None
+        self._open, self._publishers, self._tokens, self._questions = [], {}, {}, None
         self._session.close()
 
 
-def open_hub(rig: str, endpoint: str) -> Link:
-    """The end that listens at `endpoint`; BadInput where that cannot be."""
-    _check(rig, endpoint)
-    if not re.match(r"tcp/(127\.[\d.]+|localhost|\[::1\]):", endpoint):
-        raise BadInput(
-            f"endpoint {endpoint}: would listen to the network, unprotected; allowed: this machine "
-            "only, as tcp/127.0.0.1:7447"
-        )
+def open_hub(
+    rig: str, endpoint: str, also: Settings | None = None, keys: Keys | None = None
+) -> Link:
+    """The end that listens at `endpoint`, with settings beside ours; BadInput where it cannot.
+
+    With `keys` only people with a certificate come in, and may do what their role allows.
+    """
+    check(rig, endpoint, keys is not None)
+    config = merged(settings("router", "listen", endpoint, 0), also or {})
+    if keys is not None:
+        config = merged(config, merged(keys.tls(), keys.access(rig)))
     try:
         # "peer" measured the same, loss and latency; "router" is what zenoh documents for clients.
-        return Link(rig, zenoh.open(_config("router", "listen", endpoint, 0)))
+        return Link(rig, _session(config))
     except zenoh.ZError as error:
-        raise BadInput(
-            f"endpoint {endpoint}: cannot listen there ({_why(error)}); "
-            "end the run that holds the port, or give another one"
-        ) from None
+        raise BadInput(cannot_listen(endpoint, _why(error))) from None
 
 
-def open_spoke(rig: str, endpoint: str, timeout_s: float) -> Link:
-    """An end connected to the hub at `endpoint`; BadInput when none answers in `timeout_s`."""
-    _check(rig, endpoint)
+def open_spoke(rig: str, endpoint: str, timeout_s: float, keys: Keys | None = None) -> Link:
+    """An end connected to the hub at `endpoint`; BadInput when none answers in `timeout_s`.
+
+    Or when it refuses us, and why.
+    """
+    check(rig, endpoint, keys is not None)
+    config = settings("client", "connect", endpoint, timeout_s)
     try:
-        return Link(rig, zenoh.open(_config("client", "connect", endpoint, timeout_s)))
+        session = _session(merged(config, {} if keys is None else keys.tls()))
     except zenoh.ZError:
-        raise BadInput(
-            f"endpoint {endpoint}: no rig answers there within {timeout_s:g} s; "
-            "start the run first, or give the endpoint it listens at"
-        ) from None
-
-
-def _check(rig: str, endpoint: str) -> None:
-    if not re.fullmatch(r"[\w.-]+", rig):
-        raise BadInput(f"rig {rig!r}: not a name for the bus; allowed: letters, digits and _ . -")
-    match = re.fullmatch(r"tcp/(\[[0-9A-Fa-f:]+\]|[\w.-]+):(\d{1,5})", endpoint)
-    if not match or not 0 < int(match[2]) < 2**16:
-        raise BadInput(
-            f"endpoint {endpoint!r}: not understood; write tcp/<host>:<port>, as tcp/127.0.0.1:7447"
-        )
+        why = "" if endpoint.startswith(INSIDE) else refusal(*host_and_port(endpoint), keys)
+        start = "start the run first, or give the endpoint it listens at"
+        nobody = f"no rig answers there within {timeout_s:g} s; {start}"
+        raise BadInput(f"endpoint {endpoint}: {why or nobody}") from None
+    link = Link(rig, session)
+    if keys is not None and (why := unlisted(link.inquire, keys.name, rig)):
+        link.close()
+        raise BadInput(f"endpoint {endpoint}: {why}")
+    return link
 
 
 def _why(error: Exception) -> str:
@@ -294,17 +294,5 @@ def _why(error: Exception) -> str:
     return reason[1] if reason else re.sub(r" at /\S+", "", str(error))
 
 
-def _config(mode: str, way: str, endpoint: str, timeout_s: float) -> Any:
-    """Session settings: the one endpoint and no other; full queues drop at once."""
-    end = {"endpoints": [endpoint], "timeout_ms": round(timeout_s * 1000), "exit_on_failure": True}
-    drop = {"wait_before_drop": 0, "max_wait_before_drop_fragments": 0}
-    queue = {"congestion_control": {"drop": drop}, "size": {"data": 16}}
-    config = {
-        "mode": mode,
-        "listen": {"endpoints": []},
-        "connect": {"endpoints": []},
-        way: end,
-        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {"shared_memory": {"enabled": False}, "link": {"tx": {"queue": queue}}},
-    }
-    return zenoh.Config.from_json5(json.dumps(config))
+def _session(config: Settings) -> Any:
+    return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))

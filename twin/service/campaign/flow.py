@@ -19,6 +19,7 @@ from twin.service.folders import RUNS, new_folder
 from twin.service.kernels import ready
 from twin.service.outcome import EXIT_GAPS
 from twin.service.terminal import say
+from twin.stream.keys import Keys
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +34,7 @@ class Asked:
     table: str | None
     unattended: bool
     listen: str
+    keys: Keys | None = None
 
     def again(self, folder: Path) -> str:
         """The command that goes on with the campaign in a folder."""
@@ -64,7 +66,11 @@ def campaign(asked: Asked) -> int:
         refuse_full([run.bundle for run in book.pending()], folder)
         _announce(book)
         try:
-            code = unpaced(book, lock) if asked.unpaced else paced(book, asks, asked.listen)
+            code = (
+                unpaced(book, lock)
+                if asked.unpaced
+                else paced(book, asks, asked.listen, asked.keys)
+            )
         finally:
             page = write_whole(folder)
     return _conclude(book, code, page, asked)

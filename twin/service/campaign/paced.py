@@ -1,5 +1,6 @@
 """The runs of a campaign in real time, one after another, the operator between them."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from table_io.card import BadInput
@@ -15,9 +16,10 @@ from twin.service.parts import gather
 from twin.service.progress import RunProgress
 from twin.service.supervisor import Supervisor
 from twin.service.terminal import console, interruptible, say
+from twin.stream.keys import Keys, folder_of
 
 
-def paced(book: Book, asks: bool, listen: str) -> int:
+def paced(book: Book, asks: bool, listen: str, keys: Keys | None) -> int:
     """Play what is left; the exit code. After a run that did not end as planned none begins."""
     for place, run in enumerate(book.pending()):
         say(head(book, run))
@@ -27,16 +29,16 @@ def paced(book: Book, asks: bool, listen: str) -> int:
         if said.answer == "skipped":
             book.skipped(run, said)
             continue
-        code = _play(book, run, said, listen)
+        code = _play(book, run, said, listen, keys)
         if code:
             return code
         write_whole(book.folder)
     return 0
 
 
-def _play(book: Book, run: Planned, said: Answer, listen: str) -> int:
+def _play(book: Book, run: Planned, said: Answer, listen: str, keys: Keys | None) -> int:
     """A run on the table; 0 where it is complete."""
-    spec = book.begin(run, said, listen)
+    spec = replace(book.begin(run, said, listen), keys=folder_of(keys))
     bundle = spec.bundle()
     progress = RunProgress(console, len(bundle.steps), bundle.drive.planned_end)
     with interruptible() as asked, progress:

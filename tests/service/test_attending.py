@@ -1,0 +1,142 @@
+"""A recorder on another machine: what it takes through the gate, and how it ends."""
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from table_io.block import Block
+from table_io.card import PROFILES, BadInput
+from table_io.records import Event, RunStop, Timing
+from twin.service import attending
+from twin.service.attending import attend_as_recorder
+from twin.service.bundle import read_bundle
+from twin.stream.access import open_access
+from twin.stream.endpoint import PUBLIC, merged
+from twin.stream.salvage import salvage
+from twin.stream.wire import TOPIC_TYPES, Item, encode, topic
+from twin.stream.zenoh_link import open_hub
+
+from .test_live import endpoint
+
+RUN = "20260101-120000-quickstart"
+BUNDLE = read_bundle(PROFILES / "tests" / "quickstart.toml")
+RIG, SIZE, BLOCKS = BUNDLE.rig.name, BUNDLE.profile.acquisition.block_samples, 300
+END = BLOCKS * SIZE
+
+
+def block(number: int) -> Block:
+    steps = np.zeros(SIZE, dtype=np.int64)
+    values = np.full((1, SIZE), float(number))
+    return Block("meas", number * SIZE, 2000.0, ("mass_disp_m",), values, steps, steps, steps)
+
+
+def last_words() -> list[Item]:
+    timing = Timing(END, "twin", 0.0, 0.0, 0.0, 0, 0, 0.0, "normal")
+    return [RunStop(END, "complete", "", ()), timing]
+
+
+@pytest.fixture
+def gate() -> Iterator[Callable[..., str]]:
+    """Starts what stands for a gate that sends these items; its endpoint."""
+    over = threading.Event()
+    threads = []
+
+    def begin(*items: Item, run: str = RUN) -> str:
+        where, ready = endpoint(), threading.Event()
+
+        def serve() -> None:
+            link = open_hub(RIG, where, merged(PUBLIC, open_access(RIG)))
+            link.declare(tuple(TOPIC_TYPES))
+            link.alive(f"{run}.rig")
+            ready.set()
+            for item in items:
+                link.publish(topic(item), encode(item, RUN))
+                time.sleep(0.001)
+            while not over.is_set():
+                link.serve()
+                time.sleep(0.002)
+            link.close()
+
+        threads.append(threading.Thread(target=serve))
+        threads[-1].start()
+        assert ready.wait(20.0)
+        return where
+
+    yield begin
+    over.set()
+    for thread in threads:
+        thread.join()
+
+
+def test_everything_is_recorded_also_what_came_before_its_start(
+    gate: Callable[..., str], tmp_path: Path
+) -> None:
+    start = BUNDLE.describe(RUN, "table")({}, 0.0)
+    items = [Event(0, "state", "armed"), start, *map(block, range(BLOCKS)), *last_words()]
+    where = gate(*items)
+    assert attend_as_recorder(where, RIG, tmp_path / "copy", None) == 0
+    log = tmp_path / "copy" / "run.mcap"
+    sent = sorted((topic(item), encode(item, RUN)) for item in items)
+    assert sorted((one.topic, one.payload) for one in salvage(log).messages) == sent
+
+
+class Played:
+    """An inbox that hands out these items in this order, and then nothing."""
+
+    missed = 0
+
+    def __init__(self, *items: Item) -> None:
+        self.left = [(topic(item), encode(item, RUN)) for item in items]
+
+    def get(self, _: float) -> tuple[str, bytes] | None:
+        return self.left.pop(0) if self.left else None
+
+
+def test_what_comes_before_the_start_is_written_after_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(attending, "SILENT_S", 0.0)
+    start = BUNDLE.describe(RUN, "table")({}, 0.0)
+    inbox = Played(Event(0, "state", "armed"), block(0), start, block(1))
+    attending._record(RUN, inbox, tmp_path, lambda: None)  # type: ignore[arg-type]
+    part = salvage(tmp_path / ".parts" / "part-001.mcap")
+    assert sorted(one.topic for one in part.messages) == [
+        "/rig/meas", "/rig/meas", "/run/event", "/run/start",
+    ]  # fmt: skip
+
+
+def test_a_test_that_goes_silent_leaves_what_came_and_says_so(
+    gate: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(attending, "SILENT_S", 0.5)
+    start = BUNDLE.describe(RUN, "table")({}, 0.0)
+    where = gate(start, *map(block, range(10)))
+    assert attend_as_recorder(where, RIG, tmp_path / "copy", None) == attending.EXIT_GAPS
+    assert len(salvage(tmp_path / "copy" / "run.mcap").messages) == 11
+
+
+def test_ctrl_c_ends_the_recording(gate: Callable[..., str], tmp_path: Path) -> None:
+    start = BUNDLE.describe(RUN, "table")({}, 0.0)
+    where = gate(start, *map(block, range(10)))
+    timer = threading.Timer(1.0, signal.raise_signal, [signal.SIGINT])
+    timer.start()
+    code = attend_as_recorder(where, RIG, tmp_path / "copy", None)
+    timer.join()
+    assert code == attending.EXIT_INTERRUPTED
+    assert (tmp_path / "copy" / "run.mcap").exists()
+
+
+@pytest.mark.parametrize("run", ["..", "", "a" * 102])
+def test_no_folder_is_named_by_a_peer_that_sends_no_run(
+    gate: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    where = gate(run=run)
+    with pytest.raises(BadInput, match="no test runs there"):
+        attend_as_recorder(where, RIG, None, None)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,290 @@
+"""`shaketwin keys`: what it makes is sound, complete, private, and never overwritten."""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from datetime import UTC, datetime, timedelta
+from ipaddress import ip_address
+from pathlib import Path
+
+import pytest
+import typer
+from cryptography import x509
+from cryptography.x509.verification import PolicyBuilder, Store, VerificationError
+from typer.testing import CliRunner
+
+from table_io.card import BadInput
+from table_io.clock import today
+from twin.service import cli_keys
+from twin.service.authority import Pair, expiry, found, hosts_of, issue
+from twin.service.keys_folder import (
+    add_person,
+    list_keys,
+    new_keys,
+    remove_person,
+    renew,
+)
+from twin.stream.access import ROLES
+from twin.stream.keys import SOON_DAYS, read_keys, read_people
+
+HOSTS = ["rig.lab.example", "192.168.1.20", "fd00::20"]
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Path:
+    folder = tmp_path / "lab"
+    new_keys(folder, HOSTS)
+    add_person(folder, "anna", "command", [])
+    return folder
+
+
+def certificate(path: Path) -> x509.Certificate:
+    return x509.load_pem_x509_certificate(path.read_bytes())
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        str(one.relative_to(folder)): one.read_bytes() for one in folder.rglob("*") if one.is_file()
+    }
+
+
+def test_a_strict_reader_takes_the_certificates_for_their_purpose_only(lab: Path) -> None:
+    """By an implementation of RFC 5280 that shares nothing with what wrote them but the library."""
+    policy = PolicyBuilder().store(Store([certificate(lab / "ca.pem")]))
+    rig, anna = (certificate(one / "certificate.pem") for one in (lab, lab / "people" / "anna"))
+    names: list[x509.DNSName | x509.IPAddress] = [x509.DNSName("localhost")]
+    names += [x509.DNSName(HOSTS[0]), *(x509.IPAddress(ip_address(one)) for one in HOSTS[1:])]
+    for name in names:
+        policy.build_server_verifier(name).verify(rig, [])
+    policy.build_client_verifier().verify(anna, [])
+    for wrong, leaf in ((x509.DNSName("other.example"), rig), (x509.DNSName("anna"), anna)):
+        with pytest.raises(VerificationError):
+            policy.build_server_verifier(wrong).verify(leaf, [])
+    own = [(lab / "people/anna" / name).read_bytes() for name in ("certificate.pem", "key.pem")]
+    forged = issue(Pair(*own), "rig", ["localhost"], today())
+    leaf = x509.load_pem_x509_certificate(forged.certificate)
+    with pytest.raises(VerificationError):  # a person is no authority
+        policy.build_server_verifier(x509.DNSName("localhost")).verify(leaf, [anna])
+
+
+def test_what_the_extensions_say(lab: Path) -> None:
+    authority, rig = certificate(lab / "ca.pem"), certificate(lab / "certificate.pem")
+    basic = authority.extensions.get_extension_for_class(x509.BasicConstraints)
+    assert (basic.value.ca, basic.value.path_length, basic.critical) == (True, 0, True)
+    usage = authority.extensions.get_extension_for_class(x509.KeyUsage).value
+    assert (usage.key_cert_sign, usage.digital_signature) == (True, False)
+    leaf = rig.extensions.get_extension_for_class(x509.KeyUsage).value
+    assert (leaf.key_cert_sign, leaf.digital_signature) == (False, True)
+    above = authority.extensions.get_extension_for_class(x509.SubjectKeyIdentifier).value
+    of = rig.extensions.get_extension_for_class(x509.AuthorityKeyIdentifier).value
+    assert of.key_identifier == above.key_identifier
+    assert rig.issuer == authority.subject
+    now = datetime.now(UTC)
+    assert timedelta(3640) < authority.not_valid_after_utc - now < timedelta(3660)
+    assert timedelta(364) < rig.not_valid_after_utc - now <= timedelta(365)
+
+
+def test_serial_numbers_are_random_and_two_authorities_never_the_same(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        new_keys(tmp_path / name, [])
+    authorities = [certificate(tmp_path / name / "ca.pem") for name in ("one", "two")]
+    assert authorities[0].subject != authorities[1].subject
+    pair = found("x", today())
+    serials = {
+        x509.load_pem_x509_certificate(issue(pair, "a", [], today()).certificate).serial_number
+        for _ in range(20)
+    }
+    assert len(serials) == 20
+    assert min(serials) > 2**100
+
+
+def test_a_leaf_does_not_outlive_its_authority() -> None:
+    began = today() - timedelta(days=3652 - 30)
+    pair = found("old", began)
+    assert expiry(issue(pair, "a", [], today()).certificate) == expiry(pair.certificate)
+
+
+def test_private_keys_are_private_whatever_the_umask(tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        new_keys(tmp_path / "lab", [])
+        add_person(tmp_path / "lab", "anna", "observe", [])
+    finally:
+        os.umask(before)
+    modes = {
+        str(one.relative_to(tmp_path)): one.stat().st_mode & 0o777 for one in tmp_path.rglob("*")
+    }
+    assert {mode for name, mode in modes.items() if name.endswith("key.pem")} == {0o600}
+    assert {modes[name] for name in ("lab", "lab/people", "lab/people/anna")} == {0o700}
+
+
+def test_nothing_is_overwritten_and_a_name_is_given_once(lab: Path) -> None:
+    before = contents(lab)
+    for again in (
+        lambda: new_keys(lab, []),
+        lambda: add_person(lab, "anna", "observe", []),
+        lambda: add_person(lab, "Anna", "observe", []),
+        lambda: add_person(lab, "rig", "observe", []),
+        lambda: add_person(lab, "bob", "router", ["no host"]),
+        lambda: add_person(lab, "bob", "router", []),
+        lambda: add_person(lab, "bob", "observe", ["rig.lab.example"]),  # it would be another rig
+        lambda: renew(lab, "anna", ["rig.lab.example"]),
+        lambda: new_keys(lab.parent / "new", ["a b"]),
+        lambda: remove_person(lab, "bob"),
+        lambda: renew(lab, "bob", []),
+    ):
+        with pytest.raises(BadInput):
+            again()
+    assert contents(lab) == before
+    shutil.rmtree(lab / "people")  # as one does that was handed over
+    remove_person(lab, "anna")
+    with pytest.raises(BadInput, match=r"was given out, .* choose another one"):
+        add_person(lab, "anna", "observe", [])
+    add_person(lab, "anna-2", "observe", [])
+    renew(lab, "anna-2", [])
+
+
+def test_a_removed_person_has_no_role_and_the_others_keep_theirs(lab: Path) -> None:
+    add_person(lab, "ann", "observe", [])
+    text = (lab / "access.toml").read_text()
+    (lab / "access.toml").write_text(text + '"bob"   = "record"  # until May\n')
+    remove_person(lab, "anna")
+    assert read_people(lab) == {"ann": "observe", "bob": "record"}
+    assert "# until May" in (lab / "access.toml").read_text()
+    remove_person(lab, "bob")
+    assert read_people(lab) == {"ann": "observe"}
+
+
+def test_a_list_written_otherwise_by_hand_is_left_alone(lab: Path) -> None:
+    path = lab / "access.toml"
+    path.write_text('people = {anna = "command"}\n')
+    for change in (
+        lambda: add_person(lab, "bob", "observe", []),
+        lambda: remove_person(lab, "anna"),
+    ):
+        with pytest.raises(BadInput, match=r"access\.toml"):
+            change()
+    assert path.read_text() == 'people = {anna = "command"}\n'
+    assert not (lab / "people" / "bob").exists()
+
+
+def test_renewed_keys_are_new_and_the_old_are_kept(lab: Path) -> None:
+    old = {one: (lab / one).read_bytes() for one in ("certificate.pem", "key.pem", "ca.pem")}
+    hosts = hosts_of(old["certificate.pem"])
+    renew(lab, None, [])
+    renew(lab, None, ["new.example"])
+    assert (lab / "replaced/rig.1/key.pem").read_bytes() == old["key.pem"]
+    assert (lab / "replaced/rig.1/certificate.pem").read_bytes() == old["certificate.pem"]
+    assert (lab / "ca.pem").read_bytes() == old["ca.pem"]
+    assert hosts_of((lab / "replaced/rig.2/certificate.pem").read_bytes()) == hosts
+    assert {"new.example", "localhost"} <= set(hosts_of((lab / "certificate.pem").read_bytes()))
+    assert read_keys(lab).name == "rig"
+    mine = (lab / "people/anna/key.pem").read_bytes()
+    renew(lab, "anna", [])
+    assert (lab / "replaced/anna.1/key.pem").read_bytes() == mine
+    assert (lab / "people/anna/key.pem").read_bytes() != mine
+    assert read_keys(lab / "people/anna").name == "anna"
+
+
+def test_the_roles_are_the_same_everywhere(lab: Path) -> None:
+    assert tuple(cli_keys.Role) == ROLES
+    for role in ROLES:
+        (lab / "access.toml").write_text(f'[people]\nanna = "{role}"\n')
+        assert read_people(lab) == {"anna": role}
+
+
+def test_without_the_authoritys_key_nothing_is_issued(lab: Path) -> None:
+    key = lab / "ca.key.pem"
+    away = key.rename(lab.parent / "safe.pem")
+    assert read_keys(lab).name == "rig"
+    with pytest.raises(BadInput, match=r"ca\.key\.pem: cannot read it"):
+        add_person(lab, "bob", "observe", [])
+    for wrong in (b"x", (lab / "key.pem").read_bytes()):
+        key.write_bytes(wrong)
+        with pytest.raises(BadInput, match="restore"):
+            add_person(lab, "bob", "observe", [])
+    assert "bob" not in read_people(lab)
+    away.replace(key)
+    add_person(lab, "bob", "observe", [])
+
+
+def test_the_list_says_who_may_what_and_until_when(
+    lab: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add_person(lab, "bob", "observe", [])
+    remove_person(lab, "bob")
+    capsys.readouterr()
+    list_keys(lab)
+    year = today() + timedelta(days=365)
+    rows = {row.split()[0]: row for row in capsys.readouterr().out.splitlines()}
+    assert re.search(rf"command +{year:%Y}", rows["anna"])
+    assert re.search(rf"none +{year:%Y}", rows["bob"])
+    assert {"(authority)", "(rig)"} <= rows.keys()
+    for later, says in ((366 - SOON_DAYS, "days left"), (400, "EXPIRED")):
+        at = today() + timedelta(days=later)
+        monkeypatch.setattr("twin.service.keys_folder.today", lambda at=at: at)
+        list_keys(lab)
+        assert says in capsys.readouterr().out
+        monkeypatch.undo()
+
+
+def test_keys_that_expire_soon_say_so(
+    lab: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capsys.readouterr()
+    assert cli_keys.read_given(None) is None
+    assert cli_keys.read_given(lab, rig=True) is not None
+    assert capsys.readouterr().out == ""
+    monkeypatch.setattr("twin.stream.keys.today", lambda: today() + timedelta(days=360))
+    cli_keys.read_given(lab / "people" / "anna")
+    assert "good for 4 more days; then every link with it ends" in capsys.readouterr().out
+    with pytest.raises(BadInput, match="keys of anna, who cannot listen"):
+        cli_keys.read_given(lab / "people" / "anna", rig=True)
+
+
+def test_the_commands(tmp_path: Path) -> None:
+    app = typer.Typer()
+    app.add_typer(cli_keys.keys_app, name="keys")
+    folder = str(tmp_path / "lab")
+
+    def run(*words: str) -> str:
+        result = CliRunner().invoke(app, ["keys", *words], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        return result.output
+
+    run("new", folder, "--host", "rig.example", "--host", "10.0.0.9")
+    run("add", folder, "anna", "--role", "observe")
+    run("renew", folder, "anna")
+    run("list", folder)
+    run("remove", folder, "anna")
+    assert CliRunner().invoke(app, ["keys", "add", folder, "bob", "--role", "king"]).exit_code == 2
+    assert read_people(tmp_path / "lab") == {}
+
+
+def test_the_commands_of_the_page_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    app = typer.Typer()
+    app.add_typer(cli_keys.keys_app, name="keys")
+    page = (Path(cli_keys.__file__).parents[1] / "stream" / "KEYS.md").read_text()
+    lines = [line for line in page.splitlines() if line.startswith("shaketwin keys")]
+    assert len(lines) == 6
+    monkeypatch.chdir(tmp_path)
+    for line in lines:
+        words = shlex.split(line.partition(">")[0], comments=True)
+        result = CliRunner().invoke(app, words[1:], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+
+
+def test_a_fault_is_one_message_and_exit_code_2(tmp_path: Path) -> None:
+    program = Path(sys.executable).parent / "shaketwin"
+    result = subprocess.run(
+        [str(program), "keys", "list", str(tmp_path / "nowhere")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (result.returncode, result.stdout) == (2, "")
+    assert "access.toml: cannot read it: No such file" in result.stderr
+    assert "Traceback" not in result.stderr

@@ -1,0 +1,1 @@
+"""Rerun with the project's layout: blocks and records as moving pictures."""
