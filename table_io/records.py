@@ -169,8 +169,8 @@ class Estimate:
 class Ahead:
     """The next jump on the way of the sweep by the model's branch, as known at sample `index`.
 
-    `kind` is "up", "down", or "" where none is ahead; it lies at `jump_hz`, within `low_hz` to
-    `high_hz` as far as the parameters are known.
+    `kind` is "up", "down", or "" where none is ahead; it lies at `jump_hz`, between the steps at
+    `low_hz` and `high_hz`.
     """
 
     index: int

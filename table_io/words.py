@@ -21,7 +21,7 @@ LEVELS = {
     "ERROR": {"fault", "halted", "error", "died"},
     "WARN": {
         "warning", "alarm", "divergence", "late", "stop", "stopped", "sensor", "disagreement",
-        "drift", "no jump", "attractor", "instrument", "refused",
+        "drift", "no jump", "unexpected jump", "attractor", "instrument", "refused",
     },
 }  # fmt: skip
 

@@ -292,7 +292,7 @@ def test_lost_load_cells_and_accelerometer_leave_the_displacement(
 def test_a_leap_is_an_event(setup: pipeline.Setup, measured: Block) -> None:
     events = of(said(setup, [measured]), Event)
     assert {one.kind for one in events} == {"jump"}
-    assert "forward: eta_d falls" in events[0].text
+    assert "forward: the jump down between 3 and 4.6 Hz came" in events[0].text
 
 
 # Steps that are decided on while the test runs

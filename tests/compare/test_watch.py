@@ -19,12 +19,13 @@ from table_io.clock import ManualClock
 from table_io.records import Agreement, Ahead, Estimate, Event, Point, Quantities, Record, Step
 from table_io.session import play
 from twin.compare import COMPARED, pipeline
-from twin.compare.watch import KINDS
+from twin.compare.watch import KINDS, jumps
 from twin.compare.watch.held import Held, Noise, against, functions
 from twin.compare.watch.jumps import FINE_HZ, Expected, Passing, foreseen, passed
 from twin.compare.watch.steady import Steady, steadied
 from twin.model.branch import follow, settled
 from twin.service.bundle import Bundle, from_texts
+from twin.stream.wire import encode
 
 # Slow enough for many cycles of contact, short enough for a test; no loop check, no tuning.
 PROFILE = """
@@ -203,7 +204,7 @@ def point(index: int, eta: float, direction: str = "forward") -> Point:
     return Point(1000 * index, index, direction, 3.0 + 0.1 * index, own, None, n, n, n)
 
 
-def driven(etas: Sequence[float], jump_after: int | None) -> list[Record]:
+def driven(etas: Sequence[float | None], jump_after: int | None) -> list[Record]:
     """What is said about a forward sweep; the model jumps down into step `jump_after`."""
     steps = [Step(i, "forward", 3.0 + 0.1 * i, 0.5) for i in range(len(etas))]
     jumps = ()
@@ -213,8 +214,9 @@ def driven(etas: Sequence[float], jump_after: int | None) -> list[Record]:
         jumps = (Expected(before, after, -1.5, at_hz),)
     passing, items = Passing(ahead=jumps), []
     for place, eta in enumerate(etas):
-        passing, said = passed(passing, point(place, eta))
-        items.extend(said)
+        if eta is not None:
+            passing, said = passed(passing, point(place, eta))
+            items.extend(said)
     return items
 
 
@@ -223,19 +225,45 @@ def driven(etas: Sequence[float], jump_after: int | None) -> list[Record]:
     [
         ([5, 5, 5, 1, 1, 1], 3, ["jump"], "where the model expects it"),
         ([5, 5, 5, 2, 1, 1], 3, ["jump"], "where the model expects it"),  # goes on a step longer
+        ([5, 5, 5, 5, 1, 1], 3, ["jump"], "one step after"),
         ([5, 5, 5, 5, 5, 5], 3, ["no jump"], "did not come"),
-        ([5, 5, 5, 5, 1, 1], 3, ["no jump", "jump"], "1 steps later"),
-        ([5, 5, 1, 1, 1, 1], 4, ["jump"], "2 steps earlier"),
-        ([5, 5, 1, 1, 1, 1], None, ["jump"], "expects none here"),
+        ([5, 5, 5, 5, 5, 1], 3, ["no jump", "unexpected jump"], "2 steps later"),
+        ([5, 5, 1, 1, 1, 1], 4, ["unexpected jump"], "2 steps earlier"),
+        ([5, 5, 1, 1, 1, 1], None, ["unexpected jump"], "expects none here"),
         ([5, 5, 4, 4, 3, 3], None, [], ""),
+        ([5, 5, None, 1, 1, 1], 2, ["jump"], "where the model expects it"),  # a step without point
     ],
 )
 def test_a_jump_comes_or_not(
-    etas: list[float], jump: int | None, kinds: list[str], words: str
+    etas: list[float | None], jump: int | None, kinds: list[str], words: str
 ) -> None:
     told = warnings(driven(etas, jump))
     assert [one.kind for one in told] == kinds
     assert not told or words in told[-1].text
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        '[[effects]]\nid = "coulomb_friction"\nparameters = { fc = 300.0 }\n',  # sticks: no motion
+        '[[effects]]\nid = "cubic_stiffness"\nparameters = { k3 = 1e8 }\n',
+    ],
+)
+def test_a_model_with_effects_foresees_in_a_bounded_time(
+    model: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However fine and long the test: by the cycles that are computed, not by a clock."""
+    texts = [(PROFILES / one).read_text() for one in ("rigs/simulated.toml", "models/snm.toml")]
+    long = PROFILE.format(gap=4.0).replace("step_hz = 0.5", "step_hz = 0.01")
+    bundle = from_texts("x", long, texts[0], texts[1] + "\n" + model, "x")
+    cycles = []
+    original = jumps.swept
+    monkeypatch.setattr(
+        jumps, "swept", lambda *given: cycles.append(len(given[1]) * given[3]) or original(*given)
+    )
+    foreseen(bundle.profile, bundle.model, bundle.steps)
+    assert len(bundle.steps) * 8 > 3000
+    assert cycles[0] <= jumps.MOST + 2 * jumps.HOLD
 
 
 def test_the_next_jump_is_ahead_until_it_is_passed() -> None:
@@ -276,6 +304,116 @@ def cycles(amplitudes: Sequence[float]) -> list[Record]:
 def test_a_change_of_attractor_is_said_once(amplitudes: list[float], said: int) -> None:
     told = warnings(cycles([1e-3 * one for one in amplitudes]))
     assert [one.kind for one in told] == ["attractor"] * said
+
+
+def test_visits_to_one_frequency_are_one_motion() -> None:
+    """A dwell comes back with a step of its own each time, of few cycles."""
+    was, items = Steady(), []
+    for number, amplitude in enumerate([1e-3] * 6 + [3e-3] * 6):
+        step = Step(number // 3, "forward", 2.5, 0.5)
+        u = amplitude * np.sin(2 * np.pi * np.arange(400) / 400)
+        labels = (np.full(400, step.index), np.full(400, 2), np.full(400, number % 3))
+        block = Block("meas", 400 * number, 1000.0, ("rel_disp_m",), u[None], *labels)
+        was, said = steadied(was, Held(step, number, block, block, block))
+        items.extend(said)
+    assert [one.kind for one in items] == ["attractor"]
+
+
+# Where it begins late, without rest, with a model that has more
+
+
+@pytest.mark.parametrize("part", [0.2, 0.5])
+def test_a_twin_that_begins_in_motion_says_nothing_wrong_and_the_same_however_cut(
+    part: float,
+) -> None:
+    """It knows no noise; the run's last rest comes after its last cycle and must not reach back."""
+    bundle, measured = session()
+    setup, begins = bundle.twin(), int(part * len(measured))
+    found = []
+    for samples in (len(measured), 1000, 20):
+        state, _ = pipeline.start(setup, begins)
+        items: list[Record] = []
+        for first in range(begins, measured.end, samples):
+            cut = measured.cut(first, min(first + samples, measured.end))
+            state, made = pipeline.step(setup, state, cut)
+            items += [one for one in made if not isinstance(one, Block)]
+        found.append(sorted(encode(one, "") for one in items))
+        assert {one.kind for one in warnings(items)} <= {"jump"}
+    assert found[0] == found[1] == found[2]
+
+
+@pytest.mark.parametrize(
+    "truth, expected",
+    [
+        ("cubic_stiffness k3=1e8; sensor_offset.mass_disp_m offset=1e-3", {"gap_r": GAP}),
+        ("cubic_stiffness k3=1e8; sensor_gain.mass_disp_m gain=1.1", {"stiffness": STIFFNESS}),
+        ("cubic_stiffness k3=1e8; sensor_gain.force_r1_n gain=0.8",
+         {"bumper_stiffness_r": 510e3}),
+        ("gap_drift rate=3e-6", {"gap_r": GAP, "gap_l": GAP}),
+    ],
+)  # fmt: skip
+def test_what_the_model_has_is_not_found_again(truth: str, expected: dict[str, float]) -> None:
+    """Plant and model have the same effects and sensors: what is identified is the base."""
+    text = "".join(
+        EFFECT.format(
+            name.partition(".")[0],
+            f'channel = "{name.partition(".")[2]}"' if "." in name else "",
+            number.replace("=", " = "),
+        )
+        for name, number in (one.split() for one in truth.split("; "))
+    )
+    bundle, measured = session(text)
+    told = re.sub(r'channel = ("\w+")\nparameters = \{', r"parameters = { channel = \1,", text)
+    card = (PROFILES / "models/snm.toml").read_text() + "\n" + told
+    same = from_texts("x", bundle.profile_toml, bundle.rig_toml, card, "x")
+    setup = same.twin()
+    state, _ = pipeline.start(setup)
+    _, made = pipeline.step(setup, state, measured)
+    items = [one for one in made if not isinstance(one, Block)]
+    for name, value in expected.items():
+        found, sd, *_ = estimates(items, name)[-1]
+        assert abs(found - value) < 0.02 * value + 5 * sd, (name, found)
+    assert "drift" not in {one.kind for one in warnings(items)}
+
+
+def test_a_bumper_where_none_should_be_is_no_crash() -> None:
+    """The wrong set: the profile's gap is never reached, and the cells feel contact."""
+    _, measured = session()
+    bundle, _ = session("", 30.0)
+    setup = bundle.twin()
+    state, _ = pipeline.start(setup)
+    _, made = pipeline.step(setup, state, measured)
+    assert "disagreement" in {one.kind for one in made if isinstance(one, Event)}
+
+
+def test_cells_that_read_nothing_in_contact_are_beyond_their_band() -> None:
+    bundle, measured = session()
+    values = measured.values.copy()
+    for name in ("force_r1_n", "force_r2_n"):
+        values[measured.channels.index(name)] = 0.0
+    labels = measured.step, measured.label, measured.cycle
+    block = Block("meas", 0, measured.rate_hz, measured.channels, values, *labels)
+    setup = bundle.twin()
+    state, _ = pipeline.start(setup)
+    _, made = pipeline.step(setup, state, block)
+    told = [one for one in made if isinstance(one, Event) and one.kind == "disagreement"]
+    assert told
+    assert "force_r" in told[0].text
+
+
+def test_a_lost_sample_now_and_then_hides_no_disagreement_and_repeats_none() -> None:
+    truth = "[base]\nbumper_stiffness_n_m = 700e3\n"
+    bundle, measured = session(truth)
+    whole = [one for one in warnings(watched(truth)) if one.kind == "disagreement"]
+    values = measured.values.copy()
+    values[measured.channels.index("mass_disp_m"), ::1000] = np.nan
+    labels = measured.step, measured.label, measured.cycle
+    block = Block("meas", 0, measured.rate_hz, measured.channels, values, *labels)
+    setup = bundle.twin()
+    state, _ = pipeline.start(setup)
+    _, made = pipeline.step(setup, state, block)
+    told = [one for one in made if isinstance(one, Event) and one.kind == "disagreement"]
+    assert 1 <= len(told) <= len(whole) + 1
 
 
 # What stands below

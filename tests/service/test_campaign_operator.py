@@ -33,7 +33,7 @@ def attended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A campaign in real time, at a terminal; a run ends as soon as it begins."""
     folder = prepared(tmp_path, monkeypatch)
 
-    def play(book: Any, run: Any, said: Any, listen: str) -> int:
+    def play(book: Any, run: Any, said: Any, listen: str, _: Any) -> int:
         spec = book.begin(run, said, listen)
         Players.given.append(spec)
         record(spec)

@@ -125,7 +125,7 @@ def step(setup: Setup, state: State, block: Block) -> tuple[State, list[Block | 
         state = State(begin(setup.twin, block.index), watch=state.watch)
     tracks, predicted, comparisons = follow(setup.twin, state.tracks, block)
     items: list[Block | Record] = [predicted, *comparisons]
-    state = replace(state, tracks=tracks, watch=watch.rested(state.watch, block))
+    state = replace(state, tracks=tracks)
     known = _joined(state.recent, (block, predicted))
     changes = np.flatnonzero(np.diff(block.step) | np.diff(block.cycle)) + 1
     edges = [0, *changes.tolist(), len(block)]
@@ -135,6 +135,7 @@ def step(setup: Setup, state: State, block: Block) -> tuple[State, list[Block | 
             state, made = _finish(setup, state, key)
             items.extend(made)
         at, end = block.index + first, block.index + last
+        state = replace(state, watch=watch.rested(state.watch, block.cut(at, end)))
         if key[1] >= 0 and state.held:
             state = replace(state, held=(*state.held, _cut(known, at, end)))
         elif key[1] >= 0 and _begins(state, key):

@@ -10,7 +10,18 @@ from pathlib import Path
 import numpy as np
 
 from table_io.card import BadInput
-from table_io.records import Check, Event, Fault, Gap, Level, Params, Response, Timing, Trip
+from table_io.records import (
+    Agreement,
+    Check,
+    Event,
+    Fault,
+    Gap,
+    Level,
+    Params,
+    Response,
+    Timing,
+    Trip,
+)
 from twin.compare.watch import KINDS as WATCHED
 from twin.service.evidence import Run, Summary, cards, gather, quantity
 from twin.service.figures import Picture, draw_all
@@ -67,6 +78,8 @@ def render(run: Run, pictures: list[Picture]) -> str:
         gaps=recording.of(Gap),
         faults=recording.of(Fault),
         events=[one for one in recording.of(Event) if one.kind not in ("state", *WATCHED)],
+        watched=[one for one in recording.of(Event) if one.kind in WATCHED],
+        compared=any(np.isfinite(one.error).any() for one in recording.of(Agreement)),
         states=recording.stop.states if recording.stop else (),
         checks=recording.of(Check),
         trips=recording.of(Trip),

@@ -96,7 +96,7 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         "warnings": [
             {"at_s": event.index / start.rate_hz, "kind": event.kind, "text": event.text}
             for event in recording.of(Event)
-            if event.kind in WATCHED
+            if event.kind in WATCHED and event.kind != "jump"
         ],
     }
 

@@ -16,7 +16,10 @@ from twin.compare.watch.instruments import Doubts, doubted
 from twin.compare.watch.jumps import Foreseen, Passing
 from twin.compare.watch.steady import Steady, steadied
 
-KINDS = ("disagreement", "drift", "jump", "no jump", "attractor", "instrument")  # of its Events
+# Of its Events. A jump is one that came where the model has it; all others are warnings.
+KINDS = (
+    "jump", "unexpected jump", "no jump", "disagreement", "drift", "attractor", "instrument",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,9 +48,11 @@ def rested(watch: Watch, block: Block) -> Watch:
 def looked(setup: WatchSetup, watch: Watch, held: Held) -> tuple[Watch, list[Record]]:
     """After a held cycle."""
     told, agreed = agreement(setup, watch.told, watch.noise, held)
-    identified, estimates = identify(setup, watch.identified, watch.noise, held, not told.ever)
-    steady, changed = steadied(watch.steady, held)
     doubts, sensors = doubted(setup, watch.doubts, watch.noise, held)
+    identified, estimates = identify(
+        setup, watch.identified, watch.noise, held, trusted=not told.ever, doubt=doubts.any
+    )
+    steady, changed = steadied(watch.steady, held)
     after = replace(watch, told=told, identified=identified, steady=steady, doubts=doubts)
     return after, [*agreed, *estimates, *changed, *sensors]
 

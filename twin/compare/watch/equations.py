@@ -94,14 +94,23 @@ def _contact(
 
 def _added(setup: WatchSetup, held: Held, law: str) -> Float1D:
     """N that the model's effects add to a linear law, from its own restarted motion, (sample,)."""
-    nothing = np.zeros(len(held.measured))
     if not any(one.effect.acts in ("force", "linear") for one in setup.model.present):
-        return nothing
-    p, seen = setup.model.parameters, held.predicted.channel
-    u, v = seen("window/rel_disp_m"), seen("window/rel_vel_m_s")
-    right, left = 2 * seen("window/force_r1_n"), 2 * seen("window/force_l1_n")
+        return np.zeros(len(held.measured))
+    p, sensors = setup.model.parameters, {one.channel: one for one in setup.model.sensors}
+
+    def moved(name: str) -> Float1D:
+        """The restarted twin's own, without what its sensors make of it."""
+        value = held.predicted.channel(f"window/{name}")
+        one = sensors.get(name)
+        return value if one is None else (value - one.offset) / one.gain
+
+    u, v = moved("rel_disp_m"), moved("rel_vel_m_s")
+    if "mass_disp_m" in sensors and "rel_disp_m" not in held.measured.channels:
+        u = moved("mass_disp_m") - held.column("table_disp_m")
+    right = moved("force_r1_n") + moved("force_r2_n")
+    left = moved("force_l1_n") + moved("force_l2_n")
     if law == "damper":
-        total = -p.mass * seen("window/mass_acc_m_s2") - right + left
+        total = -p.mass * moved("mass_acc_m_s2") - right + left
         more = total - p.stiffness * u - p.damping * v
     else:
         side, push, k, c, gap = (
@@ -109,6 +118,7 @@ def _added(setup: WatchSetup, held: Held, law: str) -> Float1D:
             if law == "right"
             else (-1, left, p.bumper_stiffness_l, p.bumper_damping_l, p.gap_l)
         )
+        gap += setup.model.opened(held.end / setup.rate_hz)
         more = np.where(push > 0, push - k * (side * u - gap) - c * side * v, 0.0)
     return np.where(np.isfinite(more), more, 0.0)
 

@@ -71,7 +71,9 @@ class Noise:
         count = round(REST_S * block.rate_hz)
         if waiting.shape[1] < count:
             return Noise(block.channels, None, waiting)
-        return Noise(block.channels, np.ascontiguousarray(waiting[:, :count]).std(axis=1))
+        rows = [row[np.isfinite(row)] for row in waiting[:, :count]]
+        rms = [float(row.std()) if row.size else float("nan") for row in rows]
+        return Noise(block.channels, np.array(rms))
 
 
 @lru_cache(maxsize=64)

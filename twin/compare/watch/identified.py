@@ -26,7 +26,7 @@ NOTICED = 0.003  # of a stiffness; for a gap, of the deepest deformation: less c
 # Of a stiffness per e-fold of the amplitude: what a law may bend beyond the model's, while the twin
 # has stayed within its band, and once it has left it.
 BENDS, BENDS_MORE = 0.003, 0.1
-TINY, STILL_M = 1e-300, 1e-9
+STILL_M = 1e-9
 MOST = 256  # chunks of a law that are kept apart; then neighbours are put together
 NAMES = (
     ("stiffness", "damping"),
@@ -66,11 +66,12 @@ class Identified:
 
 
 def identify(
-    setup: WatchSetup, known: Identified, noise: Noise, held: Held, trusted: bool
+    setup: WatchSetup, known: Identified, noise: Noise, held: Held, trusted: bool, doubt: bool
 ) -> tuple[Identified, list[Record]]:
     """With one more cycle; the Estimate where a chunk is full.
 
-    `trusted`: the twin has stayed within its band so far, so its laws hold.
+    `trusted`: the twin has stayed within its band so far, so its laws hold. `doubt`: sensors
+    contradict each other, so no drift is told.
     """
     new = equations(setup, noise, held)
     chunks = tuple(
@@ -81,7 +82,8 @@ def identify(
     grown = [mine for mine, one in zip(chunks, new, strict=True) if one is not None]
     if not any(mine[-1].full for mine in grown):
         return known, []
-    return _told(setup, known, held, BENDS if trusted else BENDS_MORE)
+    known, items = _told(setup, known, held, BENDS if trusted else BENDS_MORE)
+    return known, [one for one in items if not (doubt and isinstance(one, Event))]
 
 
 def _grown(
@@ -138,11 +140,12 @@ def _told(
 ) -> tuple[Identified, list[Record]]:
     """The Estimate, and an Event for what has begun to drift."""
     p = setup.model.parameters
-    bumper = max(p.bumper_stiffness_r, p.bumper_stiffness_l)
+    deepest = max(known.deepest, STILL_M)
+    reach = p.stiffness, p.bumper_stiffness_r * deepest, p.bumper_stiffness_l * deepest
     names: list[str] = []
     columns: list[tuple[float, float, float, float]] = []
     for law, (two, mine) in enumerate(zip(NAMES, known.chunks, strict=True)):
-        found = _values(mine, law, bends * (p.stiffness if law == 0 else bumper * known.deepest))
+        found = _values(mine, law, bends * reach[law])
         names += two if found else ()
         columns += found
     if not names:
@@ -168,9 +171,10 @@ def _sentence(name: str, value: float, change: float, spread: float) -> str:
             f"{name} has changed by {1e3 * change:+.3f} mm (+-{2e3 * spread:.3f}) since the start, "
             f"to {1e3 * value:.3f} mm"
         )
+    first = value - change
     return (
-        f"{name} has changed by {100 * change / (value - change):+.2f} % "
-        f"(+-{200 * spread / value:.2f}) since the start, to {value:.5g}"
+        f"{name} has changed by {100 * change / first:+.2f} % "
+        f"(+-{200 * spread / first:.2f}) since the start, to {value:.5g}"
     )
 
 
@@ -189,6 +193,8 @@ def _values(
     if recent is None:
         return []
     (first, second), covariance = recent[0][:2], recent[1][:2, :2]
+    if first <= 0:  # what pushes nothing back is no spring: nothing is known yet
+        return []
     jacobian = np.eye(2)
     if law:  # of (K, K G) -> (K, G)
         jacobian[1] = -second / first**2, 1 / first
@@ -196,7 +202,7 @@ def _values(
     sd = np.sqrt(np.diag(jacobian @ covariance @ jacobian.T))
     drift = [(float("nan"), float("nan"))] * 2
     trend = _solved(whole, TREND[law], bends) if len(whole) >= LEAST else None
-    if trend is not None:
+    if trend is not None and trend[0][0] > 0:
         span = whole[-1].at_s - whole[0].at_s
         x, spread = trend
         scale = span / x[0] if law else span
@@ -220,7 +226,7 @@ def _solved(chunks: list[Chunk], trend: int | None, bends: float) -> tuple[Float
     right = prior.copy()
     if trend is not None:
         into[:, trend, count:] = when - when[0]
-        prior[count] = max(bends, TINY) ** -2
+        prior[count] = bends**-2
     right += (into.mT @ wanted[:, :, None]).sum(axis=0)[:, 0]
     matrix = (into.mT @ each @ into).sum(axis=0) + np.diag(prior)
     size = np.sqrt(np.diag(matrix))

@@ -17,7 +17,7 @@ BODIES = (
     ("table", "table_acc_m_s2", "table_disp_m"),
 )
 PAIRS = (("right", *RIGHT_CELLS), ("left", *LEFT_CELLS))
-OFF = 0.03  # of the acceleration: what mounting and calibration may be off
+OFF = 0.008  # of the acceleration: what mounting and calibration may be off
 SHARE = 0.1  # of a side's force: by which its two cells may differ
 NOISES = 5.0
 CYCLES = 3  # in a row
@@ -29,6 +29,11 @@ class Doubts:
     """Cycles in a row in doubt, or `SAID`: of each body, then of each pair of cells."""
 
     cycles: tuple[int, ...] = (0,) * (len(BODIES) + len(PAIRS))
+
+    @property
+    def any(self) -> bool:
+        """True while sensors contradict each other."""
+        return SAID in self.cycles
 
 
 def doubted(

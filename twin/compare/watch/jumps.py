@@ -22,6 +22,9 @@ from twin.model.model import Model
 LEAST = 0.15  # of log eta_d: smaller changes of the model are no jumps that a person would see
 PART = 0.5  # of the model's change: so much of it, and it is the same jump
 FINE_HZ, HOLD, LAST = 0.02, 20, 5  # of the slow drive: step, cycles at each, cycles that count
+MOST = 4000  # cycles of a model with effects: one takes 0.3 ms
+LEAVING = 3  # points on which a motion leaves its branch
+PATIENCE = 1  # steps that a jump may be late before it is missed
 NEAR = 3  # steps about a jump in which the model's own course is no guide
 
 
@@ -61,15 +64,19 @@ class Passing:
 def foreseen(profile: Profile, model: Model, steps: tuple[Step, ...]) -> Foreseen:
     """What the model does up and down the sweep's range, driven slowly.
 
-    In steps of at most `FINE_HZ`; in those of the test where effects make every cycle dear.
+    In steps of at most `FINE_HZ`; where effects make every cycle dear, in those of the test or
+    coarser ones, so that no more than `MOST` cycles are computed.
     """
     grid = np.array(profile.sweep.frequencies_hz)
-    closed = all(one.effect.acts in ("parameters", "sensor") for one in model.present)
-    parts = max(1, math.ceil(profile.sweep.step_hz / FINE_HZ)) if closed else 1
-    up = np.interp(np.arange((grid.size - 1) * parts + 1) / parts, np.arange(grid.size), grid)
+    if all(one.effect.acts in ("parameters", "sensor") for one in model.present):
+        parts, hold = max(1, math.ceil(profile.sweep.step_hz / FINE_HZ)), HOLD
+        up = np.interp(np.arange((grid.size - 1) * parts + 1) / parts, np.arange(grid.size), grid)
+    else:
+        hold = min(profile.sweep.cycles, HOLD // 2)
+        up = grid[:: math.ceil(2 * grid.size * hold / MOST)]
     way = np.concatenate([up, up[::-1]])
     level = max(step.acceleration_m_s2 for step in steps)
-    motion = swept(model, way, level, HOLD if closed else profile.sweep.cycles)
+    motion = swept(model, way, level, hold)
     reach = 0.5 * (motion.column("u_max") - motion.column("u_min"))[:, -LAST:]
     ways = ["forward"] * up.size + ["backward"] * up.size
     points = [_point(*one) for one in zip(ways, way.tolist(), reach, strict=True)]
@@ -77,38 +84,44 @@ def foreseen(profile: Profile, model: Model, steps: tuple[Step, ...]) -> Foresee
         one for jump in branches(points, "measured")[0]
         if (one := _between_steps(jump, points, steps)) is not None
     ]  # fmt: skip
-    sizes = {(one.direction, one.frequency_hz): one.measured for one in points}
-    known = {step.index: sizes.get((step.direction, step.frequency_hz)) for step in steps}
+    sizes = {(one.direction, one.frequency_hz): _size(one) for one in points}
+    known = {step.index: sizes.get((step.direction, step.frequency_hz), 0.0) for step in steps}
     return Foreseen(
         tuple(sorted(found, key=lambda one: one.after.index)),
-        {index: math.log(own.eta_d) for index, own in known.items() if own is not None},
+        {index: math.log(size) for index, size in known.items() if size > 0},
     )
 
 
 def _point(direction: str, frequency_hz: float, reach: Float1D) -> Point:
     """A point of the model: half of its u from peak to peak over the last cycles, as eta_d."""
     nothing, mean = float("nan"), float(reach.mean())
-    own = Quantities(
-        mean, nothing, nothing, nothing, nothing, nothing, (), (), nothing,
-        float(np.ptp(reach)) / mean,
-    )  # fmt: skip
+    spread = float(np.ptp(reach)) / mean if mean > 0 else 0.0  # a mass that sticks moves nowhere
+    own = Quantities(mean, nothing, nothing, nothing, nothing, nothing, (), (), nothing, spread)
     return Point(0, 0, direction, frequency_hz, own, None, nothing, nothing, nothing)
 
 
+def _size(point: Point) -> float:
+    return point.measured.eta_d if point.measured is not None else 0.0
+
+
 def _between_steps(jump: Jump, points: Sequence[Point], steps: tuple[Step, ...]) -> Expected | None:
-    """The jump between the two steps of the test where it lies; None where there are none."""
+    """The jump between the two steps of the test where it lies; None where there are none.
+
+    Its change is that from the last point before it to the farthest of the next few: with few
+    cycles at each a motion takes more than one to leave its branch.
+    """
     at_hz = 0.5 * (jump.from_hz + jump.to_hz)
+    way = [one for one in points if one.direction == jump.direction]
+    place = next(i for i, one in enumerate(way) if one.frequency_hz == jump.from_hz)
+    size, after = _size(way[place]), [_size(one) for one in way[place + 1 : place + 1 + LEAVING]]
+    if size <= 0 or min(after) <= 0:
+        return None
+    change = math.log((max(after) if jump.kind == "up" else min(after)) / size)
     sense = 1.0 if jump.to_hz > jump.from_hz else -1.0
-    for before, after in pairwise(steps):
-        here = before.direction == after.direction == jump.direction
-        if here and sense * before.frequency_hz < sense * at_hz <= sense * after.frequency_hz:
-            ends = {
-                one.frequency_hz: one.measured.eta_d
-                for one in points
-                if one.direction == jump.direction and one.measured is not None
-            }
-            change = math.log(ends[jump.to_hz] / ends[jump.from_hz])
-            return Expected(before, after, change, at_hz) if abs(change) > LEAST else None
+    for one, other in pairwise(steps):
+        here = one.direction == other.direction == jump.direction
+        if here and sense * one.frequency_hz < sense * at_hz <= sense * other.frequency_hz:
+            return Expected(one, other, change, at_hz) if abs(change) > LEAST else None
     return None
 
 
@@ -122,20 +135,18 @@ def passed(passing: Passing, point: Point) -> tuple[Passing, list[Record]]:
     last = passing.last
     passing = replace(passing, last=point)
     items: list[Record] = []
-    before = last.measured if last and last.direction == point.direction else None
-    if before is not None and point.measured is not None:
-        change = math.log(max(point.measured.eta_d, 1e-12) / max(before.eta_d, 1e-12))
-        hint = None if _smooth(passing, last, point, change) else sudden(last, point)
-        passing, said = _matched(passing, point, change, hint)
-        items += [Event(point.index, kind, text) for kind, text in said]
-    gone = tuple(one for one in passing.ahead if one.after.index <= point.step)
-    passing = replace(passing, ahead=tuple(one for one in passing.ahead if one not in gone))
+    if last is not None and last.direction == point.direction and _size(last) > 0 < _size(point):
+        change = math.log(_size(point) / _size(last))
+        passing, said = _matched(passing, last, point, change)
+        items = [Event(point.index, kind, text) for kind, text in said]
+    late = tuple(one for one in passing.ahead if one.after.index + PATIENCE <= point.step)
+    passing = replace(passing, ahead=tuple(one for one in passing.ahead if one not in late))
     return passing, [*items, ahead(passing, point)]
 
 
-def _smooth(passing: Passing, last: Point | None, point: Point, change: float) -> bool:
+def _smooth(passing: Passing, last: Point, point: Point, change: float) -> bool:
     """True where the model's own branch changes as much: the flank of a resonance is no jump."""
-    if last is None or not {last.step, point.step} <= passing.reach.keys():
+    if not {last.step, point.step} <= passing.reach.keys():
         return False
     jumps = (*passing.ahead, *passing.overdue)
     near = any(abs(one.after.index - point.step) <= NEAR for one in jumps)
@@ -144,35 +155,50 @@ def _smooth(passing: Passing, last: Point | None, point: Point, change: float) -
 
 
 def _matched(
-    passing: Passing, point: Point, change: float, hint: str | None
+    passing: Passing, last: Point, point: Point, change: float
 ) -> tuple[Passing, list[tuple[str, str]]]:
-    """(without what has come, (kind, text) of what to say)."""
-    due = [one for one in passing.ahead if one.after.index == point.step]
+    """(without what has come, (kind, text) of what to say) after a change of log eta_d."""
     said: list[tuple[str, str]] = []
-    overdue = list(passing.overdue)
+    waiting = [one for one in passing.ahead if one.after.direction == point.direction]
+    overdue = [one for one in passing.overdue if one.after.direction == point.direction]
+    due = [one for one in waiting if one.after.index <= point.step]
+    leap = sudden(last, point)
+    came = [one for one in due if _same(one, change) or (leap and change * one.change > 0)]
+    for one in came:
+        where = "where the model expects it"
+        if one.after.index <= last.step:
+            where = f"one step after where the model expects it ({one.at_hz:.3f} Hz)"
+        said.append(("jump", f"{_here(one)} came {where}"))
     for one in due:
-        if change * one.change > 0 and abs(change) >= PART * abs(one.change):
-            said.append(("jump", f"{_here(one)} came where the model expects it"))
-            passing, hint = replace(passing, came=point.step), None
-        else:
+        if one not in came and one.after.index + PATIENCE <= point.step:
             said.append(("no jump", f"{_here(one)}, as the model has it, did not come"))
             overdue.append(one)
+    hint = None if came or _smooth(passing, last, point, change) else leap
     # What jumps while it is measured does so in part only, and goes on at the next step.
     if hint is not None and point.step != passing.came + 1:
+        early = [one for one in waiting if one not in due]
+        found = next((one for one in (*overdue, *early) if _same(one, change)), None)
+        said.append(("unexpected jump", f"{hint}; {_apart(found, point)}"))
+        came = [] if found is None else [found]
+    if came or hint is not None:
         passing = replace(passing, came=point.step)
-        for one in (*overdue, *passing.ahead):
-            same_way = one.after.direction == point.direction and one not in due
-            if same_way and change * one.change > 0 and abs(change) >= PART * abs(one.change):
-                steps = point.step - one.after.index
-                when = "later" if steps > 0 else "earlier"
-                text = f"{hint}; {abs(steps)} steps {when} than the model ({one.at_hz:.3f} Hz)"
-                said.append(("jump", text))
-                overdue = [other for other in overdue if other != one]
-                passing = replace(passing, ahead=tuple(a for a in passing.ahead if a != one))
-                break
-        else:
-            said.append(("jump", f"{hint}; the model expects none here"))
-    return replace(passing, overdue=tuple(overdue)), said
+    left = tuple(one for one in passing.ahead if one not in came)
+    return replace(
+        passing, ahead=left, overdue=tuple(one for one in overdue if one not in came)
+    ), said
+
+
+def _same(one: Expected, change: float) -> bool:
+    return change * one.change > 0 and abs(change) >= PART * abs(one.change)
+
+
+def _apart(one: Expected | None, point: Point) -> str:
+    """How far from a jump of the model it came."""
+    if one is None:
+        return "the model expects none here"
+    steps = point.step - one.after.index
+    when = "later" if steps > 0 else "earlier"
+    return f"{abs(steps)} steps {when} than the model ({one.at_hz:.3f} Hz)"
 
 
 def _here(one: Expected) -> str:
@@ -186,8 +212,8 @@ def ahead(passing: Passing, point: Point) -> Ahead:
     """The next jump on the way, as seen from a step."""
     nothing = float("nan")
     here = (point.index, point.step, point.direction, point.frequency_hz)
-    if not passing.ahead:
+    one = next((one for one in passing.ahead if one.after.index > point.step), None)
+    if one is None:
         return Ahead(*here, "", nothing, nothing, nothing)
-    one = passing.ahead[0]
     ends = sorted((one.before.frequency_hz, one.after.frequency_hz))
     return Ahead(*here, one.kind, one.at_hz, *ends)

@@ -66,6 +66,7 @@ class Board:
     profile: Profile | None = None
     rig: Rig | None = None
     index: int = 0  # samples that are known to be acquired
+    seen: int = 0  # end of the last block
     state: str = ""
     state_since: int = -1
     now: tuple[int, int, int] = (-1, 0, -1)  # step, label, cycle of the last sample seen
@@ -147,9 +148,9 @@ def _block(board: Board, block: Block, start: RunStart) -> Board:
     if block.stream != "meas" or misfit(block, None, start) or mislabelled([block]):
         return board
     second = round(SECOND * block.rate_hz)
-    if block.index < second and board.index > block.end + second:
+    if block.index < second and board.seen > block.end + second:
         board = Board(board.run, board.past, start, board.profile, board.rig)
-    board.index = max(board.index, block.end)
+    board.index, board.seen = max(board.index, block.end), block.end
     board.now = int(block.step[-1]), int(block.label[-1]), int(block.cycle[-1])
     board.recent.add(block, 1.0 / board.step.frequency_hz if board.step else 0.0)
     return board
