@@ -198,7 +198,8 @@ def _apart(one: Expected | None, point: Point) -> str:
         return "the model expects none here"
     steps = point.step - one.after.index
     when = "later" if steps > 0 else "earlier"
-    return f"{abs(steps)} steps {when} than the model ({one.at_hz:.3f} Hz)"
+    many = f"{abs(steps)} steps" if abs(steps) > 1 else "one step"
+    return f"{many} {when} than the model ({one.at_hz:.3f} Hz)"
 
 
 def _here(one: Expected) -> str:
