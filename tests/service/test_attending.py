@@ -17,6 +17,7 @@ from twin.service.attending import attend_as_recorder
 from twin.service.bundle import read_bundle
 from twin.stream.access import open_access
 from twin.stream.endpoint import PUBLIC, merged
+from twin.stream.resend import Inbox
 from twin.stream.salvage import salvage
 from twin.stream.wire import TOPIC_TYPES, Item, encode, topic
 from twin.stream.zenoh_link import open_hub
@@ -120,18 +121,30 @@ def test_a_test_that_goes_silent_leaves_what_came_and_says_so(
     assert len(salvage(tmp_path / "copy" / "run.mcap").messages) == 11
 
 
-def test_ctrl_c_ends_the_recording(gate: Callable[..., str], tmp_path: Path) -> None:
+def test_ctrl_c_ends_the_recording(
+    gate: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     start = BUNDLE.describe(RUN, "table")({}, 0.0)
     where = gate(start, *map(block, range(10)))
-    timer = threading.Timer(1.0, signal.raise_signal, [signal.SIGINT])
-    timer.start()
+    record = attending._record
+
+    def interrupted(run: str, inbox: Inbox, folder: Path, asked: Callable[[], str | None]) -> bool:
+        """As it is, but Ctrl-C comes as soon as the test's beginning has."""
+
+        def asked_then() -> str | None:
+            if list(folder.rglob("*.mcap")) and asked() is None:
+                signal.raise_signal(signal.SIGINT)
+            return asked()
+
+        return record(run, inbox, folder, asked_then)
+
+    monkeypatch.setattr(attending, "_record", interrupted)
     code = attend_as_recorder(where, RIG, tmp_path / "copy", None)
-    timer.join()
     assert code == attending.EXIT_INTERRUPTED
     assert (tmp_path / "copy" / "run.mcap").exists()
 
 
-@pytest.mark.parametrize("run", ["..", "", "a" * 102])
+@pytest.mark.parametrize("run", ["..", "", "a" * 102, "observer.anna.0"])
 def test_no_folder_is_named_by_a_peer_that_sends_no_run(
     gate: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: str
 ) -> None:

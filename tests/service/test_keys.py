@@ -107,18 +107,34 @@ def test_a_leaf_does_not_outlive_its_authority() -> None:
     assert expiry(issue(pair, "a", [], today()).certificate) == expiry(pair.certificate)
 
 
+@pytest.mark.parametrize("late", [timedelta(minutes=30), timedelta(days=1)])
+def test_an_expired_authority_is_named_as_such(
+    lab: Path, monkeypatch: pytest.MonkeyPatch, late: timedelta
+) -> None:
+    ends = expiry((lab / "ca.pem").read_bytes())
+    monkeypatch.setattr("twin.service.keys_folder.today", lambda: ends + late)
+    before = contents(lab)
+    what = rf"the authority expired on {ends:%Y-%m-%d}; make new ones: `shaketwin keys new`"
+    for change in (lambda: add_person(lab, "bob", "observe", []), lambda: renew(lab, None, [])):
+        with pytest.raises(BadInput, match=what):
+            change()
+    assert contents(lab) == before
+
+
 def test_private_keys_are_private_whatever_the_umask(tmp_path: Path) -> None:
     before = os.umask(0)
     try:
         new_keys(tmp_path / "lab", [])
         add_person(tmp_path / "lab", "anna", "observe", [])
+        renew(tmp_path / "lab", None, [])
     finally:
         os.umask(before)
     modes = {
         str(one.relative_to(tmp_path)): one.stat().st_mode & 0o777 for one in tmp_path.rglob("*")
     }
     assert {mode for name, mode in modes.items() if name.endswith("key.pem")} == {0o600}
-    assert {modes[name] for name in ("lab", "lab/people", "lab/people/anna")} == {0o700}
+    folders = {mode for name, mode in modes.items() if (tmp_path / name).is_dir()}
+    assert folders == {0o700}
 
 
 def test_nothing_is_overwritten_and_a_name_is_given_once(lab: Path) -> None:
@@ -135,6 +151,9 @@ def test_nothing_is_overwritten_and_a_name_is_given_once(lab: Path) -> None:
         lambda: new_keys(lab.parent / "new", ["a b"]),
         lambda: remove_person(lab, "bob"),
         lambda: renew(lab, "bob", []),
+        lambda: renew(lab, "/x", []),
+        lambda: renew(lab, "../anna", []),
+        lambda: renew(lab, "*", []),
     ):
         with pytest.raises(BadInput):
             again()

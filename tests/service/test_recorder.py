@@ -231,6 +231,18 @@ def test_what_another_run_says_is_not_recorded(
     assert lost.text == "recorder: 4 messages missed, 0 dropped"
 
 
+def test_of_samples_that_no_log_can_hold_nothing_is_recorded(
+    tmp_path: Path, limit: Callable[[int], None]
+) -> None:
+    recorder, bus = at_work(tmp_path)
+    bus.coming.insert(9, ("/run/event", encode(Event(2**50, "stray", ""), START.run)))
+    recorder.run()
+    recorder.end()
+    assert recorded(tmp_path) == expected()
+    (left,) = [one for one in read(tmp_path / "part.mcap").of(Event) if one.kind == "recorder"]
+    assert left.text == "recorder: 1 messages left out, of impossible samples"
+
+
 def test_a_sync_that_failed_is_not_believed_to_be_mended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,10 +11,12 @@ from rich.console import Console
 from rich.table import Table
 
 from table_io.card import BadInput, find
+from table_io.records import Event, Fault, Point, Quantities
 from twin.service import folders, kernels, terminal
 from twin.service.bundle import read_bundle
 from twin.service.folders import new_folder, new_run
 from twin.service.prc_table import print_prc
+from twin.service.progress import RunProgress
 
 from .recordings import summary
 
@@ -106,3 +108,16 @@ def test_every_kernel_of_a_command_is_had_before_it_begins(monkeypatch: pytest.M
     assert warmed == ["twin"]
     kernels.ready(bundle, table=True)
     assert warmed == ["twin", "rig", "twin"]
+
+
+def test_what_a_twin_elsewhere_writes_gives_no_orders_to_the_terminal() -> None:
+    quantities = Quantities(1.0, 1.0, 1.0, 1.0, 1.0, 1.0, (), (), 0.0, 0.0)
+    evil = "\x1b[2J\x1b]0;owned\x07\nstate: at rest\u202e"
+    out = io.StringIO()
+    show = RunProgress(Console(file=out), 3, 100)
+    show(Point(1, 1, evil, 1.0, quantities, quantities, 1.0, 1.0, 0.0))
+    show(Fault(1, "twin", 0, 1, evil))
+    show(Event(1, "drift", evil))
+    said = out.getvalue().splitlines()
+    assert all(line.isprintable() for line in said)
+    assert [line[:12] for line in said[2:]] == [f"{'':>7}  fau", f"{'':>7}  dri"]

@@ -124,9 +124,9 @@ def test_a_twin_elsewhere_is_heard_without_loss(
     """What it published before anybody asked comes too: the hub may ask for what it holds."""
     twin = open_spoke(RIG, endpoint, 5.0, read_keys(own(lab, "tina")))
     closing.callback(twin.close)
-    twin.declare(("/twin/point",))
+    twin.declare(("/twin/point",), offered=True)
     twin.publish("/twin/point", b"before")
-    inbox = hub.subscribe(("/twin/point",), history=True, capacity=10)
+    inbox = hub.subscribe(("/twin/point",), history=True, capacity=10, offered=True)
     got = []
     for _ in range(200):
         twin.serve()
@@ -145,12 +145,11 @@ def test_only_a_twin_publishes_and_only_what_a_twin_computes(
     got: list[str] = []
     listener = hub._session.declare_subscriber("**", noted(got))
     session = person(who)
-    for where in (*NOT_THEIRS, "stream/twin/pred", "event/twin/point"):
+    for where in (*NOT_THEIRS, "stream/twin/pred", "event/twin/point", "offer/twin/pred"):
         put(session, where)
     settled(session)
     listener.undeclare()
-    computed = [f"{ROOT}/stream/twin/pred", f"{ROOT}/event/twin/point"]
-    assert got == (computed if who == "tina" else [])
+    assert got == ([f"{ROOT}/offer/twin/pred"] if who == "tina" else [])
 
 
 @pytest.mark.parametrize("who", KNOWN)
@@ -175,19 +174,24 @@ def test_everybody_known_asks_for_state_and_configuration(person: Any, who: str)
 
 @pytest.mark.parametrize("who", [*KNOWN, "gone"])
 def test_nobody_answers_or_listens_in_the_rigs_place(hub: Link, person: Any, who: str) -> None:
-    """A false rig gets no question; only a twin those for what it holds itself."""
+    """A false rig gets no question; a twin only the rig's own, for what it offers."""
     asked: list[str] = []
     false_rig = person(who)
     for where in ("cmd/**", "cmd/stop/anna", "state/**", "state/status", "config/**", "state/held"):
         false_rig.declare_queryable(f"{ROOT}/{where}", noted(asked))
+    false_rig.declare_queryable(f"{ROOT}/state/offers", noted(asked))
     heard(false_rig, "cmd/**", "cmd/stop/anna")
     honest = person("anna")
     assert answers(honest, "cmd/stop/anna") == [b"refused: this is run run"]
     assert answers(honest, "state/status") == [b"state/status"]
     assert answers(honest, "config/run") == [b"config/run"]
     assert answers(honest, "state/held") == []
+    assert answers(honest, "state/offers") == []
     settled(false_rig)
-    assert set(asked) == ({f"{ROOT}/state/held"} if who == "tina" else set())
+    assert asked == []
+    answers(hub._session, "state/offers")
+    settled(false_rig)
+    assert set(asked) == ({f"{ROOT}/state/offers"} if who == "tina" else set())
 
 
 @pytest.mark.parametrize("who", [*KNOWN, "gone"])
@@ -237,7 +241,7 @@ def test_a_run_with_a_twin_of_its_own_takes_no_other(lab: Path, closing: ExitSta
     closing.callback(session.close)
     got: list[str] = []
     link._session.declare_subscriber("**", noted(got))
-    put(session, "stream/twin/pred")
+    put(session, "offer/twin/pred")
     assert answers(session, "state/role/tina") == [b"twin"]
     assert got == []
 
@@ -261,10 +265,10 @@ def test_on_this_machine_everybody_asks_and_nobody_publishes(
         false_rig.liveliness().declare_token(f"{ROOT}/alive/{name}")
         for name in ("run.twin", "observer.me.1")
     ]
-    for where in (*NOT_THEIRS, "stream/twin/pred"):
+    for where in (*NOT_THEIRS, "stream/twin/pred", "offer/twin/pred"):
         put(false_rig, where)
     settled(false_rig)
-    assert published == ([f"{ROOT}/stream/twin/pred"] if twin else [])
+    assert published == ([f"{ROOT}/offer/twin/pred"] if twin else [])
     put(link._session, "stream/rig/meas")
     put(link._session, "cmd/stop/me")
     assert answers(honest, "cmd/stop/me") == [b"cmd/stop/me"]

@@ -57,6 +57,18 @@ while True:
     time.sleep(0.005)
 """
 
+# A process that gives an order and asks a question, and stalls before it hears the answers.
+ASKER = """
+import os, signal, sys, threading, time
+from twin.stream.zenoh_link import open_spoke
+link = open_spoke("rig", sys.argv[1], 5.0)
+inbox = link.subscribe(("/rig/meas",), history=True, capacity=20000)
+link.pass_on("hold", "", None, 60.0)
+threading.Thread(target=link.inquire, args=("cmd/resume", "", 60.0), daemon=True).start()
+time.sleep(0.2)
+os.kill(os.getpid(), signal.SIGSTOP)
+"""
+
 Start = Callable[..., "subprocess.Popen[str]"]
 
 
@@ -401,6 +413,23 @@ def test_a_command_that_nobody_answers_is_none_in_time(hub: Link, spoke: Link) -
     assert commands.poll() is not None
 
 
+def test_whoever_asks_and_stalls_holds_nobody_up_who_answers(
+    hub: Link, endpoint: str, start: Start
+) -> None:
+    hub.declare((MEAS_TOPIC,))
+    commands = hub.commands()
+    asker = start(ASKER, endpoint)
+    os.waitid(os.P_PID, asker.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
+    for _ in range(400):  # until nothing more goes into its pipe
+        hub.publish(MEAS_TOPIC, bytes(40_000))
+    given = [one for one in (commands.poll(), commands.poll()) if one is not None]
+    begin = time.monotonic()
+    for one in given:
+        one.reply("yes")
+    assert time.monotonic() - begin < 0.5
+    assert sorted(one.name for one in given) == ["hold", "resume"]
+
+
 def test_an_unreadable_command_is_ignored_and_counted(hub: Link, spoke: Link) -> None:
     commands = hub.commands()
     spoke.request("stop", text=b"\xff\xfe", timeout_s=0.1)  # type: ignore[arg-type]
@@ -413,8 +442,13 @@ def test_foreign_questions_and_messages_do_no_harm(hub: Link, spoke: Link) -> No
     inbox = spoke.subscribe((MEAS_TOPIC,), history=True, capacity=10)
     time.sleep(SETTLED_S)
     session = spoke._session
-    for text in (b"\xff", b"{}", b"[]", b'{"next": {"/rig/meas": 3}, "history": 1}'):
+    next_one = b'{"next": {"/rig/meas": {"%s": 1e999}}, "history": 1}' % hub._name.encode()
+    texts = (b"\xff", b"{}", b"[]", b'{"next": {"/rig/meas": 3}, "history": 1}', next_one)
+    for text in (*texts, b"[" * 60_000):
         session.get("shaketwin/rig/state/held", payload=text, timeout=0.1)
+    time.sleep(SETTLED_S)
+    for _ in range(10):
+        hub.serve()
     hub._session.put(key("rig", MEAS_TOPIC), b"no stamp")
     hub._session.put(key("rig", MEAS_TOPIC), b"odd", attachment=b"stamp")
     hub.publish(MEAS_TOPIC, numbered(0))

@@ -17,9 +17,10 @@ from twin.service.recorder import FLUSH_S, SYNC_S, Awaited
 from twin.service.spec import CAPACITY, QUIET_S, Spec
 from twin.service.tell import person
 from twin.service.terminal import interruptible, say
+from twin.stream.endpoint import running
 from twin.stream.folder import PARTS
 from twin.stream.keys import Keys
-from twin.stream.mcap_log import LogWriter
+from twin.stream.mcap_log import ImpossibleTimeError, LogWriter
 from twin.stream.resend import Inbox
 from twin.stream.wire import TOPIC_TYPES, WireError, decode, encode, topic
 from twin.stream.zenoh_link import Link, open_spoke
@@ -52,15 +53,15 @@ def attend_as_recorder(connect: str, rig: str, out: Path | None, keys: Keys | No
 
 def attend_as_twin(connect: str, rig: str, keys: Keys | None) -> int:
     """Computes for a running test that was started with --remote-twin; the exit code."""
-    from twin.service.processes import twin
+    from twin.service.twinning import compute  # much to import, for a twin alone
 
     link = open_spoke(rig, connect, CONNECT_S, keys)
     try:
-        spec = _spec(link, connect)
+        spec, missed_from = _spec(link, connect)
         who = keys.name if keys is not None else person()
         link.alive(f"observer.{who}.twin")
         say(f"computing for {spec.run}; Ctrl-C ends it, not the test")
-        twin(spec, "", link)
+        compute(spec, missed_from, link, alone=lambda: False)
     except KeyboardInterrupt:
         say("the twin has ended; the test goes on")
         return EXIT_INTERRUPTED
@@ -69,8 +70,11 @@ def attend_as_twin(connect: str, rig: str, keys: Keys | None) -> int:
     return 0
 
 
-def _spec(link: Link, connect: str) -> Spec:
-    """What the gate says of its run; looked at like any file when it is used."""
+def _spec(link: Link, connect: str) -> tuple[Spec, str]:
+    """What the gate says of its run; looked at like any file when it is used.
+
+    With it, where a twin has been there before, the sample up to which that one had come.
+    """
 
     def asked(path: str) -> str:
         answer = link.inquire(path, timeout_s=CONNECT_S)
@@ -79,15 +83,18 @@ def _spec(link: Link, connect: str) -> Spec:
         return answer.decode(errors="replace")
 
     run = _run(link, connect)
-    if not json.loads(asked("state/status")).get("remote_twin"):
+    status = json.loads(asked("state/status"))
+    if not status.get("remote_twin"):
         raise BadInput(f"{run} has a twin of its own; start it with --remote-twin for one here")
     profile, rig, model = (asked(f"config/{one}") for one in ("profile", "rig", "model"))
-    return Spec(run, str(json.loads(asked("config/run"))["name"]), "", "", profile, rig, model)
+    name = str(json.loads(asked("config/run"))["name"])
+    compared = int(status.get("compared", 0))
+    return Spec(run, name, "", "", profile, rig, model), str(compared) if compared else ""
 
 
 def _run(link: Link, connect: str) -> str:
     """The run that goes on there; its id, which names a folder here, is looked at first."""
-    runs = [name.removesuffix(".rig") for name in link.components() if name.endswith(".rig")]
+    runs = running(link.components())
     if not runs or not re.fullmatch(r"\w[\w.-]{0,100}", runs[0]):
         raise BadInput(f"endpoint {connect}: no test runs there; `shaketwin run` starts one")
     return runs[0]
@@ -153,7 +160,10 @@ class _Taking:
         if self.writer is None:
             self._early.append((name, payload))
             return
-        self.writer.write(name, payload, item.index)
+        try:
+            self.writer.write(name, payload, item.index)
+        except ImpossibleTimeError:  # so far away is no sample of this run, whatever it says
+            return
         self.waiting.heard(item)
         early, self._early = self._early, []
         for one in early:

@@ -46,15 +46,23 @@ def found(name: str, now: datetime) -> Pair:
 
 
 def issue(authority: Pair, name: str, hosts: Sequence[str], now: datetime) -> Pair:
-    """A certificate of `name`, good for a year; with `hosts` it may answer as one of them."""
+    """A certificate of `name`, good for a year; with `hosts` it may answer as one of them.
+
+    BadInput where the authority has expired, or its key is another's.
+    """
     above = x509.load_pem_x509_certificate(authority.certificate)
     signer = load_pem_private_key(authority.key, None)
     if not isinstance(signer, ec.EllipticCurvePrivateKey) or signer.public_key() != (
         above.public_key()
     ):
         raise BadInput("the authority's key does not belong to its certificate; restore the two")
+    ends = above.not_valid_after_utc
+    if now >= ends:
+        raise BadInput(
+            f"the authority expired on {ends:%Y-%m-%d}; make new ones: `shaketwin keys new`"
+        )
     key = ec.generate_private_key(ec.SECP256R1())
-    until = min(now + timedelta(days=LEAF_DAYS), above.not_valid_after_utc)
+    until = min(now + timedelta(days=LEAF_DAYS), ends)
     builder = _begin(name, key, above.subject, now, until)
     builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), True)
     builder = builder.add_extension(_usage(signs_certificates=False), critical=True)

@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from table_io.clock import Clock, RealClock
-from table_io.records import Event, Timing
+from table_io.records import Event
 from table_io.session import ORDERS
+from twin.service.offers import OFFERS, TWIN_TOPICS, Offers
 from twin.service.spec import CAPACITY, CONNECT_S, QUIET_S, Spec, orphaned, token
 from twin.service.status import PATHS, Status
 from twin.service.stopwatch import Stopwatch
@@ -23,8 +24,8 @@ from twin.stream.endpoint import PUBLIC, check, merged, safe, through
 from twin.stream.keys import read_keys
 from twin.stream.questions import Question, Questions
 from twin.stream.resend import Inbox
-from twin.stream.shelf import LARGEST_BYTES, PIECE_BYTES, Piece
-from twin.stream.wire import MEAS_TOPIC, TOPIC_TYPES, WireError, decode, encode, topic
+from twin.stream.shelf import Piece
+from twin.stream.wire import MEAS_TOPIC, TOPIC_TYPES, encode, topic
 from twin.stream.zenoh_link import Link, open_hub, open_spoke
 
 NICENESS = 5  # whoever looks waits, not whoever drives
@@ -36,10 +37,7 @@ LOOK_S = 0.25  # at who is there
 STAY_S = 5.0  # after the run, for those who still fetch it
 ASKED_WITHIN_S = 2.0  # they ask twice a second; who does not is not waited for
 LOOKED_AT, TIMING_BLOCKS = 10, 100  # of the measured blocks
-TWIN_OFFERS = (*(name for name in TOPIC_TYPES if name.startswith("/twin/")), "/run/timing")
-OFFERS = 8  # pieces taken in a turn
-MOST_TWINS, MOST_OFFERED = 16, 256  # publishers; payloads whose end has not come yet
-MOST_PIECES = LARGEST_BYTES // PIECE_BYTES + 1  # of a payload
+OFFERED_CAPACITY = 1000  # pieces that wait; more are asked for again
 LONGEST_TEXT = 1000
 NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 REFUSALS, REFUSAL_EVERY_S = 10, 10.0  # told at once; after these, one in so long
@@ -93,15 +91,6 @@ def fault(order: str, who: str, role: str, run: str, text: str) -> str:
     return ""
 
 
-def offered(name: str, payload: bytes, run: str) -> bool:
-    """Whether these bytes are what the topic promises, of this run and its twin."""
-    try:
-        of, item = decode(name, payload)
-    except WireError:
-        return False
-    return of == run and (not isinstance(item, Timing) or item.component == "twin")
-
-
 @dataclass(slots=True)
 class Refusals:
     """Which refusals are recorded: a flood of them is one sentence now and then."""
@@ -138,9 +127,7 @@ class Gate:
     status: Status = field(init=False)
     watch: Stopwatch = field(init=False)
     blocks: int = 0
-    offers: Inbox | None = None  # what a twin outside publishes
-    foreign: set[str] = field(default_factory=set)  # publishers outside
-    _offered: dict[tuple[str, str], list[Piece]] = field(default_factory=dict)
+    offers: Offers | None = None  # of a twin outside
 
     def __post_init__(self) -> None:
         self.status = Status(self.spec)
@@ -155,9 +142,8 @@ class Gate:
         while not (orphaned() and self.clock.now() - heard > self._patience()):
             if self._relay():
                 heard = self.clock.now()
-            for _ in range(OFFERS):
-                if self.offers is None or not self._take(self.offers):
-                    break
+            if self.offers is not None:
+                self._admit(self.offers)
             front.serve()
             if self.clock.now() - looked > LOOK_S:
                 self._mirror(set(present))
@@ -178,44 +164,31 @@ class Gate:
             piece = self.inbox.piece(timeout_s)
             if piece is None:
                 return count > 0
+            if self.offers is not None:
+                self.offers.inside.add(piece.source)
             self._pass(piece)
             timeout_s = 0.0
         return True
 
     def _pass(self, piece: Piece) -> None:
-        if piece.source in self.foreign:
-            self.outside.hold(piece)  # outside it is known: whoever computed it has sent it there
-        else:
-            self.outside.relay(piece)
+        self.outside.relay(piece)
         whole = self.inbox.whole(piece)
         if whole is not None:
             self.status.see(piece.topic, whole)
             if piece.topic == MEAS_TOPIC:
                 self._time()
 
-    def _take(self, offers: Inbox) -> bool:
-        """Let in what a twin outside has computed, once it is whole and what its topic promises.
-
-        True where something lay there.
-        """
-        piece = offers.piece(0.0)
-        if piece is None:
-            return False
-        if piece.source not in self.foreign and len(self.foreign) >= MOST_TWINS:
-            return True
-        if len(self._offered) > MOST_OFFERED:
-            self._offered.clear()  # beginnings without an end
-        parts = self._offered.setdefault(piece[:2], [])
-        parts.append(piece)
-        whole = offers.whole(piece)
-        if whole is None and len(parts) <= MOST_PIECES:
-            return True
-        del self._offered[piece[:2]]
-        if whole is not None and offered(piece.topic, whole, self.spec.run):
-            self.foreign.add(piece.source)
-            for part in parts:
-                self.inside.relay(part)
-        return True
+    def _admit(self, offers: Offers) -> None:
+        """Let in what a twin outside has computed; it waits until we know how far the rig is."""
+        end = 0 if self.inbox.behind else self.status.end
+        for _ in range(OFFERS if end else 0):
+            taken = offers.take(end)
+            if taken is None:
+                return
+            for piece in taken:
+                self.inbox.without.add(piece.source)
+                self.inside.relay(piece)
+                self._pass(piece)
 
     def _time(self) -> None:
         """Look at every tenth block how late it goes out; say so once a second."""
@@ -274,12 +247,17 @@ def gate(spec: Spec, _: str) -> None:
     inside.declare(tuple(TOPIC_TYPES))
     outside.declare(tuple(TOPIC_TYPES))
     inbox = inside.subscribe(tuple(TOPIC_TYPES), history=True, capacity=CAPACITY)
-    offers = None
-    if spec.remote_twin:
-        offers = outside.subscribe(TWIN_OFFERS, history=True, capacity=CAPACITY)
+    offers = _offers(spec, outside) if spec.remote_twin else None
     inside.alive(token(spec, "gate"))
     # Without keys everybody on this machine may command, as whoever they say they are.
     roles = keys.role if keys is not None else lambda _: "command"
     Gate(spec, inside, outside, inbox, RealClock(), roles, offers=offers).run()
     outside.close()
     inside.close()
+
+
+def _offers(spec: Spec, outside: Link) -> Offers:
+    from twin.compare.watch import KINDS  # much to import, which a gate without offers never needs
+
+    inbox = outside.subscribe(TWIN_TOPICS, history=True, capacity=OFFERED_CAPACITY, offered=True)
+    return Offers(inbox, spec.run, frozenset(KINDS))

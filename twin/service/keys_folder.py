@@ -107,8 +107,8 @@ def renew(folder: Path, name: str | None, hosts: Sequence[str]) -> None:
         _renew_rig(folder, [_checked_host(host) for host in hosts])
         return
     people = read_people(folder)
-    given = _given(folder, name)
-    if name not in people or not given:
+    given = _given(folder, name) if name in people else []
+    if not given:
         raise BadInput(_unknown(folder, name))
     if hosts and people[name] != ROUTER:
         raise BadInput(f"--host: {name} may {people[name]}; only a router answers at a host")
@@ -116,8 +116,7 @@ def renew(folder: Path, name: str | None, hosts: Sequence[str]) -> None:
     pair = _issue(folder, name, names)
     old = folder / PEOPLE / name
     if old.exists():
-        (folder / REPLACED).mkdir(mode=0o700, exist_ok=True)
-        old.rename(_next_free(folder / REPLACED, name))
+        old.rename(_place_of_replaced(folder, name))
     _hand(folder, name, pair)
     say(f"{old}: new keys; the old ones stay good until they expire")
 
@@ -125,7 +124,7 @@ def renew(folder: Path, name: str | None, hosts: Sequence[str]) -> None:
 def _renew_rig(folder: Path, hosts: Sequence[str]) -> None:
     old = {name: _read(folder / name) for name in (CERTIFICATE, KEY)}
     pair = _issue(folder, RIG, list(dict.fromkeys([*HERE, *(hosts or hosts_of(old[CERTIFICATE]))])))
-    kept = _next_free(folder / REPLACED, RIG)
+    kept = _place_of_replaced(folder, RIG)
     _make_folder(kept, {CERTIFICATE: old[CERTIFICATE]}, {KEY: old[KEY]})
     with tempfile.TemporaryDirectory(dir=folder, prefix=".new-") as new:
         _write(Path(new), {CERTIFICATE: pair.certificate}, {KEY: pair.key})
@@ -251,6 +250,16 @@ def _write_access(folder: Path, text: str) -> None:
             (Path(new) / ACCESS).replace(folder / ACCESS)
     except OSError as error:
         raise BadInput(f"{folder / ACCESS}: cannot write: {error.strerror}") from None
+
+
+def _place_of_replaced(folder: Path, name: str) -> Path:
+    """Where the keys of `name` go that new ones replace."""
+    place = folder / REPLACED
+    try:
+        place.mkdir(mode=0o700, exist_ok=True)
+    except OSError as error:
+        raise BadInput(f"{place}: cannot write here: {error.strerror}") from None
+    return _next_free(place, name)
 
 
 def _next_free(folder: Path, name: str, end: str = "") -> Path:

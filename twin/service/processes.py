@@ -7,52 +7,37 @@ that the supervisor is gone.
 
 import contextlib
 import os
-import platform
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from table_io.backends import open_backend
 from table_io.block import Block
 from table_io.card import BadInput
-from table_io.clock import Clock, RealClock
-from table_io.records import Decided, Fault, RunStart, RunStop
+from table_io.clock import RealClock
+from table_io.records import RunStop
 from table_io.session import ORDERS, Order, Punctuality, play
-from twin.service.bundle import warm_rig, warm_twin
+from twin.service.bundle import warm_rig
 from twin.service.gate import NICENESS, gate
 from twin.service.recorder import recorder
 from twin.service.scheduling import urgent
-from twin.service.spec import CAPACITY, CONNECT_S, QUIET_S, Spec, orphaned, token
+from twin.service.spec import CONNECT_S, LINGER_S, Spec, orphaned, token
 from twin.service.stopwatch import Stopwatch
 from twin.stream.endpoint import INSIDE
-from twin.stream.resend import Inbox
-from twin.stream.wire import (
-    MEAS_TOPIC,
-    TOPIC_TYPES,
-    Item,
-    decode,
-    encode,
-    topic,
-)
-from twin.stream.zenoh_link import Link, open_hub, open_spoke
+from twin.stream.questions import Questions
+from twin.stream.wire import TOPIC_TYPES, Item, encode, topic
+from twin.stream.zenoh_link import open_hub, open_spoke
 
-RIG_PRIORITY, TWIN_PRIORITY = 50, 40  # of real-time scheduling, where it is permitted
-LINGER_S = 10.0  # that the hub stays up after the run, so that late readers can recover
+RIG_PRIORITY = 50  # of real-time scheduling, where it is permitted
 TIMING_BLOCKS = 100
-CONTROL = ("/run/start", "/run/stop", "/rig/decided")
 RIG_TOPICS = (
     *(name for name in TOPIC_TYPES if name.startswith("/rig/")),
     "/run/start",
     "/run/stop",
     "/run/event",
     "/run/timing",
-)
-TWIN_TOPICS = (
-    *(name for name in TOPIC_TYPES if name.startswith("/twin/")),
-    "/run/fault",
-    "/run/timing",
-    "/run/event",
 )
 
 
@@ -64,28 +49,9 @@ def rig(spec: Spec, _: str) -> None:
     scheduler = urgent(RIG_PRIORITY)
     link = open_hub(bundle.rig.name, spec.endpoint)
     link.declare(RIG_TOPICS)
-    orders = link.commands()
+    orders = _Orders(link.commands(), spec.run, bundle.profile.on_death.supervisor == "stop")
     link.alive(token(spec, "rig"))
-    stop_if_orphan = bundle.profile.on_death.supervisor == "stop"
-
-    def ordered() -> tuple[str, str] | None:
-        """(name, reason) of the next command; one that was given to another run is refused."""
-        order = orders.poll()
-        if order is None:
-            return None
-        run, _, why = order.text.partition("\n")
-        known = run == spec.run and order.name in ("start", *ORDERS)
-        order.reply("yes" if known else f"refused: this is run {spec.run}")
-        return (order.name, why) if known else None
-
-    def commands() -> Order | None:
-        order = ordered()
-        if order is not None and order[0] in ORDERS:
-            return Order(order[0], order[1] or f"asked to {order[0]}")
-        alone = stop_if_orphan and orphaned()
-        return Order("stop", "the supervisor is gone") if alone else None
-
-    while (order := ordered()) is None or order[0] != "start":
+    while (order := orders.next()) is None or order[0] != "start":
         if orphaned():
             return
         clock.wait_until(clock.now() + 0.01)
@@ -94,18 +60,44 @@ def rig(spec: Spec, _: str) -> None:
     backend = open_backend(bundle.rig, bundle.profile, clock)
     punctual = Punctuality()
     watch.begin()
-    source = play(
-        bundle.session, backend, clock, bundle.describe(spec.run, "table"), commands, punctual
-    )
+    start = bundle.describe(spec.run, "table")
+    source = play(bundle.session, backend, clock, start, orders.order, punctual)
     for item in _timed(source, watch, punctual):
         link.publish(topic(item), encode(item, spec.run))
     until = clock.now() + LINGER_S
     while clock.now() < until and not orphaned():
-        orders.poll()  # serves those who still ask for what this process holds
+        orders.waiting.poll()  # serves those who still ask for what this process holds
         clock.wait_until(clock.now() + 0.005)
     link.close()
     with contextlib.suppress(OSError):  # the supervisor did, unless it is dead
         Path(spec.endpoint.removeprefix(INSIDE)).parent.rmdir()
+
+
+@dataclass(slots=True)
+class _Orders:
+    """The commands to the rig of a run, each answered at once."""
+
+    waiting: Questions
+    run: str
+    stop_if_orphan: bool
+
+    def next(self) -> tuple[str, str] | None:
+        """(name, reason) of the next command; one that was given to another run is refused."""
+        order = self.waiting.poll()
+        if order is None:
+            return None
+        run, _, why = order.text.partition("\n")
+        known = run == self.run and order.name in ("start", *ORDERS)
+        order.reply("yes" if known else f"refused: this is run {self.run}")
+        return (order.name, why) if known else None
+
+    def order(self) -> Order | None:
+        """The next order to the session, which may come from nobody's being there any more."""
+        order = self.next()
+        if order is not None and order[0] in ORDERS:
+            return Order(order[0], order[1] or f"asked to {order[0]}")
+        alone = self.stop_if_orphan and orphaned()
+        return Order("stop", "the supervisor is gone") if alone else None
 
 
 def _timed(source: Iterator[Item], watch: Stopwatch, punctual: Punctuality) -> Iterator[Item]:
@@ -122,87 +114,11 @@ def _timed(source: Iterator[Item], watch: Stopwatch, punctual: Punctuality) -> I
                 yield watch.record(item.end)
 
 
-def twin(spec: Spec, missed_from: str, joined: Link | None = None) -> None:
-    """Steps the model beside the measured blocks; publishes predictions and comparisons.
+def twin(spec: Spec, missed_from: str) -> None:
+    """Steps the model beside the measured blocks."""
+    from twin.service.twinning import compute  # much to import, for this process alone
 
-    `missed_from` is set where this is the successor of a twin that died: the sample from which its
-    comparisons are missing. On another machine it has `joined` the run through the gate.
-    """
-    from twin.compare import pipeline
-
-    bundle = spec.bundle()
-    warm_twin()
-    setup = bundle.twin()
-    clock = RealClock()
-    scheduler = urgent(TWIN_PRIORITY)
-    link = joined or open_spoke(bundle.rig.name, spec.endpoint, CONNECT_S)
-    link.declare(TWIN_TOPICS)
-    control = link.subscribe(CONTROL, history=True, capacity=CAPACITY)
-    blocks = link.subscribe((MEAS_TOPIC,), history=not missed_from, capacity=CAPACITY)
-    if joined is None:
-        link.alive(token(spec, "twin"))
-
-    def say(items: list[Item]) -> None:
-        for item in items:
-            link.publish(topic(item), encode(item, spec.run))
-
-    seconds = bundle.profile.acquisition.block_samples / bundle.drive.rate_hz
-    watch = Stopwatch("twin", clock, seconds, scheduler)
-    state: pipeline.State | None = None
-    epoch_s, end, heard = None, None, clock.now()
-    while end is None or state is None or state.tracks.index < end:
-        for record in _told(control, spec.run):
-            epoch_s = _epoch(record) or epoch_s
-            end = record.index if isinstance(record, RunStop) else end
-            if isinstance(record, Decided):
-                setup = pipeline.knowing(setup, record)
-        arrived = blocks.get(0.2)
-        if arrived is None:
-            if orphaned() and clock.now() - heard > QUIET_S:
-                break
-            continue
-        heard = clock.now()
-        run, block = decode(*arrived)
-        if run != spec.run or not isinstance(block, Block):
-            continue
-        if state is None:
-            state, begun = pipeline.start(setup, block.index)
-            say(list(begun))
-            watch.begin()
-            if missed_from:
-                lost = (int(missed_from), block.index)
-                say([Fault(block.index, "twin", *lost, "the process died and was restarted")])
-        state, items = pipeline.step(setup, state, block)
-        say(items)
-        if epoch_s is not None:
-            watch.add(clock.now() - epoch_s - (block.end - 1) / block.rate_hz)
-        if block.index // len(block) % TIMING_BLOCKS == TIMING_BLOCKS - 1:
-            say([watch.record(block.end)])
-    say([watch.record(end or 0)])
-    _linger(control, clock)
-    link.close()
-
-
-def _linger(control: Inbox, clock: Clock) -> None:
-    """Serve those who still ask for what this process holds."""
-    until = clock.now() + LINGER_S
-    while clock.now() < until and not orphaned():
-        control.get(0.02)
-
-
-def _epoch(record: Item) -> float | None:
-    """When a run began by the clock of this machine; None for what is no start here."""
-    if isinstance(record, RunStart) and record.host == platform.node():
-        return record.epoch_s
-    return None
-
-
-def _told(control: Inbox, run: str) -> Iterator[Item]:
-    """Records of a run that wait in an inbox, without waiting for more."""
-    while (arrived := control.get(0.0)) is not None:
-        of, record = decode(*arrived)
-        if of == run:
-            yield record
+    compute(spec, missed_from)
 
 
 def viewer(spec: Spec, _: str) -> None:

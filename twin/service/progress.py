@@ -86,7 +86,8 @@ class RunProgress:
             )
 
     def say(self, text: str) -> None:
-        """One line, above the bar."""
+        """One line, above the bar; of what a twin elsewhere has written, only what is printable."""
+        text = "".join(one if one.isprintable() else "?" for one in text)
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def _point(self, point: Point) -> None:

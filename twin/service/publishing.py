@@ -6,8 +6,7 @@ from contextlib import contextmanager
 from table_io.clock import RealClock
 from twin.service.bundle import Bundle
 from twin.service.gate import Front
-from twin.service.processes import LINGER_S
-from twin.service.spec import Spec
+from twin.service.spec import LINGER_S, Spec
 from twin.service.status import Status
 from twin.service.terminal import say
 from twin.stream.access import open_access

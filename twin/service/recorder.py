@@ -15,7 +15,7 @@ from twin.service.disk import RESERVE_S, Reserve, Room, bytes_per_s, free_bytes
 from twin.service.parts import LOCK
 from twin.service.spec import CAPACITY, CONNECT_S, QUIET_S, Spec, orphaned, token
 from twin.service.stopwatch import Stopwatch
-from twin.stream.mcap_log import LogWriter
+from twin.stream.mcap_log import ImpossibleTimeError, LogWriter
 from twin.stream.resend import Inbox
 from twin.stream.wire import TOPIC_TYPES, Item, WireError, decode, encode, topic
 from twin.stream.zenoh_link import Link, open_spoke
@@ -83,6 +83,7 @@ class _Recorder:
     stopping: bool = False
     lost: bool = False  # a sync failed: what the disk took since the one before is in doubt
     busy_s: float = 0.0  # since the last measured block
+    impossible: int = 0  # payloads of a sample that no log can hold
 
     def run(self) -> None:
         """Until the run is over, or nobody is there any more."""
@@ -115,6 +116,9 @@ class _Recorder:
             self.writer.describe(item)
         try:
             self.writer.write(name, payload, item.index)
+        except ImpossibleTimeError:  # so far away is no sample of this run, whatever it says
+            self.impossible += 1
+            return
         except OSError as error:
             self._troubled(error)
         self.waiting.heard(item)
@@ -187,6 +191,9 @@ class _Recorder:
         words: list[Event | Timing] = [self.watch.record(end)]
         if self.inbox.missed or self.inbox.dropped:
             text = f"recorder: {self.inbox.missed} messages missed, {self.inbox.dropped} dropped"
+            words.append(Event(end, "recorder", text))
+        if self.impossible:
+            text = f"recorder: {self.impossible} messages left out, of impossible samples"
             words.append(Event(end, "recorder", text))
         self.reserve.release()
         self.thread.shutdown()

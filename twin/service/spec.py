@@ -14,6 +14,7 @@ from twin.service.bundle import Bundle, from_texts
 CONNECT_S = 15.0
 CAPACITY = 50_000  # pieces that wait in an inbox
 LONGEST_FOLDER = 70  # characters, of about 100
+LINGER_S = 10.0  # that a publisher stays up after the run, so that late readers can recover
 QUIET_S = 3.0  # after which a process stops waiting for another's last word
 
 

@@ -5,15 +5,15 @@ from collections.abc import Collection
 from dataclasses import asdict, dataclass, field
 
 from table_io.block import Block
-from table_io.records import Decided, Event, Gap, RunStart, RunStop, Step
+from table_io.records import Comparison, Decided, Event, Gap, RunStart, RunStop, Step
 from twin.service.spec import Spec
-from twin.stream.wire import MEAS_TOPIC, Item, WireError, decode, schema
+from twin.stream.endpoint import observers
+from twin.stream.wire import CMP_TOPIC, MEAS_TOPIC, Item, WireError, decode, schema
 
 FOLLOWED = frozenset(("/run/start", "/run/stop", "/run/event", "/rig/gap", "/rig/decided"))
 TEXTS = ("profile_toml", "rig_toml", "model_toml")
 STATUS = "state/status"
 PATHS = (STATUS, *(f"config/{one}" for one in ("run", "profile", "rig", "model", "schema")))
-OBSERVER = "observer."  # begins the names under which those who only look are alive
 
 
 @dataclass(slots=True)
@@ -26,12 +26,16 @@ class Status:
     start: RunStart | None = None
     stop: RunStop | None = None
     _newest: bytes = b""  # measured block
+    _compared: bytes = b""  # newest comparison
     _decided: dict[int, Step] = field(default_factory=dict)
 
     def see(self, topic: str, payload: bytes) -> None:
-        """Take in what was published; a block is looked into only when somebody asks."""
+        """Take in what was published; what comes often is looked into only when somebody asks."""
         if topic == MEAS_TOPIC:
             self._newest = payload
+            return
+        if topic == CMP_TOPIC:
+            self._compared = payload
             return
         item = self._read(topic, payload) if topic in FOLLOWED else None
         match item:
@@ -66,6 +70,12 @@ class Status:
         block = self.block
         return 0 if block is None else block.end
 
+    @property
+    def compared(self) -> int:
+        """The sample up to which a twin has come."""
+        item = self._read(CMP_TOPIC, self._compared) if self._compared else None
+        return item.index + item.count if isinstance(item, Comparison) else 0
+
     def answer(self, path: str, present: Collection[str]) -> bytes:
         """What stands under one of `PATHS`; `present` are the names of those who are alive."""
         match path:
@@ -92,12 +102,13 @@ class Status:
             "frequency_hz": step and step.frequency_hz,
             "direction": step and step.direction,
             "index": block.end if block is not None else 0,
+            "compared": self.compared,
             "rate_hz": self.start and self.start.rate_hz,
             "planned_samples": self.start and self.start.planned_samples,
             "gaps": self.gaps,
             "remote_twin": self.spec.remote_twin,
-            "components": sorted(one for one in present if not one.startswith(OBSERVER)),
-            "observers": sorted(one for one in present if one.startswith(OBSERVER)),
+            "components": sorted({*present}.difference(observers(present))),
+            "observers": observers(present),
             "verdict": self.stop and self.stop.verdict,
             "reason": self.stop and self.stop.reason,
         }

@@ -24,7 +24,8 @@ from twin.stream.zenoh_link import Link, open_spoke
 READY_S = 30.0
 END_S = 15.0  # after the last sample, for everybody to finish
 SILENT_S = 5.0  # the rig reports every second; after this it hangs
-DEAF_S = 10.0  # so does the recorder; twice this is well before the bus forgets
+DEAF_S = 10.0  # so do the others; twice this is well before the bus forgets
+DEADLINED = ("recorder", "gate")
 DRAIN_S = 0.1  # after a death, for what the dead one had still sent
 RESTARTS = 5
 WATCHED = tuple(RECORD_TOPICS.values())
@@ -45,8 +46,10 @@ class Supervisor:
     heard: dict[str, float] = field(default_factory=dict)  # when a component last spoke
     twin_missing: bool = False  # a twin died and its successor has not said so yet
     stop: RunStop | None = None
+    stop_why: str = ""  # the table is to stop
     _parts: int = 0
     _deaf: int = 0  # recorders that hung
+    _stopping: bool = False  # the rig has said that it stops
 
     @property
     def parts(self) -> Path:
@@ -151,34 +154,41 @@ class Supervisor:
 
     def _attend(self, link: Link, inbox: Inbox) -> None:
         """Until the rig has ended: show what happens, pass a stop on, restart what died."""
-        stopping = False
-        self.heard = dict.fromkeys(("rig", "recorder"), self.clock.now())
+        self.heard = dict.fromkeys(("rig", *DEADLINED), self.clock.now())
         while self.stop is None:
             self._listen(inbox, 0.1)
-            if not stopping and (why := self.asked()):
-                stopping = self._order(link, "stop", why) == "yes"
             if self.clock.now() - self.heard["rig"] > SILENT_S:
                 text = f"the rig has been silent for {SILENT_S:g} s: if the table still moves, "
                 raise _RigDiedError(f"{text}use its own stop")
-            stopping = self._unrecorded(link) or stopping
+            self._end_hung()
             for component, child in list(self.children.items()):
                 if child.died and self.stop is None:
                     self._listen(inbox, DRAIN_S)
                     if self.stop is None:
                         self._bury(component, link)
+            self._stop_if_due(link)
         if self.twin_missing:
             self._fault(link, self.stop.index)
 
-    def _unrecorded(self, link: Link) -> bool:
-        """End a recorder that hangs; True where the table was stopped, at the second one."""
-        silent = self.clock.now() - self.heard["recorder"]
-        if "recorder" not in self.children or silent < DEAF_S:
-            return False
-        self.say(f"the recorder has been silent for {silent:.0f} s; ending it")
-        self.children["recorder"].kill()
-        self.heard["recorder"] = self.clock.now()  # its successor has as long
-        self._deaf += 1
-        return self._deaf > 1 and self._order(link, "stop", "the recorder hangs") == "yes"
+    def _stop_if_due(self, link: Link) -> None:
+        """Pass on why the table is to stop, again until the rig says that it does."""
+        self.stop_why = self.stop_why or self.asked() or ""
+        if self.stop_why and not self._stopping and self.stop is None:
+            self._stopping = self._order(link, "stop", self.stop_why) == "yes"
+
+    def _end_hung(self) -> None:
+        """End a recorder or a gate that hangs; a second such recorder stops the table."""
+        for component in DEADLINED:
+            silent = self.clock.now() - self.heard[component]
+            if component not in self.children or silent < DEAF_S:
+                continue
+            self.say(f"the {component} has been silent for {silent:.0f} s; ending it")
+            self.children[component].kill()
+            self.heard[component] = self.clock.now()  # its successor has as long
+            if component == "recorder":
+                self._deaf += 1
+        if self._deaf > 1:
+            self.stop_why = self.stop_why or "the recorder hangs"
 
     def _listen(self, inbox: Inbox, seconds: float) -> None:
         until = self.clock.now() + seconds
@@ -216,7 +226,7 @@ class Supervisor:
         if child.process.returncode > 0:
             self.say(f"  its last words: {child.words}")
         if stop:
-            self._order(link, "stop", how)
+            self.stop_why = self.stop_why or how
         if component == "twin":
             self.twin_missing = True
         if given_up:

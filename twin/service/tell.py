@@ -5,6 +5,7 @@ import re
 
 from table_io.card import BadInput
 from twin.service.terminal import say
+from twin.stream.endpoint import running
 from twin.stream.keys import Keys
 from twin.stream.zenoh_link import open_spoke
 
@@ -21,7 +22,7 @@ def tell(order: str, why: str, connect: str, rig: str, keys: Keys | None = None)
     """Hand an order to the rig that runs at the endpoint; BadInput where it does not take it."""
     link = open_spoke(rig, connect, CONNECT_S, keys)
     try:
-        runs = [name.removesuffix(".rig") for name in link.components() if name.endswith(".rig")]
+        runs = running(link.components())
         if not runs:
             raise BadInput(f"endpoint {connect}: no test runs there; `shaketwin run` starts one")
         who = person() if keys is None else keys.name

@@ -10,7 +10,7 @@ from table_io.clock import RealClock
 from table_io.records import RunStart, RunStop
 from twin.service.tell import person
 from twin.service.terminal import say
-from twin.stream.endpoint import STREAMS
+from twin.stream.endpoint import STREAMS, running
 from twin.stream.folder import log_path
 from twin.stream.keys import Keys
 from twin.stream.recording import read
@@ -161,7 +161,7 @@ class Live:
         self._show(arrived)
         if self._clock.now() > self._heard + QUIET_S:
             self._heard = self._clock.now()
-            if not any(name.endswith(".rig") for name in self._link.components()):
+            if not running(self._link.components()):
                 self.end = "the rig is not there any more"
 
     def _take(self, inbox: Inbox, seconds: float) -> list[tuple[str, Item]]:

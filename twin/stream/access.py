@@ -8,7 +8,7 @@ on which it may be. Only allowing works: a denying rule is escaped by a wider ke
 | observe | subscribe to streams and events, ask for state, history and configuration,    |
 |         | see who is there, be there as alive/observer.<own name>.<anything>            |
 | record  | the same: what a recorder needs is what an observer may                       |
-| twin    | the same, and publish what a twin computes                                    |
+| twin    | the same, and offer to the gate what a twin computes: none else hears it      |
 | command | the same, and be obeyed                                                       |
 | router  | the same in the name of whoever is behind it, whom it has to check            |
 
@@ -30,19 +30,20 @@ Rule = tuple[str, str, tuple[str, ...], tuple[str, ...]]  # name, flow, messages
 # subject, names in certificates (None for whoever it is), what is allowed
 Grant = tuple[str, list[str] | None, tuple[Rule, ...]]
 
+STATE = ("state/status", "state/role/*", "state/held")
 EVERYBODY_KNOWN: tuple[Rule, ...] = (
     ("listen", "ingress", ("declare_subscriber",), ("stream/**", "event/**")),
     ("hear", "egress", ("put",), ("stream/**", "event/**")),
-    ("ask", "ingress", ("query",), ("state/**", "config/**")),
-    ("answered", "egress", ("reply",), ("state/**", "config/**", "cmd/**")),
-    ("offered", "egress", ("declare_queryable",), ("state/**", "config/**", "cmd/**")),
+    ("ask", "ingress", ("query",), (*STATE, "config/**")),
+    ("answered", "egress", ("reply",), (*STATE, "config/**", "cmd/**")),
+    ("offered", "egress", ("declare_queryable",), (*STATE, "config/**", "cmd/**")),
     ("look", "ingress", ("liveliness_query", "declare_liveliness_subscriber"), ("alive/**",)),
     ("see", "egress", ("liveliness_token",), ("alive/**",)),
 )
 TWIN: tuple[Rule, ...] = (
-    ("compute", "ingress", ("put",), ("stream/twin/**", "event/twin/**", "event/run/timing")),
-    ("hold", "ingress", ("declare_queryable", "reply"), ("state/held",)),
-    ("held", "egress", ("query",), ("state/held",)),
+    ("compute", "ingress", ("put",), ("offer/**",)),
+    ("hold", "ingress", ("declare_queryable", "reply"), ("state/offers",)),
+    ("held", "egress", ("query",), ("state/offers",)),
 )
 STRANGER: tuple[Rule, ...] = (
     ("knock", "ingress", ("query",), (f"state/role/{NOBODY}",)),

@@ -2,6 +2,7 @@
 
 import re
 import socket
+from collections.abc import Iterable
 from typing import Any
 
 from table_io.card import BadInput
@@ -11,6 +12,7 @@ Settings = dict[str, Any]
 
 STREAMS = frozenset((*BLOCK_TOPICS.values(), CMP_TOPIC))  # what comes with every block
 INSIDE = "unixsock-stream/"  # of a run: nobody else on the machine can reach it
+OBSERVER = "observer."  # begins the names under which those who only look are alive
 MOST_SESSIONS = 64
 LARGEST_MESSAGE = 64 * 2**10  # from outside, its attachment included
 # Questions of a session a second. What comes sooner after the one before is dropped, so that who
@@ -78,14 +80,32 @@ def check(rig: str, endpoint: str, keyed: bool) -> None:
         )
 
 
-def key(rig: str, topic: str) -> str:
-    """Key on the bus of a wire topic."""
+def key(rig: str, topic: str, *, offered: bool = False) -> str:
+    """Key on the bus of a wire topic; of what is `offered` from outside, for the gate alone."""
+    if offered:
+        return f"shaketwin/{rig}/offer{topic}"
     return f"shaketwin/{rig}/{'stream' if topic in STREAMS else 'event'}{topic}"
+
+
+def held(*, offered: bool) -> str:
+    """Under which path somebody is asked for what he holds of what he published, or offered."""
+    return "state/offers" if offered else "state/held"
 
 
 def safe(name: str) -> str:
     """A name that somebody else chose, as it may stand on a terminal."""
     return re.sub(r"[^\w.-]", "?", name)[:100]
+
+
+def running(names: Iterable[str]) -> list[str]:
+    """Ids of the runs whose rig is among those who are alive; what a person chose is no run."""
+    rigs = (name for name in names if name.endswith(".rig") and not name.startswith(OBSERVER))
+    return sorted(name.removesuffix(".rig") for name in rigs)
+
+
+def observers(names: Iterable[str]) -> list[str]:
+    """The names among them under which those who only look are alive."""
+    return sorted(name for name in names if name.startswith(OBSERVER))
 
 
 def host_and_port(endpoint: str) -> tuple[str, int]:
@@ -102,6 +122,12 @@ def refuse_taken(rig: str, endpoint: str, keyed: bool) -> None:
         socket.create_server((host, port), family=_family(host)).close()
     except OSError as error:
         raise BadInput(cannot_listen(endpoint, error.strerror or str(error))) from None
+
+
+def innermost(error: Exception) -> str:
+    """The innermost reason in a message of zenoh, without its source files."""
+    reason = re.search(r"([A-Z][^\[\]:]*) \(os error", str(error))
+    return reason[1] if reason else re.sub(r" at /\S+", "", str(error))
 
 
 def cannot_listen(endpoint: str, why: str) -> str:

@@ -31,7 +31,12 @@ from twin.stream.wire import (
 
 MEDIA = {".toml": "toml", ".json": "json", ".pb": "protobuf"}
 CHUNK_BYTES = 2**20  # at most that is compressed at once
+LATEST_NS = 2**64 - 1  # that the format holds
 DRAIN_BYTES = 2**20  # at most that a writer lets wait between two flushes
+
+
+class ImpossibleTimeError(ValueError):
+    """A sample that lies later than a log can hold."""
 
 
 class LogWriter:
@@ -60,14 +65,19 @@ class LogWriter:
     def write(
         self, topic: str, payload: bytes, index: int, publish_time: int | None = None
     ) -> None:
-        """Append the bytes of one item that holds from sample `index`; `publish_time` in ns."""
+        """Append the bytes of one item that holds from sample `index`; `publish_time` in ns.
+
+        ImpossibleTimeError where that is later than a log can hold; then nothing was written.
+        """
+        log_time = round(index * 1e9 / self._rate_hz)
+        if log_time > LATEST_NS:
+            raise ImpossibleTimeError(f"sample {index}: later than a log can hold")
         if topic not in self._channels:
             name, data = schema(TOPIC_TYPES[topic])
             schema_id = self._writer.register_schema(name, "protobuf", data)
             self._channels[topic] = self._writer.register_channel(topic, "protobuf", schema_id)
         sequence = self._sequence.get(topic, 0)
         self._sequence[topic] = sequence + 1
-        log_time = round(index * 1e9 / self._rate_hz)
         self._content.add(topic, log_time, payload)
         self._writer.add_message(
             self._channels[topic],

@@ -1,10 +1,39 @@
 """Questions that others put to a process, bounded in number and size, and their answers."""
 
+import json
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 ASKED_BYTES = 4096  # of a question's text
+ASKED_HELD_BYTES = 16 * 2**10  # of one for held pieces: it names each topic's publishers
+T = TypeVar("T")
+
+
+def understood(text: bytes, most: int, checked: Callable[[Any], T]) -> T | None:
+    """What `checked` makes of JSON that somebody sent; None where it is not ours.
+
+    That is more than `most` bytes, no JSON, nested too deep, or otherwise than `checked` wants it.
+    """
+    if len(text) > most:
+        return None
+    try:
+        return checked(json.loads(text))
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
+        return None
+
+
+def asked_for(said: Any) -> dict[str, Any]:
+    """A question for held pieces as `Inbox` puts it: `who`, `history` and `next`, no more.
+
+    Raises what `understood` catches where it is none.
+    """
+    wanted = {
+        topic: {str(name): int(number) for name, number in known.items()}
+        for topic, known in said["next"].items()
+    }
+    return {"who": str(said.get("who"))[:64], "history": bool(said["history"]), "next": wanted}
 
 
 class Answerer(Protocol):

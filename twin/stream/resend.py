@@ -6,7 +6,6 @@ Who passes pieces on keeps name and numbers of their publisher, and holds them a
 listens may get a piece from either, and takes it once.
 """
 
-import json
 import secrets
 import threading
 from collections import deque
@@ -14,12 +13,14 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from table_io.clock import RealClock
+from twin.stream.questions import understood
 from twin.stream.shelf import BEGINS, ENDS, GIVE_UP_S, LARGEST_BYTES, PIECE_BYTES, STAMP, Piece
 
 ASK_EVERY_S = 0.5  # in case the last message of a topic was lost
 ASK_AGAIN_S = 0.1  # in case question or answer was lost
 ASK_MORE_S = 0.003
 LAST_NUMBER = 2**63  # of a piece
+MOST_OFFERING = 16  # publishers of a topic, of whom nobody says how many there are
 TURN_S = 0.02  # while waiting, others are answered this often
 CLOCK = RealClock()
 
@@ -73,10 +74,21 @@ class Inbox:
     """Payloads in order per topic and publisher; `subscribe` makes it, one thread reads it.
 
     `missed` pieces were gone before they could be asked for again, `dropped` ones were pushed out
-    by newer ones because nobody fetched them, `ignored` ones not ours.
+    by newer ones because nobody fetched them, `ignored` ones not ours. Of what is `offered` only so
+    many publishers are kept in mind: who comes under ever new names costs no memory. Pieces of a
+    publisher in `without` are left out: who passes them on does not want them back.
     """
 
-    def __init__(self, link: Asker, topics: tuple[str, ...], history: bool, capacity: int) -> None:
+    def __init__(
+        self,
+        link: Asker,
+        topics: tuple[str, ...],
+        history: bool,
+        capacity: int,
+        offered: bool = False,
+    ) -> None:
+        self.offered = offered
+        self.without: set[str] = set()
         self.missed = 0
         self.dropped = 0
         self.ignored = 0
@@ -124,6 +136,11 @@ class Inbox:
                 return None
         return self._ready.popleft()
 
+    @property
+    def behind(self) -> bool:
+        """Whether something is known to be missing that was not given up."""
+        return any(one.behind_since is not None for one in self._sources.values())
+
     def arrive(self, topic: str, stamp: Any, body: Any) -> None:
         """Take what zenoh's thread brings; a copy and no more, since that thread feeds the rest."""
         if stamp is None or len(body) > PIECE_BYTES or (topic and len(stamp) != STAMP.size):
@@ -149,8 +166,13 @@ class Inbox:
             self._take(stamp, body)
             return
         name, number, place = STAMP.unpack(stamp)
+        if number >= LAST_NUMBER:  # what is held of it could not be told to anybody
+            self.ignored += 1
+            return
         where = (topic, name.hex())
-        source = self._sources.setdefault(where, Source(0 if number == 0 else None))
+        if where[1] in self.without:
+            return
+        source = self._source(where, 0 if number == 0 else None)
         if source.next is None and not self._history:
             source.advance(number)
         if where in self._skipped:
@@ -164,9 +186,8 @@ class Inbox:
     def _take(self, stamp: bytes, chunk: bytes) -> None:
         """Move the pieces of an answer to `_ready`; count those that their publisher lacks."""
         self._answered = True
-        try:
-            said = [_checked(*one) for one in json.loads(stamp)]
-        except (ValueError, TypeError):
+        said = understood(stamp, PIECE_BYTES, lambda said: [_checked(*one) for one in said])
+        if said is None:
             self.ignored += 1
             return
         at = 0
@@ -174,13 +195,30 @@ class Inbox:
             begun, at = at, at + sum(size for _, size in sizes)
             if topic not in self._topics:
                 continue
-            source = self._sources.setdefault((topic, name), Source(None))
+            source = self._source((topic, name), None)
             self.missed += source.advance(first)
             for number, (place, size) in enumerate(sizes, first):
                 body, begun = chunk[begun : begun + size], begun + size
                 if number == source.next:
                     self._accept(source, Piece(topic, name, number, place, body))
             source.behind_since = CLOCK.now() if (source.next or 0) < end else None
+
+    def _source(self, where: tuple[str, str], begin: int | None) -> Source:
+        """How far we are with a topic and publisher; `begin` where it is a new one."""
+        source = self._sources.pop(where, None) if self.offered else self._sources.get(where)
+        if source is None:
+            source = Source(begin)
+        self._sources[where] = source  # of offers, after those who were heard before
+        if self.offered:
+            self._forget([one for one in self._sources if one[0] == where[0]][:-MOST_OFFERING])
+        return source
+
+    def _forget(self, forgotten: list[tuple[str, str]]) -> None:
+        """Let go of what is known of these; one that speaks again is asked for all it holds."""
+        for where in forgotten:
+            del self._sources[where]
+            self._parcels.pop(where, None)
+            self._ready = deque(one for one in self._ready if one[:2] != where)
 
     def _accept(self, source: Source, piece: Piece) -> None:
         source.next = piece.number + 1

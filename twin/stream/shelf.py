@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from table_io.clock import RealClock
 
 LARGEST_BYTES = 4 * 2**20  # of one payload
-HELD_PIECES = 5000  # per topic and publisher: 50 s of blocks
+HELD_PIECES = 5000  # per topic and publisher: 50 s of blocks, 100 of them a second
 HELD_BYTES = 64 * 2**20
 PIECE_BYTES = 48 * 2**10  # of one message on the bus: less than a batch of zenoh, 64 kB
 ANSWERED_PIECES = 1000  # at most, at a time: what tells their sizes has to fit beside them
@@ -93,8 +93,8 @@ def answer(shelves: Shelves, asked: Asked, history: bool) -> tuple[list[Any], by
         if topic not in asked:
             continue
         known = asked[topic].get(source)
-        first = (shelf.first if history else shelf.end) if known is None else int(known)
-        first = max(first, shelf.first)
+        first = (shelf.first if history else shelf.end) if known is None else known
+        first = min(max(first, shelf.first), shelf.end)
         taken = shelf.take(first, room)
         room -= sum(len(piece) for _, piece in taken)
         chunk += [piece for _, piece in taken]
@@ -115,13 +115,14 @@ class Listeners:
 
     def note(self, question: dict[str, Any], shelves: Shelves) -> None:
         """Take in a question; who does not want history begins where the shelf ends."""
-        history, who = question["history"], str(question.get("who"))[:64]
+        history, who = question["history"], question["who"]
         before = self.heard.pop(who, (0.0, {}))[1]
         asked = {}
         for (topic, source), shelf in shelves.items():
             if topic in question["next"]:
                 begin = before.get((topic, source), 0 if history else shelf.end)
-                asked[topic, source] = int(question["next"][topic].get(source, begin))
+                said = question["next"][topic].get(source, begin)
+                asked[topic, source] = min(max(said, shelf.first), shelf.end)  # it may lie
         while len(self.heard) >= ASKERS:
             del self.heard[next(iter(self.heard))]  # who asked longest ago
         self.heard[who] = CLOCK.now(), asked

@@ -8,11 +8,10 @@ spokes through the hub. Keys, with <topic> as in `wire.TOPIC_TYPES`:
 | shaketwin/<rig>/stream<topic>     | what comes with every block           | publish()         |
 | shaketwin/<rig>/event<topic>      | every other record, when it happens   | publish()         |
 | shaketwin/<rig>/state/held        | question: what do you hold from n on? | Inbox.get()       |
+| shaketwin/<rig>/offer<topic>      | for the gate; it asks at state/offers | publish()         |
 | shaketwin/<rig>/cmd/<name>        | a command to the rig, and its answer  | request()         |
 | shaketwin/<rig>/cmd/<name>/<who>  | the same to the gate, from outside    | request()         |
 | shaketwin/<rig>/alive/<component> | nothing; is there as long as it lives | alive()           |
-
-so /rig/meas travels on shaketwin/<rig>/stream/rig/meas and /run/start on .../event/run/start.
 
 Full queues drop, so a stalled spoke never slows a publisher. A payload travels in pieces that fit
 into one batch of zenoh (with such queues, larger ones never arrive). Every publisher numbers its
@@ -23,7 +22,6 @@ subscriber loses, without a word, the history of a publisher that goes on publis
 """
 
 import json
-import re
 import secrets
 from typing import Any
 
@@ -32,17 +30,21 @@ import zenoh
 from table_io.card import BadInput
 from twin.stream.endpoint import (
     INSIDE,
+    OBSERVER,
     Settings,
     cannot_listen,
     check,
+    held,
     host_and_port,
+    innermost,
     key,
     merged,
+    observers,
     safe,
     settings,
 )
 from twin.stream.keys import Keys
-from twin.stream.questions import Question, Questions
+from twin.stream.questions import ASKED_HELD_BYTES, Question, Questions, asked_for, understood
 from twin.stream.refusal import refusal, unlisted
 from twin.stream.resend import ASK_EVERY_S, Inbox
 from twin.stream.shelf import (
@@ -56,8 +58,10 @@ from twin.stream.shelf import (
     pieces,
 )
 
+# An answer is sent as its question was: so the rig's loop never waits for one who asks and stalls.
+DROP = zenoh.CongestionControl.DROP
 QUESTIONS_WAITING = 64
-MOST_PRESENT = 256
+MOST_PRESENT = 256  # observers who are kept in mind; the run's own components always are
 
 
 class Link:
@@ -78,16 +82,16 @@ class Link:
         self._questions: Any = None
         self.listeners = Listeners()
 
-    def declare(self, topics: tuple[str, ...]) -> None:
-        """Make ready to publish `topics`, so that the first one costs no more than the others."""
+    def declare(self, topics: tuple[str, ...], *, offered: bool = False) -> None:
+        """Make ready to publish `topics`, or to offer them to the gate, which no other hears."""
         for topic in topics:
             if topic not in self._publishers:
                 self._publishers[topic] = self._session.declare_publisher(
-                    key(self._rig, topic), congestion_control=zenoh.CongestionControl.DROP
+                    key(self._rig, topic, offered=offered), congestion_control=DROP
                 )
                 self._shelves[topic, self._name] = Shelf()
         if self._questions is None:
-            self._questions = self._queryable("state/held")
+            self._questions = self._queryable(held(offered=offered))
 
     def publish(self, topic: str, payload: bytes) -> None:
         """Send to whoever subscribed, and hold for those who ask later. Never waits."""
@@ -119,12 +123,12 @@ class Link:
         if query is None:
             return False
         with query:
-            try:
-                question = json.loads(query.payload.to_bytes())
-                said, chunk = answer(self._shelves, question["next"], bool(question["history"]))
-                self.listeners.note(question, self._shelves)
-            except (ValueError, TypeError, KeyError, AttributeError):
+            text = b"" if query.payload is None else query.payload.to_bytes()
+            question = understood(text, ASKED_HELD_BYTES, asked_for)
+            if question is None:
                 return True  # not one of ours: nothing to say
+            said, chunk = answer(self._shelves, question["next"], question["history"])
+            self.listeners.note(question, self._shelves)
             if said:
                 query.reply(query.key_expr, chunk, attachment=json.dumps(said))
         return True
@@ -140,25 +144,26 @@ class Link:
             if reply.ok is not None:
                 inbox.arrive("", reply.ok.attachment, reply.ok.payload)
 
-        # Answers are sent with the congestion control of the question: dropped if we are stalled.
         self._session.get(
-            f"shaketwin/{self._rig}/state/held",
+            f"shaketwin/{self._rig}/{held(offered=inbox.offered)}",
             zenoh.handlers.Callback(answered, indirect=False),
             payload=json.dumps(question),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-            congestion_control=zenoh.CongestionControl.DROP,
+            congestion_control=DROP,
             allowed_destination=zenoh.Locality.REMOTE,
             timeout=ASK_EVERY_S,
         )
 
-    def subscribe(self, topics: tuple[str, ...], *, history: bool, capacity: int) -> Inbox:
+    def subscribe(
+        self, topics: tuple[str, ...], *, history: bool, capacity: int, offered: bool = False
+    ) -> Inbox:
         """Inbox of `topics` that keeps at most `capacity` pieces waiting.
 
         With `history` it begins with what the publishers still hold and loses nothing that they
-        hold; without, it begins now and, when full, drops the oldest.
+        hold; without, it begins now and, when full, drops the oldest. `offered`: from outside.
         """
-        inbox = Inbox(self, topics, history, capacity)
+        inbox = Inbox(self, topics, history, capacity, offered)
         for topic in topics:
 
             def arrived(sample: Any, topic: str = topic) -> None:
@@ -166,7 +171,8 @@ class Link:
 
             # indirect=False: zenoh's own thread fills the inbox, instead of a Python thread each.
             callback = zenoh.handlers.Callback(arrived, indirect=False)
-            self._open.append(self._session.declare_subscriber(key(self._rig, topic), callback))
+            where = key(self._rig, topic, offered=offered)
+            self._open.append(self._session.declare_subscriber(where, callback))
         return inbox
 
     def questions(self, *paths: str) -> Questions:
@@ -187,7 +193,8 @@ class Link:
     def inquire(self, path: str, text: str = "", timeout_s: float = 1.0) -> bytes | None:
         """The answer to a question; None if there is none within `timeout_s`."""
         where = f"shaketwin/{self._rig}/{path}"
-        for reply in self._session.get(where, payload=text, timeout=timeout_s):
+        asked = self._session.get(where, payload=text, timeout=timeout_s, congestion_control=DROP)
+        for reply in asked:
             if reply.ok is not None:
                 return bytes(reply.ok.payload.to_bytes())
         return None
@@ -206,7 +213,7 @@ class Link:
 
         callback = zenoh.handlers.Callback(answered, indirect=False)
         where = f"shaketwin/{self._rig}/cmd/{command}"
-        self._session.get(where, callback, payload=text, timeout=timeout_s)
+        self._session.get(where, callback, payload=text, timeout=timeout_s, congestion_control=DROP)
 
     def alive(self, component: str) -> None:
         """Be among everybody's `components()` until this process ends, or `gone`."""
@@ -232,7 +239,7 @@ class Link:
             name = safe(str(sample.key_expr).rsplit("/", 1)[1])
             if sample.kind != zenoh.SampleKind.PUT:
                 names.discard(name)
-            elif len(names) < MOST_PRESENT:
+            elif not name.startswith(OBSERVER) or len(observers(names)) < MOST_PRESENT:
                 names.add(name)
 
         callback = zenoh.handlers.Callback(changed, indirect=False)
@@ -264,7 +271,7 @@ def open_hub(
         # "peer" measured the same, loss and latency; "router" is what zenoh documents for clients.
         return Link(rig, _session(config))
     except zenoh.ZError as error:
-        raise BadInput(cannot_listen(endpoint, _why(error))) from None
+        raise BadInput(cannot_listen(endpoint, innermost(error))) from None
 
 
 def open_spoke(rig: str, endpoint: str, timeout_s: float, keys: Keys | None = None) -> Link:
@@ -286,12 +293,6 @@ def open_spoke(rig: str, endpoint: str, timeout_s: float, keys: Keys | None = No
         link.close()
         raise BadInput(f"endpoint {endpoint}: {why}")
     return link
-
-
-def _why(error: Exception) -> str:
-    """The innermost reason in zenoh's message, without its source files."""
-    reason = re.search(r"([A-Z][^\[\]:]*) \(os error", str(error))
-    return reason[1] if reason else re.sub(r" at /\S+", "", str(error))
 
 
 def _session(config: Settings) -> Any:
