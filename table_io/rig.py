@@ -11,6 +11,10 @@ from pydantic import Field, ValidationInfo, field_validator
 from table_io.card import Card, Finite, NonNegative, Number, Positive
 from table_io.channels import BY_NAME
 from table_io.units import UNITS
+from table_io.wiring.follow import FollowWiring
+from table_io.wiring.ni import NiWiring
+from table_io.wiring.opendaq import OpenDaqWiring
+from table_io.wiring.udp import UdpWiring
 
 
 class Sensor(Card):
@@ -200,7 +204,7 @@ class Rig(Card):
 
     name: str = Field(pattern=r"^[a-z0-9_]+$")
     title: str
-    backend: Literal["simulated", "machine"]
+    backend: Literal["simulated", "machine", "ni", "opendaq", "udp", "follow"]
     rates_hz: tuple[Positive, ...] = Field(min_length=1)
     moving_mass_kg: Positive = Field(description="Table without payload, for the force margin.")
     limits: Limits
@@ -208,6 +212,10 @@ class Rig(Card):
     sensors: tuple[Sensor, ...] = Field(min_length=1)
     simulated: SimulatedTable | None = Field(None, validate_default=True)
     machine: Machine | None = Field(None, validate_default=True)
+    ni: NiWiring | None = Field(None, validate_default=True)
+    opendaq: OpenDaqWiring | None = Field(None, validate_default=True)
+    udp: UdpWiring | None = Field(None, validate_default=True)
+    follow: FollowWiring | None = Field(None, validate_default=True)
 
     @field_validator("sensors")
     @classmethod
@@ -244,12 +252,15 @@ class Rig(Card):
                 )
         return simulated
 
-    @field_validator("machine")
+    @field_validator("machine", "ni", "opendaq", "udp", "follow")
     @classmethod
-    def _reached(cls, machine: Machine | None, info: ValidationInfo) -> Machine | None:
-        if machine is None and info.data.get("backend") == "machine":
-            raise ValueError("backend 'machine' needs a [machine] table with its endpoint")
-        return machine
+    def _reached(cls, table: Card | None, info: ValidationInfo) -> Card | None:
+        if table is None and info.data.get("backend") == info.field_name:
+            raise ValueError(
+                f"backend {info.field_name!r} needs a [{info.field_name}] table: what is wired "
+                "where; see CONNECT.md"
+            )
+        return table
 
     @property
     def any_speed(self) -> bool:

@@ -33,12 +33,12 @@ waits. The next call of a rig that was only slow is MachineLost.
 `tests/table_io/conformance.py` holds every backend to this, clause by clause.
 """
 
-from collections.abc import Callable
 from typing import Protocol
 
 from table_io.block import Float1D, Float2D
+from table_io.card import BadInput
 from table_io.clock import Clock
-from table_io.profile import Profile, Specimen
+from table_io.profile import Profile
 from table_io.rig import Rig
 
 PATIENCE_S = 0.5  # after its schedule a sample that has not come is not coming
@@ -79,12 +79,25 @@ class Backend(Protocol):
 
 
 def open_backend(rig: Rig, profile: Profile, clock: Clock) -> Backend:
-    """The backend that the machine card names. Adding a backend = one file and one line here."""
-    from table_io.backends.machine import MachineBackend
-    from table_io.backends.simulated import SimulatedBackend
+    """The backend that the machine card names. Adding a backend = one folder and one case here."""
+    asked = (rig, profile.specimen, profile.acquisition.rate_hz, clock)
+    match rig.backend:
+        case "simulated":
+            from table_io.backends.simulated import SimulatedBackend
 
-    kinds: dict[str, Callable[[Rig, Specimen, float, Clock], Backend]] = {
-        "simulated": SimulatedBackend,
-        "machine": MachineBackend,
-    }
-    return kinds[rig.backend](rig, profile.specimen, profile.acquisition.rate_hz, clock)
+            return SimulatedBackend(*asked)
+        case "machine":
+            from table_io.backends.machine import MachineBackend
+
+            return MachineBackend(*asked)
+        case _:
+            raise BadInput(f"rig {rig.name}: backend {rig.backend!r} is not built yet")
+
+
+def answers(rig: Rig) -> None:
+    """BadInput where the card names a machine of its own and none answers; claims nothing."""
+    match rig.backend:
+        case "machine":
+            from table_io.backends import machine
+
+            machine.answers(rig)

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from test_machine import RATE, RIG, SPECIMEN, claim
 
-from table_io.backends import PATIENCE_S, MachineLost
-from table_io.backends.machine import MachineBackend, answers
+from table_io.backends import PATIENCE_S, MachineLost, answers
+from table_io.backends.machine import MachineBackend
 from table_io.card import BadInput
 from table_io.clock import RealClock
 from table_io.machine import server

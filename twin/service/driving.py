@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
-from table_io.backends.machine import answers
+from table_io.backends import answers
 from table_io.card import BadInput
 from table_io.clock import RealClock
 from table_io.limits import doubts, warnings

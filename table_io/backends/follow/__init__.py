@@ -1,0 +1,1 @@
+"""A controller that plays by itself; we follow it."""

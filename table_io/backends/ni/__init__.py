@@ -1,0 +1,1 @@
+"""An NI-DAQmx device."""

@@ -1,0 +1,1 @@
+"""A target that speaks our UDP packets."""

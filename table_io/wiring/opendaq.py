@@ -1,0 +1,7 @@
+"""An openDAQ device."""
+
+from table_io.card import Card
+
+
+class OpenDaqWiring(Card):
+    """What is wired where."""
