@@ -2,6 +2,7 @@
 
 import math
 
+from table_io.block import Label
 from table_io.records import (
     Check,
     Decided,
@@ -17,6 +18,14 @@ from table_io.records import (
 )
 from table_io.units import GRAVITY_M_S2
 
+DOING = {
+    Label.REST: "at rest",
+    Label.BLEND: "blending",
+    Label.SETTLE: "settling",
+    Label.MEASURE: "measuring",
+    Label.STOP: "decaying to rest",
+    Label.CHECK: "loop check",
+}
 LEVELS = {
     "ERROR": {"fault", "halted", "error", "died"},
     "WARN": {
@@ -24,6 +33,11 @@ LEVELS = {
         "drift", "no jump", "unexpected jump", "attractor", "instrument", "refused",
     },
 }  # fmt: skip
+
+
+def printable(text: str) -> str:
+    """The text without what would command a terminal: what comes from elsewhere may hold it."""
+    return "".join(one if one.isprintable() else "?" for one in text)
 
 
 def sentence(record: Record, rate_hz: float) -> tuple[str, str] | None:

@@ -73,7 +73,7 @@ def test_too_small_a_terminal_is_told_what_is_needed() -> None:
 def test_at_120_columns_everything_is_there(watched: Board) -> None:
     shown = text(watched, 120, 40)
     for part in (
-        "watched  Simulated uni-axial shaking table", "● running, measures  0:00:08",
+        "watched  Simulated uni-axial shaking table", "● running, measuring  0:00:08",
         "step  4/10   3.500 Hz ↑ forward    cycle 2/5", "13 %  0:00:52 left",
         "demanded    0.0500 g  command × 1.034", "now         0.0500 g",
         "accepted, corrected 2 ×", "jump down at 3.982 Hz (3.91 to 4.05)",

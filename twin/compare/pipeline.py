@@ -135,7 +135,8 @@ def step(setup: Setup, state: State, block: Block) -> tuple[State, list[Block | 
             state, made = _finish(setup, state, key)
             items.extend(made)
         at, end = block.index + first, block.index + last
-        state = replace(state, watch=watch.rested(state.watch, block.cut(at, end)))
+        if not state.watch.noise.known:
+            state = replace(state, watch=watch.rested(state.watch, block.cut(at, end)))
         if key[1] >= 0 and state.held:
             state = replace(state, held=(*state.held, _cut(known, at, end)))
         elif key[1] >= 0 and _begins(state, key):
@@ -171,28 +172,21 @@ def _finish(setup: Setup, state: State, key: tuple[int, int]) -> tuple[State, li
     return state, items
 
 
-def _motions(held: tuple[Piece, ...]) -> tuple[Motion, Motion]:
-    """(measured, free twin) motion over the pieces of a cycle."""
-
-    def whole(columns: list[Float1D]) -> Float1D:
-        return np.concatenate(columns)
-
-    forces = [contact_forces(block) for block, _ in held]
-    nothing = [np.full(len(block), np.nan) for block, _ in held]
-    has_acc = "mass_acc_m_s2" in held[0][0].channels
-    measured = Motion(
-        whole([rel_disp(block) for block, _ in held]),
-        whole([block.channel("mass_acc_m_s2") for block, _ in held] if has_acc else nothing),
-        whole([right for right, _ in forces]),
-        whole([-left for _, left in forces]),
+def _motions(measured: Block, predicted: Block) -> tuple[Motion, Motion]:
+    """(measured, free twin) motion over a cycle and what leads up to it."""
+    right, left = contact_forces(measured)
+    has_acc = "mass_acc_m_s2" in measured.channels
+    return Motion(
+        rel_disp(measured),
+        measured.channel("mass_acc_m_s2") if has_acc else np.full(len(measured), np.nan),
+        right,
+        -left,
+    ), Motion(
+        predicted.channel("free/rel_disp_m"),
+        predicted.channel("free/mass_acc_m_s2"),
+        2 * predicted.channel("free/force_r1_n"),
+        2 * predicted.channel("free/force_l1_n"),
     )
-    twin = Motion(
-        whole([one.channel("free/rel_disp_m") for _, one in held]),
-        whole([one.channel("free/mass_acc_m_s2") for _, one in held]),
-        whole([2 * one.channel("free/force_r1_n") for _, one in held]),
-        whole([2 * one.channel("free/force_l1_n") for _, one in held]),
-    )
-    return measured, twin
 
 
 def _cycle(setup: Setup, state: State, step: int, number: int) -> tuple[State, list[Record]]:
@@ -202,19 +196,19 @@ def _cycle(setup: Setup, state: State, step: int, number: int) -> tuple[State, l
     known = setup.step(step)
     if known is None or end - first < setup.twin.rate_hz / known.frequency_hz - SHORT:
         return state, []
-    measured, twin = _motions(held)
-    lead = first - held[0][0].index
-    from_measured, touch_m = extremes(measured, first, setup.scale, state.touching[0], lead)
-    from_twin, touch_t = extremes(twin, first, setup.scale, state.touching[1], lead)
-    label = int(held[0][0].label[lead])
+    measured, predicted = (join(blocks) for blocks in zip(*held, strict=True))
+    motion_m, motion_t = _motions(measured, predicted)
+    lead = first - measured.index
+    from_measured, touch_m = extremes(motion_m, first, setup.scale, state.touching[0], lead)
+    from_twin, touch_t = extremes(motion_t, first, setup.scale, state.touching[1], lead)
+    label = int(measured.label[lead])
     cycle = Cycle(end, step, number, label, end - first, from_measured, from_twin)
     base_acc = state.base_acc
     if label == Label.MEASURE:
-        table = np.concatenate([block.channel("table_acc_m_s2") for block, _ in held])
-        base_acc = (*base_acc, table[lead:])
-    whole, predicted = (join([pair[k] for pair in held]).cut(first, end) for k in range(2))
+        base_acc = (*base_acc, measured.channel("table_acc_m_s2")[lead:])
+    whole = measured.cut(first, end)
     true = corrected(setup.twin.model.sensors, whole)
-    one = Held(known, number, whole, true, predicted)
+    one = Held(known, number, whole, true, predicted.cut(first, end))
     watching, said = watch.looked(setup.watched, state.watch, one)
     return replace(
         state,

@@ -2,7 +2,6 @@
 
 import fcntl
 import json
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,9 +14,8 @@ from twin.service.outcome import EXIT_GAPS, EXIT_INTERRUPTED
 from twin.service.parts import LOCK, gather
 from twin.service.recorder import FLUSH_S, SYNC_S, Awaited
 from twin.service.spec import CAPACITY, QUIET_S, Spec
-from twin.service.tell import person
+from twin.service.tell import person, run_of
 from twin.service.terminal import interruptible, say
-from twin.stream.endpoint import running
 from twin.stream.folder import PARTS
 from twin.stream.keys import Keys
 from twin.stream.mcap_log import ImpossibleTimeError, LogWriter
@@ -36,10 +34,9 @@ def attend_as_recorder(connect: str, rig: str, out: Path | None, keys: Keys | No
     """
     link = open_spoke(rig, connect, CONNECT_S, keys)
     try:
-        run = _run(link, connect)
+        run = run_of(link, connect)
         folder = new_folder(out if out is not None else RUNS / f"{run}-attended", run)
-        who = keys.name if keys is not None else person()
-        link.alive(f"observer.{who}.recorder")
+        link.alive(f"observer.{person(keys)}.recorder")
         say(f"recording {run} -> {folder}; Ctrl-C ends the recording, not the test")
         with interruptible("ending the recording; the test goes on") as asked:
             inbox = link.subscribe(tuple(TOPIC_TYPES), history=True, capacity=CAPACITY)
@@ -58,8 +55,7 @@ def attend_as_twin(connect: str, rig: str, keys: Keys | None) -> int:
     link = open_spoke(rig, connect, CONNECT_S, keys)
     try:
         spec, missed_from = _spec(link, connect)
-        who = keys.name if keys is not None else person()
-        link.alive(f"observer.{who}.twin")
+        link.alive(f"observer.{person(keys)}.twin")
         say(f"computing for {spec.run}; Ctrl-C ends it, not the test")
         compute(spec, missed_from, link, alone=lambda: False)
     except KeyboardInterrupt:
@@ -82,7 +78,7 @@ def _spec(link: Link, connect: str) -> tuple[Spec, str]:
             raise BadInput(f"endpoint {connect}: does not say what runs there ({path})")
         return answer.decode(errors="replace")
 
-    run = _run(link, connect)
+    run = run_of(link, connect)
     status = json.loads(asked("state/status"))
     if not status.get("remote_twin"):
         raise BadInput(f"{run} has a twin of its own; start it with --remote-twin for one here")
@@ -90,14 +86,6 @@ def _spec(link: Link, connect: str) -> tuple[Spec, str]:
     name = str(json.loads(asked("config/run"))["name"])
     compared = int(status.get("compared", 0))
     return Spec(run, name, "", "", profile, rig, model), str(compared) if compared else ""
-
-
-def _run(link: Link, connect: str) -> str:
-    """The run that goes on there; its id, which names a folder here, is looked at first."""
-    runs = running(link.components())
-    if not runs or not re.fullmatch(r"\w[\w.-]{0,100}", runs[0]):
-        raise BadInput(f"endpoint {connect}: no test runs there; `shaketwin run` starts one")
-    return runs[0]
 
 
 def _record(run: str, inbox: Inbox, folder: Path, asked: Callable[[], str | None]) -> bool:

@@ -15,10 +15,10 @@ from pathlib import Path
 from table_io.clock import Clock, RealClock
 from table_io.records import Event
 from table_io.session import ORDERS
-from twin.service.offers import OFFERS, TWIN_TOPICS, Offers
+from twin.service.offers import LONGEST_TEXT, OFFERS, TWIN_TOPICS, Offers, readable
 from twin.service.spec import CAPACITY, CONNECT_S, QUIET_S, Spec, orphaned, token
 from twin.service.status import PATHS, Status
-from twin.service.stopwatch import Stopwatch
+from twin.service.stopwatch import TIMING_BLOCKS, Stopwatch
 from twin.stream.access import open_access
 from twin.stream.endpoint import PUBLIC, check, merged, safe, through
 from twin.stream.keys import read_keys
@@ -36,9 +36,8 @@ ANSWER_S = 1.5  # of the rig to a command
 LOOK_S = 0.25  # at who is there
 STAY_S = 5.0  # after the run, for those who still fetch it
 ASKED_WITHIN_S = 2.0  # they ask twice a second; who does not is not waited for
-LOOKED_AT, TIMING_BLOCKS = 10, 100  # of the measured blocks
+LOOKED_AT = 10  # every so manyth of the measured blocks
 OFFERED_CAPACITY = 1000  # pieces that wait; more are asked for again
-LONGEST_TEXT = 1000
 NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 REFUSALS, REFUSAL_EVERY_S = 10, 10.0  # told at once; after these, one in so long
 
@@ -86,7 +85,7 @@ def fault(order: str, who: str, role: str, run: str, text: str) -> str:
         return f"{who} has the role {role}; this takes the role command"
     if named != run:
         return f"this is run {run}"
-    if len(why) > LONGEST_TEXT or not all(one.isprintable() for one in why):
+    if not readable(why):
         return f"its reason has {len(why)} characters; allowed: {LONGEST_TEXT} printable ones"
     return ""
 

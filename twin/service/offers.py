@@ -49,15 +49,16 @@ def _a_twins(item: Item, kinds: frozenset[str]) -> bool:
     """Whether a twin says this; what a person reads is a line, and what another says is not its."""
     match item:
         case Event(kind=kind, text=text):
-            return kind in kinds and _readable(text)
+            return kind in kinds and readable(text)
         case Fault(component=component, reason=reason):
-            return component == "twin" and _readable(reason)
+            return component == "twin" and readable(reason)
         case Timing(component=component):
             return component == "twin"
     return True
 
 
-def _readable(text: str) -> bool:
+def readable(text: str) -> bool:
+    """Whether a person can be shown this as one line."""
     return len(text) <= LONGEST_TEXT and text.isprintable()
 
 

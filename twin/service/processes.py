@@ -24,14 +24,13 @@ from twin.service.gate import NICENESS, gate
 from twin.service.recorder import recorder
 from twin.service.scheduling import urgent
 from twin.service.spec import CONNECT_S, LINGER_S, Spec, orphaned, token
-from twin.service.stopwatch import Stopwatch
+from twin.service.stopwatch import TIMING_BLOCKS, Stopwatch
 from twin.stream.endpoint import INSIDE
 from twin.stream.questions import Questions
 from twin.stream.wire import TOPIC_TYPES, Item, encode, topic
 from twin.stream.zenoh_link import open_hub, open_spoke
 
 RIG_PRIORITY = 50  # of real-time scheduling, where it is permitted
-TIMING_BLOCKS = 100
 RIG_TOPICS = (
     *(name for name in TOPIC_TYPES if name.startswith("/rig/")),
     "/run/start",

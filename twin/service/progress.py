@@ -18,7 +18,7 @@ from table_io.records import (
     Trip,
 )
 from table_io.units import GRAVITY_M_S2
-from table_io.words import sentence
+from table_io.words import printable, sentence
 from twin.stream.wire import Item
 
 HEAD = (
@@ -87,7 +87,7 @@ class RunProgress:
 
     def say(self, text: str) -> None:
         """One line, above the bar; of what a twin elsewhere has written, only what is printable."""
-        text = "".join(one if one.isprintable() else "?" for one in text)
+        text = printable(text)
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def _point(self, point: Point) -> None:

@@ -8,6 +8,7 @@ from table_io.clock import Clock, cpu_seconds
 from table_io.records import Timing
 
 BIN_S = 1e-5
+TIMING_BLOCKS = 100  # between two records of a component
 BINS = 50_000  # up to 0.5 s; what is later falls into the last one
 
 

@@ -12,13 +12,12 @@ from twin.service.bundle import warm_twin
 from twin.service.offers import TWIN_TOPICS
 from twin.service.scheduling import urgent
 from twin.service.spec import CAPACITY, CONNECT_S, LINGER_S, QUIET_S, Spec, orphaned, token
-from twin.service.stopwatch import Stopwatch
+from twin.service.stopwatch import TIMING_BLOCKS, Stopwatch
 from twin.stream.resend import Inbox
 from twin.stream.wire import MEAS_TOPIC, Item, decode, encode, topic
 from twin.stream.zenoh_link import Link, open_spoke
 
 PRIORITY = 40  # of real-time scheduling, where it is permitted
-TIMING_BLOCKS = 100
 CONTROL = ("/run/start", "/run/stop", "/rig/decided")
 
 

@@ -81,7 +81,7 @@ def view_live(
     """Serves a running test to Rerun until it ends or Ctrl-C; with `picture` only draws that."""
     _room(picture)
     link = open_spoke(rig, connect, ANSWER_S, keys)
-    link.alive(f"observer.{keys.name if keys else person()}.view-{os.getpid()}")
+    link.alive(f"observer.{person(keys)}.view-{os.getpid()}")
     address = next_free(VIEW_ADDRESS)
     live = Live(link, address)
     try:

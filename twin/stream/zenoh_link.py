@@ -106,10 +106,6 @@ class Link:
     def relay(self, piece: Piece) -> None:
         """Send a piece, which may be another publisher's, and hold it. Never waits."""
         self._publishers[piece.topic].put(piece.body, attachment=piece.stamp)
-        self.hold(piece)
-
-    def hold(self, piece: Piece) -> None:
-        """Hold a piece that another publisher has sent."""
         shelf = self._shelves.setdefault((piece.topic, piece.source), Shelf())
         shelf.add(piece.number, piece.place, piece.body)
 

@@ -41,8 +41,7 @@ def begin(known: Foreseen) -> Watch:
 
 def rested(watch: Watch, block: Block) -> Watch:
     """With what the sensors say at rest."""
-    noise = watch.noise.seen(block)
-    return watch if noise is watch.noise else replace(watch, noise=noise)
+    return replace(watch, noise=watch.noise.seen(block))
 
 
 def looked(setup: WatchSetup, watch: Watch, held: Held) -> tuple[Watch, list[Record]]:

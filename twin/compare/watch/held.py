@@ -56,6 +56,11 @@ class Noise:
     rms: Float1D | None = None
     waiting: Float2D | None = None  # (channel, sample)
 
+    @property
+    def known(self) -> bool:
+        """True once enough was seen at rest."""
+        return self.rms is not None
+
     def of(self, name: str) -> float:
         """rms of a channel; NaN where nothing was seen at rest."""
         if self.rms is None or name not in self.channels:
@@ -64,7 +69,7 @@ class Noise:
 
     def seen(self, block: Block) -> "Noise":
         """With the samples at rest of one more block; the same however it was cut."""
-        if self.rms is not None:
+        if self.known:
             return self
         rest = block.values[:, block.label == Label.REST]
         waiting = rest if self.waiting is None else np.concatenate([self.waiting, rest], axis=1)

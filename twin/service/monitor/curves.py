@@ -9,6 +9,7 @@ from table_io.records import Point, Quantities
 from twin.service.monitor.board import Board
 from twin.service.monitor.braille import Curve, plot
 from twin.service.monitor.panels import DIM
+from twin.stream.rerun.plots import nice
 
 RED, BLUE, TWIN, NOW = "bright_red", "dodger_blue1", "white", "grey30"
 Value = Callable[[Quantities], float]
@@ -66,9 +67,3 @@ def _values(
         if one.direction == direction and values is not None:
             found[one.frequency_hz] = value(values)
     return sorted(found.items())
-
-
-def nice(value: float) -> float:
-    """The next of 1, 1.5, 2, 3, 4, 5, 6, 8 times a power of ten: an end for an axis."""
-    power = 10.0 ** math.floor(math.log10(value))
-    return next((k * power for k in (1, 1.5, 2, 3, 4, 5, 6, 8) if k * power >= value), 10 * power)

@@ -8,6 +8,7 @@ import numpy as np
 from rich.text import Text
 
 from table_io.block import Label
+from table_io.words import DOING, printable
 from twin.service.monitor import curves, panels
 from twin.service.monitor.board import Board
 from twin.service.monitor.panels import BAD, DIM, GOOD, WARN, About, bar, clock
@@ -21,10 +22,6 @@ STATES = {
     "at rest": "", "idle": "", "fault": BAD,
 }  # fmt: skip
 ORDERS = {"h": "hold", "r": "resume", "s": "stop", "a": "abort"}
-DOING = {
-    Label.REST: "at rest", Label.BLEND: "blends", Label.SETTLE: "settles",
-    Label.MEASURE: "measures", Label.STOP: "decays", Label.CHECK: "loop check",
-}  # fmt: skip
 ARROWS = {"forward": "↑", "backward": "↓"}
 Draw = Callable[[Board, int, int], list[Text]]
 
@@ -94,7 +91,7 @@ def screen(board: Board, about: About, width: int, height: int) -> list[Text]:
 def _fitting(line: Text, width: int) -> Text:
     """The line within its width, and printable: a text from elsewhere commands no terminal."""
     if not line.plain.isprintable():
-        line.plain = "".join(one if one.isprintable() else "?" for one in line.plain)
+        line.plain = printable(line.plain)
     line.truncate(width)
     return line
 

@@ -105,7 +105,7 @@ def monitor(
     connect: str, rig: str, wait: bool, once: bool, picture: Path | None, keys: Keys | None
 ) -> None:
     """The command: a screen where there is a terminal, else lines; or one snapshot."""
-    who = person() if keys is None else keys.name
+    who = person(keys)
     link = _joined(connect, rig, wait, keys)
     link.alive(f"observer.{who}.monitor-{os.getpid()}")
     try:

@@ -18,6 +18,7 @@ from table_io.records import (
     RunStart,
 )
 from table_io.units import GRAVITY_M_S2
+from table_io.words import DOING
 from twin.stream.rerun.looks import LINE_OF
 
 
@@ -67,16 +68,6 @@ def impacts(cycle: Cycle) -> Float2D:
     for one in (cycle.measured, cycle.twin):
         counts += [math.nan] * 2 if one is None else [len(one.onsets_r), len(one.onsets_l)]
     return np.array([counts])
-
-
-DOING = {
-    Label.REST: "at rest",
-    Label.BLEND: "blending",
-    Label.SETTLE: "settling",
-    Label.MEASURE: "measuring",
-    Label.STOP: "decaying to rest",
-    Label.CHECK: "loop check",
-}
 
 
 def status(start: RunStart, step: int, label: int) -> str:
