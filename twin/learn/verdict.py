@@ -74,6 +74,9 @@ def judge(
         share = sure / (1 + len(others))
         return Verdict("ambiguous", best, share, others, general, floor, remainder, why)
     why = "what is left is noise"
+    if left > VISIBLE * floor:
+        part = 100 * math.sqrt(left / gap)
+        why = f"beyond noise {part:.2g} % of the gap is left, as the form of a law may leave"
     if general is not None:
         why = f"more is left, unexplained; it looks like {general.names[-1]}"
         sure, remainder = 0.8 * sure, True
