@@ -6,7 +6,8 @@ The offset is the tare: the SI value that the sensor showed at rest, before prec
 import numpy as np
 
 from table_io.block import Float1D, Float2D
-from table_io.rig import Output, Sensor
+from table_io.rig import Output
+from table_io.sensor import Sensor
 
 
 def to_si(volts: Float2D, sensors: tuple[Sensor, ...], tare: dict[str, float]) -> Float2D:

@@ -235,6 +235,8 @@ def doubts(profile: Profile, rig: Rig) -> list[str]:
             f"the loop check ends at {top:.3g} Hz: at {wanted:g} Hz a tenth of the level has fewer "
             f"than {rig.output.least_lsb} DAC steps; the response beyond it is extrapolated"
         )
+    if rig.backend == "ni" and rig.ni is not None:
+        said += rig.ni.doubts
     block_s = profile.acquisition.block_samples / profile.acquisition.rate_hz
     if block_s > rig.output.lead_s / 4:
         said.append(

@@ -8,69 +8,13 @@ from typing import Literal, NamedTuple
 
 from pydantic import Field, ValidationInfo, field_validator
 
+from table_io.calibration_record import Calibration
 from table_io.card import Card, Finite, NonNegative, Number, Positive
-from table_io.channels import BY_NAME
-from table_io.units import UNITS
+from table_io.sensor import Sensor
 from table_io.wiring.follow import FollowWiring
 from table_io.wiring.ni import NiWiring
 from table_io.wiring.opendaq import OpenDaqWiring
 from table_io.wiring.udp import UdpWiring
-
-
-class Sensor(Card):
-    """A channel's way from the quantity to volts: volts = (value + offset) * volts_per_unit."""
-
-    channel: str
-    unit: str
-    range: Positive = Field(description="Full scale either side, in `unit`.")
-    volts_per_unit: Finite
-    bits: int = Field(ge=8, le=32)
-    noise_rms: NonNegative = Field(0.0, description="In `unit`; the simulated table's noise.")
-    offset: Finite = Field(0.0, description="In `unit`; the simulated table's sensor offset.")
-
-    @field_validator("channel")
-    @classmethod
-    def _known(cls, channel: str) -> str:
-        if channel not in BY_NAME:
-            near = difflib.get_close_matches(channel, BY_NAME, 1)
-            raise ValueError(
-                f"channel {channel!r} is unknown"
-                + (f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(BY_NAME)}")
-            )
-        return channel
-
-    @field_validator("unit")
-    @classmethod
-    def _unit_fits(cls, unit: str, info: ValidationInfo) -> str:
-        channel = info.data.get("channel")
-        if channel is None:
-            return unit
-        want = BY_NAME[channel].unit
-        allowed = [name for name, (si, _) in UNITS.items() if si == want]
-        if unit not in allowed:
-            raise ValueError(
-                f"unit {unit!r} does not measure {channel} ({want}); allowed: {', '.join(allowed)}"
-            )
-        return unit
-
-    @field_validator("volts_per_unit")
-    @classmethod
-    def _not_silent(cls, volts: float) -> float:
-        if volts == 0:
-            raise ValueError("volts_per_unit is 0, so the channel would be silent; allowed: not 0")
-        return volts
-
-    @property
-    def si_per_unit(self) -> float:
-        return UNITS[self.unit][1]
-
-    @property
-    def range_si(self) -> float:
-        return self.range * self.si_per_unit
-
-    @property
-    def volts_per_si(self) -> float:
-        return self.volts_per_unit / self.si_per_unit
 
 
 class Limits(Card):
@@ -216,10 +160,13 @@ class Rig(Card):
     opendaq: OpenDaqWiring | None = Field(None, validate_default=True)
     udp: UdpWiring | None = Field(None, validate_default=True)
     follow: FollowWiring | None = Field(None, validate_default=True)
+    calibrations: tuple[Calibration, ...] = Field(
+        (), description="Records of `shaketwin calibrate`, as they lie beside the card."
+    )
 
     @field_validator("sensors")
     @classmethod
-    def _complete(cls, sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
+    def _complete(cls, sensors: tuple[Sensor, ...], info: ValidationInfo) -> tuple[Sensor, ...]:
         names = [sensor.channel for sensor in sensors]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
@@ -227,6 +174,8 @@ class Rig(Card):
                 f"sensors name {', '.join(twice)} more than once; one sensor a channel"
             )
         missing = {"drive_disp_m", "table_disp_m", "table_acc_m_s2"} - set(names)
+        if info.data.get("backend") == "follow":
+            missing -= {"drive_disp_m"}  # a controller may show its command to nobody
         if missing:
             raise ValueError(
                 f"sensors lack {', '.join(sorted(missing))}; the controller needs them"
@@ -260,6 +209,17 @@ class Rig(Card):
                 f"backend {info.field_name!r} needs a [{info.field_name}] table: what is wired "
                 "where; see CONNECT.md"
             )
+        if isinstance(table, FollowWiring) and info.data.get("backend") == "follow":
+            if info.data.get(table.source) is None:
+                raise ValueError(
+                    f"source {table.source!r} needs a [{table.source}] table: who acquires what"
+                )
+            wired = [sensor.channel for sensor in info.data.get("sensors", ())]
+            if wired and table.command not in wired:
+                raise ValueError(
+                    f"command {table.command!r} is no sensor of the card; allowed: one of them, "
+                    "table_disp_m where no command is wired"
+                )
         return table
 
     @property

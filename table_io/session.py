@@ -14,7 +14,8 @@ from table_io import protection
 from table_io.backends import Backend, MachineLost
 from table_io.block import Block, Bool2D
 from table_io.calibration import noise_from, tare_from, to_si
-from table_io.clock import Clock
+from table_io.clock import Clock, today
+from table_io.due import overdue
 from table_io.player import Player, Starved
 from table_io.profile import Profile
 from table_io.records import Event, Gap, Record, Response, RunStart, RunStop, Trip
@@ -78,7 +79,7 @@ def play(
             if punctuality is not None:
                 punctuality.late_s.append(late_s)
             yield block
-            yield from _gaps(block, clipped)
+            yield from gaps(block, clipped)
             run.late(late_s)
             run.protect(block, clipped)
             run.conduct(block)
@@ -126,6 +127,8 @@ class _Run:
     def begin(self) -> dict[str, float]:
         """Open, tare, start the machine; the tare in SI."""
         self._to("checking")
+        for sentence in overdue(self.setup.rig, today().date()):
+            self._say("calibration", sentence)
         backend, sensors = self.player.backend, self.setup.rig.sensors
         backend.open()
         volts = backend.tare(int(TARE_S * self.rate_hz))
@@ -251,7 +254,7 @@ class _Run:
         yield RunStop(at, "halted", why, tuple(self.states))
 
 
-def _gaps(block: Block, clipped: Bool2D) -> Iterator[Gap]:
+def gaps(block: Block, clipped: Bool2D) -> Iterator[Gap]:
     """A Gap for every stretch of lost or of clipped samples of every channel of the block."""
     if not (clipped.any() or np.isnan(block.values).any()):
         return

@@ -29,8 +29,8 @@ DOING = {
 LEVELS = {
     "ERROR": {"fault", "halted", "error", "died"},
     "WARN": {
-        "warning", "alarm", "divergence", "late", "stop", "stopped", "sensor", "disagreement",
-        "drift", "no jump", "unexpected jump", "attractor", "instrument", "refused",
+        "warning", "calibration", "alarm", "divergence", "late", "stop", "stopped", "sensor",
+        "disagreement", "drift", "no jump", "unexpected jump", "attractor", "instrument", "refused",
     },
 }  # fmt: skip
 

@@ -78,6 +78,47 @@ class Backend(Protocol):
         """Release the machine."""
 
 
+class Source(Protocol):
+    """A backend that only acquires: clauses 1, 2, 4 and 5 without output, and 7.
+
+    Sample 0 is the next that comes after start(). Who moves the table is somebody else, and lost
+    samples, or a lost device, do not stop it: so the words of its MachineLost say.
+    """
+
+    channels: tuple[str, ...]
+    rate_hz: float
+    clock_says: str  # once started: whose clock took sample 0, and when by that clock
+
+    def open(self) -> None:
+        """Connect; nothing of the device is changed."""
+
+    def tare(self, samples: int) -> Float2D:
+        """Volts at rest before precompression, (channel, sample)."""
+
+    def start(self) -> None:
+        """Sample 0 is the next."""
+
+    def read(self, samples: int) -> Float2D:
+        """Volts of the next samples, (channel, sample), when they have been taken."""
+
+    def scheduled(self, index: int) -> float:
+        """Time on the session's clock at which sample `index` comes, in s."""
+
+    def close(self) -> None:
+        """Let the device go."""
+
+
+def open_source(rig: Rig, rate_hz: float, clock: Clock) -> Source:
+    """What acquires where a card only follows; another kind of input = one more case here."""
+    match rig.follow.source if rig.follow is not None else rig.backend:
+        case "opendaq":
+            from table_io.backends.opendaq import OpenDaqSource
+
+            return OpenDaqSource(rig, rate_hz, clock)
+        case _:
+            raise BadInput(f"rig {rig.name}: backend {rig.backend!r} does not only acquire")
+
+
 def open_backend(rig: Rig, profile: Profile, clock: Clock) -> Backend:
     """The backend that the machine card names. Adding a backend = one folder and one case here."""
     asked = (rig, profile.specimen, profile.acquisition.rate_hz, clock)
@@ -90,6 +131,19 @@ def open_backend(rig: Rig, profile: Profile, clock: Clock) -> Backend:
             from table_io.backends.machine import MachineBackend
 
             return MachineBackend(*asked)
+        case "ni":
+            from table_io.backends.ni import NiBackend
+
+            return NiBackend(*asked)
+        case "udp":
+            from table_io.backends.udp import UdpBackend
+
+            return UdpBackend(*asked)
+        case "opendaq" | "follow":
+            raise BadInput(
+                f"rig {rig.name}: backend {rig.backend!r} only acquires, so it moves nothing; a "
+                "controller that plays our drive is followed by backend = 'follow'"
+            )
         case _:
             raise BadInput(f"rig {rig.name}: backend {rig.backend!r} is not built yet")
 
@@ -101,3 +155,15 @@ def answers(rig: Rig) -> None:
             from table_io.backends import machine
 
             machine.answers(rig)
+        case "opendaq" | "follow":
+            from table_io.backends import opendaq
+
+            opendaq.answers(rig)
+        case "udp":
+            from table_io.backends import udp
+
+            udp.answers(rig)
+        case "ni":
+            from table_io.backends import ni
+
+            ni.answers(rig)

@@ -23,7 +23,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from table_io.block import Float1D, Float2D
-from table_io.rig import PlantedFault, Rig, Sensor
+from table_io.rig import PlantedFault, Rig
+from table_io.sensor import Sensor
 
 SHUT_S = 0.05  # in which the valves shut
 OIL_S = 2.0  # in which the pressure falls

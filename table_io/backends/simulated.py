@@ -21,7 +21,8 @@ from table_io.block import Float1D, Float2D
 from table_io.card import BadInput
 from table_io.clock import Clock
 from table_io.profile import Specimen
-from table_io.rig import Output, Rig, Sensor, SimulatedTable
+from table_io.rig import Output, Rig, SimulatedTable
+from table_io.sensor import Sensor
 
 REPLACE_AFTER_S = 0.02
 

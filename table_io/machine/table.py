@@ -28,7 +28,8 @@ from table_io.machine.wire import (
     say,
 )
 from table_io.profile import Specimen
-from table_io.rig import Output, Rig, Sensor
+from table_io.rig import Output, Rig
+from table_io.sensor import Sensor
 
 SILENCE_S = 30.0  # without a word from a controller before its start, where nothing moves
 
@@ -53,8 +54,8 @@ class Table:
             )
         self.rig = rig
         self.latched = ""  # how the last controller was lost
-        self._tell = tell
-        self._box = box
+        self.tell = tell
+        self.box = box
         self._life: Life | None = None
         self._heard_s = 0.0
 
@@ -66,6 +67,11 @@ class Table:
     def claimed(self) -> bool:
         """True while a controller has it, and while it comes to rest after one."""
         return self._life is not None
+
+    @property
+    def life(self) -> Life | None:
+        """What the machine does for whoever has it, for a far side of another protocol."""
+        return self._life
 
     @property
     def moving(self) -> bool:
@@ -110,7 +116,7 @@ class Table:
             out.append(self.lost(f"no word from the controller for {patience:g} s", now))
         elif life.at_rest:
             life.note("at rest")
-            self._tell(f"at rest; {life.ending}; waiting for a controller")
+            self.tell(f"at rest; {life.ending}; waiting for a controller")
             self._free()
         return out
 
@@ -122,7 +128,7 @@ class Table:
                 self.latched = f"controller lost at sample {life.taken}: {why}"
                 self._end(life, self.latched, now)
             else:
-                self._tell(f"controller lost before its start: {why}")
+                self.tell(f"controller lost before its start: {why}")
                 self._free()
         return say(Kind.LOST, why)
 
@@ -147,7 +153,7 @@ class Table:
             text = f"the table does not sample at {claim.rate_hz:g} Hz; allowed: {rates}"
             return say(Kind.REFUSED, text, Refusal.INPUT)
         try:
-            self._life = Life(self.rig, claim.specimen, claim.rate_hz, self._box)
+            self._life = Life(self.rig, claim.specimen, claim.rate_hz, self.box)
         except BadInput as error:
             return say(Kind.REFUSED, str(error), Refusal.INPUT)
         self._life.note(f"claimed; {self.latched or 'at rest'}")
@@ -169,7 +175,7 @@ class Table:
             case Kind.START:
                 life.start(now)
                 self.latched = ""
-                self._tell("a controller drives the table")
+                self.tell("a controller drives the table")
                 return [carry(Kind.STARTED, np.array([now]))]
             case Kind.RELEASE:
                 if life.started:
@@ -182,7 +188,7 @@ class Table:
 
     def _end(self, life: Life, why: str, now: float) -> None:
         left_s = life.end(why, now)
-        self._tell(f"{why}; it plays what is queued, at rest in {left_s:.2f} s")
+        self.tell(f"{why}; it plays what is queued, at rest in {left_s:.2f} s")
 
     def _free(self) -> None:
         if self._life is not None:

@@ -14,7 +14,8 @@ import numpy.typing as npt
 from table_io.block import Float1D, Float2D, Int1D
 from table_io.profile import Profile
 from table_io.protection.watch import CODES, LAG, MARKED, ONCE, PER, UNKNOWN
-from table_io.rig import Rig, Sensor
+from table_io.rig import Rig
+from table_io.sensor import Sensor
 from table_io.units import GRAVITY_M_S2
 
 PAST_S = 0.25  # of samples kept from before: the longest repetition that is found

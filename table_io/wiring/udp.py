@@ -1,7 +1,32 @@
 """A target that speaks our UDP packets."""
 
-from table_io.card import Card
+from pydantic import Field, field_validator
+
+from table_io.card import Card, Positive
 
 
 class UdpWiring(Card):
-    """What is wired where."""
+    """Where the target is; what is wired to its converters is its own affair."""
+
+    target: str = Field(description="HOST:PORT of the target.")
+    rig_port: int = Field(0, ge=0, le=65535, strict=True, description="Port of the rig; 0: any.")
+    replace_after_ms: Positive = Field(
+        40.0, le=1000.0, description="From a decision to where it can change the command."
+    )
+
+    @field_validator("target")
+    @classmethod
+    def _is_an_address(cls, target: str) -> str:
+        host, _, port = target.rpartition(":")
+        if not host or not port.isdecimal() or not 0 < int(port) <= 65535:
+            raise ValueError(
+                f"{target!r} is no address; give HOST:PORT with a port of 1 to 65535, as "
+                "192.168.7.5:7460"
+            )
+        return target
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """(host, port)."""
+        host, _, port = self.target.rpartition(":")
+        return host, int(port)

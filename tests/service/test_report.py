@@ -80,7 +80,7 @@ def test_what_happened_is_listed(run_folder: Maker) -> None:
     assert "twin 1.000 1.500 killed" in text
     assert "recorder 1.50 4.25 9.75 3 10 10.0 SCHED_FIFO" in text
     assert "lab-host" in text
-    assert "mass_disp_m 0.0001250" in text
+    assert "mass_disp_m – – – – – – – 0.0001250 m" in text
 
 
 def test_stopped_before_the_first_step(run_folder: Maker) -> None:

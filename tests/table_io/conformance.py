@@ -1,7 +1,8 @@
 """What every backend must do, clause by clause, after the words in table_io/backends/__init__.py.
 
-A clause is a function of a Bench; a new backend is held to all of them by one more Bench in
-test_conformance.py. A clause fails by AssertionError and speaks the contract's language.
+A clause is a function of a Bench; a new backend is held to all of them by one more Bench. What
+only acquires, a Source, is held to those of ACQUIRING. A clause fails by AssertionError and speaks
+the contract's language.
 """
 
 from collections.abc import Callable
@@ -10,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from table_io.backends import Backend
+from table_io.backends import Backend, Source
 from table_io.block import Float1D, Float2D
 from table_io.calibration import tare_from, to_si
 from table_io.card import BadInput
@@ -28,13 +29,24 @@ AWAY_S = 0.1  # a rig that is late, but not dead
 class Bench:
     """A backend under test: `make(rate_hz)` makes an unopened one whose machine loses LOST.
 
-    `repeatable`: two lives on it see the same samples to the bit.
+    `repeatable`: two lives on it see the same samples to the bit. Of what only acquires `play` has
+    the controller play these volts: it starts the Source, and the next sample that is read is the
+    first of them.
     """
 
     rig: Rig
     clock: Clock
     make: Callable[[float], Backend]
     repeatable: bool = False
+    play: Callable[[Source, Float1D], None] | None = None
+
+    def begin(self, backend: Backend, volts: Float1D) -> None:
+        """Have it play `volts` from its next sample on."""
+        if self.play is not None:
+            self.play(backend, volts)
+            return
+        backend.queue(0, volts)
+        backend.start()
 
     def open(self) -> Backend:
         """An open one."""
@@ -45,8 +57,7 @@ class Bench:
     def started(self, volts: Float1D) -> Backend:
         """One that plays `volts` from sample 0."""
         backend = self.open()
-        backend.queue(0, volts)
-        backend.start()
+        self.begin(backend, volts)
         return backend
 
     def newest(self, backend: Backend) -> int:
@@ -72,12 +83,19 @@ class Bench:
 
 Clause = Callable[[Bench], None]
 CLAUSES: dict[str, Clause] = {}
+ACQUIRING: dict[str, Clause] = {}  # those that hold without output too
 
 
 def clause(check: Clause) -> Clause:
     """A clause of the contract."""
     CLAUSES[check.__name__] = check
     return check
+
+
+def acquiring(check: Clause) -> Clause:
+    """A clause that what only acquires keeps as well."""
+    ACQUIRING[check.__name__] = check
+    return clause(check)
 
 
 E = TypeVar("E", bound=BaseException)
@@ -104,16 +122,18 @@ def rise(volts: float, count: int) -> Float1D:
     return volts * x**3 * (10.0 + x * (-15.0 + 6.0 * x))
 
 
-@clause
+@acquiring
 def it_says_what_it_is(bench: Bench) -> None:
     backend = bench.make(RATE)
     assert backend.channels == bench.rig.channels
     assert backend.rate_hz == RATE
+    if bench.play is not None:
+        return
     assert isinstance(backend.replace_after, int)
     assert backend.replace_after > 0
 
 
-@clause
+@acquiring
 def open_refuses_a_rate_that_the_machine_has_not(bench: Bench) -> None:
     backend = bench.make(1234.5)
     error = refused(BadInput, backend.open, "a rate that the machine does not sample at")
@@ -121,7 +141,7 @@ def open_refuses_a_rate_that_the_machine_has_not(bench: Bench) -> None:
     backend.close()
 
 
-@clause
+@acquiring
 def calls_out_of_order_are_refused(bench: Bench) -> None:
     backend = bench.make(RATE)
     zero = np.zeros(2)
@@ -131,19 +151,21 @@ def calls_out_of_order_are_refused(bench: Bench) -> None:
         ("start", backend.start),
         ("read", lambda: backend.read(1)),
     ):
+        if name == "queue" and bench.play is not None:
+            continue
         refused(RuntimeError, call, f"{name} before open")
     backend.open()
     refused(RuntimeError, lambda: backend.read(1), "read before start")
     refused(RuntimeError, lambda: backend.scheduled(0), "scheduled before start")
-    backend.queue(0, zero)
-    backend.start()
+    bench.begin(backend, zero)
     refused(RuntimeError, backend.start, "a second start")
     backend.close()
     refused(RuntimeError, lambda: backend.read(1), "read after close")
-    refused(RuntimeError, lambda: backend.queue(ROOM, zero), "queue after close")
+    if bench.play is None:
+        refused(RuntimeError, lambda: backend.queue(ROOM, zero), "queue after close")
 
 
-@clause
+@acquiring
 def tare_is_the_inputs_at_rest_and_moves_nothing(bench: Bench) -> None:
     backend = bench.open()
     volts = np.concatenate([backend.tare(400), backend.tare(1), backend.tare(399)], axis=1)
@@ -153,8 +175,7 @@ def tare_is_the_inputs_at_rest_and_moves_nothing(bench: Bench) -> None:
         quiet = 10 * sensor.noise_rms * sensor.si_per_unit + sensor.range_si * 1e-5
         assert np.ptp(line) <= 2 * quiet, f"{sensor.channel} moves"
     command = bump(0.1)
-    backend.queue(0, command)
-    backend.start()
+    bench.begin(backend, command)
     bench.check_played(backend.read(COUNT), command, "the run after a tare begins at sample 0")
     backend.close()
 
@@ -174,7 +195,7 @@ def sample_0_leaves_when_sample_0_is_taken(bench: Bench) -> None:
     backend.close()
 
 
-@clause
+@acquiring
 def samples_are_scheduled_at_the_rate(bench: Bench) -> None:
     backend = bench.started(np.zeros(2))
     first = backend.scheduled(0)
@@ -183,7 +204,7 @@ def samples_are_scheduled_at_the_rate(bench: Bench) -> None:
     backend.close()
 
 
-@clause
+@acquiring
 def read_waits_for_its_last_sample(bench: Bench) -> None:
     backend = bench.started(np.zeros(2))
     end = 0
@@ -196,7 +217,7 @@ def read_waits_for_its_last_sample(bench: Bench) -> None:
     backend.close()
 
 
-@clause
+@acquiring
 def how_reads_are_cut_changes_no_sample(bench: Bench) -> None:
     lives = []
     for cuts in ((COUNT,), (1, 7, 64, 0, COUNT - 72)):
@@ -303,7 +324,7 @@ def the_last_value_is_held(bench: Bench) -> None:
     backend.close()
 
 
-@clause
+@acquiring
 def a_lost_sample_is_nan_and_keeps_its_place(bench: Bench) -> None:
     command = bump(1.0, 800)
     backend = bench.started(command)
@@ -316,7 +337,7 @@ def a_lost_sample_is_nan_and_keeps_its_place(bench: Bench) -> None:
     backend.close()
 
 
-@clause
+@acquiring
 def close_is_safe_at_any_time(bench: Bench) -> None:
     unopened = bench.make(RATE)
     unopened.close()
@@ -329,7 +350,7 @@ def close_is_safe_at_any_time(bench: Bench) -> None:
     moving.close()
 
 
-@clause
+@acquiring
 def the_next_life_begins_at_rest_at_sample_0(bench: Bench) -> None:
     """Also where the life before was left in motion: open() waits until the machine rests."""
     moving = bench.started(bump(1.0))
@@ -338,8 +359,7 @@ def the_next_life_begins_at_rest_at_sample_0(bench: Bench) -> None:
     backend = bench.open()
     tare = tare_from(backend.tare(400), bench.rig.sensors)
     command = bump(0.5)
-    backend.queue(0, command)
-    backend.start()
+    bench.begin(backend, command)
     volts = backend.read(COUNT)
     bench.check_played(volts, command, "the second life")
     table = to_si(volts, bench.rig.sensors, tare)[bench.rig.channels.index("table_disp_m")]

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from table_io.calibration import command_to_si, command_to_volts, tare_from, to_si, to_volts
 from table_io.card import PROFILES, load
-from table_io.rig import Output, Rig, Sensor
+from table_io.rig import Output, Rig
+from table_io.sensor import Sensor
 
 RIG = load(PROFILES / "rigs" / "simulated.toml", Rig, "machine card")[0]
 REVERSED = Sensor(channel="force_l1_n", unit="kN", range=10.0, volts_per_unit=-0.5, bits=16)

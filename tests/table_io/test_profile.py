@@ -10,7 +10,8 @@ import pytest
 from table_io.card import PROFILES, BadInput, Card, find, load, parse
 from table_io.channels import BY_NAME
 from table_io.profile import Profile
-from table_io.rig import Rig, Sensor
+from table_io.rig import Rig
+from table_io.sensor import Sensor
 from table_io.units import GRAVITY_M_S2, UNITS
 
 RIG_TEXT = (PROFILES / "rigs" / "simulated.toml").read_text(encoding="utf-8")

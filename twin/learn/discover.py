@@ -93,6 +93,11 @@ def prepare(logs: Sequence[Log], model: Model, without: Sequence[str] = ()) -> P
     first = fit(sheets, first.guess, free)
     rms = [_rms(sheet.residual(first.guess)) for sheet in sheets]
     notes = []
+    if (thinned := sheets[0].thinned) > 1:
+        notes.append(
+            f"so much was recorded that of each step's cycles only the last are used, one in "
+            f"{thinned}, at least two"
+        )
     if min(rms) > MODEL_LIMITED:
         sheets = sheets_of(pairs, first.guess.model(), rms)
         notes.append(

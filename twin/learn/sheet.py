@@ -35,6 +35,7 @@ TARED = ("acc", "right", "left")
 PULLS = ("right pull", "left pull")
 SWING = 0.005  # of the largest push: by so much the low pass swings through zero after a release
 KEPT = 3  # motions of other beliefs that are remembered
+MOST_SAMPLES = 1_000_000  # in motion, of all logs together: more would ask for too much memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +52,7 @@ class Sheet:
     reference: Model
     scale: Scale
     weight: float = 1.0  # of the noise: above 1 where the model's error, not noise, is the limit
+    thinned: int = 1  # of each step's cycles, and of the blocks outside them, one part in so many
     _motions: dict[tuple[Sensor, ...], Motion] = field(default_factory=dict)
 
     def motion(self, sensors: tuple[Sensor, ...] = ()) -> Motion:
@@ -99,7 +101,22 @@ class Sheet:
             elif row >= len(FORCES):
                 side = {"right cells": 0, "left cells": 1}.get(name)
                 used[row] = m.moving & smooth if side is None else used[1 + side]
-        return used
+        return used & self._counting
+
+    @cached_property
+    def _counting(self) -> Bool2D:
+        """(sample,) of a thinned log: the last cycles of each step, and each so manyth block else.
+
+        At least two cycles, one after the other: what does not repeat in them is the noise.
+        """
+        m = self.motion()
+        if self.thinned == 1:
+            return np.ones(m.u.size, dtype=bool)
+        held = np.zeros(int(m.step.max(initial=-1)) + 2, dtype=np.int64)
+        np.maximum.at(held, m.step, m.cycle + 1)  # step -1 is the last entry
+        last = m.cycle >= (held - np.maximum(held // self.thinned, 2))[m.step]
+        counting: Bool2D = np.where(m.cycle >= 0, last, self.blocks % self.thinned == 0)
+        return counting
 
     @cached_property
     def resting(self) -> tuple[str, ...]:
@@ -274,7 +291,9 @@ def sheets_of(
     gaps = [gap for m in motions for gap in m.gaps_m if math.isfinite(gap)]
     depth = max(u - min(gaps), 1e-2 * u) if gaps else u
     scale = Scale(u, v, depth)
+    thinned = math.ceil(sum(int(m.moving.sum()) for m in motions) / MOST_SAMPLES) or 1
+    rated = zip(logs, weights or [1.0] * len(logs), strict=True)
     return tuple(
-        Sheet(number, readings, contact_n, reference, scale, weights[number] if weights else 1.0)
-        for number, (readings, contact_n) in enumerate(logs)
+        Sheet(number, readings, contact_n, reference, scale, weight, thinned)
+        for number, ((readings, contact_n), weight) in enumerate(rated)
     )

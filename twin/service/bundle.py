@@ -15,6 +15,7 @@ from table_io.limits import Margin, margins, refuse
 from table_io.profile import Profile
 from table_io.records import RunStart, Step
 from table_io.rig import Rig
+from table_io.rig_file import load_rig
 from table_io.session import Setup as SessionSetup
 from twin.model.card import ModelCard
 from twin.model.model import Model
@@ -127,7 +128,7 @@ def from_texts(name: str, profile_toml: str, rig_toml: str, model_toml: str, whe
 def read_bundle(path: Path, table: str | None = None, model: str | None = None) -> Bundle:
     """The bundle of a test profile; BadInput where the table cannot do the test."""
     profile, profile_toml = load(path, Profile, "test profile")
-    _, rig_toml = load(find(table or profile.rig, "rigs", path), Rig, "machine card")
+    _, rig_toml = load_rig(find(table or profile.rig, "rigs", path))
     _, model_toml = read_model(model or profile.model, path)
     bundle = from_texts(path.stem, profile_toml, rig_toml, model_toml, str(path))
     refuse(bundle.margins, bundle.profile, bundle.rig, str(path))

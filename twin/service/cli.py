@@ -11,6 +11,7 @@ import typer
 
 from twin.service.cli_attend import attending
 from twin.service.cli_files import Steps, files
+from twin.service.cli_hardware import hardware
 from twin.service.cli_keys import WithKeys, keys_app, read_given
 from twin.service.cli_learning import learning
 from twin.service.cli_monitor import watching
@@ -43,20 +44,6 @@ class Speed(enum.StrEnum):
 
     realtime = "realtime"
     max = "max"
-
-
-@app.command(rich_help_panel=PLAN)
-def check(
-    profile: TestProfile,
-    table: Annotated[str | None, typer.Option("--table", help="Machine card instead.")] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Folder for the drawing of the drive.")
-    ] = None,
-) -> None:
-    """Pre-flight only: the plan, the margins against the machine card, a drawing of the drive."""
-    from twin.service.driving import check as command
-
-    command(profile, table, out)
 
 
 @app.command(rich_help_panel=DRIVE)
@@ -128,11 +115,39 @@ def table(
     time_scale: Annotated[
         float, typer.Option("--time-scale", help="Times as fast as the clock, for tests.")
     ] = 1.0,
+    profile: Annotated[
+        str,
+        typer.Option("--profile", help="Its specimen stands there, where a rig cannot say which."),
+    ] = "quickstart",
+    play: Annotated[
+        Path | None,
+        typer.Option("--play", metavar="FILE", help="Of a follow card: its controller plays this."),
+    ] = None,
+    ppm: Annotated[float, typer.Option("--ppm", help="By which that controller is fast.")] = 0.0,
+    after: Annotated[
+        float, typer.Option("--after", metavar="S", help="It plays so long after we acquire.")
+    ] = 5.0,
 ) -> None:
     """The simulated table as a machine of its own, for `run PROFILE --table machine`."""
+    from twin.service.table import Vendor
     from twin.service.table import table as command
 
-    command(rig, listen, log, time_scale, sys.stdout)
+    command(rig, listen, log, time_scale, sys.stdout, profile, Vendor(play, ppm, after))
+
+
+@app.command(rich_help_panel=PLAN)
+def drive(
+    profile: TestProfile,
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="New file.")],
+    table: Annotated[str | None, typer.Option("--table", help="Machine card instead.")] = None,
+    format: Annotated[
+        str, typer.Option("--format", help="csv, txt, rpc, uff, mat or wav; else by FILE's ending.")
+    ] = "",
+) -> None:
+    """The planned drive as a file for another controller, which `run --table` then follows."""
+    from twin.service.drive_file import drive as command
+
+    command(profile, table, out, format)
 
 
 @app.command(rich_help_panel=DRIVE)
@@ -247,6 +262,7 @@ def view(
     command(log, save, picture, connect, rig, read_given(keys))
 
 
+app.add_typer(hardware)
 app.add_typer(watching)
 app.add_typer(attending)
 app.add_typer(learning)

@@ -6,7 +6,9 @@ from pathlib import Path
 
 from table_io.backends import answers
 from table_io.card import BadInput
-from table_io.clock import RealClock
+from table_io.clock import RealClock, today
+from table_io.due import overdue
+from table_io.following import planned
 from table_io.limits import doubts, warnings
 from twin.service.bundle import Bundle, read_bundle, run_id
 from twin.service.disk import refuse_full
@@ -53,7 +55,8 @@ def run(
     ready(bundle, table=True)
     refuse_full([bundle], out or RUNS)
     folder, run_name = new_run(out, bundle.name)
-    for sentence in (*warnings(bundle.margins, bundle.rig), *doubts(bundle.profile, bundle.rig)):
+    said = (*warnings(bundle.margins, bundle.rig), *doubts(bundle.profile, bundle.rig))
+    for sentence in (*said, *overdue(bundle.rig, today().date())):
         say(f"warning: {sentence}")
     say(
         f"{bundle.profile.title}: {len(bundle.steps)} steps, "
@@ -84,6 +87,8 @@ def real_time(bundle: Bundle, profile: Path) -> None:
             f"{profile}: acquisition.block_samples = {samples}: in real time at {rate:g} Hz a "
             f"block may have {least} to {most} samples; change it, or use --speed max"
         )
+    if bundle.rig.backend == "follow":
+        planned(bundle.profile, bundle.rig)  # a test that cannot be given away says so now
     answers(bundle.rig)
 
 

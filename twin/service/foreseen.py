@@ -11,7 +11,8 @@ import numpy as np
 from table_io.block import Float1D
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.limits import ROOM
-from table_io.rig import Rig, Sensor
+from table_io.rig import Rig
+from table_io.sensor import Sensor
 from table_io.units import GRAVITY_M_S2
 from twin.model.ideal import swept
 from twin.service.bundle import Bundle

@@ -9,8 +9,9 @@ from rich.table import Table
 
 from table_io.backends import open_backend
 from table_io.block import Label
-from table_io.clock import ManualClock
+from table_io.clock import ManualClock, today
 from table_io.drive import Drive
+from table_io.due import overdue
 from table_io.limits import ROOM, Limit, Margin, doubts, limits_of, warnings
 from table_io.loop_check import aims
 from table_io.policies import words_of
@@ -38,6 +39,7 @@ def print_plan(console: Console, bundle: Bundle) -> None:
         *warnings(bundle.margins, bundle.rig),
         *doubts(bundle.profile, bundle.rig),
         *clipped(sensors, bundle.rig),
+        *overdue(bundle.rig, today().date()),
     ]
     for sentence in said:
         console.print(f"warning: {sentence}", highlight=False, soft_wrap=True)
@@ -50,7 +52,9 @@ def _plan(bundle: Bundle) -> list[tuple[str, str]]:
     sweep, rate = profile.sweep, bundle.drive.rate_hz
     right, left = (f"{gap * 1e3:g} mm" for gap in profile.specimen.gaps_m)
     bumpers = f"gap right {right}, left {left}" if "inf mm" not in (right, left) else "no bumpers"
-    replace_after = open_backend(rig, profile, ManualClock()).replace_after
+    replace_after = 0  # of a controller that is only followed
+    if rig.backend != "follow":
+        replace_after = open_backend(rig, profile, ManualClock()).replace_after
     block = profile.acquisition.block_samples
     lead = max(round(rig.output.lead_s * rate), replace_after)
     check = "none"

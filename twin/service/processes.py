@@ -13,11 +13,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from table_io.backends import open_backend
+from table_io.backends import open_backend, open_source
 from table_io.block import Block
 from table_io.card import BadInput
 from table_io.clock import RealClock
-from table_io.records import RunStop
+from table_io.following import follow
+from table_io.records import Event, RunStart, RunStop
 from table_io.session import ORDERS, Order, Punctuality, play
 from twin.service.bundle import warm_rig
 from twin.service.gate import NICENESS, gate
@@ -56,11 +57,15 @@ def rig(spec: Spec, _: str) -> None:
         clock.wait_until(clock.now() + 0.01)
     seconds = bundle.profile.acquisition.block_samples / bundle.drive.rate_hz
     watch = Stopwatch("rig", clock, seconds, scheduler)
-    backend = open_backend(bundle.rig, bundle.profile, clock)
     punctual = Punctuality()
     watch.begin()
     start = bundle.describe(spec.run, "table")
-    source = play(bundle.session, backend, clock, start, orders.order, punctual)
+    asked = (clock, start, orders.order, punctual)
+    if bundle.rig.backend == "follow":
+        followed = open_source(bundle.rig, bundle.drive.rate_hz, clock)
+        source = follow(bundle.session, followed, *asked)
+    else:
+        source = play(bundle.session, open_backend(bundle.rig, bundle.profile, clock), *asked)
     for item in _timed(source, watch, punctual):
         link.publish(topic(item), encode(item, spec.run))
     until = clock.now() + LINGER_S
@@ -111,6 +116,8 @@ def _timed(source: Iterator[Item], watch: Stopwatch, punctual: Punctuality) -> I
             blocks += 1
             if blocks % TIMING_BLOCKS == 0:
                 yield watch.record(item.end)
+        elif isinstance(item, RunStart) or (isinstance(item, Event) and item.kind == "motion"):
+            yield watch.record(item.index)  # a follower now hands on no block for a while
 
 
 def twin(spec: Spec, missed_from: str) -> None:

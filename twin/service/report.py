@@ -26,6 +26,7 @@ from twin.compare.watch import KINDS as WATCHED
 from twin.service.evidence import Run, Summary, cards, gather, quantity
 from twin.service.figures import Picture, draw_all
 from twin.service.page import HERE, inside, page, significant
+from twin.service.sensor_rows import sensor_rows
 from twin.stream.recording import Recording, read
 
 MOST_ROWS = 200
@@ -80,6 +81,7 @@ def render(run: Run, pictures: list[Picture]) -> str:
         events=[one for one in recording.of(Event) if one.kind not in ("state", *WATCHED)],
         watched=[one for one in recording.of(Event) if one.kind in WATCHED],
         compared=any(np.isfinite(one.error).any() for one in recording.of(Agreement)),
+        sensors=sensor_rows(start),
         states=recording.stop.states if recording.stop else (),
         checks=recording.of(Check),
         trips=recording.of(Trip),

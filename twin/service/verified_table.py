@@ -22,6 +22,9 @@ def print_verified(found: Json, advise: bool = True) -> None:
     for topic, one in found["topics"].items():
         table.add_row(topic, str(one["messages"]), str(one["missing"] or ""))
     print_table(console, table)
+    for one in found["sensors"]:
+        if told := _sensor(one):
+            say(f"sensor {one['channel']}: {told}")
     for one in found["altered"]:
         say(f"altered: attachment {one} is not what was written")
     _some("damage", [_damage(one) for one in found["damage"]])
@@ -53,6 +56,20 @@ def _content(found: Json) -> str:
         "differs": "differs from its hash",
         "unknown": "without a hash (an unfinished log, or one of version 1)",
     }[found["content"]]
+
+
+def _sensor(one: Json) -> str:
+    """What its card says of the instrument; nothing where it says nothing."""
+    due = f"due {one['due']}{', OVERDUE when the run began' if one['overdue'] else ''}"
+    parts = (
+        one["instrument"],
+        one["serial"] and f"serial {one['serial']}",
+        one["calibrated"] and f"calibrated {one['calibrated']}",
+        one["due"] and due,
+        one["certificate"] and f"certificate {one['certificate']}",
+        one["checked"] and f"checked {one['checked']}",
+    )
+    return ", ".join(filter(None, parts))
 
 
 def _damage(one: Json) -> str:

@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from table_io.records import Comparison, Gap
 from twin.service.origin import beginning
 from twin.service.outcome import EXIT_GAPS
 from twin.service.recordings import parts_of, recorded_bundle
+from twin.service.sensor_rows import sensor_rows
 from twin.service.versions import beside_installed, changes, differing
 from twin.stream.content import Content, altered, schema_version
 from twin.stream.folder import apart as scattered
@@ -69,6 +70,7 @@ def examine(paths: list[Path], apart: Sequence[str] = ()) -> Verified:
         "content": _content(parts),
         "altered": altered(recording.metadata, recording.attachments),
         "versions": beside_installed(start.versions),
+        "sensors": [asdict(one) for one in sensor_rows(start)],
         "topics": topics(parts),
         "samples": {
             "rate_hz": start.rate_hz,

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from table_io.card import BadInput
+from table_io.clock import today
+from table_io.due import overdue
 from twin.service.bundle import Bundle, run_id
 from twin.service.campaign.book import Book, begun, reopened
 from twin.service.campaign.card import doubts, read_plan
@@ -61,7 +63,7 @@ def campaign(asked: Asked) -> int:
         if asked.resume:
             say(f"reading what is recorded in {folder}")
         book, found = reopened(folder, plan) if asked.resume else (begun(folder, plan), [])
-        for one in (*found, *doubts(plan)):
+        for one in (*found, *doubts(plan), *overdue(plan.runs[0].bundle.rig, today().date())):
             say(f"warning: {one}")
         refuse_full([run.bundle for run in book.pending()], folder)
         _announce(book)

@@ -20,6 +20,7 @@ RULE = "grey35"
 STATES = {
     "running": GOOD, "checking": GOOD, "armed": GOOD, "holding": WARN, "stopping": WARN,
     "at rest": "", "idle": "", "fault": BAD,
+    "waiting": WARN, "following": GOOD, "astray": BAD, "left": BAD,
 }  # fmt: skip
 ORDERS = {"h": "hold", "r": "resume", "s": "stop", "a": "abort"}
 ARROWS = {"forward": "↑", "backward": "↓"}

@@ -1,0 +1,66 @@
+"""The digital inputs of an NI card, read one by one on demand: a task of their own."""
+
+import contextlib
+import os
+from typing import Any
+
+import numpy as np
+from nidaqmx import GrpcSessionOptions, Task
+from nidaqmx.constants import LineGrouping
+from nidaqmx.errors import Error
+from nidaqmx.stream_readers import DigitalMultiChannelReader
+
+from table_io.backends import MachineLost
+from table_io.backends.ni.channel import channel_to
+from table_io.card import BadInput
+from table_io.wiring.ni import NiWiring
+
+READ_S = 1.0
+
+
+class Lines:
+    """The inputs that the card watches; BadInput where the driver does not know one of them."""
+
+    def __init__(self, wiring: NiWiring) -> None:
+        self._names = tuple(wiring.watched)
+        self._channel: Any = channel_to(wiring.endpoint) if wiring.endpoint else None
+        self._task: Task | None = None
+        name = f"shaketwin_watched_{os.getpid()}"
+        try:
+            options = None if self._channel is None else GrpcSessionOptions(self._channel, name)
+            self._task = Task(name, grpc_options=options)
+            for line in wiring.watched.values():
+                self._task.di_channels.add_di_chan(line, line_grouping=LineGrouping.CHAN_PER_LINE)
+            self._reader = DigitalMultiChannelReader(self._task.in_stream)
+            self._reader.verify_array_shape = False
+            self.levels()
+        except (Error, MachineLost) as error:
+            self.close()
+            raise BadInput(
+                f"ni: cannot read {', '.join(wiring.watched.values())}: {_first(error)}; mend "
+                "heartbeat_back and well in the machine card"
+            ) from None
+
+    def levels(self) -> dict[str, bool]:
+        """Name -> level now; MachineLost where the driver does not say."""
+        found = np.zeros(len(self._names), dtype=np.bool_)
+        try:
+            self._reader.read_one_sample_one_line(found, timeout=READ_S)
+        except Error as error:
+            raise MachineLost(f"the digital inputs are lost: {_first(error)}") from None
+        return dict(zip(self._names, found.tolist(), strict=True))
+
+    def close(self) -> None:
+        """Let them go; safe to call twice."""
+        task, self._task = self._task, None
+        if task is not None:
+            with contextlib.suppress(Error):
+                task.close()
+        if self._channel is not None:
+            self._channel.close()
+            self._channel = None
+
+
+def _first(error: Exception) -> str:
+    """The driver's words in one line."""
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)
