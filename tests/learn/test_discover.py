@@ -116,6 +116,25 @@ def test_several_logs_count_together() -> None:
     assert both.best.fit.spread[name] < alone.best.fit.spread[name]
 
 
+def test_where_too_much_is_recorded_the_last_cycles_say_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    truth = hidden("bumper_hardening", k2=3e7)
+    whole = prepare([log(truth)], SNM).bench.sheets[0]
+    monkeypatch.setattr("twin.learn.sheet.MOST_SAMPLES", int(whole.motion().moving.sum()) // 2)
+    found = discover([log(truth)], SNM)
+    (thin,) = found.prepared.bench.sheets
+    assert thin.row_of.size < 0.6 * whole.row_of.size
+    m = thin.motion()
+    for step in np.unique(m.step[m.step >= 0]):
+        cycles = np.unique(m.cycle[thin.used[0] & (m.step == step) & (m.cycle >= 0)])
+        held = m.cycle[m.step == step].max() + 1
+        assert cycles.tolist() == list(range(held - max(held // thin.thinned, 2), held))
+    assert found.verdict.best.names == ("bumper_hardening",)
+    assert found.verdict.best.fit.values["bumper_hardening.k2"] == pytest.approx(3e7, rel=0.05)
+    assert any("only the last are used" in note for note in found.notes)
+
+
 def test_linear_algebra_foresees_what_a_refit_finds() -> None:
     prepared = prepare([log(hidden("coulomb_friction", fc=5.0))], SNM)
     bench = prepared.bench
