@@ -35,7 +35,7 @@ TARED = ("acc", "right", "left")
 PULLS = ("right pull", "left pull")
 SWING = 0.005  # of the largest push: by so much the low pass swings through zero after a release
 KEPT = 3  # motions of other beliefs that are remembered
-MOST_SAMPLES = 1_000_000  # in motion, of all logs together: more would ask for too much memory
+MOST_SAMPLES = 500_000  # in motion, of all logs together: more would ask for too much memory
 
 
 @dataclass(frozen=True, eq=False)
