@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from table_io.card import PROFILES
+from table_io.card import PROFILES, parse
 from twin.learn.discover import Discovery, Log, discover
+from twin.model.card import ModelCard
 from twin.model.forced import along
 from twin.service.bundle import read_bundle
 from twin.service.figures import STYLE
 from twin.service.learning.command import leave, model_of
 from twin.service.learning.figures_evidence import Shown, free_run, gates, measured_forces, spread
-from twin.service.learning.logs import logs_of
+from twin.service.learning.logs import logs_of, names_of
 from twin.service.learning.page import rounded, sentence
 from twin.service.learning.told import Json, verdict_json
 from twin.service.runs import play_unpaced
@@ -198,6 +199,29 @@ def test_the_law_drawn_is_the_force_that_is_missing(every: dict[str, Left]) -> N
     assert law[there] == pytest.approx(K2 * depth**2, rel=0.1, abs=5.0)
     assert np.nanstd(after) < 0.1 * np.nanstd(wanted)
     assert np.nanmax(np.abs(spread(sheet, 0, shown.delivered[1], guess))) < 1e-6
+
+
+def test_the_model_that_is_left_says_how_well_its_numbers_are_known(every: dict[str, Left]) -> None:
+    card = parse((every["named"].folder / "model.toml").read_text(), ModelCard, "model.toml")
+    low, high = card.intervals["bumper_hardening.k2"]
+    value = float(card.effects[0].parameters["k2"])
+    assert low < value < high
+    assert high - low < 0.1 * value
+    low, high = card.intervals["stiffness"]
+    assert low < card.base.stiffness_n_m < high
+
+
+def test_logs_that_are_called_alike_are_told_apart(tmp_path: Path) -> None:
+    (tmp_path / "c").mkdir()
+    (tmp_path / "c" / "log.mcap").touch()
+    for folder in ("a/run", "b/run"):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "run.mcap").touch()
+    alike = [tmp_path / "a/run", tmp_path / "b/run/run.mcap"]
+    assert names_of(alike) == ["a/run", "b/run"]
+    assert names_of([alike[0], tmp_path / "c/log.mcap"]) == ["run", "log"]
+    assert names_of([alike[0], alike[0]])[0] == str(alike[0].resolve() / "run.mcap")
+    assert names_of([]) == []
 
 
 def test_measured_less_what_is_left_is_the_models_force(every: dict[str, Left]) -> None:

@@ -4,7 +4,7 @@ from typing import Any
 
 from pydantic import Field, field_validator, model_validator
 
-from table_io.card import BadInput, Card, NonNegative, Positive
+from table_io.card import BadInput, Card, Finite, NonNegative, Positive
 from table_io.profile import Specimen
 from twin.model.effects import find_effect
 from twin.model.effects.effect import Effect
@@ -69,6 +69,9 @@ class ModelCard(Card):
     title: str
     citation: str = ""
     fitted_on: str = ""
+    intervals: dict[str, tuple[Finite, Finite]] = Field(
+        default={}, description="95 %, of what was fitted; no calculation reads them."
+    )
     base: Base
     effects: tuple[EffectEntry, ...] = ()
 

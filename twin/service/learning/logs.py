@@ -42,34 +42,32 @@ def logs_of(paths: Sequence[Path]) -> tuple[tuple[Log, ...], tuple[str, ...]]:
 def taken(paths: Sequence[Path]) -> Iterator[Taken]:
     """The recordings, one by one; BadInput where one is given twice, whatever its name."""
     seen: dict[bytes, Path] = {}
-    for path in paths:
+    for path, name in zip(paths, names_of(paths), strict=True):
         recording = recording_of(path)
         with recording.path.open("rb") as file:
             content = hashlib.file_digest(file, "sha256").digest()
         if content in seen:
             raise BadInput(f"{path}: the same log as {seen[content]}; give each log once")
         seen[content] = path
-        yield take(recording)
+        yield take(recording, name)
 
 
-def take(recording: Recording) -> Taken:
-    """One recording made ready."""
+def take(recording: Recording, name: str) -> Taken:
+    """One recording made ready, under this name."""
     start, where = recording.start, str(recording.path)
     if start.source == "model":
         raise BadInput(f"{where}: holds a model alone, nothing measured; give a recorded test")
     profile = parse(start.profile_toml, Profile, where)
     specimen, blocks = profile.specimen, recording.pieces("meas")
     dead = _dead(blocks)
-    readings = readings_of(
-        _whole_sides(blocks, dead), named(recording), specimen.mass_kg, specimen.gaps_m
-    )
+    readings = readings_of(_whole_sides(blocks, dead), name, specimen.mass_kg, specimen.gaps_m)
     if not {*readings.channels} & {*ACCELERATIONS}:
         raise BadInput(
             f"{where}: no force can be told; needed: mass_acc_m_s2 or table_acc_m_s2 for that of "
             "the mass, or damper_force_n"
         )
     log = Log(readings, profile.comparison.contact_n, start.steps)
-    return Taken(log, blocks, tuple(_notes(recording, profile, blocks, dead)))
+    return Taken(log, blocks, tuple(_notes(recording, name, profile, blocks, dead)))
 
 
 def _dead(blocks: Sequence[Block]) -> frozenset[str]:
@@ -90,23 +88,27 @@ def _whole_sides(blocks: tuple[Block, ...], dead: frozenset[str]) -> tuple[Block
     return tuple(replace(block, channels=names, values=block.values[rows]) for block in blocks)
 
 
-def named(recording: Recording) -> str:
-    """What a person calls the recording: its run, and where it lies."""
-    path = log_path(recording.path)
-    return path.parent.name if path.name == "run.mcap" else path.stem
+def names_of(paths: Sequence[Path]) -> list[str]:
+    """What a person calls each log: its run, with the folders above where two are called alike."""
+    paths = [log_path(one).resolve() for one in paths]
+    places = [one.parent if one.name == "run.mcap" else one.with_suffix("") for one in paths]
+    for depth in range(1, max((len(one.parts) for one in places), default=0) + 1):
+        names = ["/".join(one.parts[-depth:]) for one in places]
+        if len({*names}) == len(names):
+            return names
+    return [str(one) for one in paths]
 
 
 def _notes(
-    recording: Recording, profile: Profile, blocks: Sequence[Block], dead: frozenset[str]
+    recording: Recording, name: str, profile: Profile, blocks: Sequence[Block], dead: frozenset[str]
 ) -> Iterator[str]:
     """What a reader of the verdict should know of the recording."""
-    name = named(recording)
     if recording.missing_samples:
         yield f"{name}: {recording.missing_samples} samples are missing; none is invented"
     if len({one.frequency_hz for one in recording.start.steps}) == 1:
         alike = "damping, lag, relaxation and hysteresis look alike"
         yield f"{name}: one frequency only; there {alike}"
-    yield from _bearing(recording, profile, blocks, dead)
+    yield from _bearing(recording, name, profile, blocks, dead)
     for channel in blocks[0].channels if blocks else ():
         if _clipped(blocks, channel):
             yield f"{name}: {channel} stands at its extreme for a while: clipped?"
@@ -118,7 +120,7 @@ def _notes(
 
 
 def _bearing(
-    recording: Recording, profile: Profile, blocks: Sequence[Block], dead: frozenset[str]
+    recording: Recording, name: str, profile: Profile, blocks: Sequence[Block], dead: frozenset[str]
 ) -> Iterator[str]:
     """What load cells read that the profile does not allow; BadInput where one has no sense."""
     least = MUCH * profile.comparison.contact_n
@@ -135,7 +137,7 @@ def _bearing(
                 )
             if math.isinf(gap) and push > least:
                 yield (
-                    f"{named(recording)}: {cell} bears up to {push:.0f} N, but the profile says "
+                    f"{name}: {cell} bears up to {push:.0f} N, but the profile says "
                     f"that there is no {side} bumper: give the gap"
                 )
 

@@ -200,6 +200,12 @@ def model_toml(fit: Fit, title: str, citation: str, fitted_on: str) -> tuple[str
             f"id = {_text(identity)}",
             f"parameters = {{ {', '.join(numbers)} }}",
         ]
+    lines += ["[intervals]  # 95 %"]
+    for name in fit.values:
+        known = fit.spread.get(name, 0.0) > 0 and not name.startswith((ZERO, "general."))
+        if known and log_of(name) is None:
+            low, high = (number(fit, name, "")[key] for key in ("low", "high"))
+            lines.append(f"{_text(name)} = [{low!r}, {high!r}]")
     gaps = {k: v for k, v in fit.values.items() if k.startswith(GAP) and log_of(k) is not None}
     if any(abs(v) > max(SURE * fit.spread[k], LEAST_GAP_M) for k, v in gaps.items()):
         told = ", ".join(f"{1e3 * v:+.3f} mm" for v in gaps.values())
