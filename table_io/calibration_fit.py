@@ -56,7 +56,8 @@ def fitted(applied: tuple[float, ...], applied_sd: float, means: tuple[Mean, ...
     three points on, a scatter larger than these makes the uncertainties as much larger.
     """
     x, y = np.array(applied), np.array([one.volts for one in means])
-    span = float(np.ptp(x))
+    span, middle = float(np.ptp(x)), float(x.mean())
+    x = x - middle  # so that slope and constant hardly hang together
     if span == 0:
         raise ValueError("all that was applied is alike")
     rough = float(np.polyfit(x, y, 1)[0])
@@ -70,12 +71,12 @@ def fitted(applied: tuple[float, ...], applied_sd: float, means: tuple[Mean, ...
     free = x.size - 2
     scatter = float((weight * left**2).sum() / free) if free else 0.0
     covariance = covariance * (max(scatter, 1.0) if known else scatter)
-    # offset = constant / slope
+    # offset = constant / slope - middle
     turn = np.array([-constant / slope**2, 1.0 / slope]) if slope else np.full(2, np.nan)
     return Fit(
         slope,
         math.sqrt(covariance[0, 0]),
-        constant / slope if slope else math.nan,
+        constant / slope - middle if slope else math.nan,
         math.sqrt(float(turn @ covariance @ turn)) if slope else math.nan,
         100.0 * float(np.abs(left).max()) / abs(slope * span) if free and slope else None,
     )

@@ -10,7 +10,8 @@ each channel is put when the card is read for a run (`rig_file.py`), and so into
     applied                    in `unit`, what was applied, each for a second
     applied_sd                 in `unit`, standard uncertainty of what was applied; 0: not stated
     volts, volts_sd            mean at each, and its standard error
-    volts_per_unit, .._sd      sensitivity and its standard uncertainty
+    volts_per_unit, .._sd      sensitivity and its standard uncertainty, in which each point counts
+                               with one converter step / sqrt(12) at least
     offset, offset_sd          in `unit`: volts = (value + offset) * volts_per_unit
     linearity_percent          of the span of `applied`, largest distance; from three points on
     card_volts_per_unit        what the machine card said then

@@ -14,15 +14,27 @@ from table_io.card import Card, Count, Finite, NonNegative, Positive
 from table_io.channels import BY_NAME
 from table_io.units import UNITS
 
+LAST_YEAR = 9999  # that a date can have
+
 
 def _iso(value: Any) -> Any:
     """The ISO text of a day, as TOML (a date) or a person (text) wrote it."""
     text = str(value)
-    known = re.fullmatch(r"(\d{4})-(\d\d)-(\d\d)", text)
+    known = re.fullmatch(r"([0-9]{4})-([0-9]{2})-([0-9]{2})", text)
     year, month, day = map(int, known.groups()) if known else (0, 0, 0)
     if not (year and 1 <= month <= 12 and 1 <= day <= calendar.monthrange(year, month)[1]):
         raise ValueError(f"{text} is no date; allowed: year-month-day, as 2026-03-01")
     return text
+
+
+def _after(day: str, months: int) -> str | None:
+    """The ISO day so many months later; None beyond the year 9999."""
+    year, month, of_month = map(int, day.split("-"))
+    years, month = divmod(month - 1 + months, 12)
+    year, month = year + years, month + 1
+    if year > LAST_YEAR:
+        return None
+    return f"{year:04}-{month:02}-{min(of_month, calendar.monthrange(year, month)[1]):02}"
 
 
 Day = Annotated[str, BeforeValidator(_iso)]
@@ -101,6 +113,8 @@ class Sensor(Card):
             raise ValueError("interval_months counts from `calibrated`; add it, or give `due`")
         if isinstance(value, int) and info.data.get("due") is not None:
             raise ValueError("due and interval_months say the same; give one of them")
+        if isinstance(value, int) and calibrated is not None and _after(calibrated, value) is None:
+            raise ValueError("its next calibration comes after the year 9999; give fewer months")
         return value
 
     @field_validator("shunt_tolerance")
@@ -134,7 +148,4 @@ class Sensor(Card):
         """Day of its next calibration; None where the card does not say."""
         if self.due is not None or self.calibrated is None or self.interval_months is None:
             return self.due
-        year, month, day = map(int, self.calibrated.split("-"))
-        years, month = divmod(month - 1 + self.interval_months, 12)
-        year, month = year + years, month + 1
-        return f"{year:04}-{month:02}-{min(day, calendar.monthrange(year, month)[1]):02}"
+        return _after(self.calibrated, self.interval_months)

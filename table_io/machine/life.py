@@ -36,6 +36,7 @@ class Life:
         self.ending = ""  # why nobody has it any more
         self.rest_from = 0  # once it is ending: the command is at its mean from here on
         self._output = rig.output
+        self._span_m = 1e-3 * rig.output.span_mm
         self._box = box
         self._queued = Queued()
         self._epoch_s = math.inf
@@ -72,7 +73,7 @@ class Life:
         scale, rate = self._output.volts_per_m, self.plant.rate_hz
         end = np.concatenate([self._queued.take(index - 3, index), volts])[-3:] / scale
         if np.isfinite(end).all() and not is_still(end, rate):
-            volts = np.concatenate([volts, landing(end, rate) * scale])
+            volts = np.concatenate([volts, landing(end, rate, self._span_m) * scale])
         self.play(now)
         self._put(index, volts)
 
@@ -107,7 +108,7 @@ class Life:
         last = queued.take(queued.end - 1, queued.end) / self._output.volts_per_m
         if abs(float(last[0])) > 0.5 * self._output.lsb_m:
             earliest = self.taken - 1 + self.plant.replace_after
-            home = landing(np.repeat(last, 3), rate) * self._output.volts_per_m
+            home = landing(np.repeat(last, 3), rate, self._span_m) * self._output.volts_per_m
             self._put(max(queued.end, earliest), home)
         self.rest_from = queued.end - 1
         self.note(why)

@@ -19,6 +19,7 @@ CLEAR = 10.0  # times noise, that a swing must reach
 FIRST = 0.25  # of its largest swing, that a channel's first one must reach
 TOGETHER_MS = (0.0, 60.0)  # after the first of the channels that one hand moves
 NOISE_RANGE = 1e-5  # of the range: less noise is not believed
+HELD = 5e-3  # of the range: a load cell that is farther from its rest is still pressed
 SHIFT = 0.3  # of a shunt, that shows that it was switched
 SHUNT_REST = 0.5  # the later share of what was taken, in which a shunt is read
 
@@ -60,7 +61,8 @@ class Felt:
     """What came while a hand was asked for, in the unit of each sensor, (channel, sample).
 
     `noise` is the rms of each channel at rest; the mean at rest is that of the first `before`
-    samples, in which nobody has moved yet.
+    samples, in which nobody has moved yet (`restless` where somebody has). `rest` is the mean of
+    each channel before anybody was asked.
     """
 
     rig: Rig
@@ -68,12 +70,18 @@ class Felt:
     values: Float2D
     noise: Float1D
     before: int
+    rest: Float1D | None = None
 
     def swing(self, channel: str) -> Float1D:
         """A channel about its mean at rest, (sample,); a lost sample is 0."""
         row = self.values[self.rig.channels.index(channel)]
-        known = row[: self.before][np.isfinite(row[: self.before])]
-        return np.nan_to_num(row - (known.mean() if known.size else math.nan))
+        return np.nan_to_num(row - self._early(channel))
+
+    def _early(self, channel: str) -> float:
+        """The mean of a channel at rest; NaN where nothing came."""
+        row = self.values[self.rig.channels.index(channel)][: self.before]
+        known = row[np.isfinite(row)]
+        return float(known.mean()) if known.size else math.nan
 
     def clear(self, channel: str) -> float:
         """What a swing must reach to be one, in the sensor's unit."""
@@ -83,13 +91,37 @@ class Felt:
         return CLEAR * max(noise, sensor.lsb, NOISE_RANGE * sensor.range)
 
     def first(self, channel: str) -> tuple[int, float] | None:
-        """(sample, value) at which the first swing is there; None where there is no clear one."""
-        swing = self.swing(channel)
+        """(sample, value) at which the first swing is there; None where there is no clear one.
+
+        What came in the samples at rest is none.
+        """
+        swing = self.swing(channel)[self.before :]
         largest = float(np.abs(swing).max(initial=0.0))
         if largest < self.clear(channel):
             return None
         at = int(np.argmax(np.abs(swing) >= max(FIRST * largest, self.clear(channel))))
-        return at, float(swing[at])
+        return self.before + at, float(swing[at])
+
+    def largest(self, channel: str) -> float:
+        """The largest swing once the samples at rest are over, in the sensor's unit."""
+        return float(np.abs(self.swing(channel)[self.before :]).max(initial=0.0))
+
+    def unquiet(self, channel: str) -> bool:
+        """True where the samples at rest show a swing, or a load cell that is still pressed."""
+        place = self.rig.channels.index(channel)
+        early = self.swing(channel)[: self.before]
+        if np.abs(early).max(initial=0.0) >= self.clear(channel):
+            return True
+        if self.rest is None or BY_NAME[channel].unit != "N":
+            return False
+        least = max(HELD * self.rig.sensors[place].range, self.clear(channel))
+        return abs(self._early(channel) - float(self.rest[place])) >= least
+
+
+def restless(hand: Hand, felt: Felt) -> bool:
+    """True where a hand was there already, or still, in the samples that are to be at rest."""
+    names = hand.channels if hand.shunt else _alike(hand, felt.rig)
+    return any(felt.unquiet(name) for name in names)
 
 
 def moved(hand: Hand, felt: Felt) -> int | None:
@@ -97,14 +129,16 @@ def moved(hand: Hand, felt: Felt) -> int | None:
     if hand.shunt:
         place = felt.rig.channels.index(hand.channels[0])
         shunt = felt.rig.sensors[place].shunt or math.inf
-        far = np.abs(felt.swing(hand.channels[0])) >= SHIFT * abs(shunt)
-        return int(np.argmax(far)) if far.any() else None
+        far = np.abs(felt.swing(hand.channels[0])[felt.before :]) >= SHIFT * abs(shunt)
+        return felt.before + int(np.argmax(far)) if far.any() else None
     found = [first[0] for name in _alike(hand, felt.rig) if (first := felt.first(name))]
     return min(found, default=None)
 
 
 def proven(hand: Hand, felt: Felt | None, why: str) -> tuple[Line, ...]:
-    """The lines of one hand; not tested, and why, where nobody was felt."""
+    """The lines of one hand; not tested, and why, where nobody was felt, or somebody too early."""
+    if felt is not None and restless(hand, felt):
+        felt, why = None, f"something moved before it was asked for, or was not let go: {hand.ask}"
     if felt is None:
         what = "shunt" if hand.shunt else "polarity"
         return tuple(untested(what, name, why) for name in hand.channels)
@@ -130,7 +164,7 @@ def _struck(hand: Hand, felt: Felt) -> Iterator[Line]:
         sensor = felt.rig.sensors[felt.rig.channels.index(name)]
         first = felt.first(name)
         if loudest not in hand.channels and BY_NAME[name].unit == kind:
-            own = float(np.abs(felt.swing(name)).max())
+            own = felt.largest(name)
             do = f"{loudest} felt it more: their cables, or their lines in the card, are swapped"
             yield judged("place", name, own, (most, math.inf), sensor.unit, do)
         if first is None:
@@ -149,8 +183,7 @@ def _loudest(hand: Hand, felt: Felt) -> tuple[str, float]:
     """The channel of this quantity that felt most, in SI, and that in the unit of the hand's."""
     unit = felt.rig.sensors[felt.rig.channels.index(hand.channels[0])].si_per_unit
     sizes = {
-        name: felt.rig.sensors[felt.rig.channels.index(name)].si_per_unit
-        * float(np.abs(felt.swing(name)).max(initial=0.0))
+        name: felt.rig.sensors[felt.rig.channels.index(name)].si_per_unit * felt.largest(name)
         for name in _alike(hand, felt.rig)
         if BY_NAME[name].unit == BY_NAME[hand.channels[0]].unit
     }

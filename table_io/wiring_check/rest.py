@@ -180,7 +180,10 @@ def _level(resting: Resting, place: int, sensor: Sensor) -> Iterator[Line]:
 
 
 def zero(resting: Resting) -> Iterator[Line]:
-    """The command wired back stands at the output's 0 V."""
+    """The command wired back stands at the output's 0 V, and stays there.
+
+    Judged is the sample that is farthest off: a swing may have any mean. None that came fails.
+    """
     place = resting.rig.channels.index(COMMAND)
     sensor, output = resting.rig.sensors[place], resting.rig.output
     span = 1e-3 * output.span_mm / sensor.si_per_unit
@@ -190,7 +193,9 @@ def zero(resting: Resting) -> Iterator[Line]:
         "nothing is commanded, and it is not at 0 V: something else drives this input, or the "
         "output was left there"
     )
-    shown = float(resting.means[place])
+    row = resting.values[place]
+    known = row[~np.isnan(row)]
+    shown = float(known[np.argmax(np.abs(known))]) if known.size else math.nan
     yield judged("command at 0 V", COMMAND, shown, (-most, most), sensor.unit, do)
 
 

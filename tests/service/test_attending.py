@@ -150,6 +150,6 @@ def test_no_folder_is_named_by_a_peer_that_sends_no_run(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     where = gate(run=run)
-    with pytest.raises(BadInput, match="no test runs there"):
+    with pytest.raises(BadInput, match=rf"no test runs there on rig '{RIG}'.*--rig NAME"):
         attend_as_recorder(where, RIG, None, None)
     assert not list(tmp_path.iterdir())

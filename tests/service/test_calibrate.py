@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from table_io.backends import MachineLost
 from table_io.backends.simulated import SimulatedBackend
 from table_io.block import Float1D, Float2D
+from table_io.calibration_fit import Mean
 from table_io.calibration_record import Calibration
 from table_io.card import PROFILES, BadInput, parse
 from table_io.clock import Clock
@@ -176,6 +177,10 @@ def test_a_second_record_lies_beside_the_first(
         (("--points", "0,76"), "table_disp_m", "within +-75"),
         (("--points", "0,10", "--tolerance", "0"), "table_disp_m", "--tolerance"),
         (("--points", "0,10", "--applied-sd", "nan"), "table_disp_m", "--applied-sd"),
+        (("--points", "0,10", "--tolerance", "inf"), "table_disp_m", "--tolerance"),
+        (("--points", "0,10", "--applied-sd", "1e200"), "table_disp_m", "0 to the range, 75 mm"),
+        (("--points", "1.0,1.00000001"), "table_disp_m", "at least 0.075 mm"),
+        (("--shunt", "--tolerance", "1"), "table_disp_m", "shunt_tolerance on the sensor card"),
         (("--points", "0,1", "--shunt"), "table_disp_m", "no --points"),
         (("--shunt",), "mass_disp_m", "shunt and shunt_tolerance"),
         (("--points", "0,10"), "tabel_disp_m", "no such sensor; it has: drive_disp_m"),
@@ -191,6 +196,34 @@ def test_what_cannot_be_is_refused_and_leaves_no_record(
         calibrate(*words, channel=channel)
     assert said in str(raised.value)
     assert records(tmp_path) == []
+
+
+CARD = parse(TEXT, Rig, "card").sensors[2]
+ASKED = calibrating.Asked(CARD.channel, "simulated", "0,1", False, None, 0.0, True, None)
+
+
+@pytest.mark.parametrize("turned", [1.0, -1.0])
+def test_the_departure_in_standard_deviations_has_the_sign_of_that_in_per_cent(
+    turned: float,
+) -> None:
+    sensor = CARD.model_copy(update={"volts_per_unit": turned * CARD.volts_per_unit})
+    means = (Mean(0.0, 1e-3), Mean(turned * 5.5, 1e-3))
+    record = calibrating.recorded(sensor, ASKED, (0.0, 1.0), means)
+    assert record.departure_percent == pytest.approx(10.0)
+    assert record.departure_sd == pytest.approx(0.5 / (np.sqrt(2) * 1e-3))
+
+
+def test_a_converter_that_stood_still_is_not_exact() -> None:
+    """Each point counts with a step / sqrt(12) at least."""
+    sensor = CARD.model_copy(update={"bits": 16})
+    step = sensor.lsb * sensor.volts_per_unit
+    for sd in (0.0, 1e-9):
+        means = (Mean(0.0, 0.0), Mean(5.0, sd))
+        record = calibrating.recorded(sensor, ASKED, (0.0, 1.0), means)
+        assert record.volts_per_unit_sd == pytest.approx(step * np.sqrt(2 / 12), rel=1e-6)
+    means = (Mean(0.0, 0.0), Mean(5.0, 0.05))
+    record = calibrating.recorded(sensor, ASKED, (0.0, 1.0), means)
+    assert record.volts_per_unit_sd == pytest.approx(0.05, rel=1e-3)
 
 
 def test_a_machine_that_is_lost_is_said(calibrate: Calibrate) -> None:

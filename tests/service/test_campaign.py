@@ -2,6 +2,8 @@
 
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 
@@ -10,8 +12,9 @@ from table_io.profile import SetUp
 from twin.service.bundle import Bundle
 from twin.service.campaign import flow
 from twin.service.campaign.book import appended
+from twin.service.campaign.card import Plan
 from twin.service.campaign.flow import campaign
-from twin.service.campaign.state import LOCK, locked, read_state, write_state
+from twin.service.campaign.state import LOCK, keep_cards, locked, read_state, unchanged, write_state
 
 from .campaigns import LISTED, Players, asked, files, prepared, statuses
 
@@ -106,6 +109,36 @@ def test_what_was_recorded_and_is_no_longer_so_is_measured_anew(
     assert "free: 01-free/run.mcap is missing or not what was recorded" in (
         capsys.readouterr().out.replace("\n", "")
     )
+
+
+RECORDED = """
+[[calibrations]]
+channel = "table_acc_m_s2"
+applied = [0.0, 1.0]
+"""
+
+
+def test_a_calibration_record_that_came_in_between_is_told_and_the_campaign_goes_on(
+    tmp_path: Path,
+) -> None:
+    def plan(rig_toml: str) -> Plan:
+        bundle = SimpleNamespace(profile_toml="p", rig_toml=rig_toml, model_toml="m")
+        run = SimpleNamespace(name="01", label="free", bundle=bundle)
+        return cast(Plan, SimpleNamespace(text="x", path=Path("c.toml"), runs=[run]))
+
+    card = 'name = "r"\n[output]\nspan_mm = 60.0\n'
+    keep_cards(tmp_path, plan(card))
+    assert unchanged(tmp_path, plan(card)) == []
+    for text in (card + RECORDED, card + RECORDED + RECORDED):
+        (said,) = unchanged(tmp_path, plan(text))
+        assert "free" in said
+        assert "calibration records" in said
+    for text in (
+        card.replace("60.0", "50.0") + RECORDED,
+        card + RECORDED + '[[sensors]]\nchannel = "table_acc_m_s2"\n',
+    ):
+        with pytest.raises(BadInput, match="not what began here"):
+            unchanged(tmp_path, plan(text))
 
 
 @pytest.mark.parametrize(

@@ -78,17 +78,19 @@ def test_nothing_is_moved() -> None:
     assert backend._next >= 4 * RATE  # so the witness has seen all of it
 
 
-def test_an_output_that_is_not_at_0_volts_is_not_started() -> None:
+@pytest.mark.parametrize(("volts_off", "hz"), [(0.5, 0.0), (8.0, 1.0), (8.0, 10.0)])
+def test_an_output_that_is_not_at_0_volts_is_not_started(volts_off: float, hz: float) -> None:
     class Driven(Watched):
         def tare(self, samples: int) -> Float2D:
             volts = super().tare(samples)
-            volts[0] += 0.5
+            volts[0] += volts_off * np.cos(2 * np.pi * hz * np.arange(samples) / RATE)
             return volts
 
     backend = Driven()
     found = examined(backend)
     assert backend.calls == ["close"]
-    assert failing(found) == [("command at 0 V", "drive_disp_m")]
+    assert ("command at 0 V", "drive_disp_m") in failing(found)
+    assert {channel for _, channel in failing(found)} == {"drive_disp_m"}
     untested = {one.name for one in found.lines if one.verdict == "not tested"}
     assert {"samples on time", "polarity"} <= untested
 
@@ -223,6 +225,59 @@ def test_who_does_nothing_or_declines_leaves_lines_that_are_not_tested() -> None
     found = examined(backend, RIG, backend)
     assert {one.verdict for one in found.lines if one.name == "polarity"} == {"not tested"}
     assert backend.clock.now() < 20.0  # nobody waits for who has said no
+
+
+class Hasty(Struck):
+    """Presses the right cells as soon as it is asked, so often, and a second later lets go."""
+
+    def __init__(self, rig: Rig, times: int) -> None:
+        super().__init__(rig, HANDS)
+        self.times = times
+
+    def read(self, samples: int) -> Float2D:
+        volts = super().read(samples)
+        t = (np.arange(self._next - samples, self._next) - self._asked) / RATE
+        asked = [one for one in self.asked if "right bumper" in one]
+        if asked and asked[-1] == self.asked[-1] and len(asked) <= self.times:
+            volts[self.channels.index("force_r1_n")] += 1.0 * ((t > 0.2) & (t < 0.9))
+        return volts
+
+
+@pytest.mark.parametrize(("times", "verdict"), [(1, "pass"), (9, "not tested")])
+def test_who_presses_too_early_is_asked_again(times: int, verdict: str) -> None:
+    backend = Hasty(RIG, times)
+    found = examined(backend, RIG, backend)
+    assert failing(found) == []
+    right = [one for one in backend.asked if "right bumper" in one]
+    assert len(right) == min(times + 1, 3)
+    assert "once more" in right[1]
+    lines = [one for one in found.lines if one.channel == "force_r1_n" and one.name == "polarity"]
+    assert [one.verdict for one in lines] == [verdict]
+
+
+class Holding(Struck):
+    """Presses a right cell hard, and lets go only when the left ones have been asked for once."""
+
+    def read(self, samples: int) -> Float2D:
+        volts = super().read(samples)
+        t = (np.arange(self._next - samples, self._next) - self._asked) / RATE
+        right, left = (
+            [one for one in self.asked if f"{side} bumper" in one] for side in ("right", "left")
+        )
+        if right and not left:
+            volts[self.channels.index("force_r1_n")] += 1.0 * (t > 0.6)
+        if len(left) == 1:
+            volts[self.channels.index("force_r1_n")] += 1.0 * (t < 0.45)
+        return volts
+
+
+def test_a_press_that_is_held_until_the_next_is_asked_for_swaps_nothing() -> None:
+    backend = Holding(RIG, HANDS)
+    found = examined(backend, RIG, backend)
+    assert failing(found) == []
+    assert len([one for one in backend.asked if "left bumper" in one]) == 2
+    lines = [one for one in found.lines if one.channel == "force_l1_n" and one.name == "polarity"]
+    assert [one.verdict for one in lines] == ["pass"]
 
 
 def shunted(size: float) -> Found:

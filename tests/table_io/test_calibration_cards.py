@@ -57,6 +57,8 @@ def test_a_card_says_which_instrument_and_when() -> None:
             ["calibrated = 2025-02-03", "due = 2026-02-03", "interval_months = 12"],
             ["due and interval_months say the same"],
         ),
+        (['calibrated = "9990-01-01"', "interval_months = 600"], ["after the year 9999"]),
+        (['due = "２０２０-03-01"'], ["is no date"]),
         (["shunt = 1.0"], ["shunt_tolerance", "go together"]),
         (["shunt = 0.0", "shunt_tolerance = 0.1"], ["shunt is 0"]),
         (["seriall = 'x'"], ["seriall", "did you mean 'serial'?"]),
@@ -160,6 +162,29 @@ def test_the_newest_record_of_each_channel_goes_into_the_text_of_the_card(path: 
     assert parse(text, Rig, "as recorded") == rig
     # a record tells; it changes nothing that is measured
     assert rig.sensors == parse(TEXT, Rig, "card").sensors
+
+
+def test_the_newest_record_is_so_by_its_time_and_not_by_the_name_of_its_file(path: Path) -> None:
+    old = {"by": "old", "at": "2020-01-01T00:00:00+00:00"}
+    put(path, "20260301-000000-table_acc_m_s2.toml", record(by="new", at="2026-03-01T00:00:00"))
+    put(path, "first.toml", record(**old))
+    put(path, "zzz.toml", record("mass_acc_m_s2"))
+    both = toml_of(record("mass_acc_m_s2", by="two")) + toml_of(record(**old))
+    (calibrations_of(path) / "two.toml").write_text(both)
+    rig, _ = load_rig(path)
+    assert sorted((one.channel, one.by) for one in rig.calibrations) == [
+        ("mass_acc_m_s2", "anna"),
+        ("table_acc_m_s2", "new"),
+    ]
+
+
+@pytest.mark.parametrize("at", ["x", "", "2026-13-01T00:00:00"])
+def test_a_record_without_a_time_is_refused(path: Path, at: str) -> None:
+    put(path, "one.toml", record())
+    (file,) = calibrations_of(path).glob("*.toml")
+    file.write_text(file.read_text().replace(record().at, at))
+    with pytest.raises(BadInput, match=r"one\.toml(?s:.*)ISO 8601"):
+        load_rig(path)
 
 
 def test_a_bad_record_is_named_by_its_own_file(path: Path) -> None:

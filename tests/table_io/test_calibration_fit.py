@@ -57,6 +57,13 @@ def test_a_bend_shows_as_linearity_and_widens_the_uncertainty() -> None:
     assert fit.volts_per_unit_sd > 100 * straight.volts_per_unit_sd
 
 
+def test_points_far_from_zero_and_near_together_are_no_trouble() -> None:
+    points = (1e6, 1e6 + 1e-3)
+    fit = fitted(points, 0.0, tuple(Mean(one, 1e-6) for one in volts(points)))
+    assert fit.volts_per_unit == pytest.approx(SENSITIVITY, rel=1e-6)
+    assert fit.volts_per_unit_sd == pytest.approx(math.sqrt(2) * 1e-3, rel=1e-6)
+
+
 def test_all_alike_is_refused() -> None:
     with pytest.raises(ValueError, match="alike"):
         fitted((1.0, 1.0), 0.0, (Mean(0.1, 1e-4), Mean(0.1, 1e-4)))

@@ -71,6 +71,44 @@ def test_a_landing_goes_on_smoothly_and_ends_at_rest(f: float, turn: float) -> N
     assert np.abs(whole).max() <= 1.6 * a / (2 * np.pi * f) ** 2 + 0.05 * a
 
 
+SPAN_M = 0.06
+
+
+@pytest.mark.parametrize(
+    ("size_m", "f", "most"),  # times the acceleration of the motion, or 0.5 m/s2
+    [(0.05, 0.8, 1.1), (0.05, 1.0, 1.1), (0.05, 1.5, 1.1), (0.012, 4.0, 1.1), (0.0599, 0.5, 1.2)],
+)
+def test_a_landing_from_a_large_motion_stays_within_the_span(
+    size_m: float, f: float, most: float
+) -> None:
+    for turn in np.arange(32) / 32:
+        t = turn / f + np.arange(-3, 1) / RATE
+        motion = size_m * np.sin(2 * np.pi * f * t)
+        whole = np.concatenate([motion, landing(motion[-3:], RATE, SPAN_M), np.zeros(3)])
+        assert np.abs(whole).max() <= SPAN_M
+        own = max(size_m * (2 * np.pi * f) ** 2, 0.5)
+        assert np.abs(np.diff(whole, 2)).max() * RATE**2 <= most * own
+
+
+@pytest.mark.parametrize("x", [0.0599, 0.06, 0.07, -0.06])
+@pytest.mark.parametrize("v", [0.1, 3.0, -0.4])
+def test_what_cannot_keep_within_the_span_stops_dead_and_goes_home_gently(
+    x: float, v: float
+) -> None:
+    landed = landing(x + v / RATE * np.arange(-2, 1), RATE, SPAN_M)
+    assert np.abs(landed).max() <= max(abs(x), SPAN_M)
+    assert landed[-1] == 0.0
+    if x * v > 0:
+        assert np.abs(np.diff(landed, 2)).max() * RATE**2 <= 0.5
+
+
+@pytest.mark.parametrize("x", [1e100, 20.0])
+def test_no_number_leaves_a_landing_without_an_end(x: float) -> None:
+    landed = landing(np.array([0.0, 0.0, x]), RATE, SPAN_M)
+    assert np.abs(landed).max() <= x
+    assert landed[-1] == 0.0
+
+
 @pytest.mark.parametrize(
     ("text", "part"),
     [

@@ -4,7 +4,7 @@ import socket
 import subprocess
 import threading
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,8 +15,18 @@ from udp_bench import SPECIMEN, TEXT, Address, Relay, card, free_port, relayed, 
 from table_io.backends import HEARTBEAT_S, PATIENCE_S, MachineLost, answers, open_backend
 from table_io.backends.udp import UdpBackend
 from table_io.backends.udp.link import state_of
-from table_io.backends.udp.packets import Kind, Phase, Word, decode_state, encode_word
+from table_io.backends.udp.packets import (
+    Kind,
+    Phase,
+    State,
+    Word,
+    ahead,
+    decode_state,
+    encode_state,
+    encode_word,
+)
 from table_io.backends.udp.serve import bound, serve
+from table_io.backends.udp.target import Target
 from table_io.card import PROFILES, BadInput, load, parse
 from table_io.clock import RealClock
 from table_io.machine.table import Table
@@ -100,6 +110,63 @@ def test_the_machine_card_names_the_backend_and_asking_claims_nothing(target: Se
     answers(rig_at(target.address))
     assert np.isfinite(backend.tare(10)).all()
     backend.close()
+
+
+def test_a_rig_that_only_asks_needs_no_port_that_another_has(target: Served) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("", 0))
+        held = f"rig_port = {other.getsockname()[1]}\nreplace_after"
+        text = card(target.address, "").replace("replace_after", held)
+        answers(parse(text, Rig, "udp"))
+
+
+def test_a_target_that_answers_one_port_only_is_asked_from_that_one() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as far:
+        far.bind(("127.0.0.1", 0))
+        own = free_port()
+        text = card(far.getsockname(), "").replace(
+            "replace_after", f"rig_port = {own}\nreplace_after"
+        )
+        rig, over = parse(text, Rig, "udp"), threading.Event()
+        assert rig.udp is not None
+
+        def answer() -> None:
+            far.settimeout(0.1)
+            while not over.is_set():
+                with suppress(TimeoutError):
+                    _, (host, port) = far.recvfrom(4096)
+                    if port == own:
+                        far.sendto(encode_state(State(Phase.FREE)), (host, port))
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        try:
+            assert state_of(rig.udp, CLOCK, 0.3).phase is Phase.FREE
+        finally:
+            over.set()
+            thread.join()
+
+
+@pytest.mark.parametrize("sequence", [2**31 + 10, 2**32 - 40])
+def test_a_target_that_has_sent_very_many_packets_is_heard(
+    sequence: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Old(Target):
+        def __init__(self, table: Table) -> None:
+            super().__init__(table)
+            self._sequence = sequence
+
+    monkeypatch.setattr("table_io.backends.udp.serve.Target", Old)
+    with served() as one, closing(driving(one.address)) as backend:
+        volts = np.concatenate([backend.read(100) for _ in range(5)], axis=1)
+        backend.queue(1200, np.zeros(10))
+    assert np.isfinite(volts).all()
+
+
+def test_of_two_numbers_the_newer_is_less_than_half_way_round_ahead() -> None:
+    assert [ahead(*pair) for pair in ((5, 3), (3, 5), (1, 2**32 - 1), (2**32 - 1, 1))] == [
+        2, -2, 2, -2,
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(

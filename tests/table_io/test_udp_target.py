@@ -37,6 +37,7 @@ from table_io.backends.udp.target import Target
 from table_io.block import Float1D
 from table_io.card import parse
 from table_io.machine.blackbox import BlackBox, read_box
+from table_io.machine.queued import landing
 from table_io.machine.table import Table
 from table_io.rig import Rig
 
@@ -159,7 +160,7 @@ class Desk:
     said: Sent = field(default_factory=list)
 
     def say(self, word: Word, port: int = PORT) -> None:
-        self.sequence += 1
+        self.sequence = (self.sequence + 1) & 0xFFFFFFFF
         word = replace(word, session=word.session or self.session, sequence=self.sequence)
         self.far.hear(encode_word(word), port)
 
@@ -314,6 +315,95 @@ def test_a_command_that_cannot_be_played_is_refused_whole(desk: Desk, bad: str) 
     assert bad == "long" or desk.queue(index, command).verdict is verdict
     desk.wait(0.3)
     check_played(desk, volts[:800])
+
+
+@pytest.mark.parametrize("volts", [10.1, -25.0, 1e308])
+def test_more_than_the_output_has_is_refused_whole(desk: Desk, volts: float) -> None:
+    desk.drive(sine(1.0))
+    desk.wait(0.1)
+    command = np.full(200, 0.5)
+    command[100] = volts
+    assert desk.queue(300, command).verdict is Verdict.NONSENSE
+    command[100] = np.copysign(10.0, volts)
+    assert desk.queue(300, command).verdict is Verdict.PLAYS
+
+
+@pytest.mark.parametrize(
+    ("mm", "f", "turn"),
+    [
+        *itertools.product([50.0], [0.8, 1.0, 1.5], np.arange(0.0, 1.0, 0.125)),
+        *itertools.product([12.0], [4.0], np.arange(0.0, 1.0, 0.125)),
+        (59.99, 1.5, 0.2), (59.99, 1.5, 0.23),
+    ],
+)  # fmt: skip
+def test_a_large_motion_is_landed_within_the_span(
+    desk: Desk, mm: float, f: float, turn: float
+) -> None:
+    """The same in both: the landing of `queued.py`."""
+    volts = sine((2.0 + turn) / f, mm / 6.0, f)
+    desk.drive(volts)
+    desk.wait(0.02, beats=False)
+    desk.rest()
+    played = desk.far.played()
+    assert np.abs(played).max() <= 10.0 * (1.0 + 1e-12)
+    assert played[-1] == 0.0
+    landed = landing(volts[-3:] / SCALE, RATE, 0.06) * SCALE
+    after = played[volts.size : volts.size + landed.size]
+    np.testing.assert_allclose(after, landed[: after.size], atol=1e-5)
+    assert not played[volts.size + landed.size :].any()
+
+
+def test_a_gap_between_two_queues_holds_the_last_value_whatever_was_played_before(
+    desk: Desk,
+) -> None:
+    desk.drive(np.append(sine(2.2, 3.0), np.zeros(4000)))
+    desk.wait(1.5)
+    desk.say(Word(Kind.RELEASE))
+    desk.rest()
+    desk.session, desk.queues, desk.sequence = 9, 0, 0
+    desk.said.clear()
+    desk.claim()
+    desk.wait(1.0)  # samples at rest play nothing, and are none of the command
+    assert desk.queue(0, np.zeros(2)).verdict is Verdict.PLAYS
+    assert desk.queue(4000, np.zeros(10)).verdict is Verdict.PLAYS
+    desk.say(Word(Kind.START))
+    desk.wait(2.2)
+    assert not desk.far.played().any()
+
+
+def test_sequence_numbers_wrap(desk: Desk) -> None:
+    desk.sequence = 2**32 - 20
+    desk.drive(sine(3.0))
+    state = desk.wait(2.0 * HEARTBEAT_S)
+    assert desk.sequence < 2**31
+    assert (state.phase, state.missed) == (Phase.RUNNING, 0)
+
+
+AGED = """
+#include <stdlib.h>
+#include "target.c"
+static int changes;
+void write_output(double volts) { (void)volts; }
+int read_inputs(double volts[CHANNELS]) { volts[0] = 0.0; return 0; }
+void write_heartbeat(int level) { static int was; changes += level != was; was = level; }
+int main(void) {
+    target_init();
+    t.beats = (int64_t)1 << 42;
+    target_sample();
+    changes = 0;
+    for (int k = 0; k < 2000; k++) target_sample();
+    return abs(changes - 20) > 1;
+}
+"""
+
+
+def test_the_heartbeat_beats_on_after_years(tmp_path: Path) -> None:
+    built()  # or skip
+    source, program = tmp_path / "aged.c", tmp_path / "aged"
+    source.write_text(AGED)
+    command = ["cc", "-O1", f"-I{SOURCES}", str(source), "-lm", "-o", str(program)]
+    subprocess.run(command, check=True)
+    assert subprocess.run([str(program)], check=False).returncode == 0
 
 
 def test_before_the_start_a_whole_ring_can_be_filled_and_no_more(desk: Desk) -> None:

@@ -224,3 +224,13 @@ def test_a_command_that_is_not_at_0_volts(shown_mm: float, passed: bool) -> None
     assert line.value == pytest.approx(shown_mm)
     turned = replace(Resting(RIG, RATE, values * GAIN), volts=np.full_like(values, np.nan))
     assert next(zero(turned)).verdict == "fail"  # a command that is not seen may be anywhere
+
+
+@pytest.mark.parametrize("hz", [0.5, 1.0, 10.0])
+def test_a_command_that_swings_about_0_volts_is_not_at_0_volts(hz: float) -> None:
+    """+-8 V, whose mean over a tare of one second is nothing."""
+    values = spoilt(0, 48.0 * np.sin(2 * np.pi * hz * TIME + 0.1))[:, :2000]
+    values[0, 700] = np.nan  # one that was lost hides nothing
+    (line,) = zero(Resting(RIG, RATE, values * GAIN))
+    assert line.verdict == "fail"
+    assert abs(line.value) == pytest.approx(48.0, rel=0.01)

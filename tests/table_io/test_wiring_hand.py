@@ -1,12 +1,14 @@
 """A tap, a press and a shunt prove sign, place and time of each sensor; noise proves nothing."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from table_io.block import Float1D, Float2D
 from table_io.card import PROFILES, load
 from table_io.rig import Rig
-from table_io.wiring_check import Felt, Hand, Line, hands, moved, proven
+from table_io.wiring_check import Felt, Hand, Line, hands, moved, proven, restless
 
 RIG = load(PROFILES / "rigs" / "simulated.toml", Rig, "machine card")[0]
 RATE, SAMPLES, BEFORE, AT = 2000.0, 3000, 800, 1500
@@ -129,6 +131,41 @@ def test_lost_samples_are_no_swing() -> None:
     found = {line.channel: line for line in proven(TABLE, one, "nobody") if line.name == "polarity"}
     assert found["table_disp_m"].verdict == "not tested"
     assert found["table_acc_m_s2"].verdict == "pass"
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_press_in_the_samples_at_rest_proves_nothing(sign: float) -> None:
+    """Good cells do not fail and turned ones do not pass where a person was too quick."""
+    early = {name: sign * press(1.0, BEFORE // 2) for name in RIGHT.channels}
+    assert restless(RIGHT, felt(early))
+    found = told(RIGHT, early)
+    assert {one.verdict for one in found.values()} == {"not tested"}
+    assert all("before it was asked for" in one.do for one in found.values())
+    at_once = {name: sign * press(1.0, BEFORE + 40) for name in RIGHT.channels}
+    assert not restless(RIGHT, felt(at_once))
+    verdicts = {one.verdict for one in told(RIGHT, at_once).values()}
+    assert verdicts == {"pass" if sign > 0 else "fail"}
+
+
+def test_cells_that_are_still_pressed_are_not_taken_for_swapped_ones() -> None:
+    let_go = {name: 1.0 - press(1.0, BEFORE + 100) for name in RIGHT.channels}
+    one = felt(let_go | {name: press(0.5) for name in LEFT.channels})
+    rest = np.array([sensor.offset for sensor in RIG.sensors])
+    assert restless(LEFT, replace(one, rest=rest))
+    lines = proven(LEFT, replace(one, rest=rest), "nobody")
+    assert {line.verdict for line in lines} == {"not tested"}
+    free = replace(felt({name: press(0.5) for name in LEFT.channels}), rest=rest)
+    assert {line.verdict for line in proven(LEFT, free, "nobody")} == {"pass"}
+
+
+def test_what_swings_in_the_samples_at_rest_is_not_the_first_swing() -> None:
+    swing = tap(0.2)
+    swing[100] = -0.004  # below what is clear alone, and not small beside the tap's own first
+    one = felt({"table_acc_m_s2": swing})
+    first = one.first("table_acc_m_s2")
+    assert first is not None
+    assert first[0] >= BEFORE
+    assert one.largest("table_acc_m_s2") == pytest.approx(np.abs(swing).max(), abs=0.005)
 
 
 def with_shunt(size: float) -> Rig:

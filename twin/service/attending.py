@@ -34,7 +34,7 @@ def attend_as_recorder(connect: str, rig: str, out: Path | None, keys: Keys | No
     """
     link = open_spoke(rig, connect, CONNECT_S, keys)
     try:
-        run = run_of(link, connect)
+        run = run_of(link, connect, rig)
         folder = new_folder(out if out is not None else RUNS / f"{run}-attended", run)
         link.alive(f"observer.{person(keys)}.recorder")
         say(f"recording {run} -> {folder}; Ctrl-C ends the recording, not the test")
@@ -54,7 +54,7 @@ def attend_as_twin(connect: str, rig: str, keys: Keys | None) -> int:
 
     link = open_spoke(rig, connect, CONNECT_S, keys)
     try:
-        spec, missed_from = _spec(link, connect)
+        spec, missed_from = _spec(link, connect, rig)
         link.alive(f"observer.{person(keys)}.twin")
         say(f"computing for {spec.run}; Ctrl-C ends it, not the test")
         compute(spec, missed_from, link, alone=lambda: False)
@@ -66,7 +66,7 @@ def attend_as_twin(connect: str, rig: str, keys: Keys | None) -> int:
     return 0
 
 
-def _spec(link: Link, connect: str) -> tuple[Spec, str]:
+def _spec(link: Link, connect: str, rig_name: str) -> tuple[Spec, str]:
     """What the gate says of its run; looked at like any file when it is used.
 
     With it, where a twin has been there before, the sample up to which that one had come.
@@ -78,7 +78,7 @@ def _spec(link: Link, connect: str) -> tuple[Spec, str]:
             raise BadInput(f"endpoint {connect}: does not say what runs there ({path})")
         return answer.decode(errors="replace")
 
-    run = run_of(link, connect)
+    run = run_of(link, connect, rig_name)
     status = json.loads(asked("state/status"))
     if not status.get("remote_twin"):
         raise BadInput(f"{run} has a twin of its own; start it with --remote-twin for one here")

@@ -24,6 +24,8 @@ from twin.service.wiring_check import EXIT_FAILED, machine_of
 
 MEASURED_S, PAUSE_S = 1.0, 5.0
 RAIL = 0.999  # of the range
+USUAL_PERCENT = 1.0  # that a sensitivity may depart
+LEAST_APART = 1e-3  # of the range, that what is applied must span
 FOLLOWS = 10.0  # standard errors, that the readings must at least lie apart
 
 
@@ -35,7 +37,7 @@ class Asked:
     table: str
     points: str
     shunt: bool
-    tolerance_percent: float
+    tolerance_percent: float | None  # None: the usual one, or that of the shunt
     applied_sd: float
     unattended: bool
     out: Path | None
@@ -68,15 +70,24 @@ def calibrate(asked: Asked) -> int:
 
 def _wanted(asked: Asked, sensor: Sensor) -> tuple[tuple[float, ...], list[str]]:
     """(what is applied, how a person is asked for it), point by point."""
-    if not (asked.tolerance_percent > 0 and 0 <= asked.applied_sd < math.inf):
-        raise BadInput("--tolerance and --applied-sd: allowed: above 0, and 0 or more")
+    tolerance = USUAL_PERCENT if asked.tolerance_percent is None else asked.tolerance_percent
+    if not (0 < tolerance < math.inf and 0 <= asked.applied_sd <= sensor.range):
+        raise BadInput(
+            "--tolerance and --applied-sd: allowed: above 0 %, and 0 to the range, "
+            f"{sensor.range:g} {sensor.unit}"
+        )
     if asked.shunt:
+        if asked.tolerance_percent is not None:
+            raise BadInput(
+                "--shunt: what it may depart is shunt_tolerance on the sensor card; no --tolerance"
+            )
         if asked.points or sensor.shunt is None:
             raise BadInput(
                 f"--shunt: {sensor.channel} needs shunt and shunt_tolerance on its sensor card, "
                 "and no --points"
             )
         switched = [f"switch the shunt of {sensor.channel} {state}" for state in ("off", "on")]
+        _apart((0.0, sensor.shunt), sensor, "shunt")
         return (0.0, sensor.shunt), switched
     try:
         applied = tuple(float(one) for one in asked.points.split(","))
@@ -87,7 +98,18 @@ def _wanted(asked: Asked, sensor: Sensor) -> tuple[tuple[float, ...], list[str]]
             f"--points {asked.points!r}: allowed: at least two numbers in {sensor.unit}, within "
             f"+-{sensor.range:g}, as 0,{0.5 * sensor.range:g}; or --shunt"
         )
+    _apart(applied, sensor, "--points")
     return applied, [f"apply {one:g} {sensor.unit} to {sensor.channel}" for one in applied]
+
+
+def _apart(applied: tuple[float, ...], sensor: Sensor, what: str) -> None:
+    """BadInput where what is applied lies too near together to tell a sensitivity."""
+    least = LEAST_APART * sensor.range
+    if max(applied) - min(applied) < least:
+        raise BadInput(
+            f"{what}: too near together; allowed: at least {least:g} {sensor.unit} from the "
+            "smallest to the largest"
+        )
 
 
 def _wait(prompt: str, unattended: bool) -> None:
@@ -134,11 +156,13 @@ def recorded(
             f"{sensor.channel}: {apart:.3g} V between the points, {noise:.2g} V of doubt: it did "
             "not follow what was applied; look at its cable, and that all was applied to this one"
         )
-    fit = fitted(applied, asked.applied_sd, means)
+    floor = least / math.sqrt(12.0)  # of each point: what one step of the converter leaves open
+    doubts = tuple(Mean(one.volts, max(one.sd, floor)) for one in means)
+    fit = fitted(applied, asked.applied_sd, doubts)
     card = sensor.volts_per_unit
     departure = 100.0 * (fit.volts_per_unit / card - 1.0)
     sd = fit.volts_per_unit_sd
-    allowed = asked.tolerance_percent
+    allowed = USUAL_PERCENT if asked.tolerance_percent is None else asked.tolerance_percent
     if asked.shunt and sensor.shunt is not None and sensor.shunt_tolerance is not None:
         allowed = 100.0 * sensor.shunt_tolerance / abs(sensor.shunt)
     return Calibration(
@@ -159,7 +183,7 @@ def recorded(
         linearity_percent=fit.linearity_percent,
         card_volts_per_unit=card,
         departure_percent=departure,
-        departure_sd=(fit.volts_per_unit - card) / sd if sd else None,
+        departure_sd=(fit.volts_per_unit - card) / math.copysign(sd, card) if sd else None,
         tolerance_percent=allowed,
         passed=abs(departure) <= allowed,
     )

@@ -53,8 +53,9 @@ def calibrate(
     ] = "",
     shunt: Annotated[bool, typer.Option("--shunt", help="Its shunt off, then on.")] = False,
     tolerance: Annotated[
-        float, typer.Option("--tolerance", help="Per cent that the sensitivity may depart.")
-    ] = 1.0,
+        float | None,
+        typer.Option("--tolerance", help="Per cent that the sensitivity may depart: 1."),
+    ] = None,
     applied_sd: Annotated[
         float, typer.Option("--applied-sd", help="Standard uncertainty of what is applied.")
     ] = 0.0,

@@ -20,11 +20,14 @@ def person(keys: Keys | None) -> str:
     return re.sub(r"[^A-Za-z0-9_.-]", "_", getpass.getuser())[:64] or "somebody"
 
 
-def run_of(link: Link, connect: str) -> str:
-    """Id of the run that goes on there, looked at first: it names folders. BadInput if none."""
+def run_of(link: Link, connect: str, rig: str) -> str:
+    """Id of the run of this rig there, looked at first: it names folders. BadInput if none."""
     runs = running(link.components())
     if not runs or not re.fullmatch(r"\w[\w.-]{0,100}", runs[0]):
-        raise BadInput(f"endpoint {connect}: no test runs there; `shaketwin run` starts one")
+        raise BadInput(
+            f"endpoint {connect}: no test runs there on rig {rig!r}; `shaketwin run` starts one, "
+            "--rig NAME names another rig (`name` in its machine card)"
+        )
     return runs[0]
 
 
@@ -32,7 +35,7 @@ def tell(order: str, why: str, connect: str, rig: str, keys: Keys | None = None)
     """Hand an order to the rig that runs at the endpoint; BadInput where it does not take it."""
     link = open_spoke(rig, connect, CONNECT_S, keys)
     try:
-        run = run_of(link, connect)
+        run = run_of(link, connect, rig)
         answer = link.request(f"{order}/{person(keys)}", f"{run}\n{why}", ANSWER_S)
     finally:
         link.close()

@@ -33,6 +33,7 @@ from table_io.wiring_check import (
     judged,
     moved,
     proven,
+    restless,
     untested,
     watched,
     zero,
@@ -42,6 +43,7 @@ EXIT_FAILED = 2
 PRIORITY = 50  # that of a rig: the machine takes a silence for its death
 TARE_S, REST_S, PIECE_S = 1.0, 4.0, 0.02
 CALM_S, BEFORE_S, HAND_S, AFTER_S = 1.0, 0.4, 30.0, 0.8  # of a hand: see `_felt`
+TRIES = 3  # at a hand that comes too early
 LATE_MS = 100.0
 RELEASED_S = 0.5  # after the release: until it is through, and as long a look
 
@@ -200,21 +202,29 @@ def _felt(hand: Hand, found: Found, rate: float, take: Take, person: Person) -> 
     """What came while the hand was there; None where it was left out, or nobody came.
 
     What still rings from the hand before is let go for CALM_S. Then the person is asked; from
-    BEFORE_S after that on a motion counts, and AFTER_S of it are taken.
+    BEFORE_S after that on a motion counts, and AFTER_S of it are taken. Who comes earlier, or does
+    not let go, is asked again.
     """
     scale = np.array([[one.volts_per_unit] for one in found.rig.sensors])
     piece, before, second = round(PIECE_S * rate), round(BEFORE_S * rate), round(rate)
 
     def felt(volts: Float2D) -> Felt:
-        noise = found.resting.noise if found.resting is not None else np.zeros(len(scale))
-        return Felt(found.rig, rate, volts / scale, noise, before)
+        resting = found.resting
+        noise = resting.noise if resting is not None else np.zeros(len(scale))
+        rest = resting.means if resting is not None else None
+        return Felt(found.rig, rate, volts / scale, noise, before, rest)
 
     def pieces(seconds: float) -> Float2D:
         return np.concatenate([take(piece) for _ in range(round(seconds / PIECE_S))], axis=1)
 
-    pieces(CALM_S)
-    person.ask(hand.ask)
-    volts = pieces(BEFORE_S)
+    for tried in range(TRIES):
+        pieces(CALM_S)
+        person.ask(f"let go; once more: {hand.ask}" if tried else hand.ask)
+        volts = pieces(BEFORE_S)
+        if not restless(hand, felt(volts)):
+            break
+    else:
+        return felt(volts)
     for _ in range(round(HAND_S / PIECE_S)):
         volts = np.concatenate([volts, take(piece)], axis=1)
         if moved(hand, felt(volts)) is not None:

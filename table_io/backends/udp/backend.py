@@ -11,7 +11,16 @@ import numpy as np
 
 from table_io.backends import PATIENCE_S, MachineLost
 from table_io.backends.udp.link import ANSWER_S, WORDS, Link, digest, state_of
-from table_io.backends.udp.packets import RING, Kind, Phase, Reason, State, Verdict, Word
+from table_io.backends.udp.packets import (
+    RING,
+    Kind,
+    Phase,
+    Reason,
+    State,
+    Verdict,
+    Word,
+    ahead,
+)
 from table_io.backends.udp.transfer import Arriving, Delivery, Offset
 from table_io.block import Float1D, Float2D
 from table_io.card import BadInput
@@ -40,6 +49,7 @@ class UdpBackend:
         self._clock = clock
         self._link: Link | None = None
         self._state = State(Phase.FREE)  # what the target said last
+        self._heard = False  # it has ever said something
         self._fresh = False  # since this was set to False it has said something
         self._started = False
         self._arriving = Arriving(len(self.channels))
@@ -248,9 +258,10 @@ class UdpBackend:
         if ours and state.phase is phase and not state.values.size % len(self.channels):
             values = state.values.reshape(-1, len(self.channels)).T
             self._arriving.put(state.index, values)
-        if state.sequence <= self._state.sequence or not (ours or not state.session):
+        newer = not self._heard or ahead(state.sequence, self._state.sequence) > 0
+        if not newer or not (ours or not state.session):
             return
-        self._state, self._fresh = state, True
+        self._state, self._heard, self._fresh = state, True, True
         if self._offset is not None and state.phase is Phase.RUNNING:
             self._arriving.give_up(min(state.oldest, self._arriving.seen))
             self._offset.heard(state.taken - 1, self.rate_hz, self._clock.now())

@@ -46,16 +46,17 @@ def digest(rig: Rig) -> int:
 class Link:
     """One life's words to the target and back; BadInput where the address cannot be used."""
 
-    def __init__(self, wiring: UdpWiring, clock: Clock) -> None:
+    def __init__(self, wiring: UdpWiring, clock: Clock, port: int | None = None) -> None:
         self.session = secrets.randbits(63) + 1
         self.spoke_s = clock.now()
         self._clock = clock
         self._sequence = 0
+        port = wiring.rig_port if port is None else port
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
             self._socket.setblocking(False)
-            self._socket.bind(("", wiring.rig_port))
+            self._socket.bind(("", port))
             self._socket.connect(wiring.address)  # nobody else is heard
         except OSError as error:
             self._socket.close()
@@ -67,7 +68,7 @@ class Link:
 
     def say(self, word: Word) -> None:
         """Send a word; whether it arrived is told by what comes back."""
-        self._sequence += 1
+        self._sequence = (self._sequence + 1) & 0xFFFFFFFF
         self.spoke_s = self._clock.now()
         packet = encode_word(replace(word, session=self.session, sequence=self._sequence))
         with contextlib.suppress(OSError):
@@ -90,8 +91,23 @@ class Link:
 
 
 def state_of(wiring: UdpWiring, clock: Clock, timeout_s: float = ANSWER_S) -> State:
-    """What a target says of itself; BadInput where nobody answers. Claims nothing."""
-    link = Link(wiring, clock)
+    """What a target says of itself; BadInput where nobody answers. Claims nothing.
+
+    From any port first, for another rig may have rig_port; then from that one, for some targets
+    answer no other.
+    """
+    for port in dict.fromkeys((0, wiring.rig_port)):
+        state = _told(Link(wiring, clock, port), clock, timeout_s)
+        if state is not None:
+            return state
+    raise BadInput(
+        f"no UDP target answers at {wiring.target}; start it, and see that its address and port "
+        "are those of the machine card (the simulated one: shaketwin table --rig udp_simulated)"
+    )
+
+
+def _told(link: Link, clock: Clock, timeout_s: float) -> State | None:
+    """What a target says when it is asked; None where it says nothing."""
     try:
         until = clock.now() + timeout_s
         while clock.now() < until:
@@ -102,10 +118,7 @@ def state_of(wiring: UdpWiring, clock: Clock, timeout_s: float = ANSWER_S) -> St
             clock.wait_until(min(clock.now() + timeout_s / 100, until))
     finally:
         link.close()
-    raise BadInput(
-        f"no UDP target answers at {wiring.target}; start it, and see that its address and port "
-        "are those of the machine card (the simulated one: shaketwin table --rig udp_simulated)"
-    )
+    return None
 
 
 def answers(rig: Rig) -> None:

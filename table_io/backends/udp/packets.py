@@ -112,6 +112,11 @@ class State:
         return there
 
 
+def ahead(sequence: int, other: int) -> int:
+    """How much newer one sequence number is than another, of the same sender: they wrap at 2^32."""
+    return (sequence - other + (1 << 31)) % (1 << 32) - (1 << 31)
+
+
 def _sealed(header: bytes, values: Float1D) -> bytes:
     """The bytes of a packet: header, values and zeros behind them, checksum."""
     body = header + np.asarray(values, dtype="<f8").tobytes()

@@ -2,6 +2,7 @@
 #include "target.h"
 
 #include "bytes.h"
+#include "landing.h"
 
 #include <math.h>
 
@@ -29,7 +30,7 @@ static struct {
     uint8_t arrived[RING / VALUES / 8];
     int64_t end;                      /* sample from which the last value is held */
     int64_t landing, rest_from;       /* sample at which a landing begins, -1: none; at rest */
-    double c[6], seconds;             /* the landing, V, s */
+    struct landing home;
 } t;
 
 static double ring[RING], staged[RING], history[HISTORY][CHANNELS];
@@ -40,42 +41,29 @@ static double command(int64_t index) {
     if (index < 0) return 0.0;
     if (index < t.end) return ring[index % RING];
     if (t.landing < 0 || index < t.landing) return t.end > 0 ? ring[(t.end - 1) % RING] : 0.0;
-    double s = fmin((double)(index - t.landing + 1) / t.rate_hz, t.seconds);
-    if (s >= t.seconds) return 0.0;
-    return t.c[0] + s * (t.c[1] + s * (t.c[2] + s * (t.c[3] + s * (t.c[4] + s * t.c[5]))));
+    double s = fmin((double)(index - t.landing + 1) / t.rate_hz, t.home.seconds);
+    if (s >= t.home.seconds) return 0.0;
+    return within_span(landing_at(&t.home, s));
 }
 
-/* From position x, velocity v, acceleration a (V, V/s, V/s2) to rest at 0 V, from sample `first` on:
- * the quintic that is shortest where its acceleration stays below 0.5 m/s2, or what it follows. */
+/* The landing of landing.h, from sample `first` on. */
 static void land(int64_t first, double x, double v, double a) {
-    double most = fmax(0.5 / METRES_PER_VOLT, 1.05 * fabs(a)), peak = INFINITY;
-    for (double T = 0.5; peak > most && T < 72.0; T *= 1.2) {
-        double *c = t.c;
-        c[0] = x, c[1] = v, c[2] = a / 2.0;
-        c[3] = -(20.0 * x + 12.0 * v * T + 3.0 * a * T * T) / (2.0 * T * T * T);
-        c[4] = (30.0 * x + 16.0 * v * T + 3.0 * a * T * T) / (2.0 * pow(T, 4));
-        c[5] = -(12.0 * x + 6.0 * v * T + a * T * T) / (2.0 * pow(T, 5));
-        peak = 0.0;
-        for (int k = 0; k <= 100; k++) {
-            double s = T * k / 100.0;
-            peak = fmax(peak, fabs(2 * c[2] + s * (6 * c[3] + s * (12 * c[4] + s * 20 * c[5]))));
-        }
-        t.seconds = T;
-    }
+    land_from(&t.home, x, v, a);
     t.landing = first;
-    t.rest_from = first + (int64_t)ceil(t.seconds * t.rate_hz);
+    t.rest_from = first + (int64_t)ceil(t.home.seconds * t.rate_hz);
 }
 
 /* The queue that has arrived whole replaces everything from sample `index` on. */
 static uint32_t commit(int64_t index) {
     int64_t last = t.samples, first = t.end;
+    int64_t played = t.phase == RUNNING ? t.taken : 0; /* before it all taken is at rest */
     int64_t room = t.phase == RUNNING ? t.taken + RING - 4 : RING; /* the last 3 played are kept */
     for (uint32_t k = 0; k < t.samples; k++)
-        if (!isfinite(staged[k])) return NONSENSE;
+        if (!(fabs(staged[k]) <= SPAN_V * (1.0 + 1e-9))) return NONSENSE; /* nor a NaN */
     if (index < 0 || index > room - last) return NONSENSE;
     last += index;
     if (t.phase == RUNNING && index < t.taken + LEAST_AHEAD) return LATE;
-    if (first < t.taken - 3) first = t.taken - 3 > 0 ? t.taken - 3 : 0;
+    if (first < played - 3) first = played - 3;
     for (int64_t i = first; i < index; i++) ring[i % RING] = command(i);
     for (uint32_t k = 0; k < t.samples; k++) ring[(index + k) % RING] = staged[k];
     t.end = t.rest_from = last;
@@ -201,10 +189,10 @@ int target_hear(const uint8_t *p, size_t bytes, struct peer from) {
 /* ---- each sample ---- */
 
 void target_sample(void) {
-    write_heartbeat((int)((double)t.beats++ * 20.0 / t.rate_hz) & 1);
+    write_heartbeat((int)((int64_t)((double)t.beats++ * 20.0 / t.rate_hz) & 1));
     if (t.phase == FREE) return;
     double *row = history[t.taken % HISTORY];
-    write_output(t.phase == CLAIMED ? 0.0 : command(t.taken));
+    write_output(t.phase == CLAIMED ? 0.0 : within_span(command(t.taken)));
     if (!read_inputs(row))
         for (int k = 0; k < CHANNELS; k++) row[k] = NAN;
     t.taken++;

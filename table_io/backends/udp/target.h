@@ -16,6 +16,7 @@
 #define CHANNELS 9            /* of [[sensors]] in the machine card, in its order; at most 128 */
 #define RATES {2000.0, 1000.0, 4000.0} /* Hz that your task can run at; the first at power-on */
 #define METRES_PER_VOLT 0.006 /* [output] span_mm / span_v / 1000, for the landing */
+#define SPAN_V 10.0           /* [output] span_v: more is neither taken nor played */
 #define LEAST_AHEAD 4         /* samples after the newest one that cannot be replaced any more */
 #define SETTLED_S 0.3         /* that your table needs to stand still after its command does */
 

@@ -22,6 +22,7 @@ from table_io.backends.udp.packets import (
     State,
     Verdict,
     Word,
+    ahead,
     decode_word,
     encode_state,
 )
@@ -152,8 +153,8 @@ class Target:
 
     def _obey(self, word: Word, now: float) -> None:
         """A word of the rig that has the machine."""
-        if word.sequence > self._heard:
-            self._missed += word.sequence - self._heard - 1
+        if (newer := ahead(word.sequence, self._heard)) > 0:
+            self._missed = (self._missed + newer - 1) & 0xFFFFFFFF
             self._heard = word.sequence
             if self._phase is not Phase.ENDING:  # an old word come again is no sign of life
                 self._tell(Message(wire.Kind.BEAT), now)
@@ -174,7 +175,8 @@ class Target:
     def _queued(self, index: int, volts: Float1D, now: float) -> Verdict:
         """What becomes of a command that has arrived."""
         room = self._taken + RING - 4 if self._phase is Phase.RUNNING else RING  # as in target.c
-        if not np.isfinite(volts).all() or not 0 <= index <= room - volts.size:
+        most = self._table.rig.output.span_v * (1.0 + 1e-9)
+        if not (np.abs(volts) <= most).all() or not 0 <= index <= room - volts.size:
             return Verdict.NONSENSE
         answer = self._tell(carry(wire.Kind.QUEUE, volts, index), now)
         return Verdict.PLAYS if answer.kind is wire.Kind.QUEUED else Verdict.LATE
@@ -267,5 +269,5 @@ class Target:
         )
 
     def _packet(self, state: State) -> bytes:
-        self._sequence += 1
+        self._sequence = (self._sequence + 1) & 0xFFFFFFFF
         return encode_state(replace(state, sequence=self._sequence))

@@ -136,8 +136,8 @@ def reopened(folder: Path, plan: Plan) -> tuple[Book, list[str]]:
         if not (folder / "campaign.toml").exists():
             raise BadInput(f"--resume: no campaign began in {folder}; leave --resume away")
         return begun(folder, plan), []
-    unchanged(folder, plan)
-    book, said = Book(folder, plan, read_state(folder), resumed=True), []
+    said = unchanged(folder, plan)
+    book = Book(folder, plan, read_state(folder), resumed=True)
     for run in plan.runs:
         state = book.of(run)
         parts = [part if part.verdict else settled(folder, part) for part in state.parts]

@@ -4,6 +4,7 @@ import difflib
 import fcntl
 import hashlib
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,7 @@ from twin.service.bundle import Bundle
 from twin.service.campaign.card import Plan
 
 STATE, COPY, CARDS, LOCK = "campaign.json", "campaign.toml", "cards", ".lock"
+RECORD = re.compile(r"^\[\[calibrations\]\].*\n?(?:(?!\[).+\n?|\n)*", re.MULTILINE)
 WAIT_S = 20.0  # for what is left of a killed campaign: its players, its table, its recorder
 Status = Literal["planned", "running", "complete", "interrupted", "skipped"]
 
@@ -128,8 +130,11 @@ def keep_cards(folder: Path, plan: Plan) -> None:
             (place / name).write_text(text, encoding="utf-8")
 
 
-def unchanged(folder: Path, plan: Plan) -> None:
-    """BadInput that says what differs where a campaign is not the one that began here."""
+def unchanged(folder: Path, plan: Plan) -> list[str]:
+    """BadInput that says what differs where a campaign is not the one that began here.
+
+    Calibration records that came in between change nothing that is measured: they are told.
+    """
     pairs = [(folder / COPY, plan.text, str(plan.path))]
     for run in plan.runs:
         place = folder / CARDS / run.name
@@ -137,10 +142,17 @@ def unchanged(folder: Path, plan: Plan) -> None:
             (place / name, text, f"{name.removesuffix('.toml')} of {run.label}")
             for name, text in texts(run.bundle).items()
         ]
-    changed = []
+    changed, calibrated = [], []
     for path, text, what in pairs:
         before = path.read_text(encoding="utf-8") if path.is_file() else ""
-        if before != text:
+        if before == text:
+            continue
+        if path.name == "rig.toml" and _without_records(before) == _without_records(text):
+            calibrated.append(
+                f"{what}: other calibration records than when it began; what is recorded from now "
+                "on carries these"
+            )
+        else:
             changed += [f"  {what}:", *_lines(before, text)]
     if changed:
         raise BadInput(
@@ -152,6 +164,12 @@ def unchanged(folder: Path, plan: Plan) -> None:
                 ]
             )
         )
+    return calibrated
+
+
+def _without_records(text: str) -> str:
+    """A machine card's text without its calibration records."""
+    return RECORD.sub("", text).rstrip()
 
 
 def _lines(before: str, now: str) -> list[str]:
