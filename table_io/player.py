@@ -63,7 +63,8 @@ class Player:
         self._queued = first if whole else min(self._queued, first)
 
     def feed(self) -> None:
-        """Keep `lead_s` of the drive queued beyond the next block, then a decay to rest.
+        """Keep `lead_s` of the drive queued that can still be changed, beyond the next block, then
+        a decay to rest.
 
         Starved where that comes too late; the drive is then what the machine plays instead.
         """
@@ -73,8 +74,8 @@ class Player:
         reached = self.reached()
         if self._started and self._queued < reached + self.backend.replace_after:
             raise self._starved()
-        lead = max(round(self._output.lead_s * self.drive.rate_hz), self.backend.replace_after)
-        lead += self._block
+        lead = round(self._output.lead_s * self.drive.rate_hz)
+        lead += self.backend.replace_after + self._block
         if self._queued - reached >= lead:
             return
         last = min(reached + 2 * lead, rest_from)

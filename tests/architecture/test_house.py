@@ -39,11 +39,14 @@ OWNERS = {
             "opening",
             "server",
             "service",
+            "calls",
+            "entry",
             "tasks",
         )
     },
     "grpc": {
-        f"table_io/backends/ni/{name}.py" for name in ("channel", "found", "server", "service")
+        f"table_io/backends/ni/{name}.py"
+        for name in ("calls", "channel", "found", "server", "service")
     },
     "sklearn": {"twin/service/study/rivals_blackbox.py"},
 }

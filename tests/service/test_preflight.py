@@ -64,7 +64,7 @@ def test_the_plan_of_a_shipped_test_is_whole_and_fits_a_terminal(name: str) -> N
 def test_the_plan_names_the_loop_check_the_buffer_and_the_room_that_is_left() -> None:
     text = said(shipped("g4_ss3"))
     assert "1, 2.24, 5 Hz at 0.005 g, then 5 s of rest" in text
-    assert "0.5 s of command queued ahead, 50 blocks of 20 samples; 20 ms of it" in text
+    assert "0.52 s of command queued ahead, 52 blocks of 20 samples; 20 ms of it" in text
     (row,) = (line.split() for line in text.splitlines() if line.split()[:1] == ["0.5"])
     assert row[1] == "49.68"
     assert row[-4:] == ["83", "%", "99", "%"]  # of the stroke, as it is and 20 % larger

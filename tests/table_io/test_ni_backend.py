@@ -20,7 +20,7 @@ from table_io.backends.ni.server import Door
 from table_io.backends.ni.task import Code, DriverError, Task
 from table_io.block import Block, Float1D
 from table_io.card import PROFILES, BadInput, parse
-from table_io.clock import ManualClock
+from table_io.clock import ManualClock, RealClock
 from table_io.machine.blackbox import read_box
 from table_io.profile import Profile
 from table_io.records import Gap, RunStart, RunStop, Trip
@@ -160,6 +160,8 @@ def test_samples_that_do_not_come_are_a_loss_after_patience_and_the_command_deca
     tmp_path: Path,
 ) -> None:
     bed = Bed(CARD + '[[simulated.faults]]\nkind = "stall"\nat_s = 0.5\n', tmp_path / "box")
+    bed.clock = bed.service._clock = RealClock(4.0)  # which jumps over no heartbeat
+    bed.device._now = bed.clock.now()
     backend = started(bed)
     backend.read(980)
     with pytest.raises(MachineLost, match=r"have not come|200284"):
@@ -208,7 +210,7 @@ def test_a_rig_that_is_gone_leaves_tasks_that_play_to_rest_and_the_next_one_clea
     gone = started(bed)
     gone.read(700)
     names = {task.name for task in bed.device.tasks}
-    assert names == {f"shaketwin_ni_simulated_{kind}" for kind in ("input", "output", "heartbeat")}
+    assert names == {f"shaketwin_Dev1_{kind}" for kind in ("input", "output", "heartbeat")}
     following = bed.backend()
     following.open()  # waits until it has been played
     lives = read_box(tmp_path / "box")

@@ -15,6 +15,7 @@ from table_io.card import PROFILES, BadInput, load
 from table_io.clock import ManualClock
 from table_io.course import plan
 from table_io.drive import Drive
+from table_io.player import Player
 from table_io.profile import Profile
 from table_io.records import Event, Gap, Record, RunStart, RunStop, Trip
 from table_io.rig import Rig
@@ -340,6 +341,18 @@ def test_a_machine_that_cannot_be_changed_soon_is_fed_and_stopped_as_soon_as_it_
     list(session(subject, Stop(300)))
     assert subject.changed[0] - (300 * 20 - 1) <= late + 0.01 * RATE
     assert subject.command[-1] == 0.0
+
+
+def test_what_lies_in_a_slow_device_is_no_part_of_the_lead() -> None:
+    """A device that holds nearly all of a lead: a rig that is a little late is not starved."""
+    late = round(0.48 * RATE)
+    subject = machine(replace_after=late)
+    player = Player(subject, subject.clock, RIG.output, subject.drive, 20)
+    player.start()
+    for acquired in range(0, 4000, 20):
+        player.acquired = subject.next = acquired
+        player.feed()
+        assert player._queued - acquired >= late + LEAD + 20
 
 
 def test_a_stroke_trip_aborts_and_says_sample_and_value() -> None:

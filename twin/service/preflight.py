@@ -56,7 +56,7 @@ def _plan(bundle: Bundle) -> list[tuple[str, str]]:
     if rig.backend != "follow":
         replace_after = open_backend(rig, profile, ManualClock()).replace_after
     block = profile.acquisition.block_samples
-    lead = max(round(rig.output.lead_s * rate), replace_after)
+    lead = replace_after + round(rig.output.lead_s * rate)
     check = "none"
     if profile.loop_check.enabled:
         motions = aims(profile, rig)

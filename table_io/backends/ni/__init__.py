@@ -7,6 +7,7 @@ try:
 except ImportError:
     raise BadInput("backend 'ni' needs NI's client: pip install shaketwin[ni]") from None
 
-from table_io.backends.ni.backend import NiBackend, answers
+from table_io.backends.ni.backend import NiBackend
+from table_io.backends.ni.entry import answers
 
 __all__ = ["NiBackend", "answers"]

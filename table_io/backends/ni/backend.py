@@ -12,61 +12,31 @@ from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 from nidaqmx.errors import DaqError, Error
-from nidaqmx.system import System
 
 from table_io.backends import HEARTBEAT_S, PATIENCE_S, MachineLost
 from table_io.backends.ni import opening
 from table_io.backends.ni.channel import reached
-from table_io.backends.ni.codes import Where, lost, said
+from table_io.backends.ni.codes import REMEDY, Where, lost, said
+from table_io.backends.ni.entry import unwell, wired
 from table_io.backends.ni.pace import Pace
 from table_io.backends.ni.reader import Reader
-from table_io.backends.ni.tasks import BUFFER_S, Tasks
+from table_io.backends.ni.tasks import BEAT_S, BUFFER_S, Tasks
 from table_io.block import Float1D, Float2D
 from table_io.card import BadInput
 from table_io.clock import Clock
 from table_io.machine.queued import Queued
 from table_io.profile import Specimen
 from table_io.rig import Rig
-from table_io.wiring.ni import NiWiring
 
-BEAT_S = 0.05  # between two changes of the heartbeat line: 10 Hz
 HOLD_S = (
     2.0  # of the last value that are kept behind what is queued, so the output does not run out
 )
 LOOK_S = 0.002  # of real time, between two looks at a heartbeat that is due
 PARTING_S = 0.5  # that the reader may take to end
 NO_LONGER_WRITEABLE = -200289
+MOST_INDEX = (1 << 31) - 1  # that the driver can place a write at
 
 T = TypeVar("T")
-
-
-def answers(rig: Rig) -> None:
-    """BadInput where no driver answers; claims nothing."""
-    wiring = wired(rig)
-    try:
-        if wiring.endpoint:
-            reached(rig, wiring.endpoint).close()
-        else:
-            System.local().driver_version  # noqa: B018
-    except Error as error:
-        raise BadInput(
-            f"rig {rig.name}: no NI-DAQmx driver here ({said(error)}); install it, or give "
-            "ni.endpoint of an NI gRPC Device Server"
-        ) from None
-
-
-def wired(rig: Rig) -> NiWiring:
-    """The wiring of a card; BadInput where it does not fit the sensors."""
-    if rig.ni is None:
-        raise BadInput(f"rig {rig.name}: no [ni] table; add it, or name another backend")
-    inputs = {one.channel for one in rig.ni.inputs}
-    for names, what in (
-        (set(rig.channels) - inputs, "ni.inputs lack"),
-        (inputs - set(rig.channels), "ni.inputs name, and sensors do not,"),
-    ):
-        if names:
-            raise BadInput(f"rig {rig.name}: {what} {', '.join(sorted(names))}; one input a sensor")
-    return rig.ni
 
 
 class NiBackend:
@@ -112,19 +82,28 @@ class NiBackend:
                 opening.rehearsed(rig, tasks, rate)
             finally:
                 tasks.clear()  # used up: they have played
+            clock.wait_until(clock.now() + opening.SETTLED_S)
             tasks = Tasks(rig, rate, self._channel)
         except Error as error:
+            code = error.error_code if isinstance(error, DaqError) else 0
+            see = "see the [ni] table, and NI MAX for what the device can do"
             raise BadInput(
-                f"rig {rig.name}: the device does not do what the card asks: {said(error)}; see "
-                "the [ni] table, and NI MAX for what the device can do"
+                f"rig {rig.name}: the device does not do what the card asks: {said(error)}; "
+                f"{REMEDY.get(code, see)}"
             ) from None
         self._tasks = tasks
         self._reader = Reader(tasks.read)
+        self._beat_s = -math.inf
+        self._beat()  # from now on, so that a latch that fell with it can be reset before a start
 
     def tare(self, samples: int) -> Float2D:
         """Volts at rest before precompression, (channel, sample)."""
         tasks = self._alive()
-        return self._driven("input", lambda: opening.look(tasks, samples))
+
+        def look() -> Float2D:
+            return opening.look(tasks, samples, self.rate_hz, self._beat)
+
+        return self._driven("input", look)
 
     def queue(self, index: int, volts: Float1D) -> None:
         """Replace the command from sample `index` on, (sample,); the last value is held."""
@@ -157,11 +136,20 @@ class NiBackend:
         tasks = self._alive()
         if self._pace is not None:
             raise RuntimeError("NI device: it runs already; one start() a life")
+        moves = self._queued.take(0, self._queued.end).any()  # else a latch may be reset now
+        if moves and (low := unwell(self._wiring, self._channel)):
+            self._lose("start", RuntimeError(low))
         self._driven("start", tasks.output.start)
-        self._driven("heartbeat", tasks.beat)
-        epoch_s = self._beat_s = self._clock.now()  # the early end of what is not known better
-        self._driven("start", tasks.input.start)
-        self._pace = Pace(self.rate_hz, epoch_s)
+        self._beat()
+        # The early end of what is not known better. Before the call: its answer may be lost.
+        self._pace = Pace(self.rate_hz, self._clock.now())
+        try:
+            tasks.input.start()
+        except DaqError as error:
+            self._pace = None
+            self._lose("start", error)
+        except Error as error:
+            self._lose("server", error)
 
     def read(self, samples: int) -> Float2D:
         """Volts of the next samples, (channel, sample), when they have been taken."""
@@ -230,22 +218,31 @@ class NiBackend:
 
     def _beat(self) -> None:
         """Keep heartbeat and output alive, where they are due."""
-        if self._pace is None or self._tasks is None:
+        tasks = self._tasks
+        if tasks is None:
             return
-        away_s = self._clock.now() - self._beat_s
-        if away_s > HEARTBEAT_S:
-            away = f"this rig was away for {away_s:.2f} s, and the machine goes on without it"
-            self._lose("heartbeat", TimeoutError(away))
-        if away_s >= BEAT_S:
-            if self._driven("output", self._tasks.output.is_task_done):
+        if self._away_s() >= BEAT_S:
+            if self._pace is not None and self._driven("output", tasks.output.is_task_done):
                 self._lose("output", RuntimeError("it has ended by itself"))
-            self._driven("heartbeat", self._tasks.beat)
-            self._beat_s = self._clock.now()
+            before_s = self._clock.now()
+            self._driven("heartbeat", tasks.beat)
+            self._away_s()  # the edge may have left so late
+            self._beat_s = before_s
+        if self._pace is None:
+            return
         if self._written - self._newest() < 0.5 * HOLD_S * self.rate_hz:
             try:
                 self._place(self._written, self._queued.take(self._written, self._written + 1))
             except ValueError as error:
                 self._lose("output", error)
+
+    def _away_s(self) -> float:
+        """How long the line may have been silent by now; MachineLost where the machine moves on."""
+        away_s = self._clock.now() - self._beat_s
+        if self._pace is not None and away_s > HEARTBEAT_S:
+            away = f"this rig was away for {away_s:.2f} s, and the machine goes on without it"
+            self._lose("heartbeat", TimeoutError(away))
+        return away_s
 
     def _place(self, first: int, volts: Float1D) -> None:
         """Hand output over to the driver, with a hold behind it that reaches beyond all before.
@@ -256,6 +253,8 @@ class NiBackend:
         tasks, newest = self._tasks, 0 if self._pace is None else self._newest()
         end = max(first + volts.size, newest) + round(HOLD_S * self.rate_hz)
         end = max(end, self._written)
+        if end > MOST_INDEX:
+            self._lose("counter", RuntimeError(f"the driver counts to sample {MOST_INDEX}"))
         padded = np.append(volts, np.full(end - first - volts.size, volts[-1]))
         try:
             tasks.write(first, padded)
@@ -283,7 +282,7 @@ class NiBackend:
     def _lose(self, where: Where, error: Exception) -> NoReturn:
         """The device is lost, for good: MachineLost says why and what happens now."""
         spoke = isinstance(error, DaqError) or not isinstance(error, Error)
-        self._lost = self._lost or lost(where if spoke else "server", error)
+        self._lost = self._lost or lost(where if spoke else "server", error, self._pace is not None)
         raise MachineLost(self._lost) from None
 
     def _alive(self) -> Tasks:

@@ -8,7 +8,7 @@ import grpc
 from table_io.card import BadInput
 from table_io.rig import Rig
 
-ANSWER_S = 2.0  # that a call may take, beyond what it waits for samples
+ANSWER_S = 2.0  # that a call may take, with what it waits for samples
 REACH_S = 2.0  # until somebody answers
 MOST_BYTES = 64 << 20
 
@@ -34,13 +34,13 @@ class Bounded:
 
 
 def channel_to(endpoint: str) -> Any:
-    """An open way to HOST:PORT; nothing is sent yet."""
+    """An open way to HOST:PORT, none of whose calls waits for ever; nothing is sent yet."""
     options = (
         ("grpc.enable_http_proxy", 0),
         ("grpc.max_send_message_length", MOST_BYTES),
         ("grpc.max_receive_message_length", MOST_BYTES),
     )
-    return grpc.insecure_channel(endpoint, options=options)
+    return Bounded(grpc.insecure_channel(endpoint, options=options), ANSWER_S)
 
 
 def reached(rig: Rig, endpoint: str) -> Any:
@@ -50,8 +50,8 @@ def reached(rig: Rig, endpoint: str) -> Any:
         grpc.channel_ready_future(channel).result(timeout=REACH_S)
     except grpc.FutureTimeoutError:
         channel.close()
+        desk = f", in another terminal: shaketwin table --rig {rig.name}" if rig.simulated else ""
         raise BadInput(
-            f"no NI gRPC Device Server answers at {endpoint}; start it there, or, for the "
-            f"simulated table, in another terminal: shaketwin table --rig {rig.name}"
+            f"no NI gRPC Device Server answers at {endpoint}; start it there{desk}"
         ) from None
     return channel

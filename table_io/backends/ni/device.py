@@ -103,6 +103,12 @@ class Device:
             raise DriverError(Code.INVALID_VALUE)
         task.rate_hz, task.clock, task.buffer = rate_hz, clock, max(samples, 2)
 
+    def reserve(self, task: Task) -> None:
+        """Have the device's part that a task needs; it keeps it until it is cleared."""
+        if any(one.reserved and one.kind == task.kind and one is not task for one in self.tasks):
+            raise DriverError(Code.RESERVED)
+        task.reserved = True
+
     def start(self, task: Task, now: float) -> None:
         """Start a task; an output with a trigger waits for the input that gives it."""
         self.advance(now)

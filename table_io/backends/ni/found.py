@@ -1,5 +1,6 @@
 """NI-DAQmx devices of the local driver, or of a gRPC Device Server, and what they have."""
 
+import contextlib
 from collections.abc import Iterable
 from typing import Any, Literal
 
@@ -32,7 +33,9 @@ def found(server: str | None) -> tuple[Device, ...]:
             return tuple(_device(one, "local driver") for one in System.local().devices)
         except Error as error:
             raise BadInput(_first(error)) from None
-    with grpc.insecure_channel(server) as channel:
+    from table_io.backends.ni.channel import channel_to
+
+    with contextlib.closing(channel_to(server)) as channel:
         try:
             grpc.channel_ready_future(channel).result(REACHED_S)
             system = System.remote(GrpcSessionOptions(channel, NOTHING))

@@ -19,17 +19,25 @@ READ_S = 1.0
 
 
 class Lines:
-    """The inputs that the card watches; BadInput where the driver does not know one of them."""
+    """The inputs that the card watches, or `some`; BadInput where the driver has not one of them.
 
-    def __init__(self, wiring: NiWiring) -> None:
-        self._names = tuple(wiring.watched)
-        self._channel: Any = channel_to(wiring.endpoint) if wiring.endpoint else None
+    `channel` is a way to the server that is open already, and stays open.
+    """
+
+    def __init__(
+        self, wiring: NiWiring, some: dict[str, str] | None = None, channel: Any = None
+    ) -> None:
+        watched = wiring.watched if some is None else some
+        self._names = tuple(watched)
+        self._own: Any = None  # a way to the server that ends with this
+        if channel is None and wiring.endpoint:
+            channel = self._own = channel_to(wiring.endpoint)
         self._task: Task | None = None
-        name = f"shaketwin_watched_{os.getpid()}"
+        name = f"shaketwin_{'watched' if some is None else 'well'}_{os.getpid()}"
         try:
-            options = None if self._channel is None else GrpcSessionOptions(self._channel, name)
+            options = None if channel is None else GrpcSessionOptions(channel, name)
             self._task = Task(name, grpc_options=options)
-            for line in wiring.watched.values():
+            for line in watched.values():
                 self._task.di_channels.add_di_chan(line, line_grouping=LineGrouping.CHAN_PER_LINE)
             self._reader = DigitalMultiChannelReader(self._task.in_stream)
             self._reader.verify_array_shape = False
@@ -37,7 +45,7 @@ class Lines:
         except (Error, MachineLost) as error:
             self.close()
             raise BadInput(
-                f"ni: cannot read {', '.join(wiring.watched.values())}: {_first(error)}; mend "
+                f"ni: cannot read {', '.join(watched.values())}: {_first(error)}; mend "
                 "heartbeat_back and well in the machine card"
             ) from None
 
@@ -56,9 +64,9 @@ class Lines:
         if task is not None:
             with contextlib.suppress(Error):
                 task.close()
-        if self._channel is not None:
-            self._channel.close()
-            self._channel = None
+        if self._own is not None:
+            self._own.close()
+            self._own = None
 
 
 def _first(error: Exception) -> str:

@@ -31,6 +31,11 @@ class Door:
     def __init__(self, wiring: NiWiring) -> None:
         self.wiring = wiring
         self._server: Any = None
+        if not wiring.endpoint:
+            raise BadInput(
+                "ni.endpoint is empty: the table needs an address to listen at; give one, as "
+                "127.0.0.1:31763"
+            )
         host, _, port = wiring.endpoint.rpartition(":")
         try:
             socket.create_server((host.strip("[]"), int(port))).close()

@@ -4,61 +4,27 @@ Calls come in threads of gRPC's; one lock lets them to the device one by one. On
 an input, an output and a line needs is answered; the rest is UNIMPLEMENTED.
 """
 
-import threading
-from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import grpc
 import numpy as np
 from nidaqmx._stubs import nidaqmx_pb2 as pb
-from nidaqmx._stubs import nidaqmx_pb2_grpc as rpc
 from session_pb2 import Session
 
-from table_io.backends.ni import inventory
-from table_io.backends.ni.codes import name_of
-from table_io.backends.ni.device import Device
-from table_io.backends.ni.task import Code, DriverError, Task
-from table_io.clock import Clock
-from table_io.wiring.ni import NiWiring
+from table_io.backends.ni.calls import Calls
+from table_io.backends.ni.task import FULL, Code, DriverError
+from table_io.backends.ni.task import ONBOARD as MEMORY
 
 LOOK_S = 0.002  # between two looks for samples that are late
 LONGEST_S = 10.0  # that a read may wait
-VERSION = {0x1272: 24, 0x1923: 5, 0x2F22: 0}  # of the driver: major, minor, update
 # Attributes, as DAQmx numbers them.
 POSITION, ONBOARD, CONDITION = 0x1458, 0x230B, 0x183C
-TASK_NAME, CHANNELS = 0x1276, 0x1273
 ALLOWED = 10097  # regeneration
+RESERVE = 4
 
-T = TypeVar("T")
 
-
-class Service(rpc.NiDAQmxServicer):  # type: ignore[misc]
+class Service(Calls):
     """NI's calls on a device of ours."""
-
-    def __init__(self, device: Device, wiring: NiWiring, clock: Clock) -> None:
-        self.device = device
-        self.lock = threading.Lock()
-        self._wiring = wiring
-        self._clock = clock
-        self._beat = False  # level of the heartbeat line
-
-    def turn(self) -> None:
-        """Let the device live on while nobody calls."""
-        with self.lock:
-            self.device.advance(self._clock.now())
-
-    def _do(self, context: Any, act: Callable[[float], T]) -> T:
-        """What `act` does at the present time; its error goes to the client."""
-        try:
-            with self.lock:
-                return act(self._clock.now())
-        except DriverError as error:
-            context.set_trailing_metadata((("ni-error", str(error.code)),))
-            context.abort(grpc.StatusCode.UNKNOWN, name_of(error.code))
-            raise
-
-    def _task(self, request: Any) -> Task:
-        return self.device.task(request.task.id)
 
     def CreateTask(self, request: Any, context: Any) -> Any:
         def create(now: float) -> Any:
@@ -102,7 +68,7 @@ class Service(rpc.NiDAQmxServicer):  # type: ignore[misc]
 
         def add(now: float) -> None:
             if physical not in here[kind]:
-                raise DriverError(Code.NO_SUCH_CHANNEL)
+                raise DriverError(Code.NO_SUCH_CHANNEL, f"Physical Channel Name: {physical}")
             self.device.channel(self._task(request), kind, physical)
 
         self._do(context, add)
@@ -164,6 +130,20 @@ class Service(rpc.NiDAQmxServicer):  # type: ignore[misc]
         self._do(context, change)
         return pb.SetBufferAttributeUInt32Response()
 
+    def ResetBufferAttribute(self, request: Any, context: Any) -> Any:
+        def reset(now: float) -> None:
+            self._task(request).onboard = MEMORY
+
+        self._do(context, reset)
+        return pb.ResetBufferAttributeResponse()
+
+    def ResetChanAttribute(self, request: Any, context: Any) -> Any:
+        def reset(now: float) -> None:
+            self._task(request).condition = FULL
+
+        self._do(context, reset)
+        return pb.ResetChanAttributeResponse()
+
     def GetBufferAttributeUInt32(self, request: Any, context: Any) -> Any:
         def value(now: float) -> int:
             task = self._task(request)
@@ -189,7 +169,12 @@ class Service(rpc.NiDAQmxServicer):  # type: ignore[misc]
         return pb.StopTaskResponse()
 
     def TaskControl(self, request: Any, context: Any) -> Any:
-        self._do(context, lambda now: self._task(request))
+        def control(now: float) -> None:
+            task = self._task(request)
+            if RESERVE in (request.action_raw, request.action):
+                self.device.reserve(task)
+
+        self._do(context, control)
         return pb.TaskControlResponse()
 
     def IsTaskDone(self, request: Any, context: Any) -> Any:
@@ -240,54 +225,3 @@ class Service(rpc.NiDAQmxServicer):  # type: ignore[misc]
         return pb.ReadDigitalLinesResponse(
             read_array=levels, samps_per_chan_read=1, num_bytes_per_samp=1
         )
-
-    def GetErrorString(self, request: Any, context: Any) -> Any:
-        return pb.GetErrorStringResponse(error_string=name_of(request.error_code))
-
-    def GetTaskAttributeString(self, request: Any, context: Any) -> Any:
-        task = self._do(context, lambda now: self._task(request))
-        text = {TASK_NAME: task.name, CHANNELS: ", ".join(task.channels)}
-        return pb.GetTaskAttributeStringResponse(value=text.get(request.attribute_raw, ""))
-
-    def GetSystemInfoAttributeUInt32(self, request: Any, context: Any) -> Any:
-        version = VERSION.get(request.attribute_raw, 0)
-        return pb.GetSystemInfoAttributeUInt32Response(value=version)
-
-    def GetSystemInfoAttributeString(self, request: Any, context: Any) -> Any:
-        return pb.GetSystemInfoAttributeStringResponse(value=self._names("", request, context))
-
-    def GetDeviceAttributeString(self, request: Any, context: Any) -> Any:
-        value = self._names(request.device_name, request, context)
-        return pb.GetDeviceAttributeStringResponse(value=value)
-
-    def GetDeviceAttributeUInt32(self, request: Any, context: Any) -> Any:
-        value = int(self._numbers(request, context)[0])
-        return pb.GetDeviceAttributeUInt32Response(value=value)
-
-    def GetDeviceAttributeBool(self, request: Any, context: Any) -> Any:
-        value = bool(self._numbers(request, context)[0])
-        return pb.GetDeviceAttributeBoolResponse(value=value)
-
-    def GetDeviceAttributeDouble(self, request: Any, context: Any) -> Any:
-        return pb.GetDeviceAttributeDoubleResponse(value=self._numbers(request, context)[0])
-
-    def GetDeviceAttributeDoubleArray(self, request: Any, context: Any) -> Any:
-        return pb.GetDeviceAttributeDoubleArrayResponse(value=self._numbers(request, context))
-
-    def _names(self, device: str, request: Any, context: Any) -> str:
-        def told(now: float) -> str:
-            text = inventory.names(self._wiring, device, request.attribute_raw)
-            if text is None:
-                raise DriverError(Code.NOT_SUPPORTED)
-            return text
-
-        return self._do(context, told)
-
-    def _numbers(self, request: Any, context: Any) -> tuple[float, ...]:
-        def told(now: float) -> tuple[float, ...]:
-            found = inventory.numbers(request.attribute_raw, max(self.device.rates_hz))
-            if not found:
-                raise DriverError(Code.NOT_SUPPORTED)
-            return found
-
-        return self._do(context, told)

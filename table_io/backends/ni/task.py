@@ -34,9 +34,10 @@ class Code(IntEnum):
 class DriverError(Exception):
     """An error of the driver, by its code."""
 
-    def __init__(self, code: int) -> None:
+    def __init__(self, code: int, about: str = "") -> None:
         super().__init__(f"driver error {code}")
         self.code = code
+        self.about = about  # lines of the driver's words, as "Physical Channel Name: Dev1/ai0"
 
 
 @dataclass(slots=True, eq=False)
@@ -56,6 +57,7 @@ class Task:
     offset: int = 0
     condition: int = FULL
     onboard: int = ONBOARD
+    reserved: bool = False
     running: bool = False
     armed: bool = False  # started, and waits for its trigger
     error: int = 0  # that ended it

@@ -29,7 +29,8 @@ from table_io.rig import Rig
 
 BUFFER_S = 60.0  # of output that can be queued, and of input that may wait
 READ_S = 1.0  # that a read waits; who asks for it loses patience before
-WRITE_S = 0.5
+WRITE_S = 0.2  # that a write waits: less than the heartbeat may be silent
+BEAT_S = 0.05  # between two changes of the heartbeat line: 10 Hz
 TERMINALS = {
     "differential": TerminalConfiguration.DIFF,
     "rse": TerminalConfiguration.RSE,
@@ -94,8 +95,18 @@ class Tasks:
         self.line.do_channels.add_do_chan(
             rig.ni.heartbeat, line_grouping=LineGrouping.CHAN_PER_LINE
         )
-        for task in self._made:
-            task.control(TaskMode.TASK_RESERVE)
+        self.input.control(TaskMode.TASK_RESERVE)
+        try:
+            self.output.control(TaskMode.TASK_RESERVE)
+        except DaqError:  # some say only now that their own memory cannot be cut
+            for owner, wish in (
+                (stream, "output_onbrd_buf_size"),
+                (command, "ao_data_xfer_req_cond"),
+            ):
+                with contextlib.suppress(DaqError):
+                    delattr(owner, wish)
+            self.output.control(TaskMode.TASK_RESERVE)
+        self.line.control(TaskMode.TASK_RESERVE)
         self._read = AnalogMultiChannelReader(self.input.in_stream)
         self._write = AnalogSingleChannelWriter(stream, auto_start=False)
         self._beat = DigitalSingleChannelWriter(self.line.out_stream, auto_start=True)
@@ -141,8 +152,9 @@ class Tasks:
 
 
 def session(rig: Rig, kind: str) -> str:
-    """Name of a task of this rig."""
-    return f"shaketwin_{rig.name}_{kind}"
+    """Name of a task on this rig's device, whatever its card is called."""
+    assert rig.ni is not None
+    return f"shaketwin_{rig.ni.output.split('/')[0]}_{kind}"
 
 
 def left_over(rig: Rig, channel: Any) -> dict[str, Task]:
