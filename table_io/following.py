@@ -14,7 +14,8 @@ import numpy as np
 from table_io import conductor as conducting
 from table_io.backends import MachineLost, Source
 from table_io.backends.follow.follower import REST, Follower, advance, ended, taken
-from table_io.block import Block, Bool2D
+from table_io.backends.follow.words import aligned, refuse_motion
+from table_io.block import Block, Bool2D, Float1D, Float2D
 from table_io.calibration import tare_from, to_si
 from table_io.card import BadInput
 from table_io.clock import Clock, today
@@ -66,8 +67,7 @@ def follow(
 ) -> Said:
     """RunStart, then every Block from the start of the acquisition on, its records, then RunStop.
 
-    The lateness of a block is that of its acquisition: until the drive is found, some are held back
-    for their labels.
+    A block is as late as its acquisition: until the drive is found, some are held back for labels.
     """
     run = _Following(setup, source, clock)
     try:
@@ -112,6 +112,8 @@ class _Following:
         self.given = 0  # samples that were handed on
         self.over = False
         self._rest = round(profile.acquisition.rest_s * self.rate_hz)
+        self._longest = self.drive.rest_from + self._rest
+        self._lost = 0  # samples of the command
         self._full = np.array([abs(s.range_si * s.volts_per_si) for s in rig.sensors])
         self._row = rig.channels.index(self.wiring.command)
         self._held = np.empty((len(rig.channels), 0))  # volts that were not handed on
@@ -132,6 +134,7 @@ class _Following:
         self._witness = Witness(self.setup, volts)
         self._tare = tare_from(volts, self.setup.rig.sensors)
         sensor = self.setup.rig.sensors[self._row]
+        refuse_motion(self._command(volts), sensor, self.drive, self.rate_hz)
         lsb, noise = 2 * sensor.range_si / 2**sensor.bits, self._witness.noise.get(sensor.channel)
         self._follower = Follower(self.drive, self.rate_hz, noise or 0.0, lsb)
         self.source.start()
@@ -165,8 +168,8 @@ class _Following:
         end = self.given + self._held.shape[1]
         late_s = self.clock.now() - self.source.scheduled(end - 1)
         before = self._follower
-        sensor = self.setup.rig.sensors[self._row : self._row + 1]
-        command = to_si(volts[self._row : self._row + 1], sensor, self._tare)[0]
+        command = self._command(volts)
+        self._lost += int(np.isnan(command).sum())
         self._follower = now = advance(before, command)
         if now.onset is not None and before.onset is None:
             self._say("motion", "something moves: looking for the drive in it")
@@ -175,11 +178,16 @@ class _Following:
         self._end_if_due(end)
         return late_s
 
+    def _command(self, volts: Float2D) -> Float1D:
+        """The measured command in m, (sample,)."""
+        row = slice(self._row, self._row + 1)
+        return to_si(volts[row], self.setup.rig.sensors[row], self._tare)[0]
+
     def _turned(self, now: Follower) -> None:
         """The follower has found the drive, or lost it."""
         if now.state == "playing":
             self._to("following")
-            self._say("aligned", self._alignment())
+            self._say("aligned", aligned(self._follower))
             return
         self._to("astray")
         if self._stop_by is None:  # else it is what was asked for
@@ -190,32 +198,24 @@ class _Following:
         if now.places.size and now.fit is not None:
             self.drive = self.drive.decayed(int(now.places[0]))
 
-    def _alignment(self) -> str:
-        """Where the drive lies in the recording, in words."""
-        fit = self._follower.fit
-        assert fit is not None
-        begun = fit.pivot - (fit.pivot + fit.offset) / (1.0 + 1e-6 * fit.ppm)
-        return (
-            f"sample 0 of the drive is sample {begun:.2f} of the recording (+-"
-            f"{fit.sd(round(begun)):.2g}), the newest lies in it to +-"
-            f"{fit.sd(self._follower.done):.2g}; the controller's clock runs {fit.ppm:+.2f} ppm "
-            f"beside the acquisition's (+-{fit.covariance[1, 1] ** 0.5:.2g}); its command is "
-            f"{fit.gain:.4f} of the drive; correlation {fit.correlation:.5f}"
-        )
-
     def _end_if_due(self, end: int) -> None:
         """See whether there is anything left to wait for."""
         now, state = self._follower, self._follower.state
         if state == "waiting" and now.onset is None and end > self.wiring.wait_s * self.rate_hz:
             self.verdict = "aborted"
             self.reason = f"nothing was played within {self.wiring.wait_s:g} s"
+            if self._lost > end / 2:
+                self.reason = "the command was lost, so it is not known whether it was played"
             self.over = True
         elif state in ("left", "other"):
             self.over = now.quiet and end - now.left_at > 2 * self.rate_hz
+            if not now.quiet and end > (now.onset or now.left_at) + self._longest:
+                self.over = True
+                text = f"{self.wiring.command} still moves, or cannot be told from its noise"
+                self._say("stop", f"{text}: the recording ends; {ELSEWHERE}")
         if self._stop_by is not None:
-            moved = state != "waiting" and not now.quiet
-            self.over = self.over or end >= self._stop_by or not moved
-            if end >= self._stop_by and not now.quiet:
+            self.over = self.over or end >= self._stop_by or now.still
+            if end >= self._stop_by and not now.still:
                 self._say("stop", f"the recording ends while the table still moves; {ELSEWHERE}")
 
     def labelled(self) -> Iterator[tuple[Block, Bool2D]]:
@@ -261,7 +261,7 @@ class _Following:
         self._said.extend(self._witness.check(block, self._places, self.drive))
         if not self._swept and block.step[-1] >= 0:
             self._swept = True
-            self._say("aligned", self._alignment())
+            self._say("aligned", aligned(self._follower))
 
     def late(self, late_s: float) -> None:
         """Say where a block came late."""
@@ -286,7 +286,7 @@ class _Following:
     def finish(self) -> None:
         """The last words of a recording that came to its end."""
         if self._follower.fit is not None:
-            self._say("aligned", self._alignment())
+            self._say("aligned", aligned(self._follower))
         if self._witness.tripped and self.verdict == "complete":
             self.reason += "; protection would have stopped it, see the trip"
         self._to("at rest" if self._follower.quiet else "left")

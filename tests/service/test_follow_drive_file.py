@@ -1,6 +1,7 @@
 """The drive file: exactly what is planned, read back by readers that are not ours."""
 
 import hashlib
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,8 @@ from table_io.block import Float1D
 from table_io.card import BadInput, find
 from table_io.following import planned
 from twin.service.bundle import read_bundle
-from twin.service.drive_file import DriveFile, drive, read_drive, write
+from twin.service.drive_file import WRITERS, DriveFile, drive, read_drive, write
+from twin.service.table import Vendor, table
 
 PROFILE = """
 title = "short"
@@ -151,3 +153,36 @@ def test_a_rate_that_wav_cannot_say_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="not whole"):
         write(tmp_path / "x.wav", "wav", file)
     assert not (tmp_path / "x.wav").exists()
+
+
+@pytest.mark.parametrize("kind", sorted(WRITERS))
+def test_a_name_beyond_ascii_is_written(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / f"pr\u00fcfung.{kind}"
+    write(path, kind, DriveFile("pr\u00fcfung", 0.01 * np.sin(np.arange(100) / 9.0), 1000.0, 60.0))
+    assert path.stat().st_size > 0
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_cannot_be_written_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, _: DriveFile) -> None:
+        path.write_text("half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setitem(WRITERS, "csv", full)
+    with pytest.raises(BadInput, match="No space left"):
+        write(tmp_path / "x.csv", "csv", DriveFile("x", np.zeros(10), 1000.0, 60.0))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_with_what_is_no_number_is_not_played(tmp_path: Path) -> None:
+    (tmp_path / "nan.txt").write_text("0 0\n0.0005 nan\n0.001 1\n")
+    with pytest.raises(BadInput, match="no numbers"):
+        read_drive(tmp_path / "nan.txt")
+
+
+@pytest.mark.parametrize("after", [0.0, -1.0, 0.4, float("nan")])
+def test_a_controller_cannot_play_at_once(after: float) -> None:
+    with pytest.raises(BadInput, match=r"--after .*0\.5 s and more"):
+        table("follow_simulated", None, None, 1.0, sys.stdout, vendor=Vendor(None, 0.0, after))

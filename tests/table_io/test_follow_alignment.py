@@ -8,6 +8,7 @@ import pytest
 from table_io.backends.follow.alignment import evaluated, found
 from table_io.backends.follow.controller import Played
 from table_io.backends.follow.follower import REST, Follower, advance, taken
+from table_io.backends.follow.words import aligned
 from table_io.block import Float1D, Int1D
 from table_io.card import find, load
 from table_io.conductor import rehearsed, score
@@ -199,3 +200,31 @@ def test_motion_after_the_drive_is_not_the_drive(drive: Drive) -> None:
     t = np.arange(command.size - end) / RATE
     command[end:] += 1e-4 * np.sin(2 * np.pi * 3.0 * t)
     assert followed(drive, command).state == "left"
+
+
+@pytest.mark.parametrize("gain", [0.5, 1.5])
+@pytest.mark.parametrize("at", [0, 13000])
+def test_another_amplitude_is_not_the_drive(drive: Drive, gain: float, at: int) -> None:
+    """Where no command is wired nothing else would tell."""
+    command = heard(drive, 12.0).command.copy()
+    command[at:] *= gain
+    now = followed(drive, command)
+    assert now.state == ("left" if at else "other")
+    assert f"{gain:g} of the drive's; allowed: 0.7 to 1.3" in now.why or "off the drive" in now.why
+
+
+def test_an_amplitude_within_a_third_is_followed(drive: Drive) -> None:
+    now = followed(drive, 0.75 * heard(drive, 12.0).command)
+    assert now.state == "playing"
+
+
+def test_what_was_left_does_not_change_what_is_said_of_its_clock(drive: Drive) -> None:
+    """Half a second of decay drags the place along before it is seen."""
+    command = heard(drive, 16.0, ppm=50.0).command.copy()
+    command[16100:] *= np.clip(1.0 - np.arange(command.size - 16100) / RATE, 0.0, 1.0) ** 3
+    now = followed(drive, command)
+    assert now.state == "left"
+    assert now.fit is not None
+    assert now.fit.ppm == pytest.approx(50.0, abs=3.0)
+    assert aligned(now).startswith("until it was left: ")
+    assert "newest" not in aligned(now)

@@ -5,7 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from table_io.backends.opendaq.assembly import ROOM, Assembly, UnevenError, places
+from table_io.backends.opendaq.assembly import ROOM, Assembly, JumpError, UnevenError, places
+from table_io.backends.opendaq.stamps import together
+from table_io.card import BadInput
 
 
 def test_a_stamp_is_a_place() -> None:
@@ -78,3 +80,38 @@ def test_pieces_and_cuts_change_no_sample(pieces: list[int], cuts: list[int], se
     assert np.array_equal(taken[0], expected[: taken.shape[1]], equal_nan=True)
     assert np.array_equal(taken[1], 2 * expected[: taken.shape[1]], equal_nan=True)
     assert one._values.shape[1] >= ROOM
+
+
+def test_a_clock_that_is_set_forward_is_told_and_takes_no_memory() -> None:
+    one = Assembly(2, 10_000)
+    one.put(0, np.arange(100), np.zeros(100))
+    one.put(1, np.arange(100), np.zeros(100))
+    with pytest.raises(JumpError, match="jumped by"):
+        one.put(0, np.array([10**12]), np.zeros(1))
+    with pytest.raises(JumpError):
+        one.put(1, np.array([100, 101, 10**12]), np.zeros(3))
+    assert one._values.shape[1] <= 2 * ROOM
+    one.put(0, np.arange(5000, 5010), np.zeros(10))  # a loss
+
+
+def test_a_channel_that_was_given_up_is_waited_for_when_it_speaks_again() -> None:
+    one = Assembly(2, 10_000)
+    one.put(0, np.arange(100), np.zeros(100))
+    assert one.complete == 0
+    one.give_up(100)
+    assert one.complete == 100
+    one.put(0, np.arange(100, 20_000), np.zeros(19_900))
+    assert one.complete == 20_000
+    one.put(1, np.array([19_990]), np.zeros(1))
+    assert one.complete == 19_991
+
+
+def test_stamps_that_drift_are_placed_by_what_they_drifted() -> None:
+    ticks = np.array([1000, 1500, 2000], dtype=np.int64) + 300
+    assert places(ticks, 1000, 500.0, 300.0).tolist() == [0, 1, 2]
+
+
+def test_channels_that_lie_between_each_other_are_refused() -> None:
+    together({"drive_disp_m": 1000, "force_r1_n": 3010}, 500.0, "d")
+    with pytest.raises(BadInput, match=r"force_r1_n is taken 0\.50 samples beside drive_disp_m"):
+        together({"drive_disp_m": 1000, "force_r1_n": 3250}, 500.0, "d")

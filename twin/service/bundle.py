@@ -159,7 +159,8 @@ def warm_twin() -> None:
 def warm_rig(bundle: Bundle) -> None:
     """Compile or load what the rig computes with, protection too, and its simulated table.
 
-    The beginning of a real session is played: nothing can be forgotten here.
+    The beginning of a real session is played: nothing can be forgotten here. A card that cannot
+    play, for it has no simulated table or no command, is warmed by the quickstart's.
     """
     from contextlib import closing
     from itertools import islice
@@ -168,7 +169,7 @@ def warm_rig(bundle: Bundle) -> None:
     from table_io.clock import ManualClock
     from table_io.session import play
 
-    if bundle.rig.simulated is None:
+    if bundle.rig.simulated is None or "drive_disp_m" not in bundle.rig.channels:
         bundle = read_bundle(find("quickstart", "tests"))
     clock = ManualClock()
     backend = SimulatedBackend(

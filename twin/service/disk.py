@@ -26,6 +26,8 @@ def bytes_per_s(bundle: Bundle) -> float:
 def planned_bytes(bundle: Bundle) -> float:
     """What the planned test leaves on the disk, at the most."""
     seconds = bundle.drive.planned_end / bundle.drive.rate_hz
+    if bundle.rig.follow is not None:
+        seconds += bundle.rig.follow.wait_s  # for the controller to be started
     return bytes_per_s(bundle) * (seconds + RESERVE_S) + BESIDE_BYTES
 
 

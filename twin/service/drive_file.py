@@ -15,7 +15,7 @@ import math
 import struct
 import wave
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -82,10 +82,14 @@ def write(path: Path, kind: str, file: DriveFile) -> None:
         raise BadInput(f"-o {path}: exists; nothing is overwritten, name another")
     if kind == "wav" and not file.rate_hz.is_integer():
         raise BadInput(f"wav: a rate of {file.rate_hz:g} Hz is not whole; take another format")
+    half = path.with_name(f".{path.name}.half")
     try:
-        WRITERS[kind](path, file)
+        WRITERS[kind](half, replace(file, name=file.name.encode("ascii", "replace").decode()))
+        half.rename(path)
     except OSError as error:
         raise BadInput(f"-o {path}: cannot write it: {error.strerror}") from None
+    finally:
+        half.unlink(missing_ok=True)
 
 
 def _csv(path: Path, file: DriveFile) -> None:
@@ -219,4 +223,6 @@ def read_drive(path: Path) -> tuple[Float1D, float]:
     steps = np.diff(table[:, 0])
     if table.shape[1] != 2 or table.shape[0] < 2 or not steps.min() > 0:
         raise BadInput(f"--play {path}: wants two columns, time in s and displacement in mm")
+    if not np.isfinite(table).all():
+        raise BadInput(f"--play {path}: has values that are no numbers; make it again")
     return table[:, 1] * 1e-3, round(float(1.0 / steps.mean()), 3)

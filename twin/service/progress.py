@@ -65,7 +65,7 @@ class RunProgress:
             if item.index - self._shown >= 400:
                 self._shown = item.index
                 self._bar.update(self._task, completed=item.index)
-        elif isinstance(item, Timing) and item.component == "twin":
+        elif isinstance(item, Timing) and item.component == "twin" and item.blocks:
             self._latency_ms = item.p99_ms
         elif isinstance(item, Point):
             self._point(item)

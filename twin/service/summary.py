@@ -166,6 +166,7 @@ def _timing(records: tuple[Timing, ...]) -> Json:
     """Latency of the twin: last sample of a block scheduled -> its Comparison put."""
     last = {record.component: record for record in records}
     twin = last.get("twin")
+    twin = twin if twin is not None and twin.blocks else None  # nobody timed it
     return {
         "latency_ms": {
             "p50": twin.p50_ms if twin else None,

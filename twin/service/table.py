@@ -20,6 +20,7 @@ from twin.service.scheduling import urgent
 
 PRIORITY = 60  # above the rig: the machine plays whatever the rig does
 FASTEST = 20.0
+SOONEST_S = 0.5  # that a controller may begin: what is taken earlier is in the plant already
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +95,8 @@ def _beside(
     from table_io.backends.opendaq.device import Script, serve
     from twin.service.drive_file import read_drive
 
+    if not vendor.after_s >= SOONEST_S:
+        raise BadInput(f"--after {vendor.after_s:g}: allowed: {SOONEST_S:g} s and more")
     specimen = load(find(profile, "tests"), Profile, "test profile")[0].specimen
     file = read_drive(vendor.play) if vendor.play is not None else None
     script = Script(*file, vendor.ppm, vendor.after_s) if file is not None else None

@@ -4,9 +4,7 @@ import platform
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-import numpy as np
-
-from table_io.block import Block, Label
+from table_io.block import Block
 from table_io.clock import Clock, RealClock
 from table_io.records import Decided, Fault, RunStart, RunStop
 from twin.compare import pipeline
@@ -20,7 +18,6 @@ from twin.stream.wire import MEAS_TOPIC, Item, decode, encode, topic
 from twin.stream.zenoh_link import Link, open_spoke
 
 PRIORITY = 40  # of real-time scheduling, where it is permitted
-HELD = (Label.CHECK, Label.SETTLE, Label.MEASURE)
 CONTROL = ("/run/start", "/run/stop", "/rig/decided")
 
 
@@ -48,7 +45,7 @@ def compute(
     seconds = bundle.profile.acquisition.block_samples / bundle.drive.rate_hz
     watch = Stopwatch("twin", clock, seconds, scheduler)
     twin = _Twin(spec.run, link, bundle.twin(), watch, clock, missed_from)
-    twin.waits = bundle.rig.backend == "follow"
+    twin.follows = bundle.rig.backend == "follow"
     twin.run(control, blocks, alone)
     until = clock.now() + LINGER_S
     while clock.now() < until and not alone():
@@ -69,7 +66,7 @@ class _Twin:
     state: pipeline.State | None = None
     epoch_s: float | None = None
     end: int | None = None
-    waits: bool = False  # for a controller to be started: what is held back so long is not late
+    follows: bool = False  # a device whose clock is not ours, by labels that came later: no latency
 
     def run(self, control: Inbox, blocks: Inbox, alone: Callable[[], bool]) -> None:
         """Until the end of the run is compared, or nobody is there any more."""
@@ -90,7 +87,7 @@ class _Twin:
 
     def hear(self, record: Item) -> None:
         """Take in what was planned, or decided, or that the run is over."""
-        if isinstance(record, RunStart) and record.host == platform.node():
+        if isinstance(record, RunStart) and record.host == platform.node() and not self.follows:
             self.epoch_s = record.epoch_s  # by the clock of this machine
         elif isinstance(record, RunStop):
             self.end = record.index
@@ -102,10 +99,7 @@ class _Twin:
         state = self.state if self.state is not None else self.begin(block.index)
         self.state, items = pipeline.step(self.setup, state, block)
         self.say(items)
-        # While a controller is waited for, blocks are held back until the drive is found; from its
-        # first held cycle on they come as they are taken.
-        self.waits = self.waits and not np.isin(block.label, HELD).any()
-        if self.epoch_s is not None and not self.waits:
+        if self.epoch_s is not None:
             self.watch.add(self.clock.now() - self.epoch_s - (block.end - 1) / block.rate_hz)
         if block.index // len(block) % TIMING_BLOCKS == TIMING_BLOCKS - 1:
             self.say([self.watch.record(block.end)])

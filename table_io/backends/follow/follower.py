@@ -19,6 +19,7 @@ LOOK_S, LAST_LOOK_S = 1.0, 3.0  # of motion: the first try to find it in the dri
 SURE = 0.05  # of a sample: known so well, the drive is found before the last look
 ALIKE = 0.9  # correlation below which it is another drive
 LEFT = 0.3  # of the drive's amplitude, beside it: it is not this drive any more
+MOST_PPM = 500.0  # no clock runs so wrong: what drags the place along is not the drive
 SIGMAS, STEPS = 6.0, 4.0  # beyond the noise, beyond steps of the converter
 REST = -1  # place of a sample before the drive
 QUIET_S = 0.4  # in which no motion of a stepped sine is still
@@ -34,6 +35,7 @@ class Follower:
     lsb_m: float  # of its read-back
     state: str = "waiting"  # playing, left, other
     fit: Fit | None = None
+    clean: Fit | None = None  # after the last chunk with nothing but noise beside the drive
     why: str = ""  # what is played is not the drive
     left_at: int = 0  # sample from which it was not
     beside_m: tuple[float, float] = (0.0, 0.0)  # by how much, and what is allowed
@@ -71,6 +73,19 @@ class Follower:
             return False
         return not known.size or float(np.ptp(known)) <= 2.0 * self.threshold_m
 
+    @property
+    def still(self) -> bool:
+        """True where the command rests, and does so however the controller goes on.
+
+        A drive that is searched for moves, and one that is played rests in between too.
+        """
+        if self.state == "waiting":
+            return self.onset is None
+        if self.state == "playing" and self.fit is not None:
+            place = float(self.fit.at(np.array([self.done]))[0])
+            return self.quiet and place >= self.plan.rest_from
+        return self.quiet
+
 
 def advance(now: Follower, command_m: Float1D) -> Follower:
     """The follower after more samples of the measured command, (sample,); NaN where lost."""
@@ -107,14 +122,27 @@ def _looked(now: Follower) -> Follower:
         assert fit is not None
         off, swing = astray(fit, now.plan, first, chunk, now.rate_hz)
         limit = LEFT * swing + SIGMAS * max(fit.noise, now.sigma_m) + STEPS * now.lsb_m
+        after = followed(fit, now.plan, first, chunk, now.rate_hz)
+        why, beside = _wrong(after), (off, limit)
         if off > limit:
             why = (
                 f"the command is {off * 1e3:.3g} mm (rms) off the drive from sample {first} on; "
                 f"allowed: {limit * 1e3:.3g} mm"
             )
-            now = replace(now, state="left", why=why, left_at=first, beside_m=(off, limit))
+        elif abs(after.ppm) > MOST_PPM:
+            why = (
+                f"the command is {off * 1e3:.3g} mm (rms) off the drive from sample {first} on, "
+                f"and goes through it at {after.ppm:+.0f} ppm; allowed: {MOST_PPM:g} ppm"
+            )
+        elif abs(after.gain - 1.0) > LEFT and swing > 0.0:
+            whole = swing / abs(fit.gain)
+            beside = abs(after.gain - 1.0) * whole, LEFT * whole
+        if why:
+            last = now.clean or fit  # the later ones were dragged along
+            now = replace(now, state="left", why=why, left_at=first, beside_m=beside, fit=last)
         else:
-            now = replace(now, fit=followed(fit, now.plan, first, chunk, now.rate_hz))
+            noise = SIGMAS * max(fit.noise, now.sigma_m) + STEPS * now.lsb_m
+            now = replace(now, fit=after, clean=after if off <= noise else now.clean)
     return _placed(now, edge + now.chunk)
 
 
@@ -135,16 +163,30 @@ def _waited(now: Follower, first: int, chunk: Float1D) -> Follower:
     guess = begins(now.plan, now.threshold_m, now.rate_hz) - now.onset
     fit = found(now.plan, start, heard, guess, now.rate_hz, now.lsb_m)
     good = fit is not None and fit.correlation >= ALIKE
-    if fit is not None and good and (fit.sd(fit.pivot) <= SURE or seen_s >= LAST_LOOK_S):
-        return _placed(replace(now, state="playing", fit=fit), now.done + now.chunk)
+    wrong = _wrong(fit) if fit is not None and good else ""
+    ours = fit if good and not wrong else None
+    if ours is not None and (ours.sd(ours.pivot) <= SURE or seen_s >= LAST_LOOK_S):
+        playing = replace(now, state="playing", fit=ours, clean=ours)
+        return _placed(playing, now.done + now.chunk)
     if seen_s < LAST_LOOK_S:
         return now
     correlation = fit.correlation if fit is not None else 0.0
     why = f"what moves since sample {now.onset} is not this drive (correlation {correlation:.2f})"
     if correlation <= -ALIKE:
         why = f"the drive is played with the other sign (correlation {correlation:.2f})"
+    why = wrong or why
     now = replace(now, state="other", why=why, left_at=now.onset)
     return _placed(now, now.done + now.chunk)
+
+
+def _wrong(fit: Fit) -> str:
+    """Why what fits is still not the drive: its amplitude; empty where it is."""
+    if abs(fit.gain - 1.0) > LEFT + 3.0 * fit.covariance[2, 2] ** 0.5:
+        return (
+            f"the amplitude is {fit.gain:.3g} of the drive's; allowed: {1.0 - LEFT:.2g} to "
+            f"{1.0 + LEFT:.2g}"
+        )
+    return ""
 
 
 def _level(now: Follower) -> float:

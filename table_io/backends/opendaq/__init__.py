@@ -16,9 +16,10 @@ def answers(rig: Rig) -> None:
     wiring = needed(rig)
     try:
         socket.create_connection(wiring.address, ANSWER_S).close()
-    except OSError as error:
+    except (OSError, UnicodeError) as error:
+        why = getattr(error, "strerror", None) or error
         hint = f"for a simulated one: shaketwin table --rig {rig.name}" if rig.simulated else ""
         raise BadInput(
-            f"no openDAQ device answers at {wiring.device} ({error.strerror or error}); switch it "
-            f"on, or mend opendaq.device in the card{'; ' if hint else ''}{hint}"
+            f"no openDAQ device answers at {wiring.device} ({why}); switch it on, "
+            f"or mend opendaq.device in the card{'; ' if hint else ''}{hint}"
         ) from None

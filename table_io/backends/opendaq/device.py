@@ -64,7 +64,7 @@ class Device:
     @property
     def heard(self) -> bool:
         """True while somebody acquires."""
-        return bool(len(self._signals[0][0].connections))
+        return any(len(signal.connections) for signal, _ in self._signals)
 
     def unit(self, _: Sensor) -> str:
         """The unit of a signal."""

@@ -5,13 +5,13 @@ becomes the volts that the card's sensor would give. Time stamps put every sampl
 what the device or the network lost is NaN there. A read with no thread of ours polls.
 """
 
-from datetime import datetime, timedelta
 from typing import Any
 
 import numpy as np
 
 from table_io.backends import PATIENCE_S, MachineLost
-from table_io.backends.opendaq.assembly import Assembly, UnevenError, places
+from table_io.backends.opendaq.assembly import Assembly, JumpError, UnevenError, places
+from table_io.backends.opendaq.stamps import Ticking, one_clock, together
 from table_io.block import Float2D
 from table_io.card import BadInput
 from table_io.clock import Clock
@@ -21,6 +21,8 @@ from table_io.wiring.opendaq import OpenDaqWiring
 POLL_S = 0.001
 FIRST_S = 3.0  # in which the first sample must have come
 MOST = 1 << 16  # samples that one look takes of a channel
+FAR_S = 5.0  # that stamps run ahead: their clock was set
+FOLLOWS = 0.1  # of what a look shows of a clock that is disciplined against its own rate
 STEADY_S = 10.0  # over which the device's clock is held against ours
 SAME = {"m/s²": "m/s2", "m/s^2": "m/s2", "g_n": "g", "gn": "g", "µm": "um", "μm": "um"}
 
@@ -67,10 +69,11 @@ class OpenDaqSource:
         self._readers: list[Any] = []
         self._gain = np.ones(len(rig.sensors))
         self._ticks_per_sample = 1.0
-        self._seconds_per_tick = 1.0
-        self._origin = ""
+        self._ticking: Ticking | None = None
         self._newest_tick: int | None = None
         self._first_tick = 0
+        self._drifted = 0.0  # ticks by which the stamps ran ahead since then
+        self._ticks: dict[int, int] = {}  # newest of each channel
         self._assembly: Assembly | None = None
         self._epoch: float | None = None
         self._steady = (0.0, 0.0)  # until when the clocks are compared, earliest epoch seen
@@ -97,7 +100,8 @@ class OpenDaqSource:
         signals = [self._signal(name, found) for name in self.channels]
         for row, signal in enumerate(signals):
             self._gain[row] = self._volts_per(row, signal)
-        self._check_clocks(signals)
+        self._ticking = one_clock(self._daq, signals, self.rate_hz, self._wiring.device)
+        self._ticks_per_sample = self._ticking.per_sample
         float64, int64 = self._daq.SampleType.Float64, self._daq.SampleType.Int64
         self._readers = [
             self._daq.StreamReader(one, value_type=float64, domain_type=int64) for one in signals
@@ -111,6 +115,12 @@ class OpenDaqSource:
                     "acquisition"
                 )
             self._clock.wait_until(self._clock.now() + POLL_S)
+        until = self._clock.now() + PATIENCE_S
+        while len(self._ticks) < len(self.channels) and self._clock.now() < until:
+            self._look()
+            self._clock.wait_until(self._clock.now() + POLL_S)
+        at = {self.channels[row]: tick for row, tick in self._ticks.items()}
+        together(at, self._ticks_per_sample, self._wiring.device)
 
     def tare(self, samples: int) -> Float2D:
         """Volts at rest, (channel, sample): the next samples."""
@@ -126,7 +136,9 @@ class OpenDaqSource:
         self._begin()
         self._epoch = self._clock.now()
         self._steady = (self._epoch + STEADY_S, np.inf)
-        self.clock_says = f"openDAQ clock of {self._wiring.device}, sample 0 at {self._stamp()}"
+        assert self._ticking is not None
+        stamp = self._ticking.said(self._first_tick)
+        self.clock_says = f"openDAQ clock of {self._wiring.device}, sample 0 at {stamp}"
 
     def read(self, samples: int) -> Float2D:
         """Volts of the next samples, (channel, sample), when they have come."""
@@ -181,33 +193,6 @@ class OpenDaqSource:
             f"V, or {sensor.unit} as the sensor in the card. Set it in the device, or mend the card"
         )
 
-    def _check_clocks(self, signals: list[Any]) -> None:
-        """One even clock at the test's rate, for all signals; BadInput otherwise."""
-        clocks = set()
-        for signal in signals:
-            stamp = signal.domain_signal.descriptor
-            rule, tick = stamp.rule, stamp.tick_resolution
-            if rule.type != self._daq.DataRuleType.Linear or tick is None:
-                raise BadInput(
-                    f"signal {signal.global_id} is not sampled evenly; set a sample rate"
-                )
-            delta = float(rule.parameters["delta"])
-            seconds = int(tick.numerator) / int(tick.denominator)
-            if abs(delta * seconds * self.rate_hz - 1.0) > 1e-6:
-                raise BadInput(
-                    f"acquisition.rate_hz = {self.rate_hz:g}: signal {signal.global_id} is sampled "
-                    f"at {1.0 / (delta * seconds):g} Hz; set the device's rate, or the test's"
-                )
-            domain = stamp.reference_domain_info
-            source = str(domain.reference_domain_id) if domain is not None else ""
-            clocks.add((str(stamp.origin), source, delta, seconds))
-        if len(clocks) > 1:
-            raise BadInput(
-                f"the signals of {self._wiring.device} do not share one clock; take all channels "
-                "from devices on one clock"
-            )
-        self._origin, _, self._ticks_per_sample, self._seconds_per_tick = clocks.pop()
-
     def _begin(self) -> None:
         """What comes from now on counts from sample 0."""
         if not self._readers or self._newest_tick is None:
@@ -217,7 +202,8 @@ class OpenDaqSource:
         self._assembly = None
         self._look()
         self._first_tick = self._newest_tick + round(self._ticks_per_sample)
-        self._assembly = Assembly(len(self.channels))
+        self._drifted = 0.0
+        self._assembly = Assembly(len(self.channels), round(FAR_S * self.rate_hz))
 
     def _await(self, samples: int, due: float) -> Float2D:
         """The next samples, when they have come."""
@@ -235,7 +221,7 @@ class OpenDaqSource:
                     "controller, then look after the device and its cable"
                 )
             if self._clock.now() - due > PATIENCE_S and assembly.end >= last:
-                break  # a channel that has stopped is lost; the others go on
+                assembly.give_up(last)  # a channel that has stopped is lost; the others go on
             self._clock.wait_until(self._clock.now() + POLL_S)
         return assembly.take(samples)
 
@@ -250,16 +236,26 @@ class OpenDaqSource:
                 continue
             came, newest = True, int(ticks[-1])
             self._newest_tick = max(self._newest_tick or newest, newest)
+            self._ticks[row] = newest
             if self._assembly is None:
                 continue
+            clock = self._first_tick, self._ticks_per_sample, self._drifted
             try:
-                index = places(ticks, self._first_tick, self._ticks_per_sample)
+                index = places(ticks, *clock)
                 self._assembly.put(row, index, values * self._gain[row])
+            except JumpError as error:
+                raise MachineLost(
+                    f"the clock of {self._wiring.device} jumped by "
+                    f"{error.samples / self.rate_hz:.1f} s: it was set while it ran; who plays is "
+                    "not stopped by this: stop it at its controller"
+                ) from None
             except UnevenError as error:
                 raise MachineLost(
                     f"the clock of {self._wiring.device} is not even any more: {error}; who plays "
                     "is not stopped by this: stop it at its controller"
                 ) from None
+            beside = ticks - self._first_tick - self._drifted - index * self._ticks_per_sample
+            self._drifted += FOLLOWS * float(beside.mean())
         if came:
             self._keep_time()
         return came
@@ -275,12 +271,3 @@ class OpenDaqSource:
             self._epoch, until, earliest = earliest, now + STEADY_S, np.inf
         self._epoch = min(self._epoch, earliest)
         self._steady = (until, earliest)
-
-    def _stamp(self) -> str:
-        """Time stamp of sample 0, as the device tells it."""
-        seconds = self._first_tick * self._seconds_per_tick
-        try:
-            origin = datetime.fromisoformat(self._origin.replace("Z", "+00:00"))
-            return (origin + timedelta(seconds=seconds)).isoformat()
-        except (ValueError, OverflowError):
-            return f"{seconds:.6f} s after {self._origin or 'its start'}"
