@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 from pydantic import Field, ValidationInfo, field_validator
 
 from table_io.calibration_record import Calibration
-from table_io.card import Card, Finite, NonNegative, Number, Positive
+from table_io.card import BadInput, Card, Finite, NonNegative, Number, Positive
 from table_io.sensor import Sensor
 from table_io.wiring.follow import FollowWiring
 from table_io.wiring.ni import NiWiring
@@ -230,3 +230,12 @@ class Rig(Card):
     @property
     def channels(self) -> tuple[str, ...]:
         return tuple(sensor.channel for sensor in self.sensors)
+
+    def refuse_rate(self, rate_hz: float) -> None:
+        """BadInput where the rig does not sample at this rate."""
+        if rate_hz not in self.rates_hz:
+            allowed = ", ".join(f"{rate:g}" for rate in self.rates_hz)
+            raise BadInput(
+                f"acquisition.rate_hz = {rate_hz:g}: rig {self.name} does not sample so; "
+                f"allowed: {allowed}"
+            )

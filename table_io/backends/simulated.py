@@ -132,12 +132,7 @@ class SimulatedBackend:
 
     def open(self) -> None:
         """Checks the rate and compiles the plant, so that the first read is not late."""
-        if self.rate_hz not in self._rig.rates_hz:
-            allowed = ", ".join(f"{rate:g}" for rate in self._rig.rates_hz)
-            raise BadInput(
-                f"acquisition.rate_hz = {self.rate_hz:g}: rig {self._rig.name} does not sample so; "
-                f"allowed: {allowed}"
-            )
+        self._rig.refuse_rate(self.rate_hz)
         nothing = np.empty((len(self._plant.signals), 0))
         self._plant.advance(self._plant.rest(), np.zeros(self._plant.history), nothing)
         self._is_open = True

@@ -28,9 +28,7 @@ from table_io.machine.queued import Queued
 from table_io.profile import Specimen
 from table_io.rig import Rig
 
-HOLD_S = (
-    2.0  # of the last value that are kept behind what is queued, so the output does not run out
-)
+HOLD_S = 2.0  # of the last value, behind what is queued: so the output does not run out
 LOOK_S = 0.002  # of real time, between two looks at a heartbeat that is due
 PARTING_S = 0.5  # that the reader may take to end
 NO_LONGER_WRITEABLE = -200289
@@ -64,12 +62,7 @@ class NiBackend:
     def open(self) -> None:
         """Claim the device; waits where the table still comes to rest. Plays zeros, to be sure."""
         rig, rate, clock = self._rig, self.rate_hz, self._clock
-        if rate not in rig.rates_hz:
-            allowed = ", ".join(f"{one:g}" for one in rig.rates_hz)
-            raise BadInput(
-                f"acquisition.rate_hz = {rate:g}: rig {rig.name} does not sample so; allowed: "
-                f"{allowed}"
-            )
+        rig.refuse_rate(rate)
         if self._wiring.endpoint and self._channel is None:
             self._channel = reached(rig, self._wiring.endpoint)
         try:

@@ -80,12 +80,7 @@ class OpenDaqSource:
 
     def open(self) -> None:
         """Connect, find the signals, check units and rate; nothing of the device is changed."""
-        if self.rate_hz not in self._rig.rates_hz:
-            allowed = ", ".join(f"{rate:g}" for rate in self._rig.rates_hz)
-            raise BadInput(
-                f"acquisition.rate_hz = {self.rate_hz:g}: rig {self._rig.name} does not sample so; "
-                f"allowed: {allowed}"
-            )
+        self._rig.refuse_rate(self.rate_hz)
         builder = self._daq.InstanceBuilder()
         builder.global_log_level = self._daq.LogLevel.Off
         self._instance = builder.build()

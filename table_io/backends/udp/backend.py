@@ -59,12 +59,7 @@ class UdpBackend:
 
     def open(self) -> None:
         """Claim the target; waits where it still comes to rest."""
-        if self.rate_hz not in self._rig.rates_hz:
-            allowed = ", ".join(f"{rate:g}" for rate in self._rig.rates_hz)
-            raise BadInput(
-                f"acquisition.rate_hz = {self.rate_hz:g}: rig {self._rig.name} does not sample so; "
-                f"allowed: {allowed}"
-            )
+        self._rig.refuse_rate(self.rate_hz)
         state_of(self._wiring, self._clock)
         self._link = Link(self._wiring, self._clock)
         try:
