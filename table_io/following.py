@@ -23,10 +23,9 @@ from table_io.drive import Drive
 from table_io.due import overdue
 from table_io.policies import policy_of
 from table_io.profile import Profile
-from table_io.records import Event, Record, RunStop, Trip
+from table_io.records import RunStop, Trip
 from table_io.rig import Rig
 from table_io.session import (
-    LATE_S,
     TAIL_FACTOR,
     TARE_S,
     Commands,
@@ -37,6 +36,7 @@ from table_io.session import (
     Setup,
     gaps,
 )
+from table_io.telling import Telling
 from table_io.wiring.follow import FollowWiring
 from table_io.witness import ELSEWHERE, Witness, span
 
@@ -72,10 +72,10 @@ def follow(
     run = _Following(setup, source, clock)
     try:
         yield describe(run.begin(), source.scheduled(0))
-        yield from run.told()
+        yield from run.telling.told()
         while not run.over:
             late_s = run.acquire()
-            run.late(late_s)
+            run.telling.late(late_s, run.end)
             for block, clipped in run.labelled():
                 if punctuality is not None:
                     punctuality.late_s.append(late_s)
@@ -83,7 +83,7 @@ def follow(
                 yield from gaps(block, clipped)
                 run.judge(block, clipped)
             run.obey(commands())
-            yield from run.told()
+            yield from run.telling.told()
         run.finish()
     except MachineLost as error:
         run.lost(str(error))
@@ -94,8 +94,8 @@ def follow(
             punctuality.late_s.append(0.0)
         yield block
         yield from gaps(block, clipped)
-    yield from run.told()
-    yield RunStop(run.given, run.verdict, run.reason, tuple(run.states))
+    yield from run.telling.told()
+    yield RunStop(run.given, run.verdict, run.reason, tuple(run.telling.states))
 
 
 class _Following:
@@ -107,7 +107,6 @@ class _Following:
         self.rate_hz = profile.acquisition.rate_hz
         self.drive = planned(profile, rig)
         self.wiring = rig.follow or FollowWiring()
-        self.states = ["idle"]
         self.verdict, self.reason = "complete", "the whole drive was played"
         self.given = 0  # samples that were handed on
         self.over = False
@@ -121,14 +120,14 @@ class _Following:
         self._follower = Follower(self.drive, self.rate_hz, 0.0, 0.0)
         self._places, self._last = np.empty(0, dtype=np.int64), REST
         self._stop_by: int | None = None
-        self._said: list[Record] = []
-        self._was_late = self._swept = False
+        self.telling = Telling(lambda: self.given)
+        self._swept = False
 
     def begin(self) -> dict[str, float]:
         """Open, tare, start to acquire; the tare in SI."""
-        self._to("checking")
+        self.telling.to("checking")
         for sentence in overdue(self.setup.rig, today().date()):
-            self._say("calibration", sentence)
+            self.telling.say("calibration", sentence)
         self.source.open()
         volts = self.source.tare(int(TARE_S * self.rate_hz))
         self._witness = Witness(self.setup, volts)
@@ -138,41 +137,35 @@ class _Following:
         lsb, noise = 2 * sensor.range_si / 2**sensor.bits, self._witness.noise.get(sensor.channel)
         self._follower = Follower(self.drive, self.rate_hz, noise or 0.0, lsb)
         self.source.start()
-        self._to("waiting")
-        self._say("clock", f"{self.source.clock_says}; the controller's own runs beside it")
+        self.telling.to("waiting")
+        self.telling.say("clock", f"{self.source.clock_says}; the controller's own runs beside it")
         if not self._witness.guards:
-            self._say("follow", "no command is wired: protection and loop check are off")
+            self.telling.say("follow", "no command is wired: protection and loop check are off")
         if self.wiring.command == "table_disp_m":
-            self._say("follow", "the drive is looked for in table_disp_m, which lags behind it")
+            self.telling.say(
+                "follow", "the drive is looked for in table_disp_m, which lags behind it"
+            )
         text = f"play the drive file on the controller NOW; waiting for {self.wiring.wait_s:g} s"
-        self._say("follow", text)
+        self.telling.say("follow", text)
         return self._tare
 
-    def told(self) -> Iterator[Record]:
-        """What has been said since this was asked last."""
-        said, self._said = self._said, []
-        yield from said
-
-    def _say(self, kind: str, text: str) -> None:
-        self._said.append(Event(self.given, kind, text))
-
-    def _to(self, state: str) -> None:
-        if state != self.states[-1]:
-            self.states.append(state)
-            self._say("state", state)
+    @property
+    def end(self) -> int:
+        """Samples that have been acquired."""
+        return self.given + self._held.shape[1]
 
     def acquire(self) -> float:
         """Take the next block and follow it; how late it came, s."""
         volts = self.source.read(self.setup.profile.acquisition.block_samples)
         self._held = np.concatenate([self._held, volts], axis=1)
-        end = self.given + self._held.shape[1]
+        end = self.end
         late_s = self.clock.now() - self.source.scheduled(end - 1)
         before = self._follower
         command = self._command(volts)
         self._lost += int(np.isnan(command).sum())
         self._follower = now = advance(before, command)
         if now.onset is not None and before.onset is None:
-            self._say("motion", "something moves: looking for the drive in it")
+            self.telling.say("motion", "something moves: looking for the drive in it")
         if now.state != before.state:
             self._turned(now)
         self._end_if_due(end)
@@ -186,15 +179,17 @@ class _Following:
     def _turned(self, now: Follower) -> None:
         """The follower has found the drive, or lost it."""
         if now.state == "playing":
-            self._to("following")
-            self._say("aligned", aligned(self._follower))
+            self.telling.to("following")
+            self.telling.say("aligned", aligned(self._follower))
             return
-        self._to("astray")
+        self.telling.to("astray")
         if self._stop_by is None:  # else it is what was asked for
             self.verdict = "aborted"
             self.reason = f"the controller does not play the drive: {now.why}"
             text, where = f"{self.reason}; the recording goes on until rest", self.wiring.command
-            self._said.append(Trip(now.left_at, now.done, "plan", where, *now.beside_m, text))
+            self.telling.said.append(
+                Trip(now.left_at, now.done, "plan", where, *now.beside_m, text)
+            )
         if now.places.size and now.fit is not None:
             self.drive = self.drive.decayed(int(now.places[0]))
 
@@ -212,11 +207,13 @@ class _Following:
             if not now.quiet and end > (now.onset or now.left_at) + self._longest:
                 self.over = True
                 text = f"{self.wiring.command} still moves, or cannot be told from its noise"
-                self._say("stop", f"{text}: the recording ends; {ELSEWHERE}")
+                self.telling.say("stop", f"{text}: the recording ends; {ELSEWHERE}")
         if self._stop_by is not None:
             self.over = self.over or end >= self._stop_by or now.still
             if end >= self._stop_by and not now.still:
-                self._say("stop", f"the recording ends while the table still moves; {ELSEWHERE}")
+                self.telling.say(
+                    "stop", f"the recording ends while the table still moves; {ELSEWHERE}"
+                )
 
     def labelled(self) -> Iterator[tuple[Block, Bool2D]]:
         """(block in SI, True where a sample lies at its sensor's range) as far as places are told.
@@ -255,45 +252,41 @@ class _Following:
     def judge(self, block: Block, clipped: Bool2D) -> None:
         """Hold a block against the drive, and say where the sweep begins."""
         seen = block, clipped, self._places, self.drive
-        self._said.extend(self._witness.protect(*seen))
+        self.telling.said.extend(self._witness.protect(*seen))
         if self._follower.state != "playing":
             return
-        self._said.extend(self._witness.check(block, self._places, self.drive))
+        self.telling.said.extend(self._witness.check(block, self._places, self.drive))
         if not self._swept and block.step[-1] >= 0:
             self._swept = True
-            self._say("aligned", aligned(self._follower))
-
-    def late(self, late_s: float) -> None:
-        """Say where a block came late."""
-        if late_s > LATE_S and not self._was_late:
-            end = self.given + self._held.shape[1]
-            self._say("late", f"the block that ends at sample {end} came {late_s:.3f} s late")
-        self._was_late = late_s > LATE_S
+            self.telling.say("aligned", aligned(self._follower))
 
     def obey(self, order: Order | None) -> None:
         """Say that nothing can be done from here; after a stop the recording ends."""
         if order is None or self._stop_by is not None:
             return
         if order.name in ("hold", "resume"):
-            self._say("refused", f"{order.name}: the controller plays by itself, do it there")
+            self.telling.say(
+                "refused", f"{order.name}: the controller plays by itself, do it there"
+            )
             return
         self.verdict = "stopped" if order.name == "stop" else "aborted"
         self.reason = order.why
-        self._say("stop", f"{order.why}: STOP THE TABLE AT ITS CONTROLLER, it cannot be done here")
-        end = self.given + self._held.shape[1]
-        self._stop_by = end + round(PARTING_S * self.rate_hz)
+        self.telling.say(
+            "stop", f"{order.why}: STOP THE TABLE AT ITS CONTROLLER, it cannot be done here"
+        )
+        self._stop_by = self.end + round(PARTING_S * self.rate_hz)
 
     def finish(self) -> None:
         """The last words of a recording that came to its end."""
         if self._follower.fit is not None:
-            self._say("aligned", aligned(self._follower))
+            self.telling.say("aligned", aligned(self._follower))
         if self._witness.tripped and self.verdict == "complete":
             self.reason += "; protection would have stopped it, see the trip"
-        self._to("at rest" if self._follower.quiet else "left")
+        self.telling.to("at rest" if self._follower.quiet else "left")
 
     def lost(self, why: str) -> None:
         """The last words of a recording whose device no longer answers."""
-        self._to("fault")
-        end = self.given + self._held.shape[1]
-        self._said.append(Trip(end, end, "machine", "", 0.0, 0.0, why))
+        self.telling.to("fault")
+        end = self.end
+        self.telling.said.append(Trip(end, end, "machine", "", 0.0, 0.0, why))
         self.verdict, self.reason = "halted", why

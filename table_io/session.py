@@ -18,12 +18,12 @@ from table_io.clock import Clock, today
 from table_io.due import overdue
 from table_io.player import Player, Starved
 from table_io.profile import Profile
-from table_io.records import Event, Gap, Record, Response, RunStart, RunStop, Trip
+from table_io.records import Gap, Record, Response, RunStart, RunStop, Trip
 from table_io.rig import Rig
+from table_io.telling import Telling
 
 TARE_S = 1.0
 ORDER_S = 0.1  # beyond the first sample that could change: hold and resume are not urgent
-LATE_S = 0.1  # after its schedule a block is late
 TAIL_FACTOR = 0.999  # of a sensor's range: beyond it a sample counts as clipped
 
 
@@ -72,7 +72,7 @@ def play(
     try:
         tare = run.begin()
         yield describe(tare, backend.scheduled(0))
-        yield from run.told()
+        yield from run.telling.told()
         while not run.over:
             block, clipped = run.acquire(tare)
             late_s = clock.now() - backend.scheduled(block.end - 1)
@@ -80,12 +80,12 @@ def play(
                 punctuality.late_s.append(late_s)
             yield block
             yield from gaps(block, clipped)
-            run.late(late_s)
+            run.telling.late(late_s, block.end)
             run.protect(block, clipped)
             run.conduct(block)
             run.obey(commands())
             run.feed()
-            yield from run.told()
+            yield from run.telling.told()
         yield from run.finish()
     except MachineLost as error:
         yield from run.lost(str(error))
@@ -107,12 +107,10 @@ class _Run:
         self._now = conducting.start(score)
         block = profile.acquisition.block_samples
         self.player = Player(backend, clock, setup.rig.output, self._now.drive, block)
-        self.states = ["idle"]
         self.verdict, self.reason = "complete", "the whole drive was played"
         self._rest = round(profile.acquisition.rest_s * self.rate_hz)
         self._full = np.array([abs(s.range_si * s.volts_per_si) for s in setup.rig.sensors])
-        self._said: list[Record] = []
-        self._was_late = False
+        self.telling = Telling(lambda: self.player.acquired)
 
     @property
     def end(self) -> int | None:
@@ -126,9 +124,9 @@ class _Run:
 
     def begin(self) -> dict[str, float]:
         """Open, tare, start the machine; the tare in SI."""
-        self._to("checking")
+        self.telling.to("checking")
         for sentence in overdue(self.setup.rig, today().date()):
-            self._say("calibration", sentence)
+            self.telling.say("calibration", sentence)
         backend, sensors = self.player.backend, self.setup.rig.sensors
         backend.open()
         volts = backend.tare(int(TARE_S * self.rate_hz))
@@ -136,22 +134,9 @@ class _Run:
         self._guard = protection.begin(self.setup.profile, self.setup.rig, noise)
         self._now = replace(self._now, noise={name: rms for name, (rms, _) in noise.items()})
         if self._now.stage.kind != "check":
-            self._to("armed")
+            self.telling.to("armed")
         self.player.start()
         return tare_from(volts, sensors)
-
-    def told(self) -> Iterator[Record]:
-        """What has been said since this was asked last."""
-        said, self._said = self._said, []
-        yield from said
-
-    def _say(self, kind: str, text: str) -> None:
-        self._said.append(Event(self.player.acquired, kind, text))
-
-    def _to(self, state: str) -> None:
-        if state != self.states[-1]:
-            self.states.append(state)
-            self._say("state", state)
 
     def acquire(self, tare: dict[str, float]) -> tuple[Block, Bool2D]:
         """(the next block in SI, True where a sample lies at its sensor's range)."""
@@ -166,22 +151,15 @@ class _Run:
         block = Block("meas", first, self.rate_hz, rig.channels, values, *labels)
         return block, np.abs(volts) >= TAIL_FACTOR * self._full[:, None]
 
-    def late(self, late_s: float) -> None:
-        """Say where a block came late; it is no fault while the table has its command."""
-        if late_s > LATE_S and not self._was_late:
-            end = self.player.acquired
-            self._say("late", f"the block that ends at sample {end} came {late_s:.3f} s late")
-        self._was_late = late_s > LATE_S
-
     def protect(self, block: Block, clipped: Bool2D) -> None:
         """Look at a block; the first finding that must stop the table is latched."""
         seen = protection.Seen.of(block, clipped, self.player.drive)
         self._guard, findings = protection.inspect(self._guard, seen)
         for one in findings:
             if not one.stop:
-                self._said.append(one.event())
+                self.telling.said.append(one.event())
             elif not self.player.decaying:
-                self._said.append(one.trip(block.end))
+                self.telling.said.append(one.trip(block.end))
                 self.stop("aborted", one.text)
 
     def conduct(self, block: Block) -> None:
@@ -190,7 +168,7 @@ class _Run:
             return
         before = self._now
         self._now, said = conducting.advance(before, block)
-        self._said.extend(said)
+        self.telling.said.extend(said)
         for record in said:
             if isinstance(record, Response):
                 self._guard = protection.identified(self._guard, record)
@@ -199,9 +177,9 @@ class _Run:
         if self._now.refused:
             self.verdict, self.reason = "aborted", self._now.refused
         elif before.stage.kind == "check" != self._now.stage.kind:
-            self._to("armed")
-        if self.states[-1] == "armed" and block.step[-1] >= 0:
-            self._to("running")
+            self.telling.to("armed")
+        if self.telling.states[-1] == "armed" and block.step[-1] >= 0:
+            self.telling.to("running")
 
     def obey(self, order: Order | None) -> None:
         """Do what was asked, where the state allows it."""
@@ -214,16 +192,18 @@ class _Run:
         change = {"hold": conducting.hold, "resume": conducting.resume}[order.name]
         self._now = change(before, at)
         if self._now is before:
-            self._say("refused", f"{order.name} does not apply now ({self.states[-1]})")
+            self.telling.say(
+                "refused", f"{order.name} does not apply now ({self.telling.states[-1]})"
+            )
             return
         self.player.change(self._now.drive, self._now.changed)
-        self._to("holding" if order.name == "hold" else "running")
+        self.telling.to("holding" if order.name == "hold" else "running")
 
     def stop(self, verdict: str, reason: str) -> None:
         """Bring the table to rest, for good."""
         self.verdict, self.reason = verdict, reason
-        self._to("stopping")
-        self._say("stop", f"{reason}; decaying to rest")
+        self.telling.to("stopping")
+        self.telling.say("stop", f"{reason}; decaying to rest")
         self.player.decay()
 
     def feed(self) -> None:
@@ -232,26 +212,28 @@ class _Run:
             self.player.feed()
         except Starved as error:
             at = self.player.drive.decay_at or 0
-            self._said.append(Trip(at, self.player.acquired, "late", "", 0.0, 0.0, f"{error}"))
+            self.telling.said.append(
+                Trip(at, self.player.acquired, "late", "", 0.0, 0.0, f"{error}")
+            )
             self.verdict, self.reason = "aborted", str(error)
-            self._to("stopping")
+            self.telling.to("stopping")
 
     def finish(self) -> Iterator[Record]:
         """The last records of a session that came to rest."""
         if self._now.stage.kind == "open" and not self.player.decaying:
             self.verdict, self.reason = "stopped", "held for an hour without a word"
-        self._to("at rest")
-        yield from self.told()
-        yield RunStop(self.player.acquired, self.verdict, self.reason, tuple(self.states))
+        self.telling.to("at rest")
+        yield from self.telling.told()
+        yield RunStop(self.player.acquired, self.verdict, self.reason, tuple(self.telling.states))
 
     def lost(self, why: str) -> Iterator[Record]:
         """The last records of a session whose machine no longer answers."""
-        self._to("fault")
+        self.telling.to("fault")
         at = self.player.acquired
-        self._said.append(Trip(at, at, "machine", "", 0.0, 0.0, why))
-        yield from self.told()
+        self.telling.said.append(Trip(at, at, "machine", "", 0.0, 0.0, why))
+        yield from self.telling.told()
         self.player.wait_out()
-        yield RunStop(at, "halted", why, tuple(self.states))
+        yield RunStop(at, "halted", why, tuple(self.telling.states))
 
 
 def gaps(block: Block, clipped: Bool2D) -> Iterator[Gap]:
