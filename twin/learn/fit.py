@@ -13,6 +13,7 @@ from twin.learn.sheet import Sheet
 MOST_STEPS = 40
 CLOSE = 1e-6  # of the cost: what an iteration must gain to be followed by another
 STEP = 1e-4  # of a parameter's scale, for slopes
+HELD_OUT_DAMPING = (1e-9, 1e-6, 1e-4, 1e-2, 1.0)  # of the step to a fold's own fit, in turn
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +98,16 @@ class _Search:
         columns = [self.chosen(slopes(self.sheets, guess, f, whole)) for f in self.free]
         return np.array(columns).reshape(len(self.free), -1)
 
+    def stepped(
+        self, x: Float1D, hessian: Float2D, gradient: Float1D, damping: float
+    ) -> Float1D:
+        """x a damped Newton step on; what stands at a bound and would leave it stays there."""
+        outward = ((x <= self.low) & (gradient > 0)) | ((x >= self.high) & (gradient < 0))
+        inside, step = np.flatnonzero(~outward), np.zeros_like(x)
+        if inside.size:
+            step[inside] = solved(hessian[np.ix_(inside, inside)], damping, gradient[inside])
+        return np.clip(x - step, self.low, self.high)
+
     def run(self) -> Fit:
         x = np.array([f.inside(self.guess.values[f.keys[0]]) for f in self.free])
         x = np.clip(x, self.low, self.high)
@@ -108,7 +119,7 @@ class _Search:
             hessian, gradient = jacobian @ jacobian.T, jacobian @ r
             gained = 0.0
             for _ in range(8):
-                trial = np.clip(x - solved(hessian, damping, gradient), self.low, self.high)
+                trial = self.stepped(x, hessian, gradient, damping)
                 after = self.residuals(self.at(trial))
                 there = self.chosen(after)
                 new = float(there @ there)
@@ -171,13 +182,27 @@ class _Search:
         fold, r = np.concatenate(self.folds), np.concatenate(whole)
         left = [one.copy() for one in whole]
         for k in np.unique(fold[fold >= 0]):
-            others = fold != k
-            part = jacobian[:, others]
-            step = solved(part @ part.T, 1e-9, part @ r[others])
-            there = self.residuals(self.at(np.clip(x - step, self.low, self.high)))
-            for mine, one, own in zip(left, there, self.folds, strict=True):
+            there = self._without(x, r, jacobian, fold != k)
+            for mine, one, own in zip(left, there or whole, self.folds, strict=True):
                 mine[own == k] = one[own == k]
         return tuple(left)
+
+    def _without(
+        self, x: Float1D, r: Float1D, jacobian: Float2D, others: Bool2D
+    ) -> list[Float1D] | None:
+        """(entry,) a log, after one step towards the fit on the others alone; None: it is there.
+
+        The step is damped until it does what it is for: where a fold's others hardly say a
+        number, the undamped step is a leap.
+        """
+        part = jacobian[:, others]
+        hessian, gradient, before = part @ part.T, part @ r[others], float(r[others] @ r[others])
+        for damping in HELD_OUT_DAMPING:
+            there = self.residuals(self.at(self.stepped(x, hessian, gradient, damping)))
+            left = np.concatenate(there)[others]
+            if float(left @ left) <= before:
+                return there
+        return None
 
 
 def _sizes(hessian: Float2D) -> Float1D:

@@ -129,11 +129,12 @@ def named(bench: Bench, guess: Guess, tell: Tell = lambda text: None) -> Named:
     state = Named(null, null)
     try:
         while len(state.best.effects) < MOST_EFFECTS:
-            after = _swapped(bench, _added(bench, state, tell), tell)
-            if after.best is state.best:
-                state = after
+            added = _added(bench, state, tell)
+            if added.best is state.best:  # its swaps were tried when it was taken
+                state = added
                 break
-            state = replace(after, null=_null_again(bench, after.null, after.best))
+            state = _swapped(bench, added, tell)
+            state = replace(state, null=_null_again(bench, state.null, state.best))
         return replace(state, outside=_outside(bench, state.null, state.best, tell))
     except Enough:
         return replace(state, whole=False)

@@ -2,7 +2,7 @@
 
 import contextlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,11 @@ def judge(root: Path, number: int, method: Method = discovered) -> Json:
     verdict, why = _asked(method, places.shown)
     judged = cpu_seconds()
     places.verdict.write_text(dumps(verdict), encoding="utf-8")
-    row = _scored(verdict, about, None if why else _oracle(places, about))
+    truth = [one["name"] for one in about["effects"]]
+    oracle = None if why or about["kind"] == "unknown" else _fitted(places, truth)
+    row = _scored(verdict, about, oracle)
+    if oracle and about["kind"] == "pair":
+        row["mark"] = _mark(places, truth, oracle)
     told = {name: _asked(rival, places.shown) for name, rival in RIVALS.items()}
     rivals = {
         name: _scored(found, about) | ({"failed": why_not} if why_not else {})
@@ -63,13 +67,18 @@ def _asked(method: Method, shown: Path) -> tuple[Json, str]:
         return {"verdict": "failed", "reason": _said(error)}, _said(error)
 
 
-def _oracle(places: Places, about: Json) -> float | None:
-    """Held-out error of the true structure; None where no model of the library has it."""
-    if about["kind"] == "unknown":
-        return None
+def _fitted(places: Places, effects: Sequence[str]) -> float | None:
+    """Held-out error with exactly these effects; None where no model of the library has them."""
     with contextlib.suppress(Exception):  # whatever it is, the verdict stands without
-        return true_structure(places.shown, [one["name"] for one in about["effects"]])
+        return true_structure(places.shown, effects)
     return None
+
+
+def _mark(places: Places, truth: Sequence[str], oracle: float) -> float | None:
+    """By what factor the held-out error grows without one of two effects, of the lesser one."""
+    alone = [_fitted(places, [name]) for name in truth]
+    known = [one / oracle for one in alone if one is not None]
+    return min(known) if len(known) == len(truth) else None
 
 
 def _said(error: Exception) -> str:

@@ -11,6 +11,7 @@ Json = dict[str, Any]
 Z = 1.959963984540054  # two-sided 95 %
 BINS = 10  # of stated confidence
 MATTERS = 3.0  # sizes from here on are to be named
+MARKED = 1.05  # a factor of the held-out error that either of two effects makes beside the other
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +97,7 @@ def figures(rows: Sequence[Json]) -> list[Figure]:
     large = [one for one in single if one["size"] >= MATTERS]
     quiet = [one for one in large if one["noise"] <= 0.011]
     loud = [one for one in single if one["noise"] > 0.011]
+    marked = [one for one in of["pair"] if (one.get("mark") or 0.0) >= MARKED]
     named = [one for one in good if one["said"] == "named" and one["right"]]
     found = [
         _least("top-1, size >= 3, noise <= 1 %", rate(quiet, "top1"), 0.95),
@@ -112,6 +114,8 @@ def figures(rows: Sequence[Json]) -> list[Figure]:
         _least("one effect: region right", rate(of["single"], "region"), None),
         _least("two effects: both", rate(of["pair"], "both"), 0.80),
         _least("two effects: one at least", rate(of["pair"], "one"), 0.97),
+        _least("two effects, each with a mark of its own: both", rate(marked, "both"), None),
+        _least("two effects, each with a mark of its own: one", rate(marked, "one"), None),
         _calibrated(calibration(good)),
         _median("held-out after / floor, named right", named, "after_floor", 1.10),
         _least("held-out after <= 1.05 oracle, named right",
