@@ -8,7 +8,7 @@ import pytest
 
 from learn.played import SNM, hidden, log
 from twin.learn.discover import discover, prepare, structured
-from twin.learn.naming import Enough
+from twin.learn.naming import Enough, Trying
 from twin.learn.search import folds_of, products, ranked
 from twin.learn.verdict import closed_fraction
 
@@ -168,14 +168,18 @@ def test_the_oracle_is_not_far_better() -> None:
 
 
 def test_whoever_has_enough_keeps_what_was_found() -> None:
-    said: list[str] = []
+    said: list[Trying] = []
 
-    def tell(text: str) -> None:
-        said.append(text)
-        if len(said) > 4:
+    def tell(now: Trying) -> None:
+        said.append(now)
+        if now.place == 2:
             raise Enough
 
     truth = hidden("bumper_hardening", k2=3e7) + hidden("coulomb_friction", fc=30.0)
     found = discover([log(truth)], SNM, tell)
     assert not found.named.whole
-    assert found.named.null.cost > found.verdict.best.cost or not found.verdict.best.effects
+    best = said[-1].best  # of the two that it knew then: the model alone, and the first name
+    assert best is not None
+    assert best.names == said[-2].names
+    assert found.verdict.best is best
+    assert best.cost < found.named.null.cost

@@ -23,7 +23,7 @@ from twin.learn.guess import (
     log_of,
 )
 from twin.learn.library import Candidate, candidates
-from twin.learn.naming import Bench, Explained, Named, Tell, named
+from twin.learn.naming import Bench, Explained, Named, Tell, Trying, named
 from twin.learn.readings import Readings, derives_acc
 from twin.learn.sheet import Sheet, sheets_of
 from twin.learn.verdict import Verdict, judge
@@ -164,11 +164,11 @@ def _rms(residual: Float1D) -> float:
 def discover(
     logs: Sequence[Log],
     model: Model,
-    tell: Tell = lambda text: None,
+    tell: Tell = lambda now: None,
     without: Sequence[str] = (),
 ) -> Discovery:
     """What the model lacks of what the logs say; see `verdict`."""
-    tell("the model as it is")
+    tell(Trying("the model as it is"))
     prepared = prepare(logs, model, without)
     bench = prepared.bench
     found = named(bench, prepared.guess, tell)

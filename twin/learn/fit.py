@@ -1,7 +1,9 @@
 """Levenberg-Marquardt on the sheets of several logs, with spreads that coloured residuals bear."""
 
 import math
+import os
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +15,7 @@ from twin.learn.sheet import Sheet
 MOST_STEPS = 40
 CLOSE = 1e-6  # of the cost: what an iteration must gain to be followed by another
 STEP = 1e-4  # of a parameter's scale, for slopes
+LONG = 400_000  # entries of all logs: with fewer, threads cost more than they give
 HELD_OUT_DAMPING = (1e-9, 1e-6, 1e-4, 1e-2, 1.0)  # of the step to a fold's own fit, in turn
 
 
@@ -64,6 +67,20 @@ def slopes(
     ]
 
 
+def columns(
+    sheets: Sequence[Sheet], asked: Sequence[tuple[Guess, Free]], before: Sequence[Float1D]
+) -> list[list[Float1D]]:
+    """The slopes of several numbers, each about a guess; on all cores where the logs are long."""
+
+    def one(pair: tuple[Guess, Free]) -> list[Float1D]:
+        return slopes(sheets, *pair, before)
+
+    if sum(there.size for there in before) < LONG:
+        return [*map(one, asked)]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # kernels and array sums leave the lock
+        return [*pool.map(one, asked)]
+
+
 class _Search:
     """One search; x are the free values, logarithms where they are shapes."""
 
@@ -95,8 +112,8 @@ class _Search:
         return np.concatenate([row[mask] for row, mask in zip(entries, self.train, strict=True)])
 
     def jacobian(self, guess: Guess, whole: list[Float1D]) -> Float2D:
-        columns = [self.chosen(slopes(self.sheets, guess, f, whole)) for f in self.free]
-        return np.array(columns).reshape(len(self.free), -1)
+        found = columns(self.sheets, [(guess, one) for one in self.free], whole)
+        return np.array([*map(self.chosen, found)]).reshape(len(self.free), -1)
 
     def stepped(
         self, x: Float1D, hessian: Float2D, gradient: Float1D, damping: float

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import takewhile
 
 import numpy as np
 
@@ -16,10 +17,11 @@ from table_io.block import Float1D, Int1D
 from twin.learn.fit import Fit, fit
 from twin.learn.guess import Free, Guess
 from twin.learn.library import Candidate, general
-from twin.learn.search import folds_of, products, ranked
+from twin.learn.search import Finding, Products, folds_of, products, ranked
 from twin.learn.sheet import Sheet
 
 MOST_EFFECTS = 3
+COUNTS = ("one effect", "two effects", "three effects")
 REFITTED, REFITTED_GENERAL = 5, 2  # of the candidates of a round
 LEAST_REFITTED, HOPELESS = 2, 1.5  # a cost so many times that of the best is not refitted
 WORTH_A_FIT = 0.003  # of what is left: candidates that promise less are not refitted
@@ -27,9 +29,6 @@ MINOR = 0.02  # of the first gap: what a second or third effect must close at le
 SIGNIFICANT = 4.0  # standard errors that a gain must have
 PRACTICAL = 0.03  # of what is left, over all or in one row: less is not worth a name
 LEAST_ROW = 0.01  # of all entries: a row with fewer does not speak for itself
-
-Tell = Callable[[str], None]
-
 
 @dataclass(frozen=True, eq=False)
 class Explained:
@@ -51,6 +50,21 @@ class Explained:
     def cost(self) -> float:
         """Mean square of what is left, over the noise."""
         return mean_square(self.left)
+
+
+@dataclass(frozen=True, slots=True)
+class Trying:
+    """What a search is at: a set that it fits, the `place`-th `of` so many of a stage, and the best
+    until then; nothing is fitted yet where `place` is 0."""
+
+    stage: str
+    names: tuple[str, ...] = ()
+    place: int = 0
+    of: int = 0
+    best: Explained | None = None
+
+
+Tell = Callable[[Trying], None]
 
 
 def mean_square(left: Sequence[Float1D]) -> float:
@@ -122,8 +136,10 @@ class Named:
 class Enough(Exception):
     """Raised by whoever is told, to end the search with what was found."""
 
+    fitted: tuple[Explained, ...] = ()  # in the round that it ended
 
-def named(bench: Bench, guess: Guess, tell: Tell = lambda text: None) -> Named:
+
+def named(bench: Bench, guess: Guess, tell: Tell = lambda now: None) -> Named:
     """Forward selection from the base alone, with swaps of what was taken before."""
     null = bench.explain(guess, ())
     state = Named(null, null)
@@ -136,15 +152,18 @@ def named(bench: Bench, guess: Guess, tell: Tell = lambda text: None) -> Named:
             state = _swapped(bench, added, tell)
             state = replace(state, null=_null_again(bench, state.null, state.best))
         return replace(state, outside=_outside(bench, state.null, state.best, tell))
-    except Enough:
-        return replace(state, whole=False)
+    except Enough as enough:
+        return replace(_taken(bench, state, enough.fitted), whole=False)
 
 
 def _added(bench: Bench, state: Named, tell: Tell) -> Named:
     """With the best further effect, if one is worth it."""
-    current = state.best
-    round_ = _refitted(bench, current, current.effects, tell)
-    tried = (*state.tried, *round_)
+    return _taken(bench, state, _refitted(bench, state.best, state.best.effects, tell))
+
+
+def _taken(bench: Bench, state: Named, round_: Sequence[Explained]) -> Named:
+    """With the best of a round, if it is worth it."""
+    current, tried = state.best, (*state.tried, *round_)
     best = min(round_, key=lambda one: one.cost, default=current)
     minor = current.effects and current.cost - best.cost < MINOR * (state.null.cost - best.cost)
     if minor or not bench.worth(current, best):
@@ -195,24 +214,42 @@ def _refitted(
     library: Sequence[Candidate] | None = None,
 ) -> list[Explained]:
     """The best additions to the kept effects, refitted whole."""
-    guess = current.fit.guess
+    guess, unnamed = current.fit.guess, library is not None
+    stage = "terms without a name" if unnamed else COUNTS[len(kept)]
+    if dropped is not None:
+        stage += f", in the place of {dropped.name}"
+    tell(Trying(stage, best=current))
     if dropped is not None:
         guess = guess.without(dropped.name)
         guess = bench.explain(guess, kept).fit.guess
     taken = {one.name for one in kept}
-    general_terms = library is not None
+    most = REFITTED_GENERAL if unnamed else REFITTED
     if library is None:
         library = [one for one in bench.library if one.name not in taken and one is not dropped]
     if not library:
         return []
-    found = products(bench.sheets, guess, bench.free(kept), library)
-    best = ranked(found, REFITTED_GENERAL if general_terms else REFITTED)
-    outcome = []
-    for place, one in enumerate(best):
-        hopeless = place >= LEAST_REFITTED and one.cost > HOPELESS * best[0].cost
-        if hopeless or one.cost > (1.0 - WORTH_A_FIT) * found.without:
-            break
+    outcome: list[Explained] = []
+    promising = _promising(products(bench.sheets, guess, bench.free(kept), library), most)
+    for place, one in enumerate(promising, 1):
         effects = (*kept, one.candidate)
-        tell(" + ".join(k.name for k in effects))
+        named_ = () if unnamed else tuple(outcome)
+        best = min((current, *named_), key=lambda one: one.cost)
+        try:
+            tell(Trying(stage, tuple(k.name for k in effects), place, len(promising), best))
+        except Enough as enough:
+            enough.fitted = named_
+            raise
         outcome.append(bench.explain(one.put(guess), effects))
     return outcome
+
+
+def _promising(found: Products, most: int) -> list[Finding]:
+    """The best, less those that are hopeless beside the first or promise too little."""
+    best = ranked(found, most)
+
+    def good(pair: tuple[int, Finding]) -> bool:
+        place, one = pair
+        hopeless = place >= LEAST_REFITTED and one.cost > HOPELESS * best[0].cost
+        return not hopeless and one.cost <= (1.0 - WORTH_A_FIT) * found.without
+
+    return [one for _, one in takewhile(good, enumerate(best))]

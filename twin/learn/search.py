@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from table_io.block import Float1D, Float2D, Int1D
-from twin.learn.fit import slopes, solved
+from twin.learn.fit import columns, solved
 from twin.learn.guess import Free, Guess
 from twin.learn.library import Candidate
 from twin.learn.sheet import Sheet
@@ -97,22 +97,21 @@ def products(
     """The products at a guess, over all logs. What stands at a bound is taken to stay there."""
     free = [one for one in free if one.low < guess.values[one.keys[0]] < one.high]
     before = [sheet.residual(guess) for sheet in sheets]
-    columns = [[*slopes(sheets, guess, one, before)] for one in free]
+    asked = [(guess, one) for one in free]
     variants = []
     for candidate in library:
-        amplitude = candidate.amplitude
+        amplitude, vanishing = candidate.amplitude, candidate.vanishing
+        sign = int(amplitude.low >= vanishing) - int(amplitude.high <= vanishing)
         for shape in candidate.shapes:
-            slope = slopes(sheets, candidate.put(guess, shape), amplitude, before)
-            vanishing = candidate.vanishing
-            sign = int(amplitude.low >= vanishing) - int(amplitude.high <= vanishing)
-            variants.append(Variant(candidate, shape, len(columns), sign))
-            columns.append(slope)
+            variants.append(Variant(candidate, shape, len(asked), sign))
+            asked.append((candidate.put(guess, shape), amplitude))
+    found = columns(sheets, asked, before)
     hessians, gradients, squares, folds = [], [], [], []
     for k, sheet in enumerate(sheets):
         unit = units_of(sheet)
         order = np.argsort(unit, kind="stable")
         edges = np.searchsorted(unit[order], np.arange(unit.max() + 2))
-        rows = np.array([column[k] for column in columns], dtype=np.float32)[:, order]
+        rows = np.array([column[k] for column in found], dtype=np.float32)[:, order]
         left = before[k][order].astype(np.float32)
         rest = bool((sheet.row_of == len(sheet.rows)).any())
         for u, (first, last) in enumerate(pairwise(edges)):

@@ -15,6 +15,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from threading import Lock
 
 import numpy as np
 import numpy.typing as npt
@@ -54,14 +55,19 @@ class Sheet:
     weight: float = 1.0  # of the noise: above 1 where the model's error, not noise, is the limit
     thinned: int = 1  # of each step's cycles, and of the blocks outside them, one part in so many
     _motions: dict[tuple[Sensor, ...], Motion] = field(default_factory=dict)
+    _lock: Lock = field(default_factory=Lock)  # of the motions: slopes are taken in threads
 
     def motion(self, sensors: tuple[Sensor, ...] = ()) -> Motion:
         """The motion for a belief about the sensors; the last few are remembered."""
-        if sensors not in self._motions:
-            while len(self._motions) > KEPT:
-                self._motions.pop(next(key for key in self._motions if key))
-            self._motions[sensors] = self.readings.motion(sensors)
-        return self._motions[sensors]
+        with self._lock:
+            found = self._motions.get(sensors)
+        if found is None:
+            found = self.readings.motion(sensors)
+            with self._lock:
+                while len(self._motions) > KEPT:
+                    self._motions.pop(next(key for key in self._motions if key))
+                self._motions[sensors] = found
+        return found
 
     @cached_property
     def touched(self) -> npt.NDArray[np.int8]:

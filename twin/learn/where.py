@@ -69,19 +69,21 @@ def cells(sheets: Sequence[Sheet], left: Sequence[Float1D], floor: float) -> tup
     found = []
     for sheet, r in zip(sheets, left, strict=True):
         step = sheet.readings.step[sheet.sample_of]
-        phase = phase_of(sheet)
-        for row, name in enumerate(sheet.rows):
-            for number in np.unique(step[(sheet.row_of == row) & (step >= 0)]):
-                for k, label in enumerate(PHASES):
-                    mine = (sheet.row_of == row) & (step == number) & (phase == k)
-                    if mine.any():
-                        found.append(_cell(sheet, r, mine, int(number), label, name, floor))
+        held = np.flatnonzero((step >= 0) & (sheet.row_of < len(sheet.rows)))
+        keys = np.stack([sheet.row_of, step, phase_of(sheet)])[:, held]
+        order = np.lexsort(keys[::-1])
+        keys = keys[:, order]
+        new = np.diff(keys, axis=1, prepend=-1).any(axis=0)
+        parts = np.split(held[order], np.flatnonzero(new)[1:]) if held.size else []
+        for (row, number, phase), mine in zip(keys[:, new].T.tolist(), parts, strict=True):
+            found.append(_cell(sheet, r, mine, number, PHASES[phase], sheet.rows[row], floor))
     return tuple(found)
 
 
 def _cell(
     sheet: Sheet, r: Float1D, mine: Int1D, step: int, phase: str, row: str, floor: float
 ) -> Cell:
+    """The cell of the entries at the places `mine`."""
     squares = r[mine] ** 2
     blocks = np.unique(sheet.block_of[mine], return_inverse=True)[1]
     sums = np.bincount(blocks, weights=squares - floor)

@@ -1,14 +1,18 @@
 """`shaketwin discover`: the shell round `twin.learn.discover`."""
 
 import contextlib
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from table_io.card import BadInput
 from table_io.clock import RealClock
 from table_io.profile import Specimen
 from twin.learn.discover import Discovery, Log, discover, transferred
-from twin.learn.naming import Enough, Tell
+from twin.learn.naming import Enough, Tell, Trying
 from twin.model.card import ModelCard
 from twin.model.effects import find_effect
 from twin.model.model import Model
@@ -45,10 +49,10 @@ def discover_command(
     try:
         with interruptible("stopping: what was found is kept") as stop, searching() as show:
 
-            def tell(text: str) -> None:
+            def tell(now: Trying) -> None:
                 if stop():
                     raise Enough
-                show(text)
+                show(now)
 
             logs, notes = logs_of(paths)
             apart = logs_of(held_out)[0] if held_out else ()
@@ -76,12 +80,39 @@ def discover_command(
 
 @contextlib.contextmanager
 def searching() -> Iterator[Tell]:
-    """What is being tried: a moving line on a terminal, plain lines elsewhere."""
+    """What is being tried and the best so far: a bar on a terminal, plain lines elsewhere."""
     if not console.is_terminal:
-        yield lambda text: say(f"  trying {text}")
+        yield lambda now: say(f"  {_plain(now)}") if now.place or not now.best else None
         return
-    with console.status("the model as it is") as status:
-        yield lambda text: status.update(f"trying {text}")
+    bar = Progress(
+        TextColumn("{task.description}"), BarColumn(bar_width=16), MofNCompleteColumn(),
+        TextColumn("[green]{task.fields[best]}"), TimeElapsedColumn(), console=console,
+        transient=True,
+    )  # fmt: skip
+    task = bar.add_task("", total=None, best="")
+
+    def show(now: Trying) -> None:
+        what = " + ".join(now.names) or now.stage
+        bar.update(
+            task, description=escape(what), total=now.of or None, completed=max(now.place - 1, 0),
+            best=escape(_best(now)),
+        )  # fmt: skip
+
+    with bar:
+        yield show
+
+
+def _plain(now: Trying) -> str:
+    if not now.place:
+        return f"trying {now.stage}"
+    return f"trying {' + '.join(now.names)} ({now.place} of {now.of}); {_best(now)}"
+
+
+def _best(now: Trying) -> str:
+    if now.best is None:
+        return ""
+    what = " + ".join(now.best.names) or "nothing added"
+    return f"best so far {what}: {math.sqrt(now.best.cost):.3g} of noise"
 
 
 def leave(folder: Path, found: Discovery, card: ModelCard, logs: Sequence[Log], told: Json) -> None:
@@ -104,9 +135,10 @@ def say_verdict(told: Json) -> None:
     gap = told["gap"]
     say(f"{told['verdict']}: {names}" if names else told["verdict"])
     say(f"  {told['why']}")
+    closed = f": {100 * gap['closed_fraction']:.0f} % closed" if told["effects"] else ""
     say(
         f"  gap {gap['held_out_before']:.3g} -> {gap['held_out_after']:.3g}, noise "
-        f"{gap['noise_floor']:.3g}: {100 * gap['closed_fraction']:.0f} % closed (held out)"
+        f"{gap['noise_floor']:.3g}{closed} (held out)"
     )
     for one in told["effects"]:
         for name, value in one["parameters"].items():
