@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from twin.learn.guess import ZERO
 from twin.learn.naming import Bench, Explained, Named
 
 AS_GOOD = 3.5  # standard errors by which others must be worse, else the data cannot tell
@@ -172,7 +173,13 @@ def _rivals(bench: Bench, named: Named) -> list[tuple[Explained, float]]:
         and frozenset(one.names) != frozenset(best.names)
         and named.null.cost - one.cost >= NEARLY * (named.null.cost - best.cost)
         and not _limit(one, best)
+        and not _strained(one) - _strained(best)
     ]
+
+
+def _strained(one: Explained) -> set[str]:
+    """The tares that a fit needs further off than a tare can be: that alone speaks against it."""
+    return {name for name in one.fit.at_bound if name.startswith(ZERO)}
 
 
 def _limit(one: Explained, best: Explained) -> bool:
