@@ -20,10 +20,10 @@ from twin.service.bundle import read_bundle
 from twin.service.importing import take_in
 from twin.service.learning import command
 from twin.service.learning.command import discover_command, model_of
-from twin.service.learning.figures_evidence import free_run
 from twin.service.learning.identify import identify_command
 from twin.service.learning.logs import logs_of
 from twin.service.learning.page import sentence
+from twin.service.learning.running_free import free_run
 from twin.service.outcome import EXIT_INTERRUPTED
 from twin.service.runs import play_unpaced
 from twin.stream.recording import read

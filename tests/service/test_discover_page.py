@@ -17,9 +17,10 @@ from twin.model.forced import along
 from twin.service.bundle import read_bundle
 from twin.service.figures import STYLE
 from twin.service.learning.command import leave, model_of
-from twin.service.learning.figures_evidence import Shown, free_run, gates, measured_forces, spread
+from twin.service.learning.figures_evidence import Shown, gates, measured_forces, spread
 from twin.service.learning.logs import logs_of, names_of
-from twin.service.learning.page import rounded, sentence
+from twin.service.learning.page import rounded, sentence, telling
+from twin.service.learning.running_free import free_run, misfits, runs_of
 from twin.service.learning.told import Json, verdict_json
 from twin.service.runs import play_unpaced
 
@@ -142,8 +143,8 @@ def test_the_page_says_the_verdict_the_gap_and_what_to_do(one: Left) -> None:
     for effect in one.told["effects"]:
         assert effect["id"] in page
         for name, value in effect["parameters"].items():
-            numbers = [rounded(value[key]) for key in ("value", "low", "high")]
-            cells = "".join(f"<td>{number}</td>" for number in numbers)
+            numbers = [value[key] for key in ("value", "low", "high")]
+            cells = "".join(f"<td>{rounded(one, telling(*numbers))}</td>" for one in numbers)
             assert f'<td class="text">{name}</td>{cells}' in page
 
 
@@ -252,6 +253,33 @@ def test_the_twin_comes_nearer_when_it_runs_free(every: dict[str, Left]) -> None
         assert 0.05 < forward[0][0].eta_d < 0.5
         errors.append(sum((twin.eta_a - rig.eta_a) ** 2 for rig, twin in forward))
     assert errors[1] < 0.25 * errors[0]
+
+
+def test_the_table_of_the_curves_says_how_much_nearer(every: dict[str, Left]) -> None:
+    one = every["named"]
+    shown = Shown(one.found, one.logs)
+    runs = runs_of(shown)
+    (row,) = misfits(shown, runs)
+    measured = max(p.measured.eta_d for p in runs[0][0] if p.measured is not None)
+    assert row["measured"]["eta_d"] == measured
+    assert row["after"]["error"] < 0.25 * row["before"]["error"]
+    assert f"<b>{100 * row['after']['error']:.2g} %</b>" in one.page
+    same = replace(one.found.named, null=one.found.verdict.best)  # nothing before but what is after
+    (row,) = misfits(again := Shown(replace(one.found, named=same), one.logs), runs_of(again))
+    assert row["before"] == row["after"]
+
+
+@pytest.mark.parametrize(
+    ("value", "half", "said"),
+    [(510000.0, 300.0, ("510\u2009000", "509\u2009700", "510\u2009300")),
+     (1500.4, 0.45, ("1500.40", "1499.95", "1500.85")), (0.4, 0.2, ("0.4000", "0.2000", "0.6000")),
+     (3.0, 0.0, ("3.000", "3.000", "3.000"))],
+)  # fmt: skip
+def test_an_interval_can_be_told_from_its_value(
+    value: float, half: float, said: tuple[str, ...]
+) -> None:
+    numbers = (value, value - half, value + half)
+    assert tuple(rounded(one, telling(*numbers)) for one in numbers) == said
 
 
 def test_the_gates_pass_where_no_sensor_errs_and_fail_where_one_does(

@@ -115,9 +115,7 @@ class _Search:
         found = columns(self.sheets, [(guess, one) for one in self.free], whole)
         return np.array([*map(self.chosen, found)]).reshape(len(self.free), -1)
 
-    def stepped(
-        self, x: Float1D, hessian: Float2D, gradient: Float1D, damping: float
-    ) -> Float1D:
+    def stepped(self, x: Float1D, hessian: Float2D, gradient: Float1D, damping: float) -> Float1D:
         """x a damped Newton step on; what stands at a bound and would leave it stays there."""
         outward = ((x <= self.low) & (gradient > 0)) | ((x >= self.high) & (gradient < 0))
         inside, step = np.flatnonzero(~outward), np.zeros_like(x)

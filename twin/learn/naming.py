@@ -30,6 +30,7 @@ SIGNIFICANT = 4.0  # standard errors that a gain must have
 PRACTICAL = 0.03  # of what is left, over all or in one row: less is not worth a name
 LEAST_ROW = 0.01  # of all entries: a row with fewer does not speak for itself
 
+
 @dataclass(frozen=True, eq=False)
 class Explained:
     """A set of effects with its best parameters, and what it leaves where it was not fitted."""

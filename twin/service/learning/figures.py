@@ -18,6 +18,7 @@ from table_io.block import Float1D, Float2D
 from table_io.records import Step
 from twin.learn.general import GENERAL
 from twin.learn.guess import ZERO
+from twin.learn.naming import MINOR
 from twin.learn.sheet import FORCES, Sheet
 from twin.learn.where import Cell
 from twin.service.close_ups import COLOUR, GUIDE, WIDTH, Drawn
@@ -25,9 +26,11 @@ from twin.service.figures import STYLE, Picture
 from twin.service.learning.figures_evidence import Shown, phases_of, repeats
 from twin.service.learning.figures_forces import forces, histories
 from twin.service.learning.figures_twin import curves
+from twin.service.learning.running_free import Runs
 from twin.service.learning.told import Json
 
-MOST_LOGS, MOST_BARS, MOST_TICKS = 4, 24, 24
+MOST_LOGS, MOST_BARS, MOST_TICKS = 6, 24, 24
+ROOMY = 0.3  # of the longest bar: one that is longer has its note inside
 LEAST_EXCESS = 0.1  # of the noise: where the colours begin
 LEAST_TOP = 10.0  # where they end at least: what is but noise stays pale
 SIGNIFICANT = 3.0  # standard errors: a cell with more is marked
@@ -37,13 +40,16 @@ SHORT = {
 BEFORE, AFTER, BEST, OUTSIDE = "#8b929c", "#1a7f37", "#1a7f37", "#d98a1f"
 
 
-def draw_all(shown: Shown, told: Json, folder: Path) -> dict[str, list[Picture]]:
+def draw_all(
+    shown: Shown, told: Json, runs: dict[int, Runs], folder: Path
+) -> dict[str, list[Picture]]:
     """Section of the page -> its pictures, as PNG files in `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
     with mpl.rc_context(STYLE):
         drawn = {
             "where": _maps(shown), "candidates": _candidates(told), "forces": forces(shown),
-            "histories": histories(shown), "twin": curves(shown), "time": _time(shown),
+            "histories": histories(shown), "twin": curves(shown, runs, chosen_logs(shown)),
+            "time": _time(shown),
         }  # fmt: skip
         return {
             section: [_saved(folder, *one) for one in pictures]
@@ -60,11 +66,6 @@ def chosen_logs(shown: Shown) -> list[int]:
     """The logs that are drawn, the worst of them where there are many."""
     squares = [float(one @ one) / max(one.size, 1) for one in shown.pair[0].left]
     return sorted(np.argsort(squares)[::-1][:MOST_LOGS].tolist())
-
-
-def named_log(shown: Shown, number: int) -> str:
-    """ " · log" where there are several."""
-    return f" · {shown.sheets[number].readings.name}" if len(shown.sheets) > 1 else ""
 
 
 def _maps(shown: Shown) -> Drawn:
@@ -84,7 +85,7 @@ def _maps(shown: Shown) -> Drawn:
                 f"{SIGNIFICANT:g} standard errors). Hatched: the measured motion does not repeat "
                 "from period to period (chaos, or a passage); forces along it still compare."
             )
-            yield f"map_{number}", f"Disagreement{named_log(shown, number)}", caption, figure
+            yield f"map_{number}", f"Disagreement{shown.of_log(number)}", caption, figure
 
 
 def _map(sheet: Sheet, steps: Sequence[Step], maps: list[list[Cell]]) -> Figure:
@@ -175,9 +176,11 @@ def _candidates(told: Json) -> Drawn:
     far = sets[-1]["held_out_error"] > 8 * min(best, floor)
     for y, one in enumerate(sets):
         ax.barh(y, one["held_out_error"], color=_bar(one, null, added), height=0.68)
+        inside = bool(_doubts(one)) and one["held_out_error"] > ROOMY * sets[-1]["held_out_error"]
         ax.annotate(
-            f"{one['held_out_error']:.3g}{_doubts(one)}", (one["held_out_error"], y), (4, 0),
-            textcoords="offset points", va="center", size=7.5, color=GUIDE,
+            f"{one['held_out_error']:.3g}{_doubts(one)}", (one["held_out_error"], y),
+            (-4 if inside else 4, 0), textcoords="offset points", va="center", size=7.5,
+            ha="right" if inside else "left", color="#111111" if inside else GUIDE,
         )  # fmt: skip
     ax.set_yticks(range(len(sets)), [one["id"].replace(f"{GENERAL}.", "") for one in sets], size=8)
     ax.set_ylim(len(sets) - 0.4, -0.6)
@@ -199,7 +202,8 @@ def _candidates(told: Json) -> Drawn:
     more = len(every) - len(sets)
     caption = (
         "Every set was fitted on two thirds of the steps and judged on the third that was left "
-        "out, in turn, together with the model's own parameters."
+        "out, in turn, together with the model's own parameters. A further effect is taken only "
+        f"where it closes {100 * MINOR:g} % of the first gap at least, and more than chance does."
     )
     caption += f" {more} worse sets are not drawn." if more > 0 else ""
     yield "candidates", "What was tried", caption, figure
@@ -252,7 +256,7 @@ def _time(shown: Shown) -> Drawn:
             "forcing cycle (a second where nothing is held). What grows or falls along the test "
             "is a drift; what follows the steps is not."
         )
-        title = f"Over the test{named_log(shown, number)}"
+        title = f"Over the test{shown.of_log(number)}"
         yield f"time_{number}", title, caption, figure
 
 

@@ -1,4 +1,4 @@
-"""What the pictures of a discovery show, looked up in it: forces, close-ups, free runs, gates.
+"""What the pictures of a discovery show, looked up in it: forces, close-ups, gates.
 
 Before is the model alone, refitted; after is what the verdict stands for. Both as they are on what
 was held out of their fits.
@@ -6,31 +6,25 @@ was held out of their fits.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from table_io.block import Block, Float1D, Int1D, Label
-from table_io.channels import LEFT_CELLS, RIGHT_CELLS
-from table_io.records import Point, Step
-from twin.compare.cycles import Scale
-from twin.compare.pipeline import Setup, start, step
-from twin.compare.windows import TwinSetup
+from table_io.block import Float1D, Int1D, Label
+from table_io.records import Step
 from twin.learn.discover import Discovery, Log
 from twin.learn.guess import Guess
 from twin.learn.motion import Motion
 from twin.learn.naming import Explained
 from twin.learn.sheet import FORCES, Sheet
 from twin.learn.where import PHASES, phase_of
-from twin.model.parameters import resonance
 
 LEAST_ENTRIES = 20  # of a step in a row, to be looked at
 STEPPED = 0.4  # of the time that it moves: less in steps is no stepped sine
 CYCLES = 2  # of a step in a close-up
 SPAN_S = 3.0  # of a close-up where there are no steps
 REPEATS = 0.3  # of the rms of u: a motion that differs more from period to period does not repeat
-WINDOW_S = 0.5
 FAILS, SURE = 0.1, 4.0  # excess over the noise, and its standard errors, that fail a gate
 Pair = tuple[Explained, Explained]
 
@@ -83,6 +77,10 @@ class Shown:
         v = self.found.verdict
         names = v.general.names[-1:] if v.general else v.best.names
         return " + ".join(names)
+
+    def of_log(self, number: int) -> str:
+        """ " · log" where there are several, to end a title."""
+        return f" · {self.sheets[number].readings.name}" if len(self.sheets) > 1 else ""
 
     def steps(self, number: int) -> tuple[Step, ...]:
         """The steps of a log; none where they are but spots of a motion that is no stepped sine."""
@@ -209,45 +207,6 @@ def repeats(sheet: Sheet, one: Step) -> bool:
     later = t + 1.0 / one.frequency_hz <= t[-1]
     change = np.interp(t[later] + 1.0 / one.frequency_hz, t, u) - u[later]
     return float(change.std()) <= REPEATS * float(u.std())
-
-
-def free_run(sheet: Sheet, steps: Sequence[Step], one: Explained) -> list[Point]:
-    """The PRC points of a log, measured and by the model running free on the measured table.
-
-    None where the table's acceleration or the steps are not known. Sensors that are known to err
-    are read as the explanation has them.
-    """
-    guess = one.fit.guess
-    m = sheet.motion(guess.sensors())
-    if not steps or not np.isfinite(m.table_acc).all() or not np.isfinite(m.acc).all():
-        return []
-    held = m.label == Label.MEASURE
-    cycles = [np.unique(m.cycle[held & (m.step == s.index)]).size for s in steps]
-    level = math.sqrt(2.0) * float(m.table_acc[held].std()) if held.any() else 0.0
-    if level == 0.0 or max(cycles) == 0 or sheet.reference.parameters.damping == 0:
-        return []
-    columns = {"rel_disp_m": m.u, "table_disp_m": m.table_disp, "table_acc_m_s2": m.table_acc}
-    columns["mass_acc_m_s2"] = m.acc
-    if m.cells:
-        columns |= dict.fromkeys(RIGHT_CELLS, 0.5 * m.right) | dict.fromkeys(
-            LEFT_CELLS, 0.5 * m.left
-        )
-    first = round(m.time_s[0] * m.rate_hz)
-    block = Block(
-        "meas", first, m.rate_hz, tuple(columns), np.array([*columns.values()]),
-        m.step.copy(), m.label.copy(), m.cycle.copy(),
-    )  # fmt: skip
-    model = guess.local(sheet.number, m)
-    window = round(WINDOW_S * m.rate_hz)
-    twin = TwinSetup(model, m.rate_hz, window, window, sheet.contact_n)
-    u_star, a_star, _ = resonance(replace(sheet.reference.parameters, mass=m.mass_kg), level)
-    gaps = model.parameters.gap_r, model.parameters.gap_l
-    scale = Scale(model.parameters, m.rate_hz, sheet.contact_n, u_star, a_star, gaps)
-    driven = tuple(replace(one, acceleration_m_s2=level) for one in steps)
-    setup = Setup(twin, scale, driven, max(cycles))
-    state, _ = start(setup, first)
-    _, items = step(setup, state, block)
-    return [item for item in items if isinstance(item, Point)]
 
 
 def gates(shown: Shown) -> list[Gate]:

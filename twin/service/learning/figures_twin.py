@@ -12,33 +12,37 @@ from table_io.block import Float1D
 from table_io.records import Point
 from twin.service.close_ups import COLOUR, DASH, TWIN, WIDTH, Drawn
 from twin.service.evidence import DIRECTIONS
-from twin.service.learning.figures_evidence import Shown, free_run
+from twin.service.learning.figures_evidence import Shown
+from twin.service.learning.running_free import Runs
 
 LABELS = {
     "eta_d": r"$\eta_d$, displacement", "eta_a": r"$\eta_a$, acceleration",
     "impacts_right": "impacts right", "impacts_left": "impacts left",
 }  # fmt: skip
-Runs = tuple[list[Point], list[Point]]
 
 
-def curves(shown: Shown) -> Drawn:
-    """PRCs and impacts of the worst log, before left, after right."""
-    sheet, steps = shown.sheets[shown.worst], shown.steps(shown.worst)
-    before, after = (free_run(sheet, steps, one) for one in shown.pair)
-    if not before or not after:
-        return
+def curves(shown: Shown, runs: dict[int, Runs], chosen: Sequence[int]) -> Drawn:
+    """PRCs and impacts of the chosen logs, before left, after right."""
+    for number in chosen:
+        if number in runs:
+            yield from _of_log(shown, runs[number], number)
+
+
+def _of_log(shown: Shown, runs: Runs, number: int) -> Drawn:
+    name = shown.of_log(number)
+    stem = f"_{number}" if name else ""
     caption = (
         "Per step, on its steady cycles. The twin runs freely from the first sample on, on the "
         "measured table acceleration, with the parameters fitted on all steps. In chaotic bands "
         "neither can follow the other's trajectory; sizes compare, samples do not."
     )
-    names = ["eta_d", "eta_a"]
-    figure = _figure((before, after), names)
-    yield "prc", "Pseudo-resonance curves, measured and by the twin", caption, figure
-    names = ["impacts_right", "impacts_left"]
-    if any(_curve(before, "measured", way, name)[1].any() for way in DIRECTIONS for name in names):
+    figure = _figure(runs, ["eta_d", "eta_a"])
+    yield f"prc{stem}", f"Pseudo-resonance curves, measured and by the twin{name}", caption, figure
+    sides = ["impacts_right", "impacts_left"]
+    if any(_curve(runs[0], "measured", way, one)[1].any() for way in DIRECTIONS for one in sides):
         caption = "Mean over the steady cycles of a step, from the load cells, and by the twin."
-        yield "impacts", "Impacts per forcing cycle", caption, _figure((before, after), names)
+        title = f"Impacts per forcing cycle{name}"
+        yield f"impacts{stem}", title, caption, _figure(runs, sides)
 
 
 def _curve(points: Sequence[Point], who: str, direction: str, name: str) -> tuple[Float1D, Float1D]:

@@ -14,9 +14,11 @@ from twin.learn.guess import GAP
 from twin.learn.search import LEAST_UNITS
 from twin.service.learning.figures import draw_all
 from twin.service.learning.figures_evidence import Shown, gates
+from twin.service.learning.running_free import misfits, runs_of
 from twin.service.learning.told import REFITTED, Json
 from twin.service.page import inside, page, significant
 
+LEAST_DIGITS, MOST_DIGITS = 4, 8  # of a number that was fitted
 WORDS = {
     "none": "Model and measurement agree to within the noise.",
     "named": "The model lacks {names}.",
@@ -33,7 +35,8 @@ SECTIONS = {
 def write_page(folder: Path, found: Discovery, logs: Sequence[Log], told: Json) -> Path:
     """Path of folder/report.html, with its figures in folder/figures."""
     shown = Shown(found, logs)
-    pictures = draw_all(shown, told, folder / "figures")
+    runs = runs_of(shown)
+    pictures = draw_all(shown, told, runs, folder / "figures")
     text = page(
         Path(__file__).with_name("page.html"),
         told=told,
@@ -44,6 +47,7 @@ def write_page(folder: Path, found: Discovery, logs: Sequence[Log], told: Json) 
         sections=SECTIONS,
         whole=found.named.whole,
         gates=gates(shown),
+        misfits=misfits(shown, runs),
         images={section: inside(some) for section, some in pictures.items()},
         model=(folder / "model.toml").read_text(encoding="utf-8"),
     )
@@ -82,8 +86,10 @@ def rows(told: Json, names: Sequence[str]) -> list[tuple[str, str, list[str], st
     for what, parameters in (*groups, ("the model's own, refitted", base)):
         for k, (name, value) in enumerate(parameters.items()):
             factor, unit = (1e3, "mm") if value["unit"] == "m" else (1.0, value["unit"] or "–")
-            numbers = [rounded(factor * value[key]) for key in ("value", "low", "high")]
-            found.append(("" if k else what, name, numbers, unit))
+            numbers = [factor * value[key] for key in ("value", "low", "high")]
+            digits = telling(*numbers)
+            shown = [rounded(one, digits) for one in numbers]
+            found.append(("" if k else what, name, shown, unit))
     return found
 
 
@@ -92,11 +98,21 @@ def _gap(name: str, logs: Sequence[str]) -> str:
     return f"each gap wider, {logs[int(number)]}" if number.isdigit() else name
 
 
-def rounded(value: float) -> str:
-    """Four significant digits, thousands apart."""
+def telling(value: float, low: float, high: float) -> int:
+    """Significant digits of a value that show two of its interval's half width."""
+    half, most = 0.5 * (high - low), max(map(abs, (value, low, high)))
+    if not (half > 0 and math.isfinite(half)):
+        return LEAST_DIGITS
+    digits = math.floor(math.log10(most)) - math.floor(math.log10(half)) + 2
+    return min(max(digits, LEAST_DIGITS), MOST_DIGITS)
+
+
+def rounded(value: float, digits: int = LEAST_DIGITS) -> str:
+    """So many significant digits, thousands apart."""
     if math.isfinite(value) and abs(value) >= 1e4:
-        return f"{float(f'{value:.4g}'):,.0f}".replace(",", "\u2009").replace("-", "−")
-    return significant(value, 4)
+        whole = float(f"{value:.{digits}g}")
+        return f"{whole:,.0f}".replace(",", "\u2009").replace("-", "−")
+    return significant(value, digits)
 
 
 def held_out(shown: Shown) -> str:
