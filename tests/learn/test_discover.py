@@ -3,6 +3,8 @@
 The whole study is `shaketwin study discovery`; here stands one case of each kind of verdict.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from learn.played import SNM, hidden, log
 from twin.learn.discover import discover, prepare, structured
 from twin.learn.naming import Enough, Trying
 from twin.learn.search import folds_of, products, ranked
-from twin.learn.verdict import closed_fraction
+from twin.learn.verdict import closed_fraction, judge
 
 
 def test_where_nothing_is_hidden_nothing_is_named() -> None:
@@ -183,3 +185,13 @@ def test_whoever_has_enough_keeps_what_was_found() -> None:
     assert best.names == said[-2].names
     assert found.verdict.best is best
     assert best.cost < found.named.null.cost
+
+
+def test_a_rival_that_needs_a_tare_off_beyond_all_doubt_is_none() -> None:
+    found = discover([log(hidden("bumper_hardening", k2=3e7))], SNM)
+    named, bench = found.named, found.prepared.bench
+    other = next(one for one in bench.library if one.name == "gap_drift")
+    as_good = replace(named.best, effects=(other,))  # the very same residual under another name
+    assert judge(bench, replace(named, tried=(as_good,)), 1.0).word == "ambiguous"
+    strained = replace(as_good, fit=replace(as_good.fit, at_bound=("zero0.u",)))
+    assert judge(bench, replace(named, tried=(strained,)), 1.0).word == "named"
