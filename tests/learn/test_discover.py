@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from learn.played import SNM, hidden, log
-from twin.learn.discover import discover, prepare, structured
+from twin.learn.discover import Log, discover, prepare, structured
 from twin.learn.naming import Enough, Trying
 from twin.learn.search import folds_of, products, ranked
 from twin.learn.verdict import closed_fraction, judge
@@ -107,6 +107,33 @@ def test_the_place_of_the_disagreement() -> None:
     assert sum(cell.excess * cell.count for cell in found.map_after) < 0.1 * sum(
         cell.excess * cell.count for cell in found.map_before
     )
+
+
+def test_a_motion_without_steps_has_a_place_too() -> None:
+    """In flight, and within the band in which the table was driven."""
+    one = log(hidden("cubic_stiffness", k3=3e8))
+    driven = [step.frequency_hz for step in one.steps]
+    nowhere = np.full(one.readings.step.size, -1)
+    found = discover([Log(replace(one.readings, step=nowhere), one.contact_n)], SNM)
+    assert found.where.frequency_hz is not None
+    low, high = found.where.frequency_hz
+    assert 0.8 * min(driven) < low < high < 3.5 * max(driven)  # with the third harmonic
+    assert found.where.channels == ("mass_acc_m_s2",)
+    assert found.where.direction == "both"
+
+
+def test_where_several_sets_do_as_well_what_they_share_is_named() -> None:
+    found = discover([log(hidden("bumper_hardening", k2=3e7))], SNM)
+    named, bench = found.named, found.prepared.bench
+    some = [one for one in bench.library if one.name in ("gap_drift", "table_tilt")]
+    sets = [replace(named.best, effects=(*named.best.effects, one)) for one in some]
+    also = replace(named, best=sets[0], tried=(named.best, *sets))
+    verdict = judge(bench, also, 1.0)
+    assert (verdict.word, verdict.best.names) == ("named", ("bumper_hardening",))
+    assert verdict.remainder
+    assert all(one.name in verdict.why for one in some)
+    apart = [replace(named.best, effects=(one,)) for one in some]  # and nothing where they share it
+    assert judge(bench, replace(named, best=apart[0], tried=tuple(apart)), 1.0).word == "ambiguous"
 
 
 def test_several_logs_count_together() -> None:

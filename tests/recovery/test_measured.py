@@ -97,6 +97,10 @@ def test_rubber_bearings_have_hysteresis_and_more() -> None:
     found = discover([bearing("ICA50"), bearing("ICA140")], oscillator(5.0, 0.5))
     verdict = found.verdict
     assert verdict.best.names[0] == "bouc_wen"
+    assert verdict.word == "named"
+    assert found.where.channels == ("damper_force_n",)
+    low, high = found.where.frequency_hz or (0.0, 0.0)
+    assert 0.1 < low < high < 2.0  # the first mode of the building on its bearings
     assert verdict.remainder  # the storeys above bend: no effect of ours is that
     before, after = found.named.null.cost, verdict.best.cost
     assert np.sqrt(after) < 0.7 * np.sqrt(before)

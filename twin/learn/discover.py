@@ -27,7 +27,7 @@ from twin.learn.naming import Bench, Explained, Named, Tell, Trying, named
 from twin.learn.readings import Readings, derives_acc
 from twin.learn.sheet import Sheet, sheets_of
 from twin.learn.verdict import Verdict, judge
-from twin.learn.where import Cell, Where, cells, harmonics_of, pulling, repeated, where
+from twin.learn.where import Cell, Where, cells, pulling, repeated, where
 from twin.model.model import Model
 
 LEAST_ENTRIES, LEAST_BLOCKS = 1000, 9
@@ -181,7 +181,7 @@ def discover(
     pulls = pulling(bench.sheets, verdict.best.left)
     notes = (*prepared.notes, *far(model, verdict.best.fit), *pulls)
     before = cells(bench.sheets, found.null.left, floor)
-    seen = where(before, steps, harmonics_of(bench.sheets, found.null.left, steps))
+    seen = where(bench.sheets, found.null.left, before, steps)
     after = cells(bench.sheets, verdict.best.left, floor)
     return Discovery(prepared, found, verdict, seen, before, after, notes)
 

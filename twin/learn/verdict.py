@@ -9,7 +9,7 @@ Excess is the held-out mean square over the noise, less the floor.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from twin.learn.guess import ZERO
 from twin.learn.naming import Bench, Explained, Named
@@ -69,6 +69,8 @@ def judge(
     sure = _confidence(named, rivals, left / gap)
     if doubt := _doubt(named, None if beside else general, start or {}, remainder, gap):
         return Verdict("unexplained", best, min(sure, 0.3), (), general, floor, True, doubt)
+    if others and (core := _core(bench, named, others, floor, start, noise)):
+        return core
     if others:
         names = "; ".join(" + ".join(one.names) for one in others)
         why = f"as good as {' + '.join(best.names)}: {names}"
@@ -84,6 +86,29 @@ def judge(
     elif remainder:
         why = "more is left, unexplained"
     return Verdict("named", best, sure, (), general, floor, remainder, why)
+
+
+def _core(
+    bench: Bench,
+    named: Named,
+    others: Sequence[Explained],
+    floor: float,
+    start: Mapping[str, float] | None,
+    noise: float,
+) -> Verdict | None:
+    """What every set that does as well has in common, where that is a name by itself."""
+    sets = [set(one.names) for one in (named.best, *others)]
+    common = set.intersection(*sets)
+    alone = [one for one in named.tried if common and set(one.names) == common]
+    if not alone:
+        return None
+    core = min(alone, key=lambda one: one.cost)
+    verdict = judge(bench, replace(named, best=core), floor, start, noise)
+    if verdict.word != "named":
+        return None
+    rest = " or ".join(dict.fromkeys(" + ".join(sorted(one - common)) for one in sets))
+    why = f"more is left, of which {rest} would explain a part: the data cannot tell"
+    return replace(verdict, remainder=True, why=why)
 
 
 def _doubt(

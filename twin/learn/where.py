@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import welch
 
 from table_io.block import Float1D, Int1D, Label
 from table_io.records import Step
@@ -18,6 +19,7 @@ PHASES = ("flight", "contact_right", "contact_left", "contact_both")
 MOST = 0.8  # of the excess: what is said to lie somewhere lies there so far
 NOTABLE = 0.15  # of the excess: a row or harmonic with less is not mentioned
 HARMONICS = 7
+SEGMENT_S = 20.0  # of a spectrum, where there are no steps
 PULLED = 3.0  # mean square over the noise from which on a side is said to pull
 CHANNELS = {
     "damper": ("mass_acc_m_s2",), "right": ("force_r1_n", "force_r2_n"),
@@ -65,11 +67,15 @@ def phase_of(sheet: Sheet) -> Int1D:
 
 
 def cells(sheets: Sequence[Sheet], left: Sequence[Float1D], floor: float) -> tuple[Cell, ...]:
-    """The map of a residual over the noise, (entry,) a log; `floor` is a mean square."""
+    """The map of a residual over the noise, (entry,) a log; `floor` is a mean square.
+
+    A log without any step is one step, -1.
+    """
     found = []
     for sheet, r in zip(sheets, left, strict=True):
         step = sheet.readings.step[sheet.sample_of]
-        held = np.flatnonzero((step >= 0) & (sheet.row_of < len(sheet.rows)))
+        stepped = bool((sheet.readings.step >= 0).any())
+        held = np.flatnonzero(((step >= 0) | (not stepped)) & (sheet.row_of < len(sheet.rows)))
         keys = np.stack([sheet.row_of, step, phase_of(sheet)])[:, held]
         order = np.lexsort(keys[::-1])
         keys = keys[:, order]
@@ -160,9 +166,15 @@ def _unrepeated(whole: Float1D, cycle: Int1D, here: Int1D, likeness: float) -> f
 
 
 def where(
-    map_: Sequence[Cell], steps: Sequence[Sequence[Step]], harmonics: tuple[int, ...]
+    sheets: Sequence[Sheet],
+    left: Sequence[Float1D],
+    map_: Sequence[Cell],
+    steps: Sequence[Sequence[Step]],
 ) -> Where:
-    """In words: the frequencies, direction, phase and rows that hold most of the excess."""
+    """In words: the frequencies, direction, phase and rows that hold most of the excess.
+
+    Of a residual over the noise, (entry,) a log, its map, and the steps of each log.
+    """
     sure = [one for one in map_ if one.errors > 3.0 and one.excess > 0]
     total = sum(one.excess * one.count for one in sure)
     if total <= 0:
@@ -181,12 +193,14 @@ def where(
     phase = shares([one.phase for one in sure])
     rows = shares([one.row for one in sure])
     channels = [c for row, s in rows.items() if s > NOTABLE for c in CHANNELS.get(str(row), ())]
+    if all("damper_force_n" in one.readings.channels for one in sheets):
+        channels = ["damper_force_n"]  # no other row has entries then
     return Where(
-        _band(frequency),
+        _band(frequency) or _spectral_band(sheets, left),
         next((str(k) for k, s in direction.items() if s > MOST and k), "both"),
         _phase(phase),
         tuple(dict.fromkeys(channels)),
-        harmonics,
+        _harmonics(sheets, left, steps),
     )
 
 
@@ -202,6 +216,26 @@ def _band(shares: dict[object, float]) -> tuple[float, float] | None:
     return (min(chosen), max(chosen)) if chosen else None
 
 
+def _spectral_band(sheets: Sequence[Sheet], left: Sequence[Float1D]) -> tuple[float, float] | None:
+    """The frequencies in Hz between which most of the damper row's power beyond the noise lies."""
+    found = []
+    for sheet, r in zip(sheets, left, strict=True):
+        mine, rate_hz = sheet.row_of == 0, sheet.readings.motion().rate_hz
+        whole = np.zeros(sheet.readings.time_s.size)
+        whole[sheet.sample_of[mine]] = r[mine]
+        segment = min(whole.size, round(SEGMENT_S * rate_hz))
+        hz, power = welch(whole, rate_hz, nperseg=segment)
+        found.append((hz, power * mine.sum()))
+    hz = max((one for one, _ in found), key=len, default=np.zeros(0))
+    power = np.sum([np.interp(hz, *one, right=0.0) for one in found], axis=0)
+    power = np.maximum(power - float(np.median(power)), 0.0)  # most of the band is noise alone
+    if not power.sum() > 0:
+        return None
+    held = np.cumsum(power) / power.sum()
+    low, high = np.searchsorted(held, (0.5 * (1 - MOST), 1 - 0.5 * (1 - MOST)))
+    return float(hz[low]), float(hz[high])
+
+
 def _phase(shares: dict[object, float]) -> str:
     right, left = shares.get("contact_right", 0.0), shares.get("contact_left", 0.0)
     both = right + left + shares.get("contact_both", 0.0)
@@ -213,7 +247,7 @@ def _phase(shares: dict[object, float]) -> str:
     return "all"
 
 
-def harmonics_of(
+def _harmonics(
     sheets: Sequence[Sheet], left: Sequence[Float1D], steps: Sequence[Sequence[Step]]
 ) -> tuple[int, ...]:
     """The harmonics of the drive that make a notable part of the damper row; 0 is its mean."""
