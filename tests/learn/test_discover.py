@@ -214,6 +214,22 @@ def test_whoever_has_enough_keeps_what_was_found() -> None:
     assert best.cost < found.named.null.cost
 
 
+def test_whoever_stops_in_a_swap_keeps_what_was_added() -> None:
+    told: list[Trying] = []
+
+    def tell(now: Trying) -> None:
+        told.append(now)
+        if "in the place of" in now.stage:
+            raise Enough
+
+    truth = hidden("bumper_hardening", k2=3e7) + hidden("coulomb_friction", fc=30.0)
+    found = discover([log(truth)], SNM, tell)
+    best = told[-1].best
+    assert best is not None
+    assert len(best.effects) == 2
+    assert found.named.best is best
+
+
 def test_a_rival_that_needs_a_tare_off_beyond_all_doubt_is_none() -> None:
     found = discover([log(hidden("bumper_hardening", k2=3e7))], SNM)
     named, bench = found.named, found.prepared.bench
@@ -222,3 +238,5 @@ def test_a_rival_that_needs_a_tare_off_beyond_all_doubt_is_none() -> None:
     assert judge(bench, replace(named, tried=(as_good,)), 1.0).word == "ambiguous"
     strained = replace(as_good, fit=replace(as_good.fit, at_bound=("zero0.u",)))
     assert judge(bench, replace(named, tried=(strained,)), 1.0).word == "named"
+    turned = judge(bench, replace(named, best=strained, tried=(strained, named.best)), 1.0)
+    assert (turned.word, turned.best) == ("named", named.best)  # whichever came first

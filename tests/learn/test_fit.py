@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import cast
 
 import numpy as np
@@ -30,8 +31,10 @@ class Toy:
         return self.left(guess.values["a"], guess.values["b"])
 
 
-def free(name: str, low: float = -math.inf, high: float = math.inf) -> Free:
-    return Free(name, (name,), low, high, 1.0, "")
+def free(
+    name: str, low: float = -math.inf, high: float = math.inf, vanishing: float | None = None
+) -> Free:
+    return Free(name, (name,), low, high, 1.0, "", vanishing=vanishing)
 
 
 def fitted(left: Left, a: Free, b: Free, folds: tuple[Int1D, ...] = ()) -> Fit:
@@ -54,19 +57,65 @@ def test_beside_a_number_at_its_bound_the_others_are_found(alike: float) -> None
 
 
 def test_what_is_left_out_is_judged_by_a_fit_and_not_by_a_leap() -> None:
-    """b is told by the last fold; without it next to nothing says it, and far off it explodes."""
+    """Two numbers nearly alike, in a law that explodes: an undamped step goes far along both."""
     draw = np.random.default_rng(2)
     x, noise = np.linspace(1, 2, COUNT), draw.standard_normal(COUNT)
-    fold = np.arange(COUNT) * 3 // COUNT
-    size = np.where(fold == 2, 10.0, 1e-7)
+    fold = np.arange(COUNT) % 3
 
     def left(a: float, b: float) -> Float1D:
-        return a * x + size * np.expm1(np.clip(b, -300, 300)) - (2.0 * x + noise)
+        apart = np.expm1(np.clip(40 * (a - b), -300, 300)) - 40 * (a - b)
+        return (a + b) * x + 1e-4 * (a - b) * x**2 + 1e-3 * apart - (2.0 * x + noise)
 
-    found = fitted(left, free("a"), free("b"), (fold,))
-    assert found.cost == pytest.approx(1.0, abs=0.1)
-    (out,) = found.left
-    assert 1.0 < float(out @ out) / COUNT / found.cost < 1.5
+    (out,) = fitted(left, free("a"), free("b"), (fold,)).left
+    assert 1.0 < float(out @ out) / float(noise @ noise) < 1.05
+
+
+def test_an_amplitude_that_only_one_fold_says_gains_nothing_there() -> None:
+    """Junk in the last fold alone: who saw it explains it, who did not must not."""
+    draw = np.random.default_rng(4)
+    x, noise = np.linspace(1, 2, COUNT), draw.standard_normal(COUNT)
+    fold = np.arange(COUNT) * 3 // COUNT
+    junk = np.where(fold == 2, 5.0 * np.sign(draw.standard_normal(COUNT)), 0.0)
+
+    def out(amplitude: Free) -> Float1D:
+        found = fitted(lambda a, b: a * x - b * junk - (2.0 * x + noise - junk), free("a"),
+                       amplitude, (fold,))  # fmt: skip
+        return found.left[0]
+
+    mine = fold == 2
+    nothing = fitted(lambda a, b: a * x - (2.0 * x + noise - junk), free("a"), free("b"), (fold,))
+    assert float((out(free("b", vanishing=0.0))[mine] ** 2).mean()) > 20.0
+    assert out(free("b", vanishing=0.0))[mine] == pytest.approx(nothing.left[0][mine], abs=0.05)
+    # what is not an effect's stays as it is: whatever is compared has it
+    assert float((out(free("b"))[mine] ** 2).mean()) < 2.0
+
+
+def test_what_stands_at_its_bound_makes_the_others_no_less_sure() -> None:
+    draw = np.random.default_rng(5)
+    one = draw.standard_normal(COUNT)
+    other = 0.99 * one + 0.14 * draw.standard_normal(COUNT)
+    y = 5.0 * one - 3.0 * other + draw.standard_normal(COUNT)
+    stuck = fitted(lambda a, b: a * one + b * other - y, free("a", high=1.0), free("b"))
+    fixed = fitted(lambda a, b: one + b * other - y, free("a"), free("b"))
+    assert stuck.spread["b"] == pytest.approx(fixed.spread["b"], rel=1e-3)
+    assert stuck.spread["a"] == 0.0
+
+
+def test_columns_taken_side_by_side_are_the_same() -> None:
+    draw = np.random.default_rng(6)
+    x, y = draw.standard_normal((2, COUNT)), draw.standard_normal(COUNT)
+    sheet = cast(Sheet, Toy(lambda a, b: a * x[0] + np.tanh(b * x[1]) - y))
+    free_ = [free("a"), free("b")]
+    alone = fit([sheet], Guess({"a": 0.5, "b": 0.5}), free_)
+    with ThreadPoolExecutor(2) as pool:
+        beside = fit([sheet], Guess({"a": 0.5, "b": 0.5}), free_, each=pool.map)
+    assert alone.values == beside.values
+    assert alone.spread == beside.spread
+
+
+def test_without_a_number_to_find_there_is_a_fit_too() -> None:
+    sheet = cast(Sheet, Toy(lambda a, b: np.full(COUNT, 2.0)))
+    assert fit([sheet], Guess({"a": 0.5, "b": 0.5}), []).cost == 4.0
 
 
 def test_a_fold_that_says_as_much_as_the_others_is_judged_as_least_squares_does() -> None:

@@ -263,7 +263,7 @@ def test_the_table_of_the_curves_says_how_much_nearer(every: dict[str, Left]) ->
     measured = max(p.measured.eta_d for p in runs[0][0] if p.measured is not None)
     assert row["measured"]["eta_d"] == measured
     assert row["after"]["error"] < 0.25 * row["before"]["error"]
-    assert f"<b>{100 * row['after']['error']:.2g} %</b>" in one.page
+    assert f"<b>{100 * row['after']['error']:.2f} %</b>" in one.page
     same = replace(one.found.named, null=one.found.verdict.best)  # nothing before but what is after
     (row,) = misfits(again := Shown(replace(one.found, named=same), one.logs), runs_of(again))
     assert row["before"] == row["after"]
@@ -271,7 +271,8 @@ def test_the_table_of_the_curves_says_how_much_nearer(every: dict[str, Left]) ->
 
 @pytest.mark.parametrize(
     ("value", "half", "said"),
-    [(510000.0, 300.0, ("510\u2009000", "509\u2009700", "510\u2009300")),
+    [(12345.678, 0.05, ("12\u2009345.678", "12\u2009345.628", "12\u2009345.728")),
+     (510000.0, 300.0, ("510\u2009000", "509\u2009700", "510\u2009300")),
      (1500.4, 0.45, ("1500.40", "1499.95", "1500.85")), (0.4, 0.2, ("0.4000", "0.2000", "0.6000")),
      (3.0, 0.0, ("3.000", "3.000", "3.000"))],
 )  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 from table_io.block import Float1D
 from table_io.card import BadInput
 from table_io.records import Step
-from twin.learn.fit import Fit, fit
+from twin.learn.fit import Fit, Mapped, fit
 from twin.learn.guess import (
     GAP,
     INPUT_GAIN,
@@ -76,7 +76,9 @@ class Discovery:
         return self.verdict.best.fit.guess.model()
 
 
-def prepare(logs: Sequence[Log], model: Model, without: Sequence[str] = ()) -> Prepared:
+def prepare(
+    logs: Sequence[Log], model: Model, without: Sequence[str] = (), each: Mapped = map
+) -> Prepared:
     """The logs on one bench, with the noise that the model's own stiffnesses make of the sensors'.
 
     `without` leaves effects out of the library. BadInput where there is too little to learn from.
@@ -88,9 +90,9 @@ def prepare(logs: Sequence[Log], model: Model, without: Sequence[str] = ()) -> P
     for sheet in sheets:
         _enough(sheet)
     guess, free = start(sheets, model)
-    first = fit(sheets, guess, free)
+    first = fit(sheets, guess, free, each=each)
     sheets = sheets_of(pairs, first.guess.model())
-    first = fit(sheets, first.guess, free)
+    first = fit(sheets, first.guess, free, each=each)
     rms = [_rms(sheet.residual(first.guess)) for sheet in sheets]
     notes = []
     if (thinned := sheets[0].thinned) > 1:
@@ -105,7 +107,7 @@ def prepare(logs: Sequence[Log], model: Model, without: Sequence[str] = ()) -> P
             "same, whatever its noise"
         )
     library, away = candidates(sheets, guess, without)
-    return Prepared(Bench(sheets, free, library), first, away, tuple(notes))
+    return Prepared(Bench(sheets, free, library, each), first, away, tuple(notes))
 
 
 def start(sheets: Sequence[Sheet], model: Model) -> tuple[Guess, tuple[Free, ...]]:
@@ -166,10 +168,11 @@ def discover(
     model: Model,
     tell: Tell = lambda now: None,
     without: Sequence[str] = (),
+    each: Mapped = map,
 ) -> Discovery:
-    """What the model lacks of what the logs say; see `verdict`."""
+    """What the model lacks of what the logs say; see `verdict`. `each` is a map on more cores."""
     tell(Trying("the model as it is"))
-    prepared = prepare(logs, model, without)
+    prepared = prepare(logs, model, without, each)
     bench = prepared.bench
     found = named(bench, prepared.guess, tell)
     steps = [log.steps for log in logs]

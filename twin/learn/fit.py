@@ -1,9 +1,7 @@
 """Levenberg-Marquardt on the sheets of several logs, with spreads that coloured residuals bear."""
 
 import math
-import os
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +13,14 @@ from twin.learn.sheet import Sheet
 MOST_STEPS = 40
 CLOSE = 1e-6  # of the cost: what an iteration must gain to be followed by another
 STEP = 1e-4  # of a parameter's scale, for slopes
-LONG = 400_000  # entries of all logs: with fewer, threads cost more than they give
-HELD_OUT_DAMPING = (1e-9, 1e-6, 1e-4, 1e-2, 1.0)  # of the step to a fold's own fit, in turn
+HELD_OUT_DAMPING = (1e-9, 1e-6, 1e-4, 1e-2, 1.0, 1e2, 1e4)  # of a step to a fold's own fit
+UNSAID = 1e-3  # of a number's curvature: where the others of a fold have less, they do not say it
+
+# As `map`; whoever has more cores gives one that uses them.
+Mapped = Callable[
+    [Callable[[tuple[Guess, Free]], list[Float1D]], Iterable[tuple[Guess, Free]]],
+    Iterable[list[Float1D]],
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,13 +44,14 @@ def fit(
     free: Sequence[Free],
     train: Sequence[Bool2D] | None = None,
     folds: Sequence[Int1D] = (),
+    each: Mapped = map,
 ) -> Fit:
     """The guess moved to least squares over the entries where `train`, (entry,) each, is True.
 
-    With `folds`, (entry,) a log: what is left in each fold by a fit to all the others, one
-    Gauss-Newton step away from the whole one. Below zero: never held out.
+    With `folds`, (entry,) a log: what is left in each fold by a fit to all the others, one step of
+    this search away from the whole one. Below zero: never held out.
     """
-    return _Search(sheets, guess, tuple(free), train, folds).run()
+    return _Search(sheets, guess, tuple(free), train, folds, each).run()
 
 
 def slopes(
@@ -68,17 +73,13 @@ def slopes(
 
 
 def columns(
-    sheets: Sequence[Sheet], asked: Sequence[tuple[Guess, Free]], before: Sequence[Float1D]
+    sheets: Sequence[Sheet],
+    asked: Sequence[tuple[Guess, Free]],
+    before: Sequence[Float1D],
+    each: Mapped = map,
 ) -> list[list[Float1D]]:
-    """The slopes of several numbers, each about a guess; on all cores where the logs are long."""
-
-    def one(pair: tuple[Guess, Free]) -> list[Float1D]:
-        return slopes(sheets, *pair, before)
-
-    if sum(there.size for there in before) < LONG:
-        return [*map(one, asked)]
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # kernels and array sums leave the lock
-        return [*pool.map(one, asked)]
+    """The slopes of several numbers, each about a guess."""
+    return [*each(lambda pair: slopes(sheets, *pair, before), asked)]
 
 
 class _Search:
@@ -91,8 +92,10 @@ class _Search:
         free: tuple[Free, ...],
         train: Sequence[Bool2D] | None,
         folds: Sequence[Int1D],
+        each: Mapped,
     ) -> None:
         self.sheets, self.guess, self.free, self.folds = sheets, guess, free, folds
+        self.each = each
         self.train = train or [np.ones(sheet.row_of.size, dtype=bool) for sheet in sheets]
         self.count = max(sum(int(one.sum()) for one in self.train), 1)
         low = [-math.inf if f.low == -math.inf else f.inside(f.low) for f in free]
@@ -112,8 +115,9 @@ class _Search:
         return np.concatenate([row[mask] for row, mask in zip(entries, self.train, strict=True)])
 
     def jacobian(self, guess: Guess, whole: list[Float1D]) -> Float2D:
-        found = columns(self.sheets, [(guess, one) for one in self.free], whole)
-        return np.array([*map(self.chosen, found)]).reshape(len(self.free), -1)
+        found = columns(self.sheets, [(guess, one) for one in self.free], whole, self.each)
+        entries = sum(int(one.sum()) for one in self.train)
+        return np.array([*map(self.chosen, found)]).reshape(len(self.free), entries)
 
     def stepped(self, x: Float1D, hessian: Float2D, gradient: Float1D, damping: float) -> Float1D:
         """x a damped Newton step on; what stands at a bound and would leave it stays there."""
@@ -135,6 +139,8 @@ class _Search:
             gained = 0.0
             for _ in range(8):
                 trial = self.stepped(x, hessian, gradient, damping)
+                if np.array_equal(trial, x):
+                    break
                 after = self.residuals(self.at(trial))
                 there = self.chosen(after)
                 new = float(there @ there)
@@ -155,11 +161,16 @@ class _Search:
         jacobian = self.jacobian(guess, whole)
         hessian = jacobian @ jacobian.T
         size = _sizes(hessian)
-        inverse = np.linalg.pinv(hessian / np.outer(size, size), hermitian=True)
+        known = np.flatnonzero(
+            (self.low < x) & (x < self.high)
+        )  # the others are where they must be
+        inner = np.ix_(known, known)
+        inverse = np.zeros_like(hessian)
+        inverse[inner] = np.linalg.pinv((hessian / np.outer(size, size))[inner], hermitian=True)
         inverse /= np.outer(size, size)
         gradients = jacobian * self.chosen(whole)
         first, count = 0, 0
-        scatter, known = np.zeros_like(inverse), np.zeros_like(inverse)
+        scatter, tared = np.zeros_like(inverse), np.zeros_like(inverse)
         for sheet, mask in zip(self.sheets, self.train, strict=True):
             blocks = sheet.whole_contacts[mask]
             here = slice(first, first + blocks.size)
@@ -170,12 +181,12 @@ class _Search:
             # of what was read at rest there is one number each: its deviation is what is known
             still = jacobian[:, here][:, rest] / sheet.weight
             scatter += moving @ moving.T
-            known += still @ still.T
+            tared += still @ still.T
             first += blocks.size
             count += np.unique(blocks[~rest]).size
         # the fit has taken part of the scatter away: a block's worth for each number it found
         scatter *= count / max(count - len(self.free), 1)
-        covariance = inverse @ (scatter + known) @ inverse
+        covariance = inverse @ (scatter + tared) @ inverse
         sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         scale = np.where(sd > 0, sd, 1.0)
         values, spread, stuck = {}, {}, []
@@ -194,30 +205,39 @@ class _Search:
         """(entry,) a log, what fits without each fold leave in it; nothing without folds."""
         if not self.folds:
             return ()
-        fold, r = np.concatenate(self.folds), np.concatenate(whole)
+        fold = np.concatenate(self.folds)
         left = [one.copy() for one in whole]
         for k in np.unique(fold[fold >= 0]):
-            there = self._without(x, r, jacobian, fold != k)
-            for mine, one, own in zip(left, there or whole, self.folds, strict=True):
+            there = self._without(x, whole, jacobian, fold != k)
+            for mine, one, own in zip(left, there, self.folds, strict=True):
                 mine[own == k] = one[own == k]
         return tuple(left)
 
     def _without(
-        self, x: Float1D, r: Float1D, jacobian: Float2D, others: Bool2D
-    ) -> list[Float1D] | None:
-        """(entry,) a log, after one step towards the fit on the others alone; None: it is there.
+        self, x: Float1D, whole: list[Float1D], jacobian: Float2D, others: Bool2D
+    ) -> list[Float1D]:
+        """(entry,) a log, after one step towards the fit on the others alone.
 
-        The step is damped until it does what it is for: where a fold's others hardly say a
-        number, the undamped step is a leap.
+        The step is damped until it does what it is for: undamped it may be a leap. A number that
+        the others do not say stays, and an amplitude vanishes: it would else be judged by itself.
         """
         part = jacobian[:, others]
-        hessian, gradient, before = part @ part.T, part @ r[others], float(r[others] @ r[others])
+        hessian = part @ part.T
+        unsaid = np.diag(hessian) < UNSAID * np.einsum("ij,ij->i", jacobian, jacobian)
+        absent = np.array([math.nan if f.vanishing is None else f.vanishing for f in self.free])
+        gone = unsaid & np.isfinite(absent)
+        if gone.any():
+            x = np.where(gone, absent, x)
+            whole = self.residuals(self.at(x))
+        r = np.concatenate(whole)[others]
+        gradient, before = part @ r, float(r @ r)
+        gradient[unsaid], hessian[unsaid], hessian[:, unsaid] = 0.0, 0.0, 0.0
         for damping in HELD_OUT_DAMPING:
             there = self.residuals(self.at(self.stepped(x, hessian, gradient, damping)))
             left = np.concatenate(there)[others]
             if float(left @ left) <= before:
                 return there
-        return None
+        return whole  # the others are as good as they get
 
 
 def _sizes(hessian: Float2D) -> Float1D:

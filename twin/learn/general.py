@@ -72,7 +72,7 @@ def terms(touched: bool) -> tuple[tuple[str, tuple[float, ...]], ...]:
 
 def free_of(name: str, ladder: tuple[float, ...]) -> tuple[Free, ...]:
     """The amplitude in N, and the width where the term has one."""
-    force = Free(*_named(name, "force"), -np.inf, np.inf, 1.0, "N")
+    force = Free(*_named(name, "force"), -np.inf, np.inf, 1.0, "N", vanishing=0.0)
     if not ladder:
         return (force,)
     width = Free(

@@ -95,6 +95,7 @@ class Free:
     scale: float
     unit: str
     logarithmic: bool = False
+    vanishing: float | None = None  # where what it is of is not there
 
     def inside(self, value: float) -> float:
         """The value as the fit moves it."""
@@ -159,6 +160,7 @@ def effect_free(effect: Effect, channel: str = "") -> tuple[Free, ...]:
             abs(p.typical - (p.vanishing or 0.0)) or 1.0,
             p.unit,
             logarithmic=p.vanishing is None,
+            vanishing=p.vanishing,
         )
         for p in effect.parameters
     )

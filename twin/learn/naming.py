@@ -2,7 +2,7 @@
 
 Each round is: all candidates by linear algebra about what is known so far (`search`), the best few
 refitted whole on everything, and judged on each third of the steps by a fit to the other two
-that is one Gauss-Newton step away.
+that is one step away.
 """
 
 import math
@@ -14,14 +14,13 @@ from itertools import takewhile
 import numpy as np
 
 from table_io.block import Float1D, Int1D
-from twin.learn.fit import Fit, fit
+from twin.learn.fit import Fit, Mapped, fit
 from twin.learn.guess import Free, Guess
 from twin.learn.library import Candidate, general
 from twin.learn.search import Finding, Products, folds_of, products, ranked
 from twin.learn.sheet import Sheet
 
 MOST_EFFECTS = 3
-COUNTS = ("one effect", "two effects", "three effects")
 REFITTED, REFITTED_GENERAL = 5, 2  # of the candidates of a round
 LEAST_REFITTED, HOPELESS = 2, 1.5  # a cost so many times that of the best is not refitted
 WORTH_A_FIT = 0.003  # of what is left: candidates that promise less are not refitted
@@ -80,10 +79,11 @@ class Bench:
     sheets: tuple[Sheet, ...]
     base: tuple[Free, ...]
     library: tuple[Candidate, ...]
+    each: Mapped = map
 
     def explain(self, guess: Guess, effects: Sequence[Candidate]) -> Explained:
         """The effects with the base, fitted on everything and held out fold by fold."""
-        found = fit(self.sheets, guess, self.free(effects), folds=self.folds)
+        found = fit(self.sheets, guess, self.free(effects), folds=self.folds, each=self.each)
         return Explained(tuple(effects), found)
 
     def free(self, effects: Sequence[Candidate]) -> tuple[Free, ...]:
@@ -150,9 +150,10 @@ def named(bench: Bench, guess: Guess, tell: Tell = lambda now: None) -> Named:
             if added.best is state.best:  # its swaps were tried when it was taken
                 state = added
                 break
-            state = _swapped(bench, added, tell)
+            state = added
+            state = _swapped(bench, state, tell)
             state = replace(state, null=_null_again(bench, state.null, state.best))
-        return replace(state, outside=_outside(bench, state.null, state.best, tell))
+        return replace(state, outside=_outside(bench, state, tell))
     except Enough as enough:
         return replace(_taken(bench, state, enough.fitted), whole=False)
 
@@ -184,16 +185,21 @@ def _swapped(bench: Bench, state: Named, tell: Tell) -> Named:
     return state
 
 
-def _outside(bench: Bench, null: Explained, best: Explained, tell: Tell) -> tuple[Explained, ...]:
+def _outside(bench: Bench, state: Named, tell: Tell) -> tuple[Explained, ...]:
     """What general terms do: alone, beside what was found, and in the place of each of it."""
+    best = state.best
     library = general(any((sheet.touched > 0).any() for sheet in bench.sheets))
-    found = _refitted(bench, null, (), tell, None, library)
+
+    def still(now: Trying) -> None:
+        tell(replace(now, best=best))  # whatever a round starts from, no term is a better name
+
+    found = _refitted(bench, state.null, (), still, None, library)
     if best.effects:
-        found += _refitted(bench, best, best.effects, tell, None, library)
+        found += _refitted(bench, best, best.effects, still, None, library)
     if len(best.effects) > 1:
         for member in best.effects:
             others = tuple(one for one in best.effects if one is not member)
-            found += _refitted(bench, best, others, tell, member, library)
+            found += _refitted(bench, best, others, still, member, library)
     return tuple(found)
 
 
@@ -216,7 +222,8 @@ def _refitted(
 ) -> list[Explained]:
     """The best additions to the kept effects, refitted whole."""
     guess, unnamed = current.fit.guess, library is not None
-    stage = "terms without a name" if unnamed else COUNTS[len(kept)]
+    count = len(kept) + 1
+    stage = "terms without a name" if unnamed else f"{count} effect{'s' if count > 1 else ''}"
     if dropped is not None:
         stage += f", in the place of {dropped.name}"
     tell(Trying(stage, best=current))
@@ -230,15 +237,17 @@ def _refitted(
     if not library:
         return []
     outcome: list[Explained] = []
-    promising = _promising(products(bench.sheets, guess, bench.free(kept), library), most)
+    promising = _promising(
+        products(bench.sheets, guess, bench.free(kept), library, bench.each), most
+    )
     for place, one in enumerate(promising, 1):
         effects = (*kept, one.candidate)
-        named_ = () if unnamed else tuple(outcome)
-        best = min((current, *named_), key=lambda one: one.cost)
+        fitted = () if unnamed else tuple(outcome)
+        best = min((current, *fitted), key=lambda one: one.cost)
         try:
             tell(Trying(stage, tuple(k.name for k in effects), place, len(promising), best))
         except Enough as enough:
-            enough.fitted = named_
+            enough.fitted = fitted
             raise
         outcome.append(bench.explain(one.put(guess), effects))
     return outcome

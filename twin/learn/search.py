@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from table_io.block import Float1D, Float2D, Int1D
-from twin.learn.fit import columns, solved
+from twin.learn.fit import Mapped, columns, solved
 from twin.learn.guess import Free, Guess
 from twin.learn.library import Candidate
 from twin.learn.sheet import Sheet
@@ -92,7 +92,11 @@ def folds_of(sheet: Sheet) -> Int1D:
 
 
 def products(
-    sheets: Sequence[Sheet], guess: Guess, free: Sequence[Free], library: Sequence[Candidate]
+    sheets: Sequence[Sheet],
+    guess: Guess,
+    free: Sequence[Free],
+    library: Sequence[Candidate],
+    each: Mapped = map,
 ) -> Products:
     """The products at a guess, over all logs. What stands at a bound is taken to stay there."""
     free = [one for one in free if one.low < guess.values[one.keys[0]] < one.high]
@@ -105,7 +109,7 @@ def products(
         for shape in candidate.shapes:
             variants.append(Variant(candidate, shape, len(asked), sign))
             asked.append((candidate.put(guess, shape), amplitude))
-    found = columns(sheets, asked, before)
+    found = columns(sheets, asked, before, each)
     hessians, gradients, squares, folds = [], [], [], []
     for k, sheet in enumerate(sheets):
         unit = units_of(sheet)

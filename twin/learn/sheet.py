@@ -15,7 +15,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from threading import Lock
 
 import numpy as np
 import numpy.typing as npt
@@ -54,19 +53,16 @@ class Sheet:
     scale: Scale
     weight: float = 1.0  # of the noise: above 1 where the model's error, not noise, is the limit
     thinned: int = 1  # of each step's cycles, and of the blocks outside them, one part in so many
-    _motions: dict[tuple[Sensor, ...], Motion] = field(default_factory=dict)
-    _lock: Lock = field(default_factory=Lock)  # of the motions: slopes are taken in threads
+    _motions: list[tuple[tuple[Sensor, ...], Motion]] = field(default_factory=list)
 
     def motion(self, sensors: tuple[Sensor, ...] = ()) -> Motion:
         """The motion for a belief about the sensors; the last few are remembered."""
-        with self._lock:
-            found = self._motions.get(sensors)
+        found = next((m for key, m in self._motions if key == sensors), None)
         if found is None:
             found = self.readings.motion(sensors)
-            with self._lock:
-                while len(self._motions) > KEPT:
-                    self._motions.pop(next(key for key in self._motions if key))
-                self._motions[sensors] = found
+            plain = [pair for pair in self._motions if not pair[0]]
+            last = [pair for pair in self._motions if pair[0]][-KEPT + 1 :]
+            self._motions[:] = [*plain, *last, (sensors, found)]  # at once: others may be asking
         return found
 
     @cached_property

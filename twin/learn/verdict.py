@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from twin.learn.guess import ZERO
+from twin.learn.guess import ZERO, log_of
 from twin.learn.naming import Bench, Explained, Named
 
 AS_GOOD = 3.5  # standard errors by which others must be worse, else the data cannot tell
@@ -64,6 +64,9 @@ def judge(
     left = max(best.cost - floor, 0.0)
     rivals = _rivals(bench, named)
     as_good = [one for one, errors in rivals if one.cost <= best.cost or errors < AS_GOOD]
+    if at_ease := [one for one in as_good if _strained(one) < _strained(best)]:
+        better = min(at_ease, key=lambda one: one.cost)
+        return judge(bench, replace(named, best=better), floor, start, noise)
     others = tuple({frozenset(one.names): one for one in reversed(as_good)}.values())
     remainder = left > LEFT * gap and left > VISIBLE * floor
     sure = _confidence(named, rivals, left / gap)
@@ -103,7 +106,10 @@ def _core(
     if not alone:
         return None
     core = min(alone, key=lambda one: one.cost)
-    verdict = judge(bench, replace(named, best=core), floor, start, noise)
+    # a term in the place of what they share says nothing of it
+    terms = [one for one in named.outside if len(one.effects) == 1 or common < set(one.names)]
+    of_core = replace(named, best=core, outside=tuple(terms))
+    verdict = judge(bench, of_core, floor, start, noise)
     if verdict.word != "named":
         return None
     rest = " or ".join(dict.fromkeys(" + ".join(sorted(one - common)) for one in sets))
@@ -204,7 +210,7 @@ def _rivals(bench: Bench, named: Named) -> list[tuple[Explained, float]]:
 
 def _strained(one: Explained) -> set[str]:
     """The tares that a fit needs further off than a tare can be: that alone speaks against it."""
-    return {name for name in one.fit.at_bound if name.startswith(ZERO)}
+    return {name for name in one.fit.at_bound if name.startswith(ZERO) and log_of(name) is not None}
 
 
 def _limit(one: Explained, best: Explained) -> bool:

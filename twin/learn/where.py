@@ -19,11 +19,15 @@ PHASES = ("flight", "contact_right", "contact_left", "contact_both")
 MOST = 0.8  # of the excess: what is said to lie somewhere lies there so far
 NOTABLE = 0.15  # of the excess: a row or harmonic with less is not mentioned
 HARMONICS = 7
+NO_STEP = -1
+STEPPED = 0.4  # of the time that it moves: less in steps is no stepped sine
 SEGMENT_S = 20.0  # of a spectrum, where there are no steps
+ABOVE = 3.0  # times the noise's power: a line of a spectrum with less may be noise
 PULLED = 3.0  # mean square over the noise from which on a side is said to pull
 CHANNELS = {
-    "damper": ("mass_acc_m_s2",), "right": ("force_r1_n", "force_r2_n"),
-    "left": ("force_l1_n", "force_l2_n"), "mass": ("mass_disp_m", "mass_acc_m_s2"),
+    "damper": ("mass_acc_m_s2",), "damper itself": ("damper_force_n",),
+    "right": ("force_r1_n", "force_r2_n"), "left": ("force_l1_n", "force_l2_n"),
+    "mass": ("mass_disp_m", "mass_acc_m_s2"),
     "table": ("table_disp_m", "table_acc_m_s2"),
     "mass against table": ("rel_disp_m", "mass_acc_m_s2", "table_acc_m_s2"),
     "right cells": ("force_r1_n", "force_r2_n"), "left cells": ("force_l1_n", "force_l2_n"),
@@ -66,16 +70,22 @@ def phase_of(sheet: Sheet) -> Int1D:
     return found
 
 
+def stepped(sheet: Sheet) -> bool:
+    """False where steps are but spots of a motion that is no stepped sine."""
+    moving = sheet.motion().moving
+    return bool((moving & (sheet.readings.step >= 0)).sum() > STEPPED * moving.sum())
+
+
 def cells(sheets: Sequence[Sheet], left: Sequence[Float1D], floor: float) -> tuple[Cell, ...]:
     """The map of a residual over the noise, (entry,) a log; `floor` is a mean square.
 
-    A log without any step is one step, -1.
+    A log that is no stepped sine is one step, -1.
     """
     found = []
     for sheet, r in zip(sheets, left, strict=True):
-        step = sheet.readings.step[sheet.sample_of]
-        stepped = bool((sheet.readings.step >= 0).any())
-        held = np.flatnonzero(((step >= 0) | (not stepped)) & (sheet.row_of < len(sheet.rows)))
+        in_steps = stepped(sheet)
+        step = np.where(in_steps, sheet.readings.step, NO_STEP)[sheet.sample_of]
+        held = np.flatnonzero(((step >= 0) | (not in_steps)) & (sheet.row_of < len(sheet.rows)))
         keys = np.stack([sheet.row_of, step, phase_of(sheet)])[:, held]
         order = np.lexsort(keys[::-1])
         keys = keys[:, order]
@@ -191,12 +201,13 @@ def where(
     frequency = shares([one.frequency_hz if one else None for one in at])
     direction = shares([one.direction if one else None for one in at])
     phase = shares([one.phase for one in sure])
-    rows = shares([one.row for one in sure])
+    rows = shares([_measured(sheets[one.log], one.row) for one in sure])
     channels = [c for row, s in rows.items() if s > NOTABLE for c in CHANNELS.get(str(row), ())]
-    if all("damper_force_n" in one.readings.channels for one in sheets):
-        channels = ["damper_force_n"]  # no other row has entries then
+    loose = {
+        one.log for one, step in zip(sure, at, strict=True) if not step and one.row == "damper"
+    }
     return Where(
-        _band(frequency) or _spectral_band(sheets, left),
+        _band(frequency) or _spectral_band(sheets, left, loose),
         next((str(k) for k, s in direction.items() if s > MOST and k), "both"),
         _phase(phase),
         tuple(dict.fromkeys(channels)),
@@ -204,32 +215,47 @@ def where(
     )
 
 
+def _measured(sheet: Sheet, row: str) -> str:
+    """The row, or which force it is where that was measured itself."""
+    own = row == "damper" and "damper_force_n" in sheet.readings.channels
+    return "damper itself" if own else row
+
+
 def _band(shares: dict[object, float]) -> tuple[float, float] | None:
-    """The frequencies of the steps that hold most, the largest first, as one interval."""
-    ranked = sorted(((s, k) for k, s in shares.items() if isinstance(k, float)), reverse=True)
+    """The frequencies of the steps that hold most, the largest first, as one interval.
+
+    None where most lies in no step.
+    """
+    stepped = {k: s for k, s in shares.items() if isinstance(k, float)}
+    ranked = sorted(((s, k) for k, s in stepped.items()), reverse=True)
+    if sum(stepped.values()) < 0.5:
+        return None
     held, chosen = 0.0, []
     for share, hz in ranked:
         chosen.append(hz)
         held += share
-        if held > MOST:
+        if held > MOST * sum(stepped.values()):
             break
     return (min(chosen), max(chosen)) if chosen else None
 
 
-def _spectral_band(sheets: Sequence[Sheet], left: Sequence[Float1D]) -> tuple[float, float] | None:
-    """The frequencies in Hz between which most of the damper row's power beyond the noise lies."""
+def _spectral_band(
+    sheets: Sequence[Sheet], left: Sequence[Float1D], logs: set[int]
+) -> tuple[float, float] | None:
+    """The frequencies in Hz between which most of the damper row's power beyond the noise lies,
+    of these logs; None of none."""
     found = []
-    for sheet, r in zip(sheets, left, strict=True):
+    for number in sorted(logs):
+        sheet, r = sheets[number], left[number]
         mine, rate_hz = sheet.row_of == 0, sheet.readings.motion().rate_hz
         whole = np.zeros(sheet.readings.time_s.size)
         whole[sheet.sample_of[mine]] = r[mine]
-        segment = min(whole.size, round(SEGMENT_S * rate_hz))
-        hz, power = welch(whole, rate_hz, nperseg=segment)
-        found.append((hz, power * mine.sum()))
-    hz = max((one for one, _ in found), key=len, default=np.zeros(0))
+        hz, power = welch(whole, rate_hz, nperseg=min(whole.size, round(SEGMENT_S * rate_hz)))
+        noise = float(np.median(power))  # most of the band is noise alone
+        found.append((hz, np.where(power > ABOVE * noise, power - noise, 0.0) * mine.sum()))
+    hz = max((one for one, _ in found), key=lambda one: one[-1], default=np.zeros(0))
     power = np.sum([np.interp(hz, *one, right=0.0) for one in found], axis=0)
-    power = np.maximum(power - float(np.median(power)), 0.0)  # most of the band is noise alone
-    if not power.sum() > 0:
+    if not np.sum(power) > 0:
         return None
     held = np.cumsum(power) / power.sum()
     low, high = np.searchsorted(held, (0.5 * (1 - MOST), 1 - 0.5 * (1 - MOST)))

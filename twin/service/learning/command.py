@@ -2,7 +2,9 @@
 
 import contextlib
 import math
+import os
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from rich.markup import escape
@@ -12,6 +14,7 @@ from table_io.card import BadInput
 from table_io.clock import RealClock
 from table_io.profile import Specimen
 from twin.learn.discover import Discovery, Log, discover, transferred
+from twin.learn.fit import Mapped
 from twin.learn.naming import Enough, Tell, Trying
 from twin.model.card import ModelCard
 from twin.model.effects import find_effect
@@ -24,6 +27,9 @@ from twin.service.learning.told import Json, model_toml, verdict_json
 from twin.service.outcome import EXIT_INTERRUPTED
 from twin.service.summary import dumps
 from twin.service.terminal import console, interruptible, say
+
+LONG = 120_000  # samples of all logs: with fewer, threads cost more than they give
+MOST_THREADS = 4  # each holds a motion of its own
 
 
 def model_of(name: str) -> tuple[Model, ModelCard]:
@@ -56,7 +62,8 @@ def discover_command(
 
             logs, notes = logs_of(paths)
             apart = logs_of(held_out)[0] if held_out else ()
-            found = discover(logs, start, tell, without)
+            with side_by_side(logs) as each:
+                found = discover(logs, start, tell, without, each)
     except (BadInput, Enough) as error:
         folder.rmdir()  # nothing is left of a failure
         if isinstance(error, BadInput):
@@ -79,6 +86,16 @@ def discover_command(
 
 
 @contextlib.contextmanager
+def side_by_side(logs: Sequence[Log]) -> Iterator[Mapped]:
+    """A map on all cores where the logs are long; kernels and array sums leave Python's lock."""
+    if sum(log.readings.time_s.size for log in logs) < LONG:
+        yield map
+        return
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_THREADS)) as pool:
+        yield pool.map
+
+
+@contextlib.contextmanager
 def searching() -> Iterator[Tell]:
     """What is being tried and the best so far: a bar on a terminal, plain lines elsewhere."""
     if not console.is_terminal:
@@ -89,13 +106,13 @@ def searching() -> Iterator[Tell]:
         TextColumn("[green]{task.fields[best]}"), TimeElapsedColumn(), console=console,
         transient=True,
     )  # fmt: skip
-    task = bar.add_task("", total=None, best="")
+    task = bar.add_task("reading", total=None, best="")
 
     def show(now: Trying) -> None:
-        what = " + ".join(now.names) or now.stage
+        bar.tasks[0].total = None  # update() takes None for no change
         bar.update(
-            task, description=escape(what), total=now.of or None, completed=max(now.place - 1, 0),
-            best=escape(_best(now)),
+            task, description=escape(" + ".join(now.names) or now.stage),
+            total=now.of or None, completed=max(now.place - 1, 0), best=escape(_best(now)),
         )  # fmt: skip
 
     with bar:

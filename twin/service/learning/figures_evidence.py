@@ -18,10 +18,9 @@ from twin.learn.guess import Guess
 from twin.learn.motion import Motion
 from twin.learn.naming import Explained
 from twin.learn.sheet import FORCES, Sheet
-from twin.learn.where import PHASES, phase_of
+from twin.learn.where import PHASES, phase_of, stepped
 
 LEAST_ENTRIES = 20  # of a step in a row, to be looked at
-STEPPED = 0.4  # of the time that it moves: less in steps is no stepped sine
 CYCLES = 2  # of a step in a close-up
 SPAN_S = 3.0  # of a close-up where there are no steps
 REPEATS = 0.3  # of the rms of u: a motion that differs more from period to period does not repeat
@@ -84,10 +83,7 @@ class Shown:
 
     def steps(self, number: int) -> tuple[Step, ...]:
         """The steps of a log; none where they are but spots of a motion that is no stepped sine."""
-        sheet = self.sheets[number]
-        moving = sheet.motion().moving
-        held = (sheet.readings.step >= 0) & moving
-        return tuple(self.logs[number].steps) if held.sum() > STEPPED * moving.sum() else ()
+        return tuple(self.logs[number].steps) if stepped(self.sheets[number]) else ()
 
     @cached_property
     def worst(self) -> int:

@@ -110,8 +110,9 @@ def telling(value: float, low: float, high: float) -> int:
 def rounded(value: float, digits: int = LEAST_DIGITS) -> str:
     """So many significant digits, thousands apart."""
     if math.isfinite(value) and abs(value) >= 1e4:
+        decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
         whole = float(f"{value:.{digits}g}")
-        return f"{whole:,.0f}".replace(",", "\u2009").replace("-", "−")
+        return f"{whole:,.{decimals}f}".replace(",", "\u2009").replace("-", "−")
     return significant(value, digits)
 
 

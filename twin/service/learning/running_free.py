@@ -53,7 +53,7 @@ def _peak(points: Sequence[Point], who: str) -> Json:
     known = [
         (values.eta_d, one.frequency_hz)
         for one in points
-        if (values := getattr(one, who)) is not None
+        if (values := getattr(one, who)) is not None and math.isfinite(values.eta_d)
     ]
     peak, hz = max(known, default=(math.nan, math.nan))
     return {"eta_d": peak, "frequency_hz": hz}
@@ -61,14 +61,17 @@ def _peak(points: Sequence[Point], who: str) -> Json:
 
 def _error(points: Sequence[Point]) -> float:
     pairs = [(p.twin.eta_d, p.measured.eta_d) for p in points if p.twin and p.measured]
-    twin, measured = np.array(pairs).reshape(-1, 2).T
+    known = [pair for pair in pairs if all(map(math.isfinite, pair))]
+    if not known:
+        return math.nan
+    twin, measured = np.array(known).T
     return float(np.linalg.norm(twin - measured) / max(float(np.linalg.norm(measured)), 1e-300))
 
 
 def free_run(sheet: Sheet, steps: Sequence[Step], one: Explained) -> list[Point]:
     """The PRC points of a log, measured and by the model running free on the measured table.
 
-    None where the table's acceleration or the steps are not known. Sensors that are known to err
+    Empty where the table's acceleration or the steps are not known. Sensors that are known to err
     are read as the explanation has them.
     """
     guess = one.fit.guess

@@ -40,7 +40,7 @@ def judge(root: Path, number: int, method: Method = discovered) -> Json:
     judged = cpu_seconds()
     places.verdict.write_text(dumps(verdict), encoding="utf-8")
     truth = [one["name"] for one in about["effects"]]
-    oracle = None if why or about["kind"] == "unknown" else _fitted(places, truth)
+    oracle = None if about["kind"] == "unknown" else _fitted(places, truth)
     row = _scored(verdict, about, oracle)
     if oracle and about["kind"] == "pair":
         row["mark"] = _mark(places, truth, oracle)
