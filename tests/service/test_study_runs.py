@@ -16,7 +16,7 @@ from twin.service.study.crew import by_crew
 from twin.service.study.pages import RESULTS, TABLE, read_rows
 
 from . import study_work
-from .test_study_scores import TRUE, about, verdict
+from .test_study_scores import OTHER, TRUE, about, verdict
 
 Json = dict[str, Any]
 
@@ -93,6 +93,32 @@ def test_a_verdict_that_fails_is_a_miss_that_says_why(
     assert row["rivals"]["rival"]["top1"] is False
     assert json.loads(places.verdict.read_text())["verdict"] == "named"
     assert np.isfinite(row["seconds"])
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_of_two_effects_the_row_says_what_mark_the_lesser_leaves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: bool
+) -> None:
+    """The factor by which the error grows without it; a verdict that fails has one too."""
+    number = 294000
+    places = judging.Places(tmp_path, case_of(number).label)
+    for folder in (places.shown, places.sealed):
+        folder.mkdir(parents=True)
+    places.about.write_text(json.dumps(about("pair", TRUE, OTHER, number=number)))
+    errors = {(TRUE["name"], OTHER["name"]): 1.0, (TRUE["name"],): 1.2, (OTHER["name"],): 3.0}
+    monkeypatch.setattr(judging, "true_structure", lambda shown, names: errors[tuple(names)])
+    monkeypatch.setattr(judging, "RIVALS", {})
+
+    def told(shown: Path) -> Json:
+        if fails:
+            raise ValueError("no way")
+        return verdict("named", TRUE["name"])
+
+    row = judging.judge(tmp_path, number, told)
+    assert row["mark"] == 1.2
+    assert (row["both"], row["one"]) == (False, not fails)
+    del errors[(OTHER["name"],)]  # no model of the library has it alone
+    assert judging.judge(tmp_path, number, told)["mark"] is None
 
 
 def test_bad_input_is_told(tmp_path: Path) -> None:

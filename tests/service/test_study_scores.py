@@ -219,6 +219,20 @@ def test_figures_count_what_has_its_size_and_failures_as_misses() -> None:
     assert {one.what: one for one in figures(again)}[top.what].found.startswith("84.6 % (11/13;")
 
 
+def test_two_effects_are_counted_whole_and_where_both_leave_a_mark() -> None:
+    def pair(number: int, mark: float | None, *names: str) -> Json:
+        said = verdict("named", *names) if names else verdict("failed")
+        return score(said, about("pair", TRUE, OTHER, number=number)) | {"mark": mark}
+
+    both = (TRUE["name"], OTHER["name"])
+    some = [pair(1, 2.0, *both), pair(2, 1.01, both[0]), pair(3, 1.3), pair(4, None, both[1])]
+    found = {one.what: one.found for one in figures(some)}
+    assert found["two effects: both"].startswith("25.0 % (1/4;")
+    assert found["two effects: one at least"].startswith("75.0 % (3/4;")
+    assert found["two effects, each with a mark of its own: both"].startswith("50.0 % (1/2;")
+    assert found["two effects, each with a mark of its own: one"].startswith("50.0 % (1/2;")
+
+
 def test_calibration_is_in_bins_of_what_was_stated() -> None:
     ((stated, found),) = calibration(usable(rows()))
     assert stated == pytest.approx(0.9)
