@@ -13,6 +13,7 @@ from twin.learn.discover import Log, discover, prepare, structured
 from twin.learn.naming import Enough, Trying
 from twin.learn.search import folds_of, products, ranked
 from twin.learn.verdict import closed_fraction, judge
+from twin.model.model import Model
 
 
 def test_where_nothing_is_hidden_nothing_is_named() -> None:
@@ -134,6 +135,18 @@ def test_where_several_sets_do_as_well_what_they_share_is_named() -> None:
     assert all(one.name in verdict.why for one in some)
     apart = [replace(named.best, effects=(one,)) for one in some]  # and nothing where they share it
     assert judge(bench, replace(named, best=apart[0], tried=tuple(apart)), 1.0).word == "ambiguous"
+
+
+def test_a_model_that_was_fitted_is_no_second_opinion() -> None:
+    """Its damping has taken up the loss of the hysteresis that it lacks, on other recordings."""
+    one = log(hidden("bouc_wen", force=120.0, yield_displacement=4e-4))
+    taken_up = 1.4 * prepare([one], SNM).first.values["damping"]
+    assert taken_up > 2.0 * SNM.parameters.damping
+    start = Model(replace(SNM.base, damping=taken_up))
+    doubted, believed = discover([one], start), discover([one], start, fitted=True)
+    assert doubted.verdict.word == "unexplained"
+    assert "only if the damping" in doubted.verdict.why
+    assert (believed.verdict.word, believed.verdict.best.names) == ("named", ("bouc_wen",))
 
 
 def test_several_logs_count_together() -> None:

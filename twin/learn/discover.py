@@ -169,8 +169,13 @@ def discover(
     tell: Tell = lambda now: None,
     without: Sequence[str] = (),
     each: Mapped = map,
+    fitted: bool = False,
 ) -> Discovery:
-    """What the model lacks of what the logs say; see `verdict`. `each` is a map on more cores."""
+    """What the model lacks of what the logs say; see `verdict`.
+
+    `each` is a map on more cores. `fitted`: the model's numbers come from recordings, where they
+    have taken up what it lacks: then they are no second opinion on those found here.
+    """
     tell(Trying("the model as it is"))
     prepared = prepare(logs, model, without, each)
     bench = prepared.bench
@@ -179,7 +184,7 @@ def discover(
     least = min(one.weight for one in bench.sheets) ** -2
     # what is left cannot be less than the noise: where it is, the noise was overrated
     floor = min(least * repeated(bench.sheets, found.best.left), found.best.cost)
-    verdict = judge(bench, found, floor, model.flat(), least)
+    verdict = judge(bench, found, floor, {} if fitted else model.flat(), least)
     # with the effects found the base may be the specimen's again: what is far off then is said
     pulls = pulling(bench.sheets, verdict.best.left)
     notes = (*prepared.notes, *far(model, verdict.best.fit), *pulls)

@@ -63,7 +63,7 @@ def discover_command(
             logs, notes = logs_of(paths)
             apart = logs_of(held_out)[0] if held_out else ()
             with side_by_side(logs) as each:
-                found = discover(logs, start, tell, without, each)
+                found = discover(logs, start, tell, without, each, fitted=bool(card.fitted_on))
     except (BadInput, Enough) as error:
         folder.rmdir()  # nothing is left of a failure
         if isinstance(error, BadInput):
