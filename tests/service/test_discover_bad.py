@@ -187,7 +187,7 @@ def test_an_effect_of_the_model_that_is_not_there_is_said(plain: Made, tmp_path:
 def test_enough_before_anything_leaves_nothing(
     plain: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(*_: object) -> Discovery:
+    def interrupted(*_: object, **__: object) -> Discovery:
         raise Enough
 
     monkeypatch.setattr(command, "discover", interrupted)
