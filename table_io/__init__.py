@@ -1,1 +1,1 @@
-"""The rig: drives the table and acquires the sensors. Never imports `twin`."""
+"""The rig: drives the shaking table and acquires the sensors. It never imports `twin`."""

@@ -1,7 +1,7 @@
-"""A Block: consecutive samples of several channels, labelled by the drive.
+"""Block: consecutive samples of several channels, labeled with the state of the drive.
 
-The sample index is the time: sample i is taken i / rate_hz seconds after the start of the run.
-Nothing in a calculation ever asks a wall clock.
+The sample index is the time base: sample i is taken i / rate_hz seconds after the start of the run.
+No calculation reads a wall clock.
 """
 
 from collections.abc import Iterable, Sequence
@@ -19,11 +19,11 @@ Bool2D = npt.NDArray[np.bool_]
 
 
 class Label(IntEnum):
-    """What the drive is doing at a sample."""
+    """State of the drive at a sample."""
 
     REST = 0  # no motion commanded
-    BLEND = 1  # soft start, soft stop, or change of step: never measured
-    SETTLE = 2  # held at the step, not measured: before the measured cycles, tuning, holding
+    BLEND = 1  # soft start, soft stop or change of step; never measured
+    SETTLE = 2  # held at the step but not measured: settling, tuning or an operator's hold
     MEASURE = 3  # held cycle that enters the PRC point
     STOP = 4  # decay to rest after a stop or a trip
     CHECK = 5  # held cycle of the loop check, at low level, before the sweep
@@ -31,10 +31,10 @@ class Label(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """Samples index .. index + n - 1 of one stream: `values` is float64 (channel, sample), SI.
+    """Samples index .. index + n - 1 of one stream: `values` in SI, float64 (channel, sample).
 
-    `step`, `label` and `cycle` are int64 (sample): the sweep step (-1 outside), its Label, and the
-    number of the held cycle within the step (-1 outside held cycles).
+    `step`, `label` and `cycle` are int64 (sample,): the sweep step (-1 outside the sweep), the
+    Label, and the number of the held cycle within the step (-1 outside held cycles).
     """
 
     stream: str
@@ -63,18 +63,18 @@ class Block:
 
     @property
     def time_s(self) -> Float1D:
-        """Time of each sample in s since the start of the run, (sample,)."""
+        """Time of each sample since the start of the run in s, (sample,)."""
         return (self.index + np.arange(len(self), dtype=np.float64)) / self.rate_hz
 
     def channel(self, name: str) -> Float1D:
-        """Samples of one channel, (sample,); KeyError names what there is."""
+        """Return the samples of one channel, (sample,); a KeyError lists the available channels."""
         try:
             return self.values[self.channels.index(name)]
         except ValueError:
             raise KeyError(f"{name} is not in {self.stream}: {', '.join(self.channels)}") from None
 
     def cut(self, first: int, last: int) -> "Block":
-        """Samples with index first <= i < last, as a view; ValueError outside the block."""
+        """Return samples first <= i < last as a view; ValueError if they exceed the block."""
         if not self.index <= first <= last <= self.end:
             raise ValueError(
                 f"samples {first} to {last} do not lie in the block {self.index} to {self.end}"
@@ -91,8 +91,8 @@ class Block:
             self.cycle[window],
         )
 
-    def identical(self, other: "Block") -> bool:
-        """True if every field is equal to the bit (NaN equal to the same NaN)."""
+    def is_identical(self, other: "Block") -> bool:
+        """Return True if every field is bitwise equal (NaN equals the same NaN)."""
         return (
             (self.stream, self.index, self.rate_hz, self.channels)
             == (other.stream, other.index, other.rate_hz, other.channels)
@@ -104,8 +104,8 @@ class Block:
         )
 
 
-def join(blocks: Sequence[Block]) -> Block:
-    """One block from consecutive ones of a stream; ValueError where samples are missing."""
+def join_blocks(blocks: Sequence[Block]) -> Block:
+    """Concatenate consecutive blocks of one stream; ValueError if samples are missing."""
     for left, right in pairwise(blocks):
         if (left.stream, left.end, left.rate_hz, left.channels) != (
             right.stream,
@@ -131,17 +131,17 @@ def join(blocks: Sequence[Block]) -> Block:
     )
 
 
-def recut(blocks: Iterable[Block], samples: int) -> Iterable[Block]:
-    """The same samples in blocks of `samples` (the last one may be shorter)."""
-    rest: list[Block] = []
-    held = 0
+def recut_blocks(blocks: Iterable[Block], samples: int) -> Iterable[Block]:
+    """Yield the same samples in blocks of length `samples` (the last one may be shorter)."""
+    pending: list[Block] = []
+    pending_samples = 0
     for block in blocks:
-        rest.append(block)
-        held += len(block)
-        while held >= samples:
-            whole = join(rest)
-            yield whole.cut(whole.index, whole.index + samples)
-            held -= samples
-            rest = [whole.cut(whole.index + samples, whole.end)] if held else []
-    if held:
-        yield join(rest)
+        pending.append(block)
+        pending_samples += len(block)
+        while pending_samples >= samples:
+            joined = join_blocks(pending)
+            yield joined.cut(joined.index, joined.index + samples)
+            pending_samples -= samples
+            pending = [joined.cut(joined.index + samples, joined.end)] if pending_samples else []
+    if pending_samples:
+        yield join_blocks(pending)

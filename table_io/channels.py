@@ -1,6 +1,6 @@
-"""The one table of channels: name, unit, what is positive, one sentence each.
+"""Table of all channels: name, unit, positive direction and meaning.
 
-Right is positive everywhere. The names are also the columns of CSV and Parquet files.
+Right is positive everywhere. The names are also the column names of CSV and Parquet files.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from table_io.block import Block, Float1D
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """One measured quantity; `unit` is SI."""
+    """Measured quantity with its SI unit and sign convention."""
 
     name: str
     unit: str
@@ -21,7 +21,7 @@ class Channel:
 
 
 CHANNELS: tuple[Channel, ...] = (
-    Channel("drive_disp_m", "m", "right", "Commanded table displacement, acquired back."),
+    Channel("drive_disp_m", "m", "right", "Commanded table displacement, read back."),
     Channel("table_disp_m", "m", "right", "Table displacement in the laboratory frame."),
     Channel("table_acc_m_s2", "m/s2", "right", "Table acceleration in the laboratory frame."),
     Channel("mass_disp_m", "m", "right", "Total displacement of the mass, laboratory frame."),
@@ -31,18 +31,18 @@ CHANNELS: tuple[Channel, ...] = (
     Channel("force_l1_n", "N", "compression", "First load cell on the left bumper."),
     Channel("force_l2_n", "N", "compression", "Second load cell on the left bumper."),
     Channel("damper_force_n", "N", "resists motion to the right", "Damper force, component tests."),
-    Channel("rel_disp_m", "m", "right", "Mass minus table displacement, where measured itself."),
+    Channel("rel_disp_m", "m", "right", "Mass minus table, measured directly."),
 )
-BY_NAME = {channel.name: channel for channel in CHANNELS}
+CHANNEL_BY_NAME = {channel.name: channel for channel in CHANNELS}
 
 RIGHT_CELLS = ("force_r1_n", "force_r2_n")
 LEFT_CELLS = ("force_l1_n", "force_l2_n")
 
 
-def rel_disp(block: Block) -> Float1D:
-    """u in m, right positive, (sample,): measured itself, else mass minus table displacement.
+def relative_displacement(block: Block) -> Float1D:
+    """Return u in m, right positive, (sample,): measured directly, else mass minus table.
 
-    All NaN where the channels are missing: a lost sensor is not a zero.
+    All NaN if the channels are missing, so that a lost sensor is not mistaken for zero.
     """
     if "rel_disp_m" in block.channels:
         return block.channel("rel_disp_m")
@@ -52,9 +52,9 @@ def rel_disp(block: Block) -> Float1D:
 
 
 def contact_forces(block: Block) -> tuple[Float1D, Float1D]:
-    """(F_R, F_L) in N, (sample,) each: F_R = r1 + r2 >= 0, F_L = -(l1 + l2) <= 0.
+    """Return the contact forces (F_R, F_L) in N: F_R = r1 + r2 >= 0, F_L = -(l1 + l2) <= 0.
 
-    NaN where the load cells of a side are missing.
+    Each is (sample,), and NaN if all load cells of its side are missing.
     """
     sides = []
     for cells, sign in ((RIGHT_CELLS, 1.0), (LEFT_CELLS, -1.0)):

@@ -1,26 +1,29 @@
-"""Clocks: the only import of `time`. A clock paces and measures; it never enters a calculation."""
+"""Clocks that pace loops and measure latency; the only module that imports `time`.
+
+No calculation depends on a clock.
+"""
 
 import time
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Protocol
 
-SPIN_S = 0.0002  # sleep() wakes up late by about this; the rest is waited out awake
+SPIN_S = 0.0002  # sleep() overshoots by about this much, so the remainder is a busy wait
 
 
 class Clock(Protocol):
-    """What paces a loop: seconds from an arbitrary origin, never going back."""
+    """Monotonic clock in s from an arbitrary origin."""
 
     def now(self) -> float:
-        """Seconds now."""
+        """Return the current time in s."""
 
     def wait_until(self, when: float) -> None:
-        """Return at `when` or, if that is past, at once."""
+        """Return at time `when` in s, or at once if that has passed."""
 
 
 @dataclass(frozen=True, slots=True)
 class RealClock:
-    """The machine's monotonic clock, shared by all processes on it; `pace` times as fast."""
+    """Monotonic clock of this computer, in s times `pace`: at pace 2 it runs twice as fast."""
 
     pace: float = 1.0
 
@@ -28,14 +31,14 @@ class RealClock:
         return time.monotonic() * self.pace
 
     def wait_until(self, when: float) -> None:
-        while (left := when / self.pace - time.monotonic()) > 0:
-            if left > SPIN_S:
-                time.sleep(left - SPIN_S)
+        while (remaining_s := when / self.pace - time.monotonic()) > 0:
+            if remaining_s > SPIN_S:
+                time.sleep(remaining_s - SPIN_S)
 
 
 @dataclass(slots=True)
 class ManualClock:
-    """A clock that jumps to wherever it is waited for: the same samples, as fast as possible."""
+    """Virtual clock that jumps to the awaited time: same samples, as fast as possible."""
 
     time_s: float = 0.0
 
@@ -47,15 +50,15 @@ class ManualClock:
 
 
 def cpu_seconds() -> float:
-    """Processor time that this process has used, in s, all threads."""
+    """Return the processor time used by all threads of this process in s."""
     return time.process_time()
 
 
-def today() -> datetime:
-    """Wall clock in local time, for names and provenance only."""
+def local_datetime() -> datetime:
+    """Return the wall-clock time with the local time zone, for names and provenance only."""
     return datetime.now(UTC).astimezone()
 
 
-def wall_ns() -> int:
-    """Wall clock in ns since 1970, for publish times in logs only."""
+def wall_clock_ns() -> int:
+    """Return the wall-clock time in ns since 1970, for publish times in logs only."""
     return time.time_ns()

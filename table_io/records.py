@@ -1,6 +1,6 @@
-"""The closed set of small records that flow beside Blocks.
+"""Record types of the stream next to Blocks: a closed set of small messages.
 
-Every record carries the sample index from which it holds, so a replay can put it back in its place.
+Every record carries the sample index from which it holds, so that a replay can order it exactly.
 """
 
 from dataclasses import dataclass, field
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One step of the sweep as planned: `direction` is "forward" or "backward"."""
+    """Step of the sweep; `direction` is "forward" or "backward"."""
 
     index: int
     direction: str
@@ -18,12 +18,12 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class RunStart:
-    """All that is needed to understand and repeat the run: the texts are whole TOML files."""
+    """Start record: all that is needed to understand and repeat the run, with whole TOML files."""
 
     index: int
     run: str
     name: str
-    source: str  # "table", "model": who made the measured stream
+    source: str  # origin of the measured stream: "table" or "model"
     profile_toml: str
     rig_toml: str
     model_toml: str
@@ -35,13 +35,13 @@ class RunStart:
     tare: dict[str, float]  # SI value subtracted from each channel, taken before precompression
     versions: dict[str, str]
     host: str
-    started_at: str  # ISO 8601, for people; never enters a calculation
-    epoch_s: float  # monotonic clock of the host at sample 0; only latencies are taken against it
+    started_at: str  # ISO 8601, for display only
+    epoch_s: float  # monotonic clock of the host at sample 0, for latencies only
 
 
 @dataclass(frozen=True, slots=True)
 class Params:
-    """Model parameters in SI that hold from sample `index` on."""
+    """Model parameters in SI, valid from sample `index` on."""
 
     index: int
     values: dict[str, float]
@@ -50,11 +50,11 @@ class Params:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Model against measurement over samples index .. index + count - 1, no wall clock inside.
+    """Model compared with measurement over samples index .. index + count - 1.
 
-    Per channel, sums over the samples: measured squared, error squared of the free-running twin,
-    error squared of the twin that restarts from the measured state. NaN where there is nothing to
-    compare.
+    Sums of squares per channel, SI: of the measurement, of the error of the free-running twin, and
+    of the error of the twin that restarts from the measured state. NaN where nothing can be
+    compared.
     """
 
     index: int
@@ -80,8 +80,8 @@ class Extremes:
 
 
 @dataclass(frozen=True, slots=True)
-class Cycle:
-    """One held forcing cycle that ends before sample `index`."""
+class CycleExtremes:
+    """Extremes of one held forcing cycle that ends before sample `index`."""
 
     index: int
     step: int
@@ -93,11 +93,11 @@ class Cycle:
 
 
 @dataclass(frozen=True, slots=True)
-class Quantities:
-    """What the laboratory reports at a step (Stefani et al., Eq. 1); all ratios >= 0.
+class NormalizedResponse:
+    """Normalized response at a step (Stefani et al., Eq. 1); all ratios >= 0.
 
-    `drift` is the change of eta_d over the measured cycles relative to its mean, the part of a
-    transient that is left; `spread` its range over them relative to its mean.
+    `drift` is the change of eta_d over the measured cycles relative to its mean (the remaining
+    transient); `spread` is its range over the measured cycles relative to its mean.
     """
 
     eta_d: float
@@ -113,15 +113,15 @@ class Quantities:
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
-    """The PRC point of a step whose measured cycles end before sample `index`."""
+class PrcPoint:
+    """PRC point of a step whose measured cycles end before sample `index`."""
 
     index: int
     step: int
     direction: str
     frequency_hz: float
-    measured: Quantities | None
-    twin: Quantities | None
+    measured: NormalizedResponse | None
+    twin: NormalizedResponse | None
     table_acc_peak_m_s2: float
     table_acc_fundamental_m_s2: float
     thd: float
@@ -129,11 +129,11 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """How far the restarted twin was from the measurement over a held cycle ending before `index`.
+    """Error of the restarted twin against the measurement over a held cycle ending before `index`.
 
-    Per channel, SI: rms of the error, the band within which noise and what the model may be off
-    keep it, and the error by phase: in flight, in contact right, in contact left. NaN where there
-    is nothing to compare.
+    Per channel, SI: rms error, the band expected from noise and allowed model error, and the rms
+    error by contact regime: in flight, in contact right, in contact left. NaN where nothing can be
+    compared.
     """
 
     index: int
@@ -150,10 +150,10 @@ class Agreement:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """The specimen as identified from the samples before `index`, recursively, SI.
+    """Recursive parameter estimate of the specimen from the samples before `index`, SI.
 
     `names` are parameters (stiffness, damping, gap_r, gap_l), `sd` standard deviations; `drift` is
-    the change since the first estimate that the trend over the test gives, with `drift_sd`.
+    the change since the first estimate according to the trend over the test, with `drift_sd`.
     """
 
     index: int
@@ -166,10 +166,10 @@ class Estimate:
 
 
 @dataclass(frozen=True, slots=True)
-class Ahead:
-    """The next jump on the way of the sweep by the model's branch, as known at sample `index`.
+class JumpForecast:
+    """Forecast of the next jump along the sweep from the model's branch, made at sample `index`.
 
-    `kind` is "up", "down", or "" where none is ahead; it lies at `jump_hz`, between the steps at
+    `kind` is "up", "down" or "" (no jump ahead); the jump lies at `jump_hz`, between the steps at
     `low_hz` and `high_hz`.
     """
 
@@ -185,7 +185,7 @@ class Ahead:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something a person should read: `kind` is one word."""
+    """Message to the user; `kind` is a short machine-readable word."""
 
     index: int
     kind: str
@@ -193,8 +193,8 @@ class Event:
 
 
 @dataclass(frozen=True, slots=True)
-class Gap:
-    """Samples index .. index + count - 1 are no true measurement of `channel` ("" = all)."""
+class SampleGap:
+    """Gap: samples index .. index + count - 1 of `channel` ("" = all) are not valid."""
 
     index: int
     count: int
@@ -204,9 +204,9 @@ class Gap:
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A component failed: what it should have made for from_index .. to_index - 1 is missing.
+    """Failure of a component: its output for samples from_index .. to_index - 1 is missing.
 
-    A replay does the same: nothing in between, then a fresh start at `to_index`.
+    A replay reproduces it: no output in between, then a fresh start at `to_index`.
     """
 
     index: int
@@ -218,9 +218,9 @@ class Fault:
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """How punctual a component was, over all blocks so far, in ms; `missed` counts deadlines.
+    """Latency of a component over all blocks so far in ms; `missed` counts missed deadlines.
 
-    The only record with a wall clock in it; no calculation reads it.
+    The only record that depends on a wall clock; no calculation reads it.
     """
 
     index: int
@@ -236,7 +236,7 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One line of the loop check: `value` has to lie in low .. high."""
+    """Result line of the loop check; it passes if `value` lies in low .. high."""
 
     index: int
     name: str
@@ -249,10 +249,10 @@ class Check:
 
 
 @dataclass(frozen=True, slots=True)
-class Response:
-    """The table's acceleration over its command, identified at low level, at `frequencies_hz`.
+class FrequencyResponse:
+    """FRF of the table, acceleration over command, identified at low level at `frequencies_hz`.
 
-    `gain` is a ratio, `phase_rad` negative where the table lags.
+    `gain` is a ratio; `phase_rad` is negative where the table lags.
     """
 
     index: int
@@ -263,11 +263,11 @@ class Response:
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """One look at the table's level at a step, on whole cycles that end before sample `index`.
+    """Level measurement at a step, over whole cycles that end before sample `index`.
 
-    Fundamental of the measured table acceleration beside the demanded one; `correction` is what the
-    command was multiplied with, `update` how often it was changed at this step, `accepted` that it
-    now stays for the measured cycles. `harmonics` are those of orders 2 to 5, m/s2.
+    Fundamental of the measured and of the demanded table acceleration; `correction` is the factor
+    on the command, `update` counts its changes at this step, and `accepted` means that it is frozen
+    for the measured cycles. `harmonics_m_s2` are the amplitudes of orders 2 to 5.
     """
 
     index: int
@@ -281,8 +281,8 @@ class Level:
 
 
 @dataclass(frozen=True, slots=True)
-class Decided:
-    """A step that was decided on during the test, not planned before it (track, refine)."""
+class StepAdded:
+    """Step added during the test by an adaptive policy (dwell, track or refine)."""
 
     index: int
     step: int
@@ -294,9 +294,9 @@ class Decided:
 
 @dataclass(frozen=True, slots=True)
 class Trip:
-    """Protection: what was seen in `channel` at sample `index`; latched, the table decays to rest.
+    """Protection trip in `channel` at sample `index`; latched, the table decays to rest.
 
-    `decided` is the sample up to which the session had looked when it saw this.
+    `decided` is the sample up to which the session had read when it tripped.
     """
 
     index: int
@@ -310,7 +310,7 @@ class Trip:
 
 @dataclass(frozen=True, slots=True)
 class RunStop:
-    """The end: `index` samples were acquired; verdict complete, stopped, aborted or halted."""
+    """Stop record after `index` samples; the verdict is complete, stopped, aborted or halted."""
 
     index: int
     verdict: str
@@ -322,23 +322,23 @@ Record = (
     RunStart
     | Params
     | Comparison
-    | Cycle
-    | Point
+    | CycleExtremes
+    | PrcPoint
     | Event
-    | Gap
+    | SampleGap
     | Fault
     | Timing
     | Check
-    | Response
+    | FrequencyResponse
     | Level
-    | Decided
+    | StepAdded
     | Trip
     | Agreement
     | Estimate
-    | Ahead
+    | JumpForecast
     | RunStop
 )
-RECORDS: tuple[type, ...] = (
-    RunStart, Params, Comparison, Cycle, Point, Event, Gap, Fault, Timing,
-    Check, Response, Level, Decided, Trip, Agreement, Estimate, Ahead, RunStop,
+RECORD_TYPES: tuple[type, ...] = (
+    RunStart, Params, Comparison, CycleExtremes, PrcPoint, Event, SampleGap, Fault, Timing,
+    Check, FrequencyResponse, Level, StepAdded, Trip, Agreement, Estimate, JumpForecast, RunStop,
 )  # fmt: skip

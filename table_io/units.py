@@ -1,4 +1,4 @@
-"""Human units of cards and what they are in SI."""
+"""Units allowed in config files, each with its SI unit and conversion factor."""
 
 GRAVITY_M_S2 = 9.80665
 

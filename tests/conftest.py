@@ -9,9 +9,11 @@ import pytest
 # Before anything is imported that computes; so whatever does is imported where it is needed.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+pytest_plugins = ["tests.reports.folders"]
+
 if TYPE_CHECKING:
-    from twin.service.bundle import Bundle
-    from twin.stream.recording import Recording
+    from twin.recording.reader import Recording
+    from twin.run.run_config import RunConfig
 
 PROFILE = """
 title = "Across the down-jump and back"
@@ -32,19 +34,19 @@ rate_hz = 1000.0
 
 
 @pytest.fixture(scope="session")
-def bundle(tmp_path_factory: pytest.TempPathFactory) -> "Bundle":
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> "RunConfig":
     """Six steps across the down-jump and back."""
-    from twin.service.bundle import read_bundle
+    from twin.run.run_config import read_run_config
 
     path = tmp_path_factory.mktemp("across") / "across.toml"
     path.write_text(PROFILE)
-    return read_bundle(path)
+    return read_run_config(path)
 
 
 @pytest.fixture(scope="session")
-def log_file(bundle: "Bundle", tmp_path_factory: pytest.TempPathFactory) -> Path:
+def log_file(bundle: "RunConfig", tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The recording of a run of it, alone in its folder."""
-    from twin.service.runs import play_unpaced
+    from twin.run.unpaced import play_unpaced
 
     path = tmp_path_factory.mktemp("across") / "first" / "run.mcap"
     path.parent.mkdir()
@@ -54,6 +56,6 @@ def log_file(bundle: "Bundle", tmp_path_factory: pytest.TempPathFactory) -> Path
 
 @pytest.fixture(scope="session")
 def recording(log_file: Path) -> "Recording":
-    from twin.stream.recording import read
+    from twin.recording.reader import read_recording
 
-    return read(log_file)
+    return read_recording(log_file)

@@ -1,167 +1,186 @@
-"""The contract of every backend, in words and as a Protocol.
+"""Backend contract: the call sequence and the guarantees of every machine driver.
 
-A backend owns one machine: an analogue output (the displacement command) and analogue inputs (the
-sensors), on one sample clock. It speaks volts and sample indices; it knows nothing of sweeps.
+A backend drives one machine: one analog output (the displacement command) and analog inputs (the
+sensors) on one sample clock. It works in volts and sample indices and knows nothing of the sweep.
 
-One object is one life of the machine: these calls in this order, all from one thread. A call out of
-order is RuntimeError.
-1. `open()` claims the machine, and waits where it still comes to rest after its last life. Nothing
-   moves. Errors are BadInput: what is missing (also a sample rate), what to do.
-2. `tare(samples)` returns the inputs at rest, before bumpers are precompressed, as often as asked.
+Terms. *Taken*: sampled by the machine, whether or not `read` has returned it yet. *Queued*: handed
+over by `queue` and not yet played. *Connection*: everything between `open` and `close`.
+
+A backend object serves one connection. All calls come from one thread, in the order below, with 5
+and 6 repeated in any order; a call out of order raises RuntimeError.
+
+1. `open()` claims the machine for this client. It waits while the machine is still coming to rest
+   from the previous connection, and moves nothing. Everything that the user must correct,
+   including an unsupported sample rate, raises InputError with the remedy.
+2. `tare(samples)` returns input samples at rest, before bumpers are precompressed. It may be called
+   any number of times.
 3. `queue(0, volts)` hands over the first command.
-4. `start()` starts output and input together, now: output sample i leaves when input sample i is
-   taken, at `scheduled(i)` = scheduled(0) + i / rate_hz of the session's clock. The command is
-   acquired back as `drive_disp_m`: what was queued, to a step of the output and of the input.
-5. `read(samples)` waits until the next samples are taken and returns them in order, each once, from
-   sample 0 on, however reads are cut. A sample that was lost is NaN in every lost channel: it keeps
-   its place, none is ever invented. MachineLost where they have not come PATIENCE_S after the
-   schedule of the last of them: what is queued plays on, and it ends at rest.
-6. `queue(index, volts)` at any time replaces everything queued from `index` on, exactly there.
-   After the last queued sample the output holds its value, also up to an `index` that lies beyond
-   it. The session always queues a command that ends at rest, so whatever dies, a table in motion
-   comes to rest smoothly; a machine that can brings one that ends in motion to its mean by itself.
-   `index` must lie at least `replace_after` samples after the newest one that the machine has taken
-   by now, read or not: what comes earlier is in the device and plays as it was queued. ValueError
-   otherwise, as for NaN and inf, and nothing is changed.
-7. `close()` releases the machine, which plays what is queued; safe at any time, twice, after any
-   error.
+4. `start()` starts output and inputs together, at once. Output sample i leaves when input sample i
+   is taken, at scheduled_time_s(i) = scheduled_time_s(0) + i / rate_hz on the session's clock. The
+   output is also acquired as channel `drive_disp_m`: it equals the queued command to within one
+   quantization step of the output plus one of the input.
+5. `read(samples)` blocks until the next samples have been taken, and returns them in order from
+   sample 0 on, each exactly once, however the reads are split. A lost sample is NaN in each channel
+   that lost it; it keeps its place and is never interpolated. If samples are still missing
+   SAMPLE_TIMEOUT_S after the scheduled time of the last one, `read` raises MachineLost; the queued
+   command plays on and the machine ends at rest.
+6. `queue(index, volts)` may be called at any time. It replaces everything queued from sample
+   `index` on, exactly from there. After the last queued sample the output holds its value, also up
+   to an `index` beyond that sample. `index` must be at least `replace_after` samples after the
+   newest sample taken: earlier output is already in the device and plays as it was queued. An
+   earlier `index`, NaN or inf raises ValueError and changes nothing. The session always queues a
+   command that ends at rest, so that a moving table stops smoothly whichever process fails; a
+   machine that is able to do so also brings a command that ends in motion to its mean.
+7. `close()` releases the machine, which plays what is queued. It may be called at any time, twice,
+   and after any error.
 
-A machine that watches its rig takes a silence of HEARTBEAT_S between start and close for its death,
-and goes on without it, to rest. Every call is a sign of life; one that waits gives more while it
-waits. The next call of a rig that was only slow is MachineLost.
+Watchdog. A machine that monitors its rig (the process that holds this object) assumes that the
+rig has died if no sign of life arrives for HEARTBEAT_TIMEOUT_S between start and close. It then
+continues alone, to rest. Every call is a sign of life, and a call that waits sends more while it
+waits. If the rig was only slow, its next call raises MachineLost.
 
-`tests/table_io/conformance.py` holds every backend to this, clause by clause.
+`tests/table_io/backends/conformance.py` tests every backend against each clause.
 """
 
 from typing import Protocol
 
 from table_io.block import Float1D, Float2D
-from table_io.card import BadInput
 from table_io.clock import Clock
-from table_io.profile import Profile
-from table_io.rig import Rig
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.errors import InputError
 
-PATIENCE_S = 0.5  # after its schedule a sample that has not come is not coming
-HEARTBEAT_S = 0.3  # without a word from its rig a machine that watches goes on alone
+SAMPLE_TIMEOUT_S = 0.5  # after its scheduled time a missing sample counts as lost
+HEARTBEAT_TIMEOUT_S = 0.3  # silence after which the machine's watchdog assumes a dead rig
 
 
 class MachineLost(RuntimeError):
-    """The machine does not answer; what is queued in it plays to rest."""
+    """Loss of the connection to the machine; the command queued in it plays to rest."""
 
 
 class Backend(Protocol):
-    """What the session needs of a machine; see the module for who calls what, when."""
+    """Output and inputs of one machine; the module docstring is the contract."""
 
     channels: tuple[str, ...]
     rate_hz: float
-    replace_after: int
+    replace_after: int  # samples after the newest taken one that can no longer be replaced
 
     def open(self) -> None:
-        """Claim the machine; nothing moves."""
+        """Claim the machine; nothing moves (clause 1)."""
 
     def tare(self, samples: int) -> Float2D:
-        """Volts at rest before precompression, (channel, sample)."""
+        """Return volts at rest, before precompression, (channel, sample) (clause 2)."""
 
     def queue(self, index: int, volts: Float1D) -> None:
-        """Replace the command from sample `index` on, (sample,); the last value is held."""
+        """Replace the command from sample `index` on, volts (sample,) (clauses 3 and 6)."""
 
     def start(self) -> None:
-        """Start output and input at sample 0."""
+        """Start output and inputs at sample 0 (clause 4)."""
 
     def read(self, samples: int) -> Float2D:
-        """Volts of the next samples, (channel, sample), when they have been taken."""
+        """Wait for the next samples and return their volts, (channel, sample) (clause 5)."""
 
-    def scheduled(self, index: int) -> float:
-        """Time on the session's clock at which sample `index` is taken, in s."""
+    def scheduled_time_s(self, index: int) -> float:
+        """Return the time in s, on the session's clock, at which sample `index` is taken."""
 
     def close(self) -> None:
-        """Release the machine."""
+        """Release the machine, which plays what is queued (clause 7)."""
 
 
-class Source(Protocol):
-    """A backend that only acquires: clauses 1, 2, 4 and 5 without output, and 7.
+class AcquisitionSource(Protocol):
+    """A backend without output, for a table under an external controller.
 
-    Sample 0 is the next that comes after start(). Who moves the table is somebody else, and lost
-    samples, or a lost device, do not stop it: so the words of its MachineLost say.
+    Clauses 1, 2, 4, 5 and 7 apply, without their parts on output. Sample 0 is the first sample that
+    arrives after `start`. Losing samples or the device does not stop the table, and the message of
+    MachineLost must state this.
     """
 
     channels: tuple[str, ...]
     rate_hz: float
-    clock_says: str  # once started: whose clock took sample 0, and when by that clock
+    clock_description: str  # after start: clock of the device, and its time at sample 0
 
     def open(self) -> None:
-        """Connect; nothing of the device is changed."""
+        """Connect to the device without changing its settings."""
 
     def tare(self, samples: int) -> Float2D:
-        """Volts at rest before precompression, (channel, sample)."""
+        """Return volts at rest, before precompression, (channel, sample)."""
 
     def start(self) -> None:
-        """Sample 0 is the next."""
+        """Start acquisition: the next sample to arrive is sample 0."""
 
     def read(self, samples: int) -> Float2D:
-        """Volts of the next samples, (channel, sample), when they have been taken."""
+        """Wait for the next samples and return their volts, (channel, sample)."""
 
-    def scheduled(self, index: int) -> float:
-        """Time on the session's clock at which sample `index` comes, in s."""
+    def scheduled_time_s(self, index: int) -> float:
+        """Return the time in s, on the session's clock, at which sample `index` arrives."""
 
     def close(self) -> None:
-        """Let the device go."""
+        """Disconnect from the device."""
 
 
-def open_source(rig: Rig, rate_hz: float, clock: Clock) -> Source:
-    """What acquires where a card only follows; another kind of input = one more case here."""
+def open_source(rig: RigConfig, rate_hz: float, clock: Clock) -> AcquisitionSource:
+    """Return the acquisition source of a rig without output; a new kind is a new case here."""
     match rig.follow.source if rig.follow is not None else rig.backend:
         case "opendaq":
             from table_io.backends.opendaq import OpenDaqSource
 
             return OpenDaqSource(rig, rate_hz, clock)
         case _:
-            raise BadInput(f"rig {rig.name}: backend {rig.backend!r} does not only acquire")
-
-
-def open_backend(rig: Rig, profile: Profile, clock: Clock) -> Backend:
-    """The backend that the machine card names. Adding a backend = one folder and one case here."""
-    asked = (rig, profile.specimen, profile.acquisition.rate_hz, clock)
-    match rig.backend:
-        case "simulated":
-            from table_io.backends.simulated import SimulatedBackend
-
-            return SimulatedBackend(*asked)
-        case "machine":
-            from table_io.backends.machine import MachineBackend
-
-            return MachineBackend(*asked)
-        case "ni":
-            from table_io.backends.ni import NiBackend
-
-            return NiBackend(*asked)
-        case "udp":
-            from table_io.backends.udp import UdpBackend
-
-            return UdpBackend(*asked)
-        case "opendaq" | "follow":
-            raise BadInput(
-                f"rig {rig.name}: backend {rig.backend!r} only acquires, so it moves nothing; a "
-                "controller that plays our drive is followed by backend = 'follow'"
+            raise InputError(
+                "this backend drives the table itself and is not an acquisition source",
+                where=f"rig {rig.name}",
+                key="backend",
+                value=rig.backend,
+                allowed="follow, opendaq",
             )
 
 
-def answers(rig: Rig) -> None:
-    """BadInput where the card names a machine of its own and none answers; claims nothing."""
+def open_backend(rig: RigConfig, profile: Profile, clock: Clock) -> Backend:
+    """Return the backend that the rig file selects; a new one is a folder and a case here."""
+    arguments = (rig, profile.specimen, profile.acquisition.rate_hz, clock)
+    match rig.backend:
+        case "simulated":
+            from table_io.sim.simulated_table import SimulatedBackend
+
+            return SimulatedBackend(*arguments)
+        case "machine":
+            from table_io.backends.machine.client import MachineBackend
+
+            return MachineBackend(*arguments)
+        case "ni":
+            from table_io.backends.ni import NiBackend
+
+            return NiBackend(*arguments)
+        case "udp":
+            from table_io.backends.udp import UdpBackend
+
+            return UdpBackend(*arguments)
+        case "opendaq" | "follow":
+            raise InputError(
+                "this backend only acquires and cannot drive the table",
+                where=f"rig {rig.name}",
+                key="backend",
+                value=rig.backend,
+                remedy="use backend = 'follow' for a controller that plays the drive file itself",
+            )
+
+
+def check_reachable(rig: RigConfig) -> None:
+    """Raise InputError if the machine of the rig file does not answer; claim nothing."""
     match rig.backend:
         case "machine":
-            from table_io.backends import machine
+            from table_io.backends.machine import client
 
-            machine.answers(rig)
+            client.check_reachable(rig)
         case "opendaq" | "follow":
             from table_io.backends import opendaq
 
-            opendaq.answers(rig)
+            opendaq.check_reachable(rig)
         case "udp":
             from table_io.backends import udp
 
-            udp.answers(rig)
+            udp.check_reachable(rig)
         case "ni":
             from table_io.backends import ni
 
-            ni.answers(rig)
+            ni.check_reachable(rig)

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from twin.model import exact
+from twin.model import closed_form
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 from twin.model.solver import Solver
-from twin.model.sweep import stepped_sine
-from twin.service.batch import at_gaps, batch
+from twin.model.stepped_sine import simulate_stepped_sine
+from twin.studies.batch import make_gap_variants, sweep_models
 
 AG, FREQUENCY, CYCLES, RATE = 0.05 * 9.80665, 3.4, 10, 2000.0
 G4 = Parameters(550.0, 36e3, 1100.0, 510e3, 900.0, 510e3, 900.0, 2e-3, 2e-3)
@@ -24,7 +24,7 @@ SECONDS = CYCLES / FREQUENCY
 
 
 def impacting() -> np.ndarray:
-    return stepped_sine(G4, np.arange(300, 341, 2) / 100, AG, 40).states[-1]
+    return simulate_stepped_sine(G4, np.arange(300, 341, 2) / 100, AG, 40).states[-1]
 
 
 def scipy_seconds() -> float:
@@ -66,8 +66,12 @@ def compare(benchmark, seconds_of_motion: float) -> None:
 @pytest.mark.benchmark(group="model")
 def test_sampled_driver(benchmark):
     base = AG * np.sin(W * np.arange(1, round(SECONDS * RATE) + 1) / RATE)
-    con, start, out = exact.constants(G4, RATE), impacting(), np.empty((7, base.size))
-    benchmark(lambda: exact.advance(start.copy(), con, base, out))
+    con, start, out = (
+        closed_form.discretized_params(G4, RATE),
+        impacting(),
+        np.empty((7, base.size)),
+    )
+    benchmark(lambda: closed_form.advance_state(start.copy(), con, base, out))
     assert np.isfinite(out).all()
     compare(benchmark, SECONDS)
 
@@ -75,8 +79,12 @@ def test_sampled_driver(benchmark):
 @pytest.mark.benchmark(group="model")
 def test_one_block(benchmark):
     base = np.zeros(20)
-    con, state, out = exact.constants(G4, RATE), exact.rest(G4), np.empty((7, 20))
-    benchmark(exact.advance, state, con, base, out)
+    con, state, out = (
+        closed_form.discretized_params(G4, RATE),
+        closed_form.rest_state(G4),
+        np.empty((7, 20)),
+    )
+    benchmark(closed_form.advance_state, state, con, base, out)
     assert not out.any()
 
 
@@ -84,7 +92,7 @@ def test_one_block(benchmark):
 def test_sweep_of_the_paper_at_g4(benchmark):
     up = np.arange(5, 51) / 10
     frequencies = np.concatenate([up, up[::-1]])
-    sweep = benchmark(stepped_sine, G4, frequencies, AG, 10)
+    sweep = benchmark(simulate_stepped_sine, G4, frequencies, AG, 10)
     assert np.isfinite(sweep.extremes).all()
     compare(benchmark, float(np.sum(10 / frequencies)))
 
@@ -108,14 +116,14 @@ def test_sampled_driver_with_effects(benchmark, kind):
     for effect, values in EFFECTS[kind].items():
         model = model.with_effect(effect, **values)
     solver, base, out = shaken(model)
-    benchmark(lambda: solver.advance(solver.rest(), base, base, out))
+    benchmark(lambda: solver.advance(solver.rest_state(), base, base, out))
     assert np.isfinite(out).all()
     if benchmark.stats is None:
         return
     nanoseconds = benchmark.stats.stats.min / base.size * 1e9
     plain, _, _ = shaken(Model(G4))
     begin = time.perf_counter()
-    plain.advance(plain.rest(), base, base, out)
+    plain.advance(plain.rest_state(), base, base, out)
     ratio = nanoseconds / ((time.perf_counter() - begin) / base.size * 1e9)
     benchmark.extra_info["ns_a_sample"] = round(nanoseconds)
     print(f"\n{nanoseconds:.0f} ns a sample, {ratio:.0f} times the SNM")
@@ -125,9 +133,9 @@ def test_sampled_driver_with_effects(benchmark, kind):
 def test_batch_on_all_cores(benchmark):
     up = np.arange(5, 51) / 10
     frequencies = np.concatenate([up, up[::-1]])
-    models = at_gaps(Model(G4), np.linspace(2e-3, 0.03, 64))
-    batch(models[:2], frequencies, AG, 10)
-    benchmark(batch, models, frequencies, AG, 10)
+    models = make_gap_variants(Model(G4), np.linspace(2e-3, 0.03, 64))
+    sweep_models(models[:2], frequencies, AG, 10)
+    benchmark(sweep_models, models, frequencies, AG, 10)
     if benchmark.stats is None:
         return
     one = min(_seconds(models, frequencies) for _ in range(3))
@@ -140,5 +148,5 @@ def test_batch_on_all_cores(benchmark):
 
 def _seconds(models: list[Model], frequencies: np.ndarray) -> float:
     begin = time.perf_counter()
-    batch(models, frequencies, AG, 10, cores=1)
+    sweep_models(models, frequencies, AG, 10, cores=1)
     return time.perf_counter() - begin

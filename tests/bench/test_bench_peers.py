@@ -14,10 +14,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from tests.bench.peers import AG, diffrax_sweep, scipy_sweep
 from twin.model.parameters import Parameters
-from twin.model.sweep import stepped_sine
-
-from .peers import AG, diffrax_sweep, scipy_sweep
+from twin.model.stepped_sine import simulate_stepped_sine
 
 G4 = Parameters(550.0, 36e3, 1100.0, 510e3, 900.0, 510e3, 900.0, 2e-3, 2e-3)
 CYCLES, RTOL, ATOL = 10, 1e-6, 1e-9
@@ -46,7 +45,7 @@ def seconds(call: Callable[[], object], times: int) -> float:
 
 def ours(frequencies: np.ndarray):
     """(state at the end of each frequency, onsets), extremes included in the time."""
-    sweep = stepped_sine(G4, frequencies, AG, CYCLES)
+    sweep = simulate_stepped_sine(G4, frequencies, AG, CYCLES)
     return sweep.states[:, :4], sweep.column("onsets_r").sum() + sweep.column("onsets_l").sum()
 
 

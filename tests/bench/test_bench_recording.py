@@ -16,16 +16,16 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
+from table_io.acquisition.session import run_session
 from table_io.backends import open_backend
 from table_io.block import Block
-from table_io.card import PROFILES
 from table_io.clock import ManualClock
+from table_io.config.base import PROFILES_DIR
 from table_io.records import Comparison, RunStart
-from table_io.session import play
-from twin.service.bundle import read_bundle
-from twin.service.runs import beside
-from twin.stream.mcap_log import LogWriter
-from twin.stream.wire import Item, encode, topic
+from twin.recording.mcap_log import LogWriter
+from twin.run.run_config import read_run_config
+from twin.run.unpaced import add_twin_items
+from twin.transport.codec import Item, encode_item, topic_for
 
 FLUSH_BLOCKS = 15
 BLOCKS, MORE = 300, 5000  # from the start of a test; more with -n 0 --benchmark-enable
@@ -34,11 +34,17 @@ P99_RATIO, SIZE_RATIO = 0.5, 1.25  # of HDF5: the cost of a block at the most, t
 
 def run_items(blocks: int) -> list[list[Item]]:
     """What a recorder hears with each block of a test on the simulated table; the start first."""
-    of = read_bundle(PROFILES / "tests" / "quickstart.toml")
+    of = read_run_config(PROFILES_DIR / "tests" / "quickstart.toml")
     backend = open_backend(of.rig, of.profile, ManualClock())
-    source = play(of.session, backend, ManualClock(), of.describe("bench", "table"), lambda: None)
+    source = run_session(
+        of.session_setup,
+        backend,
+        ManualClock(),
+        of.make_start_factory("bench", "table"),
+        lambda: None,
+    )
     turns: list[list[Item]] = [[]]
-    for item in islice(beside(source, of.twin()), 3 * blocks):
+    for item in islice(add_twin_items(source, of.prepare_twin()), 3 * blocks):
         if isinstance(item, Block) and item.stream == "meas":
             turns.append([])
         if isinstance(item, (Block, Comparison, RunStart)):
@@ -58,7 +64,9 @@ def costs(turns: list[list[Item]], write: Callable[[int], None]) -> np.ndarray:
 
 
 def ours(turns: list[list[Item]], path: Path) -> np.ndarray:
-    payloads = [[(topic(one), encode(one, "bench"), one.index) for one in turn] for turn in turns]
+    payloads = [
+        [(topic_for(one), encode_item(one, "bench"), one.index) for one in turn] for turn in turns
+    ]
     writer = LogWriter(path, 2000.0)
 
     def write(number: int) -> None:

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from table_io.card import find
+from table_io.config.base import find_config
 from twin.log import open_log
-from twin.service.bundle import Bundle, read_bundle
-from twin.service.replaying import Recorded, replay
-from twin.service.runs import play_unpaced
-from twin.stream import shaketwin_pb2 as pb
-from twin.stream.salvage import salvage
+from twin.recording.recovery import recover_log
+from twin.replay.pipeline_replay import RecordedRun, replay_recording
+from twin.run.run_config import RunConfig, read_run_config
+from twin.run.unpaced import play_unpaced
+from twin.transport import shaketwin_pb2 as pb
 
 # The limits of reading by protobuf lie at twice what was measured, those of real time far below.
 LEAST_TIMES_REAL_TIME = 20
@@ -23,12 +23,12 @@ MOST_READINGS_OF_A_CHANNEL = 1.0
 
 
 @pytest.fixture(scope="module")
-def bundle() -> Bundle:
-    return read_bundle(find("quickstart", "tests"))
+def bundle() -> RunConfig:
+    return read_run_config(find_config("quickstart", "tests"))
 
 
 @pytest.fixture(scope="module")
-def log(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def log(bundle: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("bench") / "run.mcap"
     play_unpaced(bundle, "bench", path, lambda: None, lambda _: None)
     return path
@@ -38,7 +38,7 @@ def read_by_protobuf(log: Path) -> int:
     """Every message parsed and its values listed, one by one: what a reader has to do at least."""
     count = 0
     kinds = {"/rig/meas": pb.Block, "/twin/pred": pb.Block, "/twin/cmp": pb.Comparison}
-    for one in salvage(log).messages:
+    for one in recover_log(log).messages:
         if kind := kinds.get(one.topic):
             message = kind.FromString(one.payload)
             if kind is pb.Block:
@@ -53,16 +53,16 @@ def cpu_s(work, *given: object) -> float:
 
 
 @pytest.mark.benchmark(group="replay")
-def test_replay_beside_reading(benchmark, bundle: Bundle, log: Path, tmp_path: Path) -> None:
+def test_replay_beside_reading(benchmark, bundle: RunConfig, log: Path, tmp_path: Path) -> None:
     """Opening, twin, comparison and writing, against parsing the recording and nothing more."""
     number = 0
 
     def replayed() -> None:
         nonlocal number
         number += 1
-        recorded = Recorded.open(log)
+        recorded = RecordedRun.open(log)
         made = tmp_path / f"{number}.mcap"
-        assert replay(recorded, bundle, made, "again", lambda _: None).identical
+        assert replay_recording(recorded, bundle, made, "again", lambda _: None).is_identical
 
     benchmark.pedantic(cpu_s, (replayed,), rounds=3)
     if benchmark.stats is None:

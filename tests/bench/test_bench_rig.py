@@ -8,24 +8,30 @@ from itertools import cycle
 import numpy as np
 from pytest_benchmark.fixture import BenchmarkFixture
 
+from table_io.acquisition.session import run_session
 from table_io.backends import open_backend
 from table_io.block import Block
-from table_io.card import PROFILES
 from table_io.clock import ManualClock
-from table_io.session import play
-from twin.compare import PREDICTED, pipeline
-from twin.service.bundle import Bundle, read_bundle
-from twin.stream.wire import decode, encode, topic
+from table_io.config.base import PROFILES_DIR
+from twin.compare import TWIN_CHANNELS, pipeline
+from twin.run.run_config import RunConfig, read_run_config
+from twin.transport.codec import decode_item, encode_item, topic_for
 
 
-def bundle() -> Bundle:
-    return read_bundle(PROFILES / "tests" / "quickstart.toml")
+def bundle() -> RunConfig:
+    return read_run_config(PROFILES_DIR / "tests" / "quickstart.toml")
 
 
-def blocks(of: Bundle, count: int) -> list[Block]:
+def blocks(of: RunConfig, count: int) -> list[Block]:
     """The first measured blocks of a test on the simulated table."""
     backend = open_backend(of.rig, of.profile, ManualClock())
-    source = play(of.session, backend, ManualClock(), of.describe("bench", "table"), lambda: None)
+    source = run_session(
+        of.session_setup,
+        backend,
+        ManualClock(),
+        of.make_start_factory("bench", "table"),
+        lambda: None,
+    )
     found: list[Block] = []
     for item in source:
         if isinstance(item, Block):
@@ -47,14 +53,14 @@ def test_the_simulated_table_reads_a_block(benchmark: BenchmarkFixture) -> None:
 
 def test_the_twin_steps_a_block(benchmark: BenchmarkFixture) -> None:
     of = bundle()
-    setup = of.twin()
-    state, _ = pipeline.start(setup)
+    setup = of.prepare_twin()
+    state, _ = pipeline.start_pipeline(setup)
     for block in blocks(of, 200):
         state, _ = pipeline.step(setup, state, block)
-    (following,) = (block for block in blocks(of, 201) if block.index == state.tracks.index)
+    (following,) = (block for block in blocks(of, 201) if block.index == state.twins.index)
     _, items = benchmark(pipeline.step, setup, state, following)
     assert isinstance(items[0], Block)
-    assert items[0].channels == PREDICTED
+    assert items[0].channels == TWIN_CHANNELS
 
 
 def test_a_block_goes_through_the_encoder_and_back(benchmark: BenchmarkFixture) -> None:
@@ -62,8 +68,8 @@ def test_a_block_goes_through_the_encoder_and_back(benchmark: BenchmarkFixture) 
 
     def there_and_back() -> tuple[Block, object]:
         block = next(some)
-        return block, decode(topic(block), encode(block, "bench"))[1]
+        return block, decode_item(topic_for(block), encode_item(block, "bench"))[1]
 
     sent, got = benchmark(there_and_back)
     assert isinstance(got, Block)
-    assert sent.identical(got)
+    assert sent.is_identical(got)

@@ -14,7 +14,7 @@ import pytest
 
 MODEL = """
 import numpy as np
-from twin.model.ideal import swept
+from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 model = Model(Parameters(550.0, 36e3, 1100.0, 510e3, 900.0, 510e3, 900.0, 2e-3, 2e-3))
@@ -25,7 +25,7 @@ model = model.with_effect("bumper_hardening", k2=1e8)
 """
 SWEEP = """
 up = np.arange(5, 51) / 10
-extremes = swept(model, np.concatenate([up, up[::-1]]), 0.05 * 9.80665, 10).extremes
+extremes = simulate_sweep(model, np.concatenate([up, up[::-1]]), 0.05 * 9.80665, 10).extremes
 assert np.isfinite(extremes).all()
 """
 LIBRARIES = "import numba, numpy, scipy.linalg"

@@ -6,28 +6,30 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from table_io.records import Point, Quantities
-from twin.compare.curves import Hysteresis, Jump, branches, sudden
-from twin.model.parameters import Parameters, resonance
-from twin.model.sweep import stepped_sine
+from table_io.records import NormalizedResponse, PrcPoint
+from twin.compare.curves import Hysteresis, PrcJump, describe_sudden_change, detect_hysteresis
+from twin.model.parameters import Parameters, free_flight_resonance
+from twin.model.stepped_sine import simulate_stepped_sine
 
 GRID = tuple(round(2.0 + 0.1 * k, 9) for k in range(21))
 LEVEL = 0.05 * 9.80665
 Curve = Callable[[float], float]
 
 
-def measured(eta_d: float, spread: float = 0.002) -> Quantities:
-    return Quantities(eta_d, eta_d, 0.0, 0.0, 0.0, 0.0, (0,), (0,), 0.0, spread)
+def measured(eta_d: float, spread: float = 0.002) -> NormalizedResponse:
+    return NormalizedResponse(eta_d, eta_d, 0.0, 0.0, 0.0, 0.0, (0,), (0,), 0.0, spread)
 
 
-def point(direction: str, hz: float, values: Quantities | None, source: str = "measured") -> Point:
+def point(
+    direction: str, hz: float, values: NormalizedResponse | None, source: str = "measured"
+) -> PrcPoint:
     pair = {"measured": None, "twin": None, source: values}
-    return Point(0, 0, direction, hz, pair["measured"], pair["twin"], LEVEL, LEVEL, 0.0)
+    return PrcPoint(0, 0, direction, hz, pair["measured"], pair["twin"], LEVEL, LEVEL, 0.0)
 
 
 def sweep(
     forward: Curve, backward: Curve, grid: Sequence[float] = GRID, source: str = "measured"
-) -> list[Point]:
+) -> list[PrcPoint]:
     """Points in driving order, up and back, with 0.4 % of scatter between the directions."""
     rng = np.random.default_rng(1)
     return [
@@ -58,7 +60,7 @@ def softening(jump_hz: float) -> Curve:
 
 
 RIGHT = (
-    [Jump("forward", 3.5, 3.6, "down"), Jump("backward", 2.7, 2.6, "up")],
+    [PrcJump("forward", 3.5, 3.6, "down"), PrcJump("backward", 2.7, 2.6, "up")],
     [Hysteresis("right", 2.7, 3.5)],
 )
 
@@ -66,32 +68,32 @@ RIGHT = (
 @pytest.mark.parametrize("source", ["measured", "twin"])
 def test_right_hysteresis(source: str) -> None:
     points = sweep(hardening(3.55), hardening(2.65), source=source)
-    assert branches(points, source) == RIGHT
-    assert branches(points, "twin" if source == "measured" else "measured") == ([], [])
+    assert detect_hysteresis(points, source) == RIGHT
+    assert detect_hysteresis(points, "twin" if source == "measured" else "measured") == ([], [])
 
 
 def test_left_hysteresis() -> None:
     points = sweep(softening(3.55), softening(2.65))
-    assert branches(points, "measured") == (
-        [Jump("forward", 3.5, 3.6, "up"), Jump("backward", 2.7, 2.6, "down")],
+    assert detect_hysteresis(points, "measured") == (
+        [PrcJump("forward", 3.5, 3.6, "up"), PrcJump("backward", 2.7, 2.6, "down")],
         [Hysteresis("left", 2.7, 3.5)],
     )
 
 
 def test_the_order_of_the_points_does_not_matter() -> None:
     points = sweep(hardening(3.55), hardening(2.65))
-    assert branches(points[::-1], "measured") == RIGHT
+    assert detect_hysteresis(points[::-1], "measured") == RIGHT
 
 
 def test_no_hysteresis_where_the_directions_agree() -> None:
     """A steep branch, even a jump that both directions make at the same place, is none."""
-    assert branches(sweep(upper, upper), "measured") == ([], [])
-    assert branches(sweep(hardening(3.05), hardening(3.05)), "measured") == ([], [])
+    assert detect_hysteresis(sweep(upper, upper), "measured") == ([], [])
+    assert detect_hysteresis(sweep(hardening(3.05), hardening(3.05)), "measured") == ([], [])
 
 
 def test_a_smooth_difference_is_no_hysteresis() -> None:
     """A gap that opened between the directions: 20 % everywhere, and no jump."""
-    assert branches(sweep(upper, lambda hz: 1.2 * upper(hz)), "measured") == ([], [])
+    assert detect_hysteresis(sweep(upper, lambda hz: 1.2 * upper(hz)), "measured") == ([], [])
 
 
 def test_two_hystereses() -> None:
@@ -103,21 +105,21 @@ def test_two_hystereses() -> None:
     def backward(hz: float) -> float:
         return lower(hz) if hz < 2.15 else hardening(3.15)(hz)
 
-    _, intervals = branches(sweep(forward, backward), "measured")
+    _, intervals = detect_hysteresis(sweep(forward, backward), "measured")
     assert intervals == [Hysteresis("left", 2.2, 2.4), Hysteresis("right", 3.2, 3.5)]
 
 
 def test_hysteresis_that_reaches_the_lower_edge() -> None:
-    jumps, intervals = branches(sweep(hardening(3.55), lower), "measured")
+    jumps, intervals = detect_hysteresis(sweep(hardening(3.55), lower), "measured")
     assert intervals == [Hysteresis("right", 2.0, 3.5)]
-    assert jumps == [Jump("forward", 3.5, 3.6, "down")]
+    assert jumps == [PrcJump("forward", 3.5, 3.6, "down")]
 
 
 def test_hysteresis_that_reaches_the_upper_edge() -> None:
     """The jump came while the highest frequency was held: the way back begins below."""
-    jumps, intervals = branches(sweep(upper, hardening(2.65)), "measured")
+    jumps, intervals = detect_hysteresis(sweep(upper, hardening(2.65)), "measured")
     assert intervals == [Hysteresis("right", 2.7, 4.0)]
-    assert jumps == [Jump("backward", 2.7, 2.6, "up")]
+    assert jumps == [PrcJump("backward", 2.7, 2.6, "up")]
 
 
 def test_missing_points_are_bridged() -> None:
@@ -127,19 +129,22 @@ def test_missing_points_are_bridged() -> None:
         if (one.direction, one.frequency_hz) not in {("forward", 3.0), ("backward", 2.6)}
     ]
     points.append(point("forward", 3.0, None))
-    jumps, intervals = branches(points, "measured")
+    jumps, intervals = detect_hysteresis(points, "measured")
     assert intervals == RIGHT[1]
-    assert jumps == [RIGHT[0][0], Jump("backward", 2.7, 2.5, "up")]
+    assert jumps == [RIGHT[0][0], PrcJump("backward", 2.7, 2.5, "up")]
 
 
 @pytest.mark.parametrize("direction", ["forward", "backward"])
 def test_one_direction_alone_has_no_hysteresis(direction: str) -> None:
     points = sweep(hardening(3.55), hardening(2.65))
-    assert branches([one for one in points if one.direction == direction], "measured") == ([], [])
+    assert detect_hysteresis([one for one in points if one.direction == direction], "measured") == (
+        [],
+        [],
+    )
 
 
 def test_no_points_at_all() -> None:
-    assert branches([], "measured") == ([], [])
+    assert detect_hysteresis([], "measured") == ([], [])
 
 
 @pytest.mark.parametrize("seed", range(30))
@@ -153,17 +158,17 @@ def test_chaotic_scatter_is_no_hysteresis(seed: int) -> None:
             points.append(
                 point(direction, hz, measured(etas.mean(), float(np.ptp(etas) / etas.mean())))
             )
-    assert branches(points, "measured") == ([], [])
+    assert detect_hysteresis(points, "measured") == ([], [])
 
 
 # The model's own sweeps: ten cycles a step, the last three measured
 
 
-def swept(gap_m: float, start_hz: float, stop_hz: float) -> list[Point]:
+def swept(gap_m: float, start_hz: float, stop_hz: float) -> list[PrcPoint]:
     p = Parameters(550.0, 36e3, 1.1e3, 510e3, 900.0, 510e3, 900.0, gap_m / 2, gap_m / 2)
     grid = [round(start_hz + 0.1 * k, 9) for k in range(round((stop_hz - start_hz) * 10) + 1)]
-    driven = stepped_sine(p, [*grid, *grid[::-1]], LEVEL, 10)
-    u_star, _, _ = resonance(p, LEVEL)
+    driven = simulate_stepped_sine(p, [*grid, *grid[::-1]], LEVEL, 10)
+    u_star, _, _ = free_flight_resonance(p, LEVEL)
     etas = (driven.column("u_max") - driven.column("u_min"))[:, -3:] / (2 * u_star)
     return [
         point("forward" if k < len(grid) else "backward", hz,
@@ -174,7 +179,7 @@ def swept(gap_m: float, start_hz: float, stop_hz: float) -> list[Point]:
 
 def test_g4_has_the_right_hysteresis_of_the_paper_and_none_in_its_chaos() -> None:
     """physics.md: fold 4.027 Hz, passed at 4.1 to 4.3 in ten cycles; up-jump 2.787 Hz."""
-    jumps, (interval,) = branches(swept(0.004, 0.5, 5.0), "measured")
+    jumps, (interval,) = detect_hysteresis(swept(0.004, 0.5, 5.0), "measured")
     assert interval.kind == "right"
     # at 2.8 Hz, 0.01 Hz above the up-jump, the transient of a step may tip it
     assert interval.from_hz in {2.8, 2.9}
@@ -186,12 +191,12 @@ def test_g4_has_the_right_hysteresis_of_the_paper_and_none_in_its_chaos() -> Non
 
 
 def test_g0_has_none() -> None:
-    assert branches(swept(0.0, 3.0, 7.0), "measured") == ([], [])
+    assert detect_hysteresis(swept(0.0, 3.0, 7.0), "measured") == ([], [])
 
 
 def test_gm2_has_a_left_one_in_the_model() -> None:
     """physics.md: SNM detaches at G-2, hysteresis 5.81 to 6.15 Hz (the rig does not)."""
-    jumps, (interval,) = branches(swept(-0.002, 4.5, 7.5), "measured")
+    jumps, (interval,) = detect_hysteresis(swept(-0.002, 4.5, 7.5), "measured")
     assert interval.kind == "left"
     assert 5.7 <= interval.from_hz <= 5.9
     assert 6.0 <= interval.to_hz <= 6.2
@@ -203,16 +208,19 @@ def test_gm2_has_a_left_one_in_the_model() -> None:
 
 def test_a_hint_names_a_leap_of_one_direction() -> None:
     a, b = point("forward", 4.0, measured(0.2)), point("forward", 4.2, measured(0.03))
-    assert sudden(a, b) == "forward: eta_d falls from 0.200 to 0.030 between 4 and 4.2 Hz"
-    assert "rises" in (sudden(b, a) or "")
+    assert (
+        describe_sudden_change(a, b)
+        == "forward: eta_d falls from 0.200 to 0.030 between 4 and 4.2 Hz"
+    )
+    assert "rises" in (describe_sudden_change(b, a) or "")
 
 
 def test_no_hint_without_a_leap_or_over_a_turn() -> None:
     a, b = point("forward", 4.0, measured(0.2)), point("forward", 4.2, measured(0.03))
-    assert sudden(None, a) is None
-    assert sudden(a, point("forward", 4.1, measured(0.15))) is None
-    assert sudden(a, point("backward", 4.2, measured(0.03))) is None
-    assert sudden(a, point("forward", 4.2, None)) is None
-    assert sudden(point("forward", 4.0, None), b) is None
-    assert sudden(a, point("forward", 4.2, measured(0.0))) is None
-    assert sudden(a, point("forward", 4.2, measured(math.nan))) is None
+    assert describe_sudden_change(None, a) is None
+    assert describe_sudden_change(a, point("forward", 4.1, measured(0.15))) is None
+    assert describe_sudden_change(a, point("backward", 4.2, measured(0.03))) is None
+    assert describe_sudden_change(a, point("forward", 4.2, None)) is None
+    assert describe_sudden_change(point("forward", 4.0, None), b) is None
+    assert describe_sudden_change(a, point("forward", 4.2, measured(0.0))) is None
+    assert describe_sudden_change(a, point("forward", 4.2, measured(math.nan))) is None

@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 
 from table_io.block import Float1D, Label
-from table_io.records import Cycle, Extremes, Step
+from table_io.records import CycleExtremes, Extremes, Step
 from table_io.units import GRAVITY_M_S2
 from twin.compare.cycles import (
-    UNKNOWN,
-    Motion,
-    Scale,
-    extremes,
-    onsets,
-    point,
-    quantities,
+    UNKNOWN_CONTACT,
+    CycleMotion,
+    PrcScale,
+    build_prc_point,
+    cycle_extremes,
+    detect_onsets,
+    measure_table_motion,
+    normalized_response,
     smooth,
-    table_motion,
 )
-from twin.model.parameters import Parameters, resonance
+from twin.model.parameters import Parameters, free_flight_resonance
 
 RATE = 2000.0
 LEVEL = 0.05 * GRAVITY_M_S2
@@ -31,15 +31,15 @@ G4 = Parameters(550.0, 36e3, 1.1e3, 510e3, 900.0, 510e3, 900.0, 0.002, 0.002)
 FREE = replace(G4, gap_r=math.inf, gap_l=math.inf)
 
 
-def scale(parameters: Parameters = G4) -> Scale:
-    u_star, a_star, _ = resonance(parameters, LEVEL)
+def scale(parameters: Parameters = G4) -> PrcScale:
+    u_star, a_star, _ = free_flight_resonance(parameters, LEVEL)
     gaps = (parameters.gap_r, parameters.gap_l)
-    return Scale(parameters, RATE, 10.0, u_star, a_star, gaps)
+    return PrcScale(parameters, RATE, 10.0, u_star, a_star, gaps)
 
 
-def motion(u: Float1D, a: Float1D, right: Float1D | None = None) -> Motion:
+def motion(u: Float1D, a: Float1D, right: Float1D | None = None) -> CycleMotion:
     nothing = np.zeros(u.size)
-    return Motion(u, a, nothing if right is None else right, nothing)
+    return CycleMotion(u, a, nothing if right is None else right, nothing)
 
 
 def cycle(
@@ -49,18 +49,18 @@ def cycle(
     label: Label = Label.MEASURE,
     u: float = 0.003,
     force: float = 500.0,
-) -> Cycle:
+) -> CycleExtremes:
     """A held cycle whose measured extremes are given; the twin has nothing to say."""
     first = number * length
     found = Extremes(u, -u, 1.0, -1.0, force, 0.0, tuple(onsets_r), ())
-    return Cycle(first + length, 0, number, int(label), length, found, None)
+    return CycleExtremes(first + length, 0, number, int(label), length, found, None)
 
 
 # Extremes
 
 
 def test_smoothing_leaves_a_parabola_as_it_is() -> None:
-    weights = scale().weights
+    weights = scale().smoothing_weights
     half = weights.size // 2
     t = np.arange(200.0)
     parabola = 3.0 - 0.2 * t + 0.01 * t**2
@@ -74,13 +74,13 @@ def test_smoothing_spans_a_tenth_of_the_shortest_half_period(gap: float) -> None
     p = replace(G4, gap_r=gap, gap_l=gap)
     stiffness = p.stiffness + (2 * p.bumper_stiffness_r if math.isfinite(gap) else 0.0)
     tenth = 0.1 * math.pi * math.sqrt(p.mass / stiffness) * RATE
-    size = scale(p).weights.size
+    size = scale(p).smoothing_weights.size
     assert size <= 33
     assert min(tenth, 32) - 2 <= size - 1 <= tenth
 
 
 def test_smoothing_of_what_is_shorter_than_it_changes_nothing() -> None:
-    weights = scale().weights
+    weights = scale().smoothing_weights
     short = np.arange(weights.size - 1.0)
     np.testing.assert_array_equal(smooth(short, weights), short)
 
@@ -91,11 +91,11 @@ def test_noise_hardly_lifts_an_extreme() -> None:
     t = np.arange(round(RATE / 3.4)) / RATE
     u = 5e-3 * np.sin(2 * math.pi * 3.4 * t)
     still = np.zeros(t.size)
-    left = math.sqrt(float(s.weights @ s.weights))
+    left = math.sqrt(float(s.smoothing_weights @ s.smoothing_weights))
     smoothed, raw = [], []
     for _ in range(300):
         noisy = u + sigma * rng.standard_normal(t.size)
-        found, _ = extremes(motion(noisy, still), 0, s, UNKNOWN)
+        found, _ = cycle_extremes(motion(noisy, still), 0, s, UNKNOWN_CONTACT)
         assert found is not None
         smoothed.append(found.u_max - 5e-3)
         raw.append(noisy.max() - 5e-3)
@@ -110,7 +110,7 @@ def test_a_contact_is_not_smeared() -> None:
     w = math.sqrt((36e3 + 510e3) / 550)
     t = np.arange(588) / RATE
     force = 2000.0 * np.clip(np.sin(w * (t - 0.1)), 0, None) * (abs(t - 0.15) < math.pi / w)
-    found, _ = extremes(motion(t, t, force), 0, s, UNKNOWN)
+    found, _ = cycle_extremes(motion(t, t, force), 0, s, UNKNOWN_CONTACT)
     assert found is not None
     assert found.force_r == pytest.approx(2000.0, rel=2e-3)
     assert found.force_l == 0.0
@@ -121,8 +121,10 @@ def test_a_peak_at_the_cut_between_two_cycles_is_not_lost(parameters: Parameters
     """A held cycle begins at any phase; without the samples that lead up to it 3 % would go."""
     s, n = scale(parameters), 400
     for phase in np.linspace(0, 2 * math.pi, 33):
-        wave = np.cos(2 * math.pi * np.arange(-s.lead, n) / n + phase)
-        found, _ = extremes(Motion(wave, wave, wave, wave), 0, s, UNKNOWN, s.lead)
+        wave = np.cos(2 * math.pi * np.arange(-s.lead_samples, n) / n + phase)
+        found, _ = cycle_extremes(
+            CycleMotion(wave, wave, wave, wave), 0, s, UNKNOWN_CONTACT, s.lead_samples
+        )
         assert found is not None
         got = (found.u_max, -found.u_min, found.a_max, -found.a_min, found.force_r, found.force_l)
         np.testing.assert_allclose(got, 1.0, rtol=2e-4)
@@ -130,11 +132,11 @@ def test_a_peak_at_the_cut_between_two_cycles_is_not_lost(parameters: Parameters
 
 def test_contact_before_the_cycle_is_no_onset_of_it() -> None:
     s = scale()
-    force = np.zeros(s.lead + 500)
+    force = np.zeros(s.lead_samples + 500)
     force[2:6] = 100.0
-    force[s.lead + 50 : s.lead + 60] = 100.0
+    force[s.lead_samples + 50 : s.lead_samples + 60] = 100.0
     still = np.zeros(force.size)
-    found, _ = extremes(motion(still, still, force), 3000, s, UNKNOWN, s.lead)
+    found, _ = cycle_extremes(motion(still, still, force), 3000, s, UNKNOWN_CONTACT, s.lead_samples)
     assert found is not None
     assert found.onsets_r == (3050,)
 
@@ -142,8 +144,8 @@ def test_contact_before_the_cycle_is_no_onset_of_it() -> None:
 def test_extremes_keep_signs_and_sides() -> None:
     t = np.arange(588) / RATE
     wave = np.sin(2 * math.pi * 3.4 * t)
-    pair = Motion(1e-3 + 2e-3 * wave, 0.5 - wave, np.full(588, 30.0), np.full(588, 70.0))
-    found, touching = extremes(pair, 1000, scale(), (False, True))
+    pair = CycleMotion(1e-3 + 2e-3 * wave, 0.5 - wave, np.full(588, 30.0), np.full(588, 70.0))
+    found, touching = cycle_extremes(pair, 1000, scale(), (False, True))
     assert found is not None
     got = (found.u_max, found.u_min, found.a_max, found.a_min, found.force_r, found.force_l)
     np.testing.assert_allclose(got, (3e-3, -1e-3, 1.5, -0.5, 30.0, 70.0), rtol=1e-5)
@@ -154,18 +156,21 @@ def test_extremes_keep_signs_and_sides() -> None:
 def test_lost_displacement_leaves_no_extremes_and_an_unknown_contact() -> None:
     u = np.zeros(500)
     u[77] = np.nan
-    assert extremes(motion(u, np.zeros(500)), 0, scale(), (True, False)) == (None, UNKNOWN)
+    assert cycle_extremes(motion(u, np.zeros(500)), 0, scale(), (True, False)) == (
+        None,
+        UNKNOWN_CONTACT,
+    )
 
 
 def test_a_lost_accelerometer_leaves_the_displacement() -> None:
     t = np.arange(588) / RATE
     u = 2e-3 * np.sin(2 * math.pi * 3.4 * t)
-    found, _ = extremes(motion(u, np.full(588, np.nan)), 0, scale(), UNKNOWN)
+    found, _ = cycle_extremes(motion(u, np.full(588, np.nan)), 0, scale(), UNKNOWN_CONTACT)
     assert found is not None
     assert found.u_max == pytest.approx(2e-3, rel=1e-5)
     assert math.isnan(found.a_max)
-    values = quantities(
-        [Cycle(588, 0, 0, int(Label.MEASURE), 588, found, None)], "measured", scale()
+    values = normalized_response(
+        [CycleExtremes(588, 0, 0, int(Label.MEASURE), 588, found, None)], "measured", scale()
     )
     assert values is not None
     assert values.eta_d == pytest.approx(2e-3 / scale().u_star_m, rel=1e-5)
@@ -177,31 +182,33 @@ def test_a_lost_accelerometer_leaves_the_displacement() -> None:
 
 def test_onsets_have_hysteresis() -> None:
     force = np.array([0.0, 9.0, 11.0, 6.0, 11.0, 4.9, 9.9, 10.1, 20.0])
-    assert onsets(force, 10.0, False) == ([2, 7], True)
-    assert onsets(force[1:], 10.0, True) == ([6], True)
+    assert detect_onsets(force, 10.0, False) == ([2, 7], True)
+    assert detect_onsets(force[1:], 10.0, True) == ([6], True)
 
 
 def test_contact_at_the_first_sample_is_an_onset_only_where_there_was_none() -> None:
     force = np.array([50.0, 50.0, 0.0])
-    assert onsets(force, 10.0, False) == ([0], False)
-    assert onsets(force, 10.0, True) == ([], False)
-    assert onsets(force, 10.0, None) == ([], False)
-    assert onsets(np.array([7.0, 8.0]), 10.0, None) == ([], None)
+    assert detect_onsets(force, 10.0, False) == ([0], False)
+    assert detect_onsets(force, 10.0, True) == ([], False)
+    assert detect_onsets(force, 10.0, None) == ([], False)
+    assert detect_onsets(np.array([7.0, 8.0]), 10.0, None) == ([], None)
 
 
 def test_lost_samples_of_a_force_are_no_release() -> None:
     force = np.array([0.0, 50.0, np.nan, 50.0, np.nan, 0.0, np.nan])
-    assert onsets(force, 10.0, None) == ([1], False)
+    assert detect_onsets(force, 10.0, None) == ([1], False)
 
 
 def test_a_lost_sample_of_a_force_in_contact_is_no_second_onset_of_its_cycle() -> None:
     force = np.zeros(500)
     force[100:160] = 400.0
     force[130] = np.nan
-    found, touching = extremes(motion(force * 0 + 1, force, force), 0, scale(), UNKNOWN)
+    found, touching = cycle_extremes(
+        motion(force * 0 + 1, force, force), 0, scale(), UNKNOWN_CONTACT
+    )
     assert found is None  # the displacement was lost with it
     still = np.zeros(500)
-    found, touching = extremes(motion(still, still, force), 0, scale(), UNKNOWN)
+    found, touching = cycle_extremes(motion(still, still, force), 0, scale(), UNKNOWN_CONTACT)
     assert found is not None
     assert found.onsets_r == (100,)
     assert math.isnan(found.force_r)
@@ -213,22 +220,22 @@ def test_noise_counts_nothing_twice() -> None:
     rng = np.random.default_rng(2)
     t = np.arange(100_000) / RATE
     force = np.clip(400.0 * np.sin(2 * math.pi * 1.0 * t), 0.0, None)
-    places, _ = onsets(force + 1.4 * rng.standard_normal(t.size), 10.0, False)
+    places, _ = detect_onsets(force + 1.4 * rng.standard_normal(t.size), 10.0, False)
     assert len(places) == 50
-    assert not onsets(1.4 * rng.standard_normal(t.size), 10.0, False)[0]
+    assert not detect_onsets(1.4 * rng.standard_normal(t.size), 10.0, False)[0]
 
 
 # Impacts per cycle
 
 
-def counted(cycles: list[Cycle]) -> tuple[int, ...]:
-    values = quantities(cycles, "measured", scale())
+def counted(cycles: list[CycleExtremes]) -> tuple[int, ...]:
+    values = normalized_response(cycles, "measured", scale())
     assert values is not None
     assert values.impacts_left == (0,) * len(values.impacts_right)
     return values.impacts_right
 
 
-def held(places: Sequence[int], settle: int = 1, measure: int = 3) -> list[Cycle]:
+def held(places: Sequence[int], settle: int = 1, measure: int = 3) -> list[CycleExtremes]:
     """Settle and measured cycles of 500 samples with onsets where they fall."""
     return [
         cycle(
@@ -283,9 +290,9 @@ def swing(hz: float, parameters: Parameters = FREE) -> tuple[Float1D, Float1D]:
     return tuple(abs(one) * np.sin(w * t + cmath.phase(one)) for one in (x, total))  # type: ignore[return-value]
 
 
-def flying(hz: float, s: Scale) -> Cycle:
-    found, _ = extremes(motion(*swing(hz, s.parameters)), 0, s, UNKNOWN)
-    return Cycle(1, 0, 0, int(Label.MEASURE), 1, found, found)
+def flying(hz: float, s: PrcScale) -> CycleExtremes:
+    found, _ = cycle_extremes(motion(*swing(hz, s.parameters)), 0, s, UNKNOWN_CONTACT)
+    return CycleExtremes(1, 0, 0, int(Label.MEASURE), 1, found, found)
 
 
 def test_free_flight_at_resonance_is_the_unit() -> None:
@@ -293,28 +300,30 @@ def test_free_flight_at_resonance_is_the_unit() -> None:
     assert s.u_star_m == pytest.approx(30.537e-3, abs=1e-6)
     assert s.a_star_m_s2 == pytest.approx(2.057, abs=1e-3)
     for source in ("measured", "twin"):
-        values = quantities([flying(1.268, s)], source, s)
+        values = normalized_response([flying(1.268, s)], source, s)
         assert values is not None
         assert values.eta_d == pytest.approx(1.0, abs=2e-5)
         assert values.eta_a == pytest.approx(1.0, abs=2e-5)
         assert (values.eta_r, values.eta_l, values.r_r, values.r_l) == (0, 0, 0, 0)
         assert (values.drift, values.spread) == (0, 0)
     # on the paper's 0.1 Hz grid the largest is 2 % less
-    grid = quantities([flying(1.3, s)], "measured", s)
+    grid = normalized_response([flying(1.3, s)], "measured", s)
     assert grid is not None
     assert grid.eta_d == pytest.approx(29.95 / 30.537, abs=1e-3)
 
 
 def test_no_contact_is_no_deformation_whatever_the_noise() -> None:
     """Load cells below the threshold carry nothing, even where u alone would say contact."""
-    values = quantities([cycle(0, u=0.0021, force=9.9)], "measured", scale())
+    values = normalized_response([cycle(0, u=0.0021, force=9.9)], "measured", scale())
     assert values is not None
     assert (values.eta_r, values.r_r) == (0, 0)
 
 
 def test_contact_gives_deformation_beyond_the_gap_and_force_over_weight() -> None:
     s = scale()
-    values = quantities([cycle(0, u=0.003), cycle(1, u=0.004, force=1500.0)], "measured", s)
+    values = normalized_response(
+        [cycle(0, u=0.003), cycle(1, u=0.004, force=1500.0)], "measured", s
+    )
     assert values is not None
     assert values.eta_d == pytest.approx(0.0035 / s.u_star_m)
     assert values.eta_r == pytest.approx((0.001 + 0.002) / 2 / s.u_star_m)
@@ -326,14 +335,17 @@ def test_contact_gives_deformation_beyond_the_gap_and_force_over_weight() -> Non
 
 def test_eta_of_a_lopsided_motion_is_half_its_range() -> None:
     s, found = scale(), Extremes(0.005, -0.001, 2.0, -0.5, 0.0, 0.0, (), ())
-    values = quantities([Cycle(500, 0, 0, int(Label.MEASURE), 500, found, None)], "measured", s)
+    values = normalized_response(
+        [CycleExtremes(500, 0, 0, int(Label.MEASURE), 500, found, None)], "measured", s
+    )
     assert values is not None
     assert values.eta_d == pytest.approx(0.003 / s.u_star_m)
     assert values.eta_a == pytest.approx(1.25 / s.a_star_m_s2)
 
 
 def test_drift_has_a_sign_and_spread_has_none() -> None:
-    values = quantities([cycle(k, u=u) for k, u in enumerate((0.003, 0.004, 0.002))], "measured",
+    cycles = [cycle(k, u=u) for k, u in enumerate((0.003, 0.004, 0.002))]
+    values = normalized_response(cycles, "measured",
                         scale())  # fmt: skip
     assert values is not None
     assert values.drift == pytest.approx(-1 / 3)
@@ -345,9 +357,11 @@ def test_negative_gap_includes_precompression() -> None:
     s = scale(replace(G4, gap_r=-0.001, gap_l=-0.001))
     still = np.zeros(500)
     swing = 1e-4 * np.sin(2 * math.pi * np.arange(500) / 500)
-    pair = Motion(swing, still, still + 561.0, still + 459.0)
-    found, _ = extremes(pair, 0, s, UNKNOWN)
-    values = quantities([Cycle(500, 0, 0, int(Label.MEASURE), 500, found, None)], "measured", s)
+    pair = CycleMotion(swing, still, still + 561.0, still + 459.0)
+    found, _ = cycle_extremes(pair, 0, s, UNKNOWN_CONTACT)
+    values = normalized_response(
+        [CycleExtremes(500, 0, 0, int(Label.MEASURE), 500, found, None)], "measured", s
+    )
     assert values is not None
     assert values.eta_r == pytest.approx(1.1e-3 / s.u_star_m, rel=1e-5)
     assert values.eta_l == pytest.approx(1.1e-3 / s.u_star_m, rel=1e-5)
@@ -358,7 +372,7 @@ def test_negative_gap_includes_precompression() -> None:
 def test_lost_load_cells_are_not_zeros() -> None:
     """Force and impacts are unknown; the deformation is that of the displacement."""
     s = scale()
-    values = quantities([cycle(0, u=0.003, force=math.nan)], "measured", s)
+    values = normalized_response([cycle(0, u=0.003, force=math.nan)], "measured", s)
     assert values is not None
     assert math.isnan(values.r_r)
     assert values.impacts_right == ()
@@ -366,8 +380,8 @@ def test_lost_load_cells_are_not_zeros() -> None:
 
 
 def test_no_measured_cycle_is_no_point() -> None:
-    assert quantities([cycle(0, label=Label.SETTLE)], "measured", scale()) is None
-    assert quantities([cycle(0)], "twin", scale()) is None
+    assert normalized_response([cycle(0, label=Label.SETTLE)], "measured", scale()) is None
+    assert normalized_response([cycle(0)], "twin", scale()) is None
 
 
 # The table
@@ -390,7 +404,7 @@ def test_harmonics_of_the_table_at_40_db(hz: float, cycles: int) -> None:
             for order, part in parts.items():
                 x += part * np.sin(order * turn + rng.uniform(0, 2 * math.pi))
             noise = 0.01 / math.sqrt(2) * rng.standard_normal(n)
-            got.append(table_motion(LEVEL * (x + noise), hz, RATE)[1:])
+            got.append(measure_table_motion(LEVEL * (x + noise), hz, RATE)[1:])
     fundamental, thd = np.array(got).reshape(2, 20, 2).transpose(2, 0, 1)
     assert abs(fundamental / LEVEL - 1).max() < 0.005
     want = np.array([0.0, math.hypot(*HARMONICS.values())])
@@ -400,7 +414,7 @@ def test_harmonics_of_the_table_at_40_db(hz: float, cycles: int) -> None:
 
 def test_an_offset_of_the_accelerometer_is_no_harmonic() -> None:
     turn = 2 * math.pi * 4.7 * np.arange(852) / RATE
-    peak, fundamental, thd = table_motion(LEVEL * np.sin(turn) + 0.05, 4.7, RATE)
+    peak, fundamental, thd = measure_table_motion(LEVEL * np.sin(turn) + 0.05, 4.7, RATE)
     assert peak == pytest.approx(LEVEL + 0.05, rel=1e-3)
     assert fundamental == pytest.approx(LEVEL, rel=1e-9)
     assert thd < 1e-9
@@ -409,13 +423,13 @@ def test_an_offset_of_the_accelerometer_is_no_harmonic() -> None:
 def test_lost_samples_of_the_table_leave_it_unknown() -> None:
     x = np.sin(2 * math.pi * 4.0 * np.arange(1000) / RATE)
     x[500] = np.nan
-    assert all(math.isnan(one) for one in table_motion(x, 4.0, RATE))
-    assert all(math.isnan(one) for one in table_motion(np.empty(0), 4.0, RATE))
+    assert all(math.isnan(one) for one in measure_table_motion(x, 4.0, RATE))
+    assert all(math.isnan(one) for one in measure_table_motion(np.empty(0), 4.0, RATE))
 
 
 def test_a_point_says_step_direction_and_frequency() -> None:
     turn = 2 * math.pi * 4.0 * np.arange(1000) / RATE
-    got = point(Step(7, "backward", 4.0, LEVEL), held([]), LEVEL * np.sin(turn), scale())
+    got = build_prc_point(Step(7, "backward", 4.0, LEVEL), held([]), LEVEL * np.sin(turn), scale())
     assert (got.index, got.step, got.direction, got.frequency_hz) == (2000, 7, "backward", 4.0)
     assert got.measured is not None
     assert got.twin is None

@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_windows import G4, RATE, followed, measured, shaken, track
 
-from table_io.block import recut
-from twin.compare.sensors import delayed
-from twin.compare.windows import TwinSetup, follow
+from table_io.block import recut_blocks
+from tests.compare.test_twins import G4, RATE, followed, measured, shaken, track
+from twin.compare.sensors import delay_signal
+from twin.compare.twins import TwinSetup, advance_twins
 from twin.model.effects import find_effect
 from twin.model.model import Model
-from twin.stream.wire import encode
+from twin.transport.codec import encode_item
 
 EVERYTHING = ("bouc_wen", "maxwell_damper", "bumper_hardening", "bumper_maxwell", "gap_drift",
               "table_tilt", "coulomb_friction")  # fmt: skip
@@ -33,7 +33,7 @@ def setup(one: Model) -> TwinSetup:
 def test_a_cubic_is_delayed_exactly(samples: float) -> None:
     t = np.arange(100.0)
     wave = 1e-4 * t**3 - 0.01 * t**2 + t
-    late = delayed(wave, samples)
+    late = delay_signal(wave, samples)
     known = np.isfinite(late)
     at = t - samples
     want = 1e-4 * at**3 - 0.01 * at**2 + at
@@ -48,9 +48,9 @@ def test_the_cut_changes_no_bit_with_effects_and_sensors(samples: int) -> None:
     one = one.with_effect("sensor_gain", "mass_disp_m", gain=1.02)
     block = measured(G4, shaken(seconds=1.2), noise=1.0)
     whole, comparisons = followed(setup(one), [block])
-    cut, others = followed(setup(one), list(recut([block], samples)))
-    assert cut.identical(whole)
-    assert [encode(c, "r") for c in comparisons] == [encode(c, "r") for c in others]
+    cut, others = followed(setup(one), list(recut_blocks([block], samples)))
+    assert cut.is_identical(whole)
+    assert [encode_item(c, "r") for c in comparisons] == [encode_item(c, "r") for c in others]
 
 
 def test_sensors_change_the_reading_and_nothing_else() -> None:
@@ -84,7 +84,7 @@ def test_hidden_states_go_on_over_a_restart() -> None:
     """With the right model the windowed twin stays on the measured motion, memory included."""
     one = model("bouc_wen", "maxwell_damper")
     solver, base = one.prepare(RATE), shaken(seconds=2.5)
-    out, state = np.empty((7, base.size)), solver.rest()
+    out, state = np.empty((7, base.size)), solver.rest_state()
     solver.advance(state, base, base, out)
     block = measured(G4, base)
     rows = block.values.copy()
@@ -103,9 +103,9 @@ def test_hidden_states_go_on_over_a_restart() -> None:
 
 def test_tracks_of_a_model_with_effects_are_values() -> None:
     one = setup(model("bouc_wen"))
-    from twin.compare.windows import begin
+    from twin.compare.twins import start_twins
 
     block = measured(G4, shaken(seconds=0.8))
-    tracks = begin(one, 0)
-    first = follow(one, tracks, block)[1]
-    assert follow(one, tracks, block)[1].identical(first)
+    tracks = start_twins(one, 0)
+    first = advance_twins(one, tracks, block)[1]
+    assert advance_twins(one, tracks, block)[1].is_identical(first)

@@ -4,11 +4,10 @@ import math
 
 import numpy as np
 
+from tests.model.reference import AG, snm
 from twin.model.effects import EFFECTS
 from twin.model.model import Model
-from twin.model.solver import Start
-
-from .reference import AG, snm
+from twin.model.solver import StateEstimate
 
 RATE = 2000.0
 FORCES = [e for e in EFFECTS if e.acts in ("force", "linear")]
@@ -48,10 +47,10 @@ def noisy(seconds: float, seed: int = 3, rate: float = RATE, peak: float = 4 * A
     return peak / 6 * sum(np.sin(2 * math.pi * f * t + phase) for f, phase in parts)
 
 
-def drive(model: Model, base: np.ndarray, start: Start | None = None, rate: float = RATE):
+def drive(model: Model, base: np.ndarray, start: StateEstimate | None = None, rate: float = RATE):
     """(state, out) after the samples."""
     solver = model.prepare(rate)
-    state = solver.rest() if start is None else solver.restart(start)
+    state = solver.rest_state() if start is None else solver.restart_state(start)
     out = np.empty((7, base.size))
     solver.advance(state, base, 0.01 * base, out)
     return state, out

@@ -4,19 +4,20 @@ import math
 
 import numpy as np
 
-from twin.model import exact
+from tests.model.reference import AG
+from twin.model import closed_form
 from twin.model.parameters import Parameters
-
-from .reference import AG
 
 U, V, A, F_R, F_L, U_R, U_L = range(7)
 
 
 def run(p: Parameters, rate: float, base: np.ndarray, state: np.ndarray | None = None):
     """(state, out, events) after the samples `base` from `state` or from rest."""
-    state = exact.rest(p) if state is None else state.copy()
+    state = closed_form.rest_state(p) if state is None else state.copy()
     out, events = np.empty((7, base.size)), np.zeros((4 * base.size + 10, 5))
-    count = exact.advance_logged(state, exact.constants(p, rate), base, out, events)
+    count = closed_form.advance_state_logged(
+        state, closed_form.discretized_params(p, rate), base, out, events
+    )
     return state, out, events[:count]
 
 
@@ -27,5 +28,5 @@ def sine(frequency: float, rate: float, seconds: float, peak: float = AG) -> np.
 
 def kicked(p: Parameters, speed: float) -> np.ndarray:
     """Rest, hit by a hammer: contacts that would pull then are released."""
-    u, _, ur, ul, right, left, *_ = exact.rest(p)
-    return exact.restart(u, speed, ur, ul, right > 0, left > 0, 0.0, p)
+    u, _, ur, ul, right, left, *_ = closed_form.rest_state(p)
+    return closed_form.restart_state(u, speed, ur, ul, right > 0, left > 0, 0.0, p)

@@ -6,12 +6,11 @@ import re
 import numpy as np
 import pytest
 
-from table_io.card import BadInput
+from table_io.errors import InputError
+from tests.model.cases import FORCES, RATE, drive, everything, having, noisy, typical, vanishing
+from tests.model.reference import snm
 from twin.model.effects import EFFECTS
 from twin.model.model import Model
-
-from .cases import FORCES, RATE, drive, everything, having, noisy, typical, vanishing
-from .reference import snm
 
 TABLE = {
     "cubic_stiffness": {"k3": "N/m3"}, "quadratic_damping": {"c2": "N s2/m2"},
@@ -40,7 +39,7 @@ class TestLaws:
         """Alone, beside another, and in the solver: the model without it."""
         without = Model(base)
         model = having(effect, base=base, values=vanishing)
-        assert not model.present
+        assert not model.present_effects
         assert not model.sensors
         assert drive(model, KICK)[1].tobytes() == drive(without, KICK)[1].tobytes()
         other = BY_ID["bouc_wen" if effect.id != "bouc_wen" else "cubic_stiffness"]
@@ -55,16 +54,16 @@ class TestLaws:
             for value in (parameter.high + 1, parameter.low - 1, math.nan):
                 values = {**typical(effect), parameter.name: value}
                 with pytest.raises(
-                    BadInput, match=re.escape(f"{parameter.low:g} to {parameter.high:g}")
+                    InputError, match=re.escape(f"{parameter.low:g} to {parameter.high:g}")
                 ):
-                    effect.check(values)
+                    effect.validate(values)
 
     def test_refuses_unknown_and_missing_parameters(self, effect):
         first = effect.parameters[0].name
-        with pytest.raises(BadInput, match=f"did you mean '{first}'"):
-            effect.check({**typical(effect), first + "x": 1.0})
-        with pytest.raises(BadInput, match=f"lacks '{first}'"):
-            effect.check({})
+        with pytest.raises(InputError, match=f"did you mean '{first}'"):
+            effect.validate({**typical(effect), first + "x": 1.0})
+        with pytest.raises(InputError, match=f"lacks '{first}'"):
+            effect.validate({})
 
     def test_tells_what_a_person_needs(self, effect):
         assert effect.term
@@ -114,7 +113,7 @@ class TestMotion:
     def cut(self, model, size):
         solver, base = model.prepare(RATE), noisy(0.7)
         whole, out = drive(model, base)
-        state, cut = solver.rest(), np.empty_like(out)
+        state, cut = solver.rest_state(), np.empty_like(out)
         for first in range(0, base.size, size):
             part = base[first : first + size]
             part.setflags(write=False)

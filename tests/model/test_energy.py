@@ -12,12 +12,21 @@ import math
 import numpy as np
 import pytest
 
-from twin.model import exact
-from twin.model.phase import CONTACT_L, CONTACT_R, MOST_EVENTS, STEP, U_L, U_R, U, V, leap
-from twin.model.sweep import stepped_sine
-
-from .motion import kicked
-from .reference import AG, snm
+from tests.model.motion import kicked
+from tests.model.reference import AG, snm
+from twin.model import closed_form
+from twin.model.contact_regime import (
+    CONTACT_L,
+    CONTACT_R,
+    MAX_EVENTS_PER_STEP,
+    STEP,
+    U_L,
+    U_R,
+    U,
+    V,
+    advance_to_event,
+)
+from twin.model.stepped_sine import simulate_stepped_sine
 
 CYCLES = 10
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(24)
@@ -49,7 +58,7 @@ def phase_integral(p, con, begin: np.ndarray, dt: float, drive) -> np.ndarray:
     base, slope, (peak, w, phase) = drive
     for node, weight in zip(NODES, WEIGHTS, strict=True):
         t, state = 0.5 * dt * (node + 1), begin.copy()
-        leap(state, con, t, *drive, False)
+        advance_to_event(state, con, t, *drive, False)
         now = base + slope * t + peak * math.sin(phase + w * t)
         total += 0.5 * dt * weight * powers(p, state, now)
     return total
@@ -57,20 +66,20 @@ def phase_integral(p, con, begin: np.ndarray, dt: float, drive) -> np.ndarray:
 
 def balance(p, frequency: float, rate: float, sampled: bool) -> tuple[np.ndarray, np.ndarray, int]:
     """(`powers` integrated over the run from a kick in J, the state at its end, onsets)."""
-    con, state = exact.constants(p, rate), kicked(p, 0.1)
+    con, state = closed_form.discretized_params(p, rate), kicked(p, 0.1)
     h, w = con[STEP], 2 * math.pi * frequency
     total, onsets, still = np.zeros(3), 0, (0.0, 0.0, 0.0)
     for i in range(round(CYCLES * rate / frequency)):
         t, before, after = 0.0, AG * math.sin(w * i * h), AG * math.sin(w * (i + 1) * h)
-        for attempt in range(MOST_EVENTS):
-            assert attempt + 1 < MOST_EVENTS
+        for attempt in range(MAX_EVENTS_PER_STEP):
+            assert attempt + 1 < MAX_EVENTS_PER_STEP
             if sampled:
                 slope = (after - before) / h
                 drive = before + slope * t, slope, still
             else:
                 drive = 0.0, 0.0, (AG, w, w * (i * h + t))
             begin = state.copy()
-            dt, side, *_ = leap(state, con, h - t, *drive, True)
+            dt, side, *_ = advance_to_event(state, con, h - t, *drive, True)
             total += phase_integral(p, con, begin, dt, drive)
             t += dt
             if side < 0:
@@ -82,10 +91,10 @@ def balance(p, frequency: float, rate: float, sampled: bool) -> tuple[np.ndarray
 def driven(p, frequency: float, rate: float, sampled: bool) -> np.ndarray:
     """The end of the same run by the driver itself."""
     if not sampled:
-        return stepped_sine(p, [frequency], AG, CYCLES, state=kicked(p, 0.1)).states[0]
+        return simulate_stepped_sine(p, [frequency], AG, CYCLES, state=kicked(p, 0.1)).states[0]
     base = AG * np.sin(2 * math.pi * frequency * np.arange(1, CYCLES * rate / frequency + 1) / rate)
     state, out = kicked(p, 0.1), np.empty((7, base.size))
-    exact.advance(state, exact.constants(p, rate), base, out)
+    closed_form.advance_state(state, closed_form.discretized_params(p, rate), base, out)
     return state
 
 
@@ -93,8 +102,8 @@ def driven(p, frequency: float, rate: float, sampled: bool) -> np.ndarray:
 @pytest.mark.parametrize("p, frequency", [(snm(), 2.0), (snm(), 0.71), (snm(**SLOW), 1.3)])
 def test_balance_closes_to_1e_9_of_the_work_done(p, frequency, sampled):
     """G4 impacting, G4 in chaos, and slow bumpers on unequal gaps."""
-    con = exact.parameter_constants(p)
-    rate = frequency * 16 * exact.substeps(con, 1 / (16 * frequency))
+    con = closed_form.continuous_params(p)
+    rate = frequency * 16 * closed_form.substep_count(con, 1 / (16 * frequency))
     (work, damper, bumpers), end, onsets = balance(p, frequency, rate, sampled)
     change = stored(p, end) - stored(p, kicked(p, 0.1))
     assert onsets > 15
@@ -107,12 +116,12 @@ def test_balance_closes_to_1e_9_of_the_work_done(p, frequency, sampled):
 def test_a_released_bumper_loses_all_that_it_holds():
     """Alone, with nothing to touch it."""
     p = snm(math.inf, gap_r=1.0)
-    con, state = exact.constants(p, 2000.0), exact.rest(p)
+    con, state = closed_form.discretized_params(p, 2000.0), closed_form.rest_state(p)
     state[U_R] = 1e-3
     begin, lost = state.copy(), 0.0
     for _ in range(100):
         here = state.copy()
         lost += phase_integral(p, con, here, con[STEP], (0.0, 0.0, (0.0, 0.0, 0.0)))[2]
-        leap(state, con, con[STEP], 0.0, 0.0, (0.0, 0.0, 0.0), True)
+        advance_to_event(state, con, con[STEP], 0.0, 0.0, (0.0, 0.0, 0.0), True)
     assert lost == pytest.approx(stored(p, begin) - stored(p, state), rel=1e-12)
     assert stored(p, state) < 1e-20

@@ -5,12 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from twin.model.orbit import events
+from tests.model.motion import U_L, U_R, U, kicked, run
+from tests.model.reference import linear_between, reference
 from twin.model.parameters import Parameters
-from twin.model.sweep import stepped_sine
-
-from .motion import U_L, U_R, U, kicked, run
-from .reference import linear_between, reference
+from twin.model.periodic_orbit import contact_events
+from twin.model.stepped_sine import simulate_stepped_sine
 
 SIZE = 3e-3  # m: of gaps and motions
 POSITION_M, FEWEST_STEPS, LONGEST = 1e-9, 30, 150
@@ -68,9 +67,9 @@ def stepped(seed: int) -> tuple[float, float, int]:
         p, start[:4], touch, lambda t: peak * math.sin(w_drive * t), ends,
         dt=1 / (FEWEST_STEPS * fast),
     )  # fmt: skip
-    found, state = events(p, hz, peak, start, 3)
+    found, state = contact_events(p, hz, peak, start, 3)
     assert found[:, 1:].tolist() == contacts[:, 1:].tolist()
-    end = stepped_sine(p, [hz], peak, 3, 8, start).states[0]
+    end = simulate_stepped_sine(p, [hz], peak, 3, 8, start).states[0]
     error = max(np.abs(one[:4] - want[:, -1])[[0, 2, 3]].max() for one in (state, end))
     return error, np.abs(found[:, 0] / hz - contacts[:, 0]).max(initial=0.0), len(found)
 

@@ -5,10 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from twin.model import exact
-
-from .motion import U_R, kicked, run, sine
-from .reference import snm
+from tests.model.motion import U_R, kicked, run, sine
+from tests.model.reference import snm
+from twin.model import closed_form
 
 
 @pytest.mark.parametrize("p, rate", [(snm(), 2000.0), (snm(-0.001), 1000.0), (snm(), 40.0)])
@@ -17,12 +16,16 @@ def test_blocks_of_any_size_give_the_same_bits(p, rate, size):
     base = sine(5.2 if p.gap_r < 0 else 2.2, rate, 4000 / rate)
     base[1234] *= 1.5
     whole, out, events = run(p, rate, base)
-    state, con, cut = exact.rest(p), exact.constants(p, rate), np.empty_like(out)
+    state, con, cut = (
+        closed_form.rest_state(p),
+        closed_form.discretized_params(p, rate),
+        np.empty_like(out),
+    )
     for first in range(0, base.size, size):
         window = slice(first, first + size)
         part = base[window]
         part.setflags(write=False)
-        exact.advance(state, con, part, cut[:, window])
+        closed_form.advance_state(state, con, part, cut[:, window])
     assert len(events) > 10
     assert cut.tobytes() == out.tobytes()
     assert state.tobytes() == whole.tobytes()
@@ -37,7 +40,7 @@ def test_a_lost_sample_makes_everything_after_it_nan(bad, gap):
     assert np.isfinite(out[:, :500]).all()
     assert np.isnan(out[:, 500:]).all()
     assert np.isnan(state).all()
-    again = exact.restart(0.0, 0.0, 0.0, 0.0, False, False, 0.0, snm(gap))
+    again = closed_form.restart_state(0.0, 0.0, 0.0, 0.0, False, False, 0.0, snm(gap))
     assert np.isfinite(run(snm(gap), 2000.0, sine(3.4, 2000.0, 1), again)[1]).all()
 
 
@@ -57,38 +60,38 @@ def test_the_bumper_remembers():
 
 def test_a_relaxed_bumper_is_flushed_before_it_is_denormal():
     p = snm()
-    state = exact.restart(0.0, 0.0, 1e-3, -1e-3, False, False, 0.0, p)
+    state = closed_form.restart_state(0.0, 0.0, 1e-3, -1e-3, False, False, 0.0, p)
     state, _, _ = run(p, 2000.0, np.zeros(1000), state)
     assert state[2] == 0.0 == state[3]
 
 
 def test_restart_makes_a_state_the_model_allows():
     p = snm()
-    pushed = exact.restart(0.003, 0.05, 0.0, 0.0, True, False, 0.1, p)
+    pushed = closed_form.restart_state(0.003, 0.05, 0.0, 0.0, True, False, 0.1, p)
     assert pushed[2] == pytest.approx(0.001)
     assert pushed[4:7].tolist() == [1.0, 0.0, 0.1]
-    pulled = exact.restart(0.0021, -0.5, 0.0, 0.0, True, False, 0.0, p)
+    pulled = closed_form.restart_state(0.0021, -0.5, 0.0, 0.0, True, False, 0.0, p)
     assert pulled[2] == pytest.approx(0.0001)
     assert pulled[4] == 0.0
-    sunk = exact.restart(-0.003, -0.05, 0.0, -0.0002, False, False, 0.0, p)
+    sunk = closed_form.restart_state(-0.003, -0.05, 0.0, -0.0002, False, False, 0.0, p)
     assert sunk[3] == pytest.approx(-0.001)
     assert sunk[5] == 1.0
-    apart = exact.restart(0.0, 0.1, 0.0005, 0.0, True, False, 0.0, p)
+    apart = closed_form.restart_state(0.0, 0.1, 0.0005, 0.0, True, False, 0.0, p)
     assert apart[2] == 0.0005
     assert apart[4] == 0.0
-    none = exact.restart(0.003, 0.05, 0.0, 0.0, True, True, 0.0, snm(math.inf))
+    none = closed_form.restart_state(0.003, 0.05, 0.0, 0.0, True, True, 0.0, snm(math.inf))
     assert none[2:6].tolist() == [0.0, 0.0, 0.0, 0.0]
 
 
 def test_restart_from_the_models_own_state_goes_on_as_before():
-    p, con = snm(), exact.constants(snm(), 2000.0)
+    p, con = snm(), closed_form.discretized_params(snm(), 2000.0)
     base = sine(3.4, 2000.0, 2)
     state = kicked(p, 0.1)
     for first in range(0, 4000, 37):
         out, other = np.empty((7, 37)), np.empty((7, 37))
-        again = exact.restart(*state[:4], state[4] > 0, state[5] > 0, state[6], p)
+        again = closed_form.restart_state(*state[:4], state[4] > 0, state[5] > 0, state[6], p)
         again[7:] = state[7:]
         part = base[first : first + 37]
-        exact.advance(state, con, part, out[:, : part.size])
-        exact.advance(again, con, part, other[:, : part.size])
+        closed_form.advance_state(state, con, part, out[:, : part.size])
+        closed_form.advance_state(again, con, part, other[:, : part.size])
         assert other[:, : part.size].tobytes() == out[:, : part.size].tobytes()

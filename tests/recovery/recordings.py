@@ -5,20 +5,20 @@ from typing import Any
 
 import numpy as np
 
-from table_io.backends.simulated import SimulatedBackend
 from table_io.block import Block, Float2D
-from table_io.card import PROFILES, load
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.clock import ManualClock
-from table_io.course import plan
-from table_io.profile import Profile
-from table_io.rig import Rig
-from twin.learn.discover import Log
-from twin.learn.readings import readings_of
+from table_io.config.base import PROFILES_DIR, load_config
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.excitation.trajectory import plan_sweep
+from table_io.sim.simulated_table import SimulatedBackend
+from twin.identification.discover import PreparedLog
+from twin.identification.signals import build_signals
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 
-RIG = load(PROFILES / "rigs" / "simulated.toml", Rig, "machine card")[0]
+RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 TRUTH = {"stiffness": 31e3, "damping": 1500.0, "bumper_stiffness": 420e3, "bumper_damping": 1300.0}
 CHANNELS = (
     "table_disp_m", "table_acc_m_s2", "mass_disp_m", "mass_acc_m_s2", *RIGHT_CELLS, *LEFT_CELLS,
@@ -60,12 +60,12 @@ def clean(right_mm: float, left_mm: float) -> Float2D:
         }
     )
     test = profile(right_mm, left_mm)
-    drive = plan(test)
+    drive = plan_sweep(test)
     count = drive.planned_end + 6000  # until the mass is at rest again
     rig = RIG.model_copy(update={"simulated": table})
     backend = SimulatedBackend(rig, test.specimen, 1000.0, ManualClock())
     seen: list[Float2D] = []
-    backend.witness = lambda first, command, signals: seen.append(signals.copy())
+    backend.observer = lambda first, command, signals: seen.append(signals.copy())
     backend.open()
     backend.queue(0, drive.command(0, count) * RIG.output.volts_per_m)
     backend.start()
@@ -79,7 +79,7 @@ def recorded(
     channels: tuple[str, ...] = CHANNELS,
 ) -> tuple[Block, ...]:  # fmt: skip
     """The measured blocks, each channel with noise of so much of its rms."""
-    true, drive = clean(*gaps_mm), plan(profile(*gaps_mm))
+    true, drive = clean(*gaps_mm), plan_sweep(profile(*gaps_mm))
     draw = np.random.default_rng(seed).standard_normal(true.shape)
     rms = np.maximum(true.std(axis=1), [0, 0, 0, 0, 9, 9, 9, 9])  # idle load cells are noisy too
     values = true + noise * rms[:, None] * draw
@@ -93,7 +93,9 @@ def recorded(
 
 def logged(
     blocks: tuple[Block, ...], gaps_mm: tuple[float, float] = (2.0, 2.0), name: str = "short"
-) -> Log:
+) -> PreparedLog:
     """The recording as a log that states these gaps."""
     gaps = (1e-3 * gaps_mm[0], 1e-3 * gaps_mm[1])
-    return Log(readings_of(blocks, name, 550.0, gaps), 10.0, plan(profile(2.0, 2.0)).steps)
+    return PreparedLog(
+        build_signals(blocks, name, 550.0, gaps), 10.0, plan_sweep(profile(2.0, 2.0)).steps
+    )

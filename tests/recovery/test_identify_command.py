@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from recovery.recordings import CHANNELS, TRUTH, card, recorded
-from table_io.card import PROFILES
+from table_io.config.base import PROFILES_DIR
 from table_io.records import RunStop
-from twin.model.card import ModelCard
-from twin.service.bundle import from_texts, read_model
-from twin.service.cli import app
-from twin.service.study.bench import toml
-from twin.stream.mcap_log import write_items
+from tests.recovery.recordings import CHANNELS, TRUTH, card, recorded
+from twin.cli.main import app
+from twin.model.config import ModelConfig
+from twin.recording.mcap_log import write_items
+from twin.run.run_config import from_texts, read_model
+from twin.validation.study.rig_setup import format_toml
 
 GAPS = (2.0, 2.0)
 
@@ -23,10 +23,10 @@ GAPS = (2.0, 2.0)
 @cache
 def recording(folder: Path) -> Path:
     """A log as a run leaves it."""
-    rig = (PROFILES / "rigs" / "simulated.toml").read_text(encoding="utf-8")
-    snm = (PROFILES / "models" / "snm.toml").read_text(encoding="utf-8")
-    bundle = from_texts("short", toml(card(*GAPS)), rig, snm, "test")
-    start = replace(bundle.describe("short", "table")({}, 0.0), channels=CHANNELS)
+    rig = (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")
+    snm = (PROFILES_DIR / "models" / "snm.toml").read_text(encoding="utf-8")
+    bundle = from_texts("short", format_toml(card(*GAPS)), rig, snm, "test")
+    start = replace(bundle.make_start_factory("short", "table")({}, 0.0), channels=CHANNELS)
     (block,) = recorded(0.01, 3, GAPS)
     path = folder / "short.mcap"
     write_items(path, [start, block, RunStop(block.end, "complete", "")], start)
@@ -45,7 +45,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 def test_the_model_that_is_left_is_one_that_a_run_takes(done: tuple[Path, str]) -> None:
     found, _ = read_model(str(done[0]))
-    assert isinstance(found, ModelCard)
+    assert isinstance(found, ModelConfig)
     assert found.base.stiffness_n_m == pytest.approx(TRUTH["stiffness"], rel=0.003)
     assert found.base.bumper_damping_n_s_m == pytest.approx(TRUTH["bumper_damping"], rel=0.01)
     assert found.effects == ()
@@ -74,8 +74,8 @@ def test_the_terminal_says_it_all(done: tuple[Path, str]) -> None:
 @pytest.mark.parametrize(
     "more, word",
     [
-        (["--out", "found.json"], "a model is a .toml file"),
-        (["--out", "there.toml"], "nothing is ever overwritten"),
+        (["--out", "found.json"], "found.json"),
+        (["--out", "there.toml"], "there.toml: exists"),
         (["--model", "nothing"], "nothing"),
     ],
 )

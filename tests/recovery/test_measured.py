@@ -10,9 +10,9 @@ import pytest
 from scipy.signal import resample_poly
 
 from table_io.block import Block, Label
-from twin.learn.discover import Log, discover, transferred
-from twin.learn.guess import INPUT_GAIN, INPUT_OFFSET
-from twin.learn.readings import readings_of
+from twin.identification.discover import PreparedLog, discover_effects, held_out_log_nrmse
+from twin.identification.parameters import INPUT_GAIN, INPUT_OFFSET
+from twin.identification.signals import build_signals
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 
@@ -27,13 +27,13 @@ def oscillator(stiffness: float, damping: float) -> Model:
     return Model(Parameters(1.0, stiffness, damping, 1.0, 1.0, 1.0, 1.0, INF, INF))
 
 
-def log(name: str, rate_hz: float, columns: dict[str, np.ndarray]) -> Log:
+def log(name: str, rate_hz: float, columns: dict[str, np.ndarray]) -> PreparedLog:
     """Columns as a log that moves all the time."""
     values = np.array(list(columns.values()))
     label = np.full(values.shape[1], int(Label.SETTLE), dtype=np.int64)
     outside = np.full(values.shape[1], -1, dtype=np.int64)
     block = Block("meas", 0, rate_hz, tuple(columns), values, outside, label, outside.copy())
-    return Log(readings_of((block,), name, 1.0, (INF, INF)), 1.0)
+    return PreparedLog(build_signals((block,), name, 1.0, (INF, INF)), 1.0)
 
 
 def table(path: Path, *columns: int) -> np.ndarray:
@@ -44,7 +44,7 @@ def table(path: Path, *columns: int) -> np.ndarray:
 
 def simulated(model: Model, acceleration: np.ndarray, rate_hz: float) -> np.ndarray:
     """u at the samples of an input that is band-limited: Runge-Kutta between them."""
-    p, k3 = model.parameters, model.value("cubic_stiffness", "k3") or 0.0
+    p, k3 = model.parameters, model.effect_parameter("cubic_stiffness", "k3") or 0.0
     parts = 8
     a, h = resample_poly(acceleration, parts, 1), 1.0 / rate_hz / parts
 
@@ -72,14 +72,14 @@ def test_silverbox_has_a_cubic_spring() -> None:
     voltage = table(DATA / "silverbox" / "SNLS80mV.csv", 0, 1)
     part = voltage[FIRST_SINE : FIRST_SINE + 26000]
     one = log("silverbox", SILVERBOX_HZ, {"table_acc_m_s2": -part[:, 0], "rel_disp_m": part[:, 1]})
-    found = discover([one], oscillator(1.5e5, 50.0))
+    found = discover_effects([one], oscillator(1.5e5, 50.0))
     assert found.verdict.best.names[0] == "cubic_stiffness"
-    assert found.verdict.word == "named"
+    assert found.verdict.outcome == "named"
 
     def missed_mv(named: bool) -> float:
-        guess = (found.verdict.best if named else found.named.null).fit.guess
+        guess = (found.verdict.best if named else found.selection.null).fit.parameters
         gain, offset = guess.values[INPUT_GAIN], guess.values[INPUT_OFFSET]
-        u = simulated(guess.model(), (-voltage[:45000, 0] - offset) / gain, SILVERBOX_HZ)
+        u = simulated(guess.to_model(), (-voltage[:45000, 0] - offset) / gain, SILVERBOX_HZ)
         return float(1e3 * (voltage[ARROW, 1] - u[ARROW]).std())
 
     assert missed_mv(named=False) > 10.0
@@ -89,21 +89,21 @@ def test_silverbox_has_a_cubic_spring() -> None:
 def test_rubber_bearings_have_hysteresis_and_more() -> None:
     """Trained on one motion at 50 and 140 %, judged on another: spring and dashpot 0.479 there."""
 
-    def bearing(name: str) -> Log:
+    def bearing(name: str) -> PreparedLog:
         rows = table(DATA / "bncs" / f"{name}.csv", 1, 2, 3, 4)
         names = ("rel_disp_m", "damper_force_n", "table_acc_m_s2", "mass_acc_m_s2")
         return log(name, 200.0, dict(zip(names, rows.T, strict=True)))
 
-    found = discover([bearing("ICA50"), bearing("ICA140")], oscillator(5.0, 0.5))
+    found = discover_effects([bearing("ICA50"), bearing("ICA140")], oscillator(5.0, 0.5))
     verdict = found.verdict
     assert verdict.best.names[0] == "bouc_wen"
-    assert verdict.word == "named"
-    assert found.where.channels == ("damper_force_n",)
-    low, high = found.where.frequency_hz or (0.0, 0.0)
+    assert verdict.outcome == "named"
+    assert found.localization.channels == ("damper_force_n",)
+    low, high = found.localization.frequency_hz or (0.0, 0.0)
     assert 0.1 < low < high < 2.0  # the first mode of the building on its bearings
-    assert verdict.remainder  # the storeys above bend: no effect of ours is that
-    before, after = found.named.null.cost, verdict.best.cost
+    assert verdict.has_remainder  # the storeys above bend: no effect of ours is that
+    before, after = found.selection.null.cost, verdict.best.cost
     assert np.sqrt(after) < 0.7 * np.sqrt(before)
     apart = bearing("CNP100")
-    assert transferred(apart, verdict.best) < 0.7 * 0.479
-    assert transferred(apart, verdict.best) < transferred(apart, found.named.null)
+    assert held_out_log_nrmse(apart, verdict.best) < 0.7 * 0.479
+    assert held_out_log_nrmse(apart, verdict.best) < held_out_log_nrmse(apart, found.selection.null)

@@ -9,40 +9,41 @@ import numpy as np
 import pytest
 
 from table_io.block import Block
-from table_io.records import Comparison, Event, Fault, Params, Point, Record, RunStart, RunStop
+from table_io.records import Comparison, Event, Fault, Params, PrcPoint, Record, RunStart, RunStop
+from tests.replay.in_memory import recorded_in
 from twin.compare import pipeline
-from twin.service.bundle import Bundle, from_texts, read_bundle
-from twin.service.replaying import Identity, replay
-from twin.service.runs import simulate
-from twin.service.summary import dumps, summarise
-from twin.stream.mcap_log import write_items
-from twin.stream.recording import Recording, read
-from twin.stream.wire import Item, encode
-
-from .recorded import recorded_in
+from twin.recording.mcap_log import write_items
+from twin.recording.reader import Recording, read_recording
+from twin.replay.pipeline_replay import ReplayComparison, replay_recording
+from twin.reports.summary import dump_strict_json, summarise
+from twin.run.run_config import RunConfig, from_texts, read_run_config
+from twin.run.unpaced import simulate_ideal
+from twin.transport.codec import Item, encode_item
 
 
-def again(recording: Recording, bundle: Bundle, folder: Path) -> tuple[Identity, Recording]:
+def again(
+    recording: Recording, bundle: RunConfig, folder: Path
+) -> tuple[ReplayComparison, Recording]:
     """What a replay found, and the log that it wrote."""
     path = folder / f"again-{len(list(folder.iterdir()))}.mcap"
-    identity = replay(recorded_in(recording), bundle, path, "again", lambda _: None)
-    return identity, read(path)
+    identity = replay_recording(recorded_in(recording), bundle, path, "again", lambda _: None)
+    return identity, read_recording(path)
 
 
 def comparisons(recording: Recording) -> list[bytes]:
-    return [encode(one, "") for one in recording.of(Comparison)]
+    return [encode_item(one, "") for one in recording.records(Comparison)]
 
 
 def records(recording: Recording) -> list[bytes]:
     """Every record but the start and what it is a replay of, which differ from run to run."""
     return [
-        encode(one, "") for one in recording.items
+        encode_item(one, "") for one in recording.items
         if not isinstance(one, (Block, RunStart))
         and not (isinstance(one, Event) and one.kind == "replay")
     ]  # fmt: skip
 
 
-def bundle_of(recording: Recording, model_toml: str | None = None) -> Bundle:
+def bundle_of(recording: Recording, model_toml: str | None = None) -> RunConfig:
     """The bundle from the recording and nothing else."""
     start = recording.start
     model = start.model_toml if model_toml is None else model_toml
@@ -54,41 +55,43 @@ def test_the_recorded_model_gives_the_recorded_comparisons(
 ) -> None:
     """From the file alone: profile, machine card and model are in it."""
     identity, made = again(recording, bundle_of(recording), tmp_path)
-    assert identity.identical
-    assert identity.recorded == identity.compared == len(recording.of(Comparison)) > 300
+    assert identity.is_identical
+    assert identity.recorded == identity.compared == len(recording.records(Comparison)) > 300
     assert (identity.differing, identity.missing, identity.first_difference) == (0, 0, None)
     assert comparisons(made) == comparisons(recording)
-    assert made.of(Point) == recording.of(Point)
+    assert made.records(PrcPoint) == recording.records(PrcPoint)
     for stream in ("meas", "pred"):
-        assert made.pieces(stream)[0].identical(recording.pieces(stream)[0])
+        assert made.contiguous_blocks(stream)[0].is_identical(
+            recording.contiguous_blocks(stream)[0]
+        )
     assert made.start == replace(recording.start, run="again", started_at=made.start.started_at)
     assert made.stop == recording.stop
 
 
 def test_a_replay_of_a_replay_is_identical(
-    recording: Recording, bundle: Bundle, tmp_path: Path
+    recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
     _, first = again(recording, bundle, tmp_path)
     identity, second = again(first, bundle, tmp_path)
-    assert identity.identical
+    assert identity.is_identical
     assert records(first) == records(second)
     for stream in ("meas", "pred"):
-        assert first.pieces(stream)[0].identical(second.pieces(stream)[0])
+        assert first.contiguous_blocks(stream)[0].is_identical(second.contiguous_blocks(stream)[0])
 
 
 def test_a_stiffer_model_differs_and_is_worse(
-    recording: Recording, bundle: Bundle, tmp_path: Path
+    recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
     other = bundle_of(recording, bundle.model_toml.replace("36000.0", "37800.0"))
     identity, made = again(recording, other, tmp_path)
-    assert not identity.identical
+    assert not identity.is_identical
     assert identity.compared == identity.recorded
     # the first restart is at 250: before the next cell of 20 samples there is nothing to differ
     assert identity.first_difference == 260
     assert identity.differing > 0.9 * (identity.recorded - 13)
     assert identity.largest["rel_disp_m"] > 0
     assert made.start.model_toml == other.model_toml
-    assert made.of(Params)[0].values["stiffness"] == 37800.0
+    assert made.records(Params)[0].values["stiffness"] == 37800.0
     before = summarise(recording, bundle.parameters)["comparison"]
     after = summarise(made, other.parameters)["comparison"]
     for name in ("rel_disp_m", "mass_acc_m_s2"):
@@ -97,7 +100,7 @@ def test_a_stiffer_model_differs_and_is_worse(
 
 
 def test_a_bit_in_the_recording_is_noticed(
-    recording: Recording, bundle: Bundle, tmp_path: Path
+    recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
     """One sample of one channel, changed by one unit in the last place."""
     items = list(recording.items)
@@ -109,18 +112,20 @@ def test_a_bit_in_the_recording_is_noticed(
     values[recording.start.channels.index("mass_disp_m"), 3] *= 1 + 2**-52
     items[place] = replace(items[place], values=values)
     write_items(tmp_path / "bent.mcap", items, recording.start)
-    identity, _ = again(read(tmp_path / "bent.mcap"), bundle, tmp_path)
-    assert not identity.identical
+    identity, _ = again(read_recording(tmp_path / "bent.mcap"), bundle, tmp_path)
+    assert not identity.is_identical
     assert identity.first_difference == items[place].index
 
 
-def test_a_lost_comparison_is_noticed(recording: Recording, bundle: Bundle, tmp_path: Path) -> None:
+def test_a_lost_comparison_is_noticed(
+    recording: Recording, bundle: RunConfig, tmp_path: Path
+) -> None:
     """A recording may lack what the twin said: what is there must agree, what is not is not asked;
     but one that a replay does not make again is missing."""
-    extra = replace(recording.of(Comparison)[300], index=3007)
+    extra = replace(recording.records(Comparison)[300], index=3007)
     write_items(tmp_path / "extra.mcap", [*recording.items, extra], recording.start)
-    identity, _ = again(read(tmp_path / "extra.mcap"), bundle, tmp_path)
-    assert not identity.identical
+    identity, _ = again(read_recording(tmp_path / "extra.mcap"), bundle, tmp_path)
+    assert not identity.is_identical
     assert identity.missing == 1
 
 
@@ -128,7 +133,7 @@ def test_a_lost_comparison_is_noticed(recording: Recording, bundle: Bundle, tmp_
 
 
 def recorded_with_faults(
-    recording: Recording, bundle: Bundle, spans: list[tuple[int, int]], path: Path
+    recording: Recording, bundle: RunConfig, spans: list[tuple[int, int]], path: Path
 ) -> Recording:
     """The recording as it would be had the twin been dead over `spans` of samples.
 
@@ -139,19 +144,19 @@ def recorded_with_faults(
         for one in recording.items
         if (isinstance(one, Block) and one.stream == "meas") or isinstance(one, (RunStart, RunStop))
     ]
-    setup = bundle.twin()
-    whole = recording.pieces("meas")[0]
+    setup = bundle.prepare_twin()
+    whole = recording.contiguous_blocks("meas")[0]
     said: list[Record | Block] = []
     lives = [0, *(edge for span in spans for edge in span), whole.end]
     for first, last in list(pairwise(lives))[::2]:
-        state, begun = pipeline.start(setup, first)
+        state, begun = pipeline.start_pipeline(setup, first)
         said.extend(begun)
         for at in range(first, last, 20):
             state, made = pipeline.step(setup, state, whole.cut(at, min(at + 20, last)))
             said.extend(made)
     said.extend(Fault(b, "twin", a, b, "the process died and was restarted") for a, b in spans)
     write_items(path, [*kept, *said], recording.start)
-    return read(path)
+    return read_recording(path)
 
 
 @pytest.mark.parametrize(
@@ -165,12 +170,12 @@ def recorded_with_faults(
     ],
 )
 def test_replay_is_dead_where_the_twin_was(
-    recording: Recording, bundle: Bundle, tmp_path: Path, spans: list[tuple[int, int]]
+    recording: Recording, bundle: RunConfig, tmp_path: Path, spans: list[tuple[int, int]]
 ) -> None:
     died = recorded_with_faults(recording, bundle, spans, tmp_path / "died.mcap")
     identity, made = again(died, bundle, tmp_path)
-    assert identity.identical
-    assert identity.recorded == len(died.of(Comparison)) < len(recording.of(Comparison))
+    assert identity.is_identical
+    assert identity.recorded == len(died.records(Comparison)) < len(recording.records(Comparison))
     assert comparisons(made) == comparisons(died)
     assert records(made) == records(died)
     for a, b in spans:
@@ -179,23 +184,23 @@ def test_replay_is_dead_where_the_twin_was(
     never, _ = again(replace(died, items=tuple(
         one for one in died.items if not isinstance(one, Fault)
     )), bundle, tmp_path)  # fmt: skip
-    assert not never.identical
+    assert not never.is_identical
     identity, _ = again(made, bundle, tmp_path)
-    assert identity.identical
+    assert identity.is_identical
 
 
 def test_a_fault_of_another_component_leaves_the_twin_alive(
-    recording: Recording, bundle: Bundle, tmp_path: Path
+    recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
     fault = Fault(3000, "recorder", 2000, 3000, "the process died and was restarted")
     write_items(tmp_path / "run.mcap", [*recording.items, fault], recording.start)
-    identity, made = again(read(tmp_path / "run.mcap"), bundle, tmp_path)
-    assert identity.identical
-    assert made.of(Fault) == (fault,)
+    identity, made = again(read_recording(tmp_path / "run.mcap"), bundle, tmp_path)
+    assert identity.is_identical
+    assert made.records(Fault) == (fault,)
 
 
 def test_missing_samples_are_replayed_as_they_were(
-    recording: Recording, bundle: Bundle, tmp_path: Path
+    recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
     kept = [
         one
@@ -204,36 +209,36 @@ def test_missing_samples_are_replayed_as_they_were(
         or (isinstance(one, Block) and one.stream == "meas" and not 2500 <= one.index < 2600)
     ]
     write_items(tmp_path / "holed.mcap", kept, recording.start)
-    _, first = again(read(tmp_path / "holed.mcap"), bundle, tmp_path)
+    _, first = again(read_recording(tmp_path / "holed.mcap"), bundle, tmp_path)
     identity, second = again(first, bundle, tmp_path)
-    assert identity.identical
+    assert identity.is_identical
     assert identity.recorded > 200
     assert first.missing_samples == second.missing_samples == 100
 
 
 def test_what_the_rig_said_is_kept_and_hints_are_said_anew(
-    recording: Recording, bundle: Bundle, tmp_path: Path
+    recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
     note = Event(2500, "note", "the operator coughed")
     write_items(tmp_path / "run.mcap", [*recording.items, note], recording.start)
-    _, made = again(read(tmp_path / "run.mcap"), bundle, tmp_path)
-    assert note in made.of(Event)
-    hints = [one for one in recording.of(Event) if one.kind == "jump"]
+    _, made = again(read_recording(tmp_path / "run.mcap"), bundle, tmp_path)
+    assert note in made.records(Event)
+    hints = [one for one in recording.records(Event) if one.kind == "jump"]
     assert hints
-    assert [one for one in made.of(Event) if one.kind == "jump"] == hints
+    assert [one for one in made.records(Event) if one.kind == "jump"] == hints
 
 
 # The model alone
 
 
 @pytest.fixture(scope="module")
-def simulated(bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Recording:
+def simulated(bundle: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> Recording:
     path = tmp_path_factory.mktemp("simulate") / "run.mcap"
-    simulate(bundle, "model", path, lambda _: None)
-    return read(path)
+    simulate_ideal(bundle, "model", path, lambda _: None)
+    return read_recording(path)
 
 
-def test_a_simulation_has_measured_nothing(simulated: Recording, bundle: Bundle) -> None:
+def test_a_simulation_has_measured_nothing(simulated: Recording, bundle: RunConfig) -> None:
     assert simulated.start.source == "model"
     summary = summarise(simulated, bundle.parameters)
     assert len(summary["steps"]) == 6
@@ -242,17 +247,17 @@ def test_a_simulation_has_measured_nothing(simulated: Recording, bundle: Bundle)
         assert step["twin"]["eta_d"] > 0
         assert step["table_acc_fundamental_m_s2"] == pytest.approx(0.05 * 9.80665, rel=1e-3)
         assert step["thd"] < 1e-3
-    assert all(one.measured is None for one in simulated.of(Point))
+    assert all(one.measured is None for one in simulated.records(PrcPoint))
     assert all(
         values == {"nrmse": None, "free_nrmse": None} for values in summary["comparison"].values()
     )
-    assert "NaN" not in dumps(summary)
+    assert "NaN" not in dump_strict_json(summary)
     assert summary["run"]["branches_from"] == "twin"
 
 
 def test_a_simulated_point_is_that_of_physics_md(simulated: Recording) -> None:
     """Impacting at 3.4 Hz with neither servo nor noise, as far as the drift leaves it."""
-    found = {(one.direction, one.frequency_hz): one.twin for one in simulated.of(Point)}
+    found = {(one.direction, one.frequency_hz): one.twin for one in simulated.records(PrcPoint)}
     values = found["forward", 3.4]
     assert values is not None
     assert abs(values.drift) < 0.05
@@ -261,7 +266,7 @@ def test_a_simulated_point_is_that_of_physics_md(simulated: Recording) -> None:
 
 
 def test_a_simulated_curve_of_free_flight_is_the_closed_form(
-    bundle: Bundle, tmp_path: Path
+    bundle: RunConfig, tmp_path: Path
 ) -> None:
     """Smooth, the same both ways, |u| = A / |K/M - w^2 + i w C/M|, within the transient left."""
     free = bundle.profile_toml.replace("= 4.0\n[", "= inf\n[").replace(
@@ -269,9 +274,9 @@ def test_a_simulated_curve_of_free_flight_is_the_closed_form(
     )
     free = free.replace("start_hz = 2.4", "start_hz = 1.4")
     (tmp_path / "free.toml").write_text(free)
-    bundle = read_bundle(tmp_path / "free.toml")
-    simulate(bundle, "free", tmp_path / "run.mcap", lambda _: None)
-    summary = summarise(read(tmp_path / "run.mcap"), bundle.parameters)
+    bundle = read_run_config(tmp_path / "free.toml")
+    simulate_ideal(bundle, "free", tmp_path / "run.mcap", lambda _: None)
+    summary = summarise(read_recording(tmp_path / "run.mcap"), bundle.parameters)
     p = bundle.parameters
     assert len(summary["steps"]) == 8
     for step in summary["steps"]:
@@ -283,20 +288,20 @@ def test_a_simulated_curve_of_free_flight_is_the_closed_form(
 
 
 def test_a_simulation_predicts_from_its_first_sample(simulated: Recording) -> None:
-    (predicted,) = simulated.pieces("pred")
+    (predicted,) = simulated.contiguous_blocks("pred")
     assert np.isfinite(predicted.channel("free/rel_disp_m")).all()
     assert np.isnan(predicted.channel("window/rel_disp_m")).all()
 
 
 def test_the_replay_of_a_simulation_is_identical(
-    simulated: Recording, bundle: Bundle, tmp_path: Path
+    simulated: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
     identity, made = again(simulated, bundle_of(simulated), tmp_path)
-    assert identity.identical
+    assert identity.is_identical
     assert identity.recorded > 300
-    assert made.of(Point) == simulated.of(Point) or all(
-        encode(a, "") == encode(b, "")
-        for a, b in zip(made.of(Point), simulated.of(Point), strict=True)
+    assert made.records(PrcPoint) == simulated.records(PrcPoint) or all(
+        encode_item(a, "") == encode_item(b, "")
+        for a, b in zip(made.records(PrcPoint), simulated.records(PrcPoint), strict=True)
     )
-    assert made.pieces("pred")[0].identical(simulated.pieces("pred")[0])
-    assert all(math.isnan(one.free_error_ss[0]) for one in made.of(Comparison))
+    assert made.contiguous_blocks("pred")[0].is_identical(simulated.contiguous_blocks("pred")[0])
+    assert all(math.isnan(one.free_error_ss[0]) for one in made.records(Comparison))

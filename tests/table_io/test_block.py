@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from table_io.block import Block, join, recut
+from table_io.block import Block, join_blocks, recut_blocks
 
 RATE = 2000.0
 CHANNELS = ("drive_disp_m", "table_disp_m", "table_acc_m_s2")
@@ -44,7 +44,7 @@ def test_no_field_and_no_sample_can_be_changed() -> None:
     one = block()
     with pytest.raises(AttributeError):
         one.index = 3  # type: ignore[misc]
-    for part in (one, one.cut(100, 200), join(pieces(one, [500]))):
+    for part in (one, one.cut(100, 200), join_blocks(pieces(one, [500]))):
         for array in (part.values, part.step, part.label, part.cycle):
             with pytest.raises(ValueError, match="read-only"):
                 array[..., 0] = 1
@@ -54,7 +54,7 @@ def test_time_comes_from_the_index() -> None:
     one = block(index=12_345_679)
     assert one.time_s[0] == 12_345_679 / RATE
     assert one.cut(12_345_700, 12_345_701).time_s[0] == one.time_s[21]
-    assert np.array_equal(join(pieces(one, [7])).time_s, one.time_s)
+    assert np.array_equal(join_blocks(pieces(one, [7])).time_s, one.time_s)
 
 
 def test_a_channel_that_is_not_there_names_what_there_is() -> None:
@@ -72,10 +72,10 @@ def test_values_and_labels_of_different_length_are_refused() -> None:
 @pytest.mark.parametrize("samples", [1, 7, 64, 500, 5000])
 def test_recut_and_join_give_back_every_bit(samples: int) -> None:
     whole = block()
-    cut = list(recut([whole], samples))
+    cut = list(recut_blocks([whole], samples))
     assert [len(one) for one in cut[:-1]] == [samples] * (len(cut) - 1)
     assert 0 < len(cut[-1]) <= samples
-    assert join(cut).identical(whole)
+    assert join_blocks(cut).is_identical(whole)
 
 
 @given(
@@ -85,10 +85,10 @@ def test_recut_and_join_give_back_every_bit(samples: int) -> None:
 @settings(max_examples=40, deadline=None)
 def test_a_recut_does_not_know_how_the_samples_came(sizes: list[int], samples: int) -> None:
     whole = block()
-    straight = list(recut([whole], samples))
-    again = list(recut(pieces(whole, sizes), samples))
+    straight = list(recut_blocks([whole], samples))
+    again = list(recut_blocks(pieces(whole, sizes), samples))
     assert len(again) == len(straight)
-    assert all(a.identical(b) for a, b in zip(again, straight, strict=True))
+    assert all(a.is_identical(b) for a, b in zip(again, straight, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -104,11 +104,11 @@ def test_a_recut_does_not_know_how_the_samples_came(sizes: list[int], samples: i
 )
 def test_join_refuses_what_does_not_continue(second: Block) -> None:
     first = block(20, index=40)
-    assert len(join([first, block(20, index=60)])) == 40
+    assert len(join_blocks([first, block(20, index=60)])) == 40
     with pytest.raises(ValueError, match="does not continue"):
-        join([first, second])
+        join_blocks([first, second])
     with pytest.raises(ValueError, match="does not continue"):
-        list(recut([first, second], 40))
+        list(recut_blocks([first, second], 40))
 
 
 @pytest.mark.parametrize("window", [(39, 45), (45, 61), (0, 3), (50, 45)])
@@ -125,12 +125,12 @@ def test_identical_sees_every_field(name: str) -> None:
         changed = getattr(one, name).copy()
         changed[..., -1] += 1
         other = changed
-    assert one.identical(block(20))
-    assert not one.identical(block(20, **{name: other}))
+    assert one.is_identical(block(20))
+    assert not one.is_identical(block(20, **{name: other}))
 
 
 def test_identical_tells_a_negative_zero_from_a_zero() -> None:
     zero = block(20).values.copy()
     assert np.signbit(zero[1, 2])
     zero[1, 2] = 0.0
-    assert not block(20).identical(block(20, values=zero))
+    assert not block(20).is_identical(block(20, values=zero))

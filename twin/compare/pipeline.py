@@ -1,7 +1,7 @@
-"""`step(setup, state, block) -> state, items`: everything that the twin says about a block.
+"""Twin pipeline: `step(setup, state, block) -> state, items` derives all records of a block.
 
-Pure: the same samples give the same items to the bit, however they are cut into blocks. Live,
-replay and `--speed max` call this same function.
+Pure: the same samples give bit-identical items for any division into blocks. Live, replay and
+`--speed max` call this same function.
 """
 
 from dataclasses import dataclass, field, replace
@@ -9,179 +9,222 @@ from itertools import pairwise
 
 import numpy as np
 
-from table_io.block import Block, Float1D, Label, join
-from table_io.channels import contact_forces, rel_disp
-from table_io.profile import Profile
-from table_io.records import Cycle, Decided, Params, Record, Step
-from twin.compare import watch
-from twin.compare.cycles import UNKNOWN, Motion, Scale, Touching, extremes, point
-from twin.compare.sensors import corrected
-from twin.compare.watch import Watch
-from twin.compare.watch.held import Held, WatchSetup
-from twin.compare.watch.jumps import Foreseen, foreseen
-from twin.compare.windows import Tracks, TwinSetup, begin, follow
+from table_io.block import Block, Float1D, Label, join_blocks
+from table_io.channels import contact_forces, relative_displacement
+from table_io.config.profile import Profile
+from table_io.records import CycleExtremes, Params, Record, Step, StepAdded
+from twin.compare import monitoring
+from twin.compare.cycles import (
+    UNKNOWN_CONTACT,
+    ContactState,
+    CycleMotion,
+    PrcScale,
+    build_prc_point,
+    cycle_extremes,
+)
+from twin.compare.monitoring import MonitoringState
+from twin.compare.monitoring.cycle import CycleData, MonitoringSetup
+from twin.compare.monitoring.jumps import JumpPrediction, predict_jumps
+from twin.compare.sensors import remove_sensor_errors
+from twin.compare.twins import TwinSetup, TwinStates, advance_twins, start_twins
 from twin.model.model import Model
-from twin.model.parameters import resonance
+from twin.model.parameters import free_flight_resonance
 
-Piece = tuple[Block, Block]  # the same samples measured and predicted
-SHORT = 3  # samples by which a held cycle may miss its length and still be whole
+BlockPair = tuple[Block, Block]  # the same samples measured and predicted
+MAX_MISSING_SAMPLES = 3  # samples that a whole held cycle may lack
 
 
 @dataclass(frozen=True, slots=True)
-class Setup:
-    """All that a twin needs to know of a run: the planned steps, and those decided on so far.
+class PipelineSetup:
+    """Setup of a twin for one run, with the planned steps and those added so far.
 
-    Only planned steps make the curves; the others are visits, at odd frequencies and repeated.
+    Only planned steps enter the curves; added ones lie between grid frequencies and may repeat.
     """
 
     twin: TwinSetup
-    scale: Scale
+    scale: PrcScale
     steps: tuple[Step, ...]
     measured_cycles: int
-    foreseen: Foreseen = field(default_factory=Foreseen)
-    decided: tuple[Step, ...] = ()
+    jump_prediction: JumpPrediction = field(default_factory=JumpPrediction)
+    added_steps: tuple[Step, ...] = ()
 
     @property
-    def watched(self) -> WatchSetup:
-        """What the watch is told."""
+    def monitoring_setup(self) -> MonitoringSetup:
+        """Setup of the monitoring."""
         twin = self.twin
-        return WatchSetup(twin.model, twin.rate_hz, twin.contact_n, self.scale.gaps_m)
+        return MonitoringSetup(twin.model, twin.rate_hz, twin.contact_n, self.scale.gaps_m)
 
-    def step(self, index: int) -> Step | None:
-        """The step of this index; None where nobody told of it."""
+    def find_step(self, index: int) -> Step | None:
+        """Return the step with this index; None if it is unknown."""
         if 0 <= index < len(self.steps):
             return self.steps[index]
-        return next((one for one in self.decided if one.index == index), None)
+        return next((step for step in self.added_steps if step.index == index), None)
 
 
 @dataclass(frozen=True, slots=True)
-class State:
-    """Before sample `tracks.index`. `held` are the pieces of the unfinished held cycle.
+class PipelineState:
+    """State before sample `twins.index`; `cycle_blocks` are pieces of the unfinished held cycle.
 
-    Pieces are (measured, predicted); the first one holds what leads up to the cycle too.
+    Pieces are (measured, predicted); the first one includes the lead samples of the cycle.
     """
 
-    tracks: Tracks
-    key: tuple[int, int] | None = None  # (step, cycle) of the last sample seen; None = unknown
-    recent: Piece | None = None  # the last samples seen, as many as lead up to a cycle
-    first: int = 0  # sample at which the held cycle began
-    held: tuple[Piece, ...] = ()
-    cycles: tuple[Cycle, ...] = ()  # of the step under way
+    twins: TwinStates
+    cycle_key: tuple[int, int] | None = None  # (step, cycle) of the last sample; None = unknown
+    recent: BlockPair | None = None  # the last samples, as many as a cycle's lead
+    cycle_start: int = 0  # sample at which the held cycle began
+    cycle_blocks: tuple[BlockPair, ...] = ()
+    cycles: tuple[CycleExtremes, ...] = ()  # of the current step
     base_acc: tuple[Float1D, ...] = ()  # of its measured cycles
-    touching: tuple[Touching, Touching] = (UNKNOWN, UNKNOWN)  # measured, twin
-    watch: Watch = field(default_factory=Watch)
+    contact: tuple[ContactState, ContactState] = (
+        UNKNOWN_CONTACT,
+        UNKNOWN_CONTACT,
+    )  # measured, twin
+    monitoring: MonitoringState = field(default_factory=MonitoringState)
 
 
-def prepare(
+def prepare_pipeline(
     profile: Profile, model: Model, steps: tuple[Step, ...], from_rest: bool = False
-) -> Setup:
-    """The setup of a run. u* and a* are the free-flight maxima, continuous in frequency, of the
-    model's linear part: one scale, whatever the effects on top of it."""
-    rate = profile.acquisition.rate_hz
-    level = max(step.acceleration_m_s2 for step in steps)
-    u_star, a_star, _ = resonance(model.parameters, level)
+) -> PipelineSetup:
+    """Prepare the setup of a run.
+
+    u* and a* are the free-flight maxima, continuous in frequency, of the model's linear part: one
+    scale, independent of its effects.
+    """
+    rate_hz = profile.acquisition.rate_hz
+    max_acceleration = max(step.acceleration_m_s2 for step in steps)
+    u_star, a_star, _ = free_flight_resonance(model.parameters, max_acceleration)
     contact_n = profile.comparison.contact_n
     twin = TwinSetup(
         model,
-        rate,
-        round(profile.comparison.window_s * rate),
+        rate_hz,
+        round(profile.comparison.window_s * rate_hz),
         profile.acquisition.block_samples,
         contact_n,
         from_rest,
     )
-    scale = Scale(model.parameters, rate, contact_n, u_star, a_star, profile.specimen.gaps_m)
-    known = foreseen(profile, model, steps)
-    return Setup(twin, scale, steps, profile.sweep.measured_cycles, known)
+    scale = PrcScale(model.parameters, rate_hz, contact_n, u_star, a_star, profile.specimen.gaps_m)
+    jump_prediction = predict_jumps(profile, model, steps)
+    return PipelineSetup(twin, scale, steps, profile.sweep.measured_cycles, jump_prediction)
 
 
-def knowing(setup: Setup, *decided: Decided) -> Setup:
-    """The setup with steps that were decided on; to be told of each before its first sample.
+def add_steps(setup: PipelineSetup, *decisions: StepAdded) -> PipelineSetup:
+    """Return the setup with added steps; call it before the first sample of each.
 
-    More than is known at a time changes nothing, nor does telling twice.
+    Adding a step earlier, or twice, changes no result.
     """
-    for one in decided:
-        if setup.step(one.step) is None:
-            step = Step(one.step, one.direction, one.frequency_hz, one.acceleration_m_s2)
-            setup = replace(setup, decided=(*setup.decided, step))
+    for decision in decisions:
+        if setup.find_step(decision.step) is None:
+            step = Step(
+                decision.step, decision.direction, decision.frequency_hz, decision.acceleration_m_s2
+            )
+            setup = replace(setup, added_steps=(*setup.added_steps, step))
     return setup
 
 
-def adopting(setup: Setup, params: Params) -> Setup:
-    """The setup whose model has these values from now on; u* and a* stay those of the run."""
+def adopt_params(setup: PipelineSetup, params: Params) -> PipelineSetup:
+    """Return the setup with a model of these values; u* and a* stay those of the run."""
     model = Model.from_flat(params.values)
     scale = replace(setup.scale, parameters=model.parameters)
     return replace(setup, twin=replace(setup.twin, model=model), scale=scale)
 
 
-def start(setup: Setup, index: int = 0) -> tuple[State, list[Record]]:
-    """The state of a twin that starts at sample `index`, and the parameters it starts with."""
-    params = Params(index, setup.twin.model.flat(), "start")
-    return State(begin(setup.twin, index), watch=watch.begin(setup.foreseen)), [params]
+def start_pipeline(setup: PipelineSetup, index: int = 0) -> tuple[PipelineState, list[Record]]:
+    """Return the state of a twin that starts at sample `index`, and its initial parameters."""
+    params = Params(index, setup.twin.model.flatten(), "start")
+    return PipelineState(
+        start_twins(setup.twin, index),
+        monitoring=monitoring.start_monitoring(setup.jump_prediction),
+    ), [params]
 
 
-def step(setup: Setup, state: State, block: Block) -> tuple[State, list[Block | Record]]:
-    """State after the block; predicted Block, Comparisons, Cycles, Points, Events it completes."""
-    if block.index != state.tracks.index:
-        state = State(begin(setup.twin, block.index), watch=state.watch)
-    tracks, predicted, comparisons = follow(setup.twin, state.tracks, block)
+def step(
+    setup: PipelineSetup, state: PipelineState, block: Block
+) -> tuple[PipelineState, list[Block | Record]]:
+    """Return the state after a block, and the predicted Block with the records it completes.
+
+    Records: Comparison, CycleExtremes, PrcPoint and those of the monitoring.
+    """
+    if block.index != state.twins.index:
+        state = PipelineState(start_twins(setup.twin, block.index), monitoring=state.monitoring)
+    twins, predicted, comparisons = advance_twins(setup.twin, state.twins, block)
     items: list[Block | Record] = [predicted, *comparisons]
-    state = replace(state, tracks=tracks)
-    known = _joined(state.recent, (block, predicted))
+    state = replace(state, twins=twins)
+    available = _join_pairs(state.recent, (block, predicted))
     changes = np.flatnonzero(np.diff(block.step) | np.diff(block.cycle)) + 1
     edges = [0, *changes.tolist(), len(block)]
     for first, last in pairwise(edges):
-        key = (int(block.step[first]), int(block.cycle[first]))
-        if key != state.key:
-            state, made = _finish(setup, state, key)
-            items.extend(made)
-        at, end = block.index + first, block.index + last
-        if not state.watch.noise.known:
-            state = replace(state, watch=watch.rested(state.watch, block.cut(at, end)))
-        if key[1] >= 0 and state.held:
-            state = replace(state, held=(*state.held, _cut(known, at, end)))
-        elif key[1] >= 0 and _begins(state, key):
-            state = replace(state, first=at, held=(_cut(known, at - setup.scale.lead, end),))
-        state = replace(state, key=key)
-    return replace(state, recent=_cut(known, block.end - setup.scale.lead, block.end)), items
+        cycle_key = (int(block.step[first]), int(block.cycle[first]))
+        if cycle_key != state.cycle_key:
+            state, records = _finish_cycle(setup, state, cycle_key)
+            items.extend(records)
+        start, end = block.index + first, block.index + last
+        if not state.monitoring.noise.is_known:
+            state = replace(
+                state, monitoring=monitoring.update_noise(state.monitoring, block.cut(start, end))
+            )
+        if cycle_key[1] >= 0 and state.cycle_blocks:
+            state = replace(
+                state, cycle_blocks=(*state.cycle_blocks, _cut_pair(available, start, end))
+            )
+        elif cycle_key[1] >= 0 and _is_cycle_start(state, cycle_key):
+            state = replace(
+                state,
+                cycle_start=start,
+                cycle_blocks=(_cut_pair(available, start - setup.scale.lead_samples, end),),
+            )
+        state = replace(state, cycle_key=cycle_key)
+    return replace(
+        state, recent=_cut_pair(available, block.end - setup.scale.lead_samples, block.end)
+    ), items
 
 
-def _joined(before: Piece | None, new: Piece) -> Piece:
-    return new if before is None else (join([before[0], new[0]]), join([before[1], new[1]]))
+def _join_pairs(before: BlockPair | None, new: BlockPair) -> BlockPair:
+    return (
+        new
+        if before is None
+        else (join_blocks([before[0], new[0]]), join_blocks([before[1], new[1]]))
+    )
 
 
-def _cut(piece: Piece, first: int, end: int) -> Piece:
-    """The samples first .. end - 1 of a piece, as far as it has them."""
+def _cut_pair(piece: BlockPair, first: int, end: int) -> BlockPair:
+    """Return the samples first .. end - 1 of a piece, as far as it has them."""
     first = max(first, piece[0].index)
     return piece[0].cut(first, end), piece[1].cut(first, end)
 
 
-def _begins(state: State, key: tuple[int, int]) -> bool:
-    """True at the true first sample of a held cycle, not where the twin woke up inside it."""
-    return state.key is not None and state.key != key
+def _is_cycle_start(state: PipelineState, cycle_key: tuple[int, int]) -> bool:
+    """Return whether a held cycle begins here, rather than the twin starting inside it."""
+    return state.cycle_key is not None and state.cycle_key != cycle_key
 
 
-def _finish(setup: Setup, state: State, key: tuple[int, int]) -> tuple[State, list[Block | Record]]:
+def _finish_cycle(
+    setup: PipelineSetup, state: PipelineState, cycle_key: tuple[int, int]
+) -> tuple[PipelineState, list[Block | Record]]:
     """Close the cycle that ended, and the step with it if another step or no cycle follows."""
     items: list[Block | Record] = []
-    if state.held and state.key is not None:
-        state, cycle = _cycle(setup, state, *state.key)
+    if state.cycle_blocks and state.cycle_key is not None:
+        state, cycle = _evaluate_cycle(setup, state, *state.cycle_key)
         items.extend(cycle)
-    if state.key is not None and state.cycles and (key[1] < 0 or key[0] != state.key[0]):
-        state, made = _point(setup, state)
-        items.extend(made)
+    if (
+        state.cycle_key is not None
+        and state.cycles
+        and (cycle_key[1] < 0 or cycle_key[0] != state.cycle_key[0])
+    ):
+        state, records = _evaluate_step(setup, state)
+        items.extend(records)
     return state, items
 
 
-def _motions(measured: Block, predicted: Block) -> tuple[Motion, Motion]:
-    """(measured, free twin) motion over a cycle and what leads up to it."""
+def _cycle_motions(measured: Block, predicted: Block) -> tuple[CycleMotion, CycleMotion]:
+    """Return (measured, free twin) motion over a cycle and its lead samples."""
     right, left = contact_forces(measured)
     has_acc = "mass_acc_m_s2" in measured.channels
-    return Motion(
-        rel_disp(measured),
+    return CycleMotion(
+        relative_displacement(measured),
         measured.channel("mass_acc_m_s2") if has_acc else np.full(len(measured), np.nan),
         right,
         -left,
-    ), Motion(
+    ), CycleMotion(
         predicted.channel("free/rel_disp_m"),
         predicted.channel("free/mass_acc_m_s2"),
         2 * predicted.channel("free/force_r1_n"),
@@ -189,50 +232,67 @@ def _motions(measured: Block, predicted: Block) -> tuple[Motion, Motion]:
     )
 
 
-def _cycle(setup: Setup, state: State, step: int, number: int) -> tuple[State, list[Record]]:
-    """The finished cycle, unless it was cut short by a stop or belongs to a step unheard of."""
-    first, end = state.first, state.held[-1][0].end
-    held, state = state.held, replace(state, held=())
-    known = setup.step(step)
-    if known is None or end - first < setup.twin.rate_hz / known.frequency_hz - SHORT:
+def _evaluate_cycle(
+    setup: PipelineSetup, state: PipelineState, step: int, number: int
+) -> tuple[PipelineState, list[Record]]:
+    """Evaluate the finished cycle, unless a stop cut it short or its step is unknown."""
+    first, end = state.cycle_start, state.cycle_blocks[-1][0].end
+    cycle_blocks, state = state.cycle_blocks, replace(state, cycle_blocks=())
+    planned_step = setup.find_step(step)
+    if (
+        planned_step is None
+        or end - first < setup.twin.rate_hz / planned_step.frequency_hz - MAX_MISSING_SAMPLES
+    ):
         return state, []
-    measured, predicted = (join(blocks) for blocks in zip(*held, strict=True))
-    motion_m, motion_t = _motions(measured, predicted)
+    measured, predicted = (join_blocks(blocks) for blocks in zip(*cycle_blocks, strict=True))
+    measured_motion, twin_motion = _cycle_motions(measured, predicted)
     lead = first - measured.index
-    from_measured, touch_m = extremes(motion_m, first, setup.scale, state.touching[0], lead)
-    from_twin, touch_t = extremes(motion_t, first, setup.scale, state.touching[1], lead)
+    measured_extremes, measured_contact = cycle_extremes(
+        measured_motion, first, setup.scale, state.contact[0], lead
+    )
+    twin_extremes, twin_contact = cycle_extremes(
+        twin_motion, first, setup.scale, state.contact[1], lead
+    )
     label = int(measured.label[lead])
-    cycle = Cycle(end, step, number, label, end - first, from_measured, from_twin)
+    cycle = CycleExtremes(end, step, number, label, end - first, measured_extremes, twin_extremes)
     base_acc = state.base_acc
     if label == Label.MEASURE:
         base_acc = (*base_acc, measured.channel("table_acc_m_s2")[lead:])
-    whole = measured.cut(first, end)
-    true = corrected(setup.twin.model.sensors, whole)
-    one = Held(known, number, whole, true, predicted.cut(first, end))
-    watching, said = watch.looked(setup.watched, state.watch, one)
+    cycle_block = measured.cut(first, end)
+    corrected = remove_sensor_errors(setup.twin.model.sensors, cycle_block)
+    cycle_data = CycleData(planned_step, number, cycle_block, corrected, predicted.cut(first, end))
+    monitoring_state, events = monitoring.monitor_cycle(
+        setup.monitoring_setup, state.monitoring, cycle_data
+    )
     return replace(
         state,
         cycles=(*state.cycles, cycle),
         base_acc=base_acc,
-        touching=(touch_m, touch_t),
-        watch=watching,
-    ), [cycle, *said]
+        contact=(measured_contact, twin_contact),
+        monitoring=monitoring_state,
+    ), [cycle, *events]
 
 
-def _point(setup: Setup, state: State) -> tuple[State, list[Record]]:
-    """The step's PRC point, where all its measured cycles were seen, and what it says of jumps."""
+def _evaluate_step(
+    setup: PipelineSetup, state: PipelineState
+) -> tuple[PipelineState, list[Record]]:
+    """Return the step's PRC point, if all measured cycles were seen, and jump events."""
     items: list[Record] = []
-    watching = state.watch
-    seen = sum(cycle.label == Label.MEASURE for cycle in state.cycles)
-    step = setup.step(state.cycles[-1].step)
-    if step is not None and seen == setup.measured_cycles:
+    monitoring_state = state.monitoring
+    measured_cycles = sum(cycle.label == Label.MEASURE for cycle in state.cycles)
+    step = setup.find_step(state.cycles[-1].step)
+    if step is not None and measured_cycles == setup.measured_cycles:
         base_acc = np.concatenate(state.base_acc)
-        made = point(step, list(state.cycles), base_acc, setup.scale)
-        items.append(made)
-        if step not in setup.decided:
-            watching, said = watch.passed(watching, made)
-            items.extend(said)
-    # The contact state is not followed through the blend to the next step.
+        point = build_prc_point(step, list(state.cycles), base_acc, setup.scale)
+        items.append(point)
+        if step not in setup.added_steps:
+            monitoring_state, events = monitoring.monitor_step(monitoring_state, point)
+            items.extend(events)
+    # The contact state is not tracked through the blend to the next step.
     return replace(
-        state, cycles=(), base_acc=(), touching=(UNKNOWN, UNKNOWN), watch=watching
+        state,
+        cycles=(),
+        base_acc=(),
+        contact=(UNKNOWN_CONTACT, UNKNOWN_CONTACT),
+        monitoring=monitoring_state,
     ), items

@@ -1,7 +1,7 @@
-"""Predicted channels as the model's sensors read them: reading = gain x value(t - lag) + offset.
+"""Sensor errors on predicted channels: reading = gain x value(t - lag) + offset.
 
-They change what is predicted, never the motion. Row by row and sample by sample, so that the cut
-into blocks changes no bit.
+They change the prediction, never the motion. Each sample is computed on its own, so results are
+bit-identical for any division into blocks.
 """
 
 import math
@@ -11,22 +11,33 @@ from dataclasses import replace
 import numpy as np
 
 from table_io.block import Block, Float1D, Float2D
-from twin.model.model import Sensor
+from twin.model.model import SensorModel
 
-TAPS = 4  # samples through which a cubic gives the value in between
-
-
-def memory(sensors: Sequence[Sensor], rate_hz: float) -> int:
-    """Samples of the past that the longest lag needs."""
-    return max((_delay(one.lag * rate_hz)[0] + TAPS - 1 for one in sensors if one.lag), default=0)
+INTERPOLATION_TAPS = 4  # samples of the interpolating cubic
 
 
-def read(
-    sensors: Sequence[Sensor], rate_hz: float, names: Sequence[str], values: Float2D, past: Float2D
+def lag_samples(sensors: Sequence[SensorModel], rate_hz: float) -> int:
+    """Return the number of past samples that the longest lag needs."""
+    return max(
+        (
+            _delay_weights(sensor.lag * rate_hz)[0] + INTERPOLATION_TAPS - 1
+            for sensor in sensors
+            if sensor.lag
+        ),
+        default=0,
+    )
+
+
+def apply_sensors(
+    sensors: Sequence[SensorModel],
+    rate_hz: float,
+    names: Sequence[str],
+    values: Float2D,
+    past: Float2D,
 ) -> Float2D:
-    """Readings (channel, sample) of `values`, whose columns follow those of `past`.
+    """Return readings (channel, sample) of `values`, whose columns follow those of `past`.
 
-    Where a lag reaches back beyond what is known, NaN.
+    NaN where a lag reaches back beyond the known samples.
     """
     if not sensors:
         return values
@@ -35,46 +46,46 @@ def read(
     for sensor in sensors:
         for row, name in enumerate(names):
             if name.split("/")[-1] == sensor.channel:
-                late = delayed(joined[row], sensor.lag * rate_hz)[past.shape[1] :]
-                readings[row] = sensor.gain * late + sensor.offset
+                delayed = delay_signal(joined[row], sensor.lag * rate_hz)[past.shape[1] :]
+                readings[row] = sensor.gain * delayed + sensor.offset
     return readings
 
 
-def kept(values: Float2D, past: Float2D, samples: int) -> Float2D:
-    """The last `samples` columns of `past` and `values`, fewer at the start."""
+def keep_last(values: Float2D, past: Float2D, samples: int) -> Float2D:
+    """Return the last `samples` columns of `past` and `values`, fewer at the start."""
     joined = np.concatenate([past, values], axis=1)
     return joined[:, max(joined.shape[1] - samples, 0) :]
 
 
-def delayed(x: Float1D, samples: float) -> Float1D:
-    """x(t - samples) by the cubic through four samples, none of them later; NaN where unknown."""
+def delay_signal(x: Float1D, samples: float) -> Float1D:
+    """Return x(t - samples) by a cubic through four samples, none later; NaN where unknown."""
     if samples == 0:
         return x
-    first, weights = _delay(samples)
+    first, weights = _delay_weights(samples)
     result = np.full(x.size, np.nan)
-    reach = first + TAPS - 1
-    if x.size > reach:
-        total = np.zeros(x.size - reach)
+    oldest = first + INTERPOLATION_TAPS - 1
+    if x.size > oldest:
+        total = np.zeros(x.size - oldest)
         for tap, weight in enumerate(weights):
-            back = first + tap
-            total += weight * x[reach - back : x.size - back]
-        result[reach:] = total
+            age = first + tap
+            total += weight * x[oldest - age : x.size - age]
+        result[oldest:] = total
     return result
 
 
-def _delay(samples: float) -> tuple[int, list[float]]:
-    """(age of the youngest sample used, the Lagrange weights of it and the three before)."""
+def _delay_weights(samples: float) -> tuple[int, list[float]]:
+    """Return (age of the youngest sample used, Lagrange weights of it and the three before)."""
     first = max(math.floor(samples) - 1, 0)
-    at = samples - first
+    position = samples - first
     weights = []
-    for one in range(TAPS):
-        others = [other for other in range(TAPS) if other != one]
-        weights.append(math.prod((at - other) / (one - other) for other in others))
+    for tap in range(INTERPOLATION_TAPS):
+        other_taps = [k for k in range(INTERPOLATION_TAPS) if k != tap]
+        weights.append(math.prod((position - k) / (tap - k) for k in other_taps))
     return first, weights
 
 
-def corrected(sensors: Sequence[Sensor], block: Block) -> Block:
-    """A measured block without the gains and offsets; a lag is not foreseen, so it stays."""
+def remove_sensor_errors(sensors: Sequence[SensorModel], block: Block) -> Block:
+    """Return a measured block without gains and offsets; a lag stays, as it needs later samples."""
     values = block.values
     for sensor in sensors:
         if sensor.channel in block.channels and (sensor.gain, sensor.offset) != (1.0, 0.0):

@@ -1,26 +1,26 @@
-"""A log as arrays, for notebooks and scripts: three lines, and every channel is there.
+"""Access to a log as numpy arrays, for notebooks and scripts.
 
 >>> from twin.log import open_log
 >>> log = open_log("runs/20260101-120000-g10")     # a run's folder, or its run.mcap
->>> log["mass_disp_m"]                             # measured, SI, one value a sample
+>>> log["mass_disp_m"]                             # measured, SI, one value per sample
 
-| what | is |
+| expression | value |
 |---|---|
-| `log["mass_disp_m"]`, `log.channels` | a measured channel; their names (as in CSV exports) |
-| `log.twin["mass_disp_m"]` | the twin that runs on from the start on the table's motion alone |
-| `log.window["mass_disp_m"]` | the twin that restarts from the measured state every window |
-| `log.time_s`, `log.step_index`, `log.label`, `log.cycle` | the one axis, and what the drive did |
+| `log["mass_disp_m"]`, `log.channels` | a measured channel; channel names (as in CSV exports) |
+| `log.twin["mass_disp_m"]` | free-running twin, driven by the table's motion alone |
+| `log.window["mass_disp_m"]` | twin restarted from the measured state every window |
+| `log.time_s`, `log.step_index`, `log.label`, `log.cycle` | time axis and labels of the drive |
 | `log.steps`, `log.step(12)` | the steps (by `index`, as in summary.json); samples of one |
-| `log.step(12).held["mass_acc_m_s2"]` | the cycles alone that enter its PRC point |
+| `log.step(12).held["mass_acc_m_s2"]` | only the cycles that enter its PRC point |
 | `log.prc`, `log.points` | the pseudo-resonance curves as arrays, and as records |
-| `log.events`, `log.gaps`, `log.faults`, `log.stop` | what happened |
-| `log.start`, `log.profile`, `log.rig`, `log.model` | what the run was made with |
+| `log.events`, `log.gaps`, `log.faults`, `log.stop` | events, gaps, faults and end of the run |
+| `log.start`, `log.profile`, `log.rig`, `log.model` | inputs of the run |
 | `log.units`, `log.to_xarray()` | SI unit by channel; all as an xarray.Dataset with units |
 
-One time axis for everything: from the first to the last measured sample, evenly spaced. In a gap,
-and where a twin said nothing, values are NaN; `step_index`, `label` and `cycle` are -1 there.
-Arrays are float64 to the bit as recorded, and read-only: copy what you want to change. Opening
-reads the start only; the first look at a stream reads that stream, the next ones cost nothing.
+All arrays share one uniform time axis from the first to the last measured sample. In gaps, and
+where a twin has no output, values are NaN; `step_index`, `label` and `cycle` are -1 there. Arrays
+are float64, bit-identical to the recording, and read-only: copy them to change values. `open_log`
+reads only the start record; a stream is read at its first use and cached.
 """
 
 from collections.abc import Iterator
@@ -31,59 +31,63 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from table_io.block import Block, Float1D, Float2D, Int1D
-from table_io.card import BadInput, parse
-from table_io.profile import Profile
+from table_io.config.base import parse_toml
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.errors import InputError
 from table_io.records import (
-    Cycle,
-    Decided,
+    CycleExtremes,
     Event,
     Fault,
-    Gap,
-    Point,
-    Quantities,
+    NormalizedResponse,
+    PrcPoint,
     RunStart,
     RunStop,
+    SampleGap,
     Step,
+    StepAdded,
 )
-from table_io.rig import Rig
-from twin.compare import PREDICTED
-from twin.log.parts import UNKNOWN, StepView, Track
-from twin.model.card import ModelCard
+from twin.compare import TWIN_CHANNELS
+from twin.log.log_data import UNKNOWN_LABEL, ChannelMap, StepView
+from twin.model.config import ModelConfig
 from twin.model.model import Model
-from twin.stream.folder import log_path
-from twin.stream.recording import Recording, read, start_of
-from twin.stream.rows import all_steps, unit
-from twin.stream.wire import MEAS_TOPIC, PRED_TOPIC, RECORD_TOPICS
+from twin.recording.reader import Recording, read_recording, read_start
+from twin.recording.run_paths import resolve_log_path
+from twin.recording.tabular import channel_unit, collect_steps
+from twin.transport.codec import MEAS_TOPIC, PRED_TOPIC, RECORD_TOPICS
 
 if TYPE_CHECKING:
     from twin.log.dataset import Dataset
 
-RECORDS = [RECORD_TOPICS[kind] for kind in (RunStop, Cycle, Decided, Event, Fault, Gap, Point)]
+RECORD_TOPICS_READ = [
+    RECORD_TOPICS[kind]
+    for kind in (RunStop, CycleExtremes, StepAdded, Event, Fault, SampleGap, PrcPoint)
+]
 
 
 def open_log(path: str | Path) -> "Log":
-    """The log in a run's folder, or in a file; BadInput where it is none.
+    """Open the log in a run's folder or file; raise InputError if there is none.
 
-    A log that was cut off opens too, with what is left of it: `log.whole` says so.
+    A damaged or unfinished log opens with its readable part; `log.whole` is then False.
     """
-    place = log_path(Path(path))
-    if not place.is_file():
-        raise BadInput(f"{place}: no such log; give a run.mcap or the folder of a run")
-    return Log(place, start_of(place))
+    file = resolve_log_path(Path(path))
+    if not file.is_file():
+        raise InputError("no such log", where=file, remedy="give a run.mcap or the folder of a run")
+    return Log(file, read_start(file))
 
 
 class Log:
-    """A recording by channel and by step; see the module's first lines."""
+    """Recording by channel and by step; see the module docstring."""
 
     def __init__(self, path: Path, start: RunStart) -> None:
         self.path = path
         self.start = start
 
     def __getitem__(self, name: str) -> Float1D:
-        """A measured channel in SI, (sample,)."""
+        """Return a measured channel in SI, (sample,)."""
         return self.measured[name]
 
-    # Without these Python takes a log for a sequence, and asks for the channels 0, 1, 2.
+    # Without these methods Python iterates a log as a sequence with indices 0, 1, 2.
     def __iter__(self) -> Iterator[str]:
         return iter(self.channels)
 
@@ -91,15 +95,16 @@ class Log:
         return name in self.channels
 
     def keys(self) -> tuple[str, ...]:
-        """The names of the measured channels."""
+        """Return the names of the measured channels."""
         return self.channels
 
     def __repr__(self) -> str:
-        one = self.start
+        start = self.start
         return (
-            f"<log {self.path}: {self.profile.title or one.name}, run {one.run}, "
-            f"{one.planned_samples / one.rate_hz:.0f} s planned at {one.rate_hz:g} Hz, "
-            f"{len(one.steps)} steps, {len(one.channels)} channels: {', '.join(one.channels)}>"
+            f"<log {self.path}: {self.profile.title or start.name}, run {start.run}, "
+            f"{start.planned_samples / start.rate_hz:.0f} s planned at {start.rate_hz:g} Hz, "
+            f"{len(start.steps)} steps, {len(start.channels)} channels: "
+            f"{', '.join(start.channels)}>"
         )
 
     @property
@@ -112,154 +117,165 @@ class Log:
 
     @cached_property
     def profile(self) -> Profile:
-        return parse(self.start.profile_toml, Profile, f"profile of {self.path}")
+        return parse_toml(self.start.profile_toml, Profile, f"profile of {self.path}")
 
     @cached_property
-    def rig(self) -> Rig:
-        return parse(self.start.rig_toml, Rig, f"machine card of {self.path}")
+    def rig(self) -> RigConfig:
+        return parse_toml(self.start.rig_toml, RigConfig, f"rig of {self.path}")
 
     @cached_property
     def model(self) -> Model:
-        card = parse(self.start.model_toml, ModelCard, f"model of {self.path}")
-        return card.model(self.profile.specimen)
+        config = parse_toml(self.start.model_toml, ModelConfig, f"model of {self.path}")
+        return config.build_model(self.profile.specimen)
 
     @cached_property
     def _records(self) -> Recording:
-        return read(self.path, RECORDS)
+        return read_recording(self.path, RECORD_TOPICS_READ)
 
     @cached_property
     def _blocks(self) -> tuple[Block, ...]:
-        return read(self.path, (MEAS_TOPIC,)).pieces("meas")
+        return read_recording(self.path, (MEAS_TOPIC,)).contiguous_blocks("meas")
 
     @cached_property
     def whole(self) -> bool:
-        """True where the file is undamaged, and each of its messages can be of this run.
+        """True if the file is undamaged and all its messages are valid in this run.
 
-        All topics are read for it, once. A test that was stopped early has a whole file too: how
-        far it came is told by `stop`, what is missing in it by `gaps`.
+        Reads all topics once. The file of a test that was stopped early is whole too; see `stop`
+        for its end and `gaps` for missing samples.
         """
-        return read(self.path).whole
+        return read_recording(self.path).is_intact
 
     @property
     def stop(self) -> RunStop | None:
         return self._records.stop
 
     @property
-    def points(self) -> tuple[Point, ...]:
-        return self._records.of(Point)
+    def points(self) -> tuple[PrcPoint, ...]:
+        return self._records.records(PrcPoint)
 
     @property
     def events(self) -> tuple[Event, ...]:
-        return self._records.of(Event)
+        return self._records.records(Event)
 
     @property
-    def gaps(self) -> tuple[Gap, ...]:
-        return self._records.of(Gap)
+    def gaps(self) -> tuple[SampleGap, ...]:
+        return self._records.records(SampleGap)
 
     @property
     def faults(self) -> tuple[Fault, ...]:
-        return self._records.of(Fault)
+        return self._records.records(Fault)
 
     @cached_property
-    def _axis(self) -> tuple[int, int]:
-        """(first sample, the one after the last) of the time axis."""
+    def _sample_range(self) -> tuple[int, int]:
+        """First sample index of the time axis, and the index after the last."""
         blocks = self._blocks
         return (blocks[0].index, blocks[-1].end) if blocks else (0, 0)
 
     @cached_property
     def time_s(self) -> Float1D:
         """Time of each sample in s since the start of the run."""
-        return _locked(np.arange(*self._axis) / self.rate_hz)
+        return _make_read_only(np.arange(*self._sample_range) / self.rate_hz)
 
     @cached_property
-    def measured(self) -> Track:
-        return Track("measured", self.channels, self._placed(self._blocks, self.channels))
+    def measured(self) -> ChannelMap:
+        return ChannelMap(
+            "measured", self.channels, self._place_on_axis(self._blocks, self.channels)
+        )
 
     @cached_property
     def predicted(self) -> Float2D:
-        """Both twins on the time axis, rows as in `twin.compare.PREDICTED`, (channel, sample)."""
-        return self._placed(read(self.path, (PRED_TOPIC,)).pieces("pred"), PREDICTED)
+        """Outputs of both twins on the time axis, (channel, sample), rows as `TWIN_CHANNELS`."""
+        return self._place_on_axis(
+            read_recording(self.path, (PRED_TOPIC,)).contiguous_blocks("pred"), TWIN_CHANNELS
+        )
 
     @cached_property
-    def twin(self) -> Track:
-        """The free-running twin."""
-        return self._track("free", "twin, free-running")
+    def twin(self) -> ChannelMap:
+        """Channels of the free-running twin."""
+        return self._select_track("free", "twin, free-running")
 
     @cached_property
-    def window(self) -> Track:
-        """The twin that restarts from the measured state every window."""
-        return self._track("window", "twin, restarted")
+    def window(self) -> ChannelMap:
+        """Channels of the twin restarted from the measured state every window."""
+        return self._select_track("window", "twin, restarted")
 
     @cached_property
     def step_index(self) -> Int1D:
         """Step of each sample, -1 outside the steps."""
-        return self._labels("step")
+        return self._label_values("step")
 
     @cached_property
     def label(self) -> Int1D:
-        """What the drive did at each sample, a `table_io.block.Label`."""
-        return self._labels("label")
+        """Phase of the drive at each sample, a `table_io.block.Label`."""
+        return self._label_values("label")
 
     @cached_property
     def cycle(self) -> Int1D:
         """Number of the held cycle within its step, -1 outside."""
-        return self._labels("cycle")
+        return self._label_values("cycle")
 
     @cached_property
     def steps(self) -> tuple[Step, ...]:
-        """The planned steps, then those that were decided on during the test."""
-        return tuple(all_steps(self.start, self._records.items).values())
+        """Planned steps, then those added during the test."""
+        return tuple(collect_steps(self.start, self._records.items).values())
 
     def step(self, index: int) -> StepView:
-        """The samples of a step, blends included; KeyError where there is none of this index."""
-        step = next((one for one in self.steps if one.index == index), None)
+        """Return the samples of a step, blends included; raise KeyError if it was not recorded."""
+        step = next((candidate for candidate in self.steps if candidate.index == index), None)
         inside = np.flatnonzero(self.step_index == index)
         if step is None or not inside.size:
-            has = sorted(set(np.unique(self.step_index).tolist()) - {UNKNOWN})
-            there = f"{has[0]} to {has[-1]}" if has else "none"
-            raise KeyError(f"no samples of a step {index}; there: {there}")
-        point = next((one for one in self.points if one.step == index), None)
-        cycles = tuple(one for one in self._records.of(Cycle) if one.step == index)
+            recorded = sorted(set(np.unique(self.step_index).tolist()) - {UNKNOWN_LABEL})
+            available = f"{recorded[0]} to {recorded[-1]}" if recorded else "none"
+            raise KeyError(f"no samples of step {index}; recorded: {available}")
+        point = next((candidate for candidate in self.points if candidate.step == index), None)
+        cycles = tuple(
+            cycle for cycle in self._records.records(CycleExtremes) if cycle.step == index
+        )
         return StepView(step, point, cycles, self, slice(int(inside[0]), int(inside[-1]) + 1))
 
     @cached_property
     def prc(self) -> dict[str, Any]:
-        """The curves as arrays (point,): step, direction, frequency_hz, then eta_d, ... measured,
-        and twin_eta_d, ... of the twin; NaN where there is nothing."""
+        """Pseudo-resonance curves as arrays (point,).
+
+        Keys: step, direction, frequency_hz; eta_d, ... measured; twin_eta_d, ... of the twin. NaN
+        where a value is missing.
+        """
         points = self.points
-        found: dict[str, Any] = {
-            name: np.array([getattr(one, name) for one in points])
+        curves: dict[str, Any] = {
+            name: np.array([getattr(point, name) for point in points])
             for name in ("step", "direction", "frequency_hz")
         }
-        for source, mark in (("measured", ""), ("twin", "twin_")):
+        for source, prefix in (("measured", ""), ("twin", "twin_")):
             for name in ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l"):
-                values = (getattr(one, source) for one in points)
-                found[mark + name] = np.array([_value(one, name) for one in values])
-        return found
+                values = (getattr(point, source) for point in points)
+                curves[prefix + name] = np.array(
+                    [_get_value(quantities, name) for quantities in values]
+                )
+        return curves
 
     @cached_property
     def units(self) -> dict[str, str]:
-        """SI unit by channel; "" of one that the table of channels does not know."""
-        twins = (name.partition("/")[2] for name in PREDICTED)
-        return {name: unit(name) for name in (*self.channels, *twins)}
+        """SI unit by channel, "" if unknown."""
+        twins = (name.partition("/")[2] for name in TWIN_CHANNELS)
+        return {name: channel_unit(name) for name in (*self.channels, *twins)}
 
     def to_xarray(self) -> "Dataset":
-        """All channels over `time` in s, the twins' as twin_free_... and twin_window_... .
+        """Return all channels over `time` in s, the twins' as twin_free_... and twin_window_... .
 
         `step`, `label` and `cycle` are coordinates; units and meanings are attributes.
         """
-        from twin.log.dataset import dataset
+        from twin.log.dataset import build_dataset
 
-        return dataset(self)
+        return build_dataset(self)
 
-    def _track(self, track: str, title: str) -> Track:
-        rows = [row for row, name in enumerate(PREDICTED) if name.startswith(f"{track}/")]
-        names = tuple(PREDICTED[row].partition("/")[2] for row in rows)
-        return Track(title, names, self.predicted[rows[0] : rows[-1] + 1])
+    def _select_track(self, track: str, title: str) -> ChannelMap:
+        rows = [row for row, name in enumerate(TWIN_CHANNELS) if name.startswith(f"{track}/")]
+        names = tuple(TWIN_CHANNELS[row].partition("/")[2] for row in rows)
+        return ChannelMap(title, names, self.predicted[rows[0] : rows[-1] + 1])
 
-    def _placed(self, blocks: tuple[Block, ...], names: tuple[str, ...]) -> Float2D:
-        """The blocks on the time axis, NaN between them, (channel, sample)."""
-        first, end = self._axis
+    def _place_on_axis(self, blocks: tuple[Block, ...], names: tuple[str, ...]) -> Float2D:
+        """Place blocks on the time axis, NaN between them, (channel, sample)."""
+        first, end = self._sample_range
         if len(blocks) == 1 and (blocks[0].index, blocks[0].end) == (first, end):
             return blocks[0].values
         values = np.full((len(names), end - first), np.nan)
@@ -268,20 +284,20 @@ class Log:
                 max(block.index, first), max(min(block.end, end), first, block.index)
             )
             values[:, inside.index - first : inside.end - first] = inside.values
-        return _locked(values)
+        return _make_read_only(values)
 
-    def _labels(self, name: str) -> Int1D:
-        first, end = self._axis
-        values = np.full(end - first, UNKNOWN)
+    def _label_values(self, name: str) -> Int1D:
+        first, end = self._sample_range
+        values = np.full(end - first, UNKNOWN_LABEL)
         for block in self._blocks:
             values[block.index - first : block.end - first] = getattr(block, name)
-        return _locked(values)
+        return _make_read_only(values)
 
 
-def _locked(values: Any) -> Any:
+def _make_read_only(values: Any) -> Any:
     values.setflags(write=False)
     return values
 
 
-def _value(values: Quantities | None, name: str) -> float:
+def _get_value(values: NormalizedResponse | None, name: str) -> float:
     return np.nan if values is None else float(getattr(values, name))

@@ -1,48 +1,53 @@
-"""A log as an xarray.Dataset. The only file that knows xarray (extra `notebook`)."""
+"""Conversion of a log to an xarray.Dataset; only this file imports xarray (extra `notebook`)."""
 
 from typing import TYPE_CHECKING
 
 from table_io.block import Label
-from table_io.card import BadInput
-from table_io.channels import BY_NAME
-from twin.compare import PREDICTED
-from twin.stream.rows import unit
+from table_io.channels import CHANNEL_BY_NAME
+from table_io.errors import InputError
+from twin.compare import TWIN_CHANNELS
+from twin.recording.tabular import channel_unit
 
 if TYPE_CHECKING:
     from xarray import Dataset as Dataset  # noqa: PLC0414
 
     from twin.log import Log
 
-LABELS = ", ".join(f"{int(one)} {one.name.lower()}" for one in Label)
+LABEL_MEANINGS = ", ".join(f"{int(label)} {label.name.lower()}" for label in Label)
 
 
-def dataset(log: "Log") -> "Dataset":
-    """All channels of a log over `time` in s, with what they and the run are as attributes."""
+def build_dataset(log: "Log") -> "Dataset":
+    """Build a Dataset of all channels over `time` in s, with units and run as attributes."""
     try:
         import xarray
     except ImportError:
-        raise BadInput(
-            "to_xarray needs xarray, which is not installed: pip install 'shaketwin[notebook]'"
+        raise InputError(
+            "to_xarray needs xarray, which is not installed",
+            remedy="pip install 'shaketwin[notebook]'",
         ) from None
-    data = {name: ("time", log[name], _attributes(name)) for name in log.channels}
-    for row, name in zip(log.predicted, PREDICTED, strict=True):
-        data[f"twin_{name.replace('/', '_')}"] = ("time", row, _attributes(name.split("/")[1]))
+    data = {name: ("time", log[name], _channel_attributes(name)) for name in log.channels}
+    for row, name in zip(log.predicted, TWIN_CHANNELS, strict=True):
+        data[f"twin_{name.replace('/', '_')}"] = (
+            "time",
+            row,
+            _channel_attributes(name.split("/")[1]),
+        )
     coordinates = {
         "time": ("time", log.time_s, {"units": "s"}),
         "step": ("time", log.step_index, {"meaning": "index of the step, -1 outside"}),
-        "label": ("time", log.label, {"meaning": f"what the drive did: {LABELS}"}),
+        "label": ("time", log.label, {"meaning": f"what the drive did: {LABEL_MEANINGS}"}),
         "cycle": ("time", log.cycle, {"meaning": "held cycle within the step, -1 outside"}),
     }
     run = log.start
-    about = {
+    attributes = {
         "run": run.run, "name": run.name, "title": log.profile.title, "rate_hz": run.rate_hz,
         "started_at": run.started_at, "host": run.host, "profile_toml": run.profile_toml,
         "rig_toml": run.rig_toml, "model_toml": run.model_toml,
     }  # fmt: skip
-    return xarray.Dataset(data, coordinates, about)
+    return xarray.Dataset(data, coordinates, attributes)
 
 
-def _attributes(name: str) -> dict[str, str]:
-    known = BY_NAME.get(name)
-    more = {"positive": known.positive, "meaning": known.meaning} if known else {}
-    return {"units": unit(name), **more}
+def _channel_attributes(name: str) -> dict[str, str]:
+    channel = CHANNEL_BY_NAME.get(name)
+    details = {"positive": channel.positive, "meaning": channel.meaning} if channel else {}
+    return {"units": channel_unit(name), **details}

@@ -1,1 +1,1 @@
-"""What the rig should do: parameters, effects, exact solver."""
+"""Simplified nonlinear model (SNM) of the rig: parameters, effects and event-exact solvers."""

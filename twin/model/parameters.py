@@ -1,19 +1,19 @@
-"""The numbers of the SNM: `Parameters` in SI, and its free-flight resonance."""
+"""`Parameters` of the SNM in SI, and its free-flight resonance."""
 
 import difflib
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 
-from table_io.card import BadInput
+from table_io.errors import InputError
 
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """The SNM in SI: kg, N/m, N s/m, m. Gaps at rest, inf = no bumper, negative = precompressed.
+    """Parameters of the SNM in SI: kg, N/m, N s/m, m. Gaps at rest, inf = no bumper, < 0 = preload.
 
     M u'' + C u' + K u + F_R + F_L = -M A;  F_j = C_j u_j' + K_j u_j in contact, 0 in flight.
-    C_j = 0 is the bumper without memory: its face is back at once, contact ends at u_j = 0.
+    C_j = 0 is a bumper without memory: its face returns at once, contact ends at u_j = 0.
     Source: Stefani, De Angelis, Andreaus, Sect. 5.
     """
 
@@ -31,46 +31,64 @@ class Parameters:
         for name, value in self.as_dict().items():
             if name.startswith("gap"):
                 if math.isnan(value) or value == -math.inf:
-                    raise BadInput(f"{name} = {value}: allowed: m, or inf for no bumper; mend it")
+                    raise InputError(
+                        "not a gap", key=name, value=float(value), allowed="m, or inf for no bumper"
+                    )
             elif not math.isfinite(value) or value < 0 or (value == 0 and "damping" not in name):
                 allowed = "0 or more" if "damping" in name else "more than 0"
-                raise BadInput(f"{name} = {value}: allowed: {allowed}, finite, in SI; mend it")
+                raise InputError(
+                    "out of range",
+                    key=name,
+                    value=float(value),
+                    allowed=f"{allowed}, finite, in SI units",
+                )
 
     def as_dict(self) -> dict[str, float]:
-        """Field name -> SI value."""
+        """Return field name -> SI value."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, float]) -> "Parameters":
-        """The inverse of `as_dict`; BadInput names what is missing or unknown."""
+        """Build from the values of `as_dict`; InputError names missing or unknown ones."""
         known = [field.name for field in fields(cls)]
         for name in values:
             if name not in known:
-                raise BadInput(f"{name}: unknown model parameter; {nearest(name, known)}")
+                raise InputError(
+                    "unknown model parameter", key=name, remedy=suggest_name(name, known)
+                )
         missing = [name for name in known if name not in values]
         if missing:
-            raise BadInput(f"model parameters lack {', '.join(missing)}; add them in SI")
+            raise InputError(
+                f"model parameters lack {', '.join(missing)}", remedy="add them in SI units"
+            )
         return cls(**{name: float(values[name]) for name in known})
 
 
-def nearest(name: str, known: list[str]) -> str:
-    """The hint that ends a message about an unknown name."""
-    near = difflib.get_close_matches(name, known, 1, 0.4)
-    return f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
+def suggest_name(name: str, known: list[str]) -> str:
+    """Return the remedy for an unknown name: the nearest known name, or all."""
+    matches = difflib.get_close_matches(name, known, 1, 0.4)
+    return f"did you mean {matches[0]!r}?" if matches else f"known: {', '.join(known)}"
 
 
-def resonance(parameters: Parameters, acceleration: float) -> tuple[float, float, float]:
-    """(u* in m, a* in m/s2, frequency of u* in Hz): free-flight maxima at peak A in m/s2.
+def free_flight_resonance(
+    parameters: Parameters, acceleration: float
+) -> tuple[float, float, float]:
+    """Return free-flight maxima (u* in m, a* in m/s2, frequency of u* in Hz) at peak A in m/s2.
 
     Linear oscillator, steady, continuous in frequency; u relative, a total; w0^2 = K/M,
-    z = C / (2 M w0). Each maximum stands at its own frequency:
+    z = C / (2 M w0). Each maximum lies at its own frequency:
         u* = A / (2 z w0^2 sqrt(1 - z^2))        at w = w0 sqrt(1 - 2 z^2), or A/w0^2 at w = 0
         a* = A T,  T^2 = (1 + x) / ((1 - r^2)^2 + x),  x = (2 z r)^2,
                                                  at r^2 = (sqrt(1 + 8 z^2) - 1) / (4 z^2)
     For the SNM at 0.05 g: 30.537 mm at 1.2678 Hz, and 2.057 m/s2 at 1.2690 Hz.
     """
     if parameters.damping == 0:
-        raise BadInput("damping = 0: the resonance has no bound; give a damping above 0 N s/m")
+        raise InputError(
+            "the free-flight resonance is unbounded",
+            key="damping",
+            value=0,
+            allowed="above 0 N s/m",
+        )
     w02 = parameters.stiffness / parameters.mass
     z2 = parameters.damping**2 / (4 * parameters.mass * parameters.stiffness)
     r2 = 4 / (math.sqrt(1 + 8 * z2) + 1) / 2

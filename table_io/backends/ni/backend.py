@@ -1,8 +1,8 @@
-"""The Backend contract on a DAQmx device, whose buffer holds what is queued.
+"""Backend for a DAQmx device, whose output buffer holds the queued command.
 
-Input is read by a thread of its own (`reader.py`); output and heartbeat are written by the
-caller's, in every call and every wait, so a rig that hangs lets its heartbeat stop. What happens at
-each error: `codes.py`. What is looked at before anything moves: `opening.py`.
+A separate thread reads the inputs (`reader.py`). Output and heartbeat are written by the caller's
+thread in every call and every wait, so the heartbeat of a rig that hangs stops. `errors.py` states
+the consequence of each driver error, `startup.py` has the checks before anything moves.
 """
 
 import contextlib
@@ -13,95 +13,97 @@ from typing import Any, NoReturn, TypeVar
 import numpy as np
 from nidaqmx.errors import DaqError, Error
 
-from table_io.backends import HEARTBEAT_S, PATIENCE_S, MachineLost
-from table_io.backends.ni import opening
-from table_io.backends.ni.channel import reached
-from table_io.backends.ni.codes import REMEDY, Where, lost, said
-from table_io.backends.ni.entry import unwell, wired
-from table_io.backends.ni.pace import Pace
-from table_io.backends.ni.reader import Reader
-from table_io.backends.ni.tasks import BEAT_S, BUFFER_S, Tasks
+from table_io.backends import HEARTBEAT_TIMEOUT_S, SAMPLE_TIMEOUT_S, MachineLost
+from table_io.backends.command_buffer import CommandBuffer
+from table_io.backends.ni import startup
+from table_io.backends.ni.channel import connect_server
+from table_io.backends.ni.clock_sync import ClockSync
+from table_io.backends.ni.errors import REMEDIES, ErrorSource, describe_error, describe_loss
+from table_io.backends.ni.probe import describe_interlock_fault, require_ni_wiring
+from table_io.backends.ni.reader import InputReader
+from table_io.backends.ni.tasks import BUFFER_S, HEARTBEAT_PERIOD_S, RigTasks
 from table_io.block import Float1D, Float2D
-from table_io.card import BadInput
 from table_io.clock import Clock
-from table_io.machine.queued import Queued
-from table_io.profile import Specimen
-from table_io.rig import Rig
+from table_io.config.profile import Specimen
+from table_io.config.rig import RigConfig
+from table_io.errors import InputError
 
-HOLD_S = 2.0  # of the last value, behind what is queued: so the output does not run out
-LOOK_S = 0.002  # of real time, between two looks at a heartbeat that is due
-PARTING_S = 0.5  # that the reader may take to end
+HOLD_S = 2.0  # of the last value after the queued command, against an output underrun
+POLL_S = 0.002  # of real time, between checks whether a heartbeat is due
+READER_CLOSE_TIMEOUT_S = 0.5  # for the reader thread to end
 NO_LONGER_WRITEABLE = -200289
-MOST_INDEX = (1 << 31) - 1  # that the driver can place a write at
+MAX_WRITE_INDEX = (1 << 31) - 1  # last sample at which the driver can place a write
 
 T = TypeVar("T")
 
 
 class NiBackend:
-    """A rig's side of one life of a DAQmx device; `channel` is a way to it that is open already."""
+    """Rig's side of one connection to a DAQmx device; `channel` is an open gRPC channel."""
 
     def __init__(
-        self, rig: Rig, specimen: Specimen, rate_hz: float, clock: Clock, channel: Any = None
+        self, rig: RigConfig, specimen: Specimen, rate_hz: float, clock: Clock, channel: Any = None
     ) -> None:
-        self._wiring = wired(rig)
+        self._wiring = require_ni_wiring(rig)
         self.channels = rig.channels
         self.rate_hz = rate_hz
-        self.replace_after = opening.replaceable(rig, rate_hz)
+        self.replace_after = startup.replace_after_samples(rig, rate_hz)
         self._rig, self._clock, self._channel = rig, clock, channel
-        self._tasks: Tasks | None = None
-        self._reader: Reader | None = None
-        self._pace: Pace | None = None
-        self._queued = Queued()
-        self._written = 0  # samples of output that the driver has
-        self._come: list[Float2D] = []  # that were not read, (channel, sample)
-        self._taken = 0  # samples that have come
-        self._read = 0
-        self._beat_s = 0.0
-        self._lost = ""  # why the device does not answer any more
+        self._tasks: RigTasks | None = None
+        self._reader: InputReader | None = None
+        self._clock_sync: ClockSync | None = None
+        self._commands = CommandBuffer()
+        self._written = 0  # samples of output handed to the driver
+        self._unread: list[Float2D] = []  # received and not yet read, (channel, sample)
+        self._received = 0  # samples
+        self._next_read = 0
+        self._last_beat_s = 0.0
+        self._loss_reason = ""  # why the device is lost; empty: it is not
 
     def open(self) -> None:
-        """Claim the device; waits where the table still comes to rest. Plays zeros, to be sure."""
+        """Claim the device once the table is at rest; plays zeros to test output replacement."""
         rig, rate, clock = self._rig, self.rate_hz, self._clock
-        rig.refuse_rate(rate)
+        rig.check_rate(rate)
         if self._wiring.endpoint and self._channel is None:
-            self._channel = reached(rig, self._wiring.endpoint)
+            self._channel = connect_server(rig, self._wiring.endpoint)
         try:
             if self._channel is not None:
-                opening.cleared(rig, self._channel, clock)
-            tasks = Tasks(rig, rate, self._channel)
+                startup.clear_leftover_tasks(rig, self._channel, clock)
+            tasks = RigTasks(rig, rate, self._channel)
             try:
-                opening.sampled(tasks, rate)
-                opening.at_rest(rig, tasks, rate, clock)
-                opening.rehearsed(rig, tasks, rate)
+                startup.verify_sample_rate(tasks, rate)
+                startup.require_rest(rig, tasks, rate, clock)
+                startup.verify_output_replacement(rig, tasks, rate)
             finally:
-                tasks.clear()  # used up: they have played
-            clock.wait_until(clock.now() + opening.SETTLED_S)
-            tasks = Tasks(rig, rate, self._channel)
+                tasks.clear()  # tasks that have played cannot be started again at sample 0
+            clock.wait_until(clock.now() + startup.SETTLE_S)
+            tasks = RigTasks(rig, rate, self._channel)
         except Error as error:
             code = error.error_code if isinstance(error, DaqError) else 0
-            see = "see the [ni] table, and NI MAX for what the device can do"
-            raise BadInput(
-                f"rig {rig.name}: the device does not do what the card asks: {said(error)}; "
-                f"{REMEDY.get(code, see)}"
+            hint = "compare the [ni] table of the rig file with the device's properties in NI MAX"
+            raise InputError(
+                f"the device rejects the configuration of the rig file: {describe_error(error)}",
+                where=f"rig {rig.name}",
+                remedy=REMEDIES.get(code, hint),
             ) from None
         self._tasks = tasks
-        self._reader = Reader(tasks.read)
-        self._beat_s = -math.inf
-        self._beat()  # from now on, so that a latch that fell with it can be reset before a start
+        self._reader = InputReader(tasks.read)
+        self._last_beat_s = -math.inf
+        # From now on, so that a latch that the silence has opened can be reset before the start.
+        self._send_heartbeat()
 
     def tare(self, samples: int) -> Float2D:
-        """Volts at rest before precompression, (channel, sample)."""
-        tasks = self._alive()
+        """Return volts at rest, before precompression, (channel, sample)."""
+        tasks = self._require_tasks()
 
-        def look() -> Float2D:
-            return opening.look(tasks, samples, self.rate_hz, self._beat)
+        def read_at_rest() -> Float2D:
+            return startup.read_at_rest(tasks, samples, self.rate_hz, self._send_heartbeat)
 
-        return self._driven("input", look)
+        return self._call_driver("input", read_at_rest)
 
     def queue(self, index: int, volts: Float1D) -> None:
-        """Replace the command from sample `index` on, (sample,); the last value is held."""
-        self._alive()
-        earliest = 0 if self._pace is None else self._newest() + self.replace_after
+        """Replace the command from sample `index` on, volts (sample,); the last value is held."""
+        self._require_tasks()
+        earliest = 0 if self._clock_sync is None else self._newest_sample() + self.replace_after
         if index < earliest:
             raise ValueError(
                 f"the command from sample {index} on is already in the device; allowed: from "
@@ -109,63 +111,69 @@ class NiBackend:
             )
         if not volts.size or not np.isfinite(volts).all():
             raise ValueError(
-                f"the command from sample {index} on is empty or holds NaN or inf; send volts"
+                f"the command from sample {index} on is empty or contains NaN or inf; send volts"
             )
-        self._beat()
+        self._send_heartbeat()
         end = index + volts.size
-        most = (0 if self._pace is None else self._newest()) + round(BUFFER_S * self.rate_hz)
-        if end + round(HOLD_S * self.rate_hz) > most:
+        max_end = (0 if self._clock_sync is None else self._newest_sample()) + round(
+            BUFFER_S * self.rate_hz
+        )
+        if end + round(HOLD_S * self.rate_hz) > max_end:
             raise ValueError(
-                f"a command up to sample {end}; allowed: {BUFFER_S - HOLD_S:g} s ahead, as much as "
-                "the driver holds"
+                f"the command ends at sample {end}, beyond the driver's buffer; allowed: up to "
+                f"{BUFFER_S - HOLD_S:g} s ahead"
             )
         first = min(index, self._written)
-        self._place(first, np.append(self._queued.take(first, index), volts))
-        self._queued.put(index, volts)
-        self._queued.forget(self._taken - 3)
+        self._write_output(first, np.append(self._commands.values(first, index), volts))
+        self._commands.replace_from(index, volts)
+        self._commands.discard_before(self._received - 3)
 
     def start(self) -> None:
-        """Start output and input at sample 0: the output waits for the trigger of the input."""
-        tasks = self._alive()
-        if self._pace is not None:
-            raise RuntimeError("NI device: it runs already; one start() a life")
-        moves = self._queued.take(0, self._queued.end).any()  # else a latch may be reset now
-        if moves and (low := unwell(self._wiring, self._channel)):
-            self._lose("start", RuntimeError(low))
-        self._driven("start", tasks.output.start)
-        self._beat()
-        # The early end of what is not known better. Before the call: its answer may be lost.
-        self._pace = Pace(self.rate_hz, self._clock.now())
+        """Start output and inputs at sample 0: the inputs trigger the armed output."""
+        tasks = self._require_tasks()
+        if self._clock_sync is not None:
+            raise RuntimeError("NI device: start() was called already; one start() a connection")
+        # A command of zeros may start with an open latch, so that it can be reset.
+        moves = self._commands.values(0, self._commands.end).any()
+        if moves and (fault := describe_interlock_fault(self._wiring, self._channel)):
+            self._raise_lost("start", RuntimeError(fault))
+        self._call_driver("start", tasks.output.start)
+        self._send_heartbeat()
+        # The time before the call is the lower bound; set first, as the answer may be lost.
+        self._clock_sync = ClockSync(self.rate_hz, self._clock.now())
         try:
             tasks.input.start()
         except DaqError as error:
-            self._pace = None
-            self._lose("start", error)
+            self._clock_sync = None
+            self._raise_lost("start", error)
         except Error as error:
-            self._lose("server", error)
+            self._raise_lost("server", error)
 
     def read(self, samples: int) -> Float2D:
-        """Volts of the next samples, (channel, sample), when they have been taken."""
-        last = self._read + samples
-        until = self.scheduled(last - 1) + PATIENCE_S
-        self._alive()
-        self._beat()
-        while self._taken < last:
-            self._fetch(last, until)
-            self._beat()
-        whole = np.concatenate([np.empty((len(self.channels), 0)), *self._come], axis=1)
-        self._come = [whole[:, samples:]]
-        self._read = last
-        return whole[:, :samples]
+        """Wait for the next samples and return their volts, (channel, sample)."""
+        last = self._next_read + samples
+        deadline_s = self.scheduled_time_s(last - 1) + SAMPLE_TIMEOUT_S
+        self._require_tasks()
+        self._send_heartbeat()
+        while self._received < last:
+            self._receive(last, deadline_s)
+            self._send_heartbeat()
+        unread = np.concatenate([np.empty((len(self.channels), 0)), *self._unread], axis=1)
+        self._unread = [unread[:, samples:]]
+        self._next_read = last
+        return unread[:, :samples]
 
-    def scheduled(self, index: int) -> float:
-        """Time on the session's clock at which sample `index` is taken, in s; see `pace.py`."""
-        if self._pace is None:
-            raise RuntimeError("NI device: start() comes first")
-        return self._pace.epoch_s + index / self.rate_hz
+    def scheduled_time_s(self, index: int) -> float:
+        """Return the time in s, on the session's clock, at which sample `index` is taken.
+
+        It follows the device's clock, see `clock_sync.py`.
+        """
+        if self._clock_sync is None:
+            raise RuntimeError("NI device: call start() first")
+        return self._clock_sync.epoch_s + index / self.rate_hz
 
     def close(self) -> None:
-        """Release the device once it has played what is queued: a stop would freeze the voltage."""
+        """Release the device once the queue is played: a stop would freeze the voltage."""
         tasks = self._tasks
         if tasks is None:
             return
@@ -173,114 +181,125 @@ class NiBackend:
         self._tasks = None
         tasks.clear()
         if self._reader is not None:
-            self._reader.close(PARTING_S)
+            self._reader.close(READER_CLOSE_TIMEOUT_S)
 
     def _play_out(self) -> None:
-        """Wait until what is queued has been played; the heartbeat goes on if nothing is lost."""
-        until = 0.0 if self._pace is None else self.scheduled(self._queued.end)
-        while self._clock.now() < until:
-            if not self._lost:
+        """Wait until the queue has been played; send heartbeats unless the device is lost."""
+        deadline_s = 0.0 if self._clock_sync is None else self.scheduled_time_s(self._commands.end)
+        while self._clock.now() < deadline_s:
+            if not self._loss_reason:
                 with contextlib.suppress(MachineLost):
-                    self._beat()
-            self._clock.wait_until(min(until, self._clock.now() + BEAT_S))
+                    self._send_heartbeat()
+            self._clock.wait_until(min(deadline_s, self._clock.now() + HEARTBEAT_PERIOD_S))
 
-    def _fetch(self, last: int, until: float) -> None:
-        """Wait for the next samples, up to `last`; the heartbeat goes on."""
+    def _receive(self, last: int, deadline_s: float) -> None:
+        """Wait for the next samples, at most up to `last`, and send heartbeats meanwhile."""
         assert self._reader is not None
-        reader, piece = self._reader, round(BEAT_S * self.rate_hz)
-        count = min(last - self._taken, piece)  # a heartbeat goes between
-        reader.ask(count)
+        reader, max_count = self._reader, round(HEARTBEAT_PERIOD_S * self.rate_hz)
+        count = min(last - self._received, max_count)  # with a heartbeat after each
+        reader.request(count)
         while True:
             try:
-                come = reader.come(LOOK_S)
-                if come is None and self._clock.now() > until:
+                volts = reader.poll(POLL_S)
+                if volts is None and self._clock.now() > deadline_s:
                     raise TimeoutError(
-                        f"the samples up to {last - 1} have not come, {PATIENCE_S:g} s after their "
-                        "schedule"
+                        f"the samples up to {last - 1} have not arrived {SAMPLE_TIMEOUT_S:g} s "
+                        "after their scheduled time"
                     )
             except (Error, TimeoutError) as error:
-                self._play_out()  # blind, but smoothly: the interlock need not act
-                self._lose("input", error)
-            if come is not None:
+                self._play_out()  # without inputs, but smoothly: the interlock need not act
+                self._raise_lost("input", error)
+            if volts is not None:
                 break
-            self._beat()
-        self._come.append(come)
-        self._taken += count
-        if self._pace is not None:
-            self._pace.came(self._taken - 1, self._clock.now())
+            self._send_heartbeat()
+        self._unread.append(volts)
+        self._received += count
+        if self._clock_sync is not None:
+            self._clock_sync.update(self._received - 1, self._clock.now())
 
-    def _beat(self) -> None:
-        """Keep heartbeat and output alive, where they are due."""
+    def _send_heartbeat(self) -> None:
+        """Toggle the heartbeat line and extend the held output, if due."""
         tasks = self._tasks
         if tasks is None:
             return
-        if self._away_s() >= BEAT_S:
-            if self._pace is not None and self._driven("output", tasks.output.is_task_done):
-                self._lose("output", RuntimeError("it has ended by itself"))
-            before_s = self._clock.now()
-            self._driven("heartbeat", tasks.beat)
-            self._away_s()  # the edge may have left so late
-            self._beat_s = before_s
-        if self._pace is None:
+        if self._check_silence_s() >= HEARTBEAT_PERIOD_S:
+            if self._clock_sync is not None and self._call_driver(
+                "output", tasks.output.is_task_done
+            ):
+                self._raise_lost("output", RuntimeError("it has ended by itself"))
+            sent_s = self._clock.now()
+            self._call_driver("heartbeat", tasks.toggle_heartbeat)
+            self._check_silence_s()  # the call may have been slow: its edge may have left only now
+            self._last_beat_s = sent_s
+        if self._clock_sync is None:
             return
-        if self._written - self._newest() < 0.5 * HOLD_S * self.rate_hz:
+        if self._written - self._newest_sample() < 0.5 * HOLD_S * self.rate_hz:
             try:
-                self._place(self._written, self._queued.take(self._written, self._written + 1))
+                self._write_output(
+                    self._written, self._commands.values(self._written, self._written + 1)
+                )
             except ValueError as error:
-                self._lose("output", error)
+                self._raise_lost("output", error)
 
-    def _away_s(self) -> float:
-        """How long the line may have been silent by now; MachineLost where the machine moves on."""
-        away_s = self._clock.now() - self._beat_s
-        if self._pace is not None and away_s > HEARTBEAT_S:
-            away = f"this rig was away for {away_s:.2f} s, and the machine goes on without it"
-            self._lose("heartbeat", TimeoutError(away))
-        return away_s
+    def _check_silence_s(self) -> float:
+        """Return the longest possible silence of the line in s; MachineLost beyond the limit."""
+        silence_s = self._clock.now() - self._last_beat_s
+        if self._clock_sync is not None and silence_s > HEARTBEAT_TIMEOUT_S:
+            problem = f"no heartbeat from this rig for {silence_s:.2f} s, beyond the watchdog limit"
+            self._raise_lost("heartbeat", TimeoutError(problem))
+        return silence_s
 
-    def _place(self, first: int, volts: Float1D) -> None:
-        """Hand output over to the driver, with a hold behind it that reaches beyond all before.
+    def _write_output(self, first: int, volts: Float1D) -> None:
+        """Write output to the driver, followed by a hold that covers all earlier output.
 
-        ValueError where the device has it already.
+        Raises ValueError if the device has already taken these samples from the buffer.
         """
         assert self._tasks is not None
-        tasks, newest = self._tasks, 0 if self._pace is None else self._newest()
+        tasks, newest = self._tasks, 0 if self._clock_sync is None else self._newest_sample()
         end = max(first + volts.size, newest) + round(HOLD_S * self.rate_hz)
         end = max(end, self._written)
-        if end > MOST_INDEX:
-            self._lose("counter", RuntimeError(f"the driver counts to sample {MOST_INDEX}"))
+        if end > MAX_WRITE_INDEX:
+            self._raise_lost(
+                "counter",
+                RuntimeError(f"the driver cannot place output after sample {MAX_WRITE_INDEX}"),
+            )
         padded = np.append(volts, np.full(end - first - volts.size, volts[-1]))
         try:
             tasks.write(first, padded)
         except DaqError as error:
-            late = error.error_code == NO_LONGER_WRITEABLE
-            if late and not self._driven("output", tasks.output.is_task_done):
-                raise ValueError(f"the device has this command already: {said(error)}") from None
-            self._lose("output", error)
+            too_late = error.error_code == NO_LONGER_WRITEABLE
+            if too_late and not self._call_driver("output", tasks.output.is_task_done):
+                raise ValueError(
+                    f"the device has already taken these samples: {describe_error(error)}"
+                ) from None
+            self._raise_lost("output", error)
         except Error as error:
-            self._lose("server", error)
+            self._raise_lost("server", error)
         self._written = end
 
-    def _newest(self) -> int:
-        """The newest sample that the machine has taken by now, read or not."""
-        since = self._clock.now() - self.scheduled(0)
-        return max(self._taken - 1, math.floor(since * self.rate_hz + 1e-6))
+    def _newest_sample(self) -> int:
+        """Return the index of the newest sample taken by now, read or not."""
+        elapsed_s = self._clock.now() - self.scheduled_time_s(0)
+        return max(self._received - 1, math.floor(elapsed_s * self.rate_hz + 1e-6))
 
-    def _driven(self, where: Where, act: Callable[[], T]) -> T:
-        """What the driver answers; its error is MachineLost."""
+    def _call_driver(self, source: ErrorSource, call: Callable[[], T]) -> T:
+        """Return the result of a driver call; raise its error as MachineLost."""
         try:
-            return act()
+            return call()
         except Error as error:
-            self._lose(where, error)
+            self._raise_lost(source, error)
 
-    def _lose(self, where: Where, error: Exception) -> NoReturn:
-        """The device is lost, for good: MachineLost says why and what happens now."""
-        spoke = isinstance(error, DaqError) or not isinstance(error, Error)
-        self._lost = self._lost or lost(where if spoke else "server", error, self._pace is not None)
-        raise MachineLost(self._lost) from None
+    def _raise_lost(self, source: ErrorSource, error: Exception) -> NoReturn:
+        """Raise MachineLost with cause, consequence and remedy, now and in every later call."""
+        driver_answered = isinstance(error, DaqError) or not isinstance(error, Error)
+        self._loss_reason = self._loss_reason or describe_loss(
+            source if driver_answered else "server", error, self._clock_sync is not None
+        )
+        raise MachineLost(self._loss_reason) from None
 
-    def _alive(self) -> Tasks:
-        if self._lost:
-            raise MachineLost(self._lost)
+    def _require_tasks(self) -> RigTasks:
+        if self._loss_reason:
+            raise MachineLost(self._loss_reason)
         if self._tasks is None:
-            raise RuntimeError("NI device: it is closed, or open() was not called")
+            raise RuntimeError("NI device: closed, or open() was not called")
         return self._tasks

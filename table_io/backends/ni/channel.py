@@ -1,57 +1,57 @@
-"""The way to NI's gRPC Device Server: a channel none of whose calls waits for ever."""
+"""gRPC channel to NI's Device Server, with a deadline on every call."""
 
 from collections.abc import Callable
 from typing import Any
 
 import grpc
 
-from table_io.card import BadInput
-from table_io.rig import Rig
+from table_io.config.rig import RigConfig
+from table_io.errors import InputError
 
-ANSWER_S = 2.0  # that a call may take, with what it waits for samples
-REACH_S = 2.0  # until somebody answers
-MOST_BYTES = 64 << 20
+CALL_TIMEOUT_S = 2.0  # of a call, including its wait for samples
+CONNECT_TIMEOUT_S = 2.0
+MAX_MESSAGE_BYTES = 64 << 20
 
 
-class Bounded:
-    """A channel whose calls end after a time: the client's own ask for none."""
+class DeadlineChannel:
+    """Channel that adds a deadline to every call: NI's client sets none."""
 
-    def __init__(self, channel: Any, seconds: float) -> None:
+    def __init__(self, channel: Any, timeout_s: float) -> None:
         self._channel = channel
-        self._seconds = seconds
+        self._timeout_s = timeout_s
 
     def unary_unary(self, *args: Any, **named: Any) -> Callable[..., Any]:
         call = self._channel.unary_unary(*args, **named)
-        seconds = self._seconds
+        timeout_s = self._timeout_s
 
-        def bounded(request: Any, metadata: Any = None) -> Any:
-            return call(request, timeout=seconds, metadata=metadata)
+        def call_with_deadline(request: Any, metadata: Any = None) -> Any:
+            return call(request, timeout=timeout_s, metadata=metadata)
 
-        return bounded
+        return call_with_deadline
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._channel, name)
 
 
-def channel_to(endpoint: str) -> Any:
-    """An open way to HOST:PORT, none of whose calls waits for ever; nothing is sent yet."""
+def open_channel(endpoint: str) -> Any:
+    """Return a channel to HOST:PORT with a deadline on every call; nothing is sent yet."""
     options = (
         ("grpc.enable_http_proxy", 0),
-        ("grpc.max_send_message_length", MOST_BYTES),
-        ("grpc.max_receive_message_length", MOST_BYTES),
+        ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
+        ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
     )
-    return Bounded(grpc.insecure_channel(endpoint, options=options), ANSWER_S)
+    return DeadlineChannel(grpc.insecure_channel(endpoint, options=options), CALL_TIMEOUT_S)
 
 
-def reached(rig: Rig, endpoint: str) -> Any:
-    """A channel to a server that answers; BadInput says how to start one."""
-    channel = channel_to(endpoint)
+def connect_server(rig: RigConfig, endpoint: str) -> Any:
+    """Return a channel to a server that answers; InputError with the remedy if none does."""
+    channel = open_channel(endpoint)
     try:
-        grpc.channel_ready_future(channel).result(timeout=REACH_S)
+        grpc.channel_ready_future(channel).result(timeout=CONNECT_TIMEOUT_S)
     except grpc.FutureTimeoutError:
         channel.close()
-        desk = f", in another terminal: shaketwin table --rig {rig.name}" if rig.simulated else ""
-        raise BadInput(
-            f"no NI gRPC Device Server answers at {endpoint}; start it there{desk}"
+        hint = f", in another terminal: shaketwin table --rig {rig.name}" if rig.simulated else ""
+        raise InputError(
+            f"no NI gRPC Device Server answers at {endpoint}", remedy=f"start it there{hint}"
         ) from None
     return channel

@@ -1,4 +1,4 @@
-"""Reads one input in a thread of its own: a driver that does not answer holds nobody else."""
+"""Input reader in a separate thread, so that a driver that hangs does not block the caller."""
 
 import threading
 from collections.abc import Callable
@@ -6,42 +6,42 @@ from queue import Empty, Queue
 
 from table_io.block import Float2D
 
-Take = Callable[[int], Float2D]
+ReadInputs = Callable[[int], Float2D]
 
 
-class Reader:
-    """Asked for samples, it hands them over when they have come; one request at a time."""
+class InputReader:
+    """Reader thread that serves one request for samples at a time."""
 
-    def __init__(self, take: Take) -> None:
-        self._take = take
-        self._asked: Queue[int] = Queue(1)
-        self._come: Queue[Float2D | Exception] = Queue(1)
+    def __init__(self, read_inputs: ReadInputs) -> None:
+        self._read_inputs = read_inputs
+        self._requests: Queue[int] = Queue(1)
+        self._results: Queue[Float2D | Exception] = Queue(1)
         self._thread = threading.Thread(target=self._run, name="input", daemon=True)
         self._thread.start()
 
-    def ask(self, samples: int) -> None:
-        """Read so many, 1 or more."""
-        self._asked.put_nowait(samples)
+    def request(self, samples: int) -> None:
+        """Request the next `samples` samples, 1 or more."""
+        self._requests.put_nowait(samples)
 
-    def come(self, wait_s: float) -> Float2D | None:
-        """What was asked for, (channel, sample), None where it has not come; errors are raised."""
+    def poll(self, timeout_s: float) -> Float2D | None:
+        """Return the requested volts, (channel, sample), or None; raise the error of the read."""
         try:
-            one = self._come.get(timeout=wait_s)
+            result = self._results.get(timeout=timeout_s)
         except Empty:
             return None
-        if isinstance(one, Exception):
-            raise one
-        return one
+        if isinstance(result, Exception):
+            raise result
+        return result
 
-    def close(self, patience_s: float) -> None:
-        """End the thread; where the driver holds it, leave it behind."""
-        if self._asked.empty():
-            self._asked.put_nowait(0)
-        self._thread.join(patience_s)
+    def close(self, timeout_s: float) -> None:
+        """End the thread; abandon it if the driver blocks it longer than the timeout."""
+        if self._requests.empty():
+            self._requests.put_nowait(0)
+        self._thread.join(timeout_s)
 
     def _run(self) -> None:
-        while samples := self._asked.get():
+        while samples := self._requests.get():
             try:
-                self._come.put(self._take(samples))
+                self._results.put(self._read_inputs(samples))
             except Exception as error:
-                self._come.put(error)
+                self._results.put(error)

@@ -1,25 +1,26 @@
-"""An openDAQ device: acquisition by its native streaming, and a simulated table served as one."""
+"""Acquisition from an openDAQ device by its native streaming."""
 
 import socket
 
-from table_io.backends.opendaq.source import OpenDaqSource, needed
-from table_io.card import BadInput
-from table_io.rig import Rig
+from table_io.backends.opendaq.source import OpenDaqSource, require_opendaq_wiring
+from table_io.config.rig import RigConfig
+from table_io.errors import InputError
 
-__all__ = ["OpenDaqSource", "answers"]
+__all__ = ["OpenDaqSource", "check_reachable"]
 
-ANSWER_S = 2.0
+CONNECT_TIMEOUT_S = 2.0
 
 
-def answers(rig: Rig) -> None:
-    """BadInput where nothing streams at the card's address, or the library is not installed."""
-    wiring = needed(rig)
+def check_reachable(rig: RigConfig) -> None:
+    """Raise InputError if the device does not answer or the library is not installed."""
+    wiring = require_opendaq_wiring(rig)
     try:
-        socket.create_connection(wiring.address, ANSWER_S).close()
+        socket.create_connection(wiring.address, CONNECT_TIMEOUT_S).close()
     except (OSError, UnicodeError) as error:
-        why = getattr(error, "strerror", None) or error
+        reason = getattr(error, "strerror", None) or error
         hint = f"for a simulated one: shaketwin table --rig {rig.name}" if rig.simulated else ""
-        raise BadInput(
-            f"no openDAQ device answers at {wiring.device} ({why}); switch it on, "
-            f"or mend opendaq.device in the card{'; ' if hint else ''}{hint}"
+        raise InputError(
+            f"no openDAQ device answers at {wiring.device} ({reason})",
+            remedy="switch it on, or correct opendaq.device in the rig file"
+            f"{'; ' if hint else ''}{hint}",
         ) from None

@@ -1,38 +1,40 @@
-"""Samples of several channels on one clock, put in their places as they come.
+"""Reassembly of samples of several channels on one clock, by their time stamps.
 
-Each channel comes by itself, in pieces; the time stamp says where a piece belongs.
+Each channel arrives separately, in pieces.
 """
 
 import numpy as np
 
 from table_io.block import Float1D, Float2D, Int1D
 
-OFF = 0.25  # of a sample that a time stamp may lie beside its place
-ROOM = 4096  # samples by which the store grows
-FAR = 1 << 16  # samples: no loss is so long, the clock was set
+MAX_STAMP_ERROR_SAMPLES = 0.25  # deviation of a time stamp from an even clock
+GROWTH_SAMPLES = 4096  # increment of the buffer
+MAX_LOSS_SAMPLES = 1 << 16  # a longer gap means that the clock was set
 
 
-class UnevenError(ValueError):
-    """Time stamps that are not those of one even clock."""
+class UnevenClockError(ValueError):
+    """Time stamps that are not evenly spaced."""
 
 
-def places(ticks: Int1D, first_tick: int, ticks_per_sample: float, drifted: float = 0.0) -> Int1D:
-    """Sample index of each time stamp, (sample,); UnevenError where one lies between samples.
+def sample_indices(
+    ticks: Int1D, first_tick: int, ticks_per_sample: float, drift_ticks: float = 0.0
+) -> Int1D:
+    """Return the sample index of each time stamp, (sample,); UnevenClockError if between samples.
 
-    `drifted` is how many ticks the stamps have run ahead of their samples since the first.
+    `drift_ticks` is the drift of the stamps against an even clock since `first_tick`, in ticks.
     """
-    exact = (ticks - first_tick - drifted) / ticks_per_sample
+    exact = (ticks - first_tick - drift_ticks) / ticks_per_sample
     index = np.rint(exact).astype(np.int64)
-    if index.size and np.abs(exact - index).max() > OFF:
+    if index.size and np.abs(exact - index).max() > MAX_STAMP_ERROR_SAMPLES:
         at = int(np.abs(exact - index).argmax())
-        raise UnevenError(
-            f"time stamp {ticks[at]} lies {abs(exact[at] - index[at]):.2f} samples off the others"
+        raise UnevenClockError(
+            f"time stamp {ticks[at]} is off by {abs(exact[at] - index[at]):.2f} samples"
         )
     return index
 
 
-class JumpError(UnevenError):
-    """A clock that was set while it ran."""
+class ClockJumpError(UnevenClockError):
+    """Jump of the clock by `samples`: it was set while it ran."""
 
     def __init__(self, samples: int) -> None:
         super().__init__(f"the clock jumped by {samples} samples")
@@ -40,18 +42,18 @@ class JumpError(UnevenError):
 
 
 class Assembly:
-    """What has come and was not handed out; NaN where nothing came."""
+    """Buffer of samples that have arrived and were not returned; missing ones are NaN."""
 
-    def __init__(self, channels: int, far: int = FAR) -> None:
-        self.first = 0  # index of the first sample that is not handed out
-        self._values = np.full((channels, ROOM), np.nan)
-        self._ends = np.zeros(channels, dtype=np.int64)  # index after the newest, each channel
+    def __init__(self, channels: int, max_loss: int = MAX_LOSS_SAMPLES) -> None:
+        self.first = 0  # index of the next sample to return
+        self._values = np.full((channels, GROWTH_SAMPLES), np.nan)
+        self._ends = np.zeros(channels, dtype=np.int64)  # after the newest sample, per channel
         self._silent = np.zeros(channels, dtype=bool)
-        self._far = far
+        self._max_loss = max_loss
 
     @property
     def complete(self) -> int:
-        """Index before which every channel that still speaks has come, or is known to be lost."""
+        """Index before which all samples of the channels that still send have arrived."""
         return int(self._ends[~self._silent].min(initial=self.end))
 
     @property
@@ -59,44 +61,45 @@ class Assembly:
         """Index after the newest sample of any channel."""
         return int(self._ends.max())
 
-    def give_up(self, before: int) -> None:
-        """Wait no more for channels that have not come so far, until they speak again."""
-        self._silent |= self._ends < before
+    def give_up(self, index: int) -> None:
+        """Stop waiting for channels that have not reached `index`, until they send again."""
+        self._silent |= self._ends < index
 
     def put(self, row: int, index: Int1D, values: Float1D) -> None:
-        """Samples of a channel; what was handed out already, or comes before sample 0, is dropped.
+        """Insert samples of a channel; drop those already returned or before sample 0.
 
-        UnevenError where they go back in time, JumpError where they are far ahead of all that came.
+        Raises UnevenClockError if the index goes back, and ClockJumpError if it is more than
+        `max_loss` ahead of everything received.
         """
         if not index.size:
             return
-        known = self._ends[row]
-        if np.diff(index).min(initial=1) < 1 or (known and index[0] < known):
-            raise UnevenError(f"time goes back, from sample {known - 1} to {index[0]}")
+        end = self._ends[row]
+        if np.diff(index).min(initial=1) < 1 or (end and index[0] < end):
+            raise UnevenClockError(f"time goes back from sample {end - 1} to {index[0]}")
         ahead = np.diff(index, prepend=max(self.end, self.first)).max()
-        if ahead > self._far:
-            raise JumpError(int(ahead))
+        if ahead > self._max_loss:
+            raise ClockJumpError(int(ahead))
         self._silent[row] = False
-        wanted = index >= self.first
-        index, values = index[wanted] - self.first, values[wanted]
+        is_new = index >= self.first
+        index, values = index[is_new] - self.first, values[is_new]
         if not index.size:
             return
         missing = int(index[-1]) + 1 - self._values.shape[1]
         if missing > 0:
             self._values = np.pad(
-                self._values, ((0, 0), (0, missing + ROOM)), constant_values=np.nan
+                self._values, ((0, 0), (0, missing + GROWTH_SAMPLES)), constant_values=np.nan
             )
         self._values[row, index] = values
         self._ends[row] = self.first + index[-1] + 1
 
     def take(self, count: int) -> Float2D:
-        """The next samples, (channel, sample); NaN where none came."""
+        """Remove and return the next samples, (channel, sample); missing ones are NaN."""
         out = np.full((self._values.shape[0], count), np.nan)
-        held = self._values[:, :count]
-        out[:, : held.shape[1]] = held
+        available = self._values[:, :count]
+        out[:, : available.shape[1]] = available
         self._values = np.pad(
             self._values[:, count:],
-            ((0, 0), (0, max(ROOM - self._values.shape[1] + count, 0))),
+            ((0, 0), (0, max(GROWTH_SAMPLES - self._values.shape[1] + count, 0))),
             constant_values=np.nan,
         )
         self.first += count

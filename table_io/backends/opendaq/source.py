@@ -1,67 +1,82 @@
-"""Acquisition from an openDAQ device: the Source half of the contract.
+"""Acquisition from an openDAQ device: an `AcquisitionSource`.
 
-The samples stay as they come: a signal in V is handed on, one in the card's unit for its channel
-becomes the volts that the card's sensor would give. Time stamps put every sample in its place, so
-what the device or the network lost is NaN there. A read with no thread of ours polls.
+A signal in V is passed on unchanged; one in the unit of the sensor is converted to the volts that
+this sensor would give. Time stamps assign every sample to its index, so samples lost by the device
+or the network are NaN. `read` polls; there is no thread.
 """
 
 from typing import Any
 
 import numpy as np
 
-from table_io.backends import PATIENCE_S, MachineLost
-from table_io.backends.opendaq.assembly import Assembly, JumpError, UnevenError, places
-from table_io.backends.opendaq.stamps import Ticking, one_clock, together
+from table_io.backends import SAMPLE_TIMEOUT_S, MachineLost
+from table_io.backends.opendaq.assembly import (
+    Assembly,
+    ClockJumpError,
+    UnevenClockError,
+    sample_indices,
+)
+from table_io.backends.opendaq.timestamps import (
+    TickClock,
+    require_common_clock,
+    require_simultaneous,
+)
 from table_io.block import Float2D
-from table_io.card import BadInput
 from table_io.clock import Clock
-from table_io.rig import Rig
-from table_io.wiring.opendaq import OpenDaqWiring
+from table_io.config.rig import RigConfig
+from table_io.config.wiring.opendaq import OpenDaqWiring
+from table_io.errors import InputError
 
 POLL_S = 0.001
-FIRST_S = 3.0  # in which the first sample must have come
-MOST = 1 << 16  # samples that one look takes of a channel
-FAR_S = 5.0  # that stamps run ahead: their clock was set
-FOLLOWS = 0.1  # of what a look shows of a clock that is disciplined against its own rate
-STEADY_S = 10.0  # over which the device's clock is held against ours
-SAME = {"m/s²": "m/s2", "m/s^2": "m/s2", "g_n": "g", "gn": "g", "µm": "um", "μm": "um"}
+FIRST_SAMPLE_TIMEOUT_S = 3.0
+MAX_READ_SAMPLES = 1 << 16  # per channel and poll
+MAX_CLOCK_JUMP_S = 5.0  # a longer jump of the stamps means that their clock was set
+DRIFT_GAIN = 0.1  # of the filter that follows the drift of a disciplined clock, per poll
+CLOCK_WINDOW_S = 10.0  # over which the device's clock is compared with the session's
+UNIT_SYNONYMS = {"m/s²": "m/s2", "m/s^2": "m/s2", "g_n": "g", "gn": "g", "µm": "um", "μm": "um"}
 
 
-def needed(rig: Rig) -> OpenDaqWiring:
-    """The card's wiring; BadInput where it is missing, incomplete, or the library is."""
+def require_opendaq_wiring(rig: RigConfig) -> OpenDaqWiring:
+    """Return the [opendaq] wiring; InputError if it is incomplete or the library is missing."""
     wiring = rig.opendaq
     if wiring is None:
-        raise BadInput(f"rig {rig.name}: no [opendaq] table; say what is wired where")
+        raise InputError(
+            "no [opendaq] table",
+            where=f"rig {rig.name}",
+            remedy="add it, with the signal of each sensor",
+        )
     missing = [name for name in rig.channels if name not in wiring.signals]
     if missing:
-        raise BadInput(
-            f"rig {rig.name}: opendaq.signals lacks {', '.join(missing)}; name a signal of the "
-            "device for each sensor of the card, or take the sensor out"
+        raise InputError(
+            f"no signal for {', '.join(missing)}",
+            where=f"rig {rig.name}",
+            key="opendaq.signals",
+            remedy="name a signal of the device for each sensor, or remove the sensor",
         )
-    library()
+    load_library()
     return wiring
 
 
-def library() -> Any:
-    """The vendor's module; BadInput where it is not installed."""
+def load_library() -> Any:
+    """Import the vendor's module; InputError if it is not installed."""
     try:
         import opendaq
     except ImportError as error:
-        raise BadInput(
-            f"openDAQ is not installed ({error}); pip install shaketwin[opendaq]"
+        raise InputError(
+            f"openDAQ is not installed ({error})", remedy="pip install shaketwin[opendaq]"
         ) from None
     return opendaq
 
 
 class OpenDaqSource:
-    """The inputs of one openDAQ device; who moves the table is somebody else."""
+    """Inputs of one openDAQ device; an external controller moves the table."""
 
-    def __init__(self, rig: Rig, rate_hz: float, clock: Clock) -> None:
-        self._wiring = needed(rig)
-        self._daq = library()
+    def __init__(self, rig: RigConfig, rate_hz: float, clock: Clock) -> None:
+        self._wiring = require_opendaq_wiring(rig)
+        self._daq = load_library()
         self.channels = rig.channels
         self.rate_hz = rate_hz
-        self.clock_says = ""  # whose clock took sample 0, and when; known after start
+        self.clock_description = ""  # clock of the device, and its time at sample 0; set by start
         self._rig = rig
         self._clock = clock
         self._instance: Any = None
@@ -69,200 +84,217 @@ class OpenDaqSource:
         self._readers: list[Any] = []
         self._gain = np.ones(len(rig.sensors))
         self._ticks_per_sample = 1.0
-        self._ticking: Ticking | None = None
+        self._tick_clock: TickClock | None = None
         self._newest_tick: int | None = None
         self._first_tick = 0
-        self._drifted = 0.0  # ticks by which the stamps ran ahead since then
-        self._ticks: dict[int, int] = {}  # newest of each channel
+        self._drift_ticks = 0.0  # drift of the stamps since then
+        self._ticks: dict[int, int] = {}  # newest stamp of each row
         self._assembly: Assembly | None = None
-        self._epoch: float | None = None
-        self._steady = (0.0, 0.0)  # until when the clocks are compared, earliest epoch seen
+        self._epoch_s: float | None = None
+        self._clock_window = (0.0, 0.0)  # end of the window, earliest epoch in it
 
     def open(self) -> None:
-        """Connect, find the signals, check units and rate; nothing of the device is changed."""
-        self._rig.refuse_rate(self.rate_hz)
+        """Connect, find the signals, check units and rate; change no setting of the device."""
+        self._rig.check_rate(self.rate_hz)
         builder = self._daq.InstanceBuilder()
         builder.global_log_level = self._daq.LogLevel.Off
         self._instance = builder.build()
         try:
             self._device = self._instance.add_device(self._wiring.device)
         except RuntimeError as error:
-            raise BadInput(
-                f"opendaq.device = {self._wiring.device}: {str(error).splitlines()[0]}; is it "
-                "switched on, and reached from here?"
+            raise InputError(
+                str(error).splitlines()[0],
+                key="opendaq.device",
+                value=self._wiring.device,
+                remedy="check that it is switched on and can be reached from this computer",
             ) from None
-        found = {str(one.global_id): one for one in self._device.signals_recursive}
-        signals = [self._signal(name, found) for name in self.channels]
+        signals_by_id = {str(signal.global_id): signal for signal in self._device.signals_recursive}
+        signals = [self._find_signal(name, signals_by_id) for name in self.channels]
         for row, signal in enumerate(signals):
             self._gain[row] = self._volts_per(row, signal)
-        self._ticking = one_clock(self._daq, signals, self.rate_hz, self._wiring.device)
-        self._ticks_per_sample = self._ticking.per_sample
+        self._tick_clock = require_common_clock(
+            self._daq, signals, self.rate_hz, self._wiring.device
+        )
+        self._ticks_per_sample = self._tick_clock.ticks_per_sample
         float64, int64 = self._daq.SampleType.Float64, self._daq.SampleType.Int64
         self._readers = [
-            self._daq.StreamReader(one, value_type=float64, domain_type=int64) for one in signals
+            self._daq.StreamReader(signal, value_type=float64, domain_type=int64)
+            for signal in signals
         ]
-        until = self._clock.now() + FIRST_S
+        deadline_s = self._clock.now() + FIRST_SAMPLE_TIMEOUT_S
         while self._newest_tick is None:
-            self._look()
-            if self._clock.now() > until:
-                raise BadInput(
-                    f"{self._wiring.device} has sent no sample for {FIRST_S:g} s; start its "
-                    "acquisition"
+            self._poll()
+            if self._clock.now() > deadline_s:
+                raise InputError(
+                    f"no sample within {FIRST_SAMPLE_TIMEOUT_S:g} s",
+                    where=self._wiring.device,
+                    remedy="start its acquisition",
                 )
             self._clock.wait_until(self._clock.now() + POLL_S)
-        until = self._clock.now() + PATIENCE_S
-        while len(self._ticks) < len(self.channels) and self._clock.now() < until:
-            self._look()
+        deadline_s = self._clock.now() + SAMPLE_TIMEOUT_S
+        while len(self._ticks) < len(self.channels) and self._clock.now() < deadline_s:
+            self._poll()
             self._clock.wait_until(self._clock.now() + POLL_S)
-        at = {self.channels[row]: tick for row, tick in self._ticks.items()}
-        together(at, self._ticks_per_sample, self._wiring.device)
+        newest_by_channel = {self.channels[row]: tick for row, tick in self._ticks.items()}
+        require_simultaneous(newest_by_channel, self._ticks_per_sample, self._wiring.device)
 
     def tare(self, samples: int) -> Float2D:
-        """Volts at rest, (channel, sample): the next samples."""
-        self._begin()
-        volts = self._await(samples, self._clock.now() + samples / self.rate_hz)
+        """Return volts at rest, (channel, sample): the next samples."""
+        self._start_counting()
+        volts = self._wait_samples(samples, self._clock.now() + samples / self.rate_hz)
         self._assembly = None
         return volts
 
     def start(self) -> None:
-        """Sample 0 is the next that comes."""
-        if self._epoch is not None:
-            raise RuntimeError("openDAQ: it runs already; one start() a life")
-        self._begin()
-        self._epoch = self._clock.now()
-        self._steady = (self._epoch + STEADY_S, np.inf)
-        assert self._ticking is not None
-        stamp = self._ticking.said(self._first_tick)
-        self.clock_says = f"openDAQ clock of {self._wiring.device}, sample 0 at {stamp}"
+        """Start acquisition: the next sample to arrive is sample 0."""
+        if self._epoch_s is not None:
+            raise RuntimeError("openDAQ: start() was called already; one start() a connection")
+        self._start_counting()
+        self._epoch_s = self._clock.now()
+        self._clock_window = (self._epoch_s + CLOCK_WINDOW_S, np.inf)
+        assert self._tick_clock is not None
+        stamp = self._tick_clock.format_tick(self._first_tick)
+        self.clock_description = f"openDAQ clock of {self._wiring.device}, sample 0 at {stamp}"
 
     def read(self, samples: int) -> Float2D:
-        """Volts of the next samples, (channel, sample), when they have come."""
-        if self._assembly is None or self._epoch is None or not self._readers:
-            raise RuntimeError("openDAQ: it is closed, or start() was not called")
-        due = self.scheduled(max(self._assembly.first + samples - 1, 0))
-        volts = self._await(samples, due)
-        self._clock.wait_until(self.scheduled(max(self._assembly.first - 1, 0)))
+        """Wait for the next samples and return their volts, (channel, sample)."""
+        if self._assembly is None or self._epoch_s is None or not self._readers:
+            raise RuntimeError("openDAQ: closed, or start() was not called")
+        due_s = self.scheduled_time_s(max(self._assembly.first + samples - 1, 0))
+        volts = self._wait_samples(samples, due_s)
+        self._clock.wait_until(self.scheduled_time_s(max(self._assembly.first - 1, 0)))
         return volts
 
-    def scheduled(self, index: int) -> float:
-        """Time on the session's clock at which sample `index` comes, in s.
+    def scheduled_time_s(self, index: int) -> float:
+        """Return the time in s, on the session's clock, at which sample `index` arrives.
 
-        The device's clock is not ours: its earliest samples of the last seconds keep this right.
+        It follows the drift of the device's clock by the earliest arrivals of each window.
         """
-        if self._epoch is None:
-            raise RuntimeError("openDAQ: start() comes first")
-        return self._epoch + index / self.rate_hz
+        if self._epoch_s is None:
+            raise RuntimeError("openDAQ: call start() first")
+        return self._epoch_s + index / self.rate_hz
 
     def close(self) -> None:
-        """Let the device go; safe to call twice."""
+        """Disconnect from the device; safe to call twice."""
         self._readers = []
         if self._device is not None:
             device, self._device = self._device, None
             self._instance.remove_device(device)
         self._instance = None
 
-    def _signal(self, channel: str, found: dict[str, Any]) -> Any:
-        """The signal that is wired to a channel."""
+    def _find_signal(self, channel: str, signals_by_id: dict[str, Any]) -> Any:
+        """Return the signal of a channel; InputError if none or several match."""
         wanted = self._wiring.signals[channel].strip("/")
-        there = [one for name, one in found.items() if f"/{name}".endswith(f"/{wanted}")]
-        if len(there) == 1 and there[0].domain_signal is not None:
-            return there[0]
-        values = sorted(name for name, one in found.items() if one.domain_signal is not None)
-        why = "has no time stamps" if there else "is no signal of the device"
-        why = "is the end of several signals" if len(there) > 1 else why
-        raise BadInput(
-            f"opendaq.signals.{channel} = {wanted!r} {why}; there are: {', '.join(values)}"
+        matches = [
+            signal for name, signal in signals_by_id.items() if f"/{name}".endswith(f"/{wanted}")
+        ]
+        if len(matches) == 1 and matches[0].domain_signal is not None:
+            return matches[0]
+        values = sorted(
+            name for name, signal in signals_by_id.items() if signal.domain_signal is not None
+        )
+        reason = "the signal has no time stamps" if matches else "not a signal of the device"
+        reason = "matches the end of several signals" if len(matches) > 1 else reason
+        raise InputError(
+            reason, key=f"opendaq.signals.{channel}", value=wanted, allowed=", ".join(values)
         )
 
     def _volts_per(self, row: int, signal: Any) -> float:
-        """Volts per unit of a signal: 1 where it is in V."""
+        """Return volts per unit of a signal: 1 if it is in V; InputError for another unit."""
         sensor = self._rig.sensors[row]
         unit = signal.descriptor.unit
         symbol = str(unit.symbol) if unit is not None else ""
         if symbol == "V":
             return 1.0
-        if SAME.get(symbol, symbol) == sensor.unit:
+        if UNIT_SYNONYMS.get(symbol, symbol) == sensor.unit:
             return sensor.volts_per_unit
-        raise BadInput(
-            f"signal {signal.global_id} of {sensor.channel} is in {symbol or 'no unit'}; allowed: "
-            f"V, or {sensor.unit} as the sensor in the card. Set it in the device, or mend the card"
+        raise InputError(
+            f"signal {signal.global_id} of {sensor.channel} is in {symbol or 'no unit'}",
+            allowed=f"V, or {sensor.unit} as for this sensor in the rig file",
+            remedy="change the unit in the device, or the sensor in the rig file",
         )
 
-    def _begin(self) -> None:
-        """What comes from now on counts from sample 0."""
+    def _start_counting(self) -> None:
+        """Count samples from 0, starting with the next one."""
         if not self._readers or self._newest_tick is None:
-            raise RuntimeError("openDAQ: it is closed, or open() was not called")
-        if self._epoch is not None:
-            raise RuntimeError("openDAQ: it runs; tare() comes before start()")
+            raise RuntimeError("openDAQ: closed, or open() was not called")
+        if self._epoch_s is not None:
+            raise RuntimeError("openDAQ: start() was called already; tare before start()")
         self._assembly = None
-        self._look()
+        self._poll()
         self._first_tick = self._newest_tick + round(self._ticks_per_sample)
-        self._drifted = 0.0
-        self._assembly = Assembly(len(self.channels), round(FAR_S * self.rate_hz))
+        self._drift_ticks = 0.0
+        self._assembly = Assembly(len(self.channels), round(MAX_CLOCK_JUMP_S * self.rate_hz))
 
-    def _await(self, samples: int, due: float) -> Float2D:
-        """The next samples, when they have come."""
+    def _wait_samples(self, samples: int, due_s: float) -> Float2D:
+        """Wait for the next samples, (channel, sample); MachineLost if none arrive."""
         assembly = self._assembly
         assert assembly is not None
-        last, heard = assembly.first + samples, self._clock.now()
+        last, last_received_s = assembly.first + samples, self._clock.now()
         while assembly.complete < last:
-            if self._look():
-                heard = self._clock.now()
-            late = self._clock.now() - max(due, heard)
-            if late > PATIENCE_S and assembly.end < last:
+            if self._poll():
+                last_received_s = self._clock.now()
+            overdue_s = self._clock.now() - max(due_s, last_received_s)
+            if overdue_s > SAMPLE_TIMEOUT_S and assembly.end < last:
                 raise MachineLost(
                     f"the openDAQ device at {self._wiring.device} has sent nothing for "
-                    f"{PATIENCE_S:g} s; who plays is not stopped by this: stop it at its "
-                    "controller, then look after the device and its cable"
+                    f"{SAMPLE_TIMEOUT_S:g} s; this does not stop the table: stop it at its "
+                    "controller, then check the device and its cable"
                 )
-            if self._clock.now() - due > PATIENCE_S and assembly.end >= last:
-                assembly.give_up(last)  # a channel that has stopped is lost; the others go on
+            if self._clock.now() - due_s > SAMPLE_TIMEOUT_S and assembly.end >= last:
+                assembly.give_up(last)  # a channel that has stopped is lost; the others continue
             self._clock.wait_until(self._clock.now() + POLL_S)
         return assembly.take(samples)
 
-    def _look(self) -> bool:
-        """Put what has come in its place; False where nothing did."""
+    def _poll(self) -> bool:
+        """Assign arrived samples to their indices; return False if none arrived."""
         if all(reader.empty for reader in self._readers):
             return False
-        came = False
+        received = False
         for row, reader in enumerate(self._readers):
-            values, ticks = reader.read_with_domain(MOST)
+            values, ticks = reader.read_with_domain(MAX_READ_SAMPLES)
             if not len(ticks):
                 continue
-            came, newest = True, int(ticks[-1])
+            received, newest = True, int(ticks[-1])
             self._newest_tick = max(self._newest_tick or newest, newest)
             self._ticks[row] = newest
             if self._assembly is None:
                 continue
-            clock = self._first_tick, self._ticks_per_sample, self._drifted
+            clock = self._first_tick, self._ticks_per_sample, self._drift_ticks
             try:
-                index = places(ticks, *clock)
+                index = sample_indices(ticks, *clock)
                 self._assembly.put(row, index, values * self._gain[row])
-            except JumpError as error:
+            except ClockJumpError as error:
                 raise MachineLost(
                     f"the clock of {self._wiring.device} jumped by "
-                    f"{error.samples / self.rate_hz:.1f} s: it was set while it ran; who plays is "
-                    "not stopped by this: stop it at its controller"
+                    f"{error.samples / self.rate_hz:.1f} s, as it was set while it ran; this does "
+                    "not stop the table: stop it at its controller"
                 ) from None
-            except UnevenError as error:
+            except UnevenClockError as error:
                 raise MachineLost(
-                    f"the clock of {self._wiring.device} is not even any more: {error}; who plays "
-                    "is not stopped by this: stop it at its controller"
+                    f"the time stamps of {self._wiring.device} are uneven: {error}; this does not "
+                    "stop the table: stop it at its controller"
                 ) from None
-            beside = ticks - self._first_tick - self._drifted - index * self._ticks_per_sample
-            self._drifted += FOLLOWS * float(beside.mean())
-        if came:
-            self._keep_time()
-        return came
+            stamp_errors = (
+                ticks - self._first_tick - self._drift_ticks - index * self._ticks_per_sample
+            )
+            self._drift_ticks += DRIFT_GAIN * float(stamp_errors.mean())
+        if received:
+            self._update_schedule()
+        return received
 
-    def _keep_time(self) -> None:
-        """Move the schedule with the device's clock: no sample comes before it was taken."""
-        if self._epoch is None or self._assembly is None:
+    def _update_schedule(self) -> None:
+        """Correct the schedule for clock drift: no sample arrives before it is taken."""
+        if self._epoch_s is None or self._assembly is None:
             return
-        now = self._clock.now()
-        until, earliest = self._steady
-        earliest = min(earliest, now - (self._assembly.end - 1) / self.rate_hz)
-        if now > until:
-            self._epoch, until, earliest = earliest, now + STEADY_S, np.inf
-        self._epoch = min(self._epoch, earliest)
-        self._steady = (until, earliest)
+        now_s = self._clock.now()
+        deadline_s, earliest_epoch_s = self._clock_window
+        earliest_epoch_s = min(earliest_epoch_s, now_s - (self._assembly.end - 1) / self.rate_hz)
+        if now_s > deadline_s:
+            self._epoch_s, deadline_s, earliest_epoch_s = (
+                earliest_epoch_s,
+                now_s + CLOCK_WINDOW_S,
+                np.inf,
+            )
+        self._epoch_s = min(self._epoch_s, earliest_epoch_s)
+        self._clock_window = (deadline_s, earliest_epoch_s)

@@ -1,7 +1,8 @@
-"""The Backend contract on a target that speaks our UDP packets.
+"""Backend for a real-time target with the UDP packets of PACKETS.md.
 
-Packets may be lost, doubled, reordered or spoilt, either way. So the rig says everything again
-until the target's state shows that it has arrived, and asks again for samples that are missing.
+Packets may be lost, duplicated, reordered or corrupted in both directions. The rig therefore
+repeats every request until the state of the target confirms it, and requests retransmission of
+missing samples.
 """
 
 import math
@@ -9,37 +10,45 @@ from typing import NoReturn
 
 import numpy as np
 
-from table_io.backends import PATIENCE_S, MachineLost
-from table_io.backends.udp.link import ANSWER_S, WORDS, Link, digest, state_of
-from table_io.backends.udp.packets import (
-    RING,
-    Kind,
-    Phase,
-    Reason,
-    State,
-    Verdict,
-    Word,
-    ahead,
+from table_io.backends import SAMPLE_TIMEOUT_S, MachineLost
+from table_io.backends.udp.link import (
+    ANSWER_TIMEOUT_S,
+    REASON_TEXTS,
+    UdpLink,
+    query_target,
+    rig_checksum,
 )
-from table_io.backends.udp.transfer import Arriving, Delivery, Offset
+from table_io.backends.udp.packets import (
+    RING_SAMPLES,
+    PacketKind,
+    Phase,
+    QueueVerdict,
+    Reason,
+    RigPacket,
+    TargetState,
+    sequence_difference,
+)
+from table_io.backends.udp.transfer import ClockOffset, CommandTransfer, ReceiveBuffer
 from table_io.block import Float1D, Float2D
-from table_io.card import BadInput
 from table_io.clock import Clock
-from table_io.profile import Specimen
-from table_io.rig import Rig
+from table_io.config.profile import Specimen
+from table_io.config.rig import RigConfig
+from table_io.errors import InputError
 
-BEAT_S = 0.03  # between heartbeats
-AGAIN_S = 0.002  # before anything is said or asked again
-RESTING_S = 30.0  # that a target may still need to come to rest after its last rig
-FAREWELL_S = 0.2  # that it may take to hear of the end
+HEARTBEAT_PERIOD_S = 0.03  # between heartbeats
+RESEND_PERIOD_S = 0.002  # between repetitions of a packet or of a retransmission request
+REST_TIMEOUT_S = 30.0  # for the target to come to rest after its previous rig
+RELEASE_TIMEOUT_S = 0.2  # for the target to confirm the release
 
 
 class UdpBackend:
-    """A rig's side of one life on the target."""
+    """Rig's side of one connection to the target."""
 
-    def __init__(self, rig: Rig, specimen: Specimen, rate_hz: float, clock: Clock) -> None:
+    def __init__(self, rig: RigConfig, specimen: Specimen, rate_hz: float, clock: Clock) -> None:
         if rig.udp is None:
-            raise BadInput(f"rig {rig.name}: no [udp] table; add it, or name another backend")
+            raise InputError(
+                "no [udp] table", where=f"rig {rig.name}", remedy="add it, or set another backend"
+            )
         self.channels = rig.channels
         self.rate_hz = rate_hz
         self.replace_after = math.ceil(rig.udp.replace_after_ms * 1e-3 * rate_hz)
@@ -47,237 +56,245 @@ class UdpBackend:
         self._wiring = rig.udp
         self._specimen = specimen
         self._clock = clock
-        self._link: Link | None = None
-        self._state = State(Phase.FREE)  # what the target said last
-        self._heard = False  # it has ever said something
-        self._fresh = False  # since this was set to False it has said something
+        self._link: UdpLink | None = None
+        self._state = TargetState(Phase.FREE)  # newest state of the target
+        self._has_state = False  # any state has arrived
+        self._has_news = False  # a state has arrived since this was set to False
         self._started = False
-        self._arriving = Arriving(len(self.channels))
-        self._offset: Offset | None = None
-        self._queues = 0
-        self._lost = ""  # why the target does not answer any more
+        self._buffer = ReceiveBuffer(len(self.channels))
+        self._clock_offset: ClockOffset | None = None
+        self._queue_count = 0
+        self._loss_reason = ""  # why the target is lost; empty: it is not
 
     def open(self) -> None:
-        """Claim the target; waits where it still comes to rest."""
-        self._rig.refuse_rate(self.rate_hz)
-        state_of(self._wiring, self._clock)
-        self._link = Link(self._wiring, self._clock)
+        """Claim the target, after waiting for it to come to rest."""
+        self._rig.check_rate(self.rate_hz)
+        query_target(self._wiring, self._clock)
+        self._link = UdpLink(self._wiring, self._clock)
         try:
             self._claim(self._link)
-        except BadInput:
+        except InputError:
             self.close()
             raise
 
     def tare(self, samples: int) -> Float2D:
-        """Volts at rest before precompression, (channel, sample): the next ones from now on."""
-        self._alive()
-        self._demand(not self._started, "it runs already; tare before start()")
-        self._arriving = Arriving(len(self.channels), self._await(Kind.BEAT).taken)
-        until = self._clock.now() + samples / self.rate_hz + PATIENCE_S
-        self._gather(self._arriving.first + samples, until)
-        return self._arriving.take(samples)
+        """Return volts at rest, before precompression, (channel, sample), from now on."""
+        self._require_link()
+        self._require(not self._started, "start() was called already; tare before start()")
+        self._buffer = ReceiveBuffer(len(self.channels), self._request(PacketKind.BEAT).taken)
+        deadline_s = self._clock.now() + samples / self.rate_hz + SAMPLE_TIMEOUT_S
+        self._receive_until(self._buffer.first + samples, deadline_s)
+        return self._buffer.take(samples)
 
     def queue(self, index: int, volts: Float1D) -> None:
-        """Replace the command from sample `index` on, (sample,); the last value is held."""
-        self._alive()
-        earliest = self._newest() + self.replace_after if self._started else 0
+        """Replace the command from sample `index` on, volts (sample,); the last value is held."""
+        self._require_link()
+        earliest = self._newest_sample() + self.replace_after if self._started else 0
         if index < earliest:
             raise ValueError(
                 f"the command from sample {index} on is already in the target; allowed: from "
                 f"{earliest} on ({self.replace_after} after the newest sample taken)"
             )
         if not volts.size or not np.isfinite(volts).all():
-            raise ValueError(f"the command from sample {index} on is empty or holds NaN or inf")
-        if volts.size > RING:
-            raise BadInput(
-                f"a command of {volts.size} samples from {index} on; a UDP target holds {RING}: "
-                "lower acquisition.rate_hz or output.lead_s"
+            raise ValueError(f"the command from sample {index} on is empty or contains NaN or inf")
+        if volts.size > RING_SAMPLES:
+            raise InputError(
+                f"the command from sample {index} on has {volts.size} samples",
+                allowed=f"{RING_SAMPLES}, the ring of a UDP target",
+                remedy="lower acquisition.rate_hz or output.lead_s",
             )
-        self._queues += 1
-        self._deliver(index, volts, self._queues)
-        if self._state.verdict is not Verdict.PLAYS:
+        self._queue_count += 1
+        self._send_command(index, volts, self._queue_count)
+        if self._state.verdict is not QueueVerdict.PLAYS:
             raise ValueError(
-                f"the target does not take the command from sample {index} on "
-                f"({self._state.verdict.name}: {self._state.taken} samples were taken)"
+                f"the target refuses the command from sample {index} on "
+                f"({self._state.verdict.name}, {self._state.taken} samples taken)"
             )
 
     def start(self) -> None:
-        """Start output and input at sample 0, now."""
-        self._alive()
-        self._demand(not self._started, "it runs already; one start() a life")
-        self._listen(0.0)  # what lies there is older than the start
-        self._arriving = Arriving(len(self.channels))
+        """Start output and inputs at sample 0, at once."""
+        self._require_link()
+        self._require(not self._started, "start() was called already; one start() a connection")
+        self._receive(0.0)  # packets from before the start
+        self._buffer = ReceiveBuffer(len(self.channels))
         self._started = True
         before = self._clock.now()
-        taken = self._await(Kind.START, Phase.RUNNING).taken
-        now = self._clock.now()
-        self._offset = Offset(max(now - (taken - 1) / self.rate_hz, before), now)
+        taken = self._request(PacketKind.START, Phase.RUNNING).taken
+        now_s = self._clock.now()
+        self._clock_offset = ClockOffset(max(now_s - (taken - 1) / self.rate_hz, before), now_s)
 
     def read(self, samples: int) -> Float2D:
-        """Volts of the next samples, (channel, sample), when they have been taken."""
-        last = self._arriving.first + samples
-        until = self.scheduled(last - 1) + PATIENCE_S
+        """Wait for the next samples and return their volts, (channel, sample)."""
+        last = self._buffer.first + samples
+        deadline_s = self.scheduled_time_s(last - 1) + SAMPLE_TIMEOUT_S
         try:
-            if not self._lost:
-                self._listen(0.0)
-                self._beat()
-            self._gather(last, until)
+            if not self._loss_reason:
+                self._receive(0.0)
+                self._send_heartbeat()
+            self._receive_until(last, deadline_s)
         except MachineLost:
-            if self._arriving.come < last:
+            if self._buffer.complete < last:
                 raise
-            # What has come is handed out first; the next call says it.
-        self._clock.wait_until(self.scheduled(last - 1))
-        return self._arriving.take(samples)
+            # Return the samples that have arrived; the next call raises the loss.
+        self._clock.wait_until(self.scheduled_time_s(last - 1))
+        return self._buffer.take(samples)
 
-    def scheduled(self, index: int) -> float:
-        """Time on the session's clock at which sample `index` is taken, in s."""
-        if self._offset is None:
-            raise RuntimeError("UDP target: start() comes first")
-        return self._offset.epoch_s + index / self.rate_hz
+    def scheduled_time_s(self, index: int) -> float:
+        """Return the time in s, on the session's clock, at which sample `index` is taken."""
+        if self._clock_offset is None:
+            raise RuntimeError("UDP target: call start() first")
+        return self._clock_offset.epoch_s + index / self.rate_hz
 
     def close(self) -> None:
-        """Release the target; where it moves it plays what is queued. Safe to call twice."""
+        """Release the target; if it moves, it plays what is queued. Safe to call twice."""
         link, self._link = self._link, None
         if link is None:
             return
-        until = self._clock.now() + FAREWELL_S
-        while self._clock.now() < until:
-            link.say(Word(Kind.RELEASE))
-            for state in link.hear(AGAIN_S):
-                self._take(state, link)
+        deadline_s = self._clock.now() + RELEASE_TIMEOUT_S
+        while self._clock.now() < deadline_s:
+            link.send(RigPacket(PacketKind.RELEASE))
+            for state in link.receive(RESEND_PERIOD_S):
+                self._handle_state(state, link)
             if self._state.phase in (Phase.FREE, Phase.ENDING):
                 break
         link.close()
 
-    def _claim(self, link: Link) -> None:
-        """The target is ours; BadInput says why it is not."""
+    def _claim(self, link: UdpLink) -> None:
+        """Claim the target; InputError with its reason if it refuses."""
         gaps = (self._specimen.gap_mm, self._specimen.gap_right_mm, self._specimen.gap_left_mm)
-        numbers = [self.rate_hz, len(self.channels), digest(self._rig), self._specimen.mass_kg]
+        numbers = [
+            self.rate_hz,
+            len(self.channels),
+            rig_checksum(self._rig),
+            self._specimen.mass_kg,
+        ]
         numbers += [math.nan if gap is None else gap for gap in gaps]
-        word = Word(Kind.CLAIM, values=np.array(numbers))
-        where = f"the UDP target at {self._wiring.target}"
-        resting_until = self._clock.now() + RESTING_S
-        until = self._clock.now() + ANSWER_S
+        packet = RigPacket(PacketKind.CLAIM, values=np.array(numbers))
+        target = f"the UDP target at {self._wiring.target}"
+        resting_until = self._clock.now() + REST_TIMEOUT_S
+        deadline_s = self._clock.now() + ANSWER_TIMEOUT_S
         while self._state.session != link.session:
-            self._fresh = False
-            link.say(word)
-            for state in link.hear(AGAIN_S):
-                self._take(state, link)
-            now = self._clock.now()
-            if self._fresh and self._state.phase is Phase.ENDING and now < resting_until:
-                until = now + ANSWER_S
-                self._clock.wait_until(now + BEAT_S)
-            elif self._fresh and self._state.reason is not Reason.NONE:
-                raise BadInput(f"{where} refuses this rig: {WORDS[self._state.reason]}")
-            elif now > until:
-                raise BadInput(f"{where} answers no claim; restart it")
-        least = self._state.least_ahead
-        if least >= self.replace_after:
-            raise BadInput(
-                f"udp.replace_after_ms = {self._wiring.replace_after_ms:g}: the target alone needs "
-                f"{1e3 * least / self.rate_hz:g} ms; give that and 10 ms for the wire"
+            self._has_news = False
+            link.send(packet)
+            for state in link.receive(RESEND_PERIOD_S):
+                self._handle_state(state, link)
+            now_s = self._clock.now()
+            if self._has_news and self._state.phase is Phase.ENDING and now_s < resting_until:
+                deadline_s = now_s + ANSWER_TIMEOUT_S
+                self._clock.wait_until(now_s + HEARTBEAT_PERIOD_S)
+            elif self._has_news and self._state.reason is not Reason.NONE:
+                raise InputError(f"{target} refuses the claim: {REASON_TEXTS[self._state.reason]}")
+            elif now_s > deadline_s:
+                raise InputError(f"{target} does not answer the claim", remedy="restart it")
+        min_lead = self._state.least_ahead
+        if min_lead >= self.replace_after:
+            raise InputError(
+                f"too short: the target alone needs {1e3 * min_lead / self.rate_hz:g} ms",
+                key="udp.replace_after_ms",
+                value=self._wiring.replace_after_ms,
+                remedy="set the time that the target needs plus 10 ms for the network",
             )
 
-    def _deliver(self, index: int, volts: Float1D, number: int) -> None:
-        """Send a command until the target has judged it."""
-        delivery, until = Delivery(volts), self._clock.now() + ANSWER_S
-        while self._state.queue != number or self._state.verdict is Verdict.ARRIVING:
-            now = self._clock.now()
-            if now > until:
-                self._lose(f"it has not taken a command for {ANSWER_S:g} s")
-            for piece, values in delivery.due(now):
-                word = Word(
-                    Kind.QUEUE, 0, 0, index, number, piece, samples=volts.size, values=values
+    def _send_command(self, index: int, volts: Float1D, number: int) -> None:
+        """Send a command, with repetitions, until the target accepts or refuses it."""
+        transfer, deadline_s = CommandTransfer(volts), self._clock.now() + ANSWER_TIMEOUT_S
+        while self._state.queue != number or self._state.verdict is QueueVerdict.ARRIVING:
+            now_s = self._clock.now()
+            if now_s > deadline_s:
+                self._raise_lost(f"it has not received a command within {ANSWER_TIMEOUT_S:g} s")
+            for piece, values in transfer.pop_due(now_s):
+                packet = RigPacket(
+                    PacketKind.QUEUE, 0, 0, index, number, piece, samples=volts.size, values=values
                 )
-                self._alive().say(word)
-            self._listen(AGAIN_S)
+                self._require_link().send(packet)
+            self._receive(RESEND_PERIOD_S)
             if self._state.queue == number:
-                delivery.heard(self._state.pieces)
+                transfer.confirm(self._state.pieces)
 
-    def _gather(self, last: int, until: float) -> None:
-        """Hear until all samples before `last` have come, or are known to be lost for good."""
-        asked_s = -math.inf
-        while self._arriving.come < last:
-            link, now = self._alive(), self._clock.now()
-            if now > until:
-                if self._arriving.seen < last:
-                    self._lose(
-                        f"it has not sent the samples up to {last - 1}, {PATIENCE_S:g} s after "
-                        "their schedule"
+    def _receive_until(self, last: int, deadline_s: float) -> None:
+        """Receive until all samples before `last` have arrived or are known to be lost."""
+        requested_s = -math.inf
+        while self._buffer.complete < last:
+            link, now_s = self._require_link(), self._clock.now()
+            if now_s > deadline_s:
+                if self._buffer.end < last:
+                    self._raise_lost(
+                        f"the samples up to {last - 1} have not arrived {SAMPLE_TIMEOUT_S:g} s "
+                        "after their scheduled time"
                     )
-                self._arriving.give_up(last)
+                self._buffer.give_up(last)
                 return
-            hole = self._arriving.hole
-            if hole is not None and now - asked_s > AGAIN_S:
-                link.say(Word(Kind.BEAT, want_from=hole[0], want_to=hole[1]))
-                asked_s = now
-            self._listen(AGAIN_S if hole else BEAT_S)
-            self._beat()
+            missing = self._buffer.missing
+            if missing is not None and now_s - requested_s > RESEND_PERIOD_S:
+                link.send(RigPacket(PacketKind.BEAT, want_from=missing[0], want_to=missing[1]))
+                requested_s = now_s
+            self._receive(RESEND_PERIOD_S if missing else HEARTBEAT_PERIOD_S)
+            self._send_heartbeat()
 
-    def _await(self, kind: Kind, phase: Phase | None = None) -> State:
-        """Say this until the target has answered, and is in this phase; what it said."""
-        until = self._clock.now() + ANSWER_S
-        self._listen(0.0)
-        self._fresh = False
-        while not self._fresh or (phase and self._state.phase is not phase):
-            if self._clock.now() > until:
-                self._lose(f"it has not answered {kind.name} for {ANSWER_S:g} s")
-            self._alive().say(Word(kind))
-            self._listen(2 * AGAIN_S)
+    def _request(self, kind: PacketKind, phase: Phase | None = None) -> TargetState:
+        """Repeat a request until the target answers and is in `phase`; return its state."""
+        deadline_s = self._clock.now() + ANSWER_TIMEOUT_S
+        self._receive(0.0)
+        self._has_news = False
+        while not self._has_news or (phase and self._state.phase is not phase):
+            if self._clock.now() > deadline_s:
+                self._raise_lost(f"no answer to {kind.name} within {ANSWER_TIMEOUT_S:g} s")
+            self._require_link().send(RigPacket(kind))
+            self._receive(2 * RESEND_PERIOD_S)
         return self._state
 
-    def _newest(self) -> int:
-        """The newest sample that the target has taken by now, read or not."""
-        since = self._clock.now() - self.scheduled(0)
-        return max(self._arriving.seen - 1, math.floor(since * self.rate_hz + 1e-6))
+    def _newest_sample(self) -> int:
+        """Return the index of the newest sample taken by now, read or not."""
+        elapsed_s = self._clock.now() - self.scheduled_time_s(0)
+        return max(self._buffer.end - 1, math.floor(elapsed_s * self.rate_hz + 1e-6))
 
-    def _beat(self) -> None:
-        link = self._alive()
-        if self._clock.now() - link.spoke_s >= BEAT_S:
-            link.say(Word(Kind.BEAT))
+    def _send_heartbeat(self) -> None:
+        link = self._require_link()
+        if self._clock.now() - link.last_sent_s >= HEARTBEAT_PERIOD_S:
+            link.send(RigPacket(PacketKind.BEAT))
 
-    def _listen(self, timeout_s: float) -> None:
-        """Take in what comes; MachineLost where the target goes on without this rig."""
-        link = self._alive()
-        for state in link.hear(timeout_s):
-            self._take(state, link)
+    def _receive(self, timeout_s: float) -> None:
+        """Process arriving packets; MachineLost if the target has dropped this rig."""
+        link = self._require_link()
+        for state in link.receive(timeout_s):
+            self._handle_state(state, link)
         if self._state.session != link.session:
-            self._lose("it has no rig any more: it was restarted, or missed this one for too long")
+            self._raise_lost("it was restarted, or received no packet from this rig for too long")
         if self._state.phase is Phase.ENDING:
-            self._lose(WORDS[self._state.reason])
+            self._raise_lost(REASON_TEXTS[self._state.reason])
 
-    def _take(self, state: State, link: Link) -> None:
-        """What the target says: samples whenever it said so, the rest only where it is new."""
+    def _handle_state(self, state: TargetState, link: UdpLink) -> None:
+        """Process a state: its samples in any order, the rest only if it is the newest."""
         ours = state.session == link.session
         phase = Phase.RUNNING if self._started else Phase.CLAIMED
         if ours and state.phase is phase and not state.values.size % len(self.channels):
             values = state.values.reshape(-1, len(self.channels)).T
-            self._arriving.put(state.index, values)
-        newer = not self._heard or ahead(state.sequence, self._state.sequence) > 0
+            self._buffer.put(state.index, values)
+        newer = not self._has_state or sequence_difference(state.sequence, self._state.sequence) > 0
         if not newer or not (ours or not state.session):
             return
-        self._state, self._heard, self._fresh = state, True, True
-        if self._offset is not None and state.phase is Phase.RUNNING:
-            self._arriving.give_up(min(state.oldest, self._arriving.seen))
-            self._offset.heard(state.taken - 1, self.rate_hz, self._clock.now())
+        self._state, self._has_state, self._has_news = state, True, True
+        if self._clock_offset is not None and state.phase is Phase.RUNNING:
+            self._buffer.give_up(min(state.oldest, self._buffer.end))
+            self._clock_offset.update(state.taken - 1, self.rate_hz, self._clock.now())
 
-    def _alive(self) -> Link:
-        if self._lost:
-            raise MachineLost(self._lost)
+    def _require_link(self) -> UdpLink:
+        if self._loss_reason:
+            raise MachineLost(self._loss_reason)
         if self._link is None:
-            raise RuntimeError("UDP target: it is closed, or open() was not called")
+            raise RuntimeError("UDP target: closed, or open() was not called")
         return self._link
 
-    def _demand(self, condition: bool, remedy: str) -> None:
+    def _require(self, condition: bool, remedy: str) -> None:
         if not condition:
             raise RuntimeError(f"UDP target: {remedy}")
 
-    def _lose(self, why: str) -> NoReturn:
-        """The target is lost, for good: MachineLost says why and what happens now."""
-        self._lost = (
-            f"the UDP target at {self._wiring.target} is lost: {why}. While it runs, what is "
-            "queued plays to rest; if it is dead, the interlock alone stops the table. Look after "
-            "the machine, then start anew"
+    def _raise_lost(self, reason: str) -> NoReturn:
+        """Raise MachineLost with cause, consequence and remedy, now and in every later call."""
+        self._loss_reason = (
+            f"the UDP target at {self._wiring.target} is lost: {reason}. If it still runs, the "
+            "queued command plays to rest; if not, only the interlock stops the table. Check the "
+            "machine, then start again"
         )
         self.close()
-        raise MachineLost(self._lost)
+        raise MachineLost(self._loss_reason)

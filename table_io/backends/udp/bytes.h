@@ -1,4 +1,4 @@
-/* Numbers to and from the bytes of a packet, little-endian on every machine; its checksum. */
+/* Encoding of packet fields, little-endian on every processor, and CRC-32. */
 #ifndef BYTES_H
 #define BYTES_H
 

@@ -1,4 +1,4 @@
-/* The smooth way to rest at 0 V from a command that ends in motion, or is held off its mean. */
+/* Smooth stop at 0 V for a command that ends in motion or is held away from its mean. */
 #ifndef LANDING_H
 #define LANDING_H
 
@@ -7,19 +7,19 @@
 #include <math.h>
 
 struct landing {
-    double c[6], seconds; /* of its polynomial, V, V/s ...; how long it takes */
+    double c[6], seconds; /* coefficients of the quintic, V, V/s, ...; duration */
 };
 
 static double within_span(double volts) { return fmax(-SPAN_V, fmin(SPAN_V, volts)); }
 
-/* V, `s` seconds after its begin. */
+/* Return the command in V, `s` seconds after the start of the stop. */
 static double landing_at(const struct landing *l, double s) {
     const double *c = l->c;
     return c[0] + s * (c[1] + s * (c[2] + s * (c[3] + s * (c[4] + s * c[5]))));
 }
 
-/* The quintic from position x, velocity v, acceleration a (V, V/s, V/s2) to rest at 0 V in T s: its
- * largest acceleration, and in `reach` its largest position. */
+/* Compute the quintic from position x, velocity v, acceleration a (V, V/s, V/s2) to rest at 0 V in
+ * T s. Return its peak acceleration in V/s2; `reach` receives its peak position in V. */
 static double quintic(struct landing *l, double T, double x, double v, double a, double *reach) {
     double *c = l->c, peak = 0.0;
     c[0] = x, c[1] = v, c[2] = a / 2.0;
@@ -36,9 +36,9 @@ static double quintic(struct landing *l, double T, double x, double v, double a,
     return peak;
 }
 
-/* Within the span: the shortest quintic from 0.5 s on whose acceleration stays below 0.5 m/s2, or
- * what it follows; else that of the least acceleration; where none stays within the span, it stops
- * dead where it is and goes home from there. */
+/* Choose, within the span, the shortest quintic from 0.5 s on whose acceleration stays below
+ * max(0.5 m/s2, 1.05 |a|); if there is none, that of least peak acceleration; if none stays within
+ * the span, the command stops abruptly at x and returns to 0 from there. */
 static void land_from(struct landing *l, double x, double v, double a) {
     double gentle = fmax(0.5 / METRES_PER_VOLT, 1.05 * fabs(a)), least = INFINITY, best = 0.0;
     double reach, span = (1.0 + 1e-9) * fmax(fabs(x), SPAN_V);

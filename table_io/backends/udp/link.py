@@ -1,4 +1,4 @@
-"""A rig's socket towards a UDP target: what it says is numbered, what comes is checked."""
+"""UDP socket of a rig: numbers the packets it sends and validates those it receives."""
 
 import contextlib
 import secrets
@@ -8,47 +8,47 @@ import zlib
 from dataclasses import replace
 
 from table_io.backends.udp.packets import (
-    STATE_BYTES,
-    Kind,
+    TARGET_PACKET_BYTES,
+    PacketKind,
     Reason,
-    State,
-    Word,
-    decode_state,
-    encode_word,
+    RigPacket,
+    TargetState,
+    decode_target_state,
+    encode_rig_packet,
 )
-from table_io.card import BadInput
 from table_io.clock import Clock, RealClock
-from table_io.rig import Rig
-from table_io.wiring.udp import UdpWiring
+from table_io.config.rig import RigConfig
+from table_io.config.wiring.udp import UdpWiring
+from table_io.errors import InputError
 
-ANSWER_S = 1.0  # that a target may take for an answer
+ANSWER_TIMEOUT_S = 1.0  # of a request
 BUFFER_BYTES = 1 << 20
 
-WORDS = {
-    Reason.NONE: "it does not say why",
+REASON_TEXTS = {
+    Reason.NONE: "no reason given",
     Reason.BUSY: "it has a rig already; end that one first",
-    Reason.RATE: "it does not sample at that rate; ask for one that it has",
-    Reason.CHANNELS: "it has another number of channels than the card has [[sensors]]; make them "
-    "the same",
-    Reason.SILENCE: "it heard no word from this rig for too long and goes on alone",
+    Reason.RATE: "it does not support this sample rate; change acquisition.rate_hz",
+    Reason.CHANNELS: "its number of channels is not that of the [[sensors]] in the rig file; make "
+    "them equal",
+    Reason.SILENCE: "it received no packet from this rig for too long and continues alone",
     Reason.RELEASED: "its rig released it",
     Reason.SWITCHED_OFF: "it is being switched off",
-    Reason.CARD: "it was started with another machine card; start it with the card of this run",
+    Reason.CARD: "it was started with another rig file; start it with the rig file of this run",
 }
 
 
-def digest(rig: Rig) -> int:
-    """A number that differs where [output] or [[sensors]] of two cards differ; never 0."""
-    told = rig.model_dump_json(include={"output", "sensors"})
-    return zlib.crc32(told.encode()) or 1
+def rig_checksum(rig: RigConfig) -> int:
+    """Return a CRC-32 over [output] and [[sensors]] of the rig config; never 0."""
+    canonical = rig.model_dump_json(include={"output", "sensors"})
+    return zlib.crc32(canonical.encode()) or 1
 
 
-class Link:
-    """One life's words to the target and back; BadInput where the address cannot be used."""
+class UdpLink:
+    """Packets of one connection to the target; InputError if the address cannot be used."""
 
     def __init__(self, wiring: UdpWiring, clock: Clock, port: int | None = None) -> None:
         self.session = secrets.randbits(63) + 1
-        self.spoke_s = clock.now()
+        self.last_sent_s = clock.now()
         self._clock = clock
         self._sequence = 0
         port = wiring.rig_port if port is None else port
@@ -57,31 +57,32 @@ class Link:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
             self._socket.setblocking(False)
             self._socket.bind(("", port))
-            self._socket.connect(wiring.address)  # nobody else is heard
+            self._socket.connect(wiring.address)  # packets from other senders are dropped
         except OSError as error:
             self._socket.close()
-            raise BadInput(
-                f"udp.target = {wiring.target!r}, udp.rig_port = {wiring.rig_port}: "
-                f"{error.strerror or error}; give an address that this computer can reach, and a "
-                "port that is free (0: any)"
+            raise InputError(
+                f"{error.strerror or error} (udp.rig_port = {wiring.rig_port})",
+                key="udp.target",
+                value=wiring.target,
+                remedy="give an address that this computer can reach, and a free port (0: any)",
             ) from None
 
-    def say(self, word: Word) -> None:
-        """Send a word; whether it arrived is told by what comes back."""
+    def send(self, packet: RigPacket) -> None:
+        """Send a packet; only the state of the target confirms that it arrived."""
         self._sequence = (self._sequence + 1) & 0xFFFFFFFF
-        self.spoke_s = self._clock.now()
-        packet = encode_word(replace(word, session=self.session, sequence=self._sequence))
+        self.last_sent_s = self._clock.now()
+        data = encode_rig_packet(replace(packet, session=self.session, sequence=self._sequence))
         with contextlib.suppress(OSError):
-            self._socket.send(packet)
+            self._socket.send(data)
 
-    def hear(self, timeout_s: float) -> list[State]:
-        """What lies there, or comes first within this time; what is no state is left out."""
-        states: list[State] = []
+    def receive(self, timeout_s: float) -> list[TargetState]:
+        """Return the waiting states, or the first within `timeout_s`; discard invalid packets."""
+        states: list[TargetState] = []
         if not select.select([self._socket], [], [], timeout_s)[0]:
             return states
-        with contextlib.suppress(OSError):  # nothing more lies there, or nobody listens there now
+        with contextlib.suppress(OSError):  # no more packets, or nothing listens there
             while True:
-                state = decode_state(self._socket.recv(STATE_BYTES + 1))
+                state = decode_target_state(self._socket.recv(TARGET_PACKET_BYTES + 1))
                 if state is not None:
                     states.append(state)
         return states
@@ -90,38 +91,41 @@ class Link:
         self._socket.close()
 
 
-def state_of(wiring: UdpWiring, clock: Clock, timeout_s: float = ANSWER_S) -> State:
-    """What a target says of itself; BadInput where nobody answers. Claims nothing.
+def query_target(
+    wiring: UdpWiring, clock: Clock, timeout_s: float = ANSWER_TIMEOUT_S
+) -> TargetState:
+    """Return the state of a target without claiming it; InputError if it does not answer.
 
-    From any port first, for another rig may have rig_port; then from that one, for some targets
-    answer no other.
+    The query is sent from any free port first, as another rig may use rig_port, then from rig_port,
+    as some targets answer only that one.
     """
     for port in dict.fromkeys((0, wiring.rig_port)):
-        state = _told(Link(wiring, clock, port), clock, timeout_s)
+        state = _poll_target(UdpLink(wiring, clock, port), clock, timeout_s)
         if state is not None:
             return state
-    raise BadInput(
-        f"no UDP target answers at {wiring.target}; start it, and see that its address and port "
-        "are those of the machine card (the simulated one: shaketwin table --rig udp_simulated)"
+    raise InputError(
+        f"no UDP target answers at {wiring.target}",
+        remedy="start it, and check that it uses the address and port of the rig file (for the "
+        "simulated target: shaketwin table --rig udp_simulated)",
     )
 
 
-def _told(link: Link, clock: Clock, timeout_s: float) -> State | None:
-    """What a target says when it is asked; None where it says nothing."""
+def _poll_target(link: UdpLink, clock: Clock, timeout_s: float) -> TargetState | None:
+    """Return the state of a target, None if it does not answer."""
     try:
-        until = clock.now() + timeout_s
-        while clock.now() < until:
-            link.say(Word(Kind.BEAT))
-            states = link.hear(timeout_s / 20)
+        deadline_s = clock.now() + timeout_s
+        while clock.now() < deadline_s:
+            link.send(RigPacket(PacketKind.BEAT))
+            states = link.receive(timeout_s / 20)
             if states:
                 return states[-1]
-            clock.wait_until(min(clock.now() + timeout_s / 100, until))
+            clock.wait_until(min(clock.now() + timeout_s / 100, deadline_s))
     finally:
         link.close()
     return None
 
 
-def answers(rig: Rig) -> None:
-    """BadInput where the card's target does not answer; claims nothing."""
+def check_reachable(rig: RigConfig) -> None:
+    """Raise InputError if the target of the rig file does not answer; claim nothing."""
     if rig.udp is not None:
-        state_of(rig.udp, RealClock())
+        query_target(rig.udp, RealClock())

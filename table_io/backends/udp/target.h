@@ -1,8 +1,8 @@
-/* The far side of our UDP packets (PACKETS.md), to be carried to dSPACE, Speedgoat, LabVIEW-RT or a
- * PLC. target.c has no memory but its own, no call of an operating system, no clock: time is counted
- * in samples. One task calls everything, each sample period:
+/* Target side of the UDP packets in PACKETS.md, for porting to dSPACE, Speedgoat, LabVIEW-RT or a
+ * PLC. target.c needs no memory allocation, operating system or clock: time is counted in samples.
+ * One task calls everything, once per sample period:
  *
- *     while (a packet lies there)            target_hear(packet, bytes, from);
+ *     while (a packet is waiting)            target_hear(packet, bytes, from);
  *     target_sample();                       (plays one sample, takes one sample)
  *     while (target_packet(packet, &to))     send it;
  */
@@ -12,40 +12,40 @@
 #include <stddef.h>
 #include <stdint.h>
 
-/* ---- what to change for your table ---- */
-#define CHANNELS 9            /* of [[sensors]] in the machine card, in its order; at most 128 */
-#define RATES {2000.0, 1000.0, 4000.0} /* Hz that your task can run at; the first at power-on */
-#define METRES_PER_VOLT 0.006 /* [output] span_mm / span_v / 1000, for the landing */
-#define SPAN_V 10.0           /* [output] span_v: more is neither taken nor played */
-#define LEAST_AHEAD 4         /* samples after the newest one that cannot be replaced any more */
-#define SETTLED_S 0.3         /* that your table needs to stand still after its command does */
+/* ---- change these for your table ---- */
+#define CHANNELS 9            /* [[sensors]] of the rig file, in its order; at most 128 */
+#define RATES {2000.0, 1000.0, 4000.0} /* Hz, rates of your task; the first at power-on */
+#define METRES_PER_VOLT 0.006 /* [output] span_mm / span_v / 1000, for the smooth stop */
+#define SPAN_V 10.0           /* [output] span_v: a larger command is refused */
+#define LEAST_AHEAD 4         /* samples after the newest one that cannot be replaced */
+#define SETTLED_S 0.3         /* for your table to come to rest after its command */
 
 /* ---- fixed by the protocol ---- */
-#define VALUES 128            /* float64 in a packet */
-#define RING 65536            /* samples of command ahead; a power of two */
-#define HISTORY 8192          /* samples that can be sent again; a power of two */
-#define WORD_BYTES 1092       /* of a packet of the rig */
-#define STATE_BYTES 1172      /* of a packet of the target */
-#define HEARTBEAT_S 0.3       /* without a word of the rig: it is dead */
-#define IDLE_S 30.0           /* the same where nothing moves */
+#define VALUES_PER_PACKET 128    /* float64 in a packet */
+#define RING_SAMPLES 65536       /* samples of command; a power of two */
+#define HISTORY_SAMPLES 8192     /* samples that can be resent; a power of two */
+#define RIG_PACKET_BYTES 1092    /* length of a packet from the rig */
+#define TARGET_PACKET_BYTES 1172 /* length of a packet to the rig */
+#define HEARTBEAT_TIMEOUT_S 0.3  /* silence after which the rig is assumed dead */
+#define IDLE_S 30.0              /* the same while nothing moves */
 
 struct peer {
     uint32_t host;
     uint16_t port;
 };
 
-/* ---- yours to write ---- */
-int read_inputs(double volts[CHANNELS]); /* all channels, the command wired back too; 0: lost */
+/* ---- write these functions ---- */
+int read_inputs(double volts[CHANNELS]); /* all channels, incl. the command wired back; 0: lost */
 void write_output(double volts);         /* the command, to the converter; 0 V is the mean */
 void write_heartbeat(int level);         /* the 10 Hz line to the interlock: see CONNECT.md */
 
-/* ---- yours to call ---- */
+/* ---- call these functions ---- */
 void target_init(void);
-int target_hear(const uint8_t *packet, size_t bytes, struct peer from); /* 1: sample 0 is next */
+int target_hear(const uint8_t *packet, size_t bytes, struct peer from); /* 1: next is sample 0 */
 void target_sample(void);
-int target_packet(uint8_t packet[STATE_BYTES], struct peer *to); /* 0: nothing more to send */
+int target_packet(uint8_t packet[TARGET_PACKET_BYTES], struct peer *to); /* 0: nothing to send */
 double target_rate_hz(void);
-void target_switch_off(void); /* end: it plays what is queued, to rest */
+void target_switch_off(void); /* drop the rig; the queued command plays to rest */
 int target_is_free(void);
 
 #endif

@@ -1,12 +1,12 @@
-"""The physical effects a model may have. Adding one: a file here and a line in `EFFECTS`.
+"""Physical effects that a model may have. To add one: a file here and a line in `EFFECTS`.
 
-Other packages add theirs by an entry point of the group `shaketwin.effects` that is an `Effect`.
+Other packages add effects through entry points of the group `shaketwin.effects`, each an `Effect`.
 """
 
 import difflib
 from importlib import metadata
 
-from table_io.card import BadInput
+from table_io.errors import InputError
 from twin.model.effects.bouc_wen import BOUC_WEN
 from twin.model.effects.bumper_asymmetry import BUMPER_ASYMMETRY
 from twin.model.effects.bumper_hardening import BUMPER_HARDENING
@@ -25,7 +25,7 @@ from twin.model.effects.sensor_lag import SENSOR_LAG
 from twin.model.effects.sensor_offset import SENSOR_OFFSET
 from twin.model.effects.table_tilt import TABLE_TILT
 
-GROUP = "shaketwin.effects"
+ENTRY_POINT_GROUP = "shaketwin.effects"
 
 EFFECTS: tuple[Effect, ...] = (
     CUBIC_STIFFNESS,
@@ -47,37 +47,58 @@ EFFECTS: tuple[Effect, ...] = (
 )
 
 
-def plugins() -> tuple[Effect, ...]:
-    """The effects that installed packages add; BadInput names one that cannot be taken."""
-    found = []
-    for entry in metadata.entry_points(group=GROUP):
-        where = f"plug-in {entry.value} of {GROUP}"
+def load_plugins() -> tuple[Effect, ...]:
+    """Load the effects that installed packages add; InputError names an unusable one."""
+    plugins = []
+    for entry in metadata.entry_points(group=ENTRY_POINT_GROUP):
+        label = f"plug-in {entry.value} of {ENTRY_POINT_GROUP}"
         try:
             effect = entry.load()
-        except Exception as error:  # whatever a foreign module raises
-            raise BadInput(f"{where}: cannot load: {error}; mend or remove the package") from error
+        except Exception as error:  # a plug-in module may raise anything
+            raise InputError(
+                f"cannot load: {error}", where=label, remedy="fix or remove the package"
+            ) from error
         if not isinstance(effect, Effect):
-            raise BadInput(f"{where}: is no Effect but {type(effect).__name__}; mend the package")
+            raise InputError(
+                f"expected an Effect, got {type(effect).__name__}",
+                where=label,
+                remedy="fix or remove the package",
+            )
         if effect.acts == "parameters" and effect.change is None:
-            raise BadInput(f"{where}: acts on parameters but has no change; mend the package")
+            raise InputError(
+                "acts on parameters but has no `change` function",
+                where=label,
+                remedy="fix or remove the package",
+            )
         if effect.acts == "force" and effect.force is None:
-            raise BadInput(f"{where}: acts as a force but has none; mend the package")
+            raise InputError(
+                "acts as a force but has no `force` function",
+                where=label,
+                remedy="fix or remove the package",
+            )
         if effect.acts not in ("parameters", "force"):
-            raise BadInput(f"{where}: acts as {effect.acts!r}; a plug-in: parameters or force")
-        found.append(effect)
-    return tuple(found)
+            raise InputError(
+                "not available to plug-ins",
+                where=label,
+                key="acts",
+                value=effect.acts,
+                allowed="parameters, force",
+                remedy="fix or remove the package",
+            )
+        plugins.append(effect)
+    return tuple(plugins)
 
 
 def find_effect(name: str) -> Effect:
-    """The effect of this id, ours before a plug-in's; BadInput names the nearest."""
+    """Return the effect with this id, built-in before plug-in; InputError names the nearest."""
     for effect in EFFECTS:
         if effect.id == name:
             return effect
-    others = plugins()
-    for effect in others:
+    plugins = load_plugins()
+    for effect in plugins:
         if effect.id == name:
             return effect
-    ids = [effect.id for effect in (*EFFECTS, *others)]
-    near = difflib.get_close_matches(name, ids, 1, 0.4)
-    hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(ids)}"
-    raise BadInput(f"effect {name!r} is unknown; {hint}")
+    ids = [effect.id for effect in (*EFFECTS, *plugins)]
+    matches = difflib.get_close_matches(name, ids, 1, 0.4)
+    hint = f"did you mean {matches[0]!r}?" if matches else f"known: {', '.join(ids)}"
+    raise InputError(f"effect {name!r} is unknown; {hint}")

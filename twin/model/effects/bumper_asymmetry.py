@@ -1,9 +1,9 @@
-"""The right bumper is not as stiff as the left one.
+"""Bumper asymmetry: right and left bumper stiffness differ.
 
     K_R = 2 K ratio / (1 + ratio),  K_L = 2 K / (1 + ratio),  K the mean, which is kept
 
-Damping stays, so the relaxation times C_j/K_j part as well. On bumpers that differ already the
-ratio multiplies theirs.
+Damping is unchanged, so the relaxation times C_j/K_j differ too. If the bumpers already differ,
+ratio multiplies their stiffness ratio.
 """
 
 from collections.abc import Mapping

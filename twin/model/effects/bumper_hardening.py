@@ -1,15 +1,15 @@
-"""The bumper grows stiffer with compression.
+"""Bumper hardening: stiffness grows with compression.
 
     contact: F_j = C_j u_j' + K_j u_j + k2 u_j |u_j|;   flight: that sum is zero, u_j relaxes
 
-Conservative part stored: k2 |u_j|^3 / 3. In flight it makes the bumper recover faster.
+Conservative: stored energy k2 |u_j|^3 / 3. In flight the bumper recovers faster.
 """
 
 from twin.model.effects.effect import Effect, EffectParameter
 
 
 def force(d: float, k2: float) -> float:
-    """k2 d |d| in N, d the deformation in m, positive in compression."""
+    """Return k2 d |d| in N, d the deformation in m, positive in compression."""
     return k2 * d * abs(d)
 
 
@@ -21,8 +21,8 @@ BUMPER_HARDENING = Effect(
     ),
     acts="force",
     residual=(
-        "In contact only: the force grows faster than the depth, so peaks are missed and light "
-        "touches are not; F_j-v_j loops bend upwards."
+        "In contact only: the force grows faster than the depth, so peaks are underestimated and "
+        "light contacts are not; F_j-v_j loops bend upwards."
     ),
     confused_with=("cubic_stiffness", "gap_offset"),
 )

@@ -1,10 +1,10 @@
-"""The bumper relaxes: a spring in series with a dashpot beside K_j and C_j.
+"""Bumper relaxation: Maxwell branch (spring and dashpot in series) parallel to K_j and C_j.
 
     contact: F_j = C_j u_j' + K_j u_j + b_j;   flight: that sum is zero
     always:  b_j' = kb u_j' - b_j / tau
 
-Linear: exact. Passive: stored b_j^2 / (2 kb), loss b_j^2 / (kb tau). After a release the branch
-still pulls the face back, so for about tau the gap seems larger than it is.
+Linear, so solved exactly. Passive: stored b_j^2 / (2 kb), loss b_j^2 / (kb tau). After a release
+the branch still pulls the face back, so for about tau the gap seems larger than it is.
 """
 
 from twin.model.effects.effect import Effect, EffectParameter

@@ -1,4 +1,4 @@
-"""The damper's spring hardens (k3 > 0) or softens (k3 < 0) with displacement.
+"""Cubic (Duffing) stiffness: the damper's spring hardens (k3 > 0) or softens (k3 < 0).
 
     M u'' + C u' + K u + k3 u^3 + F_R + F_L = -M A
 
@@ -10,7 +10,7 @@ from twin.model.effects.effect import Effect, EffectParameter
 
 
 def force(u: float, k3: float) -> float:
-    """k3 u^3 in N, u in m."""
+    """Return k3 u^3 in N, u in m."""
     return k3 * u * u * u
 
 

@@ -1,9 +1,9 @@
-"""The gap opens or closes during the test: a loose anchor, a creeping or warming bumper.
+"""Gap drift: gaps open or close during the test (loose anchor, creeping or warming bumper).
 
     G0R(t) = G0R + rate t,  G0L(t) = G0L + rate t;  t in s from sample 0 of the run
 
 The wall moves with `rate`, so in contact u_R' = u' - rate and u_L' = u' + rate; the solver follows
-the moving wall inside every step, not in stairs. A side without a bumper stays without.
+the moving wall continuously within every step. A side without a bumper is unaffected.
 """
 
 from twin.model.effects.effect import Effect, EffectParameter
@@ -18,8 +18,8 @@ GAP_DRIFT = Effect(
     ),
     acts="linear",
     residual=(
-        "Onset and release move with time on both sides alike, not with frequency: the return "
-        "sweep meets other gaps than the way out."
+        "Onset and release move with time on both sides alike, not with frequency: the backward "
+        "sweep has other gaps than the forward sweep."
     ),
     confused_with=("bumper_maxwell", "gap_offset"),
 )

@@ -1,9 +1,9 @@
-"""The mass does not rest midway between the bumpers.
+"""Gap offset: the mass does not rest midway between the bumpers.
 
     G0R = G/2 + offset,  G0L = G/2 - offset;  the total gap G is kept
 
-Where the specimen states unequal gaps the offset comes on top of them. A side without a bumper
-(infinite gap) stays without.
+If the specimen has unequal gaps the offset is added to them. A side without a bumper (infinite
+gap) is unaffected.
 """
 
 from collections.abc import Mapping

@@ -1,9 +1,9 @@
-"""All forces are off by one common factor against the mass that is believed.
+"""Mass error: all forces are off by one common factor relative to the assumed mass.
 
     M u'' + ratio (C u' + K u + F_R + F_L) = -M A;  the same as a mass of M / ratio
 
-Motion alone cannot tell it from a factor on K, C, K_j and C_j together: it is pinned only where a
-force is measured, because the forces themselves stay those of K, C, K_j and C_j.
+Motion alone cannot distinguish it from a factor on K, C, K_j and C_j together: it is identifiable
+only if a force is measured, because the forces themselves stay those of K, C, K_j and C_j.
 """
 
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ MASS_ERROR = Effect(
     term="ratio on all forces over mass",
     parameters=(
         EffectParameter(
-            "ratio", "", 0.5, 2.0, 1.0, 1.05, "Believed mass over true mass, forces kept."
+            "ratio", "", 0.5, 2.0, 1.0, 1.05, "Assumed mass over true mass, forces kept."
         ),
     ),
     acts="parameters",

@@ -1,16 +1,16 @@
-"""A spring in series with a dashpot beside K and C: the damper relaxes.
+"""Damper relaxation: Maxwell branch (spring and dashpot in series) parallel to K and C.
 
     M u'' + C u' + K u + f + F_R + F_L = -M A,  f' = k1 u' - f / tau
 
-Linear: exact. Passive: stored f^2 / (2 k1), loss f^2 / (k1 tau). Storage rises by k1 from low to
-high frequency, the loss peaks at 1 / (2 pi tau). Source: standard linear solid (Zener).
+Linear, so solved exactly. Passive: stored f^2 / (2 k1), loss f^2 / (k1 tau). Stiffness rises by k1
+from low to high frequency, the loss peaks at 1 / (2 pi tau). Source: standard linear solid (Zener).
 """
 
 from twin.model.effects.effect import Effect, EffectParameter
 
 MAXWELL_DAMPER = Effect(
     id="maxwell_damper",
-    term="k1 spring in series with a dashpot, beside K and C",
+    term="k1 spring in series with a dashpot, parallel to K and C",
     parameters=(
         EffectParameter("k1", "N/m", 0.0, 1e6, 0.0, 8e3, "Stiffness that relaxes."),
         EffectParameter("tau", "s", 1e-4, 100.0, None, 0.05, "Relaxation time."),

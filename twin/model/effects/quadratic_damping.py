@@ -1,16 +1,16 @@
-"""The damper loses more at speed: drag of a fluid or of air.
+"""Quadratic damping in the damper: drag of a fluid or of air.
 
     M u'' + C u' + c2 u' |u'| + K u + F_R + F_L = -M A
 
-Odd in u', passive: power c2 |u'|^3 >= 0. Where u' changes sign its slope has a kink.
+Odd in u', passive: power c2 |u'|^3 >= 0. Its slope has a kink where u' changes sign.
 """
 
 from twin.model.effects.effect import Effect, EffectParameter
 
 
-def force(v: float, way: float, c2: float) -> float:
-    """c2 v |v| in N, v in m/s; `way` = +1 or -1 is the sign that v has in this phase."""
-    return c2 * v * v * way
+def force(v: float, direction: float, c2: float) -> float:
+    """Return c2 v |v| in N, v in m/s; `direction` = +1 or -1 is the sign of v until a reversal."""
+    return c2 * v * v * direction
 
 
 QUADRATIC_DAMPING = Effect(

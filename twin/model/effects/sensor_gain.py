@@ -1,7 +1,7 @@
-"""A sensor reads too much or too little: reading = gain x value.
+"""Sensor gain error: reading = gain x value.
 
-Acts on one predicted channel and not on the motion. The restart from the measured state takes it
-back out of that channel.
+Acts on one predicted channel, not on the motion. The restart from the measured state removes it
+from that channel.
 """
 
 from twin.model.effects.effect import Effect, EffectParameter
@@ -12,8 +12,8 @@ SENSOR_GAIN = Effect(
     parameters=(EffectParameter("gain", "", 0.2, 5.0, 1.0, 1.05, "Reading over true value."),),
     acts="sensor",
     residual=(
-        "In proportion to the channel itself, in every phase; the motion channels no longer fit "
-        "each other, which no force law can do."
+        "In proportion to the channel itself, in flight and in contact; the motion channels become "
+        "inconsistent with each other, which no force law can cause."
     ),
     confused_with=("mass_error", "table_tilt"),
 )

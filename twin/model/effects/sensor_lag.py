@@ -1,7 +1,7 @@
-"""A sensor, its filter or its wire reads late: reading(t) = value(t - lag).
+"""Sensor lag, of the sensor, its filter or its wiring: reading(t) = value(t - lag).
 
-Acts on one predicted channel and not on the motion; between samples the value is a cubic through
-four of them. Before the first prediction is as old as the lag the reading is unknown (NaN).
+Acts on one predicted channel, not on the motion; values between samples come from a cubic through
+four of them. Until the first prediction is as old as the lag the reading is unknown (NaN).
 """
 
 from twin.model.effects.effect import Effect, EffectParameter
@@ -13,7 +13,7 @@ SENSOR_LAG = Effect(
     acts="sensor",
     residual=(
         "In proportion to the rate of change of the channel, so it grows with frequency; the "
-        "motion channels no longer fit each other."
+        "motion channels become inconsistent with each other."
     ),
     confused_with=("maxwell_damper", "quadratic_damping"),
 )

@@ -1,7 +1,7 @@
-"""A sensor does not read zero at zero: reading = value + offset.
+"""Sensor offset: reading = value + offset.
 
-Acts on one predicted channel and not on the motion. The restart from the measured state takes it
-back out of that channel.
+Acts on one predicted channel, not on the motion. The restart from the measured state removes it
+from that channel.
 """
 
 from twin.model.effects.effect import Effect, EffectParameter

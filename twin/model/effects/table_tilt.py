@@ -1,10 +1,10 @@
-"""The table rocks as it moves, and the mass feels a part of its own weight.
+"""Table tilt: the table rocks as it moves, so part of the weight acts on the mass.
 
     M u'' + C u' + K u + F_R + F_L = -M A - M g theta,  theta = tilt x table displacement
 
 theta in rad, positive where it pushes the mass to the left when the table is on the right;
-g = 9.80665 m/s2. It acts as base acceleration A + g tilt x, so the solution stays closed form. The
-total acceleration is u'' + A as everywhere, in the laboratory's horizontal direction.
+g = 9.80665 m/s2. It acts as base acceleration A + g tilt x, so the closed form remains. The total
+acceleration is u'' + A as elsewhere, in the laboratory's horizontal direction.
 """
 
 from twin.model.effects.effect import Effect, EffectParameter

@@ -1,0 +1,256 @@
+"""Session: generator that runs a test on a backend and yields Blocks and records.
+
+States: idle, checking, armed, running, holding, stopping, at rest, fault. Every session ends with a
+decay of the command to rest. The queued command always ends at rest, even if this process dies.
+"""
+
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from table_io import sequencer
+from table_io.acquisition.event_log import EventLog
+from table_io.acquisition.output_queue import BufferUnderrun, OutputQueue
+from table_io.backends import Backend, MachineLost
+from table_io.block import Block, Bool2D
+from table_io.clock import Clock, local_datetime
+from table_io.config.calibration import compute_tare, measure_noise, volts_to_si
+from table_io.config.calibration_due import find_overdue_calibrations
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.records import FrequencyResponse, Record, RunStart, RunStop, SampleGap, Trip
+from table_io.safety import protection
+
+TARE_S = 1.0
+COMMAND_DELAY_S = 0.1  # extra margin for hold and resume, which are not urgent
+CLIP_RATIO = 0.999  # of a sensor's range; a sample at or above it is clipped
+
+
+@dataclass(frozen=True, slots=True)
+class SessionSetup:
+    """Profile and rig config of a session."""
+
+    profile: Profile
+    rig: RigConfig
+
+
+@dataclass(frozen=True, slots=True)
+class OperatorCommand:
+    """Command of the operator, or of a process on the operator's behalf, to a session."""
+
+    name: str  # hold, resume, stop, abort
+    reason: str
+
+
+@dataclass(slots=True)
+class LatenessLog:
+    """Lateness of each block in s, from the schedule of its last sample to its delivery."""
+
+    late_s: list[float] = field(default_factory=list)
+
+
+RunDescriber = Callable[[dict[str, float], float], RunStart]  # (tare, epoch_s) -> start record
+CommandSource = Callable[[], OperatorCommand | None]  # must not block
+SessionOutput = Generator[Block | Record, None, None]
+COMMAND_NAMES = ("hold", "resume", "stop", "abort")
+
+
+def run_session(
+    setup: SessionSetup,
+    backend: Backend,
+    clock: Clock,
+    describe: RunDescriber,
+    commands: CommandSource,
+    punctuality: LatenessLog | None = None,
+) -> SessionOutput:
+    """Yield RunStart, then every Block followed by its records, then RunStop.
+
+    Closing the generator early also brings the table to rest before the machine is released.
+    """
+    run = _Session(setup, backend, clock)
+    try:
+        tare = run.begin()
+        yield describe(tare, backend.scheduled_time_s(0))
+        yield from run.event_log.drain()
+        while not run.is_finished:
+            block, clipped = run.acquire(tare)
+            late_s = clock.now() - backend.scheduled_time_s(block.end - 1)
+            if punctuality is not None:
+                punctuality.late_s.append(late_s)
+            yield block
+            yield from find_gaps(block, clipped)
+            run.event_log.report_lateness(late_s, block.end)
+            run.protect(block, clipped)
+            run.advance_test(block)
+            run.execute(commands())
+            run.feed()
+            yield from run.event_log.drain()
+        yield from run.finish()
+    except MachineLost as error:
+        yield from run.report_machine_loss(str(error))
+    finally:
+        try:
+            run.output_queue.bring_to_rest()
+        finally:
+            backend.close()
+
+
+class _Session:
+    """Mutable state of a session: output queue, sequencer state, protection and event log."""
+
+    def __init__(self, setup: SessionSetup, backend: Backend, clock: Clock) -> None:
+        profile = setup.profile
+        self.setup = setup
+        self.rate_hz = profile.acquisition.rate_hz
+        plan = sequencer.make_test_plan(profile, setup.rig, backend.replace_after)
+        self._state = sequencer.start_test(plan)
+        block = profile.acquisition.block_samples
+        self.output_queue = OutputQueue(backend, clock, setup.rig.output, self._state.drive, block)
+        self.verdict, self.reason = "complete", "the whole drive was played"
+        self._rest_samples = round(profile.acquisition.rest_s * self.rate_hz)
+        self._full_scale_v = np.array([abs(s.range_si * s.volts_per_si) for s in setup.rig.sensors])
+        self.event_log = EventLog(lambda: self.output_queue.acquired)
+
+    @property
+    def end(self) -> int | None:
+        """Sample at which the recording ends, with the servo at rest; None while unknown."""
+        known = (
+            self._state.is_finished
+            or self._state.stage.kind == "open"
+            or self.output_queue.is_decaying
+        )
+        return self.output_queue.drive.rest_start + self._rest_samples if known else None
+
+    @property
+    def is_finished(self) -> bool:
+        return self.end is not None and self.output_queue.acquired >= self.end
+
+    def begin(self) -> dict[str, float]:
+        """Open and start the machine; return the tare per channel in SI."""
+        self.event_log.enter_state("checking")
+        for sentence in find_overdue_calibrations(self.setup.rig, local_datetime().date()):
+            self.event_log.add_event("calibration", sentence)
+        backend, sensors = self.output_queue.backend, self.setup.rig.sensors
+        backend.open()
+        volts = backend.tare(int(TARE_S * self.rate_hz))
+        noise = measure_noise(volts, sensors)
+        self._protection = protection.start_protection(self.setup.profile, self.setup.rig, noise)
+        self._state = replace(self._state, noise={name: rms for name, (rms, _) in noise.items()})
+        if self._state.stage.kind != "check":
+            self.event_log.enter_state("armed")
+        self.output_queue.start()
+        return compute_tare(volts, sensors)
+
+    def acquire(self, tare: dict[str, float]) -> tuple[Block, Bool2D]:
+        """Read (next block in SI, mask of clipped samples (channel, sample))."""
+        rig, first = self.setup.rig, self.output_queue.acquired
+        count = self.setup.profile.acquisition.block_samples
+        if self.end is not None:
+            count = min(count, self.end - first)
+        volts = self.output_queue.backend.read(count)
+        labels = self.output_queue.drive.labels(first, count)
+        values = volts_to_si(volts, rig.sensors, tare)
+        self.output_queue.acquired += count
+        block = Block("meas", first, self.rate_hz, rig.channels, values, *labels)
+        return block, np.abs(volts) >= CLIP_RATIO * self._full_scale_v[:, None]
+
+    def protect(self, block: Block, clipped: Bool2D) -> None:
+        """Apply protection to a block; the first finding that must stop the table is latched."""
+        observation = protection.Observation.from_drive(block, clipped, self.output_queue.drive)
+        self._protection, findings = protection.inspect_samples(self._protection, observation)
+        for finding in findings:
+            if not finding.stop:
+                self.event_log.pending.append(finding.to_event())
+            elif not self.output_queue.is_decaying:
+                self.event_log.pending.append(finding.to_trip(block.end))
+                self.stop("aborted", finding.text)
+
+    def advance_test(self, block: Block) -> None:
+        """Advance the sequencer by a block and pass its changes of the drive to the queue."""
+        if self.output_queue.is_decaying:
+            return
+        previous = self._state
+        self._state, records = sequencer.advance_test(previous, block)
+        self.event_log.pending.extend(records)
+        for record in records:
+            if isinstance(record, FrequencyResponse):
+                self._protection = protection.set_response(self._protection, record)
+        if self._state.drive is not previous.drive:
+            self.output_queue.change_drive(self._state.drive, self._state.changed_from)
+        if self._state.refusal:
+            self.verdict, self.reason = "aborted", self._state.refusal
+        elif previous.stage.kind == "check" != self._state.stage.kind:
+            self.event_log.enter_state("armed")
+        if self.event_log.states[-1] == "armed" and block.step[-1] >= 0:
+            self.event_log.enter_state("running")
+
+    def execute(self, command: OperatorCommand | None) -> None:
+        """Execute an operator command if the state allows it."""
+        if command is None or self.output_queue.is_decaying:
+            return
+        if command.name in ("stop", "abort"):
+            self.stop("stopped" if command.name == "stop" else "aborted", command.reason)
+            return
+        previous, index = (
+            self._state,
+            self.output_queue.first_changeable() + round(COMMAND_DELAY_S * self.rate_hz),
+        )
+        change = {"hold": sequencer.hold_test, "resume": sequencer.resume_test}[command.name]
+        self._state = change(previous, index)
+        if self._state is previous:
+            self.event_log.add_event(
+                "refused", f"{command.name} is not possible in state {self.event_log.states[-1]!r}"
+            )
+            return
+        self.output_queue.change_drive(self._state.drive, self._state.changed_from)
+        self.event_log.enter_state("holding" if command.name == "hold" else "running")
+
+    def stop(self, verdict: str, reason: str) -> None:
+        """Stop the test: start the final decay to rest."""
+        self.verdict, self.reason = verdict, reason
+        self.event_log.enter_state("stopping")
+        self.event_log.add_event("stop", f"{reason}; decaying to rest")
+        self.output_queue.decay()
+
+    def feed(self) -> None:
+        """Keep the queue filled; on a buffer underrun the table stops by itself, with a Trip."""
+        try:
+            self.output_queue.feed()
+        except BufferUnderrun as error:
+            decay_start = self.output_queue.drive.decay_start or 0
+            self.event_log.pending.append(
+                Trip(decay_start, self.output_queue.acquired, "late", "", 0.0, 0.0, f"{error}")
+            )
+            self.verdict, self.reason = "aborted", str(error)
+            self.event_log.enter_state("stopping")
+
+    def finish(self) -> Iterator[Record]:
+        """Yield the last records of a session that came to rest."""
+        if self._state.stage.kind == "open" and not self.output_queue.is_decaying:
+            self.verdict, self.reason = "stopped", "hold timed out after 1 h"
+        self.event_log.enter_state("at rest")
+        yield from self.event_log.drain()
+        yield RunStop(
+            self.output_queue.acquired, self.verdict, self.reason, tuple(self.event_log.states)
+        )
+
+    def report_machine_loss(self, reason: str) -> Iterator[Record]:
+        """Yield the last records of a session whose machine no longer answers."""
+        self.event_log.enter_state("fault")
+        index = self.output_queue.acquired
+        self.event_log.pending.append(Trip(index, index, "machine", "", 0.0, 0.0, reason))
+        yield from self.event_log.drain()
+        self.output_queue.wait_for_rest()
+        yield RunStop(index, "halted", reason, tuple(self.event_log.states))
+
+
+def find_gaps(block: Block, clipped: Bool2D) -> Iterator[SampleGap]:
+    """Yield a SampleGap for every run of lost or clipped samples of every channel."""
+    if not (clipped.any() or np.isnan(block.values).any()):
+        return
+    for name, values, at_range in zip(block.channels, block.values, clipped, strict=True):
+        for invalid, reason in ((np.isnan(values), "lost"), (at_range, "clipped")):
+            edges = np.flatnonzero(np.diff(invalid, prepend=False, append=False))
+            for first, last in edges.reshape(-1, 2).tolist():
+                yield SampleGap(block.index + first, last - first, name, reason)

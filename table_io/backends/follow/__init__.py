@@ -1,1 +1,0 @@
-"""A controller that plays by itself; we follow it."""

@@ -1,0 +1,138 @@
+"""Loading of TOML files into validated, frozen models; one message lists all faults of a file."""
+
+import difflib
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from table_io.errors import InputError
+
+# In a wheel the profiles lie inside this package, in a source tree next to it.
+PROFILES_DIR = next(
+    folder / "profiles"
+    for folder in Path(__file__).resolve().parents[1:3]
+    if (folder / "profiles").is_dir()
+)
+
+# Strict: `true` or "0.05" in place of a number is a mistake, not a 1 or a 0.05.
+Number = Annotated[float, Field(strict=True)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
+Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+Count = Annotated[int, Field(strict=True)]
+
+
+class ConfigModel(BaseModel):
+    """Base class of all configs read from a file: unknown keys are errors, values are frozen.
+
+    A relation between two values is checked at the later of the two keys, against the valid earlier
+    ones (`info.data`), so that a fault in one key does not hide the others.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+ConfigT = TypeVar("ConfigT", bound=ConfigModel)
+
+
+def _known_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
+    """Return the keys allowed in the table that holds the last key of `location`."""
+    current: Any = model
+    for key in location[:-1]:
+        if isinstance(key, int) or key not in current.model_fields:
+            continue  # an index of a list, or a name that the user chooses
+        annotation: Any = current.model_fields[key].annotation
+        stack = [annotation]
+        while stack:
+            item = stack.pop()
+            if isinstance(item, type) and issubclass(item, BaseModel):
+                current = item
+                break
+            stack.extend(getattr(item, "__args__", ()))
+    return list(current.model_fields)
+
+
+def _format_error(model: type[BaseModel], error: Any) -> str:
+    """Describe one validation error: key, value, what is allowed, what to do."""
+    location: tuple[int | str, ...] = error["loc"]
+    key = ".".join(str(part) for part in location) or "file"
+    if error["type"] == "extra_forbidden":
+        known = _known_keys(model, location)
+        near = difflib.get_close_matches(str(location[-1]), known, 1, 0.4)
+        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
+        return f"{key}: unknown key; {hint}"
+    if error["type"] == "missing":
+        return f"{key}: missing; add it"
+    message = str(error["msg"]).removeprefix("Value error, ")
+    if error["type"] == "value_error":
+        return f"{key}: {message}"
+    return f"{key} = {error['input']!r}: {message[0].lower()}{message[1:]}"
+
+
+def parse_toml(text: str, model: type[ConfigT], source: str) -> ConfigT:
+    """Parse TOML text into a validated config; InputError lists all faults under `source`."""
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(
+            f"not valid TOML: {error}", where=source, remedy="correct the line that it names"
+        ) from None
+    except RecursionError:
+        raise InputError(
+            "brackets are nested too deeply", where=source, remedy="remove the nesting"
+        ) from None
+    try:
+        return model.model_validate(raw)
+    except ValidationError as error:
+        faults = [
+            _format_error(model, error_details) for error_details in error.errors(include_url=False)
+        ]
+        raise InputError("\n".join([f"{source}:", *(f"  {fault}" for fault in faults)])) from None
+
+
+def read_text(path: Path, kind: str) -> str:
+    """Read the text of a file; InputError names the kind of file and the TOML files next to it."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        siblings = sorted(other.name for other in path.parent.glob("*.toml"))
+        hint = f"there: {', '.join(siblings)}" if siblings else "give the path of a TOML file"
+        raise InputError(f"no such {kind}", where=path, remedy=hint) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read this {kind}: {error}", where=path) from None
+
+
+def find_config(name: str, folder: str, profile_path: Path | None = None) -> Path:
+    """Return the path of config `name`: a path, or a name in `folder` next to a profile or ours."""
+    direct = Path(name)
+    if direct.suffix == ".toml":
+        by_profile = profile_path.parent / direct if profile_path is not None else direct
+        return by_profile if by_profile.is_file() else direct
+    folders = [PROFILES_DIR / folder]
+    if profile_path is not None:
+        folders.insert(0, profile_path.resolve().parent.parent / folder)
+    for folder_path in folders:
+        if (folder_path / f"{name}.toml").is_file():
+            return folder_path / f"{name}.toml"
+    known = sorted({path.stem for place in folders for path in place.glob("*.toml")})
+    near = difflib.get_close_matches(name, known, 1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    raise InputError(
+        f"not found in {folder}",
+        where="" if profile_path is None else profile_path,
+        key=name,
+        remedy=f"{hint}known: {', '.join(known) or 'none'}; or give the path of a .toml file",
+    )
+
+
+def resolve_config(path: Path, folder: str) -> Path:
+    """Return the path of a config file given as a path, or as the bare name of a shipped one."""
+    return path if path.exists() or len(path.parts) > 1 else find_config(str(path), folder)
+
+
+def load_config(path: Path, model: type[ConfigT], kind: str) -> tuple[ConfigT, str]:
+    """Load a config from a file; return (validated config, text of the file)."""
+    text = read_text(path, kind)
+    return parse_toml(text, model, str(path)), text

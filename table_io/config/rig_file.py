@@ -1,0 +1,48 @@
+"""Loading of a rig file together with the newest calibration record of each channel."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+from table_io.config.base import load_config, parse_toml
+from table_io.config.calibration_record import (
+    CalibrationFile,
+    CalibrationRecord,
+    format_calibration_toml,
+)
+from table_io.config.rig import RigConfig
+from table_io.errors import InputError
+
+
+def calibrations_dir(path: Path) -> Path:
+    """Return the folder of the calibration records of a rig file."""
+    return path.with_suffix(".calibrations")
+
+
+def load_rig(path: Path) -> tuple[RigConfig, str]:
+    """Load (rig config, its text with the records appended); InputError names a faulty file."""
+    _, text = load_config(path, RigConfig, "rig file")
+    newest: dict[str, tuple[datetime, CalibrationRecord]] = {}
+    for file in sorted(calibrations_dir(path).glob("*.toml")):
+        records, _ = load_config(file, CalibrationFile, "calibration record")
+        for record in records.calibrations:
+            made_at, previous = _parse_time(record.at, file), newest.get(record.channel)
+            if previous is None or made_at >= previous[0]:
+                newest[record.channel] = made_at, record
+    text = "\n".join([text, *(format_calibration_toml(record) for _, record in newest.values())])
+    return parse_toml(text, RigConfig, str(path)), text
+
+
+def _parse_time(at: str, file: Path) -> datetime:
+    """Parse the time of a record, UTC if it has no time zone; InputError names its file."""
+    try:
+        made_at = datetime.fromisoformat(at)
+    except ValueError:
+        raise InputError(
+            "not a time",
+            where=file,
+            key="at",
+            value=at,
+            allowed="ISO 8601, for example 2026-03-10T10:00:00+00:00",
+            remedy="correct it or remove this record",
+        ) from None
+    return made_at if made_at.tzinfo is not None else made_at.replace(tzinfo=UTC)

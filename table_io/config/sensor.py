@@ -1,0 +1,158 @@
+"""Sensor config: scaling to volts, instrument data and calibration dates.
+
+Dates are ISO (2026-03-01). Dates never stop a test; `calibration_due.py` reports overdue ones.
+"""
+
+import calendar
+import difflib
+import re
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field, ValidationInfo, field_validator
+
+from table_io.channels import CHANNEL_BY_NAME
+from table_io.config.base import ConfigModel, Count, Finite, NonNegative, Positive
+from table_io.units import UNITS
+
+MAX_YEAR = 9999  # of a four-digit ISO date
+
+
+def _parse_day(value: Any) -> Any:
+    """Return the ISO text of a day that TOML parsed as a date or as text."""
+    text = str(value)
+    known = re.fullmatch(r"([0-9]{4})-([0-9]{2})-([0-9]{2})", text)
+    year, month, day = map(int, known.groups()) if known else (0, 0, 0)
+    if not (year and 1 <= month <= 12 and 1 <= day <= calendar.monthrange(year, month)[1]):
+        raise ValueError(f"{text} is not a date; allowed: year-month-day, e.g. 2026-03-01")
+    return text
+
+
+def _add_months(day: str, months: int) -> str | None:
+    """Return the ISO day `months` months later; None beyond the year 9999."""
+    year, month, of_month = map(int, day.split("-"))
+    years, month = divmod(month - 1 + months, 12)
+    year, month = year + years, month + 1
+    if year > MAX_YEAR:
+        return None
+    return f"{year:04}-{month:02}-{min(of_month, calendar.monthrange(year, month)[1]):02}"
+
+
+IsoDate = Annotated[str, BeforeValidator(_parse_day)]
+
+
+class SensorConfig(ConfigModel):
+    """Sensor of one channel: volts = (value + offset) * volts_per_unit."""
+
+    channel: str
+    unit: str
+    range: Positive = Field(description="Full scale on either side, in `unit`.")
+    volts_per_unit: Finite = Field(description="Sensitivity; negative if the sensor is reversed.")
+    bits: int = Field(ge=8, le=32)
+    noise_rms: NonNegative = Field(
+        0.0, description="In `unit`, measured at rest; also the noise of the simulated table."
+    )
+    offset: Finite = Field(0.0, description="In `unit`, reading at 0; every run tares it.")
+    maker: str = ""
+    model: str = ""
+    serial: str = Field("", description="Serial number.")
+    calibrated: IsoDate | None = Field(None, description="Day of the last calibration.")
+    due: IsoDate | None = Field(None, description="Day of the next one; or give interval_months.")
+    interval_months: Annotated[Count, Field(ge=1, le=600)] | None = None
+    certificate: str = ""
+    calibrated_by: str = ""
+    shunt: Finite | None = Field(None, description="In `unit`, shift caused by its shunt.")
+    shunt_tolerance: Positive | None = Field(
+        None, validate_default=True, description="In `unit`, on either side of `shunt`."
+    )
+    filter_hz: Positive | None = Field(None, description="-3 dB of its filter; information only.")
+    delay_ms: NonNegative = Field(0.0, description="Of its electronics; information only.")
+
+    @field_validator("channel")
+    @classmethod
+    def _check_channel(cls, channel: str) -> str:
+        if channel not in CHANNEL_BY_NAME:
+            near = difflib.get_close_matches(channel, CHANNEL_BY_NAME, 1)
+            raise ValueError(
+                f"channel {channel!r} is unknown"
+                + (
+                    f"; did you mean {near[0]!r}?"
+                    if near
+                    else f"; known: {', '.join(CHANNEL_BY_NAME)}"
+                )
+            )
+        return channel
+
+    @field_validator("unit")
+    @classmethod
+    def _check_unit(cls, unit: str, info: ValidationInfo) -> str:
+        channel = info.data.get("channel")
+        if channel is None:
+            return unit
+        si_unit = CHANNEL_BY_NAME[channel].unit
+        allowed = [name for name, (si, _) in UNITS.items() if si == si_unit]
+        if unit not in allowed:
+            raise ValueError(
+                f"unit {unit!r} does not measure {channel} ({si_unit}); allowed: "
+                f"{', '.join(allowed)}"
+            )
+        return unit
+
+    @field_validator("volts_per_unit")
+    @classmethod
+    def _check_sensitivity(cls, sensitivity: float) -> float:
+        if sensitivity == 0:
+            raise ValueError("volts_per_unit is 0, so the signal would be lost; allowed: not 0")
+        return sensitivity
+
+    @field_validator("due", "interval_months")
+    @classmethod
+    def _check_due(cls, value: str | int | None, info: ValidationInfo) -> str | int | None:
+        calibrated = info.data.get("calibrated")
+        if value is None or "calibrated" not in info.data:
+            return value
+        if isinstance(value, str) and calibrated is not None and value < calibrated:
+            raise ValueError(f"due {value} lies before calibrated {calibrated}; correct one")
+        if isinstance(value, int) and calibrated is None:
+            raise ValueError("interval_months counts from `calibrated`; add that, or give `due`")
+        if isinstance(value, int) and info.data.get("due") is not None:
+            raise ValueError("due and interval_months both give the next calibration; keep one")
+        if (
+            isinstance(value, int)
+            and calibrated is not None
+            and _add_months(calibrated, value) is None
+        ):
+            raise ValueError("its next calibration lies after the year 9999; give fewer months")
+        return value
+
+    @field_validator("shunt_tolerance")
+    @classmethod
+    def _check_shunt(cls, tolerance: float | None, info: ValidationInfo) -> float | None:
+        if "shunt" in info.data and (info.data["shunt"] is None) != (tolerance is None):
+            raise ValueError("shunt and shunt_tolerance go together; give both or neither")
+        if info.data.get("shunt") == 0.0:
+            raise ValueError("shunt is 0, which checks nothing; allowed: not 0")
+        return tolerance
+
+    @property
+    def si_per_unit(self) -> float:
+        return UNITS[self.unit][1]
+
+    @property
+    def range_si(self) -> float:
+        return self.range * self.si_per_unit
+
+    @property
+    def volts_per_si(self) -> float:
+        return self.volts_per_unit / self.si_per_unit
+
+    @property
+    def lsb(self) -> float:
+        """One step of the A/D converter in `unit`."""
+        return 2.0 * self.range / 2.0**self.bits
+
+    @property
+    def due_date(self) -> str | None:
+        """Day of the next calibration; None if the config does not give it."""
+        if self.due is not None or self.calibrated is None or self.interval_months is None:
+            return self.due
+        return _add_months(self.calibrated, self.interval_months)

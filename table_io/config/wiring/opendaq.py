@@ -1,0 +1,51 @@
+"""Wiring of an openDAQ device."""
+
+from pydantic import Field, field_validator
+
+from table_io.channels import CHANNEL_BY_NAME
+from table_io.config.base import ConfigModel
+
+NATIVE_SCHEME = "daq.nd://"
+
+
+class OpenDaqWiring(ConfigModel):
+    """Address of the device, and its signal for each channel."""
+
+    device: str = Field(description="Native streaming: daq.nd://HOST or daq.nd://HOST:PORT.")
+    signals: dict[str, str] = Field(
+        min_length=1, description="Channel = id of the signal, or a unique end of it."
+    )
+
+    @field_validator("device")
+    @classmethod
+    def _check_device(cls, device: str) -> str:
+        host, colon, port = device.removeprefix(NATIVE_SCHEME).partition(":")
+        if not device.startswith(NATIVE_SCHEME) or not host or (colon and not port.isdecimal()):
+            raise ValueError(
+                f"device {device!r} is not an openDAQ native connection; allowed: daq.nd://HOST or "
+                "daq.nd://HOST:PORT"
+            )
+        return device
+
+    @field_validator("signals")
+    @classmethod
+    def _check_signals(cls, signals: dict[str, str]) -> dict[str, str]:
+        unknown = [name for name in signals if name not in CHANNEL_BY_NAME]
+        if unknown:
+            raise ValueError(
+                f"signals name unknown channels {', '.join(unknown)}; known: "
+                f"{', '.join(CHANNEL_BY_NAME)}"
+            )
+        ids = list(signals.values())
+        duplicates = sorted({signal for signal in ids if ids.count(signal) > 1})
+        if duplicates:
+            raise ValueError(
+                f"signals wire {', '.join(duplicates)} to two channels; give each channel its own"
+            )
+        return signals
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """(host, port) of the streaming server."""
+        host, _, port = self.device.removeprefix(NATIVE_SCHEME).partition(":")
+        return host, int(port or 7420)

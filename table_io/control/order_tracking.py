@@ -1,0 +1,85 @@
+"""Order tracking: least-squares fit of harmonics at the known phase of the drive.
+
+x(t) = offset + sum over k of Im(c_k exp(2 pi i k phase)), so a real c_1 is in phase with the
+acceleration sine of the drive. The phase is the closed form of the drive at each sample, so only
+amplitudes are estimated, and a cycle need not be a whole number of samples.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from table_io.block import Float1D
+
+HARMONIC_COUNT = 10
+Complex1D = npt.NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HarmonicFit:
+    """Harmonic fit: offset, c_1 .. c_n and rms residual, in the unit of the samples."""
+
+    offset: float
+    amplitudes: Complex1D
+    residual_rms: float
+
+    @property
+    def fundamental(self) -> float:
+        """Amplitude of the fundamental."""
+        return float(abs(self.amplitudes[0]))
+
+    @property
+    def distortion(self) -> float:
+        """Total harmonic distortion (THD): rss of harmonics 2 to n over the fundamental."""
+        return float(np.sqrt(np.sum(np.abs(self.amplitudes[1:]) ** 2)) / abs(self.amplitudes[0]))
+
+
+NO_FIT = HarmonicFit(float("nan"), np.full(HARMONIC_COUNT, complex("nan")), float("nan"))
+
+
+def track_harmonics(
+    values: Float1D, phase: Float1D, harmonics: int = HARMONIC_COUNT
+) -> HarmonicFit:
+    """Fit the harmonics of `values`, (sample,), at the drive `phase` in cycles, (sample,).
+
+    Harmonics with fewer than four samples per cycle are not fitted (zero). All NaN if samples are
+    lost or too few.
+    """
+    return _fit_harmonics(_harmonic_basis(phase, harmonics), values, harmonics)
+
+
+def track_channels(
+    values: Float1D, phase: Float1D, harmonics: int = HARMONIC_COUNT
+) -> list[HarmonicFit]:
+    """Apply `track_harmonics` to several channels, (channel, sample), with one phase."""
+    basis = _harmonic_basis(phase, harmonics)
+    return [_fit_harmonics(basis, row, harmonics) for row in values]
+
+
+def _harmonic_basis(phase: Float1D, harmonics: int) -> Float1D:
+    """Return the basis columns 1, sin, cos, sin 2, cos 2, ..., (sample, 2 orders + 1)."""
+    cycles = float(np.ptp(phase)) if phase.size else 0.0
+    resolvable = int(phase.size / (4 * cycles)) if cycles > 0 else 0
+    orders = min(harmonics, resolvable)
+    rotation = np.exp(2j * np.pi * phase)
+    basis = np.ones((phase.size, 2 * orders + 1))
+    wave = np.ones_like(rotation)
+    for k in range(orders):
+        wave = wave * rotation
+        basis[:, 2 * k + 1], basis[:, 2 * k + 2] = wave.imag, wave.real
+    return basis
+
+
+def _fit_harmonics(basis: Float1D, values: Float1D, harmonics: int) -> HarmonicFit:
+    columns = basis.shape[1]
+    if columns < 3 or values.size < 2 * columns or not np.isfinite(values).all():
+        return NO_FIT
+    # Not BLAS: on a busy computer its threads can wait seconds for one another.
+    normal, rhs = np.einsum("ij,ik->jk", basis, basis), np.einsum("ij,i->j", basis, values)
+    solution = np.linalg.solve(normal, rhs)
+    amplitudes = np.zeros(harmonics, dtype=np.complex128)
+    # a sin + b cos = Im((a + i b) exp(i theta))
+    amplitudes[: columns // 2] = solution[1::2] + 1j * solution[2::2]
+    rms = float(np.sqrt(np.mean((values - np.einsum("ij,j->i", basis, solution)) ** 2)))
+    return HarmonicFit(float(solution[0]), amplitudes, rms)

@@ -1,0 +1,264 @@
+"""Drive: displacement command of a phase-continuous stepped sine of constant peak acceleration.
+
+A drive is an immutable tuple of segments, each a closed form of the sample index, so any sample can
+be computed at any time and cutting it into blocks changes no bit. The phase is continuous;
+amplitude and frequency change by quintic blends (C2), because switching at a zero crossing would
+cause a jump of the table velocity.
+
+In a segment, with s(x) = 6x^5 - 15x^4 + 10x^3 over its length,
+    f = f0 + (f1 - f0) s,   level = l0 + (l1 - l0) s,   theta = 2 pi (phase0 + integral f dt)
+    displacement = -level / (2 pi f)^2 sin(theta), so that in a held segment the acceleration is
+    level sin(theta).
+The command uses the corrected level, level * correction, which blends like the level itself.
+`shape` adds harmonics that cancel those of the table: sin(theta) is replaced by sin(theta) + sum
+over k >= 2 of Im(shape_k exp(i k theta)).
+"""
+
+import math
+from bisect import bisect_right
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from table_io.block import Float1D, Int1D, Label
+from table_io.records import Step
+
+RAMP_CYCLES = 2.0  # a soft start over one cycle would peak at 1.12, over two at 1.02
+RAMP_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """Segment of `count` samples from `start`; f in Hz, level in m/s2, phase0 in cycles."""
+
+    start: int
+    count: int
+    label: Label
+    step: int
+    f0: float
+    f1: float
+    level0: float
+    level1: float
+    phase0: float
+    cycles: int = 0  # held cycles, 0 in a blend
+    settle: int = 0  # the first held cycles, which are not measured
+    correction0: float = 1.0  # factor on the command
+    correction1: float = 1.0
+    shape0: tuple[complex, ...] = ()  # orders 2, 3, ... of the command, relative
+    shape1: tuple[complex, ...] = ()
+
+    @property
+    def end(self) -> int:
+        return self.start + self.count
+
+    def phase(self, x: Float1D, rate_hz: float) -> Float1D:
+        """Return the phase in cycles at the fractions x of the segment, (x,)."""
+        ramp = x**4 * (2.5 + x * (-3.0 + x))
+        return self.phase0 + self.count / rate_hz * (self.f0 * x + (self.f1 - self.f0) * ramp)
+
+
+def smoothstep(x: Float1D) -> Float1D:
+    """Return the quintic blend from 0 to 1 at x, with zero first and second end derivatives."""
+    return x**3 * (10.0 + x * (-15.0 + 6.0 * x))
+
+
+def segment_displacement(segment: Segment, x: Float1D, rate_hz: float) -> Float1D:
+    """Return the commanded displacement in m at the fractions x of a segment, (x,)."""
+    s = smoothstep(x)
+    f = segment.f0 + (segment.f1 - segment.f0) * s
+    low, high = _command_levels(segment)
+    theta = 2 * math.pi * segment.phase(x, rate_hz)
+    wave = np.sin(theta)
+    for k in range(max(len(segment.shape0), len(segment.shape1))):
+        before, after = _harmonic(segment.shape0, k), _harmonic(segment.shape1, k)
+        wave += np.imag((before + (after - before) * s) * np.exp(1j * (k + 2) * theta))
+    return -(low + (high - low) * s) / (2 * math.pi * f) ** 2 * wave
+
+
+def _command_levels(segment: Segment) -> tuple[float, float]:
+    """Return the levels of the command in m/s2 at the two ends of a segment."""
+    return segment.level0 * segment.correction0, segment.level1 * segment.correction1
+
+
+def _harmonic(shape: tuple[complex, ...], k: int) -> complex:
+    return shape[k] if k < len(shape) else 0j
+
+
+def _quadratures(
+    segment: Segment, x: Float1D, rate_hz: float, levels: tuple[float, float]
+) -> tuple[Float1D, Float1D, Float1D, Float1D]:
+    """Return (v_sin, v_cos, a_sin, a_cos): velocity = v_sin sin + v_cos cos, acceleration alike.
+
+    `levels` in m/s2 at the ends of the segment: the demanded ones, or those of the command.
+    """
+    duration = segment.count / rate_hz
+    s = smoothstep(x)
+    ds = 30 * x**2 * (1 - x) ** 2 / duration
+    dds = 60 * x * (1 - x) * (1 - 2 * x) / duration**2
+    df, dl = segment.f1 - segment.f0, levels[1] - levels[0]
+    f, level = segment.f0 + df * s, levels[0] + dl * s
+    w = 2 * math.pi * f
+    g = level / w**2
+    dg = (dl * ds - 2 * level * df * ds / f) / w**2
+    ddg = (
+        dl * dds
+        - 4 * dl * df * ds**2 / f
+        - 2 * level * df * dds / f
+        + 6 * level * (df * ds / f) ** 2
+    ) / w**2
+    dw = 2 * math.pi * df * ds
+    return -dg, -g * w, g * w**2 - ddg, -(2 * dg * w + g * dw)
+
+
+def segment_motion(segment: Segment, x: Float1D, rate_hz: float) -> tuple[Float1D, Float1D]:
+    """Return (velocity in m/s, acceleration in m/s2) of an ideal table at the fractions x."""
+    levels = (segment.level0, segment.level1)
+    v_sin, v_cos, a_sin, a_cos = _quadratures(segment, x, rate_hz, levels)
+    theta = 2 * math.pi * segment.phase(x, rate_hz)
+    sin, cos = np.sin(theta), np.cos(theta)
+    return v_sin * sin + v_cos * cos, a_sin * sin + a_cos * cos
+
+
+def peak_acceleration_ratio(segment: Segment, rate_hz: float) -> float:
+    """Return the peak acceleration of a segment at its worst phase over the larger of its levels.
+
+    The larger of two ratios: demanded motion to demanded level, and corrected command to corrected
+    level.
+    """
+    x = np.linspace(0.0, 1.0, 401)
+    ratios = []
+    for levels in ((segment.level0, segment.level1), _command_levels(segment)):
+        _, _, a_sin, a_cos = _quadratures(segment, x, rate_hz, levels)
+        ratios.append(float(np.hypot(a_sin, a_cos).max()) / max(levels))
+    return max(ratios)
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Displacement command as far as it is known; it always ends at rest.
+
+    Where segments overlap the later one applies, which cuts a hold short. From sample `decay_start`
+    on, if set, the command decays to rest.
+    """
+
+    rate_hz: float
+    segments: tuple[Segment, ...]
+    steps: tuple[Step, ...]
+    decay_start: int | None = None
+
+    @cached_property
+    def _starts(self) -> list[int]:
+        return [segment.start for segment in self.segments]
+
+    def segment_at(self, index: int) -> Segment:
+        """Return the segment that contains sample `index`; outside, the first or last one."""
+        return self.segments[max(bisect_right(self._starts, index) - 1, 0)]
+
+    @property
+    def planned_end(self) -> int:
+        """Index from which the drive would be at rest if it were not stopped."""
+        return self.segments[-1].end if self.segments else 0
+
+    @cached_property
+    def decay_samples(self) -> int:
+        """Length of the decay in samples: max(2 cycles, 0.5 s) at the frequency where it begins.
+
+        One sample if it begins before the soft start, so that the table never starts to move.
+        """
+        if self.decay_start is None:
+            return 0
+        if not self.segments or self.decay_start < self.segments[0].start:
+            return 1
+        segment = self.segment_at(self.decay_start)
+        x = np.clip(np.array([(self.decay_start - segment.start) / segment.count]), 0.0, 1.0)
+        f = segment.f0 + (segment.f1 - segment.f0) * float(smoothstep(x)[0])
+        return math.ceil(max(RAMP_CYCLES / f, RAMP_S) * self.rate_hz)
+
+    @property
+    def rest_start(self) -> int:
+        """Index from which the command is exactly zero."""
+        if self.decay_start is None:
+            return self.planned_end
+        return min(self.decay_start + self.decay_samples, max(self.planned_end, self.decay_start))
+
+    def decay_from(self, at: int) -> "Drive":
+        """Return the same drive with a smooth decay to rest from sample `at` on."""
+        return replace(
+            self, decay_start=at if self.decay_start is None else min(at, self.decay_start)
+        )
+
+    def command(self, first: int, count: int) -> Float1D:
+        """Return the displacement in m of samples first .. first + count - 1; 0 outside."""
+        displacement_m = np.zeros(count)
+        for segment, window, x in self._overlaps(first, count):
+            displacement_m[window] = segment_displacement(segment, x, self.rate_hz)
+        return displacement_m * self._decay_factor(first, count)
+
+    def acceleration(self, first: int, count: int) -> Float1D:
+        """Return the acceleration in m/s2 of an ideal table, without decay, (count,)."""
+        acceleration = np.zeros(count)
+        for segment, window, x in self._overlaps(first, count):
+            acceleration[window] = segment_motion(segment, x, self.rate_hz)[1]
+        return acceleration
+
+    def phase(self, first: int, count: int) -> Float1D:
+        """Return the phase of each sample in cycles, (count,); 0 outside the drive."""
+        phase = np.zeros(count)
+        for segment, window, x in self._overlaps(first, count):
+            phase[window] = segment.phase(x, self.rate_hz)
+        return phase
+
+    def level(self, first: int, count: int) -> Float1D:
+        """Return the demanded peak acceleration in m/s2, decay included, (count,)."""
+        level = np.zeros(count)
+        for segment, window, x in self._overlaps(first, count):
+            low, high = segment.level0, segment.level1
+            level[window] = low + (high - low) * smoothstep(x)
+        return level * self._decay_factor(first, count)
+
+    def _decay_factor(self, first: int, count: int) -> Float1D:
+        """Return the factor of the decay on the command, 1 before it, (count,)."""
+        if self.decay_start is None:
+            return np.ones(count)
+        x = (np.arange(first, first + count) - self.decay_start) / self.decay_samples
+        return 1.0 - smoothstep(np.clip(x, 0.0, 1.0))
+
+    def labels(self, first: int, count: int) -> tuple[Int1D, Int1D, Int1D]:
+        """Return (step, label, held cycle) of each sample, (count,) each; -1 outside the sweep."""
+        step = np.full(count, -1, dtype=np.int64)
+        label = np.full(count, int(Label.REST), dtype=np.int64)
+        cycle = np.full(count, -1, dtype=np.int64)
+        for segment, window, x in self._overlaps(first, count):
+            step[window] = segment.step
+            label[window] = segment.label
+            if segment.cycles:
+                turns = x * segment.count * segment.f0 / self.rate_hz
+                # A cycle may begin exactly on a sample: the tolerance absorbs rounding.
+                done = np.floor(turns + 1e-9).astype(np.int64)
+                cycle[window] = np.minimum(done, segment.cycles - 1)
+                label[window] = np.where(
+                    cycle[window] >= segment.settle, int(Label.MEASURE), int(Label.SETTLE)
+                )
+        if self.decay_start is not None:
+            index = np.arange(first, first + count)
+            stopping = (index >= self.decay_start) & (index < self.rest_start)
+            label[stopping] = int(Label.STOP)
+            label[index >= self.rest_start] = int(Label.REST)
+            cycle[index >= self.decay_start] = -1
+            step[index >= self.rest_start] = -1
+        return step, label, cycle
+
+    def _overlaps(self, first: int, count: int) -> list[tuple[Segment, slice, Float1D]]:
+        """List (segment, window in the requested samples, segment fractions) of each overlap."""
+        last = first + count
+        overlaps = []
+        first_segment = max(bisect_right(self._starts, first) - 1, 0)
+        for segment in self.segments[first_segment:]:
+            if segment.start >= last:
+                break
+            lo, hi = max(first, segment.start), min(last, segment.end)
+            if lo < hi:
+                x = (np.arange(lo, hi) - segment.start) / segment.count
+                overlaps.append((segment, slice(lo - first, hi - first), x))
+        return overlaps

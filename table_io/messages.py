@@ -1,0 +1,89 @@
+"""One-line text of a record, identical on the terminal, in the viewer and in the report."""
+
+import math
+
+from table_io.block import Label
+from table_io.records import (
+    Check,
+    Event,
+    Fault,
+    FrequencyResponse,
+    Level,
+    Params,
+    Record,
+    RunStop,
+    SampleGap,
+    StepAdded,
+    Trip,
+)
+from table_io.units import GRAVITY_M_S2
+
+LABEL_TEXTS = {
+    Label.REST: "at rest",
+    Label.BLEND: "blending",
+    Label.SETTLE: "settling",
+    Label.MEASURE: "measuring",
+    Label.STOP: "decaying to rest",
+    Label.CHECK: "loop check",
+}
+SEVERITY_KINDS = {
+    "ERROR": {"fault", "halted", "error", "died"},
+    "WARN": {
+        "warning", "calibration", "alarm", "divergence", "late", "stop", "stopped", "sensor",
+        "disagreement", "drift", "no jump", "unexpected jump", "attractor", "instrument", "refused",
+    },
+}  # fmt: skip
+
+
+def replace_nonprintable(text: str) -> str:
+    """Return the text with nonprintable characters replaced by ?: foreign text may hold escapes."""
+    return "".join(character if character.isprintable() else "?" for character in text)
+
+
+def format_record(record: Record, rate_hz: float) -> tuple[str, str] | None:
+    """Return (INFO, WARN or ERROR, text) of a record, or None for a record that is only data."""
+    match record:
+        case Event(kind=kind, text=text):
+            level = next(
+                (severity for severity, kinds in SEVERITY_KINDS.items() if kind in kinds), "INFO"
+            )
+            return level, f"{kind}: {text}"
+        case SampleGap(count=count, channel=channel, reason=reason):
+            return "WARN", f"gap: {count} samples of {channel or 'all channels'} {reason}"
+        case Fault(component=component, from_index=first, to_index=last, reason=reason):
+            span = f"{first / rate_hz:.3f} s to {last / rate_hz:.3f} s"
+            return "ERROR", f"{component} failed, no output from {span}: {reason}"
+        case Params(reason=reason):
+            return "INFO", f"twin parameters: {reason}"
+        case Trip(kind=kind, text=text):
+            return "ERROR", f"protection ({kind}): {text}"
+        case Check():
+            return ("INFO" if record.passed else "ERROR"), _format_check(record)
+        case FrequencyResponse(frequencies_hz=frequencies, gain=gain):
+            points = ", ".join(
+                f"{g:.3f} at {f:g} Hz" for f, g in zip(frequencies, gain, strict=True)
+            )
+            return "INFO", f"table FRF gain (acceleration / command): {points}"
+        case Level():
+            return ("INFO" if record.accepted else "WARN"), _format_level(record)
+        case StepAdded(frequency_hz=frequency, reason=reason):
+            return "INFO", f"next step at {frequency:g} Hz: {reason}"
+        case RunStop(verdict=verdict, reason=reason):
+            return ("INFO" if verdict == "complete" else "WARN"), f"{verdict}: {reason}"
+    return None
+
+
+def _format_check(check: Check) -> str:
+    how = "pass" if check.passed else "FAIL"
+    value = f"{check.value:.4g} {check.unit}".rstrip()
+    limited = math.isfinite(check.low) or math.isfinite(check.high)
+    allowed = f" (allowed {check.low:.4g} to {check.high:.4g})" if limited else ""
+    return f"check {how}: {check.name}, {check.channel}: {value}{allowed}"
+
+
+def _format_level(level: Level) -> str:
+    return (
+        f"level at step {level.step}: {level.measured_m_s2 / GRAVITY_M_S2:.4f} g measured, "
+        f"{level.demanded_m_s2 / GRAVITY_M_S2:.4f} g demanded; command multiplied by "
+        f"{level.correction:.4f} after {level.update} updates"
+    )

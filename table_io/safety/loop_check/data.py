@@ -1,0 +1,202 @@
+"""Data of a loop check by channel: rest, held motions and tones.
+
+A tone is the complex fundamental of a channel over a held motion, divided by the commanded peak
+acceleration; it is 1 for a perfect table. Displacements are converted to acceleration (-w^2 x),
+forces are in N per m/s2.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from table_io.block import Block, Float1D, Label
+from table_io.channels import CHANNEL_BY_NAME
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.control.order_tracking import track_channels, track_harmonics
+from table_io.excitation.drive import Drive, Segment
+
+Complex1D = npt.NDArray[np.complex128]
+TRACKED_ORDERS = 5  # fitted together; higher orders are orthogonal over whole cycles
+REST_WINDOW_S = 1.0  # at the end of the rest after the motion, when residual motion has decayed
+
+
+@dataclass(frozen=True)
+class LoopCheckData:
+    """Recorded loop check; `block` holds rest, motions and rest after them; SI, tared.
+
+    `tare_noise` is the rms of each channel during the tare, as far as known.
+    """
+
+    block: Block
+    drive: Drive
+    profile: Profile
+    rig: RigConfig
+    tare_noise: dict[str, float]
+
+    @cached_property
+    def holds(self) -> tuple[Segment, ...]:
+        """The held motions, lowest frequency first."""
+        segments = [
+            segment
+            for segment in self.drive.segments
+            if segment.step < 0 and segment.label == Label.CHECK
+        ]
+        inside = [
+            segment
+            for segment in segments
+            if self.block.index <= segment.start < segment.end <= self.block.end
+        ]
+        return tuple(sorted(inside, key=lambda segment: segment.f0))
+
+    @cached_property
+    def frequencies_hz(self) -> Float1D:
+        """Frequency of each held motion, (hold,)."""
+        return np.array([hold.f0 for hold in self.holds])
+
+    @cached_property
+    def rest_before(self) -> Block:
+        """Samples at rest before the motion."""
+        return self.block.cut(self.block.index, self._motion_span[0])
+
+    @cached_property
+    def rest_after(self) -> Block:
+        """Last REST_WINDOW_S of the rest after the motion."""
+        rest = self.block.end - self._motion_span[1]
+        count = min(rest, math.ceil(REST_WINDOW_S * self.block.rate_hz))
+        return self.block.cut(self.block.end - count, self.block.end)
+
+    @cached_property
+    def moving(self) -> Block:
+        """Samples from the first held motion to the end of the last one."""
+        return self.block.cut(min(h.start for h in self.holds), max(h.end for h in self.holds))
+
+    @cached_property
+    def _motion_span(self) -> tuple[int, int]:
+        segments = [segment for segment in self.drive.segments if segment.step < 0]
+        return segments[0].start, max(segment.end for segment in segments)
+
+    @property
+    def test_level(self) -> float:
+        """Peak acceleration of the test, m/s2."""
+        return self.profile.sweep.steps[0].acceleration_m_s2
+
+    def has(self, *names: str) -> bool:
+        """Return True if all these channels exist and none is lost entirely."""
+        return all(
+            name in self.block.channels and np.isfinite(self.block.channel(name)).any()
+            for name in names
+        )
+
+    def window(self, hold: Segment) -> Block:
+        """Return the last whole cycles of a held motion, without its first, settling cycle."""
+        cycles = max(math.floor(hold.count * hold.f0 / self.block.rate_hz + 1e-6) - 1, 1)
+        count = min(round(cycles * self.block.rate_hz / hold.f0), hold.count)
+        return self.block.cut(hold.end - count, hold.end)
+
+    def phase(self, window: Block) -> Float1D:
+        """Return the phase of the drive over a window, in cycles, (sample,)."""
+        return self.drive.phase(window.index, len(window))
+
+    def tones(self, name: str) -> Complex1D:
+        """Return the tone of a channel at each held motion, (hold,); NaN where it is lost."""
+        units = np.array([self._tone_scale(name, hold) for hold in self.holds])
+        return self._fundamentals[self.block.channels.index(name)] * units
+
+    @cached_property
+    def _fundamentals(self) -> npt.NDArray[np.complex128]:
+        """Fundamental of every channel at each held motion, (channel, hold)."""
+        fundamentals = np.empty((len(self.block.channels), len(self.holds)), dtype=np.complex128)
+        for k, hold in enumerate(self.holds):
+            window = self.window(hold)
+            phase = self.phase(window)
+            for n, tracked in enumerate(track_channels(window.values, phase, TRACKED_ORDERS)):
+                values = window.values[n]
+                finite = np.isfinite(values)
+                harmonics = (
+                    tracked
+                    if finite.all()
+                    else track_harmonics(values[finite], phase[finite], TRACKED_ORDERS)
+                )
+                fundamentals[n, k] = harmonics.amplitudes[0]
+        return fundamentals
+
+    def tone_errors(self, name: str) -> Float1D:
+        """Return the standard error of |tone| due to the noise at rest, (hold,)."""
+        noise = self.noise(name)
+        return np.array(
+            [
+                noise * math.sqrt(2.0 / len(self.window(hold))) * abs(self._tone_scale(name, hold))
+                for hold in self.holds
+            ]
+        )
+
+    def tone_snr(self, name: str) -> float:
+        """Return the largest ratio of tone to standard error of a channel; 0 if it is lost."""
+        ratios = np.abs(self.tones(name)) / self.tone_errors(name)
+        return float(np.nan_to_num(ratios, nan=0.0).max())
+
+    def _tone_scale(self, name: str, hold: Segment) -> float:
+        """Return the factor from an amplitude of the channel to its tone."""
+        level = hold.level0 * hold.correction0
+        return (
+            -((2 * math.pi * hold.f0) ** 2) if CHANNEL_BY_NAME[name].unit == "m" else 1.0
+        ) / level
+
+    def noise(self, name: str) -> float:
+        """Return the rms of a channel at rest about its mean, SI; at least its rounding noise."""
+        rest_rms = _finite_std(self.rest_before.channel(name))
+        rounding = self.lsb(name) / math.sqrt(12.0)
+        return (
+            max(rest_rms, self.tare_noise.get(name, 0.0), rounding) if rest_rms >= 0 else math.nan
+        )
+
+    def lsb(self, name: str) -> float:
+        """Return one step of a channel's converter, SI."""
+        sensor = next(sensor for sensor in self.rig.sensors if sensor.channel == name)
+        return 2.0 * sensor.range_si / 2.0**sensor.bits
+
+
+def _finite_std(values: Float1D) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.std()) if finite.size else math.nan
+
+
+def derivative_mismatch(
+    displacement: tuple[Float1D, float],
+    acceleration: tuple[Float1D, float],
+    phase: Float1D,
+    omega: float,
+    rate_hz: float,
+) -> tuple[float, float]:
+    """Compare a displacement with an acceleration: return (|ratio - 1|, its standard error).
+
+    The ratio is the second derivative of the displacement over the acceleration. Both are given as
+    (samples, noise rms), SI, over one window at the constant angular frequency `omega`. Weak form:
+    integral phi'' x dt = integral phi a dt with phi = sin^4 times the drive's tone, which vanishes
+    with three derivatives at both ends: exact for any motion, independent of offsets, and without
+    differentiating noise.
+    """
+    x, a = displacement[0], acceleration[0]
+    length_s = x.size / rate_hz
+    angle = np.pi * (np.arange(x.size) + 0.5) / x.size
+    sin2, cos2 = np.sin(angle) ** 2, np.cos(angle) ** 2
+    window = sin2**2
+    slope = 4 * math.pi / length_s * sin2 * np.sin(angle) * np.cos(angle)
+    curvature = (math.pi / length_s) ** 2 * (12 * sin2 * cos2 - 4 * sin2**2)
+    tone = np.exp(-2j * np.pi * phase)
+    phi = window * tone
+    phi_dd = (curvature - 2j * omega * slope - omega**2 * window) * tone
+    displacement_integral, acceleration_integral = complex(phi_dd @ x), complex(phi @ a)
+    scatter = math.hypot(
+        displacement[1] * float(np.linalg.norm(phi_dd)),
+        acceleration[1] * float(np.linalg.norm(phi)),
+    )
+    if acceleration_integral == 0:
+        return math.nan, math.inf
+    return abs(displacement_integral / acceleration_integral - 1.0), scatter / max(
+        abs(acceleration_integral), abs(displacement_integral)
+    )

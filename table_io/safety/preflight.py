@@ -1,0 +1,303 @@
+"""Pre-flight check: demands of a drive against the limits of the rig, before anything moves."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.control.amplitude_control import MAX_CORRECTION
+from table_io.control.frf import evaluate_gain
+from table_io.errors import InputError
+from table_io.excitation.drive import Drive, Segment, segment_displacement, segment_motion
+from table_io.records import FrequencyResponse, Step
+from table_io.safety.loop_check import plan_targets
+from table_io.units import GRAVITY_M_S2
+
+LOOP_CHECK = "loop check"
+CORRECTION_HEADROOM = 1.2  # factor of amplitude correction for which stroke should remain
+PAYLOAD_RATIO_RANGE = (0.01, 2.0)  # plausible mass of a specimen over the table's moving mass
+
+
+@dataclass(frozen=True, slots=True)
+class StepDemand:
+    """Peak demands of one step, its blends included; SI, `amplitude_lsb` in DAC steps.
+
+    The motions of the loop check have step -1 and direction "loop check".
+    """
+
+    step: int
+    direction: str
+    frequency_hz: float
+    displacement_m: float  # of the command; the other peaks are those of the resulting motion
+    velocity_m_s: float
+    acceleration_m_s2: float
+    force_n: float
+    amplitude_lsb: float
+
+    @property
+    def name(self) -> str:
+        """Label of the step for messages."""
+        if self.step < 0:
+            return f"{self.direction} ({self.frequency_hz:g} Hz)"
+        return f"step {self.step} ({self.frequency_hz:g} Hz {self.direction})"
+
+
+@dataclass(frozen=True, slots=True)
+class RigLimit:
+    """A limit of the rig in its display unit, and the demand that it bounds."""
+
+    name: str
+    unit: str
+    allowed: float
+    demand: Callable[[StepDemand], float]
+
+
+def list_limits(rig: RigConfig) -> tuple[RigLimit, ...]:
+    """List the limits of a rig (displacement, velocity, acceleration, force)."""
+    limits = rig.limits
+    stroke = min(limits.stroke_mm, rig.output.span_mm)
+    return (
+        RigLimit("displacement", "mm", stroke, lambda row: row.displacement_m * 1e3),
+        RigLimit("velocity", "mm/s", limits.velocity_mm_s, lambda row: row.velocity_m_s * 1e3),
+        RigLimit(
+            "acceleration",
+            "g",
+            limits.acceleration_g,
+            lambda row: row.acceleration_m_s2 / GRAVITY_M_S2,
+        ),
+        RigLimit("force", "kN", limits.force_kn, lambda row: row.force_n * 1e-3),
+    )
+
+
+def compute_demands(drive: Drive, profile: Profile, rig: RigConfig) -> tuple[StepDemand, ...]:
+    """Compute the peak demands of each motion of the loop check, then of each step.
+
+    Peaks are those of an ideal table over the held cycles and the blend before them. Steps that
+    are not in the drive yet count with their held cycles only.
+    """
+    check_peaks: dict[float, list[tuple[float, float, float]]] = {}
+    step_peaks: dict[int, list[tuple[float, float, float]]] = {}
+    for segment in drive.segments:
+        peaks = _segment_peaks(segment, drive.rate_hz)
+        if segment.step < 0:
+            check_peaks.setdefault(segment.f1, []).append(peaks)
+        else:
+            step_peaks.setdefault(segment.step, []).append(peaks)
+    mass = rig.moving_mass_kg + profile.specimen.mass_kg
+    check_levels = {
+        segment.f1: segment.level1
+        for segment in drive.segments
+        if segment.step < 0 and segment.level1
+    }
+    rows = [
+        _build_demand(Step(-1, LOOP_CHECK, f, check_levels[f]), segment_peaks, mass, rig)
+        for f, segment_peaks in sorted(check_peaks.items())
+    ]
+    for step in drive.steps:
+        rows.append(
+            _build_demand(step, step_peaks.get(step.index, [_steady_peaks(step)]), mass, rig)
+        )
+    return tuple(rows)
+
+
+def _build_demand(
+    step: Step, peaks: list[tuple[float, float, float]], mass: float, rig: RigConfig
+) -> StepDemand:
+    d, v, a = (max(values) for values in zip(*peaks, strict=True))
+    lsb = _steady_peaks(step)[0] / rig.output.lsb_m
+    return StepDemand(step.index, step.direction, step.frequency_hz, d, v, a, mass * a, lsb)
+
+
+def _steady_peaks(step: Step) -> tuple[float, float, float]:
+    """Return the amplitudes of (displacement, velocity, acceleration) of a held step, SI."""
+    w = 2 * math.pi * step.frequency_hz
+    a = step.acceleration_m_s2
+    return a / w**2, a / w, a
+
+
+def _segment_peaks(segment: Segment, rate_hz: float) -> tuple[float, float, float]:
+    """Return the peak (displacement, velocity, acceleration) of a segment, SI."""
+    points = int(min(segment.count, 200 * max(segment.cycles, 4)))
+    x = np.linspace(0.0, 1.0, points + 1)
+    v, a = segment_motion(segment, x, rate_hz)
+    d = segment_displacement(segment, x, rate_hz)
+    return float(abs(d).max()), float(abs(v).max()), float(abs(a).max())
+
+
+def check_limits(
+    rows: tuple[StepDemand, ...], profile: Profile, rig: RigConfig, source: str
+) -> None:
+    """Raise an InputError with step, limit and remedy for every limit that is exceeded."""
+    faults = [
+        *_find_rate_faults(profile, rig),
+        *_find_exceeded_limits(rows, rig),
+        *_find_clipped_sensors(rows, rig),
+    ]
+    coarsest = min((row for row in rows if row.step >= 0), key=lambda row: row.amplitude_lsb)
+    if coarsest.amplitude_lsb < rig.output.least_lsb:
+        faults.append(
+            f"step {coarsest.step} ({coarsest.frequency_hz:g} Hz): amplitude is "
+            f"{coarsest.amplitude_lsb:.1f} steps of the DAC; allowed: at least "
+            f"{rig.output.least_lsb}. Raise sweep.acceleration_g, lower sweep.stop_hz, or use an "
+            "output with more bits or a smaller span"
+        )
+    if faults:
+        heading = f"{source}: the table {rig.name!r} cannot do this test; nothing was started"
+        raise InputError("\n".join([heading, *(f"  {fault}" for fault in faults)]))
+
+
+def _find_rate_faults(profile: Profile, rig: RigConfig) -> list[str]:
+    """List a message for each rate or frequency that the rig does not support."""
+    faults = []
+    if profile.acquisition.rate_hz not in rig.rates_hz:
+        rates = ", ".join(f"{rate:g}" for rate in rig.rates_hz)
+        faults.append(f"acquisition.rate_hz {profile.acquisition.rate_hz:g} Hz; allowed: {rates}")
+    max_hz = rig.limits.frequency_hz
+    requested_hz = {"sweep.stop_hz": profile.sweep.stop_hz}
+    if profile.loop_check.enabled and profile.loop_check.frequencies_hz:
+        requested_hz["loop_check.frequencies_hz"] = max(profile.loop_check.frequencies_hz)
+    faults += [
+        f"{key} {f:g} Hz; allowed: at most {max_hz:g}"
+        for key, f in requested_hz.items()
+        if f > max_hz
+    ]
+    return faults
+
+
+def _find_exceeded_limits(rows: tuple[StepDemand, ...], rig: RigConfig) -> list[str]:
+    """List a message per exceeded limit: its first row and the number of further rows."""
+    faults = []
+    for limit in list_limits(rig):
+        exceeding = [row for row in rows if limit.demand(row) > limit.allowed]
+        if exceeding:
+            first = exceeding[0]
+            suffix = f" and {len(exceeding) - 1} more" if len(exceeding) > 1 else ""
+            remedy = (
+                "Raise loop_check.frequencies_hz or lower loop_check.level"
+                if first.step < 0
+                else "Lower sweep.acceleration_g or raise sweep.start_hz"
+            )
+            faults.append(
+                f"{first.name}{suffix}: {limit.name} {limit.demand(first):.4g} {limit.unit}; "
+                f"allowed: at most {limit.allowed:g} {limit.unit}. {remedy}"
+            )
+    return faults
+
+
+def _find_clipped_sensors(rows: tuple[StepDemand, ...], rig: RigConfig) -> list[str]:
+    """List a message for each sensor of the table that the drive would clip."""
+    faults = []
+    for sensor in rig.sensors:
+        if sensor.channel not in TABLE_SENSORS:
+            continue
+        worst = max(rows, key=TABLE_SENSORS[sensor.channel])
+        peak = TABLE_SENSORS[sensor.channel](worst) / sensor.si_per_unit
+        if peak > sensor.range:
+            faults.append(
+                f"{worst.name}: {sensor.channel} {peak:.4g} {sensor.unit}; allowed: at most its "
+                f"range, {sensor.range:g} {sensor.unit}. Lower sweep.acceleration_g, or use a "
+                "sensor with a larger range"
+            )
+    return faults
+
+
+TABLE_SENSORS: dict[str, Callable[[StepDemand], float]] = {
+    "drive_disp_m": lambda row: row.displacement_m,
+    "table_disp_m": lambda row: row.displacement_m,
+    "table_acc_m_s2": lambda row: row.acceleration_m_s2,
+}
+
+
+def list_drive_warnings(rows: tuple[StepDemand, ...], rig: RigConfig) -> list[str]:
+    """List warnings about low DAC resolution and missing headroom for amplitude correction."""
+    messages = []
+    steps = [row for row in rows if row.step >= 0]
+    coarse = [row for row in steps if row.amplitude_lsb < rig.output.warn_lsb]
+    if coarse:
+        lowest = min(coarse, key=lambda row: row.amplitude_lsb)
+        messages.append(
+            f"{len(coarse)} steps have an amplitude below {rig.output.warn_lsb} DAC steps "
+            f"(least: {lowest.amplitude_lsb:.0f} at {lowest.frequency_hz:g} Hz); their motion may "
+            "be coarse"
+        )
+    stroke = list_limits(rig)[0]
+    tight = [row for row in steps if CORRECTION_HEADROOM * stroke.demand(row) > stroke.allowed]
+    if tight:
+        messages.append(
+            f"{tight[0].name}: {stroke.demand(tight[0]):.4g} mm of {stroke.allowed:g} mm leave no "
+            f"room to correct the command by {100 * (CORRECTION_HEADROOM - 1):.0f} %"
+        )
+    return messages
+
+
+def list_setup_warnings(profile: Profile, rig: RigConfig) -> list[str]:
+    """List warnings about implausible values of the specimen, loop check or output buffer."""
+    messages = []
+    mass_ratio = profile.specimen.mass_kg / rig.moving_mass_kg
+    if not PAYLOAD_RATIO_RANGE[0] <= mass_ratio <= PAYLOAD_RATIO_RANGE[1]:
+        messages.append(
+            f"specimen.mass_kg {profile.specimen.mass_kg:g} is {mass_ratio:.3g} times the moving "
+            f"mass of the table, {rig.moving_mass_kg:g} kg; is it in kg?"
+        )
+    max_gap_m = max(
+        (abs(gap) for gap in profile.specimen.gaps_m if math.isfinite(gap)), default=0.0
+    )
+    if max_gap_m * 1e3 > rig.limits.stroke_mm:
+        messages.append(
+            f"a gap of {max_gap_m * 1e3:g} mm per side exceeds the stroke of the table, "
+            f"{rig.limits.stroke_mm:g} mm; is it in mm?"
+        )
+    targets = plan_targets(profile, rig) if profile.loop_check.enabled else ()
+    requested_hz = max(profile.loop_check.frequencies_hz, default=profile.sweep.stop_hz)
+    if targets and max(target.frequency_hz for target in targets) < 0.999 * requested_hz:
+        highest_hz = max(target.frequency_hz for target in targets)
+        messages.append(
+            f"the loop check ends at {highest_hz:.3g} Hz: at {requested_hz:g} Hz a tenth of the "
+            f"level has fewer than {rig.output.least_lsb} DAC steps; the response above "
+            f"{highest_hz:.3g} Hz is extrapolated"
+        )
+    if rig.backend == "ni" and rig.ni is not None:
+        messages += rig.ni.warnings
+    block_s = profile.acquisition.block_samples / profile.acquisition.rate_hz
+    if block_s > rig.output.lead_s / 4:
+        messages.append(
+            f"a block lasts {block_s:g} s, so {rig.output.lead_s:g} s of queued command are fewer "
+            "than four blocks; lower acquisition.block_samples"
+        )
+    return messages
+
+
+def check_corrected_drive(
+    steps: tuple[Step, ...], response: FrequencyResponse, rig: RigConfig
+) -> list[str]:
+    """List a message per limit that the command corrected for the measured response exceeds.
+
+    The table then moves as demanded, but its command is larger by 1 / gain. So displacement,
+    velocity and acceleration of the command are compared with the limits of the rig, and 1 / gain
+    with MAX_CORRECTION of amplitude control.
+    """
+    rows, excessive = [], []
+    for step in steps:
+        correction = 1.0 / evaluate_gain(response, step.frequency_hz)
+        d, v, a = (correction * peak for peak in _steady_peaks(step))
+        rows.append(
+            StepDemand(step.index, step.direction, step.frequency_hz, d, v, a, 0.0, math.inf)
+        )
+        if correction > MAX_CORRECTION:
+            excessive.append((correction, rows[-1]))
+    faults = [
+        f"corrected for the table's response, {fault}"
+        for fault in _find_exceeded_limits(tuple(rows), rig)
+    ]
+    if excessive:
+        correction, row = max(excessive, key=lambda item: item[0])
+        faults.append(
+            f"{row.name}: the table follows with a gain of {1.0 / correction:.3g}, so the command "
+            f"would have to be {correction:.3g} times as large; "
+            f"allowed: at most {MAX_CORRECTION:g}. "
+            "Lower sweep.stop_hz, or tune the servo"
+        )
+    return faults

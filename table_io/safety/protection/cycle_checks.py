@@ -1,0 +1,278 @@
+"""Cycle checks: level, response, drift and sensor consistency over one whole cycle.
+
+Each function yields suspicions; one that persists over several checks becomes a finding.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from table_io.block import Label
+from table_io.control.order_tracking import track_harmonics
+from table_io.safety.protection.consistency import WeakFormPair, compare_motion, make_window
+from table_io.safety.protection.cycle import TRACKED_HARMONICS, DriveCycle, Suspicion, suspect_drift
+
+MAX_MISMATCH_RATIO = 0.12  # of the motion; slightly more than the limit of the loop check
+MAX_MISMATCH_CHANGE = 0.05  # of the motion; change from the mean ratio of the last ten cycles
+MIN_BASELINE_CHECKS = 6  # checks from which that mean ratio is used
+OFFSET_RANGE_RATIO = 1e-3  # of a sensor's range
+MAX_OFFSET_RESIDUAL_RATIO = 0.3  # remaining share of a mismatch that an offset explains
+OFFSET_AMPLITUDE_RATIO = 0.02  # of the table's motion
+MAX_READ_BACK_ERROR = 0.02  # of the command
+MAX_GAIN_CHANGE = 0.2  # of the identified response
+MAX_LAG_CHANGE_RATIO, MAX_LAG_CHANGE_S = 0.5, 0.003  # of the identified lag, and absolute minimum
+AVERAGING_CHECKS = 20  # ten cycles: longer than a transient
+MAX_SWING_ASYMMETRY = 0.35  # of the swing of the mass: twice that of the chaotic case G4
+SENSOR_PAIRS = (
+    (("table_disp_m",), "table_acc_m_s2"),
+    (("mass_disp_m",), "mass_acc_m_s2"),
+    (("rel_disp_m", "table_disp_m"), "mass_acc_m_s2"),
+)
+
+
+def compare_sensor_pairs(cycle: DriveCycle) -> Iterator[tuple[tuple[str, ...], str, WeakFormPair]]:
+    """Yield (displacement channels, acceleration channel, comparison) of each measured pair."""
+    pairs = [pair for pair in SENSOR_PAIRS if cycle.has(*pair[0], pair[1])]
+    if not pairs:
+        return
+    count = cycle.phase.size
+    middle = 0.5 * float(cycle.phase[0] + cycle.phase[-1])
+    weight = make_window(count, cycle.cycle_count, middle, cycle.context.rate_hz)
+    for names, acceleration in pairs:
+        x = np.sum([cycle.clean_channel(name) for name in names], axis=0)
+        noise = cycle.sigma(*names), cycle.sigma(acceleration)
+        yield (
+            names,
+            acceleration,
+            compare_motion(weight, x, cycle.clean_channel(acceleration), noise),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class PairBaseline:
+    """Baseline of a sensor pair: last consistent comparison, and ratio averaged over checks."""
+
+    last: WeakFormPair
+    ratio: complex = complex("nan")
+    check_count: int = 0
+
+    def update(self, pair: WeakFormPair) -> "PairBaseline":
+        """Return the baseline updated with one more consistent comparison."""
+        if not math.isfinite(abs(pair.ratio)):
+            return PairBaseline(pair, self.ratio, self.check_count)
+        if not self.check_count:
+            return PairBaseline(pair, pair.ratio, 1)
+        weight = 1.0 / min(self.check_count + 1, AVERAGING_CHECKS)
+        return PairBaseline(
+            pair, self.ratio + weight * (pair.ratio - self.ratio), self.check_count + 1
+        )
+
+
+def check_sensor_pair(
+    cycle: DriveCycle,
+    names: tuple[str, ...],
+    acceleration: str,
+    pair: WeakFormPair,
+    baseline: PairBaseline | None,
+) -> Iterator[Suspicion]:
+    """Yield a suspicion if a displacement and an acceleration are inconsistent, or became so.
+
+    The sensor that changed more since the last consistent check is suspected; if the motion itself
+    changes from cycle to cycle, it may be the other one.
+    """
+    share, limit, problem = (
+        pair.mismatch / pair.size if pair.size else 0.0,
+        MAX_MISMATCH_RATIO,
+        "does not fit",
+    )
+    if (
+        share <= MAX_MISMATCH_RATIO
+        and baseline is not None
+        and baseline.check_count >= MIN_BASELINE_CHECKS
+    ):
+        share, limit, problem = (
+            pair.ratio_mismatch(baseline.ratio) / pair.size,
+            MAX_MISMATCH_CHANGE,
+            "no longer fits",
+        )
+    max_offset = OFFSET_RANGE_RATIO * cycle.context.range_si(acceleration) + 6.0 * pair.sigma_offset
+    if share <= limit:
+        # A gain error within its limit may cause an apparent offset of this size.
+        if abs(pair.offset) > max_offset + MAX_MISMATCH_RATIO * pair.average:
+            yield suspect_drift(
+                acceleration, pair.offset, max_offset + MAX_MISMATCH_RATIO * pair.average, "m/s2"
+            )
+        return
+    if (
+        abs(pair.offset) > max_offset
+        and pair.mismatch_without_offset < MAX_OFFSET_RESIDUAL_RATIO * pair.mismatch
+    ):
+        yield suspect_drift(acceleration, pair.offset, max_offset, "m/s2")
+        return
+    suspected, other = names[0], acceleration
+    if baseline is not None:
+        displacement_change = abs(pair.displacement[1] - baseline.last.displacement[1])
+        if abs(pair.acceleration[1] - baseline.last.acceleration[1]) > displacement_change:
+            suspected, other = acceleration, names[0]
+    text = f"{suspected} {problem} {other}: they differ by {100 * share:.0f} % of the motion; "
+    text += f"allowed: {100 * limit:.0f} %"
+    yield Suspicion("consistency", suspected, share, limit, text, group=names[0])
+
+
+def check_table_mean(cycle: DriveCycle) -> Iterator[Suspicion]:
+    """Check that the mean of the table's displacement over a held cycle is that at rest."""
+    if not cycle.has("table_disp_m"):
+        return
+    table = cycle.tones["table_disp_m"]
+    limit = OFFSET_RANGE_RATIO * cycle.context.range_si("table_disp_m")
+    limit += OFFSET_AMPLITUDE_RATIO * table.fundamental + cycle.sigma("table_disp_m")
+    if abs(table.offset) > limit:
+        yield suspect_drift("table_disp_m", table.offset, limit, "m")
+
+
+@dataclass(frozen=True, slots=True)
+class SwingAverage:
+    """Mean and half the range of u in m, averaged over about AVERAGING_CHECKS checks."""
+
+    mean: float = 0.0
+    half: float = 0.0
+    check_count: int = 0
+
+
+def update_swing(cycle: DriveCycle, average: SwingAverage) -> SwingAverage:
+    """Return the average updated with one more cycle; unchanged where u is not measured."""
+    u = cycle.relative_displacement()
+    if u is None:
+        return average
+    weight = 1.0 / min(average.check_count + 1, AVERAGING_CHECKS)
+    mean, half = float(u.mean()), 0.5 * float(np.ptp(u))
+    return SwingAverage(
+        average.mean + weight * (mean - average.mean),
+        average.half + weight * (half - average.half),
+        average.check_count + 1,
+    )
+
+
+def check_mass_mean(cycle: DriveCycle, swing: SwingAverage) -> Iterator[Suspicion]:
+    """Check that the mass swings about the middle, averaged over AVERAGING_CHECKS checks.
+
+    The limit allows for impacts on one side more than on the other, and for unequal gaps.
+    """
+    right, left = cycle.context.profile.specimen.gaps_m
+    gap_asymmetry = abs(right - left) / 2 if right != left else 0.0
+    name = "rel_disp_m" if "rel_disp_m" in cycle.context.rig.channels else "mass_disp_m"
+    if swing.check_count < AVERAGING_CHECKS or name not in cycle.context.rig.channels:
+        return
+    limit = (
+        OFFSET_RANGE_RATIO * cycle.context.range_si(name)
+        + MAX_SWING_ASYMMETRY * swing.half
+        + gap_asymmetry
+    )
+    if abs(swing.mean) > limit:
+        yield suspect_drift(name, swing.mean, limit, "m")
+
+
+def check_level(cycle: DriveCycle) -> Iterator[Suspicion]:
+    """Compare the fundamental of the table's acceleration with the demanded level."""
+    if not cycle.has("table_acc_m_s2") or cycle.level <= 0.0:
+        return
+    settings, measured = cycle.context.profile.protection, cycle.tones["table_acc_m_s2"].fundamental
+    error = measured / cycle.level - 1.0
+    message = f"table at {measured:.4g} m/s2, demanded {cycle.level:.4g} m/s2"
+    # Before the measured cycles the level may still be converging.
+    if abs(error) > settings.alarm and cycle.label == Label.MEASURE:
+        limit = math.copysign(settings.alarm, error)
+        text = f"{message}: {100 * error:+.1f} %; allowed: +-{100 * settings.alarm:g} %"
+        yield Suspicion(
+            "level", "table_acc_m_s2", measured, (1 + limit) * cycle.level, text, "alarm", 1
+        )
+    error_db = 20 * math.log10(max(measured / cycle.level, 1e-9))
+    if abs(error_db) > settings.abort_db:
+        limit = math.copysign(settings.abort_db, error_db)
+        text = f"{message}: {error_db:+.1f} dB; allowed: +-{settings.abort_db:g} dB"
+        bound = 10 ** (limit / 20) * cycle.level
+        yield Suspicion("level", "table_acc_m_s2", measured, bound, text, "stop")
+
+
+def check_command_gain(cycle: DriveCycle) -> Iterator[Suspicion]:
+    """Compare the gain of the command read back with 1.
+
+    It covers commands too small for the check of every sample.
+    """
+    commanded = cycle.tones["command"].fundamental
+    if not cycle.has("drive_disp_m") or commanded == 0.0:
+        return
+    limit = MAX_READ_BACK_ERROR + cycle.context.rig.output.lsb_m / commanded
+    gain = cycle.tones["drive_disp_m"].fundamental / commanded
+    if abs(gain - 1.0) > limit:
+        text = f"the command read back is {gain:.3f} of what was queued; allowed: +-{limit:.3f}"
+        yield Suspicion("command", "drive_disp_m", gain, 1 + math.copysign(limit, gain - 1), text)
+
+
+def measure_transfer(cycle: DriveCycle) -> tuple[complex, complex]:
+    """Return (table displacement, table acceleration) over the command, complex; NaN if lost.
+
+    The acceleration is converted to displacement (-1/w^2).
+    """
+    command = complex(cycle.tones["command"].amplitudes[0])
+    transfers = []
+    for name, scale in (("table_disp_m", 1.0), ("table_acc_m_s2", -(cycle.omega**-2))):
+        measurable = cycle.has(name) and command != 0
+        tone = scale * complex(cycle.tones[name].amplitudes[0])
+        transfers.append(tone / command if measurable else complex("nan"))
+    return transfers[0], transfers[1]
+
+
+def check_response(
+    cycle: DriveCycle, transfers: tuple[complex, complex], reference: complex
+) -> Iterator[Suspicion]:
+    """Compare the table's response to its command with the reference.
+
+    If oil pressure falls, the lag of a servo grows before its amplitude decreases.
+    """
+    ratios = [transfer / reference for transfer in transfers]
+    if not all(math.isfinite(abs(ratio)) and ratio for ratio in ratios):
+        return
+    lag_s = phase_lag_s(reference, cycle.omega)
+    deflection = payload_deflection(cycle, lag_s)
+    gain, max_change = (
+        min(map(abs, ratios), key=lambda ratio: abs(ratio - 1.0)),
+        MAX_GAIN_CHANGE + deflection,
+    )
+    # Both sensors must show the change; if only one does, it is a fault of that sensor.
+    if abs(gain - 1.0) > max_change:
+        text = f"the gain of the table is {gain:.2f} times its earlier value; "
+        text += f"allowed: +-{100 * max_change:.0f} %"
+        yield Suspicion(
+            "response", "table_acc_m_s2", gain, 1 + math.copysign(max_change, gain - 1), text
+        )
+    extra_lag_s = min((-np.angle(ratio) / cycle.omega for ratio in ratios), key=abs)
+    limit = max(MAX_LAG_CHANGE_RATIO * lag_s, MAX_LAG_CHANGE_S) + deflection / cycle.omega
+    if abs(extra_lag_s) > limit:
+        text = (
+            f"the table lags {1e3 * (lag_s + extra_lag_s):.1f} ms behind its command, "
+            f"{1e3 * lag_s:.1f} ms before; allowed: {1e3 * (lag_s + limit):.1f} ms"
+        )
+        yield Suspicion("response", "table_disp_m", lag_s + extra_lag_s, lag_s + limit, text)
+
+
+def payload_deflection(cycle: DriveCycle, lag_s: float) -> float:
+    """Return the table displacement caused by the specimen, relative to the table's amplitude.
+
+    M / m a / p^2 with p = 2 / lag of a servo with a double pole p.
+    """
+    if not cycle.has("mass_acc_m_s2", "table_disp_m"):
+        return 0.0
+    context = cycle.context
+    a = track_harmonics(
+        cycle.clean_channel("mass_acc_m_s2"), cycle.phase, TRACKED_HARMONICS
+    ).fundamental
+    ratio = context.profile.specimen.mass_kg / context.rig.moving_mass_kg
+    return ratio * a * (0.5 * lag_s) ** 2 / cycle.tones["table_disp_m"].fundamental
+
+
+def phase_lag_s(ratio: complex, omega: float) -> float:
+    """Return the lag of a response in s."""
+    return float(-np.angle(ratio)) / omega

@@ -1,0 +1,153 @@
+"""Findings of the protection and their messages."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from table_io.channels import CHANNEL_BY_NAME
+from table_io.config.profile import Profile
+from table_io.records import Event, Trip
+from table_io.safety.protection import sample_checks
+from table_io.safety.protection.cycle import Suspicion, format_si
+from table_io.units import GRAVITY_M_S2
+
+CONTROL_CHANNELS = frozenset(
+    {"drive_disp_m", "table_disp_m", "table_acc_m_s2"}
+)  # needed by the controller
+MACHINE_ALARM_KINDS = frozenset({"level", "response"})  # all other kinds are sensor faults
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Fault at sample `index`; `stop`: it latches a trip, otherwise it raises an alarm."""
+
+    index: int
+    kind: str  # one word: stroke, velocity, lost, stuck, level, ...
+    channel: str
+    value: float  # SI
+    limit: float  # SI
+    text: str
+    stop: bool
+
+    def to_trip(self, decided_at: int) -> Trip:
+        """Return the trip of this finding; `decided_at` is the last sample known by then."""
+        return Trip(
+            self.index, decided_at, self.kind, self.channel, self.value, self.limit, self.text
+        )
+
+    def to_event(self) -> Event:
+        """Return the alarm event of a finding that does not stop the table."""
+        return Event(
+            self.index, "alarm" if self.kind in MACHINE_ALARM_KINDS else "sensor", self.text
+        )
+
+
+class Wording(NamedTuple):
+    """Kind, severity and message template of a code of `sample_checks`.
+
+    `severity` is "stop", "alarm" or "sensor" (depending on the channel); `unit` is that of value
+    and limit ("": unit of the channel), `scale` its factor from SI.
+    """
+
+    kind: str
+    severity: str
+    sentence: str
+    unit: str = ""
+    scale: float = 1.0
+
+
+_BEYOND = "{channel}: {value} at sample {at} exceeds {limit}"
+WORDINGS = {
+    sample_checks.STROKE: Wording("stroke", "stop", _BEYOND, "mm", 1e3),
+    sample_checks.VELOCITY: Wording(
+        "velocity",
+        "stop",
+        "the table moves at {value} at sample {at}; allowed: {limit}",
+        "mm/s",
+        1e3,
+    ),
+    sample_checks.ACCELERATION: Wording("acceleration", "stop", _BEYOND, "g", 1 / GRAVITY_M_S2),
+    sample_checks.FORCE: Wording(
+        "force",
+        "stop",
+        "the actuator force is {value} at sample {at}; allowed: {limit}",
+        "kN",
+        1e-3,
+    ),
+    sample_checks.RAIL: Wording(
+        "rail", "sensor", "{channel} is at the end of its range, {limit}, at sample {at}"
+    ),
+    sample_checks.LOST: Wording("lost", "alarm", "{channel} is lost at sample {at}"),
+    sample_checks.DROPPED: Wording("lost", "alarm", "all channels are lost at sample {at}"),
+    sample_checks.BLIND: Wording(
+        "lost",
+        "sensor",
+        "{channel} is lost for {value} at sample {at}; allowed: {limit}",
+        "ms",
+        1e3,
+    ),
+    sample_checks.STUCK: Wording(
+        "stuck", "sensor", "{channel} has not changed for {value} samples at sample {at}", " ", 1.0
+    ),
+    sample_checks.SILENT: Wording(
+        "silent",
+        "sensor",
+        "{channel} shows less noise than at rest at sample {at}: {value} rms; expected: at least "
+        "{limit}; check its cable",
+    ),
+    sample_checks.SPIKE: Wording(
+        "spike", "alarm", "{channel}: sample {at} deviates by {value} from its neighbors"
+    ),
+    sample_checks.REPEATED: Wording(
+        "repeated",
+        "alarm",
+        "the samples up to {at} repeat those {value} earlier; they are not new measurements",
+        "ms",
+        1e3,
+    ),
+    sample_checks.COMMAND: Wording(
+        "command",
+        "stop",
+        "the command read back differs by {value} from the queued one at sample {at}; "
+        "allowed: {limit}",
+        "mm",
+        1e3,
+    ),
+    sample_checks.FOLLOWING: Wording(
+        "following",
+        "stop",
+        "the table deviates by {value} from its command at sample {at}; allowed: {limit}",
+        "mm",
+        1e3,
+    ),
+}
+
+
+def to_finding(
+    code: int, index: int, channel: str, value: float, limit: float, profile: Profile
+) -> Finding:
+    """Make the finding of a sample check, with its message."""
+    wording = WORDINGS[code]
+    unit = wording.unit or CHANNEL_BY_NAME[channel].unit
+    text = wording.sentence.format(
+        channel=channel,
+        at=index,
+        value=format_si(value * wording.scale, unit),
+        limit=format_si(limit * wording.scale, unit),
+    )
+    stop = _is_stop(wording.severity, channel, profile)
+    return Finding(index, wording.kind, channel, value, limit, text, stop)
+
+
+def confirm_suspicion(suspicion: Suspicion, index: int, profile: Profile) -> Finding:
+    """Make the finding of a suspicion that is confirmed before sample `index`."""
+    stop = _is_stop(suspicion.severity, suspicion.channel, profile)
+    text = f"{suspicion.text} (before sample {index})"
+    return Finding(
+        index, suspicion.kind, suspicion.channel, suspicion.value, suspicion.limit, text, stop
+    )
+
+
+def _is_stop(severity: str, channel: str, profile: Profile) -> bool:
+    if severity == "sensor":
+        return channel in CONTROL_CHANNELS or profile.protection.sensor == "stop"
+    return severity == "stop"

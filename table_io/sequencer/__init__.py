@@ -1,0 +1,108 @@
+"""Test sequencer: state machine that runs the loop check, then tunes and measures each step.
+
+The state is an immutable value. `advance_test(state, block)` adds measured samples; at fixed
+samples it evaluates whole cycles and decides, and the decision changes the command `margin` samples
+later. The same samples therefore give the same command however they are cut into blocks. The table
+never waits for a decision: the drive always continues as if the level were accepted, and always
+ends at rest.
+
+    check --(passes)--> tune --(level accepted)---> hold, then tune at the next step, ...
+                        tune --(not accepted)-----> blend to the corrected level, tune again
+                        hold --(policy decides)---> the next step, or the end
+    open: the operator holds the test at its step; on resume the step is tuned and measured again.
+"""
+
+import math
+from dataclasses import replace
+
+from table_io.adaptive import make_policy
+from table_io.block import Block, Label
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.excitation.drive import Drive
+from table_io.excitation.trajectory import start_trajectory
+from table_io.records import Record
+from table_io.safety import loop_check
+from table_io.sequencer.actions import approach_step, hold_step
+from table_io.sequencer.decisions import DECISION_FUNCTIONS, accept_level
+from table_io.sequencer.state import SequencerState, Stage, TestPlan
+
+__all__ = [
+    "SequencerState", "Stage", "TestPlan", "advance_test", "hold_test", "make_test_plan",
+    "nominal_drive", "resume_test", "start_test",
+]  # fmt: skip
+
+DECISION_HORIZON_S = 0.25  # from an evaluation to the change of the command; a block is shorter
+
+
+def make_test_plan(profile: Profile, rig: RigConfig, replace_after: int = 0) -> TestPlan:
+    """Return the plan of a test on a backend that can change samples `replace_after` ahead."""
+    rate = profile.acquisition.rate_hz
+    horizon = max(math.ceil(DECISION_HORIZON_S * rate), profile.acquisition.block_samples)
+    return TestPlan(profile, rig, replace_after + horizon + 1, make_policy(profile))
+
+
+def start_test(plan: TestPlan) -> SequencerState:
+    """Return the state of a test at rest; a loop check comes first if the profile enables it."""
+    profile = plan.profile
+    trajectory, steps = start_trajectory(profile), profile.sweep.steps
+    targets = loop_check.plan_targets(profile, plan.rig) if profile.loop_check.enabled else ()
+    if not targets:
+        initial = SequencerState(plan, trajectory, trajectory.to_drive(steps), Stage("end"), steps)
+        return replace(approach_step(initial, profile.first_step), changed_from=0)
+    for target in targets:
+        trajectory = trajectory.append_blend(target, -1, profile.sweep.blend_cycles, Label.BLEND)
+        cycles = loop_check.count_hold_cycles(target, profile)
+        count = math.ceil(cycles * trajectory.rate_hz / target.frequency_hz)
+        trajectory = trajectory.append_hold(count, -1, Label.CHECK)
+    trajectory = trajectory.append_blend(
+        replace(trajectory.target, level_m_s2=0.0), -1, profile.sweep.blend_cycles, Label.BLEND
+    )
+    trajectory = trajectory.append_rest(
+        math.ceil(profile.loop_check.rest_s * trajectory.rate_hz) + plan.margin
+    )
+    stage = Stage("check", -1, 0, trajectory.end - plan.margin)
+    return SequencerState(plan, trajectory, trajectory.to_drive(steps), stage, steps)
+
+
+def advance_test(state: SequencerState, block: Block) -> tuple[SequencerState, tuple[Record, ...]]:
+    """Return (state, new records) after a measured block; blocks must come in order."""
+    state = replace(state, blocks=(*state.blocks, block), records=())
+    while state.stage.kind in DECISION_FUNCTIONS and state.stage.last <= block.end:
+        state = DECISION_FUNCTIONS[state.stage.kind](state)
+    blocks = tuple(kept_block for kept_block in state.blocks if kept_block.end > state.stage.first)
+    return replace(state, blocks=blocks if not state.is_finished else (), records=()), state.records
+
+
+def hold_test(state: SequencerState, index: int) -> SequencerState:
+    """Hold the step that contains sample `index`; return the state unchanged outside the sweep."""
+    if state.stage.kind in ("check", "open") or index >= state.drive.planned_end:
+        return state
+    trajectory = state.trajectory.cut(index)
+    if trajectory.end < index or not trajectory.segments or trajectory.segments[-1].step < 0:
+        return state  # the drive is already ending, or the sweep has not begun
+    step = trajectory.segments[-1].step
+    return hold_step(replace(state, trajectory=trajectory, changed_from=trajectory.end), step)
+
+
+def resume_test(state: SequencerState, index: int) -> SequencerState:
+    """Resume from a hold: tune and measure the step again."""
+    if state.stage.kind != "open":
+        return state
+    state = replace(state, trajectory=state.trajectory.cut(index))
+    return replace(approach_step(state, state.stage.step), changed_from=index)
+
+
+def nominal_drive(plan: TestPlan) -> Drive:
+    """Return the nominal drive: every level accepted at once and no operator command."""
+    state = start_test(plan)
+    while not state.is_finished:
+        if state.stage.kind == "check":
+            state = approach_step(state, plan.profile.first_step)
+        elif state.stage.kind == "tune":
+            state = accept_level(state)
+        elif state.stage.step + 1 < len(state.steps):
+            state = approach_step(state, state.stage.step + 1)
+        else:
+            state = replace(state, stage=Stage("end"))  # a policy needs measured results
+    return state.drive

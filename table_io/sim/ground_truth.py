@@ -1,0 +1,266 @@
+"""Ground truth of the simulated table: hidden parameters and effects, in a file of its own.
+
+    [base]                      # in SI, overrides rig file and specimen
+    damper_stiffness_n_m = 36900.0
+    [[effects]]
+    id = "bouc_wen"
+    form = "n"                  # default: first form of the id
+    parameters = { force = 150.0, yield_displacement = 3e-3 }
+    [[effects]]
+    id = "sensor_gain"
+    channel = "mass_acc_m_s2"
+    parameters = { gain = 1.05 }
+
+The rig file states the path and hash of this file; only the simulated backend reads it.
+`DEFINITION_BY_ID` lists the effects that can be hidden. Signs and meanings are those of the effects
+of the same name in the model library; the functional forms differ (`hidden_plant.py`), so that no
+model can reproduce the truth exactly.
+"""
+
+import difflib
+import hashlib
+import math
+from typing import NamedTuple
+
+from pydantic import Field, ValidationInfo, field_validator
+
+from table_io.channels import CHANNEL_BY_NAME
+from table_io.config.base import ConfigModel, Finite, NonNegative, Number, Positive, parse_toml
+from table_io.errors import InputError
+
+
+class HiddenParameter(NamedTuple):
+    """Parameter of an effect in SI; at `vanishing` the effect is absent.
+
+    `vanishing` None: the parameter only shapes the effect. `default` None: it must be given.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    vanishing: float | None
+    typical: float
+    default: float | None = None
+
+
+class EffectDefinition(NamedTuple):
+    """Definition of an effect in one form; `in_library`: the model library has this effect."""
+
+    id: str
+    form: str
+    in_library: bool
+    parameters: tuple[HiddenParameter, ...]
+    meaning: str
+
+    @property
+    def is_sensor_effect(self) -> bool:
+        """True if it acts on a channel and leaves the motion unchanged."""
+        return self.id.startswith("sensor_")
+
+
+Q = HiddenParameter
+SLIP_SPEED = Q("slip_speed", "m/s", 1e-4, 0.01, None, 1e-3, 1e-3)
+EFFECT_DEFINITIONS: tuple[EffectDefinition, ...] = (
+    EffectDefinition("cubic_stiffness", "stretched", True, (Q("k3", "N/m3", -3e7, 1e10, 0.0, 1e7),),
+         "k3 u^3 / sqrt(1 + (u / 0.15 m)^2)"),
+    EffectDefinition("quadratic_damping", "rounded", True,
+         (Q("c2", "N s2/m2", 0.0, 1e6, 0.0, 2e3),),
+         "c2 u' sqrt(u'^2 + (1 mm/s)^2)"),
+    EffectDefinition("coulomb_friction", "tanh", True,
+         (Q("fc", "N", 0.0, 5e3, 0.0, 50.0), SLIP_SPEED),
+         "fc tanh(u' / slip_speed)"),
+    EffectDefinition("coulomb_friction", "stribeck", False,
+         (Q("fc", "N", 0.0, 5e3, 0.0, 40.0), Q("fs", "N", 0.0, 1e4, 0.0, 120.0),
+          Q("stribeck_speed", "m/s", 1e-3, 1.0, None, 0.02), SLIP_SPEED),
+         "(fc + (fs - fc) exp(-(u' / stribeck_speed)^2)) tanh(u' / slip_speed)"),
+    EffectDefinition("bouc_wen", "n", True,
+         (Q("force", "N", 0.0, 1e4, 0.0, 150.0),
+          Q("yield_displacement", "m", 1e-5, 0.1, None, 3e-3),
+          Q("exponent", "", 1.0, 10.0, None, 1.5, 1.5), Q("beta", "", 0.0, 1.0, None, 0.6, 0.6)),
+         "force z; yield_displacement z' = u' - |z|^exponent (beta |u'| sign(z) + (1 - beta) u')"),
+    EffectDefinition("maxwell_damper", "ode", True,
+         (Q("k1", "N/m", 0.0, 1e6, 0.0, 8e3), Q("tau", "s", 1e-4, 100.0, None, 0.05)),
+         "f' = k1 u' - f / tau, in parallel with K and C"),
+    EffectDefinition("bumper_hardening", "exponential", True,
+         (Q("k2", "N/m2", 0.0, 1e10, 0.0, 1e8),),
+         "2 k2 l^2 (exp(d / l) - 1 - d / l) in each bumper, l = 0.1 m"),
+    EffectDefinition("hunt_crossley", "saturating", True, (Q("ch", "N s/m2", 0.0, 1e9, 0.0, 5e5),),
+         "ch l tanh(d / l) d' in each bumper, l = 0.03 m"),
+    EffectDefinition("bumper_maxwell", "ode", True,
+         (Q("kb", "N/m", 0.0, 1e7, 0.0, 2e5), Q("tau", "s", 1e-4, 100.0, None, 0.05)),
+         "b_j' = kb d_j' - b_j / tau in each bumper"),
+    EffectDefinition("bumper_asymmetry", "stiffness", True, (Q("ratio", "", 0.2, 5.0, 1.0, 1.2),),
+         "K_R / K_L = ratio, their mean and the damping kept"),
+    EffectDefinition("gap_offset", "shift", True, (Q("offset", "m", -0.015, 0.015, 0.0, 3e-4),),
+         "right gap + offset, left gap - offset"),
+    EffectDefinition("gap_drift", "linear", True, (Q("rate", "m/s", -1e-4, 1e-4, 0.0, 5e-6),),
+         "both gaps + rate t, t from sample 0"),
+    EffectDefinition("table_tilt", "sine", True, (Q("tilt", "rad/m", -10.0, 10.0, 0.0, 0.1),),
+         "-M g sin(tilt y) on the mass, y the table displacement"),
+    EffectDefinition("mass_error", "mass", True, (Q("ratio", "", 0.5, 2.0, 1.0, 1.05),),
+         "true mass = assumed mass / ratio"),
+    EffectDefinition("sensor_gain", "gain", True, (Q("gain", "", 0.2, 5.0, 1.0, 1.05),),
+         "reading = gain x value"),
+    EffectDefinition("sensor_lag", "delay", True, (Q("lag", "s", 0.0, 0.05, 0.0, 1e-3),),
+         "reading(t) = value(t - lag)"),
+    EffectDefinition("sensor_offset", "after_tare", True,
+         (Q("offset", "unit of the channel", -1e4, 1e4, 0.0, 1e-3),),
+         "reading = value + offset, which arises after the tare"),
+    EffectDefinition("quintic_stiffness", "u5", False,
+         (Q("k5", "N/m5", -1e15, 1e15, 0.0, 3e10),), "k5 u^5"),
+    EffectDefinition("even_stiffness", "u2", False,
+         (Q("ke", "N/m2", -1e7, 1e7, 0.0, 3e5),), "ke u^2"),
+    EffectDefinition("cubic_damping", "v3", False,
+         (Q("c3", "N s3/m3", 0.0, 1e7, 0.0, 2e4),), "c3 u'^3"),
+    EffectDefinition("position_damping", "u2v", False,
+         (Q("cu", "N s/m3", 0.0, 1e9, 0.0, 3e6),), "cu u^2 u'"),
+    EffectDefinition("stiffness_drift", "linear", False,
+         (Q("rate", "1/s", -1e-2, 1e-2, 0.0, 1e-4),),
+         "the damper's spring K (1 + rate t), t from sample 0"),
+    EffectDefinition("dead_band", "tanh", False, (Q("width", "m", 0.0, 0.02, 0.0, 1e-3),),
+         "dead band of +-width of the damper's spring K: -K width tanh(u / width)"),
+    EffectDefinition("adhesion", "pull", False, (Q("force", "N", 0.0, 1e4, 0.0, 100.0),),
+         "contact ends when the bumper pulls with this force"),
+    EffectDefinition("bumper_cubic", "d3", False, (Q("kc", "N/m3", 0.0, 1e13, 0.0, 4e10),),
+         "kc d^3 in each bumper"),
+    EffectDefinition("appendage", "sprung", False,
+         (Q("mass", "kg", 0.0, 200.0, 0.0, 20.0), Q("frequency", "Hz", 0.1, 50.0, None, 6.0),
+          Q("damping_ratio", "", 0.0, 1.0, None, 0.02, 0.02)),
+         "a second mass on a spring and a dashpot on the specimen"),
+)  # fmt: skip
+# By (id, form); the first form of an id is its default.
+DEFINITION_BY_ID: dict[tuple[str, str], EffectDefinition] = {
+    (definition.id, definition.form): definition for definition in EFFECT_DEFINITIONS
+}
+
+
+def _suggest(name: str, known_names: list[str]) -> str:
+    matches = difflib.get_close_matches(name, known_names, 1, 0.4)
+    return f"did you mean {matches[0]!r}?" if matches else f"known: {', '.join(known_names)}"
+
+
+def _find_parameter_faults(definition: EffectDefinition, given: dict[str, float]) -> list[str]:
+    """List a message for each unknown, missing or out-of-range parameter of an effect."""
+    known_names = [parameter.name for parameter in definition.parameters]
+    faults = [
+        f"no parameter {name!r}; {_suggest(name, known_names)}"
+        for name in given
+        if name not in known_names
+    ]
+    for parameter in definition.parameters:
+        value = given.get(parameter.name, parameter.default)
+        allowed = f"allowed: {parameter.low:g} to {parameter.high:g} {parameter.unit}".rstrip()
+        if value is None:
+            faults.append(f"lacks {parameter.name!r}; add it, {allowed}")
+        elif not parameter.low <= value <= parameter.high:
+            faults.append(f"{parameter.name} = {value:g}; {allowed}")
+    return faults
+
+
+class HiddenEffect(ConfigModel):
+    """One entry of [[effects]]; `parameters` is completed with defaults."""
+
+    id: str
+    form: str = Field("", validate_default=True, description="Empty: first form of the id.")
+    channel: str | None = None
+    # Declared last: its validation needs the other fields.
+    parameters: dict[str, Finite] = Field(description="Parameters of the effect, in SI.")
+
+    @field_validator("id")
+    @classmethod
+    def _check_id(cls, name: str) -> str:
+        ids = list(dict.fromkeys(definition.id for definition in EFFECT_DEFINITIONS))
+        if name not in ids:
+            raise ValueError(f"effect {name!r} is unknown; {_suggest(name, ids)}")
+        return name
+
+    @field_validator("form")
+    @classmethod
+    def _check_form(cls, form: str, info: ValidationInfo) -> str:
+        forms = [
+            definition.form
+            for definition in EFFECT_DEFINITIONS
+            if definition.id == info.data.get("id")
+        ]
+        if not forms:
+            return form
+        if form and form not in forms:
+            raise ValueError(f"{info.data['id']} has no form {form!r}; {_suggest(form, forms)}")
+        return form or forms[0]
+
+    @field_validator("parameters")
+    @classmethod
+    def _complete_parameters(
+        cls, given: dict[str, float], info: ValidationInfo
+    ) -> dict[str, float]:
+        definition = DEFINITION_BY_ID.get((info.data.get("id", ""), info.data.get("form", "")))
+        if definition is None:
+            return given
+        faults, channel = _find_parameter_faults(definition, given), info.data.get("channel")
+        if not definition.is_sensor_effect and channel is not None:
+            faults.append("has no channel; leave it out")
+        elif definition.is_sensor_effect and channel not in CHANNEL_BY_NAME:
+            faults.append(f"needs a channel; {_suggest(str(channel), list(CHANNEL_BY_NAME))}")
+        if faults:
+            raise ValueError(f"{definition.id}: " + "; ".join(faults))
+        return {
+            parameter.name: given.get(parameter.name, parameter.default or 0.0)
+            for parameter in definition.parameters
+        }
+
+    @property
+    def definition(self) -> EffectDefinition:
+        return DEFINITION_BY_ID[self.id, self.form]
+
+
+class BaseOverrides(ConfigModel):
+    """True values that override rig file and specimen, SI; None: no override."""
+
+    mass_kg: Positive | None = None
+    damper_stiffness_n_m: Positive | None = None
+    damper_damping_n_s_m: NonNegative | None = None
+    bumper_stiffness_n_m: Positive | None = None
+    bumper_damping_n_s_m: Positive | None = None
+    gap_right_m: Number | None = None
+    gap_left_m: Number | None = None
+
+    @field_validator("gap_right_m", "gap_left_m")
+    @classmethod
+    def _check_gap(cls, gap: float | None, info: ValidationInfo) -> float | None:
+        if gap is not None and (math.isnan(gap) or gap == -math.inf):
+            raise ValueError(
+                f"{info.field_name} is {gap}; allowed: m, or inf without a bumper on this side"
+            )
+        return gap
+
+
+class GroundTruth(ConfigModel):
+    """Ground-truth file: overridden parameters of the rig and its hidden effects."""
+
+    base: BaseOverrides = BaseOverrides()
+    effects: tuple[HiddenEffect, ...] = ()
+
+    @field_validator("effects")
+    @classmethod
+    def _check_unique(cls, effects: tuple[HiddenEffect, ...]) -> tuple[HiddenEffect, ...]:
+        names = [(effect.id, effect.channel or "") for effect in effects]
+        duplicates = sorted({" ".join(name).strip() for name in names if names.count(name) > 1})
+        if duplicates:
+            raise ValueError(f"{', '.join(duplicates)} more than once; keep one of each")
+        return effects
+
+
+def parse_ground_truth(raw: bytes, sha256: str, source: str) -> GroundTruth:
+    """Parse the bytes of a ground-truth file; InputError if they do not match the hash."""
+    digest = hashlib.sha256(raw).hexdigest()
+    if digest != sha256.lower():
+        raise InputError(
+            f"the SHA-256 of this ground-truth file is {digest}",
+            where=source,
+            key="truth_sha256",
+            value=sha256,
+            remedy="use the file that the rig file was written for, or enter its hash as "
+            "truth_sha256 in the rig file",
+        )
+    return parse_toml(raw.decode(errors="replace"), GroundTruth, source)

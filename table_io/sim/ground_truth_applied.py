@@ -1,0 +1,110 @@
+"""Application of a ground truth: plant with hidden effects, and distortion of sensor readings.
+
+Everything in SI. Parameters and signs as in `ground_truth.DEFINITION_BY_ID`.
+"""
+
+import math
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from table_io.block import Float1D, Float2D
+from table_io.errors import InputError
+from table_io.sim.ground_truth import GroundTruth
+from table_io.sim.hidden_plant import HiddenCoefficients, HiddenPlant
+from table_io.sim.plant import Plant
+
+# Parameters whose coefficient has a different name.
+COEFFICIENT_NAMES = {
+    "coulomb_friction": {"stribeck_speed": "vs", "slip_speed": "v0"},
+    "bouc_wen": {"force": "fy", "yield_displacement": "uy", "exponent": "n"},
+    "bumper_maxwell": {"tau": "tau_b"},
+    "gap_drift": {"rate": "gap_rate"},
+    "stiffness_drift": {"rate": "stiffness_rate"},
+    "dead_band": {"width": "dead_width"},
+    "adhesion": {"force": "pull"},
+    "appendage": {"mass": "m2", "frequency": "w2", "damping_ratio": "z2"},
+}
+CUBIC_POINTS = 4  # samples of the interpolation
+
+
+def build_hidden_plant(plant: Plant, truth: GroundTruth) -> HiddenPlant:
+    """Build the plant with hidden effects from the nominal plant."""
+    parameters: dict[str, Any] = {field.name: getattr(plant, field.name) for field in fields(Plant)}
+    parameters |= truth.base.model_dump(exclude_none=True)
+    coefficients: dict[str, Any] = {}
+    for effect in truth.effects:
+        p = effect.parameters
+        match effect.id:
+            case "mass_error":
+                parameters["mass_kg"] /= p["ratio"]
+            case "gap_offset":
+                parameters["gap_right_m"] += p["offset"]
+                parameters["gap_left_m"] -= p["offset"]
+            case "bumper_asymmetry":
+                coefficients["stiffness_ratio"] = (
+                    2 * p["ratio"] / (1 + p["ratio"]),
+                    2 / (1 + p["ratio"]),
+                )
+            case _ if not effect.definition.is_sensor_effect:
+                names = COEFFICIENT_NAMES.get(effect.id, {})
+                coefficients |= {names.get(key, key): value for key, value in p.items()}
+    if "fc" in coefficients:
+        coefficients.setdefault("fs", coefficients["fc"])
+    if "w2" in coefficients:
+        coefficients["w2"] *= 2 * math.pi
+    return HiddenPlant(**parameters, hidden=HiddenCoefficients(**coefficients))
+
+
+class SensorDistortion:
+    """Distortion of sensor readings by gain, lag and offset; samples must come in order."""
+
+    def __init__(self, truth: GroundTruth, channels: tuple[str, ...], rate_hz: float) -> None:
+        self._rate_hz = rate_hz
+        for effect in truth.effects:
+            if effect.channel is not None and effect.channel not in channels:
+                raise InputError(
+                    "the rig has no sensor of this channel",
+                    where=f"ground truth, effect {effect.id}",
+                    key="channel",
+                    value=effect.channel,
+                    allowed=", ".join(channels),
+                )
+        self._errors = [
+            (effect.id, channels.index(str(effect.channel)), next(iter(effect.parameters.values())))
+            for effect in sorted(truth.effects, key=lambda effect: effect.id == "sensor_offset")
+            if effect.definition.is_sensor_effect
+        ]
+        self._history: dict[int, Float1D] = {}
+
+    def apply(self, values: Float2D) -> Float2D:
+        """Return distorted readings without noise from true values, (channel, sample) each."""
+        values = values.copy()
+        for effect_id, row, size in self._errors:
+            match effect_id:
+                case "sensor_gain":
+                    values[row] *= size
+                case "sensor_offset":
+                    values[row] += size
+                case "sensor_lag":
+                    values[row] = self._delay(row, values[row], size * self._rate_hz)
+        return values
+
+    def _delay(self, row: int, values: Float1D, lag: float) -> Float1D:
+        """Return values(t - lag), lag in samples, by causal cubic interpolation, (sample,)."""
+        whole_samples = max(math.floor(lag) - 1, 0)
+        depth = whole_samples + CUBIC_POINTS - 1
+        if values.size == 0:
+            return values
+        history = self._history.get(row, np.full(depth, values[0]))  # constant before sample 0
+        known = np.concatenate([history, values])
+        self._history[row] = known[known.size - depth :]
+        positions = (
+            whole_samples + np.arange(CUBIC_POINTS) - lag
+        )  # of the four samples, relative to the delayed time
+        weights = [math.prod(a / (a - b) for a in positions if a != b) for b in positions]
+        delayed: Float1D = np.zeros(values.size)
+        for back, weight in enumerate(weights):
+            delayed += weight * known[depth - whole_samples - back :][: values.size]
+        return delayed

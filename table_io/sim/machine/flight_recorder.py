@@ -1,0 +1,147 @@
+"""Flight recorder of the machine: accepted commands, played command and plant, every sample.
+
+The file consists of wire messages, written unbuffered so that it survives any process: SESSION
+begins a session, STARTED is its time of sample 0, QUEUE an accepted command, PLAYED the samples,
+NOTE any other event.
+"""
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from table_io.backends.command_buffer import CommandBuffer
+from table_io.backends.machine.protocol import (
+    MachineMessage,
+    MessageKind,
+    MessageParser,
+    ProtocolError,
+    encode_message,
+    text_message,
+    values_message,
+)
+from table_io.block import Float1D, Float2D
+from table_io.errors import InputError
+from table_io.sim.plant import SIGNALS
+
+# Of each sample, SI: the command as the converter played it, and the plant.
+RECORDED_FIELDS = ("command_m", *SIGNALS)
+
+
+class FlightRecorder:
+    """Writer of a new file; InputError if it exists or cannot be created.
+
+    A later write error is reported once and ends the recording, but does not stop the machine.
+    """
+
+    def __init__(self, path: Path, notify: Callable[[str], None]) -> None:
+        self._path = path
+        self._notify = notify
+        try:
+            self._file = path.open("xb", buffering=0)
+        except FileExistsError:
+            raise InputError(
+                "the file exists and will not be overwritten",
+                where=f"--log {path}",
+                remedy="give the name of a new file",
+            ) from None
+        except OSError as error:
+            raise InputError(f"cannot write: {error.strerror}", where=f"--log {path}") from None
+
+    def begin_session(self, rate_hz: float, volts_per_m: float) -> None:
+        """Record that a controller has claimed the machine, with sample rate and command scale."""
+        header = {"rate_hz": rate_hz, "volts_per_m": volts_per_m}
+        self._write(text_message(MessageKind.SESSION, json.dumps(header)))
+
+    def record_start(self, epoch_s: float) -> None:
+        """Record the time of sample 0 on the monotonic clock, in s."""
+        self._write(values_message(MessageKind.STARTED, np.array([epoch_s])))
+
+    def record_command(self, index: int, volts: Float1D) -> None:
+        """Record an accepted command in V, (sample,)."""
+        self._write(values_message(MessageKind.QUEUE, volts, index))
+
+    def record_samples(self, index: int, command_m: Float1D, signals: Float2D) -> None:
+        """Record played samples: command in m, (sample,), and SIGNALS, (6, sample)."""
+        self._write(values_message(MessageKind.PLAYED, np.vstack([command_m, signals]).T, index))
+
+    def note(self, index: int, text: str) -> None:
+        """Record an event at sample `index`."""
+        self._write(text_message(MessageKind.NOTE, text, index))
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _write(self, message: MachineMessage) -> None:
+        if self._file.closed:
+            return
+        try:
+            self._file.write(encode_message(message))
+        except OSError as error:
+            self._file.close()
+            self._notify(f"--log {self._path}: the flight recording ends here: {error.strerror}")
+
+
+@dataclass
+class RecordedSession:
+    """Recording of one controller's connection, until rest."""
+
+    rate_hz: float
+    volts_per_m: float
+    epoch_s: float = math.nan
+    # (field, sample)
+    samples: Float2D = field(default_factory=lambda: np.empty((len(RECORDED_FIELDS), 0)))
+    notes: list[tuple[int, str]] = field(default_factory=list)
+    missing: int = 0  # samples
+    queued: CommandBuffer = field(default_factory=CommandBuffer)
+
+    def row(self, name: str) -> Float1D:
+        """Return one of RECORDED_FIELDS, (sample,)."""
+        line: Float1D = self.samples[RECORDED_FIELDS.index(name)]
+        return line
+
+    @property
+    def command_m(self) -> Float1D:
+        """Command as accepted, before the converter, in m, (sample,)."""
+        return self.queued.values(0, self.samples.shape[1]) / self.volts_per_m
+
+
+def read_flight_record(path: Path) -> list[RecordedSession]:
+    """Read the sessions of a flight record, also of a truncated one."""
+    sessions: list[RecordedSession] = []
+    session_chunks: list[list[Float2D]] = []
+    for message in _parse_messages(path):
+        if message.kind is MessageKind.SESSION:
+            sessions.append(RecordedSession(**message.json))
+            session_chunks.append([])
+        elif message.kind is MessageKind.STARTED:
+            sessions[-1].epoch_s = float(message.values[0])
+        elif message.kind is MessageKind.QUEUE:
+            sessions[-1].queued.replace_from(message.index, message.values)
+        elif message.kind is MessageKind.NOTE:
+            sessions[-1].notes.append((message.index, message.text))
+        elif message.kind is MessageKind.PLAYED:
+            chunk = message.values.reshape(-1, len(RECORDED_FIELDS)).T
+            sessions[-1].missing += abs(
+                message.index - sum(part.shape[1] for part in session_chunks[-1])
+            )
+            session_chunks[-1].append(chunk)
+    for session, chunks in zip(sessions, session_chunks, strict=True):
+        if chunks:
+            session.samples = np.concatenate(chunks, axis=1)
+    return sessions
+
+
+def _parse_messages(path: Path) -> list[MachineMessage]:
+    parser = MessageParser()
+    try:
+        return parser.feed(path.read_bytes())
+    except ProtocolError:
+        raise InputError(
+            "not a flight record of a table",
+            where=path,
+            remedy="give a file written by shaketwin table --log",
+        ) from None

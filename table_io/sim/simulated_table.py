@@ -1,0 +1,272 @@
+"""Simulated table: backend with converters and sensors around the plant, paced by any clock.
+
+Samples depend neither on the clock nor on the division of reads: a run is bit-identical in real
+time and as fast as possible. Injected faults are in `faults.py`.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from table_io.backends import SAMPLE_TIMEOUT_S, MachineLost
+from table_io.block import Float1D, Float2D
+from table_io.clock import Clock
+from table_io.config.profile import Specimen
+from table_io.config.rig import OutputConfig, RigConfig, SimulatedTableConfig
+from table_io.config.sensor import SensorConfig
+from table_io.errors import InputError
+from table_io.sim.faults import build_faults
+from table_io.sim.ground_truth import GroundTruth, parse_ground_truth
+from table_io.sim.ground_truth_applied import SensorDistortion, build_hidden_plant
+from table_io.sim.plant import SIGNALS, Plant
+
+MIN_REPLACE_AHEAD_S = 0.02
+
+
+def build_plant(table: SimulatedTableConfig, specimen: Specimen, rate_hz: float) -> Plant:
+    """Build the nominal plant of a simulated table and a specimen."""
+    right, left = specimen.gaps_m
+    return Plant(
+        mass_kg=specimen.mass_kg,
+        damper_stiffness_n_m=table.damper_stiffness_n_m,
+        damper_damping_n_s_m=table.damper_damping_n_s_m,
+        bumper_stiffness_n_m=table.bumper_stiffness_n_m,
+        bumper_damping_n_s_m=table.bumper_damping_n_s_m,
+        gap_right_m=right,
+        gap_left_m=left,
+        table_mass_kg=table.moving_mass_kg,
+        servo_bandwidth_hz=table.servo_bandwidth_hz,
+        servo_delay_s=table.servo_delay_ms * 1e-3,
+        payload_reaction=table.payload_reaction,
+        rate_hz=rate_hz,
+    )
+
+
+def load_ground_truth(table: SimulatedTableConfig) -> GroundTruth | None:
+    """Load the ground truth of a simulated table; None without one; InputError if unreadable."""
+    if table.truth is None:
+        return None
+    try:
+        raw = Path(table.truth).read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"cannot read the ground-truth file: {error}",
+            key="simulated.truth",
+            value=table.truth,
+            remedy="give its path, absolute or relative to the working directory",
+        ) from None
+    return parse_ground_truth(raw, str(table.truth_sha256), table.truth)
+
+
+def quantize_command(volts: Float1D, output: OutputConfig) -> Float1D:
+    """Quantize a command as the converter plays it: m, (sample,), whole steps, clipped."""
+    step = 2 * output.span_v / 2**output.bits
+    max_code = 2 ** (output.bits - 1)
+    codes = np.clip(np.rint(volts / step), -max_code, max_code - 1)
+    metres: Float1D = codes * (step / output.volts_per_m)
+    return metres
+
+
+class Digitizer:
+    """Digitizer: adds offset and noise to true values, clips and quantizes them to volts."""
+
+    def __init__(self, sensors: tuple[SensorConfig, ...]) -> None:
+        def column(values: list[float]) -> Float2D:
+            return np.array(values, dtype=np.float64)[:, None]
+
+        self._gain = column([s.volts_per_si for s in sensors])
+        # The command read back has no sensor and is never tared: no offset.
+        wired = [s.channel == "drive_disp_m" for s in sensors]
+        offsets = [
+            0.0 if w else s.offset * s.si_per_unit for s, w in zip(sensors, wired, strict=True)
+        ]
+        self._offset = column(offsets)
+        self._noise = column([s.noise_rms * s.si_per_unit for s in sensors])
+        self._half = column([2.0 ** (s.bits - 1) for s in sensors])
+        self._step = column([abs(s.range * s.volts_per_unit) for s in sensors]) / self._half
+
+    def digitize(self, values: Float2D, noise: np.random.Generator) -> Float2D:
+        """Return volts, (channel, sample), from SI values of the same shape.
+
+        Noise is drawn sample by sample, so it does not depend on the division into calls.
+        """
+        samples = noise.standard_normal(values.shape[::-1]).T
+        codes = np.rint((values + self._offset + self._noise * samples) * self._gain / self._step)
+        digitised: Float2D = np.clip(codes, -self._half, self._half - 1) * self._step
+        return digitised
+
+
+class SimulatedBackend:
+    """Backend of the simulated table; sample i is taken at start + i / rate_hz."""
+
+    def __init__(self, rig: RigConfig, specimen: Specimen, rate_hz: float, clock: Clock) -> None:
+        if rig.simulated is None:
+            raise InputError(
+                "the rig file has no section [simulated]",
+                where=f"rig {rig.name}",
+                remedy="add it, or choose another backend",
+            )
+        self.channels = rig.channels
+        self.rate_hz = rate_hz
+        self.replace_after = round(MIN_REPLACE_AHEAD_S * rate_hz)
+        self._rig = rig
+        self._clock = clock
+        self._plant = build_plant(rig.simulated, specimen, rate_hz)
+        self._distortion: SensorDistortion | None = None
+        if truth := load_ground_truth(rig.simulated):
+            self._plant = build_hidden_plant(self._plant, truth)
+            self._distortion = SensorDistortion(truth, rig.channels, rate_hz)
+        self._plant_with_share = lru_cache(2)(self._build_plant_with_share)
+        self._faults = build_faults(rig.simulated.faults, rig, rate_hz, rig.simulated.seed)
+        self._state = self._plant.rest_state()
+        self._digitizer = Digitizer(rig.sensors)
+        self._noise = np.random.default_rng([rig.simulated.seed, 0])
+        self._tare_noise = np.random.default_rng([rig.simulated.seed, 1])
+        # Played command in m from sample `_origin` on; the output is at 0 V before sample 0.
+        self._history = self._plant.history_samples + self._faults.history_samples
+        self._command = np.zeros(self._history)
+        self._origin = -self._history
+        self._next = 0
+        self._epoch: float | None = None
+        self._is_open = False
+        # Called with the true values of samples taken: (first sample, command in m, SIGNALS in SI).
+        self.observer: Callable[[int, Float1D, Float2D], None] | None = None
+
+    def open(self) -> None:
+        """Check the rate and compile the plant, so that the first read is not late."""
+        self._rig.check_rate(self.rate_hz)
+        no_samples = np.empty((len(self._plant.signals), 0))
+        self._plant.advance(
+            self._plant.rest_state(), np.zeros(self._plant.history_samples), no_samples
+        )
+        self._is_open = True
+
+    def tare(self, samples: int) -> Float2D:
+        """Return volts at rest before precompression, (channel, sample)."""
+        self._require(self._is_open, "open() comes first")
+        return self._digitizer.digitize(np.zeros((len(self.channels), samples)), self._tare_noise)
+
+    def queue(self, index: int, volts: Float1D) -> None:
+        """Replace the command from sample `index` on, in V, (sample,); the last value is held."""
+        self._require(self._is_open, "open() comes first")
+        earliest = 0 if self._epoch is None else self._newest_sample() + self.replace_after
+        if index < earliest:
+            raise ValueError(
+                f"the command from sample {index} on is already in the device; allowed: from "
+                f"{earliest} on ({self.replace_after} after the newest sample taken)"
+            )
+        if not np.isfinite(volts).all():
+            raise ValueError(
+                f"the command from sample {index} on contains NaN or inf; send finite volts"
+            )
+        oldest = self._next - self._history
+        played = self._command_between(oldest, index)
+        self._command = np.concatenate([played, quantize_command(volts, self._rig.output)])
+        self._origin = oldest
+
+    def start(self) -> None:
+        """Start output and input at sample 0, now."""
+        self._require(self._is_open, "open() comes first")
+        self._require(self._epoch is None, "start() was called already; call it once")
+        self._epoch = self._clock.now()
+
+    def read(self, samples: int) -> Float2D:
+        """Wait for the next samples and return their volts, (channel, sample)."""
+        self._require(self._is_open, "the backend is closed")
+        self._wait_for_samples(self._next, self._next + samples)
+        return self.take(samples)
+
+    def lateness_s(self, first: int, last: int) -> float:
+        """Return the delay of samples first .. last - 1 after their schedule, s; inf: never."""
+        return self._faults.lateness_s(first, last)
+
+    def take(self, samples: int) -> Float2D:
+        """Return volts of the next samples as `read` does, but without waiting."""
+        first = self._next
+        queued = self._command_between(first - self._history, first + samples)
+        drive = self._faults.apply_to_output(first - self._history, queued)[
+            self._faults.history_samples :
+        ]
+        command = self._faults.apply_to_servo(first - self._plant.history_samples, drive)
+        signals = np.empty((len(self._plant.signals), samples))
+        done = 0
+        for count, share in self._faults.bandwidth_shares(first, samples):
+            end = done + count
+            span = command[done : self._plant.history_samples + end]
+            self._plant_with_share(share).advance(self._state, span, signals[:, done:end])
+            done = end
+        self._next += samples
+        played_m = drive[self._plant.history_samples :]
+        if self.observer is not None:
+            self.observer(first, played_m, signals[: len(SIGNALS)])
+        values = self._true_values(played_m, signals)
+        if self._distortion is not None:
+            values = self._distortion.apply(values)
+        return self._faults.apply_to_inputs(first, self._digitizer.digitize(values, self._noise))
+
+    def scheduled_time_s(self, index: int) -> float:
+        """Return the time on the session's clock at which sample `index` is taken, in s."""
+        if self._epoch is None:
+            raise RuntimeError("simulated table: start() comes first")
+        return self._epoch + index / self.rate_hz
+
+    def close(self) -> None:
+        """Release the machine; safe to call twice."""
+        self._is_open = False
+
+    def _wait_for_samples(self, first: int, last: int) -> None:
+        """Wait for samples first .. last - 1; MachineLost after SAMPLE_TIMEOUT_S."""
+        due_s, late_s = self.scheduled_time_s(last - 1), self.lateness_s(first, last)
+        self._clock.wait_until(due_s + min(late_s, SAMPLE_TIMEOUT_S))
+        if late_s > SAMPLE_TIMEOUT_S:
+            raise MachineLost(
+                f"the simulated table has not sent the samples up to {last - 1}, "
+                f"{SAMPLE_TIMEOUT_S:g} s after their schedule; the queued command brings the table "
+                "to rest. Check the table, then start again"
+            )
+
+    def _newest_sample(self) -> int:
+        """Return the index of the newest sample taken so far, read or not."""
+        elapsed_s = self._clock.now() - self.scheduled_time_s(0)
+        return max(self._next - 1, math.floor(elapsed_s * self.rate_hz + 1e-6))
+
+    def _build_plant_with_share(self, share: float) -> Plant:
+        """Return the plant with this fraction of its servo's bandwidth."""
+        bandwidth = share * self._plant.servo_bandwidth_hz
+        return self._plant if share == 1.0 else replace(self._plant, servo_bandwidth_hz=bandwidth)
+
+    def _require(self, condition: bool, remedy: str) -> None:
+        if not condition:
+            raise RuntimeError(f"simulated table: {remedy}")
+
+    def _command_between(self, first: int, last: int) -> Float1D:
+        """Return the played command of samples first .. last - 1, m; the last value is held."""
+        start, stop = first - self._origin, last - self._origin
+        size = self._command.size
+        if stop <= size:
+            return self._command[start:stop]
+        tail = np.full(stop - max(start, size), self._command[-1])
+        return np.concatenate([self._command[start:], tail])
+
+    def _true_values(self, drive: Float1D, signals: Float2D) -> Float2D:
+        """Return true values in SI, (channel, sample); the two cells of a side share its force."""
+        y, y_acc, x, x_acc, right, left, *hidden = signals
+        balance = -self._plant.mass_kg * x_acc - right - left
+        true = {
+            "drive_disp_m": drive,
+            "table_disp_m": y,
+            "table_acc_m_s2": y_acc,
+            "mass_disp_m": x,
+            "mass_acc_m_s2": x_acc,
+            "force_r1_n": 0.5 * right,
+            "force_r2_n": 0.5 * right,
+            "force_l1_n": -0.5 * left,
+            "force_l2_n": -0.5 * left,
+            "damper_force_n": hidden[0] if hidden else balance,
+            "rel_disp_m": x - y,
+        }
+        return np.array([true[name] for name in self.channels])

@@ -1,0 +1,239 @@
+"""A campaign from its file to its end: order, refusals, what a resume keeps."""
+
+import tomllib
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
+
+from table_io.config.profile import SetUpConfirmation
+from table_io.errors import InputError
+from tests.campaign.campaigns import LISTED, Players, asked, files, prepared, statuses
+from twin.campaign import command
+from twin.campaign.campaign_state import append_sections
+from twin.campaign.command import run_campaign
+from twin.campaign.config import CampaignPlan
+from twin.campaign.state import (
+    LOCK_FILE,
+    copy_configs,
+    hold_lock,
+    read_state,
+    require_unchanged,
+    write_state,
+)
+from twin.run.run_config import RunConfig
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    return prepared(tmp_path, monkeypatch)
+
+
+def test_the_runs_are_played_in_order_each_in_a_folder_of_its_own(folder: Path) -> None:
+    assert run_campaign(asked(folder)) == 0
+    assert [Path(one.folder).name for one in Players.given] == ["01-free", "02-g4", "03-again"]
+    assert [one.name for one in Players.given] == ["free", "g4", "g4"]
+    assert statuses(folder) == ["complete"] * 3
+    assert (folder / "out" / "campaign.toml").read_text() == LISTED
+
+
+def test_a_recording_says_what_was_asked_before_it_and_who_answered(folder: Path) -> None:
+    run_campaign(asked(folder))
+    noted = [tomllib.loads(one.profile_toml)["set_up"] for one in Players.given]
+    assert [one["asked"] for one in noted] == ["Take the bumpers away", "Set 4 mm", ""]
+    assert [one["answer"] for one in noted] == ["unattended", "unattended", "not asked"]
+    assert noted[1]["notes"] == "look at the bolts"
+    assert noted[0]["campaign"] == "Three gaps"
+    told = read_state(folder / "out").runs[1].set_up[0]
+    assert (told.who, told.at) == (noted[1]["who"], noted[1]["at"])
+    assert told.who
+    assert told.at.startswith("20")
+
+
+def test_any_text_of_an_operator_is_kept_as_it_is(folder: Path) -> None:
+    wild = 'a "quote" \\ back\nline\ttab \x7f \u2212 \U0001f600'
+    card = SetUpConfirmation(campaign=wild, label="l", asked=wild, answer="done", who="w", at="now")
+    text = append_sections((folder / "g4.toml").read_text(), {"set_up": card})
+    assert tomllib.loads(text)["set_up"]["asked"] == wild
+
+
+def test_after_a_protection_no_run_begins_and_it_says_how_to_go_on(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Players.ends["g4"] = ("aborted", 2)
+    assert run_campaign(asked(folder)) == 3
+    assert statuses(folder) == ["complete", "interrupted", "planned"]
+    said = capsys.readouterr().out
+    assert "g4, again" in said
+    again = f"shaketwin campaign {folder}/c.toml --out {folder}/out --resume --speed max"
+    assert again in said.replace("\n", "")
+
+
+def test_a_resume_keeps_what_is_complete_and_goes_on_with_the_rest(folder: Path) -> None:
+    Players.ends["g4"] = ("aborted", 2)
+    run_campaign(asked(folder))
+    kept = files(folder / "out")
+    Players.given.clear()
+    Players.ends.clear()
+    assert run_campaign(asked(folder, resume=True)) == 0
+    assert [Path(one.folder).name for one in Players.given] == ["02-g4-2", "03-again"]
+    assert statuses(folder) == ["complete"] * 3
+    assert {name: files(folder / "out")[name] for name in kept} == kept
+    assert "resume" not in tomllib.loads(Players.given[0].profile_toml)  # forward began anew
+
+
+def test_a_run_goes_on_at_the_direction_that_was_interrupted(folder: Path) -> None:
+    Players.ends["g4"] = ("stopped", 5)  # three forward, two of three backward
+    run_campaign(asked(folder))
+    first = read_state(folder / "out").runs[1].parts[0].run
+    Players.given.clear()
+    Players.ends.clear()
+    run_campaign(asked(folder, resume=True))
+    assert tomllib.loads(Players.given[0].profile_toml)["resume"] == {"first_step": 3, "of": first}
+    assert [part.first_step for part in read_state(folder / "out").runs[1].parts] == [0, 3]
+
+
+def test_a_complete_campaign_is_resumed_by_doing_nothing(folder: Path) -> None:
+    run_campaign(asked(folder))
+    before = files(folder / "out")
+    Players.given.clear()
+    assert run_campaign(asked(folder, resume=True)) == 0
+    assert Players.given == []
+    assert files(folder / "out") == before
+
+
+def test_what_was_recorded_and_is_no_longer_so_is_measured_anew(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_campaign(asked(folder))
+    (folder / "out" / "01-free" / "run.mcap").write_bytes(b"damaged")
+    Players.given.clear()
+    assert run_campaign(asked(folder, resume=True)) == 0
+    assert [Path(one.folder).name for one in Players.given] == ["01-free-2"]
+    assert (folder / "out" / "01-free" / "run.mcap").read_bytes() == b"damaged"
+    assert "free: 01-free/run.mcap" in capsys.readouterr().out.replace("\n", "")
+
+
+RECORDED = """
+[[calibrations]]
+channel = "table_acc_m_s2"
+applied = [0.0, 1.0]
+"""
+
+
+def test_a_calibration_record_that_came_in_between_is_told_and_the_campaign_goes_on(
+    tmp_path: Path,
+) -> None:
+    def plan(rig_toml: str) -> CampaignPlan:
+        bundle = SimpleNamespace(profile_toml="p", rig_toml=rig_toml, model_toml="m")
+        run = SimpleNamespace(name="01", label="free", bundle=bundle)
+        return cast(CampaignPlan, SimpleNamespace(text="x", path=Path("c.toml"), runs=[run]))
+
+    card = 'name = "r"\n[output]\nspan_mm = 60.0\n'
+    copy_configs(tmp_path, plan(card))
+    assert require_unchanged(tmp_path, plan(card)) == []
+    for text in (card + RECORDED, card + RECORDED + RECORDED):
+        (said,) = require_unchanged(tmp_path, plan(text))
+        assert "free" in said
+        assert "calibration records" in said
+    for text in (
+        card.replace("60.0", "50.0") + RECORDED,
+        card + RECORDED + '[[sensors]]\nchannel = "table_acc_m_s2"\n',
+    ):
+        with pytest.raises(InputError) as error:
+            require_unchanged(tmp_path, plan(text))
+        assert error.value.where == str(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "said"),
+    [
+        ("c.toml", "Set 4 mm", "Set 5 mm", '-prompt = "Set 4 mm"'),
+        ("g4.toml", "cycles = 4", "cycles = 6", "+cycles = 6"),
+    ],
+)
+def test_another_campaign_is_not_resumed(
+    folder: Path, file: str, old: str, new: str, said: str
+) -> None:
+    Players.ends["free"] = ("aborted", 2)
+    run_campaign(asked(folder))
+    before = files(folder / "out")
+    path = folder / file
+    path.write_text(path.read_text().replace(old, new))
+    Players.given.clear()
+    with pytest.raises(InputError) as error:
+        run_campaign(asked(folder, resume=True))
+    assert error.value.where == str(folder / "out")
+    assert said in str(error.value)
+    assert Players.given == []
+    assert files(folder / "out") == before
+
+
+def test_a_folder_with_content_is_refused_unless_it_is_resumed(folder: Path) -> None:
+    run_campaign(asked(folder))
+    with pytest.raises(InputError, match=r"has content.*--resume"):
+        run_campaign(asked(folder))
+    with pytest.raises(InputError, match="--out DIR"):
+        run_campaign(asked(folder, resume=True, out=None))
+    with pytest.raises(InputError, match="no such folder"):
+        run_campaign(asked(folder, resume=True, out=folder / "nowhere"))
+    (folder / "other").mkdir()
+    (folder / "other" / "mine.txt").write_text("mine")
+    with pytest.raises(InputError) as error:
+        run_campaign(asked(folder, resume=True, out=folder / "other"))
+    assert error.value.where == str(folder / "other")
+
+
+def test_a_table_that_keeps_its_own_time_is_refused_at_full_speed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "table_io.config.rig.RigConfig.runs_at_any_speed", property(lambda _: False)
+    )
+    with pytest.raises(InputError) as error:
+        run_campaign(asked(folder))
+    assert "--speed = 'max'" in str(error.value)  # of each profile, in one message
+    assert not (folder / "out").exists()
+
+
+def test_two_campaigns_do_not_work_in_one_folder(folder: Path) -> None:
+    Players.ends["free"] = ("aborted", 2)
+    run_campaign(asked(folder))
+    with (
+        hold_lock(folder / "out" / LOCK_FILE),
+        pytest.raises(InputError, match=str(folder / "out")),
+    ):
+        run_campaign(asked(folder, resume=True))
+
+
+def test_a_state_that_cannot_be_written_leaves_the_old_one(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_campaign(asked(folder))
+    before = read_state(folder / "out")
+
+    def full(_: int) -> None:
+        raise OSError("no space left")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="no space"):
+        write_state(folder / "out", before.model_copy(update={"runs": ()}))
+    assert read_state(folder / "out") == before
+
+
+def test_every_test_is_judged_before_the_first_one_moves(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged = []
+
+    def judge(bundle: RunConfig, _: Path) -> None:
+        judged.append(bundle.name)
+        if bundle.name == "g4":
+            raise InputError("the machine does not answer")
+
+    monkeypatch.setattr(command, "_require_any_speed", judge)
+    with pytest.raises(InputError, match="does not answer"):
+        run_campaign(asked(folder))
+    assert judged == ["free", "g4"]
+    assert not (folder / "out").exists()

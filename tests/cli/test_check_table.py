@@ -1,0 +1,406 @@
+"""`check --table NAME`: the wiring is proven at rest, by hand where there is one; nothing moves."""
+
+import json
+import re
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from table_io.backends import MachineLost
+from table_io.block import Float1D, Float2D
+from table_io.clock import ManualClock
+from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.profile import Specimen
+from table_io.config.rig import RigConfig
+from table_io.errors import InputError
+from table_io.sim.machine.flight_recorder import read_flight_record
+from table_io.sim.simulated_table import SimulatedBackend
+from twin.cli.check_table import WiringCheckResult, examine_wiring
+from twin.cli.main import app
+
+TEXT = (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")
+RIG = parse_toml(TEXT, RigConfig, "simulated")
+RATE, SPECIMEN = 2000.0, Specimen(mass_kg=550.0, gap_mm=4.0)
+
+
+class Watched(SimulatedBackend):
+    """Remembers what it is told, and what the plant did."""
+
+    def __init__(self, rig: RigConfig = RIG) -> None:
+        self.clock = ManualClock()
+        super().__init__(rig, SPECIMEN, RATE, self.clock)
+        self.calls: list[str] = []
+        self.queued: list[Float1D] = []
+        self.moved_m = 0.0
+        self.observer = self._see
+
+    def _see(self, first: int, command: Float1D, signals: Float2D) -> None:
+        self.moved_m = max(self.moved_m, *(float(np.abs(one).max()) for one in (command, signals)))
+
+    def queue(self, index: int, volts: Float1D) -> None:
+        self.calls.append("queue")
+        self.queued.append(volts.copy())
+        super().queue(index, volts)
+
+    def start(self) -> None:
+        self.calls.append("start")
+        super().start()
+
+    def close(self) -> None:
+        self.calls.append("close")
+        super().close()
+
+
+def examined(backend: Watched, rig: RigConfig = RIG, person: object = False) -> WiringCheckResult:
+    return examine_wiring(rig, backend.clock, backend, person)  # type: ignore[arg-type]
+
+
+def planted(*faults: str) -> RigConfig:
+    return parse_toml(TEXT + "\n[[simulated.faults]]\n".join(["", *faults]), RigConfig, "card")
+
+
+def failing(found: WiringCheckResult) -> list[tuple[str, str]]:
+    return [(one.name, one.channel) for one in found.lines if one.verdict == "fail"]
+
+
+def test_nothing_is_moved() -> None:
+    backend = Watched()
+    found = examined(backend)
+    assert found.has_passed
+    assert backend.calls == ["queue", "start", "close"]
+    assert not np.concatenate(backend.queued).any()
+    assert backend.moved_m == 0.0
+    assert backend._next >= 4 * RATE  # so the witness has seen all of it
+
+
+@pytest.mark.parametrize(("volts_off", "hz"), [(0.5, 0.0), (8.0, 1.0), (8.0, 10.0)])
+def test_an_output_that_is_not_at_0_volts_is_not_started(volts_off: float, hz: float) -> None:
+    class Driven(Watched):
+        def tare(self, samples: int) -> Float2D:
+            volts = super().tare(samples)
+            volts[0] += volts_off * np.cos(2 * np.pi * hz * np.arange(samples) / RATE)
+            return volts
+
+    backend = Driven()
+    found = examined(backend)
+    assert backend.calls == ["close"]
+    assert ("command at 0 V", "drive_disp_m") in failing(found)
+    assert {channel for _, channel in failing(found)} == {"drive_disp_m"}
+    untested = {one.name for one in found.lines if one.verdict == "not tested"}
+    assert {"samples on time", "polarity"} <= untested
+
+
+@pytest.mark.parametrize(
+    ("fault", "line"),
+    [
+        ('kind = "stuck"\nchannel = "{}"\nat_s = 0.0', "stuck"),
+        ('kind = "stuck"\nchannel = "{}"\nat_s = 2.5', "stuck"),
+        ('kind = "cable_off"\nchannel = "{}"\nat_s = 0.0', "noise"),
+        ('kind = "rail"\nchannel = "{}"\nat_s = 0.0', "at the rail"),
+        ('kind = "rail"\nchannel = "{}"\nat_s = 1.0\nfor_s = 0.001', "at the rail"),
+        ('kind = "nan"\nchannel = "{}"\nat_s = 0.0', "lost samples"),
+        ('kind = "nan"\nchannel = "{}"\nat_s = 3.0\nfor_s = 0.01', "lost samples"),
+        ('kind = "drift"\nchannel = "{}"\nat_s = 0.0\nsize = 0.1', "steady"),
+        ('kind = "spike"\nchannel = "{}"\nat_s = 2.0\nsize = 0.3', "spikes"),
+    ],
+)
+@pytest.mark.parametrize("channel", ["table_disp_m", "mass_acc_m_s2", "force_r2_n"])
+def test_what_is_broken_is_found_by_its_line_and_no_other_channel_is_blamed(
+    fault: str, line: str, channel: str
+) -> None:
+    rig = planted(fault.format(channel))
+    found = examined(Watched(rig), rig)
+    assert (line, channel) in failing(found)
+    assert {one for _, one in failing(found)} == {channel}
+    assert all(one.do for one in found.lines if one.verdict == "fail")
+
+
+def test_what_needs_a_motion_is_not_said_to_be_right() -> None:
+    """A turned sensor and a wrong gain do not show at rest: their lines are not tested."""
+    turned = 'kind = "polarity"\nchannel = "mass_acc_m_s2"\nat_s = 0.0'
+    gain = 'kind = "gain"\nchannel = "force_r1_n"\nat_s = 0.0\nsize = 0.1'
+    rig = planted(turned, gain)
+    found = examined(Watched(rig), rig)
+    assert found.has_passed
+    untested = {one.channel for one in found.lines if one.verdict == "not tested"}
+    assert {"mass_acc_m_s2", "force_r1_n"} <= untested
+
+
+def test_a_machine_that_falls_silent_is_a_line_and_it_is_released() -> None:
+    rig = planted('kind = "stall"\nat_s = 1.0')
+    backend = Watched(rig)
+    found = examined(backend, rig)
+    assert [name for name, _ in failing(found)] == ["machine answers"]
+    assert "simulated table" in found.lines[-1].do
+    assert backend.calls[-1] == "close"
+
+
+def test_a_machine_that_hands_over_late_is_said() -> None:
+    class Slow(Watched):
+        def read(self, samples: int) -> Float2D:
+            volts = super().read(samples)
+            self.clock.wait_until(self.scheduled_time_s(self._next - 1) + 0.15)
+            return volts
+
+    assert failing(examined(Slow())) == [("samples on time", "")]
+
+
+class Struck(Watched):
+    """A person taps when asked: the swing of each channel, in the sensor's unit, 0.6 s later."""
+
+    def __init__(self, rig: RigConfig, swings: dict[str, dict[str, float]]) -> None:
+        super().__init__(rig)
+        self._swings, self._now, self._asked = swings, {}, 0
+        self.asked: list[str] = []
+        self.tired = False
+
+    def ask(self, what: str) -> None:
+        self.asked.append(what)
+        self._asked = self._next
+        self._now = next((one for key, one in self._swings.items() if key in what), {})
+
+    def declines(self) -> bool:
+        return self.tired
+
+    def read(self, samples: int) -> Float2D:
+        volts = super().read(samples)
+        t = (np.arange(self._next - samples, self._next) - self._asked) / RATE - 0.6
+        swing = np.where(t >= 0, np.exp(-8.0 * t) * np.sin(60.0 * np.maximum(t, 0.0)), 0.0)
+        for name, size in self._now.items():
+            row = self.channels.index(name)
+            volts[row] += size * swing * self._rig.sensors[row].volts_per_unit
+        return volts
+
+
+HANDS = {
+    "tap the table": {"table_acc_m_s2": 0.3, "mass_acc_m_s2": 0.02},
+    "tap the mass": {"mass_acc_m_s2": 0.3, "mass_disp_m": 0.5},
+    "right bumper": {"force_r1_n": 0.4, "force_r2_n": 0.3},
+    "left bumper": {"force_l1_n": 0.4, "force_l2_n": 0.3},
+}
+
+
+def struck(rig: RigConfig = RIG, **hands: dict[str, float]) -> tuple[Struck, WiringCheckResult]:
+    backend = Struck(rig, HANDS | {key.replace("_", " "): one for key, one in hands.items()})
+    return backend, examined(backend, rig, backend)
+
+
+def test_a_person_who_taps_as_asked_proves_every_polarity() -> None:
+    backend, found = struck()
+    assert [one.split(",")[0] for one in backend.asked] == [
+        "tap the table to the right", "tap the mass to the right",
+        "press the load cells of the right bumper", "press the load cells of the left bumper",
+    ]  # fmt: skip
+    polarity = {one.channel: one.verdict for one in found.lines if one.name == "polarity"}
+    assert polarity.pop("table_disp_m") == "not tested"  # the servo held it
+    assert set(polarity.values()) == {"pass"}
+    assert len(polarity) == 7
+    assert found.has_passed
+    assert not np.concatenate(backend.queued).any()
+    assert backend.moved_m == 0.0
+
+
+def test_a_planted_polarity_is_found_by_the_tap() -> None:
+    rig = planted('kind = "polarity"\nchannel = "mass_acc_m_s2"\nat_s = 0.0')
+    assert rig.simulated is not None
+    hands = {"mass_acc_m_s2": -0.3, "mass_disp_m": 0.5}  # the fault turns what the sensor gives
+    _, found = struck(rig, tap_the_mass=hands)
+    assert failing(found) == [("polarity", "mass_acc_m_s2")]
+
+
+def test_who_does_nothing_or_declines_leaves_lines_that_are_not_tested() -> None:
+    backend, found = struck(RIG, right_bumper={})
+    untested = {one.channel for one in found.lines if one.name == "polarity"} - {
+        one.channel for one in found.lines if one.name == "polarity" and one.verdict == "pass"
+    }
+    assert untested == {"table_disp_m", "force_r1_n", "force_r2_n"}
+    assert found.has_passed
+    backend = Struck(RIG, {})
+    backend.tired = True
+    found = examined(backend, RIG, backend)
+    assert {one.verdict for one in found.lines if one.name == "polarity"} == {"not tested"}
+    assert backend.clock.now() < 20.0  # nobody waits for who has said no
+
+
+class Hasty(Struck):
+    """Presses the right cells as soon as it is asked, so often, and a second later lets go."""
+
+    def __init__(self, rig: RigConfig, times: int) -> None:
+        super().__init__(rig, HANDS)
+        self.times = times
+
+    def read(self, samples: int) -> Float2D:
+        volts = super().read(samples)
+        t = (np.arange(self._next - samples, self._next) - self._asked) / RATE
+        asked = [one for one in self.asked if "right bumper" in one]
+        if asked and asked[-1] == self.asked[-1] and len(asked) <= self.times:
+            volts[self.channels.index("force_r1_n")] += 1.0 * ((t > 0.2) & (t < 0.9))
+        return volts
+
+
+@pytest.mark.parametrize(("times", "verdict"), [(1, "pass"), (9, "not tested")])
+def test_who_presses_too_early_is_asked_again(times: int, verdict: str) -> None:
+    backend = Hasty(RIG, times)
+    found = examined(backend, RIG, backend)
+    assert failing(found) == []
+    right = [one for one in backend.asked if "right bumper" in one]
+    assert len(right) == min(times + 1, 3)
+    assert "once more" in right[1]
+    lines = [one for one in found.lines if one.channel == "force_r1_n" and one.name == "polarity"]
+    assert [one.verdict for one in lines] == [verdict]
+
+
+class Holding(Struck):
+    """Presses a right cell hard, and lets go only when the left ones have been asked for once."""
+
+    def read(self, samples: int) -> Float2D:
+        volts = super().read(samples)
+        t = (np.arange(self._next - samples, self._next) - self._asked) / RATE
+        right, left = (
+            [one for one in self.asked if f"{side} bumper" in one] for side in ("right", "left")
+        )
+        if right and not left:
+            volts[self.channels.index("force_r1_n")] += 1.0 * (t > 0.6)
+        if len(left) == 1:
+            volts[self.channels.index("force_r1_n")] += 1.0 * (t < 0.45)
+        return volts
+
+
+def test_a_press_that_is_held_until_the_next_is_asked_for_swaps_nothing() -> None:
+    backend = Holding(RIG, HANDS)
+    found = examined(backend, RIG, backend)
+    assert failing(found) == []
+    assert len([one for one in backend.asked if "left bumper" in one]) == 2
+    lines = [one for one in found.lines if one.channel == "force_l1_n" and one.name == "polarity"]
+    assert [one.verdict for one in lines] == ["pass"]
+
+
+def shunted(size: float) -> WiringCheckResult:
+    head = 'channel = "force_r1_n"\nunit = "kN"\n'
+    assert TEXT.count(head) == 1
+    text = TEXT.replace(head, head + "shunt = 2.0\nshunt_tolerance = 0.05\n")
+    rig = parse_toml(text, RigConfig, "card")
+
+    class Switched(Struck):
+        def read(self, samples: int) -> Float2D:
+            volts = super().read(samples)
+            if "shunt" in (self.asked or [""])[-1]:
+                late = (np.arange(self._next - samples, self._next) - self._asked) / RATE > 1.0
+                volts[self.channels.index("force_r1_n")] += size * late
+            return volts
+
+    backend = Switched(rig, HANDS)
+    return examined(backend, rig, backend)
+
+
+def test_a_shunt_proves_the_gain() -> None:
+    assert failing(shunted(2.02)) == []
+    assert [one.verdict for one in shunted(2.02).lines if one.name == "shunt"] == ["pass"]
+    assert failing(shunted(2.2)) == [("shunt", "force_r1_n")]
+    assert failing(shunted(-2.0)) == [("shunt", "force_r1_n")]
+
+
+Invoke = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Invoke:
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words: str) -> tuple[int, str]:
+        result = CliRunner().invoke(app, ["check", *words])
+        if result.exception is not None and not isinstance(result.exception, SystemExit):
+            raise result.exception
+        return result.exit_code, result.stdout
+
+    return run
+
+
+def test_the_command_says_it_in_a_table_and_ends_with_2_where_a_line_fails(
+    invoke: Invoke, tmp_path: Path
+) -> None:
+    code, text = invoke("--table", "simulated")
+    assert code == 0
+    assert "no line fails" in text
+    assert text.rstrip().endswith("nothing was moved")
+    fault = '\n[[simulated.faults]]\nkind = "cable_off"\nchannel = "mass_disp_m"\nat_s = 0.0\n'
+    due = TEXT.replace('channel = "force_l2_n"', 'channel = "force_l2_n"\ndue = 2020-01-01')
+    (tmp_path / "card.toml").write_text(due + fault)
+    code, text = invoke("--table", "card.toml")
+    assert code == 2
+    assert "FAIL noise, mass_disp_m: " in text
+    assert "warning: force_l2_n: its calibration was due on 2020-01-01" in text
+    assert "no line fails" not in text
+
+
+def test_as_json_every_line_stands_there(invoke: Invoke) -> None:
+    code, text = invoke("--table", "simulated", "--json")
+    found = json.loads(text)
+    assert (code, found["passed"], found["backend"]) == (0, True, "simulated")
+    assert {one["channel"] for one in found["lines"]} == {*RIG.channels, ""}
+    assert {one["verdict"] for one in found["lines"]} == {"pass", "not tested"}
+    (acc,) = (one for one in found["inputs"] if one["channel"] == "table_acc_m_s2")
+    assert acc["noise_rms"] == pytest.approx(0.0005, rel=0.1)
+    assert acc["mean"] == pytest.approx(0.001, abs=1e-4)
+
+
+def test_what_is_asked_for_must_fit(invoke: Invoke) -> None:
+    quick = str(PROFILES_DIR / "tests" / "quickstart.toml")
+    for words in ((), ("--json",), (quick, "--json"), (quick, "--unattended")):
+        with pytest.raises(InputError, match="PROFILE"):
+            invoke(*words)
+    with pytest.raises(InputError, match="did you mean 'simulated'"):
+        invoke("--table", "simulatd")
+    assert "ready: nothing exceeds" in invoke(quick)[1]  # the pre-flight is what it was
+
+
+def test_a_loss_is_no_traceback() -> None:
+    class Lost(Watched):
+        def tare(self, samples: int) -> Float2D:
+            raise MachineLost("the cable is out; put it in")
+
+    found = examined(Lost())
+    assert failing(found) == [("machine answers", "")]
+    assert found.lines[0].do == "the cable is out; put it in"
+
+
+def free_port(kind: int) -> int:
+    with socket.socket(socket.AF_INET, kind) as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["machine", "ni_simulated", "udp_simulated"])
+def test_on_a_table_of_its_own_every_line_passes_and_its_black_box_saw_no_motion(
+    name: str, tmp_path: Path
+) -> None:
+    text = (PROFILES_DIR / "rigs" / f"{name}.toml").read_text(encoding="utf-8")
+    port = free_port(socket.SOCK_DGRAM if name == "udp_simulated" else socket.SOCK_STREAM)
+    card, box = tmp_path / "card.toml", tmp_path / "box"
+    lines = '\nheartbeat_back = "Dev1/port0/line1"\nwell = { limit = "Dev1/port0/line2" }\n'
+    text = text.replace("[ni]\n", f"[ni]{lines}")
+    card.write_text(re.sub(r"127\.0\.0\.1:\d+", f"127.0.0.1:{port}", text))
+    shaketwin = Path(sys.executable).parent / "shaketwin"
+    command = [shaketwin, "table", "--rig", card, "--log", box]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as table:
+        assert table.stdout is not None
+        assert "waiting at" in table.stdout.readline()
+        words = [shaketwin, "check", "--table", card, "--json"]
+        result = subprocess.run(words, capture_output=True, text=True, timeout=90, check=False)
+        table.terminate()
+    assert result.returncode == 0, result.stdout + result.stderr
+    passed = {one["name"] for one in json.loads(result.stdout)["lines"] if one["verdict"] == "pass"}
+    assert {"noise", "command at 0 V", "samples on time"} <= passed
+    assert ({"heartbeat comes back", "heartbeat stops", "all is well"} <= passed) == (
+        name == "ni_simulated"
+    )
+    lives = read_flight_record(box)
+    assert max(life.samples.shape[1] for life in lives) >= 4 * RATE
+    assert not any(life.samples.any() for life in lives)

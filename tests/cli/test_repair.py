@@ -1,0 +1,78 @@
+"""A repair that fails leaves nothing behind, so that it can be tried again, and says why it did."""
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from table_io.errors import InputError
+from tests.recording.test_mcap_log import run, write
+from twin.cli import repair
+from twin.cli.repair import write_repaired
+from twin.cli.verify import Verification, examine_logs
+
+
+@pytest.fixture
+def old(tmp_path: Path) -> Path:
+    write(tmp_path / "old.mcap", run(), flush_every=7)
+    return tmp_path / "old.mcap"
+
+
+def test_a_full_disk_leaves_no_half_of_a_file(
+    old: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    verified, new = examine_logs([old]), tmp_path / "new.mcap"
+    write_some = os.write
+
+    def full(descriptor: int, data: bytes) -> int:
+        write_some(descriptor, data[:100])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("twin.recording.append_only_file.os.write", full)
+        with pytest.raises(OSError, match="No space left"):
+            write_repaired(verified, [old], new)
+    assert not new.exists()
+    write_repaired(verified, [old], new)
+    assert examine_logs([new]).report["damage"] == []
+
+
+def test_what_failed_first_is_told(
+    old: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not what failed then, as the file was closed."""
+    verified, new = examine_logs([old]), tmp_path / "new.mcap"
+
+    def fails(*_: object) -> None:
+        raise OSError(errno.EIO, "the first")
+
+    def fails_then(*_: object) -> None:
+        raise OSError(errno.EIO, "the second")
+
+    monkeypatch.setattr("twin.recording.mcap_log.LogWriter.write", fails)
+    monkeypatch.setattr("twin.recording.mcap_log.LogWriter.close", fails_then)
+    with pytest.raises(OSError, match="the first"):
+        write_repaired(verified, [old], new)
+
+
+def test_one_that_reads_back_as_another_is_not_left(
+    old: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    verified, new = examine_logs([old]), tmp_path / "new.mcap"
+
+    def forgetful(paths: list[Path]) -> Verification:
+        again = examine_logs(paths)
+        return Verification(again.recording, again.messages[1:], again.report)
+
+    monkeypatch.setattr(repair, "examine_logs", forgetful)
+    with pytest.raises(InputError, match="differs from what was read"):
+        write_repaired(verified, [old], new)
+    assert not new.exists()
+
+
+def test_what_was_there_stays(old: Path) -> None:
+    before = old.read_bytes()
+    with pytest.raises(InputError, match="exists already"):
+        write_repaired(examine_logs([old]), [old], old)
+    assert old.read_bytes() == before

@@ -1,0 +1,105 @@
+"""`verify` of a test that has no end, of one that was repaired, and of parts not yet together."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from table_io.errors import InputError
+from table_io.records import RunStop, SampleGap
+from tests.recording.example_run import SIZE, START, block, run, write
+from twin.cli.main import app
+from twin.cli.verify import find_missing_end
+from twin.exchange.export import export_log
+from twin.log import open_log
+from twin.recording.reader import read_recording
+from twin.recording.run_paths import PARTS_FOLDER, resolve_log_path
+
+PLANNED = START.planned_samples
+
+
+def verify(*words: object) -> tuple[int, dict[str, Any]]:
+    """(exit code, what it says as JSON)."""
+    result = CliRunner().invoke(app, ["verify", *map(str, words), "--json"])
+    return result.exit_code, json.loads(result.stdout)
+
+
+def said(*words: object) -> list[str]:
+    """The lines that it says to people."""
+    return CliRunner().invoke(app, ["verify", *map(str, words)]).stdout.splitlines()
+
+
+@pytest.fixture
+def cut(tmp_path: Path) -> Path:
+    """A log of which the second half is gone."""
+    path = tmp_path / "run.mcap"
+    sizes = write(path, run(), flush_every=10)
+    path.write_bytes(path.read_bytes()[: sizes[len(sizes) // 2]])
+    return path
+
+
+def test_half_a_test_is_not_whole_even_if_its_file_is(cut: Path) -> None:
+    code, found = verify(cut)
+    end = read_recording(cut).contiguous_blocks("meas")[-1].end
+    lost = {"first": end, "count": PLANNED - end, "channel": "", "reason": "no end was recorded"}
+    assert 0 < end < PLANNED
+    assert (code, found["gaps"].count(lost)) == (4, 1)
+    new = cut.with_name("new.mcap")
+    assert verify(cut, "--repair", new)[0] == 4
+    code, found = verify(new)
+    assert (code, found["sound"], found["damage"]) == (4, False, [])
+    assert found["gaps"].count(lost) == 1
+    assert read_recording(new).is_intact  # the file; the test is not
+    assert not [
+        one for one in read_recording(new).records(SampleGap) if not one.channel
+    ]  # nobody knows what was lost
+    lines = said(new)
+    assert lines[-1] == "the file is whole, the recording has gaps"
+    assert any(f"samples {end} to {PLANNED - 1} " in one and "no end" in one for one in lines)
+
+
+def test_a_repaired_log_says_of_what(cut: Path) -> None:
+    new = cut.with_name("new.mcap")
+    assert any("`--repair NEW`" in one for one in said(cut))
+    lines = said(cut, "--repair", new)
+    assert new.exists()
+    assert "damaged" in lines
+    assert not any("--repair NEW" in one for one in lines)  # it was given
+    assert any(one.startswith("repaired: from run.mcap: the file was never") for one in said(new))
+    assert verify(new)[1]["repaired"]["from_1"] == "run.mcap"
+    assert verify(cut)[1]["repaired"] == {}
+
+
+def test_no_end_is_a_gap_even_of_no_samples(tmp_path: Path) -> None:
+    items = [one for one in run() if not isinstance(one, RunStop)]
+    write(tmp_path / "run.mcap", [*items, block(PLANNED)])  # more than was planned
+    assert find_missing_end(read_recording(tmp_path / "run.mcap")) == [(PLANNED + SIZE, 0)]
+    code, found = verify(tmp_path)
+    assert (code, found["gaps"][0]["count"]) == (4, 0)
+    assert any(f"from sample {PLANNED + SIZE} (at " in one for one in said(tmp_path))
+
+
+def test_parts_alone_are_no_log_yet(tmp_path: Path) -> None:
+    """One sentence says what to do, whoever is asked; `verify` says what is in them, and that."""
+    folder = tmp_path / "killed"
+    (folder / PARTS_FOLDER).mkdir(parents=True)
+    write(folder / PARTS_FOLDER / "part-001.mcap", run())
+    words = f"{folder}: its recorder was killed: `shaketwin report {folder}` merges the parts"
+    for reader in (
+        resolve_log_path,
+        open_log,
+        lambda place: export_log(place, ["csv"], None, (), None),
+    ):
+        with pytest.raises(InputError) as caught:
+            reader(folder)
+        assert str(caught.value) == words
+    code, found = verify(folder)
+    assert (code, found["sound"], found["apart"]) == (4, False, [words])
+    assert found["samples"]["acquired"] == PLANNED
+    assert said(folder)[-1] == words
+    (folder / PARTS_FOLDER / "part-001.mcap").rename(folder / "run.mcap")
+    assert "apart" in verify(folder)[1]
+    assert verify(folder)[1]["apart"] == []
+    assert resolve_log_path(folder) == folder / "run.mcap"

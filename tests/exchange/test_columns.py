@@ -1,0 +1,141 @@
+"""Which column is which, in which unit, and when its samples were taken."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from table_io.block import Float1D
+from table_io.errors import InputError
+from twin.exchange.columns import ImportedSamples, read_column_map, read_samples
+from twin.exchange.formats import SampleTable, make_column
+from twin.exchange.sampling import find_holes
+
+TIME = np.arange(400) / 200.0
+
+
+def taken(folder: Path, card: str | None = None, **columns: Float1D) -> ImportedSamples:
+    """The samples of a table of these columns with a map of this text."""
+    path = folder / "map.toml"
+    if card is not None:
+        path.write_text(card)
+    file = folder / "table.csv"
+    file.touch()
+    held = {name: make_column(values) for name, values in columns.items()}
+    table = SampleTable(file, held, first_row=2)
+    return read_samples(table, read_column_map(path if card is not None else None))
+
+
+def refused(folder: Path, words: list[str], card: str | None = None, **columns: Float1D) -> None:
+    with pytest.raises(InputError) as caught:
+        taken(folder, card, **columns)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def wave(hz: float = 2.0) -> Float1D:
+    return np.sin(2 * np.pi * hz * TIME)
+
+
+def test_a_map_converts_as_it_says_and_leaves_the_rest_out(tmp_path: Path) -> None:
+    card = """
+    [columns]
+    time_s = { column = "t", unit = "ms" }
+    rel_disp_m = { column = "V2", unit = "mm", gain = -2.0, offset = 0.5 }
+    table_acc_m_s2 = { column = "V1", unit = "g" }
+    """
+    found = taken(tmp_path, card, t=1e3 * TIME, V1=wave(), V2=wave(3), V3=wave(4))
+    assert found.rate_hz == 200.0
+    assert list(found.channels) == ["table_acc_m_s2", "rel_disp_m"]
+    np.testing.assert_allclose(found.channels["table_acc_m_s2"], 9.80665 * wave())
+    np.testing.assert_allclose(found.channels["rel_disp_m"], -2e-3 * wave(3) + 0.5)
+    assert "left out: V3" in found.notes
+
+
+def test_a_rate_stands_in_for_time(tmp_path: Path) -> None:
+    found = taken(tmp_path, "rate_hz = 610.35", rel_disp_m=wave())
+    assert found.rate_hz == 610.35
+    assert found.index.tolist() == list(range(400))
+
+
+@pytest.mark.parametrize(
+    ("card", "words"),
+    [
+        ("rate_hz = 0", ["map.toml", "rate_hz = 0"]),
+        ("rate = 5.0", ["rate: unknown key", "'rate_hz'"]),
+        ("[columns]\nrel_dsp_m = {column = 'b'}", ["rel_dsp_m", "did you mean 'rel_disp_m'?"]),
+        ("[columns]\nrel_disp_m = {column = 'b', unit = 'N'}", ["unit 'N'", "m, mm, um"]),
+        ("[columns]\nrel_disp_m = {column = 'b', gain = 0.0}", ["gain is 0"]),
+        ("[columns]\nrel_disp_m = {colum = 'b'}", ["did you mean 'column'?"]),
+        ("[columns]\nrel_disp_m = {column = 'bb'}", ["no column 'bb'", "did you mean 'b'?"]),
+        ("rate_hz = 5.0\n[columns]\ntime_s = {column = 't'}", ["keep one"]),
+        ("[columns]\nrel_disp_m = {column = 'b'}", ["no column time_s", "rate_hz"]),
+        ("rate_hz = 5.0", ["no channel in it"]),
+        (
+            "rate_hz = 5.0\n[columns]\nrel_disp_m = {column = 'b', gain = 1e308, offset = 1e308}",
+            ["rel_disp_m", "'b'", "infinite"],
+        ),
+    ],
+)
+def test_maps_that_cannot_be(tmp_path: Path, card: str, words: list[str]) -> None:
+    refused(tmp_path, words, card, t=TIME, b=wave())
+
+
+def test_an_unknown_column_without_a_map_is_refused_with_the_nearest_name(tmp_path: Path) -> None:
+    words = ["'table_acc'", "did you mean 'table_acc_m_s2'?", "--columns"]
+    refused(tmp_path, words, time_s=TIME, table_acc=wave())
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "words"),
+    [
+        (7, TIME[6], ["row 9", "time must rise"]),
+        (7, TIME[2], ["row 9", "time must rise"]),
+        (7, np.nan, ["row 9", "empty"]),
+    ],
+)
+def test_time_that_does_not_rise_names_its_row(
+    tmp_path: Path, place: int, value: float, words: list[str]
+) -> None:
+    time = TIME.copy()
+    time[place] = value
+    refused(tmp_path, ["table.csv", "time_s", *words], time_s=time, rel_disp_m=wave())
+
+
+def test_time_that_is_nowhere_uniform_is_refused(tmp_path: Path) -> None:
+    for time in (TIME**1.5, np.sort(np.random.default_rng(0).uniform(0, 2, 400))):
+        refused(tmp_path, ["resample"], time_s=time, rel_disp_m=wave())
+
+
+@pytest.mark.parametrize("rate", [200.0, 610.35, 2000.0, 1e4 / 3])
+def test_rounded_and_jittering_time_is_taken_as_uniform(tmp_path: Path, rate: float) -> None:
+    jitter = np.random.default_rng(0).uniform(-0.2, 0.2, 5000)
+    time = 3.0 + (np.arange(5000) + jitter) / rate
+    found = taken(tmp_path, time_s=np.round(time, 5), rel_disp_m=np.ones(5000))
+    assert found.index.tolist() == list(range(5000))
+    assert found.rate_hz == pytest.approx(rate, rel=2e-5)
+    assert any("jitters" in text for text in found.notes)
+    assert any("begins at" in text for text in found.notes)
+
+
+def test_holes_keep_their_length(tmp_path: Path) -> None:
+    keep = np.r_[0:100, 103:250, 390:400]
+    found = taken(tmp_path, time_s=np.round(TIME, 3)[keep], rel_disp_m=wave()[keep])
+    assert found.index.tolist() == keep.tolist()
+    assert find_holes(found.index) == [(100, 3), (250, 140)]
+
+
+@pytest.mark.parametrize("wrong", [1000.0, 9.80665])
+def test_a_unit_that_looks_wrong_is_pointed_out(tmp_path: Path, wrong: float) -> None:
+    x, a = 1e-3 * wave(), -1e-3 * (4 * np.pi) ** 2 * wave()
+    fine = taken(tmp_path, time_s=TIME, table_disp_m=x, table_acc_m_s2=a)
+    assert not [text for text in fine.notes if "warning" in text]
+    odd = taken(tmp_path, time_s=TIME, table_disp_m=x, table_acc_m_s2=a / wrong)
+    assert [text for text in odd.notes if "warning:" in text and "table_disp_m" in text]
+    np.testing.assert_array_equal(odd.channels["table_acc_m_s2"], a / wrong)
+
+
+def test_what_is_missing_or_lost_is_said(tmp_path: Path) -> None:
+    found = taken(tmp_path, time_s=TIME, rel_disp_m=wave(), force_r1_n=np.full(400, np.nan))
+    assert "force_r1_n: all samples lost" in found.notes
+    assert any(text.startswith("not in the file: drive_disp_m") for text in found.notes)

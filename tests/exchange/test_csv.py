@@ -1,0 +1,91 @@
+"""Somebody's text table: what is read, and what is refused with row, column and remedy."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from table_io.errors import InputError
+from twin.exchange.formats import SampleTable, read_table
+from twin.exchange.formats.csv import MAX_LINE_CHARS
+
+GOOD = "time_s,table_acc_m_s2\n0,1.5\n0.1,-2e-3\n0.2,3\n"
+
+
+def read(folder: Path, content: str | bytes) -> SampleTable:
+    path = folder / "table.csv"
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return read_table(path)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        GOOD,
+        "\ufeff" + GOOD,
+        GOOD.replace("\n", "\r\n"),
+        GOOD.rstrip(),
+        GOOD + "\n\n",
+        GOOD.replace(",", ";"),
+        GOOD.replace(",", "\t"),
+        GOOD.replace(",", " , "),
+        GOOD.replace("\n", ",\n"),
+        GOOD.replace("time_s,table_acc_m_s2", '"time_s","table_acc_m_s2",'),
+    ],
+    ids=["plain", "BOM", "CRLF", "no end", "blank end", ";", "tab", "spaces", "trailing", "quoted"],
+)
+def test_the_same_table_in_other_clothes(tmp_path: Path, content: str) -> None:
+    table = read(tmp_path, content)
+    assert list(table.columns) == ["time_s", "table_acc_m_s2"]
+    assert table.read_column("time_s").tolist() == [0.0, 0.1, 0.2]
+    assert table.read_column("table_acc_m_s2").tolist() == [1.5, -2e-3, 3.0]
+
+
+def test_another_delimiter_is_said(tmp_path: Path) -> None:
+    assert read(tmp_path, GOOD).notes == ()
+    assert "semicolons" in read(tmp_path, GOOD.replace(",", ";")).notes[0]
+    assert "tabs" in read(tmp_path, GOOD.replace(",", "\t")).notes[0]
+
+
+def test_an_empty_cell_is_a_lost_sample(tmp_path: Path) -> None:
+    found = read(tmp_path, "a,b,c\n1,,3\n4,NaN,\n").read_column
+    assert np.isnan(found("b")).all()
+    assert found("a").tolist() == [1.0, 4.0]
+    assert np.isnan(found("c")).tolist() == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("", ["empty"]),
+        ("  \n\n", ["empty"]),
+        (b"\x89PNG\r\n\x1a\n\0\0", ["binary"]),
+        (b"a,b\n1,\xff\n", ["not UTF-8"]),
+        ("a,b\n", ["no samples"]),
+        ("1,2\n3,4\n", ["row 1", "names no columns", "time_s, drive_disp_m, ", "--columns"]),
+        ("a,,c\n1,2,3\n", ["row 1", "column 2", "no name"]),
+        ("a,b,a\n1,2,3\n", ["row 1", "a more than once"]),
+        ("a,b\n1,2\n3\n", ["row 3", "1 cells", "2 columns"]),
+        ("a,b\n1,2\n3,4,5\n", ["row 3", "3 cells"]),
+        ("a,b\n1,2,3,4\n", ["row 2", "decimal commas"]),
+        ("a;b\n1;2\n3;4,5\n", ["row 3", "column 'b'", "'4,5'", "decimal comma", "a point"]),
+        ("a,b\ns,mm\n1,2\n", ["row 2", "column 'a'", "'s'", "--columns"]),
+        ("a,b\n1,2\n3,N/A\n", ["row 3", "column 'b'", "leave a lost sample empty"]),
+        ("a,b\n1,2\n3,inf\n", ["row 3", "column 'b'", "infinite"]),
+        ("a,b\n1,2\n\n3,4\n", ["row 3 is empty"]),
+        ('a,b\n1,"2\n' + "3,4\n" * 50_000, ["row 2", "quote"]),
+        ("a,b\n" + "1" * (MAX_LINE_CHARS + 5), ["line of more than"]),
+    ],
+)
+def test_hostile_tables(tmp_path: Path, content: str | bytes, words: list[str]) -> None:
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, content)
+    for word in ["table.csv", *words]:
+        assert word in str(caught.value)
+
+
+def test_a_file_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="No such file"):
+        read_table(tmp_path / "none.csv")
+    with pytest.raises(InputError, match="directory"):
+        read_table(tmp_path)

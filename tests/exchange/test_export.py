@@ -1,0 +1,289 @@
+"""What goes out to other tools comes back to the bit, with its gaps, its NaN and its labels."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+from typer.testing import CliRunner
+
+from table_io.config.base import PROFILES_DIR
+from table_io.errors import InputError
+from table_io.records import RunStop, StepAdded
+from tests.exchange.exported import LABEL_FIELDS, LOST, exported, measured
+from tests.reports.recordings import MEASURED, RATE, STEPS, blocks, start_record
+from twin.cli.main import app
+from twin.exchange.columns import read_column_map, read_samples
+from twin.exchange.export import export_log
+from twin.exchange.formats import read_table
+from twin.exchange.labels import read_labels
+from twin.recording.mcap_log import write_items
+from twin.recording.reader import read_recording
+from twin.recording.tabular import LABEL_UNITS, TWIN_PREFIX, iter_batches, read_log_table
+
+FORMATS = ("csv", "parquet", "mat")
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    return exported(tmp_path_factory.mktemp("export"), (*FORMATS, "rrd"))
+
+
+@pytest.fixture(scope="module")
+def log(both: tuple[Path, Path]) -> Path:
+    return both[0]
+
+
+@pytest.fixture(scope="module")
+def out(both: tuple[Path, Path]) -> Path:
+    """The log in every format, as out.csv and so on."""
+    return both[1]
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_samples_and_labels_come_back_to_the_bit(log: Path, out: Path, kind: str) -> None:
+    index, values, *labels = measured(read_recording(log))
+    table = read_table(out.with_suffix(f".{kind}"))
+    found = read_samples(table, None)
+    assert found.rate_hz == RATE
+    assert found.index.tolist() == index.tolist()
+    assert not set(range(*LOST)) & set(found.index.tolist())
+    assert set(found.channels) == set(MEASURED)
+    for name, row in zip(MEASURED, values, strict=True):
+        assert found.channels[name].tobytes() == row.tobytes(), name
+    back = read_labels(table, found)
+    assert back.steps == STEPS
+    for name, true in zip(LABEL_FIELDS, labels, strict=True):
+        assert getattr(back, name)[index].tolist() == true.tolist()
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_the_twin_goes_out_beside_the_measurement(log: Path, out: Path, kind: str) -> None:
+    table = read_table(out.with_suffix(f".{kind}"))
+    index = measured(read_recording(log))[0]
+    (told,) = read_recording(log).contiguous_blocks("pred")
+    for name in ("free/rel_disp_m", "window/force_l2_n"):
+        column = table.read_column(TWIN_PREFIX + name.replace("/", "_"))
+        assert np.isnan(column[index < told.index]).all()
+        spoken = told.channel(name)[index[index >= told.index] - told.index]
+        assert column[index >= told.index].tobytes() == spoken.tobytes()
+
+
+@pytest.mark.parametrize("kind", ["parquet", "mat"])
+def test_profile_card_and_model_go_with_it(log: Path, out: Path, kind: str) -> None:
+    start = read_recording(log).start
+    assert read_table(out.with_suffix(f".{kind}")).texts == {
+        "profile_toml": start.profile_toml,
+        "rig_toml": start.rig_toml,
+        "model_toml": start.model_toml,
+    }
+
+
+def test_parquet_says_the_unit_of_every_column(out: Path) -> None:
+    columns = read_table(out.with_suffix(".parquet")).columns
+    units = {name: held.unit for name, held in columns.items()}
+    assert units["time_s"] == "s"
+    assert units["mass_acc_m_s2"] == units["twin_window_mass_acc_m_s2"] == "m/s2"
+    assert units["twin_free_rel_vel_m_s"] == "m/s"
+    assert {name: units[name] for name in LABEL_UNITS} == LABEL_UNITS
+
+
+def test_other_libraries_read_the_files(out: Path) -> None:
+    pandas = np.genfromtxt(out.with_suffix(".csv"), delimiter=",", names=True)
+    scipy_io = pytest.importorskip("scipy.io")
+    mat = scipy_io.loadmat(out.with_suffix(".mat"))
+    assert mat["mass_disp_m"].shape == (pandas.size, 1)
+    assert mat["mass_disp_m"].tobytes() == pandas["mass_disp_m"].tobytes()
+    assert mat["units"]["mass_disp_m"][0, 0].item() == "m"
+    parquet = pytest.importorskip("pyarrow.parquet").read_table(out.with_suffix(".parquet"))
+    assert parquet["step"].to_pylist() == mat["step"].reshape(-1).tolist()
+
+
+def rows_by_entity(rrd: Path) -> dict[str, int]:
+    """How often each entity changes, by Rerun's own reader."""
+    found: dict[str, int] = {}
+    for chunk in RrdReader(rrd).stream():
+        if not chunk.is_static:
+            name = str(chunk.entity_path)
+            found[name] = found.get(name, 0) + chunk.num_rows
+    return found
+
+
+def test_rerun_reads_its_file(log: Path, out: Path, tmp_path: Path) -> None:
+    """Whether it was fed batch by batch, or in one, as a log out of its order has to be."""
+    found = rows_by_entity(out.with_suffix(".rrd"))
+    assert sum(rows >= measured(read_recording(log))[0].size for rows in found.values()) >= 3
+    start = read_recording(log).start
+    write_items(tmp_path / "run.mcap", [*read_recording(log).items], start)
+    assert iter_batches(tmp_path / "run.mcap", 9) is not None
+    assert iter_batches(log, 9) is None
+    assert export_log(tmp_path, ["rrd"], None, (), None) == 0
+    assert rows_by_entity(tmp_path / "run.rrd") == found
+
+
+def test_a_choice_of_channels_and_steps(log: Path, tmp_path: Path) -> None:
+    assert export_log(log, ["csv"], tmp_path / "a.csv", ("mass_disp_m",), (2, 3)) == 0
+    table = read_table(tmp_path / "a.csv")
+    assert set(table.columns) == {"time_s", "mass_disp_m", *LABEL_UNITS}
+    assert set(table.read_column("step")) == {2, 3}
+    found = read_samples(table, None)
+    back = read_labels(table, found)
+    assert [one.frequency_hz for one in back.steps] == [2.0, 2.5]
+    assert any("numbered from 0" in text for text in back.messages)
+
+
+def test_steps_that_were_decided_on_in_the_test_are_known(tmp_path: Path) -> None:
+    start = replace(start_record(), steps=STEPS[:-1])
+    extra = StepAdded(0, 7, "backward", 1.0, 0.49, "tracked")
+    write_items(tmp_path / "run.mcap", [start, extra, *blocks()], start)
+    table_steps = read_log_table(tmp_path / "run.mcap").steps
+    assert table_steps[7] == STEPS[-1]
+
+
+@pytest.mark.parametrize(
+    ("kinds", "channels", "steps", "words"),
+    [
+        ([], (), None, ["--csv", "--rrd"]),
+        (["csv"], ("mass_dsp_m",), None, ["mass_dsp_m", "mass_disp_m"]),
+        (["csv"], (), (90, 91), ["no sample in steps 90 to 91"]),
+        (["rrd"], ("mass_disp_m",), None, ["--rrd"]),
+        (["csv", "rrd"], (), (1, 2), ["--rrd"]),
+    ],
+)
+def test_what_cannot_be_exported(
+    log: Path, tmp_path: Path, kinds: list[str], channels: Any, steps: Any, words: list[str]
+) -> None:
+    with pytest.raises(InputError) as caught:
+        export_log(log, kinds, tmp_path / "new" / "x", channels, steps)
+    for word in words:
+        assert word in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_nothing_is_overwritten_and_no_half_file_left(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "x.csv").write_text("mine")
+    with pytest.raises(InputError, match="exists already"):
+        export_log(log, ["csv"], tmp_path / "x", (), None)
+    assert (tmp_path / "x.csv").read_text() == "mine"
+    with pytest.raises(InputError, match="no such log"):
+        export_log(tmp_path / "none.mcap", ["csv"], None, (), None)
+    with pytest.raises(InputError, match="not an MCAP file"):
+        export_log(tmp_path / "x.csv", ["mat"], None, (), None)
+
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("twin.exchange.formats.mat.savemat", full)
+    with pytest.raises(OSError, match="No space"):
+        export_log(log, ["mat"], tmp_path / "y", (), None)
+    assert not (tmp_path / "y.mat").exists()
+
+
+def test_a_library_that_is_missing_is_said_before_anything_is_written(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    monkeypatch.delitem(sys.modules, "twin.exchange.formats.parquet", raising=False)
+    with pytest.raises(InputError, match=r"--parquet: pyarrow is not installed; pip install"):
+        export_log(log, ["csv", "parquet"], tmp_path / "new" / "x", (), None)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_a_call_wrote_goes_with_what_it_could_not_write(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And nothing else does: not a file that came to stand there meanwhile."""
+    there = tmp_path / "x.foxglove.layout.json"
+
+    def slow(*_: Any) -> None:
+        there.write_text("mine")
+
+    monkeypatch.setattr("twin.exchange.foxglove.write_foxglove", slow)
+    with pytest.raises(InputError, match=r"layout.json: exists already"):
+        export_log(log, ["csv", "foxglove"], tmp_path / "x", ("mass_disp_m",), None)
+    assert [*tmp_path.iterdir()] == [there]
+    assert there.read_text() == "mine"
+
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("twin.exchange.formats.mat.savemat", full)
+    with pytest.raises(OSError, match="No space"):
+        export_log(log, ["csv", "mat"], tmp_path / "a" / "b" / "y", ("mass_disp_m",), None)
+    assert [*tmp_path.iterdir()] == [there]
+    assert "rows of" not in capsys.readouterr().out
+
+
+def test_a_log_without_its_end_is_said_to_be_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start = start_record()
+    cut = [item for item in blocks()[:4] if not isinstance(item, RunStop)]
+    write_items(tmp_path / "run.mcap", [start, *cut], start)
+    assert export_log(tmp_path, ["csv"], None, (), None) == 0
+    assert "unfinished" in capsys.readouterr().err
+    assert len(read_table(tmp_path / "run.csv").columns["time_s"].values) == 2500
+
+
+def test_labels_that_contradict_themselves_name_the_row(out: Path, tmp_path: Path) -> None:
+    lines = out.with_suffix(".csv").read_text().splitlines()
+    names = lines[0].split(",")
+
+    def refused(row: int, column: str, cell: str, *words: str) -> None:
+        cells = lines[row - 1].split(",")
+        cells[names.index(column)] = cell
+        path = tmp_path / "wrong.csv"
+        path.write_text("\n".join([*lines[: row - 1], ",".join(cells), *lines[row:]]))
+        table = read_table(path)
+        with pytest.raises(InputError) as caught:
+            read_labels(table, read_samples(table, read_column_map(None)))
+        for word in (f"row {row}", *words):
+            assert word in str(caught.value)
+
+    refused(9, "label", "7", "label is 7", "0 to 5")
+    refused(9, "cycle", "0.5", "cycle is 0.5", "whole numbers")
+    refused(9, "step", "nan", "step is nan")
+    refused(9, "frequency_hz", "3.0", "frequency_hz is 3", "step 0")
+    refused(2, "direction", "0", "step 0 lacks direction")
+
+
+def test_a_name_with_an_ending_is_the_name_of_all(log: Path, tmp_path: Path) -> None:
+    assert export_log(log, ["csv", "mat"], tmp_path / "new" / "a.csv", ("mass_disp_m",), None) == 0
+    assert sorted(one.name for one in (tmp_path / "new").iterdir()) == ["a.csv", "a.mat"]
+
+
+def test_the_commands(log: Path, tmp_path: Path) -> None:
+    run = CliRunner()
+    new = tmp_path / "a.csv"
+    asked = ["export", str(log), "--csv", "--steps", "1:2", "--channel", "mass_disp_m"]
+    told = run.invoke(app, [*asked, "-o", str(new)])
+    assert told.exit_code == 0, told.output
+    assert "rows of 8 columns" in told.output
+    assert isinstance(run.invoke(app, [*asked[:-3], "x"]).exception, InputError)
+    told = run.invoke(app, ["import", str(new), "--list"])
+    assert "mass_disp_m: " in told.output
+    assert isinstance(run.invoke(app, ["import", str(new)]).exception, InputError)
+    both = run.invoke(app, ["import", str(new), "--list", "-o", str(tmp_path / "b.mcap")])
+    assert "leave -o out" in str(both.exception)
+    assert run.invoke(app, ["import", str(new), "-o", str(tmp_path / "a.mcap")]).exit_code == 4
+    assert (
+        len(read_recording(tmp_path / "a.mcap").start.steps) == 2
+    )  # and lost samples, hence the 4
+
+
+def test_half_a_view_is_taken_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    start = replace(start_record(), profile_toml=(PROFILES_DIR / "tests/g4_ss3.toml").read_text())
+    write_items(tmp_path / "run.mcap", [start, *blocks()], start)
+
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("twin.viewer.view.RerunView.feed", full)
+    with pytest.raises(OSError, match="No space"):
+        export_log(tmp_path, ["rrd"], None, (), None)
+    assert not (tmp_path / "run.rrd").exists()

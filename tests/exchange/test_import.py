@@ -1,0 +1,298 @@
+"""A table of samples becomes a log: what our own run says of itself comes out of its CSV again."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from table_io.block import Block, Label
+from table_io.errors import InputError
+from table_io.records import Comparison, Event, PrcPoint, SampleGap
+from tests.exchange.csv_tables import write_csv
+from tests.run.test_unpaced import QUICK, played
+from twin.cli.replay import ReplayRequest, replay_logs
+from twin.cli.report import print_recording_prc
+from twin.exchange.export import export_log
+from twin.exchange.import_table import import_samples, print_contents
+from twin.recording.reader import Recording, read_recording
+from twin.reports.summary import summarise
+from twin.run.recordings import read_recorded_config
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+SHORT = QUICK.replace("start_hz = 2.6", "start_hz = 3.6")
+SILVERBOX = """
+rate_hz = 610.35
+[columns]
+table_acc_m_s2 = { column = "V1", gain = -1.0 }
+rel_disp_m = { column = "V2" }
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Recording]:
+    """A folder with quick.toml and table.csv of an unpaced run, and the run itself."""
+    folder = tmp_path_factory.mktemp("ours")
+    recording = read_recording(played(folder, SHORT)[1])
+    write_csv(recording, folder / "table.csv")
+    return folder, recording
+
+
+@pytest.fixture(scope="module")
+def imported(run: tuple[Path, Recording]) -> Recording:
+    folder, _ = run
+    log = folder / "imported" / "run.mcap"
+    assert import_samples(folder / "table.csv", log, folder / "quick.toml", None, None) == 0
+    return read_recording(log)
+
+
+def whole(recording: Recording) -> Block:
+    (piece,) = recording.contiguous_blocks("meas")
+    return piece
+
+
+def steps(recording: Recording) -> list[dict[str, Any]]:
+    return summarise(recording, read_recorded_config(recording).parameters)["steps"]
+
+
+def said(recording: Recording) -> str:
+    return "\n".join(event.text for event in recording.records(Event))
+
+
+def test_the_samples_are_those_of_the_run(run: tuple[Path, Recording], imported: Recording) -> None:
+    ours, theirs = whole(run[1]), whole(imported)
+    assert (theirs.rate_hz, theirs.channels) == (ours.rate_hz, ours.channels)
+    np.testing.assert_allclose(theirs.values, ours.values, rtol=1e-8)
+
+
+def test_steps_and_measured_cycles_are_found_where_they_were_driven(
+    run: tuple[Path, Recording], imported: Recording
+) -> None:
+    ours, theirs = whole(run[1]), whole(imported)
+    assert imported.start.steps == run[1].start.steps
+    for step in imported.start.steps:
+        true, found = (
+            np.flatnonzero((one.step == step.index) & (one.label == Label.MEASURE))
+            for one in (ours, theirs)
+        )
+        length = ours.rate_hz / step.frequency_hz
+        assert abs(true[0] - found[0]) < 0.02 * length
+        assert abs(true[-1] - found[-1]) < 0.02 * length
+        held = (ours.step == step.index) & (ours.cycle >= 0) & (theirs.cycle >= 0)
+        assert (ours.cycle == theirs.cycle)[held].mean() > 0.98
+
+
+def test_the_prc_is_that_of_the_run(run: tuple[Path, Recording], imported: Recording) -> None:
+    for ours, theirs in zip(steps(run[1]), steps(imported), strict=True):
+        assert ours["frequency_hz"] == theirs["frequency_hz"]
+        assert ours["direction"] == theirs["direction"]
+        # At the jump the motion is no steady one, and a sample earlier is another motion.
+        near = 5e-3 if ours["measured"]["spread"] > 0.02 else 1e-3
+        for key in ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l"):
+            assert theirs["measured"][key] == pytest.approx(ours["measured"][key], rel=near)
+        assert ours["measured"]["impacts_right"] == theirs["measured"]["impacts_right"]
+
+
+def test_prc_and_replay_take_it_as_one_of_ours(
+    imported: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str], draft: None
+) -> None:
+    print_recording_prc(imported.path, True)
+    assert '"frequency_hz": 3.6' in capsys.readouterr().out
+    assert replay_logs(ReplayRequest([imported.path], [], tmp_path / "again")) == 0
+    assert len(read_recording(tmp_path / "again" / "run.mcap").records(PrcPoint)) == len(
+        imported.start.steps
+    )
+    assert (tmp_path / "again" / "report.html").stat().st_size > 10_000
+
+
+def test_a_sweep_that_is_another_changes_no_step(
+    run: tuple[Path, Recording], tmp_path: Path, draft: None
+) -> None:
+    profile = tmp_path / "other.toml"
+    profile.write_text(SHORT.replace("start_hz = 3.6", "start_hz = 1.0").replace("0.2", "1.7"))
+    log = tmp_path / "other.mcap"
+    import_samples(run[0] / "table.csv", log, profile, None, None)
+    recording = read_recording(log)
+    driven = [(one.direction, one.frequency_hz) for one in run[1].start.steps]
+    found = [(one.direction, one.frequency_hz) for one in recording.start.steps]
+    assert [way for way, _ in found] == [way for way, _ in driven]
+    np.testing.assert_allclose([hz for _, hz in found], [hz for _, hz in driven], rtol=2e-3)
+    assert replay_logs(ReplayRequest([log], [], tmp_path / "again")) == 0
+    again = read_recording(tmp_path / "again" / "run.mcap").records(PrcPoint)
+    assert [one.frequency_hz for one in again] == [hz for _, hz in found]
+
+
+def rows(run: tuple[Path, Recording]) -> list[str]:
+    """Header and rows of the first second of the sweep."""
+    return (run[0] / "table.csv").read_text().splitlines()[:6001]
+
+
+def test_a_hole_is_a_gap_between_two_blocks(run: tuple[Path, Recording], tmp_path: Path) -> None:
+    lines = rows(run)
+    del lines[2001:2051]
+    (tmp_path / "holed.csv").write_text("\n".join(lines))
+    log = tmp_path / "run.mcap"
+    assert import_samples(tmp_path / "holed.csv", log, run[0] / "quick.toml", None, None) == 4
+    recording = read_recording(log)
+    assert recording.records(SampleGap) == (SampleGap(2000, 50, "", "lost"),)
+    assert [(one.index, one.end) for one in recording.contiguous_blocks("meas")] == [
+        (0, 2000),
+        (2050, 6000),
+    ]
+    assert recording.missing_samples == 50
+
+
+def test_lost_cells_and_lost_sensors_stay_lost(run: tuple[Path, Recording], tmp_path: Path) -> None:
+    table = [line.split(",") for line in rows(run)]
+    place = table[0].index("force_r1_n")
+    other = table[0].index("mass_acc_m_s2")
+    for line in table[1:]:
+        line[place] = ""
+    table[101][other] = "NaN"
+    (tmp_path / "lost.csv").write_text("\n".join(map(",".join, table)))
+    assert import_samples(
+        tmp_path / "lost.csv", tmp_path / "l.mcap", run[0] / "quick.toml", None, None
+    )
+    recording = read_recording(tmp_path / "l.mcap")
+    assert np.isnan(whole(recording).channel("force_r1_n")).all()
+    assert np.flatnonzero(np.isnan(whole(recording).channel("mass_acc_m_s2"))).tolist() == [100]
+    assert set(recording.records(SampleGap)) == {
+        SampleGap(0, 6000, "force_r1_n", "lost"),
+        SampleGap(100, 1, "mass_acc_m_s2", "lost"),
+    }
+    assert "force_r1_n: all samples lost" in said(recording)
+
+
+def test_the_profile_holds_at_another_rate(run: tuple[Path, Recording], tmp_path: Path) -> None:
+    lines = rows(run)
+    (tmp_path / "half.csv").write_text("\n".join([lines[0], *lines[1::2]]))
+    profile = tmp_path / "half.toml"
+    profile.write_text(SHORT + "[acquisition]\nblock_samples = 10 # ten\nrate_hz = 2000.0\n")
+    import_samples(tmp_path / "half.csv", tmp_path / "half.mcap", profile, None, None)
+    found = read_recorded_config(read_recording(tmp_path / "half.mcap")).profile
+    assert found.acquisition.rate_hz == 1000.0
+    assert found.acquisition.block_samples == 10
+    assert found.specimen.gap_mm == 4.0
+    (tmp_path / "slow.csv").write_text("\n".join([lines[0], *lines[1::10]]))
+    with pytest.raises(InputError, match=r"200 Hz of .*slow.csv(.|\n)*at least 440"):
+        import_samples(tmp_path / "slow.csv", tmp_path / "slow.mcap", profile, None, None)
+
+
+def test_our_own_export_is_the_same_run_again(
+    run: tuple[Path, Recording], tmp_path: Path, draft: None
+) -> None:
+    assert export_log(run[1].path, ["parquet"], tmp_path / "out", (), None) == 0
+    assert import_samples(tmp_path / "out.parquet", tmp_path / "again.mcap", None, None, None) == 0
+    again = read_recording(tmp_path / "again.mcap")
+    assert whole(again).is_identical(whole(run[1]))
+    for name in ("steps", "profile_toml", "rig_toml", "model_toml"):
+        assert getattr(again.start, name) == getattr(run[1].start, name)
+    (ours,), (theirs,) = (one.contiguous_blocks("pred") for one in (run[1], again))
+    assert theirs.is_identical(ours)
+    assert again.records(PrcPoint) == run[1].records(PrcPoint)
+    assert "no --profile" not in said(again)
+    assert "steps, labels and cycles are taken from the file" in said(again)
+
+
+def test_a_table_without_a_profile_says_so_and_has_its_curve(
+    run: tuple[Path, Recording], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its labels tell how many cycles were held and measured, 6 and 2 here."""
+    assert export_log(run[1].path, ["csv"], tmp_path / "out", (), None) == 0
+    assert import_samples(tmp_path / "out.csv", tmp_path / "bare.mcap", None, None, None) == 0
+    bare = read_recording(tmp_path / "bare.mcap")
+    assert len(bare.records(PrcPoint)) == len(run[1].start.steps)
+    sweep = read_recorded_config(bare).profile.sweep
+    assert (sweep.cycles, sweep.measured_cycles) == (6, 2)
+    (warning,) = (one for one in bare.records(Event) if one.kind == "warning")
+    assert warning.text.startswith("no --profile: unit mass, no bumpers, a 1 Hz placeholder model")
+    assert warning.text in capsys.readouterr().out
+    assert "no --profile" not in said(run[1])
+
+
+def test_labels_of_a_table_stand_before_what_its_motion_tells(
+    run: tuple[Path, Recording], tmp_path: Path
+) -> None:
+    """One that is not all of them is none."""
+    assert export_log(run[1].path, ["csv"], tmp_path / "out", ("table_acc_m_s2",), (1, 2)) == 0
+    import_samples(tmp_path / "out.csv", tmp_path / "a.mcap", run[0] / "quick.toml", None, None)
+    steps = read_recording(tmp_path / "a.mcap").start.steps
+    assert [one.frequency_hz for one in steps] == [
+        one.frequency_hz for one in run[1].start.steps[1:3]
+    ]
+    lines = (tmp_path / "out.csv").read_text().splitlines()
+    kept = [k for k, name in enumerate(lines[0].split(",")) if name != "cycle"]
+    rows = [",".join(line.split(",")[k] for k in kept) for line in lines]
+    (tmp_path / "less.csv").write_text("\n".join(rows))
+    import_samples(tmp_path / "less.csv", tmp_path / "b.mcap", run[0] / "quick.toml", None, None)
+    assert "left out: step, label, direction" in said(read_recording(tmp_path / "b.mcap"))
+
+
+def test_a_shaking_table_of_others(tmp_path: Path) -> None:
+    card = tmp_path / "map.toml"
+    card.write_text(
+        '[columns]\ntime_s = { column = "timepos:1" }\n'
+        'table_disp_m = { column = "timepos:2", gain = 0.01 }\n'
+    )
+    file = there("shaking_table/SineA5F2.npz")
+    assert import_samples(file, tmp_path / "a.mcap", None, None, card) == 0
+    recording = read_recording(tmp_path / "a.mcap")
+    assert (whole(recording).rate_hz, len(whole(recording))) == (200.0, 4001)
+    (step,) = recording.start.steps
+    assert step.frequency_hz == pytest.approx(2.0, rel=1e-3)
+
+
+def test_what_a_file_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    print_contents(there("bncs/CNP100.csv"), None)
+    assert "rel_disp_m: " in capsys.readouterr().out
+
+
+def test_a_component_test_without_a_table_is_a_log_that_is_not_replayed(tmp_path: Path) -> None:
+    time = np.arange(4000) / 200
+    u = 0.01 * np.sin(2 * np.pi * time)
+    table = np.array([time, u, 36e3 * u]).T
+    file, log = tmp_path / "component.csv", tmp_path / "component.mcap"
+    np.savetxt(file, table, delimiter=",", header="time_s,rel_disp_m,damper_force_n", comments="")
+    assert import_samples(file, log, None, None, None) == 0
+    recording = read_recording(log)
+    assert recording.start.channels == ("damper_force_n", "rel_disp_m")
+    assert not recording.records(Comparison)
+    assert "no --profile" in said(recording)
+    assert recording.start.steps[0].frequency_hz == pytest.approx(1.0, rel=1e-3)
+    with pytest.raises(InputError, match="no table_acc_m_s2"):
+        replay_logs(ReplayRequest([log], [], tmp_path / "out"))
+    with pytest.raises(InputError, match="exists already"):
+        import_samples(file, log, None, None, None)
+
+
+def there(name: str) -> Path:
+    path = DATA / name
+    if not path.is_file():
+        pytest.skip("the measured data of others are not here")
+    return path
+
+
+def test_a_building_under_an_earthquake(tmp_path: Path, draft: None) -> None:
+    log = tmp_path / "b" / "run.mcap"
+    assert import_samples(there("bncs/CNP100.csv"), log, None, None, None) == 0
+    recording = read_recording(log)
+    block = whole(recording)
+    assert block.rate_hz == 200.0
+    assert block.channel("rel_disp_m")[0] == -9.43853e-05
+    assert set(block.step) == {-1}
+    assert set(block.label) == {Label.REST, Label.SETTLE}
+    assert "no stepped sine" in said(recording)
+    assert replay_logs(ReplayRequest([log], [], tmp_path / "again")) == 0
+
+
+def test_the_silverbox_by_a_map(tmp_path: Path) -> None:
+    (tmp_path / "map.toml").write_text(SILVERBOX)
+    file, log = tmp_path / "s.csv", tmp_path / "s.mcap"
+    lines = there("silverbox/SNLS80mV.csv").read_text().splitlines(keepends=True)
+    file.write_text("".join(lines[:20_001]))
+    assert import_samples(file, log, None, None, tmp_path / "map.toml") == 0
+    block = whole(read_recording(log))
+    assert (block.rate_hz, len(block)) == (610.35, 20_000)
+    assert block.channel("table_acc_m_s2")[0] == -0.0057756
+    assert block.channel("rel_disp_m")[0] == 0.0093978
+    assert set(block.step) == {-1}

@@ -1,0 +1,82 @@
+"""Short recordings of the simulated table, with something hidden in it, made ready for learning."""
+
+import hashlib
+import tempfile
+from functools import cache
+from pathlib import Path
+
+from table_io.acquisition.session import SessionSetup, run_session
+from table_io.backends import open_backend
+from table_io.block import Block
+from table_io.clock import ManualClock
+from table_io.config.base import PROFILES_DIR, load_config
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.records import RunStart
+from twin.identification.discover import PreparedLog
+from twin.identification.signals import build_signals
+from twin.model.model import Model
+from twin.model.parameters import Parameters
+
+RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
+TRUE = Parameters(550.0, 36e3, 1.1e3, 510e3, 900.0, 510e3, 900.0, 0.002, 0.002)
+SNM = Model(TRUE)
+
+
+def profile(gap_mm: float = 4.0, start_hz: float = 1.4, stop_hz: float = 4.4) -> Profile:
+    """Up and back in a few steps, through flight, impacts and jumps."""
+    sweep = {"start_hz": start_hz, "stop_hz": stop_hz, "step_hz": 0.6, "cycles": 5}
+    return Profile.model_validate(
+        {
+            "title": "short",
+            "specimen": {"mass_kg": 550.0, "gap_mm": gap_mm},
+            "sweep": sweep,
+            "acquisition": {"rate_hz": 1000.0},
+            "loop_check": {"enabled": False},
+            "control": {"enabled": False},
+        }
+    )
+
+
+@cache
+def blocks(truth: str = "", noise: float = 1.0, gap_mm: float = 4.0) -> tuple[Block, ...]:
+    """Measured blocks of a rig that hides a truth, with so many times the card's noise."""
+    sensors = [one.model_copy(update={"noise_rms": one.noise_rms * noise}) for one in RIG.sensors]
+    simulated = RIG.simulated
+    assert simulated is not None
+    with tempfile.TemporaryDirectory() as folder:
+        if truth:
+            path = Path(folder) / "truth.toml"
+            path.write_text(truth)
+            sealed = hashlib.sha256(truth.encode()).hexdigest()
+            update = {"truth": str(path), "truth_sha256": sealed}
+            simulated = simulated.model_copy(update=update)
+        rig = RIG.model_copy(update={"sensors": tuple(sensors), "simulated": simulated})
+        clock, test = ManualClock(), profile(gap_mm)
+
+        def start(tare: dict[str, float], epoch_s: float) -> RunStart:
+            return RunStart(
+                0, "r", "n", "table", "", "", "", 1e3, 20, rig.channels, (), 0, tare, {}, "", "",
+                epoch_s,
+            )  # fmt: skip
+
+        source = run_session(
+            SessionSetup(test, rig), open_backend(rig, test, clock), clock, start, lambda: None
+        )
+        return tuple(item for item in source if isinstance(item, Block))
+
+
+def log(truth: str = "", noise: float = 1.0, gap_mm: float = 4.0) -> PreparedLog:
+    """The same, made ready."""
+    test = profile(gap_mm)
+    readings = build_signals(blocks(truth, noise, gap_mm), "short", 550.0, test.specimen.gaps_m)
+    return PreparedLog(readings, test.comparison.contact_n, test.sweep.steps)
+
+
+def hidden(effect: str, channel: str = "", form: str = "", **parameters: float) -> str:
+    """A sealed truth with one effect."""
+    lines = ["[[effects]]", f'id = "{effect}"']
+    lines += [f'channel = "{channel}"'] if channel else []
+    lines += [f'form = "{form}"'] if form else []
+    numbers = ", ".join(f"{name} = {value!r}" for name, value in parameters.items())
+    return "\n".join([*lines, f"parameters = {{ {numbers} }}", ""])

@@ -1,0 +1,126 @@
+"""Motion from lasers and accelerometers, and what their disagreement says."""
+
+import numpy as np
+import pytest
+
+from table_io.block import Block
+from table_io.errors import InputError
+from tests.identification.played import TRUE, blocks, hidden, log
+from twin.identification.signals import build_signals
+from twin.model.inverse_dynamics import forces_along
+from twin.model.model import Model, SensorModel
+
+
+def test_velocity_is_that_of_the_displacement() -> None:
+    motion = log().signals.fuse_motion()
+    inside = motion.moving & (np.arange(motion.u.size) > 500)
+    slope = np.gradient(motion.u, 1.0 / motion.rate_hz)
+    error = (slope - motion.v)[inside]
+    assert np.sqrt(np.mean(error**2)) < 0.02 * np.sqrt(np.mean(motion.v[inside] ** 2))
+
+
+def test_the_fused_motion_is_better_than_the_laser_by_far() -> None:
+    """Against the same run without noise: the card's lasers have 5 um, their difference 7."""
+    noisy, clean = log(noise=4.0).signals.fuse_motion(), log(noise=1e-3).signals.fuse_motion()
+    error = (noisy.u - clean.u)[clean.moving]
+    assert 0 < error.std() < 0.5 * 4 * 7e-6
+    assert noisy.noise.u == pytest.approx(error.std(), rel=0.3)
+
+
+@pytest.mark.parametrize("noise", [1.0, 20.0])
+def test_sound_sensors_surprise_nobody(noise: float) -> None:
+    motion = log(noise=noise).signals.fuse_motion()
+    assert [one.body for one in motion.consistency_residuals] == [
+        "mass",
+        "table",
+        "right cells",
+        "left cells",
+    ]
+    for one in motion.consistency_residuals:
+        assert np.mean(one.values[motion.moving] ** 2) == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize(
+    ("effect", "channel", "body"),
+    [
+        ("sensor_gain", "mass_acc_m_s2", "mass"),
+        ("sensor_gain", "table_disp_m", "table"),
+        ("sensor_gain", "force_l2_n", "left cells"),
+    ],
+)
+def test_the_gate_names_the_body_and_the_belief_closes_it(
+    effect: str, channel: str, body: str
+) -> None:
+    readings = log(hidden(effect, channel, gain=1.05)).signals
+
+    def odd(sensors: tuple[SensorModel, ...]) -> dict[str, float]:
+        motion = readings.fuse_motion(sensors)
+        return {
+            one.body: float(np.mean(one.values[motion.moving] ** 2))
+            for one in motion.consistency_residuals
+        }
+
+    before = odd(())
+    assert before[body] > 3.0
+    assert all(value < 1.3 for name, value in before.items() if name != body)
+    assert odd((SensorModel(channel, gain=1.05),))[body] == pytest.approx(1.0, abs=0.15)
+
+
+def test_no_force_law_breaks_the_gate() -> None:
+    motion = log(hidden("bumper_hardening", k2=1e8)).signals.fuse_motion()
+    for one in motion.consistency_residuals:
+        assert np.mean(one.values[motion.moving] ** 2) < 1.2
+
+
+def test_a_lag_is_taken_back() -> None:
+    late = log(hidden("sensor_lag", "mass_acc_m_s2", lag=2e-3)).signals
+    sound = log().signals.fuse_motion()
+    mended = late.fuse_motion((SensorModel("mass_acc_m_s2", lag=2e-3),))
+    error = (mended.acc - sound.acc)[sound.moving]
+    was = (late.fuse_motion().acc - sound.acc)[sound.moving]
+    assert error.std() < 0.1 * was.std()
+
+
+def test_without_displacement_there_is_nothing_to_learn() -> None:
+    one = blocks()[0]
+    place = one.channels.index("mass_acc_m_s2")
+    poor = Block(
+        one.stream, one.index, one.rate_hz, ("mass_acc_m_s2",), one.values[place : place + 1],
+        one.step, one.label, one.cycle,
+    )  # fmt: skip
+    with pytest.raises(InputError, match="rel_disp_m") as error:
+        build_signals((poor,), "poor", 550.0, (0.002, 0.002))
+    assert error.value.where == "poor"
+
+
+def test_a_dead_channel_is_no_channel() -> None:
+    dead = []
+    for one in blocks():
+        values = one.values.copy()
+        values[one.channels.index("force_r1_n")] = 0.0
+        dead.append(
+            Block(
+                one.stream,
+                one.index,
+                one.rate_hz,
+                one.channels,
+                values,
+                one.step,
+                one.label,
+                one.cycle,
+            )
+        )
+    assert "force_r1_n" not in build_signals(tuple(dead), "dead", 550.0, (0.002, 0.002)).channels
+
+
+def test_along_a_motion_the_forces_are_those_of_the_law() -> None:
+    time = np.arange(500) / 500.0
+    u, v = 0.004 * np.sin(6.0 * time), 0.024 * np.cos(6.0 * time)
+    touched = np.array([u > 0.002, u < -0.002]).astype(np.int8)
+    model = Model(TRUE).with_effect("cubic_stiffness", k3=1e8)
+    damper, right, left = forces_along(model, u, v, time, touched)
+    np.testing.assert_allclose(damper, 36e3 * u + 1.1e3 * v + 1e8 * u**3, rtol=1e-12, atol=1e-9)
+    push = 510e3 * (u - 0.002) + 900.0 * v
+    np.testing.assert_allclose(right, np.where(u > 0.002, push, 0.0), rtol=1e-12, atol=1e-9)
+    pull = 510e3 * (u + 0.002) + 900.0 * v
+    np.testing.assert_allclose(left, np.where(u < -0.002, pull, 0.0), rtol=1e-12, atol=1e-9)

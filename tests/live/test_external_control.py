@@ -1,0 +1,81 @@
+"""What a run beside a controller of its own asks of the disk, the warm-up and the stopwatch."""
+
+import platform
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from table_io.backends.opendaq import check_reachable
+from table_io.config.base import find_config, load_config
+from table_io.config.rig import RigConfig
+from table_io.errors import InputError
+from table_io.records import RunStart, Timing
+from table_io.sim.opendaq import OpenDaqServer
+from twin.live.twin_process import _TwinProcess
+from twin.reports.summary import _timing
+from twin.run.disk import bytes_per_s, planned_bytes
+from twin.run.run_config import compile_rig_kernels, read_run_config
+
+SPARE = "drive_disp_m"
+
+
+def no_command(folder: Path) -> Path:
+    """The card without a wire for the command."""
+    text = find_config("follow_simulated", "rigs").read_text()
+    first = text.index(f'[[sensors]]\nchannel = "{SPARE}"')
+    after = text.index("[[sensors]]", first + 1)
+    text = (text[:first] + text[after:]).replace(f'{SPARE} = "command"\n', "")
+    path = folder / "follow_bare.toml"
+    path.write_text(text.replace(f'command = "{SPARE}"', 'command = "table_disp_m"'))
+    assert SPARE not in tomllib.loads(path.read_text())["opendaq"]["signals"]
+    return path
+
+
+def test_a_card_without_a_command_is_warmed_up(tmp_path: Path) -> None:
+    compile_rig_kernels(
+        read_run_config(find_config("quickstart", "tests"), str(no_command(tmp_path)))
+    )
+
+
+def test_the_time_that_is_waited_for_the_controller_needs_room() -> None:
+    here = read_run_config(find_config("quickstart", "tests"), "simulated")
+    followed = read_run_config(find_config("quickstart", "tests"), "follow_simulated")
+    assert followed.rig.follow is not None
+    more = bytes_per_s(followed) * followed.rig.follow.wait_s
+    assert planned_bytes(followed) - planned_bytes(here) == pytest.approx(more)
+
+
+@pytest.mark.parametrize("follows", [False, True])
+def test_no_latency_is_told_of_blocks_that_were_held_back(follows: bool) -> None:
+    twin = _TwinProcess("r", *[None] * 4, "", external_clock=follows)  # type: ignore[arg-type]
+    table = "r", "n", "table", "", "", "", 2000.0, 20, (), (), 0, {}, {}
+    twin.handle_record(RunStart(0, *table, platform.node(), "", 5.0))
+    assert twin.epoch_s == (None if follows else 5.0)
+
+
+def test_a_stopwatch_that_saw_nothing_says_no_latency() -> None:
+    found = _timing((Timing(0, "twin", 0.0, 0.0, 0.0, 0, 0, 0.1, "normal"),))
+    assert found["latency_ms"] == {"p50": None, "p99": None, "max": None}
+
+
+def test_an_address_that_is_no_name_is_told() -> None:
+    pytest.importorskip("opendaq")
+    rig, _ = load_config(find_config("follow_simulated", "rigs"), RigConfig, "card")
+    assert rig.opendaq is not None
+    wiring = rig.opendaq.model_copy(update={"device": "daq.nd://a..b"})
+    with pytest.raises(InputError, match=r"no openDAQ device answers at daq\.nd://a\.\.b"):
+        check_reachable(rig.model_copy(update={"opendaq": wiring}))
+
+
+class Signal:
+    """One that so many acquire."""
+
+    def __init__(self, connections: int) -> None:
+        self.connections = [None] * connections
+
+
+def test_who_acquires_only_the_last_signal_is_heard() -> None:
+    device = object.__new__(OpenDaqServer)
+    device._signals = [(Signal(0), None), (Signal(1), None)]
+    assert device.has_client

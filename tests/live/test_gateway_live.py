@@ -1,0 +1,54 @@
+"""A live run, and a recorder beside it that comes through the gate, while the gate dies."""
+
+import subprocess
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from tests.live.test_live import (
+    QUICK,
+    SHAKETWIN,
+    assert_whole,
+    endpoint,
+    finish,
+    kill,
+    replayed,
+    running,
+    start,
+)
+from twin.recording.recovery import recover_log
+
+pytestmark = pytest.mark.slow
+LONG = QUICK.replace("cycles = 5", "cycles = 20", 1)
+
+
+def test_a_dead_gate_leaves_no_gap_here_nor_there(tmp_path: Path) -> None:
+    listen = endpoint()
+    process = start(tmp_path, "--listen", listen, profile=LONG)
+    running(process)
+    there = tmp_path / "there"
+    command = [SHAKETWIN, "attend", "recorder", "--connect", listen, "--out", str(there)]
+    attending = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert attending.stdout is not None
+    assert attending.stdout.readline().startswith("recording")
+    tell = [SHAKETWIN, "tell", "--connect", listen]
+    assert subprocess.run([*tell, "hold", "--why", "a look"], check=False).returncode == 0
+    kill(process, "gate")
+    tries = (subprocess.run([*tell, "resume"], check=False).returncode for _ in range(10))
+    assert any(code == 0 for code in tries), "the next gate never came"
+    code, said, recording, _ = finish(process, tmp_path)
+    assert code == 0, said
+    assert "gate died (SIGKILL); restarting it, the table goes on" in said
+    assert "order: hold: a look by " in said
+    assert_whole(recording)
+    attending.communicate(timeout=90)
+    assert attending.returncode == 0
+    here, beside = (
+        Counter((one.topic, one.payload) for one in recover_log(folder / "run.mcap").messages)
+        for folder in (tmp_path / "out", there)
+    )
+    only_here = here - beside
+    assert [topic for topic, _ in only_here] == ["/run/timing"]  # the recorder's last word
+    assert not beside - here
+    assert replayed(tmp_path).returncode == 0

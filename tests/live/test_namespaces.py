@@ -1,0 +1,21 @@
+"""Two hosts as network namespaces, where this machine lets us make some."""
+
+import json
+
+import pytest
+
+from tests.live.cable_pull import BLOCKS
+from tests.live.namespaces import enclosed, refusal
+
+WHY = refusal()
+
+
+@pytest.mark.skipif(bool(WHY), reason=f"no network namespaces here: {WHY}")
+def test_a_cable_pulled_for_two_seconds_leaves_no_gap() -> None:
+    process = enclosed("tests.live.cable_pull")
+    try:
+        said, _ = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 0, said
+    assert json.loads(said.splitlines()[-1]) == {"got": list(range(BLOCKS)), "missed": 0}

@@ -1,0 +1,275 @@
+"""The recorder on a disk that fills up, comes back or dies, as it sees its bus and its clock."""
+
+import errno
+import os
+import resource
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from table_io.block import Block
+from table_io.clock import ManualClock
+from table_io.errors import InputError
+from table_io.records import Event, RunStop, Timing
+from tests.reports.recordings import blocks, start_record
+from twin.live import recorder as module
+from twin.live.latency import LatencyHistogram
+from twin.live.process_config import ProcessConfig
+from twin.live.recorder import _Recorder
+from twin.recording.mcap_log import LogWriter, iter_messages
+from twin.recording.merge import verify_log
+from twin.recording.reader import read_recording
+from twin.run.disk import DiskForecast, DiskReserve
+from twin.transport.codec import encode_item, topic_for
+
+START = start_record()
+BLOCK_S = 0.05
+SPEC = ProcessConfig(START.run, "short", "", "", "", "", "")
+
+
+@dataclass
+class Bus:
+    """Link and inbox of a recorder: what comes, when, and what it says itself."""
+
+    coming: deque[tuple[str, bytes]]
+    clock: ManualClock
+    each_turn: Callable[[int], None] = lambda _: None
+    said: list[Any] = field(default_factory=list)
+    orders: list[str] = field(default_factory=list)
+    answers: deque[str | None] = field(default_factory=deque)
+    turns: int = 0
+    missed: int = 0
+    dropped: int = 0
+
+    def get(self, _: float) -> tuple[str, bytes] | None:
+        self.turns += 1
+        self.clock.time_s += BLOCK_S / 3
+        self.each_turn(self.turns)
+        return self.coming.popleft() if self.coming else None
+
+    def publish(self, name: str, payload: bytes) -> None:
+        self.said.append((name, payload))
+        self.coming.appendleft((name, payload))
+
+    def send_command(self, name: str, text: str, timeout_s: float) -> str | None:
+        self.orders.append(f"{name} {text} {timeout_s}")
+        return self.answers.popleft() if self.answers else "yes"
+
+
+@pytest.fixture
+def limit(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], None]]:
+    """Sets how large files may become, in bytes; -1 is as large as they like."""
+    monkeypatch.setattr(module, "is_orphaned", lambda: False)
+    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+
+
+def items() -> list[Any]:
+    """A whole run: start, 200 blocks with what the twin says, stop, the twin's last word."""
+    some = next(one for one in blocks() if isinstance(one, Block) and one.stream == "meas")
+    size = len(some)
+    run: list[Any] = [START]
+    for number in range(200):
+        run += [replace(some, index=number * size, stream=name) for name in ("meas", "pred")]
+        run.append(Event(number * size, "tick", str(number)))
+    end = 200 * size
+    return [*run, RunStop(end, "complete", "", ()), Timing(end, "twin", 0, 0, 0, 0, 0, 0, "")]
+
+
+def at_work(folder: Path, room_s: float = 1e3) -> tuple[_Recorder, Bus]:
+    """A recorder that is about to record the run."""
+    clock = ManualClock()
+    bus = Bus(deque((topic_for(one), encode_item(one, START.run)) for one in items()), clock)
+    link: Any = bus
+    reserve = DiskReserve(folder / "reserve", 1000)
+    writer = LogWriter(folder / "part.mcap", START.rate_hz)
+    watch = LatencyHistogram("recorder", clock, BLOCK_S)
+    return _Recorder(
+        SPEC, link, link, writer, watch, DiskForecast(room_s), reserve, START.rate_hz, clock
+    ), bus
+
+
+def told(bus: Bus, kind: str) -> list[str]:
+    """The texts of the events that the recorder published."""
+    found = [one for one in read_items(bus) if isinstance(one, Event) and one.kind == kind]
+    return [one.text for one in found]
+
+
+def read_items(bus: Bus) -> list[Any]:
+    from twin.transport.codec import decode_item
+
+    return [decode_item(*one)[1] for one in bus.said]
+
+
+def recorded(folder: Path) -> list[Any]:
+    """Kind and index of everything in the part but what the recorder said itself."""
+    own = ("disk", "recorder")
+    return sorted(
+        (type(one).__name__, one.index)
+        for one in read_recording(folder / "part.mcap").items
+        if not (isinstance(one, Event) and one.kind in own)
+        and not (isinstance(one, Timing) and one.component == "recorder")
+    )
+
+
+def expected() -> list[Any]:
+    return sorted((type(one).__name__, one.index) for one in items())
+
+
+def test_all_that_came_is_in_the_file_a_quarter_second_later(
+    tmp_path: Path, limit: Callable[[int], None]
+) -> None:
+    recorder, bus = at_work(tmp_path)
+    lags = []
+
+    def look(turn: int) -> None:
+        if turn % 25 == 0 and bus.coming:
+            lags.append(turn - 1 - len(list(iter_messages(tmp_path / "part.mcap"))))
+
+    bus.each_turn = look
+    recorder.run()
+    recorder.finish()
+    assert len(lags) > 20
+    assert max(lags) * BLOCK_S / 3 <= 0.25
+    assert verify_log(tmp_path / "part.mcap")
+    assert recorded(tmp_path) == expected()
+    timings = [one for one in read_items(bus) if isinstance(one, Timing)]
+    assert len(timings) >= 200 * BLOCK_S - 2  # one a second
+    assert {one.component for one in timings} == {"recorder"}
+    assert not bus.orders
+    assert not (tmp_path / "reserve").exists()
+
+
+def test_a_full_disk_stops_the_table_once_and_loses_nothing_if_there_is_room_again(
+    tmp_path: Path, limit: Callable[[int], None]
+) -> None:
+    recorder, bus = at_work(tmp_path)
+    bus.answers.append(None)  # the first order is not heard
+
+    def disk(turn: int) -> None:
+        if turn in (200, 400, 450):
+            limit(-1 if turn == 400 else (tmp_path / "part.mcap").stat().st_size + 100)
+        if turn == 399:
+            assert not (tmp_path / "reserve").exists()
+        if turn == 520:
+            limit(-1)
+
+    bus.each_turn = disk
+    recorder.run()
+    recorder.finish()
+    first, again, *_ = told(bus, "disk")
+    assert first.startswith("cannot write the recording (File too large: ")
+    assert "part.mcap): the table is stopped; what was written stays readable" in first
+    assert again == "the disk takes the recording again; what waited is written"
+    why = f"stop {START.run}\ncannot write the recording (File too large: {tmp_path}/part.mcap)"
+    assert bus.orders == [f"{why} 0.5"] * 2
+    assert verify_log(tmp_path / "part.mcap")
+    assert recorded(tmp_path) == expected()
+
+
+def test_a_disk_that_stays_full_leaves_what_was_written_readable(
+    tmp_path: Path, limit: Callable[[int], None]
+) -> None:
+    recorder, bus = at_work(tmp_path)
+    bus.each_turn = lambda turn: limit(60_000) if turn == 5 else None
+    recorder.run()
+    with pytest.raises(
+        InputError, match=r"the end of the recording could not be written: File too"
+    ):
+        recorder.finish()
+    assert bus.orders
+    part = read_recording(tmp_path / "part.mcap")
+    assert not part.is_intact
+    assert part.start == START
+    assert len(part.items) > 10
+
+
+def test_a_disk_that_fills_up_is_told_in_time(
+    tmp_path: Path, limit: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "free_bytes", lambda _: 1_000_000)
+    recorder, bus = at_work(tmp_path, room_s=1e6)
+    recorder.run()
+    recorder.finish()
+    assert [text for text in told(bus, "disk") if "1 MB left on the disk: room for" in text]
+    assert not bus.orders
+
+
+def test_a_disk_that_does_not_sync_stops_the_table(
+    tmp_path: Path, limit: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def dying(_: int) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(os, "fsync", dying)
+    monkeypatch.setattr(module, "SYNC_INTERVAL_S", 1.0)
+    recorder, bus = at_work(tmp_path)
+    recorder.run()
+    recorder.finish()
+    assert told(bus, "disk")[0].startswith("cannot write the recording (Input/output error: ")
+    assert len(bus.orders) == 1
+    assert verify_log(tmp_path / "part.mcap")
+    assert recorded(tmp_path) == expected()
+
+
+def test_what_another_run_says_is_not_recorded(
+    tmp_path: Path, limit: Callable[[int], None]
+) -> None:
+    recorder, bus = at_work(tmp_path)
+    bus.coming.insert(9, ("/run/event", encode_item(Event(3, "stray", ""), "another")))
+    bus.coming.insert(12, ("/rig/meas", b"\xff\xffstray"))
+    bus.missed = 4
+    recorder.run()
+    recorder.finish()
+    assert recorded(tmp_path) == expected()
+    assert not [one for one in iter_messages(tmp_path / "part.mcap") if b"stray" in one.payload]
+    (lost,) = [
+        one
+        for one in read_recording(tmp_path / "part.mcap").records(Event)
+        if one.kind == "recorder"
+    ]
+    assert lost.text == "recorder: 4 messages missed, 0 dropped"
+
+
+def test_of_samples_that_no_log_can_hold_nothing_is_recorded(
+    tmp_path: Path, limit: Callable[[int], None]
+) -> None:
+    recorder, bus = at_work(tmp_path)
+    bus.coming.insert(9, ("/run/event", encode_item(Event(2**50, "stray", ""), START.run)))
+    recorder.run()
+    recorder.finish()
+    assert recorded(tmp_path) == expected()
+    (left,) = [
+        one
+        for one in read_recording(tmp_path / "part.mcap").records(Event)
+        if one.kind == "recorder"
+    ]
+    assert left.text == "recorder: 1 messages left out, of impossible samples"
+
+
+def test_a_sync_that_failed_is_not_believed_to_be_mended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk tells once what it lost; the syncs after it succeed."""
+    recorder, bus = at_work(tmp_path)
+    calls: list[int] = []
+
+    def sync(writer: LogWriter) -> None:
+        calls.append(1)
+        if len(calls) == 1:
+            raise OSError(errno.EIO, "Input/output error", "part.mcap")
+
+    monkeypatch.setattr(module, "SYNC_INTERVAL_S", 0.2)
+    monkeypatch.setattr(module.LogWriter, "sync", sync)
+    monkeypatch.setattr(module, "is_orphaned", lambda: False)
+    recorder.run()
+    recorder.finish()
+    assert len(calls) > 3
+    assert len(told(bus, "disk")) == 1
+    assert "Input/output error" in told(bus, "disk")[0]
+    assert len(bus.orders) == 1

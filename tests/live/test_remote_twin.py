@@ -1,0 +1,306 @@
+"""A twin outside the gate: what is let in of what it offers, and what others may not."""
+
+import itertools
+import os
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from table_io.block import Block
+from table_io.records import Comparison, Event, Fault, Params, RunStop, Timing
+from tests.live.test_gateway import (
+    BUNDLE,
+    CAPACITY,
+    PATIENCE_S,
+    RIG,
+    RUN,
+    Door,
+    Rig,
+    joined,
+    took,
+    until,
+)
+from tests.live.test_gateway import spec as spec_of_a_run
+from twin.live import gateway as gates
+from twin.live import twin_process
+from twin.live.join import join_as_twin
+from twin.live.process_config import ProcessConfig
+from twin.live.remote_twin import (
+    MAX_LEAD_SAMPLES,
+    MAX_PARTIAL_PAYLOADS,
+    MAX_PAYLOAD_FRAGMENTS,
+    OfferFilter,
+    is_valid_offer,
+)
+from twin.transport.codec import CMP_TOPIC, MEAS_TOPIC, Item, decode_item, encode_item, topic_for
+from twin.transport.endpoint import key_expression
+from twin.transport.history_cache import (
+    FRAGMENT_BYTES,
+    FRAGMENT_HEADER,
+    Fragment,
+    HistoryCache,
+    split_payload,
+)
+from twin.transport.zenoh_link import BusLink, open_spoke
+
+KINDS = frozenset(("drift", "no jump"))
+RATE_HZ = BUNDLE.drive.rate_hz
+SIZE = BUNDLE.profile.acquisition.block_samples
+END = 5000
+PARAMS = Params(0, {"stiffness": 1.0}, "x")
+TIMING = Timing(0, "twin", 0, 0, 0, 0, 0, 0, "")
+COMPARED = Comparison(END + MAX_LEAD_SAMPLES - 1, 2, (), (), (), ())
+
+spec = spec_of_a_run
+
+
+def measured(number: int) -> Block:
+    """At rest."""
+    rest = np.zeros(SIZE, dtype=np.int64)
+    values = np.zeros((len(BUNDLE.rig.channels), SIZE))
+    return Block("meas", number * SIZE, RATE_HZ, BUNDLE.rig.channels, values, rest, rest, rest)
+
+
+@pytest.mark.parametrize(
+    ("item", "taken"),
+    [
+        (PARAMS, True),
+        (replace(PARAMS, index=END + MAX_LEAD_SAMPLES), True),
+        (replace(PARAMS, index=END + MAX_LEAD_SAMPLES + 1), False),
+        (replace(PARAMS, index=2**50), False),
+        (COMPARED, False),
+        (replace(COMPARED, count=1), True),
+        (Fault(0, "twin", 0, 2**50, "x"), False),
+        (Fault(10, "twin", 0, 10, "it joined late"), True),
+        (Fault(10, "recorder", 0, 10, "x"), False),
+        (TIMING, True),
+        (replace(TIMING, component="rig"), False),
+        (Event(0, "drift", "of the stiffness, 5 % ± 1 %"), True),
+        (Event(0, "drift", "\x1b[2J"), False),
+        (Event(0, "drift", "x" * 1001), False),
+        (Event(0, "state", "running"), False),
+        (Event(0, "order", "stop: by anna"), False),
+    ],
+)
+def test_of_a_twin_outside_only_what_a_twin_says_is_taken(item: Item, taken: bool) -> None:
+    name = topic_for(item)
+    assert is_valid_offer(name, encode_item(item, RUN), RUN, END, KINDS) == taken
+    assert not is_valid_offer(name, encode_item(item, "another"), RUN, END, KINDS)
+    assert not is_valid_offer(name, b"garbage", RUN, END, KINDS)
+
+
+class Lying:
+    """An inbox in which these pieces lie."""
+
+    def __init__(self, *there: Fragment) -> None:
+        self.there = list(there)
+
+    def get_fragment(self, _: float) -> Fragment | None:
+        return self.there.pop(0) if self.there else None
+
+
+def offers(*there: Fragment) -> OfferFilter:
+    inbox: Any = Lying(*there)
+    return OfferFilter(inbox, RUN, KINDS)
+
+
+def parts(source: str, reason: str = "x", number: int = 0) -> list[Fragment]:
+    return list(
+        split_payload(
+            "/twin/params", source, number, encode_item(replace(PARAMS, reason=reason), RUN)
+        )
+    )
+
+
+def test_nobody_outside_speaks_under_a_name_of_the_run() -> None:
+    mine, theirs = parts("aa"), parts("bb")
+    some = offers(*theirs, *mine, *theirs)
+    some.run_publishers.add("bb")
+    assert [some.take(END) for _ in range(4)] == [[], mine, [], None]
+
+
+def test_who_was_let_in_is_let_in_further() -> None:
+    first, second = parts("aa"), parts("aa", number=1)
+    some = offers(*first, *second)
+    assert some.take(END) == first
+    some.run_publishers.add("aa")
+    assert some.take(END) == second
+
+
+def test_a_payload_in_pieces_is_let_in_whole_or_not_at_all() -> None:
+    whole = parts("aa", "x" * 2 * FRAGMENT_BYTES)
+    after = parts("aa", "y" * FRAGMENT_BYTES, number=7)
+    some = offers(*whole, whole[0], whole[2], *whole[1:], *after)
+    assert [some.take(END) for _ in range(9)] == [[], [], whole, [], [], [], [], [], after]
+
+
+def test_beginnings_without_an_end_are_forgotten() -> None:
+    long = parts("aa", "x" * MAX_PAYLOAD_FRAGMENTS * FRAGMENT_BYTES)
+    begun = [parts(f"{n:04x}", "x" * FRAGMENT_BYTES)[0] for n in range(2 * MAX_PARTIAL_PAYLOADS)]
+    some = offers(*long, *begun)
+    while some.take(END) is not None:
+        assert len(some._partial_payloads) <= MAX_PARTIAL_PAYLOADS
+    assert "aa" not in some._twin_publishers
+
+
+@pytest.fixture(scope="module")
+def rig(spec: ProcessConfig) -> Iterator[Rig]:
+    """A rig, and a gate that takes offers; the first blocks are played."""
+    one = Rig(replace(spec, remote_twin=True))
+    thread = threading.Thread(target=one.play)
+    thread.start()
+    assert one.ready.wait(PATIENCE_S)
+    start = BUNDLE.make_start_factory(RUN, "table")({}, 0.0)
+    one.waiting += [(topic_for(item), encode_item(item, RUN)) for item in (start, measured(0))]
+    with pytest.MonkeyPatch.context() as patch:
+        doors: list[Door] = []
+        patch.setattr(os, "nice", lambda _: 0)
+        patch.setattr(gates, "is_orphaned", lambda: bool(doors) and doors[-1].shut.is_set())
+        patch.setattr(gates, "MAX_QUIET_S", 0.2)
+        doors.append(Door(one.spec))
+        yield one
+        doors[-1].close()
+    one.over.set()
+    thread.join()
+
+
+@contextmanager
+def serving(*links: BusLink) -> Iterator[None]:
+    """Publishers that have nothing more to say answer those who ask; closed in the end."""
+    over = threading.Event()
+
+    def serve() -> None:
+        while not over.wait(0.002):
+            for link in links:
+                link.serve()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+        for link in links:
+            link.close()
+
+
+def test_a_twin_outside_is_heard_inside_and_by_everybody_once(rig: Rig) -> None:
+    twin, listener = joined(rig.spec), joined(rig.spec)
+    inside = open_spoke(RIG, rig.spec.endpoint, PATIENCE_S)
+    topics = ("/twin/params", "/run/timing", "/run/event")
+    inboxes = [
+        link.subscribe(topics, history=True, capacity=CAPACITY) for link in (inside, listener)
+    ]
+    twin.declare(topics, offered=True)
+    said: list[Item] = [replace(PARAMS, index=n, reason="x" * 60_000) for n in range(5)]
+    said += [TIMING, Event(0, "drift", "of the stiffness")]
+    twin.publish("/twin/params", b"garbage")
+    far = [replace(PARAMS, index=2**50), replace(TIMING, component="rig"), Event(0, "order", "")]
+    for item in (*far, *said):
+        twin.publish(topic_for(item), encode_item(item, RUN))
+    with serving(twin):
+        heard = [took(inbox, len(said)) for inbox in inboxes]
+        rest = [inbox.get(0.3) for inbox in inboxes]
+    for one in heard:
+        assert sorted(one) == sorted((topic_for(item), encode_item(item, RUN)) for item in said)
+    assert rest == [None, None]
+    inside.close()
+    listener.close()
+
+
+def test_under_the_rigs_name_nobody_silences_it(rig: Rig) -> None:
+    """Its name stands beside every sample that it publishes."""
+    inside, observer, forger = (
+        open_spoke(RIG, where, PATIENCE_S)
+        for where in (rig.spec.endpoint, rig.spec.listen, rig.spec.listen)
+    )
+    name = "/run/timing"
+    supervisor = inside.subscribe((name,), history=True, capacity=CAPACITY)
+    stamps: list[bytes] = []
+    observer._session.declare_subscriber(
+        key_expression(RIG, name), lambda one: stamps.append(one.attachment.to_bytes())
+    )
+    own = [encode_item(replace(TIMING, component="rig", index=n), RUN) for n in range(4)]
+    while not stamps:
+        rig.waiting.append((name, own[0]))
+        time.sleep(0.05)
+    source, _, _ = FRAGMENT_HEADER.unpack(stamps[-1])
+    forger.declare((name,), offered=True)
+    shelf = HistoryCache()
+    shelf.add(10**9, 3, encode_item(TIMING, RUN))
+    forger._caches[name, source.hex()] = shelf
+    put = forger._session.put
+    with serving(forger):
+        for where in (key_expression(RIG, name), key_expression(RIG, name, offered=True)):
+            put(where, encode_item(TIMING, RUN), attachment=FRAGMENT_HEADER.pack(source, 10**9, 3))
+        time.sleep(0.7)  # in which the gate asks what is on offer
+        rig.waiting += [(name, one) for one in own[1:]]
+        until(lambda: not rig.waiting)
+        heard = [one[1] for one in iter(lambda: supervisor.get(0.2), None)]
+    assert [one for one in heard if one in own[1:]] == own[1:]
+    assert supervisor.missed == 0
+    for link in (inside, observer):
+        link.close()
+
+
+def test_a_twin_answers_nobody_but_the_gate(rig: Rig) -> None:
+    victim, twin = joined(rig.spec), joined(rig.spec)
+    inbox = victim.subscribe((MEAS_TOPIC,), history=True, capacity=CAPACITY)
+    there = len([one for one in rig.sent if one[0] == MEAS_TOPIC])
+    assert len(took(inbox, there)) == there
+    ((_, source), _), *_ = inbox._positions.items()
+    for offering in (True, False):
+        liar = joined(rig.spec) if not offering else twin
+        liar.declare(("/twin/params",), offered=offering)
+        shelf = HistoryCache()
+        shelf.add(there, 3, b"forged")
+        liar._caches[MEAS_TOPIC, source] = shelf
+        with serving(liar):
+            assert inbox.get(0.7) is None
+    victim.close()
+
+
+def test_a_twin_that_comes_after_another_says_what_is_missing(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`attend twin` from its start to the end of the run; it reads no standard input."""
+    monkeypatch.setattr(twin_process, "LINGER_S", 0.3)
+    monkeypatch.setattr(twin_process, "request_realtime", lambda _: "")
+    inside = open_spoke(RIG, rig.spec.endpoint, PATIENCE_S)
+    topics = (CMP_TOPIC, "/run/fault", "/twin/params")
+    inbox = inside.subscribe(topics, history=True, capacity=CAPACITY)
+    inside.declare((CMP_TOPIC,))
+    inside.publish(CMP_TOPIC, encode_item(Comparison(0, 3 * SIZE, (), (), (), ()), RUN))
+    observer = joined(rig.spec)
+    until(lambda: b'"compared": %d' % (3 * SIZE) in (observer.query("state/status") or b""))
+    codes: list[int] = []
+    thread = threading.Thread(
+        target=lambda: codes.append(join_as_twin(rig.spec.listen, RIG, None)), daemon=True
+    )
+    thread.start()
+    heard: list[Item] = []
+    for number in itertools.count(1):
+        rig.waiting.append((MEAS_TOPIC, encode_item(measured(number), RUN)))
+        if (one := inbox.get(0.01)) is not None:
+            heard.append(decode_item(*one)[1])
+        faults = [item for item in heard if isinstance(item, Fault)]
+        if faults or number == 2000:
+            break
+    rig.waiting.append(
+        ("/run/stop", encode_item(RunStop(faults[0].index + SIZE, "complete", "", ()), RUN))
+    )
+    rig.waiting.append((MEAS_TOPIC, encode_item(measured(number + 1), RUN)))
+    thread.join(PATIENCE_S)
+    assert codes == [0]
+    (said,) = faults
+    assert (said.component, said.from_index, said.to_index) == ("twin", 3 * SIZE, said.index)
+    assert said.index % SIZE == 0
+    observer.close()
+    inside.close()

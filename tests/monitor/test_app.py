@@ -1,0 +1,297 @@
+"""The monitor on a bus: who joins late, a rig that goes and comes, a terminal, a file, nobody."""
+
+import fcntl
+import io
+import os
+import pty
+import re
+import select
+import struct
+import subprocess
+import sys
+import termios
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+from rich.text import Text
+
+from table_io.errors import InputError
+from table_io.records import RunStop
+from tests.live.test_live import endpoint
+from tests.monitor.monitored import RUN, block, point, records, start, stream
+from twin.monitor import app
+from twin.monitor.app import MonitorClient, run_event_loop, run_monitor
+from twin.monitor.display import TerminalDisplay
+from twin.monitor.panels import SessionStatus
+from twin.monitor.run_state import LiveRunState
+from twin.transport.codec import TOPIC_TYPES, Item, encode_item, topic_for
+from twin.transport.zenoh_link import BusLink, open_hub, open_spoke
+
+SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
+ROUNDS = 200  # of 0.05 s: long enough for anything here
+
+
+def publish(hub: BusLink, items: Sequence[Item], run: str = RUN) -> None:
+    for item in items:
+        hub.publish(topic_for(item), encode_item(item, run))
+
+
+@contextmanager
+def hub_at(place: str) -> Iterator[BusLink]:
+    hub = open_hub("simulated", place)
+    try:
+        hub.declare(tuple(TOPIC_TYPES))
+        yield hub
+    finally:
+        hub.close()
+
+
+@contextmanager
+def running(place: str) -> Iterator[None]:
+    """A rig that has published what there is to know, and goes on with blocks; all may command."""
+    over = threading.Event()
+    with hub_at(place) as hub:
+        roles = hub.declare_requests("state/role/*")
+
+        def play() -> None:
+            publish(hub, records())
+            at = 7000
+            while not over.wait(0.02):
+                publish(hub, stream(at, at + 20))
+                at += 20
+                if (question := roles.poll()) is not None:
+                    question.reply("command")
+
+        player = threading.Thread(target=play)
+        player.start()
+        try:
+            yield
+        finally:
+            over.set()
+            player.join()
+
+
+@contextmanager
+def watching_at(place: str) -> Iterator[MonitorClient]:
+    link = open_spoke("simulated", place, 5.0)
+    try:
+        yield MonitorClient(link, "ana")
+    finally:
+        link.close()
+
+
+def until(watch: MonitorClient, hub: BusLink, what: Callable[[LiveRunState], object]) -> None:
+    """Listen until something is true of the board."""
+    for _ in range(ROUNDS):
+        hub.serve()
+        watch.listen(0.05)
+        if what(watch.run_state):
+            return
+    raise AssertionError("it never came")
+
+
+def test_who_joins_late_gets_what_was_and_then_what_comes() -> None:
+    place = endpoint()
+    with hub_at(place) as hub:
+        publish(hub, [*records(), *stream(6000, 8000)])
+        with watching_at(place) as watch:
+            until(
+                watch,
+                hub,
+                lambda b: b.start and len(b.points) == 3 and b.rig_state and len(b.events) == 4,
+            )
+            publish(hub, [block(8000)])
+            until(watch, hub, lambda b: b.recent.end == 8020)
+            # 50 s of old samples are nobody's wish
+            assert [one.index for one in watch.run_state.recent.blocks] == [8000]
+            assert watch.ignored == 0
+
+
+def test_bytes_that_are_no_record_are_left_out() -> None:
+    place = endpoint()
+    with hub_at(place) as hub, watching_at(place) as watch:
+        hub.publish("/twin/point", b"\xff\xff garbage")
+        publish(hub, [start(), point(1)])
+        until(watch, hub, lambda b: b.points)
+        assert watch.ignored == 1
+
+
+def test_a_rig_that_goes_is_silent_and_a_new_run_at_its_place_is_shown() -> None:
+    place = endpoint()
+    with watching_after(place) as watch:
+        watch.listen(0.1)
+        assert watch.session_status().silent_s > 0.05
+        with hub_at(place) as hub:
+            publish(hub, [start("20260102-120000-next"), point(4)], "20260102-120000-next")
+            until(watch, hub, lambda b: b.run.endswith("next") and list(b.points) == [4])
+
+
+@contextmanager
+def watching_after(place: str) -> Iterator[MonitorClient]:
+    """A watch whose rig has gone after its records."""
+    with hub_at(place) as hub:
+        link = open_spoke("simulated", place, 5.0)
+        watch = MonitorClient(link, "ana")
+        publish(hub, records())
+        until(watch, hub, lambda b: len(b.points) == 3)
+    try:
+        yield watch
+    finally:
+        link.close()
+
+
+class Sheet(TerminalDisplay):
+    """A display whose keys are told beforehand."""
+
+    def __init__(self, keys: str) -> None:
+        super().__init__(Console(file=io.StringIO()))
+        self.keys = iter(keys)
+        self.shown: list[str] = []
+
+    def show(self, lines: Sequence[Text]) -> None:
+        self.shown.append(lines[-1].plain)
+
+    def read_key(self) -> str:
+        return next(self.keys).replace("-", "")
+
+
+class Still:
+    """A watch at which nothing happens."""
+
+    def __init__(self, commands: bool) -> None:
+        self.run_state = LiveRunState()
+        self.commands = commands
+
+    def listen(self, seconds: float) -> list[Item]:
+        return []
+
+    def session_status(self, asked: str = "") -> SessionStatus:
+        return SessionStatus(may_command=self.commands, pending_command=asked)
+
+
+@pytest.mark.parametrize(
+    ("keys", "commands", "orders"),
+    [
+        ("sy-q", True, ["stop"]),
+        ("s--y-q", True, ["stop"]),
+        ("snyq", True, []),
+        ("sq-q", True, []),
+        ("yq", True, []),
+        ("hyryayq", True, ["hold", "resume", "abort"]),
+        ("syhyq", False, []),
+    ],
+)
+def test_an_order_goes_out_only_after_a_yes_of_who_may(
+    keys: str, commands: bool, orders: list[str]
+) -> None:
+    given: list[str] = []
+
+    def order(name: str) -> str:
+        given.append(name)
+        return f"told to {name}"
+
+    watch, sheet = Still(commands), Sheet(keys)
+    run_event_loop(watch, sheet, order)  # type: ignore[arg-type]
+    assert given == orders
+    assert [one.text for one in watch.run_state.events.values()] == [
+        f"told to {one}" for one in orders
+    ]
+    assert any("y = yes" in line for line in sheet.shown) == (commands and keys != "yq")
+
+
+def test_only_lines_that_changed_are_written() -> None:
+    out = io.StringIO()
+    sheet = TerminalDisplay(Console(file=out, width=20, height=3, force_terminal=True))
+    sheet.show([Text("one"), Text("two")])
+    assert "one" in out.getvalue()
+    assert "\x1b[2J" in out.getvalue()
+    out.truncate(0)
+    sheet.show([Text("one"), Text("three", "red")])
+    assert "one" not in out.getvalue()
+    assert "three" in out.getvalue()
+    assert "\x1b[2;1H" in out.getvalue()
+    out.truncate(0)
+    sheet.show([Text("one"), Text("three", "red")])
+    assert out.getvalue().strip("\0") == ""
+
+
+def test_once_and_picture(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(app, "SNAPSHOT_S", 0.2)
+    place, picture = endpoint(), tmp_path / "now.svg"
+    with running(place):
+        run_monitor(place, "simulated", False, True, None, None)
+        assert "watched" in capsys.readouterr().out
+        run_monitor(place, "simulated", False, False, picture, None)
+        assert "<svg" in picture.read_text()
+        with pytest.raises(InputError, match="exists already"):
+            run_monitor(place, "simulated", False, False, picture, None)
+        with pytest.raises(InputError, match="cannot write"):
+            run_monitor(place, "simulated", False, False, tmp_path / "no" / "now.svg", None)
+
+
+def test_nobody_there_and_nothing_said_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(app, "ANSWER_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(app, "START_TIMEOUT_S", 0.3)
+    place = endpoint()
+    with pytest.raises(InputError, match="no rig answers there"):
+        run_monitor(place, "simulated", False, True, None, None)
+    with pytest.raises(InputError, match="not understood"):
+        run_monitor("nonsense", "simulated", True, True, None, None)
+    with hub_at(place), pytest.raises(InputError, match="no test at the endpoint"):
+        run_monitor(place, "simulated", False, True, None, None)
+
+
+def test_without_a_terminal_it_is_a_line_a_step_until_the_end() -> None:
+    place = endpoint()
+    with hub_at(place) as hub:
+        publish(hub, [*records(), RunStop(8000, "complete", "all driven")])
+        process = subprocess.Popen(
+            [SHAKETWIN, "monitor", "--connect", place],
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
+        while process.poll() is None:
+            hub.serve()
+        said = process.stdout.read() if process.stdout else ""
+    assert process.returncode == 0, said
+    assert [line.split()[0] for line in said.splitlines() if "forward" in line] == [
+        "1/10", "2/10", "3/10",
+    ]  # fmt: skip
+    assert "complete: all driven" in said
+
+
+def test_on_a_terminal_it_draws_and_gives_it_back(tmp_path: Path) -> None:
+    place = endpoint()
+    here, there = pty.openpty()
+    fcntl.ioctl(there, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    before = termios.tcgetattr(there)
+    with running(place):
+        process = subprocess.Popen(
+            [SHAKETWIN, "monitor", "--connect", place],
+            stdin=there, stdout=there, stderr=there,
+            env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "", "LINES": ""},
+        )  # fmt: skip
+        shown = read_until(here, rb"Warnings and events.*abort")
+        assert b"\x1b[?1049h" in shown
+        assert termios.tcgetattr(there)[3] != before[3]
+        os.write(here, b"q")
+        shown = read_until(here, rb"\x1b\[\?1049l")
+        assert process.wait(20) == 0
+    assert termios.tcgetattr(there) == before
+    os.close(here)
+    os.close(there)
+
+
+def read_until(terminal: int, what: bytes) -> bytes:
+    """What a terminal shows until that is in it."""
+    shown = b""
+    while not re.search(what, shown, re.DOTALL):
+        assert select.select([terminal], [], [], 20.0)[0], f"never shown: {what!r}"
+        shown += os.read(terminal, 65536)
+        assert len(shown) < 200_000, f"never shown: {what!r}"
+    return shown

@@ -1,0 +1,100 @@
+"""A recording on a disk that fills up and comes back: always a clean prefix, nothing lost."""
+
+import contextlib
+import errno
+import os
+import random
+import resource
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.recording.example_run import RATE, START, payloads, run, write
+from twin.recording.append_only_file import AppendOnlyFile
+from twin.recording.mcap_log import LogWriter, iter_messages
+from twin.recording.merge import verify_log
+from twin.recording.reader import read_recording
+from twin.recording.recovery import recover_log
+from twin.transport.codec import encode_item, topic_for
+
+Limit = Callable[[int], None]
+
+
+@pytest.fixture
+def limit() -> Iterator[Limit]:
+    """Sets how large files of this process may become, in bytes; -1 is as large as they like."""
+    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+
+
+def test_what_does_not_fit_waits_and_is_written_once(tmp_path: Path, limit: Limit) -> None:
+    file, expected = AppendOnlyFile(tmp_path / "a"), b""
+    chance = random.Random(1)
+    for number in range(200):
+        piece = chance.randbytes(chance.randrange(2000))
+        limit((number * 17 % 200) * 900 + 10)  # the room comes and goes
+        file.write(piece)
+        expected += piece
+        with contextlib.suppress(OSError):
+            file.drain()
+        there = (tmp_path / "a").read_bytes()
+        assert expected.startswith(there)
+        assert (file.tell(), file.pending_bytes) == (len(expected), len(expected) - len(there))
+    file.write(b"more")
+    limit(0)
+    with pytest.raises(OSError, match=r"File too large: '.*/a'"):
+        file.drain()
+    limit(-1)
+    file.close()
+    file.close()
+    expected += b"more"
+    assert (tmp_path / "a").read_bytes() == expected
+
+
+@pytest.mark.parametrize("room", [0, 500, 2_000, 9_000, 13_777, 20_000])
+def test_a_log_goes_on_where_the_disk_was_full(tmp_path: Path, limit: Limit, room: int) -> None:
+    write(tmp_path / "whole.mcap", run(), flush_every=3)
+    assert room < (tmp_path / "whole.mcap").stat().st_size
+    writer, failed = LogWriter(tmp_path / "a.mcap", RATE), 0
+    writer.write_run_description(START)
+    limit(room)
+    for number, item in enumerate(run(), 1):
+        writer.write(topic_for(item), encode_item(item, START.run), item.index)
+        if number % 3 == 0:
+            try:
+                writer.flush()
+            except OSError:
+                failed += 1
+    assert failed
+    with pytest.raises(OSError, match="File too large"):
+        writer.close()
+    # meanwhile: every chunk that fitted can be read, in order
+    found = [one.payload for one in iter_messages(tmp_path / "a.mcap")]
+    assert found == payloads(run())[: len(found)]
+    assert bool(found) is (room > 5000)
+    limit(-1)
+    writer.close()
+    assert verify_log(tmp_path / "a.mcap")
+    assert recover_log(tmp_path / "a.mcap").is_intact  # ended once
+    assert payloads(read_recording(tmp_path / "a.mcap").items) == payloads(
+        read_recording(tmp_path / "whole.mcap").items
+    )
+
+
+@pytest.mark.parametrize("call", ["write", "fsync"])
+def test_a_dying_disk_is_named_by_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
+) -> None:
+    def dead(*_: object) -> int:
+        raise OSError(errno.EIO, "Input/output error")
+
+    writer = LogWriter(tmp_path / "a.mcap", RATE)
+    writer.write_run_description(START)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, call, dead)
+        with pytest.raises(OSError, match=r"Input/output error: '.*a.mcap'"):
+            writer.flush() if call == "write" else writer.sync()
+    writer.close()
+    assert verify_log(tmp_path / "a.mcap")

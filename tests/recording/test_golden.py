@@ -1,0 +1,132 @@
+"""Logs of every schema version stay readable to the bit; a newer one is refused by its number.
+
+`golden/vN.mcap` was written by the code of version N: three steps of a sweep, 0.1 MB. A golden file
+is never renewed; a new version adds its own.
+"""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from table_io.errors import InputError
+from table_io.records import PrcPoint
+from tests.recording.example_run import START, run
+from twin.log import open_log
+from twin.recording import mcap_log
+from twin.recording.log_metadata import (
+    SCHEMA_VERSION,
+    ContentHash,
+    find_altered_attachments,
+    read_schema_version,
+)
+from twin.recording.mcap_log import iter_messages, write_items
+from twin.recording.merge import merge, verify_log
+from twin.recording.reader import read_recording
+from twin.recording.recovery import recover_log
+from twin.recording.tabular import iter_batches, read_log_table
+
+GOLDEN = Path(__file__).parent / "golden"
+WRITTEN = {  # version: (sha256 of the content, messages, measured eta_d of each step)
+    1: (
+        "70ddf2c37d0a880db963d2f8aab209570f5333f5126c8bf431f5744aa9656648",
+        129,
+        (0.10615427913608139, 0.0819036788347143, 0.09453897270552923),
+    ),
+    2: (
+        "4a1f4de8363cdc392e72b809a3de64bfc9bed7b66b659ad69224f525696b4725",
+        129,
+        (0.10615427913608139, 0.0819036788347143, 0.09453897270552923),
+    ),
+}
+
+
+def content(path: Path) -> dict[str, str]:
+    """The hash and the counts of what a log holds."""
+    found = ContentHash()
+    for one in iter_messages(path):
+        found.add(one.topic, one.log_time, one.payload)
+    return found.to_metadata()
+
+
+def test_every_version_has_its_golden_file() -> None:
+    assert set(WRITTEN) == set(range(1, SCHEMA_VERSION + 1))
+    assert {path.name for path in GOLDEN.iterdir()} == {f"v{number}.mcap" for number in WRITTEN}
+
+
+@pytest.mark.parametrize("version", WRITTEN)
+def test_a_log_of_any_version_is_read_to_the_bit(version: int) -> None:
+    path = GOLDEN / f"v{version}.mcap"
+    digest, messages, eta_d = WRITTEN[version]
+    found, recording = recover_log(path), read_recording(path)
+    assert found.is_intact
+    assert read_schema_version(path, found.metadata) == version
+    assert (content(path)["sha256"], len(recording.items)) == (digest, messages)
+    points = [one.measured.eta_d for one in recording.records(PrcPoint) if one.measured]
+    assert tuple(points) == eta_d
+    assert recording.is_intact
+    assert recording.missing_samples == 0
+    assert [step.frequency_hz for step in recording.start.steps] == pytest.approx([3.8, 3.9, 4.0])
+    assert find_altered_attachments(found.metadata, found.attachments) == []
+
+
+@pytest.mark.parametrize("version", WRITTEN)
+def test_a_log_says_its_hash_since_version_2(version: int) -> None:
+    path = GOLDEN / f"v{version}.mcap"
+    assert verify_log(path) is (version >= 2)
+    assert recover_log(path).metadata.get("content") == (content(path) if version >= 2 else None)
+
+
+@pytest.mark.parametrize("version", WRITTEN)
+def test_merging_brings_a_log_to_the_newest_version(version: int, tmp_path: Path) -> None:
+    part, out = tmp_path / "part.mcap", tmp_path / "out.mcap"
+    shutil.copy(GOLDEN / f"v{version}.mcap", part)
+    merge([part], out)
+    assert read_schema_version(out, recover_log(out).metadata) == SCHEMA_VERSION
+    assert verify_log(out)
+    assert [one.index for one in read_recording(out).items] == [
+        one.index for one in read_recording(part).items
+    ]
+    assert sorted(one.payload for one in iter_messages(out)) == sorted(
+        one.payload for one in iter_messages(part)
+    )
+
+
+def merged(path: Path) -> None:
+    merge([path], path.with_name("out.mcap"))
+
+
+def merged_of_a_killed_recorder(path: Path) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    merged(path)
+
+
+@pytest.mark.parametrize(
+    "reader",
+    [
+        read_recording,
+        read_log_table,
+        lambda path: iter_batches(path, 9),
+        open_log,
+        merged,
+        merged_of_a_killed_recorder,
+    ],
+    ids=["read", "gather", "batches", "open_log", "merge", "merge_killed"],
+)
+def test_a_newer_version_is_refused_by_its_number(
+    reader: Callable[[Path], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as newer:
+        newer.setattr(mcap_log, "SCHEMA_VERSION", SCHEMA_VERSION + 1)
+        write_items(tmp_path / "new.mcap", run(), START)
+    with pytest.raises(InputError, match=r"new.mcap: written in schema version 3; allowed: 1 to 2"):
+        reader(tmp_path / "new.mcap")
+    assert not (tmp_path / "out.mcap").exists()
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "two", "9" * 5000, "1.0", ""])
+def test_a_version_that_is_none_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match="written in schema version"):
+        read_schema_version(Path("a.mcap"), {"run": {"schema": text}})

@@ -1,0 +1,371 @@
+"""Damaged logs: one accident costs what it hit and no more, and no file costs more than it may."""
+
+import random
+import re
+import struct
+import tracemalloc
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import CompressionType, Writer
+
+from table_io.block import Block
+from table_io.errors import InputError
+from table_io.records import Comparison, Fault, FrequencyResponse, RunStop, Step, StepAdded
+from tests.exchange.mutants import BOMBS, bomb, spans, written
+from tests.recording.test_mcap_log import START, payloads, run, write
+from tests.transport.test_codec import any_block
+from twin.recording.mcap_records import CHUNK, MAGIC, MAX_RECORD_BYTES, RECORD_HEADER
+from twin.recording.merge import merge
+from twin.recording.reader import read_recording
+from twin.recording.recovery import recover_log
+from twin.recording.size_limits import work_limit
+from twin.transport.block_decoding import decode_blocks
+from twin.transport.codec import Item, WireError, decode_item, encode_item, topic_for
+
+EVERY = 7  # messages in a chunk
+COST = 2**24  # that a small file may cost here
+
+
+@pytest.fixture(scope="module")
+def content(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A whole log of many chunks."""
+    path = tmp_path_factory.mktemp("log") / "run.mcap"
+    write(path, run(), flush_every=EVERY)
+    return path.read_bytes()
+
+
+def chunks(content: bytes) -> list[tuple[int, int]]:
+    return [(first, end) for opcode, first, end in spans(content) if opcode == CHUNK]
+
+
+def kept(path: Path, content: bytes) -> list[bytes]:
+    """Payloads of what is found in a file, in file order."""
+    path.write_bytes(content)
+    return [one.payload for one in recover_log(path).messages]
+
+
+def without(number: int) -> list[bytes]:
+    """The payloads of the whole log but for those of one chunk."""
+    all_of_them = payloads(run())
+    return all_of_them[: number * EVERY] + all_of_them[(number + 1) * EVERY :]
+
+
+def flipped(content: bytes, first: int, end: int) -> bytes:
+    at = (first + end) // 2 + 20
+    return content[:at] + bytes([content[at] ^ 16]) + content[at + 1 :]
+
+
+def zeroed(content: bytes, first: int, end: int) -> bytes:
+    return content[: first + 60] + bytes(end - first - 60) + content[end:]
+
+
+def gnawed(content: bytes, first: int, end: int) -> bytes:
+    return content[: first + 70] + content[end - 30 :]
+
+
+def stuffed(content: bytes, first: int, end: int) -> bytes:
+    return content[: first + 70] + b"\x06garbage\x00\x00" * 50 + content[first + 70 :]
+
+
+def stretched(content: bytes, first: int, end: int) -> bytes:
+    return content[: first + 1] + struct.pack("<Q", end - first + 40) + content[first + 9 :]
+
+
+def endless(content: bytes, first: int, end: int) -> bytes:
+    return content[: first + 1] + struct.pack("<Q", 2**63) + content[first + 9 :]
+
+
+def renamed(content: bytes, first: int, end: int) -> bytes:
+    return content[:first] + b"\x07" + content[first + 1 :]
+
+
+def missing(content: bytes, first: int, end: int) -> bytes:
+    return content[:first] + content[end:]
+
+
+Accident = Callable[[bytes, int, int], bytes]
+
+
+@pytest.mark.parametrize(
+    "accident", [flipped, zeroed, gnawed, stuffed, stretched, endless, renamed, missing]
+)
+def test_an_accident_costs_one_chunk(accident: Accident, content: bytes, tmp_path: Path) -> None:
+    places = chunks(content)
+    assert len(places) > 10
+    for number in (0, len(places) // 2, len(places) - 1):
+        bad = accident(content, *places[number])
+        assert kept(tmp_path / "bad.mcap", bad) == without(number)
+        recording = read_recording(tmp_path / "bad.mcap")
+        assert not recording.is_intact
+        assert recording.damage
+        assert recording.start == START  # of the first chunk too: it stands there twice
+        lost = payloads(run())[number * EVERY : (number + 1) * EVERY]
+        assert not set(payloads(recording.items)) & (set(lost) - {payloads([START])[0]})
+
+
+def test_the_damage_is_told_by_its_place(content: bytes, tmp_path: Path) -> None:
+    first, end = chunks(content)[3]
+    (tmp_path / "bad.mcap").write_bytes(flipped(content, first, end))
+    damage = recover_log(tmp_path / "bad.mcap").damage
+    assert [(one.offset, one.size) for one in damage] == [(first, end - first)]
+
+
+def test_several_accidents_cost_several_chunks(content: bytes, tmp_path: Path) -> None:
+    places = chunks(content)
+    bad = endless(flipped(content, *places[2]), *places[6])
+    expected = [one for one in payloads(run()) if one in without(2) and one in without(6)]
+    assert kept(tmp_path / "bad.mcap", bad) == expected
+
+
+def test_a_killed_recorder_without_its_first_chunk_has_not_written_for_nothing(
+    content: bytes, tmp_path: Path
+) -> None:
+    places = chunks(content)
+    path = tmp_path / "bad.mcap"
+    path.write_bytes(flipped(content, *places[0])[: places[-1][1]])
+    recording = read_recording(path)
+    assert sorted(payloads(recording.items)) == sorted([*without(0), encode_item(START, START.run)])
+
+
+def test_a_bad_sector_costs_the_chunk_on_it(
+    content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, end = chunks(content)[4]
+
+    class Dying(BytesIO):
+        def read(self, size: int | None = -1) -> bytes:
+            at = self.tell()
+            if at < end - 20 and at + (size or 0) > first + 50:
+                raise OSError(5, "Input/output error")
+            return super().read(size)
+
+    (tmp_path / "a.mcap").write_bytes(content)
+    monkeypatch.setattr(Path, "open", lambda *_: Dying(content))
+    found = recover_log(tmp_path / "a.mcap")
+    assert [one.payload for one in found.messages] == without(4)
+    assert [(one.offset, one.size) for one in found.damage] == [(first, end - first)]
+
+
+def test_merging_gives_up_nothing_that_stands_after_damage(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "part.mcap").write_bytes(flipped(content, *chunks(content)[3]))
+    merge([tmp_path / "part.mcap"], tmp_path / "out.mcap")
+    assert sorted(payloads(read_recording(tmp_path / "out.mcap").items)) == sorted(without(3))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_order_and_copies_of_chunks_change_nothing_but_are_seen(
+    seed: int, content: bytes, tmp_path: Path
+) -> None:
+    chance, found = random.Random(seed), spans(content)
+    body = [content[first:end] for opcode, first, end in found if opcode == CHUNK]
+    rest = [content[first:end] for opcode, first, end in found if opcode not in (CHUNK, 7)]
+    mixed = [*body, *chance.sample(body, 3)]
+    chance.shuffle(mixed)
+    path = tmp_path / "mixed.mcap"
+    path.write_bytes(MAGIC + rest[0] + b"".join(mixed) + b"".join(rest[1:]) + MAGIC)
+    recording = read_recording(path)
+    assert sorted(payloads(recording.items)) == sorted(payloads(run()))
+    assert [item.index for item in recording.items] == sorted(one.index for one in run())
+    assert not recording.is_intact
+    assert recording.missing_samples == 0
+
+
+def test_a_lost_beginning_costs_what_stood_there(content: bytes, tmp_path: Path) -> None:
+    (_, _), (first, _) = chunks(content)[:2]
+    for lost in (MAGIC[1:5], content[:20], content[: first + 30]):
+        found = kept(tmp_path / "bad.mcap", bytes(len(lost)) + content[len(lost) :])
+        expected = payloads(run())
+        assert found in (expected, expected[2 * EVERY :], expected[EVERY:])
+
+
+@pytest.mark.parametrize("packing", list(CompressionType))
+def test_every_packing_of_the_format_is_read(packing: CompressionType, tmp_path: Path) -> None:
+    stream = BytesIO()
+    writer = Writer(stream, compression=packing)
+    writer.start()
+    channel = writer.register_channel("/run/start", "protobuf", 0)
+    writer.add_message(channel, 0, encode_item(START, START.run), 7, 3)
+    writer.finish()
+    (tmp_path / "a.mcap").write_bytes(stream.getvalue())
+    (one,) = recover_log(tmp_path / "a.mcap").messages
+    assert (one.topic, one.sequence, one.publish_time) == ("/run/start", 3, 7)
+    assert read_recording(tmp_path / "a.mcap").start == START
+
+
+@pytest.mark.parametrize("kind", range(len(BOMBS)))
+def test_no_bomb_goes_off(kind: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("twin.recording.size_limits.MIN_WORK_BYTES", COST)
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(bomb(kind))
+    tracemalloc.start()
+    try:
+        found = recover_log(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert found.damage
+    assert not found.is_intact
+    assert peak < 3 * MAX_RECORD_BYTES + 2 * COST
+    with pytest.raises(InputError, match=r"holds no start record|not a shaketwin log"):
+        read_recording(path)
+
+
+def test_a_sound_file_is_read_whole_however_long_it_is(
+    content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Work is limited by the size of the file alone, and a sound one needs a small part of it."""
+    path = tmp_path / "a.mcap"
+    path.write_bytes(content)
+    monkeypatch.setattr("twin.recording.size_limits.MIN_WORK_BYTES", 0)
+    assert recover_log(path).is_intact
+    monkeypatch.setattr("twin.recording.size_limits.WORK_PER_BYTE", 100)
+    assert recover_log(path).is_intact
+    assert work_limit(2**50) == 2**50 * 100
+
+
+def test_what_does_not_fit_into_memory_is_refused_and_is_no_damage(
+    content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Charged is what is kept: of other topics nothing, of empty messages what they cost."""
+    path, small = tmp_path / "a.mcap", 50_000
+    path.write_bytes(content)
+    monkeypatch.setattr("twin.recording.recovery.memory_limit_bytes", lambda: small)
+    assert recover_log(path, frozenset(("/rig/gap",))).is_intact
+    with pytest.raises(InputError, match="needs more memory"):
+        recover_log(path)
+    path.write_bytes(bomb(2))  # of messages without a payload
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match="needs more memory"):
+            recover_log(path)
+        held = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert held < 3 * MAX_RECORD_BYTES + small
+
+
+@given(blocks=st.lists(any_block(), max_size=4), copies=st.integers(1, 5))
+@settings(max_examples=30, deadline=None)
+def test_many_blocks_at_once_are_those_one_by_one(blocks: list[Block], copies: int) -> None:
+    for name in ("/rig/meas", "/twin/pred"):
+        some = [one for one in blocks if topic_for(one) == name]
+        raw = [
+            encode_item(replace(one, index=(one.index + 50 * k) % 2**40), "r")
+            for one in some
+            for k in range(copies)
+        ]
+        raw += [b"\xff\xff", *(payload[:-1] for payload in raw)]
+        for payload, result in zip(raw, decode_blocks(name, raw), strict=True):
+            if isinstance(result, WireError):
+                with pytest.raises(WireError, match=re.escape(str(result))):
+                    decode_item(name, payload)
+                continue
+            run_id, block = decode_item(name, payload)
+            assert result[0] == run_id
+            assert isinstance(result[1], Block)
+            assert isinstance(block, Block)
+            assert result[1].is_identical(block)
+
+
+def blocks_of(items: list[Item]) -> list[Block]:
+    return [one for one in items if isinstance(one, Block) and one.stream == "meas"]
+
+
+RUN = run()
+ONE = blocks_of(RUN)[9]
+SUMS = (1.0, 2.0)
+LIES: dict[str, Item] = {
+    "sampling rate": replace(ONE, rate_hz=1000.0),
+    "channels are not those of the run": replace(ONE, channels=("drive_disp_m", "force_r1_n")),
+    "duplicate samples": replace(ONE, index=ONE.index - 5),
+    "invalid labels": replace(ONE, label=np.full(len(ONE), 77)),
+    "unequal lengths": Comparison(180, 20, START.channels, SUMS, SUMS, (*SUMS, 3.0)),
+    "negative sum": Comparison(180, 20, START.channels, SUMS, SUMS, (-1.0, 1.0)),
+    "/rig/response: columns of unequal": FrequencyResponse(180, (1.0, 2.0), (1.0,), (0.0, 0.0)),
+    "direction = 'sideways'": StepAdded(180, 3, "sideways", 2.0, 1.0, "x"),
+    "frequency_hz = nan": StepAdded(180, 3, "forward", float("nan"), 1.0, "x"),
+    "before the beginning": Fault(180, "twin", 100, 50, "x"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("words", LIES)
+def test_what_cannot_be_is_left_out_and_told(words: str, tmp_path: Path) -> None:
+    lie = LIES[words]
+    items = [one for one in RUN if one is not ONE or not isinstance(lie, Block)]
+    told = [(topic_for(one), encode_item(one, START.run), one.index) for one in [*items, lie]]
+    recording = read_recording(written(tmp_path / "lie.mcap", told, START))
+    left = [
+        one
+        for one in items
+        if not (
+            isinstance(lie, Block) and encode_item(one, START.run) == encode_item(ONE, START.run)
+        )
+    ]
+    assert sorted(payloads(recording.items)) == sorted(payloads(left))
+    assert not recording.is_intact
+    assert any(words in one.reason for one in recording.damage), recording.damage
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"rate_hz": float("nan")}, "rate_hz = nan"),
+        ({"rate_hz": -2000.0}, "rate_hz = -2000"),
+        ({"channels": ("a", "a")}, "duplicate channels"),
+        ({"block_samples": 0}, "block_samples = 0"),
+        ({"planned_samples": 2**52}, "planned_samples"),
+        ({"steps": ()}, "no steps"),
+        ({"steps": (Step(0, "up", 2.0, 0.5),)}, "invalid steps"),
+        ({"steps": (Step(0, "forward", float("inf"), 0.5),)}, "invalid steps"),
+        ({"steps": (Step(1, "forward", 2.0, 0.5), Step(0, "forward", 3.0, 0.5))}, "out of order"),
+    ],
+)
+def test_a_start_that_cannot_be_is_refused(
+    changed: dict[str, object], words: str, tmp_path: Path
+) -> None:
+    start = replace(START, **changed)
+    path = tmp_path / "run.mcap"
+    written(
+        path, [("/run/start", encode_item(start, start.run), 0)], replace(start, rate_hz=2000.0)
+    )
+    stripped = [one for one in spans(path.read_bytes()) if one[0] != 9]  # without its copy
+    raw = path.read_bytes()
+    path.write_bytes(MAGIC + b"".join(raw[first:end] for _, first, end in stripped) + MAGIC)
+    with pytest.raises(InputError, match=words):
+        read_recording(path)
+
+
+def test_messages_of_another_run_are_left_out(tmp_path: Path) -> None:
+    stop = RunStop(600, "complete", "x", ())
+    told = [(topic_for(one), encode_item(one, START.run), one.index) for one in run()]
+    path = written(
+        tmp_path / "a.mcap", [*told, ("/run/stop", encode_item(stop, "other"), 600)], START
+    )
+    recording = read_recording(path)
+    assert payloads([recording.stop] if recording.stop else []) == payloads(run()[-1:])
+    assert [one.reason for one in recording.damage] == ["/run/stop: of another run"]
+
+
+def test_only_the_topics_asked_for_are_read(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(content)
+    recording = read_recording(tmp_path / "a.mcap", ["/rig/gap"])
+    wanted = [one for one in run() if topic_for(one) in ("/rig/gap", "/run/start")]
+    assert sorted(payloads(recording.items)) == sorted(payloads(wanted))
+    assert recording.is_intact
+
+
+def test_a_wrong_checksum_of_the_whole_is_told(content: bytes, tmp_path: Path) -> None:
+    first, end = next((first, end) for opcode, first, end in spans(content) if opcode == 15)
+    assert end - first == RECORD_HEADER.size + 4
+    wrong = struct.pack("<I", zlib.crc32(b"another"))
+    assert kept(tmp_path / "a.mcap", content[: end - 4] + wrong + content[end:]) == payloads(run())
+    (one,) = recover_log(tmp_path / "a.mcap").damage
+    assert "the data differ" in one.reason

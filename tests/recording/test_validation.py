@@ -1,0 +1,121 @@
+"""What cannot be in a run enters nothing, whoever reads: as a whole, rows, batches or channels."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from table_io.block import Block
+from table_io.records import Event, Record
+from tests.recording.example_run import RATE, START, block, run
+from twin.exchange.export import export_log
+from twin.log import open_log
+from twin.recording.mcap_log import LogWriter
+from twin.recording.reader import iter_valid_items, read_recording
+from twin.recording.recovery import recover_log
+from twin.recording.tabular import iter_batches, read_log_table
+from twin.transport.codec import Item, encode_item, topic_for
+
+
+def foreign(path: Path) -> Path:
+    """A log in order, and in it a block and an event that another run has at the same samples."""
+    other = replace(block(200), values=block(200).values + 1.0)
+    strange: list[Item] = [other, Event(200, "jump", "of another run")]
+    writer = LogWriter(path, RATE)
+    writer.write_run_description(START)
+    for item in run():
+        if item.index == 200 and strange:  # before the true samples
+            for one in strange:
+                writer.write(topic_for(one), encode_item(one, "another"), one.index)
+            strange = []
+        writer.write(topic_for(item), encode_item(item, START.run), item.index)
+    writer.close()
+    return path
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return foreign(tmp_path_factory.mktemp("foreign") / "run.mcap")
+
+
+@pytest.fixture(scope="module")
+def true() -> Block:
+    """The samples that the run has."""
+    return block(0, samples=600)
+
+
+def test_a_recording_leaves_out_what_is_of_another_run(log: Path, true: Block) -> None:
+    recording = read_recording(log)
+    (meas,) = recording.contiguous_blocks("meas")
+    assert meas.values.tobytes() == true.values.tobytes()
+    assert not recording.is_intact
+    assert [one.reason for one in recording.damage] == [
+        "/rig/meas: of another run", "/run/event: of another run",
+    ]  # fmt: skip
+
+
+def test_rows_leave_it_out_and_are_not_whole(log: Path, true: Block) -> None:
+    rows = read_log_table(log)
+    for number, name in enumerate(START.channels):
+        assert (
+            rows.read_columns(slice(0, 600), name)[name].tobytes() == true.values[number].tobytes()
+        )
+    assert not rows.is_intact
+    assert not any(isinstance(one, Event) and "another" in one.text for one in rows.records)
+
+
+def test_an_export_says_so(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert export_log(log, ["csv"], tmp_path / "a.csv", (), None) == 0
+    assert "invalid items" in capsys.readouterr().err
+
+
+def test_batches_leave_it_out(log: Path) -> None:
+    fed = iter_batches(log, 20)
+    assert fed is not None
+    items = [one for batch in fed for one in batch]
+    assert encode_item(items[0], START.run) == encode_item(START, START.run)
+    mine, theirs = (
+        sorted(encode_item(one, "") for one in some) for some in (items, read_recording(log).items)
+    )
+    assert mine == theirs
+
+
+def test_the_door_is_whole_where_every_topic_is(log: Path, true: Block, tmp_path: Path) -> None:
+    """Also where the records alone are in order."""
+    door = open_log(log)
+    assert door["drive_disp_m"].tobytes() == true.values[0].tobytes()
+    assert door.whole is read_recording(log).is_intact is False
+    writer = LogWriter(tmp_path / "run.mcap", RATE)
+    writer.write_run_description(START)
+    for item in run():
+        writer.write(topic_for(item), encode_item(item, START.run), item.index)
+    strange = block(200)
+    writer.write(topic_for(strange), encode_item(strange, "another"), 200)
+    writer.close()
+    assert open_log(tmp_path).whole is read_recording(tmp_path / "run.mcap").is_intact is False
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        replace(block(20), rate_hz=1000.0),
+        replace(block(20), channels=("drive_disp_m", "force_r1_n")),
+        replace(block(20), label=np.full(20, 99)),
+        START,
+        Event(2**60, "late", "after any run"),
+    ],
+    ids=["rate", "channels", "label", "start", "late"],
+)
+def test_one_filter_by_the_rules_of_the_reader(odd: Block | Record) -> None:
+    said: list[str] = []
+    bad, good = encode_item(odd, START.run), encode_item(block(20), START.run)
+    assert list(iter_valid_items(topic_for(odd), [bad], START, said)) == []
+    assert bool(said) is (odd is not START)
+    assert len(list(iter_valid_items("/rig/meas", [b"\xff", good], START, said))) == 1
+    assert "not a Block" in said[-1]
+
+
+def test_what_a_file_holds_is_not_what_is_read(log: Path) -> None:
+    """The foreign messages are in the file, so the tests above leave out something."""
+    assert len(recover_log(log).messages) == len(read_recording(log).items) + 2

@@ -1,0 +1,152 @@
+"""What the log of a replay says of itself: who made it, of what, and where its beginning is."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from table_io.records import Comparison, Event
+from tests.replay.in_memory import recorded_in
+from twin.cli.replay import ReplayRequest, replay_logs
+from twin.cli.verify import examine_logs, verify_logs
+from twin.recording.mcap_log import write_items
+from twin.recording.reader import Recording, read_recording
+from twin.replay.pipeline_replay import ReplayComparison, SampleRange, replay_recording
+from twin.reports.finalize import EXIT_NOT_IDENTICAL
+from twin.run.run_config import RunConfig
+from twin.run.versions import read_installed_versions
+
+
+def again(
+    recording: Recording, bundle: RunConfig, path: Path, run: str, span: SampleRange | None = None
+) -> tuple[ReplayComparison, Recording]:
+    identity = replay_recording(recorded_in(recording), bundle, path, run, lambda _: None, span)
+    return identity, read_recording(path)
+
+
+def notes(recording: Recording, kind: str) -> list[str]:
+    return [one.text for one in recording.records(Event) if one.kind == kind]
+
+
+def without_comparisons(recording: Recording, path: Path, *, ended: bool) -> Path:
+    items = [
+        one for one in recording.items
+        if not isinstance(one, Comparison) and (ended or one is not recording.stop)
+    ]  # fmt: skip
+    write_items(path, items, recording.start)
+    return path
+
+
+@pytest.fixture
+def some_steps(recording: Recording, bundle: RunConfig, tmp_path: Path) -> Recording:
+    span = SampleRange.of_steps(recording, 2, 3)
+    return again(recording, bundle, tmp_path / "some.mcap", "some", span)[1]
+
+
+@pytest.fixture
+def found(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What the command has to say of a replay; no report is drawn."""
+    kept: dict[str, Any] = {}
+
+    def close(folder: Path, bundle: RunConfig, view: bool, extra: dict[str, Any]) -> int:
+        kept.update(extra["replay"])
+        return 0
+
+    monkeypatch.setattr("twin.cli.replay.finalize_run", close)
+    return kept
+
+
+def test_it_states_what_made_it_and_of_what(
+    recording: Recording, bundle: RunConfig, tmp_path: Path
+) -> None:
+    start = replace(
+        recording.start, versions={"numpy": "0.1"}, host="elsewhere", started_at="long ago"
+    )
+    write_items(tmp_path / "old.mcap", [start, *recording.items[1:]], start)
+    old = read_recording(tmp_path / "old.mcap")
+    _, made = again(old, bundle, tmp_path / "new.mcap", "new")
+    assert made.start.versions == read_installed_versions()
+    assert made.start.host == recording.start.host
+    assert made.start.started_at > "2"
+    content = old.metadata["content"]["sha256"]
+    assert notes(made, "replay") == [f"replay of {old.run}, sha256 of its content {content}"]
+    assert notes(made, "cut") == []
+    _, third = again(made, bundle, tmp_path / "third.mcap", "third")
+    assert len(notes(third, "replay")) == 2  # of a replay: the whole chain
+    assert notes(third, "replay")[0] != notes(third, "replay")[1]
+
+
+def test_some_steps_are_a_sound_recording(some_steps: Recording, recording: Recording) -> None:
+    first = some_steps.start.index
+    assert notes(some_steps, "cut") == [f"from {recording.run} at sample {first}"]
+    assert verify_logs([some_steps.path], False, None) == 0
+    found = examine_logs([some_steps.path]).report
+    assert (found["gaps"], found["damage"], found["sound"]) == ([], [], True)
+    assert found["replay"] == {
+        "possible": True,
+        "identical": False,
+        "because": [f"its beginning is in {recording.run}"],
+    }
+
+
+def test_a_gap_before_the_first_of_some_steps_is_one(some_steps: Recording, tmp_path: Path) -> None:
+    first = some_steps.start.index
+    write_items(tmp_path / "a.mcap", [
+        one for one in some_steps.items if one.index != first or one is some_steps.start
+    ], some_steps.start)  # fmt: skip
+    (gap,) = examine_logs([tmp_path / "a.mcap"]).report["gaps"]
+    assert gap["first"] == first
+
+
+def test_some_steps_replayed_are_not_said_to_differ(
+    some_steps: Recording,
+    recording: Recording,
+    tmp_path: Path,
+    found: dict[str, Any],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Alone and among many: the twin comes to them from before their first sample."""
+    assert replay_logs(ReplayRequest([some_steps.path], [], tmp_path / "one")) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert found["differing"] > 0
+    assert (found["identical"], found["beginning"]) == (None, recording.run)
+    assert f"its beginning is in {recording.run}; " in said
+    made = read_recording(tmp_path / "one" / "run.mcap")
+    assert notes(made, "cut") == notes(some_steps, "cut")  # as true of this one
+    logs = [some_steps.path, recording.path]
+    assert replay_logs(ReplayRequest(logs, [], tmp_path / "many")) == 0
+    rows = json.loads((tmp_path / "many" / "comparison.json").read_text())["replays"]
+    assert [row["identical"] for row in rows] == [None, True]
+
+
+@pytest.mark.parametrize("ended", [True, False])
+def test_where_none_was_recorded_nothing_differs(
+    recording: Recording,
+    tmp_path: Path,
+    found: dict[str, Any],
+    capsys: pytest.CaptureFixture[str],
+    ended: bool,
+) -> None:
+    """Nor is it said that none are made."""
+    log = without_comparisons(recording, tmp_path / "a.mcap", ended=ended)
+    assert replay_logs(ReplayRequest([log], [], tmp_path / "one")) == 0
+    made = len(read_recording(tmp_path / "one" / "run.mcap").records(Comparison))
+    assert made > 300
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"no comparisons were recorded; {made} are made" in said
+    assert found["identical"] is None
+
+
+def test_one_that_differs_is_told_alone_and_among_many(
+    recording: Recording, tmp_path: Path, found: dict[str, Any]
+) -> None:
+    """A recording that ended and lacks a comparison that the replay makes."""
+    lost = recording.records(Comparison)[300]
+    log = tmp_path / "a.mcap"
+    write_items(log, [one for one in recording.items if one is not lost], recording.start)
+    assert replay_logs(ReplayRequest([log], [], tmp_path / "one")) == EXIT_NOT_IDENTICAL
+    assert (found["identical"], found["unrecorded"]) == (False, 1)
+    asked = ReplayRequest([log, recording.path], [], tmp_path / "many")
+    assert replay_logs(asked) == EXIT_NOT_IDENTICAL

@@ -1,0 +1,323 @@
+"""What a person is shown of a discovery: the page, its figures, for each of the four verdicts."""
+
+import hashlib
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from table_io.config.base import PROFILES_DIR, parse_toml
+from twin.cli.discover import write_results
+from twin.identification.discover import Discovery, PreparedLog, discover_effects
+from twin.model.config import ModelConfig
+from twin.model.inverse_dynamics import forces_along
+from twin.reports.discovery.figure_data import (
+    DiscoveryView,
+    check_instruments,
+    entries_to_samples,
+    measured_forces,
+)
+from twin.reports.discovery.free_running import compute_misfits, run_log_free, run_logs_free
+from twin.reports.discovery.loading import load_logs, name_logs
+from twin.reports.discovery.page import count_digits, format_rounded, format_verdict
+from twin.reports.discovery.serialize import Json, verdict_to_json
+from twin.reports.figures import RC_PARAMS
+from twin.run.run_config import read_model_template, read_run_config
+from twin.run.unpaced import play_unpaced
+
+K2 = 4.0e7  # N/m2
+SHORT = """
+title = "G4, a few steps"
+rig = "{rig}"
+[specimen]
+mass_kg = 550.0
+gap_mm = 4.0
+[sweep]
+start_hz = 2.8
+stop_hz = 4.4
+step_hz = 0.4
+cycles = 4
+[acquisition]
+rate_hz = 1000.0
+block_samples = 50
+[loop_check]
+enabled = false
+[control]
+enabled = false
+"""
+AWAY = (
+    "sensor_gain", "sensor_lag", "sensor_offset", "table_tilt", "bumper_maxwell", "hunt_crossley",
+    "mass_error", "maxwell_damper", "bouc_wen",
+)  # fmt: skip
+WITHOUT = (*AWAY, "bumper_hardening")
+VERDICTS = ("none", "named", "ambiguous", "unexplained")
+FIGURES = {
+    "map_0", "candidates", "damper_force", "bumper_force", "histories", "prc", "impacts", "time_0",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Left:
+    """A discovery and what was left of it in a folder."""
+
+    found: Discovery
+    logs: Sequence[PreparedLog]
+    told: Json
+    folder: Path
+
+    @property
+    def page(self) -> str:
+        return (self.folder / "report.html").read_text(encoding="utf-8")
+
+
+def recorded(folder: Path) -> Path:
+    """The log of a short unpaced run, of a rig whose bumpers harden."""
+    truth, card = folder / "truth.toml", folder / "rig.toml"
+    text = f'[[effects]]\nid = "bumper_hardening"\nparameters = {{ k2 = {K2} }}\n'
+    truth.write_text(text)
+    sealed = hashlib.sha256(text.encode()).hexdigest()
+    rig = (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")
+    card.write_text(f'{rig}truth = "{truth}"\ntruth_sha256 = "{sealed}"\n')
+    (folder / "p.toml").write_text(SHORT.format(rig=card))
+    log = folder / "hard.mcap"
+    play_unpaced(read_run_config(folder / "p.toml"), "hard", log, lambda: None, lambda item: None)
+    return log
+
+
+def left(folder: Path, logs: Sequence[PreparedLog], found: Discovery) -> Left:
+    folder.mkdir()
+    told = verdict_to_json(found, 1.5, ["<b>said</b>"])
+    write_results(folder, found, read_model_template("snm")[1], logs, told)
+    return Left(found, logs, told, folder)
+
+
+@pytest.fixture(scope="module")
+def every(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Left]]:
+    """A discovery of each verdict, all of one recording, with coarse pictures.
+
+    None: with the model that the one before found. Unexplained: the truth is left out of the
+    library. Ambiguous: another set is said to be as good, and the recording has no steps.
+    """
+    root, model = tmp_path_factory.mktemp("pages"), read_model_template("snm")[0]
+    logs, _ = load_logs([recorded(root)])
+    known = discover_effects(logs, model, without=AWAY)
+    rival = next(one for one in known.selection.tried if one.names != known.verdict.best.names)
+    unsure = replace(
+        known, verdict=replace(known.verdict, outcome="ambiguous", alternatives=(rival,))
+    )
+    stepless = [replace(log, steps=()) for log in logs]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(RC_PARAMS, "savefig.dpi", 40)
+        out = {"named": left(root / "named", logs, known)}
+        out["ambiguous"] = left(root / "ambiguous", stepless, unsure)
+        whole = read_model_template(str(root / "named" / "model.toml"))[0]
+        out["none"] = left(root / "none", logs, discover_effects(logs, whole, without=AWAY))
+        out["unexplained"] = left(
+            root / "unexplained", logs, discover_effects(logs, model, without=WITHOUT)
+        )
+        yield out
+
+
+@pytest.fixture(params=VERDICTS)
+def one(request: pytest.FixtureRequest, every: dict[str, Left]) -> Left:
+    return every[request.param]
+
+
+def test_each_verdict_is_the_one_meant(every: dict[str, Left]) -> None:
+    assert {word: left.told["verdict"] for word, left in every.items()} == {w: w for w in VERDICTS}
+
+
+def test_the_page_needs_nothing_else(one: Left, tmp_path: Path) -> None:
+    page = one.page
+    assert not re.search(r"(src|href)=[\"'](?!data:)|url\(|@import|<script", page)
+    assert page.count("data:image/png;base64,") == len(list((one.folder / "figures").iterdir()))
+    assert "&lt;b&gt;said&lt;/b&gt;" in page
+    assert "<b>said" not in page
+    assert not re.search(r"\bnan\b|\bNone\b</|\{\{|Undefined", page)
+
+
+def test_the_page_says_the_verdict_the_gap_and_what_to_do(one: Left) -> None:
+    page, gap = one.page, one.told["gap"]
+    assert f'<p class="verdict {one.told["verdict"]}">' in page
+    assert one.told["why"] in page.replace("&#39;", "'")
+    assert one.told["next_run"][1:] in page
+    for value in (gap["held_out_before"], gap["held_out_after"], gap["noise_floor"]):
+        assert f"{value:.3g}" in page
+    for effect in one.told["effects"]:
+        assert effect["id"] in page
+        for name, value in effect["parameters"].items():
+            numbers = [value[key] for key in ("value", "low", "high")]
+            cells = "".join(
+                f"<td>{format_rounded(one, count_digits(*numbers))}</td>" for one in numbers
+            )
+            assert f'<td class="text">{name}</td>{cells}' in page
+
+
+def test_the_first_sentence(every: dict[str, Left]) -> None:
+    heads = {word: re.search("<h1>(.*)</h1>", left.page)[1] for word, left in every.items()}  # type: ignore[index]
+    assert "agree to within the noise" in heads["none"]
+    assert heads["named"] == "The model lacks bumper_hardening."
+    assert "cannot tell which" in heads["ambiguous"]
+    for names in every["ambiguous"].told["ambiguous"]:
+        assert " with ".join(names) in heads["ambiguous"]
+    assert "no effect of the library explains" in heads["unexplained"]
+
+
+def test_a_sensor_that_errs_is_not_laid_to_the_model() -> None:
+    effect = {"id": "sensor_gain", "channel": "mass_acc_m_s2"}
+    told = {"verdict": "named", "effects": [effect], "ambiguous": []}
+    sentence = format_verdict(told)
+    assert "sensor_gain of mass_acc_m_s2" in sentence
+    assert "model lacks" not in sentence
+
+
+def test_what_fell_away_is_said_with_its_reason(every: dict[str, Left]) -> None:
+    page = every["unexplained"].page
+    assert "Effects that were not tested" in page
+    assert page.count("left out of the library") == len(WITHOUT)
+
+
+def test_every_figure_is_there_and_not_empty(one: Left) -> None:
+    files = {path.stem: path for path in (one.folder / "figures").glob("*.png")}
+    stepped = any(log.steps for log in one.logs)
+    assert files.keys() == (FIGURES if stepped else FIGURES - {"map_0", "prc", "impacts"})
+    assert ("No map over frequency" in one.page) != stepped
+    for name, path in files.items():
+        pixels = imread(path)[..., :3]
+        assert (pixels.min(axis=2) < 0.9).mean() > 0.01, name
+
+
+def test_a_term_without_a_name_is_drawn_and_never_in_the_model(every: dict[str, Left]) -> None:
+    one = every["unexplained"]
+    shown = DiscoveryView(one.found, one.logs)
+    assert one.found.verdict.generic is not None
+    assert shown.law_name.startswith("general.bumper")
+    assert "generic term, bumper" in one.page
+    assert "general" not in (one.folder / "model.toml").read_text()
+
+
+def test_the_law_drawn_is_the_force_that_is_missing(every: dict[str, Left]) -> None:
+    shown = DiscoveryView(every["named"].found, every["named"].logs)
+    assert shown.law is not None
+    assert shown.law_forces is not None
+    sheet, guess = shown.log_residuals[0], shown.law.fit.parameters
+    wanted, law, after = (entries_to_samples(sheet, 1, part, guess) for part in shown.law_forces)
+    there = np.isfinite(law)
+    depth = sheet.motion().u[there] - sheet.motion().gaps_m[0] - guess.values["gap0"]
+    assert law[there] == pytest.approx(K2 * depth**2, rel=0.1, abs=5.0)
+    assert np.nanstd(after) < 0.1 * np.nanstd(wanted)
+    assert np.nanmax(np.abs(entries_to_samples(sheet, 0, shown.law_forces[1], guess))) < 1e-6
+
+
+def test_the_model_that_is_left_says_how_well_its_numbers_are_known(every: dict[str, Left]) -> None:
+    card = parse_toml((every["named"].folder / "model.toml").read_text(), ModelConfig, "model.toml")
+    low, high = card.intervals["bumper_hardening.k2"]
+    value = float(card.effects[0].parameters["k2"])
+    assert low < value < high
+    assert high - low < 0.1 * value
+    low, high = card.intervals["stiffness"]
+    assert low < card.base.stiffness_n_m < high
+
+
+def test_logs_that_are_called_alike_are_told_apart(tmp_path: Path) -> None:
+    (tmp_path / "c").mkdir()
+    (tmp_path / "c" / "log.mcap").touch()
+    for folder in ("a/run", "b/run"):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "run.mcap").touch()
+    alike = [tmp_path / "a/run", tmp_path / "b/run/run.mcap"]
+    assert name_logs(alike) == ["a/run", "b/run"]
+    assert name_logs([alike[0], tmp_path / "c/log.mcap"]) == ["run", "log"]
+    assert name_logs([alike[0], alike[0]])[0] == str(alike[0].resolve() / "run.mcap")
+    assert name_logs([]) == []
+
+
+def test_measured_less_what_is_left_is_the_models_force(every: dict[str, Left]) -> None:
+    one = every["named"]
+    sheet, guess = (
+        DiscoveryView(one.found, one.logs).log_residuals[0],
+        one.found.verdict.best.fit.parameters,
+    )
+    m = sheet.motion()
+    model_at_log = guess.model_for_log(0, m)
+    damper, right, left = forces_along(model_at_log, m.u, m.v, m.time_s, sheet.contact_state)
+    measured = measured_forces(sheet, guess)
+    for row, model in enumerate((damper, right, -left)):
+        away = entries_to_samples(sheet, row, sheet.evaluate(guess), guess)
+        used = np.isfinite(away)
+        assert used.any()
+        assert (measured[row] - away)[used] == pytest.approx(model[used], abs=5.0)  # of a tare
+
+
+def test_the_twin_comes_nearer_when_it_runs_free(every: dict[str, Left]) -> None:
+    one = every["named"]
+    shown = DiscoveryView(one.found, one.logs)
+    errors = []
+    for explained in shown.before_after:
+        points = run_log_free(shown.log_residuals[0], shown.sweep_steps(0), explained)
+        assert len(points) == len(one.logs[0].steps)
+        forward = [
+            (p.measured, p.twin)
+            for p in points
+            if p.direction == "forward" and p.measured is not None and p.twin is not None
+        ]
+        assert 0.05 < forward[0][0].eta_d < 0.5
+        errors.append(sum((twin.eta_a - rig.eta_a) ** 2 for rig, twin in forward))
+    assert errors[1] < 0.25 * errors[0]
+
+
+def test_the_table_of_the_curves_says_how_much_nearer(every: dict[str, Left]) -> None:
+    one = every["named"]
+    shown = DiscoveryView(one.found, one.logs)
+    runs = run_logs_free(shown)
+    (row,) = compute_misfits(shown, runs)
+    measured = max(p.measured.eta_d for p in runs[0][0] if p.measured is not None)
+    assert row["measured"]["eta_d"] == measured
+    assert row["after"]["error"] < 0.25 * row["before"]["error"]
+    assert f"<b>{100 * row['after']['error']:.2f} %</b>" in one.page
+    same = replace(
+        one.found.selection, null=one.found.verdict.best
+    )  # nothing before but what is after
+    (row,) = compute_misfits(
+        again := DiscoveryView(replace(one.found, selection=same), one.logs), run_logs_free(again)
+    )
+    assert row["before"] == row["after"]
+
+
+@pytest.mark.parametrize(
+    ("value", "half", "said"),
+    [(12345.678, 0.05, ("12\u2009345.678", "12\u2009345.628", "12\u2009345.728")),
+     (510000.0, 300.0, ("510\u2009000", "509\u2009700", "510\u2009300")),
+     (1500.4, 0.45, ("1500.40", "1499.95", "1500.85")), (0.4, 0.2, ("0.4000", "0.2000", "0.6000")),
+     (3.0, 0.0, ("3.000", "3.000", "3.000"))],
+)  # fmt: skip
+def test_an_interval_can_be_told_from_its_value(
+    value: float, half: float, said: tuple[str, ...]
+) -> None:
+    numbers = (value, value - half, value + half)
+    assert tuple(format_rounded(one, count_digits(*numbers)) for one in numbers) == said
+
+
+def test_the_gates_pass_where_no_sensor_errs_and_fail_where_one_does(
+    every: dict[str, Left],
+) -> None:
+    one = every["none"]
+    shown = DiscoveryView(one.found, one.logs)
+    assert {gate.passed for gate in check_instruments(shown)} == {True}
+    assert ">FAIL<" not in one.page
+    sheet = shown.log_residuals[0]
+    null = one.found.selection.null
+    mass = sheet.entry_row == sheet.rows.index("mass")
+    at_rest = sheet.entry_row == len(sheet.rows)
+    wrong = np.where(mass, 2.0, np.where(at_rest, 9.0, null.held_out[0]))
+    broken = replace(
+        one.found.selection, null=replace(null, fit=replace(null.fit, held_out=(wrong,)))
+    )
+    broken_view = DiscoveryView(replace(one.found, selection=broken), one.logs)
+    failed = [gate.label for gate in check_instruments(broken_view) if not gate.passed]
+    assert failed[0].startswith("mass: ")
+    assert len(failed) == 1 + len(sheet.rest_channels)

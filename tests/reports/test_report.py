@@ -1,0 +1,183 @@
+"""The report of a run: what it shows is what was recorded, whatever is missing."""
+
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from table_io.block import Block
+from table_io.errors import InputError
+from table_io.records import Comparison, Event, Fault, RunStop, SampleGap, Timing
+from tests.reports.folders import Drawn, Maker
+from tests.reports.recordings import MEASURED, blocks, one_step, start_record, summary
+from twin.recording.mcap_log import write_items
+from twin.recording.reader import read_recording
+from twin.reports.page import format_significant
+from twin.reports.report import render_report, write_report
+from twin.reports.report_data import build_report_data
+from twin.transport.codec import Item
+
+pytestmark = pytest.mark.usefixtures("draft")
+
+
+def page(folder: Path) -> str:
+    return write_report(folder).read_text(encoding="utf-8")
+
+
+def bare(folder: Path) -> str:
+    """The page without its pictures, which take their time."""
+    told = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    return render_report(build_report_data(read_recording(folder / "run.mcap"), told), [])
+
+
+def words(html: str) -> str:
+    """The page as a reader sees it, markup and pictures left out."""
+    return " ".join(re.sub(r"<[^>]*>", " ", html).split())
+
+
+def test_numbers_are_those_of_the_summary(run_folder: Maker) -> None:
+    text = words(bare(run_folder()))
+    for number in ("0.123", "0.136", "0.568", "0.0345", "0.212", "2 3 2", "1.23", "0.488", "2.15"):
+        assert number in text
+    for number in ("30.54", "2.057", "1.11", "2.22", "3.33", "0.0512", "0.102"):
+        assert number in text
+
+
+def test_jumps_and_hysteresis_are_told_and_the_verdict_stands_on_top(run_folder: Maker) -> None:
+    text = words(bare(run_folder()))
+    assert "hysteresis right both 1.5 2" in text
+    assert "jump 1 down forward 2 2.5" in text
+    assert text.index("8 of 8 steps; right hysteresis 1.5 to 2 Hz") < text.index("What was run")
+
+
+def test_page_refers_to_nothing_outside_itself(drawn: Drawn) -> None:
+    assert not re.search(r"https?://|url\(|@import|<link|<script|<iframe", drawn.html)
+    sources = re.findall(r'(?:src|href|srcset)="([^"]{0,22})', drawn.html)
+    assert sources
+    assert all(source.startswith("data:image/png;base64,") for source in sources)
+
+
+def test_markup_in_texts_and_events_is_escaped(run_folder: Maker) -> None:
+    html = bare(run_folder([*blocks(), Event(3, "note", "<img src=x onerror=y>")]))
+    assert "<script>" not in html
+    assert "<img src=x" not in html
+    assert "&lt;script&gt;alert" in html
+    assert "&lt;img src=x onerror=y&gt;" in html
+    assert "<h1>Quick &lt;i&gt;look&lt;/i&gt;</h1>" in html
+
+
+def test_what_happened_is_listed(run_folder: Maker) -> None:
+    items: list[Item] = [
+        *blocks(), SampleGap(100, 7, "force_l2_n", "clipped"),
+        Fault(500, "twin", 500, 750, "killed"),
+        Timing(900, "recorder", 1.5, 4.25, 9.75, 3, 10, 0.1, "SCHED_FIFO"),
+    ]  # fmt: skip
+    text = words(bare(run_folder(items)))
+    assert "0.200 100 7 force_l2_n clipped" in text
+    assert "twin 1.000 1.500 killed" in text
+    assert "recorder 1.50 4.25 9.75 3 10 10.0 SCHED_FIFO" in text
+    assert "lab-host" in text
+    assert "mass_disp_m – – – – – – – 0.0001250 m" in text
+
+
+def test_stopped_before_the_first_step(run_folder: Maker) -> None:
+    told = {**summary(), "steps": [], "jumps": [], "hysteresis": [], "verdict": "stopped"}
+    text = words(page(run_folder([RunStop(0, "stopped", "operator")], told)))
+    assert "0 of 8 steps" in text
+    assert "No step was finished." in text
+
+
+def test_stopped_after_one_step_and_a_recording_at_hand_is_not_read_again(
+    run_folder: Maker,
+) -> None:
+    folder = run_folder(*one_step())
+    recording = read_recording(folder / "run.mcap")
+    (folder / "run.mcap").unlink()
+    assert "1 of 8 steps" in words(write_report(folder, recording).read_text(encoding="utf-8"))
+
+
+def test_missing_numbers_are_dashes(run_folder: Maker) -> None:
+    told = summary()
+    told["steps"][2]["measured"] = None
+    told["steps"][3]["twin"]["eta_d"] = None
+    told["steps"][4]["measured"]["eta_a"] = math.nan
+    told["steps"][5].update(thd=None, table_acc_peak_m_s2=None)
+    told.update(u_star_m=None, comparison={"rel_disp_m": {"nrmse": None}})
+    told["timing"]["latency_ms"] = {"p50": None, "p99": None, "max": None}
+    text = words(page(run_folder(told=told)))
+    assert not re.search(r"\bnan\b", text)
+    assert "None" not in text.replace("None.", "")
+    assert "u* = – mm" in text
+
+
+def test_nothing_recorded_is_touched(run_folder: Maker) -> None:
+    folder = run_folder(*one_step())
+    before = [(folder / name).read_bytes() for name in ("run.mcap", "summary.json")]
+    assert page(folder) == page(folder)
+    assert [(folder / name).read_bytes() for name in ("run.mcap", "summary.json")] == before
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"run": {}, "verdict": "x", "steps": [1]}'])
+def test_damaged_summary_is_one_message(run_folder: Maker, text: str) -> None:
+    folder = run_folder()
+    (folder / "summary.json").write_text(text)
+    with pytest.raises(InputError) as refused:
+        write_report(folder)
+    assert refused.value.where == str(folder / "summary.json")
+    assert refused.value.remedy
+
+
+@pytest.mark.parametrize("name", ["summary.json", "run.mcap"])
+def test_missing_file_is_named(run_folder: Maker, name: str) -> None:
+    folder = run_folder()
+    (folder / name).unlink()
+    with pytest.raises(InputError, match=name.replace(".", r"\.")):
+        write_report(folder)
+
+
+def test_import_without_profile(run_folder: Maker, tmp_path: Path) -> None:
+    start = replace(start_record(), profile_toml="", rig_toml="", model_toml="not = [toml")
+    run_folder()
+    (tmp_path / "run.mcap").unlink()
+    write_items(tmp_path / "run.mcap", [start, *blocks()], start)
+    assert "Specimen unknown" in words(bare(tmp_path))
+
+
+def test_model_alone(run_folder: Maker) -> None:
+    told = {**summary(("twin",)), "comparison": {}}
+    items = [one for one in blocks() if not isinstance(one, Comparison) and one.index >= 0]
+    folder = run_folder(
+        [i for i in items if not (isinstance(i, Block) and i.stream == "meas")], told
+    )
+    text = words(page(folder))
+    assert "nothing measured" in text
+    assert "0.136" in text
+    assert not (folder / "figures" / "comparison.png").exists()
+    assert (folder / "figures" / "prc.png").exists()
+
+
+def test_no_bumpers_no_force_pictures(run_folder: Maker) -> None:
+    folder = run_folder(*one_step(MEASURED[:4]), gap="inf")
+    text = words(page(folder))
+    assert "no bumpers, free flight" in text
+    assert "Impacts per forcing cycle" not in text
+    assert not (folder / "figures" / "bumpers.png").exists()
+
+
+@pytest.mark.parametrize("lost", ["mass_disp_m", "mass_acc_m_s2", "table_acc_m_s2", "force_l1_n"])
+def test_a_lost_channel_never_stops_the_report(run_folder: Maker, lost: str) -> None:
+    items, told = one_step(tuple(one for one in MEASURED if one != lost))
+    html = page(run_folder(items, {**told, "verdict": "complete"}))
+    assert "<b>complete</b>" in html
+
+
+@pytest.mark.parametrize(
+    "value, text",
+    [(0.12345, "0.123"), (12.345, "12.3"), (1234.5, "1234"), (0.0, "0"), (-0.5, "−0.500"),
+     (None, "–"), (math.nan, "–"), (1.5e-12, "1.50·10^−12")],
+)  # fmt: skip
+def test_significant_digits(value: float | None, text: str) -> None:
+    assert format_significant(value) == text

@@ -1,0 +1,123 @@
+"""What the terminal shows, where results go, and what is said while kernels compile."""
+
+import io
+import re
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+from rich.table import Table
+
+from table_io.config.base import find_config
+from table_io.errors import InputError
+from table_io.records import Event, Fault, NormalizedResponse, PrcPoint
+from tests.reports.recordings import summary
+from twin.reports.prc_table import print_prc
+from twin.run import folders, terminal, warm_up
+from twin.run.folders import make_output_folder, make_run_folder
+from twin.run.progress import RunProgress
+from twin.run.run_config import read_run_config
+
+
+def printed(width: int) -> list[str]:
+    """The PRC of the summary at hand, as lines of a terminal of this width."""
+    out = io.StringIO()
+    print_prc(Console(file=out, width=width), summary())
+    return out.getvalue().splitlines()
+
+
+@pytest.mark.parametrize("width", [40, 48, 52, 64, 80, 100, 130, 400])
+def test_curves_are_readable_at_any_width(width: int) -> None:
+    lines = printed(width)
+    assert all(len(line) <= width for line in lines)
+    assert not any("…" in line for line in lines)
+    steps = [line for line in lines if re.search(r"(forward|backward).* \d\.\d{3}", line)]
+    assert len(steps) == 8
+    for line, step in zip(steps, summary()["steps"], strict=True):
+        assert f"{step['measured']['eta_d']:.3f} | {step['twin']['eta_d']:.3f}" in line
+
+
+def test_a_line_each_where_no_table_fits() -> None:
+    lines = printed(24)
+    assert any(line.startswith("  direction forward: f [Hz] 1.000, eta_d 0.123 | 0.136")
+               for line in lines)  # fmt: skip
+
+
+def test_what_is_left_out_is_said_and_nothing_is_left_out_in_a_file() -> None:
+    assert any("--json" in line for line in printed(60))
+    wide = printed(terminal.FILE_COLUMNS)
+    assert not any("--json" in line for line in wide)
+    assert any("impacts L" in line and "eta_R" in line for line in wide)
+
+
+def test_a_table_without_room_is_a_line_a_row() -> None:
+    table = Table("sensor", "most", "used", title="sensors")
+    table.add_row("mass_acc_m_s2", "0.48 g", "10 %")
+    table.add_row("table_disp_m", "49.7 mm", "")
+    out = io.StringIO()
+    terminal.print_table(Console(file=out, width=20), table)
+    assert out.getvalue().splitlines() == [
+        "sensors", "  sensor mass_acc_m_s2: most 0.48 g, used 10 %",
+        "  sensor table_disp_m: most 49.7 mm",
+    ]  # fmt: skip
+
+
+def test_two_runs_of_one_second_have_folders_and_names_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(folders, "make_run_id", lambda name: f"20250101-000000-{name}")
+    found = [make_run_folder(None, "quick") for _ in range(3)]
+    names = ["20250101-000000-quick", "20250101-000000-quick-2", "20250101-000000-quick-3"]
+    assert [folder for folder, _ in found] == [Path("runs") / name for name in names]
+    assert [run for _, run in found] == names
+    assert make_run_folder(tmp_path / "mine", "quick") == (tmp_path / "mine", names[0])
+
+
+def test_a_folder_with_content_is_refused_an_empty_one_taken(tmp_path: Path) -> None:
+    assert make_output_folder(tmp_path, "x") == tmp_path
+    (tmp_path / "mine").touch()
+    with pytest.raises(InputError, match="exists and has content"):
+        make_output_folder(tmp_path, "x")
+
+
+def test_only_a_long_wait_is_told(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = signal.getsignal(signal.SIGALRM)
+    monkeypatch.setattr(terminal, "ANNOUNCE_AFTER_S", 0.05)
+    with terminal.announce_if_slow("compiling"):
+        pass
+    time.sleep(0.1)
+    assert capsys.readouterr().out == ""
+    with terminal.announce_if_slow("compiling"):
+        time.sleep(0.2)
+    assert capsys.readouterr().out == "compiling\n"
+    assert signal.getsignal(signal.SIGALRM) is before
+
+
+def test_every_kernel_of_a_command_is_had_before_it_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the cache holds: a part of it is not the whole."""
+    warmed: list[str] = []
+    monkeypatch.setattr(warm_up, "compile_twin_kernels", lambda: warmed.append("twin"))
+    monkeypatch.setattr(warm_up, "compile_rig_kernels", lambda bundle: warmed.append("rig"))
+    bundle = read_run_config(find_config("quickstart", "tests"))
+    warm_up.compile_kernels(bundle)
+    assert warmed == ["twin"]
+    warm_up.compile_kernels(bundle, table=True)
+    assert warmed == ["twin", "rig", "twin"]
+
+
+def test_what_a_twin_elsewhere_writes_gives_no_orders_to_the_terminal() -> None:
+    quantities = NormalizedResponse(1.0, 1.0, 1.0, 1.0, 1.0, 1.0, (), (), 0.0, 0.0)
+    evil = "\x1b[2J\x1b]0;owned\x07\nstate: at rest\u202e"
+    out = io.StringIO()
+    show = RunProgress(Console(file=out), 3, 100)
+    show(PrcPoint(1, 1, evil, 1.0, quantities, quantities, 1.0, 1.0, 0.0))
+    show(Fault(1, "twin", 0, 1, evil))
+    show(Event(1, "drift", evil))
+    said = out.getvalue().splitlines()
+    assert all(line.isprintable() for line in said)
+    assert [line[:12] for line in said[2:]] == [f"{'':>7}  fau", f"{'':>7}  dri"]

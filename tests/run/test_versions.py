@@ -1,0 +1,93 @@
+"""Versions in recordings: the numerics revision follows the code that computes the bits."""
+
+import ast
+import hashlib
+from pathlib import Path
+
+import pytest
+
+import twin
+from twin.run import versions
+from twin.run.versions import NUMERICS_REVISION, compare_versions, find_version_changes
+
+# Of model and comparison without names, comments and docstrings. When it differs, replay recordings
+# that were made before the change: where all are bit-identical, renew the hash; where one is not,
+# raise NUMERICS_REVISION too.
+STRUCTURE = {"revision 1": "0ea0e7448a9f"}
+
+
+class Anonymizer(ast.NodeTransformer):
+    """Replaces identifiers by numbers in order of appearance; removes texts and errors."""
+
+    def __init__(self) -> None:
+        self.numbers: dict[str, str] = {}
+
+    def generic_visit(self, node: ast.AST) -> ast.AST:
+        super().generic_visit(node)
+        for field in ("name", "id", "arg", "attr", "asname", "module"):
+            value = getattr(node, field, None)
+            if isinstance(value, str):
+                setattr(node, field, self.numbers.setdefault(value, str(len(self.numbers))))
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            node.body = [each for each in body if not is_text(each)]  # type: ignore[attr-defined]
+        return node
+
+    def visit_Constant(self, node: ast.Constant) -> ast.Constant:
+        return ast.Constant("") if isinstance(node.value, str) else node
+
+    def visit_JoinedStr(self, node: ast.JoinedStr) -> ast.Constant:
+        return ast.Constant("")
+
+    def visit_Raise(self, node: ast.Raise) -> ast.Raise:
+        return ast.Raise()
+
+
+def is_text(node: ast.AST) -> bool:
+    constant = node.value if isinstance(node, ast.Expr) else None
+    return isinstance(constant, ast.Constant) and isinstance(constant.value, str)
+
+
+def hash_structure(packages: tuple[Path, ...]) -> str:
+    """Hash of the code's structure, whatever its files, functions and variables are called."""
+    functions = sorted(
+        ast.dump(Anonymizer().visit(node))
+        for package in packages
+        for path in package.rglob("*.py")
+        for node in ast.parse(path.read_text()).body
+        if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Assign)
+    )
+    return hashlib.sha256("\n".join(functions).encode()).hexdigest()[:12]
+
+
+def test_the_revision_belongs_to_the_code() -> None:
+    root = Path(twin.__file__).parent
+    assert hash_structure((root / "model", root / "compare")) == STRUCTURE[NUMERICS_REVISION]
+
+
+def test_only_the_structure_counts(tmp_path: Path) -> None:
+    def structure(text: str) -> str:
+        (tmp_path / "a.py").write_text(text)
+        return hash_structure((tmp_path,))
+
+    before = structure("def f(u, k):\n    return k * u")
+    assert structure('def g(x, a):\n    """Force."""\n    return a * x  # N') == before
+    assert structure("def f(u, k):\n    return u * k") != before
+    assert structure("def f(u, k):\n    return 2 * k * u") != before
+
+
+def test_recordings_of_version_0_1_are_of_revision_1(monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded = {"kernels": "1947a383fe41"}
+    assert "kernels" not in find_version_changes(recorded)
+    assert compare_versions(recorded)["kernels"]["recorded"] == "revision 1"
+    monkeypatch.setattr(versions, "NUMERICS_REVISION", "revision 2")
+    versions.read_installed_versions.cache_clear()
+    try:
+        changes = find_version_changes(recorded)
+    finally:
+        versions.read_installed_versions.cache_clear()
+    assert changes["kernels"] == {"recorded": "revision 1", "installed": "revision 2"}
+
+
+def test_an_unknown_hash_is_a_change() -> None:
+    assert "kernels" in find_version_changes({"kernels": "0123456789ab"})

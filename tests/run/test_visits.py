@@ -1,0 +1,97 @@
+"""A test that finds its way, recorded, summed up, replayed: visits are no points of a curve."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from table_io.config.base import PROFILES_DIR
+from table_io.records import Comparison, Event, Fault, PrcPoint, StepAdded
+from twin.recording.reader import Recording, read_recording
+from twin.replay.pipeline_replay import RecordedRun, replay_recording
+from twin.reports.report import format_headline
+from twin.reports.report_data import build_report_data, extract_run_prc
+from twin.reports.summary import format_summary, summarise
+from twin.run.run_config import RunConfig, from_texts
+from twin.run.unpaced import play_unpaced
+from twin.transport.codec import encode_item
+
+PROFILE = """
+title = "Two frequencies, and a dwell at the second"
+[specimen]
+mass_kg = 550.0
+gap_mm = 4.0
+[sweep]
+start_hz = 3.8
+stop_hz = 4.0
+step_hz = 0.2
+cycles = 3
+measured_cycles = 2
+directions = ["forward"]
+[dwell]
+cycles = 6
+[loop_check]
+enabled = false
+[acquisition]
+rate_hz = 1000.0
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunConfig, Recording, dict[str, Any]]:
+    texts = [
+        (PROFILES_DIR / name).read_text() for name in ("rigs/simulated.toml", "models/snm.toml")
+    ]
+    bundle = from_texts("short", PROFILE, texts[0], texts[1], "short")
+    log = tmp_path_factory.mktemp("visits") / "run.mcap"
+    play_unpaced(bundle, "short", log, lambda: None, lambda item: None)
+    recording = read_recording(log)
+    return bundle, recording, summarise(recording, bundle.parameters)
+
+
+def test_visits_stand_beside_the_steps_with_their_reasons(run: tuple) -> None:
+    bundle, recording, summary = run
+    assert [step["index"] for step in summary["steps"]] == [0, 1]
+    assert [visit["index"] for visit in summary["visits"]] == [2, 3]
+    for visit, decided in zip(summary["visits"], recording.records(StepAdded), strict=True):
+        assert (visit["frequency_hz"], visit["direction"]) == (4.0, "forward")
+        assert visit["reason"] == decided.reason
+        assert visit["measured"]["eta_d"] == pytest.approx(visit["twin"]["eta_d"], rel=0.03)
+    (found,) = [one.text for one in recording.records(Event) if one.kind == "found"]
+    assert summary["found"] == [found]
+    assert "6 cycles held in 2 visits" in format_summary(summary)
+    shown = build_report_data(recording, summary)
+    assert extract_run_prc(shown, "measured", "forward", "eta_d")[0].tolist() == [3.8, 4.0]
+    assert format_headline(shown).startswith("2 of 2 steps")
+    assert found in format_headline(shown)
+    assert len(bundle.steps) == 2
+
+
+def test_a_replay_says_of_the_visits_what_was_said_to_the_bit(run: tuple, tmp_path: Path) -> None:
+    bundle, recording, summary = run
+    made = tmp_path / "run.mcap"
+    identity = replay_recording(
+        RecordedRun.open(recording.path), bundle, made, "again", lambda item: None
+    )
+    assert identity.is_identical
+    again = read_recording(tmp_path / "run.mcap")
+    for kind in (Comparison, PrcPoint, StepAdded, Event):
+        said = [one for one in again.records(kind) if getattr(one, "kind", "") != "replay"]
+        assert [encode_item(one, "") for one in said] == [
+            encode_item(one, "") for one in recording.records(kind)
+        ]
+    assert len(again.records(PrcPoint)) == 4
+    assert summarise(again, bundle.parameters)["visits"] == summary["visits"]
+
+
+def test_visits_that_a_dead_twin_missed_are_measured_all_the_same(run: tuple) -> None:
+    bundle, recording, summary = run
+    end = recording.stop.index
+    fault = Fault(end, "twin", 0, end, "it died")
+    kept = tuple(one for one in recording.items if not isinstance(one, PrcPoint))
+    found = summarise(replace(recording, items=(*kept, fault)), bundle.parameters)
+    assert [visit["measured"] for visit in found["visits"]] == [
+        visit["measured"] for visit in summary["visits"]
+    ]
+    assert {visit["twin"] for visit in found["visits"]} == {None}

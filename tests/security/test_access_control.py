@@ -1,0 +1,281 @@
+"""What each role can and cannot do to a rig, tried with sessions of zenoh's own."""
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from table_io.errors import InputError
+from tests.security.laboratory import (
+    COMPONENTS,
+    PEOPLE,
+    RIG,
+    ROOT,
+    alive,
+    answers,
+    door,
+    free_port,
+    laboratory,
+    noted,
+    own,
+    put,
+)
+from tests.security.laboratory import person as raw_person
+from tests.security.laboratory import session as raw_session
+from twin.security.access_control import build_open_access
+from twin.security.credentials import read_credentials
+from twin.transport.codec import TOPIC_TYPES
+from twin.transport.endpoint import PUBLIC_HUB_SETTINGS, Settings, key_expression
+from twin.transport.zenoh_link import BusLink, open_spoke
+
+KNOWN = [name for name in PEOPLE if name != "gone"]
+NOT_THEIRS = ("stream/rig/meas", "event/run/start", "cmd/stop/anna", "state/status", "**")
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return laboratory(tmp_path_factory.mktemp("keys") / "lab")
+
+
+@pytest.fixture(scope="module")
+def endpoint() -> str:
+    return f"tls/127.0.0.1:{free_port()}"
+
+
+@pytest.fixture(scope="module")
+def hub(lab: Path, endpoint: str) -> Iterator[BusLink]:
+    with door(endpoint, keys=read_credentials(lab)) as link:
+        yield link
+
+
+@pytest.fixture
+def closing() -> Iterator[ExitStack]:
+    with ExitStack() as stack:
+        yield stack
+
+
+@pytest.fixture
+def person(hub: BusLink, lab: Path, endpoint: str, closing: ExitStack) -> Any:
+    """Opens a session with the keys of somebody."""
+
+    def come(name: str) -> Any:
+        session = raw_person(lab, name, endpoint)
+        closing.callback(session.close)
+        return session
+
+    return come
+
+
+def settled(session: Any) -> None:
+    """Whatever the session sent before has been seen by the hub, and the other way round."""
+    assert answers(session, "state/role/none")
+
+
+def heard(session: Any, *keys: str) -> list[str]:
+    """The keys of what a session gets for these subscriptions, growing."""
+    got: list[str] = []
+    for one in keys:
+        where = f"{ROOT}/{one}"
+        session.declare_subscriber(where, noted(got))
+    settled(session)
+    return got
+
+
+@pytest.mark.parametrize("who", KNOWN)
+def test_everybody_known_hears_every_topic(hub: BusLink, person: Any, who: str) -> None:
+    session = person(who)
+    got = heard(
+        session, *(key_expression(RIG, topic).removeprefix(f"{ROOT}/") for topic in TOPIC_TYPES)
+    )
+    for topic in TOPIC_TYPES:
+        put(hub._session, key_expression(RIG, topic).removeprefix(f"{ROOT}/"))
+    settled(session)
+    assert sorted(got) == sorted(key_expression(RIG, topic) for topic in TOPIC_TYPES)
+
+
+@pytest.mark.parametrize("who", [*KNOWN, "gone"])
+def test_nobody_hears_commands_or_what_is_wider(hub: BusLink, person: Any, who: str) -> None:
+    session = person(who)
+    got = heard(session, "**", "*/rig/meas", "cmd/**", "state/**", "../**")
+    for where in ("stream/rig/meas", "event/run/start", "cmd/stop/anna", "state/held"):
+        put(hub._session, where)
+    settled(session)
+    assert got == []
+
+
+def test_who_is_not_in_the_list_hears_nothing(hub: BusLink, person: Any) -> None:
+    asked: list[str] = []
+    rig = hub._session.declare_queryable(f"{ROOT}/**", noted(asked))
+    session = person("gone")
+    got = heard(session, "stream/rig/meas", "event/run/start")
+    put(hub._session, "stream/rig/meas")
+    settled(session)
+    assert (got, alive(session)) == ([], set())
+    for one in ("state/status", "state/role/gone", "state/role/*", "config/run", "cmd/stop/gone"):
+        assert answers(session, one) == []
+    rig.undeclare()
+    assert set(asked) == {f"{ROOT}/state/role/none"}
+
+
+def test_a_twin_elsewhere_is_heard_without_loss(
+    hub: BusLink, lab: Path, endpoint: str, closing: ExitStack
+) -> None:
+    """What it published before anybody asked comes too: the hub may ask for what it holds."""
+    twin = open_spoke(RIG, endpoint, 5.0, read_credentials(own(lab, "tina")))
+    closing.callback(twin.close)
+    twin.declare(("/twin/point",), offered=True)
+    twin.publish("/twin/point", b"before")
+    inbox = hub.subscribe(("/twin/point",), history=True, capacity=10, offered=True)
+    got = []
+    for _ in range(200):
+        twin.serve()
+        if (one := inbox.get(0.05)) is not None:
+            got.append(one[1])
+            if len(got) == 2:
+                break
+            twin.publish("/twin/point", b"after")
+    assert got == [b"before", b"after"]
+
+
+@pytest.mark.parametrize("who", [*KNOWN, "gone"])
+def test_only_a_twin_publishes_and_only_what_a_twin_computes(
+    hub: BusLink, person: Any, who: str
+) -> None:
+    got: list[str] = []
+    listener = hub._session.declare_subscriber("**", noted(got))
+    session = person(who)
+    for where in (*NOT_THEIRS, "stream/twin/pred", "event/twin/point", "offer/twin/pred"):
+        put(session, where)
+    settled(session)
+    listener.undeclare()
+    assert got == ([f"{ROOT}/offer/twin/pred"] if who == "tina" else [])
+
+
+@pytest.mark.parametrize("who", KNOWN)
+def test_a_command_bears_the_name_of_who_gives_it(person: Any, who: str) -> None:
+    session = person(who)
+    (answer,) = answers(session, f"cmd/stop/{who}")
+    assert (b"this takes the role command" in answer) == (PEOPLE[who] != "command")
+    others = [other for other in PEOPLE if other != who]
+    for forged in (*others, "*", f"{who}/{who}", f"{who}$*", "rig"):
+        assert answers(session, f"cmd/stop/{forged}") == []
+    assert answers(session, "cmd/**") == []
+    assert answers(session, "**") == []
+
+
+@pytest.mark.parametrize("who", KNOWN)
+def test_everybody_known_asks_for_state_and_configuration(person: Any, who: str) -> None:
+    session = person(who)
+    assert answers(session, "state/status") == [b"state/status"]
+    assert answers(session, "config/run") == [b"config/run"]
+    assert answers(session, f"state/role/{who}") == [PEOPLE[who].encode()]
+
+
+@pytest.mark.parametrize("who", [*KNOWN, "gone"])
+def test_nobody_answers_or_listens_in_the_rigs_place(hub: BusLink, person: Any, who: str) -> None:
+    """A false rig gets no question; a twin only the rig's own, for what it offers."""
+    asked: list[str] = []
+    false_rig = person(who)
+    for where in ("cmd/**", "cmd/stop/anna", "state/**", "state/status", "config/**", "state/held"):
+        false_rig.declare_queryable(f"{ROOT}/{where}", noted(asked))
+    false_rig.declare_queryable(f"{ROOT}/state/offers", noted(asked))
+    heard(false_rig, "cmd/**", "cmd/stop/anna")
+    honest = person("anna")
+    assert answers(honest, "cmd/stop/anna") == [b"refused: this is run run"]
+    assert answers(honest, "state/status") == [b"state/status"]
+    assert answers(honest, "config/run") == [b"config/run"]
+    assert answers(honest, "state/held") == []
+    assert answers(honest, "state/offers") == []
+    settled(false_rig)
+    assert asked == []
+    answers(hub._session, "state/offers")
+    settled(false_rig)
+    assert set(asked) == ({f"{ROOT}/state/offers"} if who == "tina" else set())
+
+
+@pytest.mark.parametrize("who", [*KNOWN, "gone"])
+def test_nobody_is_there_under_anothers_name(hub: BusLink, person: Any, who: str) -> None:
+    session = person(who)
+    false = (
+        "run.twin",
+        "run.rig.2",
+        "observer",
+        "observer.rig.1",
+        "observer.ann",
+        "observer.zoe.1",
+    )
+    others = [f"observer.{other}.1" for other in PEOPLE if other != who]
+    kept = [
+        session.liveliness().declare_token(f"{ROOT}/alive/{name}")
+        for name in (*false, *others, f"observer.{who}x.1", f"observer.{who}.1")
+    ]
+    settled(session)
+    theirs = {f"observer.{who}.1"} if who in KNOWN else set()
+    assert alive(hub._session) == {*COMPONENTS} | theirs
+    assert alive(person("bob")) == {*COMPONENTS} | theirs
+    assert kept
+
+
+def test_our_own_end_says_who_is_not_in_the_list(lab: Path) -> None:
+    """By a hub that drops what comes too fast, as the gate's does."""
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    with door(endpoint, extra_settings=PUBLIC_HUB_SETTINGS, keys=read_credentials(lab)):
+        said_to_whom(lab, endpoint)
+
+
+def said_to_whom(lab: Path, endpoint: str) -> None:
+    with pytest.raises(
+        InputError, match="certificate is good, but gone is not in the rig's access"
+    ):
+        open_spoke(RIG, endpoint, 5.0, read_credentials(own(lab, "gone")))
+    with pytest.raises(InputError, match=r"'other'.*--rig"):
+        open_spoke("other", endpoint, 5.0, read_credentials(own(lab, "anna")))
+    link = open_spoke(RIG, endpoint, 5.0, read_credentials(own(lab, "anna")))
+    assert link.query("state/status") == b"state/status"
+    link.close()
+
+
+def test_a_run_with_a_twin_of_its_own_takes_no_other(lab: Path, closing: ExitStack) -> None:
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    link = closing.enter_context(door(endpoint, keys=read_credentials(lab).without_twin_roles()))
+    session = raw_person(lab, "tina", endpoint)
+    closing.callback(session.close)
+    got: list[str] = []
+    link._session.declare_subscriber("**", noted(got))
+    put(session, "offer/twin/pred")
+    assert answers(session, "state/role/tina") == [b"twin"]
+    assert got == []
+
+
+@pytest.mark.parametrize("twin", [False, True])
+def test_on_this_machine_everybody_asks_and_nobody_publishes(
+    closing: ExitStack, twin: bool
+) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    also: Settings = build_open_access(RIG, remote_twin=twin)
+    link = closing.enter_context(door(endpoint, extra_settings=also))
+    session, false_rig, honest = (raw_session(endpoint, {}) for _ in range(3))
+    for one in (session, false_rig, honest):
+        closing.callback(one.close)
+    published: list[str] = []
+    link._session.declare_subscriber("**", noted(published))
+    got, too_wide = heard(session, "stream/rig/meas"), heard(honest, "**", "cmd/**")
+    asked: list[str] = []
+    false_rig.declare_queryable(f"{ROOT}/cmd/**", noted(asked))
+    kept = [
+        false_rig.liveliness().declare_token(f"{ROOT}/alive/{name}")
+        for name in ("run.twin", "observer.me.1")
+    ]
+    for where in (*NOT_THEIRS, "stream/twin/pred", "offer/twin/pred"):
+        put(false_rig, where)
+    settled(false_rig)
+    assert published == ([f"{ROOT}/offer/twin/pred"] if twin else [])
+    put(link._session, "stream/rig/meas")
+    put(link._session, "cmd/stop/me")
+    assert answers(honest, "cmd/stop/me") == [b"cmd/stop/me"]
+    settled(session)
+    assert (got, too_wide, asked) == ([f"{ROOT}/stream/rig/meas"], [], [])
+    assert alive(session) == {*COMPONENTS, "observer.me.1"}
+    assert kept

@@ -1,0 +1,282 @@
+"""Every way not to be let in says which it is and what to do."""
+
+import re
+import shutil
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from table_io.clock import local_datetime
+from table_io.errors import InputError
+from tests.security.laboratory import RIG, aged, door, free_port, kept, laboratory, own, session
+from twin.live.control import send_command
+from twin.security import tls_diagnostics as refusal_module
+from twin.security.certificate_authority import CertificateKeyPair, issue_certificate
+from twin.security.credentials import Credentials, read_credentials
+from twin.security.tls_diagnostics import diagnose_refusal
+from twin.transport.endpoint import Settings
+from twin.transport.zenoh_link import open_hub, open_spoke
+
+SHORT_S = 0.3
+HERE = "127.0.0.1"
+
+
+@dataclass(frozen=True, slots=True)
+class Doors:
+    """What stands in a laboratory, and in one that is not its own."""
+
+    folder: Path
+    lab: Path
+    other: Path
+    keyed: str  # the rig's endpoint
+    plain: str  # one without keys
+    aged: str  # one whose certificate has expired
+    elsewhere: str  # one whose certificate is for rig.lab.example
+    false: str  # one that shows a person's certificate
+
+    def keys(self, name: str = "anna") -> Credentials:
+        return read_credentials(own(self.lab, name))
+
+    def forced(self, folder: Path) -> Credentials:
+        """Keys that nobody looked at, as another program would use them."""
+        return replace(self.keys(), folder=folder)
+
+
+@contextmanager
+def standing(folder: Path) -> Iterator[Doors]:
+    """A rig with keys, and beside it what one may take for it."""
+    lab, other = laboratory(folder / "lab"), laboratory(folder / "other")
+    authority = CertificateKeyPair((lab / "ca.pem").read_bytes(), (lab / "ca.key.pem").read_bytes())
+    rig = read_credentials(lab)
+    away = kept(
+        folder / "away",
+        lab,
+        issue_certificate(authority, "rig", ["rig.lab.example"], local_datetime()),
+    )
+    old = aged(lab, folder / "old", "rig", 400.0, (HERE,))
+    secure = [f"tls/{HERE}:{free_port()}" for _ in range(4)]
+    plain = f"tcp/{HERE}:{free_port()}"
+    with (
+        door(secure[0], keys=rig),
+        door(secure[1], keys=replace(rig, folder=old)),
+        door(secure[2], keys=replace(rig, folder=away)),
+        door(secure[3], keys=replace(rig, folder=own(lab, "bob"))),
+        door(plain),
+    ):
+        yield Doors(folder, lab, other, secure[0], plain, *secure[1:])
+
+
+@pytest.fixture(scope="module")
+def doors(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Doors]:
+    with standing(tmp_path_factory.mktemp("keys")) as doors:
+        yield doors
+
+
+def test_the_right_certificate_comes_in(doors: Doors) -> None:
+    for endpoint in (doors.keyed, doors.keyed.replace(HERE, "localhost")):
+        link = open_spoke(RIG, endpoint, 5.0, doors.keys())
+        assert link.query("state/status") == b"state/status"
+        link.close()
+
+
+def forged(doors: Doors) -> Credentials:
+    """A certificate of anna by another authority, beside the right ca.pem."""
+    folder = doors.folder / "forged"
+    if not folder.exists():
+        shutil.copytree(own(doors.other, "anna"), folder)
+        shutil.copy(doors.lab / "ca.pem", folder)
+    return doors.forced(folder)
+
+
+def issued_by_bob(doors: Doors) -> Credentials:
+    """A certificate of anna, signed by bob, and his behind it."""
+    folder = doors.folder / "issued"
+    if not folder.exists():
+        bob = CertificateKeyPair(
+            *((own(doors.lab, "bob") / one).read_bytes() for one in ("certificate.pem", "key.pem"))
+        )
+        false = issue_certificate(bob, "anna", [], local_datetime())
+        kept(folder, doors.lab, CertificateKeyPair(false.certificate + bob.certificate, false.key))
+    return doors.forced(folder)
+
+
+def expired(doors: Doors) -> Credentials:
+    folder = doors.folder / "expired"
+    return doors.forced(folder if folder.exists() else aged(doors.lab, folder, "anna", 400.0))
+
+
+def nowhere(_: Doors) -> str:
+    return f"tls/{HERE}:{free_port()}"
+
+
+REFUSED: dict[str, tuple[Callable[[Doors], str], Callable[[Doors], Credentials | None], str]] = {
+    "no certificate": (
+        lambda doors: doors.keyed,
+        lambda _: None,
+        r"asks for certificates; give yours with --keys FOLDER",
+    ),
+    "plain TCP against TLS": (
+        lambda doors: doors.keyed.replace("tls/", "tcp/"),
+        lambda _: None,
+        r"takes only people with keys; write tls/ .* --keys FOLDER",
+    ),
+    "TLS against plain TCP": (
+        lambda doors: doors.plain.replace("tcp/", "tls/"),
+        lambda doors: doors.keys(),
+        r"does not speak TLS: .* write tcp/ for a run on this machine",
+    ),
+    "keys with tcp/": (
+        lambda doors: doors.plain,
+        lambda doors: doors.keys(),
+        r"tcp/ shows no certificate; with --keys write tls/",
+    ),
+    "plain TCP over the network": (
+        lambda _: "tcp/192.0.2.1:7447",
+        lambda _: None,
+        r"would go over the network, unprotected; .* --keys FOLDER tls/",
+    ),
+    "another laboratory's keys": (
+        lambda doors: doors.keyed,
+        lambda doors: read_credentials(own(doors.other, "anna")),
+        r"not from the authority in .*ca\.pem .*`shaketwin keys`",
+    ),
+    "a forged certificate": (
+        lambda doors: doors.keyed,
+        forged,
+        r"your certificate \(anna\) is refused: the rig does not know the authority",
+    ),
+    "a certificate issued by a person": (
+        lambda doors: doors.keyed,
+        issued_by_bob,
+        r"your certificate \(anna\) is refused: .*issued",
+    ),
+    "an expired certificate": (
+        lambda doors: doors.keyed,
+        expired,
+        r"your certificate \(anna\) is refused: it has expired",
+    ),
+    "the rig's certificate expired": (
+        lambda doors: doors.aged,
+        lambda doors: doors.keys(),
+        r"rig's certificate has expired .* `shaketwin keys renew`",
+    ),
+    "another host's certificate": (
+        lambda doors: doors.elsewhere,
+        lambda doors: doors.keys(),
+        r"rig's certificate is not for 127\.0\.0\.1; .* keys renew FOLDER --host 127\.0\.0\.1",
+    ),
+    "a person in the rig's place": (
+        lambda doors: doors.false,
+        lambda doors: doors.keys(),
+        r"shows a person's certificate, not a rig's",
+    ),
+    "not in the access list": (
+        lambda doors: doors.keyed,
+        lambda doors: doors.keys("gone"),
+        r"certificate is good, but gone is not in the rig's access list",
+    ),
+    "nobody there": (nowhere, lambda doors: doors.keys(), r"start the run first"),
+    "no such machine": (
+        lambda _: "tls/no-such-machine.invalid:7447",
+        lambda doors: doors.keys(),
+        r"check the name",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_a_refusal_says_which_it_is_and_what_to_do(what: str, doors: Doors) -> None:
+    where, whose, says = REFUSED[what]
+    with pytest.raises(InputError, match=says):
+        open_spoke(RIG, where(doors), SHORT_S, whose(doors)).close()
+
+
+@pytest.mark.parametrize("who", ["bob", "rec", "tina"])
+def test_an_order_without_the_role_is_refused_by_name_and_role(doors: Doors, who: str) -> None:
+    with pytest.raises(InputError, match=f"{who} has the role .*; this takes the role command"):
+        send_command("stop", "", doors.keyed, RIG, doors.keys(who))
+
+
+def test_an_order_with_the_role_is_obeyed(doors: Doors, capsys: pytest.CaptureFixture[str]) -> None:
+    send_command("stop", "", doors.keyed, RIG, doors.keys("anna"))
+    assert "told to stop" in capsys.readouterr().out
+
+
+def test_a_foreign_client_without_a_certificate_is_refused(doors: Doors) -> None:
+    only_authority: Settings = {
+        "transport": {"link": {"tls": {"root_ca_certificate": str(doors.lab / "ca.pem")}}}
+    }
+    with pytest.raises(zenoh.ZError):
+        session(doors.keyed, only_authority, SHORT_S)
+
+
+def test_a_rig_without_keys_does_not_listen_to_the_network() -> None:
+    for endpoint in ("tcp/0.0.0.0:7447", "tcp/192.168.1.5:7447", "tcp/[::]:7447", "tcp/rig:7447"):
+        with pytest.raises(
+            InputError, match=r"over the network, unprotected; allowed: this machine"
+        ):
+            open_hub(RIG, endpoint)
+    with pytest.raises(InputError, match="give yours with --keys"):
+        open_hub(RIG, "tls/0.0.0.0:7447")
+
+
+def test_a_rig_with_keys_listens_on_every_interface(doors: Doors) -> None:
+    port = free_port()
+    with door(f"tls/0.0.0.0:{port}", keys=read_credentials(doors.lab)):
+        link = open_spoke(RIG, f"tls/{HERE}:{port}", 5.0, doors.keys())
+        assert link.query("state/status") == b"state/status"
+        link.close()
+
+
+def test_a_rig_that_is_full_says_so(doors: Doors) -> None:
+    endpoint = f"tls/{HERE}:{free_port()}"
+    one: Settings = {"transport": {"unicast": {"max_sessions": 1}}}
+    with door(endpoint, extra_settings=one, keys=read_credentials(doors.lab)):
+        first = open_spoke(RIG, endpoint, 5.0, doors.keys())
+        with pytest.raises(InputError, match="too many are connected; try again"):
+            open_spoke(RIG, endpoint, SHORT_S, doors.keys("bob"))
+        first.close()
+
+
+def test_an_address_that_zenoh_takes_for_no_name_is_said(doors: Doors) -> None:
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError as error:
+        pytest.skip(f"no IPv6 here: {error}")
+    endpoint = f"tls/[::1]:{free_port()}"
+    with (
+        door(endpoint, keys=read_credentials(doors.lab)),
+        pytest.raises(InputError, match="names and IPv4 addresses only; give a name"),
+    ):
+        open_spoke(RIG, endpoint, SHORT_S, doors.keys())
+
+
+@pytest.mark.parametrize("says", [b"", b"HTTP/1.1 400 Bad Request\r\n\r\n", None])
+@pytest.mark.parametrize("with_keys", [True, False])
+def test_whatever_else_listens_there_is_told_apart_in_time(
+    doors: Doors, says: bytes | None, with_keys: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that closes, one that speaks otherwise, one that is silent."""
+    monkeypatch.setattr(refusal_module, "CONNECT_TIMEOUT_S", 0.2)
+    with socket.create_server((HERE, 0)) as server:
+
+        def answer() -> None:
+            guest, _ = server.accept()
+            with guest:
+                if says is not None:
+                    guest.sendall(says)
+                else:
+                    while guest.recv(4096):
+                        pass
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        said = diagnose_refusal(HERE, server.getsockname()[1], doors.keys() if with_keys else None)
+        thread.join()
+    assert re.search("does not speak TLS" if with_keys else "^$", said)

@@ -1,0 +1,157 @@
+"""`python -m tests.studies.external_control [alignment|labels|live] ...`: the figures of following.
+
+alignment: random shifts, clocks to 100 ppm and noise of 1 % (rms, of the amplitude of the drive's
+first motion) on the measured command; the error of the place of a sample, in samples.
+labels: a whole test of twelve minutes beside a clock of 50 ppm.
+live: quickstart through the openDAQ client, in real time, in a network of its own (as root).
+"""
+
+import json
+import math
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from table_io.acquisition.drive_follower import DriveFollower, advance_follower, take_drive_indices
+from table_io.acquisition.external_control import plan_open_loop_drive
+from table_io.block import Float1D
+from table_io.config.base import find_config, load_config
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.excitation.drive import Drive
+from table_io.sim.controller import DrivePlayback
+
+RATE = 2000.0
+LSB = 2 * 0.06 / 2**24
+LATER = (5.0, 10.0, 20.0, 40.0)  # s after the motion began
+CASES = (
+    ("quickstart", True, 2.4), ("quickstart", False, 2.4),
+    ("g16", True, 1.0), ("g4_ss1", True, 0.5), ("g4_ss1", False, 0.5), ("g0", False, 0.5),
+)  # fmt: skip
+PROGRAM = Path(sys.executable).parent / "shaketwin"
+
+
+def drive_of(name: str, check: bool) -> Drive:
+    profile, _ = load_config(find_config(name, "tests"), Profile, "profile")
+    rig, _ = load_config(find_config("follow_simulated", "rigs"), RigConfig, "card")
+    raw = profile.model_dump() | {
+        "loop_check": profile.loop_check.model_dump() | {"enabled": check}
+    }
+    return plan_open_loop_drive(Profile.model_validate(raw), rig)
+
+
+def followed(
+    drive: Drive, ppm: float, begins: float, rng: np.random.Generator
+) -> tuple[float, list[float]]:
+    """(s from the motion's begin until it is found, error in samples at each of LATER)."""
+    first = drive.segments[0]
+    sigma = 0.01 * first.level1 / (2 * math.pi * first.f1) ** 2
+    motion = begins + first.start
+    count = int(motion + (LATER[-1] + 0.5) * RATE)
+    played = DrivePlayback(drive.command(0, count), RATE, RATE, begins, ppm)
+    now, found_s, errors = DriveFollower(drive, RATE, sigma, LSB), math.nan, []
+    for at in range(0, count, 500):
+        command = played.command(at, 500) + sigma * rng.standard_normal(500)
+        now = advance_follower(now, np.rint(command / LSB) * LSB)
+        if now.fit is None:
+            continue
+        since = (now.processed_end - motion) / RATE
+        error = (
+            float(now.fit.drive_index(np.array([now.processed_end]))[0])
+            - (now.processed_end - begins) * played.values_per_sample
+        )
+        if not errors:
+            found_s, errors = since, [abs(error)]
+        elif len(errors) <= len(LATER) and since >= LATER[len(errors) - 1]:
+            errors.append(abs(error))
+    assert now.state == "playing", now.reason
+    return found_s, errors
+
+
+def alignment(lives: int) -> None:
+    """The largest error of all lives, in samples."""
+    later = ", ".join(f"at {one:g} s" for one in LATER)
+    print(f"drive, lives: found after s at most; error when found p50, max; max {later}")
+    for name, check, hz in CASES:
+        drive, rng = drive_of(name, check), np.random.default_rng(11)
+        all_of = [
+            followed(drive, rng.uniform(-100, 100), rng.uniform(3000, 9000), rng)
+            for _ in range(lives)
+        ]
+        errors = np.array([one for _, one in all_of])
+        print(
+            f"{name} from {hz} Hz, {'with' if check else 'without'} loop check, {lives}: "
+            f"{max(one for one, _ in all_of):.2f}; {np.median(errors[:, 0]):.3f}, "
+            + ", ".join(f"{one:.3f}" for one in errors.max(axis=0)),
+            flush=True,
+        )
+
+
+def labels(ppm: float = 50.0) -> None:
+    drive, begins = drive_of("g4_ss3", True), 7000.37
+    for noise in (0.0, 0.01):
+        told, true = _told(drive, ppm, begins, noise)
+        moving = true >= drive.segments[0].start
+        off = np.abs(told - true)[moving]
+        low = int(min(told.min(), true.min())) - 1
+        rows = drive.labels(low, int(max(told.max(), true.max())) + 4 - low)
+        wrong = np.zeros(told.size, dtype=bool)
+        for row in rows:
+            wrong |= row[told - low] != row[np.rint(true).astype(int) - low]
+        edges = sum(int(np.count_nonzero(np.diff(row))) for row in rows)
+        print(
+            f"labels over {true.size / RATE:.0f} s at {ppm:g} ppm, noise {100 * noise:g} %: "
+            f"place off by {off.max():.2f} samples at most (0.5 is the nearest one), p99 "
+            f"{np.percentile(off, 99):.2f}; {int(wrong[moving].sum())} of {moving.sum()} samples "
+            f"have another label, at {edges} edges",
+            flush=True,
+        )
+
+
+def _told(drive: Drive, ppm: float, begins: float, noise: float) -> tuple[np.ndarray, Float1D]:
+    """(places told, true places) of every sample."""
+    file, rng = drive.command(0, drive.rest_start + 1000), np.random.default_rng(3)
+    first = drive.segments[0]
+    sigma = noise * first.level1 / (2 * math.pi * first.f1) ** 2
+    played = DrivePlayback(file, RATE, RATE, begins, ppm)
+    now, count, told = DriveFollower(drive, RATE, sigma, LSB), played.end // 500 * 500, []
+    for at in range(0, count, 500):
+        command = played.command(at, 500) + sigma * rng.standard_normal(500)
+        now = advance_follower(now, np.rint(command / LSB) * LSB)
+        now, places = take_drive_indices(now, now.located_end - now.taken_end)
+        told.append(places)
+    assert now.state == "playing", now.reason
+    return np.concatenate(told)[:count], (np.arange(count) - begins) * played.values_per_sample
+
+
+def live() -> None:
+    from tests.table_io.backends.separate_processes import own_network
+
+    profile = find_config("quickstart", "tests")
+    with tempfile.TemporaryDirectory() as folder, own_network():
+        file, out = Path(folder) / "drive.csv", Path(folder) / "run"
+        card = ["--table", "follow_simulated"]
+        subprocess.run([PROGRAM, "drive", profile, *card, "-o", file], check=True)
+        words = ["table", "--rig", "follow_simulated", "--play", file, "--ppm", "50"]
+        with subprocess.Popen([PROGRAM, *words], stdout=subprocess.PIPE, text=True) as table:
+            assert table.stdout is not None
+            assert "at rest" in table.stdout.readline()
+            subprocess.run([PROGRAM, "run", profile, *card, "--out", out], check=False)
+            table.send_signal(signal.SIGINT)
+        summary = json.loads((out / "summary.json").read_text())
+        print({key: summary[key] for key in ("verdict", "reason", "gaps")})
+        print(json.dumps(summary["timing"]["components"], indent=1))
+
+
+if __name__ == "__main__":
+    asked = sys.argv[1:] or ["alignment", "labels", "live"]
+    if "alignment" in asked:
+        alignment(240)
+    if "labels" in asked:
+        labels()
+    if "live" in asked:
+        live()

@@ -1,0 +1,81 @@
+"""How soon the watch sees what was planted, and whether it is silent otherwise: the table.
+
+    python tests/studies/monitoring.py [PROFILE ...]
+
+Plays each profile of profiles/tests (all of the paper's without arguments) on the simulated rig, at
+its own rate and as fast as it goes, clean and with 5 % of stiffness lost over the test, and prints
+what was said. Some minutes a profile.
+"""
+
+import hashlib
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from table_io.acquisition.session import run_session
+from table_io.backends import open_backend
+from table_io.block import Block
+from table_io.clock import ManualClock
+from table_io.config.base import PROFILES_DIR
+from table_io.records import Event, Record
+from twin.compare.monitoring import EVENT_KINDS
+from twin.run.run_config import RunConfig, from_texts
+from twin.run.unpaced import add_twin_items
+
+ALL = ("ginf", "g30", "g16", "g10", "g4_ss1", "g4_ss2", "g4_ss3", "g0", "gm1", "gm2", "gm10")
+LOST = 0.05
+TRUTH = '[[effects]]\nid = "stiffness_drift"\nparameters = {{ rate = {:.9f} }}\n'
+
+
+def said(name: str, truth: str, folder: Path) -> Iterator[tuple[RunConfig, Record | Block]]:
+    """Every item of a session with that truth."""
+    texts = [(PROFILES_DIR / one).read_text() for one in (
+        f"tests/{name}.toml", "rigs/simulated.toml", "models/snm.toml")]  # fmt: skip
+    if truth:
+        sealed = folder / "truth.toml"
+        sealed.write_text(truth)
+        digest = hashlib.sha256(truth.encode()).hexdigest()
+        more = f'[simulated]\ntruth = "{sealed}"\ntruth_sha256 = "{digest}"'
+        texts[1] = texts[1].replace("[simulated]", more)
+    bundle, clock = from_texts(name, *texts, name), ManualClock()
+    backend = open_backend(bundle.rig, bundle.profile, clock)
+    items = run_session(bundle.session, backend, clock, bundle.describe("r", "table"), lambda: None)
+    for item in add_twin_items(items, bundle.twin()):
+        yield bundle, item
+
+
+def row(name: str, truth: str) -> tuple[str, float]:
+    """(a line of the table, s that the test took)."""
+    events: list[Event] = []
+    begins, end, rate = -1, 0, 1.0
+    with TemporaryDirectory() as folder:
+        for bundle, item in said(name, truth, Path(folder)):
+            rate = bundle.drive.rate_hz
+            if isinstance(item, Block) and item.stream == "meas":
+                if begins < 0 and (item.step >= 0).any():
+                    begins = item.index
+                end = item.end
+            elif isinstance(item, Event) and item.kind in EVENT_KINDS:
+                events.append(item)
+    jumps = [one for one in events if one.kind in ("jump", "no jump")]
+    as_expected = sum("where the model expects it" in one.text for one in jumps)
+    others = [one for one in events if one.kind not in ("jump", "no jump", "drift")]
+    drift = next((one for one in events if one.kind == "drift"), None)
+    seen = "-" if drift is None else f"{(drift.index - begins) / rate:.0f} s: {drift.text}"
+    kinds = ", ".join(sorted({one.kind for one in others})) or "-"
+    lasts = (end - begins) / rate
+    clean = "5 % lost" if truth else "clean"
+    return f"| {name} | {clean} | {as_expected} of {len(jumps)} | {seen} | {kinds} |", lasts
+
+
+def main(names: Sequence[str]) -> None:
+    print("| test | planted | jumps as expected | drift seen after | else |\n|---|---|---|---|---|")
+    for name in names or ALL:
+        line, lasts = row(name, "")
+        print(line, flush=True)
+        print(row(name, TRUTH.format(-LOST / lasts))[0], flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,224 @@
+"""What the UDP path does in real time: the figures of the documentation.
+
+    python -m tests.studies.udp                 all of it, about five minutes
+    python -m tests.studies.udp latency kills   some of it
+
+latency: from a decision to the first changed sample, and how long the command took to arrive.
+kills: a rig is killed in motion; how soon command and table rest, from the target's black box.
+quickstart: a whole run through `shaketwin table`; lost samples, gaps, blocks on time.
+target: the target is killed in a run; what the rig says, and whether the recording is whole.
+"""
+
+import json
+import math
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+
+from table_io.acquisition.output_queue import DECISION_S
+from table_io.acquisition.session import SessionSetup, run_session
+from table_io.backends.udp import UdpBackend
+from table_io.clock import RealClock
+from table_io.config.base import PROFILES_DIR, load_config, parse_toml
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.records import Event
+from table_io.sim.machine.flight_recorder import read_flight_record
+from tests.table_io.backends.udp_bench import (
+    SPECIMEN,
+    card,
+    compiled,
+    free_port,
+    python_target,
+    relayed,
+)
+from twin.live.scheduling import request_realtime
+
+RATE = 2000.0
+SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
+DECISIONS, KILLS = 400, 10
+STILL_M = 2e-4
+TEST = """
+title = "Short"
+[specimen]
+mass_kg = 550.0
+gap_mm = 4.0
+[sweep]
+start_hz = 1.0
+stop_hz = 3.0
+step_hz = 0.5
+cycles = 4
+measured_cycles = 2
+[loop_check]
+enabled = false
+[control]
+enabled = false
+"""
+
+
+def latency(folder: Path) -> None:
+    """Decays of 4 s (8000 samples, 63 packets) decided at random times, each to be obeyed."""
+    for side in ("python", "c"):
+        for share in (0.0, 0.01):
+            with ExitStack() as stack:
+                if side == "python":
+                    address = stack.enter_context(python_target(folder, ""))
+                else:
+                    address = ("127.0.0.1", free_port())
+                    program = compiled(folder)
+                    command = [str(program), address[0], str(address[1])]
+                    process = stack.enter_context(subprocess.Popen(command, stdout=-3))
+                    stack.callback(process.terminate)
+                if share:
+                    address = stack.enter_context(relayed(address, 1, share)).address
+                _decide(address, f"{side:6s} {100 * share:g} % of each evil")
+
+
+def _decide(address: tuple[str, int], title: str) -> None:
+    clock, chance = RealClock(), random.Random(1)
+    request_realtime(50)  # as the rig is in a run
+    backend = UdpBackend(parse_toml(card(address, ""), RigConfig, "card"), SPECIMEN, RATE, clock)
+    for _ in range(100):  # a target that was just started
+        try:
+            backend.open()
+            break
+        except ValueError:
+            time.sleep(0.05)
+    backend.queue(0, np.zeros(2))
+    backend.start()
+    changed, handed, refused = [], [], 0
+    for _ in range(DECISIONS):
+        backend.read(20 * chance.randint(1, 4))
+        decided = clock.now()
+        while True:
+            at = backend._newest_sample() + 1 + backend.replace_after + math.ceil(DECISION_S * RATE)
+            asked = clock.now()
+            try:
+                backend.queue(at, np.zeros(8000))
+                break
+            except ValueError:
+                refused += 1
+        handed.append(clock.now() - asked)
+        changed.append(backend.scheduled_time_s(at) - decided)
+    missed = backend._state.missed
+    backend.close()
+    ms = [1e3 * np.percentile(one, (50, 99, 100)) for one in (changed, handed)]
+    print(
+        f"latency {title}: decision to first changed sample p50 {ms[0][0]:.1f} p99 {ms[0][1]:.1f} "
+        f"max {ms[0][2]:.1f} ms; 8000 samples handed over in p50 {ms[1][0]:.1f} p99 "
+        f"{ms[1][1]:.1f} max {ms[1][2]:.1f} ms; refused {refused} of {DECISIONS}; {missed} packets "
+        "missed by the target",
+        flush=True,
+    )
+
+
+def drive(path: str, test: str) -> None:
+    """A rig to be killed: says so once it has started."""
+    rig = load_config(Path(path), RigConfig, "machine card")[0]
+    profile = load_config(Path(test), Profile, "test profile")[0]
+    backend = UdpBackend(rig, profile.specimen, RATE, RealClock())
+
+    def describe(_: dict[str, float], epoch_s: float) -> Event:
+        print("started", flush=True)
+        return Event(0, "started", repr(epoch_s))
+
+    request_realtime(50)
+    for _ in run_session(SessionSetup(profile, rig), backend, RealClock(), describe, lambda: None):  # type: ignore[arg-type]
+        pass
+
+
+def kills(folder: Path) -> None:
+    """Each rig is killed at a random time of its test, the next one waits for the rest."""
+    test, chance, killed = folder / "test.toml", random.Random(2), []
+    test.write_text(TEST)
+    with python_target(folder, "", "--log", str(folder / "box")):
+        for _ in range(KILLS):
+            command = [
+                sys.executable,
+                "-m",
+                "tests.studies.udp",
+                "drive",
+                str(folder / "card.toml"),
+                str(test),
+            ]
+            with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as rig:
+                assert rig.stdout is not None
+                assert "started" in rig.stdout.readline()
+                time.sleep(chance.uniform(2.0, 12.0))
+                killed.append(time.monotonic())
+                rig.kill()
+        time.sleep(8.0)
+    rests, peaks = [], []
+    for at, life in zip(killed, read_flight_record(folder / "box"), strict=True):
+        count = round((at - life.epoch_s) * RATE)
+        command, table = life.command_m, life.row("table_disp")
+        rests.append((np.flatnonzero(np.abs(command) > 1e-6)[-1] - count) / RATE)
+        table_s = (np.flatnonzero(np.abs(table) > STILL_M)[-1] - count) / RATE
+        peaks.append(np.abs(np.diff(command, 2)).max() * RATE**2 / 9.80665)
+        assert command[-1] == 0.0, "the command rests at its mean"
+        print(
+            f"kills: command at rest {rests[-1]:.2f} s after, table within 0.2 mm {table_s:.2f} s"
+        )
+    print(f"kills: {KILLS}, the longest {max(rests):.2f} s; peak of the command {max(peaks):.4f} g")
+
+
+def quickstart(folder: Path) -> None:
+    """A whole run, in real time."""
+    with python_target(folder, ""):
+        _run(folder, "quickstart", lambda: None)
+
+
+def target(folder: Path) -> None:
+    """The target is killed 20 s into a run."""
+    path = folder / "card.toml"
+    path.write_text(card(("127.0.0.1", free_port()), ""))
+    command = [SHAKETWIN, "table", "--rig", str(path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert "waiting at" in process.stdout.readline()
+
+        def kill() -> None:
+            time.sleep(20.0)
+            process.kill()
+
+        _run(folder, "target", kill)
+
+
+def _run(folder: Path, title: str, meanwhile: Callable[[], None]) -> None:
+    """`shaketwin run` of the quickstart on this card; what came of it."""
+    out = folder / title
+    profile = PROFILES_DIR / "tests" / "quickstart.toml"
+    command = [SHAKETWIN, "run", str(profile), "--table", str(folder / "card.toml"), "--out", out]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        meanwhile()
+        said = process.communicate()[0]
+    summary = json.loads((out / "summary.json").read_text())
+    verify = [SHAKETWIN, "verify", str(out / "run.mcap")]
+    verified = subprocess.run(verify, stdout=subprocess.PIPE, text=True, check=False)
+    print(f"{title}: exit {process.returncode}; {said.strip().splitlines()[-1]}")
+    print(f"{title}: {summary['verdict']}, {summary.get('reason')}; gaps {summary['gaps']}")
+    print(f"{title}: {json.dumps(summary['timing'])}")
+    print(
+        f"{title}: verify exit {verified.returncode}: {verified.stdout.strip()[:600]}", flush=True
+    )
+
+
+def main() -> None:
+    if sys.argv[1:2] == ["drive"]:
+        drive(*sys.argv[2:])
+        return
+    studies = {one.__name__: one for one in (latency, kills, quickstart, target)}
+    for name in sys.argv[1:] or studies:
+        with tempfile.TemporaryDirectory() as folder:
+            studies[name](Path(folder))
+
+
+if __name__ == "__main__":
+    main()

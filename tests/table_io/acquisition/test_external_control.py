@@ -1,0 +1,285 @@
+"""A session that follows: what it records, what it says, and that it stops nothing."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import pytest
+
+from table_io.acquisition.external_control import plan_open_loop_drive, record_external
+from table_io.acquisition.session import OperatorCommand, SessionSetup
+from table_io.backends import MachineLost
+from table_io.block import Block, Float1D, Label, join_blocks
+from table_io.clock import ManualClock
+from table_io.config.base import find_config, load_config, parse_toml
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.errors import InputError
+from table_io.excitation.drive import Drive
+from table_io.records import Check, Event, FrequencyResponse, RunStart, RunStop, Trip
+from tests.table_io.acquisition.external_controller import Bystander, whole
+
+BEGINS = 4000.37
+SWEEP = {
+    "start_hz": 2.4, "stop_hz": 2.8, "step_hz": 0.2, "cycles": 3, "measured_cycles": 2,
+    "directions": ["forward"],
+}  # fmt: skip
+
+
+def setup(check: bool = False, text: str = "", **changes: object) -> SessionSetup:
+    profile, _ = load_config(find_config("quickstart", "tests"), Profile, "profile")
+    raw = profile.model_dump() | {"sweep": SWEEP, "loop_check": {"enabled": check}, **changes}
+    path = find_config("follow_simulated", "rigs")
+    rig = parse_toml(text or path.read_text(), RigConfig, "card")
+    return SessionSetup(Profile.model_validate(raw), rig)
+
+
+def start(tare: dict[str, float], epoch_s: float) -> RunStart:
+    return RunStart(
+        0, "r", "n", "table", "", "", "", 2000.0, 20, (), (), 0, tare, {}, "", "", epoch_s
+    )
+
+
+@dataclass(frozen=True)
+class Followed:
+    """Everything that a session said, and the drive that it planned."""
+
+    items: list[object]
+    drive: Drive
+
+    def of(self, kind: type) -> list:
+        return [one for one in self.items if isinstance(one, kind)]
+
+    @property
+    def block(self) -> Block:
+        return join_blocks(self.of(Block))
+
+    @property
+    def stop(self) -> RunStop:
+        assert isinstance(self.items[-1], RunStop)
+        return self.items[-1]
+
+    def said(self, kind: str) -> list[str]:
+        return [one.text for one in self.of(Event) if one.kind == kind]
+
+
+def run(
+    one: SessionSetup,
+    file: Callable[[Drive], Float1D] = whole,
+    ppm: float = 50.0,
+    kind: type[Bystander] = Bystander,
+    orders: Callable[[int], OperatorCommand | None] = lambda _: None,
+) -> Followed:
+    """A session beside a controller that plays a file; `orders` are asked by the block's number."""
+    drive, clock = plan_open_loop_drive(one.profile, one.rig), ManualClock()
+    played = np.ascontiguousarray(file(drive))
+    source = kind(one.rig, one.profile.specimen, 2000.0, clock, played, BEGINS, ppm)
+    asked = iter(range(10**9))
+    items = list(record_external(one, source, clock, start, lambda: orders(next(asked))))
+    return Followed(items, drive)
+
+
+def stopped_early(drive: Drive) -> Float1D:
+    """The controller's own stop in the second step: a decay of half a second."""
+    values = whole(drive)
+    at = next(one.end for one in drive.segments if one.step == 1) - 300
+    left = np.clip(1.0 - np.arange(values.size - at) / 1000.0, 0.0, 1.0)
+    values[at:] *= left**3 * (10.0 + left * (-15.0 + 6.0 * left))
+    return values
+
+
+@pytest.fixture(scope="module")
+def checked() -> Followed:
+    return run(setup(check=True))
+
+
+def test_the_whole_is_recorded_from_the_start_of_the_acquisition_on(checked: Followed) -> None:
+    block = checked.block  # which joins: no sample is missing
+    assert isinstance(checked.items[0], RunStart)
+    assert block.index == 0
+    assert np.isfinite(block.values).all()
+    assert checked.stop.verdict == "complete"
+    assert checked.stop.index == block.end
+    assert checked.stop.states == ("idle", "checking", "waiting", "following", "at rest")
+
+
+def test_every_sample_is_labelled_by_its_place_in_the_drive(checked: Followed) -> None:
+    """To the nearest sample, but where two labels meet within the noise of the alignment."""
+    block = checked.block
+    true = (np.arange(len(block)) - BEGINS) * (1 + 50e-6)
+    place = np.rint(true).astype(int)
+    labels = checked.drive.labels(int(place[0]), int(place[-1] - place[0]) + 1)
+    for told, drive in zip((block.step, block.label, block.cycle), labels, strict=True):
+        wrong = np.flatnonzero(told != drive[place - place[0]])
+        # what was given on before motion was seen, at less than what can be seen of it
+        unseen = wrong[(block.label[wrong] == Label.REST) & (wrong < BEGINS + 1100)]
+        assert len(wrong) - len(unseen) <= len(np.flatnonzero(np.diff(drive)))
+
+
+def test_the_loop_check_is_judged_and_how_it_was_aligned_is_said(checked: Followed) -> None:
+    checks = checked.of(Check)
+    assert len(checks) > 30
+    assert all(one.passed for one in checks)
+    assert len(checked.of(FrequencyResponse)) == 1
+    said = checked.said("aligned")
+    assert len(said) == 3
+    assert "sample 0 of the drive is sample 4000.3" in said[-1]
+    assert float(said[-1].split(" ppm")[0].split()[-1]) == pytest.approx(50.0, abs=1.0)
+    (clock,) = checked.said("clock")
+    assert clock.startswith("the simulated table's clock; ")
+    assert not checked.of(Trip)
+
+
+def test_a_loop_check_that_fails_stops_nothing_and_says_so() -> None:
+    text = find_config("follow_simulated", "rigs").read_text()
+    text += '\n[[simulated.faults]]\nkind = "polarity"\nat_s = 0.0\nchannel = "table_acc_m_s2"\n'
+    one = run(setup(check=True, text=text))
+    assert any("failed" in line and "its controller" in line for line in one.said("check"))
+    assert one.stop.verdict == "complete"
+    assert "protection would have stopped it" in one.stop.reason or not one.of(Trip)
+
+
+def test_what_protection_sees_is_in_the_record_and_the_table_goes_on() -> None:
+    text = find_config("follow_simulated", "rigs").read_text()
+    text += '\n[[simulated.faults]]\nkind = "cable_off"\nat_s = 5.0\nchannel = "table_disp_m"\n'
+    one = run(setup(text=text))
+    trips = one.of(Trip)
+    assert len(trips) == 1
+    assert "stop it at its controller" in trips[0].text
+    assert one.stop.verdict == "complete"
+    assert "see the trip" in one.stop.reason
+
+
+def test_a_controller_that_stops_early_is_seen_and_recorded_to_rest() -> None:
+    one = run(setup(), stopped_early)
+    left = next(s.end for s in one.drive.segments if s.step == 1) - 300 + BEGINS
+    (trip,) = [trip for trip in one.of(Trip) if trip.kind == "plan"]
+    assert left - 500 <= trip.index <= trip.decided <= left + 2000
+    assert "off the drive" in trip.text
+    assert one.stop.verdict == "aborted"
+    assert "does not play the drive" in one.stop.reason
+    assert one.stop.states[-2:] == ("astray", "at rest")
+    block = one.block
+    assert np.abs(block.channel("drive_disp_m")[-400:]).max() < 1e-6
+    measured = np.flatnonzero(block.label == Label.MEASURE)
+    assert measured.max() <= left + 2000
+
+
+def test_another_drive_is_not_taken_for_ours() -> None:
+    other = plan_open_loop_drive(
+        setup(sweep=SWEEP | {"start_hz": 2.6, "stop_hz": 3.4}).profile, setup().rig
+    )
+    one = run(setup(), lambda _: whole(other))
+    assert one.stop.verdict == "aborted"
+    assert "not this drive" in one.stop.reason
+    assert (one.block.step == -1).all()
+
+
+def test_nothing_played_is_the_end_after_the_cards_time() -> None:
+    text = (
+        find_config("follow_simulated", "rigs")
+        .read_text()
+        .replace("wait_s = 300.0", "wait_s = 6.0")
+    )
+    one = run(setup(text=text), lambda _: np.zeros(10))
+    assert one.stop.verdict == "aborted"
+    assert "nothing was played within 6 s" in one.stop.reason
+    assert one.block.end == pytest.approx(12000, abs=40)
+
+
+def order(name: str, at: int, asked: int) -> OperatorCommand | None:
+    return OperatorCommand(name, f"asked to {name}") if asked == at else None
+
+
+@pytest.mark.parametrize("name", ["hold", "resume"])
+def test_hold_and_resume_are_refused_with_words(name: str) -> None:
+    one = run(setup(), orders=partial(order, name, 300))
+    (text,) = one.said("refused")
+    assert name in text
+    assert "controller" in text
+    assert one.stop.verdict == "complete"
+
+
+@pytest.mark.parametrize(("name", "verdict"), [("stop", "stopped"), ("abort", "aborted")])
+def test_a_stop_says_where_to_stop_and_ends_the_recording(name: str, verdict: str) -> None:
+    """The controller plays on: ten seconds later the recording ends, and says that it moves."""
+    long = setup(sweep=SWEEP | {"cycles": 20})
+    one = run(long, orders=partial(order, name, 500))
+    assert one.stop.verdict == verdict
+    assert any("STOP THE TABLE AT ITS CONTROLLER" in line for line in one.said("stop"))
+    assert any("while the table still moves" in line for line in one.said("stop"))
+    assert one.block.end == pytest.approx(501 * 20 + 20000, abs=40)
+    assert one.stop.states[-1] == "left"
+
+
+def test_a_stop_that_is_followed_at_the_controller_is_recorded_to_rest() -> None:
+    one = run(setup(), stopped_early, orders=partial(order, "stop", 500))
+    left = next(s.end for s in one.drive.segments if s.step == 1) - 300 + BEGINS
+    assert left - 4000 < 500 * 20 < left
+    assert one.stop.verdict == "stopped"
+    assert one.stop.reason == "asked to stop"
+    assert not [trip for trip in one.of(Trip) if trip.kind == "plan"]
+    assert one.stop.states[-1] == "at rest"
+    assert one.block.end > left + 1400
+    assert np.abs(one.block.channel("drive_disp_m")[-300:]).max() < 1e-6
+
+
+def test_a_stop_while_waiting_ends_at_once() -> None:
+    one = run(setup(), orders=partial(order, "stop", 20))
+    assert one.stop.verdict == "stopped"
+    assert one.block.end <= 30 * 20
+
+
+def test_a_test_that_decides_while_it_runs_cannot_be_given_away() -> None:
+    profile = load_config(find_config("track", "tests"), Profile, "profile")[0]
+    with pytest.raises(InputError, match="decides while it runs"):
+        plan_open_loop_drive(profile, setup().rig)
+
+
+class Breaking(Bystander):
+    """The device is lost in mid-test."""
+
+    def take(self, samples: int) -> np.ndarray:
+        if self._next > 12000:
+            raise MachineLost("nobody answers; stop it at its controller")
+        return super().take(samples)
+
+
+def test_a_lost_device_leaves_all_that_was_acquired() -> None:
+    one = run(setup(), kind=Breaking)
+    assert one.stop.verdict == "halted"
+    assert one.block.end == one.stop.index == 12020
+    assert one.of(Trip)[-1].kind == "machine"
+
+
+def no_command() -> str:
+    """The card without a wire for the command."""
+    text = find_config("follow_simulated", "rigs").read_text()
+    command = text.index('[[sensors]]\nchannel = "drive_disp_m"')
+    after = text.index("[[sensors]]", command + 1)
+    text = (text[:command] + text[after:]).replace(
+        'command = "drive_disp_m"', 'command = "table_disp_m"'
+    )
+    return text.replace('drive_disp_m = "command"\n', "")
+
+
+def test_where_no_command_is_wired_the_table_stands_for_it() -> None:
+    """Its labels lag as the table does; protection is off, and both are said."""
+    one = run(setup(text=no_command()))
+    assert one.stop.verdict == "complete"
+    assert any("protection and loop check are off" in line for line in one.said("follow"))
+    assert any("lags behind" in line for line in one.said("follow"))
+    block = one.block
+    true = np.rint((np.arange(len(block)) - BEGINS) * (1 + 50e-6)).astype(int)
+    step, _, _ = one.drive.labels(int(true[0]), true.size + 10)
+    for index in (1, 2):
+        first, expected = (int(np.flatnonzero(row == index)[0]) for row in (block.step, step))
+        assert 10 <= first - expected - (-true[0] - round(BEGINS)) <= 60
+
+
+def test_the_card_wants_its_source() -> None:
+    text = find_config("follow_simulated", "rigs").read_text()
+    bare = text[: text.index("\n[opendaq]")] + text[text.index("\n[limits]") :]
+    with pytest.raises(InputError, match=r"source 'opendaq' needs a \[opendaq\] table"):
+        parse_toml(bare, RigConfig, "card")

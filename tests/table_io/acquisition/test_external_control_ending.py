@@ -1,0 +1,118 @@
+"""When a session that follows ends, and what it says then: stops, noise, and who played before."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from table_io.acquisition.external_control import plan_open_loop_drive
+from table_io.block import Float1D, Label
+from table_io.config.base import find_config
+from table_io.errors import InputError
+from table_io.excitation.drive import Drive
+from tests.table_io.acquisition.external_controller import Bystander, whole
+from tests.table_io.acquisition.test_external_control import (
+    BEGINS,
+    SWEEP,
+    no_command,
+    order,
+    run,
+    setup,
+    stopped_early,
+)
+
+
+class Floating(Bystander):
+    """The cable of the command falls off in mid-test: what is left is noise."""
+
+    def take(self, samples: int) -> np.ndarray:
+        volts = super().take(samples)
+        if self._next > 12000:
+            draw = np.random.default_rng(self._next).standard_normal(samples)
+            volts[self.channels.index("drive_disp_m")] = 1e-4 * draw
+        return volts
+
+
+def test_a_command_that_never_rests_again_ends_the_recording() -> None:
+    """As long after the motion began as the drive takes, not at the operator's patience."""
+    one = run(
+        setup(), kind=Floating, orders=lambda n: pytest.fail("for ever") if n > 5000 else None
+    )
+    assert one.stop.verdict == "aborted"
+    assert any("drive_disp_m still moves" in line for line in one.said("stop"))
+    assert one.block.end <= BEGINS + one.drive.rest_start + 4000
+    assert one.stop.states[-1] == "left"
+
+
+def test_a_stop_in_the_rest_before_the_sweep_does_not_end_a_controller_that_plays_on() -> None:
+    long = setup(check=True, sweep=SWEEP | {"cycles": 12})
+    drive = plan_open_loop_drive(long.profile, long.rig)
+    sweep = next(one.start for one in drive.segments if one.step == 0)
+    asked = round((BEGINS + sweep - 900) / 20)
+    one = run(long, orders=partial(order, "stop", asked))
+    assert one.stop.verdict == "stopped"
+    assert one.block.end == pytest.approx((asked + 1) * 20 + 20000, abs=40)
+    assert one.stop.states[-1] == "left"
+    assert (one.block.label == Label.MEASURE).any()
+
+
+def test_a_stop_while_the_drive_is_searched_for_does_not_end_in_motion() -> None:
+    asked = round(BEGINS + 2200) // 20
+    one = run(setup(), stopped_early, orders=partial(order, "stop", asked))
+    assert one.said("motion")
+    assert one.stop.states[-1] == "at rest"
+    assert one.block.end > BEGINS + 8000
+    assert np.abs(one.block.channel("drive_disp_m")[-300:]).max() < 1e-6
+
+
+class Before(Bystander):
+    """Its controller plays while the tare is taken."""
+
+    def tare(self, samples: int) -> np.ndarray:
+        volts = super().tare(samples)
+        moved = self.file.command(-samples, samples) * self._rig.sensors[0].volts_per_si
+        volts[self.channels.index("drive_disp_m")] += moved
+        return volts
+
+
+class Early(Before):
+    """The same, well in the drive."""
+
+    def __init__(self, *words: object) -> None:
+        super().__init__(*words[:5], -9000.4, words[6])  # type: ignore[arg-type]
+
+
+def test_a_controller_that_plays_before_the_start_is_refused() -> None:
+    with pytest.raises(InputError) as error:
+        run(setup(), kind=Early)
+    assert error.value.key == "drive_disp_m"
+    assert run(setup(), kind=Before).stop.verdict == "complete"
+
+
+class Lost(Bystander):
+    """Its command never comes."""
+
+    def take(self, samples: int) -> np.ndarray:
+        volts = super().take(samples)
+        volts[self.channels.index("drive_disp_m")] = np.nan
+        return volts
+
+
+def test_a_lost_command_is_not_said_to_be_no_motion() -> None:
+    text = (
+        find_config("follow_simulated", "rigs")
+        .read_text()
+        .replace("wait_s = 300.0", "wait_s = 6.0")
+    )
+    one = run(setup(text=text), kind=Lost)
+    assert one.stop.verdict == "aborted"
+    assert "the command was lost, so it is not known" in one.stop.reason
+
+
+def test_half_the_amplitude_is_told_where_no_command_is_wired() -> None:
+    def half(drive: Drive) -> Float1D:
+        return 0.5 * whole(drive)
+
+    one = run(setup(text=no_command()), half)
+    assert one.stop.verdict == "aborted"
+    assert "of the drive's; allowed: 0.7 to 1.3" in one.stop.reason

@@ -1,0 +1,93 @@
+"""From the exported file to the report: the programs as a person runs them, through openDAQ."""
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from table_io.config.base import find_config
+from table_io.errors import InputError
+from tests.table_io.backends.separate_processes import own_network
+from twin.cli.table import ExternalController, serve_table
+
+pytest.importorskip("opendaq")
+PROGRAM = Path(sys.executable).parent / "shaketwin"
+PROFILE = """
+title = "short"
+[specimen]
+mass_kg = 550.0
+gap_mm = 4.0
+[sweep]
+start_hz = 3.0
+stop_hz = 3.2
+step_hz = 0.2
+cycles = 4
+measured_cycles = 2
+directions = ["forward"]
+[loop_check]
+enabled = false
+"""
+FOLLOWED = ("--table", "follow_simulated")
+
+
+def shaketwin(*words: object, folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [PROGRAM, *map(str, words)], cwd=folder, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.slow
+def test_a_drive_is_exported_played_followed_recorded_and_replayed(tmp_path: Path) -> None:
+    (tmp_path / "short.toml").write_text(PROFILE)
+    with own_network():
+        made = shaketwin("drive", "short.toml", *FOLLOWED, "-o", "drive.csv", folder=tmp_path)
+        assert made.returncode == 0, made.stderr
+        words = ["table", "--rig", "follow_simulated", "--play", "drive.csv", "--ppm", "-60"]
+        with subprocess.Popen(
+            [PROGRAM, *words], cwd=tmp_path, stdout=subprocess.PIPE, text=True
+        ) as device:
+            assert device.stdout is not None
+            try:
+                assert "EVERY interface" in device.stdout.readline()
+                ran = shaketwin("run", "short.toml", *FOLLOWED, "--out", "run", folder=tmp_path)
+                device.send_signal(signal.SIGINT)
+                assert "switched off at rest" in device.stdout.read()
+            finally:
+                device.kill()
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert "play the drive file on the controller NOW" in ran.stdout
+    assert "-60" in ran.stdout.split("runs ")[-1].split(" ppm")[0]
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["verdict"] == "complete"
+    assert summary["gaps"] == 0
+    assert [step["frequency_hz"] for step in summary["steps"]] == [3.0, 3.2]
+    for step in summary["steps"]:
+        assert step["measured"]["eta_d"] == pytest.approx(step["twin"]["eta_d"], rel=0.02)
+    again = shaketwin("replay", "run", "--out", "again", folder=tmp_path)
+    assert again.returncode == 0, again.stdout + again.stderr
+    assert "identical to the bit" in again.stdout
+
+
+def test_only_a_followed_table_is_played_by_somebody_else() -> None:
+    with pytest.raises(InputError, match="belongs to a follow card"):
+        serve_table(
+            "simulated",
+            None,
+            None,
+            1.0,
+            sys.stdout,
+            controller=ExternalController(find_config("g0", "tests")),
+        )
+
+
+def test_a_run_without_the_device_says_how_to_start_one(tmp_path: Path) -> None:
+    (tmp_path / "short.toml").write_text(PROFILE)
+    with own_network():
+        ran = shaketwin("run", "short.toml", *FOLLOWED, "--out", "run", folder=tmp_path)
+    assert ran.returncode == 2
+    assert "no openDAQ device answers" in ran.stderr
+    assert "shaketwin table --rig follow_simulated" in ran.stderr
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,87 @@
+"""A test that was interrupted goes on at a step: from rest, checked again, its steps as before."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from table_io.block import Label
+from table_io.config.base import PROFILES_DIR, load_config, parse_toml
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.errors import InputError
+from table_io.excitation.trajectory import plan_sweep
+from table_io.safety.preflight import compute_demands
+from table_io.sequencer import make_test_plan, nominal_drive, start_test
+
+RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
+TEXT = """
+title = "short"
+[specimen]
+mass_kg = 550.0
+gap_mm = 4.0
+[sweep]
+start_hz = 2.0
+stop_hz = 4.0
+step_hz = 1.0
+cycles = 4
+measured_cycles = 2
+"""
+
+
+def profile(first: int | None = None, **more: Any) -> Profile:
+    text = TEXT if first is None else f'{TEXT}[resume]\nfirst_step = {first}\nof = "before"\n'
+    return parse_toml(text, Profile, "test").model_copy(update=more)
+
+
+@pytest.mark.parametrize("control", [True, False])
+def test_it_goes_on_from_rest_at_its_step_after_a_loop_check(control: bool) -> None:
+    one = profile(3)
+    one = one.model_copy(update={"control": one.control.model_copy(update={"enabled": control})})
+    drive = nominal_drive(make_test_plan(one, RIG))
+    step, label, _ = drive.labels(0, drive.planned_end)
+    assert list(dict.fromkeys(step[step >= 0].tolist())) == [3, 4, 5]
+    assert (label == Label.CHECK).any()
+    begins = int(np.flatnonzero(step == 3)[0])
+    assert np.flatnonzero(label == Label.CHECK)[-1] < begins
+    assert not drive.command(begins - 2000, 2000).any()  # rest, then a soft start
+    first = drive.segment_at(begins)
+    assert (first.level0, first.f1) == (0.0, 4.0)
+
+
+def test_its_steps_are_those_of_the_whole_test() -> None:
+    assert nominal_drive(make_test_plan(profile(3), RIG)).steps == profile().sweep.steps
+    assert start_test(make_test_plan(profile(5), RIG)).steps == profile().sweep.steps
+
+
+def test_without_a_loop_check_it_goes_on_at_its_step_too() -> None:
+    none = profile().loop_check.model_copy(update={"enabled": False})
+    drive = nominal_drive(make_test_plan(profile(4, loop_check=none), RIG))
+    assert {one.step for one in drive.segments} == {4, 5}
+
+
+def test_its_plan_and_its_margins_are_those_of_what_is_driven() -> None:
+    one = profile(4)
+    assert {segment.step for segment in plan_sweep(one).segments} == {4, 5}
+    rows, whole = (
+        {
+            row.step: row
+            for row in compute_demands(nominal_drive(make_test_plan(test, RIG)), test, RIG)
+        }
+        for test in (one, profile())
+    )
+    assert rows[5].displacement_m == pytest.approx(whole[5].displacement_m, rel=0.02)
+    assert rows[4].displacement_m > 0
+
+
+def test_nothing_is_resumed_where_nothing_was_interrupted() -> None:
+    assert profile().first_step == 0
+    assert nominal_drive(make_test_plan(profile(0), RIG)) == nominal_drive(
+        make_test_plan(profile(), RIG)
+    )
+
+
+@pytest.mark.parametrize(("first", "said"), [(6, "allowed: 0 to 5"), (-1, "first_step = -1")])
+def test_a_step_that_is_not_there_is_refused(first: int, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        profile(first)

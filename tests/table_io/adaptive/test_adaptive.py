@@ -1,0 +1,701 @@
+"""Tests that find their way: on specimens whose resonance and whose jumps are known."""
+
+import cmath
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from table_io.adaptive import Decision, StepResult, describe_adaptive_test, make_policy
+from table_io.adaptive.jump_refinement import choose_part
+from table_io.adaptive.resonance_tracking import interpolate_phase_crossing, parabola_vertex
+from table_io.adaptive.result import mean_swing
+from table_io.block import Block, Float1D, Label
+from table_io.config.base import PROFILES_DIR, load_config, parse_toml
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.control.order_tracking import HARMONIC_COUNT, NO_FIT, HarmonicFit
+from table_io.errors import InputError
+from table_io.records import Event, Record, Step, StepAdded
+from table_io.sequencer import (
+    SequencerState,
+    advance_test,
+    hold_test,
+    make_test_plan,
+    nominal_drive,
+    resume_test,
+    start_test,
+)
+from table_io.units import GRAVITY_M_S2
+
+RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
+A = 0.05 * GRAVITY_M_S2
+NATURAL_HZ, DAMPING = (
+    1.2876,
+    0.1236,
+)  # of the paper's damper: K = 36 kN/m, C = 1.1 kN s/m, M = 550 kg
+
+
+def profile(tool: str, card: dict[str, Any], **sweep: Any) -> Profile:
+    grid = {"start_hz": 1.0, "stop_hz": 1.6, "step_hz": 0.1, "cycles": 5, "measured_cycles": 2}
+    return Profile.model_validate(
+        {
+            "title": "finds its way",
+            "specimen": {"mass_kg": 550.0, "gap_mm": 4.0},
+            "sweep": {**grid, "directions": ["forward"], **sweep},
+            "loop_check": {"enabled": False},
+            tool: card,
+        }
+    )
+
+
+def result(step: Step, u: complex, swing_m: float | None = None, level: float = 1.0) -> StepResult:
+    """A step whose u has this fundamental in m beside a table at `level` of what was asked."""
+
+    def tracked(fundamental: complex) -> HarmonicFit:
+        return HarmonicFit(0.0, np.array([fundamental] + (HARMONIC_COUNT - 1) * [0j]), 0.0)
+
+    table = tracked(A * level * cmath.exp(0.3j))
+    moved = tracked(u * level * cmath.exp(0.3j))
+    size = abs(u) if swing_m is None else swing_m
+    return StepResult(step, table, moved, NO_FIT, size * level)
+
+
+Specimen = Callable[[Step], StepResult]
+
+
+def linear(f: float, natural_hz: float = NATURAL_HZ) -> complex:
+    """u in m of M u'' + C u' + K u = -M A, complex at the phase of A."""
+    w, n = 2 * math.pi * f, 2 * math.pi * natural_hz
+    return -A / (n * n - w * w + 2j * DAMPING * n * w)
+
+
+@dataclass
+class Driven:
+    """What a policy asked for and found."""
+
+    results: list[StepResult]
+    reasons: list[str]
+    found: str
+
+    @property
+    def visits(self) -> list[Step]:
+        return [one.step for one in self.results[-len(self.reasons) :]] if self.reasons else []
+
+
+def driven(test: Profile, specimen: Specimen) -> Driven:
+    """Plays a policy against a specimen, as the conductor does."""
+    policy, steps = make_policy(test), list(test.sweep.steps)
+    assert policy is not None
+    results, reasons, place = [], list[str](), 0
+    while True:
+        results.append(specimen(steps[place]))
+        said = policy(tuple(results))
+        assert said == policy(tuple(results)), "the same results, another decision"
+        if isinstance(said, str):
+            return Driven(results, reasons, said)
+        if isinstance(said, Decision):
+            steps.append(Step(len(steps), said.direction, said.frequency_hz, A))
+            reasons.append(said.reason)
+            place = len(steps) - 1
+        else:
+            place += 1
+            assert place < len(test.sweep.steps), "the sweep is over"
+
+
+# Dwell
+
+
+@pytest.mark.parametrize(
+    "card, visits", [({"cycles": 20}, 4), ({"cycles": 21}, 5), ({"seconds": 12.5}, 4)]
+)
+def test_dwell_stays_at_the_last_step_for_as_long_as_asked(
+    card: dict[str, Any], visits: int
+) -> None:
+    one = driven(profile("dwell", card), lambda step: result(step, 1e-3 + 0j))
+    assert len(one.results) == 7 + visits
+    assert {(step.frequency_hz, step.direction) for step in one.visits} == {(1.6, "forward")}
+    assert f"{5 * visits} cycles held in {visits} visits" in one.found
+
+
+def test_dwell_goes_on_without_a_laser() -> None:
+    one = driven(
+        profile("dwell", {"cycles": 10}), lambda step: result(step, complex("nan"), math.nan)
+    )
+    assert len(one.visits) == 2
+
+
+# Track
+
+
+def tracking(by: str, **changes: Any) -> dict[str, Any]:
+    return {"by": by, "step_hz": 0.05, "resolution_hz": 0.002, **changes}
+
+
+def at(found: str) -> float:
+    """The first frequency in Hz that a sentence says."""
+    words = found.split()
+    return float(words[words.index("Hz") - 1])
+
+
+@pytest.mark.parametrize("level", [0.0, 0.02])
+def test_by_phase_the_natural_frequency_is_found_whatever_the_level(level: float) -> None:
+    """u is 90 degrees ahead at the undamped natural frequency: K / M, whatever the damping."""
+    errors = itertools.cycle([1 + level, 1 - level, 1.0])
+    one = driven(
+        profile("track", tracking("phase")),
+        lambda step: result(step, linear(step.frequency_hz), level=next(errors)),
+    )
+    assert at(one.found) == pytest.approx(NATURAL_HZ, abs=0.002)
+    assert len(one.visits) <= 4
+    # it left the sweep where the resonance was near, and was careful from there on
+    assert len(one.results) - len(one.visits) <= 4
+    first = len(one.results) - len(one.visits) - 1
+    moves = np.abs(np.diff([r.step.frequency_hz for r in one.results[first:]]))
+    assert moves.max() <= 0.05 + 1e-9
+
+
+@pytest.mark.parametrize("level", [0.0, 0.01])
+def test_by_peak_the_maximum_of_u_is_found_below_it(level: float) -> None:
+    """|u| is largest at f sqrt(1 - 2 zeta^2); an error of the level does not move it."""
+    errors = itertools.cycle([1 + level, 1 - level, 1.0])
+    one = driven(
+        profile("track", tracking("peak", resolution_hz=0.005)),
+        lambda step: result(step, linear(step.frequency_hz), level=next(errors)),
+    )
+    peak = NATURAL_HZ * math.sqrt(1 - 2 * DAMPING**2)
+    assert peak == pytest.approx(1.268, abs=0.001)
+    assert at(one.found) == pytest.approx(peak, abs=0.004)
+    assert len(one.visits) <= 9
+    first = len(one.results) - len(one.visits) - 1
+    moves = np.abs(np.diff([r.step.frequency_hz for r in one.results[first:]]))
+    assert moves.max() <= 0.05 + 1e-9
+
+
+@pytest.mark.parametrize("by", ["phase", "peak"])
+@pytest.mark.parametrize("direction", ["forward", "backward"])
+def test_a_resonance_that_moves_is_followed(by: str, direction: str) -> None:
+    """The damper warms up: 1 % of its frequency over 30 visits."""
+    seen = itertools.count()
+
+    def warming(step: Step) -> StepResult:
+        return result(step, linear(step.frequency_hz, NATURAL_HZ * (1 - 0.01 * next(seen) / 30)))
+
+    card = tracking(by, follow=24, resolution_hz=0.005)
+    one = driven(profile("track", card, directions=[direction]), warming)
+    last = NATURAL_HZ * (1 - 0.01 * len(one.results) / 30)
+    if by == "peak":
+        last *= math.sqrt(1 - 2 * DAMPING**2)
+    words = one.found.split()
+    followed = float(words[words.index("to", words.index("followed")) + 1])
+    assert followed == pytest.approx(last, abs=0.003)
+    assert at(one.found) - followed > 0.005
+
+
+FOLD_HZ = 4.0274
+
+
+def upper(f: float) -> complex:
+    """Near the end of the large branch of G4: f = fold - c (phase - 75)^2, then the small one."""
+    if f > FOLD_HZ:
+        return 0.8e-3 + 0j
+    phase = 75.0 + 15.3 * math.sqrt((FOLD_HZ - f) / 0.0272)
+    size = 6.54e-3 - 2.5e-3 * abs(f - 3.99)
+    return cmath.rect(size, math.radians(phase))
+
+
+def test_a_branch_that_turns_back_is_followed_to_its_phase_without_a_fall() -> None:
+    """What a Newton step over frequency would overshoot: the branch ends 0.027 Hz further on."""
+    fallen = []
+
+    def specimen(step: Step) -> StepResult:
+        if step.frequency_hz > FOLD_HZ:
+            fallen.append(step.frequency_hz)
+        return result(step, upper(step.frequency_hz))
+
+    sweep = {"start_hz": 3.0, "stop_hz": 4.4, "step_hz": 0.1}
+    card = tracking("phase", step_hz=0.03, resolution_hz=0.004)
+    one = driven(profile("track", card, **sweep), specimen)
+    assert not fallen
+    assert at(one.found) == pytest.approx(FOLD_HZ - 0.0272 * (15.0 / 15.3) ** 2, abs=0.004)
+
+
+def test_a_fall_off_the_branch_ends_the_search_and_is_said() -> None:
+    card = tracking("phase", phase_deg=70.0, step_hz=0.03, resolution_hz=0.004)
+    sweep = {"start_hz": 3.0, "stop_hz": 4.4, "step_hz": 0.1}
+    one = driven(
+        profile("track", card, **sweep), lambda step: result(step, upper(step.frequency_hz))
+    )
+    assert "where this branch ends" in one.found
+    assert one.results[-1].step.frequency_hz > FOLD_HZ
+    assert one.results[-2].step.frequency_hz <= FOLD_HZ
+
+
+@pytest.mark.parametrize("by", ["phase", "peak"])
+def test_no_resonance_in_the_sweep_ends_with_the_sweep(by: str) -> None:
+    test = profile("track", tracking(by), start_hz=2.0, stop_hz=3.0)
+    one = driven(test, lambda step: result(step, linear(step.frequency_hz)))
+    assert "was not met in the sweep" in one.found
+    assert len(one.results) == 11
+    assert not one.visits
+
+
+@pytest.mark.parametrize("by", ["phase", "peak"])
+def test_no_visit_moves_by_more_than_the_step(by: str) -> None:
+    """A small step costs visits on the way, and is kept from the last step of the sweep on."""
+    card = tracking(by, step_hz=0.01, visits=60)
+    test = profile("track", {**card, "lowest_hz": 1.21})  # the sweep is left before, at 1.2
+    one = driven(test, lambda step: result(step, linear(step.frequency_hz, 1.25)))
+    first = len(one.results) - len(one.visits) - 1
+    moves = np.abs(np.diff([r.step.frequency_hz for r in one.results[first:]]))
+    assert moves.max() <= 0.01 + 1e-9
+    assert len(moves) >= 5
+    assert at(one.found) == pytest.approx(1.25 if by == "phase" else 1.231, abs=0.003)
+
+
+def test_the_range_is_kept_and_the_visits_are_counted() -> None:
+    test = profile("track", tracking("phase", lowest_hz=1.0, highest_hz=1.25))
+    one = driven(test, lambda step: result(step, linear(step.frequency_hz)))
+    assert "was not met" in one.found
+    stiffer = itertools.count()
+
+    def rising(step: Step) -> StepResult:
+        return result(step, linear(step.frequency_hz, 1.25 + 0.005 * next(stiffer)))
+
+    one = driven(profile("track", tracking("phase", highest_hz=1.31, follow=50)), rising)
+    assert max(step.frequency_hz for step in one.visits) == 1.31
+    assert "at 1.31 Hz, the end of the range" in one.found
+    runs_away = itertools.count()
+
+    def elusive(step: Step) -> StepResult:
+        return result(step, linear(step.frequency_hz, 1.25 + 0.03 * (next(runs_away) % 2)))
+
+    one = driven(profile("track", tracking("phase", visits=7)), elusive)
+    assert len(one.visits) == 7
+    assert "not found in 7 visits" in one.found
+
+
+@pytest.mark.parametrize("tool, card", [("track", tracking("peak")), ("refine", None)])
+def test_without_u_there_is_nothing_to_go_by(tool: str, card: dict[str, Any] | None) -> None:
+    test = profile(tool, card or {"resolution_hz": 0.02, "cycles": 100})
+    one = driven(test, lambda step: result(step, complex("nan"), math.nan))
+    assert "was not measured at 1 Hz" in one.found
+    assert not one.visits
+
+
+def test_a_phase_near_180_degrees_does_not_flip_its_sign() -> None:
+    """Far below a resonance u lies against A: noise makes it 179 or 181, never -179."""
+    step = Step(0, "forward", 0.5, A)
+    for phase in (179.0, 181.0, 90.0, 0.0, -5.0):
+        u = cmath.rect(1e-3, math.radians(phase))
+        assert result(step, u).phase_deg == pytest.approx(phase, abs=1e-9)
+
+
+def test_a_crossing_is_interpolated_over_the_phase() -> None:
+    fold = [(4.0 - 0.001 * (p - 75.0) ** 2, p) for p in (110.0, 100.0, 95.0)]
+    assert interpolate_phase_crossing(fold, 90.0, 0.01) == pytest.approx(
+        4.0 - 0.001 * 15.0**2, abs=1e-9
+    )
+    line = [(1.0, 100.0), (1.1, 80.0)]
+    assert interpolate_phase_crossing(line, 90.0, 0.01) == pytest.approx(1.05)
+    assert (
+        interpolate_phase_crossing([(1.0, 80.0), (1.1, 100.0)], 90.0, 0.01) is None
+    )  # it rises: no resonance
+    assert (
+        interpolate_phase_crossing([(1.0, 100.0), (1.001, 80.0)], 90.0, 0.01) is None
+    )  # too near to tell
+    assert interpolate_phase_crossing(line[:1], 90.0, 0.01) is None
+
+
+def test_a_summit_is_that_of_the_parabola() -> None:
+    def y(x: float) -> float:
+        return 3.0 - 2.0 * (x - 1.23) ** 2
+
+    points = [(x, y(x)) for x in (1.3, 1.1, 1.2)]
+    assert parabola_vertex(points) == pytest.approx(1.23)
+    assert parabola_vertex([(x, -value) for x, value in points]) is None
+    assert parabola_vertex(points[:2]) is None
+    assert parabola_vertex([points[0], points[0], points[1]]) is None
+
+
+# Refine
+
+
+@dataclass
+class Bistable:
+    """Two branches of u over f; a jump is passed `late` visits after it was due."""
+
+    rises_hz: float  # the small branch ends, going down if it hardens
+    falls_hz: float  # the large one ends
+    hardens: bool = True
+    late: int = 0
+    large: bool | None = None
+    due: int = 0
+
+    def __call__(self, step: Step) -> StepResult:
+        f = step.frequency_hz
+        up, down = f < self.rises_hz, f > self.falls_hz
+        if not self.hardens:
+            up, down = f > self.rises_hz, f < self.falls_hz
+        if self.large is None:
+            self.large = up
+        if down if self.large else up:
+            self.due += 1
+            if self.due > self.late:
+                self.large = not self.large
+        else:
+            self.due = 0
+        size = (5e-3 if self.large else 1.5e-3) * (1 + 0.1 * (f - 3.4))
+        return result(step, size + 0j)
+
+
+WIDE: dict[str, Any] = {"start_hz": 2.4, "stop_hz": 4.4, "directions": ["forward", "backward"]}
+
+
+def refining(**changes: Any) -> dict[str, Any]:
+    return {"resolution_hz": 0.0125, "cycles": 2000, **changes}
+
+
+def intervals(found: str) -> dict[str, tuple[float, float]]:
+    """Kind and direction of each jump -> (last good, first bad) in Hz."""
+    out = {}
+    for part in found.removeprefix("refine: ").split("; "):
+        if "-jump" in part:
+            words = part.split()
+            a, b = words.index("between") + 1, words.index("and") + 1
+            out[" ".join(words[:2])] = float(words[a]), float(words[b])
+    return out
+
+
+@pytest.mark.parametrize("hardens", [True, False])
+@pytest.mark.parametrize("step_hz, resolution_hz", [(0.1, 0.0125), (0.2, 0.0125), (0.5, 0.005)])
+def test_every_jump_is_narrowed_in_its_own_direction(
+    hardens: bool, step_hz: float, resolution_hz: float
+) -> None:
+    """Down and up, forward and backward: a hardening specimen, and a softening one."""
+    low, high = 2.7912, 4.0274
+    specimen = Bistable(low, high) if hardens else Bistable(high, low, hardens=False)
+    test = profile("refine", refining(resolution_hz=resolution_hz), **WIDE | {"step_hz": step_hz})
+    one = driven(test, specimen)
+    names = ("down-jump", "up-jump") if hardens else ("up-jump", "down-jump")
+    wanted = {f"{names[0]} forward": high, f"{names[1]} backward": low}
+    found = intervals(one.found)
+    assert found.keys() == wanted.keys()
+    for name, (good, bad) in found.items():
+        assert min(good, bad) <= wanted[name] <= max(good, bad)
+        assert abs(good - bad) <= resolution_hz + 1e-9
+        assert (good < bad) == name.endswith("forward")
+    assert "no jump" not in one.found
+
+
+def test_after_every_jump_the_branch_is_reached_again_from_where_the_branches_meet() -> None:
+    specimen = Bistable(2.7912, 4.0274)
+    one = driven(profile("refine", refining(), **WIDE | {"directions": ["forward"]}), specimen)
+    sizes = [r.swing_m > 3e-3 for r in one.results]
+    falls = 0
+    for k in range(1, len(one.results)):
+        before, now = (one.results[j].step.frequency_hz for j in (k - 1, k))
+        if sizes[k - 1] and not sizes[k]:
+            falls += 1
+            if falls > 1 and k + 1 < len(one.results):
+                assert one.results[k + 1].step.frequency_hz == 2.4
+        elif k > 21 and sizes[k - 1] and sizes[k] and now != 2.4:
+            assert 0 <= now - before <= 0.1 + 1e-9, "on the branch, never more than a sweep step"
+    assert falls >= 2
+    assert {step.direction for step in one.visits} == {"forward"}
+
+
+def test_approach_hz_shortens_the_way_and_one_inside_the_hysteresis_is_found_out() -> None:
+    forward = WIDE | {"directions": ["forward"]}
+    short = driven(profile("refine", refining(approach_hz=2.7), **forward), Bistable(2.75, 4.0274))
+    long = driven(profile("refine", refining(), **forward), Bistable(2.75, 4.0274))
+    assert intervals(short.found) == intervals(long.found)
+    assert len(short.visits) < len(long.visits)
+    assert min(step.frequency_hz for step in short.visits) == 2.7
+    lost = driven(profile("refine", refining(approach_hz=3.4), **forward), Bistable(2.75, 4.0274))
+    assert "not met again at 3.4 Hz" in lost.found
+    assert {step.frequency_hz for step in lost.visits} == {3.4}
+
+
+def test_a_jump_that_comes_late_is_found_earlier_the_longer_a_frequency_is_held() -> None:
+    """Slow passage: it leaves two visits after it was due, so the sweep finds it too far on."""
+    forward = WIDE | {"directions": ["forward"]}
+    specimen = Bistable(2.7912, 3.89, late=2)
+    short = driven(profile("refine", refining(), **forward), replace(specimen))
+    long = driven(profile("refine", refining(hold_cycles=20), **forward), replace(specimen))
+    (a, _), (c, d) = (intervals(one.found)["down-jump forward"] for one in (short, long))
+    assert a > 3.89 + 0.01
+    assert c <= 3.89 <= d
+    assert " 5 held cycles" in short.found
+    assert "20 held cycles" in long.found
+
+
+def test_a_jump_that_takes_two_steps_of_the_sweep_is_one() -> None:
+    """The first visit after the fold is passed finds the motion half way down."""
+    specimen, before = Bistable(2.7912, 4.0274), []
+
+    def falling(step: Step) -> StepResult:
+        seen = specimen(step)
+        before.append(seen.swing_m)
+        if len(before) > 1 and before[-1] < 0.5 * before[-2]:
+            return replace(seen, swing_m=math.sqrt(0.99 * before[-1] * before[-2]))
+        return seen
+
+    forward = WIDE | {"directions": ["forward"]}
+    one = driven(profile("refine", refining(), **forward), falling)
+    assert one.found.count("down-jump") == 1
+    good, bad = intervals(one.found)["down-jump forward"]
+    assert good <= 4.0274 <= bad <= good + 0.0125 + 1e-9
+
+
+def test_a_fold_that_drifts_under_way_is_found_where_it_is_last() -> None:
+    """What was good before is no longer: the interval moves back with it."""
+    specimen = Bistable(2.7912, 4.0274)
+
+    def drifting(step: Step) -> StepResult:
+        was = specimen.large
+        seen = specimen(step)
+        if was and not specimen.large:
+            specimen.falls_hz -= 0.025
+        return seen
+
+    forward = WIDE | {"directions": ["forward"]}
+    one = driven(profile("refine", refining(resolution_hz=0.004), **forward), drifting)
+    good, bad = intervals(one.found)["down-jump forward"]
+    assert bad - good <= 0.004 + 1e-9
+    assert good <= specimen.falls_hz + 0.025 <= bad
+
+
+@pytest.mark.parametrize("cycles", [5, 60, 150, 400])
+def test_the_cycles_allowed_are_never_exceeded(cycles: int) -> None:
+    test = profile("refine", refining(cycles=cycles, resolution_hz=0.002), **WIDE)
+    one = driven(test, Bistable(2.7912, 4.0274))
+    assert 5 * len(one.visits) <= cycles
+    assert f"{cycles} cycles do not suffice" in one.found
+    for name, true in (("down-jump forward", 4.0274), ("up-jump backward", 2.7912)):
+        good, bad = intervals(one.found)[name]
+        assert min(good, bad) <= true <= max(good, bad)
+
+
+def test_without_a_jump_there_is_nothing_to_refine() -> None:
+    test = profile("refine", refining(resolution_hz=0.02))
+    one = driven(test, lambda step: result(step, linear(step.frequency_hz)))
+    assert one.found == "refine: the sweep found no jump"
+    assert len(one.results) == 7
+
+
+def test_a_steep_change_is_not_taken_for_a_jump() -> None:
+    def steep(step: Step) -> StepResult:
+        return result(step, 5e-3 * math.exp(-6.0 * (step.frequency_hz - 3.0)) + 0j)
+
+    test = profile("refine", refining(), **WIDE | {"directions": ["forward"]})
+    assert "no jump" in driven(test, steep).found
+
+
+@pytest.mark.parametrize("parts", [2, 8, 20])
+def test_the_worst_case_needs_the_fewest_visits(parts: int) -> None:
+    """Against a search over all strategies; halves where the way back is free, else it creeps."""
+
+    def worst(n: int, hold: int, back: int) -> int:
+        return min(
+            (
+                hold + max(worst(n - k, hold, back), worst(k, hold, back) + (back if k > 1 else 0))
+                for k in range(1, n)
+            ),
+            default=0,
+        )
+
+    if parts < 20:
+        for hold_, back in ((1, 0), (1, 3), (4, 8)):
+            assert choose_part(parts, hold_, back)[0] == worst(parts, hold_, back)
+    assert choose_part(parts, 1, 0)[0] == math.ceil(math.log2(parts))
+    assert choose_part(parts, 1, 1000) == (parts - 1, 1)
+
+
+# Swing
+
+
+def test_a_swing_is_the_mean_over_whole_cycles() -> None:
+    phase = 7.3 + np.arange(1201) * 3.0 / 1200
+    size = np.floor(phase - phase[0] + 1e-9).clip(0, 2) + 1.0
+    assert mean_swing(size * np.sin(2 * math.pi * phase), phase) == pytest.approx(2.0, rel=1e-3)
+    assert math.isnan(mean_swing(np.full(1201, np.nan), phase))
+    assert math.isnan(mean_swing(np.empty(0), np.empty(0)))
+
+
+# In the conductor
+
+
+@dataclass
+class Table:
+    """An ideal table: what it is told it does; no specimen on it."""
+
+    now: SequencerState
+    at: int = 0
+
+    def play(self, samples: int, until: int = 10**9) -> list[Record]:
+        said: list[Record] = []
+        while self.at < until and not (
+            self.now.is_finished and self.at >= self.now.drive.rest_start
+        ):
+            drive, first = self.now.drive, self.at
+            metres = drive.command(first, samples)
+            values = np.array([metres, metres, drive.acceleration(first, samples)])
+            names = ("drive_disp_m", "table_disp_m", "table_acc_m_s2")
+            labels = drive.labels(first, samples)
+            self.at += samples
+            self.now, new = advance_test(
+                self.now, Block("meas", first, drive.rate_hz, names, values, *labels)
+            )
+            said += new
+        return said
+
+
+def dwelling(**control: Any) -> Profile:
+    test = profile("dwell", {"cycles": 9}, start_hz=3.0, stop_hz=4.0, step_hz=1.0, cycles=3)
+    return test.model_copy(update={"control": test.control.model_copy(update=control)})
+
+
+@pytest.mark.parametrize("samples", [7, 500])
+def test_the_cut_of_the_samples_changes_no_decision(samples: int) -> None:
+    whole, cut = (Table(start_test(make_test_plan(dwelling(), RIG, 40))) for _ in range(2))
+    assert whole.play(20) == cut.play(samples)
+    assert whole.now.drive == cut.now.drive
+
+
+@pytest.mark.parametrize("control", [True, False])
+def test_a_decided_step_is_announced_before_it_begins(control: bool) -> None:
+    table = Table(start_test(make_test_plan(dwelling(enabled=control), RIG, 40)))
+    said = table.play(20)
+    decided = [one for one in said if isinstance(one, StepAdded)]
+    assert [one.step for one in decided] == [2, 3, 4]
+    drive = table.now.drive
+    step, label, cycle = drive.labels(0, table.at)
+    for one in decided:
+        begins = int(np.flatnonzero(step == one.step)[0])
+        assert begins - one.index >= 0.25 * drive.rate_hz
+        held = (step == one.step) & (cycle >= 0)
+        assert held.sum() == math.ceil(3 * drive.rate_hz / 4.0)
+        assert (label[held] == Label.MEASURE).sum() == pytest.approx(2 * drive.rate_hz / 4.0, abs=1)
+    (found,) = [one for one in said if isinstance(one, Event)]
+    assert found.kind == "found"
+    assert found.index == max(np.flatnonzero(cycle >= 0)) + 1
+    # all the while the motion went on as it was: no blend from the first held cycle to the last
+    first, last = np.flatnonzero((step == 1) & (cycle >= 0))[0], np.flatnonzero(cycle >= 0)[-1]
+    assert Label.BLEND not in label[first:last]
+    command: Float1D = drive.command(0, drive.rest_start + 10)
+    assert np.abs(np.diff(command, 2)).max() * drive.rate_hz**2 <= 1.05 * A
+    assert not command[drive.rest_start :].any()
+
+
+def test_a_rehearsal_plays_the_sweep_and_ends() -> None:
+    one = make_test_plan(dwelling(), RIG, 40)
+    drive = nominal_drive(one)
+    assert drive.steps == one.profile.sweep.steps
+    assert {segment.step for segment in drive.segments} == {0, 1}
+    assert len([segment for segment in drive.segments if segment.cycles]) == 2
+
+
+@pytest.mark.parametrize("after", [0, 2000])
+def test_a_person_may_hold_a_decided_step_and_go_on(after: int) -> None:
+    """Also between a decision and its step: the step before is then measured anew."""
+    table = Table(start_test(make_test_plan(dwelling(enabled=False), RIG, 40)))
+    said: list[Record] = []
+    while not [one for one in said if isinstance(one, StepAdded) and one.step == 3]:
+        said += table.play(20, until=table.at + 20)
+    said += table.play(20, until=table.at + after)
+    held = int(table.now.drive.labels(table.at, 1)[0][0])
+    assert held >= 2, "the case must lie in a decided step"
+    table.now = hold_test(table.now, table.at + 100)
+    assert table.now.stage.kind == "open"
+    said += table.play(20, until=table.at + 6000)
+    table.now = resume_test(table.now, table.at + 100)
+    said += table.play(20)
+    measured = [one.step.index for one in table.now.results]
+    assert measured == ([0, 1, 2, 3, 4] if after else [0, 1, 2, 4, 5])
+    assert [one.kind for one in said if isinstance(one, Event)] == ["found"]
+
+
+# The cards
+
+
+TEST = (PROFILES_DIR / "tests" / "track.toml").read_text(encoding="utf-8").split("[track]")[0]
+
+
+@pytest.mark.parametrize(
+    "card, key, part",
+    [
+        ("[dwell]", "dwell.seconds", "give either cycles or seconds"),
+        ("[dwell]\ncycles = 5\nseconds = 3.0", "dwell.seconds", "give either cycles or seconds"),
+        ("[track]\nby = 'phase'\nstep_hz = 0.05", "track.resolution_hz", "missing"),
+        (
+            "[track]\nby = 'phase'\nstep_hz = 0.05\nresolution_hz = 0.04",
+            "track.resolution_hz",
+            "at most 0.025",
+        ),
+        (
+            "[track]\nby = 'peak'\nstep_hz = 0.05\nresolution_hz = 0.01\nphase_deg = 90.0",
+            "track.phase_deg",
+            "by = 'peak'",
+        ),
+        (
+            "[track]\nby = 'peak'\nstep_hz = 0.05\nresolution_hz = 0.01\nhighest_hz = 1.7",
+            "track",
+            "highest_hz 1.7 lies outside the sweep; allowed: 1 to 1.6",
+        ),
+        (
+            "[track]\nby = 'peak'\nstep_hz = 0.4\nresolution_hz = 0.01",
+            "track",
+            "steps of 0.4",
+        ),
+        ("[refine]\nresolution_hz = 0.1\ncycles = 9", "refine", "allowed: 0.000781 to below 0.1"),
+        (
+            "[refine]\nresolution_hz = 0.01\ncycles = 9\napproach_hz = 0.9",
+            "refine",
+            "approach_hz 0.9 lies outside the sweep",
+        ),
+        (
+            "[dwell]\ncycles = 5\n[refine]\nresolution_hz = 0.01\ncycles = 9",
+            "refine",
+            "allowed: one of dwell, track, refine",
+        ),
+    ],
+)
+def test_a_card_that_does_not_fit_is_refused_in_one_sentence(
+    card: str, key: str, part: str
+) -> None:
+    with pytest.raises(InputError) as caught:
+        parse_toml(TEST + card, Profile, "some/test.toml")
+    (fault,) = (line.strip() for line in str(caught.value).splitlines()[1:])
+    assert fault.split(" ")[0].rstrip(":") == key
+    assert part in fault
+
+
+def test_one_frequency_leaves_nothing_to_track_or_to_refine() -> None:
+    single = TEST.replace("stop_hz = 1.6", "stop_hz = 1.0")
+    for card in (
+        "[track]\nby = 'peak'\nstep_hz = 0.05\nresolution_hz = 0.01",
+        "[refine]\nresolution_hz = 0.01\ncycles = 9",
+    ):
+        with pytest.raises(InputError, match="one frequency"):
+            parse_toml(single + card, Profile, "some/test.toml")
+    assert parse_toml(single + "[dwell]\ncycles = 5", Profile, "some/test.toml").dwell is not None
+
+
+@pytest.mark.parametrize(
+    "name, part",
+    [
+        ("dwell", "3.4 Hz forward, for 40"),
+        ("track", "find it to 0.002 Hz in 1 to 1.6 Hz"),
+        ("refine_g4", "at most 800 held cycles"),
+        ("g4_ss3", ""),
+    ],
+)
+def test_the_plan_of_a_shipped_test_in_words(name: str, part: str) -> None:
+    test = load_config(PROFILES_DIR / "tests" / f"{name}.toml", Profile, "test")[0]
+    assert part in describe_adaptive_test(test)
+    assert bool(describe_adaptive_test(test)) == bool(part) == (make_policy(test) is not None)

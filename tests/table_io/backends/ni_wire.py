@@ -1,0 +1,113 @@
+"""NI's client and our device in one process, on one clock, with no socket between: for tests."""
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import grpc
+from nidaqmx._stubs import nidaqmx_pb2 as pb
+
+from table_io.backends.ni import NiBackend
+from table_io.clock import Clock, ManualClock
+from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.profile import Specimen
+from table_io.config.rig import RigConfig
+from table_io.sim.machine.flight_recorder import FlightRecorder
+from table_io.sim.ni.device import SimulatedDaqDevice
+from table_io.sim.ni.interlock import InterlockedTable
+from table_io.sim.ni.service import NiDeviceService
+
+SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
+CARD = (PROFILES_DIR / "rigs" / "ni_simulated.toml").read_text()
+
+
+class Answer(grpc.RpcError):
+    """What a client sees of an error: its code, its words, its metadata."""
+
+    def __init__(self, code: Any, details: str, trailing: Any) -> None:
+        super().__init__(details)
+        self._answer = (code, details, trailing)
+
+    def code(self) -> Any:
+        return self._answer[0]
+
+    def details(self) -> Any:
+        return self._answer[1]
+
+    def trailing_metadata(self) -> Any:
+        return [SimpleNamespace(key=key, value=value) for key, value in self._answer[2]]
+
+
+class Context:
+    """What a server's call sees of its client."""
+
+    trailing: tuple[Any, ...] = ()
+
+    def set_trailing_metadata(self, metadata: tuple[Any, ...]) -> None:
+        self.trailing = metadata
+
+    def abort(self, code: Any, details: str) -> None:
+        raise Answer(code, details, self.trailing)
+
+    def is_active(self) -> bool:
+        return True
+
+
+class Wire:
+    """A channel whose calls arrive at once, through the same bytes as on a socket."""
+
+    def __init__(self, service: NiDeviceService) -> None:
+        self._service = service
+        self._calls: dict[str, Callable[..., Any]] = {}
+
+    def unary_unary(
+        self,
+        path: str,
+        request_serializer: Callable[[Any], bytes],
+        response_deserializer: Callable[[bytes], Any],
+        **_: Any,
+    ) -> Callable[..., Any]:
+        name = path.rsplit("/", 1)[1]
+        if name in self._calls:
+            return self._calls[name]
+        request_type = getattr(pb, f"{name}Request", None)
+
+        def call(request: Any, timeout: float = 0.0, metadata: Any = None) -> Any:
+            sent = request_type.FromString(request_serializer(request))  # type: ignore[union-attr]
+            answer = getattr(self._service, name)(sent, Context())
+            return response_deserializer(answer.SerializeToString())
+
+        self._calls[name] = call
+        return call
+
+    def unary_stream(self, *_: Any, **__: Any) -> None:
+        return None
+
+    stream_unary = stream_stream = unary_stream
+
+
+class Bed:
+    """A device with its table, and backends that reach it."""
+
+    def __init__(self, text: str = CARD, box: Path | None = None) -> None:
+        self.rig = parse_toml(text, RigConfig, "ni_simulated")
+        self.clock: Clock = ManualClock(100.0)
+        self.told: list[str] = []
+        self.box = FlightRecorder(box, self.told.append) if box is not None else None
+        self.table = InterlockedTable(self.rig, SPECIMEN, self.told.append, self.box)
+        self.table.warm_up()
+        self.device = SimulatedDaqDevice(self.table, self.rig.rates_hz, self.clock.now())
+        assert self.rig.ni is not None
+        self.device.faults = list(self.rig.ni.faults)
+        self.service = NiDeviceService(self.device, self.rig.ni, self.clock)
+        self.wire = Wire(self.service)
+
+    def backend(self, rate_hz: float = 2000.0) -> NiBackend:
+        return NiBackend(self.rig, SPECIMEN, rate_hz, self.clock, self.wire)
+
+    def rest(self) -> None:
+        """Let it come to rest."""
+        while self.device.moving:
+            self.clock.wait_until(self.clock.now() + 0.1)
+            self.service.advance()

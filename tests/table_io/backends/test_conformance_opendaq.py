@@ -1,0 +1,142 @@
+"""The openDAQ client keeps every clause that needs no output, against a device of ours."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from table_io.backends import MachineLost
+from table_io.backends.opendaq import OpenDaqSource, check_reachable
+from table_io.block import Float1D
+from table_io.clock import RealClock
+from table_io.config.base import parse_toml
+from table_io.config.calibration import volts_to_si
+from table_io.config.rig import RigConfig
+from table_io.errors import InputError
+from tests.table_io.backends.conformance import ACQUIRING, Bench
+from tests.table_io.backends.separate_processes import own_network
+from tests.table_io.backends.test_conformance import card
+
+pytest.importorskip("opendaq")
+FAR_SIDE = Path(__file__).with_name("opendaq_far_side.py")
+RATE = 2000.0
+
+
+@dataclass(frozen=True)
+class Device(Bench):
+    """A Bench and the process behind it."""
+
+    process: subprocess.Popen[str] | None = None
+
+
+@contextmanager
+def far_side(folder: Path, unit: str = "V") -> Iterator[Device]:
+    """An openDAQ device in a process of its own, and a Bench on it."""
+    rig, text = card("follow_simulated")
+    path = folder / "card.toml"
+    path.write_text(text)
+    clock = RealClock()
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, FAR_SIDE, path, unit], **pipes) as process:
+        assert "waiting" in process.stdout.readline()
+
+        def play(source: OpenDaqSource, volts: Float1D) -> None:
+            source.start()
+            process.stdin.write(json.dumps(volts.tolist()) + "\n")
+            process.stdin.flush()
+            stamp = int(process.stdout.readline())
+            source.read(round((stamp - source._first_tick) / source._ticks_per_sample))
+
+        try:
+            yield Device(
+                rig, clock, lambda rate: OpenDaqSource(rig, rate, clock), play=play, process=process
+            )
+        finally:
+            process.kill()
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    with own_network(), far_side(tmp_path_factory.mktemp("device")) as one:
+        yield one
+
+
+@pytest.mark.parametrize("clause", ACQUIRING)
+def test_the_client_keeps_the_contract(clause: str, bench: Bench) -> None:
+    ACQUIRING[clause](bench)
+
+
+def changed(rig: RigConfig, **signals: str) -> RigConfig:
+    """The card with other signals wired."""
+    wiring = rig.opendaq.model_copy(update={"signals": {**rig.opendaq.signals, **signals}})
+    return rig.model_copy(update={"opendaq": wiring})
+
+
+def test_a_signal_that_is_not_there_is_named_with_those_that_are(bench: Bench) -> None:
+    source = OpenDaqSource(changed(bench.rig, force_r1_n="cell_9"), RATE, bench.clock)
+    with pytest.raises(InputError, match=r"signals\.force_r1_n = 'cell_9'.*/Sig/cell_r1"):
+        source.open()
+    source.close()
+
+
+def test_a_signal_without_time_stamps_is_refused(bench: Bench) -> None:
+    source = OpenDaqSource(changed(bench.rig, force_r1_n="time"), RATE, bench.clock)
+    with pytest.raises(InputError, match=r"signals\.force_r1_n = 'time'.*no time stamps"):
+        source.open()
+    source.close()
+
+
+def test_another_rate_than_the_devices_is_refused(bench: Bench) -> None:
+    source = OpenDaqSource(bench.rig, 1000.0, bench.clock)
+    with pytest.raises(InputError, match=r"rate_hz = 1000.*at 2000 Hz"):
+        source.open()
+    source.close()
+
+
+def test_who_does_not_answer_is_named(bench: Bench) -> None:
+    away = bench.rig.opendaq.model_copy(update={"device": "daq.nd://127.0.0.1:7499"})
+    with pytest.raises(InputError, match=r"no openDAQ device answers.*shaketwin table --rig"):
+        check_reachable(bench.rig.model_copy(update={"opendaq": away}))
+    check_reachable(bench.rig)
+
+
+def test_signals_in_the_cards_units_are_the_volts_of_its_sensors(tmp_path: Path) -> None:
+    """And in another unit they are refused."""
+    with own_network(), far_side(tmp_path, "card") as bench:
+        source = bench.open()
+        volts = source.tare(400)
+        source.close()
+        rig = bench.rig
+        at_rest = volts_to_si(volts, rig.sensors, {}).mean(axis=1)
+        offset = [0.0 if s.channel == "drive_disp_m" else s.offset for s in rig.sensors]
+        expected = np.array(offset) * [s.si_per_unit for s in rig.sensors]
+        noise = np.array([s.noise_rms * s.si_per_unit + s.range_si * 1e-6 for s in rig.sensors])
+        assert (np.abs(at_rest - expected) < noise).all()
+        metres = parse_toml(
+            (tmp_path / "card.toml").read_text().replace('unit = "mm"', 'unit = "m"', 1),
+            RigConfig,
+            "m",
+        )
+        wrong = OpenDaqSource(metres, RATE, bench.clock)
+        with pytest.raises(InputError, match=r"drive_disp_m is in mm; allowed: V, or m"):
+            wrong.open()
+        wrong.close()
+
+
+def test_a_device_that_dies_is_told(tmp_path: Path) -> None:
+    """Each time, and no sample is made up."""
+    with own_network(), far_side(tmp_path) as bench:
+        source = bench.started(np.zeros(2))
+        source.read(400)
+        bench.process.kill()
+        with pytest.raises(MachineLost, match="stop it at its controller"):
+            source.read(4000)
+        with pytest.raises(MachineLost, match="sent nothing"):
+            source.read(4000)
+        source.close()

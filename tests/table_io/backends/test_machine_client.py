@@ -1,0 +1,236 @@
+"""The machine over a socket: controllers, strangers, and what a controller is told."""
+
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from table_io.backends import SAMPLE_TIMEOUT_S, MachineLost, check_reachable
+from table_io.backends.machine.client import MachineBackend
+from table_io.backends.machine.endpoint import Endpoint, open_listener, parse_endpoint
+from table_io.backends.machine.protocol import (
+    MachineMessage,
+    MessageKind,
+    MessageParser,
+    encode_message,
+    values_message,
+)
+from table_io.clock import RealClock
+from table_io.config.rig import MachineConfig, RigConfig
+from table_io.errors import InputError
+from table_io.sim.machine import server
+from table_io.sim.machine.flight_recorder import FlightRecorder, read_flight_record
+from table_io.sim.machine.table import SimulatedMachine
+from tests.table_io.sim.test_machine import RATE, RIG, SPECIMEN, claim
+
+
+def at(where: str) -> RigConfig:
+    return RIG.model_copy(update={"machine": MachineConfig(endpoint=where)})
+
+
+def controller(where: str) -> MachineBackend:
+    return MachineBackend(at(where), SPECIMEN, RATE, RealClock())
+
+
+@dataclass
+class Served:
+    """A machine that runs beside the test."""
+
+    where: str
+    told: list[str]
+    table: SimulatedMachine
+
+
+@contextmanager
+def served(where: Endpoint, box: FlightRecorder | None = None) -> Iterator[Served]:
+    told: list[str] = []
+    table = SimulatedMachine(RIG, told.append, box)
+    listener = open_listener(where)
+    text = where.text
+    if where.family is socket.AF_INET:
+        text = f"tcp/127.0.0.1:{listener.getsockname()[1]}"
+    going = [True]
+    thread = threading.Thread(
+        target=server.serve_machine, args=(listener, table, RealClock(), lambda: bool(going))
+    )
+    thread.start()
+    try:
+        yield Served(text, told, table)
+    finally:
+        going.clear()
+        thread.join()
+
+
+@pytest.fixture
+def machine() -> Iterator[Served]:
+    with served(parse_endpoint("tcp/127.0.0.1:0")) as one:
+        yield one
+
+
+def driving(where: str) -> MachineBackend:
+    """A controller whose table moves for a little, to rest."""
+    backend = controller(where)
+    backend.open()
+    x = np.clip(np.arange(600) / 598, 0.0, 1.0)
+    backend.queue(0, 0.1 * 64 * (x * (1 - x)) ** 3)
+    backend.start()
+    backend.read(20)
+    return backend
+
+
+def test_nobody_there_says_how_to_start_it(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no table answers.*shaketwin table --rig machine"):
+        controller(f"unix/{tmp_path / 'none'}").open()
+    with pytest.raises(InputError, match=r"no table answers.*shaketwin table --rig machine"):
+        check_reachable(at(f"unix/{tmp_path / 'none'}"))
+
+
+def test_asking_whether_it_is_there_claims_nothing(machine: Served) -> None:
+    check_reachable(at(machine.where))
+    backend = controller(machine.where)
+    backend.open()
+    check_reachable(at(machine.where))
+    assert backend.tare(10).shape == (len(RIG.sensors), 10)
+    backend.close()
+    check_reachable(RIG.model_copy(update={"backend": "simulated"}))
+
+
+def test_what_is_no_machine_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("table_io.backends.machine.client.ANSWER_TIMEOUT_S", 0.05)
+    with closing(socket.create_server(("127.0.0.1", 0))) as mute:
+        where = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
+        with pytest.raises(InputError, match=r"shaketwin table --rig machine"):
+            controller(where).open()
+
+
+def test_one_controller_at_a_time(machine: Served) -> None:
+    first = driving(machine.where)
+    with pytest.raises(InputError, match="has a controller already"):
+        controller(machine.where).open()
+    first.read(200)
+    first.close()
+
+
+def test_a_machine_that_is_switched_off_says_so_and_ends_at_rest(tmp_path: Path) -> None:
+    box = FlightRecorder(tmp_path / "box", print)
+    with served(parse_endpoint(f"unix/{tmp_path / 'table'}"), box) as one:
+        backend = driving(one.where)
+    with pytest.raises(MachineLost, match="switched off"):
+        backend.read(20000)
+    (life,) = read_flight_record(tmp_path / "box")
+    assert life.command_m[-1] == 0.0
+    assert life.samples.shape[1] >= 600
+    assert "switched off" in life.notes[-2][1]
+    assert life.notes[-1][1] == "at rest"
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"GET / HTTP/1.1\r\n\r\n",
+        encode_message(claim()),
+        encode_message(MachineMessage(MessageKind.QUEUE, 9, b"1")),
+    ],
+)
+def test_garbage_loses_the_controller_and_not_the_machine(machine: Served, data: bytes) -> None:
+    backend = driving(machine.where)
+    backend._require_connection().sendall(data)
+    with pytest.raises(MachineLost, match="invalid message"):
+        backend.read(20000)
+    with pytest.raises(MachineLost, match="invalid message"):
+        backend.queue(5000, np.zeros(2))
+    backend.close()
+    again = controller(machine.where)
+    again.open()  # waits for the rest
+    assert "at rest" in machine.told[-1]
+    again.close()
+
+
+def test_what_has_come_is_handed_out_before_the_loss_is_told(machine: Served) -> None:
+    backend = driving(machine.where)
+    while backend._received < 200:
+        backend._receive()
+    backend._require_connection().shutdown(socket.SHUT_RDWR)
+    assert np.isfinite(backend.read(100)).all()
+    with pytest.raises(MachineLost, match="connection"):
+        backend.read(4000)
+    assert backend.scheduled_time_s(2000) > backend.scheduled_time_s(0)
+    again = controller(machine.where)
+    again.open()  # waits for the rest
+    again.close()
+    assert "the connection closed" in machine.told[-1]
+
+
+def test_strangers_at_the_door_do_not_disturb(machine: Served) -> None:
+    backend = driving(machine.where)
+    host, port = "127.0.0.1", int(machine.where.rpartition(":")[2])
+    for data in (b"", b"\0" * 5000, encode_message(claim()), b"STM1"):
+        with closing(socket.create_connection((host, port))) as stranger:
+            stranger.sendall(data)
+    assert backend.read(400).shape == (len(RIG.sensors), 400)
+    backend.close()
+
+
+def test_samples_that_do_not_come_are_a_lost_machine(tmp_path: Path) -> None:
+    """A machine that answers and then hands over nothing: patience, then MachineLost."""
+    path = str(tmp_path / "mute")
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(path)
+    listener.listen()
+
+    def answer() -> None:
+        connection, _ = listener.accept()
+        parser, answers = MessageParser(), 0
+        replies = [
+            MachineMessage(MessageKind.GRANTED, 60),
+            MachineMessage(MessageKind.QUEUED),
+            values_message(MessageKind.STARTED, np.array([RealClock().now()])),
+        ]
+        while data := connection.recv(1 << 16):
+            for one in parser.feed(data):
+                if one.kind is not MessageKind.BEAT and answers < 3:
+                    connection.sendall(encode_message(replies[answers]))
+                    answers += 1
+        connection.close()
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    backend = controller(f"unix/{path}")
+    backend.open()
+    backend.queue(0, np.zeros(2))
+    backend.start()
+    with pytest.raises(MachineLost, match=f"{SAMPLE_TIMEOUT_S:g} s after"):
+        backend.read(20)
+    assert RealClock().now() >= backend.scheduled_time_s(19) + SAMPLE_TIMEOUT_S
+    thread.join()
+    listener.close()
+
+
+def test_an_endpoint_in_use_is_refused_and_a_dead_one_taken_over(tmp_path: Path) -> None:
+    where = parse_endpoint(f"unix/{tmp_path / 'table'}")
+    with closing(open_listener(where)), pytest.raises(InputError, match="another table listens"):
+        open_listener(where)
+    open_listener(where).close()  # its file was left behind
+    with closing(open_listener(parse_endpoint("tcp/127.0.0.1:0"))) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(InputError) as error:
+            open_listener(parse_endpoint(f"tcp/127.0.0.1:{port}"))
+        assert error.value.where == f"--listen tcp/127.0.0.1:{port}"
+
+
+@pytest.mark.parametrize("missing", [("machine", "[machine]"), ("simulated", "[simulated]")])
+def test_a_card_without_its_table_is_refused(missing: tuple[str, str]) -> None:
+    key, name = missing
+    rig = RIG.model_copy(update={key: None})
+    make: Callable[[], object] = (
+        (lambda: MachineBackend(rig, SPECIMEN, RATE, RealClock()))
+        if key == "machine"
+        else (lambda: SimulatedMachine(rig, print))
+    )
+    with pytest.raises(InputError, match=name.replace("[", r"\[").replace("]", r"\]")):
+        make()

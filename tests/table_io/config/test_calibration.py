@@ -1,0 +1,70 @@
+"""Volts and SI, both ways: volts = (value + offset) * volts_per_si; the tare takes the offset."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from table_io.config.base import PROFILES_DIR, load_config
+from table_io.config.calibration import (
+    command_to_si,
+    command_to_volts,
+    compute_tare,
+    si_to_volts,
+    volts_to_si,
+)
+from table_io.config.rig import OutputConfig, RigConfig
+from table_io.config.sensor import SensorConfig
+
+RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
+REVERSED = SensorConfig(channel="force_l1_n", unit="kN", range=10.0, volts_per_unit=-0.5, bits=16)
+
+
+def ramp(channels: int) -> np.ndarray:
+    return np.linspace(-3.0, 4.0, 7 * channels).reshape(channels, 7)
+
+
+def test_the_sign_and_the_unit_of_the_convention() -> None:
+    # 2 kN of compression on a cell that shows 0.4 kN at rest and gives -0.5 V a kN.
+    volts = si_to_volts(np.array([[2000.0]]), (REVERSED,), {"force_l1_n": 400.0})
+    assert volts[0, 0] == pytest.approx((2.0 + 0.4) * -0.5)
+    assert volts_to_si(np.array([[-1.2]]), (REVERSED,), {"force_l1_n": 400.0})[
+        0, 0
+    ] == pytest.approx(2e3)
+
+
+@given(st.lists(st.floats(-100.0, 100.0), min_size=9, max_size=9))
+def test_both_directions_undo_each_other(offsets: list[float]) -> None:
+    tare = dict(zip(RIG.channels, offsets, strict=True))
+    values = ramp(len(RIG.sensors))
+    there = si_to_volts(values, RIG.sensors, tare)
+    np.testing.assert_allclose(volts_to_si(there, RIG.sensors, tare), values, rtol=0, atol=1e-12)
+    back = si_to_volts(volts_to_si(values, RIG.sensors, tare), RIG.sensors, tare)
+    np.testing.assert_allclose(back, values, rtol=0, atol=1e-9)
+
+
+def test_a_tare_removes_what_the_sensors_show_at_rest() -> None:
+    shown = {name: 0.01 * (place + 1) for place, name in enumerate(RIG.channels)}
+    rest = si_to_volts(np.zeros((len(RIG.channels), 100)), RIG.sensors, shown)
+    tare = compute_tare(rest, RIG.sensors)
+    assert "drive_disp_m" not in tare  # the command is where zero is; it is never moved
+    assert tare == pytest.approx({k: v for k, v in shown.items() if k != "drive_disp_m"})
+    moved = si_to_volts(np.ones((len(RIG.channels), 5)), RIG.sensors, shown)
+    np.testing.assert_allclose(volts_to_si(moved, RIG.sensors, tare)[1:], 1.0, atol=1e-12)
+
+
+def test_a_sample_lost_during_the_tare_does_not_lose_the_channel() -> None:
+    rest = si_to_volts(np.zeros((len(RIG.channels), 100)), RIG.sensors, {"table_disp_m": 0.002})
+    rest[1, 3] = np.nan
+    rest[4, :] = np.nan
+    tare = compute_tare(rest, RIG.sensors)
+    assert tare["table_disp_m"] == pytest.approx(0.002)
+    assert np.isnan(tare[RIG.channels[4]])  # no zero is known, so no value is made up
+
+
+def test_the_command_fills_its_span_and_comes_back() -> None:
+    output = OutputConfig(span_mm=60.0, span_v=10.0, bits=16)
+    metres = np.linspace(-0.06, 0.06, 9)
+    volts = command_to_volts(metres, output)
+    assert (volts[0], volts[-1]) == (-10.0, 10.0)
+    np.testing.assert_allclose(command_to_si(volts, output), metres, rtol=1e-15)

@@ -1,0 +1,222 @@
+"""Sensor cards and calibration records: what they refuse, when they are due, where they go."""
+
+import json
+import tomllib
+from datetime import date
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.calibration_due import find_overdue_calibrations
+from table_io.config.calibration_record import CalibrationRecord, format_calibration_toml
+from table_io.config.rig import RigConfig
+from table_io.config.rig_file import calibrations_dir, load_rig
+from table_io.config.sensor import SensorConfig
+from table_io.errors import InputError
+
+TEXT = (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")
+TODAY = date(2026, 3, 10)
+HEAD = 'channel = "table_acc_m_s2"\nunit = "g"\n'
+
+
+def card(*lines: str) -> str:
+    """The shipped card with more lines on its table's accelerometer."""
+    assert TEXT.count(HEAD) == 1
+    return TEXT.replace(HEAD, HEAD + "\n".join(lines) + "\n")
+
+
+def acc(*lines: str) -> SensorConfig:
+    rig = parse_toml(card(*lines), RigConfig, "card")
+    return rig.sensors[rig.channels.index("table_acc_m_s2")]
+
+
+def test_a_card_says_which_instrument_and_when() -> None:
+    sensor = acc(
+        'maker = "PCB"', 'model = "3713B"', 'serial = "LW 12"', "calibrated = 2025-03-11",
+        "interval_months = 12", 'certificate = "K-77"', 'calibrated_by = "the institute"',
+        "shunt = 1.0", "shunt_tolerance = 0.02", "filter_hz = 500.0", "delay_ms = 0.4",
+    )  # fmt: skip
+    assert sensor.calibrated == "2025-03-11"
+    assert sensor.due_date == "2026-03-11"
+    json.dumps(sensor.model_dump())  # it is sent to a machine in another process
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        (["calibrated = 2025-02-30"], ["not valid TOML"]),
+        (['calibrated = "2025-02-30"'], ["calibrated", "2025-02-30", "2026-03-01"]),
+        (["calibrated = 2025-02-03T10:00:00"], ["allowed: year-month-day"]),
+        (["calibrated = 20250203"], ["20250203", "allowed: year-month-day"]),
+        (["interval_months = 12"], ["interval_months", "calibrated"]),
+        (["calibrated = 2025-02-03", "interval_months = 0"], ["interval_months = 0"]),
+        (["calibrated = 2025-02-03", "due = 2025-02-02"], ["due 2025-02-02 lies before"]),
+        (
+            ["calibrated = 2025-02-03", "due = 2026-02-03", "interval_months = 12"],
+            ["interval_months", "due and interval_months"],
+        ),
+        (['calibrated = "9990-01-01"', "interval_months = 600"], ["after the year 9999"]),
+        (['due = "２０２０-03-01"'], ["allowed: year-month-day"]),
+        (["shunt = 1.0"], ["shunt_tolerance", "go together"]),
+        (["shunt = 0.0", "shunt_tolerance = 0.1"], ["shunt is 0"]),
+        (["seriall = 'x'"], ["seriall", "did you mean 'serial'?"]),
+    ],
+)
+def test_a_card_that_cannot_be(lines: list[str], words: list[str]) -> None:
+    with pytest.raises(InputError) as raised:
+        parse_toml(card(*lines), RigConfig, "card.toml")
+    for word in ("card.toml", *words):
+        assert word in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("calibrated", "months", "due"),
+    [
+        ("2024-01-31", 1, "2024-02-29"),
+        ("2025-01-31", 1, "2025-02-28"),
+        ("2025-12-01", 12, "2026-12-01"),
+        ("2025-11-30", 15, "2027-02-28"),
+        ("2025-03-11", 24, "2027-03-11"),
+    ],
+)
+def test_months_end_where_a_month_ends(calibrated: str, months: int, due: str) -> None:
+    assert acc(f"calibrated = {calibrated}", f"interval_months = {months}").due_date == due
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        (["calibrated = 2025-03-10", "interval_months = 12"], ""),  # due today is not overdue
+        (["calibrated = 2025-03-09", "interval_months = 12"], "2026-03-09, 1 days ago"),
+        (["due = 2026-01-01", 'serial = "LW 12"'], "(serial LW 12)"),
+        (["calibrated = 2026-03-11"], "calibrated on 2026-03-11"),
+        (["calibrated = 2020-03-10"], ""),  # nobody said for how long
+    ],
+)
+def test_what_is_overdue_is_told(lines: list[str], said: str) -> None:
+    told = find_overdue_calibrations(parse_toml(card(*lines), RigConfig, "card"), TODAY)
+    assert len(told) == bool(said)
+    if said:
+        assert said in told[0]
+        assert told[0].startswith("table_acc_m_s2")
+
+
+def test_sensors_without_any_date_are_told_of_a_real_table_only() -> None:
+    assert find_overdue_calibrations(parse_toml(TEXT, RigConfig, "card"), TODAY) == []
+    real = parse_toml(card("due = 2027-01-01"), RigConfig, "card").model_copy(
+        update={"simulated": None}
+    )
+    (told,) = find_overdue_calibrations(real, TODAY)
+    assert "mass_acc_m_s2" in told
+    assert "table_acc_m_s2" not in told
+    assert "drive_disp_m" not in told
+
+
+def record(channel: str = "table_acc_m_s2", **other: object) -> CalibrationRecord:
+    known: dict[str, object] = {
+        "channel": channel, "unit": "g", "serial": "LW 12", "at": "2026-03-10T10:00:00+00:00",
+        "by": "anna", "method": "points", "applied": (-1.0, 1.0), "volts": (-5.0, 5.005),
+        "volts_sd": (1e-5, 1e-5), "volts_per_unit": 5.0025, "volts_per_unit_sd": 1e-5,
+        "offset": 5e-4, "offset_sd": 1e-6, "card_volts_per_unit": 5.0, "departure_percent": 0.05,
+        "departure_sd": 250.0, "tolerance_percent": 1.0, "passed": True,
+    }  # fmt: skip
+    return CalibrationRecord.model_validate(known | other)
+
+
+@given(st.text(st.characters(exclude_categories=["Cs"])), st.floats(-1e9, 1e9))
+def test_a_record_comes_back_from_its_file_as_it_was(by: str, number: float) -> None:
+    one = record(by=by, offset=number, linearity_percent=0.1)
+    (raw,) = tomllib.loads(format_calibration_toml(one))["calibrations"]
+    assert CalibrationRecord.model_validate(raw) == one
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    file = tmp_path / "mine.toml"
+    file.write_text(TEXT, encoding="utf-8")
+    return file
+
+
+def put(path: Path, name: str, one: CalibrationRecord) -> None:
+    folder = calibrations_dir(path)
+    folder.mkdir(exist_ok=True)
+    (folder / name).write_text(format_calibration_toml(one), encoding="utf-8")
+
+
+def test_a_card_without_records_is_read_as_it_is(path: Path) -> None:
+    rig, text = load_rig(path)
+    assert text == TEXT
+    assert rig.calibrations == ()
+
+
+def test_the_newest_record_of_each_channel_goes_into_the_text_of_the_card(path: Path) -> None:
+    put(path, "20260101-000000-table_acc_m_s2.toml", record(by="old"))
+    put(path, "20260201-000000-table_acc_m_s2.toml", record(by="new"))
+    put(path, "20250101-000000-mass_acc_m_s2.toml", record("mass_acc_m_s2"))
+    rig, text = load_rig(path)
+    assert {(one.channel, one.by) for one in rig.calibrations} == {
+        ("table_acc_m_s2", "new"),
+        ("mass_acc_m_s2", "anna"),
+    }
+    assert text.startswith(TEXT)
+    assert parse_toml(text, RigConfig, "as recorded") == rig
+    # a record tells; it changes nothing that is measured
+    assert rig.sensors == parse_toml(TEXT, RigConfig, "card").sensors
+
+
+def test_the_newest_record_is_so_by_its_time_and_not_by_the_name_of_its_file(path: Path) -> None:
+    old = {"by": "old", "at": "2020-01-01T00:00:00+00:00"}
+    put(path, "20260301-000000-table_acc_m_s2.toml", record(by="new", at="2026-03-01T00:00:00"))
+    put(path, "first.toml", record(**old))
+    put(path, "zzz.toml", record("mass_acc_m_s2"))
+    both = format_calibration_toml(record("mass_acc_m_s2", by="two")) + format_calibration_toml(
+        record(**old)
+    )
+    (calibrations_dir(path) / "two.toml").write_text(both)
+    rig, _ = load_rig(path)
+    assert sorted((one.channel, one.by) for one in rig.calibrations) == [
+        ("mass_acc_m_s2", "anna"),
+        ("table_acc_m_s2", "new"),
+    ]
+
+
+@pytest.mark.parametrize("at", ["x", "", "2026-13-01T00:00:00"])
+def test_a_record_without_a_time_is_refused(path: Path, at: str) -> None:
+    put(path, "one.toml", record())
+    (file,) = calibrations_dir(path).glob("*.toml")
+    file.write_text(file.read_text().replace(record().at, at))
+    with pytest.raises(InputError, match=r"one\.toml(?s:.*)ISO 8601"):
+        load_rig(path)
+
+
+def test_a_bad_record_is_named_by_its_own_file(path: Path) -> None:
+    put(path, "20260101-000000-table_acc_m_s2.toml", record())
+    (file,) = calibrations_dir(path).glob("*.toml")
+    file.write_text(file.read_text().replace("offset =", "ofset ="))
+    with pytest.raises(InputError, match=r"20260101-000000-table_acc_m_s2\.toml") as raised:
+        load_rig(path)
+    assert "did you mean 'offset'" in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    "path", sorted((PROFILES_DIR / "rigs").glob("*.toml")), ids=lambda one: one.stem
+)
+def test_every_shipped_card_is_valid_and_named_as_its_file(path: Path) -> None:
+    rig, _ = load_rig(path)
+    assert rig.name == path.stem
+    assert rig.title
+    assert find_overdue_calibrations(rig, TODAY) == [] or rig.simulated is None
+
+
+def test_simulated_cards_differ_from_the_first_only_in_how_they_are_reached() -> None:
+    first = parse_toml(TEXT, RigConfig, "card").model_dump(exclude={"name", "title", "backend"})
+    for path in (PROFILES_DIR / "rigs").glob("*_simulated.toml"):
+        other = load_rig(path)[0]
+        reached = {"machine", "ni", "opendaq", "udp", "follow"}
+        assert other.model_dump(exclude={"name", "title", "backend"} | reached) == {
+            key: value for key, value in first.items() if key not in reached
+        }, path
+        assert getattr(other, other.backend) is not None

@@ -1,0 +1,140 @@
+"""Digital inputs: a heartbeat that comes back and stops, switches that say that all is well."""
+
+from collections.abc import Iterator
+from concurrent import futures
+from typing import Any
+
+import grpc
+import pytest
+from nidaqmx._stubs import nidaqmx_pb2_grpc as rpc
+
+from table_io.backends import MachineLost
+from table_io.backends.digital_inputs import open_digital_inputs
+from table_io.backends.ni.digital_lines import NiDigitalInputs
+from table_io.clock import ManualClock
+from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.rig import RigConfig
+from table_io.config.wiring.ni import NiWiring
+from table_io.errors import InputError
+from table_io.safety.wiring_check import CheckLine, check_digital_inputs
+from table_io.sim.ni.device import SimulatedDaqDevice
+from table_io.sim.ni.service import NiDeviceService
+
+TEXT = (PROFILES_DIR / "rigs" / "ni_simulated.toml").read_text(encoding="utf-8")
+WATCHED = """
+heartbeat_back = "Dev1/port0/line1"
+well = { "stroke limit right" = "Dev1/port0/line2" }
+"""
+LOOKS, SECONDS = 200, 4.0
+
+
+def beating(hz: float, count: int = LOOKS, well: bool = True) -> list[dict[str, bool]]:
+    """Looks fifty times a second at a heartbeat, and at a switch."""
+    return [{"heartbeat": (2.0 * hz * k / 50.0) % 2.0 >= 1.0, "limit": well} for k in range(count)]
+
+
+def judged(held: list[dict[str, bool]], after: list[dict[str, bool]]) -> dict[str, CheckLine]:
+    return {one.name: one for one in check_digital_inputs(held, SECONDS, after, True, True)}
+
+
+def test_a_heartbeat_that_beats_and_stops_passes() -> None:
+    found = judged(beating(10.0), beating(0.0, 25))
+    assert {one.verdict for one in found.values()} == {"pass"}
+    assert found["heartbeat comes back"].value == pytest.approx(10.0, abs=0.2)
+
+
+@pytest.mark.parametrize("hz", [0.0, 2.0, 20.0])
+def test_a_heartbeat_that_is_none_of_ours(hz: float) -> None:
+    found = judged(beating(hz), beating(0.0, 25))
+    assert found["heartbeat comes back"].verdict == "fail"
+    assert found["heartbeat comes back"].do
+
+
+def test_a_heartbeat_that_goes_on_without_the_rig() -> None:
+    assert judged(beating(10.0), beating(10.0, 25))["heartbeat stops"].verdict == "fail"
+
+
+def test_a_switch_that_says_that_not_all_is_well_even_once() -> None:
+    held = beating(10.0)
+    held[77]["limit"] = False
+    line = judged(held, beating(0.0, 25))["all is well"]
+    assert (line.verdict, line.channel) == ("fail", "limit")
+
+
+def test_what_no_card_names_is_not_tested_and_what_to_do_is_said() -> None:
+    found = {one.name: one for one in check_digital_inputs([], SECONDS, [], True, False)}
+    assert {one.verdict for one in found.values()} == {"not tested"}
+    assert "heartbeat_back" in found["heartbeat comes back"].do
+    assert "by hand" in found["stroke limits and emergency stop"].do
+    assert check_digital_inputs([], SECONDS, [], False, True) == ()
+
+
+def test_a_card_without_such_inputs_opens_none() -> None:
+    assert open_digital_inputs(parse_toml(TEXT, RigConfig, "card")) is None
+    assert (
+        open_digital_inputs(
+            parse_toml((PROFILES_DIR / "rigs" / "simulated.toml").read_text(), RigConfig, "c")
+        )
+        is None
+    )
+
+
+class Nothing:
+    """A table that stands still."""
+
+    moving = False
+
+    def play(self, now: float) -> list[Any]:
+        return []
+
+
+@pytest.fixture
+def lab() -> Iterator[tuple[NiWiring, NiDeviceService, grpc.Server]]:
+    """A device server with the card's digital inputs, and the way to it."""
+    wiring = parse_toml(TEXT.replace("[ni]\n", f"[ni]{WATCHED}"), RigConfig, "card").ni
+    assert wiring is not None
+    clock = ManualClock()
+    service = NiDeviceService(SimulatedDaqDevice(Nothing(), (2000.0,), 0.0), wiring, clock)  # type: ignore[arg-type]
+    server = grpc.server(futures.ThreadPoolExecutor(2))
+    port = server.add_insecure_port("127.0.0.1:0")
+    rpc.add_NiDAQmxServicer_to_server(service, server)
+    server.start()
+    yield wiring.model_copy(update={"endpoint": f"127.0.0.1:{port}"}), service, server
+    server.stop(None)
+
+
+Lab = tuple[NiWiring, NiDeviceService, grpc.Server]
+
+
+def test_the_vendors_client_reads_the_lines_of_the_card(lab: Lab) -> None:
+    wiring, service, _ = lab
+    lines = NiDigitalInputs(wiring)
+    assert lines.read_levels() == {"heartbeat": False, "stroke limit right": True}
+    service._heartbeat_level = True
+    assert lines.read_levels() == {"heartbeat": True, "stroke limit right": True}
+    lines.close()
+    lines.close()
+    assert service.device.tasks == ()
+    NiDigitalInputs(wiring).close()  # and once more
+
+
+def test_a_line_that_the_device_has_not_is_said(lab: Lab) -> None:
+    wiring, service, _ = lab
+    with pytest.raises(InputError, match=r"Dev1/port9/line9.*heartbeat_back and well"):
+        NiDigitalInputs(wiring.model_copy(update={"well": {"limit": "Dev1/port9/line9"}}))
+    assert service.device.tasks == ()
+
+
+def test_a_server_that_goes_is_a_lost_machine(lab: Lab) -> None:
+    wiring, _, server = lab
+    lines = NiDigitalInputs(wiring)
+    server.stop(None).wait()
+    with pytest.raises(MachineLost, match="the digital inputs cannot be read"):
+        lines.read_levels()
+    lines.close()
+
+
+@pytest.mark.parametrize("key", ["heartbeat_back = 'Dev1/ai0'", "well = { limit = 'port0' }"])
+def test_what_is_no_line_is_refused_by_the_card(key: str) -> None:
+    with pytest.raises(InputError, match=key.split(" ", maxsplit=1)[0]):
+        parse_toml(TEXT.replace("[ni]\n", f"[ni]\n{key}\n"), RigConfig, "card")

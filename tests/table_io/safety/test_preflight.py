@@ -1,0 +1,248 @@
+"""Pre-flight margins against closed forms, and refusals that name step and limit."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from table_io.config.base import PROFILES_DIR, load_config
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.errors import InputError
+from table_io.excitation.trajectory import plan_sweep
+from table_io.records import FrequencyResponse
+from table_io.safety.preflight import (
+    StepDemand,
+    check_corrected_drive,
+    check_limits,
+    compute_demands,
+    list_drive_warnings,
+    list_setup_warnings,
+)
+from table_io.sequencer import make_test_plan, nominal_drive
+from table_io.units import GRAVITY_M_S2
+
+RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
+A = 0.05 * GRAVITY_M_S2
+
+
+def rig(table: str = "limits", **changes: float) -> RigConfig:
+    """The machine card with other values in one of its tables."""
+    raw = RIG.model_dump()
+    raw[table].update(changes)
+    return RigConfig.model_validate(raw)
+
+
+def profile(start_hz: float = 0.5, stop_hz: float = 10.0, **tables: Any) -> Profile:
+    """A test of two steps, up and down, with other tables."""
+    sweep = {"start_hz": start_hz, "stop_hz": stop_hz, "step_hz": stop_hz - start_hz, "cycles": 3}
+    specimen = {"mass_kg": 550.0, "gap_mm": 4.0}
+    return Profile.model_validate(
+        {"title": "limits", "specimen": specimen, "sweep": sweep} | tables
+    )
+
+
+def rows(test: Profile, card: RigConfig = RIG) -> tuple[StepDemand, ...]:
+    return compute_demands(plan_sweep(test), test, card)
+
+
+def refusal(test: Profile, card: RigConfig) -> list[str]:
+    with pytest.raises(InputError) as caught:
+        check_limits(rows(test, card), test, card, "a.toml")
+    head, *faults = str(caught.value).splitlines()
+    assert head == "a.toml: the table 'simulated' cannot do this test; nothing was started"
+    return [fault.strip() for fault in faults]
+
+
+def test_margins_agree_with_closed_forms() -> None:
+    first, second, third, fourth = rows(profile(1.0, 5.0))
+    assert [row.step for row in (first, second, third, fourth)] == [0, 1, 2, 3]
+    assert [row.direction for row in (first, fourth)] == ["forward", "backward"]
+    w = 2 * math.pi * 1.0
+    for row in (first, fourth):  # the largest of held cycles and blends: never less than held
+        assert row.displacement_m == pytest.approx(A / w**2, rel=2e-3)
+        assert A / w * 0.9999 <= row.velocity_m_s <= 1.05 * A / w
+        assert A * 0.9999 <= row.acceleration_m_s2 <= 1.05 * A
+        assert row.force_n == pytest.approx((2000.0 + 550.0) * row.acceleration_m_s2)
+        assert row.amplitude_lsb == pytest.approx(A / w**2 / (0.12 / 2**18))
+    # The turn repeats 5 Hz without a blend, so its margins are those of held cycles alone.
+    w = 2 * math.pi * 5.0
+    assert third.displacement_m == pytest.approx(A / w**2, rel=1e-3)
+    assert third.velocity_m_s == pytest.approx(A / w, rel=1e-3)
+    assert third.acceleration_m_s2 == pytest.approx(A, rel=1e-3)
+
+
+def test_a_16_bit_output_of_100_mm_has_41_steps_left_at_10_hz() -> None:
+    card = rig("output", span_mm=100.0, bits=16, least_lsb=1)
+    row = rows(profile(), card)[1]
+    held_mm = 1e3 * A / (2 * math.pi * 10.0) ** 2
+    assert held_mm == pytest.approx(0.124, abs=5e-4)
+    assert card.output.lsb_m == pytest.approx(200e-3 / 65536)
+    assert row.amplitude_lsb == pytest.approx(held_mm * 1e-3 / (200e-3 / 65536))
+    assert round(row.amplitude_lsb) == 41
+    (warning,) = list_drive_warnings(rows(profile(), card), card)
+    assert "2 steps have an amplitude below 100 DAC steps (least: 41 at 10 Hz)" in warning
+    assert list_drive_warnings(rows(profile()), RIG) == []
+
+
+@pytest.mark.parametrize(
+    ("table", "changes", "parts"),
+    [
+        ("limits", {"stroke_mm": 40.0}, ("step 0 (0.5 Hz forward)", "displacement 49.6", "40 mm")),
+        ("output", {"span_mm": 45.0}, ("step 0 (0.5 Hz forward)", "displacement 49.6", "45 mm")),
+        ("limits", {"velocity_mm_s": 100.0}, ("(0.5 Hz ", "velocity 15", "100 mm/s")),
+        ("limits", {"acceleration_g": 0.04}, ("acceleration 0.05", "at most 0.04 g")),
+        ("limits", {"force_kn": 1.0}, ("force 1.2", "at most 1 kN")),
+        ("limits", {"frequency_hz": 9.0}, ("sweep.stop_hz 10 Hz", "at most 9")),
+        ("output", {"bits": 12}, ("step 1 (10 Hz)", "4.2 steps of the DAC", "at least 20")),
+    ],
+    ids=["stroke", "span", "velocity", "acceleration", "force", "frequency", "resolution"],
+)
+def test_a_refusal_names_the_step_and_the_limit(
+    table: str, changes: dict[str, float], parts: tuple[str, ...]
+) -> None:
+    (fault,) = refusal(profile(), rig(table, **changes))
+    for part in parts:
+        assert part in fault
+
+
+def test_a_rate_that_the_card_does_not_have_is_refused() -> None:
+    (fault,) = refusal(profile(acquisition={"rate_hz": 1500.0}), RIG)
+    assert fault == "acquisition.rate_hz 1500 Hz; allowed: 1000, 2000, 4000"
+
+
+def test_all_limits_that_are_exceeded_stand_in_one_refusal() -> None:
+    card = rig(stroke_mm=1.0, velocity_mm_s=1.0, acceleration_g=0.01, force_kn=0.1)
+    faults = refusal(profile(acquisition={"rate_hz": 1500.0}), card)
+    assert len(faults) == 5
+
+
+def test_what_is_just_allowed_is_not_refused() -> None:
+    asked = rows(profile())
+    card = rig(
+        stroke_mm=max(row.displacement_m for row in asked) * 1e3 * (1 + 1e-9),
+        force_kn=max(row.force_n for row in asked) * 1e-3 * (1 + 1e-9),
+    )
+    check_limits(rows(profile(), card), profile(), card, "a.toml")
+
+
+def with_check(test: Profile, card: RigConfig = RIG) -> tuple[StepDemand, ...]:
+    """Margins of the drive as it is played, loop check and tuning included."""
+    return compute_demands(nominal_drive(make_test_plan(test, card)), test, card)
+
+
+def test_the_loop_check_has_rows_of_its_own_before_the_steps() -> None:
+    found = with_check(profile())
+    assert [row.step for row in found] == [-1, -1, -1, 0, 1, 2, 3]
+    assert [row.name for row in found[:1]] == ["loop check (1 Hz)"]
+    for row, f in zip(found, (1.0, math.sqrt(10.0), 10.0), strict=False):
+        assert row.frequency_hz == pytest.approx(f)
+        assert row.acceleration_m_s2 == pytest.approx(0.1 * A, rel=0.06)
+        assert row.amplitude_lsb == pytest.approx(
+            0.1 * A / (2 * math.pi * f) ** 2 / RIG.output.lsb_m
+        )
+    # The smallest amplitude of the check has 27 DAC steps: neither refused nor warned of.
+    assert found[2].amplitude_lsb < RIG.output.warn_lsb
+    check_limits(found, profile(), RIG, "a.toml")
+    check_limits((replace(found[0], amplitude_lsb=5.0), *found[1:]), profile(), RIG, "a.toml")
+    assert list_drive_warnings(found, RIG) == []
+
+
+def test_a_loop_check_that_the_table_cannot_do_is_refused_by_name() -> None:
+    test = profile(loop_check={"frequencies_hz": (0.05, 30.0)})
+    with pytest.raises(InputError) as caught:
+        check_limits(with_check(test), test, RIG, "a.toml")
+    text = str(caught.value)
+    assert "loop_check.frequencies_hz 30 Hz; allowed: at most 20" in text
+    assert "loop check (0.05 Hz) and 1 more: displacement 496" in text
+    assert "Raise loop_check.frequencies_hz or lower loop_check.level" in text
+
+
+@pytest.mark.parametrize(
+    ("channel", "full", "words"),
+    [
+        ("table_disp_m", 40.0, "step 0 (0.5 Hz forward): table_disp_m 49.6"),
+        ("drive_disp_m", 40.0, "step 0 (0.5 Hz forward): drive_disp_m 49.6"),
+        ("table_acc_m_s2", 0.05, "step 1 (10 Hz forward): table_acc_m_s2 0.05"),
+    ],
+)
+def test_a_sensor_of_the_table_that_would_clip_is_refused(
+    channel: str, full: float, words: str
+) -> None:
+    sensors = [
+        {**one.model_dump(), "range": full if one.channel == channel else one.range}
+        for one in RIG.sensors
+    ]
+    card = RigConfig.model_validate(RIG.model_dump() | {"sensors": sensors})
+    (fault,) = refusal(profile(), card)
+    assert fault.startswith(words)
+    assert f"at most its range, {full:g}" in fault
+    # What the specimen does to its sensors is not known before the test.
+    mass = [
+        {**one.model_dump(), "range": 0.1 if "mass" in one.channel else one.range}
+        for one in RIG.sensors
+    ]
+    card = RigConfig.model_validate(RIG.model_dump() | {"sensors": mass})
+    check_limits(rows(profile(), card), profile(), card, "a.toml")
+
+
+def test_a_command_without_room_for_a_correction_is_worth_a_warning() -> None:
+    asked = rows(profile())
+    assert list_drive_warnings(asked, RIG) == []  # 49.7 mm of 60 mm: 20 % more are 59.6 mm
+    (said,) = list_drive_warnings(asked, rig(stroke_mm=59.0))
+    assert said.startswith("step 0 (0.5 Hz forward): 49.6")
+    assert "leave no room to correct the command by 20 %" in said
+
+
+@pytest.mark.parametrize(
+    ("tables", "words"),
+    [
+        ({"specimen": {"mass_kg": 5.5, "gap_mm": 4.0}}, "is it in kg?"),
+        ({"specimen": {"mass_kg": 550e3, "gap_mm": 4.0}}, "is it in kg?"),
+        ({"specimen": {"mass_kg": 550.0, "gap_mm": 4000.0}}, "is it in mm?"),
+        ({"acquisition": {"block_samples": 500}}, "fewer than four blocks"),
+    ],
+)
+def test_what_hardly_fits_the_machine_is_doubted(tables: dict[str, Any], words: str) -> None:
+    (said,) = list_setup_warnings(profile(**tables), RIG)
+    assert words in said
+
+
+def test_a_plain_test_is_not_doubted() -> None:
+    for gap_mm in (math.inf, 30.0, 0.0, -10.0):
+        specimen = {"mass_kg": 550.0, "gap_mm": gap_mm}
+        assert list_setup_warnings(profile(specimen=specimen), RIG) == []
+
+
+def test_a_loop_check_that_ends_below_the_sweep_is_said() -> None:
+    (said,) = list_setup_warnings(profile(), rig("output", span_mm=100.0, bits=16))
+    assert said.startswith(
+        "the loop check ends at 4.51 Hz: at 10 Hz a tenth of the level has fewer"
+    )
+    off = profile(loop_check={"enabled": False})
+    assert list_setup_warnings(off, rig("output", span_mm=100.0, bits=16)) == []
+
+
+def response(gain: float) -> FrequencyResponse:
+    """A flat response up to 1 Hz that has fallen to `gain` at 10 Hz."""
+    return FrequencyResponse(5, (1.0, 3.0, 10.0), (1.0, 1.0, gain), (0.0, 0.0, 0.0))
+
+
+def test_the_corrected_command_is_held_against_the_card() -> None:
+    steps = profile().sweep.steps
+    assert check_corrected_drive(steps, response(0.9), RIG) == []
+    flat = FrequencyResponse(5, (1.0,), (0.8,), (0.0,))
+    (said,) = check_corrected_drive(steps, flat, RIG)
+    assert "step 0 (0.5 Hz forward) and 1 more: displacement 62.1 mm" in said
+    assert "allowed: at most 60 mm" in said
+    assert said.startswith("corrected for the table's response")
+    # 0.05 g at 10 Hz asked of a table that gives 0.6 of it.
+    (said,) = check_corrected_drive(steps, response(0.6), rig(acceleration_g=0.08))
+    assert "(10 Hz forward) and 1 more: acceleration 0.08333 g" in said
+
+
+def test_a_correction_beyond_what_control_may_do_is_said_before_the_sweep() -> None:
+    (said,) = check_corrected_drive(profile().sweep.steps, response(0.4), RIG)
+    assert said.startswith("step 1 (10 Hz forward): the table follows with a gain of 0.4")
+    assert "2.5 times as large; allowed: at most 2" in said

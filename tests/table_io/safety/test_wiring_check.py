@@ -1,0 +1,246 @@
+"""What is wrong with the wiring is found at rest, by its own line; what is right passes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from table_io.block import Float2D
+from table_io.config.base import PROFILES_DIR, load_config
+from table_io.config.rig import RigConfig
+from table_io.safety.wiring_check import (
+    CheckLine,
+    RestingInputs,
+    check_resting_inputs,
+    check_zero_command,
+)
+
+RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
+RATE, SAMPLES = 2000.0, 8000
+ACC = RIG.channels.index("table_acc_m_s2")
+LASER = RIG.channels.index("table_disp_m")
+CELL = RIG.channels.index("force_l2_n")
+TIME = np.arange(SAMPLES) / RATE
+
+
+def column(values: list[float]) -> Float2D:
+    return np.array(values)[:, None]
+
+
+GAIN = column([sensor.volts_per_unit for sensor in RIG.sensors])
+
+
+def still(rate: float = RATE, seed: int = 3) -> Float2D:
+    """What the inputs of the shipped card show at rest, in the unit of each sensor."""
+    noise = np.random.default_rng(seed).standard_normal((len(RIG.sensors), SAMPLES))
+    values = column([s.offset for s in RIG.sensors]) + noise * column(
+        [s.noise_rms for s in RIG.sensors]
+    )
+    lsb = column([s.lsb for s in RIG.sensors])
+    rounded: Float2D = np.rint(values / lsb) * lsb
+    return rounded
+
+
+def lines(values: Float2D, rate: float = RATE, rig: RigConfig = RIG) -> tuple[CheckLine, ...]:
+    return check_resting_inputs(RestingInputs(rig, rate, values * GAIN))
+
+
+def failing(values: Float2D, rate: float = RATE) -> set[tuple[str, str]]:
+    return {(one.name, one.channel) for one in lines(values, rate) if one.verdict == "fail"}
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_what_is_right_passes(seed: int) -> None:
+    assert failing(still(seed=seed)) == set()
+
+
+def test_every_channel_has_every_line_and_each_says_what_to_do_where_it_is_not_a_pass() -> None:
+    found = lines(still())
+    for sensor in RIG.sensors[1:]:
+        names = [one.name for one in found if one.channel == sensor.channel]
+        assert names == [
+            "lost samples", "at the rail", "stuck", "noise", "bits used", "spikes", "mains hum",
+            "offset", "steady", "same noise as another",
+        ]  # fmt: skip
+    assert all(bool(one.do) == (one.verdict != "pass") for one in found)
+    # A command that stands still, without noise, cannot be told from one that is stuck.
+    assert [one.channel for one in found if one.verdict == "not tested"] == ["drive_disp_m"]
+
+
+def spoilt(row: int, values: np.ndarray | float) -> Float2D:
+    """The inputs at rest with another row."""
+    out = still()
+    out[row] = values
+    return out
+
+
+def test_a_lost_channel_is_lost_and_nothing_else_is_said_of_it() -> None:
+    values = spoilt(ACC, np.nan)
+    assert failing(values) == {("lost samples", "table_acc_m_s2")}
+    assert [one.value for one in lines(values) if one.channel == "table_acc_m_s2"] == [100.0]
+    values = still()
+    values[CELL, 100] = np.nan
+    assert failing(values) == {("lost samples", "force_l2_n")}
+
+
+def test_a_stuck_channel_from_the_first_sample_or_later() -> None:
+    assert ("stuck", "table_acc_m_s2") in failing(spoilt(ACC, 0.001))
+    values = still()
+    values[ACC, 5000:] = values[ACC, 4999]
+    assert ("stuck", "table_acc_m_s2") in failing(values)
+    values = still()
+    values[ACC, 5000:5400] = values[ACC, 4999]  # 0.2 s: a converter may repeat itself so long
+    assert ("stuck", "table_acc_m_s2") not in failing(values)
+
+
+def test_noise_below_half_a_step_is_not_taken_for_a_stuck_channel() -> None:
+    sensors = tuple(
+        one.model_copy(update={"bits": 12, "noise_rms": 0.005}) if one.unit == "mm" else one
+        for one in RIG.sensors
+    )
+    rig = RIG.model_copy(update={"sensors": sensors})
+    values = spoilt(LASER, 0.1)
+    (line,) = (
+        one
+        for one in lines(values, rig=rig)
+        if one.channel == "table_disp_m" and one.name == "stuck"
+    )
+    assert line.verdict == "not tested"
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_channel_at_its_rail(sign: float) -> None:
+    assert ("at the rail", "table_disp_m") in failing(spoilt(LASER, sign * 75.0))
+    values = still()
+    values[LASER, 7] = sign * 75.0
+    assert ("at the rail", "table_disp_m") in failing(values)
+
+
+def test_a_cable_that_is_off_is_too_quiet_and_a_bad_earth_too_loud() -> None:
+    quiet = 2e-5 * np.random.default_rng(5).standard_normal(SAMPLES)  # 100 dB under 2 g
+    found = {one.channel: one for one in lines(spoilt(ACC, quiet)) if one.name == "noise"}
+    assert found["table_acc_m_s2"].verdict == "fail"
+    assert found["table_acc_m_s2"].value < found["table_acc_m_s2"].low
+    loud = still()
+    loud[ACC] += 0.002 * np.random.default_rng(5).standard_normal(SAMPLES)
+    assert failing(loud) == {("noise", "table_acc_m_s2")}
+
+
+def test_a_card_without_noise_is_told_what_to_put_there() -> None:
+    sensors = tuple(one.model_copy(update={"noise_rms": 0.0}) for one in RIG.sensors)
+    rig = RIG.model_copy(update={"sensors": sensors})
+    found = [one for one in lines(still(), rig=rig) if one.name == "noise"]
+    assert {one.verdict for one in found} == {"not tested"}
+    (laser,) = (one.do for one in found if one.channel == "table_disp_m")
+    assert "noise_rms" in laser
+    assert float(laser.split(" mm")[0].split()[-1]) == pytest.approx(0.005, rel=0.05)
+    assert {one.verdict for one in lines(still(), rig=rig)} == {"pass", "not tested"}
+
+
+@pytest.mark.parametrize(
+    ("mains", "rate"),
+    [(49.9, 1000.0), (50.0, 2000.0), (50.13, 4000.0), (60.0, 1000.0), (59.95, 2000.0)],
+)
+def test_hum_is_told_with_its_mains_and_its_size(mains: float, rate: float) -> None:
+    t = np.arange(SAMPLES) / rate
+    values = still()
+    values[CELL] += 0.004 * np.sqrt(2) * np.sin(2 * np.pi * mains * t + 0.3)
+    values[CELL] += 0.001 * np.sqrt(2) * np.sin(2 * np.pi * 3 * mains * t)
+    found = {one.channel: one for one in lines(values, rate) if one.name == "mains hum"}
+    assert found["force_l2_n"].verdict == "fail"
+    assert found["force_l2_n"].value == pytest.approx(np.hypot(0.004, 0.001), rel=0.03)
+    told = float(found["force_l2_n"].do.split(" Hz")[0].split()[-1])
+    assert told == pytest.approx(mains, abs=0.051)
+    resting = RestingInputs(RIG, rate, values * GAIN)
+    assert resting.hum.frequency_hz == pytest.approx(mains, abs=0.02 * rate / SAMPLES)
+    # What every other channel makes of white noise is no hum.
+    assert [one.channel for one in found.values() if one.verdict == "fail"] == ["force_l2_n"]
+
+
+def test_hum_in_two_channels_is_hum_and_not_one_signal_twice() -> None:
+    values = still()
+    for row in (CELL, ACC):
+        values[row] += 20 * RIG.sensors[row].noise_rms * np.sin(2 * np.pi * 50.02 * TIME)
+    found = failing(values)
+    assert {channel for name, channel in found if name == "mains hum"} == {
+        "force_l2_n",
+        "table_acc_m_s2",
+    }
+    assert not any(name == "same noise as another" for name, _ in found)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_one_signal_at_two_inputs(sign: float) -> None:
+    values = still()
+    other = RIG.channels.index("mass_acc_m_s2")
+    values[other] = sign * values[ACC]
+    named = {one.channel: one for one in lines(values) if one.name == "same noise as another"}
+    assert [one.channel for one in named.values() if one.verdict == "fail"] == [
+        "table_acc_m_s2",
+        "mass_acc_m_s2",
+    ]
+    assert "mass_acc_m_s2" in named["table_acc_m_s2"].do
+    assert named["table_acc_m_s2"].value == pytest.approx(sign, abs=0.01)
+
+
+def test_offset_drift_and_spike() -> None:
+    assert failing(still() + np.eye(len(RIG.sensors))[[CELL]].T * 3.0) == {("offset", "force_l2_n")}
+    values = still()
+    values[LASER] += 0.1 * TIME
+    assert ("steady", "table_disp_m") in failing(values)
+    values = still()
+    values[ACC, 1234] += 0.01
+    assert failing(values) == {("spikes", "table_acc_m_s2")}
+
+
+def test_the_offset_of_the_card_is_where_the_range_begins() -> None:
+    """A laser that stands 40 mm off is right where its card says so."""
+    sensors = tuple(
+        one.model_copy(update={"offset": 40.0}) if one.channel == "table_disp_m" else one
+        for one in RIG.sensors
+    )
+    rig = RIG.model_copy(update={"sensors": sensors})
+    values = still()
+    assert [one.channel for one in lines(values, rig=rig) if one.verdict == "fail"] == [
+        "table_disp_m"
+    ]
+    values[LASER] += 40.0
+    assert not [one for one in lines(values, rig=rig) if one.verdict == "fail"]
+
+
+def test_the_bits_that_noise_leaves() -> None:
+    resting = RestingInputs(RIG, RATE, still() * GAIN)
+    laser = RIG.sensors[LASER]
+    assert resting.effective_bits(LASER) == pytest.approx(
+        np.log2(150.0 / (np.sqrt(12) * 0.005)), abs=0.05
+    )
+    assert resting.effective_bits(0) == RIG.sensors[0].bits  # nothing but the converter's own steps
+    loud = laser.model_copy(update={"noise_rms": 1.0})
+    rig = RIG.model_copy(update={"sensors": (RIG.sensors[0], loud, *RIG.sensors[2:])})
+    values = spoilt(LASER, np.random.default_rng(5).standard_normal(SAMPLES))
+    failed = [one for one in lines(values, rig=rig) if one.verdict == "fail"]
+    assert [(one.name, one.channel) for one in failed] == [("bits used", "table_disp_m")]
+
+
+@pytest.mark.parametrize(
+    ("shown_mm", "passed"), [(0.0, True), (0.05, True), (0.07, False), (-6.0, False)]
+)
+def test_a_command_that_is_not_at_0_volts(shown_mm: float, passed: bool) -> None:
+    values = spoilt(0, shown_mm)
+    (line,) = check_zero_command(RestingInputs(RIG, RATE, values * GAIN))
+    assert (line.verdict == "pass") is passed
+    assert line.value == pytest.approx(shown_mm)
+    turned = replace(RestingInputs(RIG, RATE, values * GAIN), volts=np.full_like(values, np.nan))
+    assert (
+        next(check_zero_command(turned)).verdict == "fail"
+    )  # a command that is not seen may be anywhere
+
+
+@pytest.mark.parametrize("hz", [0.5, 1.0, 10.0])
+def test_a_command_that_swings_about_0_volts_is_not_at_0_volts(hz: float) -> None:
+    """+-8 V, whose mean over a tare of one second is nothing."""
+    values = spoilt(0, 48.0 * np.sin(2 * np.pi * hz * TIME + 0.1))[:, :2000]
+    values[0, 700] = np.nan  # one that was lost hides nothing
+    (line,) = check_zero_command(RestingInputs(RIG, RATE, values * GAIN))
+    assert line.verdict == "fail"
+    assert abs(line.value) == pytest.approx(48.0, rel=0.01)

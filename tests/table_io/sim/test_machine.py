@@ -1,0 +1,428 @@
+"""The machine as a process of its own: what it says, how it watches, how it comes to rest."""
+
+import contextlib
+import json
+import math
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from table_io.backends import HEARTBEAT_TIMEOUT_S
+from table_io.backends.machine.protocol import (
+    MachineMessage,
+    MessageKind,
+    ProtocolError,
+    Refusal,
+    text_message,
+    values_message,
+)
+from table_io.block import Float1D
+from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.profile import Specimen
+from table_io.config.rig import RigConfig
+from table_io.errors import InputError
+from table_io.sim.machine.flight_recorder import FlightRecorder, read_flight_record
+from table_io.sim.machine.table import SimulatedMachine
+
+RATE = 2000.0
+TEXT = (PROFILES_DIR / "rigs" / "machine.toml").read_text()
+RIG = parse_toml(TEXT, RigConfig, "machine")
+SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
+SCALE = RIG.output.volts_per_m
+TICK_S = 0.005
+LATE = """
+[[simulated.faults]]
+kind = "late"
+at_s = 0.2
+size = 0.1
+"""
+STALL = """
+[[simulated.faults]]
+kind = "stall"
+at_s = 0.2
+"""
+
+OIL_LOSS = """
+[[simulated.faults]]
+kind = "oil_loss"
+at_s = 0.5
+size = 0.05
+"""
+
+
+def claim(rig: RigConfig = RIG, rate_hz: float = RATE, **changes: object) -> MachineMessage:
+    """What a controller says first."""
+    told = {
+        "rate_hz": rate_hz,
+        "specimen": SPECIMEN.model_dump(),
+        "output": rig.output.model_dump(),
+        "sensors": [sensor.model_dump() for sensor in rig.sensors],
+    }
+    return text_message(MessageKind.CLAIM, json.dumps(told | changes))
+
+
+def sine(seconds: float, amplitude_m: float = 5e-3, f: float = 2.0) -> Float1D:
+    """Volts of a motion that grows smoothly and goes on: its end is in motion."""
+    t = np.arange(round(seconds * RATE)) / RATE
+    x = np.clip(t / 0.5, 0.0, 1.0)
+    grows = x**3 * (10.0 + x * (-15.0 + 6.0 * x))
+    metres: Float1D = amplitude_m * grows * np.sin(2 * np.pi * f * t)
+    return metres * SCALE
+
+
+def acceleration(metres: Float1D) -> float:
+    """Largest acceleration of a command in m/s2, rest before it included."""
+    return float(np.abs(np.diff(np.concatenate([np.zeros(2), metres]), 2)).max() * RATE**2)
+
+
+@dataclass
+class Desk:
+    """A table and its controller in time that passes when it is told to."""
+
+    folder: Path
+    card: str = TEXT
+    now: float = 100.0
+    told: list[str] = field(default_factory=list)
+    heard: list[MachineMessage] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.box = FlightRecorder(self.folder / "box", self.told.append)
+        self.table = SimulatedMachine(
+            parse_toml(self.card, RigConfig, "card"), self.told.append, self.box
+        )
+
+    def say(self, *messages: MachineMessage) -> list[MachineMessage]:
+        """The answers."""
+        return [answer for one in messages for answer in self.table.handle_message(one, self.now)]
+
+    def drive(self, volts: Float1D) -> None:
+        """Claim, queue, start."""
+        kinds = [one.kind for one in self.say(claim(), values_message(MessageKind.QUEUE, volts))]
+        assert kinds == [MessageKind.GRANTED, MessageKind.QUEUED]
+        assert self.say(MachineMessage(MessageKind.START))[0].values.tolist() == [self.now]
+
+    def wait(self, seconds: float, beats: bool = True) -> None:
+        """Time passes."""
+        for _ in range(round(seconds / TICK_S)):
+            self.now += TICK_S
+            if beats:
+                self.say(MachineMessage(MessageKind.BEAT))
+            self.heard += self.table.tick(self.now)
+
+    def rest(self) -> None:
+        """Time passes without a controller until the table is free; it has ten seconds."""
+        for _ in range(2000):
+            if not self.table.is_claimed:
+                return
+            self.wait(TICK_S, beats=False)
+        raise AssertionError("it did not come to rest")
+
+    def kinds(self) -> list[MessageKind]:
+        return [one.kind for one in self.heard]
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Desk:
+    return Desk(tmp_path)
+
+
+def test_the_shipped_machine_is_the_simulated_one_in_a_process_of_its_own() -> None:
+    own = {"name", "title", "backend", "machine"}
+    simulated = parse_toml(
+        (PROFILES_DIR / "rigs" / "simulated.toml").read_text(), RigConfig, "simulated"
+    )
+    assert RIG.model_dump(exclude=own) == simulated.model_dump(exclude=own)
+
+
+def test_it_plays_and_hands_over_every_sample_once(desk: Desk) -> None:
+    desk.drive(sine(0.5))
+    desk.wait(0.3)
+    assert set(desk.kinds()) == {MessageKind.TAKEN}
+    counts = [one.values.size // len(RIG.sensors) for one in desk.heard]
+    assert [one.index for one in desk.heard] == np.cumsum([0, *counts[:-1]]).tolist()
+    assert sum(counts) == 601  # sample 0 is that of the start
+
+
+def test_a_silent_controller_is_lost_in_time_and_what_is_queued_plays_to_rest(desk: Desk) -> None:
+    volts = sine(1.0)
+    desk.drive(volts)
+    desk.wait(0.5)
+    desk.wait(HEARTBEAT_TIMEOUT_S - TICK_S, beats=False)
+    assert not desk.table.latched_reason
+    desk.wait(3 * TICK_S, beats=False)
+    assert "no message from the controller for 0.3 s" in desk.table.latched_reason
+    assert desk.heard[-1].kind is MessageKind.LOST
+    desk.rest()
+    assert "controller lost" in desk.told[-1]
+    assert "at rest" in desk.told[-1]
+    (life,) = read_flight_record(desk.folder / "box")
+    command = life.command_m
+    np.testing.assert_array_equal(command[: volts.size], volts / SCALE)
+    assert life.missing == 0
+    assert command[-1] == 0.0
+    assert acceleration(command) <= 1.05 * acceleration(volts / SCALE)
+    assert np.abs(life.row("command_m") - command).max() <= 0.501 * RIG.output.lsb_m
+    assert np.abs(life.row("table_disp")[-100:]).max() < 1e-4
+    assert np.abs(life.row("table_disp")).max() > 3e-3
+
+
+def test_signs_of_life_keep_it(desk: Desk) -> None:
+    desk.drive(sine(0.2))
+    for _ in range(10):
+        desk.wait(HEARTBEAT_TIMEOUT_S - TICK_S, beats=False)
+        desk.say(MachineMessage(MessageKind.BEAT))
+    assert not desk.table.latched_reason
+
+
+def test_a_queue_that_ends_in_motion_is_brought_home_and_replaced_in_time(desk: Desk) -> None:
+    volts = sine(1.0)
+    desk.drive(volts[:1200])
+    desk.wait(0.5)
+    assert (
+        desk.say(values_message(MessageKind.QUEUE, volts[1200:], 1200))[0].kind
+        is MessageKind.QUEUED
+    )
+    desk.wait(3.0)
+    desk.table.drop_controller("it is over", desk.now)
+    desk.rest()
+    (life,) = read_flight_record(desk.folder / "box")
+    np.testing.assert_array_equal(life.command_m[:2000], volts / SCALE)
+    assert acceleration(life.command_m) <= 1.05 * acceleration(volts / SCALE)
+
+
+def test_what_is_held_off_the_mean_goes_home_once_nobody_holds_it(desk: Desk) -> None:
+    x = np.linspace(0.0, 1.0, 1000)
+    desk.drive(np.append(x**3 * (10.0 + x * (-15.0 + 6.0 * x)), 1.0))
+    desk.wait(1.0)
+    desk.say(MachineMessage(MessageKind.RELEASE))
+    desk.rest()
+    (life,) = read_flight_record(desk.folder / "box")
+    assert life.command_m[2000] == pytest.approx(1.0 / SCALE)
+    assert life.command_m[-1] == 0.0
+    assert acceleration(life.command_m) < 0.55
+
+
+def test_a_table_that_stands_still_in_the_middle_of_its_queue_is_not_at_rest(desk: Desk) -> None:
+    x = np.clip(np.arange(1000) / 998, 0.0, 1.0)
+    volts = np.concatenate([np.zeros(1500), 64.0 * (x * (1.0 - x)) ** 3])
+    desk.drive(volts)
+    desk.wait(0.1)
+    desk.table.drop_controller("gone", desk.now)
+    desk.rest()
+    (life,) = read_flight_record(desk.folder / "box")
+    np.testing.assert_array_equal(life.command_m[:2500], volts / SCALE)
+    assert life.notes[-1][0] >= 2500 + 0.2 * RATE
+
+
+def test_a_table_without_oil_pressure_is_given_the_time_that_it_needs(tmp_path: Path) -> None:
+    desk = Desk(tmp_path, TEXT + OIL_LOSS)
+    desk.drive(sine(4.0, f=1.0))
+    desk.wait(4.0)
+    desk.table.drop_controller("gone", desk.now)
+    desk.rest()
+    (life,) = read_flight_record(desk.folder / "box")
+    quiet = life.row("table_disp")[-400:]
+    assert np.ptp(quiet) <= 1e-4
+    late = np.flatnonzero(np.abs(life.row("table_disp")) > 1e-4)[-1]
+    assert late > np.flatnonzero(life.command_m)[-1] + 0.2 * RATE  # or this shows nothing
+
+
+def test_time_that_passed_without_a_tick_is_past(desk: Desk) -> None:
+    desk.drive(sine(1.0))
+    desk.wait(0.1)
+    desk.now += 0.05
+    (answer,) = desk.say(values_message(MessageKind.QUEUE, np.zeros(9), 201 + 60))
+    assert (answer.kind, answer.index) == (MessageKind.REFUSED, Refusal.VALUE)
+
+
+def test_nobody_else_gets_a_table_that_moves(desk: Desk) -> None:
+    assert desk.table.busy_refusal() is None
+    desk.drive(sine(1.0))
+    busy = desk.table.busy_refusal()
+    assert busy is not None
+    assert (busy.index, "has a controller already" in busy.text) == (Refusal.INPUT, True)
+    desk.wait(0.6)
+    desk.table.drop_controller("gone", desk.now)
+    busy = desk.table.busy_refusal()
+    assert busy is not None
+    assert (busy.index, "still coming to rest" in busy.text) == (Refusal.RESTING, True)
+    desk.rest()
+    assert desk.table.busy_refusal() is None
+    desk.drive(sine(0.5, f=3.0))
+    assert not desk.table.latched_reason
+    desk.wait(0.2)
+    lives = read_flight_record(desk.folder / "box")
+    assert [life.missing for life in lives] == [0, 0]
+    np.testing.assert_array_equal(lives[1].command_m[:400], sine(0.2, f=3.0) / SCALE)
+    assert lives[1].notes[0] == (0, "claimed; controller lost at sample 1201: gone")
+
+
+def test_who_goes_before_the_start_leaves_it_free(desk: Desk) -> None:
+    desk.say(claim(), values_message(MessageKind.QUEUE, sine(1.0)))
+    desk.wait(29.0, beats=False)
+    assert desk.table.is_claimed
+    desk.wait(2.0, beats=False)
+    assert not desk.table.is_claimed
+    desk.say(claim(), MachineMessage(MessageKind.RELEASE))
+    assert not desk.table.is_claimed
+    assert not desk.table.latched_reason
+
+
+@pytest.mark.parametrize(
+    ("message", "why"),
+    [
+        (claim(RIG.model_copy(update={"sensors": RIG.sensors[:3]})), "sensors.* differs"),
+        (
+            claim(parse_toml(TEXT.replace("bits = 18", "bits = 16"), RigConfig, "")),
+            "output.* differs",
+        ),
+        (claim(rate_hz=1234.0), "1234"),
+        (claim(rate_hz=1e300), "allowed: 1000, 2000, 4000"),
+    ],
+)
+def test_a_claim_that_does_not_fit_is_refused(
+    desk: Desk, message: MachineMessage, why: str
+) -> None:
+    (answer,) = desk.say(message)
+    assert (answer.kind, answer.index) == (MessageKind.REFUSED, Refusal.INPUT)
+    assert re.search(why, answer.text)
+    assert not desk.table.is_claimed
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        MachineMessage(MessageKind.START),
+        MachineMessage(MessageKind.GRANTED),
+        text_message(MessageKind.CLAIM, "{}"),
+        text_message(MessageKind.CLAIM, "["),
+        MachineMessage(MessageKind.CLAIM, 0, b"\xff"),
+        claim(rate_hz=math.nan),
+        claim(specimen={"mass_kg": -1.0, "gap_mm": 4.0}),
+        claim(sensors=[]),
+    ],
+)
+def test_a_claim_that_is_none_is_garbage(desk: Desk, message: MachineMessage) -> None:
+    with pytest.raises(ProtocolError):
+        desk.say(message)
+    assert not desk.table.is_claimed
+
+
+@pytest.mark.parametrize(
+    ("message", "refusal"),
+    [
+        (MachineMessage(MessageKind.QUEUE, 5000, b"1234567"), None),
+        (MachineMessage(MessageKind.TAKEN, 0), None),
+        (MachineMessage(MessageKind.PLAYED, 0), None),
+        (claim(), None),
+        (MachineMessage(MessageKind.QUEUE, 5000), Refusal.VALUE),
+        (values_message(MessageKind.QUEUE, np.array([np.nan]), 5000), Refusal.VALUE),
+        (values_message(MessageKind.QUEUE, np.array([0.0]), -(2**62)), Refusal.VALUE),
+        (values_message(MessageKind.QUEUE, np.array([0.0]), 10), Refusal.VALUE),
+        (MachineMessage(MessageKind.TARE, -1), Refusal.VALUE),
+        (MachineMessage(MessageKind.TARE, 2**40), Refusal.VALUE),
+        (MachineMessage(MessageKind.START), Refusal.ORDER),
+    ],
+)
+def test_nonsense_does_not_reach_the_table(
+    desk: Desk, message: MachineMessage, refusal: Refusal | None
+) -> None:
+    volts = sine(1.0)
+    desk.drive(volts)
+    desk.wait(0.2)
+    if refusal is None:
+        with pytest.raises(ProtocolError):
+            desk.say(message)
+    else:
+        (answer,) = desk.say(message)
+        assert (answer.kind, answer.index) == (MessageKind.REFUSED, refusal)
+    desk.wait(0.2)
+    desk.table.drop_controller("enough", desk.now)
+    desk.rest()
+    (life,) = read_flight_record(desk.folder / "box")
+    np.testing.assert_array_equal(life.command_m[: volts.size], volts / SCALE)
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.sampled_from([*MessageKind]),
+    st.integers(-(2**63), 2**63 - 1),
+    st.one_of(st.binary(max_size=64), st.floats().map(lambda x: np.array([x]).tobytes())),
+)
+def test_whatever_is_said_the_table_answers_or_calls_it_garbage(
+    tmp_path_factory: pytest.TempPathFactory, kind: MessageKind, index: int, payload: bytes
+) -> None:
+    desk = Desk(tmp_path_factory.mktemp("desk"))
+    for drives in (False, True):
+        if drives:
+            desk.drive(sine(0.1))
+        with contextlib.suppress(ProtocolError):
+            desk.say(MachineMessage(kind, index, payload))
+        if desk.table.is_claimed:
+            desk.wait(0.02)
+
+
+def test_a_command_far_ahead_does_not_fill_the_memory(desk: Desk) -> None:
+    desk.drive(sine(1.0))
+    (answer,) = desk.say(values_message(MessageKind.QUEUE, np.zeros(2), 2**62))
+    assert (answer.kind, answer.index) == (MessageKind.REFUSED, Refusal.VALUE)
+    assert "at most" in answer.text
+
+
+def test_late_samples_are_handed_over_late_and_in_order(tmp_path: Path) -> None:
+    desk = Desk(tmp_path, TEXT + LATE)
+    desk.drive(sine(1.0))
+    came: list[tuple[int, float]] = []
+    for _ in range(100):
+        desk.heard.clear()
+        desk.wait(TICK_S)
+        came += [(one.index, desk.now) for one in desk.heard]
+    indices = [index for index, _ in came]
+    assert indices == sorted(indices)
+    at = next(now for index, now in came if index + 10 > 400)
+    assert at - 100.2 == pytest.approx(0.1, abs=2 * TICK_S)
+    after = next(now for index, now in came if index > 800)
+    assert after - 100.0 - 801 / RATE < 2 * TICK_S
+
+
+def test_a_machine_that_stalls_still_plays_and_remembers(tmp_path: Path) -> None:
+    desk = Desk(tmp_path, TEXT + STALL)
+    desk.drive(sine(1.0))
+    desk.wait(0.6)
+    assert sum(one.values.size for one in desk.heard) // len(RIG.sensors) <= 400
+    desk.table.drop_controller("it heard nothing", desk.now)
+    desk.rest()
+    (life,) = read_flight_record(desk.folder / "box")
+    assert life.missing == 0
+    assert life.samples.shape[1] > 2000
+    assert life.command_m[-1] == 0.0
+
+
+def test_a_black_box_that_is_cut_off_is_readable(desk: Desk) -> None:
+    desk.drive(sine(1.0))
+    desk.wait(0.5)
+    path = desk.folder / "box"
+    whole = read_flight_record(path)[0].samples
+    path.write_bytes(path.read_bytes()[:-100])
+    (life,) = read_flight_record(path)
+    assert life.missing == 0
+    count = life.samples.shape[1]
+    assert whole.shape[1] - 20 <= count < whole.shape[1]
+    np.testing.assert_array_equal(life.samples, whole[:, :count])
+
+
+def test_a_black_box_overwrites_nothing_and_names_what_is_none(tmp_path: Path) -> None:
+    path = tmp_path / "box"
+    path.write_text("something else, long enough for a header")
+    with pytest.raises(InputError, match="will not be overwritten"):
+        FlightRecorder(path, print)
+    with pytest.raises(InputError, match="not a flight record") as error:
+        read_flight_record(path)
+    assert error.value.where == str(path)
+    with pytest.raises(InputError, match="cannot write"):
+        FlightRecorder(tmp_path / "none" / "box", print)

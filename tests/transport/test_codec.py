@@ -1,0 +1,299 @@
+"""The one encoder: every item comes back to the bit, and bytes that are no item are refused."""
+
+import struct
+import subprocess
+import sys
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, get_args, get_origin, get_type_hints
+
+import numpy as np
+import pytest
+from google.protobuf.descriptor import FieldDescriptor
+from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from table_io.block import Block
+from table_io.records import (
+    RECORD_TYPES,
+    CycleExtremes,
+    Extremes,
+    PrcPoint,
+    Record,
+    RunStart,
+    SampleGap,
+)
+from twin.transport import codec
+from twin.transport import shaketwin_pb2 as pb
+from twin.transport.codec import Item, WireError, decode_item, encode_item, topic_for
+
+STREAM = Path(codec.__file__).parent
+ODD = (float("nan"), float("inf"), float("-inf"), -0.0, 5e-324, 1.7976931348623157e308)
+
+
+@cache
+def anything_like(hint: Any) -> st.SearchStrategy[Any]:
+    """Values of a type as it stands in the records."""
+    if get_origin(hint) is UnionType:
+        return st.one_of(*(anything_like(arg) for arg in get_args(hint)))
+    if get_origin(hint) is tuple:
+        return st.lists(anything_like(get_args(hint)[0]), max_size=4).map(tuple)
+    if get_origin(hint) is dict:
+        return st.dictionaries(*(anything_like(arg) for arg in get_args(hint)), max_size=4)
+    if is_dataclass(hint):
+        hints = get_type_hints(hint)
+        return st.builds(hint, **{one.name: anything_like(hints[one.name]) for one in fields(hint)})
+    return {
+        NoneType: st.none(),
+        int: st.integers(0, codec.MAX_SAMPLE_INDEX),
+        bool: st.booleans(),
+        float: st.one_of(st.sampled_from(ODD), st.floats()),
+        str: st.text(max_size=20),
+    }[hint]
+
+
+@st.composite
+def any_block(draw: st.DrawFn) -> Block:
+    channels = tuple(draw(st.lists(st.text(max_size=8), max_size=4)))
+    samples = draw(st.integers(0, 30))
+    size = len(channels) * samples
+    numbers = st.one_of(st.sampled_from(ODD), st.floats())
+    values = draw(st.lists(numbers, min_size=size, max_size=size))
+    whole = st.lists(st.integers(-1, 2**40), min_size=samples, max_size=samples)
+    labels = [np.array(draw(whole), dtype=np.int64) for _ in range(3)]
+    return Block(
+        draw(st.sampled_from(sorted(codec.BLOCK_TOPICS))),
+        draw(st.integers(0, codec.MAX_SAMPLE_INDEX - samples)),
+        draw(st.floats(1.0, 1e6)),
+        channels,
+        np.array(values, dtype=np.float64).reshape(len(channels), samples),
+        *labels,
+    )
+
+
+def bits(value: Any) -> Any:
+    """The value with every float replaced by its eight bytes, so that equal means to the bit."""
+    if isinstance(value, float):
+        return struct.pack("<d", value)
+    if isinstance(value, tuple):
+        return tuple(bits(one) for one in value)
+    if isinstance(value, dict):
+        return {key: bits(one) for key, one in value.items()}
+    if is_dataclass(value):
+        return type(value), tuple(bits(getattr(value, one.name)) for one in fields(value))
+    return value
+
+
+def returned(item: Item) -> Item:
+    """The item after a way through bytes."""
+    name, back = decode_item(topic_for(item), encode_item(item, "run-7"))
+    assert name == (item.run if isinstance(item, RunStart) else "run-7")
+    return back
+
+
+@pytest.mark.parametrize("kind", RECORD_TYPES, ids=lambda kind: kind.__name__)
+def test_every_record_comes_back_to_the_bit(kind: type) -> None:
+    @given(anything_like(kind))
+    @settings(max_examples=40, deadline=None)
+    def law(record: Record) -> None:
+        back = returned(record)
+        assert bits(back) == bits(record)
+        assert encode_item(back, "run-7") == encode_item(record, "run-7")
+
+    law()
+
+
+@given(any_block())
+@settings(max_examples=80, deadline=None)
+def test_every_block_comes_back_to_the_bit(block: Block) -> None:
+    back = returned(block)
+    assert isinstance(back, Block)
+    assert back.is_identical(block)
+    assert back.values.shape == block.values.shape
+    assert encode_item(back, "run-7") == encode_item(block, "run-7")
+
+
+def test_what_is_missing_is_not_what_is_empty() -> None:
+    none = CycleExtremes(20, 1, 0, 3, 100, None, None)
+    zeros = Extremes(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, (), ())
+    empty = CycleExtremes(20, 1, 0, 3, 100, zeros, None)
+    assert returned(none) == none
+    assert returned(empty) == empty
+    assert encode_item(none, "") != encode_item(empty, "")
+    point = PrcPoint(20, 1, "forward", 2.0, None, None, -0.0, float("nan"), 0.0)
+    assert bits(returned(point)) == bits(point)
+
+
+def test_the_order_in_a_dictionary_changes_no_byte() -> None:
+    def start(names: str) -> RunStart:
+        tare = {name: float(ord(name)) for name in names}
+        return RunStart(
+            0, "run", "n", "table", "", "", "", 2e3, 20, (), (), 0, tare, {}, "", "", 0.0
+        )
+
+    letters = "abcdefghijklmnop"
+    assert encode_item(start(letters), "") == encode_item(start(letters[::-1]), "")
+
+
+def test_every_kind_has_a_topic_of_its_own() -> None:
+    assert set(codec.RECORD_TOPICS) == set(RECORD_TYPES) == set(get_args(Record))
+    topics = [*codec.BLOCK_TOPICS.values(), *codec.RECORD_TOPICS.values()]
+    assert len(set(topics)) == len(topics)
+    assert set(codec.TOPIC_TYPES) == set(topics)
+    assert set(codec.item_types()) == set(codec.TOPIC_TYPES.values())
+    for stream, name in codec.BLOCK_TOPICS.items():
+        empty = np.zeros(0, dtype=np.int64)
+        block = Block(stream, 0, 2e3, ("a",), np.zeros((1, 0)), empty, empty, empty)
+        assert topic_for(block) == name
+
+
+def cards() -> list[type]:
+    """Every dataclass that travels, the nested ones included."""
+    return [kind for kind in codec.MESSAGE_NAMES if kind is not Block]
+
+
+def wanted(hint: Any) -> tuple[str, str]:
+    """(kind, "one" | "optional" | "many" | "map") that a proto field must have for a type hint."""
+    if get_origin(hint) is UnionType:
+        return wanted(next(arg for arg in get_args(hint) if arg is not NoneType))[0], "optional"
+    if get_origin(hint) is tuple:
+        return wanted(get_args(hint)[0])[0], "many"
+    if get_origin(hint) is dict:
+        return " to ".join(wanted(arg)[0] for arg in get_args(hint)), "map"
+    return codec.MESSAGE_NAMES.get(hint, hint.__name__), "one"
+
+
+def found(field: FieldDescriptor) -> tuple[str, str]:
+    """The same of a proto field."""
+    kinds = {
+        FieldDescriptor.CPPTYPE_INT64: "int",
+        FieldDescriptor.CPPTYPE_UINT64: "int",
+        FieldDescriptor.CPPTYPE_DOUBLE: "float",
+        FieldDescriptor.CPPTYPE_BOOL: "bool",
+        FieldDescriptor.CPPTYPE_STRING: "str",
+    }
+    if field.message_type is None:
+        return kinds[field.cpp_type], "many" if field.is_repeated else "one"
+    if field.message_type.GetOptions().map_entry:
+        parts = field.message_type.fields_by_name
+        return f"{found(parts['key'])[0]} to {found(parts['value'])[0]}", "map"
+    return field.message_type.name, "many" if field.is_repeated else "optional"
+
+
+@pytest.mark.parametrize("kind", cards(), ids=lambda kind: kind.__name__)
+def test_the_schema_has_the_fields_of_the_record_and_no_other(kind: type) -> None:
+    hints = get_type_hints(kind)
+    record = {one.name: wanted(hints[one.name]) for one in fields(kind)}
+    if kind in RECORD_TYPES:
+        record["run"] = ("str", "one")  # the wire adds the run to what does not name it itself
+    message = pb.DESCRIPTOR.message_types_by_name[codec.MESSAGE_NAMES[kind]]
+    assert {field.name: found(field) for field in message.fields} == record
+
+
+def test_the_schema_has_the_fields_of_a_block_and_no_other() -> None:
+    message = pb.DESCRIPTOR.message_types_by_name["Block"]
+    names = {one.name for one in fields(Block)} - {"values"}  # they stand in the channels
+    assert {field.name for field in message.fields} == {*names, "run"}
+    channel = {field.name for field in message.fields_by_name["channels"].message_type.fields}
+    assert channel == {"name", "values"}
+    messages = {codec.MESSAGE_NAMES[kind] for kind in cards()} | {"Block", "Channel"}
+    assert set(pb.DESCRIPTOR.message_types_by_name) == messages
+
+
+def refused_or_an_item(name: str, payload: bytes) -> bool:
+    """True if the bytes are refused in the words of the codec, or are an item of that topic."""
+    try:
+        _, item = decode_item(name, payload)
+    except WireError as error:
+        return str(error).startswith(f"{name}: not a ")
+    return topic_for(item) == name
+
+
+@given(name=st.sampled_from(sorted(codec.TOPIC_TYPES)), payload=st.binary(max_size=200))
+@settings(max_examples=300, deadline=None)
+def test_garbage_is_refused_or_is_an_item(name: str, payload: bytes) -> None:
+    assert refused_or_an_item(name, payload)
+
+
+@given(st.data())
+@settings(max_examples=150, deadline=None)
+def test_damaged_bytes_are_refused_or_are_an_item(data: st.DataObject) -> None:
+    item = data.draw(any_block() if data.draw(st.booleans()) else anything_like(PrcPoint))
+    payload = bytearray(encode_item(item, "run"))
+    for _ in range(data.draw(st.integers(1, 3))):
+        payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
+    cut = data.draw(st.integers(0, len(payload)))
+    assert refused_or_an_item(topic_for(item), bytes(payload[:cut]))
+
+
+def test_bytes_on_the_wrong_topic_are_refused() -> None:
+    labels = np.zeros(2, dtype=np.int64)
+    block = Block("meas", 0, 2e3, ("a",), np.ones((1, 2)), labels, labels, labels)
+    with pytest.raises(WireError, match=r"/twin/pred: not a Block: .*'meas'"):
+        decode_item(codec.PRED_TOPIC, encode_item(block, "run"))
+    with pytest.raises(WireError, match=r"/rig/nothing: unknown topic; known: /rig/meas"):
+        decode_item("/rig/nothing", encode_item(SampleGap(0, 1, "", "lost"), "run"))
+
+
+@pytest.mark.parametrize("cut", ["values", "step"])
+def test_a_block_with_unequal_lengths_is_refused(cut: str) -> None:
+    message = pb.Block(
+        run="r",
+        stream="meas",
+        rate_hz=2e3,
+        channels=[pb.Channel(name=name, values=[1.0, 2.0]) for name in "ab"],
+        step=[0, 0],
+        label=[0, 0],
+        cycle=[0, 0],
+    )
+    assert len(decode_item(codec.MEAS_TOPIC, message.SerializeToString())[1]) == 2  # type: ignore[arg-type]
+    del (message.channels[1].values if cut == "values" else message.step)[-1:]
+    with pytest.raises(WireError, match="not a Block"):
+        decode_item(codec.MEAS_TOPIC, message.SerializeToString())
+
+
+def test_a_record_that_the_schema_does_not_know_cannot_slip_through(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    @dataclass(frozen=True)
+    class Gap:  # as if a field had been added to the record and not to the schema
+        index: int
+        colour: str
+
+    monkeypatch.setitem(codec.MESSAGE_NAMES, Gap, "Gap")
+    with pytest.raises(ValueError, match="colour"):
+        encode_item(Gap(1, "red"), "run")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", codec.item_types(), ids=lambda kind: kind.__name__)
+def test_the_schema_in_a_log_is_that_of_its_messages(kind: type) -> None:
+    name, data = codec.message_schema(kind)
+    (file,) = FileDescriptorSet.FromString(data).file
+    assert name == f"{file.package}.{codec.MESSAGE_NAMES[kind]}"
+    assert codec.MESSAGE_NAMES[kind] in {message.name for message in file.message_type}
+
+
+def test_the_generated_module_is_what_the_proto_file_says(tmp_path: Path) -> None:
+    pytest.importorskip("grpc_tools", reason='needs the extra "proto" to read shaketwin.proto')
+    out = tmp_path / "descriptors"
+    command = [sys.executable, "-m", "grpc_tools.protoc", f"-I{STREAM}"]
+    command += [f"--descriptor_set_out={out}", str(STREAM / "shaketwin.proto")]
+    subprocess.run(command, check=True)
+    (written,) = FileDescriptorSet.FromString(out.read_bytes()).file
+    generated = FileDescriptorProto()
+    pb.DESCRIPTOR.CopyToProto(generated)
+    assert plain(generated) == plain(written)
+
+
+def plain(file: FileDescriptorProto) -> FileDescriptorProto:
+    """The descriptor without its JSON names, which only some tools write."""
+    waiting = list(file.message_type)
+    while waiting:
+        message = waiting.pop()
+        waiting.extend(message.nested_type)
+        for field in message.field:
+            field.ClearField("json_name")
+    return file

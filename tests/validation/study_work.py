@@ -1,0 +1,29 @@
+"""What processes of a crew do in tests: they are sent by name, so it stands in a module."""
+
+import os
+import signal
+from typing import Any
+
+from twin.validation.study.scoring import score_verdict
+
+CLEAN: dict[str, Any] = {
+    "cell": "none/1%", "kind": "none", "noise": 0.01, "size": 0.0, "reached": 1.0,
+    "region": None, "ended": "complete", "sized": True, "effects": [],
+}  # fmt: skip
+
+
+def fine(number: int) -> dict[str, Any]:
+    return score_verdict({"verdict": "none"}, CLEAN | {"number": number}) | {"process": os.getpid()}
+
+
+def deadly(number: int) -> dict[str, Any]:
+    """Dies of an odd number."""
+    if number % 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return fine(number)
+
+
+def endless(number: int) -> dict[str, Any]:
+    """Never comes back."""
+    signal.pause()
+    return fine(number)

@@ -1,0 +1,73 @@
+"""Rivals on the same readings: what they name, how far down they come, and the table of it."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.identification.played import SNM, hidden, log
+from tests.validation.test_study_scores import about, verdict
+from twin.validation.study import baselines
+from twin.validation.study.baseline_terms import make_regression_problem
+from twin.validation.study.comparison_tables import format_baseline_table
+from twin.validation.study.scoring import score_verdict
+
+
+def test_without_the_packages_the_study_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(baselines, "find_spec", lambda package: None)
+    assert baselines.find_baselines() == {}
+    assert "not installed: pysindy, sklearn; pip install" in baselines.describe_missing()
+    monkeypatch.setattr(baselines, "find_spec", lambda package: True)
+    assert set(baselines.find_baselines()) == {"pysindy", "blackbox"}
+    assert baselines.describe_missing() == ""
+
+
+def test_where_nothing_is_hidden_the_base_makes_the_forces() -> None:
+    """Rows, noise and states are those of discovery: with the true base, noise is left."""
+    bench = make_regression_problem(log(), SNM)
+    left = []
+    for one in bench.regressions:
+        found = np.linalg.lstsq(one.base, one.force, rcond=None)[0]
+        left.append(one.force - one.base @ found)
+    gap = bench.gap(left)
+    assert gap["held_out_after"] == pytest.approx(gap["held_out_before"], rel=0.01)
+    assert gap["held_out_after"] == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "effect, values",
+    [
+        ("cubic_stiffness", {"k3": 1e9}),
+        ("gap_drift", {"rate": 3e-5}),
+        ("bumper_asymmetry", {"ratio": 1.2}),
+    ],
+)
+def test_sparse_regression_names_what_the_state_makes(effect: str, values: Any) -> None:
+    sindy = pytest.importorskip("twin.validation.study.baseline_sindy", exc_type=ImportError)
+    found = sindy.select_terms(make_regression_problem(log(hidden(effect, **values)), SNM))
+    assert found["effects"][0]["id"] == effect
+    assert found["gap"]["held_out_after"] < 0.7 * found["gap"]["held_out_before"]
+
+
+def test_boosted_trees_close_a_gap_that_has_no_name() -> None:
+    blackbox = pytest.importorskip("twin.validation.study.baseline_blackbox", exc_type=ImportError)
+    truth = hidden("cubic_stiffness", k3=1e9)
+    found = blackbox.fit_boosted_trees(make_regression_problem(log(truth), SNM))
+    assert found["effects"] == []
+    assert found["gap"]["held_out_after"] < 0.7 * found["gap"]["held_out_before"]
+
+
+def test_the_table_lays_them_side_by_side() -> None:
+    true = {"name": "table_tilt", "parameters": {}, "vanishing": {}}
+    case = about("single", true)
+    rows = [
+        score_verdict(verdict("named", "table_tilt"), case) | {"held_out": 1.01, "rivals": {
+            "pysindy": score_verdict(verdict("named", "mass_error"), case) | {"held_out": 1.5},
+            "blackbox": score_verdict(verdict("unexplained"), case) | {"held_out": 2.25},
+        }},
+        score_verdict(verdict("none"), about("none")) | {"held_out": 1.0},
+    ]  # fmt: skip
+    lines = list(format_baseline_table(rows))
+    assert "| table_tilt | 1/1 | 0/1 | 1.010 | 1.500 | 2.250 |" in lines
+    assert not any("(nothing)" in one for one in lines), "no rival saw that case"
+    assert list(format_baseline_table(rows[1:])) == []

@@ -1,0 +1,270 @@
+"""The blind cases: drawn from their numbers alone, of the size asked for, and silent about it."""
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from table_io.block import Label
+from table_io.config.base import parse_toml
+from table_io.errors import InputError
+from table_io.sim.ground_truth import GroundTruth
+from twin.recording.reader import read_recording as read_log
+from twin.run.recordings import read_recorded_config
+from twin.validation.study import amplitude_search, generation, strata
+from twin.validation.study.amplitude_search import (
+    BaselineResidual,
+    apply_sensor_effect,
+    evaluate_residual,
+    find_share,
+    max_share,
+    scale_parameters,
+)
+from twin.validation.study.evaluation import evaluate_case
+from twin.validation.study.generation import CasePaths, generate_case
+from twin.validation.study.rig_setup import (
+    PROFILE,
+    StudySignals,
+    compute_noise_rms,
+    make_rig_toml,
+    simulate_signals,
+)
+from twin.validation.study.strata import CELLS, NUMBERS_PER_CELL, Case, draw_case, list_case_numbers
+
+
+def case_in(cell: str, place: int = 0) -> Case:
+    names = [one.name for one in CELLS]
+    return draw_case(NUMBERS_PER_CELL * names.index(cell) + place)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Case, CasePaths]:
+    case = case_in("single/coulomb_friction/3/1%")
+    return case, generate_case(case, tmp_path_factory.mktemp("study"))
+
+
+def test_a_case_is_drawn_from_its_number_alone() -> None:
+    numbers = list_case_numbers(2)
+    alone = draw_case(numbers[100])
+    for number in numbers[:100]:
+        draw_case(number)
+    assert draw_case(numbers[100]) == alone
+    assert draw_case(numbers[100]).base == alone.base
+    every = [draw_case(number) for number in numbers]
+    assert len({one.label for one in every}) == len({one.salt for one in every}) == len(every)
+    assert {len(one.label) for one in every} == {10}
+
+
+def test_every_effect_size_noise_and_kind_has_its_cells() -> None:
+    counts = {kind: sum(c.kind == kind for c in CELLS) for kind in ("none", "single", "unknown")}
+    assert counts == {"none": 3, "single": 13 * 9, "unknown": 9 * 9}
+    assert len({cell.name for cell in CELLS}) == len(CELLS)
+    assert len(list_case_numbers(10, ["none/*"])) == 150
+    assert len(list_case_numbers(10, ["single/*/3/1%"])) == 130
+    first = list_case_numbers(3, ["single/*/3/1%"])[:13]
+    assert [number % NUMBERS_PER_CELL for number in first] == [0] * 13, (
+        "one of each cell comes first"
+    )
+    with pytest.raises(InputError) as error:
+        list_case_numbers(1, ["singles/*"])
+    assert (error.value.key, error.value.value) == ("--cells", "singles/*")
+
+
+def test_the_base_is_scattered_within_five_per_cent_in_clean_cases_too() -> None:
+    for cell in ("none/1%", "single/cubic_stiffness/3/1%"):
+        base = np.array([list(case_in(cell, k).base.values()) for k in range(200)])
+        assert np.abs(base - 1.0).max() <= 0.05
+        assert (base.std(axis=0) > 0.024).all()
+
+
+def test_a_pair_is_two_effects_of_the_library() -> None:
+    drawn = [case_in("pair/3/1%", k).planted for k in range(50)]
+    names = [tuple(one.effect.name for one in pair) for pair in drawn]
+    assert all(len(set(pair)) == 2 for pair in names)
+    assert len(set(names)) > 30
+
+
+@pytest.mark.parametrize(
+    "cell", ["single/mass_error/3/1%", "sensor/sensor_gain.mass_acc_m_s2/1.5/0.2%"]
+)
+def test_sizes_land_where_they_were_asked(cell: str) -> None:
+    """The residual of a refitted baseline over the noise, from signals with that noise on."""
+    case = case_in(cell)
+    shares, left = generation._find_shares(case)
+    assert left.size == pytest.approx(case.cell.size, rel=0.1)
+    assert noisy_size(case, shares[0]) == pytest.approx(case.cell.size, rel=0.25)
+
+
+def test_the_size_of_the_case_that_was_made(made: tuple[Case, CasePaths]) -> None:
+    case, places = made
+    about = json.loads(places.about.read_text())
+    assert about["reached"] == pytest.approx(3.0, rel=0.1)
+    fc = about["effects"][0]["parameters"]["fc"]
+    share = fc / case.planted[0].effect.amplitudes[0].typical
+    assert noisy_size(case, share) == pytest.approx(3.0, rel=0.25)
+
+
+def test_noise_alone_has_size_one() -> None:
+    signals = simulate_signals(make_rig_toml(0.0))
+    for noise in strata.NOISE_LEVELS:
+        assert noisy(signals, signals, compute_noise_rms(noise)).rms == pytest.approx(1.0, abs=0.05)
+
+
+def noisy_size(case: Case, share: float) -> float:
+    (one,) = case.planted
+    signals = generation._simulate_truth(case, case.planted, [share])
+    return noisy(
+        apply_sensor_effect(one, share, signals), signals, compute_noise_rms(case.cell.noise)
+    ).rms
+
+
+def noisy(seen: StudySignals, truly: StudySignals, rms: Mapping[str, float]) -> BaselineResidual:
+    """What the baseline leaves of noisy readings over their noise; the noise is white to 225 Hz."""
+    draw, size = np.random.default_rng(1), seen.step.size
+    inside = np.fft.rfftfreq(size, 1e-3) <= amplitude_search.BANDWIDTH_HZ
+    noise = {
+        name: np.fft.irfft(np.fft.rfft(draw.normal(0.0, s, size)) * inside, size)
+        for name, s in rms.items()
+    }
+    right = seen.right + noise["force_r1_n"] + noise["force_r2_n"]
+    left = seen.left - noise["force_l1_n"] - noise["force_l2_n"]
+    channels = {name: values + noise[name] for name, values in seen.channels.items()}
+    return evaluate_residual(
+        StudySignals(channels, right, left, seen.step, seen.moving), truly, rms
+    )
+
+
+def test_an_effect_that_cannot_reach_its_size_says_what_it_reaches() -> None:
+    (one,) = case_in("single/gap_offset/10/1%").planted
+    asked: list[float] = []
+
+    def saturates(share: float) -> BaselineResidual:
+        asked.append(share)
+        return BaselineResidual(min(share, 2.0), {1.0: 1.0}, {"flight": 1.0})
+
+    share, left = find_share(one, 10.0, saturates)
+    assert left.size == pytest.approx(np.hypot(1.0, 2.0))
+    assert max(asked) <= max_share(one)
+    bounds = one.effect.amplitudes[0]
+    assert bounds.low <= scale_parameters(one, share)["offset"] <= bounds.high
+
+
+def test_what_does_not_have_its_size_is_not_played(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    case = case_in("single/gap_offset/10/1%")
+    little = BaselineResidual(2.0, {1.0: 1.0}, {"flight": 1.0})
+    monkeypatch.setattr(generation, "_find_shares", lambda case: ([1.0], little))
+    places = generate_case(case, tmp_path)
+    about = json.loads(places.about.read_text())
+    assert about["ended"] == "not played: the effect reaches size 2.24"
+    assert not about["sized"]
+    assert not places.log.exists()
+    row = evaluate_case(tmp_path, case.number, lambda shown: pytest.fail("nothing to judge"))
+    assert (row["sized"], row["reached"]) == (False, pytest.approx(5**0.5))
+
+
+def test_a_residual_that_falls_again_is_sought_before_it_falls() -> None:
+    (one,) = case_in("single/coulomb_friction/10/1%").planted
+    share, left = find_share(
+        one,
+        3.0,
+        lambda s: BaselineResidual(0.2 * s**2 if s < 4 else 0.1, {1.0: 1.0}, {"flight": 1.0}),
+    )
+    assert left.size == pytest.approx(3.0, rel=0.05)
+    assert share == pytest.approx((8.0**0.5 / 0.2) ** 0.5, rel=0.05)
+
+
+def test_the_test_shows_flight_both_branches_and_irregular_impacts() -> None:
+    signals = simulate_signals(make_rig_toml(0.0))
+    assert 55 < signals.moving.sum() / 1000 < 65
+    steps = PROFILE.sweep.steps
+    share = {
+        (one.direction, one.frequency_hz): (signals.right[signals.step == one.index] > 0).mean()
+        for one in steps
+    }
+    assert share["forward", 3.6] > 0.25
+    assert share["backward", 3.6] == 0.0
+    peaks = []
+    slow = signals.step == next(one.index for one in steps if one.frequency_hz == 1.2)
+    right = signals.right[slow]
+    onsets = np.flatnonzero((right[1:] > 0) & (right[:-1] <= 0))
+    peaks = [right[a:b].max() for a, b in zip(onsets, [*onsets[1:], right.size], strict=True)]
+    assert len(peaks) > 5
+    assert np.std(peaks) > 0.2 * np.mean(peaks), "impacts differ from one to the next"
+
+
+def test_noise_is_the_same_whatever_is_hidden() -> None:
+    assert compute_noise_rms(0.01)["mass_acc_m_s2"] == pytest.approx(0.009, rel=0.01)
+    texts = {
+        make_rig_toml(case_in(cell).cell.noise)
+        for cell in ("none/1%", "single/bouc_wen/10/1%", "unknown/appendage/1.5/1%")
+    }
+    assert len(texts) == 1
+
+
+def test_the_recording_is_whole_and_has_the_noise_of_its_cell(made: tuple[Case, CasePaths]) -> None:
+    case, places = made
+    recording = read_log(places.log)
+    assert recording.stop is not None
+    assert recording.stop.verdict == "complete"
+    whole = recording.contiguous_blocks("meas")[0]
+    rest = whole.label == Label.REST
+    first = np.flatnonzero(~rest)[0]
+    for name, rms in compute_noise_rms(case.cell.noise).items():
+        assert whole.channel(name)[:first].std() == pytest.approx(rms, rel=0.15), name
+    assert read_recorded_config(recording).model.effects == ()
+
+
+def test_nothing_that_is_shown_holds_the_truth(made: tuple[Case, CasePaths]) -> None:
+    case, places = made
+    text = (places.sealed_dir / "truth.toml").read_text()
+    truth = parse_toml(text, GroundTruth, "truth")
+    assert truth.effects[0].id == "coulomb_friction"
+    numbers = [n for n in re.findall(r"= ([-\d.e]+)$", text, re.M) if len(n) > 4]
+    assert len(numbers) >= 6
+    words = ["coulomb", case.salt, case.cell.name]
+    secrets = [*map(re.escape, words), *(rf"\b{one}\b" for one in (*numbers, case.number))]
+    shown = list(places.case_dir.iterdir())
+    assert {path.name for path in shown} == {"log.mcap", "profile.toml", "model.toml"}
+    start = read_log(places.log).start
+    texts = [*(path.read_bytes() for path in shown), *(
+        one.encode() for one in (start.rig_toml, start.profile_toml, start.model_toml, start.run)
+    )]  # fmt: skip
+    for secret in secrets:
+        where = [k for k, held in enumerate(texts) if re.search(secret.encode(), held)]
+        assert not where, secret
+    assert f'truth_sha256 = "{generation._sha256(text)}"' in start.rig_toml
+
+
+def test_a_case_that_was_cut_off_is_made_anew_and_the_same(made: tuple[Case, CasePaths]) -> None:
+    case, places = made
+    before, samples = places.about.read_text(), read_log(places.log).contiguous_blocks("meas")[0]
+    sealed = (places.sealed_dir / "truth.toml").read_text()
+    assert generate_case(case, places.root) == places
+    places.about.unlink()
+    places.log.write_bytes(places.log.read_bytes()[:1000])
+    generate_case(draw_case(case.number), places.root)
+    assert json.loads(places.about.read_text()) == json.loads(before)
+    assert (places.sealed_dir / "truth.toml").read_text() == sealed
+    assert read_log(places.log).contiguous_blocks("meas")[0].is_identical(samples)
+
+
+def test_every_kind_that_can_be_hidden_has_what_the_generator_needs() -> None:
+    for cell in CELLS:
+        for hidden in cell.effects:
+            assert hidden.amplitudes, hidden.name
+    for (effect, name), (low, high) in strata.SHAPE_RANGES.items():
+        kinds = [one for one in strata.EFFECT_DEFINITIONS if one.id == effect]
+        found = [q for kind in kinds for q in kind.parameters if q.name == name]
+        assert found, (effect, name)
+        assert all(q.low <= low < high <= q.high for q in found), (effect, name)
+
+
+def test_the_root_may_be_anywhere(tmp_path: Path) -> None:
+    places = CasePaths(tmp_path, "ab")
+    assert places.case_dir.is_relative_to(tmp_path / "cases")
+    assert places.sealed_dir.is_relative_to(tmp_path / "sealed")

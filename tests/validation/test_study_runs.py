@@ -1,0 +1,139 @@
+"""A study as it runs: processes that die, what is done already, verdicts that fail, bad input."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from table_io.errors import InputError
+from tests.validation import study_work
+from tests.validation.test_study_scores import OTHER, TRUE, about, verdict
+from twin.validation.study import evaluation, worker_pool
+from twin.validation.study.command import run_cases, run_discovery_study
+from twin.validation.study.report import RESULTS_FILE, TABLE_FILE, read_rows
+from twin.validation.study.strata import draw_case
+from twin.validation.study.worker_pool import map_in_processes
+
+Json = dict[str, Any]
+
+
+def test_a_study_goes_on_after_a_line_that_was_cut(tmp_path: Path) -> None:
+    """Done ones are not done again, failed and cut ones are; nothing that was found is lost."""
+    there = [study_work.fine(0), study_work.fine(2) | {"failed": "why"}]
+    text = "".join(json.dumps(one) + "\n" for one in there) + '{"number": 4, "ri'
+    (tmp_path / RESULTS_FILE).write_text(text)
+    assert run_cases(tmp_path, [0, 2, 4], 1, study_work.fine) == 0
+    after = read_rows(tmp_path / RESULTS_FILE)
+    assert [one["number"] for one in after] == [0, 2, 2, 4]
+    assert after[0]["process"] == there[0]["process"]
+    assert "failed" not in after[2]
+    assert (tmp_path / RESULTS_FILE).read_text().startswith(text)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_process_that_dies_loses_only_its_case(workers: int) -> None:
+    found = {
+        one["number"]: one
+        for one in map_in_processes(range(4), workers, study_work.deadly, lambda: False)
+    }
+    assert sorted(found) == [0, 1, 2, 3]
+    for number, row in found.items():
+        assert ("failed" in row) == bool(number % 2)
+    assert found[1]["failed"] == "its process died (exit code -9)"
+
+
+def test_a_case_that_does_not_end_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker_pool, "MAX_CASE_S", 0.3)
+    found = list(map_in_processes([1, 3], 1, study_work.endless, lambda: False))
+    assert [one["number"] for one in found] == [1, 3]
+    assert all(one["failed"] == "took longer than 0.3 s" for one in found)
+
+
+def test_a_stop_hands_out_what_is_under_way() -> None:
+    asked: list[int] = []
+
+    def stop() -> bool:
+        return len(asked) > 0
+
+    found = []
+    for row in map_in_processes(range(100), 1, study_work.fine, stop):
+        found.append(row["number"])
+        asked.append(1)
+    assert found == [0, 1]
+
+
+def test_a_verdict_that_fails_is_a_miss_that_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    case = draw_case(3000)
+    places = evaluation.CasePaths(tmp_path, case.label)
+    for folder in (places.case_dir, places.sealed_dir):
+        folder.mkdir(parents=True)
+    places.about.write_text(json.dumps(about("single", TRUE, number=3000)))
+
+    def broken(shown: Path) -> Json:
+        raise ValueError("no way")
+
+    row = evaluation.evaluate_case(tmp_path, 3000, broken)
+    assert row["failed"] == "ValueError: no way"
+    assert (row["top1"], row["right"], row["sized"]) == (False, False, True)
+
+    def told(shown: Path) -> Json:
+        assert shown == places.case_dir, "a method sees only what is shown"
+        return verdict("named", "bumper_hardening", seconds=math.nan)
+
+    monkeypatch.setattr(evaluation, "BASELINES", {"rival": broken})
+    monkeypatch.setattr(evaluation, "fit_true_structure", lambda shown, effects: 1.05)
+    row = evaluation.evaluate_case(tmp_path, 3000, told)
+    assert row["right"]
+    assert row["after_oracle"] == 1.0
+    assert row["rivals"]["rival"]["top1"] is False
+    assert json.loads(places.verdict.read_text())["verdict"] == "named"
+    assert np.isfinite(row["seconds"])
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_of_two_effects_the_row_says_what_mark_the_lesser_leaves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: bool
+) -> None:
+    """The factor by which the error grows without it; a verdict that fails has one too."""
+    number = 294000
+    places = evaluation.CasePaths(tmp_path, draw_case(number).label)
+    for folder in (places.case_dir, places.sealed_dir):
+        folder.mkdir(parents=True)
+    places.about.write_text(json.dumps(about("pair", TRUE, OTHER, number=number)))
+    errors = {(TRUE["name"], OTHER["name"]): 1.0, (TRUE["name"],): 1.2, (OTHER["name"],): 3.0}
+    monkeypatch.setattr(evaluation, "fit_true_structure", lambda shown, names: errors[tuple(names)])
+    monkeypatch.setattr(evaluation, "BASELINES", {})
+
+    def told(shown: Path) -> Json:
+        if fails:
+            raise ValueError("no way")
+        return verdict("named", TRUE["name"])
+
+    row = evaluation.evaluate_case(tmp_path, number, told)
+    assert row["mark"] == 1.2
+    assert (row["both"], row["one"]) == (False, not fails)
+    del errors[(OTHER["name"],)]  # no model of the library has it alone
+    assert evaluation.evaluate_case(tmp_path, number, told)["mark"] is None
+
+
+def test_bad_input_is_told(tmp_path: Path) -> None:
+    for asked, key, value in (
+        ({"seeds": 0}, "--seeds", 0),
+        ({"patterns": ["nix/*"]}, "--cells", "nix/*"),
+        ({"patterns": ["999999999"]}, "case", 999999999),
+        ({"workers": 0}, "--workers", 0),
+        ({"resume": True}, "--resume", None),
+    ):
+        given: Json = {"seeds": 1, "patterns": ["none/1%"], "workers": 1, "resume": False}
+        with pytest.raises(InputError) as error:
+            run_discovery_study(tmp_path / "new", **(given | asked))
+        assert (error.value.key, error.value.value) == (key, value)
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / TABLE_FILE).touch()
+    with pytest.raises(InputError, match="has content"):
+        run_discovery_study(tmp_path / "there", 1, ["none/1%"], 1, False)

@@ -1,0 +1,201 @@
+"""A running test as a view: who comes late has all but old samples; it ends as the run does."""
+
+import socket
+import threading
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from table_io.block import Block
+from table_io.errors import InputError
+from table_io.records import Event, PrcPoint, RunStart, RunStop
+from twin.cli import view
+from twin.transport.codec import MEAS_TOPIC, TOPIC_TYPES, Item, encode_item, topic_for
+from twin.transport.zenoh_link import BusLink, open_hub, open_spoke
+from twin.viewer import live_view
+from twin.viewer.live_view import LiveView
+
+CHANNELS = ("table_disp_m",)
+START = RunStart(
+    index=0, run="r1", name="n", source="table", profile_toml="", rig_toml="", model_toml="",
+    rate_hz=2000.0, block_samples=20, channels=CHANNELS, steps=(), planned_samples=4000, tare={},
+    versions={}, host="here", started_at="", epoch_s=0.0,
+)  # fmt: skip
+STOP = RunStop(400, "complete", "played")
+TURNS = 200
+
+
+class Seen:
+    """Stands for the view: keeps what it is fed."""
+
+    def __init__(self, start: RunStart, *, serve: str) -> None:
+        self.start, self.serve = start, serve
+        self.items: list[Item] = []
+        self.closed = False
+
+    def feed(self, items: Sequence[Item]) -> None:
+        self.items += items
+
+    def close(self) -> None:
+        self.closed = True
+
+    def of(self, kind: type) -> list[Any]:
+        return [one for one in self.items if isinstance(one, kind)]
+
+
+def block(index: int) -> Block:
+    labels = tuple(np.zeros(20, dtype=np.int64) for _ in range(3))
+    return Block("meas", index, 2000.0, CHANNELS, np.full((1, 20), 1.0 * index), *labels)
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return int(probe.getsockname()[1])
+
+
+@pytest.fixture
+def ends(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[BusLink, BusLink]]:
+    """Hub of a rig that is alive, and a spoke; the view is a `Seen`."""
+    monkeypatch.setattr(live_view, "RerunView", Seen)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    hub = open_hub("rig", endpoint)
+    hub.declare(tuple(TOPIC_TYPES))
+    hub.declare_alive("r1.rig")
+    spoke = open_spoke("rig", endpoint, 5.0)
+    yield hub, spoke
+    spoke.close()
+    hub.close()
+
+
+def put(hub: BusLink, *items: Item, run: str = "r1") -> None:
+    for item in items:
+        hub.publish(topic_for(item), encode_item(item, run))
+
+
+def seen(live: LiveView) -> Seen:
+    assert isinstance(live.view, Seen)
+    return live.view
+
+
+def until(hub: BusLink, live: LiveView, done: Any) -> None:
+    """Let both turn until it is so."""
+    for _ in range(TURNS):
+        if done():
+            return
+        live.listen(0.01)
+        for _ in range(10):
+            hub.serve()
+    raise AssertionError("it never came")
+
+
+def test_who_comes_late_has_the_start_the_events_and_the_prc(ends: tuple[BusLink, BusLink]) -> None:
+    hub, spoke = ends
+    points = [PrcPoint(20 * k, k, "forward", 1.0 + k, None, None, 1.0, 1.0, 0.0) for k in range(90)]
+    put(hub, START, Event(0, "state", "checking"), *points)
+    put(hub, *(block(20 * k) for k in range(100)))
+    live = LiveView(spoke, "127.0.0.1:1")
+    until(hub, live, lambda: live.view is not None and len(seen(live).of(PrcPoint)) == 90)
+    assert (seen(live).start, seen(live).serve) == (START, "127.0.0.1:1")
+    assert seen(live).of(PrcPoint) == points
+    assert [one.text for one in seen(live).of(Event)] == ["checking"]
+    put(hub, block(2000), block(2020))
+    until(hub, live, lambda: len(seen(live).of(Block)) >= 2)
+    assert [one.index for one in seen(live).of(Block)] == [2000, 2020]  # none of the past
+    put(hub, block(2040), STOP)
+    until(hub, live, lambda: live.is_over)
+    assert [one.index for one in seen(live).of(Block)] == [2000, 2020, 2040]
+    assert live.end_reason.endswith("complete, played")
+
+
+def test_the_last_blocks_are_waited_for(
+    ends: tuple[BusLink, BusLink], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Slow:
+        """Hands a block to one who waits for it."""
+
+        def __init__(self) -> None:
+            self.left = [(MEAS_TOPIC, encode_item(block(20), "r1"))]
+
+        def get(self, seconds: float) -> tuple[str, bytes] | None:
+            return self.left.pop() if self.left and seconds >= live_view.DRAIN_S else None
+
+    hub, spoke = ends
+    live = LiveView(spoke, "127.0.0.1:1")
+    monkeypatch.setattr(live, "_blocks", Slow())
+    put(hub, START, STOP)
+    until(hub, live, lambda: live.is_over)
+    assert [one.index for one in seen(live).of(Block)] == [20]
+
+
+def test_garbage_and_another_run_are_passed_over(ends: tuple[BusLink, BusLink]) -> None:
+    hub, spoke = ends
+    live = LiveView(spoke, "127.0.0.1:1")
+    until(hub, live, lambda: hub.subscriber_progress.positions)
+    put(hub, block(0), run="r0")
+    hub.publish(MEAS_TOPIC, b"\xff" * 300)
+    hub.publish("/run/event", b"\x08")
+    put(hub, block(20))
+    until(hub, live, lambda: live.ignored == 2)
+    put(hub, START, block(0), STOP, run="r0")
+    put(hub, block(40), STOP)
+    until(hub, live, lambda: live.is_over)
+    assert [one.index for one in seen(live).of(Block)] == [20, 40]
+    assert len(seen(live).of(RunStop)) == 1
+    assert live.ignored == 5
+
+
+def test_it_ends_where_the_rig_is_gone(
+    ends: tuple[BusLink, BusLink], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hub, spoke = ends
+    live = LiveView(spoke, "127.0.0.1:1")
+    put(hub, START, block(0))
+    until(hub, live, lambda: live.view is not None)
+    monkeypatch.setattr(live_view, "MAX_SILENCE_S", 0.0)
+    live.listen(0.01)
+    assert not live.is_over  # silent, but its process is there
+    hub.undeclare_alive("r1.rig")
+    until(hub, live, lambda: live.is_over)
+    assert "rig" in live.end_reason
+
+
+def test_the_command_says_where_it_serves_and_how_it_ended(
+    ends: tuple[BusLink, BusLink],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    hub, spoke = ends
+    opened: list[str] = []
+    monkeypatch.setattr(view, "open_spoke", lambda *_: spoke)
+    monkeypatch.setattr(view, "open_viewer", lambda url: opened.append(url) or "opened")
+    over = threading.Event()
+
+    def rig() -> None:
+        put(hub, START)
+        while not over.is_set():
+            if any(name.startswith("observer.") for name in hub.list_components()) and opened:
+                put(hub, STOP)
+
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        taken = f"127.0.0.1:{other.getsockname()[1]}"
+        monkeypatch.setattr(view, "VIEW_ADDRESS", taken)
+        thread = threading.Thread(target=rig)
+        thread.start()
+        view.view_live("tcp/127.0.0.1:1", "rig")
+        over.set()
+        thread.join()
+    said = capsys.readouterr().out
+    assert "live view: rerun rerun+http://127.0.0.1:" in said
+    assert opened
+    assert taken not in opened[0]
+    assert "complete, played" in said
+
+
+def test_what_only_a_recording_can_give_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="give its LOG"):
+        view.show_view(None, tmp_path / "v.rrd", None, "tcp/127.0.0.1:1", "rig")
+    with pytest.raises(InputError, match="folder does not exist"):
+        view.show_view(None, None, tmp_path / "no" / "v.png", "tcp/127.0.0.1:1", "rig")

@@ -1,0 +1,117 @@
+"""Where the view goes: files, this machine's ports, the viewer and its picture."""
+
+import re
+import socket
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from table_io.errors import InputError
+from tests.viewer.example_run import (
+    blocks,
+    recording,
+    records,
+    scalars,
+    start,
+)
+from twin.viewer import window
+from twin.viewer.address import find_free_address, format_live_view, parse_address, viewer_url
+from twin.viewer.view import RerunView, write_rrd
+from twin.viewer.window import open_viewer, take_screenshot
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("view") / "view.rrd"
+    write_rrd(recording([*blocks(), *records()]), out)
+    return out
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return int(probe.getsockname()[1])
+
+
+def test_file_and_server_at_once(tmp_path: Path) -> None:
+    port = free_port()
+    view = RerunView(start(), save=tmp_path / "v.rrd", serve=f"127.0.0.1:{port}")
+    with pytest.raises(InputError, match=f"{port}.*in use"):
+        RerunView(start(), serve=f"127.0.0.1:{port}")
+    view.feed(blocks()[:20])
+    view.close()
+    assert scalars(tmp_path / "v.rrd", "/u/measured")[0].size == 200
+
+
+def test_without_a_display_it_says_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(window.sys, "platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert "--bind 127.0.0.1" in open_viewer("rerun+http://127.0.0.1:9876/proxy")
+    with pytest.raises(InputError, match="no such file"):
+        open_viewer(tmp_path / "none.rrd")
+    monkeypatch.setattr(window, "find_spec", lambda _: None)
+    with pytest.raises(InputError, match="pip install rerun-sdk"):
+        open_viewer("rerun+http://127.0.0.1:9876/proxy")
+
+
+def test_the_picture_of_a_running_test(tmp_path: Path) -> None:
+    address = f"127.0.0.1:{free_port()}"
+    view = RerunView(start(), serve=address)
+    items = recording([*blocks(), *records()]).items
+    view.feed([one for one in items if one.index < 8000])
+    assert drawn(viewer_url(address), tmp_path / "live.png") == []
+    view.close()
+    picture = pixels(tmp_path / "live.png")
+    height, width = picture.shape[:2]
+    assert redness(picture[: int(0.8 * height), width // 2 :]) > 300
+
+
+def drawn(source: Path | str, png: Path, at_s: float | None = None) -> list[str]:
+    """What views complain of; skips where nothing can be drawn, and nowhere else."""
+    try:
+        return take_screenshot(source, png, at_s)
+    except InputError as error:
+        if not re.search("needs a graphics library|the machine is busy", str(error)):
+            raise
+        pytest.skip(str(error))
+
+
+def pixels(path: Path) -> Any:
+    """(row, column, colour) of a picture."""
+    image = pytest.importorskip("PIL.Image")
+    return np.asarray(image.open(path).convert("RGB")).astype(int)
+
+
+def redness(picture: Any) -> int:
+    """How many pixels have the colour of what is measured."""
+    red = (picture[..., 0] > 200) & (picture[..., 1] < 140) & (picture[..., 2] < 140)
+    return int(red.sum())
+
+
+def test_the_picture(whole: Path, tmp_path: Path) -> None:
+    assert drawn(whole, tmp_path / "view.png", 4.0) == []
+    picture = pixels(tmp_path / "view.png")
+    height, width = picture.shape[:2]
+    for rows in np.array_split(np.arange(int(0.8 * height)), 3):
+        assert redness(picture[rows][:, width // 2 :]) > 100  # u, acceleration, force
+    assert redness(picture[height // 3 : 2 * height // 3, : width // 3]) > 20  # PRC
+    assert redness(picture[2 * height // 3 :, : width // 5]) > 100  # phase plane
+    assert np.unique(picture[: height // 3, : width // 4].reshape(-1, 3), axis=0).shape[0] > 50
+
+
+def test_a_view_on_a_taken_port_takes_the_next() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as one:
+        port = one.getsockname()[1]
+        with pytest.raises(InputError) as refused:
+            parse_address(f"127.0.0.1:{port}")
+        assert refused.value.value == f"127.0.0.1:{port}"
+        host, _, other = find_free_address(f"127.0.0.1:{port}").rpartition(":")
+        assert host == "127.0.0.1"
+        assert int(other) > port
+        assert parse_address(f"{host}:{other}") == (host, int(other))
+    assert "127.0.0.1:9876" in format_live_view("127.0.0.1:9877")
+    assert "(" not in format_live_view("127.0.0.1:9876")

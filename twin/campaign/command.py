@@ -1,0 +1,141 @@
+"""`shaketwin campaign`: check everything, play the runs, report the outcome."""
+
+import shlex
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from table_io.clock import local_datetime
+from table_io.config.calibration_due import find_overdue_calibrations
+from table_io.errors import InputError
+from twin.campaign.campaign_state import ActiveCampaign, begin_campaign, resume_campaign
+from twin.campaign.config import list_campaign_warnings, read_plan
+from twin.campaign.offline import play_offline
+from twin.campaign.realtime import play_realtime
+from twin.campaign.report import write_campaign_report
+from twin.campaign.state import LOCK_FILE, hold_lock
+from twin.reports.finalize import EXIT_GAPS
+from twin.run.disk import require_disk_space
+from twin.run.folders import RUNS_FOLDER, make_output_folder
+from twin.run.realtime import check_realtime
+from twin.run.run_config import RunConfig, make_run_id
+from twin.run.terminal import print_line
+from twin.run.warm_up import compile_kernels
+from twin.security.credentials import Credentials
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignOptions:
+    """Options of the command line."""
+
+    path: Path
+    out: Path | None
+    resume: bool
+    unpaced: bool
+    model: str | None
+    table: str | None
+    unattended: bool
+    listen: str
+    keys: Credentials | None = None
+
+    def resume_command(self, folder: Path) -> str:
+        """Return the command line that resumes the campaign of a folder."""
+        words = ["shaketwin", "campaign", str(self.path), "--out", str(folder), "--resume"]
+        for option, value in (("--model", self.model), ("--table", self.table)):
+            words += [option, value] if value else []
+        words += ["--speed", "max"] if self.unpaced else []
+        words += ["--yes"] if self.unattended else []
+        return shlex.join(words)
+
+
+def run_campaign(options: CampaignOptions) -> int:
+    """Play all runs of a campaign that are not complete; return the exit code."""
+    allowed = _require_any_speed if options.unpaced else check_realtime
+    plan = read_plan(options.path, options.table, options.model, allowed)
+    compile_kernels(plan.runs[0].bundle, table=True)
+    ask_operator = not (options.unpaced or options.unattended)
+    if ask_operator and not sys.stdin.isatty():
+        raise InputError(
+            "no terminal to ask the operator between the runs",
+            remedy="give --yes to run without confirmation",
+        )
+    if not options.resume:
+        require_disk_space([run.bundle for run in plan.runs], options.out or RUNS_FOLDER)
+    folder = _prepare_folder(options)
+    with hold_lock(folder / LOCK_FILE) as lock:
+        if options.resume:
+            print_line(f"reading the recordings in {folder}")
+        active, warnings = (
+            resume_campaign(folder, plan) if options.resume else (begin_campaign(folder, plan), [])
+        )
+        for warning in (
+            *warnings,
+            *list_campaign_warnings(plan),
+            *find_overdue_calibrations(plan.runs[0].bundle.rig, local_datetime().date()),
+        ):
+            print_line(f"warning: {warning}")
+        require_disk_space([run.bundle for run in active.pending_runs()], folder)
+        _print_plan(active)
+        try:
+            code = (
+                play_offline(active, lock)
+                if options.unpaced
+                else play_realtime(active, ask_operator, options.listen, options.keys)
+            )
+        finally:
+            page = write_campaign_report(folder)
+    return _print_outcome(active, code, page, options)
+
+
+def _require_any_speed(bundle: RunConfig, _: Path) -> None:
+    if not bundle.rig.runs_at_any_speed:
+        raise InputError(
+            "this rig runs in real time only",
+            where=bundle.rig.name,
+            key="--speed",
+            value="max",
+            remedy="omit --speed",
+        )
+
+
+def _prepare_folder(options: CampaignOptions) -> Path:
+    """Return the campaign's folder: a new one, or with --resume the existing one."""
+    if not options.resume:
+        try:
+            return make_output_folder(options.out, make_run_id(options.path.stem))
+        except InputError as error:
+            raise InputError(f"{error}, or add --resume to continue the campaign in it") from None
+    if options.out is None:
+        raise InputError(
+            "the folder of the campaign is missing", key="--resume", remedy="give it with --out DIR"
+        )
+    if not options.out.is_dir():
+        raise InputError(
+            "no such folder",
+            where=f"--out {options.out}",
+            remedy="omit --resume to start a campaign there",
+        )
+    return options.out
+
+
+def _print_plan(campaign: ActiveCampaign) -> None:
+    plan, pending = campaign.plan, campaign.pending_runs()
+    print_line(
+        f"{plan.config.title}: {len(plan.runs)} runs, {plan.seconds / 60:.0f} min of motion "
+        f"-> {campaign.folder}"
+    )
+    if campaign.resumed:
+        print_line(f"complete: {len(plan.runs) - len(pending)}, remaining: {len(pending)}")
+
+
+def _print_outcome(
+    campaign: ActiveCampaign, code: int, page: Path, options: CampaignOptions
+) -> int:
+    """Print the outcome and the command that resumes the campaign; return the exit code."""
+    pending, runs = campaign.pending_runs(), campaign.state.runs
+    print_line(f"{len(runs) - len(pending)} of {len(runs)} runs complete -> {page}")
+    if pending:
+        print_line(f"remaining: {', '.join(run.label for run in pending)}; continue with")
+        print_line(f"  {options.resume_command(campaign.folder)}")
+    gaps = sum(part.gaps for run in runs for part in run.parts if run.status == "complete")
+    return EXIT_GAPS if not code and gaps else code

@@ -1,0 +1,213 @@
+"""Campaign file: configuration models, and checks of every run before anything moves."""
+
+import difflib
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError, field_validator
+
+from table_io.config.base import (
+    PROFILES_DIR,
+    ConfigModel,
+    Count,
+    find_config,
+    parse_toml,
+    read_text,
+    resolve_config,
+)
+from table_io.errors import InputError
+from table_io.safety.preflight import list_drive_warnings as coarse
+from twin.run.run_config import RunConfig, read_run_config
+
+ResumeMode = Literal["direction", "step", "run"]
+CheckRun = Callable[[RunConfig, Path], None]  # raises InputError if a run cannot be played
+
+
+class CampaignRun(ConfigModel):
+    """One entry of the list: a test, and the set-up change before it."""
+
+    profile: str = Field(
+        description="Name of a test, or path of a .toml file relative to this file."
+    )
+    label: str = Field("", pattern=r"^([A-Za-z0-9][A-Za-z0-9_.-]*)?$")
+    prompt: str = Field("", description="Set-up change to confirm before the run; empty: none.")
+    notes: str = ""
+    repeat: Count = Field(1, ge=1, le=50)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of the repetitions: label, label-rep2, ...; the default is the profile's name."""
+        label = self.label or Path(self.profile).stem
+        return (label, *(f"{label}-rep{k}" for k in range(2, self.repeat + 1)))
+
+
+class CampaignConfig(ConfigModel):
+    """A campaign: its runs in order, and where an interrupted run continues."""
+
+    title: str
+    citation: str = ""
+    notes: str = ""
+    resume: ResumeMode = Field(
+        "direction", description="Part of an interrupted run to repeat: direction, step or run."
+    )
+    runs: tuple[CampaignRun, ...] = Field((), validate_default=True)
+
+    @field_validator("runs")
+    @classmethod
+    def _require_runs(cls, runs: tuple[CampaignRun, ...]) -> tuple[CampaignRun, ...]:
+        if not runs:
+            raise ValueError('no runs; add at least one [[runs]] with profile = "..."')
+        return runs
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """A checked run of a campaign; `prompt` is empty where the set-up does not change."""
+
+    number: int
+    label: str
+    prompt: str
+    notes: str
+    bundle: RunConfig
+
+    @property
+    def name(self) -> str:
+        """Name of its folder, NN-label."""
+        return f"{self.number:02d}-{self.label}"
+
+
+@dataclass(frozen=True)
+class CampaignPlan:
+    """All runs of a campaign, checked."""
+
+    path: Path
+    config: CampaignConfig
+    text: str
+    runs: tuple[PlannedRun, ...]
+
+    @property
+    def seconds(self) -> float:
+        """Total duration of all drives in s."""
+        return sum(run.bundle.drive.planned_end / run.bundle.drive.rate_hz for run in self.runs)
+
+
+def read_plan(
+    path: Path, table: str | None, model: str | None, check_run: CheckRun
+) -> CampaignPlan:
+    """Return the plan of a campaign file; one InputError lists every fault in it and its tests."""
+    path = resolve_config(path, "campaigns")
+    text = read_text(path, "campaign")
+    faults: dict[str, list[str]] = {}
+    bundles: dict[str, RunConfig] = {}
+    entries = _list_runs(text)
+    for name in dict.fromkeys(run.profile for run in entries):
+        place = path
+        try:
+            place = _find_profile(name, path)
+            bundles[name] = read_run_config(place, table, model)
+            _refuse_own_sections(bundles[name])
+            check_run(bundles[name], place)
+        except InputError as error:
+            faults.setdefault(str(error).removeprefix(f"{place}: "), []).append(name)
+    labels = [label for run in entries for label in run.labels]
+    if twice := sorted({label for label in labels if labels.count(label) > 1}):
+        faults[f"label {', '.join(map(repr, twice))} is used twice; give each run its own"] = [
+            "runs"
+        ]
+    try:
+        config = parse_toml(text, CampaignConfig, str(path))
+    except InputError as error:
+        raise InputError("\n".join([str(error), *_format_faults(faults)])) from None
+    if faults:
+        raise InputError("\n".join([f"{path}: nothing was started:", *_format_faults(faults)]))
+    runs = [
+        (label, run.prompt if k == 0 else "", run.notes, bundles[run.profile])
+        for run in config.runs
+        for k, label in enumerate(run.labels)
+    ]
+    return CampaignPlan(
+        path, config, text, tuple(PlannedRun(n, *fields) for n, fields in enumerate(runs, 1))
+    )
+
+
+def _list_runs(text: str) -> list[CampaignRun]:
+    """Return the runs listed in a campaign file, except those that cannot be parsed."""
+    try:
+        runs: Any = tomllib.loads(text).get("runs")
+    except tomllib.TOMLDecodeError:
+        return []
+    runs_listed = []
+    for entry in runs if isinstance(runs, list) else []:
+        try:
+            known = {name: entry[name] for name in ("profile", "label", "repeat") if name in entry}
+            runs_listed.append(CampaignRun.model_validate(known))
+        except (ValidationError, TypeError):
+            continue  # reported when the whole file is parsed
+    return runs_listed
+
+
+def _find_profile(name: str, path: Path) -> Path:
+    """Return the path of a run's profile; InputError with the nearest name if it is missing."""
+    place = find_config(name, "tests", path)
+    if place.is_file():
+        return place
+    candidate = path.parent / name
+    profiles_by_name = {
+        profile_path.name: profile_path for profile_path in candidate.parent.glob("*.toml")
+    }
+    near = difflib.get_close_matches(candidate.name, profiles_by_name, 1, 0.4)
+    included = sorted(profile_path.stem for profile_path in (PROFILES_DIR / "tests").glob("*.toml"))
+    hint = f"did you mean {near[0]!r}?" if near else f"included tests: {', '.join(included)}"
+    raise InputError(f"no such test profile in {candidate.parent}", where=name, remedy=hint)
+
+
+def _refuse_own_sections(bundle: RunConfig) -> None:
+    for name in ("resume", "set_up"):
+        if getattr(bundle.profile, name) is not None:
+            raise InputError(
+                "this section is written by the campaign",
+                key=f"[{name}]",
+                remedy="remove it from the profile",
+            )
+
+
+def _format_faults(faults: dict[str, list[str]]) -> list[str]:
+    """Return lines with every fault; a fault shared by several profiles is listed once."""
+    lines = []
+    for message, names in faults.items():
+        lines += [f"  {', '.join(names)}:", *(f"    {line}" for line in message.splitlines())]
+    return lines
+
+
+def is_free_flight(bundle: RunConfig) -> bool:
+    """Return whether the specimen has no bumpers."""
+    return bundle.profile.specimen.gap_mm == float("inf")
+
+
+def list_campaign_warnings(plan: CampaignPlan) -> list[str]:
+    """Return warnings about plans that are allowed but unusual."""
+    warnings = [
+        f"{run.label}: {sentence}"
+        for run in plan.runs
+        for sentence in coarse(run.bundle.margins, run.bundle.rig)
+    ]
+    free = [run for run in plan.runs if is_free_flight(run.bundle)]
+    if not free:
+        return [*warnings, "no free flight in this campaign: its curves are divided by u* and a* "
+                "of the model, not by measured ones"]  # fmt: skip
+    if free[0].number != 1:
+        warnings.append(
+            f"free flight ({free[0].label}) is not the first run: u* and a*, by which every curve "
+            "is divided, are unknown until then"
+        )
+    level = free[0].bundle.profile.sweep.acceleration_g
+    other_levels = [run for run in plan.runs if run.bundle.profile.sweep.acceleration_g != level]
+    if other_levels:
+        warnings.append(
+            f"{', '.join(run.label for run in other_levels)}: another level than the free flight's "
+            f"{level:g} g, by whose u* and a* the curves are divided"
+        )
+    return warnings

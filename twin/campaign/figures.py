@@ -1,0 +1,155 @@
+"""Figures of a campaign: PRC families as in the paper's Figs. 2 and 5, and level errors."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from table_io.config.profile import Sweep
+from table_io.records import PrcPoint
+from table_io.units import GRAVITY_M_S2
+from twin.campaign.merge import prc_points
+from twin.campaign.summary import CampaignData, CampaignRunData, describe_normalization
+from twin.reports.figures import Picture
+from twin.reports.measured_campaign import MeasuredCampaign
+from twin.reports.paper_cases import PaperCase, PaperTest
+from twin.reports.plot_style import (
+    DIRECTION_COLOURS,
+    DIRECTIONS,
+    GUIDE_COLOUR,
+    PAPER_RC_PARAMS,
+    TRANSITION_COLOURS,
+    PaperFigure,
+    format_minus,
+)
+from twin.reports.prc_families import draw_all_gaps, draw_transition
+
+NEAR_HZ = 1e-9
+
+
+def draw_campaign_figures(campaign: CampaignData, folder: Path) -> list[Picture]:
+    """Draw the figures as PNG files in `folder`; return them with titles and captions."""
+    folder.mkdir(parents=True, exist_ok=True)
+    pictures = []
+    with mpl.rc_context(PAPER_RC_PARAMS):
+        for drawing in _draw_each(campaign):
+            path = folder / f"{drawing.name}.png"
+            drawing.figure.savefig(path)
+            pictures.append(Picture(path, drawing.title, drawing.caption))
+    return pictures
+
+
+def _draw_each(campaign: CampaignData) -> Iterator[PaperFigure]:
+    cases, measured_campaign = prc_families(campaign)
+    drawn = [draw_all_gaps(cases, measured_campaign)]
+    if sum(name in cases for name in TRANSITION_COLOURS) > 1:
+        drawn.append(draw_transition(cases, measured_campaign))
+    normalization = describe_normalization(campaign.stars)
+    for drawing in drawn:
+        caption = f"{drawing.caption} {normalization[0].upper()}{normalization[1:]}."
+        yield replace(drawing, name=drawing.name.removeprefix("rig_"), caption=caption)
+    if any(run.summary["steps"] for run in campaign.runs):
+        yield _draw_levels(campaign)
+
+
+@dataclass(frozen=True, eq=False)
+class CampaignGap(PaperCase):
+    """A gap of a campaign; where its sweeps overlap, only the finest grid is drawn."""
+
+    @cached_property
+    def points(self) -> tuple[PrcPoint, ...]:
+        sweeps = [test.profile.sweep for test in self.tests]
+        return tuple(
+            point
+            for test in self.tests
+            for point in test.points
+            if not _is_covered_finer(point.frequency_hz, test.profile.sweep, sweeps)
+        )
+
+
+def _is_covered_finer(hz: float, of: Sweep, sweeps: list[Sweep]) -> bool:
+    """Return whether another sweep covers a frequency in finer steps."""
+    return any(
+        sweep.step_hz < of.step_hz and sweep.start_hz - NEAR_HZ <= hz <= sweep.stop_hz + NEAR_HZ
+        for sweep in sweeps
+    )
+
+
+def prc_families(campaign: CampaignData) -> tuple[dict[str, PaperCase], MeasuredCampaign]:
+    """Return the model's curves and the measured points by gap, the largest gap first."""
+    stars = (campaign.stars["u_star_m"], campaign.stars["a_star_m_s2"]) if campaign.stars else None
+    by_gap: dict[float, list[CampaignRunData]] = {}
+    for run in campaign.runs:
+        by_gap.setdefault(run.profile.specimen.gap_mm, []).append(run)
+    cases: dict[str, PaperCase] = {}
+    measured_campaign = MeasuredCampaign()
+    for gap_mm in sorted(by_gap, reverse=True):
+        runs = by_gap[gap_mm]
+        name = "G∞" if math.isinf(gap_mm) else f"G{gap_mm:g}"
+        tests = {
+            (run.test, run.profile.sweep): PaperTest(
+                run.test, run.profile, run.model.parameters,
+                run.model if run.model.present_effects else None, stars,
+            )
+            for run in runs
+        }  # fmt: skip
+        cases[name] = CampaignGap(name, tuple(tests.values()))
+        sweeps = [run.profile.sweep for run in runs if run.summary["steps"]]
+        measured_campaign.points[name] = [
+            point
+            for run in runs
+            for point in prc_points(run.summary["steps"])
+            if not _is_covered_finer(point.frequency_hz, run.profile.sweep, sweeps)
+        ]
+    return cases, measured_campaign
+
+
+def _draw_levels(campaign: CampaignData) -> PaperFigure:
+    """Draw the level error: fundamental of the table acceleration over the demand, minus 1."""
+    figure = Figure(figsize=(11, 3.4))
+    ax = figure.subplots()
+    band = 100 * max(run.profile.control.tolerance for run in campaign.runs)
+    ax.axhspan(-band, band, color="#1a7f37", alpha=0.10, lw=0)
+    for run in campaign.runs:
+        level = run.profile.sweep.acceleration_g * GRAVITY_M_S2
+        for direction in DIRECTIONS:
+            direction_points = [
+                point for point in prc_points(run.summary["steps"]) if point.direction == direction
+            ]
+            f = np.array([point.frequency_hz for point in direction_points])
+            measured = np.array([point.table_acc_fundamental_m_s2 for point in direction_points])
+            ax.plot(
+                f,
+                100 * (measured / level - 1),
+                "o",
+                ms=2.8,
+                mew=0,
+                color=DIRECTION_COLOURS[direction],
+            )
+    ax.axhline(0, color=GUIDE_COLOUR, lw=0.8)
+    low, high = ax.get_ylim()
+    ax.set_ylim(min(low, -1.2 * band), max(high, 1.2 * band))
+    ax.set_xlabel("$f$ in Hz")
+    ax.set_ylabel("level error in %")
+    handles = [
+        Line2D([], [], color=c, marker="o", ls="", label=direction)
+        for direction, c in DIRECTION_COLOURS.items()
+    ]
+    figure.legend(handles=handles, loc="outside upper center", ncols=2)
+    return PaperFigure(
+        "level", "", "Level of the table at every measured step of every run",
+        "Fundamental of the measured table acceleration over the demanded one, minus one. Green: "
+        f"the tolerance of ±{band:g} %.",
+        figure,
+    )  # fmt: skip
+
+
+def format_gap(gap_mm: float) -> str:
+    """Return the name of a gap as in the paper: G16, G−1, G∞."""
+    return "G∞" if math.isinf(gap_mm) else format_minus(f"G{gap_mm:g}")

@@ -1,0 +1,82 @@
+"""Terminal messages of a campaign, and prompts for the operator."""
+
+import getpass
+from typing import Literal
+
+from table_io.clock import local_datetime
+from twin.campaign.campaign_state import ActiveCampaign
+from twin.campaign.config import PlannedRun
+from twin.campaign.merge import merge_summaries, read_summary
+from twin.campaign.state import OperatorAnswer
+from twin.reports.summary import format_summary
+from twin.run.terminal import console, print_line
+
+Reply = Literal["done", "skipped", "unattended", "not asked"]
+
+
+def format_run_name(campaign: ActiveCampaign, run: PlannedRun) -> str:
+    """Return the number of a run, the number of runs, and its label."""
+    return f"{run.number:>2}/{len(campaign.plan.runs)} {run.label}"
+
+
+def format_run_start(campaign: ActiveCampaign, run: PlannedRun) -> str:
+    """Return one line that describes the run about to be played."""
+    steps, first = run.bundle.profile.sweep.steps, campaign.starting_step(run)
+    text = f"{format_run_name(campaign, run)}: {run.bundle.profile.title}"
+    if not campaign.run_state(run).parts:
+        return f"{text}; {len(steps)} steps"
+    where = f"{steps[first].frequency_hz:g} Hz {steps[first].direction}"
+    return f"{text}; continues from step {first + 1} of {len(steps)}, {where}"
+
+
+def make_answer(asked: str, reply: Reply) -> OperatorAnswer:
+    """Return an operator answer with user name and time."""
+    try:
+        who = getpass.getuser()
+    except (KeyError, OSError):
+        who = "unknown"
+    return OperatorAnswer(
+        asked=asked, answer=reply, who=who, at=local_datetime().isoformat(timespec="seconds")
+    )
+
+
+def format_run_end(campaign: ActiveCampaign, run: PlannedRun) -> str:
+    """Return one line with the results of a run, merged over its recordings."""
+    state, folder = campaign.run_state(run), campaign.folder
+    summaries = [read_summary(folder / part.folder) for part in state.parts]
+    merged = merge_summaries(state, run.bundle.profile, summaries)
+    text = f"{format_run_name(campaign, run)}: {format_summary(merged)}"
+    return f"{text}; from {len(summaries)} recordings" if len(summaries) > 1 else text
+
+
+def unattended_answer(asked: str) -> OperatorAnswer:
+    """Return the answer recorded when no operator is asked."""
+    return make_answer(asked, "unattended" if asked else "not asked")
+
+
+def ask_operator(campaign: ActiveCampaign, run: PlannedRun, first: bool) -> OperatorAnswer | None:
+    """Ask the operator to confirm the set-up of a run; return the answer, or None to stop.
+
+    The first run after a resume asks for its set-up even if the run before it had the same one.
+    """
+    prompt = campaign.required_set_up(run) if first and campaign.resumed else run.prompt
+    if not prompt:
+        return make_answer("", "not asked")
+    if run.notes:
+        print_line(run.notes)
+    print_line(f"SET-UP: {prompt}")
+    while True:
+        try:
+            reply = console.input(
+                "Press Enter when done, s to skip this run, q to stop the campaign: "
+            )
+        except (KeyboardInterrupt, EOFError):
+            print_line("")
+            return None
+        match reply.strip().lower():
+            case "":
+                return make_answer(prompt, "done")
+            case "s":
+                return make_answer(prompt, "skipped")
+            case "q":
+                return None

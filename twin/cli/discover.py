@@ -1,0 +1,190 @@
+"""`shaketwin discover`: files, progress and console output of `twin.identification.discover`."""
+
+import contextlib
+import math
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from table_io.clock import RealClock
+from table_io.errors import InputError
+from twin.identification.discover import (
+    Discovery,
+    PreparedLog,
+    discover_effects,
+    held_out_log_nrmse,
+)
+from twin.identification.least_squares import MapFunction
+from twin.identification.selection import Cancelled, ProgressCallback, SelectionProgress
+from twin.model.config import ModelConfig
+from twin.model.effects import find_effect
+from twin.reports.discovery.loading import load_logs
+from twin.reports.discovery.page import write_discovery_page
+from twin.reports.discovery.serialize import Json, model_to_toml, verdict_to_json
+from twin.reports.finalize import EXIT_INTERRUPTED
+from twin.reports.summary import dump_strict_json
+from twin.run.folders import make_run_folder
+from twin.run.run_config import read_model_template
+from twin.run.terminal import catch_interrupts, console, print_line
+
+MIN_THREADED_SAMPLES = 120_000  # of all logs; with fewer, threads do not pay
+MAX_THREADS = 4  # limits memory: each thread holds its own motion
+
+
+def discover_command(
+    paths: Sequence[Path],
+    model: str,
+    out: Path | None,
+    without: Sequence[str] = (),
+    held_out: Sequence[Path] = (),
+) -> int:
+    """Run a discovery and write its results to a new folder; return the exit code."""
+    clock = RealClock()
+    start_s = clock.now()
+    start, config = read_model_template(model)
+    for name in without:
+        find_effect(name)
+    folder, _ = make_run_folder(out, "discover")
+    try:
+        with (
+            catch_interrupts("stopping: the best result so far is kept") as is_stopping,
+            show_progress() as show,
+        ):
+
+            def report(progress: SelectionProgress) -> None:
+                if is_stopping():
+                    raise Cancelled
+                show(progress)
+
+            logs, notes = load_logs(paths)
+            held_out_logs = load_logs(held_out)[0] if held_out else ()
+            with open_mapper(logs) as mapper:
+                discovery = discover_effects(
+                    logs, start, report, without, mapper, fitted=bool(config.fitted_on)
+                )
+    except (InputError, Cancelled) as error:
+        folder.rmdir()  # leave no empty folder after a failure
+        if isinstance(error, InputError):
+            raise
+        print_line("interrupted before any result; nothing is written")
+        return EXIT_INTERRUPTED
+    verdict = verdict_to_json(discovery, clock.now() - start_s, notes)
+    verdict["held_out_logs"] = [
+        {
+            "log": log.signals.name,
+            "nrmse_before": held_out_log_nrmse(log, discovery.selection.null),
+            "nrmse_after": held_out_log_nrmse(log, discovery.verdict.best),
+        }
+        for log in held_out_logs
+    ]
+    write_results(folder, discovery, config, logs, verdict)
+    print_verdict(verdict)
+    print_line(f"{folder}")
+    return 0 if discovery.selection.complete else EXIT_INTERRUPTED
+
+
+@contextlib.contextmanager
+def open_mapper(logs: Sequence[PreparedLog]) -> Iterator[MapFunction]:
+    """Yield a threaded map for long logs, else `map`; kernels and array sums release the GIL."""
+    if sum(log.signals.time_s.size for log in logs) < MIN_THREADED_SAMPLES:
+        yield map
+        return
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_THREADS)) as pool:
+        yield pool.map
+
+
+@contextlib.contextmanager
+def show_progress() -> Iterator[ProgressCallback]:
+    """Yield a progress callback: a progress bar on a terminal, plain lines elsewhere."""
+    if not console.is_terminal:
+        yield (
+            lambda progress: (
+                print_line(f"  {_format_progress(progress)}")
+                if progress.index or not progress.best
+                else None
+            )
+        )
+        return
+    bar = Progress(
+        TextColumn("{task.description}"), BarColumn(bar_width=16), MofNCompleteColumn(),
+        TextColumn("[green]{task.fields[best]}"), TimeElapsedColumn(), console=console,
+        transient=True,
+    )  # fmt: skip
+    task = bar.add_task("reading", total=None, best="")
+
+    def show(progress: SelectionProgress) -> None:
+        bar.tasks[0].total = None  # update() takes None for no change
+        bar.update(
+            task, description=escape(" + ".join(progress.names) or progress.stage),
+            total=progress.count or None, completed=max(progress.index - 1, 0),
+            best=escape(_format_best(progress)),
+        )  # fmt: skip
+
+    with bar:
+        yield show
+
+
+def _format_progress(progress: SelectionProgress) -> str:
+    if not progress.index:
+        return f"fitting {progress.stage}"
+    place = f"{progress.index} of {progress.count}"
+    return f"fitting {' + '.join(progress.names)} ({place}); {_format_best(progress)}"
+
+
+def _format_best(progress: SelectionProgress) -> str:
+    if progress.best is None:
+        return ""
+    names = " + ".join(progress.best.names) or "nothing added"
+    return f"best so far {names}: {math.sqrt(progress.best.cost):.3g} times the noise"
+
+
+def write_results(
+    folder: Path,
+    discovery: Discovery,
+    config: ModelConfig,
+    logs: Sequence[PreparedLog],
+    verdict: Json,
+) -> None:
+    """Write verdict.json, model.toml, figures and report.html to the folder."""
+    names = ", ".join(log.signals.name for log in logs)
+    added = " + ".join(discovery.verdict.best.names) or "nothing added"
+    title = f"{config.title}; {added}"
+    text, omitted = model_to_toml(discovery.verdict.best.fit, title, config.citation, names)
+    verdict["notes"] += omitted
+    (folder / "model.toml").write_text(text, encoding="utf-8")
+    (folder / "verdict.json").write_text(dump_strict_json(verdict), encoding="utf-8")
+    write_discovery_page(folder, discovery, logs, verdict)
+
+
+def print_verdict(verdict: Json) -> None:
+    """Print the verdict, the gap, the fitted parameters and the notes."""
+    names = " + ".join(
+        ".".join(filter(None, (effect["id"], effect.get("channel"))))
+        for effect in verdict["effects"]
+    )
+    gap = verdict["gap"]
+    print_line(f"{verdict['verdict']}: {names}" if names else verdict["verdict"])
+    print_line(f"  {verdict['why']}")
+    closed = f": {100 * gap['closed_fraction']:.0f} % closed" if verdict["effects"] else ""
+    print_line(
+        f"  gap {gap['held_out_before']:.3g} -> {gap['held_out_after']:.3g}, noise "
+        f"{gap['noise_floor']:.3g}{closed} (held out)"
+    )
+    for effect in verdict["effects"]:
+        for name, value in effect["parameters"].items():
+            half = 0.5 * (value["high"] - value["low"])
+            print_line(
+                f"  {effect['id']} {name} = {value['value']:.5g} +- {half:.2g} {value['unit']}"
+            )
+    for log in verdict.get("held_out_logs", []):
+        print_line(
+            f"  {log['log']}, held out entirely: NRMSE of the damper force "
+            f"{log['nrmse_before']:.3g} -> {log['nrmse_after']:.3g}"
+        )
+    for note in verdict["notes"]:
+        print_line(f"  note: {note}")
+    print_line(f"  suggested next test: {verdict['next_run']}")

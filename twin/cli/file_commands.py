@@ -1,0 +1,114 @@
+"""Commands for files: verify, import, export; each imports its implementation when called."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+FILES_PANEL = "Keep and pass on what was recorded"
+files_app = typer.Typer()
+
+StepsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--steps",
+        metavar="FIRST:LAST",
+        help="Step indices FIRST:LAST, from 0, both included; or one index.",
+    ),
+]
+
+
+@files_app.command("verify", rich_help_panel=FILES_PANEL)
+def verify_command(
+    log: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="LOG...", help="A log, the folder of a run, or the parts of one log."
+        ),
+    ],
+    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    repair: Annotated[
+        Path | None,
+        typer.Option("--repair", metavar="NEW", help="Write the recoverable data to this new log."),
+    ] = None,
+) -> None:
+    """Verify that a recording is complete and can be replayed; list what is missing.
+
+    Exit code 0: whole; 4: it has gaps, or the file is damaged or was altered; 2: no log.
+    """
+    from twin.cli.verify import verify_logs as command
+
+    raise typer.Exit(command(log, json, repair))
+
+
+@files_app.command("import", rich_help_panel=FILES_PANEL)
+def import_command(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="CSV, Parquet, MAT, UFF 58, TDMS, HDF5 or npz.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="LOG", help="New log, a .mcap file.")
+    ] = None,
+    profile: Annotated[
+        Path | None, typer.Option("--profile", help="Test profile with specimen, gaps and sweep.")
+    ] = None,
+    rig: Annotated[str | None, typer.Option("--rig", help="Rig file or name.")] = None,
+    columns: Annotated[
+        Path | None,
+        typer.Option("--columns", metavar="MAP", help="Column map, a .toml file."),
+    ] = None,
+    contents: Annotated[
+        bool, typer.Option("--list", help="List the contents of the file only.")
+    ] = False,
+) -> None:
+    """Import a table of samples as a log; steps come from its labels or its motion."""
+    from twin.exchange import import_table
+
+    if contents:
+        if out is not None:
+            from table_io.errors import InputError
+
+            raise InputError(f"{out}: --list only says what {file} holds; leave -o out, or --list")
+        import_table.print_contents(file, columns)
+        return
+    if out is None:
+        from table_io.errors import InputError
+
+        raise InputError(f"{file}: no -o LOG; say where the new log goes, as -o run.mcap")
+    raise typer.Exit(import_table.import_samples(file, out, profile, rig, columns))
+
+
+@files_app.command("export", rich_help_panel=FILES_PANEL)
+def export_command(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="A run.mcap or the folder of a run.")],
+    csv: Annotated[bool, typer.Option("--csv", help="CSV text without loss of precision.")] = False,
+    parquet: Annotated[
+        bool, typer.Option("--parquet", help="Parquet with units and profile.")
+    ] = False,
+    mat: Annotated[bool, typer.Option("--mat", help="MATLAB v5.")] = False,
+    foxglove: Annotated[
+        bool,
+        typer.Option("--foxglove", help="Foxglove: MCAP with a message per sample, and a layout."),
+    ] = False,
+    rrd: Annotated[bool, typer.Option("--rrd", help="Rerun, with the project's layout.")] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", help="New file without ending; default: next to LOG."),
+    ] = None,
+    channel: Annotated[
+        list[str] | None,
+        typer.Option("--channel", help="Only this column with time_s and the labels; repeatable."),
+    ] = None,
+    steps: StepsOption = None,
+) -> None:
+    """Export measurement and twin of a log for other tools, in several formats at once."""
+    from twin.exchange.export import export_log
+
+    requested = {"csv": csv, "parquet": parquet, "mat": mat, "foxglove": foxglove, "rrd": rrd}
+    formats = [kind for kind, wanted in requested.items() if wanted]
+    step_span = None
+    if steps is not None:
+        from twin.replay.step_range import parse_step_range
+
+        step_span = parse_step_range(steps)
+    raise typer.Exit(export_log(log, formats, out, tuple(channel or ()), step_span))

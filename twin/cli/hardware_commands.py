@@ -1,0 +1,104 @@
+"""Commands for the hardware; each imports its implementation when called."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+PLAN_PANEL = "Before a test"
+hardware_app = typer.Typer()
+
+
+@hardware_app.command("check", rich_help_panel=PLAN_PANEL)
+def check_command(
+    profile: Annotated[
+        Path | None,
+        typer.Argument(metavar="[PROFILE]", help="Test profile: a .toml file or a name."),
+    ] = None,
+    table: Annotated[
+        str | None, typer.Option("--table", help="Rig file or name, instead of the profile's.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for a plot of the drive.")
+    ] = None,
+    unattended: Annotated[
+        bool,
+        typer.Option(
+            "--unattended", help="Without PROFILE: skip the checks that need an operator."
+        ),
+    ] = False,
+    json: Annotated[bool, typer.Option("--json", help="Without PROFILE: print JSON.")] = False,
+) -> None:
+    """Check a test before anything moves: print plan and margins, plot the drive.
+
+    Without PROFILE: the wiring of --table NAME at rest, and by a tap; nothing is moved.
+    """
+    if profile is not None and not (unattended or json):
+        from twin.cli.run import check_profile as preflight
+
+        preflight(profile, table, out)
+    elif profile is None and table is not None and out is None:
+        from twin.cli.check_table import check_wiring
+
+        raise typer.Exit(check_wiring(table, unattended, json))
+    else:
+        from table_io.errors import InputError
+
+        raise InputError(
+            "check: give a PROFILE, with --out, for the pre-flight of a test; or only --table "
+            "NAME, with --unattended or --json, for the wiring of a table"
+        )
+
+
+@hardware_app.command("calibrate", rich_help_panel=PLAN_PANEL)
+def calibrate_command(
+    channel: Annotated[str, typer.Argument(metavar="CHANNEL", help="Channel of the sensor.")],
+    table: Annotated[str, typer.Option("--table", help="Rig file or name.")],
+    points: Annotated[
+        str,
+        typer.Option(
+            "--points", metavar="A,B,...", help="Applied values in the unit of the channel."
+        ),
+    ] = "",
+    shunt: Annotated[
+        bool, typer.Option("--shunt", help="Calibrate by its shunt: off, then on.")
+    ] = False,
+    tolerance: Annotated[
+        float | None,
+        typer.Option("--tolerance", help="Allowed deviation of the sensitivity in per cent: 1."),
+    ] = None,
+    applied_sd: Annotated[
+        float, typer.Option("--applied-sd", help="Standard uncertainty of the applied values.")
+    ] = 0.0,
+    unattended: Annotated[
+        bool, typer.Option("--unattended", help="Five seconds per point, without prompts.")
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="New file for the record, instead of the default.")
+    ] = None,
+) -> None:
+    """Calibrate a sensor: measure sensitivity and offset, compare with the rig file.
+
+    Leaves a dated record, which goes into every recording from then on; edits no card.
+    """
+    from twin.cli.calibrate import CalibrationRequest
+    from twin.cli.calibrate import calibrate_sensor as command
+
+    request = CalibrationRequest(
+        channel, table, points, shunt, tolerance, applied_sd, unattended, out
+    )
+    raise typer.Exit(command(request))
+
+
+@hardware_app.command("devices", rich_help_panel=PLAN_PANEL)
+def devices_command(
+    ni: Annotated[
+        str | None,
+        typer.Option("--ni", metavar="HOST:PORT", help="Also query this NI gRPC device server."),
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """List rig files, NI and openDAQ devices that respond, with their channels."""
+    from twin.cli.devices import print_devices as command
+
+    command(ni, json)

@@ -1,0 +1,267 @@
+"""`shaketwin identify`: files and console output of `twin.identification.identify`."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from rich.table import Table
+
+from table_io.clock import RealClock
+from table_io.errors import InputError
+from twin.identification.cross_checks import fitted_gap
+from twin.identification.identify import WINDOW_S, IdentificationResult, identify_parameters
+from twin.identification.least_squares import FitResult
+from twin.identification.parameters import GAP_PREFIX, ZERO_PREFIX, ParameterSet, parse_log_number
+from twin.reports.discovery.loading import load_recordings
+from twin.reports.discovery.serialize import INTERVAL_SIGMA, Json, model_to_toml, parameter_to_json
+from twin.reports.summary import dump_strict_json
+from twin.run.folders import make_output_folder, make_run_folder
+from twin.run.run_config import read_model_template
+from twin.run.terminal import console, print_line, print_table
+
+METHOD = (
+    "least squares of the forces on the measured motion, corrected for the bias caused by noise of "
+    "that motion; 95 % intervals from the scatter between forcing cycles"
+)
+GAPS_NOTE = "gaps belong to the test profile of each log, not to the model file"
+SYMBOLS = {
+    "stiffness": "K", "damping": "C", "bumper_stiffness": "K_j", "bumper_damping": "C_j",
+}  # fmt: skip
+
+
+def identify_command(paths: Sequence[Path], model: str, out: Path | None) -> int:
+    """Identify parameters from recordings; write a model file and figures; return the exit code."""
+    clock = RealClock()
+    start_s = clock.now()
+    target = _resolve_target(out)
+    start, config = read_model_template(model)
+    with console.status("reading"):
+        loaded_logs = [*load_recordings(paths)]
+    with console.status("fitting the forces on the measured motion"):
+        result = identify_parameters(
+            [loaded.log for loaded in loaded_logs], [loaded.blocks for loaded in loaded_logs], start
+        )
+    names = ", ".join(loaded.log.signals.name for loaded in loaded_logs)
+    text, omitted = model_to_toml(
+        _drop_log_parameters(result.fit), f"{config.title}; identified", METHOD, names
+    )
+    report = identification_to_json(
+        result,
+        [
+            *(note for loaded in loaded_logs for note in loaded.notes),
+            *result.notes,
+            *omitted,
+            GAPS_NOTE,
+        ],
+    )
+    report["start"] = model
+    report["seconds"] = clock.now() - start_s
+    folder = make_output_folder(target.with_suffix(""), "")
+    target.write_text(text, encoding="utf-8")
+    (folder / "identify.json").write_text(dump_strict_json(report), encoding="utf-8")
+    from twin.reports.discovery.identify_figures import (
+        draw_identification_figures,  # slow to import
+    )
+
+    draw_identification_figures(result, folder)
+    print_identification(report)
+    print_line(f"{target}; figures and identify.json in {folder}")
+    return 0
+
+
+def _resolve_target(out: Path | None) -> Path:
+    """Return the path of the new model file; raise InputError, before the fit, if not usable."""
+    if out is None:
+        return make_run_folder(None, "identify")[0] / "model.toml"
+    if out.suffix != ".toml":
+        raise InputError("not a model file", where=f"--out {out}", allowed="a name in .toml")
+    if out.exists():
+        raise InputError(
+            "exists; files are never overwritten", where=f"--out {out}", remedy="give a new name"
+        )
+    # checked here and created at the end, so that a failure leaves no folder
+    make_output_folder(out.with_suffix(""), "").rmdir()
+    return out
+
+
+def _drop_log_parameters(fit: FitResult) -> FitResult:
+    """Return the fit without the parameters of single logs: tare errors and gap corrections."""
+    kept_values = {
+        key: value
+        for key, value in fit.parameters.values.items()
+        if not key.startswith(ZERO_PREFIX)
+    }
+    values = {key: value for key, value in fit.values.items() if parse_log_number(key) is None}
+    return replace(fit, parameters=ParameterSet(kept_values), values=values)
+
+
+def identification_to_json(result: IdentificationResult, notes: Sequence[str]) -> Json:
+    """Return the content of identify.json, in SI units."""
+    fit, log_residuals = result.fit, result.problem.log_residuals
+    names = [residuals.signals.name for residuals in log_residuals]
+    units = {parameter.name: parameter.unit for parameter in fit.free}
+    return {
+        "method": METHOD,
+        "logs": names,
+        "parameters": {
+            parameter.name: parameter_to_json(fit, parameter.name, parameter.unit)
+            | _compare_with_start(result, parameter.name, parameter.keys[0])
+            for parameter in fit.free
+            if parse_log_number(parameter.name) is None
+        },
+        "gaps": {name: _gap_json(result, k) for k, name in enumerate(names)},
+        "zeros": {
+            parameter.name: parameter_to_json(fit, parameter.name, parameter.unit)
+            for parameter in fit.free
+            if parameter.name.startswith(ZERO_PREFIX)
+        },
+        "gap_offset": _interval_json(*result.asymmetry, "m") if result.asymmetry else None,
+        "correlations": [{"of": [a, b], "value": value} for a, b, value in result.correlated_pairs],
+        "rms_over_noise": math.sqrt(fit.cost),
+        "converged": fit.converged,
+        "at_bound": [*fit.at_bound],
+        "not_determined": [*result.undetermined],
+        "sources": [
+            {
+                "source": part.source,
+                "entries": part.entry_count,
+                "converged": part.converged,
+                "parameters": {
+                    name: _interval_json(*pair, units[name]) for name, pair in part.values.items()
+                },
+            }
+            for part in result.subsets
+        ],
+        "contacts": [
+            _interval_json(gaps.value, gaps.std_error, "m")
+            | {
+                "log": names[gaps.log], "side": gaps.side, "kind": gaps.kind,
+                "scatter": gaps.scatter,
+                "count": int(gaps.gaps.size), "correction": float(gaps.depth.mean()),
+            }
+            for gaps in result.contact_gaps
+        ],
+        "windows": [
+            {"log": name, "window_s": WINDOW_S, "nrmse_start": pair[0], "nrmse_identified": pair[1]}
+            for name, pair in zip(names, result.window_errors, strict=True)
+            if pair
+        ],
+        "warnings": [*result.warnings],
+        "notes": [*notes],
+    }  # fmt: skip
+
+
+def _interval_json(value: float, sd: float, unit: str) -> Json:
+    return {
+        "value": value,
+        "low": value - INTERVAL_SIGMA * sd,
+        "high": value + INTERVAL_SIGMA * sd,
+        "unit": unit,
+    }
+
+
+def _compare_with_start(result: IdentificationResult, name: str, key: str) -> Json:
+    """Return the value of the start model and the difference from it in standard deviations."""
+    start_value, sd = result.start.values.get(key), result.fit.std_errors[name]
+    if start_value is None:
+        return {}
+    return {
+        "start": start_value,
+        "deviations": (result.fit.values[name] - start_value) / sd if sd else None,
+    }
+
+
+def _gap_json(result: IdentificationResult, log: int) -> Json:
+    """Return the total gap of a log in m: stated, and with contact the fitted one."""
+    residuals, name = result.problem.log_residuals[log], f"{GAP_PREFIX}{log}"
+    sides = {side: fitted_gap(residuals, result.fit, side) for side in ("right", "left")}
+    gap: Json = {"stated": sum(residuals.signals.gaps_m), "unit": "m", **sides}
+    if name in result.fit.std_errors:
+        gap |= _interval_json(sum(sides.values()), 2 * result.fit.std_errors[name], "m")
+    return gap
+
+
+def print_identification(report: Json) -> None:
+    """Print the parameters as tables, then correlations, errors, warnings and notes."""
+    table = Table(title="Identified parameters, with 95 % intervals", title_justify="left")
+    for heading in ("", "value", "+-", "unit", "start model", "difference in std dev"):
+        table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
+    for name, note in report["parameters"].items():
+        deviations = note.get("deviations")
+        table.add_row(
+            SYMBOLS.get(name, name), *_format_interval(note), note["unit"],
+            f"{note['start']:g}" if "start" in note else "",
+            f"{deviations:+.1f}" if deviations else "",
+        )  # fmt: skip
+    for log, note in report["gaps"].items():
+        if "low" in note:
+            gap_deviations = (
+                INTERVAL_SIGMA * 2 * (note["value"] - note["stated"]) / (note["high"] - note["low"])
+            )
+            table.add_row(
+                f"gap of {log}",
+                *_format_interval(note, 1e3),
+                "mm",
+                f"{1e3 * note['stated']:g}",
+                f"{gap_deviations:+.1f}",
+            )
+    print_table(console, table)
+    _print_subsets(report)
+    for note in report["correlations"]:
+        print_line(
+            f"strongly correlated: {' and '.join(note['of'])}, correlation {note['value']:+.2f}"
+        )
+    for note in report["windows"]:
+        print_line(
+            f"{note['log']}: error of u over windows of {note['window_s']:g} s, "
+            f"{100 * note['nrmse_start']:.3g} % of its rms with the start model, "
+            f"{100 * note['nrmse_identified']:.3g} % as identified"
+        )
+    print_line(f"rms residual over the sensor noise: {report['rms_over_noise']:.3f}")
+    for note in report["warnings"]:
+        print_line(f"warning: {note}")
+    for note in report["notes"]:
+        print_line(f"note: {note}")
+
+
+def _print_subsets(report: Json) -> None:
+    """Print the estimates from subsets of the samples, and the gaps from contact onsets."""
+    names = [name for name in report["parameters"] if name in SYMBOLS]
+    gaps = [
+        f"{GAP_PREFIX}{k}" for k, log in enumerate(report["logs"]) if "low" in report["gaps"][log]
+    ]
+    table = Table(title="Estimates from subsets of the samples", title_justify="left")
+    table.add_column("")
+    for name in names:
+        unit = report["parameters"][name]["unit"]
+        table.add_column(f"{SYMBOLS[name]} in {unit}", justify="right")
+    for name in gaps:
+        table.add_column(
+            f"gap correction per side, log {name[len(GAP_PREFIX) :]}, mm", justify="right"
+        )
+    for subset in report["sources"]:
+        estimates = subset["parameters"]
+        cells = [
+            " +- ".join(_format_interval(estimates[name])) if name in estimates else ""
+            for name in names
+        ]
+        cells += [
+            " +- ".join(_format_interval(estimates[g], 1e3)) if g in estimates else "" for g in gaps
+        ]
+        table.add_row(subset["source"], *cells)
+    print_table(console, table)
+    for contact in report["contacts"]:
+        print_line(
+            f"{contact['log']}: {contact['side']} gap from {contact['count']} {contact['kind']}s "
+            f"{' +- '.join(_format_interval(contact, 1e3))} mm, "
+            f"scatter {1e3 * contact['scatter']:.3f} mm, "
+            f"corrected by {1e3 * contact['correction']:.3f} mm"
+        )
+
+
+def _format_interval(estimate: Json, scale: float = 1.0) -> tuple[str, str]:
+    """Return (value, half interval) as text, with the digits that the interval justifies."""
+    half = 0.5 * scale * (estimate["high"] - estimate["low"])
+    places = max(0, 1 - math.floor(math.log10(half))) if 0 < half < math.inf else 3
+    return f"{scale * estimate['value']:.{places}f}", f"{half:.{places}f}"

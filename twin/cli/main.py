@@ -1,0 +1,338 @@
+"""Command line. Each command imports its implementation when called, which keeps --help fast."""
+
+import contextlib
+import enum
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from twin.cli.credential_commands import KeysOption, keys_app, read_keys_option
+from twin.cli.file_commands import StepsOption, files_app
+from twin.cli.hardware_commands import hardware_app
+from twin.cli.identification_commands import identification_app
+from twin.cli.live_commands import live_app
+from twin.cli.monitor_command import monitor_app
+
+# The matrices are small: BLAS threads cost more than they gain and delay the processes of a run.
+# Set before numpy is imported; child processes inherit it.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    help="Drive a shaking table through a test, with a digital twin of the specimen running "
+    "alongside; record, compare, replay, report.",
+)
+
+PLAN_PANEL, DRIVE_PANEL, LOOK_PANEL = (
+    "Before a test",
+    "Drive and compute",
+    "Inspect recordings",
+)
+
+ProfileArgument = Annotated[
+    Path,
+    typer.Argument(
+        metavar="PROFILE", help="Test profile: a .toml file or the name of a shipped one."
+    ),
+]
+LogArgument = Annotated[
+    Path, typer.Argument(metavar="LOG", help="A run.mcap or the folder of a run.")
+]
+OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
+ModelOption = Annotated[
+    str | None, typer.Option("--model", help="Model: a .toml file or the name of a shipped one.")
+]
+ListenOption = Annotated[
+    str, typer.Option("--listen", help="Endpoint at which observers reach the test.")
+]
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+
+
+class Speed(enum.StrEnum):
+    """Pace of a run."""
+
+    realtime = "realtime"
+    max = "max"
+
+
+@app.command("run", rich_help_panel=DRIVE_PANEL)
+def run_command(
+    profile: ProfileArgument,
+    out: OutOption = None,
+    speed: Annotated[
+        Speed, typer.Option("--speed", help="Pace; max requires a simulated table.")
+    ] = Speed.realtime,
+    model: ModelOption = None,
+    table: Annotated[
+        str | None, typer.Option("--table", help="Rig file or name, instead of the profile's.")
+    ] = None,
+    view: Annotated[
+        bool, typer.Option("--view", help="Serve a Rerun view and write view.rrd.")
+    ] = False,
+    listen: ListenOption = DEFAULT_ENDPOINT,
+    keys: KeysOption = None,
+    router: Annotated[
+        str, typer.Option("--router", help="Also connect to this zenoh router.")
+    ] = "",
+    remote_twin: Annotated[
+        bool,
+        typer.Option("--remote-twin", help="Start no twin here; expect `join twin` elsewhere."),
+    ] = False,
+) -> None:
+    """Run a test: drive the table, acquire, run the twin, publish, record, report."""
+    from twin.cli.run import run_test as command
+
+    unpaced, credentials = speed is Speed.max, read_keys_option(keys, rig=True)
+    code = command(
+        profile, out, unpaced, model, table, view, listen, credentials, router, remote_twin
+    )
+    raise typer.Exit(code)
+
+
+@app.command("campaign", rich_help_panel=DRIVE_PANEL)
+def campaign_command(
+    file: Annotated[
+        Path,
+        typer.Argument(metavar="FILE", help="Campaign: a .toml file or the name of a shipped one."),
+    ],
+    out: OutOption = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue the campaign in --out DIR.")
+    ] = False,
+    speed: Annotated[
+        Speed,
+        typer.Option("--speed", help="Pace; max is unattended and requires a simulated table."),
+    ] = Speed.realtime,
+    model: ModelOption = None,
+    table: Annotated[
+        str | None, typer.Option("--table", help="Rig file or name, instead of the profile's.")
+    ] = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Unattended: do not prompt between runs.")
+    ] = False,
+    listen: ListenOption = DEFAULT_ENDPOINT,
+    keys: KeysOption = None,
+) -> None:
+    """Run a list of tests with set-up changes between them; resume where it stopped."""
+    from twin.campaign.command import CampaignOptions
+    from twin.campaign.command import run_campaign as command
+
+    unpaced, credentials = speed is Speed.max, read_keys_option(keys, rig=True)
+    request = CampaignOptions(file, out, resume, unpaced, model, table, yes, listen, credentials)
+    raise typer.Exit(command(request))
+
+
+@app.command("table", rich_help_panel=DRIVE_PANEL)
+def table_command(
+    rig: Annotated[str, typer.Option("--rig", help="Rig file or name.")] = "machine",
+    listen: Annotated[
+        str | None,
+        typer.Option(
+            "--listen", help="tcp/127.0.0.1:PORT or unix/PATH, instead of the rig file's."
+        ),
+    ] = None,
+    log: Annotated[
+        Path | None, typer.Option("--log", help="New file for the flight recorder: every sample.")
+    ] = None,
+    time_scale: Annotated[
+        float, typer.Option("--time-scale", help="Speed relative to real time, for tests.")
+    ] = 1.0,
+    profile: Annotated[
+        str,
+        typer.Option("--profile", help="Test profile whose specimen is on the table."),
+    ] = "quickstart",
+    play: Annotated[
+        Path | None,
+        typer.Option(
+            "--play",
+            metavar="FILE",
+            help="Drive file that the simulated external controller plays.",
+        ),
+    ] = None,
+    ppm: Annotated[
+        float, typer.Option("--ppm", help="Clock error of that controller in parts per million.")
+    ] = 0.0,
+    after: Annotated[
+        float,
+        typer.Option(
+            "--after",
+            metavar="S",
+            help="Delay in s between the start of acquisition and its drive.",
+        ),
+    ] = 5.0,
+) -> None:
+    """Start the simulated table as a separate machine, for `run PROFILE --table machine`."""
+    from twin.cli.table import ExternalController
+    from twin.cli.table import serve_table as command
+
+    command(rig, listen, log, time_scale, sys.stdout, profile, ExternalController(play, ppm, after))
+
+
+@app.command("drive", rich_help_panel=PLAN_PANEL)
+def drive_command(
+    profile: ProfileArgument,
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="New file.")],
+    table: Annotated[
+        str | None, typer.Option("--table", help="Rig file or name, instead of the profile's.")
+    ] = None,
+    format: Annotated[
+        str,
+        typer.Option(
+            "--format", help="csv, txt, rpc, uff, mat or wav; default: the ending of FILE."
+        ),
+    ] = "",
+) -> None:
+    """Export the planned drive for an external controller, which `run --table` then follows."""
+    from twin.exchange.drive_file import export_drive as command
+
+    command(profile, table, out, format)
+
+
+@app.command("simulate", rich_help_panel=DRIVE_PANEL)
+def simulate_command(
+    profile: ProfileArgument,
+    model: Annotated[
+        list[str] | None,
+        typer.Option("--model", help="Model: a .toml file or a name; repeatable."),
+    ] = None,
+    gap: Annotated[
+        list[str] | None,
+        typer.Option("--gap", metavar="MM", help="Total gap: mm, inf or FROM:TO:STEP; repeatable."),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", help="Cores for many models or gaps; default: all.")
+    ] = None,
+    out: OutOption = None,
+    view: Annotated[bool, typer.Option("--view", help="Also write view.rrd.")] = False,
+) -> None:
+    """Run the model alone on the ideal drive; or compare many models and gaps."""
+    from twin.cli.simulate import simulate_profile as command
+
+    raise typer.Exit(command(profile, model or [], gap or [], workers, out, view))
+
+
+@app.command("replay", rich_help_panel=LOOK_PANEL)
+def replay_command(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs or folders of runs.")],
+    model: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--model", help="Another model: a .toml file, a name or `recorded`; repeatable."
+        ),
+    ] = None,
+    out: OutOption = None,
+    speed: Annotated[str, typer.Option("--speed", help="Multiple of real time, or max.")] = "max",
+    steps: StepsOption = None,
+    publish: Annotated[
+        bool, typer.Option("--publish", help="Also publish on the bus, like a live run.")
+    ] = False,
+    listen: ListenOption = DEFAULT_ENDPOINT,
+    keys: KeysOption = None,
+    view: Annotated[bool, typer.Option("--view", help="Also write view.rrd.")] = False,
+) -> None:
+    """Replay recordings; with the recorded model the comparisons are bit-identical.
+
+    Several logs or models give one table of the error of each model on each recording.
+    """
+    from twin.cli.replay import ReplayRequest, replay_logs
+
+    credentials = read_keys_option(keys, rig=True)
+    request = ReplayRequest(
+        logs, model or [], out, speed, view, listen if publish else None, steps, credentials
+    )
+    raise typer.Exit(replay_logs(request))
+
+
+@app.command("prc", rich_help_panel=LOOK_PANEL)
+def prc_command(
+    log: LogArgument,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Print pseudo-resonance curves, jumps, hysteresis, impacts per cycle."""
+    from twin.cli.report import print_recording_prc as command
+
+    command(log, json)
+
+
+@app.command("paper", rich_help_panel=LOOK_PANEL)
+def paper_command(
+    model: ModelOption = None,
+    out: OutOption = None,
+    campaign: Annotated[
+        list[Path] | None,
+        typer.Option("--campaign", help="A recording or a folder of recordings; repeatable."),
+    ] = None,
+) -> None:
+    """Reproduce the paper's figures and list where the model agrees or departs."""
+    from twin.validation.paper.command import compare_with_paper as command
+
+    command(out, campaign or [], model)
+
+
+@app.command("report", rich_help_panel=LOOK_PANEL)
+def report_command(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run or campaign.")],
+) -> None:
+    """Write the report of a run or campaign again: one self-contained HTML file."""
+    from twin.cli.report import write_folder_report as command
+
+    command(folder)
+
+
+@app.command("view", rich_help_panel=LOOK_PANEL)
+def view_command(
+    log: Annotated[
+        Path | None, typer.Argument(metavar="[LOG]", help="A run.mcap or the folder of a run.")
+    ] = None,
+    save: Annotated[
+        Path | None, typer.Option("--save", help="Write this .rrd file and open no viewer.")
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option("--picture", help="Render the view to this .png file.")
+    ] = None,
+    connect: Annotated[
+        str, typer.Option("--connect", help="Endpoint of a running test, without LOG.")
+    ] = "tcp/127.0.0.1:7447",
+    rig: Annotated[str, typer.Option("--rig", help="Name of the running rig.")] = "simulated",
+    keys: KeysOption = None,
+) -> None:
+    """Open Rerun with the project's layout, on a recording or a running test."""
+    from twin.cli.view import show_view as command
+
+    command(log, save, picture, connect, rig, read_keys_option(keys))
+
+
+app.add_typer(hardware_app)
+app.add_typer(monitor_app)
+app.add_typer(live_app)
+app.add_typer(identification_app)
+app.add_typer(files_app)
+app.add_typer(keys_app, name="keys", rich_help_panel=PLAN_PANEL)
+
+
+def main() -> None:
+    """Run the command line; an input error is one message on standard error and exit code 2."""
+    with contextlib.suppress(BrokenPipeError):
+        try:
+            app()
+        except ValueError as error:
+            from table_io.errors import InputError
+
+            if not isinstance(error, InputError):
+                raise
+            print(f"shaketwin: {error}", file=sys.stderr)
+            raise SystemExit(2) from None
+        except OSError as error:
+            if isinstance(error, BrokenPipeError):
+                raise
+            advice = ""
+            if sys.argv[1:2] in (["run"], ["campaign"]):  # the others record nothing
+                advice = "; the recording is kept: run `shaketwin report DIR` after correcting this"
+            print(f"shaketwin: {error}{advice}", file=sys.stderr)
+            raise SystemExit(2) from None

@@ -1,0 +1,66 @@
+"""`prc` and `report`: response curves and report of a recording."""
+
+from pathlib import Path
+
+from table_io.errors import InputError
+from twin.campaign.state import STATE_FILE
+from twin.reports import summary as summaries
+from twin.run.recordings import open_recording, read_recorded_config
+from twin.run.terminal import console, print_line
+from twin.studies import TABLE_FILE
+
+
+def print_recording_prc(log: Path, as_json: bool) -> None:
+    """Print the PRC of a recording, or of every run of a campaign, as a table or JSON."""
+    from twin.reports.prc_table import print_prc
+
+    keys = ("run", "u_star_m", "a_star_m_s2", "steps", "jumps", "hysteresis")
+    if (log / STATE_FILE).is_file():
+        from twin.campaign.summary import read_campaign
+
+        runs = [run.summary for run in read_campaign(log).runs]
+        if as_json:
+            print(
+                summaries.dump_strict_json(
+                    {"runs": [{key: run[key] for key in keys} for run in runs]}
+                )
+            )
+        for run in runs if not as_json else ():
+            print_prc(console, run)
+        return
+    recording = open_recording(log)
+    summary = summaries.summarise(recording, read_recorded_config(recording).parameters)
+    if as_json:
+        print(summaries.dump_strict_json({key: summary[key] for key in keys}))
+    else:
+        print_prc(console, summary)
+
+
+def write_folder_report(folder: Path) -> None:
+    """Rewrite report.html in the folder of a run, campaign or batch.
+
+    A run or campaign is reported from its recordings, a batch from its table.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; give the folder of a run or a batch")
+    from twin.recording.run_paths import PARTS_FOLDER
+    from twin.reports.report import write_report
+    from twin.run.merge_parts import merge_run_parts
+
+    if (folder / PARTS_FOLDER).is_dir():
+        merge_run_parts(folder)
+    if (folder / STATE_FILE).is_file():
+        from twin.campaign.report import write_campaign_report
+
+        print_line(f"{write_campaign_report(folder)}")
+        return
+    if (folder / TABLE_FILE).is_file():
+        from twin.studies.page import write_study_page
+
+        print_line(f"{write_study_page(folder)}")
+        return
+    recording = open_recording(folder)
+    if not (folder / "summary.json").exists():
+        summary = summaries.summarise(recording, read_recorded_config(recording).parameters)
+        summaries.write_summary(summary, folder / "summary.json")
+    print_line(f"{write_report(folder, recording)}")

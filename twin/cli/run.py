@@ -1,0 +1,129 @@
+"""`check` and `run`: check a test before the table moves, and run it."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from table_io.clock import RealClock, local_datetime
+from table_io.config.calibration_due import find_overdue_calibrations
+from table_io.errors import InputError
+from table_io.safety.preflight import list_drive_warnings, list_setup_warnings
+from twin.reports.finalize import EXIT_ABORTED, EXIT_INTERRUPTED, finalize_run
+from twin.run.disk import require_disk_space
+from twin.run.folders import RUNS_FOLDER, make_output_folder, make_run_folder
+from twin.run.progress import RunProgress
+from twin.run.realtime import check_realtime
+from twin.run.run_config import RunConfig, make_run_id, read_run_config
+from twin.run.terminal import catch_interrupts, console, print_line
+from twin.run.warm_up import compile_kernels
+from twin.security.credentials import Credentials, credentials_folder
+from twin.viewer.address import VIEW_ADDRESS, find_free_address, format_live_view
+
+
+def check_profile(profile: Path, table: str | None, out: Path | None) -> None:
+    """Print the plan and its margins; draw the drive if `out` is given."""
+    from twin.cli.check import draw_drive, print_plan
+
+    config = read_run_config(profile, table)
+    print_plan(console, config)
+    if out is not None:
+        folder = make_output_folder(out, make_run_id(config.name))
+        print_line(f"drive drawn: {draw_drive(config, folder / 'drive.png')}")
+
+
+def run_test(
+    profile: Path,
+    out: Path | None,
+    unpaced: bool,
+    model: str | None,
+    table: str | None,
+    view: bool,
+    listen: str,
+    keys: Credentials | None = None,
+    router: str = "",
+    remote_twin: bool = False,
+) -> int:
+    """Run a test on the table, in real time or at full speed; return the exit code."""
+    config = read_run_config(profile, table, model)
+    if unpaced and not config.rig.runs_at_any_speed:
+        raise InputError(f"--speed max: {config.rig.name!r} keeps its own time; leave --speed away")
+    if not unpaced:
+        check_realtime(config, profile)
+    compile_kernels(config, table=True)
+    require_disk_space([config], out or RUNS_FOLDER)
+    folder, run_id = make_run_folder(out, config.name)
+    messages = (
+        *list_drive_warnings(config.margins, config.rig),
+        *list_setup_warnings(config.profile, config.rig),
+    )
+    for sentence in (*messages, *find_overdue_calibrations(config.rig, local_datetime().date())):
+        print_line(f"warning: {sentence}")
+    print_line(
+        f"{config.profile.title}: {len(config.steps)} steps, "
+        f"{config.drive.planned_end / config.drive.rate_hz:.0f} s on {config.rig.title} "
+        f"-> {folder}"
+    )
+    with catch_interrupts() as poll_interrupt:
+        if unpaced:
+            _run_unpaced(config, run_id, folder, poll_interrupt)
+        else:
+            connection = (listen, keys, router, remote_twin)
+            began = _run_live(config, run_id, folder, poll_interrupt, view, *connection)
+            if not began:
+                return EXIT_INTERRUPTED
+    code = finalize_run(folder, config, view)
+    return EXIT_INTERRUPTED if poll_interrupt() and code == EXIT_ABORTED else code
+
+
+def _run_unpaced(
+    config: RunConfig, run: str, folder: Path, poll_interrupt: Callable[[], str | None]
+) -> None:
+    from twin.run.unpaced import play_unpaced
+
+    with RunProgress(console, len(config.steps), config.drive.planned_end) as progress:
+        play_unpaced(config, run, folder / "run.mcap", poll_interrupt, progress)
+
+
+def _run_live(
+    config: RunConfig,
+    run: str,
+    folder: Path,
+    poll_interrupt: Callable[[], str | None],
+    view: bool,
+    listen: str,
+    keys: Credentials | None,
+    router: str,
+    remote_twin: bool,
+) -> bool:
+    """Run a test in real time; return False if it was interrupted before it began."""
+    from twin.live.process_config import ProcessConfig
+    from twin.live.supervisor import Supervisor
+    from twin.run.merge_parts import merge_run_parts
+
+    process_config = ProcessConfig(
+        run,
+        config.name,
+        str(folder),
+        listen,
+        config.profile_toml,
+        config.rig_toml,
+        config.model_toml,
+        serve_view=find_free_address(VIEW_ADDRESS) if view else "",
+        keys=credentials_folder(keys),
+        router=router,
+        remote_twin=remote_twin,
+    )
+    with RunProgress(console, len(config.steps), config.drive.planned_end) as progress:
+        supervisor = Supervisor(
+            process_config,
+            config.profile.on_death,
+            RealClock(),
+            progress,
+            poll_interrupt,
+            progress.print_line,
+        )
+        if view:
+            progress.print_line(format_live_view(process_config.serve_view))
+        began = supervisor.run()
+    if began:
+        merge_run_parts(folder)
+    return began

@@ -1,0 +1,42 @@
+"""`simulate`: simulate one model on the ideal drive, or a batch of models and gaps."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from table_io.errors import InputError
+from twin.reports.finalize import finalize_run
+from twin.run.folders import make_run_folder
+from twin.run.progress import RunProgress
+from twin.run.run_config import read_run_config
+from twin.run.terminal import console
+from twin.run.warm_up import compile_kernels
+
+
+def simulate_profile(
+    profile: Path,
+    models: Sequence[str],
+    gaps: Sequence[str],
+    workers: int | None,
+    out: Path | None,
+    view: bool,
+) -> int:
+    """Simulate one model, recorded like a run, or several models or gaps as a batch."""
+    if len(models) <= 1 and not gaps:
+        return _simulate_one(profile, models[0] if models else None, out, view)
+    if view:
+        raise InputError("--view shows one run; leave it away, or give one --model and no --gap")
+    from twin.studies.command import simulate_all
+
+    return simulate_all(profile, models, gaps, workers, out)
+
+
+def _simulate_one(profile: Path, model: str | None, out: Path | None, view: bool) -> int:
+    """Simulate one model at the profile's gap; return the exit code."""
+    from twin.run.unpaced import simulate_ideal as play
+
+    config = read_run_config(profile, None, model)
+    compile_kernels(config)
+    folder, run = make_run_folder(out, f"{config.name}-model")
+    with RunProgress(console, len(config.steps), config.drive.planned_end) as progress:
+        play(config, run, folder / "run.mcap", progress)
+    return finalize_run(folder, config, view)

@@ -1,0 +1,225 @@
+"""`verify`: check the integrity of a recording and locate damage and gaps."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from table_io.errors import InputError
+from table_io.records import Comparison, SampleGap
+from twin.recording.log_metadata import ContentHash, find_altered_attachments, read_schema_version
+from twin.recording.reader import Recording, build_recording
+from twin.recording.recovery import Damage, LogMessage, RecoveredLog, recover_log
+from twin.recording.run_paths import explain_unmerged_parts as scattered
+from twin.replay.provenance import find_earlier_run
+from twin.reports.finalize import EXIT_GAPS
+from twin.reports.sensor_table import build_sensor_rows
+from twin.run.recordings import list_parts, read_recorded_config
+from twin.run.versions import compare_versions, find_version_changes, format_version_changes
+
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Verification:
+    """Recording, the messages of its items, and the report as printed by `--json`."""
+
+    recording: Recording
+    messages: list[LogMessage]
+    report: Json
+
+
+def verify_logs(logs: list[Path], as_json: bool, repair: Path | None) -> int:
+    """Verify a log or its parts, print the report, repair if asked; return the exit code."""
+    from twin.cli.verify_table import print_verification
+    from twin.reports.summary import dump_strict_json
+    from twin.run.terminal import print_line
+
+    paths = [part for log in logs for part in list_parts(log)]
+    verification = examine_logs(paths, [message for log in logs if (message := scattered(log))])
+    if as_json:
+        print(dump_strict_json(verification.report))
+    else:
+        print_verification(verification.report, advise=repair is None)
+    if repair is not None:
+        from twin.cli.repair import write_repaired
+
+        sentence = write_repaired(verification, paths, repair)
+        if not as_json:
+            print_line(f"repaired -> {repair}: {sentence}")
+    return 0 if verification.report["sound"] else EXIT_GAPS
+
+
+def examine_logs(paths: list[Path], unmerged: Sequence[str] = ()) -> Verification:
+    """Examine a log or the parts of one; InputError if no recording can be read.
+
+    `unmerged` has a sentence for each folder whose parts were not merged.
+    """
+    parts = [recover_log(path) for path in paths]
+    recording, messages = build_recording(paths[0], _join_parts(paths, parts))
+    start = recording.start
+    unrecorded = find_unrecorded_gaps(recording)
+    report: Json = {
+        "log": [str(path) for path in paths],
+        "bytes": sum(path.stat().st_size for path in paths),
+        "run": recording.run,
+        "profile": start.name,
+        "started_at": start.started_at,
+        "schema": _read_schema_version(paths[0], recording),
+        "content": _check_content(parts),
+        "altered": find_altered_attachments(recording.metadata, recording.attachments),
+        "versions": compare_versions(start.versions),
+        "sensors": [asdict(row) for row in build_sensor_rows(start)],
+        "topics": count_messages(parts),
+        "samples": {
+            "rate_hz": start.rate_hz,
+            "acquired": sum(map(len, recording.contiguous_blocks("meas"))),
+            "missing": recording.missing_samples,
+            "planned": start.planned_samples,
+            "stopped": recording.stop.verdict if recording.stop else None,
+        },
+        "gaps": [
+            *({"first": first, "count": count, "channel": "", "reason": "missing in this file"}
+              for first, count in unrecorded),
+            *({"first": first, "count": count, "channel": "", "reason": "no end was recorded"}
+              for first, count in find_missing_end(recording)),
+            *({"first": gap.index, "count": gap.count, "channel": gap.channel,
+               "reason": gap.reason} for gap in recording.records(SampleGap)),
+        ],
+        "damage": [
+            {"byte": damage.offset, "bytes": damage.size, "reason": damage.reason}
+            for damage in recording.damage
+        ],
+        "repaired": recording.metadata.get("repaired", {}),
+        "apart": list(unmerged),
+    }  # fmt: skip
+    if report["content"] == "differs":
+        report["damage"].append(
+            {"byte": 0, "bytes": 0, "reason": "the messages are not those that were written"}
+        )
+    report["sound"] = not any(report[fault] for fault in ("damage", "gaps", "altered", "apart"))
+    report["replay"] = assess_replay(recording)
+    return Verification(recording, messages, report)
+
+
+def find_unrecorded_gaps(recording: Recording) -> list[tuple[int, int]]:
+    """Return (first, count) of measured samples that are missing without a recorded gap."""
+    gaps = {
+        (gap.index, gap.count)
+        for gap in recording.records(SampleGap)
+        if not gap.channel and gap.count > 0
+    }
+    pieces = recording.contiguous_blocks("meas")
+    last = recording.stop.index if recording.stop else (pieces[-1].end if pieces else 0)
+    inner_edges = (edge for piece in pieces for edge in (piece.index, piece.end))
+    edges = [recording.start.index, *inner_edges, last]
+    holes = [
+        (first, end - first) for first, end in zip(edges[::2], edges[1::2], strict=True)
+        if end > first
+    ]  # fmt: skip
+    return [hole for hole in holes if hole not in gaps]
+
+
+def find_missing_end(recording: Recording) -> list[tuple[int, int]]:
+    """Return (first, count) of the planned samples after the end of a log without stop record.
+
+    Such a log is incomplete even if no planned sample is missing: the count may be 0.
+    """
+    if recording.stop is not None:
+        return []
+    pieces = recording.contiguous_blocks("meas")
+    end = pieces[-1].end if pieces else recording.start.index
+    return [(end, max(recording.start.planned_samples - end, 0))]
+
+
+def count_messages(parts: list[RecoveredLog]) -> Json:
+    """Count the messages of each topic, and those missing by sequence number, from 0."""
+    count: dict[str, int] = defaultdict(int)
+    missing: dict[str, int] = defaultdict(int)
+    for part in parts:
+        numbers: dict[str, set[int]] = defaultdict(set)
+        for message in part.messages:
+            numbers[message.topic].add(message.sequence)
+            count[message.topic] += 1
+        stated = part.metadata.get("content", {})
+        for topic in {*numbers, *(name for name in stated if name.startswith("/"))}:
+            sequences = numbers[topic]
+            text = stated.get(topic, "")
+            stated_count = int(text) if text.isdecimal() and len(text) < 16 else 0
+            missing[topic] += max(stated_count, max(sequences, default=-1) + 1) - len(sequences)
+    return {
+        topic: {"messages": count[topic], "missing": missing[topic]}
+        for topic in sorted({*count, *missing})
+    }
+
+
+def assess_replay(recording: Recording) -> Json:
+    """Assess whether a log can be replayed, and what prevents bitwise identity."""
+    reasons = []
+    try:
+        if "table_acc_m_s2" not in recording.start.channels:
+            raise InputError("no channel table_acc_m_s2, which drives the twin")
+        if not recording.blocks("meas"):
+            raise InputError("no measured samples")
+        read_recorded_config(recording)
+    except InputError as error:
+        return {"possible": False, "identical": False, "because": [str(error)]}
+    if recording.missing_samples:
+        reasons.append(f"{recording.missing_samples} samples are missing")
+    if log_of_beginning := find_earlier_run(recording):
+        reasons.append(f"its beginning is in {log_of_beginning}")
+    if version_changes := format_version_changes(find_version_changes(recording.start.versions)):
+        reasons.append(f"versions differ: {version_changes}")
+    if not recording.records(Comparison):
+        reasons.append("no comparisons were recorded")
+    elif not recording.is_intact:
+        reasons.append("damaged: comparisons may be missing")
+    return {"possible": True, "identical": not reasons, "because": reasons}
+
+
+def _join_parts(paths: list[Path], parts: list[RecoveredLog]) -> RecoveredLog:
+    """Join the parts of a recording without duplicates; each part has its own sequence numbers."""
+    if len(parts) == 1:
+        return parts[0]
+    runs = {part.metadata["run"].get("id", "") for part in parts if "run" in part.metadata}
+    if len(runs) > 1:
+        raise InputError(
+            f"{paths[0]} and {paths[-1]}: of different runs ({', '.join(sorted(runs)[:5])}); give "
+            "the parts of one run, or verify them one by one"
+        )
+    joined = RecoveredLog(topics=frozenset().union(*(part.topics for part in parts)))
+    messages: dict[tuple[str, bytes], LogMessage] = {}  # without duplicates of two recorders
+    for path, part in zip(paths, parts, strict=True):
+        for message in part.messages:
+            messages.setdefault((message.topic, message.payload), message)
+        joined.metadata |= part.metadata
+        joined.attachments |= part.attachments
+        joined.damage += [
+            replace(damage, reason=f"{path.name}: {damage.reason}") for damage in part.damage
+        ]
+    joined.messages = list(messages.values())
+    joined.damage.append(Damage(0, 0, f"{len(parts)} parts that were not put together"))
+    return joined
+
+
+def _read_schema_version(path: Path, recording: Recording) -> int | None:
+    try:
+        return read_schema_version(path, recording.metadata)
+    except InputError:
+        return None  # damaged file, reported as damage
+
+
+def _check_content(parts: list[RecoveredLog]) -> str:
+    """Return "same" or "differs" by the content hash, "unknown" if a file has none."""
+    state = "same"
+    for part in parts:
+        stated = part.metadata.get("content")
+        if stated is None:
+            return "unknown"
+        content = ContentHash()
+        for message in part.messages:
+            content.add(message.topic, message.log_time, message.payload)
+        if content.to_metadata() != stated:
+            state = "differs"
+    return state

@@ -1,0 +1,102 @@
+"""`shaketwin view`: show a recording or a running test in Rerun."""
+
+import os
+import tempfile
+from pathlib import Path
+
+from table_io.clock import RealClock
+from table_io.errors import InputError
+from twin.recording.reader import read_recording
+from twin.recording.run_paths import resolve_log_path
+from twin.run.terminal import print_line
+from twin.security.credentials import Credentials, user_name
+from twin.transport.zenoh_link import open_spoke
+from twin.viewer.address import VIEW_ADDRESS, find_free_address, format_live_view, viewer_url
+from twin.viewer.live_view import BATCH_S, LiveView
+from twin.viewer.view import write_rrd
+from twin.viewer.window import open_viewer, take_screenshot
+
+ANSWER_TIMEOUT_S = 2.0
+CAPTURE_S = 6.0  # of a running test before its screenshot
+
+
+def show_view(
+    log: Path | None,
+    save: Path | None,
+    picture: Path | None,
+    connect: str,
+    rig: str,
+    keys: Credentials | None = None,
+) -> None:
+    """Show a recording, or a running test if `log` is None."""
+    if log is not None:
+        view_log(resolve_log_path(log), save, picture)
+    elif save is not None:
+        raise InputError(f"--save {save}: of a recording only; give its LOG, or leave --save away")
+    else:
+        view_live(connect, rig, picture, keys)
+
+
+def view_log(log: Path, save: Path | None, picture: Path | None) -> None:
+    """Open a recording in Rerun; with `save` or `picture` only write these files."""
+    for path in (save, picture):
+        _require_parent(path)
+    recording = read_recording(log)
+    if save is None and picture is None:
+        rrd = Path(tempfile.mkdtemp(prefix="shaketwin-")) / "view.rrd"
+        write_rrd(recording, rrd)
+        print_line(open_viewer(rrd))
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        rrd = save if save is not None else Path(folder) / "view.rrd"
+        write_rrd(recording, rrd)
+        if picture is not None:
+            take_screenshot(rrd, picture)
+    for path in (save, picture):
+        if path is not None:
+            print_line(f"{path}")
+
+
+def _require_parent(path: Path | None) -> None:
+    """Raise InputError if the folder of a new file does not exist."""
+    if path is not None and not path.absolute().parent.is_dir():
+        raise InputError(f"{path}: its folder does not exist; make it, or give another place")
+
+
+def view_live(
+    connect: str, rig: str, picture: Path | None = None, keys: Credentials | None = None
+) -> None:
+    """Show a running test in Rerun until its end or Ctrl-C; with `picture` only a screenshot."""
+    _require_parent(picture)
+    link = open_spoke(rig, connect, ANSWER_TIMEOUT_S, keys)
+    link.declare_alive(f"observer.{user_name(keys)}.view-{os.getpid()}")
+    address = find_free_address(VIEW_ADDRESS)
+    live = LiveView(link, address)
+    try:
+        while live.view is None and not live.is_over:
+            live.listen(BATCH_S)
+        if picture is not None:
+            _take_screenshot(live, viewer_url(address), picture)
+            return
+        print_line(format_live_view(address))
+        print_line(open_viewer(viewer_url(address)))
+        while not live.is_over:
+            live.listen(BATCH_S)
+        print_line(live.end_reason)
+    except KeyboardInterrupt:
+        print_line("view closed; the test goes on")
+    finally:
+        live.close()
+        link.close()
+
+
+def _take_screenshot(live: LiveView, source: str, picture: Path) -> None:
+    """Write a screenshot of a running test after `CAPTURE_S`."""
+    clock = RealClock()
+    deadline_s = clock.now() + CAPTURE_S
+    while clock.now() < deadline_s and not live.is_over:
+        live.listen(BATCH_S)
+    if live.is_over:
+        raise InputError(f"{live.end_reason} before there was anything to draw; give its LOG")
+    take_screenshot(source, picture)
+    print_line(f"{picture}")

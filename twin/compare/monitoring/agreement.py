@@ -1,0 +1,123 @@
+"""Agreement check: is the restarted twin within its tolerance band?
+
+    band = 3 x noise at rest + 5 % of the cycle's amplitude
+
+It covers noise and the error of a good model. For displacements the amplitude is that of u, since
+the total one may be small where the mass hardly moves; for forces the first term is at least the
+contact threshold. On the simulated rig with the right model the error stays below half of the
+band; see the tests.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from table_io.block import Bool2D, Float1D
+from table_io.channels import contact_forces, relative_displacement
+from table_io.records import Agreement, Event, Record
+from twin.compare import COMPARED_CHANNELS
+from twin.compare.monitoring.cycle import ChannelNoise, CycleData, MonitoringSetup
+from twin.compare.twins import compared_values
+
+NOISE_FACTOR = 3.0
+AMPLITUDE_TOLERANCE = 0.05  # of the amplitude
+MAX_AGREEING_SHARE = 0.7  # of the band: below it twin and rig agree again
+MIN_CYCLES_OUTSIDE = 2  # consecutive cycles beyond the band before an Event
+ALREADY_REPORTED = -1
+PHASE_NAMES = ("in flight", "in contact right", "in contact left")
+
+
+@dataclass(frozen=True, slots=True)
+class AgreementState:
+    """Consecutive cycles beyond a band, or `ALREADY_REPORTED` until all channels agree again."""
+
+    cycles: int = 0
+    ever_reported: bool = False
+
+
+def check_agreement(
+    setup: MonitoringSetup, state: AgreementState, noise: ChannelNoise, cycle: CycleData
+) -> tuple[AgreementState, list[Record]]:
+    """Return the Agreement of a cycle, and an Event if channels have left their bands."""
+    measured = compared_values(cycle.measured)
+    errors = [
+        (values - cycle.predicted.channel(f"window/{name}")) ** 2
+        for values, name in zip(measured, COMPARED_CHANNELS, strict=True)
+    ]
+    phase_errors = [[_rms(squares[phase]) for squares in errors] for phase in _phases(setup, cycle)]
+    half_ranges = [_half_range(values) for values in measured]
+    band = [
+        _min_band(setup, noise, name)
+        + AMPLITUDE_TOLERANCE * (half_ranges[0] if name.endswith("disp_m") else half_range)
+        for half_range, name in zip(half_ranges, COMPARED_CHANNELS, strict=True)
+    ]
+    record = Agreement(
+        cycle.end, cycle.step.index, cycle.number, len(cycle.measured), COMPARED_CHANNELS,
+        tuple(_rms(squares) for squares in errors), tuple(band),
+        *(tuple(rms) for rms in phase_errors),
+    )  # fmt: skip
+    shares = [
+        e / b if b > 0 and not np.isnan(e) else 0.0
+        for e, b in zip(record.error, record.band, strict=True)
+    ]
+    if np.isnan(record.error).all():  # nothing was measured
+        return state, [record]
+    if state.cycles == ALREADY_REPORTED:
+        return AgreementState(ALREADY_REPORTED if max(shares) > MAX_AGREEING_SHARE else 0, True), [
+            record
+        ]
+    cycles = state.cycles + 1 if max(shares) > 1 else 0
+    if cycles < MIN_CYCLES_OUTSIDE:
+        return AgreementState(cycles, state.ever_reported), [record]
+    return AgreementState(ALREADY_REPORTED, True), [
+        record,
+        Event(cycle.end, "disagreement", _sentence(cycle, record, shares)),
+    ]
+
+
+def _sentence(cycle: CycleData, record: Agreement, shares: list[float]) -> str:
+    worst = int(np.argmax(shares))
+    also_outside = [
+        COMPARED_CHANNELS[i] for i, share in enumerate(shares) if share > 1 and i != worst
+    ]
+    phase_errors = [errors[worst] for errors in (record.flight, record.right, record.left)]
+    phase = PHASE_NAMES[int(np.nanargmax(phase_errors))]
+    return (
+        f"{COMPARED_CHANNELS[worst]} differs from the restarted twin by "
+        f"{record.error[worst]:.3g} (rms), {shares[worst]:.1f} times the band, at "
+        f"{cycle.step.frequency_hz:g} Hz {cycle.step.direction}, most {phase}"
+        + (f"; also {', '.join(also_outside)}" if also_outside else "")
+    )
+
+
+def _min_band(setup: MonitoringSetup, noise: ChannelNoise, name: str) -> float:
+    """Return the band of a compared channel without motion; NaN if its noise is unknown."""
+    rms = noise.channel_rms(name)
+    if name == "rel_disp_m" and np.isnan(rms):
+        rms = float(np.hypot(noise.channel_rms("mass_disp_m"), noise.channel_rms("table_disp_m")))
+    if name.startswith("force"):
+        return max(setup.contact_n, NOISE_FACTOR * rms) if rms > 0 else setup.contact_n
+    return NOISE_FACTOR * rms if rms > 0 else float("nan")
+
+
+def _phases(setup: MonitoringSetup, cycle: CycleData) -> list[Bool2D]:
+    """Return masks of flight, contact right and contact left: by load cells, else by gaps."""
+    u = relative_displacement(cycle.measured)
+    contacts = []
+    for side, force, gap in zip((1, -1), contact_forces(cycle.measured), setup.gaps_m, strict=True):
+        known = ~np.isnan(force)
+        contacts.append(np.where(known, side * force > setup.contact_n, side * u > gap))
+    right, left = contacts
+    return [~(right | left), right, left]
+
+
+def _rms(squares: Float1D) -> float:
+    """Return the root of the mean of known squares; NaN if less than half are known."""
+    known = squares[~np.isnan(squares)]
+    return float(np.sqrt(known.mean())) if 2 * known.size > squares.size else float("nan")
+
+
+def _half_range(values: Float1D) -> float:
+    """Return half of the range of the known values; NaN if none is known."""
+    known = values[np.isfinite(values)]
+    return 0.5 * float(np.ptp(known)) if known.size else float("nan")

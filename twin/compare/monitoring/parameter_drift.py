@@ -1,0 +1,274 @@
+"""Running estimate of the specimen's parameters, and detection of their drift.
+
+The equations of each held cycle are summed in chunks of a few cycles, and the chunks give
+    value   least squares over the recent ones
+    drift   least squares over all, stiffness or gap with a linear trend in time and another in the
+            logarithm of the amplitude, so that a nonlinear law is not taken for a drift
+with standard deviations from the scatter among the chunks where it exceeds the noise.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from table_io.block import Float1D, Float2D
+from table_io.channels import relative_displacement
+from table_io.records import Estimate, Event, Record
+from twin.compare.monitoring.cycle import ChannelNoise, CycleData, MonitoringSetup
+from twin.compare.monitoring.force_equations import force_equations
+
+MIN_CHUNK_S, MIN_CHUNK_CYCLES = 1.0, 3  # least time and cycles, held in one step
+RECENT_S = 30.0  # of the test, whose chunks give the value
+MIN_DRIFT_CHUNKS = 8  # before a drift is reported
+LOAD_CELL_GAIN_SD = 0.01  # of a contact force: constant gain error of load cells
+MIN_DRIFT_SIGMA = 4.0  # standard deviations, for a drift to be reported
+MIN_DRIFT_FRACTION = 0.003  # of a stiffness; for a gap, of the deepest deformation
+# Of a stiffness per e-fold of the amplitude: how far a law may deviate from the model's, while the
+# twin has stayed within its band, and after it has left it.
+LAW_CURVATURE, UNTRUSTED_LAW_CURVATURE = 0.003, 0.1
+MIN_AMPLITUDE_M = 1e-9
+MAX_CHUNKS = 256  # chunks of a law, before neighbors are merged
+PARAMETER_NAMES = (
+    ("stiffness", "damping"),
+    ("bumper_stiffness_r", "gap_r"),
+    ("bumper_stiffness_l", "gap_l"),
+)
+TREND_COLUMNS = (0, 1, 1)  # index of the linear parameter of each law that may drift
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chunk:
+    """Normal equations of one law's n parameters, (n, n) and (n,), from `count` cycles.
+
+    Mean time `time_s`, `duration_s` in all; `log_amplitude` is the mean logarithm of the amplitude
+    of u in m.
+    """
+
+    time_s: float
+    log_amplitude: float
+    step: int
+    count: int
+    duration_s: float
+    matrix: Float2D
+    rhs: Float1D
+
+    @property
+    def full(self) -> bool:
+        return self.count >= MIN_CHUNK_CYCLES and self.duration_s >= MIN_CHUNK_S
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriftState:
+    """Chunks of each law so far, the last one still growing; parameters reported to drift."""
+
+    chunks: tuple[tuple[Chunk, ...], ...] = ((), (), ())
+    drifting: frozenset[str] = frozenset()
+    max_depth_m: float = 0.0  # deepest bumper deformation
+
+
+def update_estimate(
+    setup: MonitoringSetup,
+    state: DriftState,
+    noise: ChannelNoise,
+    cycle: CycleData,
+    trusted: bool,
+    doubt: bool,
+) -> tuple[DriftState, list[Record]]:
+    """Update with one cycle; return an Estimate when a chunk is complete, and drift Events.
+
+    `trusted`: the twin has stayed within its band so far, so its laws hold. `doubt`: sensors
+    contradict each other, so no drift is reported.
+    """
+    cycle_equations = force_equations(setup, noise, cycle)
+    chunks = tuple(
+        law_chunks
+        if equations is None
+        else _add_cycle(law_chunks, cycle, setup.rate_hz, *equations)
+        for law_chunks, equations in zip(state.chunks, cycle_equations, strict=True)
+    )
+    state = replace(
+        state, chunks=chunks, max_depth_m=max(state.max_depth_m, _max_depth(setup, cycle))
+    )
+    grown = [
+        law_chunks
+        for law_chunks, equations in zip(chunks, cycle_equations, strict=True)
+        if equations is not None
+    ]
+    if not any(law_chunks[-1].full for law_chunks in grown):
+        return state, []
+    state, items = _report_drift(
+        setup, state, cycle, LAW_CURVATURE if trusted else UNTRUSTED_LAW_CURVATURE
+    )
+    return state, [item for item in items if not (doubt and isinstance(item, Event))]
+
+
+def _add_cycle(
+    chunks: tuple[Chunk, ...], cycle: CycleData, rate_hz: float, rows: Float2D, values: Float1D
+) -> tuple[Chunk, ...]:
+    """Add the noise-scaled equations (equation, n) and (equation,) of a cycle."""
+    duration_s = len(cycle.measured) / rate_hz
+    time_s = cycle.end / rate_hz - 0.5 * duration_s
+    last = chunks[-1] if chunks else None
+    if last is None or last.step != cycle.step.index or last.full:
+        size = rows.shape[1]
+        last = Chunk(time_s, 0.0, cycle.step.index, 0, 0.0, np.zeros((size, size)), np.zeros(size))
+    else:
+        chunks = chunks[:-1]
+    log_amplitude = float(
+        np.log(max(np.ptp(relative_displacement(cycle.corrected)), MIN_AMPLITUDE_M))
+    )
+    grown = Chunk(
+        last.time_s + (time_s - last.time_s) / (last.count + 1),
+        last.log_amplitude + (log_amplitude - last.log_amplitude) / (last.count + 1),
+        last.step,
+        last.count + 1,
+        last.duration_s + duration_s,
+        last.matrix + (rows[:, :, None] * rows[:, None, :]).sum(axis=0),
+        last.rhs + (rows * values[:, None]).sum(axis=0),
+    )
+    return (*(_merge_pairs(chunks) if len(chunks) >= MAX_CHUNKS else chunks), grown)
+
+
+def _merge_pairs(chunks: tuple[Chunk, ...]) -> tuple[Chunk, ...]:
+    """Return the chunks with neighbors merged in pairs."""
+    pairs = zip(chunks[::2], chunks[1::2], strict=False)
+    return tuple(
+        Chunk(
+            0.5 * (a.time_s + b.time_s),
+            0.5 * (a.log_amplitude + b.log_amplitude),
+            b.step,
+            a.count + b.count,
+            a.duration_s + b.duration_s,
+            a.matrix + b.matrix,
+            a.rhs + b.rhs,
+        )
+        for a, b in pairs
+    ) + (chunks[-1:] if len(chunks) % 2 else ())
+
+
+def _max_depth(setup: MonitoringSetup, cycle: CycleData) -> float:
+    """Return the deepest bumper deformation of the cycle in m."""
+    u = relative_displacement(cycle.corrected)
+    extents = [float(np.nanmax(s * u)) for s in (1, -1)] if np.isfinite(u).any() else [0.0, 0.0]
+    return max(0.0, *(r - g for r, g in zip(extents, setup.gaps_m, strict=True)))
+
+
+def _report_drift(
+    setup: MonitoringSetup, state: DriftState, cycle: CycleData, law_curvature: float
+) -> tuple[DriftState, list[Record]]:
+    """Return the Estimate, and an Event for each parameter that has begun to drift."""
+    p = setup.model.parameters
+    max_depth_m = max(state.max_depth_m, MIN_AMPLITUDE_M)
+    force_scale = (
+        p.stiffness,
+        p.bumper_stiffness_r * max_depth_m,
+        p.bumper_stiffness_l * max_depth_m,
+    )
+    names: list[str] = []
+    columns: list[tuple[float, float, float, float]] = []
+    for law, (law_names, law_chunks) in enumerate(zip(PARAMETER_NAMES, state.chunks, strict=True)):
+        estimates = _law_estimates(law_chunks, law, law_curvature * force_scale[law])
+        names += law_names if estimates else ()
+        columns += estimates
+    if not names:
+        return state, []
+    values, sd, drift, drift_sd = (tuple(column) for column in zip(*columns, strict=True))
+    record = Estimate(cycle.end, cycle.step.index, tuple(names), values, sd, drift, drift_sd)
+    items: list[Record] = [record]
+    drifting = set(state.drifting)
+    for name, value, change, spread in zip(names, values, drift, drift_sd, strict=True):
+        min_change = MIN_DRIFT_FRACTION * (
+            state.max_depth_m if name.startswith("gap") else abs(value)
+        )
+        is_significant = abs(change) > MIN_DRIFT_SIGMA * spread and abs(change) > min_change
+        if is_significant and name not in drifting:
+            items.append(Event(cycle.end, "drift", _sentence(name, value, change, spread)))
+            drifting.add(name)
+        elif abs(change) < 0.5 * MIN_DRIFT_SIGMA * spread:
+            drifting.discard(name)
+    return replace(state, drifting=frozenset(drifting)), items
+
+
+def _sentence(name: str, value: float, change: float, spread: float) -> str:
+    if name.startswith("gap"):
+        return (
+            f"{name} has changed by {1e3 * change:+.3f} mm (+-{2e3 * spread:.3f}) since the start, "
+            f"to {1e3 * value:.3f} mm"
+        )
+    first = value - change
+    return (
+        f"{name} has changed by {100 * change / first:+.2f} % "
+        f"(+-{200 * spread / first:.2f}) since the start, to {value:.5g}"
+    )
+
+
+def _law_estimates(
+    chunks: tuple[Chunk, ...], law: int, law_curvature: float
+) -> list[tuple[float, float, float, float]]:
+    """Return (value, sd, drift, sd of the drift) of both parameters of a law; empty at first.
+
+    `law_curvature`: allowed dependence of the drifting one on the logarithm of the amplitude.
+    """
+    full_chunks = [chunk for chunk in chunks if chunk.count >= MIN_CHUNK_CYCLES]
+    if len(full_chunks) < 2:
+        return []
+    since_s = min(full_chunks[-1].time_s - RECENT_S, full_chunks[-2].time_s)
+    recent = _solve_chunks([chunk for chunk in full_chunks if chunk.time_s >= since_s], None, 0.0)
+    if recent is None:
+        return []
+    (first, second), covariance = recent[0][:2], recent[1][:2, :2]
+    if first <= 0:  # not a spring: too few data yet
+        return []
+    jacobian = np.eye(2)
+    if law:  # of (K, K G) -> (K, G)
+        jacobian[1] = -second / first**2, 1 / first
+        second = second / first
+    sd = np.sqrt(np.diag(jacobian @ covariance @ jacobian.T))
+    drift = [(float("nan"), float("nan"))] * 2
+    trend = (
+        _solve_chunks(full_chunks, TREND_COLUMNS[law], law_curvature)
+        if len(full_chunks) >= MIN_DRIFT_CHUNKS
+        else None
+    )
+    if trend is not None and trend[0][0] > 0:
+        span = full_chunks[-1].time_s - full_chunks[0].time_s
+        x, spread = trend
+        scale = span / x[0] if law else span
+        drift[TREND_COLUMNS[law]] = float(scale * x[-1]), float(scale * np.sqrt(spread[-1, -1]))
+    return [(float(first), float(sd[0]), *drift[0]), (float(second), float(sd[1]), *drift[1])]
+
+
+def _solve_chunks(
+    chunks: list[Chunk], trend: int | None, law_curvature: float
+) -> tuple[Float1D, Float2D] | None:
+    """Return (parameters, covariance) by least squares over the chunks; None if singular.
+
+    With a trend of one of them, two more follow: per e-fold of the amplitude, and per s. The
+    covariance is that of the noise, larger where the chunks scatter more.
+    """
+    matrices = np.array([chunk.matrix for chunk in chunks])
+    right_sides = np.array([chunk.rhs for chunk in chunks])
+    regressors = np.array([(chunk.log_amplitude, chunk.time_s) for chunk in chunks])
+    count = right_sides.shape[1]
+    expansion = np.tile(np.eye(count, count if trend is None else count + 2), (len(chunks), 1, 1))
+    prior = np.zeros(expansion.shape[2])
+    prior[2:count] = LOAD_CELL_GAIN_SD**-2  # load-cell gains are 1 within this
+    rhs = prior.copy()
+    if trend is not None:
+        expansion[:, trend, count:] = regressors - regressors[0]
+        prior[count] = law_curvature**-2
+    rhs += (expansion.mT @ right_sides[:, :, None]).sum(axis=0)[:, 0]
+    matrix = (expansion.mT @ matrices @ expansion).sum(axis=0) + np.diag(prior)
+    size = np.sqrt(np.diag(matrix))
+    if not (size > 0).all():
+        return None
+    scaled = matrix / np.outer(size, size)
+    if np.linalg.cond(scaled) > 1e10:
+        return None
+    inverse = np.linalg.inv(scaled) / np.outer(size, size)
+    x: Float1D = inverse @ rhs
+    residuals = (expansion.mT @ (right_sides - (matrices @ expansion) @ x)[:, :, None])[:, :, 0]
+    dof_factor = len(chunks) / max(len(chunks) - x.size, 1)
+    scatter = dof_factor * inverse @ (residuals.T @ residuals) @ inverse
+    inflation = np.sqrt(np.maximum(np.diag(scatter) / np.diag(inverse), 1.0))
+    return x, inverse * np.outer(inflation, inflation)

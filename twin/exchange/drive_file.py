@@ -1,0 +1,248 @@
+"""`shaketwin drive`: export of the planned drive as a file for another controller, and its reader.
+
+    csv  header line, after comments with unit, rate and hash
+    txt  time in s and displacement in mm, separated by a tab, without header
+    rpc  RPC III time history (MTS), one channel in mm, short integers with peak 32752
+    uff  universal file, one data set 58, evenly spaced double precision, in m
+    mat  MATLAB 5: time_s, displacement_mm, rate_hz, sha256
+    wav  32-bit PCM, one channel; full scale is `output.span_mm` of the rig file
+
+The hash is SHA-256 of the displacements in m as little-endian float64; `run` plans the same drive.
+"""
+
+import hashlib
+import math
+import struct
+import wave
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from table_io.acquisition.external_control import plan_open_loop_drive
+from table_io.block import Float1D
+from table_io.errors import InputError
+from twin.run.run_config import read_run_config
+from twin.run.terminal import print_line
+
+CSV_HEADER = "time_s,drive_disp_mm"
+RPC_FRAME_POINTS = 1024
+# Readers compute counts * SCALE or counts * SCALE * INT_FULL_SCALE / 32768; with 32768 both agree.
+RPC_PEAK, RPC_FULL_SCALE = 32752, 32768
+WAV_FULL_SCALE = 2**31 - 1
+
+
+@dataclass(frozen=True, eq=False)
+class DriveFile:
+    """Drive displacement in m, (sample,), at `rate_hz`; `span_mm` is the command's full scale."""
+
+    name: str
+    values_m: Float1D
+    rate_hz: float
+    span_mm: float
+
+    @property
+    def sha256(self) -> str:
+        return hashlib.sha256(self.values_m.astype("<f8").tobytes()).hexdigest()
+
+    @property
+    def time_s(self) -> Float1D:
+        return np.arange(self.values_m.size) / self.rate_hz
+
+
+def export_drive(profile: Path, table: str | None, out: Path, file_format: str) -> None:
+    """Write the planned drive of a test to a new file."""
+    file_format = file_format or FORMAT_BY_SUFFIX.get(out.suffix.lower(), "")
+    if file_format not in WRITERS:
+        raise InputError(
+            "unknown format",
+            where=f"--format {file_format or out.suffix or out.name!r}",
+            allowed=", ".join(WRITERS),
+        )
+    bundle = read_run_config(profile, table)
+    plan, rig = plan_open_loop_drive(bundle.profile, bundle.rig), bundle.rig
+    rest_samples = math.ceil(bundle.profile.acquisition.rest_s * plan.rate_hz)
+    values = plan.command(0, plan.rest_start + rest_samples)
+    file = DriveFile(bundle.name, values, plan.rate_hz, rig.output.span_mm)
+    write_drive(out, file_format, file)
+    print_line(
+        f"{out} ({file_format}): {values.size} values at {plan.rate_hz:g} Hz, "
+        f"{values.size / plan.rate_hz:.1f} s, largest {abs(values).max() * 1e3:.4g} mm, sha256 "
+        f"{file.sha256}"
+    )
+    if file_format == "rpc":
+        step = abs(values).max() * 1e6 / RPC_PEAK
+        print_line(f"resolution of rpc: {step:.3g} um; the other formats are finer")
+    print_line("play it once, from rest, unscaled, without a ramp or filter of the controller")
+
+
+def write_drive(path: Path, file_format: str, file: DriveFile) -> None:
+    """Write a new drive file; raise InputError if it exists or cannot be written."""
+    if path.exists():
+        raise InputError(
+            "exists already; nothing is overwritten", where=f"-o {path}", remedy="give another name"
+        )
+    if file_format == "wav" and not file.rate_hz.is_integer():
+        raise InputError(
+            f"a rate of {file.rate_hz:g} Hz is not whole",
+            where="--format wav",
+            remedy="use another format",
+        )
+    partial_path = path.with_name(f".{path.name}.half")
+    try:
+        WRITERS[file_format](
+            partial_path, replace(file, name=file.name.encode("ascii", "replace").decode())
+        )
+        partial_path.rename(path)
+    except OSError as error:
+        raise InputError(f"-o {path}: cannot write it: {error.strerror}") from None
+    finally:
+        partial_path.unlink(missing_ok=True)
+
+
+def _write_csv(path: Path, file: DriveFile) -> None:
+    header = (
+        f"# shaketwin drive of {file.name}\n# rate_hz {file.rate_hz!r}\n# unit mm, right positive\n"
+        f"# sha256 {file.sha256}\n{CSV_HEADER}\n"
+    )
+    _write_columns(path, file, header, ",")
+
+
+def _write_txt(path: Path, file: DriveFile) -> None:
+    _write_columns(path, file, "", "\t")
+
+
+def _write_columns(path: Path, file: DriveFile, header: str, delimiter: str) -> None:
+    rows = np.stack([file.time_s, file.values_m * 1e3], axis=1)
+    with path.open("w", encoding="ascii") as out:
+        out.write(header)
+        np.savetxt(out, rows, fmt=("%.7f", "%.9f"), delimiter=delimiter)
+
+
+def _write_rpc(path: Path, file: DriveFile) -> None:
+    frames = math.ceil(file.values_m.size / RPC_FRAME_POINTS)
+    peak = float(np.abs(file.values_m).max()) * 1e3
+    scale = peak / RPC_PEAK
+    values = np.zeros(frames * RPC_FRAME_POINTS, dtype="<i2")
+    values[: file.values_m.size] = np.rint(file.values_m * 1e3 / scale)
+    parameters = {
+        "FILE_TYPE": "TIME_HISTORY",
+        "TIME_TYPE": "DRIVE",
+        "DELTA_T": f"{1.0 / file.rate_hz:.6E}",
+        "CHANNELS": "1",
+        "DATE": "",
+        "REPEATS": "1",
+        "DATA_TYPE": "SHORT_INTEGER",
+        "INT_FULL_SCALE": f"{RPC_FULL_SCALE}",
+        "PTS_PER_FRAME": f"{RPC_FRAME_POINTS}",
+        "PTS_PER_GROUP": f"{RPC_FRAME_POINTS}",
+        "FRAMES": f"{frames}",
+        "HALF_FRAMES": "0",
+        "BYPASS_FILTER": "0",
+        "PARTITIONS": "1",
+        "PART.CHAN_1": "1",
+        "PART.NCHAN_1": "1",
+        "DESC.CHAN_1": "drive_disp",
+        "UNITS.CHAN_1": "mm",
+        "SCALE.CHAN_1": f"{scale:.9E}",
+        "LOWER_LIMIT.CHAN_1": f"{-peak:.6E}",
+        "UPPER_LIMIT.CHAN_1": f"{peak:.6E}",
+        "MAP.CHAN_1": "1",
+        "DRIVE_SHA256": file.sha256,
+    }
+    blocks = math.ceil((len(parameters) + 3) / 4)
+    leading = {
+        "FORMAT": "BINARY_IEEE_LITTLE_END",
+        "NUM_HEADER_BLOCKS": f"{blocks}",
+        "NUM_PARAMS": f"{len(parameters) + 3}",
+    }
+    header = b"".join(
+        struct.pack("32s96s", key.encode(), value.encode())
+        for key, value in (leading | parameters).items()
+    )
+    path.write_bytes(header.ljust(512 * blocks, b"\0") + values.tobytes())
+
+
+def _write_uff(path: Path, file: DriveFile) -> None:
+    node = f" {'NONE':<10}{0:10d}{0:4d}"
+    axis = "{:10d}{:5d}{:5d}{:5d} {:<20} {:<20}"
+    lines = [
+        f"{-1:6d}",
+        f"{58:6d}",
+        "drive_disp_m",
+        f"shaketwin drive of {file.name}"[:80],
+        "NONE",
+        f"sha256 {file.sha256}",
+        "NONE",
+        f"{1:5d}{1:10d}{0:5d}{0:10d}{node}{node}",
+        f"{4:10d}{file.values_m.size:10d}{1:10d}{0.0:13.5E}{1.0 / file.rate_hz:13.5E}{0.0:13.5E}",
+        axis.format(17, 0, 0, 0, "Time", "s"),
+        axis.format(8, 1, 0, 0, "Displacement", "m"),
+        axis.format(0, 0, 0, 0, "NONE", "NONE"),
+        axis.format(0, 0, 0, 0, "NONE", "NONE"),
+    ]
+    for k in range(0, file.values_m.size, 4):
+        lines.append("".join(f"{value:20.12E}" for value in file.values_m[k : k + 4]))
+    lines.append(f"{-1:6d}")
+    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+def _write_mat(path: Path, file: DriveFile) -> None:
+    from scipy.io import savemat
+
+    variables = {
+        "time_s": file.time_s[:, None],
+        "displacement_mm": file.values_m[:, None] * 1e3,
+        "rate_hz": file.rate_hz,
+        "sha256": file.sha256,
+    }
+    savemat(path, variables, appendmat=False)
+
+
+def _write_wav(path: Path, file: DriveFile) -> None:
+    share = file.values_m * 1e3 / file.span_mm
+    with wave.open(str(path), "wb") as out:
+        out.setparams((1, 4, int(file.rate_hz), share.size, "NONE", ""))
+        out.writeframes(np.rint(share * WAV_FULL_SCALE).astype("<i4").tobytes())
+
+
+WRITERS: dict[str, Callable[[Path, DriveFile], None]] = {
+    "csv": _write_csv, "txt": _write_txt, "rpc": _write_rpc, "uff": _write_uff, "mat": _write_mat,
+    "wav": _write_wav,
+}  # fmt: skip
+FORMAT_BY_SUFFIX = {
+    ".csv": "csv", ".txt": "txt", ".dat": "txt", ".asc": "txt", ".rpc": "rpc", ".drv": "rpc",
+    ".rsp": "rpc", ".tim": "rpc", ".uff": "uff", ".unv": "uff", ".u58": "uff", ".mat": "mat",
+    ".wav": "wav",
+}  # fmt: skip
+
+
+def read_drive(path: Path) -> tuple[Float1D, float]:
+    """Return (displacement in m, (sample,), rate in Hz) of a csv or txt drive file.
+
+    For the simulated controller: a real one reads the file itself. Raises InputError if the file is
+    not a drive.
+    """
+    try:
+        lines = path.read_text(encoding="ascii").splitlines()
+        rows = [line for line in lines if line and line[0] in "0123456789-+. "]
+        table = np.loadtxt(rows, delimiter="," if "," in rows[0] else None, ndmin=2)
+    except (OSError, ValueError, IndexError) as error:
+        raise InputError(
+            f"no drive file ({error})",
+            where=f"--play {path}",
+            remedy="make one: shaketwin drive PROFILE -o FILE.csv",
+        ) from None
+    steps = np.diff(table[:, 0])
+    if table.shape[1] != 2 or table.shape[0] < 2 or not steps.min() > 0:
+        raise InputError(
+            "wrong columns",
+            where=f"--play {path}",
+            allowed="two columns, rising time in s and displacement in mm",
+        )
+    if not np.isfinite(table).all():
+        raise InputError(
+            "has values that are no numbers", where=f"--play {path}", remedy="make the file again"
+        )
+    return table[:, 1] * 1e-3, round(float(1.0 / steps.mean()), 3)

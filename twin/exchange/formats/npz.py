@@ -1,0 +1,34 @@
+"""Reader of numpy .npz files; pickled objects are never loaded."""
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from twin.exchange.formats import ColumnKey, SampleTable, add_array, extract_column
+
+
+def scan_columns(path: Path) -> SampleTable:
+    """Scan the array headers of a file; values are not read."""
+    table = SampleTable(path)
+    with zipfile.ZipFile(path) as archive:
+        for member in archive.namelist():
+            with archive.open(member) as file:
+                version = np.lib.format.read_magic(file)
+                header = (
+                    np.lib.format.read_array_header_1_0
+                    if version == (1, 0)
+                    else np.lib.format.read_array_header_2_0
+                )
+                shape, _, dtype = header(file)
+            name = member.removesuffix(".npy")
+            add_array(table, name, shape, dtype.kind, (name,))
+    return table
+
+
+def load_column(path: Path, key: ColumnKey) -> Any:
+    """Read the values of a column, (row,)."""
+    name, k = key
+    with np.load(path, allow_pickle=False) as arrays:
+        return extract_column(arrays[name], int(k))

@@ -1,0 +1,42 @@
+"""Reader of LabVIEW TDMS files, with columns `group/channel`; only this file imports npTDMS."""
+
+from pathlib import Path
+from typing import Any
+
+from nptdms import TdmsFile
+
+from twin.exchange.formats import ColumnInfo, ColumnKey, SampleTable
+
+
+def scan_columns(path: Path) -> SampleTable:
+    """Scan the channels of a file; rate and start time are their waveform properties."""
+    with TdmsFile.open(path) as file:
+        is_truncated = file.file_status.incomplete_final_segment
+        table = SampleTable(
+            path, notes=("warning: the file ends inside a segment",) if is_truncated else ()
+        )
+        for group in file.groups():
+            for channel in group.channels():
+                name = f"{group.name}/{channel.name}"
+                kind = "O" if channel.dtype is None else channel.dtype.kind
+                if kind not in "fiub" or len(channel) < 2:
+                    table.skipped[name] = f"{len(channel)} values of {channel.dtype}"
+                    continue
+                properties = channel.properties
+                step = float(properties.get("wf_increment", 0.0))
+                table.columns[name] = ColumnInfo(
+                    len(channel),
+                    (group.name, channel.name),
+                    str(properties.get("unit_string", "")),
+                    1.0 / step if step > 0 else None,
+                    float(properties.get("wf_start_offset", 0.0)),
+                    group=group.name,
+                )
+    return table
+
+
+def load_column(path: Path, key: ColumnKey) -> Any:
+    """Read the values of a column, (row,), with the scaling in the file."""
+    group, channel = key
+    with TdmsFile.open(path) as file:
+        return file[group][channel][:]

@@ -1,0 +1,275 @@
+"""`shaketwin import`: conversion of a table of samples to a log."""
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from table_io.block import Block, Float1D, Float2D
+from table_io.config.base import find_config, load_config, parse_toml
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.errors import InputError
+from table_io.records import Event, RunStart, RunStop, SampleGap, Step
+from twin.exchange.columns import ImportedSamples, read_column_map, read_samples
+from twin.exchange.formats import TOML_TEXTS, SampleTable, read_table
+from twin.exchange.labels import read_labels, typical_cycles
+from twin.exchange.sampling import find_holes
+from twin.identification.step_detection import DetectedSteps, find_steps
+from twin.reports.finalize import EXIT_GAPS
+from twin.run.progress import RunProgress
+from twin.run.run_config import RunConfig, from_texts, make_run_id, read_model
+from twin.run.terminal import console, print_line
+from twin.run.unpaced import SIMULATED_BLOCK_SAMPLES, add_twin_items, record_items
+from twin.run.warm_up import compile_kernels
+from twin.transport.codec import Item
+
+NO_PROFILE = (
+    "warning: no --profile: unit mass, no bumpers, a 1 Hz placeholder model; PRC and twin are "
+    "meaningless, give --profile"
+)
+MOTION_CHANNELS = (
+    "drive_disp_m",
+    "table_disp_m",
+    "table_acc_m_s2",
+    "rel_disp_m",
+)  # steps are detected in the first one present
+MAX_GAPS = 1000  # per channel: beyond, lost samples are only counted
+MAX_SAMPLES_PER_ROW = 10  # beyond, the rows are not one recording
+PLAIN_PROFILE = """\
+title = {title}
+notes = "No profile was given: a unit mass without bumpers, so a force is one per unit mass."
+rig = {rig}
+[specimen]
+mass_kg = 1.0
+gap_mm = inf
+[acquisition]
+rate_hz = {rate_hz!r}
+[sweep]
+start_hz = {hz!r}
+stop_hz = {hz!r}
+step_hz = {hz!r}
+cycles = {cycles}
+measured_cycles = {measured}
+"""
+PLAIN_MODEL = """\
+title = "Placeholder: 1 Hz, 5 % damping; the specimen is unknown, give --model"
+[base]
+stiffness_n_m = 39.47841760435743
+damping_n_s_m = 0.6283185307179586
+bumper_stiffness_n_m = 1.0
+bumper_damping_n_s_m = 0.0
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class _SampleGrid:
+    """Samples on the uniform time grid, values (channel, sample), NaN in the holes."""
+
+    channels: tuple[str, ...]
+    values: Float2D
+    holes: list[tuple[int, int]]
+
+    @property
+    def size(self) -> int:
+        return int(self.values.shape[1])
+
+    @property
+    def segments(self) -> Iterator[tuple[int, int]]:
+        """(first, end) of the segments between the holes."""
+        first = 0
+        for hole, count in self.holes:
+            yield first, hole
+            first = hole + count
+        yield first, self.size
+
+
+def import_samples(
+    file: Path, out: Path, profile: Path | None, rig: str | None, columns: Path | None
+) -> int:
+    """Convert the table in `file` to a new log at `out`; return the exit code."""
+    if out.exists():
+        raise InputError("exists already", where=out, remedy="nothing recorded is ever overwritten")
+    if out.suffix != ".mcap":
+        raise InputError("not the name of a log", where=out, allowed="names that end in .mcap")
+    column_map = read_column_map(columns)
+    if profile is not None:
+        load_config(profile, Profile, "test profile")  # report errors before reading a long table
+    table = read_table(file, column_map.group if column_map is not None else "")
+    samples_read = read_samples(table, column_map)
+    file_labels = read_labels(table, samples_read) if samples_read.labels else None
+    config = _build_run_config(table, profile, rig, samples_read.rate_hz, file_labels)
+    grid = _to_grid(file, samples_read)
+    if file_labels is not None:
+        labels = file_labels
+    else:
+        signal, is_acc = _motion_signal(grid)
+        labels = find_steps(
+            signal,
+            samples_read.rate_hz,
+            config.profile.sweep,
+            is_acc=is_acc,
+            on_grid=profile is not None,
+        )
+    steps = labels.steps or config.steps
+    config = replace(config, drive=replace(config.drive, steps=steps))
+    missing_profile = (NO_PROFILE,) if profile is None and not _has_config_texts(table) else ()
+    notes = (*missing_profile, *samples_read.notes, *labels.messages, _describe_steps(labels.steps))
+    gaps = 0
+    with RunProgress(console, len(steps), grid.size) as progress:
+
+        def on_item(item: Item) -> None:
+            nonlocal gaps
+            gaps += isinstance(item, SampleGap)
+            progress(item)
+
+        run = make_run_id(file.stem)
+        start = replace(
+            config.make_start_factory(run, "table")({}, 0.0),
+            channels=grid.channels,
+            planned_samples=grid.size,
+        )
+        items = _iter_items(file, start, grid, labels, notes)
+        if "table_acc_m_s2" in grid.channels:
+            compile_kernels(config)
+            items = add_twin_items(items, config.prepare_twin())
+        out.parent.mkdir(parents=True, exist_ok=True)
+        record_items(items, out, run, samples_read.rate_hz, on_item)
+    print_line(f"{grid.size} samples of {len(grid.channels)} channels, {gaps} gaps -> {out}")
+    return EXIT_GAPS if gaps else 0
+
+
+def print_contents(file: Path, columns: Path | None) -> None:
+    """Print the contents of a file, one line per column."""
+    column_map = read_column_map(columns)
+    for line in read_table(file, column_map.group if column_map is not None else "").contents:
+        print_line(line)
+
+
+def _has_config_texts(table: SampleTable) -> bool:
+    """Return whether the table carries profile, rig and model, as an export does."""
+    return len(table.texts) == len(TOML_TEXTS)
+
+
+def _build_run_config(
+    table: SampleTable,
+    profile: Path | None,
+    rig: str | None,
+    rate_hz: float,
+    labels: DetectedSteps | None,
+) -> RunConfig:
+    """Build the run config of the log, with the sampling rate of the file."""
+    file = table.path
+    if profile is None and _has_config_texts(table):
+        profile_toml, rig_toml, model_toml = (table.texts[name] for name in TOML_TEXTS)
+        file_profile = parse_toml(profile_toml, Profile, f"profile in {file}")
+        if file_profile.acquisition.rate_hz != rate_hz:
+            profile_toml = _set_rate(profile_toml, rate_hz)
+        if rig is not None:
+            rig_toml = load_config(find_config(rig, "rigs"), RigConfig, "rig file")[1]
+        return from_texts(file.stem, profile_toml, rig_toml, model_toml, f"config in {file}")
+    if profile is None:
+        hz = min(1.0, rate_hz / 100)  # placeholder that passes profile validation
+        cycles, measured = typical_cycles(labels) if labels is not None else (3, 3)
+        text = PLAIN_PROFILE.format(
+            title=json.dumps(f"Imported: {file.name}"),
+            rig=json.dumps(rig or "simulated"),
+            rate_hz=rate_hz,
+            hz=hz,
+            cycles=cycles,
+            measured=measured,
+        )
+        rig_toml = load_config(find_config(rig or "simulated", "rigs"), RigConfig, "rig file")[1]
+        return from_texts(file.stem, text, rig_toml, PLAIN_MODEL, f"{file} without a profile")
+    test_profile, text = load_config(profile, Profile, "test profile")
+    rig_toml = load_config(
+        find_config(rig or test_profile.rig, "rigs", profile), RigConfig, "rig file"
+    )[1]
+    model_toml = read_model(test_profile.model, profile)[1]
+    source = f"{profile}, at the {rate_hz:g} Hz of {file}"
+    if test_profile.acquisition.rate_hz != rate_hz:
+        text = _set_rate(text, rate_hz)
+    return from_texts(profile.stem, text, rig_toml, model_toml, source)
+
+
+def _set_rate(profile_toml: str, rate_hz: float) -> str:
+    """Return the text of a profile with `acquisition.rate_hz` replaced."""
+    header = re.search(r"(?m)^[ \t]*\[acquisition\].*$", profile_toml)
+    if header is None:
+        return f"{profile_toml.rstrip()}\n\n[acquisition]\nrate_hz = {rate_hz!r}\n"
+    before, after = profile_toml[: header.end()], profile_toml[header.end() :]
+    table = re.split(r"(?m)^[ \t]*\[", after, maxsplit=1)[0]
+    without = re.sub(r"(?m)^[ \t]*rate_hz[ \t]*=.*\n?", "", table)
+    return f"{before}\nrate_hz = {rate_hz!r}{without}{after[len(table) :]}"
+
+
+def _to_grid(file: Path, imported: ImportedSamples) -> _SampleGrid:
+    """Place the samples on the uniform time grid; raise InputError if most are missing."""
+    size = int(imported.index[-1]) + 1
+    if size > MAX_SAMPLES_PER_ROW * imported.index.size:
+        raise InputError(
+            f"{imported.index.size} rows over {size / imported.rate_hz:.6g} s at "
+            f"{imported.rate_hz:g} Hz: most samples are missing",
+            where=file,
+            remedy="import its parts one by one",
+        )
+    values = np.full((len(imported.channels), size), np.nan)
+    for row, channel in zip(values, imported.channels.values(), strict=True):
+        row[imported.index] = channel
+    return _SampleGrid(tuple(imported.channels), values, find_holes(imported.index))
+
+
+def _motion_signal(grid: _SampleGrid) -> tuple[Float1D, bool]:
+    """Return (signal for step detection, (sample,), whether it is an acceleration)."""
+    for name, values in zip(grid.channels, grid.values, strict=True):
+        if name in MOTION_CHANNELS and np.isfinite(values).any():
+            return values, name == "table_acc_m_s2"
+    return np.full(grid.size, np.nan), False
+
+
+def _describe_steps(steps: tuple[Step, ...]) -> str:
+    """Describe the detected steps in one line."""
+    if not steps:
+        return "no steps found: no PRC can be computed"
+    frequencies = [step.frequency_hz for step in steps]
+    directions = " and ".join(dict.fromkeys(step.direction for step in steps))
+    span = f"{min(frequencies):.4g} to {max(frequencies):.4g} Hz"
+    return f"found {len(steps)} steps, {directions}, {span}"
+
+
+def _iter_items(
+    file: Path, start: RunStart, grid: _SampleGrid, detected: DetectedSteps, notes: tuple[str, ...]
+) -> Iterator[Item]:
+    """Yield the items of the log: start, notes as events, blocks, gaps and stop."""
+    yield start
+    yield Event(0, "imported", file.name)
+    for text in notes:
+        _, is_warning, rest = text.rpartition("warning: ")
+        yield Event(0, "warning" if is_warning else "imported", rest)
+    for first, end in grid.segments:
+        for begin in range(first, end, SIMULATED_BLOCK_SAMPLES):
+            window = slice(begin, min(begin + SIMULATED_BLOCK_SAMPLES, end))
+            labels = detected.step[window], detected.label[window], detected.cycle[window]
+            values = np.ascontiguousarray(grid.values[:, window])
+            yield Block("meas", begin, start.rate_hz, grid.channels, values, *labels)
+        yield from (SampleGap(end, count, "", "lost") for hole, count in grid.holes if hole == end)
+    yield from _iter_lost_samples(grid)
+    yield RunStop(grid.size, "complete", f"the whole of {file.name}", ("idle", "at rest"))
+
+
+def _iter_lost_samples(grid: _SampleGrid) -> Iterator[Item]:
+    """Yield a SampleGap per stretch of lost samples of a channel, or one Event if too many."""
+    is_hole = np.zeros(grid.size, dtype=bool)
+    for first, count in grid.holes:
+        is_hole[first : first + count] = True
+    for name, values in zip(grid.channels, grid.values, strict=True):
+        is_lost = np.isnan(values) & ~is_hole
+        edges = np.flatnonzero(np.diff(is_lost, prepend=False, append=False)).reshape(-1, 2)
+        if len(edges) > MAX_GAPS:
+            yield Event(0, "warning", f"{name}: {int(is_lost.sum())} of {grid.size} samples lost")
+            continue
+        for first, last in edges.tolist():
+            yield SampleGap(first, last - first, name, "lost")

@@ -1,0 +1,1 @@
+"""Identification of parameters and missing effects from recorded tests."""

@@ -1,0 +1,231 @@
+"""Cross-checks of a fit: estimates from subsets of the samples, and warnings on disagreement."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from table_io.block import Bool2D
+from table_io.records import Step
+from twin.identification.contact_onsets import ContactGaps
+from twin.identification.least_squares import FitResult, compute_slopes, fit_parameters
+from twin.identification.parameters import GAP_PREFIX, ZERO_PREFIX, FreeParameter, ParameterSet
+from twin.identification.residuals import LogResiduals
+
+MIN_SUBSET_BLOCKS = 6  # with fewer blocks the standard error of a subset is unreliable
+# standard deviations at which two estimates disagree; high because about thirty are compared
+MIN_DISAGREEMENT_SIGMA = 4.0
+# smallest disagreement reported: relative, and for a gap in m
+MIN_DISAGREEMENT_SHARE, MIN_DISAGREEMENT_M = 0.01, 2e-5
+OPPOSED_SUBSETS = (
+    ("small motion", "large motion"), ("forward", "backward"), ("early", "late"),
+    ("contact right", "contact left"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class SubsetEstimate:
+    """Estimate from a subset of the samples; `values` hold (value, standard deviation) in SI."""
+
+    source: str
+    values: Mapping[str, tuple[float, float]]
+    entry_count: int
+    converged: bool
+
+
+def select_observable(
+    log_residuals: Sequence[LogResiduals],
+    parameters: ParameterSet,
+    free: Sequence[FreeParameter],
+    train: Sequence[Bool2D] | None,
+) -> tuple[FreeParameter, ...]:
+    """Return the parameters that change any residual where `train`, (entry,) each, is True."""
+    before = [residuals.evaluate(parameters) for residuals in log_residuals]
+    masks = train or [np.ones(values.size, dtype=bool) for values in before]
+    return tuple(
+        parameter
+        for parameter in free
+        if any(
+            slope[mask].any()
+            for slope, mask in zip(
+                compute_slopes(log_residuals, parameters, parameter, before), masks, strict=True
+            )
+        )
+    )
+
+
+def estimate_subsets(
+    log_residuals: Sequence[LogResiduals], steps: Sequence[Sequence[Step]], joint: FitResult
+) -> tuple[SubsetEstimate, ...]:
+    """Estimate the parameters from free flight, contacts of each side, and opposed halves."""
+    # tare errors are determined by the rest row alone
+    free = [parameter for parameter in joint.free if not parameter.name.startswith(ZERO_PREFIX)]
+    flight = [
+        parameter for parameter in free if not parameter.name.startswith(("bumper_", GAP_PREFIX))
+    ]
+    estimates = [
+        _estimate_subset(
+            "free flight", log_residuals, joint, flight, [*map(_flight_mask, log_residuals)]
+        )
+    ]
+    for row, side in ((1, "right"), (2, "left")):
+        side_free = [
+            replace(parameter, keys=(f"{parameter.name}_{side[0]}",))
+            if parameter.name.startswith("bumper_")
+            else parameter
+            for parameter in free
+            if parameter.name.startswith(("bumper_", GAP_PREFIX)) and "." not in parameter.name
+        ]
+        side_masks = [residuals.entry_row == row for residuals in log_residuals]
+        estimates.append(
+            _estimate_subset(f"contact {side}", log_residuals, joint, side_free, side_masks)
+        )
+    log_halves = [
+        _half_masks(residuals, log_steps)
+        for residuals, log_steps in zip(log_residuals, steps, strict=True)
+    ]
+    for name in log_halves[0]:
+        masks = [halves[name] for halves in log_halves]
+        if any(mask.any() for mask in masks) and not all(mask.all() for mask in masks):
+            estimates.append(_estimate_subset(name, log_residuals, joint, free, masks))
+    return tuple(estimate for estimate in estimates if estimate.values)
+
+
+def _flight_mask(residuals: LogResiduals) -> Bool2D:
+    """Return the damper entries in flight, (entry,); well inside the gaps if contact is unknown."""
+    m = residuals.motion()
+    right, left = m.gaps_m
+    inside_gaps = (m.u < 0.9 * right) & (m.u > -0.9 * left)
+    if m.damper is not None:
+        inside_gaps = np.ones(m.u.size, dtype=bool)
+    in_flight = np.where(
+        (residuals.contact_state < 0).any(axis=0),
+        inside_gaps,
+        (residuals.contact_state == 0).all(axis=0),
+    )
+    mask: Bool2D = (residuals.entry_row == 0) & in_flight[residuals.entry_sample]
+    return mask
+
+
+def _half_masks(residuals: LogResiduals, steps: Sequence[Step]) -> dict[str, Bool2D]:
+    """Return the entries of each half by name, (entry,) each, without the rest row."""
+    m, sample = residuals.motion(), residuals.entry_sample
+    peaks = np.zeros(int(residuals.sample_block[-1]) + 1)
+    np.maximum.at(peaks, residuals.sample_block, np.abs(m.u))
+    peak = peaks[residuals.sample_block]
+    median_peak = float(np.median(peak[m.moving]))
+    late = m.time_s > float(np.median(m.time_s[m.moving]))
+    halves = {
+        "small motion": peak <= median_peak, "large motion": peak > median_peak, "early": ~late,
+        "late": late,
+    }  # fmt: skip
+    for direction in ("forward", "backward"):
+        halves[direction] = np.isin(
+            m.step, [step.index for step in steps if step.direction == direction]
+        )
+    moving_rows = residuals.entry_row < len(residuals.rows)
+    return {name: mask[sample] & moving_rows for name, mask in halves.items()}
+
+
+def _estimate_subset(
+    source: str, log_residuals: Sequence[LogResiduals], joint: FitResult,
+    free: Sequence[FreeParameter],
+    train: Sequence[Bool2D],
+) -> SubsetEstimate:  # fmt: skip
+    """Fit one subset; return no values if it has too few blocks."""
+    entries = sum(int(mask.sum()) for mask in train)
+    blocks = sum(
+        np.unique(residuals.entry_block[mask]).size
+        for residuals, mask in zip(log_residuals, train, strict=True)
+    )
+    observable = (
+        select_observable(log_residuals, joint.parameters, free, train)
+        if blocks >= MIN_SUBSET_BLOCKS
+        else ()
+    )
+    if not observable:
+        return SubsetEstimate(source, {}, entries, True)
+    fit = fit_parameters(log_residuals, joint.parameters, observable, train)
+    values = {
+        parameter.name: (fit.values[parameter.name], fit.std_errors[parameter.name])
+        for parameter in observable
+    }
+    determined = {name: pair for name, pair in values.items() if pair[1] > 0}
+    return SubsetEstimate(source, determined, entries, fit.converged)
+
+
+def list_fit_warnings(
+    log_residuals: Sequence[LogResiduals], joint: FitResult, fixed: Sequence[str]
+) -> Iterator[str]:
+    """Yield warnings on convergence, bounds and parameters that the logs do not determine."""
+    if not joint.converged:
+        yield "the fit has not converged: do not use its values"
+    for name in joint.at_bound:
+        yield f"{name}: at its bound, {joint.values[name]:.4g}; its interval is not valid"
+    names = [parameter.name for parameter in joint.free]
+    if "bumper_stiffness" not in names:
+        yield "no log touches a bumper: K_j and C_j are those of the start model, gaps as stated"
+    else:
+        for residuals in log_residuals:
+            if f"{GAP_PREFIX}{residuals.log_number}" not in names:
+                yield f"{residuals.signals.name}: touches no bumper; its gap is the stated one"
+    for name in fixed:
+        yield f"{name}: not determined by the logs; kept as in the start model"
+
+
+def list_asymmetry_warnings(asymmetry: tuple[float, float] | None) -> Iterator[str]:
+    """Yield a warning if the gaps differ from the stated ones in opposite directions."""
+    if asymmetry and abs(asymmetry[0]) > max(
+        MIN_DISAGREEMENT_M, MIN_DISAGREEMENT_SIGMA * asymmetry[1]
+    ):
+        offset, sd = asymmetry
+        yield (
+            f"the gaps differ from the stated ones: right {1e3 * offset:+.3f} mm, left "
+            f"{-1e3 * offset:+.3f} mm (+- {1.96e3 * sd:.3f}); the fit shifts both equally; run "
+            "discover to test for gap_offset"
+        )
+
+
+def list_disagreements(joint: FitResult, parts: Sequence[SubsetEstimate]) -> Iterator[str]:
+    """Yield a warning where opposed subsets, or free flight and the joint fit, disagree."""
+    by_name = {part.source: part.values for part in parts}
+    joint_values = {name: (value, joint.std_errors[name]) for name, value in joint.values.items()}
+    pairs = [(a, b, by_name.get(a, {}), by_name.get(b, {})) for a, b in OPPOSED_SUBSETS]
+    pairs.append(("free flight", "the joint fit", by_name.get("free flight", {}), joint_values))
+    units = {parameter.name: parameter.unit for parameter in joint.free}
+    for a, b, first, second in pairs:
+        for name in first.keys() & second.keys():
+            (x, sx), (y, sy) = first[name], second[name]
+            if _disagree(x - y, math.hypot(sx, sy), y, units[name]):
+                yield (
+                    f"{name}: {x:.5g} {units[name]} in {a}, {y:.5g} in {b}, "
+                    f"{abs(x - y) / math.hypot(sx, sy):.0f} standard deviations apart: the "
+                    "specimen changed, or the model lacks an effect; run discover to find it"
+                )
+
+
+def _disagree(difference: float, sd: float, value: float, unit: str) -> bool:
+    notable = MIN_DISAGREEMENT_M if unit == "m" else MIN_DISAGREEMENT_SHARE * abs(value)
+    return abs(difference) > max(MIN_DISAGREEMENT_SIGMA * sd, notable)
+
+
+def list_onset_warnings(
+    log_residuals: Sequence[LogResiduals], joint: FitResult, contact_gaps: Sequence[ContactGaps]
+) -> Iterator[str]:
+    """Yield a warning where the gap from contact onsets or releases differs from the fitted gap."""
+    for gaps in contact_gaps:
+        gap = fitted_gap(log_residuals[gaps.log], joint, gaps.side)
+        sd = math.hypot(gaps.std_error, joint.std_errors.get(f"{GAP_PREFIX}{gaps.log}", 0.0))
+        if _disagree(gaps.value - gap, sd, gap, "m"):
+            yield (
+                f"{log_residuals[gaps.log].signals.name}: {gaps.side} {gaps.kind}s lie at "
+                f"{1e3 * gaps.value:.3f} mm, the fitted gap at {1e3 * gap:.3f} mm: the bumper law "
+                "may differ (hunt_crossley, bumper_maxwell), or the gaps may be unequal"
+            )
+
+
+def fitted_gap(residuals: LogResiduals, joint: FitResult, side: str) -> float:
+    """Return the fitted gap of a side of a log in m."""
+    p = joint.parameters.model_for_log(residuals.log_number, residuals.motion()).parameters
+    return p.gap_r if side == "right" else p.gap_l

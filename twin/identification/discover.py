@@ -1,0 +1,300 @@
+"""Discovery of missing effects: from the signals of logs and a model to a verdict."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from table_io.block import Float1D
+from table_io.errors import InputError
+from table_io.records import Step
+from twin.identification.candidates import Candidate, list_candidates
+from twin.identification.least_squares import FitResult, MapFunction, fit_parameters
+from twin.identification.localization import (
+    Localization,
+    ResidualCell,
+    build_cells,
+    estimate_repeatability_floor,
+    find_pulling_bumpers,
+    localize_excess,
+)
+from twin.identification.parameters import (
+    GAP_PREFIX,
+    INPUT_GAIN,
+    INPUT_OFFSET,
+    SENSOR_PREFIX,
+    ZERO_PREFIX,
+    FreeParameter,
+    ParameterSet,
+    list_base_parameters,
+    list_model_effect_parameters,
+    parse_log_number,
+)
+from twin.identification.residuals import LogResiduals, build_log_residuals
+from twin.identification.selection import (
+    FittedSet,
+    ProgressCallback,
+    SelectionProblem,
+    SelectionProgress,
+    SelectionResult,
+    stepwise_selection,
+)
+from twin.identification.signals import LogSignals, derives_acc
+from twin.identification.verdict import DiscoveryVerdict, judge_selection
+from twin.model.model import Model
+
+MIN_ENTRIES, MIN_BLOCKS = 1000, 9
+MODEL_LIMITED_RMS = 50.0  # residual rms over the noise above which model error limits the fit
+MAX_PARAMETER_RATIO = 1.5  # ratio to the model's parameter beyond which the specimen is another one
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedLog:
+    """Log prepared for identification: signals, contact threshold in N, steps."""
+
+    signals: LogSignals
+    contact_n: float
+    steps: tuple[Step, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedProblem:
+    """Selection problem of a set of logs, fit of the base model, excluded effects, and notes."""
+
+    problem: SelectionProblem
+    first_fit: FitResult
+    excluded: dict[str, str]
+    notes: tuple[str, ...]
+
+    @property
+    def parameters(self) -> ParameterSet:
+        return self.first_fit.parameters
+
+
+@dataclass(frozen=True, eq=False)
+class Discovery:
+    """Result of a discovery. The maps show cross-validation residuals before and after."""
+
+    prepared: PreparedProblem
+    selection: SelectionResult
+    verdict: DiscoveryVerdict
+    localization: Localization
+    map_before: tuple[ResidualCell, ...]
+    map_after: tuple[ResidualCell, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def model(self) -> Model:
+        """Model with the effects found, without sensor errors."""
+        return self.verdict.best.fit.parameters.to_model()
+
+
+def prepare_problem(
+    logs: Sequence[PreparedLog],
+    model: Model,
+    without: Sequence[str] = (),
+    mapper: MapFunction = map,
+) -> PreparedProblem:
+    """Prepare a selection problem; sensor noise becomes force noise through the fitted stiffness.
+
+    `without` leaves effects out of the library. Raise InputError if there are too few samples.
+    """
+    if not logs:
+        raise InputError("no log is given", remedy="give at least one recording")
+    pairs = [(log.signals, log.contact_n) for log in logs]
+    log_residuals = build_log_residuals(pairs, model)
+    for residuals in log_residuals:
+        _check_enough_data(residuals)
+    parameters, free = initialize_parameters(log_residuals, model)
+    first = fit_parameters(log_residuals, parameters, free, mapper=mapper)
+    log_residuals = build_log_residuals(pairs, first.parameters.to_model())
+    first = fit_parameters(log_residuals, first.parameters, free, mapper=mapper)
+    rms = [_rms(residuals.evaluate(first.parameters)) for residuals in log_residuals]
+    notes = []
+    if (thinned := log_residuals[0].thinning) > 1:
+        notes.append(
+            f"the recordings are long: of the cycles of each step only the last are used, one in "
+            f"{thinned} and at least two"
+        )
+    if min(rms) > MODEL_LIMITED_RMS:
+        log_residuals = build_log_residuals(pairs, first.parameters.to_model(), rms)
+        notes.append(
+            f"the residual is at least {min(rms):.0f} times the noise: model error dominates, so "
+            "every log gets the same weight, regardless of its noise"
+        )
+    library, excluded = list_candidates(log_residuals, parameters, without)
+    return PreparedProblem(
+        SelectionProblem(log_residuals, free, library, mapper), first, excluded, tuple(notes)
+    )
+
+
+def initialize_parameters(
+    log_residuals: Sequence[LogResiduals], model: Model
+) -> tuple[ParameterSet, tuple[FreeParameter, ...]]:
+    """Return (start values of a fit of the model, its free parameters)."""
+    has_contact = [bool((residuals.contact_state != 0).any()) for residuals in log_residuals]
+    fit_input = any(
+        derives_acc(residuals.signals.channels)
+        and "damper_force_n" not in residuals.signals.channels
+        for residuals in log_residuals
+    )
+    parameters = ParameterSet.from_model(model, len(log_residuals))
+    if fit_input:
+        parameters = parameters.with_values(
+            {INPUT_GAIN: _input_gain(log_residuals[0], model), INPUT_OFFSET: 0.0}
+        )
+    zero_sigmas = [
+        {
+            quantity: residuals.signals.rest_value(quantity)[1]
+            for quantity in residuals.signals.zero_channels
+        }
+        for residuals in log_residuals
+    ]
+    parameters = parameters.with_values(
+        {
+            f"{ZERO_PREFIX}{number}.{quantity}": 0.0
+            for number, sigmas in enumerate(zero_sigmas)
+            for quantity in sigmas
+        }
+    )
+    return parameters, (
+        *list_base_parameters(model, has_contact, fit_input, zero_sigmas),
+        *list_model_effect_parameters(model),
+    )
+
+
+def _input_gain(residuals: LogResiduals, model: Model) -> float:
+    """Estimate the input gain: measured table acceleration over that required by the model."""
+    m, p = residuals.motion(), model.parameters
+    needed = m.acc - m.table_acc + (p.stiffness * m.u + p.damping * m.v) / p.mass
+    table_acc = m.table_acc
+    slope = float(np.nanmean(needed * table_acc) / max(float(np.nanmean(table_acc**2)), 1e-300))
+    return 1.0 / abs(slope) if slope else 1.0
+
+
+def _check_enough_data(residuals: LogResiduals) -> None:
+    entries, blocks = residuals.entry_row.size, np.unique(residuals.entry_block).size
+    if entries < MIN_ENTRIES or blocks < MIN_BLOCKS:
+        raise InputError(
+            f"too few usable samples: {entries} in {blocks} cycles",
+            where=residuals.signals.name,
+            allowed=f"at least {MIN_ENTRIES} in {MIN_BLOCKS} cycles",
+            remedy="record a longer test",
+        )
+
+
+def find_implausible_parameters(model: Model, fit: FitResult) -> list[str]:
+    """Return messages on fitted parameters that differ too much for the same specimen."""
+    flat, notes = model.flatten(), []
+    for parameter in fit.free:
+        expected, value = flat.get(parameter.keys[0], 0.0), fit.values[parameter.name]
+        differs = (
+            expected > 0
+            and parameter.unit in ("N/m", "N s/m")
+            and not expected / MAX_PARAMETER_RATIO < value < expected * MAX_PARAMETER_RATIO
+        )
+        if differs and value > 0:
+            notes.append(
+                f"{parameter.name}: {value:.4g} {parameter.unit} in the recording, "
+                f"{expected:.4g} in the model; check that "
+                "the model and the mass are those of this specimen"
+            )
+        if (
+            parameter.name.startswith(GAP_PREFIX)
+            and parse_log_number(parameter.name) is not None
+            and abs(value) > 1e-3
+        ):
+            notes.append(
+                f"{parameter.name}: each gap differs by {1e3 * value:+.2f} mm from the stated one"
+            )
+    return notes
+
+
+def _rms(residual: Float1D) -> float:
+    return math.sqrt(float(residual @ residual) / max(residual.size, 1))
+
+
+def discover_effects(
+    logs: Sequence[PreparedLog],
+    model: Model,
+    report: ProgressCallback = lambda progress: None,
+    without: Sequence[str] = (),
+    mapper: MapFunction = map,
+    fitted: bool = False,
+) -> Discovery:
+    """Find the effects that the model lacks by stepwise selection, and judge them (`verdict`).
+
+    `mapper` may be a parallel map. `fitted`: the parameters of the model were fitted to recordings
+    and may have absorbed missing effects; then they are not used to check the new ones.
+    """
+    report(SelectionProgress("the model alone"))
+    prepared = prepare_problem(logs, model, without, mapper)
+    problem = prepared.problem
+    selection = stepwise_selection(problem, prepared.parameters, report)
+    steps = [log.steps for log in logs]
+    noise_floor = min(residuals.weight for residuals in problem.log_residuals) ** -2
+    # a residual below the noise means that the noise was overestimated
+    floor = min(
+        noise_floor * estimate_repeatability_floor(problem.log_residuals, selection.best.held_out),
+        selection.best.cost,
+    )
+    verdict = judge_selection(
+        problem, selection, floor, {} if fitted else model.flatten(), noise_floor
+    )
+    # implausible base parameters are reported only if they remain so with the effects added
+    pulls = find_pulling_bumpers(problem.log_residuals, verdict.best.held_out)
+    notes = (*prepared.notes, *find_implausible_parameters(model, verdict.best.fit), *pulls)
+    before = build_cells(problem.log_residuals, selection.null.held_out, floor)
+    localization = localize_excess(problem.log_residuals, selection.null.held_out, before, steps)
+    after = build_cells(problem.log_residuals, verdict.best.held_out, floor)
+    return Discovery(prepared, selection, verdict, localization, before, after, notes)
+
+
+def fit_known_effects(
+    logs: Sequence[PreparedLog], model: Model, effects: Sequence[str]
+) -> FittedSet | None:
+    """Fit exactly these effects with the base (oracle result); None if one is not a candidate."""
+    prepared = prepare_problem(logs, model)
+    candidates = {candidate.name: candidate for candidate in prepared.problem.library}
+    if not set(effects) <= candidates.keys():
+        return None
+    best = None
+    effects_fitted: list[Candidate] = [candidates[name] for name in effects]
+    for rung in range(max((len(candidate.shapes) for candidate in effects_fitted), default=1)):
+        parameters = prepared.parameters
+        for candidate in effects_fitted:
+            shape = candidate.shapes[min(rung, len(candidate.shapes) - 1)]
+            parameters = candidate.add_to(parameters, shape, _small_amplitude(candidate))
+        fit = fit_parameters(
+            prepared.problem.log_residuals,
+            parameters,
+            prepared.problem.free_parameters(effects_fitted),
+        )
+        if best is None or fit.cost < best.cost:
+            best = fit
+    return prepared.problem.fit_effects(best.parameters, effects_fitted) if best else None
+
+
+def _small_amplitude(candidate: Candidate) -> float:
+    free = candidate.amplitude
+    return min(max(candidate.vanishing + 1e-3 * free.scale, free.low), free.high)
+
+
+def held_out_log_nrmse(log: PreparedLog, fitted: FittedSet) -> float:
+    """Return the NRMSE of the damper force on a held-out log, with the gaps stated there."""
+    fitted_parameters = fitted.fit.parameters
+    parameters = ParameterSet.from_model(fitted_parameters.to_model(), 1).with_values(
+        {
+            name: value
+            for name, value in fitted_parameters.values.items()
+            if name.startswith(SENSOR_PREFIX)
+        }
+    )
+    (residuals,) = build_log_residuals([(log.signals, log.contact_n)], fitted_parameters.to_model())
+    motion = residuals.motion(parameters.assumed_sensors())
+    mass = parameters.model_for_log(0, motion).parameters.mass
+    damper = residuals.entry_row == 0
+    error = residuals.evaluate(parameters)[damper] * residuals.force_noise(motion, mass)[0]
+    force = residuals.measured_forces(motion, mass)[0][residuals.entry_sample[damper]]
+    return float(error.std() / force.std())

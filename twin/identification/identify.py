@@ -1,0 +1,262 @@
+"""Identification of parameters, gaps and uncertainties from recordings: joint fit, cross-checks.
+
+The joint fit uses all forces on the measured motion of all logs. Cross-checks follow the manual
+procedure of the paper's authors, each on its own samples: free flight gives K and C, the load cells
+of each bumper give K_j, C_j and its gap, the positions of contact onset and release give the gaps;
+and the same fit is repeated on small and large motion, forward and backward, early and late. Where
+they disagree, the model lacks an effect or the specimen changed.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from table_io.block import Block, Label
+from table_io.channels import relative_displacement
+from twin.compare import TWIN_CHANNELS
+from twin.compare.twins import TwinSetup, advance_twins, start_twins
+from twin.identification.contact_onsets import ContactGaps, estimate_contact_gaps
+from twin.identification.cross_checks import (
+    SubsetEstimate,
+    estimate_subsets,
+    list_asymmetry_warnings,
+    list_disagreements,
+    list_fit_warnings,
+    list_onset_warnings,
+    select_observable,
+)  # fmt: skip
+from twin.identification.discover import PreparedLog, find_implausible_parameters, prepare_problem
+from twin.identification.least_squares import FitResult, compute_slopes, fit_parameters
+from twin.identification.parameters import (
+    ZERO_PREFIX,
+    FreeParameter,
+    ParameterSet,
+    list_effect_parameters,
+)
+from twin.identification.residuals import LogResiduals
+from twin.identification.selection import SelectionProblem
+from twin.identification.signals import LogSignals
+from twin.model.effects import find_effect
+from twin.model.model import Model
+
+WINDOW_S = 1.0
+GAP_OFFSET_KEY = "gap_offset.offset"
+MIN_REPORTED_CORRELATION = 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class IdentificationResult:
+    """Result of an identification.
+
+    `window_errors` are (nrmse of u before, after) of each log, or None.
+    """
+
+    problem: SelectionProblem
+    start: ParameterSet
+    fit: FitResult
+    undetermined: tuple[str, ...]  # not determined by the logs: kept as in the start model
+    subsets: tuple[SubsetEstimate, ...]
+    # right gap minus half the total gap, and its standard deviation, in m
+    asymmetry: tuple[float, float] | None
+    contact_gaps: tuple[ContactGaps, ...]
+    window_errors: tuple[tuple[float, float] | None, ...]
+    warnings: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def correlated_pairs(self) -> tuple[tuple[str, str, float], ...]:
+        """Pairs of strongly correlated parameters, with their correlation."""
+        correlation, names = self.fit.correlation, [parameter.name for parameter in self.fit.free]
+        return tuple(
+            (names[i], names[k], float(correlation[i, k]))
+            for i in range(len(names))
+            for k in range(i)
+            if abs(correlation[i, k]) > MIN_REPORTED_CORRELATION
+            and not names[i].startswith(ZERO_PREFIX)
+        )
+
+
+def identify_parameters(
+    logs: Sequence[PreparedLog], blocks: Sequence[Sequence[Block]], model: Model
+) -> IdentificationResult:
+    """Identify the parameters of a model from logs and their measured blocks; see the module.
+
+    Raise InputError if a log holds too few usable samples.
+    """
+    prepared = prepare_problem(logs, model)
+    problem = prepared.problem
+    log_residuals = problem.log_residuals
+    joint, fixed = _fit_determined(log_residuals, prepared.parameters, problem.base)
+    joint = correct_bias(log_residuals, joint)
+    flat = joint.parameters.to_model().flatten()
+    law_r, law_l = ((flat[f"bumper_stiffness_{s}"], flat[f"bumper_damping_{s}"]) for s in "rl")
+    contact_gaps = tuple(
+        gaps
+        for residuals, log_blocks in zip(log_residuals, blocks, strict=True)
+        for gaps in estimate_contact_gaps(residuals, log_blocks, (law_r, law_l), joint.parameters)
+    )
+    asymmetry = _estimate_asymmetry(log_residuals, joint)
+    parts = estimate_subsets(log_residuals, [log.steps for log in logs], joint)
+    start = ParameterSet.from_model(model, len(log_residuals))
+    windows = tuple(
+        _compare_windows(residuals, log_blocks, start, joint.parameters)
+        for residuals, log_blocks in zip(log_residuals, blocks, strict=True)
+    )
+    warnings = (
+        *list_fit_warnings(log_residuals, joint, fixed), *list_asymmetry_warnings(asymmetry),
+        *list_disagreements(joint, parts),
+        *list_onset_warnings(log_residuals, joint, contact_gaps),
+    )  # fmt: skip
+    return IdentificationResult(
+        problem,
+        start,
+        joint,
+        fixed,
+        parts,
+        asymmetry,
+        contact_gaps,
+        windows,
+        warnings,
+        (*prepared.notes, *find_implausible_parameters(model, joint)),
+    )
+
+
+def _fit_determined(
+    log_residuals: Sequence[LogResiduals], parameters: ParameterSet, free: Sequence[FreeParameter]
+) -> tuple[FitResult, tuple[str, ...]]:
+    """Fit the parameters that the logs determine; return (fit, names of the other parameters)."""
+    determined = select_observable(log_residuals, parameters, free, None)
+    fixed = tuple(parameter.name for parameter in free if parameter not in determined)
+    return fit_parameters(log_residuals, parameters, determined), fixed
+
+
+def correct_bias(log_residuals: Sequence[LogResiduals], fit: FitResult) -> FitResult:
+    """Correct a fit for the bias caused by noise of u and u' (errors in variables).
+
+    With e the noise of the motion, a residual contains -(K e_u + C e_v + M e_a)/s and its slope
+    -e_u/s, so at the true parameters the gradient is not 0 but, per sample of the damper row and
+    of a bumper row,
+
+        b_K = (K var_u + M cov(u, a)) / s^2,   b_C = C var_v / s^2,   b_Kj = K_j var_u / s^2, ...
+
+    and least squares is biased by -H^-1 b. The displacement is fused with the accelerometer, so
+    cov(u, a) = -w^2 P_u summed over frequency: minus the variance of the velocity noise of the
+    mass.
+    """
+    bias = np.zeros(len(fit.free))
+    hessian = np.zeros((bias.size, bias.size))
+    flat = fit.parameters.to_model().flatten()
+    for residuals in log_residuals:
+        before = residuals.evaluate(fit.parameters)
+        rows = np.array(
+            [
+                compute_slopes([residuals], fit.parameters, parameter, [before])[0]
+                for parameter in fit.free
+            ]
+        )
+        hessian += rows @ rows.T
+        m = residuals.motion()
+        if residuals.whitening is not None or (m.damper is None and not m.has_load_cells):
+            continue  # noise whitened, or samples selected by the model: the formula does not hold
+        counts = np.bincount(residuals.entry_row, minlength=3)[:3] / residuals.weight**2
+        with_acc = (
+            m.mass_kg * _shared_noise_variance(residuals.signals) if m.damper is None else 0.0
+        )
+        n, noise = m.noise, residuals.force_noise(m, m.mass_kg)
+        for row, names in enumerate((("stiffness", "damping"), *_bumper_names())):
+            if not counts[row]:
+                continue
+            k, c = (flat[name] for name in names)
+            share = counts[row] / noise[row] ** 2
+            biases = (k * n.u**2 - (with_acc if row == 0 else 0.0), c * n.v**2)
+            for name, amount in zip(names, biases, strict=True):
+                bias += [
+                    share * amount if name in parameter.keys else 0.0 for parameter in fit.free
+                ]
+    size = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+    correction = np.linalg.lstsq(hessian / np.outer(size, size), bias / size, rcond=1e-14)[0] / size
+    values = {
+        parameter.name: parameter.to_external(
+            parameter.to_internal(fit.values[parameter.name]) + float(step)
+        )
+        for parameter, step in zip(fit.free, correction, strict=True)
+        if parameter.name not in fit.at_bound
+    }
+    flat_values = {
+        key: values[parameter.name]
+        for parameter in fit.free
+        if parameter.name in values
+        for key in parameter.keys
+    }
+    return replace(
+        fit, parameters=fit.parameters.with_values(flat_values), values={**fit.values, **values}
+    )
+
+
+def _bumper_names() -> tuple[tuple[str, str], ...]:
+    return tuple((f"bumper_stiffness_{side}", f"bumper_damping_{side}") for side in "rl")
+
+
+def _shared_noise_variance(signals: LogSignals) -> float:
+    """Return -cov(u, a) in m2/s2 of the noise that the accelerometer of the mass adds to u."""
+    noise, share = signals.noise_rms, 1.0
+    s_x, s_a = noise.get("mass_disp_m"), noise.get("mass_acc_m_s2")
+    if s_a is None:
+        return 0.0
+    if s_x is None or "table_disp_m" not in noise:
+        if "table_acc_m_s2" not in noise:
+            return 0.0
+        combined = math.hypot(s_a, noise["table_acc_m_s2"])
+        s_x, s_a, share = noise["rel_disp_m"], combined, (s_a / combined) ** 2
+    fused = s_a * s_x / np.hypot(s_a, signals.omega**2 * s_x)
+    return share * signals.grid.white_noise_rms(signals.omega * fused * signals.low_pass) ** 2
+
+
+def _estimate_asymmetry(
+    log_residuals: Sequence[LogResiduals], joint: FitResult
+) -> tuple[float, float] | None:
+    """Return (offset of the gaps, standard deviation) in m from the joint fit extended by it."""
+    both_sides = all((residuals.contact_state > 0).any(axis=1).all() for residuals in log_residuals)
+    if not both_sides or GAP_OFFSET_KEY in joint.parameters.values:
+        return None
+    free = (*joint.free, *list_effect_parameters(find_effect("gap_offset")))
+    fit = fit_parameters(log_residuals, joint.parameters.with_values({GAP_OFFSET_KEY: 0.0}), free)
+    return fit.values[GAP_OFFSET_KEY], fit.std_errors[GAP_OFFSET_KEY]
+
+
+def _compare_windows(
+    residuals: LogResiduals, blocks: Sequence[Block], *parameter_sets: ParameterSet
+) -> tuple[float, float] | None:
+    """Return the nrmse of u of two parameter sets over windows restarted from the measured state.
+
+    In chaotic motion a free run diverges after a few cycles. None without table acceleration.
+    """
+    if not blocks or "table_acc_m_s2" not in residuals.signals.channels:
+        return None
+    before, after = (
+        window_nrmse(
+            blocks,
+            parameters.model_for_log(residuals.log_number, residuals.motion()),
+            residuals.contact_n,
+        )
+        for parameters in parameter_sets
+    )
+    return before, after
+
+
+def window_nrmse(blocks: Sequence[Block], model: Model, contact_n: float) -> float:
+    """Return the rms of measured minus predicted u over the rms of u, in windows of `WINDOW_S`."""
+    window = round(WINDOW_S * blocks[0].rate_hz)
+    setup = TwinSetup(model, blocks[0].rate_hz, window, window, contact_n)
+    row, errors, squares = TWIN_CHANNELS.index("window/rel_disp_m"), 0.0, 0.0
+    for block in blocks:
+        # Fortran order: the channels of a sample are contiguous
+        copy = replace(block, values=np.asfortranarray(block.values))
+        _, predicted, _ = advance_twins(setup, start_twins(setup, block.index), copy)
+        u, u_predicted = relative_displacement(block), predicted.values[row]
+        finite = np.isfinite(u) & np.isfinite(u_predicted) & (block.label != Label.REST)
+        errors += float(((u - u_predicted)[finite] ** 2).sum())
+        squares += float((u[finite] ** 2).sum())
+    return math.sqrt(errors / squares) if squares else math.nan

@@ -1,0 +1,276 @@
+"""Levenberg-Marquardt fit to several logs, with standard errors robust to colored residuals."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from table_io.block import Bool2D, Float1D, Float2D, Int1D
+from twin.identification.parameters import FreeParameter, ParameterSet, parse_log_number
+from twin.identification.residuals import LogResiduals
+
+MAX_ITERATIONS = 40
+MIN_COST_GAIN = 1e-6  # relative cost decrease below which the iteration stops
+SLOPE_STEP = 1e-4  # finite-difference step, relative to the scale of a parameter
+HELD_OUT_DAMPINGS = (1e-9, 1e-6, 1e-4, 1e-2, 1.0, 1e2, 1e4)  # tried for the step of a fold's refit
+# of a parameter's curvature: with less in the training folds, they do not determine it
+MIN_CURVATURE_SHARE = 1e-3
+
+# Same interface as `map`; a caller may supply a parallel one.
+MapFunction = Callable[
+    [
+        Callable[[tuple[ParameterSet, FreeParameter]], list[Float1D]],
+        Iterable[tuple[ParameterSet, FreeParameter]],
+    ],
+    Iterable[list[Float1D]],
+]
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    """Fitted parameters with standard errors, correlation and held-out residuals."""
+
+    parameters: ParameterSet
+    free: tuple[FreeParameter, ...]
+    values: Mapping[str, float]
+    std_errors: Mapping[str, float]  # standard deviations, robust to colored residuals
+    correlation: Float2D
+    cost: float  # mean square of the residual over its noise, on the training samples
+    converged: bool
+    at_bound: tuple[str, ...]
+    held_out: tuple[Float1D, ...] = ()  # per log, cross-validation residual, (entry,)
+
+
+def fit_parameters(
+    log_residuals: Sequence[LogResiduals],
+    start: ParameterSet,
+    free: Sequence[FreeParameter],
+    train: Sequence[Bool2D] | None = None,
+    folds: Sequence[Int1D] = (),
+    mapper: MapFunction = map,
+) -> FitResult:
+    """Fit the free parameters by least squares to the entries where `train`, (entry,), is True.
+
+    With `folds`, (entry,) per log, also compute the cross-validation residual: that of each fold
+    after refitting to the others, by one step from the full fit. Folds below zero are never held
+    out.
+    """
+    return _LevenbergMarquardt(log_residuals, start, tuple(free), train, folds, mapper).run()
+
+
+def compute_slopes(
+    log_residuals: Sequence[LogResiduals],
+    parameters: ParameterSet,
+    free: FreeParameter,
+    before: Sequence[Float1D],
+) -> list[Float1D]:
+    """Return d residual / d parameter (internal value) by finite difference, (entry,) per log."""
+    x = free.to_internal(parameters.values[free.keys[0]])
+    step = SLOPE_STEP * (1.0 if free.logarithmic else free.scale)
+    if (math.exp(x + step) if free.logarithmic else x + step) > free.high:
+        step = -step
+    moved = parameters.with_values(dict.fromkeys(free.keys, free.to_external(x + step)))
+    log_number = parse_log_number(free.name)
+    return [
+        (residuals.evaluate(moved) - old) / step
+        if log_number in (None, residuals.log_number)
+        else np.zeros(old.size)  # a parameter of another log
+        for residuals, old in zip(log_residuals, before, strict=True)
+    ]
+
+
+def compute_columns(
+    log_residuals: Sequence[LogResiduals],
+    requests: Sequence[tuple[ParameterSet, FreeParameter]],
+    before: Sequence[Float1D],
+    mapper: MapFunction = map,
+) -> list[list[Float1D]]:
+    """Return the Jacobian columns of several parameters, each at its own parameter set."""
+    return [*mapper(lambda pair: compute_slopes(log_residuals, *pair, before), requests)]
+
+
+class _LevenbergMarquardt:
+    """One Levenberg-Marquardt fit; x are the internal values of the free parameters."""
+
+    def __init__(
+        self,
+        log_residuals: Sequence[LogResiduals],
+        start: ParameterSet,
+        free: tuple[FreeParameter, ...],
+        train: Sequence[Bool2D] | None,
+        folds: Sequence[Int1D],
+        mapper: MapFunction,
+    ) -> None:
+        self.log_residuals, self.start, self.free, self.folds = log_residuals, start, free, folds
+        self.mapper = mapper
+        self.train = train or [
+            np.ones(residuals.entry_row.size, dtype=bool) for residuals in log_residuals
+        ]
+        self.count = sum(int(mask.sum()) for mask in self.train)
+        low = [-math.inf if f.low == -math.inf else f.to_internal(f.low) for f in free]
+        self.low = np.array(low)
+        self.high = np.array(
+            [math.inf if f.high == math.inf else f.to_internal(f.high) for f in free]
+        )
+
+    def parameters_at(self, x: Float1D) -> ParameterSet:
+        values: dict[str, float] = {}
+        for free, value in zip(self.free, x, strict=True):
+            values |= dict.fromkeys(free.keys, free.to_external(float(value)))
+        return self.start.with_values(values)
+
+    def evaluate(self, parameters: ParameterSet) -> list[Float1D]:
+        return [residuals.evaluate(parameters) for residuals in self.log_residuals]
+
+    def select_training(self, entries: Sequence[Float1D]) -> Float1D:
+        return np.concatenate([row[mask] for row, mask in zip(entries, self.train, strict=True)])
+
+    def compute_jacobian(self, parameters: ParameterSet, current: list[Float1D]) -> Float2D:
+        columns = compute_columns(
+            self.log_residuals, [(parameters, free) for free in self.free], current, self.mapper
+        )
+        return np.array([*map(self.select_training, columns)]).reshape(len(self.free), self.count)
+
+    def take_step(self, x: Float1D, hessian: Float2D, gradient: Float1D, damping: float) -> Float1D:
+        """Return x after a damped Gauss-Newton step; a parameter that would leave a bound stays."""
+        outward = ((x <= self.low) & (gradient > 0)) | ((x >= self.high) & (gradient < 0))
+        inside, step = np.flatnonzero(~outward), np.zeros_like(x)
+        if inside.size:
+            step[inside] = solve_damped(hessian[np.ix_(inside, inside)], damping, gradient[inside])
+        return np.clip(x - step, self.low, self.high)
+
+    def run(self) -> FitResult:
+        x = np.array([f.to_internal(self.start.values[f.keys[0]]) for f in self.free])
+        x = np.clip(x, self.low, self.high)
+        current = self.evaluate(self.parameters_at(x))
+        r = self.select_training(current)
+        cost, damping, converged = float(r @ r), 1e-4, not self.free
+        for _ in range(0 if converged else MAX_ITERATIONS):
+            jacobian = self.compute_jacobian(self.parameters_at(x), current)
+            hessian, gradient = jacobian @ jacobian.T, jacobian @ r
+            gain = 0.0
+            for _ in range(8):
+                trial_x = self.take_step(x, hessian, gradient, damping)
+                if np.array_equal(trial_x, x):
+                    break
+                trial_values = self.evaluate(self.parameters_at(trial_x))
+                trial_chosen = self.select_training(trial_values)
+                trial_cost = float(trial_chosen @ trial_chosen)
+                if trial_cost < cost:
+                    gain = (cost - trial_cost) / max(cost, 1e-300)
+                    x, current, r, cost = trial_x, trial_values, trial_chosen, trial_cost
+                    damping = max(damping / 10, 1e-9)
+                    break
+                damping *= 10
+            if gain < MIN_COST_GAIN:
+                converged = True
+                break
+        return self._build_result(x, current, cost, converged)
+
+    def _build_result(
+        self, x: Float1D, current: list[Float1D], cost: float, converged: bool
+    ) -> FitResult:
+        """Return the fit with standard errors from a sandwich estimator clustered by block."""
+        parameters = self.parameters_at(x)
+        jacobian = self.compute_jacobian(parameters, current)
+        hessian = jacobian @ jacobian.T
+        scale = _curvature_scale(hessian)
+        # parameters at a bound are fixed there
+        inner = np.flatnonzero((self.low < x) & (x < self.high))
+        inner_block = np.ix_(inner, inner)
+        inverse = np.zeros_like(hessian)
+        inverse[inner_block] = np.linalg.pinv(
+            (hessian / np.outer(scale, scale))[inner_block], hermitian=True
+        )
+        inverse /= np.outer(scale, scale)
+        gradients = jacobian * self.select_training(current)
+        first, count = 0, 0
+        scatter, rest_scatter = np.zeros_like(inverse), np.zeros_like(inverse)
+        for residuals, mask in zip(self.log_residuals, self.train, strict=True):
+            blocks = residuals.entry_contact_block[mask]
+            entries = slice(first, first + blocks.size)
+            at_rest = (residuals.entry_row == len(residuals.rows))[mask]
+            block_gradients = np.array(
+                [np.bincount(blocks[~at_rest], weights=row[entries][~at_rest]) for row in gradients]
+            )
+            # a rest row has a single entry: its variance is taken from the noise
+            rest_slopes = jacobian[:, entries][:, at_rest] / residuals.weight
+            scatter += block_gradients @ block_gradients.T
+            rest_scatter += rest_slopes @ rest_slopes.T
+            first += blocks.size
+            count += np.unique(blocks[~at_rest]).size
+        # small-sample correction: each fitted parameter costs one degree of freedom
+        scatter *= count / max(count - len(self.free), 1)
+        covariance = inverse @ (scatter + rest_scatter) @ inverse
+        sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        divisor = np.where(sd > 0, sd, 1.0)
+        values, std_errors, at_bound = {}, {}, []
+        for i, free in enumerate(self.free):
+            values[free.name] = free.to_external(float(x[i]))
+            std_errors[free.name] = float(sd[i] * (values[free.name] if free.logarithmic else 1.0))
+            if x[i] in (self.low[i], self.high[i]):
+                at_bound.append(free.name)
+        correlation = covariance / np.outer(divisor, divisor)
+        return FitResult(
+            parameters, self.free, values, std_errors, correlation, cost / max(self.count, 1),
+            converged,
+            tuple(at_bound), self._compute_held_out(x, current, jacobian),
+        )  # fmt: skip
+
+    def _compute_held_out(
+        self, x: Float1D, current: list[Float1D], jacobian: Float2D
+    ) -> tuple[Float1D, ...]:
+        """Return the cross-validation residual of each log, (entry,); empty without folds."""
+        if not self.folds:
+            return ()
+        fold = np.concatenate(self.folds)
+        held_out = [values.copy() for values in current]
+        for k in np.unique(fold[fold >= 0]):
+            refitted = self._refit_without(x, current, jacobian, fold != k)
+            for target, source, log_fold in zip(held_out, refitted, self.folds, strict=True):
+                target[log_fold == k] = source[log_fold == k]
+        return tuple(held_out)
+
+    def _refit_without(
+        self, x: Float1D, current: list[Float1D], jacobian: Float2D, training: Bool2D
+    ) -> list[Float1D]:
+        """Return the residual of each log, (entry,), after one step towards the training-fold fit.
+
+        The step is damped until the training cost does not increase. A parameter that the training
+        folds do not determine keeps its value; an amplitude among them is set to its vanishing
+        value, because otherwise the held-out fold would judge a value fitted to itself.
+        """
+        part = jacobian[:, training]
+        hessian = part @ part.T
+        undetermined = np.diag(hessian) < MIN_CURVATURE_SHARE * np.einsum(
+            "ij,ij->i", jacobian, jacobian
+        )
+        vanishing = np.array([math.nan if f.vanishing is None else f.vanishing for f in self.free])
+        dropped = undetermined & np.isfinite(vanishing)
+        if dropped.any():
+            x = np.where(dropped, vanishing, x)
+            current = self.evaluate(self.parameters_at(x))
+        r = np.concatenate(current)[training]
+        gradient, cost = part @ r, float(r @ r)
+        gradient[undetermined], hessian[undetermined], hessian[:, undetermined] = 0.0, 0.0, 0.0
+        for damping in HELD_OUT_DAMPINGS:
+            trial = self.evaluate(self.parameters_at(self.take_step(x, hessian, gradient, damping)))
+            trial_r = np.concatenate(trial)[training]
+            if float(trial_r @ trial_r) <= cost:
+                return trial
+        return current  # no step improves the training folds
+
+
+def _curvature_scale(hessian: Float2D) -> Float1D:
+    """Return the root of the diagonal of the Hessian, (p,), used for scaling."""
+    curvature = np.sqrt(np.diag(hessian))
+    return np.where(curvature > 0, curvature, 1.0)
+
+
+def solve_damped(hessian: Float2D, damping: float, gradient: Float1D) -> Float1D:
+    """Solve for the damped Gauss-Newton step, (p,), after diagonal scaling."""
+    scale = _curvature_scale(hessian)
+    scaled = hessian / np.outer(scale, scale) + damping * np.eye(scale.size)
+    step: Float1D = np.linalg.lstsq(scaled, gradient / scale, rcond=1e-14)[0] / scale
+    return step

@@ -1,0 +1,81 @@
+"""Measured motion from sensor fusion: displacement, velocity, forces, and their noise.
+
+Each body, mass and table, has a laser (accurate at low frequency) and an accelerometer (accurate at
+high frequency). Per frequency, with white noise s_x and s_a and angular frequency w, the
+minimum-variance estimate and the sensor-consistency residual are
+    X = (s_a^2 X_laser - w^2 s_x^2 A) / (s_a^2 + w^4 s_x^2),   V = i w X
+    residual = (A + w^2 X_laser) / sqrt(s_a^2 + w^4 s_x^2)
+so noise is neither differentiated nor integrated without bound, and there is no delay. The
+residual is white with variance 1 for any force law; a deviation indicates a sensor error.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from table_io.block import Bool2D, Float1D, Int1D, Label
+
+
+@dataclass(frozen=True, slots=True)
+class MotionNoise:
+    """Rms noise of one sample at the rate of the motion, SI; NaN without the channel."""
+
+    u: float  # of the fused displacement
+    v: float  # of the fused velocity
+    acc: float  # total acceleration of the mass
+    right: float
+    left: float
+    force: float  # of a directly measured damper force
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ConsistencyResidual:
+    """Sensor-consistency residual: disagreement of two redundant sensors over its noise, (sample,).
+
+    Laser and accelerometer of a body ("mass", "table", "mass against table"), or the two load
+    cells of a side ("right cells", "left cells").
+    """
+
+    body: str
+    values: Float1D
+    acc_sensitivity: float = 0.0  # change of `values` per m/s2 of constant accelerometer offset
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredMotion:
+    """Fused motion and forces of a test at `rate_hz`, SI, right positive, (sample,) each.
+
+    `right` = F_R >= 0 and `left` = -F_L >= 0; NaN if not measured. `damper` is the damper force if
+    it was measured directly (component tests), else None. `good` is False near lost samples.
+    """
+
+    name: str
+    rate_hz: float
+    mass_kg: float
+    gaps_m: tuple[float, float]
+    time_s: Float1D
+    u: Float1D
+    v: Float1D
+    acc: Float1D
+    table_acc: Float1D
+    table_disp: Float1D
+    right: Float1D
+    left: Float1D
+    step: Int1D
+    label: Int1D
+    cycle: Int1D
+    good: Bool2D
+    noise: MotionNoise
+    consistency_residuals: tuple[ConsistencyResidual, ...] = ()
+    damper: Float1D | None = None
+
+    @property
+    def has_load_cells(self) -> bool:
+        """True if bumper forces were measured."""
+        return bool(np.isfinite(self.right).any())
+
+    @property
+    def moving(self) -> Bool2D:
+        """Samples with the drive in motion and all channels valid, (sample,)."""
+        moving: Bool2D = self.good & (self.label != Label.REST)
+        return moving

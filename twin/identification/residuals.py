@@ -1,0 +1,345 @@
+"""Residuals: measured minus modelled forces, evaluated on the measured motion.
+
+    damper            -M a - F_R - F_L - D; the damper force from the force balance, or measured
+    right, left       F_R - model, -(F_L - model), where contact was measured
+    mass, table       sensor-consistency residuals, see `motion`
+    right, left cells difference of the two load cells of a side
+    right, left pull  tension of a side just after release, where every bumper law gives zero force
+    rest              reading of each channel before the motion starts, and of u; one entry each
+Each row is divided by its noise. Without load cells the damper row holds all forces, and contact
+comes from the model. Nothing is simulated (inverse dynamics), so a fit converges from distant start
+values and in chaotic motion.
+
+Residuals of real rigs are autocorrelated (colored): statistics use blocks, never single samples.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from table_io.block import Bool2D, Float1D, Float2D, Int1D
+from twin.identification.generic_terms import GENERIC_PREFIX, TermScale, compute_generic_forces
+from twin.identification.motion import ConsistencyResidual, MeasuredMotion
+from twin.identification.parameters import SLIP_SPEED, ParameterSet
+from twin.identification.signals import LogSignals, derives_acc
+from twin.model.inverse_dynamics import forces_along, tilt_force
+from twin.model.model import Model, SensorModel
+
+CONTACT_NOISE_FACTOR = 8.0  # times the rms noise of a load cell: above it there is contact
+CONTACT_MARGIN_S = 0.012  # around contact and release, where the low pass smears the force step
+BLOCK_S = 1.0  # block length where there are no forcing cycles
+FORCE_ROWS = ("damper", "right", "left")
+TARED_CHANNELS = ("acc", "right", "left")
+PULL_ROWS = ("right pull", "left pull")
+# of the largest contact force: undershoot of the low pass after a release
+MAX_UNDERSHOOT_SHARE = 0.005
+MAX_CACHED_MOTIONS = 3  # for assumed sensor models other than the nominal one
+MAX_SAMPLES = 500_000  # moving samples of all logs together; limits memory
+
+
+@dataclass(frozen=True, eq=False)
+class LogResiduals:
+    """Regression problem of one log: residual rows, sample selection, blocks and noise.
+
+    `log_number` is the index of the log; `reference` supplies the stiffness and damping that
+    convert noise of the motion into noise of the forces.
+    """
+
+    log_number: int
+    signals: LogSignals
+    contact_n: float
+    reference: Model
+    scale: TermScale
+    weight: float = 1.0  # noise multiplier; above 1 where model error, not noise, limits the fit
+    thinning: int = 1  # keep one in `thinning` of the cycles of a step and of the other blocks
+    _motion_cache: list[tuple[tuple[SensorModel, ...], MeasuredMotion]] = field(
+        default_factory=list
+    )
+
+    def motion(self, sensors: tuple[SensorModel, ...] = ()) -> MeasuredMotion:
+        """Return the motion for assumed sensor models; the most recent ones are cached."""
+        motion = next((m for key, m in self._motion_cache if key == sensors), None)
+        if motion is None:
+            motion = self.signals.fuse_motion(sensors)
+            unmodified = [pair for pair in self._motion_cache if not pair[0]]
+            recent = [pair for pair in self._motion_cache if pair[0]][-MAX_CACHED_MOTIONS + 1 :]
+            # a single assignment, because other threads may be reading
+            self._motion_cache[:] = [*unmodified, *recent, (sensors, motion)]
+        return motion
+
+    @cached_property
+    def contact_state(self) -> npt.NDArray[np.int8]:
+        """Measured contact of right and left, (2, sample): 1 contact, 0 none, -1 unknown."""
+        m = self.motion()
+        if not m.has_load_cells:
+            known = -1 if any(math.isfinite(gap) for gap in m.gaps_m) else 0
+            return np.full((2, m.u.size), known, dtype=np.int8)
+        sides = []
+        for push, rms, gap in (
+            (m.right, m.noise.right, m.gaps_m[0]),
+            (m.left, m.noise.left, m.gaps_m[1]),
+        ):
+            idle = float(np.median(push[~m.moving])) if gap > 0 and (~m.moving).any() else 0.0
+            sides.append(push - idle > max(self.contact_n, CONTACT_NOISE_FACTOR * rms))
+        return np.array(sides, dtype=np.int8)
+
+    @cached_property
+    def row_mask(self) -> Bool2D:
+        """Sample selection of each residual row, (row, sample)."""
+        m = self.motion()
+        used = np.zeros((len(self.rows), m.u.size), dtype=bool)
+        used[0] = m.moving & np.isfinite(self.measured_forces(m, m.mass_kg)[0])
+        margin = max(round(CONTACT_MARGIN_S * m.rate_hz), 1)
+        window = np.ones(2 * margin + 1)
+        if m.has_load_cells and m.damper is None:
+            for row in range(2):
+                in_contact = self.contact_state[row] > 0
+                used[1 + row] = (
+                    m.moving & in_contact & (np.convolve(~in_contact, window, "same") == 0)
+                )
+        recent = np.concatenate([np.zeros(margin), np.ones(margin + 1)])
+        change = np.abs(np.diff(self.contact_state, axis=1, prepend=self.contact_state[:, :1])).any(
+            axis=0
+        )
+        smooth = np.convolve(change, window, "same") == 0
+        for row, name in enumerate(self.rows):
+            if name in PULL_ROWS:
+                in_contact = self.contact_state[PULL_ROWS.index(name)] > 0
+                used[row] = m.moving & ~in_contact & (np.convolve(in_contact, recent, "same") > 0)
+            elif row >= len(FORCE_ROWS):
+                side = {"right cells": 0, "left cells": 1}.get(name)
+                used[row] = m.moving & smooth if side is None else used[1 + side]
+        return used & self._thinning_mask
+
+    @cached_property
+    def _thinning_mask(self) -> Bool2D:
+        """Samples kept after thinning, (sample,): the last cycles of each step, every n-th block.
+
+        At least two consecutive cycles are kept: their difference gives the noise.
+        """
+        m = self.motion()
+        if self.thinning == 1:
+            return np.ones(m.u.size, dtype=bool)
+        cycle_count = np.zeros(int(m.step.max(initial=-1)) + 2, dtype=np.int64)
+        np.maximum.at(cycle_count, m.step, m.cycle + 1)  # step -1 is the last entry
+        is_counted = m.cycle >= (cycle_count - np.maximum(cycle_count // self.thinning, 2))[m.step]
+        counting: Bool2D = np.where(
+            m.cycle >= 0, is_counted, self.sample_block % self.thinning == 0
+        )
+        return counting
+
+    @cached_property
+    def rest_channels(self) -> tuple[str, ...]:
+        """Channels that must read zero at rest."""
+        if min(self.signals.gaps_m) <= 0:  # precompression: forces at rest are real
+            return ()
+        return tuple(self.signals.rest_values)
+
+    @cached_property
+    def rows(self) -> tuple[str, ...]:
+        """Names of the rows that have samples; the rest row follows them."""
+        m = self.motion()
+        pulls = PULL_ROWS if m.has_load_cells and m.damper is None else ()
+        return (*FORCE_ROWS, *(consistency.body for consistency in m.consistency_residuals), *pulls)
+
+    @cached_property
+    def entry_row(self) -> Int1D:
+        """Row of each residual entry, (entry,)."""
+        rows = np.repeat(np.arange(len(self.rows)), self.row_mask.sum(axis=1))
+        return np.concatenate([rows, np.full(self._rest_entry_count, len(self.rows))])
+
+    @property
+    def _rest_entry_count(self) -> int:
+        """Number of residual entries in the rest row."""
+        return len(self.rest_channels) + len(self.signals.zero_channels)
+
+    @cached_property
+    def entry_sample(self) -> Int1D:
+        """Sample of each residual entry, (entry,)."""
+        samples = [np.flatnonzero(row) for row in self.row_mask]
+        return np.concatenate([*samples, np.zeros(self._rest_entry_count, dtype=np.int64)])
+
+    @cached_property
+    def entry_block(self) -> Int1D:
+        """Block of each residual entry, (entry,)."""
+        return self.sample_block[self.entry_sample]
+
+    @cached_property
+    def entry_contact_block(self) -> Int1D:
+        """Block of each entry, (entry,), without splitting a contact at a block boundary.
+
+        Slow errors of u bias C_j in one direction during compression and in the other during
+        restitution; a contact split in two would look like two strong gradients. A contact longer
+        than two blocks is split nevertheless.
+        """
+        in_flight = (self.contact_state <= 0).all(axis=0)
+        last_flight = np.maximum.accumulate(np.where(in_flight, np.arange(in_flight.size), 0))
+        start_block = self.sample_block[last_flight]
+        contact_block: Int1D = np.where(
+            self.sample_block - start_block <= 1, start_block, self.sample_block
+        )
+        return contact_block[self.entry_sample]
+
+    def measured_forces(
+        self, m: MeasuredMotion, mass_kg: float, parameters: ParameterSet | None = None
+    ) -> Float2D:
+        """Return (3, sample) in N: damper force from the force balance of the mass, F_R, -F_L."""
+        zero_error = {
+            channel: parameters.zero_error(self.log_number, channel) if parameters else 0.0
+            for channel in TARED_CHANNELS
+        }
+        if m.damper is not None:
+            nothing = np.full(m.u.size, np.nan)
+            return np.array([m.damper, nothing, nothing])
+        inertia, right, left = (
+            -mass_kg * (m.acc - zero_error["acc"]), m.right - zero_error["right"],
+            m.left - zero_error["left"]
+        )  # fmt: skip
+        return np.array([inertia - right + left if m.has_load_cells else inertia, right, left])
+
+    def force_noise(self, m: MeasuredMotion, mass_kg: float) -> Float1D:
+        """Return the rms sensor noise of the force rows in N, (3,).
+
+        Use the assumed mass and sensor gains; otherwise a smaller mass would seem to fit better
+        only because it scales the noise of the accelerometer down.
+        """
+        n, p = m.noise, self.reference.parameters
+        motion = math.hypot(p.stiffness * n.u, p.damping * n.v)
+        sides = [
+            math.hypot(cells, k * n.u, c * n.v)
+            for cells, k, c in (
+                (n.right, p.bumper_stiffness_r, p.bumper_damping_r),
+                (n.left, p.bumper_stiffness_l, p.bumper_damping_l),
+            )
+        ]
+        if m.damper is not None:
+            return np.array([math.hypot(n.force, motion), np.nan, np.nan])
+        cells = (n.right, n.left) if m.has_load_cells else ()
+        if self.whitening is not None:
+            return np.array([mass_kg, *sides])
+        return np.array([math.hypot(mass_kg * n.acc, motion, *cells), *sides])
+
+    @cached_property
+    def whitening(self) -> Float1D | None:
+        """Whitening filter of the damper row, (frequency,); None with an accelerometer."""
+        if not derives_acc(self.signals.channels) or self.motion().damper is not None:
+            return None
+        p = self.reference.parameters
+        return self.signals.whitening(p.stiffness / p.mass, p.damping / p.mass)
+
+    @cached_property
+    def sample_block(self) -> Int1D:
+        """Block number of each sample, (sample,): a forcing cycle, or one second outside steps."""
+        m = self.motion()
+        second_number = (m.time_s / BLOCK_S).astype(np.int64)
+        second = np.where(m.cycle >= 0, 0, second_number)
+        key = np.stack([m.step, m.cycle, second])
+        change = np.any(np.diff(key, axis=1) != 0, axis=0)
+        numbers: Int1D = np.concatenate([[0], np.cumsum(change)])
+        return numbers
+
+    def evaluate(self, parameters: ParameterSet) -> Float1D:
+        """Return the residual over its noise, (entry,): measured minus model, row after row."""
+        m = self.motion(parameters.assumed_sensors())
+        model = parameters.model_for_log(self.log_number, m)
+        u = m.u - parameters.zero_error(self.log_number, "u")
+        d, right, left = forces_along(model, u, m.v, m.time_s, self.contact_state)
+        if SLIP_SPEED in parameters.values:
+            fc = model.effect_parameter("coulomb_friction", "fc") or 0.0
+            d = d + fc * (
+                np.tanh(m.v / parameters.values[SLIP_SPEED]) - np.where(m.v > 0, 1.0, -1.0)
+            )
+        if not m.has_load_cells and m.damper is None:
+            d = d + right + left
+        if model.effect_parameter("table_tilt", "tilt"):
+            d = d + tilt_force(model, m.table_disp)
+        expected = np.array([d, right, -left])
+        if any(name.startswith(GENERIC_PREFIX) for name in parameters.values):
+            p = model.parameters
+            generic = compute_generic_forces(
+                parameters.values, m, (p.gap_r, p.gap_l), self.contact_state, self.scale
+            )
+            expected += generic
+        mass = model.parameters.mass
+        rows = self.measured_forces(m, mass, parameters) - expected
+        rows /= self.force_noise(m, mass)[:, None]
+        if self.whitening is not None:
+            rows[0] = self.signals.grid.apply_gain(rows[0], self.whitening)
+        all_rows = [
+            *rows,
+            *(
+                self._correct_consistency(consistency, parameters)
+                for consistency in m.consistency_residuals
+            ),
+        ]
+        if m.has_load_cells and m.damper is None:
+            all_rows += [*self._pull_rows(m, parameters)]
+        samples = [row[used] for row, used in zip(all_rows, self.row_mask, strict=True)]
+        return np.concatenate([*samples, self._rest_entries(parameters)]) / self.weight
+
+    def _correct_consistency(
+        self, consistency: ConsistencyResidual, parameters: ParameterSet
+    ) -> Float1D:
+        """Return a consistency residual less the tare errors of the accelerometers, (sample,)."""
+        signs = {"mass": (1, 0), "table": (0, 1), "mass against table": (1, -1)}
+        mass, table = signs.get(consistency.body, (0, 0))
+        zero_error = mass * parameters.zero_error(
+            self.log_number, "acc"
+        ) + table * parameters.zero_error(self.log_number, "table")
+        return (
+            consistency.values - consistency.acc_sensitivity * zero_error
+            if zero_error
+            else consistency.values
+        )
+
+    def _pull_rows(self, m: MeasuredMotion, parameters: ParameterSet) -> Float2D:
+        """Return the tension of each side over the noise of its cells, (2, sample); 0 for pushes.
+
+        The mean square of pure noise is at most 1: only its negative half enters, scaled by
+        sqrt(2). The undershoot of the low pass after a release is not counted as tension.
+        """
+        sides = (m.right, "right", m.noise.right), (m.left, "left", m.noise.left)
+        return np.array([
+            np.minimum(
+                push - parameters.zero_error(self.log_number, name)
+                + MAX_UNDERSHOOT_SHARE * np.nanmax(push), 0.0)
+            * math.sqrt(2.0) / rms
+            for push, name, rms in sides
+        ])  # fmt: skip
+
+    def _rest_entries(self, parameters: ParameterSet) -> Float1D:
+        """Return the rest row, (entry,): readings at rest less offsets, tare errors, over noise."""
+        offsets = {sensor.channel: sensor.offset for sensor in parameters.assumed_sensors()}
+        expected = [
+            (self.signals.rest_values[name], offsets.get(name, 0.0)) for name in self.rest_channels
+        ]
+        entries = [(mean - offset_si) / sigma for (mean, sigma), offset_si in expected]
+        for quantity, channels in self.signals.zero_channels.items():
+            mean, sigma = self.signals.rest_value(quantity)
+            offset_sum = sum(sign * offsets.get(name, 0.0) for name, sign in channels)
+            entries.append(
+                (mean - offset_sum - parameters.zero_error(self.log_number, quantity)) / sigma
+            )
+        return np.array(entries)
+
+
+def build_log_residuals(
+    logs: Sequence[tuple[LogSignals, float]], reference: Model, weights: Sequence[float] = ()
+) -> tuple[LogResiduals, ...]:
+    """Build the residuals of several logs, each (signals, contact threshold in N), on one scale."""
+    motions = [signals.fuse_motion() for signals, _ in logs]
+    u = max(float(np.abs(m.u[m.moving]).max(initial=0.0)) for m in motions) or 1.0
+    v = max(float(np.abs(m.v[m.moving]).max(initial=0.0)) for m in motions) or 1.0
+    gaps = [gap for m in motions for gap in m.gaps_m if math.isfinite(gap)]
+    depth = max(u - min(gaps), 1e-2 * u) if gaps else u
+    scale = TermScale(u, v, depth)
+    thinning = math.ceil(sum(int(m.moving.sum()) for m in motions) / MAX_SAMPLES) or 1
+    weighted = zip(logs, weights or [1.0] * len(logs), strict=True)
+    return tuple(
+        LogResiduals(number, signals, contact_n, reference, scale, weight, thinning)
+        for number, ((signals, contact_n), weight) in enumerate(weighted)
+    )

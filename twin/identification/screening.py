@@ -1,0 +1,194 @@
+"""Linear screening of candidates: cross-validation of all of them from normal equations.
+
+Around a fitted parameter set the residual is linear in the base parameters and in the amplitude of
+every candidate. One pass over the data sums the products of all slopes per unit (a step of the
+sweep); any candidate is then fitted to some units and judged on the others from these sums alone.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from table_io.block import Float1D, Float2D, Int1D
+from twin.identification.candidates import Candidate
+from twin.identification.least_squares import MapFunction, compute_columns, solve_damped
+from twin.identification.parameters import FreeParameter, ParameterSet
+from twin.identification.residuals import LogResiduals
+
+FOLD_COUNT, NEVER_HELD_OUT = 3, -1
+MIN_STEP_UNITS = 6  # with fewer steps, blocks are held out instead
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """Candidate with one of its trial shapes, and the column of its slope in the sums."""
+
+    candidate: Candidate
+    shape: tuple[float, ...]
+    column: int
+    sign: int  # of the amplitudes allowed: +1, -1, or 0 for both
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """Normal equations per unit: slope products, (unit, p, p), and slope x residual, (unit, p).
+
+    The first `base_count` slopes are those of the parameters already in the fit.
+    """
+
+    hessian: Float2D
+    gradient: Float2D
+    residual_squares: Float1D
+    fold: Int1D
+    base_count: int
+    variants: tuple[Variant, ...]
+    scale: Float1D
+
+    @property
+    def base_cost(self) -> float:
+        """Cross-validation sum of squares without any candidate."""
+        return float(self.cross_validate(())[0].sum())
+
+    def cross_validate(self, columns: Sequence[int]) -> tuple[Float1D, Float1D]:
+        """Return (held-out residual squares, (unit,); mean step of the given columns, (p,))."""
+        indices = [*range(self.base_count), *columns]
+        hessian = self.hessian[:, indices][:, :, indices]
+        gradient = self.gradient[:, indices]
+        squares, steps = np.empty_like(self.residual_squares), []
+        for k in range(FOLD_COUNT):
+            held_out = self.fold == k
+            if not held_out.any() or held_out.all():
+                continue
+            step = -solve_damped(
+                hessian[~held_out].sum(axis=0), 1e-12, gradient[~held_out].sum(axis=0)
+            )
+            squares[held_out] = (
+                self.residual_squares[held_out]
+                + 2 * gradient[held_out] @ step
+                + hessian[held_out] @ step @ step
+            )
+            steps.append(step)
+        mean = np.mean(steps, axis=0)
+        held_out = self.fold == NEVER_HELD_OUT
+        squares[held_out] = (
+            self.residual_squares[held_out]
+            + 2 * gradient[held_out] @ mean
+            + hessian[held_out] @ mean @ mean
+        )
+        return squares, mean[self.base_count :]
+
+
+def assign_units(residuals: LogResiduals) -> Int1D:
+    """Return the unit of each entry, (entry,): its step or its block; the rest row comes last."""
+    step = residuals.signals.step[residuals.entry_sample]
+    steps = np.unique(step[step >= 0])
+    if steps.size >= MIN_STEP_UNITS:
+        # samples outside steps belong to the preceding step
+        log_step = residuals.signals.step
+        last = np.maximum.accumulate(np.where(log_step >= 0, np.arange(log_step.size), 0))
+        step = log_step[last][residuals.entry_sample]
+    else:
+        step = residuals.entry_block
+    at_rest = residuals.entry_row == len(residuals.rows)
+    number = np.unique(step, return_inverse=True)[1]
+    return np.where(at_rest, number.max() + 1, number)
+
+
+def assign_folds(residuals: LogResiduals) -> Int1D:
+    """Return the cross-validation fold of each entry, (entry,); the rest row is never held out."""
+    at_rest = residuals.entry_row == len(residuals.rows)
+    return np.where(at_rest, NEVER_HELD_OUT, assign_units(residuals) % FOLD_COUNT)
+
+
+def build_normal_equations(
+    log_residuals: Sequence[LogResiduals],
+    parameters: ParameterSet,
+    free: Sequence[FreeParameter],
+    library: Sequence[Candidate],
+    mapper: MapFunction = map,
+) -> NormalEquations:
+    """Build the normal equations at a parameter set; parameters at a bound are held fixed."""
+    free = [
+        parameter
+        for parameter in free
+        if parameter.low < parameters.values[parameter.keys[0]] < parameter.high
+    ]
+    before = [residuals.evaluate(parameters) for residuals in log_residuals]
+    requests = [(parameters, parameter) for parameter in free]
+    variants = []
+    for candidate in library:
+        amplitude, vanishing = candidate.amplitude, candidate.vanishing
+        sign = int(amplitude.low >= vanishing) - int(amplitude.high <= vanishing)
+        for shape in candidate.shapes:
+            variants.append(Variant(candidate, shape, len(requests), sign))
+            requests.append((candidate.add_to(parameters, shape), amplitude))
+    columns = compute_columns(log_residuals, requests, before, mapper)
+    hessians, gradients, squares, folds = [], [], [], []
+    for k, residuals in enumerate(log_residuals):
+        unit = assign_units(residuals)
+        order = np.argsort(unit, kind="stable")
+        edges = np.searchsorted(unit[order], np.arange(unit.max() + 2))
+        rows = np.array([column[k] for column in columns], dtype=np.float32)[:, order]
+        residual = before[k][order].astype(np.float32)
+        has_rest = bool((residuals.entry_row == len(residuals.rows)).any())
+        for u, (first, last) in enumerate(pairwise(edges)):
+            part, r = rows[:, first:last], residual[first:last]
+            hessians.append((part @ part.T).astype(np.float64))
+            gradients.append((part @ r).astype(np.float64))
+            squares.append(float(r @ r))
+            folds.append(NEVER_HELD_OUT if has_rest and last == unit.size else u % FOLD_COUNT)
+    hessian = np.array(hessians)
+    scale = np.sqrt(np.maximum(np.einsum("upp->p", hessian), 1e-300))
+    return NormalEquations(
+        hessian / np.outer(scale, scale), np.array(gradients) / scale, np.array(squares),
+        np.array(folds), len(free), tuple(variants), scale,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScreenedCandidate:
+    """Candidate with one trial shape, its held-out residual squares and its amplitude."""
+
+    variant: Variant
+    held_out_squares: Float1D  # (unit,) sums of squares
+    amplitude: float
+
+    @property
+    def candidate(self) -> Candidate:
+        return self.variant.candidate
+
+    @property
+    def cost(self) -> float:
+        return float(self.held_out_squares.sum())
+
+    def add_to(self, parameters: ParameterSet) -> ParameterSet:
+        """Add the candidate to a parameter set with the screened amplitude."""
+        free = self.candidate.amplitude
+        start = self.candidate.vanishing + self.amplitude
+        return self.candidate.add_to(
+            parameters, self.variant.shape, min(max(start, free.low), free.high)
+        )
+
+
+def rank_candidates(equations: NormalEquations, max_count: int) -> tuple[ScreenedCandidate, ...]:
+    """Return the best candidates, each with its best trial shape, best first."""
+    best: dict[str, ScreenedCandidate] = {}
+    for variant in equations.variants:
+        screened = _screen_variant(equations, variant)
+        if screened is not None:
+            name = screened.candidate.name
+            best[name] = min(best.get(name, screened), screened, key=lambda finding: finding.cost)
+    return tuple(sorted(best.values(), key=lambda screened: screened.cost)[:max_count])
+
+
+def _screen_variant(equations: NormalEquations, variant: Variant) -> ScreenedCandidate | None:
+    """Screen one variant; None if its amplitude has a sign that is not allowed."""
+    held_out_squares, steps = equations.cross_validate([variant.column])
+    amplitude = float(steps[0] / equations.scale[variant.column])
+    return (
+        ScreenedCandidate(variant, held_out_squares, amplitude)
+        if variant.sign * amplitude >= 0
+        else None
+    )

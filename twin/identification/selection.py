@@ -1,0 +1,319 @@
+"""Stepwise (forward with exchange) selection of missing effects by cross-validation.
+
+Each round screens all candidates by linear least squares around the current fit (`screening`),
+refits the best few on all data, and judges each by three-fold cross-validation over the steps.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import takewhile
+
+import numpy as np
+
+from table_io.block import Float1D, Int1D
+from twin.identification.candidates import Candidate, list_generic_candidates
+from twin.identification.least_squares import FitResult, MapFunction, fit_parameters
+from twin.identification.parameters import FreeParameter, ParameterSet
+from twin.identification.residuals import LogResiduals
+from twin.identification.screening import (
+    NormalEquations,
+    ScreenedCandidate,
+    assign_folds,
+    build_normal_equations,
+    rank_candidates,
+)
+
+MAX_EFFECTS = 3
+MAX_REFITS, MAX_GENERIC_REFITS = 5, 2  # candidates refitted in a round
+MIN_REFITS, MAX_COST_RATIO = 2, 1.5  # beyond the first two, skip costs above this ratio to the best
+MIN_PROMISED_GAIN = 0.003  # of the residual squares: candidates that promise less are not refitted
+MIN_GAP_SHARE = 0.02  # of the initial gap that a second or third effect must close
+MIN_GAIN_SIGMA = 4.0  # standard errors by which a gain must exceed zero
+MIN_GAIN_SHARE = 0.03  # of the residual squares, overall or in one row, that an effect must remove
+MIN_ROW_SHARE = 0.01  # of all entries: a smaller row is not judged by itself
+
+
+@dataclass(frozen=True, eq=False)
+class FittedSet:
+    """Set of effects with its fitted parameters and cross-validation residuals."""
+
+    effects: tuple[Candidate, ...]
+    fit: FitResult
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(effect.name for effect in self.effects)
+
+    @property
+    def held_out(self) -> tuple[Float1D, ...]:
+        """Cross-validation residual over the noise of each log, (entry,)."""
+        return self.fit.held_out
+
+    @property
+    def cost(self) -> float:
+        """Mean square of the cross-validation residual over the noise."""
+        return mean_square(self.held_out)
+
+
+@dataclass(frozen=True, slots=True)
+class SelectionProgress:
+    """Progress of a selection: set being fitted, `index` of `count` of a stage, and best so far.
+
+    `index` is 0 at the start of a stage, before its first fit.
+    """
+
+    stage: str
+    names: tuple[str, ...] = ()
+    index: int = 0
+    count: int = 0
+    best: FittedSet | None = None
+
+
+ProgressCallback = Callable[[SelectionProgress], None]
+
+
+def mean_square(held_out: Sequence[Float1D]) -> float:
+    """Return the mean square over the entries of all logs."""
+    return float(
+        sum(values @ values for values in held_out)
+        / max(sum(values.size for values in held_out), 1)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SelectionProblem:
+    """Selection problem: residuals of the logs, base parameters, and library of candidates."""
+
+    log_residuals: tuple[LogResiduals, ...]
+    base: tuple[FreeParameter, ...]
+    library: tuple[Candidate, ...]
+    mapper: MapFunction = map
+
+    def fit_effects(self, start: ParameterSet, effects: Sequence[Candidate]) -> FittedSet:
+        """Fit the effects with the base to all data, with cross-validation residuals."""
+        result = fit_parameters(
+            self.log_residuals,
+            start,
+            self.free_parameters(effects),
+            folds=self.folds,
+            mapper=self.mapper,
+        )
+        return FittedSet(tuple(effects), result)
+
+    def free_parameters(self, effects: Sequence[Candidate]) -> tuple[FreeParameter, ...]:
+        """Return the free parameters: those of the base and of the effects."""
+        return (*self.base, *(free for effect in effects for free in effect.free))
+
+    @cached_property
+    def folds(self) -> tuple[Int1D, ...]:
+        """Cross-validation fold of each entry, (entry,) per log."""
+        return tuple(assign_folds(residuals) for residuals in self.log_residuals)
+
+    def compute_gain(self, before: FittedSet, after: FittedSet) -> tuple[float, float, float]:
+        """Return (share of the residual squares removed, largest share in one row, significance).
+
+        With b the residual of `after` and d the difference of the two residuals, the gain is the
+        sum of d^2 + 2 d b. Its standard error is that of the second term, from the scatter over
+        the blocks; the significance is the gain in standard errors.
+        """
+        gain, chance = 0.0, 0.0
+        rows: dict[str, list[float]] = {}
+        for old, new, residuals in zip(
+            before.held_out, after.held_out, self.log_residuals, strict=True
+        ):
+            gain += float(old @ old - new @ new)
+            chance += float(
+                (np.bincount(residuals.entry_block, weights=2 * (old - new) * new) ** 2).sum()
+            )
+            for index, name in enumerate((*residuals.rows, "rest")):
+                mask = residuals.entry_row == index
+                if mask.sum() > MIN_ROW_SHARE * mask.size:
+                    row = rows.setdefault(name, [0.0, 0.0])
+                    row[0] += float(old[mask] @ old[mask] - new[mask] @ new[mask])
+                    row[1] += float(old[mask] @ old[mask])
+        total = before.cost * sum(a.size for a in before.held_out)
+        share = gain / max(total, 1e-300)
+        largest = max(
+            (gained / row_total for gained, row_total in rows.values() if row_total > 0),
+            default=share,
+        )
+        return share, max(largest, share), gain / max(math.sqrt(chance), 1e-300)
+
+    def is_worthwhile(self, before: FittedSet, after: FittedSet) -> bool:
+        """Return True if `after` is better than `before`, significantly and by enough to matter."""
+        share, row, errors = self.compute_gain(before, after)
+        return share > 0 and row > MIN_GAIN_SHARE and errors > MIN_GAIN_SIGMA
+
+
+@dataclass(frozen=True, eq=False)
+class SelectionResult:
+    """Outcome of a selection: the null (base alone), the best set, and every set refitted."""
+
+    null: FittedSet
+    best: FittedSet
+    tried: tuple[FittedSet, ...] = field(default=())
+    generic_sets: tuple[FittedSet, ...] = field(default=())  # sets with a generic term
+    complete: bool = True  # False after a cancellation
+
+
+class Cancelled(Exception):
+    """Exception for a progress callback to stop the selection and keep the best set so far."""
+
+    fitted: tuple[FittedSet, ...] = ()  # sets completed in the cancelled round
+
+
+def stepwise_selection(
+    problem: SelectionProblem, start: ParameterSet, report: ProgressCallback = lambda progress: None
+) -> SelectionResult:
+    """Select effects stepwise from the base alone: forward steps, each followed by exchanges."""
+    null = problem.fit_effects(start, ())
+    state = SelectionResult(null, null)
+    try:
+        while len(state.best.effects) < MAX_EFFECTS:
+            previous, state = state.best, _forward_step(problem, state, report)
+            if state.best is previous:  # its exchanges were tried when it was accepted
+                break
+            state = _exchange_step(problem, state, report)
+            state = replace(state, null=_refit_null(problem, state.null, state.best))
+        return replace(state, generic_sets=_fit_generic_terms(problem, state, report))
+    except Cancelled as cancelled:
+        return replace(_accept_best(problem, state, cancelled.fitted), complete=False)
+
+
+def _forward_step(
+    problem: SelectionProblem, state: SelectionResult, report: ProgressCallback
+) -> SelectionResult:
+    """Add the best further effect, if it is worthwhile."""
+    return _accept_best(
+        problem, state, _refit_candidates(problem, state.best, state.best.effects, report)
+    )
+
+
+def _accept_best(
+    problem: SelectionProblem, state: SelectionResult, fitted_sets: Sequence[FittedSet]
+) -> SelectionResult:
+    """Accept the best set of a round, if it is worthwhile."""
+    current, tried = state.best, (*state.tried, *fitted_sets)
+    best = min(fitted_sets, key=lambda fitted: fitted.cost, default=current)
+    is_minor = current.effects and current.cost - best.cost < MIN_GAP_SHARE * (
+        state.null.cost - best.cost
+    )
+    if is_minor or not problem.is_worthwhile(current, best):
+        best = current
+    return replace(state, best=best, tried=tried)
+
+
+def _exchange_step(
+    problem: SelectionProblem, state: SelectionResult, report: ProgressCallback
+) -> SelectionResult:
+    """Replace each earlier effect by a better one, if one exists."""
+    for replaced in state.best.effects[:-1]:
+        kept = tuple(effect for effect in state.best.effects if effect is not replaced)
+        fitted_sets = _refit_candidates(problem, state.best, kept, report, replaced)
+        state = replace(state, tried=(*state.tried, *fitted_sets))
+        best = min(fitted_sets, key=lambda fitted: fitted.cost, default=state.best)
+        if problem.is_worthwhile(state.best, best):
+            state = replace(state, best=best)
+    return state
+
+
+def _fit_generic_terms(
+    problem: SelectionProblem, state: SelectionResult, report: ProgressCallback
+) -> tuple[FittedSet, ...]:
+    """Fit generic terms alone, in addition to the best effects, and in place of each of them."""
+    best = state.best
+    library = list_generic_candidates(
+        any((residuals.contact_state > 0).any() for residuals in problem.log_residuals)
+    )
+
+    def report_best(progress: SelectionProgress) -> None:
+        # a generic term is never reported as the best set
+        report(replace(progress, best=best))
+
+    fitted_sets = _refit_candidates(problem, state.null, (), report_best, None, library)
+    if best.effects:
+        fitted_sets += _refit_candidates(problem, best, best.effects, report_best, None, library)
+    if len(best.effects) > 1:
+        for replaced in best.effects:
+            kept = tuple(effect for effect in best.effects if effect is not replaced)
+            fitted_sets += _refit_candidates(problem, best, kept, report_best, replaced, library)
+    return tuple(fitted_sets)
+
+
+def _refit_null(problem: SelectionProblem, null: FittedSet, best: FittedSet) -> FittedSet:
+    """Refit the null from the best set's parameters; an unconverged null causes false alarms."""
+    parameters = best.fit.parameters
+    for effect in best.effects:
+        parameters = parameters.without_effect(effect.name)
+    refitted = problem.fit_effects(parameters, ())
+    return refitted if refitted.cost < null.cost else null
+
+
+def _refit_candidates(
+    problem: SelectionProblem,
+    current: FittedSet,
+    kept: tuple[Candidate, ...],
+    report: ProgressCallback,
+    dropped: Candidate | None = None,
+    library: Sequence[Candidate] | None = None,
+) -> list[FittedSet]:
+    """Screen the candidates, then refit the best additions to the kept effects on all data."""
+    parameters, generic = current.fit.parameters, library is not None
+    count = len(kept) + 1
+    stage = "generic terms" if generic else f"{count} effect{'s' if count > 1 else ''}"
+    if dropped is not None:
+        stage += f", replacing {dropped.name}"
+    report(SelectionProgress(stage, best=current))
+    if dropped is not None:
+        parameters = parameters.without_effect(dropped.name)
+        parameters = problem.fit_effects(parameters, kept).fit.parameters
+    kept_names = {effect.name for effect in kept}
+    max_refits = MAX_GENERIC_REFITS if generic else MAX_REFITS
+    if library is None:
+        library = [
+            candidate
+            for candidate in problem.library
+            if candidate.name not in kept_names and candidate is not dropped
+        ]
+    if not library:
+        return []
+    fitted_sets: list[FittedSet] = []
+    promising = _select_promising(
+        build_normal_equations(
+            problem.log_residuals,
+            parameters,
+            problem.free_parameters(kept),
+            library,
+            problem.mapper,
+        ),
+        max_refits,
+    )
+    for index, screened in enumerate(promising, 1):
+        effects = (*kept, screened.candidate)
+        completed = () if generic else tuple(fitted_sets)
+        best = min((current, *completed), key=lambda fitted: fitted.cost)
+        try:
+            report(
+                SelectionProgress(
+                    stage, tuple(effect.name for effect in effects), index, len(promising), best
+                )
+            )
+        except Cancelled as cancelled:
+            cancelled.fitted = completed
+            raise
+        fitted_sets.append(problem.fit_effects(screened.add_to(parameters), effects))
+    return fitted_sets
+
+
+def _select_promising(equations: NormalEquations, max_count: int) -> list[ScreenedCandidate]:
+    """Return the best candidates, without those far worse than the first or with little gain."""
+    ranked = rank_candidates(equations, max_count)
+
+    def is_promising(indexed: tuple[int, ScreenedCandidate]) -> bool:
+        index, screened = indexed
+        hopeless = index >= MIN_REFITS and screened.cost > MAX_COST_RATIO * ranked[0].cost
+        return not hopeless and screened.cost <= (1.0 - MIN_PROMISED_GAIN) * equations.base_cost
+
+    return [screened for _, screened in takewhile(is_promising, enumerate(ranked))]

@@ -1,0 +1,358 @@
+"""Signals of a log as spectra, and their fusion into a motion for assumed sensor models.
+
+Gain, lag and offset of a sensor are simple operations on its spectrum, so a fit can vary them.
+"""
+
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from table_io.block import Block, Bool2D, Float1D, Int1D, Label, join_blocks
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from table_io.errors import InputError
+from twin.identification.motion import ConsistencyResidual, MeasuredMotion, MotionNoise
+from twin.identification.spectra import (
+    FrequencyGrid,
+    Spectrum,
+    estimate_white_noise,
+    exclude_margins,
+)
+from twin.model.model import SensorModel
+
+LOST_MARGIN_S = 0.3  # excluded around lost samples: the fusion spreads the interpolation error
+OPEN_END_S = 0.5  # excluded at an end of the record that is not at rest
+BODY_SENSORS = (
+    ("mass", "mass_disp_m", "mass_acc_m_s2"),
+    ("table", "table_disp_m", "table_acc_m_s2"),
+)
+USED_CHANNELS = (
+    "rel_disp_m", "mass_disp_m", "table_disp_m", "mass_acc_m_s2", "table_acc_m_s2",
+    *RIGHT_CELLS, *LEFT_CELLS, "damper_force_n",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class LogSignals:
+    """Signals of a log: spectrum and rms noise of each channel, specimen data and labels."""
+
+    name: str
+    mass_kg: float
+    gaps_m: tuple[float, float]
+    grid: FrequencyGrid
+    omega: Float1D
+    low_pass: Float1D
+    unit_spectrum: Spectrum
+    spectra: Mapping[str, Spectrum]
+    noise_rms: Mapping[str, float]
+    rest_values: Mapping[str, tuple[float, float]]  # (mean, its std error) before the motion, SI
+    time_s: Float1D
+    step: Int1D
+    label: Int1D
+    cycle: Int1D
+    good: Bool2D
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        return tuple(self.spectra)
+
+    @property
+    def zero_channels(self) -> dict[str, tuple[tuple[str, float], ...]]:
+        """Channels, with signs, that make up u, acc, table (its acceleration), right and left.
+
+        Only tared quantities: those with a rest value of every channel.
+        """
+        displacements = (("mass_disp_m", 1.0), ("table_disp_m", -1.0))
+        channels_of = {
+            "u": displacements if "mass_disp_m" in self.spectra else (("rel_disp_m", 1.0),),
+            "acc": (("mass_acc_m_s2", 1.0),),
+            "table": (("table_acc_m_s2", 1.0),),
+            "right": tuple((cell, 1.0) for cell in RIGHT_CELLS if cell in self.spectra),
+            "left": tuple((cell, 1.0) for cell in LEFT_CELLS if cell in self.spectra),
+        }
+        return {
+            name: channels
+            for name, channels in channels_of.items()
+            if channels and {channel for channel, _ in channels} <= self.rest_values.keys()
+        }
+
+    def rest_value(self, name: str) -> tuple[float, float]:
+        """Return (mean, standard error) of one of `zero_channels` at rest, SI.
+
+        With precompression the readings at rest are real: the mean is then 0, because only the
+        standard error of the tare is known.
+        """
+        rest = [(sign, *self.rest_values[channel]) for channel, sign in self.zero_channels[name]]
+        pressed = min(self.gaps_m) <= 0
+        mean = 0.0 if pressed else sum(sign * mean for sign, mean, _ in rest)
+        return mean, float(np.hypot.reduce([sd for _, _, sd in rest])) / float(np.sqrt(2.0))
+
+    def whitening(self, stiffness: float, damping: float) -> Float1D:
+        """Return the whitening filter of the force balance without accelerometer, (frequency,).
+
+        It is a gain per kg that makes the noise white with rms 1 where the acceleration of the mass
+        comes from its displacement. The noise of u then enters through -w^2 u and K u + C u': for a
+        stiffness in N/(m kg) and a damping in N s/(m kg) it is s_u |K - w^2 + i w C|, small where
+        the signal is large.
+        """
+        displacement = "rel_disp_m" if "rel_disp_m" in self.noise_rms else "mass_disp_m"
+        s_u = self.noise_rms[displacement] * np.abs(
+            stiffness - self.omega**2 + 1j * self.omega * damping
+        )
+        gain: Float1D = self.low_pass / np.hypot(s_u, self.noise_rms["table_acc_m_s2"])
+        return gain / self.grid.white_noise_rms(self.low_pass)
+
+    def fuse_motion(self, sensors: Sequence[SensorModel] = ()) -> MeasuredMotion:
+        """Return the motion, assuming that these sensors read gain x value(t - lag) + offset."""
+        spectra = dict(self.spectra)
+        for sensor in sensors:
+            if sensor.channel in spectra:
+                shifted = spectra[sensor.channel] - sensor.offset * self.unit_spectrum
+                spectra[sensor.channel] = (
+                    shifted * np.exp(1j * self.omega * sensor.lag) / sensor.gain
+                )
+        noise = dict(self.noise_rms)
+        for sensor in sensors:
+            if sensor.channel in noise:
+                noise[sensor.channel] /= abs(sensor.gain)
+        return _SensorFusion(self, spectra, noise).fuse()
+
+
+def derives_acc(channels: Container[str]) -> bool:
+    """Return True if the acceleration of the mass is derived from its displacement."""
+    return "mass_acc_m_s2" not in channels and "table_acc_m_s2" in channels
+
+
+class _SensorFusion:
+    """Minimum-variance fusion of displacement and acceleration spectra into one motion."""
+
+    def __init__(
+        self, signals: LogSignals, spectra: Mapping[str, Spectrum], noise: Mapping[str, float]
+    ) -> None:
+        self.signals, self.spectra, self.noise_rms = signals, spectra, noise
+        self.grid, self.omega, self.low_pass = signals.grid, signals.omega, signals.low_pass
+        self.missing = np.full(signals.time_s.size, np.nan)
+
+    def fuse(self) -> MeasuredMotion:
+        signals = self.signals
+        position, noise_u, noise_v, consistency = self._relative_displacement()
+        right, noise_right = self._side_force(RIGHT_CELLS)
+        left, noise_left = self._side_force(LEFT_CELLS)
+        kept_share = self.grid.white_noise_rms(self.low_pass)
+        acc, noise_acc = (
+            self._time_series("mass_acc_m_s2"),
+            self._channel_noise("mass_acc_m_s2") * kept_share,
+        )
+        if derives_acc(self.spectra):
+            acc = self.grid.to_time_domain(
+                (self.spectra["table_acc_m_s2"] - self.omega**2 * position) * self.low_pass
+            )
+        noise = MotionNoise(
+            noise_u, noise_v, noise_acc, noise_right * kept_share, noise_left * kept_share,
+            self._channel_noise("damper_force_n") * kept_share,
+        )  # fmt: skip
+        consistency += self._load_cell_residuals()
+        damper = self._time_series("damper_force_n") if "damper_force_n" in self.spectra else None
+        return MeasuredMotion(
+            signals.name, self.grid.rate_hz / self.grid.decimation, signals.mass_kg,
+            signals.gaps_m, signals.time_s,
+            self.grid.to_time_domain(position * self.low_pass),
+            self.grid.to_time_domain(1j * self.omega * position * self.low_pass),
+            acc, self._time_series("table_acc_m_s2"), self._time_series("table_disp_m"),
+            right, left,
+            signals.step, signals.label, signals.cycle, signals.good, noise, consistency, damper,
+        )  # fmt: skip
+
+    def _relative_displacement(
+        self,
+    ) -> tuple[Spectrum, float, float, tuple[ConsistencyResidual, ...]]:
+        """Return (spectrum of u, rms noise of u, rms noise of v, consistency residuals)."""
+        spectra = self.spectra
+        if {"mass_disp_m", "table_disp_m"} <= spectra.keys():
+            pairs = [self._fuse_body(*body) for body in BODY_SENSORS]
+            noise_density = np.hypot(pairs[0][1], pairs[1][1])
+            consistency = tuple(pair[2] for pair in pairs if pair[2] is not None)
+            return (
+                pairs[0][0] - pairs[1][0],
+                self._displacement_noise(noise_density),
+                self._velocity_noise(noise_density),
+                consistency,
+            )
+        acc, noise = None, 0.0
+        if {"mass_acc_m_s2", "table_acc_m_s2"} <= spectra.keys():
+            acc = spectra["mass_acc_m_s2"] - spectra["table_acc_m_s2"]
+            noise = float(
+                np.hypot(
+                    self._channel_noise("mass_acc_m_s2"), self._channel_noise("table_acc_m_s2")
+                )
+            )
+        spectrum, noise_density, residual = self._fuse(
+            "mass against table",
+            spectra["rel_disp_m"],
+            self._channel_noise("rel_disp_m"),
+            acc,
+            noise,
+        )
+        return (
+            spectrum,
+            self._displacement_noise(noise_density),
+            self._velocity_noise(noise_density),
+            (residual,) if residual else (),
+        )
+
+    def _fuse_body(
+        self, body: str, laser: str, accelerometer: str
+    ) -> tuple[Spectrum, Float1D, Any]:
+        acc = self.spectra.get(accelerometer)
+        return self._fuse(
+            body,
+            self.spectra[laser],
+            self._channel_noise(laser),
+            acc,
+            self._channel_noise(accelerometer),
+        )
+
+    def _fuse(
+        self, body: str, position: Spectrum, s_x: float, acc: Spectrum | None, s_a: float
+    ) -> tuple[Spectrum, Float1D, ConsistencyResidual | None]:
+        """Return (fused spectrum, its noise per frequency over white, consistency residual)."""
+        if acc is None:
+            return position, np.full(self.omega.size, s_x), None
+        w2 = self.omega**2
+        variance = s_a**2 + w2**2 * s_x**2
+        fused = (s_a**2 * position - w2 * s_x**2 * acc) / variance
+        difference = self.grid.to_time_domain(
+            (acc + w2 * position) / np.sqrt(variance) * self.low_pass
+        )
+        kept_share = self.grid.white_noise_rms(self.low_pass)
+        consistency = ConsistencyResidual(body, difference / kept_share, 1.0 / (s_a * kept_share))
+        return fused, s_a * s_x / np.sqrt(variance), consistency
+
+    def _load_cell_residuals(self) -> tuple[ConsistencyResidual, ...]:
+        """Return the difference of the two load cells of each side over their noise."""
+        residuals = []
+        for side, (first, second) in (("right cells", RIGHT_CELLS), ("left cells", LEFT_CELLS)):
+            if {first, second} <= self.spectra.keys():
+                difference = self._time_series(first) - self._time_series(second)
+                noise = np.hypot(
+                    self._channel_noise(first), self._channel_noise(second)
+                ) * self.grid.white_noise_rms(self.low_pass)
+                residuals.append(ConsistencyResidual(side, difference / noise))
+        return tuple(residuals)
+
+    def _displacement_noise(self, noise_density: Float1D) -> float:
+        return self.grid.white_noise_rms(noise_density * self.low_pass)
+
+    def _velocity_noise(self, noise_density: Float1D) -> float:
+        return self.grid.white_noise_rms(self.omega * noise_density * self.low_pass)
+
+    def _time_series(self, name: str) -> Float1D:
+        return (
+            self.grid.to_time_domain(self.spectra[name] * self.low_pass)
+            if name in self.spectra
+            else self.missing
+        )
+
+    def _channel_noise(self, name: str) -> float:
+        return self.noise_rms.get(name, float("nan"))
+
+    def _side_force(self, cells: tuple[str, ...]) -> tuple[Float1D, float]:
+        """Return (force of the cells of a side, (sample,) in N, its rms noise before filtering)."""
+        present = [name for name in cells if name in self.spectra]
+        if not present:
+            return self.missing, float("nan")
+        total = np.sum([self.spectra[name] for name in present], axis=0)
+        return self.grid.to_time_domain(total * self.low_pass), float(
+            np.hypot.reduce([*map(self._channel_noise, present)])
+        )
+
+
+def build_signals(
+    blocks: tuple[Block, ...], name: str, mass_kg: float, gaps_m: tuple[float, float]
+) -> LogSignals:
+    """Build the signals of measured blocks; raise InputError if no displacement was measured."""
+    block = _join_with_gaps(blocks, name)
+    columns = {
+        key: block.channel(key)
+        for key in USED_CHANNELS
+        if key in block.channels and is_channel_alive(block.channel(key))
+    }
+    if "rel_disp_m" not in columns and not {"mass_disp_m", "table_disp_m"} <= columns.keys():
+        raise InputError(
+            "the displacement of the mass relative to the table was not measured",
+            where=name,
+            allowed="logs with rel_disp_m, or with mass_disp_m and table_disp_m",
+        )
+    at_rest = _find_rest(block)
+    good = np.logical_and.reduce([np.isfinite(values) for values in columns.values()])
+    grid = FrequencyGrid(len(block), block.rate_hz)
+    usable = exclude_margins(good, round(LOST_MARGIN_S * block.rate_hz))
+    margin = round(OPEN_END_S * block.rate_hz)
+    if block.label[0] != Label.REST:
+        usable[:margin] = False
+    if block.label[-1] != Label.REST:
+        usable[-margin:] = False
+    size = -(-len(block) // grid.decimation)
+    noise = {key: estimate_white_noise(values, at_rest) for key, values in columns.items()}
+    return LogSignals(
+        name, mass_kg, gaps_m, grid, grid.omega, grid.low_pass,
+        grid.to_spectrum(np.ones(len(block))),
+        {key: grid.to_spectrum(values) for key, values in columns.items()},
+        noise,
+        _measure_rest(columns, at_rest, noise),
+        (block.index + grid.decimation * np.arange(size)) / block.rate_hz,
+        block.step[:: grid.decimation], block.label[:: grid.decimation],
+        block.cycle[:: grid.decimation],
+        usable[:: grid.decimation],
+    )  # fmt: skip
+
+
+def is_channel_alive(values: Float1D) -> bool:
+    """Return False for a dead channel: no samples, or a constant value."""
+    finite = values[np.isfinite(values)]
+    return bool(finite.size and np.ptp(finite) > 0.0)
+
+
+def _join_with_gaps(blocks: tuple[Block, ...], name: str) -> Block:
+    """Join blocks into one; missing samples between them become NaN."""
+    if not blocks:
+        raise InputError(
+            "the log has no measured samples", where=name, remedy="give a recorded test"
+        )
+    parts: list[Block] = []
+    for block in blocks:
+        if parts and parts[-1].end < block.index:
+            parts.append(_missing_block(parts[-1], block.index))
+        parts.append(block)
+    return join_blocks(parts)
+
+
+def _missing_block(before: Block, until: int) -> Block:
+    count = until - before.end
+    outside = np.full(count, -1, dtype=np.int64)
+    values = np.full((len(before.channels), count), np.nan)
+    label = np.zeros(count, dtype=np.int64)
+    return Block(
+        before.stream, before.end, before.rate_hz, before.channels, values, outside, label, outside
+    )
+
+
+def _find_rest(block: Block) -> Bool2D:
+    """Find the samples at rest before the motion, (sample,): there all readings are noise."""
+    moving = np.flatnonzero(block.label != Label.REST)
+    at_rest = np.zeros(len(block), dtype=bool)
+    at_rest[: moving[0] if moving.size else 0] = True
+    return at_rest
+
+
+def _measure_rest(
+    columns: Mapping[str, Float1D], at_rest: Bool2D, noise: Mapping[str, float]
+) -> dict[str, tuple[float, float]]:
+    """Return (mean, std error) of each channel at rest, SI; the tare's own error is included."""
+    rest_values = {}
+    for key, values in columns.items():
+        finite = values[at_rest & np.isfinite(values)]
+        if finite.size >= 100:
+            rest_values[key] = float(finite.mean()), noise[key] * float(np.sqrt(2.0 / finite.size))
+    return rest_values

@@ -1,0 +1,123 @@
+"""Spectra of whole records: low-pass filtering, decimation and noise estimates."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
+from scipy.signal import welch
+
+from table_io.block import Bool2D, Float1D
+
+TARGET_RATE_HZ = 500.0  # 50 samples of a contact of 0.1 s; noise above the band is removed
+ROLL_OFF_START = 0.8  # of the new Nyquist frequency: start of the low-pass roll-off
+PAD_S = 2.0
+# samples of a Welch segment; bands of the spectrum, the quietest of which gives the noise
+SEGMENT_SAMPLES, BAND_COUNT = 1024, 8
+MIN_NOISE_SHARE = 1e-4  # of a channel's rms: lower limit of the noise estimate
+Spectrum = npt.NDArray[np.complex128]
+
+
+@dataclass(frozen=True, eq=False)
+class FrequencyGrid:
+    """Time and frequency grid of a record: zero-padded FFT, low pass and decimation."""
+
+    size: int
+    rate_hz: float
+
+    @property
+    def decimation(self) -> int:
+        return max(int(self.rate_hz // TARGET_RATE_HZ), 1)
+
+    @property
+    def padded_size(self) -> int:
+        pad = round(PAD_S * self.rate_hz)
+        return self.decimation * next_fast_len(-(-(self.size + pad) // self.decimation), real=True)
+
+    @property
+    def bin_count(self) -> int:
+        return self.padded_size // self.decimation // 2 + 1
+
+    @property
+    def omega(self) -> Float1D:
+        """Angular frequencies in rad/s, (frequency,)."""
+        return 2 * np.pi * rfftfreq(self.padded_size, 1.0 / self.rate_hz)[: self.bin_count]
+
+    @property
+    def low_pass(self) -> Float1D:
+        """Gain of the low pass, (frequency,); 1 everywhere without decimation."""
+        if self.decimation == 1:
+            return np.ones(self.bin_count)
+        x = self.omega * self.decimation / (np.pi * self.rate_hz)
+        low: Float1D = 0.5 + 0.5 * np.cos(
+            np.pi * np.clip((x - ROLL_OFF_START) / (1 - ROLL_OFF_START), 0, 1)
+        )
+        return low
+
+    def to_spectrum(self, values: Float1D) -> Spectrum:
+        """Return the spectrum, (frequency,), of values at the original rate, (sample,)."""
+        return rfft(bridge_gaps(values), self.padded_size)[: self.bin_count]
+
+    def apply_gain(self, values: Float1D, gain: Float1D) -> Float1D:
+        """Filter values at the decimated rate, (sample,), with a gain, (frequency,)."""
+        spectrum = rfft(values, self.padded_size // self.decimation)
+        filtered: Float1D = irfft(spectrum * gain, self.padded_size // self.decimation)[
+            : values.size
+        ]
+        return filtered
+
+    def to_time_domain(self, spectrum: Spectrum) -> Float1D:
+        """Return the values of a spectrum at the decimated rate, (sample,)."""
+        count = -(-self.size // self.decimation)
+        samples: Float1D = (
+            irfft(spectrum, self.padded_size // self.decimation)[:count] / self.decimation
+        )
+        return samples
+
+    @property
+    def neighbour_correlation(self) -> float:
+        """Correlation of the noise of two adjacent samples at the decimated rate."""
+        power = self.low_pass**2
+        return float(
+            np.sum(power * np.cos(self.omega * self.decimation / self.rate_hz)) / power.sum()
+        )
+
+    def white_noise_rms(self, gain: Float1D) -> float:
+        """Return the rms of white noise of rms 1 (original rate) after a gain, (frequency,)."""
+        return float(np.sqrt(np.sum(gain**2) / (self.padded_size / 2 + 1)))
+
+
+def estimate_white_noise(values: Float1D, rest: Bool2D) -> float:
+    """Return the rms noise of a channel, assumed white: scatter at rest or floor of the spectrum.
+
+    Where the two agree within the uncertainty of the scatter at rest, the floor is used, which is
+    more accurate.
+    """
+    quiet = values[rest & np.isfinite(values)]
+    finite = values[np.isfinite(values)]
+    _, density = welch(finite, 1.0, nperseg=min(SEGMENT_SAMPLES, finite.size))
+    bands = np.array_split(density[1:-1], BAND_COUNT)
+    floor = float(np.sqrt(0.5 * min(float(np.median(band)) for band in bands)))
+    if quiet.size >= 100:
+        scatter = float(quiet.std())
+        if abs(floor - scatter) > 3.0 * scatter / np.sqrt(2.0 * quiet.size):
+            floor = scatter
+    return max(floor, MIN_NOISE_SHARE * float(finite.std()), 1e-300)
+
+
+def bridge_gaps(values: Float1D) -> Float1D:
+    """Interpolate lost samples linearly, (sample,); callers exclude them from the fit."""
+    finite = np.isfinite(values)
+    if finite.all():
+        return values
+    places = np.arange(values.size)
+    return np.interp(places, places[finite], values[finite])
+
+
+def exclude_margins(good: Bool2D, margin: int) -> Bool2D:
+    """Return the good samples without a lost one within `margin` samples, (sample,)."""
+    if good.all():
+        return good.copy()
+    spread = np.convolve(~good, np.ones(2 * margin + 1), "same") > 0
+    usable: Bool2D = ~spread
+    return usable

@@ -1,0 +1,323 @@
+"""Verdict on a selection: none, named, ambiguous or unexplained, with a confidence.
+
+The gap's excess is the mean square of the cross-validation residual over the noise, less the floor.
+    none         the residual of the base model is noise
+    named        the effects close the gap, no other effects and no generic term do so better
+    ambiguous    other effects fit as well: the data cannot distinguish them
+    unexplained  a residual remains, or a generic term fits much better than any library effect
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from twin.identification.parameters import ZERO_PREFIX, parse_log_number
+from twin.identification.selection import FittedSet, SelectionProblem, SelectionResult
+
+# standard errors by which a rival set must be worse to be excluded
+MIN_SEPARATION_SIGMA = 3.5
+# of the gap closed by the best set: a set that closes less is no rival, however few the data
+MIN_RIVAL_GAP_SHARE = 0.8
+MAX_REMAINDER_SHARE = 0.06  # of the gap's excess: a larger remainder is reported as unexplained
+# of the gap's excess: gain that makes a generic term better than a library effect in its place
+MIN_GENERIC_GAIN_SHARE = 0.012
+# of the gap's excess: the same where it replaces one of several effects
+MIN_REPLACEMENT_GAIN_SHARE = 0.001
+MIN_VISIBLE_EXCESS = 0.05  # of the floor: excess below which there is no gap
+# ratio to both start and null beyond which a base parameter was absorbed by the selected effects
+MAX_BASE_RATIO = 1.6
+# ratio of start and null below which the start is no independent check
+MAX_SAME_BASE_RATIO = 1.2
+NEVER_AT_BOUND = ("stiffness", "damping", "bumper_stiffness")  # positive in a real specimen
+MIN_NAMED_GAP_SHARE = 0.5  # of the gap's excess that the named effects must close
+
+
+@dataclass(frozen=True, eq=False)
+class DiscoveryVerdict:
+    """Verdict with the sets of effects and the numbers behind it (mean squares over the noise)."""
+
+    outcome: str
+    best: FittedSet
+    confidence: float
+    alternatives: tuple[FittedSet, ...]  # as good as the best, if ambiguous
+    generic: FittedSet | None  # set with a generic term that fits better, or improves the null
+    floor: float
+    has_remainder: bool  # the residual exceeds the floor by more than an inexact force law explains
+    reason: str
+
+
+def judge_selection(
+    problem: SelectionProblem,
+    selection: SelectionResult,
+    floor: float,
+    start: Mapping[str, float] | None = None,
+    noise: float = 1.0,
+) -> DiscoveryVerdict:
+    """Judge the outcome of a selection; `floor` is a mean square over the noise.
+
+    `start` are the base parameters of the given model, an independent check of the fitted ones.
+    `noise` is the mean square of sensor noise alone: below it no effect is named.
+    """
+    null, best = selection.null, selection.best
+    gap = max(null.cost - floor, 1e-9)
+    generic = _find_better_generic(problem, selection, floor)
+    is_additional = generic is not None and _needs_named_effects(selection, generic, gap)
+    if null.cost < noise and null.cost < (1 + 2 * MIN_VISIBLE_EXCESS) * best.cost:
+        reason = "the residual of the model is below the noise of the sensors"
+        return DiscoveryVerdict("none", null, 0.9, (), None, floor, False, reason)
+    if not best.effects:
+        return _judge_unnamed(problem, selection, floor, generic)
+    remaining = max(best.cost - floor, 0.0)
+    rivals = _find_rivals(problem, selection)
+    as_good = [
+        fitted
+        for fitted, errors in rivals
+        if fitted.cost <= best.cost or errors < MIN_SEPARATION_SIGMA
+    ]
+    if unstrained := [
+        fitted for fitted in as_good if _zeros_at_bound(fitted) < _zeros_at_bound(best)
+    ]:
+        alternative = min(unstrained, key=lambda fitted: fitted.cost)
+        return judge_selection(problem, replace(selection, best=alternative), floor, start, noise)
+    alternatives = tuple({frozenset(fitted.names): fitted for fitted in reversed(as_good)}.values())
+    has_remainder = remaining > MAX_REMAINDER_SHARE * gap and remaining > MIN_VISIBLE_EXCESS * floor
+    confidence = _confidence(selection, rivals, remaining / gap)
+    if doubt := _find_doubt(
+        selection, None if is_additional else generic, start or {}, has_remainder, gap
+    ):
+        return DiscoveryVerdict(
+            "unexplained", best, min(confidence, 0.3), (), generic, floor, True, doubt
+        )
+    if alternatives and (
+        core := _judge_common_core(problem, selection, alternatives, floor, start, noise)
+    ):
+        return core
+    if alternatives:
+        names = "; ".join(" + ".join(fitted.names) for fitted in alternatives)
+        reason = f"as good as {' + '.join(best.names)}: {names}"
+        share = confidence / (1 + len(alternatives))
+        return DiscoveryVerdict(
+            "ambiguous", best, share, alternatives, generic, floor, has_remainder, reason
+        )
+    reason = "the residual is noise"
+    if remaining > MIN_VISIBLE_EXCESS * floor:
+        percent = 100 * math.sqrt(remaining / gap)
+        reason = (
+            f"{percent:.2g} % of the gap remains, as an inexact form of the force law may leave"
+        )
+    if generic is not None:
+        reason = f"part of the gap remains unexplained; it resembles {generic.names[-1]}"
+        confidence, has_remainder = 0.8 * confidence, True
+    elif has_remainder:
+        reason = "part of the gap remains unexplained"
+    return DiscoveryVerdict("named", best, confidence, (), generic, floor, has_remainder, reason)
+
+
+def _judge_common_core(
+    problem: SelectionProblem,
+    selection: SelectionResult,
+    alternatives: Sequence[FittedSet],
+    floor: float,
+    start: Mapping[str, float] | None,
+    noise: float,
+) -> DiscoveryVerdict | None:
+    """Return the verdict on the effects common to all equally good sets, if it is "named"."""
+    sets = [set(fitted.names) for fitted in (selection.best, *alternatives)]
+    common = set.intersection(*sets)
+    candidates = [fitted for fitted in selection.tried if common and set(fitted.names) == common]
+    if not candidates:
+        return None
+    core = min(candidates, key=lambda fitted: fitted.cost)
+    # a generic term that replaces the common effects is no evidence on them
+    generic_sets = [
+        fitted
+        for fitted in selection.generic_sets
+        if len(fitted.effects) == 1 or common < set(fitted.names)
+    ]
+    of_core = replace(selection, best=core, generic_sets=tuple(generic_sets))
+    verdict = judge_selection(problem, of_core, floor, start, noise)
+    if verdict.outcome != "named":
+        return None
+    alternatives_text = " or ".join(
+        dict.fromkeys(" + ".join(sorted(names - common)) for names in sets)
+    )
+    reason = (
+        f"part of the gap remains, to which {alternatives_text} may contribute: the data cannot "
+        "distinguish them"
+    )
+    return replace(verdict, has_remainder=True, reason=reason)
+
+
+def _find_doubt(
+    selection: SelectionResult,
+    generic: FittedSet | None,
+    start: Mapping[str, float],
+    has_remainder: bool,
+    gap: float,
+) -> str:
+    """Return the reason why the best effects must not be named; empty if there is none."""
+    best = selection.best
+    names = " + ".join(best.names)
+    if generic is not None:
+        return f"{generic.names[-1]} explains what {names} cannot"
+    if absorbed := _describe_absorbed_base(selection, start):
+        return f"{names} would close the gap only if {absorbed}"
+    if has_remainder and (selection.null.cost - best.cost) < MIN_NAMED_GAP_SHARE * gap:
+        return "the best effects close less than half of the gap"
+    at_bound = [
+        effect.amplitude.name
+        for effect in best.effects
+        if effect.amplitude.name in best.fit.at_bound
+    ]
+    return (
+        f"{', '.join(at_bound)} is at its bound, and part of the gap remains"
+        if has_remainder and at_bound
+        else ""
+    )
+
+
+def _judge_unnamed(
+    problem: SelectionProblem, selection: SelectionResult, floor: float, generic: FittedSet | None
+) -> DiscoveryVerdict:
+    null = selection.null
+    if generic is not None and problem.is_worthwhile(null, generic):
+        reason = f"no effect of the library, but {generic.names[-1]} explains part of the gap"
+        return DiscoveryVerdict("unexplained", null, 0.9, (), generic, floor, True, reason)
+    if null.cost > (1 + 2 * MIN_VISIBLE_EXCESS) * floor:
+        reason = "the residual exceeds the noise, and no effect of the library explains it"
+        return DiscoveryVerdict("unexplained", null, 0.8, (), None, floor, True, reason)
+    if at_bound := [name for name in NEVER_AT_BOUND if name in null.fit.at_bound]:
+        reason = (
+            f"the residual is noise only with {', '.join(at_bound)} at its bound, which is not "
+            "physical"
+        )
+        return DiscoveryVerdict("unexplained", null, 0.8, (), None, floor, True, reason)
+    return DiscoveryVerdict("none", null, 0.95, (), None, floor, False, "the residual is noise")
+
+
+def _find_better_generic(
+    problem: SelectionProblem, selection: SelectionResult, floor: float
+) -> FittedSet | None:
+    """Return the set with a generic term that fits much better than the best set without."""
+    best, gap = selection.best, max(selection.null.cost - floor, 1e-9)
+    for fitted in sorted(selection.generic_sets, key=lambda fitted: fitted.cost):
+        gain = best.cost - fitted.cost
+        is_additional = len(fitted.effects) > len(best.effects) > 0
+        if (
+            gain > (MAX_REMAINDER_SHARE if is_additional else MIN_GENERIC_GAIN_SHARE) * gap
+            and problem.compute_gain(best, fitted)[2] > MIN_SEPARATION_SIGMA
+        ):
+            return fitted
+        is_replacement = len(fitted.effects) == len(best.effects) > 1
+        if (
+            is_replacement
+            and gain > MIN_REPLACEMENT_GAIN_SHARE * gap
+            and problem.compute_gain(best, fitted)[2] > MIN_SEPARATION_SIGMA
+        ):
+            return fitted
+        if len(fitted.effects) < len(best.effects) and gain > -MIN_GENERIC_GAIN_SHARE * gap:
+            return fitted  # one generic term fits as well as several effects
+    return None
+
+
+def _needs_named_effects(selection: SelectionResult, generic: FittedSet, gap: float) -> bool:
+    """Return True if the generic term alone fits much worse than together with the effects."""
+    if len(generic.effects) <= len(selection.best.effects):
+        return False
+    costs = [fitted.cost for fitted in selection.generic_sets if len(fitted.effects) == 1]
+    return min(costs, default=math.inf) - generic.cost > MAX_REMAINDER_SHARE * gap
+
+
+def _describe_absorbed_base(selection: SelectionResult, start: Mapping[str, float]) -> str:
+    """Describe the base parameter absorbed by the selected effects; empty if there is none."""
+    for name in ("stiffness", "damping"):
+        given = start.get(name, 0.0)
+        null, best = (
+            fitted.fit.values.get(name, 0.0) for fitted in (selection.null, selection.best)
+        )
+        if min(given, null) <= 0 or _ratio(given, null) < MAX_SAME_BASE_RATIO:
+            continue
+        if best <= 0 or min(_ratio(best, given), _ratio(best, null)) > MAX_BASE_RATIO:
+            return f"the {name} were {best:.4g} instead of {given:.4g} as in the model"
+    return ""
+
+
+def _ratio(a: float, b: float) -> float:
+    return max(a / b, b / a)
+
+
+def _find_rivals(
+    problem: SelectionProblem, selection: SelectionResult
+) -> list[tuple[FittedSet, float]]:
+    """Return (set, standard errors by which it is worse) of each rival.
+
+    A rival has as many effects as the best set, but others, and closes nearly as much of the gap.
+    """
+    best = selection.best
+    return [
+        (rival, problem.compute_gain(rival, best)[2])
+        for rival in selection.tried
+        if len(rival.effects) == len(best.effects)
+        and frozenset(rival.names) != frozenset(best.names)
+        and selection.null.cost - rival.cost
+        >= MIN_RIVAL_GAP_SHARE * (selection.null.cost - best.cost)
+        and not _is_limit_case(rival, best)
+        and not _zeros_at_bound(rival) - _zeros_at_bound(best)
+    ]
+
+
+def _zeros_at_bound(fitted: FittedSet) -> set[str]:
+    """Return the tare errors at their bound: a fit that needs them is implausible."""
+    return {
+        name
+        for name in fitted.fit.at_bound
+        if name.startswith(ZERO_PREFIX) and parse_log_number(name) is not None
+    }
+
+
+def _is_limit_case(fitted: FittedSet, best: FittedSet) -> bool:
+    """Return True if the set only replaces Coulomb friction by Bouc-Wen, whose limit it is."""
+    is_swap = {*fitted.names} ^ {*best.names} == {"bouc_wen", "coulomb_friction"}
+    return is_swap and "coulomb_friction" in best.names
+
+
+def _confidence(
+    selection: SelectionResult, rivals: Sequence[tuple[FittedSet, float]], remaining_share: float
+) -> float:
+    """Return the confidence, 0 to 1, from the separation from rivals and the remaining gap."""
+    best = selection.best
+    margin = min((errors for _, errors in rivals), default=10.0)
+    separation = 1.0 / (1.0 + math.exp(-(margin - 2.0)))
+    # of the gap's rms: an inexact form of the right law may leave a sixth, a wrong law leaves half
+    completeness = 0.4 + 0.6 / (
+        1.0 + math.exp((math.sqrt(max(remaining_share, 0.0)) - 0.27) / 0.04)
+    )
+    validity = 1.0 if best.fit.converged and not best.fit.at_bound else 0.6
+    return 0.98 * separation * completeness * validity
+
+
+def closed_fraction(before: float, after: float, floor: float) -> float:
+    """Return (before - after) / (before - floor) of the roots of the given mean squares."""
+    b, a, f = (math.sqrt(max(x, 0.0)) for x in (before, after, floor))
+    return (b - a) / (b - f) if b > f else 0.0
+
+
+def suggest_next_run(
+    outcome: str, best: Sequence[str], alternatives: Sequence[Sequence[str]]
+) -> str:
+    """Suggest the test that would distinguish or confirm the effects."""
+    names = {name.split(".")[0] for names in (best, *alternatives) for name in names}
+    if outcome == "none":
+        return "no further test is needed; a sweep at another amplitude would confirm the result"
+    if names & {"bouc_wen", "maxwell_damper", "coulomb_friction", "quadratic_damping"}:
+        return (
+            "the same sweep at half and at twice the amplitude: hysteresis and friction change "
+            "with amplitude, relaxation only with frequency"
+        )
+    if any(name.startswith("sensor_") for name in names):
+        return "a calibration of the channels named, then the same sweep"
+    if names & {"gap_offset", "gap_drift", "bumper_asymmetry"}:
+        return "the same sweep again with the set-up unchanged, then with another gap"
+    if names & {"bumper_hardening", "hunt_crossley", "bumper_maxwell"}:
+        return "a sweep at twice the amplitude: deeper contact at higher speed"
+    return "the same sweep at another amplitude and, where there are bumpers, another gap"

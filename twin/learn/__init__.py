@@ -1,1 +1,0 @@
-"""What explains the difference between model and measurement: identify, discover."""

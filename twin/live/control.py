@@ -1,0 +1,46 @@
+"""`shaketwin control`: hold, resume, stop or abort a running test from another terminal."""
+
+import re
+
+from table_io.errors import InputError
+from twin.run.terminal import print_line
+from twin.security.credentials import Credentials, user_name
+from twin.transport.endpoint import list_runs
+from twin.transport.zenoh_link import BusLink, open_spoke
+
+CONNECT_TIMEOUT_S = 3.0
+ANSWER_TIMEOUT_S = 2.0
+
+
+def find_run(link: BusLink, connect: str, rig: str) -> str:
+    """Return the id of the run of this rig at the endpoint; InputError if there is none.
+
+    The id comes from the network and names folders, so it is validated first.
+    """
+    runs = list_runs(link.list_components())
+    if not runs or not re.fullmatch(r"\w[\w.-]{0,100}", runs[0]):
+        raise InputError(
+            f"endpoint {connect}: no test runs there on rig {rig!r}; `shaketwin run` starts one, "
+            "--rig NAME names another rig (`name` in its machine card)"
+        )
+    return runs[0]
+
+
+def send_command(
+    command: str, reason: str, connect: str, rig: str, keys: Credentials | None = None
+) -> None:
+    """Send a command to the rig that runs at the endpoint; InputError if it is not accepted."""
+    link = open_spoke(rig, connect, CONNECT_TIMEOUT_S, keys)
+    try:
+        run = find_run(link, connect, rig)
+        answer = link.send_command(
+            f"{command}/{user_name(keys)}", f"{run}\n{reason}", ANSWER_TIMEOUT_S
+        )
+    finally:
+        link.close()
+    if answer != "yes":
+        raise InputError(
+            f"{command}: {answer or f'the rig did not answer within {ANSWER_TIMEOUT_S:g} s'}; "
+            "in need use the machine's own emergency stop"
+        )
+    print_line(f"{run}: told to {command}")

@@ -1,0 +1,195 @@
+"""Closed-form solver of the SNM on sampled table acceleration: state in, state out.
+
+The table acceleration is linear between samples (first-order hold). The motion in each contact
+regime has a closed form and every contact event is located in time. The state is float64
+(STATE_SIZE,):
+    u, v, u_r, u_l          m, m/s, m, m (u_r >= 0, u_l <= 0)
+    contact_r, contact_l    1.0 in contact, else 0.0
+    A                       table acceleration at this sample, m/s2
+    impulse_r, impulse_l    impulse of the contact in progress, N s
+There is no other memory: results are bit-identical for any division of the samples into blocks.
+"""
+
+import math
+
+import numpy as np
+
+from table_io.block import Float1D, Float2D
+from twin.model.closed_form_kernel import advance_samples
+from twin.model.contact_regime import (
+    BASE,
+    C_L,
+    C_R,
+    CONTACT_L,
+    CONTACT_R,
+    E_L,
+    E_R,
+    G_L,
+    G_R,
+    K_L,
+    K_R,
+    MASS,
+    MODE_SIZE,
+    MODES,
+    PARAMS_SIZE,
+    R_L,
+    R_R,
+    STATE_SIZE,
+    STEP,
+    SUBSTEPS,
+    U_L,
+    U_R,
+    U,
+    V,
+    transition_matrix,
+)  # fmt: skip
+from twin.model.parameters import Parameters
+
+OUTPUT_NAMES = ("u", "v", "a", "f_r", "f_l", "u_r", "u_l")
+EVENT_COLUMNS = ("time_s", "side", "onset", "closing_speed", "impulse")
+MAX_PHASE_STEP_RAD = 0.5  # rad per substep in the stiffest mode, so that no event is missed
+
+_EMPTY_EVENTS = np.empty((0, len(EVENT_COLUMNS)))
+
+
+def rest_state(parameters: Parameters) -> Float1D:
+    """Return the static equilibrium state, A = 0: K u + F_R + F_L = 0, F_j = K_j u_j in contact.
+
+    Negative gaps: both in contact at u = (K_L p_L - K_R p_R) / (K + K_R + K_L), p_j = -G0j; only
+    one bumper in contact where the other stays clear. A gap of zero counts as flight.
+    """
+    state = np.zeros(STATE_SIZE)
+    k, gap_r, gap_l = parameters.stiffness, parameters.gap_r, parameters.gap_l
+    kr, kl = parameters.bumper_stiffness_r, parameters.bumper_stiffness_l
+    for right, left in ((False, False), (True, False), (False, True), (True, True)):
+        gap_force = (kr * gap_r if right else 0.0) - (kl * gap_l if left else 0.0)
+        if not math.isfinite(gap_force):
+            continue
+        u = gap_force / (k + kr * right + kl * left)
+        if (u - gap_r > 0) == right and (-u - gap_l > 0) == left:
+            state[U], state[CONTACT_R], state[CONTACT_L] = u, right, left
+            state[U_R] = u - gap_r if right else 0.0
+            state[U_L] = u + gap_l if left else 0.0
+            return state
+    raise AssertionError("a system of positive springs has one equilibrium")
+
+
+def continuous_params(parameters: Parameters) -> Float1D:
+    """Return the step-independent part of `discretized_params`, (PARAMS_SIZE,)."""
+    p = parameters
+    params = np.zeros(PARAMS_SIZE)
+    kr, cr, kl, cl = (
+        p.bumper_stiffness_r,
+        p.bumper_damping_r,
+        p.bumper_stiffness_l,
+        p.bumper_damping_l,
+    )
+    params[MASS] = p.mass
+    # A face without a dashpot is released at u_j = 0, where it stays: it has no relaxation rate.
+    params[R_R], params[R_L] = kr / cr if cr > 0 else 0.0, kl / cl if cl > 0 else 0.0
+    params[K_R], params[K_L], params[C_R], params[C_L], params[G_R], params[G_L] = (
+        kr,
+        kl,
+        cr,
+        cl,
+        p.gap_r,
+        p.gap_l,
+    )
+    for mode in range(4):
+        right, left = mode & 1, mode >> 1
+        k = p.stiffness + right * kr + left * kl
+        c = p.damping + right * cr + left * cl
+        # A mode with an infinite gap is never entered; zero keeps inf * 0 out of the table.
+        f0 = right * kr * (p.gap_r if math.isfinite(p.gap_r) else 0.0)
+        f0 -= left * kl * (p.gap_l if math.isfinite(p.gap_l) else 0.0)
+        b = MODES + mode * MODE_SIZE
+        params[b : b + 5] = k, c, f0, c / (2 * p.mass), k / p.mass
+    return params
+
+
+def substep_count(params: Float1D, step_s: float) -> int:
+    """Return the number of substeps of a step in s, of at most `MAX_PHASE_STEP_RAD` rad each.
+
+    The stiffest reachable mode counts; both contacts at once are possible only where the total gap
+    is not positive.
+    """
+    both_contacts = params[G_R] + params[G_L] <= 0
+    w2 = max(params[MODES + mode * MODE_SIZE + 4] for mode in ((3,) if both_contacts else (1, 2)))
+    return max(1, math.ceil(step_s * math.sqrt(w2) / MAX_PHASE_STEP_RAD))
+
+
+def discretized_params(parameters: Parameters, rate_hz: float) -> Float1D:
+    """Return the kernel constants of the parameters at this sampling rate, (PARAMS_SIZE,)."""
+    params = continuous_params(parameters)
+    substeps = substep_count(params, 1 / rate_hz)
+    step = 1 / (rate_hz * substeps)
+    params[STEP], params[SUBSTEPS] = step, substeps
+    for e, r in ((E_R, R_R), (E_L, R_L)):
+        params[e] = math.exp(-params[r] * step) if params[r] > 0 else 0.0
+    for b in range(MODES, PARAMS_SIZE, MODE_SIZE):
+        params[b + 5 : b + 9] = transition_matrix(step, params[b + 3], params[b + 4])
+    return params
+
+
+def advance_state(state: Float1D, params: Float1D, base_acc: Float1D, out: Float2D) -> None:
+    """Advance `state` in place from its sample through the next n samples.
+
+    base_acc: table acceleration at these n samples in m/s2, (n,). out (7, n), `OUTPUT_NAMES`: u in
+    m, v in m/s, total acceleration in m/s2, F_R >= 0 and F_L <= 0 in N, u_R and u_L in m.
+    After a NaN in the input, out and the state are NaN until a restart.
+    """
+    advance_samples(state, params, base_acc, out, _EMPTY_EVENTS)
+
+
+def advance_state_logged(
+    state: Float1D, params: Float1D, base_acc: Float1D, out: Float2D, events: Float2D
+) -> int:
+    """Advance as `advance_state`, log contact events to `events` (m, 5) and return their number.
+
+    `EVENT_COLUMNS`: time in s since the sample where the call began; side +1 right, -1 left; onset
+    1 or release 0; closing speed relative to the bumper's face in m/s, at onsets; impulse of the
+    contact in N s (right >= 0, left <= 0), at releases. Events beyond m are counted, not written.
+    """
+    return int(advance_samples(state, params, base_acc, out, events))
+
+
+def restart_state(
+    u: float,
+    v: float,
+    u_r: float,
+    u_l: float,
+    force_r_contact: bool,
+    force_l_contact: bool,
+    base_acc: float,
+    parameters: Parameters,
+) -> Float1D:
+    """Return a consistent model state from a measured estimate (SI, right positive, base_acc = A).
+
+    In contact u_j follows u. A contact that would pull becomes flight from the touching point, one
+    on an uncompressed bumper becomes flight; a flight that penetrates becomes touching. All NaN if
+    any input is.
+    """
+    p = parameters
+    if math.isnan(u + v + u_r + u_l + base_acc):
+        return np.full(STATE_SIZE, np.nan)
+    state = np.zeros(STATE_SIZE)
+    state[U], state[V], state[BASE] = u, v, base_acc
+    # The left side is mirrored, so that both are evaluated with right-hand signs.
+    state[U_R], state[CONTACT_R] = _bumper_state(
+        u - p.gap_r, v, u_r, force_r_contact, p.bumper_stiffness_r, p.bumper_damping_r
+    )
+    mirrored_u_l, state[CONTACT_L] = _bumper_state(
+        -u - p.gap_l, -v, -u_l, force_l_contact, p.bumper_stiffness_l, p.bumper_damping_l
+    )
+    state[U_L] = -mirrored_u_l
+    return state
+
+
+def _bumper_state(
+    depth: float, v: float, uj: float, contact: bool, k: float, c: float
+) -> tuple[float, bool]:
+    """Return (u_j, contact) of a bumper in right-hand signs; `depth` is the u_j at the mass."""
+    relaxed = max(uj, 0.0)
+    if depth >= 0 and (contact or relaxed < depth):
+        return depth, c * v + k * depth > 0
+    return relaxed, False

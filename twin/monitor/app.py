@@ -1,0 +1,225 @@
+"""Monitor application: event loop with bus link, terminal and keyboard."""
+
+import contextlib
+import io
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from rich.console import Console
+
+from table_io.clock import RealClock
+from table_io.errors import InputError
+from table_io.records import Comparison
+from twin.live.control import send_command
+from twin.monitor.display import TerminalDisplay, open_display
+from twin.monitor.panels import SessionStatus
+from twin.monitor.run_state import LiveRunState, update_run_state
+from twin.monitor.screen import COMMAND_KEYS, SILENT_S, draw_screen
+from twin.run.progress import RunProgress
+from twin.run.terminal import console, print_line
+from twin.security.credentials import Credentials, user_name
+from twin.transport.codec import MEAS_TOPIC, RECORD_TOPICS, Item, WireError, decode_item
+from twin.transport.endpoint import check_endpoint
+from twin.transport.reliable_subscriber import ReliableSubscriber
+from twin.transport.zenoh_link import BusLink, open_spoke
+
+ANSWER_TIMEOUT_S = 2.0
+FRAME_S = 0.25
+POLL_S = 0.05  # period of keyboard polling
+SNAPSHOT_S = 1.5  # listening time for a snapshot, which shows the last second
+START_TIMEOUT_S = 5.0  # wait for the start record of a run
+QUEUE_CAPACITY = 5000
+MAX_ITEMS = 1000  # per drain, so that a replay at full speed leaves time to draw
+COMPARISON_TOPIC = RECORD_TOPICS[Comparison]
+LIVE_TOPICS = (MEAS_TOPIC, COMPARISON_TOPIC)  # without history: old samples are not shown
+HISTORY_TOPICS = tuple(topic for topic in RECORD_TOPICS.values() if topic != COMPARISON_TOPIC)
+DEFAULT_SIZE = 120, 40
+CommandSender = Callable[[str], str]  # command -> result for the user
+
+
+class MonitorClient:
+    """Bus client that receives a run and updates its run state."""
+
+    def __init__(self, link: BusLink, user: str) -> None:
+        self.run_state = LiveRunState()
+        self.ignored = 0
+        self._link = link
+        self._user = user
+        self._role = ""
+        self._components = link.watch_components()
+        self._records = link.subscribe(HISTORY_TOPICS, history=True, capacity=QUEUE_CAPACITY)
+        self._blocks = link.subscribe(LIVE_TOPICS, history=False, capacity=QUEUE_CAPACITY)
+        self._clock = RealClock()
+        self._last_arrival_s = self._clock.now()
+
+    def listen(self, seconds: float) -> list[Item]:
+        """Receive for `seconds` and update the run state; return the received records."""
+        deadline = self._clock.now() + seconds
+        items = self._drain(self._records, seconds)
+        while (remaining_s := deadline - self._clock.now()) > 0:
+            items += self._drain(self._records, remaining_s)
+        self._drain(self._blocks, 0.0)
+        return items
+
+    def _drain(self, subscriber: ReliableSubscriber, seconds: float) -> list[Item]:
+        """Process queued messages and return their items; wait at most `seconds` for the first."""
+        items: list[Item] = []
+        while len(items) < MAX_ITEMS and (message := subscriber.get(seconds)) is not None:
+            self._last_arrival_s, seconds = self._clock.now(), 0.0
+            try:
+                run, item = decode_item(*message)
+            except WireError:
+                self.ignored += 1
+                continue
+            previous, self.run_state = self.run_state, update_run_state(self.run_state, run, item)
+            if previous.run != self.run_state.run:
+                self._role = (self._link.query(f"state/role/{self._user}") or b"").decode()
+            items.append(item)
+        return items
+
+    def session_status(self, pending_command: str = "") -> SessionStatus:
+        """Return the session status shown on the screen in addition to the run state."""
+        silent_s = self._clock.now() - self._last_arrival_s
+        return SessionStatus(
+            frozenset(self._components), silent_s, self._role == "command", pending_command
+        )
+
+    def wait_for_run(self, wait: bool) -> None:
+        """Listen until a run is known and one second of it received.
+
+        Without `wait`, raise InputError if none appears within `START_TIMEOUT_S`.
+        """
+        deadline = self._clock.now() + START_TIMEOUT_S
+        while self.run_state.start is None:
+            self.listen(POLL_S)
+            if not wait and self._clock.now() > deadline:
+                raise InputError(
+                    f"no test at the endpoint within {START_TIMEOUT_S:g} s",
+                    allowed="a test that is running or has just ended",
+                    remedy="start one with `shaketwin run`",
+                )
+        self.listen(SNAPSHOT_S)
+
+
+def run_monitor(
+    connect: str,
+    rig: str,
+    wait: bool,
+    once: bool,
+    picture: Path | None,
+    credentials: Credentials | None,
+) -> None:
+    """Run the monitor: interactive in a terminal, otherwise line output; or one snapshot."""
+    user = user_name(credentials)
+    link = _connect(connect, rig, wait, credentials)
+    link.declare_alive(f"observer.{user}.monitor-{os.getpid()}")
+    try:
+        client = MonitorClient(link, user)
+        if once or picture is not None:
+            client.wait_for_run(wait)
+            write_snapshot(client, picture)
+        elif sys.stdin.isatty() and console.is_terminal:
+            signal.signal(signal.SIGTERM, signal.default_int_handler)
+            with open_display(console) as display:
+                run_event_loop(
+                    client,
+                    display,
+                    lambda command: submit_command(command, connect, rig, credentials),
+                )
+        else:
+            print_progress(client)
+    except KeyboardInterrupt:
+        print_line("monitor closed; the test continues")
+    finally:
+        link.close()
+
+
+def _connect(connect: str, rig: str, wait: bool, credentials: Credentials | None) -> BusLink:
+    """Connect to the endpoint; with `wait`, retry until it answers and print the reason once."""
+    check_endpoint(rig, connect, credentials is not None)
+    is_reported = False
+    while True:
+        try:
+            return open_spoke(rig, connect, ANSWER_TIMEOUT_S, credentials)
+        except InputError as error:
+            if not wait:
+                raise
+            if not is_reported:
+                print_line(f"waiting: {error}")
+            is_reported = True
+
+
+def run_event_loop(client: MonitorClient, display: TerminalDisplay, send: CommandSender) -> None:
+    """Draw the screen and handle keys until `q`; a command is sent only after `y`."""
+    clock, pending, drawn_s = RealClock(), "", float("-inf")
+    while (key := display.read_key()) != "q" or pending:
+        if pending and key:
+            if key == "y":
+                client.run_state.add_message(send(pending))
+            pending = ""
+        elif not pending and client.session_status().may_command:
+            pending = COMMAND_KEYS.get(key, "")
+        client.listen(POLL_S)
+        if key or clock.now() >= drawn_s + FRAME_S:
+            drawn_s = clock.now()
+            display.show(
+                draw_screen(client.run_state, client.session_status(pending), *display.size)
+            )
+
+
+def submit_command(command: str, connect: str, rig: str, credentials: Credentials | None) -> str:
+    """Send a command as `shaketwin control` does; return its result in one sentence."""
+    output = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(output):
+            send_command(command, "requested from the monitor", connect, rig, credentials)
+    except InputError as error:
+        return f"refused: {error}"
+    return " ".join(output.getvalue().split())
+
+
+def print_progress(client: MonitorClient) -> None:
+    """Print one line per step and event until the run ends, for output without a terminal."""
+    items = client.listen(FRAME_S)
+    while client.run_state.start is None:
+        items += client.listen(FRAME_S)
+    with RunProgress(
+        console, client.run_state.step_count, client.run_state.start.planned_samples
+    ) as progress:
+        is_silent = False
+        while True:
+            for item in items:
+                progress(item)
+            if client.run_state.stop is not None:
+                progress.print_line(
+                    f"ended: {client.run_state.stop.verdict}: {client.run_state.stop.reason}"
+                )
+                return
+            items, was_silent = client.listen(FRAME_S), is_silent
+            is_silent = client.session_status().silent_s > SILENT_S
+            if is_silent and not was_silent:
+                progress.print_line("no data received; waiting (Ctrl-C to quit)")
+
+
+def write_snapshot(client: MonitorClient, picture: Path | None) -> None:
+    """Write the screen once, as text to the console or as a new .svg file."""
+    width, height = console.size if console.is_terminal or "COLUMNS" in os.environ else DEFAULT_SIZE
+    lines = draw_screen(client.run_state, client.session_status(), width, height)
+    if picture is None:
+        for line in lines:
+            console.print(line, soft_wrap=True, highlight=False)
+        return
+    svg_console = Console(record=True, width=width, height=height, file=io.StringIO())
+    for line in lines:
+        svg_console.print(line, highlight=False)
+    try:
+        with picture.open("x") as file:
+            file.write(svg_console.export_svg(title="shaketwin monitor"))
+    except FileExistsError:
+        raise InputError("exists already", where=picture, remedy="choose another name") from None
+    except OSError as error:
+        raise InputError(f"cannot write here: {error.strerror}", where=picture) from None
+    print_line(f"{picture}")

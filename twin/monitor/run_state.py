@@ -1,0 +1,226 @@
+"""State of a running test as received; `update_run_state` adds one block or record.
+
+Bounded in size. Repeated items and the order of items of different topics do not matter: a late
+subscriber receives the history while new items arrive.
+"""
+
+import contextlib
+from collections import deque
+from collections.abc import Hashable
+from dataclasses import dataclass, field, replace
+from typing import TypeVar, cast
+
+from table_io.block import Block
+from table_io.config.base import parse_toml
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.errors import InputError
+from table_io.messages import format_record
+from table_io.records import (
+    Agreement,
+    Check,
+    Comparison,
+    CycleExtremes,
+    Estimate,
+    Event,
+    FrequencyResponse,
+    JumpForecast,
+    Level,
+    PrcPoint,
+    Record,
+    RunStart,
+    RunStop,
+    SampleGap,
+    Step,
+    StepAdded,
+    Timing,
+)
+from twin.monitor.recent import WINDOW_S, RecentSamples
+from twin.recording.validation import (
+    has_invalid_labels,
+    validate_block,
+    validate_record,
+    validate_start,
+)
+
+T = TypeVar("T")
+K = TypeVar("K")
+V = TypeVar("V")
+
+MAX_POINTS = 20_000  # both directions of the largest sweep, and as many added steps
+MAX_EVENTS = 200
+MAX_TEXT_LENGTH = 1000  # characters
+MAX_COMPONENTS = 32  # of components and of channels with gaps
+
+
+@dataclass(frozen=True, slots=True)
+class EventLine:
+    """Event text for the user; `level` is INFO, WARN or ERROR."""
+
+    index: int
+    level: str
+    text: str
+
+
+@dataclass(slots=True)
+class LiveRunState:
+    """State of the run `run` as shown on the screen; SI, times in samples."""
+
+    run: str = ""
+    past_runs: tuple[str, ...] = ()  # earlier runs, whose late items are ignored
+    start: RunStart | None = None
+    profile: Profile | None = None
+    rig: RigConfig | None = None
+    index: int = 0  # number of samples known to be acquired
+    block_end: int = 0  # end of the last block
+    rig_state: str = ""
+    rig_state_since: int = -1
+    position: tuple[int, int, int] = (-1, 0, -1)  # step, label, cycle of the last sample seen
+    added_steps: dict[int, Step] = field(default_factory=dict)
+    points: dict[int, PrcPoint] = field(default_factory=dict)
+    latest: dict[type, Record] = field(default_factory=dict)
+    timings: dict[str, Timing] = field(default_factory=dict)
+    gaps: dict[tuple[str, str], tuple[int, int]] = field(default_factory=dict)  # end, samples
+    events: dict[Hashable, EventLine] = field(default_factory=dict)
+    stop: RunStop | None = None
+    recent: RecentSamples = field(default_factory=RecentSamples)
+    pending: deque[tuple[str, Record]] = field(default_factory=lambda: deque(maxlen=MAX_POINTS))
+
+    @property
+    def rate_hz(self) -> float:
+        return self.start.rate_hz if self.start else 1.0
+
+    @property
+    def step(self) -> Step | None:
+        """Current step; None outside the sweep or if the step is unknown."""
+        return self.find_step(self.position[0])
+
+    def find_step(self, index: int) -> Step | None:
+        """Return the step of this index, planned or added during the test; None if unknown."""
+        if self.start and 0 <= index < len(self.start.steps):
+            return self.start.steps[index]
+        return self.added_steps.get(index)
+
+    @property
+    def step_count(self) -> int:
+        """Number of steps of the test known so far."""
+        return max([len(self.start.steps) if self.start else 0, *(k + 1 for k in self.added_steps)])
+
+    def add_message(self, text: str) -> None:
+        """Add a message of the monitor itself to the events."""
+        self.events[self.index, text] = EventLine(self.index, "INFO", text)
+
+    def get_latest(self, kind: type[T]) -> T | None:
+        """Return the newest record of a type."""
+        return cast("T | None", self.latest.get(kind))
+
+
+def update_run_state(run_state: LiveRunState, run: str, item: Block | Record) -> LiveRunState:
+    """Return the run state updated with one item; a new state if another run starts.
+
+    Records that arrive before the start record are kept for it; invalid items are ignored.
+    """
+    if run in run_state.past_runs:
+        return run_state
+    if run_state.start is None or run != run_state.run:
+        if isinstance(item, RunStart) and not validate_start(item):
+            return _start_run(run_state, item)
+        if not isinstance(item, Block):
+            run_state.pending.append((run, item))
+    elif isinstance(item, Block):
+        return _add_block(run_state, item, run_state.start)
+    elif not validate_record(item, run_state.start):
+        run_state.index = max(run_state.index, item.index)
+        _add_record(run_state, item)
+        _add_event(run_state, item)
+    return run_state
+
+
+def _start_run(previous: LiveRunState, start: RunStart) -> LiveRunState:
+    """Return the state of a new run from its start record, valid configs and pending records."""
+    past = (
+        (*previous.past_runs, previous.run)[-MAX_COMPONENTS:]
+        if previous.start
+        else previous.past_runs
+    )
+    run_state = LiveRunState(start.run, past, start)
+    with contextlib.suppress(InputError):
+        run_state.profile = parse_toml(start.profile_toml, Profile, "profile of the run")
+    with contextlib.suppress(InputError):
+        run_state.rig = parse_toml(start.rig_toml, RigConfig, "rig file of the run")
+    for run, record in previous.pending:
+        update_run_state(run_state, run, record)
+    return run_state
+
+
+def _add_block(run_state: LiveRunState, block: Block, start: RunStart) -> LiveRunState:
+    """Add a block; a block near sample 0 after later ones is a replay that starts again."""
+    if block.stream != "meas" or validate_block(block, None, start) or has_invalid_labels([block]):
+        return run_state
+    window_samples = round(WINDOW_S * block.rate_hz)
+    if block.index < window_samples and run_state.block_end > block.end + window_samples:
+        run_state = LiveRunState(
+            run_state.run, run_state.past_runs, start, run_state.profile, run_state.rig
+        )
+    run_state.index, run_state.block_end = max(run_state.index, block.end), block.end
+    run_state.position = int(block.step[-1]), int(block.label[-1]), int(block.cycle[-1])
+    run_state.recent.add(block, 1.0 / run_state.step.frequency_hz if run_state.step else 0.0)
+    return run_state
+
+
+def _add_record(run_state: LiveRunState, record: Record) -> None:
+    """Store a record unless a newer one of its kind is known."""
+    match record:
+        case RunStop():
+            run_state.stop = record
+        case Comparison():
+            run_state.recent.add_comparison(record, run_state.rate_hz)
+        case Event(kind="state") if record.index >= run_state.rig_state_since:
+            run_state.rig_state, run_state.rig_state_since = record.text, record.index
+        case PrcPoint():
+            _put_bounded(run_state.points, record.step, record, MAX_POINTS)
+        case StepAdded(step=index, direction=direction, frequency_hz=f, acceleration_m_s2=a):
+            _put_bounded(run_state.added_steps, index, Step(index, direction, f, a), MAX_POINTS)
+        case Timing():
+            _put_bounded(run_state.timings, record.component, record, MAX_COMPONENTS)
+        case Agreement() | JumpForecast() | CycleExtremes() | Estimate() | Level():
+            previous = run_state.latest.get(type(record))
+            if previous is None or previous.index <= record.index:
+                run_state.latest[type(record)] = record
+
+
+def _add_event(run_state: LiveRunState, record: Record) -> None:
+    """Add the event text of a record; gaps of one channel and reason are merged into one."""
+    if isinstance(record, SampleGap):
+        gap_key = record.channel, record.reason
+        end, samples = run_state.gaps.get(gap_key, (-1, 0))
+        if record.index < end:
+            return
+        samples += record.count
+        _put_bounded(
+            run_state.gaps, gap_key, (record.index + record.count, samples), MAX_COMPONENTS
+        )
+        record = replace(record, count=samples)
+    entry = format_record(record, run_state.rate_hz)
+    if entry and not _is_shown_elsewhere(record):
+        key = gap_key if isinstance(record, SampleGap) else (record.index, entry[1])
+        run_state.events.pop(key, None)
+        run_state.events[key] = EventLine(record.index, entry[0], entry[1][:MAX_TEXT_LENGTH])
+        if len(run_state.events) > MAX_EVENTS:
+            del run_state.events[
+                min(run_state.events, key=lambda event_key: run_state.events[event_key].index)
+            ]
+
+
+def _is_shown_elsewhere(record: Record) -> bool:
+    """Return True for a record shown in another panel, or a passed check."""
+    return isinstance(record, Level | FrequencyResponse) or (
+        isinstance(record, Check) and record.passed
+    )
+
+
+def _put_bounded(entries: dict[K, V], key: K, value: V, max_entries: int) -> None:
+    """Store a value under its key; drop the oldest entry beyond `max_entries`."""
+    entries[key] = value
+    if len(entries) > max_entries:
+        del entries[next(iter(entries))]

@@ -1,0 +1,199 @@
+"""Writer and reader of the log: an MCAP file with the protobuf payloads of the bus.
+
+`LOG.md` in this folder specifies the format. Profile, rig, model and calibration are written before
+the first message, so that an interrupted recording is self-contained. Only this file imports mcap.
+"""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from mcap.exceptions import McapError
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.records import Chunk, DataEnd
+from mcap.records import Message as MessageRecord
+from mcap.records import Metadata as MetadataRecord
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
+
+from table_io.clock import wall_clock_ns
+from table_io.records import RunStart
+from twin.recording.append_only_file import AppendOnlyFile
+from twin.recording.log_metadata import (
+    SCHEMA_VERSION,
+    ContentHash,
+    Metadata,
+    build_attachments,
+    hash_attachments,
+)
+from twin.recording.recovery import LogMessage, recover_log
+from twin.transport.codec import (
+    TOPIC_TYPES,
+    Item,
+    encode_item,
+    message_schema,
+)
+
+MEDIA_TYPES = {".toml": "toml", ".json": "json", ".pb": "protobuf"}
+CHUNK_BYTES = 2**20  # uncompressed size at which a chunk is closed
+MAX_LOG_TIME_NS = 2**64 - 1  # uint64 in MCAP
+MAX_PENDING_BYTES = 2**20  # unwritten bytes between two flushes
+
+
+class LogTimeError(ValueError):
+    """Sample index whose log time exceeds the range of the format."""
+
+
+class LogWriter:
+    """Writer of items to a new MCAP file; refuses to overwrite a file.
+
+    A method that raises OSError (disk full or failing) may be called again; no data are lost.
+    """
+
+    def __init__(self, path: Path, rate_hz: float, chunk_bytes: int = CHUNK_BYTES) -> None:
+        self.path = path
+        self._rate_hz = rate_hz
+        self._file = AppendOnlyFile(path)
+        # the checksum of the data section reveals a record lost inside the file
+        self._writer = Writer(self._file, chunk_bytes, enable_data_crcs=True)
+        self._writer.start(profile="shaketwin", library="shaketwin")
+        self._channels: dict[str, int] = {}
+        self._next_sequence: dict[str, int] = {}
+        self._content = ContentHash()
+        self._finished = False
+
+    @property
+    def size(self) -> int:
+        """Size in bytes, including data not yet written to the disk."""
+        return self._file.tell()
+
+    def write(
+        self, topic: str, payload: bytes, index: int, publish_time: int | None = None
+    ) -> None:
+        """Append the payload of an item at sample `index`; `publish_time` is wall-clock time in ns.
+
+        Raises LogTimeError, and writes nothing, if the log time exceeds the range of the format.
+        """
+        log_time = round(index * 1e9 / self._rate_hz)
+        if log_time > MAX_LOG_TIME_NS:
+            raise LogTimeError(f"sample {index}: its time exceeds the range of a log")
+        if topic not in self._channels:
+            name, data = message_schema(TOPIC_TYPES[topic])
+            schema_id = self._writer.register_schema(name, "protobuf", data)
+            self._channels[topic] = self._writer.register_channel(topic, "protobuf", schema_id)
+        sequence = self._next_sequence.get(topic, 0)
+        self._next_sequence[topic] = sequence + 1
+        self._content.add(topic, log_time, payload)
+        self._writer.add_message(
+            self._channels[topic],
+            log_time=log_time,
+            data=payload,
+            publish_time=wall_clock_ns() if publish_time is None else publish_time,
+            sequence=sequence % 2**32,
+        )
+        if self._file.pending_bytes > MAX_PENDING_BYTES:
+            self._file.drain()
+
+    def write_run_description(self, start: RunStart) -> None:
+        """Write metadata and attachments of the run; call it before the first message."""
+        texts = build_attachments(start)
+        run_metadata = {"id": start.run, "schema": str(SCHEMA_VERSION), "host": start.host}
+        self.write_metadata(
+            "run", {**run_metadata, "started_at": start.started_at, **start.versions}
+        )
+        self.write_metadata("attachments", hash_attachments(texts))
+        for name, data in texts.items():
+            media = f"application/{MEDIA_TYPES[Path(name).suffix]}"
+            self._writer.add_attachment(wall_clock_ns(), 0, name, media, data)
+
+    def write_metadata(self, name: str, values: dict[str, str]) -> None:
+        """Write a metadata record."""
+        self._writer.add_metadata(name, values)
+
+    def flush(self) -> None:
+        """Close the chunk and write it, so that its data survive a crash of this process."""
+        self._writer.flush()
+        self._file.drain()
+
+    def sync(self) -> None:
+        """Wait until flushed data are on the disk, so that they survive a power failure."""
+        self._file.sync()
+
+    def close(self) -> None:
+        """Finish the file with its content hash and close it; may be called again."""
+        if not self._finished:
+            self._finished = True
+            self._writer.flush()
+            self.write_metadata("content", self._content.to_metadata())
+            self._writer.finish()
+        self._file.close()
+
+
+def iter_messages(path: Path) -> Iterator[LogMessage]:
+    """Yield the messages in file order, one chunk in memory; a damaged file is read as a whole."""
+    count = 0
+    with path.open("rb") as stream:
+        reader = NonSeekingReader(stream, validate_crcs=True)
+        try:
+            for _, channel, message in reader.iter_messages(log_time_order=False):
+                count += 1
+                yield LogMessage(
+                    channel.topic,
+                    message.log_time,
+                    message.data,
+                    message.sequence,
+                    message.publish_time,
+                )
+            return
+        except OSError:
+            raise
+        except Exception:
+            pass  # on damage, the parser and its decompressor raise any exception
+    yield from recover_log(path).messages[count:]  # also messages after the damage
+
+
+def read_metadata(path: Path) -> Metadata:
+    """Return the metadata records of a finished log by name; empty if it is cut off or damaged."""
+    with path.open("rb") as stream:
+        try:
+            return {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
+        except (McapError, ValueError, EOFError):
+            return {}
+
+
+def read_leading_metadata(path: Path) -> Metadata:
+    """Return the metadata records before the first message by name, also of an unfinished log."""
+    metadata_by_name: Metadata = {}
+    with path.open("rb") as stream:
+        try:
+            for record in StreamReader(stream, emit_chunks=True).records:
+                if isinstance(record, (Chunk, MessageRecord, DataEnd)):
+                    break
+                if isinstance(record, MetadataRecord):
+                    metadata_by_name.setdefault(record.name, record.metadata)
+        except OSError:
+            raise
+        except Exception:
+            pass  # as in `iter_messages`; reading the messages reports the damage
+    return metadata_by_name
+
+
+@contextlib.contextmanager
+def open_foreign_log(file: BinaryIO) -> Iterator[Writer]:
+    """Yield an MCAP writer for foreign schemas; the file is finished on exit."""
+    writer = Writer(file)
+    writer.start(library="shaketwin")
+    yield writer
+    writer.finish()
+
+
+def write_items(path: Path, items: list[Item], start: RunStart) -> None:
+    """Write a new log with these items, for tests and conversions."""
+    from twin.transport.codec import topic_for
+
+    writer = LogWriter(path, start.rate_hz)
+    writer.write_run_description(start)
+    for item in items:
+        writer.write(topic_for(item), encode_item(item, start.run), item.index)
+    writer.close()

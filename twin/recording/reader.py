@@ -1,0 +1,323 @@
+"""Log reader: all valid items of a log in order of sample index, and a list of the damage."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+from table_io.block import Block, join_blocks
+from table_io.errors import InputError
+from table_io.records import Record, RunStart, RunStop
+from twin.recording.log_metadata import START_COPY_NAME, read_schema_version
+from twin.recording.mcap_log import iter_messages, read_leading_metadata
+from twin.recording.recovery import (
+    UNNAMED_TOPIC_PREFIX,
+    Damage,
+    LogMessage,
+    RecoveredLog,
+    recover_log,
+)
+from twin.recording.validation import (
+    has_invalid_labels,
+    validate_block,
+    validate_record,
+    validate_start,
+)
+from twin.transport.block_decoding import decode_blocks
+from twin.transport.codec import (
+    BLOCK_TOPICS,
+    RECORD_TOPICS,
+    TOPIC_TYPES,
+    Item,
+    WireError,
+    decode_item,
+    encode_item,
+)
+
+START_TOPIC = RECORD_TOPICS[RunStart]
+# Order of items with the same sample index: start first, then by table of topics, stop last. So a
+# recording reads the same in whatever order its parts were written.
+TOPIC_ORDER = {topic: place for place, topic in enumerate(TOPIC_TYPES)}
+TOPIC_ORDER |= {START_TOPIC: -1, RECORD_TOPICS[RunStop]: len(TOPIC_TYPES)}
+R = TypeVar("R", bound=Record)
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """Recording: a whole log in memory.
+
+    `is_intact` is True if the file is undamaged and every message read is valid in its run. Whether
+    the test itself is complete follows from `stop` and `missing_samples`.
+    """
+
+    path: Path
+    run: str
+    start: RunStart
+    items: tuple[Item, ...]
+    is_intact: bool
+    damage: tuple[Damage, ...] = ()
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    _contiguous_blocks: dict[str, tuple[Block, ...]] = field(
+        default_factory=dict, repr=False, compare=False
+    )
+
+    def records(self, kind: type[R]) -> tuple[R, ...]:
+        """Return all records of one type, in order of sample index."""
+        return tuple(item for item in self.items if isinstance(item, kind))
+
+    def blocks(self, stream: str) -> tuple[Block, ...]:
+        """Return all blocks of stream "meas" or "pred", in order of sample index."""
+        return tuple(
+            item for item in self.items if isinstance(item, Block) and item.stream == stream
+        )
+
+    def contiguous_blocks(self, stream: str) -> tuple[Block, ...]:
+        """Return the stream joined into one block between each pair of gaps; cached."""
+        if stream not in self._contiguous_blocks:
+            runs: list[list[Block]] = []
+            for block in self.blocks(stream):
+                if runs and runs[-1][-1].end == block.index:
+                    runs[-1].append(block)
+                else:
+                    runs.append([block])
+            self._contiguous_blocks[stream] = tuple(join_blocks(run) for run in runs)
+        return self._contiguous_blocks[stream]
+
+    @property
+    def stop(self) -> RunStop | None:
+        stops = self.records(RunStop)
+        return stops[-1] if stops else None
+
+    @property
+    def missing_samples(self) -> int:
+        """Number of measured samples between start and stop that are not in the file."""
+        pieces = self.contiguous_blocks("meas")
+        end = self.stop.index if self.stop else (pieces[-1].end if pieces else 0)
+        return end - self.start.index - sum(len(piece) for piece in pieces)
+
+
+def read_recording(path: Path, topics: Iterable[str] = TOPIC_TYPES) -> Recording:
+    """Read the recording in `path`, with its start record and the items of `topics`.
+
+    Raises InputError if it is not a shaketwin log. A damaged log is read as far as possible;
+    `damage` lists the rest.
+    """
+    return build_recording(path, recover_log(path, frozenset((START_TOPIC, *topics))))[0]
+
+
+def build_recording(path: Path, recovered: RecoveredLog) -> tuple[Recording, list[LogMessage]]:
+    """Return (recording, message of each of its items) from a recovered log."""
+    problems = _assign_unnamed_topics(recovered)
+    topics_present = {*recovered.topics, *(message.topic for message in recovered.messages)}
+    if topics_present and not topics_present & TOPIC_TYPES.keys():
+        foreign = sorted(topic[:80] for topic in recovered.topics)
+        raise InputError(
+            f"an MCAP file, but not a shaketwin log (topics: {', '.join(foreign[:5])})",
+            where=path,
+            remedy="give the run.mcap of a run",
+        )
+    entries, errors = _decode_messages(
+        [message for message in recovered.messages if message.topic in TOPIC_TYPES]
+    )
+    start = _find_start(path, entries, errors, recovered.attachments.get(START_COPY_NAME))
+    problems += _remove_mislabelled(entries)
+    entries.sort(key=lambda entry: (entry[1].index, TOPIC_ORDER[entry[0].topic], entry[0].payload))
+    kept, rejected = _select_valid(entries, start, recovered.is_intact)
+    problems += rejected
+    try:
+        read_schema_version(path, recovered.metadata)
+    except InputError as error:
+        if recovered.is_intact:
+            raise
+        problems.append(str(error))  # the version may be damaged: read the rest
+    damage = (
+        *recovered.damage,
+        *(Damage(0, 0, text) for text in (*_count_repeats(errors), *_count_repeats(problems))),
+    )
+    items = tuple(item for _, item in kept)
+    extras = recovered.metadata, recovered.attachments
+    recording = Recording(path, start.run, start, items, not damage, damage, *extras)
+    return recording, [message for message, _ in kept]
+
+
+def _assign_unnamed_topics(recovered: RecoveredLog) -> list[str]:
+    """Infer topics lost with the first chunk: the topic whose encoding equals the payload.
+
+    Returns a problem for each such message.
+    """
+    if not any(topic.startswith(UNNAMED_TOPIC_PREFIX) for topic in recovered.topics):
+        return []
+    run = recovered.metadata.get("run", {}).get("id", "")
+    topic_by_placeholder: dict[str, str] = {}
+    for message in recovered.messages:
+        if (
+            message.topic.startswith(UNNAMED_TOPIC_PREFIX)
+            and message.topic not in topic_by_placeholder
+        ):
+            matching_topics = (
+                topic for topic in TOPIC_TYPES if _matches_topic(topic, message.payload, run)
+            )
+            topic_by_placeholder[message.topic] = next(matching_topics, message.topic)
+    recovered.messages = [
+        message._replace(topic=topic_by_placeholder.get(message.topic, message.topic))
+        for message in recovered.messages
+    ]
+    return [
+        f"topic unknown: {message.topic}"
+        for message in recovered.messages
+        if message.topic in topic_by_placeholder
+    ]
+
+
+def _matches_topic(topic: str, payload: bytes, run: str) -> bool:
+    try:
+        item_run, item = decode_item(topic, payload)
+    except WireError:
+        return False
+    return item_run == run != "" and encode_item(item, run) == payload
+
+
+def read_start(path: Path) -> RunStart:
+    """Read the start record of a log without the rest; if damaged, as `read_recording` does.
+
+    Raises InputError if there is none, or if the log has a newer schema version.
+    """
+    try:
+        read_schema_version(path, read_leading_metadata(path))
+        first = next(
+            (message for message in iter_messages(path) if message.topic == START_TOPIC), None
+        )
+        start = decode_item(START_TOPIC, first.payload)[1] if first else None
+    except (InputError, OSError, WireError):
+        start = None
+    is_valid = isinstance(start, RunStart) and not validate_start(start)
+    return start if isinstance(start, RunStart) and is_valid else read_recording(path, ()).start
+
+
+def iter_valid_items(
+    topic: str, payloads: Iterable[bytes], start: RunStart, problems: list[str]
+) -> Iterator[Item]:
+    """Yield the items of a topic that are valid in the run of `start`, without start records.
+
+    These are the rules of `read_recording` for streaming; reasons of rejection are appended to
+    `problems`. Repeated samples are not detected: the caller selects among them.
+    """
+    entries, errors = _decode_messages([LogMessage(topic, 0, body) for body in payloads])
+    problems += errors
+    problems += _remove_mislabelled(entries)
+    for _, item, run in entries:
+        if reason := _rejection_reason(item, run, None, start):
+            problems.append(f"{topic}: {reason}")
+        elif not isinstance(item, RunStart):
+            yield item
+
+
+def _rejection_reason(item: Item, run: str, before: Block | None, start: RunStart) -> str:
+    """Return why an item is invalid in the run of `start` after block `before`, or ""."""
+    if run != start.run:
+        return "of another run"
+    return (
+        validate_block(item, before, start)
+        if isinstance(item, Block)
+        else validate_record(item, start)
+    )
+
+
+_Entry = tuple[LogMessage, Item, str]  # message, decoded item, run id
+
+
+def _decode_messages(messages: list[LogMessage]) -> tuple[list[_Entry], list[str]]:
+    """Return (decoded messages, errors of those that do not decode)."""
+    entries: list[_Entry] = []
+    errors = []
+    by_topic: dict[str, list[LogMessage]] = {}
+    for message in messages:
+        by_topic.setdefault(message.topic, []).append(message)
+    for name, topic_messages in by_topic.items():
+        payloads = [message.payload for message in topic_messages]
+        blocks = name in BLOCK_TOPICS.values()
+        results = decode_blocks(name, payloads) if blocks else _decode_records(name, payloads)
+        for message, result in zip(topic_messages, results, strict=True):
+            if isinstance(result, WireError):
+                errors.append(str(result))
+            else:
+                entries.append((message, result[1], result[0]))
+    return entries, errors
+
+
+def _decode_records(name: str, payloads: list[bytes]) -> Iterable[tuple[str, Item] | WireError]:
+    for payload in payloads:
+        try:
+            yield decode_item(name, payload)
+        except WireError as error:
+            yield error
+
+
+def _find_start(
+    path: Path, entries: list[_Entry], errors: list[str], copy: bytes | None
+) -> RunStart:
+    """Return the start record or its copy; raise InputError if both are missing."""
+    problems = [*errors]
+    for _, item, _ in entries:
+        if isinstance(item, RunStart):
+            if not (reason := validate_start(item)):
+                return item
+            problems.append(f"{START_TOPIC}: {reason}")
+    for result in _decode_records(START_TOPIC, [copy] if copy is not None else []):
+        if not isinstance(result, WireError) and isinstance(result[1], RunStart):
+            entries.append((LogMessage(START_TOPIC, 0, copy or b""), result[1], result[0]))
+            errors.append(f"{START_TOPIC}: lost; its copy is used")
+            return result[1]
+    if problems:
+        raise InputError(f"{path}: damaged or foreign: {problems[0]}")
+    raise InputError(f"{path}: holds no start record, so profile and model are unknown")
+
+
+def _remove_mislabelled(entries: list[_Entry]) -> list[str]:
+    """Remove blocks with impossible labels; return a problem for each."""
+    blocks = [item for _, item, _ in entries if isinstance(item, Block)]
+    if not blocks or not has_invalid_labels(blocks):
+        return []
+    count = len(entries)
+    entries[:] = [
+        entry
+        for entry in entries
+        if not (isinstance(entry[1], Block) and has_invalid_labels([entry[1]]))
+    ]
+    return ["samples with invalid labels"] * (count - len(entries))
+
+
+def _select_valid(
+    entries: list[_Entry], start: RunStart, is_intact: bool
+) -> tuple[list[tuple[LogMessage, Item]], list[str]]:
+    """Return (items that are valid together in one run, reasons of rejection of the others)."""
+    kept: list[tuple[LogMessage, Item]] = []
+    problems = []
+    last_blocks: dict[str, Block] = {}
+    seen_keys: set[tuple[str, int, bytes]] = set()
+    for message, item, run in entries:
+        if not is_intact:  # a repeated chunk repeats each of its messages
+            key = (message.topic, message.sequence, message.payload)
+            if key in seen_keys:
+                problems.append(f"{message.topic}: duplicate message")
+                continue
+            seen_keys.add(key)
+        before = last_blocks.get(item.stream) if isinstance(item, Block) else None
+        reason = _rejection_reason(item, run, before, start)
+        if item is not start and (reason or isinstance(item, RunStart)):
+            problems.append(f"{message.topic}: {reason or 'duplicate message'}")
+            continue
+        if isinstance(item, Block):
+            last_blocks[item.stream] = item
+        kept.append((message, item))
+    return kept, problems
+
+
+def _count_repeats(texts: Iterable[str]) -> list[str]:
+    """Return each text once, with its count."""
+    return [
+        text if count == 1 else f"{text} ({count} messages)"
+        for text, count in Counter(texts).most_common(20)
+    ]

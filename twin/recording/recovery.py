@@ -1,0 +1,327 @@
+"""Recovery of all readable messages from a damaged MCAP file, with bounded memory.
+
+Invalid records are skipped. Reading resumes after a damaged chunk at the end that it declares, and
+after other damage at the next valid record. Work and memory are limited from the start.
+"""
+
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from table_io.errors import InputError
+from twin.recording.mcap_records import (
+    ATTACHMENT,
+    CHANNEL,
+    CHUNK,
+    DATA_END,
+    FIXED_LENGTH_OPCODES,
+    FOOTER,
+    HEADER,
+    MAGIC,
+    MAX_RECORD_BYTES,
+    MESSAGE,
+    MESSAGE_HEADER,
+    MESSAGE_INDEX,
+    METADATA,
+    MIN_RECORD_LENGTHS,
+    RECORD_HEADER,
+    UINT32,
+    UINT64,
+    InvalidRecordError,
+    decompress_chunk,
+    find_record_candidates,
+    iter_records,
+    parse_attachment,
+    parse_string,
+    parse_string_map,
+    read_uncompressed_size,
+)
+from twin.recording.size_limits import (
+    ENTRY_OVERHEAD_BYTES,
+    WORK_PER_RECORD,
+    memory_limit_bytes,
+    work_limit,
+)
+
+UNFINISHED_REASON = "the file was never finished: its recorder was killed, or still writes"
+SEARCH_WINDOW_BYTES = 2**20  # searched at once for the next record
+UNNAMED_TOPIC_PREFIX = "?"  # placeholder topic of messages whose channel record is lost
+
+
+class LogMessage(NamedTuple):
+    """Encoded message of a log; times in ns, `sequence` counts within the topic."""
+
+    topic: str
+    log_time: int
+    payload: bytes
+    sequence: int = 0
+    publish_time: int = 0
+
+
+_RawMessage = tuple[int, int, int, int, bytes]  # channel, sequence, log and publish time, payload
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """Unreadable range of a file: `size` bytes from byte `offset`, and the reason."""
+
+    offset: int
+    size: int
+    reason: str
+
+
+@dataclass(slots=True)
+class RecoveredLog:
+    """Readable content of a file; `is_intact` if it is finished and every checksum matches."""
+
+    messages: list[LogMessage] = field(default_factory=list)
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    damage: list[Damage] = field(default_factory=list)
+    topics: frozenset[str] = frozenset()  # of all messages, wanted or not
+    is_intact: bool = False
+
+
+def recover_log(path: Path, topics: frozenset[str] | None = None) -> RecoveredLog:
+    """Recover the readable content of `path`, only of `topics` if given.
+
+    Raises InputError if it is not an MCAP file, or does not fit into memory.
+    """
+    try:
+        with path.open("rb") as file:
+            size = file.seek(0, 2)
+            scanner = _Scanner(file, size, topics)
+            if not scanner.is_mcap():
+                raise InputError(
+                    "not an MCAP file", where=path, remedy="give the run.mcap of a run"
+                )
+            return scanner.run()
+    except OSError as error:
+        raise InputError(f"cannot read this log: {error.strerror}", where=path) from None
+    except MemoryError:
+        raise InputError(
+            "needs more memory than is available",
+            where=path,
+            remedy="read it on a computer with more memory",
+        ) from None
+
+
+@dataclass(slots=True)
+class _Scanner:
+    """Scanner state of one pass through a file."""
+
+    file: BinaryIO
+    size: int
+    wanted_topics: frozenset[str] | None
+    recovered: RecoveredLog = field(default_factory=RecoveredLog)
+    topic_by_channel: dict[int, str] = field(default_factory=dict)
+    raw_messages: list[_RawMessage] = field(default_factory=list)
+    skipped_channels: set[int] = field(default_factory=set)  # of unwanted topics
+    crc: int = 0  # since the start, or since the end of the data section
+    remaining_work: int = 0
+    remaining_memory: int = 0  # bytes
+
+    def is_mcap(self) -> bool:
+        """Detect an MCAP file by its leading or trailing magic, or by its header record."""
+        start, end = (
+            self._read_at(0, len(MAGIC) + RECORD_HEADER.size),
+            self._read_at(self.size - len(MAGIC)),
+        )
+        if MAGIC.startswith(start[: len(MAGIC)]) or end == MAGIC:
+            return True
+        return len(start) == 17 and start[8] == HEADER and UINT64.unpack_from(start, 9)[0] < 1000
+
+    def run(self) -> RecoveredLog:
+        """Read the file to its end, skipping damage."""
+        self.remaining_work, self.remaining_memory = work_limit(self.size), memory_limit_bytes()
+        self.crc, after_footer = zlib.crc32(MAGIC), False
+        offset = len(MAGIC)
+        if self._read_at(0, offset) != MAGIC:
+            self._note_damage(0, min(offset, self.size), "not the beginning of an MCAP file")
+        while offset < self.size:
+            if after_footer and self._read_at(offset) == MAGIC:
+                self.recovered.is_intact = (
+                    not self.recovered.damage and offset + len(MAGIC) == self.size
+                )
+                offset += len(MAGIC)
+                continue
+            try:
+                opcode, content = self._read_record(offset)
+                self._process_record(opcode, content, offset)
+                after_footer = opcode == FOOTER
+                offset += RECORD_HEADER.size + len(content)
+            except InvalidRecordError as error:
+                after_footer, end = False, self._find_next_record(offset)
+                self._note_damage(offset, end - offset, str(error))
+                offset = end
+            if self.remaining_work < 0:
+                self._note_damage(
+                    offset, self.size - offset, "decompresses to more than any recording"
+                )
+                break
+        if not self.recovered.is_intact and not self.recovered.damage:
+            self._note_damage(self.size, 0, UNFINISHED_REASON)
+        self._assign_topics()
+        return self.recovered
+
+    def _read_at(self, offset: int, count: int = len(MAGIC)) -> bytes:
+        """Read bytes of the file; zeros, which are no record, where the disk fails."""
+        try:
+            self.file.seek(max(offset, 0))
+            return self.file.read(count)
+        except OSError:
+            return bytes(min(count, self.size - offset))
+
+    def _reserve_memory(self, size: int) -> None:
+        self.remaining_memory -= ENTRY_OVERHEAD_BYTES + size
+        if self.remaining_memory < 0:
+            raise MemoryError
+
+    def _note_damage(self, offset: int, size: int, reason: str) -> None:
+        self._reserve_memory(0)
+        self.recovered.damage.append(Damage(offset, size, reason))
+
+    def _read_header(self, offset: int) -> tuple[int, int]:
+        """Read (opcode, content length) at byte `offset`; raise InvalidRecordError if invalid."""
+        header = self._read_at(offset, RECORD_HEADER.size)
+        if len(header) < RECORD_HEADER.size:
+            raise InvalidRecordError("cut off within a record")
+        opcode, length = RECORD_HEADER.unpack(header)
+        if opcode not in MIN_RECORD_LENGTHS:
+            raise InvalidRecordError("not a record")
+        if length > self.size - offset - RECORD_HEADER.size:
+            raise InvalidRecordError("a record that ends beyond the file")
+        min_length = MIN_RECORD_LENGTHS[opcode]
+        if (
+            length > MAX_RECORD_BYTES
+            or length < min_length
+            or (opcode in FIXED_LENGTH_OPCODES and length != min_length)
+        ):
+            raise InvalidRecordError("a record of impossible length")
+        return opcode, length
+
+    def _read_record(self, offset: int) -> tuple[int, bytes]:
+        """Read (opcode, content) of the record at byte `offset`."""
+        opcode, length = self._read_header(offset)
+        self.remaining_work -= max(WORK_PER_RECORD, length // 16)
+        content = self._read_at(offset + RECORD_HEADER.size, length)
+        if len(content) < length:
+            raise InvalidRecordError("the file shrinks while it is read")
+        return opcode, content
+
+    def _process_record(self, opcode: int, content: bytes, offset: int) -> None:
+        """Parse a record and keep its content; raise InvalidRecordError if it is damaged."""
+        previous_crc = self.crc
+        self.crc = zlib.crc32(
+            content, zlib.crc32(RECORD_HEADER.pack(opcode, len(content)), previous_crc)
+        )
+        if opcode == CHUNK:
+            self.raw_messages += self._parse_messages(self._decompress(content))
+        elif opcode == DATA_END:
+            self._check_crc(
+                content, previous_crc, offset, "the data differ from those that were written"
+            )
+            self.crc = 0
+        elif opcode == FOOTER:
+            summary = RECORD_HEADER.pack(opcode, len(content)) + content[:-4]
+            crc = zlib.crc32(summary, previous_crc)
+            self._check_crc(content, crc, offset, "the summary differs from that written")
+        elif opcode == ATTACHMENT:
+            name, data = parse_attachment(content)
+            self._reserve_memory(len(content))
+            self.recovered.attachments.setdefault(name, data)
+        elif opcode == METADATA:
+            name, end = parse_string(content, 0)
+            self._reserve_memory(16 * len(content))  # pairs of short strings
+            self.recovered.metadata.setdefault(name, parse_string_map(content, end))
+        else:
+            self.raw_messages += self._parse_messages(
+                RECORD_HEADER.pack(opcode, len(content)) + content
+            )
+
+    def _check_crc(self, content: bytes, crc: int, offset: int, reason: str) -> None:
+        """Record damage if the CRC at the end of `content` differs in an otherwise sound file."""
+        if UINT32.unpack(content[-4:])[0] not in (0, crc) and not self.recovered.damage:
+            self._note_damage(offset, 0, reason)
+
+    def _parse_messages(self, data: bytes) -> list[_RawMessage]:
+        """Return the messages in a chunk and register its channels."""
+        messages: list[_RawMessage] = []
+        max_records = self.remaining_work // WORK_PER_RECORD
+        count = 0
+        for count, (opcode, begin, end) in enumerate(iter_records(data), 1):
+            if count > max_records:
+                break
+            if opcode == MESSAGE:
+                header = MESSAGE_HEADER.unpack_from(data, begin)
+                if header[0] not in self.skipped_channels:
+                    self._reserve_memory(end - begin)
+                    messages.append((*header, data[begin + MESSAGE_HEADER.size : end]))
+            elif opcode == CHANNEL:
+                channel = int.from_bytes(data[begin : begin + 2], "little")
+                if channel not in self.topic_by_channel:
+                    self.topic_by_channel[channel] = parse_string(data[begin:end], 4)[0]
+                    self._reserve_memory(end - begin)
+                topic = self.topic_by_channel[channel]
+                if self.wanted_topics is not None and topic not in self.wanted_topics:
+                    self.skipped_channels.add(channel)
+        self.remaining_work -= WORK_PER_RECORD * count
+        return messages
+
+    def _decompress(self, content: bytes) -> bytes:
+        self.remaining_work -= read_uncompressed_size(content)
+        return decompress_chunk(content)
+
+    def _find_next_record(self, offset: int) -> int:
+        """Return the offset of the next valid record after `offset`, or the size of the file."""
+        try:
+            opcode, length = self._read_header(offset)
+            end = offset + RECORD_HEADER.size + length
+            if opcode == CHUNK and (end == self.size or self._read_header(end)[0]):
+                return end
+        except InvalidRecordError:
+            pass
+        offset += 1
+        while offset < self.size and self.remaining_work >= 0:
+            for candidate in find_record_candidates(
+                self._read_at(offset, SEARCH_WINDOW_BYTES + RECORD_HEADER.size)
+            ):
+                if self._is_valid_record(offset + candidate):
+                    return offset + candidate
+            offset += SEARCH_WINDOW_BYTES + 1
+        return self.size
+
+    def _is_valid_record(self, offset: int) -> bool:
+        """Check for a valid record at `offset`, followed by another one or the end of the file."""
+        self.remaining_work -= WORK_PER_RECORD
+        try:
+            opcode, length = self._read_header(offset)
+            next_offset = offset + RECORD_HEADER.size + length
+            if opcode != FOOTER and next_offset != self.size:
+                self._read_header(next_offset)
+            self.remaining_work -= length
+            content = self._read_record(offset)[1]
+            if opcode == CHUNK:
+                self._decompress(content)
+            elif opcode == ATTACHMENT:
+                parse_attachment(content)
+            elif opcode == METADATA:
+                parse_string_map(content, parse_string(content, 0)[1])
+            elif opcode == MESSAGE_INDEX:
+                return UINT32.unpack_from(content, 2)[0] == length - 6 and length % 16 == 6
+        except InvalidRecordError:
+            return False
+        return self.remaining_work >= 0
+
+    def _assign_topics(self) -> None:
+        """Set the topic of each message; its channel record may be anywhere in the file."""
+        for channel in {raw[0] for raw in self.raw_messages} - self.topic_by_channel.keys():
+            self.topic_by_channel[channel] = f"{UNNAMED_TOPIC_PREFIX}{channel}"
+            self.recovered.is_intact = False
+        self.recovered.topics = frozenset(self.topic_by_channel.values())
+        self.recovered.messages = [
+            LogMessage(self.topic_by_channel[channel], log_time, payload, sequence, publish_time)
+            for channel, sequence, log_time, publish_time, payload in self.raw_messages
+            if channel not in self.skipped_channels
+        ]

@@ -1,0 +1,1 @@
+"""Files of `identify` and `discover`: load recordings, write models, verdicts and reports."""

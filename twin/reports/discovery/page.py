@@ -1,0 +1,149 @@
+"""HTML report of a discovery: the discrepancy, the effects found, and the gap before and after.
+
+The numbers are those of verdict.json; the file is self-contained.
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from twin.identification.discover import Discovery, PreparedLog
+from twin.identification.parameters import GAP_PREFIX
+from twin.identification.screening import MIN_STEP_UNITS
+from twin.reports.discovery.figure_data import DiscoveryView, check_instruments
+from twin.reports.discovery.figures import draw_discovery_figures
+from twin.reports.discovery.free_running import compute_misfits, run_logs_free
+from twin.reports.discovery.serialize import REFITTED_SUFFIX, Json
+from twin.reports.page import embed_images, format_significant, render_page
+
+MIN_DIGITS, MAX_DIGITS = 4, 8  # significant digits of a fitted value
+VERDICT_SENTENCES = {
+    "none": "Model and measurement agree to within the noise.",
+    "named": "The model lacks {names}.",
+    "ambiguous": "The model lacks an effect, but these recordings cannot tell which: {names}.",
+    "unexplained": "The model lacks an effect, and no effect of the library explains the gap.",
+}
+SECTIONS = {
+    "where": "Location of the discrepancy", "candidates": "Candidates", "gates": "Sensor checks",
+    "forces": "Residual forces", "histories": "Before and after, on the measured motion",
+    "twin": "Before and after, free-running twin", "time": "Residual over time",
+}  # fmt: skip
+
+
+def write_discovery_page(
+    folder: Path, discovery: Discovery, logs: Sequence[PreparedLog], verdict: Json
+) -> Path:
+    """Write folder/report.html and its figures to folder/figures; return the path of the page."""
+    view = DiscoveryView(discovery, logs)
+    runs = run_logs_free(view)
+    pictures = draw_discovery_figures(view, verdict, runs, folder / "figures")
+    text = render_page(
+        Path(__file__).with_name("page.html"),
+        verdict=verdict,
+        sentence=format_verdict(verdict),
+        held_out=describe_held_out(view),
+        rows=list_parameter_rows(verdict, [log.signals.name for log in logs]),
+        logs=[_log_facts(log) for log in logs],
+        sections=SECTIONS,
+        complete=discovery.selection.complete,
+        gates=check_instruments(view),
+        misfits=compute_misfits(view, runs),
+        images={
+            section: embed_images(section_pictures)
+            for section, section_pictures in pictures.items()
+        },
+        model=(folder / "model.toml").read_text(encoding="utf-8"),
+    )
+    path = folder / "report.html"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def format_effect(effect: Json) -> str:
+    """Return the display name of an effect: its id, with the channel of a sensor effect."""
+    return f"{effect['id']} of {effect['channel']}" if effect.get("channel") else effect["id"]
+
+
+def format_verdict(verdict: Json) -> str:
+    """Return the verdict as one sentence."""
+    names = " and ".join(format_effect(effect) for effect in verdict["effects"])
+    if verdict["ambiguous"]:
+        names = ", or ".join(" with ".join(ids) for ids in verdict["ambiguous"])
+    if verdict["verdict"] == "named" and all(
+        effect.get("channel") for effect in verdict["effects"]
+    ):
+        return f"No effect is missing; a sensor has an error: {names}."
+    text = VERDICT_SENTENCES[verdict["verdict"]].format(names=names)
+    if verdict["verdict"] == "none" and verdict["why"].endswith(REFITTED_SUFFIX):
+        text = "No effect is missing, but the model agrees only with other parameters than it has."
+    if verdict["verdict"] == "unexplained" and names:
+        text += f" The closest is {names}, but it is not sufficient."
+    return text
+
+
+def list_parameter_rows(
+    verdict: Json, names: Sequence[str]
+) -> list[tuple[str, str, list[str], str]]:
+    """Return (group, parameter, [value, low, high], unit) of all fitted values, lengths in mm."""
+    term = verdict["remainder"]["evidence"]
+    groups = [(format_effect(effect), effect["parameters"]) for effect in verdict["effects"]]
+    groups += [(f"generic term, {term['term']}", term["parameters"])] if term else []
+    base = {_gap_label(name, names): value for name, value in verdict["base"].items()}
+    rows = []
+    for title, parameters in (*groups, ("base parameters, refitted", base)):
+        for k, (name, value) in enumerate(parameters.items()):
+            factor, unit = (1e3, "mm") if value["unit"] == "m" else (1.0, value["unit"] or "–")
+            numbers = [factor * value[key] for key in ("value", "low", "high")]
+            digits = count_digits(*numbers)
+            texts = [format_rounded(number, digits) for number in numbers]
+            rows.append(("" if k else title, name, texts, unit))
+    return rows
+
+
+def _gap_label(name: str, logs: Sequence[str]) -> str:
+    number = name.removeprefix(GAP_PREFIX)
+    return f"gap correction per side, {logs[int(number)]}" if number.isdigit() else name
+
+
+def count_digits(value: float, low: float, high: float) -> int:
+    """Return the significant digits of a value that show two digits of its half interval."""
+    half_width, largest = 0.5 * (high - low), max(map(abs, (value, low, high)))
+    if not (half_width > 0 and math.isfinite(half_width)):
+        return MIN_DIGITS
+    digits = math.floor(math.log10(largest)) - math.floor(math.log10(half_width)) + 2
+    return min(max(digits, MIN_DIGITS), MAX_DIGITS)
+
+
+def format_rounded(value: float, digits: int = MIN_DIGITS) -> str:
+    """Format a value with `digits` significant digits and thousands separators."""
+    if math.isfinite(value) and abs(value) >= 1e4:
+        decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
+        rounded = float(f"{value:.{digits}g}")
+        return f"{rounded:,.{decimals}f}".replace(",", "\u2009").replace("-", "−")
+    return format_significant(value, digits)
+
+
+def describe_held_out(view: DiscoveryView) -> str:
+    """Return a sentence that describes the cross-validation."""
+    counts = [
+        np.unique(residuals.signals.step[residuals.signals.step >= 0]).size
+        for residuals in view.log_residuals
+    ]
+    unit = "steps" if min(counts) >= MIN_STEP_UNITS else "cycles or seconds"
+    names = ", ".join(residuals.signals.name for residuals in view.log_residuals)
+    return (
+        f"{names}: three-fold cross-validation over the {unit}; each third is judged by a fit to "
+        "the other two. The parameters are those of a final fit to all data."
+    )
+
+
+def _log_facts(log: PreparedLog) -> Json:
+    r = log.signals
+    gaps = [f"{1e3 * gap:g}" for gap in r.gaps_m]
+    return {
+        "name": r.name, "seconds": float(r.time_s[-1] - r.time_s[0]), "steps": len(log.steps),
+        "mass": r.mass_kg, "channels": r.channels,
+        "gaps": "no bumpers" if gaps[0] == "inf" else f"gaps {gaps[0]} and {gaps[1]} mm",
+    }  # fmt: skip

@@ -1,0 +1,98 @@
+"""Predicted peaks of every sensor compared with its range, from a simulation of the sweep.
+
+A prediction beyond a range gives a warning only, because the model may be wrong. The demand of the
+drive on the sensors of the table is checked in `table_io.safety.preflight`.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from table_io.block import Float1D
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from table_io.config.rig import RigConfig
+from table_io.config.sensor import SensorConfig
+from table_io.safety.preflight import CORRECTION_HEADROOM
+from table_io.units import GRAVITY_M_S2
+from twin.model.ideal_response import simulate_sweep
+from twin.run.run_config import RunConfig
+
+MAX_RANGE_SHARE = (
+    1.0 / CORRECTION_HEADROOM
+)  # a larger predicted share gives a warning: the specimen may differ from the model
+
+
+@dataclass(frozen=True, slots=True)
+class PredictedPeak:
+    """Predicted peak of a sensor over the sweep, in the sensor's unit, and the step of the peak."""
+
+    sensor: SensorConfig
+    peak: float
+    frequency_hz: float
+    direction: str
+
+    @property
+    def range_share(self) -> float:
+        """Peak as a share of the sensor range."""
+        return self.peak / self.sensor.range
+
+
+def predict_peaks(run_config: RunConfig) -> tuple[PredictedPeak, ...]:
+    """Predict the peak of each sensor of the rig that the model covers."""
+    predictions = []
+    peaks = _compute_peaks(run_config)
+    for sensor in run_config.rig.sensors:
+        if sensor.channel in peaks:
+            values = peaks[sensor.channel]
+            step = run_config.steps[int(np.argmax(values))]
+            peak = float(values.max()) / sensor.si_per_unit
+            predictions.append(PredictedPeak(sensor, peak, step.frequency_hz, step.direction))
+    return tuple(predictions)
+
+
+def _compute_peaks(run_config: RunConfig) -> dict[str, Float1D]:
+    """Compute the peak of each channel at each step, SI, (step,).
+
+    Total displacement of the mass: upper bound, sum of table and relative displacement.
+    """
+    steps, sweep = run_config.steps, run_config.profile.sweep
+    frequencies = np.array([step.frequency_hz for step in steps])
+    level = sweep.acceleration_g * GRAVITY_M_S2
+    # The first step runs twice and the first run is dropped: the real drive has a soft start.
+    motion = simulate_sweep(
+        run_config.model, np.r_[frequencies[:1], frequencies], level, sweep.cycles
+    )
+    table = level / (2 * np.pi * frequencies) ** 2
+
+    def max_magnitude(*names: str) -> Float1D:
+        rows = [np.abs(motion.column(name)[1:]).max(axis=1) for name in names]
+        peaks: Float1D = np.max(rows, axis=0)
+        return peaks
+
+    u, a = max_magnitude("u_max", "u_min"), max_magnitude("a_max", "a_min")
+    right, left = max_magnitude("f_r_max"), max_magnitude("f_l_min")
+    peaks = {
+        "drive_disp_m": table,
+        "table_disp_m": table,
+        "table_acc_m_s2": np.full(frequencies.size, level),
+        "mass_disp_m": u + table,
+        "mass_acc_m_s2": a,
+        "rel_disp_m": u,
+        "damper_force_n": run_config.profile.specimen.mass_kg * a + np.maximum(right, left),
+    }
+    for cells, force in ((RIGHT_CELLS, right), (LEFT_CELLS, left)):
+        present = [name for name in cells if name in run_config.rig.channels]
+        peaks |= {name: force / len(present) for name in present}
+    return peaks
+
+
+def format_clipping_warnings(predictions: tuple[PredictedPeak, ...], rig: RigConfig) -> list[str]:
+    """Format a warning for each sensor predicted near or beyond the end of its range."""
+    return [
+        f"{prediction.sensor.channel}: the model predicts {prediction.peak:.4g} "
+        f"{prediction.sensor.unit} at {prediction.frequency_hz:g} Hz {prediction.direction}, "
+        f"{100 * prediction.range_share:.0f} % of its range on "
+        f"{rig.name!r}; use a sensor with a larger range"
+        for prediction in predictions
+        if prediction.range_share > MAX_RANGE_SHARE
+    ]

@@ -1,0 +1,142 @@
+"""HTML report of a run: one self-contained file.
+
+Values from the summary are shown unchanged; the page loads nothing from outside.
+"""
+
+import json
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+
+from table_io.errors import InputError
+from table_io.records import (
+    Agreement,
+    Check,
+    Event,
+    Fault,
+    FrequencyResponse,
+    Level,
+    Params,
+    SampleGap,
+    Timing,
+    Trip,
+)
+from twin.compare.monitoring import EVENT_KINDS as MONITOR_KINDS
+from twin.recording.reader import Recording, read_recording
+from twin.reports.figures import Picture, draw_run_figures
+from twin.reports.page import TEMPLATE_DIR, embed_images, format_significant, render_page
+from twin.reports.report_data import (
+    ReportData,
+    Summary,
+    build_report_data,
+    parse_toml_tables,
+    step_quantity,
+)
+from twin.reports.sensor_table import build_sensor_rows
+
+MAX_ROWS = 200
+
+
+def write_report(folder: Path, recording: Recording | None = None) -> Path:
+    """Write folder/report.html and its figures from run.mcap and summary.json; return the path.
+
+    A `recording` already in memory is not read again.
+    """
+    summary = _read_summary(folder / "summary.json")
+    run = build_report_data(recording or read_recording(folder / "run.mcap"), summary)
+    path = folder / "report.html"
+    path.write_text(render_report(run, draw_run_figures(run, folder / "figures")), encoding="utf-8")
+    return path
+
+
+def _read_summary(path: Path) -> Summary:
+    """Read the summary of a run; raise InputError if it is missing, damaged or of another kind."""
+    remedy = "give a folder written by run, replay or simulate"
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+        for step in summary["steps"]:
+            _ = step["index"], step["frequency_hz"], step["direction"]
+        _ = summary["run"].get("name"), summary["verdict"]
+    except FileNotFoundError:
+        raise InputError("file not found", where=path, remedy=remedy) from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read the summary: {error}", where=path, remedy=remedy) from None
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"not the summary of a run (missing: {error})", where=path, remedy=remedy
+        ) from None
+    return dict(summary)
+
+
+def render_report(run: ReportData, pictures: list[Picture]) -> str:
+    """Render the report page as HTML text with every figure embedded."""
+    start, recording = run.recording.start, run.recording
+    texts = {name: getattr(start, f"{name}_toml") for name in ("profile", "rig", "model")}
+    return render_page(
+        TEMPLATE_DIR / "report.html",
+        run=run,
+        summary=run.summary,
+        start=start,
+        headline=format_headline(run),
+        configs={name: parse_toml_tables(text) for name, text in texts.items()},
+        images=embed_images(pictures),
+        demand={step.index: step.acceleration_m_s2 for step in start.steps},
+        texts=[(name, sha256(text.encode()).hexdigest(), text) for name, text in texts.items()],
+        timings={timing.component: timing for timing in recording.records(Timing)},
+        gaps=recording.records(SampleGap),
+        faults=recording.records(Fault),
+        events=[
+            event
+            for event in recording.records(Event)
+            if event.kind not in ("state", *MONITOR_KINDS)
+        ],
+        monitor_events=[event for event in recording.records(Event) if event.kind in MONITOR_KINDS],
+        compared=any(
+            np.isfinite(agreement.error).any() for agreement in recording.records(Agreement)
+        ),
+        sensors=build_sensor_rows(start),
+        states=recording.stop.states if recording.stop else (),
+        checks=recording.records(Check),
+        trips=recording.records(Trip),
+        response=next(iter(recording.records(FrequencyResponse)), None),
+        level=worst_level(run),
+        parameters=recording.records(Params),
+        max_rows=MAX_ROWS,
+        quantity=step_quantity,
+    )
+
+
+def worst_level(run: ReportData) -> dict[str, float] | None:
+    """Return the largest level errors (relative) with and without control, and most updates.
+
+    None if no step has level records.
+    """
+    levels = [step["level"] for step in run.steps if step.get("level")]
+    if not levels:
+        return None
+    return {
+        "controlled": max(abs(level["error"]) for level in levels),
+        "uncontrolled": max(abs(level["error_uncorrected"]) for level in levels),
+        "updates": max(record.update for record in run.recording.records(Level)),
+        "steps": len(levels),
+    }
+
+
+def format_headline(run: ReportData) -> str:
+    """Format the headline: steps completed, hysteresis, findings and largest excursion."""
+    done_count = sum(1 for step in run.steps if step.get("measured") or step.get("twin"))
+    parts = [f"{done_count} of {len(run.recording.start.steps) or len(run.steps)} steps"]
+    parts += [
+        f"{interval['kind']} hysteresis {interval['from_hz']:g} to {interval['to_hz']:g} Hz"
+        for interval in run.summary.get("hysteresis") or []
+    ] or ["no hysteresis"]
+    parts += run.summary.get("found") or []
+    eta_d = np.nan_to_num([step_quantity(step, run.source, "eta_d") for step in run.steps])
+    if eta_d.any():
+        peak_step = run.steps[int(np.argmax(eta_d))]
+        location = f"{peak_step['frequency_hz']:g} Hz {peak_step['direction']}"
+        parts.append(
+            f"largest normalized excursion {format_significant(eta_d.max())} at {location}"
+        )
+    return "; ".join(parts) + "."

@@ -1,0 +1,269 @@
+"""summary.json: results of a run, computed from its recording; the keys are a stable interface."""
+
+import json
+import math
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from table_io.config.base import parse_toml
+from table_io.config.profile import Profile
+from table_io.records import (
+    Check,
+    Comparison,
+    Estimate,
+    Event,
+    Fault,
+    Level,
+    NormalizedResponse,
+    PrcPoint,
+    SampleGap,
+    StepAdded,
+    Timing,
+    Trip,
+)
+from twin.compare import COMPARED_CHANNELS
+from twin.compare.curves import detect_hysteresis
+from twin.compare.monitoring import EVENT_KINDS as MONITOR_KINDS
+from twin.model.model import Model
+from twin.model.parameters import Parameters, free_flight_resonance
+from twin.recording.reader import Recording
+
+Json = dict[str, Any]
+ESTIMATE_KEYS = ("value", "sd", "drift", "drift_sd")
+
+
+def summarise(recording: Recording, parameters: Parameters) -> Json:
+    """Compute the summary of a recording whose twin ran with these parameters."""
+    start = recording.start
+    profile = parse_toml(start.profile_toml, Profile, "recorded profile")
+    level = max(step.acceleration_m_s2 for step in start.steps)
+    u_star, a_star, peak_hz = free_flight_resonance(parameters, level)
+    points = _collect_points(recording, parameters, profile)
+    source = "twin" if start.source == "model" else "measured"
+    reasons = {addition.step: addition.reason for addition in recording.records(StepAdded)}
+    planned = [point for point in points if point.step not in reasons]
+    jumps, intervals = detect_hysteresis(planned, source)
+    twin_jumps, twin_intervals = detect_hysteresis(planned, "twin")
+    levels = recording.records(Level)
+    stop = recording.stop
+    end = stop.index if stop else max((block.end for block in recording.blocks("meas")), default=0)
+    samples = max(end - start.index, 0)
+    return {
+        "run": {
+            "id": start.run,
+            "name": start.name,
+            "title": profile.title,
+            "source": start.source,
+            "started_at": start.started_at,
+            "host": start.host,
+            "rate_hz": start.rate_hz,
+            "samples": samples,
+            "duration_s": samples / start.rate_hz,
+            "normalisation": (
+                f"u* and a* are the maxima of the model in free flight, continuous in frequency "
+                f"(at {peak_hz:.3f} Hz, {level:.4g} m/s2)"
+            ),
+            "branches_from": source,
+        },
+        "verdict": stop.verdict if stop else "halted",
+        "reason": stop.reason if stop else "the recording ends without a stop record",
+        "gaps": len(recording.records(SampleGap)) + (1 if recording.missing_samples else 0),
+        "lost_samples": recording.missing_samples,
+        "faults": [asdict(fault) for fault in recording.records(Fault)],
+        "u_star_m": u_star,
+        "a_star_m_s2": a_star,
+        "checks": [asdict(check) for check in recording.records(Check)],
+        "trips": [asdict(trip) for trip in recording.records(Trip)],
+        "steps": [_step_entry(point) | _level_entry(point, levels) for point in planned],
+        # Steps added during the test are not part of the PRC grid.
+        "visits": [
+            {**_step_entry(point), "reason": reasons[point.step]}
+            for point in points
+            if point.step in reasons
+        ],
+        "found": [event.text for event in recording.records(Event) if event.kind == "found"],
+        "jumps": [asdict(jump) for jump in jumps],
+        "hysteresis": [asdict(interval) for interval in intervals],
+        "twin_jumps": [asdict(jump) for jump in twin_jumps],
+        "twin_hysteresis": [asdict(interval) for interval in twin_intervals],
+        "timing": _timing(recording.records(Timing)),
+        "comparison": channel_nrmse(recording.records(Comparison), parameters),
+        "estimates": _estimates_entry(recording.records(Estimate)),
+        "warnings": [
+            {"at_s": event.index / start.rate_hz, "kind": event.kind, "text": event.text}
+            for event in recording.records(Event)
+            if event.kind in MONITOR_KINDS and event.kind != "jump"
+        ],
+    }
+
+
+def _estimates_entry(estimates: tuple[Estimate, ...]) -> Json:
+    """Return the last parameter estimates of the run, SI; `drift` since the start."""
+    if not estimates:
+        return {}
+    last = estimates[-1]
+    rows = zip(last.names, last.values, last.sd, last.drift, last.drift_sd, strict=True)
+    return {name: dict(zip(ESTIMATE_KEYS, row, strict=True)) for name, *row in rows}
+
+
+def _collect_points(
+    recording: Recording, parameters: Parameters, profile: Profile
+) -> tuple[PrcPoint, ...]:
+    """Return the recorded PRC points; recompute the measured part of those lost to a fault."""
+    points = {point.step: point for point in recording.records(PrcPoint)}
+    if recording.records(Fault):
+        from twin.compare import pipeline
+
+        setup = pipeline.prepare_pipeline(profile, Model(parameters), recording.start.steps)
+        setup = pipeline.add_steps(setup, *recording.records(StepAdded))
+        state, _ = pipeline.start_pipeline(setup)
+        for block in recording.contiguous_blocks("meas"):
+            state, items = pipeline.step(setup, state, block)
+            for item in items:
+                if isinstance(item, PrcPoint):
+                    points.setdefault(item.step, replace(item, twin=None))
+    return tuple(points[step] for step in sorted(points))
+
+
+def _step_entry(point: PrcPoint) -> Json:
+    def to_json(values: NormalizedResponse | None) -> Json | None:
+        return None if values is None else asdict(values)
+
+    return {
+        "index": point.step,
+        "direction": point.direction,
+        "frequency_hz": point.frequency_hz,
+        "measured": to_json(point.measured),
+        "twin": to_json(point.twin),
+        "table_acc_peak_m_s2": point.table_acc_peak_m_s2,
+        "table_acc_fundamental_m_s2": point.table_acc_fundamental_m_s2,
+        "thd": point.thd,
+    }
+
+
+def _level_entry(point: PrcPoint, levels: tuple[Level, ...]) -> Json:
+    """Return the amplitude control results of a step; {} if its level was not controlled."""
+    step_levels = [level for level in levels if level.step == point.step]
+    if not step_levels:
+        return {}
+    last = step_levels[-1]
+    measured_m_s2 = point.table_acc_fundamental_m_s2
+    return {
+        "level": {
+            "demanded_m_s2": last.demanded_m_s2,
+            "error": measured_m_s2 / last.demanded_m_s2 - 1,
+            "error_uncorrected": measured_m_s2 / last.correction / last.demanded_m_s2 - 1,
+            "correction": last.correction,
+            "updates": last.update,
+            "accepted": last.accepted,
+        }
+    }
+
+
+def _timing(records: tuple[Timing, ...]) -> Json:
+    """Return the twin latency in ms (scheduled last sample of a block to published Comparison).
+
+    Also the missed deadlines and the timing of each component.
+    """
+    last = {record.component: record for record in records}
+    twin = last.get("twin")
+    twin = twin if twin is not None and twin.blocks else None
+    return {
+        "latency_ms": {
+            "p50": twin.p50_ms if twin else None,
+            "p99": twin.p99_ms if twin else None,
+            "max": twin.max_ms if twin else None,
+        },
+        "missed_deadlines": sum(record.missed for record in last.values()) if last else None,
+        "components": {
+            name: {key: value for key, value in asdict(record).items() if key != "component"}
+            for name, record in last.items()
+        },
+    }
+
+
+def channel_nrmse(comparisons: tuple[Comparison, ...], parameters: Parameters) -> Json:
+    """Return the NRMSE by channel: `nrmse` of the restarted twin, `free_nrmse` of the free one.
+
+    NRMSE = sqrt(sum of squared errors / sum of squared measurements). The restarted twin shows the
+    model error; the free one also the divergence between solutions. None for the load cells of an
+    absent bumper, which measure noise only.
+    """
+    absent = {
+        cell
+        for cells, gap in ((RIGHT_CELLS, parameters.gap_r), (LEFT_CELLS, parameters.gap_l))
+        for cell in cells
+        if math.isinf(gap)
+    }
+    comparisons = tuple(
+        comparison for comparison in comparisons if comparison.channels == COMPARED_CHANNELS
+    )
+    if not comparisons:
+        return {}
+    measured, free, window = (
+        np.array([getattr(comparison, name) for comparison in comparisons])
+        for name in ("measured_ss", "free_error_ss", "window_error_ss")
+    )
+    entries: Json = {}
+    for column, name in enumerate(COMPARED_CHANNELS):
+        values = {}
+        for key, error in (("nrmse", window), ("free_nrmse", free)):
+            is_known = np.isfinite(error[:, column]) & np.isfinite(measured[:, column])
+            total = measured[is_known, column].sum()
+            values[key] = (
+                math.sqrt(error[is_known, column].sum() / total)
+                if total > 0 and name not in absent
+                else None
+            )
+        entries[name] = values
+    return entries
+
+
+def format_summary(summary: Json) -> str:
+    """Format the result of a run in one line."""
+    parts = [f"{summary['verdict']}: {len(summary['steps'])} steps"]
+    if summary.get("visits"):
+        parts.append(f"{len(summary['visits'])} steps added during the test")
+    parts += summary.get("found", [])
+    for interval in summary["hysteresis"]:
+        parts.append(
+            f"{interval['kind']} hysteresis {interval['from_hz']:g} to {interval['to_hz']:g} Hz"
+        )
+    for jump in summary["jumps"]:
+        parts.append(f"jump {jump['kind']} {jump['from_hz']:g} -> {jump['to_hz']:g} Hz")
+    error = summary["comparison"].get("rel_disp_m", {}).get("nrmse")
+    if error is not None:
+        parts.append(f"twin NRMSE of u {100 * error:.2g} %")
+    latency = summary["timing"]["latency_ms"]["p99"]
+    if latency is not None:
+        parts.append(f"latency p99 {latency:.2g} ms")
+    parts.append(f"{summary['gaps']} gaps")
+    if summary["faults"]:
+        parts.append(f"{len(summary['faults'])} faults")
+    if summary["verdict"] != "complete":
+        parts.append(summary["reason"])
+    return "; ".join(parts)
+
+
+def write_summary(summary: Json, path: Path) -> None:
+    """Write a summary as strict JSON; non-finite numbers become null."""
+    path.write_text(dump_strict_json(summary) + "\n")
+
+
+def dump_strict_json(summary: Json) -> str:
+    """Return a summary as strict JSON text; non-finite numbers become null."""
+    return json.dumps(_replace_nonfinite(summary), indent=1, allow_nan=False)
+
+
+def _replace_nonfinite(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, dict):
+        return {key: _replace_nonfinite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_replace_nonfinite(item) for item in value]
+    return value

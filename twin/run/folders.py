@@ -1,0 +1,55 @@
+"""Creation of result folders; existing content is never overwritten."""
+
+from itertools import count
+from pathlib import Path
+
+from table_io.errors import InputError
+from twin.run.run_config import make_run_id
+
+RUNS_FOLDER = Path("runs")
+
+
+def make_run_folder(out: Path | None, name: str) -> tuple[Path, str]:
+    """Create a run's folder as `make_output_folder` does; return (folder, run id)."""
+    run = make_run_id(name)
+    folder = make_output_folder(out, run)
+    return folder, run if out is not None else folder.name
+
+
+def make_output_folder(out: Path | None, run_name: str) -> Path:
+    """Create an empty folder for results: `out`, or runs/<run_name>, numbered if that exists.
+
+    InputError if `out` has content or is not writable.
+    """
+    folder = RUNS_FOLDER / run_name if out is None else out
+    try:
+        if out is None:
+            folder = _make_free_folder(folder)
+        elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise InputError(
+                f"--out {out}: exists and has content; nothing recorded is ever overwritten. "
+                "Give a new folder"
+            )
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / ".probe"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise InputError(f"--out {folder}: cannot write here: {error.strerror}") from None
+    return folder
+
+
+def _make_free_folder(folder: Path) -> Path:
+    """Create and return `folder`, or the first of <folder>-2, -3, ... that does not exist.
+
+    Creating it at once prevents two processes from choosing the same name.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    for number in count(1):
+        candidate = folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
+        try:
+            candidate.mkdir()
+        except FileExistsError:
+            continue
+        return candidate
+    raise AssertionError("there is always a next name")

@@ -1,0 +1,30 @@
+"""Check that a test can run in real time: block length, and a machine that answers."""
+
+import math
+from pathlib import Path
+
+from table_io.acquisition.external_control import plan_open_loop_drive
+from table_io.backends import check_reachable
+from table_io.errors import InputError
+from twin.run.run_config import RunConfig
+
+MIN_BLOCK_S, MAX_BLOCK_S = 0.002, 0.05  # protection checks once per block
+
+
+def check_realtime(config: RunConfig, profile_path: Path) -> None:
+    """Raise InputError if a block is too short or too long, or no machine answers.
+
+    Shorter blocks cannot be processed in time; longer ones delay protection too much.
+    """
+    samples, rate_hz = config.profile.acquisition.block_samples, config.drive.rate_hz
+    min_samples, max_samples = math.ceil(rate_hz * MIN_BLOCK_S), math.floor(rate_hz * MAX_BLOCK_S)
+    if not min_samples <= samples <= max_samples:
+        raise InputError(
+            f"{profile_path}: acquisition.block_samples = {samples}: in real time at {rate_hz:g} "
+            f"Hz a block may have {min_samples} to {max_samples} samples; change it, or use "
+            "--speed max"
+        )
+    if config.rig.backend == "follow":
+        # Raises now if the test cannot be played by an external controller.
+        plan_open_loop_drive(config.profile, config.rig)
+    check_reachable(config.rig)

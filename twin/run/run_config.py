@@ -1,0 +1,203 @@
+"""Configuration of a run: profile, rig, model and drive, validated together beforehand."""
+
+import platform
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from table_io.acquisition.session import SessionSetup
+from table_io.clock import local_datetime
+from table_io.config.base import find_config, load_config, parse_toml, resolve_config
+from table_io.config.profile import Profile, Specimen
+from table_io.config.rig import RigConfig
+from table_io.config.rig_file import load_rig
+from table_io.errors import InputError
+from table_io.excitation.drive import Drive
+from table_io.excitation.trajectory import plan_sweep
+from table_io.records import RunStart, Step
+from table_io.safety.preflight import StepDemand, check_limits, compute_demands
+from table_io.sequencer import make_test_plan, nominal_drive
+from twin.model.config import ModelConfig
+from twin.model.model import Model
+from twin.model.parameters import Parameters
+from twin.run.versions import read_installed_versions
+
+if TYPE_CHECKING:
+    from twin.compare.pipeline import PipelineSetup
+
+WARM_UP_ITEMS = 100  # of a session (1 s); every kernel is called within the first blocks
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Configuration of a run, as TOML texts and as validated objects.
+
+    `drive` is the nominal drive: it is played if the loop check passes and no level is corrected.
+    """
+
+    name: str
+    profile: Profile
+    rig: RigConfig
+    model: Model
+    drive: Drive
+    margins: tuple[StepDemand, ...]
+    profile_toml: str
+    rig_toml: str
+    model_toml: str
+
+    @property
+    def session_setup(self) -> SessionSetup:
+        return SessionSetup(self.profile, self.rig)
+
+    def prepare_twin(self, from_rest: bool = False) -> "PipelineSetup":
+        """Return the twin's setup; the import compiles kernels that are not cached."""
+        from twin.compare import pipeline
+
+        setup = pipeline.prepare_pipeline(self.profile, self.model, self.steps, from_rest)
+        setup.twin.solver  # noqa: B018  compiles now, not at the first sample
+        return setup
+
+    @property
+    def ideal_drive(self) -> Drive:
+        """Drive of an ideal table: the sweep without loop check and tuning."""
+        return plan_sweep(self.profile)
+
+    @property
+    def parameters(self) -> Parameters:
+        """Linear parameters of the model."""
+        return self.model.parameters
+
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        return self.drive.steps
+
+    def make_start_factory(
+        self, run: str, source: str
+    ) -> Callable[[dict[str, float], float], RunStart]:
+        """Return a function that makes the RunStart from tare and epoch."""
+
+        def make_start(tare: dict[str, float], epoch_s: float) -> RunStart:
+            table = ("drive_disp_m", "table_disp_m", "table_acc_m_s2")
+            return RunStart(
+                index=0,
+                run=run,
+                name=self.name,
+                source=source,
+                profile_toml=self.profile_toml,
+                rig_toml=self.rig_toml,
+                model_toml=self.model_toml,
+                rate_hz=self.profile.acquisition.rate_hz,
+                block_samples=self.profile.acquisition.block_samples,
+                channels=self.rig.channels if source == "table" else table,
+                steps=self.steps,
+                planned_samples=self.drive.planned_end,
+                tare=tare,
+                versions=dict(read_installed_versions()),
+                host=platform.node(),
+                started_at=local_datetime().isoformat(timespec="seconds"),
+                epoch_s=epoch_s,
+            )
+
+        return make_start
+
+
+def from_texts(
+    name: str, profile_toml: str, rig_toml: str, model_toml: str, source: str
+) -> RunConfig:
+    """Build a `RunConfig` from TOML texts; InputError lists all faults of a text."""
+    profile = parse_toml(profile_toml, Profile, source)
+    rig = parse_toml(rig_toml, RigConfig, f"machine card of {source}")
+    model_config = parse_toml(model_toml, ModelConfig, f"model of {source}")
+    try:
+        drive = nominal_drive(make_test_plan(profile, rig))
+    except ArithmeticError as error:
+        raise InputError(
+            f"{source}: no drive follows from these numbers ({error}); look for a wrong power of "
+            "ten"
+        ) from None
+    model = model_config.build_model(profile.specimen)
+    model.check_rate(profile.acquisition.rate_hz)
+    return RunConfig(
+        name,
+        profile,
+        rig,
+        model,
+        drive,
+        compute_demands(drive, profile, rig),
+        profile_toml,
+        rig_toml,
+        model_toml,
+    )
+
+
+def read_run_config(path: Path, table: str | None = None, model: str | None = None) -> RunConfig:
+    """Read the `RunConfig` of a test profile; InputError if the test exceeds the table's limits."""
+    path = resolve_config(path, "tests")
+    profile, profile_toml = load_config(path, Profile, "test profile")
+    _, rig_toml = load_rig(find_config(table or profile.rig, "rigs", path))
+    _, model_toml = read_model(model or profile.model, path)
+    config = from_texts(path.stem, profile_toml, rig_toml, model_toml, str(path))
+    check_limits(config.margins, config.profile, config.rig, str(path))
+    return config
+
+
+def read_model(name: str, relative_to: Path | None = None) -> tuple[ModelConfig, str]:
+    """Read a model file by its name in models/ or its path; return (config, text)."""
+    return load_config(find_config(name, "models", relative_to), ModelConfig, "model")
+
+
+def make_run_id(name: str) -> str:
+    """Return <date>-<time>-<profile>: the run's id and the name of its folder."""
+    return f"{local_datetime():%Y%m%d-%H%M%S}-{name}"
+
+
+def compile_twin_kernels() -> None:
+    """Compile or load the kernels of the exact solver by running them once on a few samples."""
+    import numpy as np
+
+    from twin.model.closed_form import advance_state, discretized_params, rest_state
+
+    parameters = Parameters(550.0, 36e3, 1.1e3, 510e3, 900.0, 510e3, 900.0, 0.002, 0.002)
+    state = rest_state(parameters)
+    advance_state(state, discretized_params(parameters, 2000.0), np.zeros(4), np.empty((7, 4)))
+
+
+def compile_rig_kernels(config: RunConfig) -> None:
+    """Compile or load the kernels of the rig, its protection and its simulated table.
+
+    The start of a real session is run, so that every kernel is called. The quickstart profile
+    replaces a rig that has no simulated table or no command channel.
+    """
+    from contextlib import closing
+    from itertools import islice
+
+    from table_io.acquisition.session import run_session
+    from table_io.clock import ManualClock
+    from table_io.sim.simulated_table import SimulatedBackend
+
+    if config.rig.simulated is None or "drive_disp_m" not in config.rig.channels:
+        config = read_run_config(find_config("quickstart", "tests"))
+    clock = ManualClock()
+    backend = SimulatedBackend(
+        config.rig, config.profile.specimen, config.profile.acquisition.rate_hz, clock
+    )
+    session = run_session(
+        config.session_setup,
+        backend,
+        clock,
+        config.make_start_factory("warm", "table"),
+        lambda: None,
+    )
+    with closing(session):  # which closes the backend too
+        for _ in islice(session, WARM_UP_ITEMS):
+            pass
+
+
+def read_model_template(name: str) -> tuple[Model, ModelConfig]:
+    """Return (model, config) of a model file, with a mass of 1 kg and infinite gaps.
+
+    Mass and gaps are set from each log.
+    """
+    card, _ = read_model(name)
+    return card.build_model(Specimen(mass_kg=1.0, gap_mm=float("inf"))), card

@@ -1,0 +1,83 @@
+"""Terminal output, and interruption by Ctrl-C."""
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.table import Table
+
+DECAY_MESSAGE = "stopping: the table decays to rest"
+ANNOUNCE_AFTER_S = 1.5  # longer than loading from a cache
+FILE_COLUMNS = 400  # of output to a file or pipe, where lines need no wrapping
+
+
+def _console_columns() -> int | None:
+    """Return the columns of standard output, or None to ask the terminal or COLUMNS."""
+    is_set = os.environ.get("COLUMNS", "").isdigit()
+    return None if sys.stdout.isatty() or is_set else FILE_COLUMNS
+
+
+console = Console(width=_console_columns())
+
+
+def print_line(text: str) -> None:
+    """Print a line verbatim, without markup; only the terminal wraps it."""
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def fits_width(on: Console, table: Table) -> bool:
+    """Return True if the console is wide enough for every cell of a table in one line."""
+    return on.measure(table, options=on.options.update(width=FILE_COLUMNS)).maximum <= on.width
+
+
+def print_table(on: Console, table: Table) -> None:
+    """Print a table, or one line per row if the console is too narrow."""
+    if fits_width(on, table):
+        on.print(table)
+        return
+    if table.title:
+        on.print(table.title, highlight=False, soft_wrap=True)
+    name_column, *columns = table.columns
+    for row, name in enumerate(map(str, name_column.cells)):
+        cells = [(str(column.header), str([*column.cells][row])) for column in columns]
+        text = ", ".join(f"{head} {cell}" for head, cell in cells if cell)
+        on.print(f"  {name_column.header} {name}: {text}", highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def catch_interrupts(
+    sentence: str = "stopping: the table decays to rest",
+) -> Iterator[Callable[[], str | None]]:
+    """Catch SIGINT and SIGTERM; yield a function that returns the reason to stop, or None.
+
+    The sentence is printed at the first signal.
+    """
+    signals: list[int] = []
+
+    def handle_signal(number: int, _: object) -> None:
+        if not signals:
+            print_line(sentence)
+        signals.append(number)
+
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    old_handlers = [signal.signal(number, handle_signal) for number in numbers]
+    try:
+        yield lambda: f"interrupted ({signal.Signals(signals[0]).name})" if signals else None
+    finally:
+        for number, handler in zip(numbers, old_handlers, strict=True):
+            signal.signal(number, handler)
+
+
+@contextmanager
+def announce_if_slow(sentence: str) -> Iterator[None]:
+    """Print a sentence if the body takes longer than `ANNOUNCE_AFTER_S`."""
+    old_handler = signal.signal(signal.SIGALRM, lambda *_: print_line(sentence))
+    signal.setitimer(signal.ITIMER_REAL, ANNOUNCE_AFTER_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, old_handler)

@@ -1,0 +1,250 @@
+"""Credentials: a folder of keys, verified, and the TLS and access settings made from it.
+
+`shaketwin keys` makes two kinds of folder: the rig's, with the access list, and a person's.
+
+| file            | content                                                | folder           |
+|-----------------|--------------------------------------------------------|------------------|
+| ca.pem          | certificate of the authority, verifies the peer        | both             |
+| certificate.pem | own certificate; its common name is the user name      | both             |
+| key.pem         | private key of that certificate, mode 0600             | both             |
+| access.toml     | people and their roles                                 | the rig's        |
+| ca.key.pem      | private key of the authority, needed only by `keys`    | the rig's, or at |
+|                 |                                                        | a safer place    |
+
+A certificate is verified as a peer would verify it, by a TLS handshake in memory.
+"""
+
+import getpass
+import re
+import ssl
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator
+
+from table_io.clock import local_datetime
+from table_io.config.base import ConfigModel, parse_toml, read_text
+from table_io.errors import InputError
+from twin.security.access_control import NO_ROLE, RIG_NAME, build_people_access
+
+AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, ACCESS_FILE = (
+    "ca.pem",
+    "certificate.pem",
+    "key.pem",
+    "access.toml",
+)
+EXPIRY_WARNING_DAYS = 30  # before a certificate expires
+MAX_NAME_LENGTH = 64  # X.509's upper bound of a common name
+# X509_V_FLAG_NO_CHECK_TIME: dates are checked here, for a message that names them
+NO_CHECK_TIME_FLAG = 0x200000
+OTHERS_MODE_BITS, WRITE_BY_OTHERS_MODE_BITS = 0o077, 0o022
+NAME_ALPHABET = frozenset("abcdefghijklmnopqrstuvwxyz0123456789_-")
+
+
+def check_name(name: str) -> str:
+    """Return `name` if it is valid for a person's certificate; raise ValueError otherwise.
+
+    Dots are not allowed: in alive/observer.<name>.<anything> `a` could pass for `a.b`.
+    """
+    if not (set(name) <= NAME_ALPHABET and 0 < len(name) <= MAX_NAME_LENGTH and name[0].isalnum()):
+        raise ValueError(
+            f"{name!r} is no name for a certificate; allowed: up to {MAX_NAME_LENGTH} of a-z 0-9 "
+            "_ -, starting with a letter or digit"
+        )
+    if name in (RIG_NAME, NO_ROLE):
+        raise ValueError(f"{name!r} is a reserved name; choose another")
+    return name
+
+
+class AccessList(ConfigModel):
+    """Access list `access.toml`: role by the common name of a certificate."""
+
+    people: dict[
+        Annotated[str, AfterValidator(check_name)],
+        Literal["observe", "record", "twin", "command", "router"],
+    ]
+
+
+def read_people(folder: Path) -> dict[str, str]:
+    """Read the access list of a rig's folder; return role by name."""
+    path = folder / ACCESS_FILE
+    _check_file_mode(path, WRITE_BY_OTHERS_MODE_BITS, "others may change it", "go-w")
+    return dict(parse_toml(read_text(path, "access list"), AccessList, str(path)).people)
+
+
+@dataclass(frozen=True, slots=True)
+class Credentials:
+    """Verified folder of keys, made by `read_credentials`.
+
+    `people` maps name to role in the rig's folder and is None in a person's.
+    """
+
+    folder: Path
+    name: str  # common name of the certificate
+    valid_until: datetime  # expiry of the certificate
+    people: Mapping[str, str] | None = field(repr=False)
+
+    @property
+    def days_left(self) -> int:
+        """Whole days until the certificate expires."""
+        return (self.valid_until - local_datetime()).days
+
+    def tls_settings(self) -> dict[str, Any]:
+        """Return zenoh's settings for mutual TLS with certificates of this authority."""
+        certificate, key = str(self.folder / CERTIFICATE_FILE), str(self.folder / KEY_FILE)
+        tls = {
+            "root_ca_certificate": str(self.folder / AUTHORITY_FILE),
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+            "listen_certificate": certificate,
+            "listen_private_key": key,
+            "connect_certificate": certificate,
+            "connect_private_key": key,
+        }
+        return {"transport": {"link": {"tls": tls, "protocols": ["tls"]}}}
+
+    def access_settings(self, rig: str) -> dict[str, Any]:
+        """Return zenoh's access-control settings of the rig's hub."""
+        return build_people_access(rig, self.people or {})
+
+    def without_twin_roles(self) -> "Credentials":
+        """Return credentials in which role `twin` is `observe`, for a run with its own twin."""
+        people = {
+            name: "observe" if role == "twin" else role
+            for name, role in (self.people or {}).items()
+        }
+        return replace(self, people=people)
+
+    def role_of(self, name: str) -> str:
+        """Return the current role of `name`, reading the list again so that removals take effect.
+
+        Every role is `NO_ROLE` if the list cannot be read.
+        """
+        try:
+            return read_people(self.folder).get(name, NO_ROLE)
+        except InputError:
+            return NO_ROLE
+
+
+def read_credentials(folder: Path) -> Credentials:
+    """Read and verify the keys in a folder; raise InputError if they cannot be used."""
+    folder = folder.absolute()
+    for name in (AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE):
+        if not (folder / name).is_file():
+            raise InputError(
+                f"--keys {folder}: {name} is missing; give a folder that `shaketwin keys new` or "
+                "`shaketwin keys add` made"
+            )
+    _check_file_mode(
+        folder / KEY_FILE, OTHERS_MODE_BITS, "others on this machine may read it", "go-rwx"
+    )
+    certificate = _verify_certificate(folder)
+    valid_from, valid_until = (
+        datetime.fromtimestamp(ssl.cert_time_to_seconds(certificate[when]), UTC)
+        for when in ("notBefore", "notAfter")
+    )
+    time = local_datetime()
+    if not valid_from <= time < valid_until:
+        remedy = (
+            "ask for new keys (`shaketwin keys renew`)"
+            if time >= valid_until
+            else "check the clock"
+        )
+        raise InputError(
+            f"{folder / CERTIFICATE_FILE}: valid from {valid_from:%Y-%m-%d} to "
+            f"{valid_until:%Y-%m-%d}, it is now {time:%Y-%m-%d %H:%M}: "
+            f"{'expired' if time >= valid_until else 'not yet valid'}; {remedy}"
+        )
+    names = dict(entry for part in certificate["subject"] for entry in part)
+    people = read_people(folder) if (folder / ACCESS_FILE).exists() else None
+    return Credentials(folder, names.get("commonName", ""), valid_until, people)
+
+
+def credentials_folder(keys: Credentials | None) -> str:
+    """Return the path of the keys, to pass to another process, or "" without keys."""
+    return "" if keys is None else str(keys.folder)
+
+
+def read_rig_credentials(folder: Path) -> Credentials:
+    """Read the keys of a rig; raise InputError for a person's folder."""
+    keys = read_credentials(folder)
+    if keys.people is None:
+        raise InputError(
+            f"the keys of {keys.name} are a person's and cannot open an endpoint",
+            where=f"--keys {folder}",
+            remedy="give the rig's folder, which holds access.toml",
+        )
+    return keys
+
+
+def _check_file_mode(path: Path, bits: int, reason: str, remedy: str) -> None:
+    try:
+        mode = path.stat().st_mode
+    except OSError as error:
+        raise InputError(f"{path}: cannot read it: {error.strerror}") from None
+    if mode & bits:
+        raise InputError(f"{path}: mode {mode & 0o777:04o}, {reason}; chmod {remedy} {path}")
+
+
+def create_tls_context(folder: Path, side: int) -> ssl.SSLContext:
+    """Return a TLS 1.3 context that presents the certificate and verifies the peer's."""
+    context = ssl.SSLContext(side)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    try:
+        context.load_cert_chain(folder / CERTIFICATE_FILE, folder / KEY_FILE, password=lambda: "")
+    except ssl.SSLError as error:
+        if error.reason == "KEY_VALUES_MISMATCH":
+            problem = f"{KEY_FILE} does not belong to {CERTIFICATE_FILE}"
+        else:
+            problem = f"{CERTIFICATE_FILE} or {KEY_FILE} is damaged, encrypted or no PEM file"
+        raise InputError(f"--keys {folder}: {problem}; ask for new keys") from None
+    except OSError as error:
+        raise InputError(f"--keys {folder}: cannot read the keys: {error.strerror}") from None
+    try:
+        context.load_verify_locations(folder / AUTHORITY_FILE)
+    except (ssl.SSLError, OSError):
+        raise InputError(
+            f"{folder / AUTHORITY_FILE}: not the certificate of an authority; ask for it again"
+        ) from None
+    context.verify_mode = ssl.CERT_REQUIRED
+    return context
+
+
+def _verify_certificate(folder: Path) -> dict[str, Any]:
+    """Verify the certificate against ca.pem by a handshake in memory; return it as a peer's."""
+    client, server = (
+        create_tls_context(folder, side)
+        for side in (ssl.PROTOCOL_TLS_CLIENT, ssl.PROTOCOL_TLS_SERVER)
+    )
+    client.check_hostname = False
+    client.verify_mode = ssl.CERT_NONE
+    server.verify_flags |= NO_CHECK_TIME_FLAG
+    to_client, to_server = ssl.MemoryBIO(), ssl.MemoryBIO()
+    connections = [
+        client.wrap_bio(to_client, to_server),
+        server.wrap_bio(to_server, to_client, server_side=True),
+    ]
+    try:
+        for connection in (*connections, *connections):
+            try:
+                connection.do_handshake()
+            except ssl.SSLWantReadError:
+                continue
+    except ssl.SSLError as error:
+        reason = getattr(error, "verify_message", "") or error.reason
+        raise InputError(
+            f"{folder / CERTIFICATE_FILE}: not issued by the authority in {AUTHORITY_FILE} of the "
+            f"same folder ({reason}); ask for both together"
+        ) from None
+    return connections[1].getpeercert() or {}
+
+
+def user_name(keys: Credentials | None) -> str:
+    """Return the name in the certificate; without keys the login name on this machine."""
+    if keys is not None:
+        return keys.name
+    return re.sub(r"[^A-Za-z0-9_.-]", "_", getpass.getuser())[:64] or "somebody"

@@ -1,1 +1,0 @@
-"""Processes, supervisor, report, command line."""

@@ -1,1 +1,0 @@
-"""`identify` and `discover` on files: recordings in, models, verdicts, figures and pages out."""

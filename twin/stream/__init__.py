@@ -1,1 +1,0 @@
-"""The outside world: one encoder, one link, one log, one view."""

@@ -1,1 +1,0 @@
-"""Rerun with the project's layout: blocks and records as moving pictures."""

@@ -1,0 +1,296 @@
+"""Codec (serialization): Blocks and records to protobuf bytes and back.
+
+The bus and the log carry the same bytes. The schema is `shaketwin.proto` in this folder; other
+languages generate their classes from it. Only this package imports protobuf.
+"""
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import fields, is_dataclass
+from functools import cache, partial
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, get_args, get_origin, get_type_hints
+
+import numpy as np
+from google.protobuf.descriptor_pb2 import (
+    DescriptorProto,
+    FieldDescriptorProto,
+    FileDescriptorProto,
+    FileDescriptorSet,
+)
+from google.protobuf.message import DecodeError
+from google.protobuf.timestamp_pb2 import Timestamp
+
+from table_io.block import Block
+from table_io.records import (
+    RECORD_TYPES,
+    Agreement,
+    Check,
+    Comparison,
+    CycleExtremes,
+    Estimate,
+    Event,
+    Extremes,
+    Fault,
+    FrequencyResponse,
+    JumpForecast,
+    Level,
+    NormalizedResponse,
+    Params,
+    PrcPoint,
+    Record,
+    RunStart,
+    RunStop,
+    SampleGap,
+    Step,
+    StepAdded,
+    Timing,
+    Trip,
+)
+from twin.transport import shaketwin_pb2 as pb
+from twin.transport.block_encoding import encode_block
+
+Item = Block | Record
+
+# All topics of the stream.
+MEAS_TOPIC = "/rig/meas"
+PRED_TOPIC = "/twin/pred"
+CMP_TOPIC = "/twin/cmp"
+BLOCK_TOPICS = {"meas": MEAS_TOPIC, "pred": PRED_TOPIC}
+RECORD_TOPICS: dict[type, str] = {
+    RunStart: "/run/start",
+    RunStop: "/run/stop",
+    Event: "/run/event",
+    Fault: "/run/fault",
+    SampleGap: "/rig/gap",
+    Check: "/rig/check",
+    FrequencyResponse: "/rig/response",
+    Level: "/rig/level",
+    StepAdded: "/rig/decided",
+    Trip: "/rig/trip",
+    Params: "/twin/params",
+    Comparison: CMP_TOPIC,
+    CycleExtremes: "/twin/cycle",
+    PrcPoint: "/twin/point",
+    Agreement: "/twin/agreement",
+    Estimate: "/twin/estimate",
+    JumpForecast: "/twin/ahead",
+    Timing: "/run/timing",
+}
+# Message names in `shaketwin.proto`: they stay when a class is renamed.
+MESSAGE_NAMES = {
+    Block: "Block",
+    Step: "Step",
+    Extremes: "Extremes",
+    NormalizedResponse: "Quantities",
+    RunStart: "RunStart",
+    RunStop: "RunStop",
+    Event: "Event",
+    Fault: "Fault",
+    SampleGap: "Gap",
+    Check: "Check",
+    FrequencyResponse: "Response",
+    Level: "Level",
+    StepAdded: "Decided",
+    Trip: "Trip",
+    Params: "Params",
+    Comparison: "Comparison",
+    CycleExtremes: "Cycle",
+    PrcPoint: "Point",
+    Agreement: "Agreement",
+    Estimate: "Estimate",
+    JumpForecast: "Ahead",
+    Timing: "Timing",
+}
+TOPIC_TYPES: dict[str, type] = {
+    **dict.fromkeys(BLOCK_TOPICS.values(), Block),
+    **{topic: kind for kind, topic in RECORD_TOPICS.items()},
+}
+
+MAX_SAMPLE_INDEX = 2**53  # above, float64 cannot represent every integer
+
+
+class WireError(ValueError):
+    """Payload that does not decode as the message type of its topic."""
+
+
+def topic_for(item: Item) -> str:
+    """Return the topic on which an item is published and logged."""
+    return BLOCK_TOPICS[item.stream] if isinstance(item, Block) else RECORD_TOPICS[type(item)]
+
+
+def encode_item(item: Item, run: str) -> bytes:
+    """Encode an item deterministically: equal items give equal bytes."""
+    if isinstance(item, Block):
+        return encode_block(item, run)
+    message = _to_message(item)
+    if not isinstance(item, RunStart):
+        message.run = run
+    return bytes(message.SerializeToString(deterministic=True))
+
+
+def strip_run(payload: bytes, kind: type, run: str) -> bytes:
+    """Return the payload of a record without its run id, its last field, for comparing runs."""
+    return payload.removesuffix(_run_suffix(kind, run))
+
+
+@cache
+def _run_suffix(kind: type, run: str) -> bytes:
+    return bytes(getattr(pb, MESSAGE_NAMES[kind])(run=run).SerializeToString())
+
+
+def decode_item(topic_name: str, payload: bytes) -> tuple[str, Item]:
+    """Decode a payload of a topic to (run id, item); raise WireError if it is not valid."""
+    kind = TOPIC_TYPES.get(topic_name)
+    if kind is None:
+        raise WireError(f"{topic_name}: unknown topic; known: {', '.join(TOPIC_TYPES)}")
+    message: Any = getattr(pb, MESSAGE_NAMES[kind])()
+    try:
+        message.ParseFromString(payload)
+        if kind is Block and BLOCK_TOPICS.get(message.stream) != topic_name:
+            raise ValueError(f"its stream is {message.stream!r}")
+        return message.run, _to_block(message) if kind is Block else _to_record(kind, message)
+    except (DecodeError, ValueError, TypeError, OverflowError) as error:
+        raise WireError(f"{topic_name}: not a {MESSAGE_NAMES[kind]}: {error}") from None
+
+
+def message_schema(kind: type) -> tuple[str, bytes]:
+    """Return (full message name, serialized FileDescriptorSet) of an item type."""
+    return f"shaketwin.{MESSAGE_NAMES[kind]}", FileDescriptorSet(
+        file=[_file_descriptor()]
+    ).SerializeToString()
+
+
+def build_flat_schema(name: str, columns: Sequence[tuple[str, str]]) -> bytes:
+    """Return the serialized FileDescriptorSet of a flat message with (field, type) columns.
+
+    Fields are numbered from 1. A type is a protobuf scalar type, or "time" for a Timestamp.
+    """
+    package, _, message_name = name.rpartition(".")
+    message = DescriptorProto(name=message_name)
+    for number, (field, kind) in enumerate(columns, start=1):
+        descriptor = message.field.add(name=field, number=number)
+        descriptor.label = FieldDescriptorProto.LABEL_OPTIONAL
+        descriptor.type = FieldDescriptorProto.Type.Value(
+            f"TYPE_{'message' if kind == 'time' else kind}".upper()
+        )
+        if kind == "time":
+            descriptor.type_name = f".{Timestamp.DESCRIPTOR.full_name}"
+    timestamp_file = FileDescriptorProto()
+    Timestamp.DESCRIPTOR.file.CopyToProto(timestamp_file)
+    file = FileDescriptorProto(name=f"{name}.proto", package=package, syntax="proto3")
+    file.dependency.append(timestamp_file.name)
+    file.message_type.append(message)
+    return FileDescriptorSet(file=[timestamp_file, file]).SerializeToString()
+
+
+def _file_descriptor() -> Any:
+    proto = FileDescriptorProto()
+    pb.DESCRIPTOR.CopyToProto(proto)
+    return proto
+
+
+def _to_block(message: Any) -> Block:
+    if not 0 < message.rate_hz < float("inf"):
+        raise ValueError(f"rate_hz = {message.rate_hz}")
+    if message.index + len(message.step) > MAX_SAMPLE_INDEX:
+        raise ValueError(f"index = {message.index}")
+    return Block(
+        message.stream,
+        message.index,
+        message.rate_hz,
+        tuple(channel.name for channel in message.channels),
+        np.array([channel.values for channel in message.channels], dtype=np.float64).reshape(
+            len(message.channels), len(message.step)
+        ),
+        np.array(message.step, dtype=np.int64),
+        np.array(message.label, dtype=np.int64),
+        np.array(message.cycle, dtype=np.int64),
+    )
+
+
+def _to_message(record: Any) -> Any:
+    """Convert a dataclass, nested ones included, to its protobuf message; None is left unset."""
+    kind = type(record)
+    if kind not in _FIELD_NAMES:
+        _FIELD_NAMES[kind] = tuple(field.name for field in fields(kind))
+    values = {}
+    for name in _FIELD_NAMES[kind]:
+        value = getattr(record, name)
+        if value is not None:
+            values[name] = value if type(value) in _SCALAR_TYPES else _to_plain(value)
+    return getattr(pb, MESSAGE_NAMES[kind])(**values)
+
+
+def _to_plain(value: Any) -> Any:
+    if isinstance(value, tuple):  # elements share one type, so the first decides
+        return (
+            value
+            if not value or type(value[0]) in _SCALAR_TYPES
+            else [_to_plain(element) for element in value]
+        )
+    return _to_message(value) if is_dataclass(value) else value
+
+
+def _conversion_plan(kind: Any) -> list[tuple[str, bool, Callable[[Any], Any]]]:
+    """Return (field name, whether optional, converter from the protobuf value) of each field."""
+    hints = get_type_hints(kind)
+    plan = []
+    for field in fields(kind):
+        hint = hints[field.name]
+        optional = get_origin(hint) is UnionType
+        if optional:
+            (hint,) = (arg for arg in get_args(hint) if arg is not NoneType)
+        plan.append((field.name, optional, _field_converter(hint)))
+    return plan
+
+
+def _field_converter(hint: Any) -> Callable[[Any], Any]:
+    inner = next(iter(get_args(hint)), None)
+    if get_origin(hint) is tuple and is_dataclass(inner):
+        return lambda value: tuple(_to_record(inner, element) for element in value)
+    if is_dataclass(hint):
+        return partial(_to_record, hint)
+    return get_origin(hint) or (_check_integer if hint is int else hint)
+
+
+def _check_integer(value: int) -> int:
+    if value > MAX_SAMPLE_INDEX:
+        raise ValueError(f"{value} is above the maximum, {MAX_SAMPLE_INDEX}")
+    return value
+
+
+_FIELD_NAMES: dict[type, tuple[str, ...]] = {}
+_SCALAR_TYPES = frozenset((int, float, str, bool, dict))
+_CONVERSION_PLANS: dict[type, list[tuple[str, bool, Callable[[Any], Any]]]] = {}
+
+
+def _to_record(kind: Any, message: Any) -> Any:
+    """Convert a protobuf message to its dataclass; inverse of `_to_message`."""
+    if kind not in _CONVERSION_PLANS:
+        _CONVERSION_PLANS[kind] = _conversion_plan(kind)
+    return kind(
+        **{
+            name: None if optional and not message.HasField(name) else make(getattr(message, name))
+            for name, optional, make in _CONVERSION_PLANS[kind]
+        }
+    )
+
+
+def item_types() -> Iterable[type]:
+    """Return all item types that have a topic."""
+    return (Block, *RECORD_TYPES)
+
+
+def regenerate_protobuf() -> None:
+    """Regenerate shaketwin_pb2.py and .pyi from the .proto (needs the extra "proto")."""
+    folder = Path(__file__).parent
+    command = [sys.executable, "-m", "grpc_tools.protoc", f"-I{folder}"]
+    command += [f"--python_out={folder}", f"--pyi_out={folder}", str(folder / "shaketwin.proto")]
+    subprocess.run(command, check=True)
+
+
+if __name__ == "__main__":
+    regenerate_protobuf()

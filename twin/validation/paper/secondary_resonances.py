@@ -1,0 +1,166 @@
+"""Secondary resonances of G4 in the low frequency range (Fig. 9)."""
+
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from twin.reports.measured_campaign import MeasuredCampaign
+from twin.reports.paper_cases import PaperCase, extract_prc
+from twin.reports.players import SystemMotion
+from twin.reports.plot_style import (
+    DIRECTION_COLOURS,
+    DIRECTIONS,
+    GUIDE_COLOUR,
+    PaperFigure,
+    PaperFigures,
+    direction_handles,
+    draw_obstacles,
+    experiment_style,
+    label_panel,
+    plot_bumper_loops,
+    plot_inertia_loop,
+    plot_phase_portrait,
+)
+from twin.validation.paper.study import SECONDARY_HZ, PaperStudy
+
+SWEEP_RANGES = (  # name, start and stop in Hz, colour, position of the label in Hz
+    ("SS1", 0.5, 0.8, "#cfeccb", 0.65), ("SS2", 0.8, 1.6, "#fde0b5", 1.3),
+    ("SS3", 0.5, 5.0, "#d3e9f7", 3.3),
+)  # fmt: skip
+MEASURED_CYCLES = 3  # measured cycles of a step, in portraits and loops
+SHOWN_CYCLES = 2  # cycles shown in the histories
+
+
+def draw_secondary_resonance_figure(
+    study: PaperStudy, campaign: MeasuredCampaign | None
+) -> PaperFigures:
+    """Draw Fig. 9, for the model only."""
+    if campaign is not None:
+        return
+    case = study.cases["G4"]
+    figure = Figure(figsize=(15.5, 11))
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.02, 1))[0]
+    grid = left.add_gridspec(4, 3)
+    _draw_prc(left.add_subplot(grid[0, :]), case)
+    motions = [
+        {
+            direction: case.simulate_motion(hz, direction, MEASURED_CYCLES)
+            for direction in DIRECTIONS
+        }
+        for hz in SECONDARY_HZ
+    ]
+    for column, pair in enumerate(motions):
+        rows = [left.add_subplot(grid[1 + row, column]) for row in range(3)]
+        _draw_loops(rows, pair, case, column)
+    axes = right.subplots(3, 3, sharey="row", sharex="col")
+    for column, pair in enumerate(motions):
+        _draw_histories(axes[:, column], pair, case, column)
+    figure.legend(handles=direction_handles(experiment_style), loc="outside upper center", ncols=2)
+    yield PaperFigure(
+        "fig09_secondary", "9", "Secondary resonances of G4",
+        "a PRC of η_a with the ranges of the three sweeps and the three observed resonances; "
+        "b–d phase portraits, e–g inertia force against u, h–j contact force against bumper "
+        f"position, over the {MEASURED_CYCLES} measured cycles; k–m u, n–p total acceleration, "
+        "q–s contact forces over time. Red bands: the contacts within one forcing cycle of the "
+        f"forward sweep. Dashed: the gap. {_describe_chaos(study)}",
+        figure,
+    )  # fmt: skip
+
+
+def _describe_chaos(study: PaperStudy) -> str:
+    chaotic = [f"{hz:g}" for hz in SECONDARY_HZ if study.is_chaotic(hz)]
+    if not chaotic:
+        return "The model is chaotic at none of the three."
+    where = "all three" if len(chaotic) == len(SECONDARY_HZ) else f"{' and '.join(chaotic)} Hz"
+    return f"The model is chaotic at {where}: cycles and directions differ there."
+
+
+def _draw_prc(ax: Axes, case: PaperCase) -> None:
+    for name, low, high, colour, label_hz in SWEEP_RANGES[::-1]:
+        ax.axvspan(low, high, color=colour, lw=0, zorder=0.3)
+        ax.annotate(
+            name, (label_hz, 0.06), xycoords=("data", "axes fraction"), ha="center", size=9,
+            color="#333333",
+        )  # fmt: skip
+    for direction, size in (("forward", 4.2), ("backward", 2.4)):
+        frequencies, values = extract_prc(case.points, "twin", direction, "eta_a")
+        ax.plot(
+            frequencies,
+            values,
+            "o-",
+            color=DIRECTION_COLOURS[direction],
+            ms=size,
+            lw=size / 3,
+            mew=0,
+        )
+    for number, hz in enumerate(SECONDARY_HZ, 1):
+        ax.axvline(hz, color="#111111", ls=(0, (4, 2)), lw=1)
+        ax.annotate(
+            f"$f_{number}$", (hz, 0.97), (3, 0), xycoords=("data", "axes fraction"),
+            textcoords="offset points", va="top", size=9,
+        )  # fmt: skip
+    ax.set_xlim(0.4, 5.05)
+    ax.set_ylim(bottom=0)
+    ax.set_xlabel("$f$ in Hz")
+    ax.set_ylabel(r"$\eta_a$")
+    label_panel(ax, "a")
+
+
+def _draw_loops(
+    rows: list[Axes], pair: dict[str, SystemMotion], case: PaperCase, column: int
+) -> None:
+    p = case.parameters
+    for direction in DIRECTIONS:
+        style = experiment_style(direction, 1.0)
+        plot_phase_portrait(rows[0], pair[direction], **style)
+        plot_inertia_loop(rows[1], pair[direction], p.mass, False, **style)
+        plot_bumper_loops(rows[2], pair[direction], False, **style)
+    names = ("bcd", "efg", "hij")
+    labels = (
+        ("$u$ in mm", "$u'$ in mm/s"), ("$u$ in mm", "$F_I$ in kN"), ("$v_j$ in mm", "$F_j$ in kN"),
+    )  # fmt: skip
+    for ax, letters, (x_label, y_label) in zip(rows, names, labels, strict=True):
+        title = f"$f_{column + 1}$ = {SECONDARY_HZ[column]:g} Hz" if letters == "bcd" else ""
+        label_panel(ax, letters[column], title)
+        draw_obstacles(p, ax.axvline)
+        ax.axhline(0, color=GUIDE_COLOUR, lw=0.5, zorder=0.6)
+        ax.set_xlabel(x_label)
+        ax.set_ylabel(y_label if column == 0 else "")
+
+
+def _draw_histories(axes: Any, pair: dict[str, SystemMotion], case: PaperCase, column: int) -> None:
+    hz = SECONDARY_HZ[column]
+    for direction in DIRECTIONS:
+        style, motion = experiment_style(direction, 1.0), pair[direction]
+        axes[0].plot(motion.time, motion.u * 1e3, **style)
+        axes[1].plot(motion.time, motion.a, **style)
+        for force in (motion.force_r, motion.force_l):
+            axes[2].plot(motion.time, force / 1e3, **style)
+    forward = pair["forward"]
+    start_s = _find_longest_flight_end(forward, hz)
+    inside = (forward.time >= start_s) & (forward.time < start_s + 1 / hz)
+    for ax, letters in zip(axes, ("klm", "nop", "qrs"), strict=True):
+        for in_contact in (forward.force_r > 0, forward.force_l < 0):
+            ax.fill_between(
+                forward.time, 0, 1, where=in_contact & inside, transform=ax.get_xaxis_transform(),
+                color=DIRECTION_COLOURS["forward"], alpha=0.20, lw=0,
+            )  # fmt: skip
+        label_panel(
+            ax, letters[column], f"$f_{column + 1}$ = {hz:g} Hz" if letters == "klm" else ""
+        )
+        ax.set_xlim(0, SHOWN_CYCLES / hz)
+    draw_obstacles(case.parameters, axes[0].axhline)
+    axes[2].set_xlabel("$t$ in s")
+    if column == 0:
+        for ax, label in zip(axes, ("$u$ in mm", "$a$ in m/s²", "$F_j$ in kN"), strict=True):
+            ax.set_ylabel(label)
+
+
+def _find_longest_flight_end(motion: SystemMotion, hz: float) -> float:
+    """Return the time in s just before the end of the longest flight in the first cycle."""
+    in_contact = (motion.force_r > 0) | (motion.force_l < 0)
+    starts = motion.time[1:][in_contact[1:] & ~in_contact[:-1]]
+    ends = motion.time[1:][~in_contact[1:] & in_contact[:-1]]
+    flights = [(b - ends[ends < b].max(), b) for b in starts if (ends < b).any() and b < 1 / hz]
+    return float(max(flights)[1] - 0.01 / hz) if flights else 0.3 / hz

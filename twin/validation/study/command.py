@@ -1,0 +1,169 @@
+"""`shaketwin study discovery`: evaluate blind cases on several processes; resumable."""
+
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, TextIO
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from table_io.clock import RealClock
+from table_io.errors import InputError
+from twin.reports.finalize import EXIT_INTERRUPTED
+from twin.run.folders import make_output_folder
+from twin.run.terminal import catch_interrupts, console, print_line
+from twin.validation.study.baselines import describe_missing
+from twin.validation.study.comparison_tables import CONTROL_TITLES
+from twin.validation.study.controls import CONTROL_CELLS, run_controls
+from twin.validation.study.evaluation import evaluate_case
+from twin.validation.study.report import (
+    CONTROLS_FILE,
+    RESULTS_FILE,
+    read_rows,
+    verdict_label,
+    write_study_pages,
+)
+from twin.validation.study.strata import draw_case, list_case_numbers
+from twin.validation.study.worker_pool import Work, map_in_processes
+
+Json = dict[str, Any]
+DEFAULT_DIR = Path("runs") / "study-discovery"
+STOPPING_MESSAGE = "stopping after the cases in progress"
+
+
+def run_discovery_study(
+    out: Path | None,
+    seeds: int,
+    patterns: Sequence[str],
+    workers: int | None,
+    resume: bool,
+    controls: bool = False,
+) -> int:
+    """Evaluate the requested cases that have no result, then the controls; return the exit code."""
+    if workers is not None and workers < 1:
+        raise InputError(
+            "invalid number of processes",
+            key="--workers",
+            value=workers,
+            allowed="1 or more",
+            remedy="omit --workers to use all cores",
+        )
+    numbers = _parse_cases(seeds, patterns)
+    folder = _open_folder(out, resume)
+    if describe_missing():
+        print_line(describe_missing())
+    processes = workers or len(os.sched_getaffinity(0))
+    exit_code = run_cases(folder, numbers, processes, partial(evaluate_case, folder))
+    if controls and exit_code == 0:
+        print_line(f"negative controls on {CONTROL_CELLS}")
+        return run_cases(
+            folder,
+            list_case_numbers(seeds, [CONTROL_CELLS]),
+            processes,
+            partial(run_controls, folder),
+            CONTROLS_FILE,
+        )
+    return exit_code
+
+
+def run_cases(
+    folder: Path, numbers: Sequence[int], workers: int, work: Work, results: str = RESULTS_FILE
+) -> int:
+    """Evaluate the cases without a row in `results`, then write the pages; return the exit code."""
+    rows = {row["number"]: row for row in read_rows(folder / results)}
+    pending = [number for number in numbers if number not in rows or rows[number].get("failed")]
+    print_line(
+        f"{len(pending)} of {len(numbers)} cases to evaluate on {workers} processes -> {folder}"
+    )
+    clock = RealClock()
+    start_s = clock.now()
+    with (
+        catch_interrupts(STOPPING_MESSAGE) as stop,
+        (folder / results).open("a", encoding="utf-8") as file,
+    ):
+        _terminate_last_line(folder / results, file)
+        done = sum(1 for _ in _evaluate_cases(pending, workers, work, stop, file))
+        reason = stop()
+    page = write_study_pages(folder)
+    print_line(
+        f"{done} cases in {clock.now() - start_s:.0f} s -> {page}"
+        + (f"; {reason}" if reason else "")
+    )
+    return 0 if done == len(pending) else EXIT_INTERRUPTED
+
+
+def _evaluate_cases(
+    pending: Sequence[int], workers: int, work: Work, stop: Callable[[], object], file: TextIO
+) -> Iterator[Json]:
+    """Evaluate the pending cases; yield each row after it is written to the file."""
+    right_count = 0
+    with _make_progress() as bar:
+        task = bar.add_task("cases", total=len(pending))
+        for index, row in enumerate(map_in_processes(pending, workers, work, stop), 1):
+            row.setdefault("cell", draw_case(row["number"]).cell.name)
+            file.write(json.dumps(row) + "\n")
+            file.flush()
+            right_count += bool(row.get("right"))
+            print_line(f"{index:>5}/{len(pending):<5} {row['number']:>6}  {_format_row(row)}")
+            bar.update(task, advance=1, description=f"cases, {right_count} right")
+            yield row
+
+
+def _format_row(row: Json) -> str:
+    """Return one line about a case."""
+    if row.get("failed"):
+        return f"{row['cell']}: FAILED: {row['failed']}"
+    if not row["sized"]:
+        return f"{row['cell']}: excluded: {row['ended']}"
+    mark = "right" if row["right"] else "MISSED"
+    if "said" not in row:
+        results = (
+            f"{control}: {row[control]['said']} {' + '.join(row[control]['named'])}"
+            for control in CONTROL_TITLES
+        )
+        return f"{row['cell']}: {'; '.join(results)}: {mark}"
+    confidence = "" if row["confidence"] is None else f" ({row['confidence']:.2f})"
+    seconds = "" if row.get("seconds") is None else f", {row['seconds']:.1f} s"
+    return f"{row['cell']}: {verdict_label(row)}{confidence}: {mark}{seconds}"
+
+
+def _parse_cases(seeds: int, patterns: Sequence[str]) -> list[int]:
+    """Return case numbers from cell patterns and numbers, separated by commas."""
+    words = [word for pattern in patterns for word in pattern.split(",") if word]
+    own = [int(word) for word in words if word.isdecimal()]
+    for number in own:
+        draw_case(number)
+    cells = [word for word in words if not word.isdecimal()]
+    return own + (list_case_numbers(seeds, cells) if cells or not own else [])
+
+
+def _open_folder(out: Path | None, resume: bool) -> Path:
+    """Return the folder of the study: a new one, or with `resume` an existing one."""
+    folder = out or DEFAULT_DIR
+    if resume:
+        if not (folder / RESULTS_FILE).is_file():
+            raise InputError(
+                "no study to resume",
+                where=f"--out {folder}",
+                key="--resume",
+                remedy="omit --resume to start one",
+            )
+        return folder
+    return make_output_folder(folder, folder.name)
+
+
+def _terminate_last_line(path: Path, file: TextIO) -> None:
+    """Terminate an incomplete last line, so that the next row starts on a new line."""
+    text = path.read_bytes()
+    if text and not text.endswith(b"\n"):
+        file.write("\n")
+        file.flush()
+
+
+def _make_progress() -> Progress:
+    return Progress(
+        TextColumn("[bold]{task.description}"), BarColumn(bar_width=40), MofNCompleteColumn(),
+        TimeRemainingColumn(), console=console, disable=not console.is_terminal, transient=True,
+    )  # fmt: skip

@@ -1,0 +1,219 @@
+"""Generation of a case: public files in cases/<label>, ground truth in sealed/<label>.
+
+    cases/<label>   log.mcap  profile.toml  model.toml
+    sealed/<label>  truth.toml  about.json
+
+The recording comes from an ordinary session on the simulated table at maximum speed. It contains
+the nominal values and the SHA-256 of the sealed file, which is salted.
+"""
+
+import hashlib
+import json
+import math
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from table_io.acquisition.session import run_session
+from table_io.backends import open_backend
+from table_io.clock import ManualClock
+from table_io.records import RunStop
+from twin.recording.mcap_log import write_items
+from twin.run.run_config import from_texts
+from twin.validation.study.amplitude_search import (
+    BaselineResidual,
+    apply_sensor_effect,
+    evaluate_residual,
+    find_share,
+    scale_parameters,
+)
+from twin.validation.study.rig_setup import (
+    MODEL_TOML,
+    NOMINAL_RIG,
+    PROFILE,
+    PROFILE_TOML,
+    StudySignals,
+    compute_noise_rms,
+    format_toml,
+    make_rig_toml,
+    simulate_signals,
+)
+from twin.validation.study.strata import Case, PlantedEffect
+
+TRUTH_DIGITS = 6  # significant digits of a number in the truth
+
+
+@dataclass(frozen=True, slots=True)
+class CasePaths:
+    """Folders and files of a case."""
+
+    root: Path
+    label: str
+
+    @property
+    def case_dir(self) -> Path:
+        """Folder that discovery may read."""
+        return self.root / "cases" / self.label
+
+    @property
+    def sealed_dir(self) -> Path:
+        """Folder with the ground truth."""
+        return self.root / "sealed" / self.label
+
+    @property
+    def log(self) -> Path:
+        """Path of the recording."""
+        return self.case_dir / "log.mcap"
+
+    @property
+    def verdict(self) -> Path:
+        """Path of the verdict of discovery."""
+        return self.case_dir / "verdict.json"
+
+    @property
+    def about(self) -> Path:
+        """Path of the description of the case, for scoring."""
+        return self.sealed_dir / "about.json"
+
+
+def generate_case(case: Case, root: Path) -> CasePaths:
+    """Generate the files of a case, unless they exist; return their paths.
+
+    `about.json` is written last: a case without it is incomplete and is generated again.
+    """
+    paths = CasePaths(root, case.label)
+    if paths.about.is_file():
+        return paths
+    for folder in (paths.case_dir, paths.sealed_dir):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+    shares, residual = _find_shares(case)
+    truth_path = paths.sealed_dir / "truth.toml"
+    text = f"# {case.salt}\n" + format_toml(make_truth(case, case.planted, shares))
+    truth_path.write_text(text, encoding="utf-8")
+    outcome = f"not played: the effect reaches size {residual.size:.3g}"
+    if case.cell.accepts(residual.size):
+        stop = _record_case(case, paths, truth_path.resolve(), _sha256(text))
+        outcome = stop.verdict if stop.verdict == "complete" else f"{stop.verdict}: {stop.reason}"
+    (paths.case_dir / "profile.toml").write_text(PROFILE_TOML, encoding="utf-8")
+    (paths.case_dir / "model.toml").write_text(MODEL_TOML, encoding="utf-8")
+    about = {
+        "number": case.number,
+        "cell": case.cell.name,
+        "kind": case.cell.kind,
+        "noise": case.cell.noise,
+        "size": case.cell.size,
+        "reached": residual.size,
+        "ended": outcome,
+        "sized": outcome == "complete",
+        "region": residual.region if case.planted else None,
+        "effects": [
+            _describe_effect(planted, share)
+            for planted, share in zip(case.planted, shares, strict=True)
+        ],
+    }
+    paths.about.write_text(json.dumps(about, indent=1), encoding="utf-8")
+    return paths
+
+
+def _describe_effect(planted: PlantedEffect, share: float) -> dict[str, Any]:
+    """Return the description of a planted effect for scoring."""
+    return {
+        "name": planted.effect.name,
+        "form": planted.effect.definition.form,
+        "parameters": _round_values(scale_parameters(planted, share)),
+        "vanishing": {
+            parameter.name: parameter.vanishing for parameter in planted.effect.amplitudes
+        },
+    }
+
+
+def make_truth(
+    case: Case, planted_effects: Sequence[PlantedEffect], shares: Sequence[float]
+) -> dict[str, Any]:
+    """Return the content of the sealed file: scattered base parameters and planted effects."""
+    table, scatter = NOMINAL_RIG["simulated"], case.base
+    names = ("damper_stiffness", "damper_damping", "bumper_stiffness", "bumper_damping")
+    units = ("n_m", "n_s_m", "n_m", "n_s_m")
+    keys = [f"{name}_{unit}" for name, unit in zip(names, units, strict=True)]
+    base = {key: scatter[name] * table[key] for key, name in zip(keys, names, strict=True)}
+    right, left = PROFILE.specimen.gaps_m
+    base |= {"gap_right_m": scatter["gap"] * right, "gap_left_m": scatter["gap"] * left}
+    effects = [
+        {"id": planted.effect.definition.id, "form": planted.effect.definition.form}
+        | ({"channel": planted.effect.channel} if planted.effect.channel else {})
+        | {"parameters": _round_values(scale_parameters(planted, share))}
+        for planted, share in zip(planted_effects, shares, strict=True)
+    ]
+    return {"base": _round_values(base)} | ({"effects": effects} if effects else {})
+
+
+def _find_shares(case: Case) -> tuple[list[float], BaselineResidual]:
+    """Return the share at which each effect alone has the cell's size, and the residual of all."""
+    noise = compute_noise_rms(case.cell.noise)
+
+    @cache
+    def base_signals() -> StudySignals:
+        """Simulate once: sensor effects do not change the true signals."""
+        return _simulate_truth(case, [], [])
+
+    def compute_residual(
+        planted_effects: Sequence[PlantedEffect], shares: Sequence[float]
+    ) -> BaselineResidual:
+        sensors = [planted.effect.definition.is_sensor_effect for planted in planted_effects]
+        readings = signals = (
+            base_signals() if all(sensors) else _simulate_truth(case, planted_effects, shares)
+        )
+        for planted, share in zip(planted_effects, shares, strict=True):
+            readings = apply_sensor_effect(planted, share, readings)
+        return evaluate_residual(readings, signals, noise)
+
+    def find_share_alone(planted: PlantedEffect) -> tuple[float, BaselineResidual]:
+        return find_share(
+            planted, case.cell.size, lambda share: compute_residual([planted], [share])
+        )
+
+    searches = [find_share_alone(planted) for planted in case.planted]
+    shares = [share for share, _ in searches]
+    return shares, searches[0][1] if len(searches) == 1 else compute_residual(case.planted, shares)
+
+
+def _simulate_truth(
+    case: Case, planted: Sequence[PlantedEffect], shares: Sequence[float]
+) -> StudySignals:
+    text = format_toml(make_truth(case, planted, shares))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "truth.toml"
+        path.write_text(text, encoding="utf-8")
+        return simulate_signals(make_rig_toml(0.0, truth=str(path), sha256=_sha256(text)))
+
+
+def _record_case(case: Case, paths: CasePaths, truth_path: Path, sha256: str) -> RunStop:
+    """Record a session of the case; return its final record."""
+    rig = make_rig_toml(case.cell.noise, case.noise_seed, str(truth_path), sha256)
+    bundle = from_texts("case", PROFILE_TOML, rig, MODEL_TOML, f"case {case.label}")
+    clock = ManualClock()
+    backend = open_backend(bundle.rig, bundle.profile, clock)
+    make_start = bundle.make_start_factory(case.label, "table")
+    start, *rest = run_session(bundle.session_setup, backend, clock, make_start, lambda: None)
+    assert not isinstance(start, RunStop)
+    write_items(paths.log, [start, *rest], start)  # type: ignore[arg-type]
+    stop = rest[-1]
+    assert isinstance(stop, RunStop)
+    return stop
+
+
+def _round_values(values: dict[str, float]) -> dict[str, float]:
+    return {
+        name: float(f"{value:.{TRUTH_DIGITS}g}")
+        for name, value in values.items()
+        if math.isfinite(value)
+    }
+
+
+def _sha256(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()

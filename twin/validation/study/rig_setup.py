@@ -1,0 +1,146 @@
+"""Test profile and rig config of the study, as texts that do not reveal the truth.
+
+G4 at 0.05 g, ten frequencies forward and backward, about 60 s: chaos and several impacts per cycle
+below 1.6 Hz, the impacting branch up to 4.4 Hz forward, flight from 4.2 Hz backward. Loop check and
+level control are off: the twin is driven by the measured table motion anyway.
+"""
+
+import json
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from table_io.block import Bool2D, Float1D, Float2D, Int1D, Label
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from table_io.clock import ManualClock
+from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.excitation.trajectory import plan_sweep
+from table_io.sim.simulated_table import SimulatedBackend
+
+PROFILE_TOML = """\
+title = "G4, ten frequencies up and back"
+rig = "simulated"
+model = "snm"
+
+[specimen]
+mass_kg = 550.0
+gap_mm = 4.0
+
+[sweep]
+start_hz = 0.8
+stop_hz = 4.4
+step_hz = 0.4
+cycles = 4
+acceleration_g = 0.05
+
+[acquisition]
+rate_hz = 1000.0
+block_samples = 50
+rest_s = 1.0
+
+[loop_check]
+enabled = false
+
+[control]
+enabled = false
+
+[protection]
+sensor = "warn"
+alarm = 1.0
+abort_db = 12.0
+"""
+PROFILE = parse_toml(PROFILE_TOML, Profile, "the study's test")
+MODEL_TOML = (PROFILES_DIR / "models" / "snm.toml").read_text(encoding="utf-8")
+NOMINAL_RIG: dict[str, Any] = tomllib.loads(
+    (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")
+)
+SETTLING_S = 8.0  # until the mass is at rest, to avoid spectral leakage
+SIGNAL_CHANNELS = (
+    "table_disp_m", "table_acc_m_s2", "mass_disp_m", "mass_acc_m_s2", *RIGHT_CELLS, *LEFT_CELLS,
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class StudySignals:
+    """Signals in SI, (sample,) each; F_R >= 0, F_L <= 0; `step` is -1 outside of any step."""
+
+    channels: Mapping[str, Float1D]
+    right: Float1D
+    left: Float1D
+    step: Int1D
+    moving: Bool2D
+
+
+def make_rig_toml(noise: float, seed: int = 0, truth: str = "", sha256: str = "") -> str:
+    """Return the rig config; the noise of each sensor is a share of its rms in the nominal test.
+
+    The nominal rms is used so that the noise does not depend on the truth.
+    """
+    config = NOMINAL_RIG | {"simulated": NOMINAL_RIG["simulated"] | {"seed": seed}}
+    if truth:
+        config["simulated"] |= {"truth": truth, "truth_sha256": sha256}
+    rms = compute_noise_rms(noise) if noise else {}
+    config["sensors"] = [
+        sensor | {"noise_rms": rms.get(sensor["channel"], 0.0) / _si_per_unit(sensor["channel"])}
+        for sensor in NOMINAL_RIG["sensors"]
+    ]
+    return format_toml(config)
+
+
+@cache
+def compute_noise_rms(noise: float) -> dict[str, float]:
+    """Return the rms of each channel's noise in SI, rounded to two digits."""
+    signals = simulate_signals(make_rig_toml(0.0))
+    return {
+        name: float(f"{noise * values[signals.moving].std():.1e}")
+        for name, values in signals.channels.items()
+    }
+
+
+def simulate_signals(rig_text: str) -> StudySignals:
+    """Simulate the study's test on the machine of a rig config, without session and sensors."""
+    rig, rate = parse_toml(rig_text, RigConfig, "the study's machine"), PROFILE.acquisition.rate_hz
+    drive = plan_sweep(PROFILE)
+    count = drive.planned_end + round(SETTLING_S * rate)
+    backend = SimulatedBackend(rig, PROFILE.specimen, rate, ManualClock())
+    recorded: list[Float2D] = []
+    backend.observer = lambda first, command, signals: recorded.append(signals.copy())
+    backend.open()
+    backend.queue(0, drive.command(0, count) * rig.output.volts_per_m)
+    backend.start()
+    backend.take(count)
+    table_disp, table_acc, mass_disp, mass_acc, force_right, force_left = recorded[0]
+    step, label, _ = drive.labels(0, count)
+    cells = dict.fromkeys(RIGHT_CELLS, 0.5 * force_right) | dict.fromkeys(
+        LEFT_CELLS, -0.5 * force_left
+    )
+    channels = (
+        dict(zip(SIGNAL_CHANNELS, (table_disp, table_acc, mass_disp, mass_acc), strict=False))
+        | cells
+    )
+    return StudySignals(channels, force_right, force_left, step, np.asarray(label) != Label.REST)
+
+
+def _si_per_unit(channel: str) -> float:
+    rig = parse_toml(format_toml(NOMINAL_RIG), RigConfig, "simulated.toml")
+    return next(sensor.si_per_unit for sensor in rig.sensors if sensor.channel == channel)
+
+
+def format_toml(table: Mapping[str, Any], path: str = "") -> str:
+    """Return the TOML text of a table of numbers, strings, lists and nested tables."""
+    plain, nested = [], []
+    for key, value in table.items():
+        where = f"{path}.{key}" if path else key
+        if isinstance(value, Mapping):
+            nested.append(f"\n[{where}]\n{format_toml(value, where)}")
+        elif isinstance(value, list | tuple) and value and isinstance(value[0], Mapping):
+            nested += [f"\n[[{where}]]\n{format_toml(entry, where)}" for entry in value]
+        else:
+            plain.append(f"{key} = {json.dumps(value, ensure_ascii=False)}\n")
+    return "".join(plain + nested)
