@@ -72,7 +72,7 @@ def test_a_plug_in_adds_a_force(monkeypatch):
     assert np.abs(p.mass * out[2] + force).max() < 1e-9 * np.abs(force).max()
     plain = drive(Model(snm()), noisy(0.5))[1]
     assert np.abs(out[0] - plain[0]).max() > 1e-5
-    assert model.prepare(RATE).plugin_force is model.prepare(2 * RATE).plugin_force  # compiled once
+    assert model.prepare(RATE).laws is model.prepare(2 * RATE).laws  # compiled once
     with pytest.raises(InputError, match="did you mean 'quintic_spring'"):
         find_effect("quintic_sprin")
 
@@ -96,7 +96,7 @@ def test_plug_ins_that_repeat_a_built_in_law_agree_with_it_and_keep_apart(monkey
         (ImportError("no module"), "cannot load: no module"),
         ("text", "expected an Effect, got str"),
         (Effect("x", "x", (), "force", "x", ()), "acts as a force but has no `force`"),
-        (Effect("x", "x", (), "linear", "x", ()), "acts = 'linear': not available to plug-ins"),
+        (Effect("x", "x", (), "linear", "x", ()), "acts = 'linear' is not available to plug-ins"),
     ],
 )
 def test_a_bad_plug_in_is_named(monkeypatch, effect, says):

@@ -24,12 +24,6 @@ from twin.model.effects.effect import Effect
 
 LADDER_LENGTH = 9
 SLIP_SPEEDS_M_S = (1e-5, 3e-4, 1e-3, 3e-3)  # trial values; friction near zero velocity varies
-BUMPER_EFFECTS = frozenset({
-    "bumper_hardening", "hunt_crossley", "bumper_maxwell", "bumper_asymmetry", "gap_offset",
-    "gap_drift",
-})  # fmt: skip
-# channels without which an effect is not observable
-REQUIRED_CHANNELS = {"table_tilt": ("table_disp_m",)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,9 +113,9 @@ def list_candidates(
 
 
 def _exclusion_reason(effect: Effect, has_contact: bool, channels: set[str]) -> str:
-    if effect.id in BUMPER_EFFECTS and not has_contact:
+    if effect.is_in_bumpers and not has_contact:
         return "there was no contact with a bumper"
-    missing = [name for name in REQUIRED_CHANNELS.get(effect.id, ()) if name not in channels]
+    missing = [name for name in effect.required_channels if name not in channels]
     if missing:
         return f"needs {', '.join(missing)}"
     if effect.id == "mass_error":

@@ -26,7 +26,7 @@ from twin.identification.generic_terms import GENERIC_PREFIX, TermScale, compute
 from twin.identification.motion import ConsistencyResidual, MeasuredMotion
 from twin.identification.parameters import SLIP_SPEED, ParameterSet
 from twin.identification.signals import LogSignals, derives_acc
-from twin.model.inverse_dynamics import forces_along, tilt_force
+from twin.model.inverse_dynamics import forces_along
 from twin.model.model import Model, SensorModel
 
 CONTACT_NOISE_FACTOR = 8.0  # times the rms noise of a load cell: above it there is contact
@@ -255,8 +255,9 @@ class LogResiduals:
             )
         if not m.has_load_cells and m.damper is None:
             d = d + right + left
-        if model.effect_parameter("table_tilt", "tilt"):
-            d = d + tilt_force(model, m.table_disp)
+        added = model.added_acceleration(m.table_disp)
+        if added is not None:
+            d = d + model.parameters.mass * added
         expected = np.array([d, right, -left])
         if any(name.startswith(GENERIC_PREFIX) for name in parameters.values):
             p = model.parameters

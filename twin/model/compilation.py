@@ -2,11 +2,13 @@
 
 import zlib
 from collections.abc import Callable, Mapping
+from functools import wraps
+from inspect import signature
 from types import CodeType
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
-from numba import njit
-from numba.extending import register_jitable
+from numba import njit, types
+from numba.extending import overload, register_jitable
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -32,6 +34,31 @@ def jit_helper(*, inlined: bool = False) -> Callable[[F], F]:
     return decorator
 
 
+def jit_helper_unless_none(argument: str, otherwise: Callable[..., Any]) -> Callable[[F], F]:
+    """As an inlined `jit_helper`, but the function is `otherwise` where `argument` is None.
+
+    The type of the argument decides at compilation, so the case that is absent costs nothing.
+    """
+
+    def decorate(function: F) -> F:
+        position = list(signature(function).parameters).index(argument)
+
+        @wraps(function)
+        def helper(*args: Any) -> Any:
+            return (otherwise if args[position] is None else function)(*args)
+
+        @overload(  # type: ignore[untyped-decorator]
+            helper, strict=False, jit_options={"nogil": True, "forceinline": True}
+        )
+        def select(*args: Any) -> Callable[..., Any]:
+            return otherwise if args[position] in (None, types.none) else function
+
+        helper.implementations = function, otherwise  # type: ignore[attr-defined]
+        return cast("F", helper)
+
+    return decorate
+
+
 def source_revision(namespace: Mapping[str, Any]) -> int:
     """Return a checksum of the functions and numbers of a module, the same in every process.
 
@@ -42,9 +69,10 @@ def source_revision(namespace: Mapping[str, Any]) -> int:
     """
     parts: list[tuple[str, ...]] = []
     for name, item in sorted(namespace.items()):
-        code = getattr(getattr(item, "py_func", item), "__code__", None)
-        if code is not None:
-            parts.append((name, *_code_fingerprint(code)))
+        functions = getattr(item, "implementations", (getattr(item, "py_func", item),))
+        codes = [code for f in functions if (code := getattr(f, "__code__", None)) is not None]
+        if codes:
+            parts.extend((name, *_code_fingerprint(code)) for code in codes)
         elif isinstance(item, int | float):
             parts.append((name, repr(item)))
     return zlib.crc32(repr(parts).encode())

@@ -3,217 +3,202 @@
 The state is float64 (STATE_SIZE,):
     u, v, u_r, u_l, contact_r, contact_l, A      as in `closed_form`
     f, b_r, b_l                                  branch forces in N, of u's sign
-    z, direction                                 hysteresis; sign of u', 0 where the mass sticks
+    z, s                                         hysteresis; states of added laws, `LAW_STATES`
+    direction                                    sign of u', 0 where the mass sticks
     clock                                        samples since sample 0 of the run
 There is no other memory: results are bit-identical for any division of the samples into blocks.
 """
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 from numba import float64, types
 
 from table_io.block import Float1D, Float2D
-from twin.model.compilation import jit_helper, jit_kernel, source_revision
+from twin.model.compilation import (
+    jit_helper,
+    jit_helper_unless_none,
+    jit_kernel,
+    source_revision,
+)
 from twin.model.event_location import REVERSAL_GUARD, StateAndRates, integrate_to_event
 from twin.model.event_location import REVISION as EVENTS_REVISION
 from twin.model.force_laws import (
-    C_L,
-    C_R,
-    CH,
-    DRIFT,
-    FC,
-    FY,
-    G_L,
-    G_R,
-    GAP_L,
-    GAP_R,
-    KB,
-    KERNEL_PARAMS_SIZE,
-    PERIOD,
-    PLUGIN_FORCE_TYPE,
-    STEP,
-    SUBSTEPS,
-    U_0,
-    U_L,
-    U_R,
-    UY,
-    Z_0,
-    KernelParams,
-    PluginForce,
-    StateVector,
-    StepContext,
-    U,
-    V,
+    ADDED_LAWS_TYPE,
+    COEFFICIENTS_TYPE,
+    LAW_STATES,
+    AddedLaws,
+    Coefficients,
+    LawStates,
+    Motion,
+    Start,
+    bumper_coefficients,
+    bumper_dashpot,
     bumper_deformation,
     bumper_force,
     hysteretic_variable,
     static_friction,
-    table_acceleration,
-)  # fmt: skip
+)
 from twin.model.solver import OUTPUT_COUNT
 
-(
-    CONTACT_R,
-    CONTACT_L,
-    STATE_BASE,
-    STATE_F,
-    STATE_B_R,
-    STATE_B_L,
-    STATE_Z,
-    DIRECTION,
-    CLOCK,
-    STATE_SIZE,
-) = range(4, 14)
+U, V, U_R, U_L, CONTACT_R, CONTACT_L, STATE_BASE, STATE_F, STATE_B_R, STATE_B_L, STATE_Z = range(11)
+STATE_S = STATE_Z + 1
+DIRECTION, CLOCK, STATE_SIZE = (STATE_S + LAW_STATES + n for n in range(3))
 DENORMAL_LIMIT = 1e-30  # m, N, 1: smaller values are set to zero
 MAX_EVENTS_PER_STEP = 60  # only rounding can come near it
 
 
 @jit_helper(inlined=True)
-def next_step_context(
-    context: StepContext, x: StateVector, t: float, direction: float, params: KernelParams
-) -> StepContext:
-    """Return the context of a step that begins at state x, t s into this one."""
-    z = context[Z_0]
-    if params[FY] > 0.0 and direction != 0.0:
-        z = hysteretic_variable(z, x[U] - context[U_0], direction, params[UY])
-    _, _, gap_r, gap_l, base, slope, peak, w, phase = context
-    opening = params[DRIFT] * t
-    return (
-        x[U],
-        z,
-        gap_r + opening,
-        gap_l + opening,
-        base + slope * t,
-        slope,
-        peak,
-        w,
-        phase + w * t,
-    )
+def next_start(start: Start, x: Motion, t: float, p: Coefficients) -> Start:
+    """Return the start of a step that begins at state x, t s into this one."""
+    z = start.z
+    if p.fy > 0.0 and start.direction != 0.0:
+        z = hysteretic_variable(z, x.u - start.u, start.direction, p.uy)
+    opening = p.drift * t
+    return Start(
+        x.u, z, start.gap_r + opening, start.gap_l + opening, start.base + start.slope * t,
+        start.slope, start.mode, start.direction,
+    )  # fmt: skip
 
 
 @jit_helper()
 def apply_event(
-    guard_index: int,
-    x: StateVector,
-    context: StepContext,
-    params: KernelParams,
-    mode: int,
-    direction: float,
-    plugin_force: PluginForce,
-) -> tuple[StateVector, int, float]:
-    """Return (state, mode, direction) after an event at x, where `context` begins."""
-    u, v, u_r, u_l, f, b_r, b_l = x
-    if guard_index == REVERSAL_GUARD:
+    guard: int, x: Motion, start: Start, p: Coefficients, laws: AddedLaws | None
+) -> tuple[Motion, Start]:
+    """Return (state, start of the next step) after an event at x, where `start` begins."""
+    u, v, u_r, u_l, f, b_r, b_l, s = x
+    _, z, gap_r, gap_l, base, slope, mode, direction = start
+    if guard == REVERSAL_GUARD:
         v = 0.0
-        x = (u, v, u_r, u_l, f, b_r, b_l)
-        friction = static_friction(x, context, params, mode, 0.0, plugin_force)
-        if direction != 0.0 and abs(friction) <= params[FC]:
-            direction = 0.0 if params[FC] > 0.0 else -direction
+        x = Motion(u, v, u_r, u_l, f, b_r, b_l, s)
+        friction = static_friction(x, start, p, 0.0, laws)
+        if direction != 0.0 and abs(friction) <= p.fc:
+            direction = 0.0 if p.fc > 0.0 else -direction
         else:
             direction = math.copysign(1.0, friction)
-        return x, mode, direction
-    mode ^= 1 << guard_index
-    # A face without memory returns immediately.
-    c = params[C_R] if guard_index == 0 else params[C_L]
-    memoryless = c + params[CH] == 0.0 and params[KB] == 0.0
-    if guard_index == 0 and mode & 1:
-        u_r = u - context[GAP_R]
-    elif guard_index == 0 and memoryless:
-        u_r = 0.0
-    elif guard_index == 1 and mode & 2:
-        u_l = u + context[GAP_L]
-    elif guard_index == 1 and memoryless:
-        u_l = 0.0
-    return (u, v, u_r, u_l, f, b_r, b_l), mode, direction
+        return x, Start(u, z, gap_r, gap_l, base, slope, mode, direction)
+    mode ^= 1 << guard
+    if (mode >> guard) & 1:
+        u_r, u_l = (u - gap_r, u_l) if guard == 0 else (u_r, u + gap_l)
+    elif _is_memoryless(guard, u_r if guard == 0 else -u_l, x, p, laws):
+        # A face without memory returns immediately.
+        u_r, u_l = (0.0, u_l) if guard == 0 else (u_r, 0.0)
+    x = Motion(u, v, u_r, u_l, f, b_r, b_l, s)
+    return x, Start(u, z, gap_r, gap_l, base, slope, mode, direction)
 
 
 @jit_helper(inlined=True)
-def flush_to_zero(u_j: float, sign: float, b: float) -> float:
-    """Return u_j of a free face: zero once decayed, or overshot with no branch force driving it."""
-    return 0.0 if abs(u_j) < DENORMAL_LIMIT or (sign * u_j < 0.0 and b == 0.0) else u_j
+def _is_memoryless(side: int, d: float, x: Motion, p: Coefficients, laws: AddedLaws | None) -> bool:
+    """Return whether nothing delays the recovery of a bumper released at deformation d."""
+    _, c = bumper_coefficients(p, side)
+    if c + p.ch != 0.0 or p.kb != 0.0:
+        return False
+    return bumper_dashpot(p, side, d, x.s, laws) <= 0.0
+
+
+@jit_helper(inlined=True)
+def flush_face(u_j: float, sign: float, is_driven: bool) -> float:
+    """Return u_j of a free face: zero once decayed, or overshot with no branch driving it."""
+    return 0.0 if abs(u_j) < DENORMAL_LIMIT or (sign * u_j < 0.0 and not is_driven) else u_j
+
+
+@jit_helper(inlined=True)
+def flush_value(value: float) -> float:
+    """Return 0 for a value that has decayed."""
+    return value if abs(value) > DENORMAL_LIMIT else 0.0
+
+
+@jit_helper_unless_none("s", lambda s: None)
+def flush_states(s: Any) -> LawStates:
+    """Return the states of added laws, zero where decayed."""
+    return (
+        flush_value(s[0]), flush_value(s[1]), flush_value(s[2]), flush_value(s[3]),
+        flush_value(s[4]), flush_value(s[5]),
+    )  # fmt: skip
+
+
+@jit_helper_unless_none("laws", lambda state, laws: None)
+def read_states(state: Float1D, laws: Any) -> LawStates:
+    """Return the states of added laws in a state."""
+    return (
+        state[STATE_S], state[STATE_S + 1], state[STATE_S + 2], state[STATE_S + 3],
+        state[STATE_S + 4], state[STATE_S + 5],
+    )  # fmt: skip
+
+
+@jit_helper_unless_none("s", lambda state, s: None)
+def write_states(state: Float1D, s: Any) -> None:
+    """Write the states of added laws into a state."""
+    for index in range(LAW_STATES):
+        state[STATE_S + index] = s[index]
 
 
 @jit_helper()
 def advance_step(
-    h: float,
-    x: StateVector,
-    context: StepContext,
-    params: KernelParams,
-    propagators: Float2D,
-    mode: int,
-    direction: float,
-    plugin_force: PluginForce,
-) -> tuple[StateAndRates, StepContext, int, float]:
-    """Return (state and rates, context, mode, direction) after h s through any events."""
+    h: float, x: Motion, start: Start, p: Coefficients, propagators: Float2D, laws: AddedLaws | None
+) -> tuple[StateAndRates, Start]:
+    """Return (state and rates, start of the next step) after h s through any events."""
     t, motion = 0.0, (x, x)
     for attempt in range(MAX_EVENTS_PER_STEP):
         search = attempt + 1 < MAX_EVENTS_PER_STEP
-        dt, guard_index, motion = integrate_to_event(
-            h - t, x, context, params, propagators, mode, direction, plugin_force, search
-        )
+        dt, guard, motion = integrate_to_event(h - t, x, start, p, propagators, laws, search)
         x = motion[0]
-        context = next_step_context(context, x, dt, direction, params)
+        start = next_start(start, x, dt, p)
         t += dt
-        if guard_index < 0:
+        if guard < 0:
             break
-        x, mode, direction = apply_event(
-            guard_index, x, context, params, mode, direction, plugin_force
-        )
-    u, v, u_r, u_l, f, b_r, b_l = x
-    f, b_r = f if abs(f) > DENORMAL_LIMIT else 0.0, b_r if abs(b_r) > DENORMAL_LIMIT else 0.0
-    b_l = b_l if abs(b_l) > DENORMAL_LIMIT else 0.0
-    u_r = u_r if mode & 1 else flush_to_zero(u_r, 1.0, b_r)
-    u_l = u_l if mode & 2 else flush_to_zero(u_l, -1.0, b_l)
-    return ((u, v, u_r, u_l, f, b_r, b_l), motion[1]), context, mode, direction
+        x, start = apply_event(guard, x, start, p, laws)
+    u, v, u_r, u_l, f, b_r, b_l, s = x
+    f, b_r, b_l = flush_value(f), flush_value(b_r), flush_value(b_l)
+    s = flush_states(s)
+    u_r = u_r if start.mode & 1 else flush_face(u_r, 1.0, b_r != 0.0 or p.has_bumper_states)
+    u_l = u_l if start.mode & 2 else flush_face(u_l, -1.0, b_l != 0.0 or p.has_bumper_states)
+    return (Motion(u, v, u_r, u_l, f, b_r, b_l, s), motion[1]), start
 
 
 @jit_helper(inlined=True)
-def set_step_context(
-    x: StateVector,
-    context: StepContext,
-    params: KernelParams,
-    mode: int,
-    time: float,
-    base: float,
-    slope: float,
-) -> tuple[StateVector, StepContext]:
-    """Return x and the context at a time in s since sample 0; gaps and drive do not accumulate."""
-    gap_r, gap_l = params[G_R] + params[DRIFT] * time, params[G_L] + params[DRIFT] * time
-    u, v, u_r, u_l, f, b_r, b_l = x
-    x = (u, v, u - gap_r if mode & 1 else u_r, u + gap_l if mode & 2 else u_l, f, b_r, b_l)
-    return x, (u, context[Z_0], gap_r, gap_l, base, slope, context[6], context[7], context[8])
+def set_start(
+    x: Motion, start: Start, p: Coefficients, time: float, base: float, slope: float
+) -> tuple[Motion, Start]:
+    """Return x and the start at a time in s since sample 0; gaps and drive do not accumulate."""
+    gap_r, gap_l = p.gap_r + p.drift * time, p.gap_l + p.drift * time
+    u, v, u_r, u_l, f, b_r, b_l, s = x
+    u_r = u - gap_r if start.mode & 1 else u_r
+    u_l = u + gap_l if start.mode & 2 else u_l
+    x = Motion(u, v, u_r, u_l, f, b_r, b_l, s)
+    return x, Start(u, start.z, gap_r, gap_l, base, slope, start.mode, start.direction)
 
 
 @jit_helper(inlined=True)
 def contact_force(
-    x: StateVector, context: StepContext, params: KernelParams, mode: int, side: int
+    x: Motion, start: Start, p: Coefficients, side: int, laws: AddedLaws | None
 ) -> float:
     """Return F_R >= 0 or F_L <= 0 in N at the start of a step."""
-    if not (mode >> side) & 1:
+    if not (start.mode >> side) & 1:
         return 0.0
-    d, dd, b = bumper_deformation(x, context, params, mode, side, 0.0)
-    return (1.0 - 2.0 * side) * max(0.0, bumper_force(params, side, d, dd, b))
+    d, dd, b = bumper_deformation(x, start, p, side, 0.0, laws)
+    return (1.0 - 2.0 * side) * max(0.0, bumper_force(p, side, d, dd, b, x.s, laws))
 
 
 _READ = types.Array(float64, 1, "A", readonly=True)
 _OUT = types.Array(float64, 2, "A")
+_KERNELS = [
+    types.void(float64[::1], COEFFICIENTS_TYPE, float64[:, ::1], laws, _READ, _OUT)
+    for laws in (types.none, ADDED_LAWS_TYPE)
+]
 REVISION = source_revision(globals()) ^ EVENTS_REVISION
-
-
-_PARAMS = types.UniTuple(float64, KERNEL_PARAMS_SIZE)
-_KERNEL = types.void(float64[::1], _PARAMS, float64[:, ::1], PLUGIN_FORCE_TYPE, _READ, _OUT)
 
 
 def _build_kernel(revision: int) -> Callable[..., None]:
     """Return the kernel; `revision` is a free variable of it and so part of numba's cache key."""
 
-    @jit_kernel(_KERNEL, cache=True)
+    @jit_kernel(_KERNELS, cache=True)
     def integrate_samples(
         state: Float1D,
-        params: KernelParams,
+        p: Coefficients,
         propagators: Float2D,
-        plugin_force: PluginForce,
+        laws: AddedLaws | None,
         base_acc: Float1D,
         out: Float2D,
     ) -> None:
@@ -225,54 +210,35 @@ def _build_kernel(revision: int) -> Callable[..., None]:
             return
         if state.size < STATE_SIZE or out.shape[0] < OUTPUT_COUNT or out.shape[1] < base_acc.size:
             raise ValueError("state or out is too small for these samples; see Solver.advance")
-        substeps, h = int(params[SUBSTEPS]), params[STEP]
-        x = (
-            state[U],
-            state[V],
-            state[U_R],
-            state[U_L],
-            state[STATE_F],
-            state[STATE_B_R],
-            state[STATE_B_L],
-        )
+        x = Motion(
+            state[U], state[V], state[U_R], state[U_L],
+            state[STATE_F], state[STATE_B_R], state[STATE_B_L], read_states(state, laws),
+        )  # fmt: skip
         mode = int(state[CONTACT_R] > 0) + 2 * int(state[CONTACT_L] > 0)
-        direction, clock, base = state[DIRECTION], state[CLOCK], state[STATE_BASE]
-        context = (x[U], state[STATE_Z], 0.0, 0.0, base, 0.0, 0.0, 0.0, 0.0)
+        clock, base = state[CLOCK], state[STATE_BASE]
+        start = Start(x.u, state[STATE_Z], 0.0, 0.0, base, 0.0, mode, state[DIRECTION])
         for i in range(base_acc.size):
-            for substep in range(substeps):
-                slope = (base_acc[i] - base) / (h * (substeps - substep))
-                time = (clock + i + substep / substeps) * params[PERIOD]
-                x, context = set_step_context(x, context, params, mode, time, base, slope)
-                motion, context, mode, direction = advance_step(
-                    h, x, context, params, propagators, mode, direction, plugin_force
-                )
-                x, base = motion[0], base + slope * h if substep + 1 < substeps else base_acc[i]
-            if not math.isfinite(base) or not math.isfinite(x[U]):
+            for substep in range(p.substeps):
+                slope = (base_acc[i] - base) / (p.step * (p.substeps - substep))
+                time = (clock + i + substep / p.substeps) * p.period
+                x, start = set_start(x, start, p, time, base, slope)
+                motion, start = advance_step(p.step, x, start, p, propagators, laws)
+                x = motion[0]
+                base = base + slope * p.step if substep + 1 < p.substeps else base_acc[i]
+            if not math.isfinite(base) or not math.isfinite(x.u):
                 base = math.nan
-                x = (base, base, base, base, base, base, base)
-            x, context = set_step_context(
-                x, context, params, mode, (clock + i + 1) * params[PERIOD], base, 0.0
-            )
+                x = Motion(base, base, base, base, base, base, base, x.s)
+            x, start = set_start(x, start, p, (clock + i + 1) * p.period, base, 0.0)
             flight_force = base - base
-            out[0, i], out[1, i], out[2, i] = (
-                x[U],
-                x[V],
-                motion[1][V] + table_acceleration(context, 0.0),
-            )
-            out[3, i] = contact_force(x, context, params, mode, 0) + flight_force
-            out[4, i] = contact_force(x, context, params, mode, 1) + flight_force
-            out[5, i], out[6, i] = x[U_R], x[U_L]
-        (
-            state[U],
-            state[V],
-            state[U_R],
-            state[U_L],
-            state[STATE_F],
-            state[STATE_B_R],
-            state[STATE_B_L],
-        ) = x
-        state[CONTACT_R], state[CONTACT_L] = float(mode & 1), float(mode >> 1)
-        state[STATE_BASE], state[STATE_Z], state[DIRECTION] = base, context[Z_0], direction
+            out[0, i], out[1, i], out[2, i] = x.u, x.v, motion[1].v + start.base
+            out[3, i] = contact_force(x, start, p, 0, laws) + flight_force
+            out[4, i] = contact_force(x, start, p, 1, laws) + flight_force
+            out[5, i], out[6, i] = x.u_r, x.u_l
+        state[U], state[V], state[U_R], state[U_L] = x.u, x.v, x.u_r, x.u_l
+        state[STATE_F], state[STATE_B_R], state[STATE_B_L] = x.f, x.b_r, x.b_l
+        state[CONTACT_R], state[CONTACT_L] = float(start.mode & 1), float(start.mode >> 1)
+        state[STATE_BASE], state[STATE_Z], state[DIRECTION] = base, start.z, start.direction
+        write_states(state, x.s)
         if math.isnan(base):
             state[:CLOCK] = math.nan
         state[CLOCK] = clock + base_acc.size

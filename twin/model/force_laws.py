@@ -1,24 +1,22 @@
 """Force laws of all effects in one compiled right-hand side, with their coefficients.
 
-    M u'' + C u' + K u + k3 u^3 + c2 u' |u'| + Fc sign(u') + Fy z + f + extra + F_R + F_L = -M A
-    contact: F_j = (C_j + ch |u_j|) u_j' + K_j u_j + k2 u_j |u_j| + b_j
+    M u'' + C u' + K u + k3 u^3 + c2 u' |u'| + Fc sign(u') + Fy z + f + D + F_R + F_L = -M A
+    contact: F_j = (C_j + ch |u_j|) u_j' + K_j u_j + k2 u_j |u_j| + b_j + B_j
              u_R = u - G0R, u_L = u + G0L
     flight:  F_j = 0, that sum is zero and u_j relaxes
-    f' = k1 u' - f / tau1,  b_j' = kb u_j' - b_j / tau,  G0j grows with `DRIFT`
+    f' = k1 u' - f / tau1,  b_j' = kb u_j' - b_j / tau,  G0j grows with the gap drift
 
-SI, right positive. Each term is described in its file in `effects`; `extra` is the force of
-plug-ins. An effect with a zero coefficient is absent. Sides are 0 = right, 1 = left; `mode` =
-contact_r + 2 contact_l; `direction` is the sign of u', 0 where the mass sticks.
+SI, right positive. Each term is described in its file in `effects`; D and B_j are the forces of
+effects that bring their own law (see `added_laws`), with their internal states `s`. An effect with
+a zero coefficient is absent. Sides are 0 = right, 1 = left.
 """
 
-import math
 from collections.abc import Callable
-from functools import cache
-from typing import Any
+from typing import Any, NamedTuple, get_type_hints
 
-from numba import float64, types
+from numba import float64, int64, types
 
-from twin.model.compilation import jit_helper, jit_kernel, source_revision
+from twin.model.compilation import jit_helper, jit_helper_unless_none, source_revision
 from twin.model.effects import (
     bouc_wen,
     bumper_hardening,
@@ -27,33 +25,104 @@ from twin.model.effects import (
     hunt_crossley,
     quadratic_damping,
 )
+from twin.model.effects.law import DAMPER
 
-# State at one time: u, u', u_R, u_L, f, b_R, b_L; or its rates.
-StateVector = tuple[float, float, float, float, float, float, float]
-U, V, U_R, U_L, F, B_R, B_L = range(7)
-# Start of a step: u, z, gaps, and the drive A = base + slope t + peak sin(phase + w t).
-StepContext = tuple[float, float, float, float, float, float, float, float, float]
-U_0, Z_0, GAP_R, GAP_L, BASE, SLOPE, PEAK, W, PHASE = range(9)
-# Size of the state of linear propagation, see `event_integrator._generator_matrix`.
-LINEAR_SIZE = 12
-
-# Indices of coefficients: RATE_* are 1/tau; gaps at sample 0; sampling period, number of substeps
-# and their length; flags: model is linear, reversals of u' are events, plug-ins add a force, whose
-# coefficients begin at PLUGIN_FIRST.
-MASS, K, C, K_R, K_L, C_R, C_L, K3, C2, FC, FY, UY, K1, RATE_1, K2, CH, KB, RATE_B, DRIFT = range(
-    19
-)
-G_R, G_L, PERIOD, SUBSTEPS, STEP, IS_LINEAR, REVERSAL_EVENTS, HAS_PLUGIN, PLUGIN_FIRST = range(
-    19, 28
-)
-MAX_PLUGIN_PARAMETERS = 8  # in total over all plug-ins of a model
-KERNEL_PARAMS_SIZE = PLUGIN_FIRST + MAX_PLUGIN_PARAMETERS
-KernelParams = tuple[float, ...]
-
+LAW_PARAMETERS, LAW_STATES = 8, 6  # of all added laws of a model together
+RELAXED = (0.0,) * LAW_STATES
+REVERSAL_SPEED_M_S = 1e-300  # of the sign that follows a reversal
 NO_WALL_M = 1e9  # m: gap of an absent bumper; finite, so that zero times it is zero
-PLUGIN_FORCE_SIGNATURE = float64(float64, float64, types.UniTuple(float64, MAX_PLUGIN_PARAMETERS))
-PLUGIN_FORCE_TYPE = types.FunctionType(PLUGIN_FORCE_SIGNATURE)
-PluginForce = Callable[[float, float, KernelParams], float]
+
+# Without added laws both are None: kernels are compiled for both cases and pay only for theirs.
+LawStates = tuple[float, ...] | None
+# (place, deformation, its rate, states, coefficients) -> (force in N, rate of each state)
+AddedLaws = Callable[[int, float, float, tuple[float, ...], tuple[float, ...]], tuple[float, ...]]
+ADDED_LAWS_SIGNATURE = types.UniTuple(float64, 1 + LAW_STATES)(
+    int64,
+    float64,
+    float64,
+    types.UniTuple(float64, LAW_STATES),
+    types.UniTuple(float64, LAW_PARAMETERS),
+)
+
+
+class Motion(NamedTuple):
+    """State at one time, or its rates: u, u', u_R, u_L, branch forces, states of added laws."""
+
+    u: float
+    v: float
+    u_r: float
+    u_l: float
+    f: float
+    b_r: float
+    b_l: float
+    s: LawStates
+
+
+class Start(NamedTuple):
+    """Start of a step, in which A = base + slope t.
+
+    `u`, `z`: displacement and hysteretic variable there; `mode` = contact_r + 2 contact_l;
+    `direction` is the sign of u', 0 where the mass sticks.
+    """
+
+    u: float
+    z: float
+    gap_r: float
+    gap_l: float
+    base: float
+    slope: float
+    mode: int
+    direction: float
+
+
+class Coefficients(NamedTuple):
+    """Coefficients of a model at one sampling rate; the step-dependent ones are zero before that.
+
+    `rate_1` and `rate_b` are 1/tau; gaps are those at sample 0; `step` is one of `substeps` of the
+    sampling period. `has_reversals`: reversals of u' are events. `laws` are the parameters of the
+    added laws, `has_bumper_states` tells that one in a bumper has states.
+    """
+
+    m: float
+    k: float
+    c: float
+    k_r: float
+    k_l: float
+    c_r: float
+    c_l: float
+    k3: float
+    c2: float
+    fc: float
+    fy: float
+    uy: float
+    k1: float
+    rate_1: float
+    k2: float
+    ch: float
+    kb: float
+    rate_b: float
+    drift: float
+    gap_r: float
+    gap_l: float
+    is_linear: bool
+    has_reversals: bool
+    has_bumper_states: bool
+    laws: tuple[float, ...]
+    period: float = 0.0
+    substeps: int = 0
+    step: float = 0.0
+
+
+ADDED_LAWS_TYPE = types.FunctionType(ADDED_LAWS_SIGNATURE)
+_NUMBA_TYPES = {
+    float: float64,
+    int: int64,
+    bool: types.boolean,
+    tuple[float, ...]: types.UniTuple(float64, LAW_PARAMETERS),
+}
+COEFFICIENTS_TYPE = types.NamedTuple(
+    [_NUMBA_TYPES[kind] for kind in get_type_hints(Coefficients).values()], Coefficients
+)
 
 cubic_force = jit_helper(inlined=True)(cubic_stiffness.force)
 quadratic_force = jit_helper(inlined=True)(quadratic_damping.force)
@@ -63,165 +132,162 @@ hardening_force = jit_helper(inlined=True)(bumper_hardening.force)
 hunt_crossley_damping = jit_helper(inlined=True)(hunt_crossley.damping)
 
 
-@jit_kernel(PLUGIN_FORCE_SIGNATURE, cache=True)
-def no_plugin_force(u: float, v: float, c: KernelParams) -> float:
-    """Return 0 N, the force without plug-ins."""
-    return 0.0
+@jit_helper_unless_none("laws", lambda force, place, q, w, s, p, laws: force)
+def add_law_force(
+    force: float, place: int, q: float, w: float, s: Any, p: Coefficients, laws: Any
+) -> float:
+    """Return `force` plus that of the added laws at a place, in N."""
+    return force + laws(place, q, w, s, p.laws)[0]
 
 
-@jit_helper(inlined=True)
-def bumper_force(params: KernelParams, side: int, d: float, dd: float, b: float) -> float:
-    """Return the push of a bumper in N; deformation d, rate dd, branch force b: compression > 0."""
-    k, c = (params[K_R], params[C_R]) if side == 0 else (params[K_L], params[C_L])
+@jit_helper_unless_none("laws", lambda dashpot, side, d, s, p, laws: dashpot)
+def add_law_dashpot(
+    dashpot: float, side: int, d: float, s: Any, p: Coefficients, laws: Any
+) -> float:
+    """Return `dashpot` plus d(push)/d(rate) of the added laws in a bumper, in N s/m."""
+    return dashpot + laws(side, d, 1.0, s, p.laws)[0] - laws(side, d, 0.0, s, p.laws)[0]
+
+
+@jit_helper_unless_none("s", lambda s, h, rates: None)
+def add_scaled_states(s: Any, h: float, rates: Any) -> LawStates:
+    """Return s + h rates."""
     return (
-        k * d + (c + hunt_crossley_damping(d, params[CH])) * dd + hardening_force(d, params[K2]) + b
-    )
+        s[0] + h * rates[0], s[1] + h * rates[1], s[2] + h * rates[2], s[3] + h * rates[3],
+        s[4] + h * rates[4], s[5] + h * rates[5],
+    )  # fmt: skip
 
 
 @jit_helper(inlined=True)
-def recovery_rate(params: KernelParams, side: int, d: float, b: float) -> float:
+def bumper_coefficients(p: Coefficients, side: int) -> tuple[float, float]:
+    """Return (stiffness, damping) of a bumper."""
+    return (p.k_r, p.c_r) if side == 0 else (p.k_l, p.c_l)
+
+
+@jit_helper(inlined=True)
+def bumper_force(
+    p: Coefficients, side: int, d: float, dd: float, b: float, s: LawStates, laws: AddedLaws | None
+) -> float:
+    """Return the push of a bumper in N; deformation d, rate dd, branch force b: compression > 0."""
+    k, c = bumper_coefficients(p, side)
+    push = k * d + (c + hunt_crossley_damping(d, p.ch)) * dd + hardening_force(d, p.k2) + b
+    return add_law_force(push, side, d, dd, s, p, laws)
+
+
+@jit_helper(inlined=True)
+def bumper_dashpot(
+    p: Coefficients, side: int, d: float, s: LawStates, laws: AddedLaws | None
+) -> float:
+    """Return d(push)/d(rate) of a bumper in N s/m at deformation d."""
+    _, c = bumper_coefficients(p, side)
+    return add_law_dashpot(c + hunt_crossley_damping(d, p.ch), side, d, s, p, laws)
+
+
+@jit_helper(inlined=True)
+def recovery_rate(
+    p: Coefficients, side: int, d: float, b: float, s: LawStates, laws: AddedLaws | None
+) -> float:
     """Return the rate in m/s of the deformation d of a free bumper; b as in `bumper_force`.
 
     Without a dashpot the face has no memory of its own: it lies where the springs balance.
     """
-    if d == 0.0 and b == 0.0:
+    if d == 0.0 and b == 0.0 and not p.has_bumper_states:
         return 0.0
-    dashpot = (params[C_R] if side == 0 else params[C_L]) + hunt_crossley_damping(d, params[CH])
+    dashpot = bumper_dashpot(p, side, d, s, laws)
     if dashpot > 0.0:
-        return -bumper_force(params, side, d, 0.0, b) / dashpot
+        return -bumper_force(p, side, d, 0.0, b, s, laws) / dashpot
     if b == 0.0:
         return 0.0
-    k = params[K_R] if side == 0 else params[K_L]
-    return b * params[RATE_B] / (k + 2 * params[K2] * abs(d) + params[KB])
+    k, _ = bumper_coefficients(p, side)
+    return b * p.rate_b / (k + 2 * p.k2 * abs(d) + p.kb)
 
 
 @jit_helper(inlined=True)
 def bumper_deformation(
-    x: StateVector, context: StepContext, params: KernelParams, mode: int, side: int, t: float
+    x: Motion, start: Start, p: Coefficients, side: int, t: float, laws: AddedLaws | None
 ) -> tuple[float, float, float]:
     """Return (d, d', b) of a bumper, t s into the step, positive in compression."""
     if side == 0:
-        sign, uj, b, gap = 1.0, x[U_R], x[B_R], context[GAP_R]
+        sign, uj, b, gap = 1.0, x.u_r, x.b_r, start.gap_r
     else:
-        sign, uj, b, gap = -1.0, x[U_L], -x[B_L], context[GAP_L]
-    if (mode >> side) & 1:
-        return sign * x[U] - gap - params[DRIFT] * t, sign * x[V] - params[DRIFT], b
+        sign, uj, b, gap = -1.0, x.u_l, -x.b_l, start.gap_l
+    if (start.mode >> side) & 1:
+        return sign * x.u - gap - p.drift * t, sign * x.v - p.drift, b
     d = sign * uj
-    return d, recovery_rate(params, side, d, b), b
+    return d, recovery_rate(p, side, d, b, x.s, laws), b
+
+
+@jit_helper(inlined=True)
+def damper_rate(v: float, direction: float) -> float:
+    """Return u' for the added laws: at a reversal the limit on the side that follows it."""
+    return v if direction * v > 0.0 else direction * REVERSAL_SPEED_M_S
 
 
 @jit_helper(inlined=True)
 def internal_force(
-    x: StateVector,
-    context: StepContext,
-    params: KernelParams,
-    mode: int,
-    direction: float,
-    t: float,
-    plugin_force: PluginForce,
+    x: Motion, start: Start, direction: float, p: Coefficients, t: float, laws: AddedLaws | None
 ) -> float:
     """Return the sum in N of all forces on the left side of the equation of motion."""
-    u, v = x[U], x[V]
-    force = params[K] * u + params[C] * v + x[F]
-    if params[IS_LINEAR] == 0.0:
+    u, v = x.u, x.v
+    force = p.k * u + p.c * v + x.f
+    if not p.is_linear:
         force += (
-            cubic_force(u, params[K3])
-            + quadratic_force(v, direction, params[C2])
-            + coulomb_force(direction, params[FC])
+            cubic_force(u, p.k3)
+            + quadratic_force(v, direction, p.c2)
+            + coulomb_force(direction, p.fc)
         )
-        if params[FY] > 0.0:
+        if p.fy > 0.0:
             # z is constant while the mass sticks.
-            z = context[Z_0]
+            z = start.z
             if direction != 0.0:
-                z = hysteretic_variable(z, u - context[U_0], direction, params[UY])
-            force += params[FY] * z
-        if params[HAS_PLUGIN] > 0.0:
-            force += plugin_force(u, v, params[PLUGIN_FIRST:])
-    if mode & 1:
-        d, dd, b = bumper_deformation(x, context, params, mode, 0, t)
-        force += bumper_force(params, 0, d, dd, b)
-    if mode & 2:
-        d, dd, b = bumper_deformation(x, context, params, mode, 1, t)
-        force -= bumper_force(params, 1, d, dd, b)
+                z = hysteretic_variable(z, u - start.u, direction, p.uy)
+            force += p.fy * z
+        force = add_law_force(force, DAMPER, u, damper_rate(v, direction), x.s, p, laws)
+    if start.mode & 1:
+        d, dd, b = bumper_deformation(x, start, p, 0, t, laws)
+        force += bumper_force(p, 0, d, dd, b, x.s, laws)
+    if start.mode & 2:
+        d, dd, b = bumper_deformation(x, start, p, 1, t, laws)
+        force -= bumper_force(p, 1, d, dd, b, x.s, laws)
     return force
 
 
-@jit_helper(inlined=True)
-def table_acceleration(context: StepContext, t: float) -> float:
-    """Return the table acceleration in m/s2, t s into the step."""
-    base = context[BASE] + context[SLOPE] * t
-    if context[PEAK] != 0.0:
-        base += context[PEAK] * math.sin(context[PHASE] + context[W] * t)
-    return base
+@jit_helper_unless_none("laws", lambda s, u, du, d_r, dd_r, d_l, dd_l, p, laws: None)
+def law_state_rates(
+    s: Any, u: float, du: float, d_r: float, dd_r: float, d_l: float, dd_l: float,
+    p: Coefficients, laws: Any,
+) -> LawStates:  # fmt: skip
+    """Return d/dt of the states of all added laws; deformations and rates of damper and bumpers."""
+    rates = laws(DAMPER, u, du, s, p.laws)[1:]
+    rates = add_scaled_states(rates, 1.0, laws(0, d_r, dd_r, s, p.laws)[1:])
+    return add_scaled_states(rates, 1.0, laws(1, d_l, dd_l, s, p.laws)[1:])
 
 
 @jit_helper(inlined=True)
 def state_rates(
-    x: StateVector,
-    context: StepContext,
-    params: KernelParams,
-    mode: int,
-    direction: float,
-    t: float,
-    plugin_force: PluginForce,
-) -> StateVector:
+    x: Motion, start: Start, p: Coefficients, t: float, laws: AddedLaws | None
+) -> Motion:
     """Return d/dt of a state, t s into the step."""
     du, dv = 0.0, 0.0
-    if direction != 0.0 or params[FC] == 0.0:
-        force = internal_force(x, context, params, mode, direction, t, plugin_force)
-        du, dv = x[V], -table_acceleration(context, t) - force / params[MASS]
-    _, right, b_r = bumper_deformation(x, context, params, mode, 0, t)
-    _, left, b_l = bumper_deformation(x, context, params, mode, 1, t)
-    return (
-        du, dv, right, -left, params[K1] * du - params[RATE_1] * x[F],
-        params[KB] * right - params[RATE_B] * b_r, params[RATE_B] * b_l - params[KB] * left,
+    if start.direction != 0.0 or p.fc == 0.0:
+        force = internal_force(x, start, start.direction, p, t, laws)
+        du, dv = x.v, -(start.base + start.slope * t) - force / p.m
+    d_r, right, b_r = bumper_deformation(x, start, p, 0, t, laws)
+    d_l, left, b_l = bumper_deformation(x, start, p, 1, t, laws)
+    law_du = damper_rate(du, start.direction)
+    s = law_state_rates(x.s, x.u, law_du, d_r, right, d_l, left, p, laws)
+    return Motion(
+        du, dv, right, -left, p.k1 * du - p.rate_1 * x.f,
+        p.kb * right - p.rate_b * b_r, p.rate_b * b_l - p.kb * left, s,
     )  # fmt: skip
 
 
 @jit_helper(inlined=True)
 def static_friction(
-    x: StateVector,
-    context: StepContext,
-    params: KernelParams,
-    mode: int,
-    t: float,
-    plugin_force: PluginForce,
+    x: Motion, start: Start, p: Coefficients, t: float, laws: AddedLaws | None
 ) -> float:
     """Return the friction in N that holds the mass in place."""
-    force = internal_force(x, context, params, mode, 0.0, t, plugin_force)
-    return -(params[MASS] * table_acceleration(context, t) + force)
-
-
-@cache
-def combine_forces(forces: tuple[tuple[Callable[..., float], int], ...]) -> PluginForce:
-    """Compile one `PluginForce` from (Python force, number of parameters) of each plug-in.
-
-    Compiled once in every process: numba's cache on disk does not notice that a plug-in changed.
-    """
-    plugin_force: Any = no_plugin_force
-    first = 0
-    for force, size in forces:
-        plugin_force, first = _add_force(plugin_force, jit_kernel()(force), first), first + size
-    return jit_kernel(PLUGIN_FORCE_SIGNATURE)(plugin_force.py_func)
-
-
-def _add_force(sum_before: Any, force: Any, first: int) -> Any:
-    """Return `sum_before` plus a force whose parameters begin at `first`."""
-
-    def both(u, v, c):  # type: ignore[no-untyped-def]
-        own = (
-            c[first],
-            c[(first + 1) % MAX_PLUGIN_PARAMETERS],
-            c[(first + 2) % MAX_PLUGIN_PARAMETERS],
-            c[(first + 3) % MAX_PLUGIN_PARAMETERS],
-            c[(first + 4) % MAX_PLUGIN_PARAMETERS],
-            c[(first + 5) % MAX_PLUGIN_PARAMETERS],
-            c[(first + 6) % MAX_PLUGIN_PARAMETERS],
-            c[(first + 7) % MAX_PLUGIN_PARAMETERS],
-        )
-        return sum_before(u, v, c) + force(u, v, own)
-
-    return jit_kernel()(both)
+    force = internal_force(x, start, 0.0, p, t, laws)
+    return -(p.m * (start.base + start.slope * t) + force)
 
 
 REVISION = source_revision(globals())

@@ -11,61 +11,52 @@ this is what makes a fit converge (see `twin.identification`).
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from numba import float64, types
 
 from table_io.block import Float1D, Float2D
-from twin.model import force_laws
-from twin.model.compilation import jit_helper, jit_kernel
-from twin.model.event_integrator import kernel_params
+from twin.model.compilation import (
+    jit_helper,
+    jit_helper_unless_none,
+    jit_kernel,
+    source_revision,
+)
+from twin.model.effects.law import DAMPER, sum_law_properties
+from twin.model.event_integrator import kernel_coefficients
 from twin.model.force_laws import (
-    C2,
-    C_L,
-    C_R,
-    DRIFT,
-    FC,
-    FY,
-    G_L,
-    G_R,
-    HAS_PLUGIN,
-    K1,
-    K3,
-    K_L,
-    K_R,
-    KB,
-    KERNEL_PARAMS_SIZE,
+    ADDED_LAWS_TYPE,
+    COEFFICIENTS_TYPE,
     NO_WALL_M,
-    PLUGIN_FIRST,
-    PLUGIN_FORCE_TYPE,
-    RATE_1,
-    RATE_B,
-    UY,
-    C,
-    K,
-    KernelParams,
+    RELAXED,
+    AddedLaws,
+    Coefficients,
+    LawStates,
+    add_law_force,
+    add_scaled_states,
+    bumper_coefficients,
+    bumper_dashpot,
     bumper_force,
     coulomb_force,
     cubic_force,
     hysteretic_variable,
     quadratic_force,
 )
+from twin.model.force_laws import REVISION as LAWS_REVISION
 from twin.model.model import Model
-from twin.model.solver import GRAVITY_M_S2
 
+MAX_STATE_RELAXATIONS = 0.5  # relaxation times of an added law per step of its integration
 FORCE_ROWS = ("damper", "right", "left")
 # One signature: numba never caches a kernel specialized to the function of an effect.
 _READ = types.Array(float64, 1, "A", readonly=True)
-_KERNEL = types.void(
-    _READ,
-    _READ,
-    _READ,
-    float64[:, ::1],
-    types.UniTuple(float64, KERNEL_PARAMS_SIZE),
-    PLUGIN_FORCE_TYPE,
-    float64[:, ::1],
-)
+_KERNELS = [
+    types.void(
+        _READ, _READ, _READ, float64[:, ::1], COEFFICIENTS_TYPE, laws, float64, float64[:, ::1]
+    )
+    for laws in (types.none, ADDED_LAWS_TYPE)
+]
 CONTACT_UNKNOWN, NO_CONTACT, IN_CONTACT = -1, 0, 1  # measured contact state
 
 
@@ -81,16 +72,14 @@ def relax_branch(
 
 
 @jit_helper()
-def recover_bumper(
-    params: KernelParams, side: int, d: float, b: float, h: float
-) -> tuple[float, float]:
+def recover_bumper(p: Coefficients, side: int, d: float, b: float, h: float) -> tuple[float, float]:
     """Return (deformation, branch force) of a free bumper after h s.
 
     Closed form of d' = -(K_j d + b) / C_j and b' = kb d' - b / tau: two real rates, never equal
     while kb > 0. Without a dashpot K_j d + b = 0 at every time.
     """
-    k, c = (params[K_R], params[C_R]) if side == 0 else (params[K_L], params[C_L])
-    kb, rate = params[KB], params[RATE_B]
+    k, c = bumper_coefficients(p, side)
+    kb, rate = p.kb, p.rate_b
     if c <= 0.0:
         b = b * math.exp(-h * rate / (1.0 + kb / k))
         return -b / k, b
@@ -105,7 +94,7 @@ def recover_bumper(
 
 @jit_helper()
 def track_face(
-    params: KernelParams,
+    p: Coefficients,
     side: int,
     d: float,
     face: float,
@@ -119,78 +108,164 @@ def track_face(
     A face that the mass meets meanwhile jumps to it; at the first sample (h = 0) it has relaxed.
     """
     if was_in_contact:
-        return d, relax_branch(b, params[RATE_B], params[KB], d - face, h)
-    face, b = recover_bumper(params, side, face, b, h)
+        return d, relax_branch(b, p.rate_b, p.kb, d - face, h)
+    face, b = recover_bumper(p, side, face, b, h)
     if contact > 0.5 or (contact < -0.5 and d > face):
-        return d, b + (params[KB] * (d - face) if h > 0.0 else 0.0)
+        return d, b + (p.kb * (d - face) if h > 0.0 else 0.0)
     return face, b
+
+
+@jit_helper_unless_none("laws", lambda place, s, q, w, h, steps, p, laws: None)
+def advance_law_states(
+    place: int, s: Any, q: float, w: float, h: float, steps: int, p: Coefficients, laws: Any
+) -> LawStates:
+    """Return the states of the added laws at a place after h s, from deformation q at rate w.
+
+    Classical fourth-order Runge-Kutta in `steps` equal steps.
+    """
+    dt = h / steps
+    for n in range(steps):
+        q0 = q + n * dt * w
+        k1 = laws(place, q0, w, s, p.laws)[1:]
+        k2 = laws(place, q0 + 0.5 * dt * w, w, add_scaled_states(s, 0.5 * dt, k1), p.laws)[1:]
+        k3 = laws(place, q0 + 0.5 * dt * w, w, add_scaled_states(s, 0.5 * dt, k2), p.laws)[1:]
+        k4 = laws(place, q0 + dt * w, w, add_scaled_states(s, dt, k3), p.laws)[1:]
+        s = add_scaled_states(s, dt / 6.0, k1)
+        s = add_scaled_states(add_scaled_states(s, dt / 3.0, k2), dt / 3.0, k3)
+        s = add_scaled_states(s, dt / 6.0, k4)
+    return s
+
+
+@jit_helper()
+def recover_face_and_states(
+    side: int, face: float, b: float, s: Any, h: float, steps: int, p: Coefficients, laws: Any
+) -> tuple[float, float, LawStates]:
+    """Return (face position, branch force, law states) of a free bumper after h s.
+
+    The face moves so that the bumper's force is zero; midpoint rule in `steps` equal steps.
+    """
+    dt = h / steps
+    for _ in range(steps):
+        middle, middle_b, middle_s = face, b, s
+        for length in (0.5 * dt, dt):
+            dashpot = bumper_dashpot(p, side, middle, middle_s, laws)
+            if dashpot <= 0.0:
+                return 0.0, 0.0, s
+            w = -bumper_force(p, side, middle, 0.0, middle_b, middle_s, laws) / dashpot
+            rates = laws(side, middle, w, middle_s, p.laws)[1:]
+            b_rate = p.kb * w - p.rate_b * middle_b
+            middle, middle_b = face + length * w, b + length * b_rate
+            middle_s = add_scaled_states(s, length, rates)
+        face, b, s = middle, middle_b, middle_s
+    return face, b, s
+
+
+@jit_helper_unless_none(
+    "laws", lambda side, d, dd, face, b, s, was, contact, h, fastest_rate, p, laws: (face, b, s)
+)
+def track_face_with_laws(
+    side: int, d: float, dd: float, face: float, b: float, s: Any, was_in_contact: bool,
+    contact: float, h: float, fastest_rate: float, p: Coefficients, laws: Any,
+) -> tuple[float, float, LawStates]:  # fmt: skip
+    """Return (face position in m, branch force in N, law states) as `track_face`."""
+    if h == 0.0:
+        return max(d, 0.0) if contact > 0.5 else face, b, s
+    steps = 1 + int(h * fastest_rate / MAX_STATE_RELAXATIONS)
+    if was_in_contact:
+        s = advance_law_states(side, s, face, (d - face) / h, h, steps, p, laws)
+        return d, relax_branch(b, p.rate_b, p.kb, d - face, h), s
+    free_face, free_b, free_s = recover_face_and_states(side, face, b, s, h, steps, p, laws)
+    if contact > 0.5 or (contact < -0.5 and d > free_face):
+        # The mass met the face on the way; the face follows it from where both were.
+        share = 1.0
+        if d > free_face and dd > 0.0:
+            share = min(1.0, (d - free_face) / (dd * h))
+        free_face, free_b, free_s = recover_face_and_states(
+            side, face, b, s, h * (1.0 - share), steps, p, laws
+        )
+        w = (d - free_face) / (h * share) if share > 0.0 else 0.0
+        free_s = advance_law_states(side, free_s, free_face, w, h * share, steps, p, laws)
+        return d, free_b + p.kb * (d - free_face), free_s
+    return free_face, free_b, free_s
+
+
+@jit_helper_unless_none("laws", lambda laws: None)
+def relaxed_states(laws: Any) -> LawStates:
+    """Return the relaxed states of the added laws."""
+    return RELAXED
 
 
 def _build_force_kernel(revision: int) -> Callable[..., None]:
     """Return the kernel; `revision` is a free variable of it and so part of numba's cache key."""
 
-    @jit_kernel(_KERNEL, cache=True)
-    def kernel(
+    @jit_kernel(_KERNELS, cache=True)
+    def kernel(  # noqa: PLR0912
         u: Float1D,
         v: Float1D,
         time: Float1D,
         contact: Float2D,
-        params: KernelParams,
-        plugin_force: force_laws.PluginForce,
+        p: Coefficients,
+        laws: AddedLaws | None,
+        fastest_rate: float,
         out: Float2D,
     ) -> None:
         """Fill `out` (3, sample): D, F_R, F_L in N; `contact` (2, sample) as `CONTACT_UNKNOWN`."""
         if revision < 0:
             return
-        z, f, b_r, b_l = 0.0, 0.0, 0.0, 0.0
+        z, f, b_r, b_l, s = 0.0, 0.0, 0.0, 0.0, relaxed_states(laws)
         face_r, face_l = 0.0, 0.0  # face positions in m, tracked only with relaxation
         in_contact_r, in_contact_l = False, False
         for k in range(u.size):
             h = time[k] - time[k - 1] if k else 0.0
             if k:
                 du = u[k] - u[k - 1]
-                if params[FY] > 0.0 and du != 0.0:
-                    z = hysteretic_variable(z, du, math.copysign(1.0, du), params[UY])
-                if params[K1] > 0.0 or f != 0.0:
-                    f = relax_branch(f, params[RATE_1], params[K1], du, h)
+                if p.fy > 0.0 and du != 0.0:
+                    z = hysteretic_variable(z, du, math.copysign(1.0, du), p.uy)
+                if p.k1 > 0.0 or f != 0.0:
+                    f = relax_branch(f, p.rate_1, p.k1, du, h)
+                if fastest_rate >= 0.0:
+                    steps = 1 + int(h * fastest_rate / MAX_STATE_RELAXATIONS)
+                    s = advance_law_states(DAMPER, s, u[k - 1], du / h, h, steps, p, laws)
             direction = 1.0 if v[k] > 0.0 else -1.0
-            damper = params[K] * u[k] + params[C] * v[k] + cubic_force(u[k], params[K3])
+            damper = p.k * u[k] + p.c * v[k] + cubic_force(u[k], p.k3)
             damper += (
-                quadratic_force(v[k], direction, params[C2])
-                + coulomb_force(direction, params[FC])
-                + params[FY] * z
+                quadratic_force(v[k], direction, p.c2)
+                + coulomb_force(direction, p.fc)
+                + p.fy * z
                 + f
             )
-            if params[HAS_PLUGIN] > 0.0:
-                damper += plugin_force(u[k], v[k], params[PLUGIN_FIRST:])
-            opening = params[DRIFT] * time[k]
+            damper = add_law_force(damper, DAMPER, u[k], v[k], s, p, laws)
+            opening = p.drift * time[k]
             out[0, k] = damper
             for side in range(2):
                 sign = 1.0 if side == 0 else -1.0
-                gap = (params[G_R] if side == 0 else params[G_L]) + opening
-                d, dd = sign * u[k] - gap, sign * v[k] - params[DRIFT]
+                gap = (p.gap_r if side == 0 else p.gap_l) + opening
+                d, dd = sign * u[k] - gap, sign * v[k] - p.drift
                 b, face, was_in_contact = (
                     (b_r, face_r, in_contact_r) if side == 0 else (b_l, face_l, in_contact_l)
                 )
-                if params[KB] > 0.0:
-                    face, b = track_face(
-                        params, side, d, face, b, was_in_contact, contact[side, k], h
-                    )
-                bumper_push = bumper_force(params, side, d, dd, b) if d > -0.5 * NO_WALL_M else 0.0
+                if p.has_bumper_states:
+                    face, b, s = track_face_with_laws(
+                        side, d, dd, face, b, s, was_in_contact, contact[side, k], h,
+                        fastest_rate, p, laws,
+                    )  # fmt: skip
+                elif p.kb > 0.0:
+                    face, b = track_face(p, side, d, face, b, was_in_contact, contact[side, k], h)
+                push = bumper_force(p, side, d, dd, b, s, laws) if d > -0.5 * NO_WALL_M else 0.0
                 if contact[side, k] < -0.5:
-                    in_contact = bumper_push > 0.0 and (was_in_contact or d >= face)
+                    in_contact = push > 0.0 and (was_in_contact or d >= face)
                 else:
                     in_contact = contact[side, k] > 0.5
                 if side == 0:
                     b_r, face_r, in_contact_r = b, face, in_contact
                 else:
                     b_l, face_l, in_contact_l = b, face, in_contact
-                out[1 + side, k] = sign * bumper_push if in_contact else 0.0
+                out[1 + side, k] = sign * push if in_contact else 0.0
 
     return kernel
 
 
-_force_kernel = _build_force_kernel(force_laws.REVISION)
+_force_kernel = _build_force_kernel(source_revision(globals()) ^ LAWS_REVISION)
 
 
 def forces_along(
@@ -200,17 +275,24 @@ def forces_along(
 
     u in m and v in m/s, (sample,), at times `time_s` in s since the start of the run; `contact`
     (2, sample) right and left: IN_CONTACT, NO_CONTACT, or CONTACT_UNKNOWN where the model decides.
-    Effects on the base acceleration (see `tilt_force`) and on sensors are not included.
+    Effects on the input (see `Model.added_acceleration`) and on sensors are not included.
     """
-    params, plugin_force = kernel_params(model)
+    coefficients, laws = kernel_coefficients(model)
+    fastest_rate = _fastest_law_rate(model)
     out = np.empty((3, u.size))
-    _force_kernel(
-        u, v, time_s, contact.astype(np.float64), tuple(params.tolist()), plugin_force, out
-    )
+    _force_kernel(u, v, time_s, contact.astype(np.float64), coefficients, laws, fastest_rate, out)
     return out
 
 
-def tilt_force(model: Model, table_disp: Float1D) -> Float1D:
-    """Return the force in N of table tilt on the mass, M g tilt x, on the left side; (sample,)."""
-    tilt = model.effect_parameter("table_tilt", "tilt") or 0.0
-    return model.parameters.mass * GRAVITY_M_S2 * tilt * table_disp
+def _fastest_law_rate(model: Model) -> float:
+    """Return the fastest relaxation in 1/s of the added laws and their faces; -1 without states."""
+    if not any(effect.states for effect, _ in model.added_laws):
+        return -1.0
+    properties, p = sum_law_properties(model.added_laws), model.parameters
+    rates = [law.relaxation_rate for law in properties.values()]
+    for side, (k, c) in enumerate(
+        ((p.bumper_stiffness_r, p.bumper_damping_r), (p.bumper_stiffness_l, p.bumper_damping_l))
+    ):
+        if c > 0:
+            rates.append((k + properties[side].stiffness) / c)
+    return max(rates)

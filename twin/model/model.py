@@ -5,7 +5,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any, overload
 
+from table_io.block import Float1D
 from table_io.errors import InputError
 from twin.model.effects import find_effect
 from twin.model.effects.effect import Effect
@@ -79,9 +81,17 @@ class Model:
     def __post_init__(self) -> None:
         present = {instance.effect.id for instance in self.present_effects}
         p = self.parameters
-        if {"hunt_crossley", "bumper_maxwell"} <= present and not (
-            p.bumper_damping_r > 0 and p.bumper_damping_l > 0
-        ):
+        has_dashpots = p.bumper_damping_r > 0 and p.bumper_damping_l > 0
+        for effect, _ in self.added_laws:
+            if effect.is_in_bumpers and effect.states and not has_dashpots:
+                raise InputError(
+                    "a bumper law with memory needs bumper damping: without it the speed of a free "
+                    "face is undefined",
+                    where=f"effect {effect.id!r}",
+                    allowed="bumper damping above 0 N s/m",
+                    remedy="set a bumper damping or remove the effect",
+                )
+        if {"hunt_crossley", "bumper_maxwell"} <= present and not has_dashpots:
             raise InputError(
                 "hunt_crossley and bumper_maxwell together need bumper damping: without it the "
                 "speed of the relaxing face at touch is undefined",
@@ -120,6 +130,35 @@ class Model:
             if instance.effect.id == effect:
                 return instance.values[parameter]
         return None
+
+    @cached_property
+    def added_laws(self) -> tuple[tuple[Effect, Mapping[str, float]], ...]:
+        """Present effects that bring their own force law, each with its values."""
+        return tuple(
+            (instance.effect, instance.values)
+            for instance in self.present_effects
+            if instance.effect.force is not None
+        )
+
+    @cached_property
+    def _input_effects(self) -> tuple[EffectInstance, ...]:
+        return tuple(i for i in self.present_effects if i.effect.input_acceleration is not None)
+
+    @overload
+    def added_acceleration(self, table_disp: float) -> float | None: ...
+    @overload
+    def added_acceleration(self, table_disp: Float1D) -> Float1D | None: ...
+    def added_acceleration(self, table_disp: Any) -> Any:
+        """Return what input effects add to the table acceleration in m/s2; None without any.
+
+        It acts on the mass only: a sensor on the table does not measure it.
+        """
+        added = None
+        for instance in self._input_effects:
+            assert instance.effect.input_acceleration is not None
+            own = instance.effect.input_acceleration(table_disp, instance.values)
+            added = own if added is None else added + own
+        return added
 
     def gap_opening_m(self, time_s: float) -> float:
         """Return by how many m each gap has drifted open, `time_s` after sample 0."""

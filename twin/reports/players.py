@@ -15,7 +15,7 @@ import numpy as np
 from table_io.block import Float1D, Float2D
 from twin.model import closed_form, periodic_orbit
 from twin.model.contact_regime import CONTACT_L, CONTACT_R
-from twin.model.event_integrator_kernel import STATE_F, STATE_Z
+from twin.model.event_integrator_kernel import DIRECTION, STATE_F
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 from twin.model.solver import OUTPUT_COUNT, Solver
@@ -274,7 +274,7 @@ def _renormalize(reference: Float1D, neighbour: Float1D, ratio: float) -> Float1
     The discrete states (contact and direction) are those of `reference`.
     """
     renormalized = reference.copy()
-    for rows in (slice(0, CONTACT_R), slice(STATE_F, STATE_Z + 1)):
+    for rows in (slice(0, CONTACT_R), slice(STATE_F, DIRECTION)):
         renormalized[rows] += ratio * (neighbour[rows] - reference[rows])
     return renormalized
 

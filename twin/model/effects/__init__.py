@@ -17,6 +17,7 @@ from twin.model.effects.effect import Effect
 from twin.model.effects.gap_drift import GAP_DRIFT
 from twin.model.effects.gap_offset import GAP_OFFSET
 from twin.model.effects.hunt_crossley import HUNT_CROSSLEY
+from twin.model.effects.law import find_law_problem
 from twin.model.effects.mass_error import MASS_ERROR
 from twin.model.effects.maxwell_damper import MAXWELL_DAMPER
 from twin.model.effects.quadratic_damping import QUADRATIC_DAMPING
@@ -64,29 +65,26 @@ def load_plugins() -> tuple[Effect, ...]:
                 where=label,
                 remedy="fix or remove the package",
             )
-        if effect.acts == "parameters" and effect.change is None:
-            raise InputError(
-                "acts on parameters but has no `change` function",
-                where=label,
-                remedy="fix or remove the package",
-            )
-        if effect.acts == "force" and effect.force is None:
-            raise InputError(
-                "acts as a force but has no `force` function",
-                where=label,
-                remedy="fix or remove the package",
-            )
-        if effect.acts not in ("parameters", "force"):
-            raise InputError(
-                "not available to plug-ins",
-                where=label,
-                key="acts",
-                value=effect.acts,
-                allowed="parameters, force",
-                remedy="fix or remove the package",
-            )
+        problem = _find_plugin_problem(effect)
+        if problem:
+            raise InputError(problem, where=label, remedy="fix or remove the package")
         plugins.append(effect)
     return tuple(plugins)
+
+
+def _find_plugin_problem(effect: Effect) -> str:
+    """Return why a plug-in's effect cannot be used, "" if it can."""
+    match effect.acts:
+        case "parameters" if effect.change is None:
+            return "acts on parameters but has no `change` function"
+        case "input" if effect.input_acceleration is None:
+            return "acts on the input but has no `input_acceleration` function"
+        case "parameters" | "input":
+            return ""
+        case "force":
+            return find_law_problem(effect)
+        case _:
+            return f"acts = {effect.acts!r} is not available to plug-ins: parameters, input, force"
 
 
 def find_effect(name: str) -> Effect:

@@ -35,6 +35,7 @@ BUMPER_ASYMMETRY = Effect(
         ),
     ),
     acts="parameters",
+    place="bumpers",
     change=_change,
     residual=(
         "In contact only, of the same sign on both sides: force in proportion to |u_j|, so even "

@@ -20,6 +20,7 @@ BUMPER_HARDENING = Effect(
         EffectParameter("k2", "N/m2", 0.0, 1e10, 0.0, 1e8, "Coefficient of depth squared."),
     ),
     acts="force",
+    place="bumpers",
     residual=(
         "In contact only: the force grows faster than the depth, so peaks are underestimated and "
         "light contacts are not; F_j-v_j loops bend upwards."

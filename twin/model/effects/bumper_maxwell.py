@@ -17,6 +17,7 @@ BUMPER_MAXWELL = Effect(
         EffectParameter("tau", "s", 1e-4, 100.0, None, 0.05, "Relaxation time."),
     ),
     acts="linear",
+    place="bumpers",
     residual=(
         "In contact only: stiffer at first and softer later, earlier release; after a recent "
         "contact the gap seems larger."

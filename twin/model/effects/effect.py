@@ -3,7 +3,7 @@
 import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from table_io.errors import InputError
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 #   force       a force law of any shape; integrated
 #   sensor      on a predicted channel; the motion is unchanged
 Acts = Literal["parameters", "input", "linear", "force", "sensor"]
+Place = Literal["damper", "bumpers", "right_bumper", "left_bumper", "input", "mass", "sensor"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,12 +39,23 @@ class EffectParameter:
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """A physical effect; `change` if it acts on parameters, `force` if a plug-in adds a force.
+    """A physical effect: all that solver, identification and discovery know of it.
 
-    `force(u, v, c)` in N is on the left side of the equation of motion, u in m, v in m/s, and c[i]
-    is the value of parameters[i]. It is plain Python that numba can compile, without memory, smooth
-    where v keeps its sign. Force laws of this package are compiled into the solver and leave
-    `force` None.
+    An effect brings, by `acts`:
+
+    - parameters: `change(parameters, values)`, the changed parameters.
+    - input: `input_acceleration(table_disp, values)` in m/s2, added to the table acceleration as
+      the mass feels it; table_disp in m, (n,) or a number.
+    - force: a law, `force(q, w, c)` in N at deformation q in m and its rate w in m/s. At the damper
+      these are u and u', and the force is on the left side of the equation of motion; in a bumper
+      they are its compression and rate, and the force pushes. `place` "bumpers" is the same law in
+      both. A law with memory has `states`, zero when relaxed, with `force(q, w, s, c)` and
+      `rates(q, w, s, c)`, the d/dt of each state as a tuple of floats. c[i] is the value of
+      parameters[i], s[i] that of states[i].
+
+    A law is plain Python that numba can compile, continuous, and smooth where w keeps its sign. In
+    a bumper it is elastic plus a dashpot, linear in w, and zero where q, w and s are. Force laws
+    of this package may instead be compiled into the solver and leave `force` None.
     """
 
     id: str
@@ -54,6 +66,16 @@ class Effect:
     confused_with: tuple[str, ...]
     change: "Callable[[Parameters, Mapping[str, float]], Parameters] | None" = None
     force: Callable[..., float] | None = None
+    place: Place = "damper"
+    states: tuple[str, ...] = ()
+    rates: Callable[..., tuple[float, ...]] | None = None
+    input_acceleration: Callable[[Any, Mapping[str, float]], Any] | None = None
+    required_channels: tuple[str, ...] = ()  # without which it is not observable
+
+    @property
+    def is_in_bumpers(self) -> bool:
+        """Return whether only a test with contact shows it."""
+        return self.place in ("bumpers", "right_bumper", "left_bumper")
 
     def validate(self, values: Mapping[str, float]) -> None:
         """Raise InputError unless `values` has each parameter, nothing else, within its bounds."""

@@ -30,6 +30,7 @@ GAP_OFFSET = Effect(
         ),
     ),
     acts="parameters",
+    place="bumpers",
     change=_change,
     residual=(
         "Contact begins early on one side and late on the other: force residual of one sign "

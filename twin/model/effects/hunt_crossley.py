@@ -23,6 +23,7 @@ HUNT_CROSSLEY = Effect(
         EffectParameter("ch", "N s/m2", 0.0, 1e9, 0.0, 5e5, "Damping per depth of compression."),
     ),
     acts="force",
+    place="bumpers",
     residual=(
         "In contact only: loss that grows with depth; where C_j was fitted without it, a force "
         "jump at touch that is too large and one in the middle that is too small."

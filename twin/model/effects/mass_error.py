@@ -29,6 +29,7 @@ MASS_ERROR = Effect(
         ),
     ),
     acts="parameters",
+    place="mass",
     change=_change,
     residual=(
         "Acceleration off in proportion to the whole force, resonance moved by its root, in flight "

@@ -11,6 +11,7 @@ SENSOR_GAIN = Effect(
     term="reading = gain x value, of one channel",
     parameters=(EffectParameter("gain", "", 0.2, 5.0, 1.0, 1.05, "Reading over true value."),),
     acts="sensor",
+    place="sensor",
     residual=(
         "In proportion to the channel itself, in flight and in contact; the motion channels become "
         "inconsistent with each other, which no force law can cause."

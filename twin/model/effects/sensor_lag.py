@@ -11,6 +11,7 @@ SENSOR_LAG = Effect(
     term="reading(t) = value(t - lag), of one channel",
     parameters=(EffectParameter("lag", "s", 0.0, 0.05, 0.0, 1e-3, "Delay of the reading."),),
     acts="sensor",
+    place="sensor",
     residual=(
         "In proportion to the rate of change of the channel, so it grows with frequency; the "
         "motion channels become inconsistent with each other."

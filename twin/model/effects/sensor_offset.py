@@ -15,6 +15,7 @@ SENSOR_OFFSET = Effect(
         ),
     ),
     acts="sensor",
+    place="sensor",
     residual="A constant in one channel, at rest too; no harmonics in the others.",
     confused_with=("gap_offset", "table_tilt"),
 )

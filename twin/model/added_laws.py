@@ -1,0 +1,118 @@
+"""Laws that effects bring themselves (`Effect.force`), compiled for the solver.
+
+The solver knows the laws of this package by their coefficients. All others become one compiled
+function of (place, deformation, rate, states, coefficients), so that the solver itself is compiled
+and cached only once, whatever effects a model has.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any
+
+from numba.core.errors import NumbaError
+
+from table_io.errors import InputError
+from twin.model.compilation import jit_kernel
+from twin.model.effects.effect import Effect
+from twin.model.effects.law import PLACES
+from twin.model.force_laws import (
+    ADDED_LAWS_SIGNATURE,
+    LAW_PARAMETERS,
+    LAW_STATES,
+    AddedLaws,
+)
+
+
+def pack_coefficients(laws: Sequence[tuple[Effect, Mapping[str, float]]]) -> tuple[float, ...]:
+    """Return the parameters of all laws, padded to `LAW_PARAMETERS`; InputError if too many."""
+    values = [values[p.name] for effect, values in laws for p in effect.parameters]
+    state_count = sum(len(PLACES[effect.place]) * len(effect.states) for effect, _ in laws)
+    for count, limit, what in (
+        (len(values), LAW_PARAMETERS, "parameters"),
+        (state_count, LAW_STATES, "states, those of each bumper counted"),
+    ):
+        if count > limit:
+            raise InputError(
+                f"the laws of {', '.join(effect.id for effect, _ in laws)} have {count} {what}",
+                allowed=f"at most {limit} in total",
+                remedy="remove an effect",
+            )
+    return (*values, *[0.0] * (LAW_PARAMETERS - len(values)))
+
+
+@cache
+def compile_laws(effects: tuple[Effect, ...]) -> AddedLaws | None:
+    """Compile the laws of these effects into one function, None for none.
+
+    Compiled once in every process: numba's cache on disk does not notice that a plug-in changed.
+    InputError if numba cannot compile a law.
+    """
+    laws: Any = _no_laws
+    first_parameter = first_state = 0
+    for effect in effects:
+        try:
+            force, rates = _compile_law(effect)
+            for place in PLACES[effect.place]:
+                laws = _add_law(laws, force, rates, place, first_parameter, first_state)
+                first_state += len(effect.states)
+            laws.compile(ADDED_LAWS_SIGNATURE)
+        except NumbaError as error:
+            raise InputError(
+                f"its law cannot be compiled: {str(error).strip().splitlines()[0]}",
+                where=f"effect {effect.id!r}",
+                remedy="use only arithmetic, `math`, comparisons and float tuples in it",
+            ) from error
+        first_parameter += len(effect.parameters)
+    return jit_kernel(ADDED_LAWS_SIGNATURE)(laws.py_func) if effects else None
+
+
+def _compile_law(effect: Effect) -> tuple[Any, Any]:
+    """Return force and rates of a law, both compiled functions of (q, w, s, c)."""
+    assert effect.force is not None
+    force = jit_kernel()(effect.force)
+    if effect.rates is None:
+        return jit_kernel()(lambda q, w, s, c: force(q, w, c)), _no_rates
+    return force, jit_kernel()(effect.rates)
+
+
+@jit_kernel()
+def _no_laws(
+    place: int, q: float, w: float, s: tuple[float, ...], c: tuple[float, ...]
+) -> tuple[float, ...]:
+    return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@jit_kernel()
+def _no_rates(q: float, w: float, s: tuple[float, ...], c: tuple[float, ...]) -> tuple[float, ...]:
+    return (0.0,)
+
+
+@jit_kernel()
+def _rate_of(rates: tuple[float, ...], index: int) -> float:
+    """Return the rate of one state, 0 for a state of another law."""
+    return rates[index] if 0 <= index < len(rates) else 0.0
+
+
+def _add_law(
+    before: Any, force: Any, rates: Any, own_place: int, first_parameter: int, first_state: int
+) -> Any:
+    """Return the laws `before` and one more, whose parameters and states begin at these numbers."""
+    p, n = first_parameter, first_state
+
+    def laws(place, q, w, s, c):  # type: ignore[no-untyped-def]
+        total = before(place, q, w, s, c)
+        if place != own_place:
+            return total
+        own_s = (s[n % 6], s[(n + 1) % 6], s[(n + 2) % 6], s[(n + 3) % 6], s[(n + 4) % 6],
+                 s[(n + 5) % 6])  # fmt: skip
+        own_c = (c[p], c[(p + 1) % 8], c[(p + 2) % 8], c[(p + 3) % 8], c[(p + 4) % 8],
+                 c[(p + 5) % 8], c[(p + 6) % 8], c[(p + 7) % 8])  # fmt: skip
+        own = rates(q, w, own_s, own_c)
+        return (
+            total[0] + force(q, w, own_s, own_c),
+            total[1] + _rate_of(own, -n), total[2] + _rate_of(own, 1 - n),
+            total[3] + _rate_of(own, 2 - n), total[4] + _rate_of(own, 3 - n),
+            total[5] + _rate_of(own, 4 - n), total[6] + _rate_of(own, 5 - n),
+        )  # fmt: skip
+
+    return jit_kernel()(laws)
