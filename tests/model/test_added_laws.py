@@ -1,0 +1,212 @@
+"""Effects of another package: bumper laws, laws with states and inputs do all that ours do."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from table_io.errors import InputError
+from tests.identification.played import SNM, hidden, log
+from tests.model import laboratory_laws
+from tests.model.cases import RATE, drive, noisy, typical
+from tests.model.motion import sine
+from tests.model.reference import snm
+from tests.plugin_package import install_package
+from twin.identification.discover import discover_effects
+from twin.model.effects import find_effect, load_plugins
+from twin.model.effects.effect import Effect
+from twin.model.effects.law import find_law_problem
+from twin.model.inverse_dynamics import forces_along
+from twin.model.model import Model
+from twin.model.solver import StateEstimate
+
+KICK = noisy(1.0)
+BASES = {"plain": snm(), "preload": snm(-0.001), "uneven": snm(bumper_stiffness_r=7e5, gap_l=3e-3)}
+# (their effect, ours with the same law, values of ours in the order of theirs)
+SAME_LAWS = [
+    ("zener_damper", "maxwell_damper", ("k1", "tau")),
+    ("zener_bumper", "bumper_maxwell", ("kb", "tau")),
+    ("slip_damper", "bouc_wen", ("force", "yield_displacement")),
+    ("deep_dashpot", "hunt_crossley", ("ch",)),
+    ("rocking", "table_tilt", ("tilt",)),
+]
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory) -> Path:
+    """Install the laboratory's package; return the folder that holds it."""
+    names = [name for name, item in vars(laboratory_laws).items() if isinstance(item, Effect)]
+    return install_package(
+        tmp_path_factory.mktemp("package"),
+        "laboratory_package",
+        Path(laboratory_laws.__file__).read_text(),
+        {"shaketwin.effects": {name.lower(): f"laboratory_package:{name}" for name in names}},
+    )
+
+
+@pytest.fixture
+def plugins(package, monkeypatch) -> None:
+    monkeypatch.syspath_prepend(package)
+
+
+def add(effect_id: str, base=None, **values: float) -> Model:
+    effect = find_effect(effect_id)
+    return Model(base or snm()).with_effect(effect_id, **(values or typical(effect)))
+
+
+@pytest.mark.usefixtures("plugins")
+class TestInstalled:
+    def test_the_package_is_found(self):
+        assert {effect.id for effect in load_plugins()} == {e.id for e in laboratory_laws.EFFECTS}
+
+    @pytest.mark.parametrize("base", BASES.values(), ids=BASES)
+    @pytest.mark.parametrize(("theirs", "ours", "names"), SAME_LAWS)
+    def test_the_same_law_gives_the_same_motion(self, theirs, ours, names, base):
+        values = list(typical(find_effect(ours)).values())
+        their_names = [parameter.name for parameter in find_effect(theirs).parameters]
+        own = Model(base).with_effect(ours, **dict(zip(names, values, strict=True)))
+        added = Model(base).with_effect(theirs, **dict(zip(their_names, values, strict=True)))
+        expected, out = drive(own, KICK)[1], drive(added, KICK)[1]
+        scale = np.abs(expected).max(axis=1, keepdims=True)
+        assert (np.abs(out - expected) <= 2e-6 * scale).all()
+        # without the law the motion is another one
+        assert np.abs(drive(Model(base), KICK)[1][0] - expected[0]).max() > 1e-3 * scale[0]
+
+    @pytest.mark.parametrize(("theirs", "ours", "names"), SAME_LAWS[:4])
+    def test_the_same_law_gives_the_same_forces_along_a_motion(self, theirs, ours, names):
+        values = list(typical(find_effect(ours)).values())
+        their_names = [parameter.name for parameter in find_effect(theirs).parameters]
+        own = SNM.with_effect(ours, **dict(zip(names, values, strict=True)))
+        added = SNM.with_effect(theirs, **dict(zip(their_names, values, strict=True)))
+        u, v, _, right, left = drive(own, 2.0 * sine(2.6, RATE, 4.0), StateEstimate(0, 0.0, 0.0))[
+            1
+        ][:5]
+        time = np.arange(1, u.size + 1) / RATE
+        contact = np.array([right > 0, left < 0]).astype(np.int8)
+        expected = forces_along(own, u, v, time, contact)
+        found = forces_along(added, u, v, time, contact)
+        plain = forces_along(SNM, u, v, time, contact)
+        row = 0 if ours in ("maxwell_damper", "bouc_wen") else 1
+        effect_size = np.abs(plain - expected)[row].max()
+        assert np.abs(found - expected)[row].max() < 0.02 * effect_size
+
+    def test_one_law_on_each_side_is_the_law_on_both(self):
+        both = Model(snm()).with_effect("bumper_hardening", k2=1e8)
+        sides = Model(snm()).with_effect("hard_right", k2=1e8).with_effect("hard_left", k2=1e8)
+        right = Model(snm()).with_effect("hard_right", k2=1e8)
+        expected = drive(both, KICK)[1]
+        assert np.abs(drive(sides, KICK)[1][0] - expected[0]).max() < 1e-9
+        assert np.abs(drive(right, KICK)[1][0] - expected[0]).max() > 1e-6
+
+    def test_a_cubic_bumper_pushes_as_it_says(self):
+        p = snm()
+        out = drive(add("cubic_bumper", k3=5e10), KICK)[1]
+        u, v, acc, right, left = out[:5]
+        inside = right > 0
+        d = u[inside] - p.gap_r
+        push = p.bumper_stiffness_r * d + p.bumper_damping_r * v[inside] + 5e10 * d**3
+        assert inside.sum() > 100
+        assert right[inside] == pytest.approx(push, rel=1e-9)
+        balance = p.mass * acc + p.damping * v + p.stiffness * u + right + left
+        assert np.abs(balance).max() < 1e-9 * np.abs(right).max()
+
+    def test_a_law_with_states_has_a_passive_branch(self):
+        """Stored b^2 / 2k may not exceed the work done on the branch, f u' integrated."""
+        values = {"stiffness": 2e5, "relaxation_time": 0.05}
+        model = add("zener_damper", **values)
+        p, out = snm(), drive(model, KICK)[1]
+        u, v, acc, right, left = out[:5]
+        force = -(p.mass * acc + p.damping * v + p.stiffness * u + right + left)
+        work = np.cumsum(force * v) / RATE
+        stored = force**2 / (2 * values["stiffness"])
+        assert (work - stored > -0.01 * work.max()).all()
+
+    @pytest.mark.parametrize("size", [1, 7, 64, 500])
+    def test_blocks_of_any_size_give_the_same_bits(self, size):
+        model = add("zener_bumper").with_effect("slip_damper", force=100.0, yield_displacement=1e-3)
+        model = model.with_effect("cubic_bumper", k3=1e10)
+        whole, out = drive(model, KICK)
+        solver, cut = model.prepare(RATE), np.empty_like(out)
+        state = solver.rest_state()
+        for first in range(0, KICK.size, size):
+            part = KICK[first : first + size]
+            solver.advance(state, part, 0.01 * part, cut[:, first : first + size])
+        assert cut.tobytes() == out.tobytes()
+        assert state.tobytes() == whole.tobytes()
+
+    def test_what_does_not_fit_is_refused(self):
+        model = add("zener_bumper").with_effect("slip_damper", force=1.0, yield_displacement=1e-3)
+        model = model.with_effect("zener_damper", stiffness=1.0, relaxation_time=1.0)
+        model = model.with_effect("smooth_friction", force=1.0, speed=1e-2)
+        with pytest.raises(InputError) as error:
+            model.with_effect("cubic_bumper", k3=1.0).with_effect("rocking", tilt=0.1).with_effect(
+                "deep_dashpot", c=1.0
+            ).prepare(RATE)
+        assert error.value.allowed.startswith("at most 8")
+        with pytest.raises(InputError) as error:
+            add("zener_bumper", base=snm(bumper_damping_r=0.0))
+        assert "zener_bumper" in error.value.where
+
+    @pytest.mark.parametrize(
+        ("truth", "name", "parameter", "value", "without"),
+        [
+            (hidden("bumper_cubic", kc=2e9), "cubic_bumper", "k3", 2e9, ()),
+            (
+                hidden("maxwell_damper", k1=8e3, tau=0.05), "zener_damper", "stiffness", 8e3,
+                ("maxwell_damper",),
+            ),
+        ],
+        ids=["bumper law", "law with a state"],
+    )  # fmt: skip
+    def test_discovery_names_it_with_its_parameter(self, truth, name, parameter, value, without):
+        others = {effect.id for effect in laboratory_laws.EFFECTS} - {name}
+        verdict = discover_effects([log(truth)], SNM, without=(*without, *others)).verdict
+        assert verdict.outcome == "named", verdict.reason
+        assert verdict.best.names == (name,)
+        assert verdict.best.fit.values[f"{name}.{parameter}"] == pytest.approx(value, rel=0.05)
+
+
+LAW = laboratory_laws.ZENER_BUMPER
+
+
+@pytest.mark.parametrize(
+    ("effect", "problem"),
+    [
+        (replace(LAW, force=None), "no `force`"),
+        (replace(LAW, place="table"), "'table'"),
+        (replace(LAW, rates=None), "belong together"),
+        (replace(LAW, rates=lambda q, w, s, c: (0.0, 0.0)), "2 values for 1 states"),
+        (replace(LAW, force=lambda q, w, s, c: w * abs(w)), "linear in the rate"),
+        (replace(LAW, force=lambda q, w, s, c: 5.0), "zero at deformation 0"),
+        (replace(LAW, force=lambda q, w, s, c: s[3]), "IndexError"),
+        (replace(LAW, force=lambda q, w, s, c: float("nan")), "not finite"),
+    ],
+)
+def test_a_law_that_cannot_work_is_told_why(effect, problem):
+    assert not find_law_problem(LAW)
+    assert problem in find_law_problem(effect)
+
+
+def test_commands_take_it(package, tmp_path):
+    """`simulate` with both kinds of law, in a process that finds the installed package."""
+    snm_file = (Path(__file__).parents[2] / "profiles/models/snm.toml").read_text()
+    model = tmp_path / "model.toml"
+    model.write_text(
+        snm_file
+        + '\n[[effects]]\nid = "cubic_bumper"\nparameters = { k3 = 1e10 }\n'
+        + '\n[[effects]]\nid = "zener_damper"\n'
+        + "parameters = { stiffness = 8e3, relaxation_time = 0.05 }\n"
+    )
+    code = (
+        f"import sys; sys.path.insert(0, {str(package)!r}); from twin.cli.main import main; "
+        f"sys.exit(main())"
+    )
+    arguments = ["simulate", "quickstart", "--model", str(model), "--out", str(tmp_path / "out")]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out" / "summary.json").exists()
