@@ -14,7 +14,7 @@ from table_io.errors import InputError
 from tests.model.cases import RATE, drive, everything, having, noisy
 from tests.model.reference import AG, snm
 from tests.model.test_parameters import CARD
-from twin.model.closed_form_solver import ClosedFormSolver
+from twin.model.closed_form import ClosedFormSolver
 from twin.model.config import ModelConfig
 from twin.model.effects import EFFECTS, find_effect
 from twin.model.effects.effect import Effect, EffectParameter

@@ -207,7 +207,7 @@ class Model:
             from twin.model.event_integrator import EventDrivenSolver
 
             return EventDrivenSolver.from_model(self, rate_hz)
-        from twin.model.closed_form_solver import ClosedFormSolver
+        from twin.model.closed_form import ClosedFormSolver
 
         return ClosedFormSolver.from_model(self, rate_hz)
 
