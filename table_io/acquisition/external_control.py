@@ -40,13 +40,13 @@ from table_io.acquisition.session import (
 )
 from table_io.adaptive import make_policy
 from table_io.backends import AcquisitionSource, MachineLost
+from table_io.backends.follow import FollowWiring
 from table_io.block import Block, Bool2D, Float1D, Float2D
 from table_io.clock import Clock, local_datetime
 from table_io.config.calibration import compute_tare, volts_to_si
 from table_io.config.calibration_due import find_overdue_calibrations
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
-from table_io.config.wiring.follow import FollowWiring
 from table_io.errors import InputError
 from table_io.excitation.drive import Drive
 from table_io.records import RunStop, Trip
@@ -119,7 +119,7 @@ class _ExternalSession:
         self.setup, self.source, self.clock = setup, source, clock
         self.rate_hz = profile.acquisition.rate_hz
         self.drive = plan_open_loop_drive(profile, rig)
-        self.wiring = rig.follow or FollowWiring()
+        self.wiring = rig.get_section(FollowWiring) or FollowWiring()
         self.verdict, self.reason = "complete", "the whole drive was played"
         self.delivered = 0  # samples that were delivered
         self.is_finished = False

@@ -40,13 +40,22 @@ continues alone, to rest. Every call is a sign of life, and a call that waits se
 waits. If the rig was only slow, its next call raises MachineLost.
 
 `tests/table_io/backends/conformance.py` tests every backend against each clause.
+
+A module makes a backend known by a `BackendDescriptor`, registered under the backend's name in the
+entry-point group `shaketwin.backends`. What differs between backends is stated there; nothing else
+asks which backend a rig has.
 """
 
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
 from typing import Protocol
 
+from table_io.backends.digital_inputs import DigitalInputs
+from table_io.backends.discovery import DeviceSearch
 from table_io.block import Float1D, Float2D
 from table_io.clock import Clock
-from table_io.config.profile import Profile
+from table_io.config.backend import BackendConfig, require_backend
+from table_io.config.profile import Profile, Specimen
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 
@@ -118,69 +127,82 @@ class AcquisitionSource(Protocol):
         """Disconnect from the device."""
 
 
-def open_source(rig: RigConfig, rate_hz: float, clock: Clock) -> AcquisitionSource:
-    """Return the acquisition source of a rig without output; a new kind is a new case here."""
-    match rig.follow.source if rig.follow is not None else rig.backend:
-        case "opendaq":
-            from table_io.backends.opendaq import OpenDaqSource
+@dataclass(frozen=True, kw_only=True)
+class BackendDescriptor:
+    """Everything that the program knows of a backend; give `open` or `open_source`.
 
-            return OpenDaqSource(rig, rate_hz, clock)
-        case _:
-            raise InputError(
-                "this backend drives the table itself and is not an acquisition source",
-                where=f"rig {rig.name}",
-                key="backend",
-                value=rig.backend,
-                allowed="follow, opendaq",
-            )
+    Its module must import no vendor library: the functions import what they need when called.
+    """
+
+    config: type[BackendConfig]  # of the section of the rig file that has the backend's name
+    open: Callable[[RigConfig, Specimen, float, Clock], Backend] | None = None  # rate in Hz
+    open_source: Callable[[RigConfig, float, Clock], AcquisitionSource] | None = None  # rate in Hz
+    any_speed: bool = False  # any clock may pace it: simulated in the process of the rig
+    is_simulated: bool = False  # moves no real table
+    external_control: bool = False  # `run` records the table while another controller drives it
+    check_reachable: Callable[[RigConfig], None] | None = None  # InputError if nothing answers
+    open_digital_inputs: Callable[[RigConfig], DigitalInputs | None] | None = None  # with heartbeat
+    # Searches for devices by a label, at least at these addresses of rig files.
+    list_searches: Callable[[Collection[str]], Mapping[str, DeviceSearch]] | None = None
+
+    @property
+    def drives(self) -> bool:
+        """True if the backend has a command output; False if it only acquires."""
+        return self.open is not None
+
+
+def find_descriptor(rig: RigConfig) -> BackendDescriptor:
+    """Return the descriptor of the rig's backend; InputError if it is not installed."""
+    return get_descriptor(rig.backend, f"rig {rig.name}")
+
+
+def get_descriptor(name: str, where: object, key: str = "backend") -> BackendDescriptor:
+    """Return the descriptor of the backend `name`; InputError if it is not installed."""
+    descriptor = require_backend(name, where, key)
+    if not isinstance(descriptor, BackendDescriptor) or not (
+        descriptor.drives or descriptor.open_source
+    ):
+        raise InputError(
+            "neither drives nor acquires",
+            where=where,
+            key=key,
+            value=name,
+            allowed="a BackendDescriptor with open or open_source",
+            remedy="fix or remove the package",
+        )
+    return descriptor
+
+
+def open_source(rig: RigConfig, rate_hz: float, clock: Clock) -> AcquisitionSource:
+    """Return the acquisition source of a rig without output."""
+    descriptor = find_descriptor(rig)
+    if descriptor.open_source is None:
+        raise InputError(
+            "this backend drives the table itself and is not an acquisition source",
+            where=f"rig {rig.name}",
+            key="backend",
+            value=rig.backend,
+            allowed="a backend that only acquires",
+        )
+    return descriptor.open_source(rig, rate_hz, clock)
 
 
 def open_backend(rig: RigConfig, profile: Profile, clock: Clock) -> Backend:
-    """Return the backend that the rig file selects; a new one is a folder and a case here."""
-    arguments = (rig, profile.specimen, profile.acquisition.rate_hz, clock)
-    match rig.backend:
-        case "simulated":
-            from table_io.sim.simulated_table import SimulatedBackend
-
-            return SimulatedBackend(*arguments)
-        case "machine":
-            from table_io.backends.machine.client import MachineBackend
-
-            return MachineBackend(*arguments)
-        case "ni":
-            from table_io.backends.ni import NiBackend
-
-            return NiBackend(*arguments)
-        case "udp":
-            from table_io.backends.udp import UdpBackend
-
-            return UdpBackend(*arguments)
-        case "opendaq" | "follow":
-            raise InputError(
-                "this backend only acquires and cannot drive the table",
-                where=f"rig {rig.name}",
-                key="backend",
-                value=rig.backend,
-                remedy="use backend = 'follow' for a controller that plays the drive file itself",
-            )
+    """Return the backend that the rig file selects."""
+    descriptor = find_descriptor(rig)
+    if descriptor.open is None:
+        raise InputError(
+            "this backend only acquires and cannot drive the table",
+            where=f"rig {rig.name}",
+            key="backend",
+            value=rig.backend,
+            remedy="use backend = 'follow' for a controller that plays the drive file itself",
+        )
+    return descriptor.open(rig, profile.specimen, profile.acquisition.rate_hz, clock)
 
 
 def check_reachable(rig: RigConfig) -> None:
     """Raise InputError if the machine of the rig file does not answer; claim nothing."""
-    match rig.backend:
-        case "machine":
-            from table_io.backends.machine import client
-
-            client.check_reachable(rig)
-        case "opendaq" | "follow":
-            from table_io.backends import opendaq
-
-            opendaq.check_reachable(rig)
-        case "udp":
-            from table_io.backends import udp
-
-            udp.check_reachable(rig)
-        case "ni":
-            from table_io.backends import ni
-
-            ni.check_reachable(rig)
+    check = find_descriptor(rig).check_reachable
+    if check is not None:
+        check(rig)

@@ -1,10 +1,10 @@
 """Result of device discovery, in the same form for every vendor.
 
-`discover_devices(...)` in table_io/backends/{ni,opendaq}/discovery.py returns a tuple of
-`DiscoveredDevice`. It raises InputError if it cannot search: a library is not installed (the
-message has the pip line) or a server does not answer.
+A `DeviceSearch` returns a tuple of `DiscoveredDevice`. It raises InputError if it cannot search: a
+library is not installed (the message has the pip line) or a server does not answer.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -23,10 +23,13 @@ class ChannelGroup:
 class DiscoveredDevice:
     """One device that answered, and its channels."""
 
-    kind: Literal["ni", "opendaq", "udp"]
+    kind: str  # name of its backend
     name: str  # as written in the rig file: Dev1, daq.nd://...
     where: str  # address of its server, or "local driver"
     product: str = ""
     serial: str = ""
     simulated: bool = False
     ports: tuple[ChannelGroup, ...] = ()
+
+
+DeviceSearch = Callable[[], tuple[DiscoveredDevice, ...]]

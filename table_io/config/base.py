@@ -33,28 +33,35 @@ class ConfigModel(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    @classmethod
+    def list_keys(cls) -> list[str]:
+        """List the allowed keys."""
+        return list(cls.model_fields)
+
+    @classmethod
+    def find_table_model(cls, key: str) -> "type[ConfigModel] | None":
+        """Return the model of the table or tables at `key`; None if it holds no table."""
+        stack: list[Any] = [cls.model_fields[key].annotation] if key in cls.model_fields else []
+        while stack:
+            item = stack.pop()
+            if isinstance(item, type) and issubclass(item, ConfigModel):
+                return item
+            stack.extend(getattr(item, "__args__", ()))
+        return None
+
 
 ConfigT = TypeVar("ConfigT", bound=ConfigModel)
 
 
-def _known_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
+def _known_keys(model: type[ConfigModel], location: tuple[int | str, ...]) -> list[str]:
     """Return the keys allowed in the table that holds the last key of `location`."""
-    current: Any = model
     for key in location[:-1]:
-        if isinstance(key, int) or key not in current.model_fields:
-            continue  # an index of a list, or a name that the user chooses
-        annotation: Any = current.model_fields[key].annotation
-        stack = [annotation]
-        while stack:
-            item = stack.pop()
-            if isinstance(item, type) and issubclass(item, BaseModel):
-                current = item
-                break
-            stack.extend(getattr(item, "__args__", ()))
-    return list(current.model_fields)
+        # An index of a list, or a name that the user chooses, has no model of its own.
+        model = (model.find_table_model(key) if isinstance(key, str) else None) or model
+    return model.list_keys()
 
 
-def _format_error(model: type[BaseModel], error: Any) -> str:
+def _format_error(model: type[ConfigModel], error: Any) -> str:
     """Describe one validation error: key, value, what is allowed, what to do."""
     location: tuple[int | str, ...] = error["loc"]
     key = ".".join(str(part) for part in location) or "file"

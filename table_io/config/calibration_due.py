@@ -16,7 +16,7 @@ def find_overdue_calibrations(rig: RigConfig, today: date) -> list[str]:
     undated = [
         sensor.channel for sensor in sensors if sensor.calibrated is None and sensor.due is None
     ]
-    if undated and rig.simulated is None:
+    if undated and not rig.is_simulated:
         warnings.append(
             f"no date of calibration: {', '.join(undated)}; add `calibrated` and `due` to their "
             "[[sensors]] tables in the rig file"

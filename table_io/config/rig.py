@@ -3,19 +3,27 @@
 Keys carry their unit in the name (`span_mm`, `lead_s`); properties return SI.
 """
 
-import difflib
-from typing import Literal, NamedTuple
+from collections.abc import Mapping
+from typing import Any, Self, TypeVar
 
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import (
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import InitErrorDetails
 
-from table_io.config.base import ConfigModel, Finite, NonNegative, Number, Positive
+from table_io.config.backend import BACKEND_GROUP, BackendConfig, list_entry_points, load_backend
+from table_io.config.base import ConfigModel, Number, Positive
 from table_io.config.calibration_record import CalibrationRecord
 from table_io.config.sensor import SensorConfig
-from table_io.config.wiring.follow import FollowWiring
-from table_io.config.wiring.ni import NiWiring
-from table_io.config.wiring.opendaq import OpenDaqWiring
-from table_io.config.wiring.udp import UdpWiring
 from table_io.errors import InputError
+
+SectionT = TypeVar("SectionT", bound=BackendConfig)
 
 
 class MachineLimits(ConfigModel):
@@ -52,121 +60,24 @@ class OutputConfig(ConfigModel):
         return replace_after + round(self.lead_s * rate_hz)
 
 
-class FaultKind(NamedTuple):
-    """Keys of a fault kind: channel needed, meaning of its size ("": none), its duration."""
+class RigConfig(ConfigModel):
+    """Rig file of a shaking table: its limits, output, sensors and the sections of backends.
 
-    channel: bool
-    size: str
-    duration: Literal["must", "may", "no"]  # for_s required, optional (else permanent), forbidden
-
-
-FAULT_KINDS = {
-    "dropped": FaultKind(False, "", "must"),
-    "repeated": FaultKind(False, "", "must"),
-    "replayed": FaultKind(False, "", "must"),
-    "late": FaultKind(False, "seconds", "no"),
-    "stall": FaultKind(False, "", "no"),
-    "stuck": FaultKind(True, "", "may"),
-    "cable_off": FaultKind(True, "", "may"),
-    "gain": FaultKind(True, "relative error, 0.1 reads a tenth too much", "may"),
-    "polarity": FaultKind(True, "", "may"),
-    "rail": FaultKind(True, "", "may"),
-    "drift": FaultKind(True, "units of the sensor a second", "may"),
-    "spike": FaultKind(True, "units of the sensor", "no"),
-    "nan": FaultKind(True, "", "may"),
-    "power_loss": FaultKind(False, "", "no"),
-    "oil_loss": FaultKind(False, "share of the servo's bandwidth that is left", "no"),
-}
-
-
-class InjectedFault(ConfigModel):
-    """Fault injected into the simulated machine; `sim/faults.py` describes each kind.
-
-    Keys that a kind does not use must be omitted.
+    A section is a table named like an installed backend and validated by its config model. Sections
+    of a backend that is not installed are kept unread, so that a recording can be read without the
+    package that drove its table; `load_rig` refuses them.
     """
 
-    at_s: NonNegative = Field(description="Time from the start of the run.")
-    for_s: Positive | None = None
-    channel: str | None = None
-    size: Finite | None = None
-    kind: str = Field(description="Last key: it decides which others are needed.")
-
-    @field_validator("kind")
-    @classmethod
-    def _complete(cls, kind: str, info: ValidationInfo) -> str:
-        if kind not in FAULT_KINDS:
-            near = difflib.get_close_matches(kind, FAULT_KINDS, 1, 0.4)
-            raise ValueError(
-                f"kind {kind!r} is unknown"
-                + (f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(FAULT_KINDS)}")
-            )
-        requirements = FAULT_KINDS[kind]
-        keys = (
-            ("channel", requirements.channel, requirements.channel, "one of the rig's sensors"),
-            ("size", bool(requirements.size), bool(requirements.size), requirements.size),
-            ("for_s", requirements.duration == "must", requirements.duration != "no", "seconds"),
-        )
-        for key, required, permitted, meaning in keys:
-            given = info.data.get(key) is not None
-            if required and key in info.data and not given:
-                raise ValueError(f"kind {kind!r} needs {key} ({meaning}); add it")
-            if given and not permitted:
-                raise ValueError(f"kind {kind!r} has no {key}; leave it out")
-        size = info.data.get("size")
-        if kind in ("late", "oil_loss") and size is not None and size <= 0:
-            raise ValueError(
-                f"kind {kind!r} has size {size:g}; allowed: above 0 ({requirements.size})"
-            )
-        return kind
-
-
-class SimulatedTableConfig(ConfigModel):
-    """Simulated machine: servo, payload reaction and the true specimen on it."""
-
-    servo_bandwidth_hz: Positive = Field(description="-3 dB of the closed displacement loop.")
-    servo_delay_ms: NonNegative
-    moving_mass_kg: Positive
-    payload_reaction: bool = True
-    seed: int = 0
-    damper_stiffness_n_m: Positive
-    damper_damping_n_s_m: NonNegative
-    bumper_stiffness_n_m: Positive
-    bumper_damping_n_s_m: Positive
-    faults: tuple[InjectedFault, ...] = ()
-    truth: str | None = Field(None, description="Path of a sealed file, see `sim/ground_truth.py`.")
-    truth_sha256: str | None = Field(None, pattern=r"^[0-9a-fA-F]{64}$", validate_default=True)
-
-    @field_validator("truth_sha256")
-    @classmethod
-    def _check_truth_pair(cls, sha256: str | None, info: ValidationInfo) -> str | None:
-        if "truth" in info.data and (info.data["truth"] is None) != (sha256 is None):
-            raise ValueError("truth and truth_sha256 go together; give both or neither")
-        return sha256
-
-
-class MachineConfig(ConfigModel):
-    """Machine in a separate process: `shaketwin table` simulates its [simulated] table."""
-
-    endpoint: str = Field(description="tcp/127.0.0.1:PORT or unix/PATH, on this computer only.")
-
-
-class RigConfig(ConfigModel):
-    """Rig file of a shaking table: its limits, output, sensors and wiring."""
+    model_config = ConfigDict(extra="allow")  # the sections
 
     name: str = Field(pattern=r"^[a-z0-9_]+$")
     title: str
-    backend: Literal["simulated", "machine", "ni", "opendaq", "udp", "follow"]
+    backend: str
     rates_hz: tuple[Positive, ...] = Field(min_length=1)
     moving_mass_kg: Positive = Field(description="Table without payload, for the force margin.")
     limits: MachineLimits
     output: OutputConfig
     sensors: tuple[SensorConfig, ...] = Field(min_length=1)
-    simulated: SimulatedTableConfig | None = Field(None, validate_default=True)
-    machine: MachineConfig | None = Field(None, validate_default=True)
-    ni: NiWiring | None = Field(None, validate_default=True)
-    opendaq: OpenDaqWiring | None = Field(None, validate_default=True)
-    udp: UdpWiring | None = Field(None, validate_default=True)
-    follow: FollowWiring | None = Field(None, validate_default=True)
     calibrations: tuple[CalibrationRecord, ...] = Field(
         (), description="Records of `shaketwin calibrate`, appended when the file is read."
     )
@@ -183,7 +94,8 @@ class RigConfig(ConfigModel):
                 f"sensors name {', '.join(duplicates)} more than once; one sensor per channel"
             )
         missing = {"drive_disp_m", "table_disp_m", "table_acc_m_s2"} - set(names)
-        if info.data.get("backend") == "follow":
+        backend = load_backend(info.data.get("backend", ""))
+        if backend is None or not backend.drives:
             missing -= {"drive_disp_m"}  # an external controller may have no command output
         if missing:
             raise ValueError(
@@ -191,50 +103,90 @@ class RigConfig(ConfigModel):
             )
         return sensors
 
-    @field_validator("simulated")
+    @model_validator(mode="wrap")
     @classmethod
-    def _check_simulated(
-        cls, simulated: SimulatedTableConfig | None, info: ValidationInfo
-    ) -> SimulatedTableConfig | None:
-        if simulated is None and info.data.get("backend") == "simulated":
-            raise ValueError(
-                "backend 'simulated' needs a [simulated] table with servo and specimen"
-            )
-        names = [sensor.channel for sensor in info.data.get("sensors", ())]
-        for fault in simulated.faults if simulated and names else ():
-            if fault.channel is not None and fault.channel not in names:
-                near = difflib.get_close_matches(fault.channel, names, 1, 0.4)
-                raise ValueError(
-                    f"fault {fault.kind!r}: the rig has no sensor {fault.channel!r}"
-                    + (f"; did you mean {near[0]!r}?" if near else f"; it has: {', '.join(names)}")
+    def _validate_sections(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        """Validate sections and fields, so that one error lists the faults of both."""
+        if not isinstance(data, Mapping):
+            return handler(data)
+        values, faults = dict(data), list[InitErrorDetails]()
+        own_name = str(values.get("backend"))
+        own_section = values.get(own_name)
+        is_installed = load_backend(own_name) is not None
+        if is_installed and own_section is None:
+            faults.append(
+                _make_fault(
+                    own_name,
+                    f"backend {own_name!r} needs a [{own_name}] table with its settings; see "
+                    "CONNECT.md",
                 )
-        return simulated
+            )
+        # A section may name that of another backend, as [follow] does.
+        sources = own_section.values() if isinstance(own_section, Mapping) else ()
+        for name in [key for key in values if key not in cls.model_fields]:
+            backend = load_backend(name)
+            if backend is not None and values[name] is not None:
+                try:
+                    values[name] = backend.config.model_validate(values[name])
+                except ValidationError as error:
+                    faults += _list_faults(error, (name,))
+            elif backend is None and is_installed and name not in sources:
+                faults.append(
+                    InitErrorDetails(type="extra_forbidden", loc=(name,), input=values[name])
+                )
+        try:
+            rig = handler(values)
+        except ValidationError as error:
+            faults = _list_faults(error) + faults
+        else:
+            for name, section in rig.sections.items():
+                faults += [_make_fault(name, fault) for fault in section.list_faults(rig)]
+        if faults:
+            raise ValidationError.from_exception_data(cls.__name__, faults)
+        return rig
 
-    @field_validator("machine", "ni", "opendaq", "udp", "follow")
     @classmethod
-    def _check_wiring(cls, wiring: ConfigModel | None, info: ValidationInfo) -> ConfigModel | None:
-        if wiring is None and info.data.get("backend") == info.field_name:
-            raise ValueError(
-                f"backend {info.field_name!r} needs a [{info.field_name}] table with its "
-                "wiring; see CONNECT.md"
-            )
-        if isinstance(wiring, FollowWiring) and info.data.get("backend") == "follow":
-            if info.data.get(wiring.source) is None:
-                raise ValueError(
-                    f"source {wiring.source!r} needs a [{wiring.source}] table with its wiring"
-                )
-            wired = [sensor.channel for sensor in info.data.get("sensors", ())]
-            if wired and wiring.command not in wired:
-                raise ValueError(
-                    f"command {wiring.command!r} is not a sensor of the rig; allowed: a sensor, "
-                    "table_disp_m if no command is wired"
-                )
-        return wiring
+    def list_keys(cls) -> list[str]:
+        return [*super().list_keys(), *list_entry_points(BACKEND_GROUP)]
+
+    @classmethod
+    def find_table_model(cls, key: str) -> type[ConfigModel] | None:
+        backend = load_backend(key)
+        return super().find_table_model(key) if backend is None else backend.config
+
+    @property
+    def sections(self) -> dict[str, BackendConfig]:
+        """Sections of installed backends by name."""
+        extra = self.model_extra or {}
+        return {key: value for key, value in extra.items() if isinstance(value, BackendConfig)}
+
+    @property
+    def backend_section(self) -> BackendConfig:
+        """Section of the rig's own backend; an empty one if that is not installed."""
+        return self.sections.get(self.backend, BackendConfig())
+
+    def get_section(self, model: type[SectionT]) -> SectionT | None:
+        """Return the section of this config model; None if the rig file has none."""
+        sections = self.sections.values()
+        return next((section for section in sections if isinstance(section, model)), None)
 
     @property
     def runs_at_any_speed(self) -> bool:
         """True if any clock may pace the machine: it is simulated in the process of the rig."""
-        return self.backend == "simulated"
+        backend = load_backend(self.backend)
+        return backend is not None and backend.any_speed
+
+    @property
+    def under_external_control(self) -> bool:
+        """True if another controller drives the table, and a run only records it."""
+        backend = load_backend(self.backend)
+        return backend is not None and backend.external_control
+
+    @property
+    def is_simulated(self) -> bool:
+        """True if the rig file has the section of a simulated table, perhaps behind a protocol."""
+        backends = map(load_backend, self.sections)
+        return any(backend is not None and backend.is_simulated for backend in backends)
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -251,3 +203,21 @@ class RigConfig(ConfigModel):
                 allowed=f"{allowed} Hz",
                 remedy="change rate_hz in the profile",
             )
+
+
+def _make_fault(name: str, message: str) -> InitErrorDetails:
+    error = {"error": ValueError(message)}
+    return InitErrorDetails(type="value_error", loc=(name,), input=None, ctx=error)
+
+
+def _list_faults(error: ValidationError, location: tuple[str, ...] = ()) -> list[InitErrorDetails]:
+    """Return the faults of a validation error, at a location."""
+    return [
+        InitErrorDetails(
+            type=fault["type"],
+            loc=(*location, *fault["loc"]),
+            input=fault["input"],
+            ctx=fault.get("ctx", {}),
+        )
+        for fault in error.errors(include_url=False)
+    ]

@@ -3,6 +3,7 @@
 from datetime import UTC, datetime
 from pathlib import Path
 
+from table_io.config.backend import require_backend
 from table_io.config.base import load_config, parse_toml
 from table_io.config.calibration_record import (
     CalibrationFile,
@@ -19,8 +20,14 @@ def calibrations_dir(path: Path) -> Path:
 
 
 def load_rig(path: Path) -> tuple[RigConfig, str]:
-    """Load (rig config, its text with the records appended); InputError names a faulty file."""
-    _, text = load_config(path, RigConfig, "rig file")
+    """Load (rig config, its text with the records appended).
+
+    InputError names a faulty file, and a backend that is not installed.
+    """
+    rig, text = load_config(path, RigConfig, "rig file")
+    require_backend(rig.backend, path)
+    for name in (rig.model_extra or {}).keys() - rig.sections.keys():
+        require_backend(name, path, key=f"[{name}]")
     newest: dict[str, tuple[datetime, CalibrationRecord]] = {}
     for file in sorted(calibrations_dir(path).glob("*.toml")):
         records, _ = load_config(file, CalibrationFile, "calibration record")

@@ -259,8 +259,7 @@ def list_setup_warnings(profile: Profile, rig: RigConfig) -> list[str]:
             f"level has fewer than {rig.output.least_lsb} DAC steps; the response above "
             f"{highest_hz:.3g} Hz is extrapolated"
         )
-    if rig.backend == "ni" and rig.ni is not None:
-        messages += rig.ni.warnings
+    messages += rig.backend_section.warnings
     block_s = profile.acquisition.block_samples / profile.acquisition.rate_hz
     if block_s > rig.output.lead_s / 4:
         messages.append(

@@ -23,8 +23,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from table_io.block import Float1D, Float2D
-from table_io.config.rig import InjectedFault, RigConfig
+from table_io.config.rig import RigConfig
 from table_io.config.sensor import SensorConfig
+from table_io.sim.config import InjectedFault
 
 VALVE_CLOSING_S = 0.05  # duration of valve closing
 OIL_LOSS_S = 2.0  # duration of the pressure drop

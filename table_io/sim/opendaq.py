@@ -4,23 +4,20 @@ The server of the openDAQ library listens on EVERY interface of the computer wit
 any client that reaches its port can read the samples. No client can move the table.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from table_io.backends.machine.protocol import MachineMessage
 from table_io.backends.opendaq.source import load_library, require_opendaq_wiring
-from table_io.block import Float1D, Float2D
-from table_io.clock import Clock, wall_clock_ns
-from table_io.config.profile import Specimen
+from table_io.block import Float2D
+from table_io.clock import wall_clock_ns
 from table_io.config.rig import RigConfig
 from table_io.config.sensor import SensorConfig
 from table_io.errors import InputError
 from table_io.sim.controller import DrivePlayback
 from table_io.sim.machine.connection import MachineSession
-from table_io.sim.machine.flight_recorder import FlightRecorder
+from table_io.sim.table_service import PlaybackPlan, TableService
 
 TICK_S = 0.004  # between two updates of the plant
 MAX_QUEUED_S = 0.5  # of the file, queued in the plant
@@ -110,16 +107,6 @@ class OpenDaqServer:
         return builder.build()
 
 
-@dataclass(frozen=True, eq=False)
-class PlaybackPlan:
-    """Drive file in m for the controller, its rate, clock error in ppm and start delay in s."""
-
-    values_m: Float1D
-    rate_hz: float
-    ppm: float = 0.0
-    after_s: float = 5.0  # after a client starts to acquire
-
-
 class SimulatedController:
     """Table and controller: plays the file once per acquisition, `after_s` after its start."""
 
@@ -174,40 +161,30 @@ class SimulatedController:
             self._queued += count
 
 
-def serve_opendaq(
-    rig: RigConfig,
-    specimen: Specimen,
-    plan: PlaybackPlan | None,
-    recorder: FlightRecorder | None,
-    clock: Clock,
-    notify: Callable[[str], None],
-    keep_running: Callable[[], bool],
-) -> None:
-    """Serve device and controller while `keep_running()`, then bring the table to rest.
-
-    Without a `plan` the table stays at rest.
-    """
+def serve_opendaq(service: TableService) -> None:
+    """Serve device and controller, and finally bring the table to rest."""
+    rig, plan, clock = service.rig, service.plan, service.clock
     rate_hz = rig.rates_hz[len(rig.rates_hz) // 2]
     if plan is not None and plan.rate_hz in rig.rates_hz:
         rate_hz = plan.rate_hz
-    session = MachineSession(rig, specimen, rate_hz, recorder)
+    session = MachineSession(rig, service.specimen, rate_hz, service.open_recorder())
     device = OpenDaqServer(rig, rate_hz)
     controller = SimulatedController(session, rig, plan)
-    notify(
-        f"{rig.title}, at rest; openDAQ device waiting at {require_opendaq_wiring(rig).device} and "
-        f"on EVERY interface of this computer, {rate_hz:g} Hz"
+    service.begin(
+        f"{require_opendaq_wiring(rig).device} and on EVERY interface of this computer, "
+        f"{rate_hz:g} Hz"
     )
     session.start(clock.now())
     has_client, stopping = False, False
     while not (stopping and controller.at_rest):
         now_s = clock.now()
-        if not stopping and not keep_running():
+        if not stopping and not service.keep_running():
             stopping = True
             controller.stop(now_s)
         if has_client != device.has_client:
             has_client = device.has_client
             plays = f"; the controller plays in {plan.after_s:g} s" if plan and has_client else ""
-            notify(("acquisition started" if has_client else "acquisition ended") + plays)
+            service.notify(("acquisition started" if has_client else "acquisition ended") + plays)
         for message in controller.advance(now_s, has_client):
             device.send(message.index, message.values.reshape(-1, len(rig.channels)).T)
         clock.wait_until(now_s + TICK_S)

@@ -16,9 +16,10 @@ from table_io.backends import SAMPLE_TIMEOUT_S, MachineLost
 from table_io.block import Float1D, Float2D
 from table_io.clock import Clock
 from table_io.config.profile import Specimen
-from table_io.config.rig import OutputConfig, RigConfig, SimulatedTableConfig
+from table_io.config.rig import OutputConfig, RigConfig
 from table_io.config.sensor import SensorConfig
 from table_io.errors import InputError
+from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.faults import build_faults
 from table_io.sim.ground_truth import GroundTruth, parse_ground_truth
 from table_io.sim.ground_truth_applied import SensorDistortion, build_hidden_plant
@@ -104,7 +105,8 @@ class SimulatedBackend:
     """Backend of the simulated table; sample i is taken at start + i / rate_hz."""
 
     def __init__(self, rig: RigConfig, specimen: Specimen, rate_hz: float, clock: Clock) -> None:
-        if rig.simulated is None:
+        table = rig.get_section(SimulatedTableConfig)
+        if table is None:
             raise InputError(
                 "the rig file has no section [simulated]",
                 where=f"rig {rig.name}",
@@ -115,17 +117,17 @@ class SimulatedBackend:
         self.replace_after = round(MIN_REPLACE_AHEAD_S * rate_hz)
         self._rig = rig
         self._clock = clock
-        self._plant = build_plant(rig.simulated, specimen, rate_hz)
+        self._plant = build_plant(table, specimen, rate_hz)
         self._distortion: SensorDistortion | None = None
-        if truth := load_ground_truth(rig.simulated):
+        if truth := load_ground_truth(table):
             self._plant = build_hidden_plant(self._plant, truth)
             self._distortion = SensorDistortion(truth, rig.channels, rate_hz)
         self._plant_with_share = lru_cache(2)(self._build_plant_with_share)
-        self._faults = build_faults(rig.simulated.faults, rig, rate_hz, rig.simulated.seed)
+        self._faults = build_faults(table.faults, rig, rate_hz, table.seed)
         self._state = self._plant.rest_state()
         self._digitizer = Digitizer(rig.sensors)
-        self._noise = np.random.default_rng([rig.simulated.seed, 0])
-        self._tare_noise = np.random.default_rng([rig.simulated.seed, 1])
+        self._noise = np.random.default_rng([table.seed, 0])
+        self._tare_noise = np.random.default_rng([table.seed, 1])
         # Played command in m from sample `_origin` on; the output is at 0 V before sample 0.
         self._history = self._plant.history_samples + self._faults.history_samples
         self._command = np.zeros(self._history)

@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 from table_io.backends.discovery import ChannelGroup, DiscoveredDevice
 from table_io.backends.ni import discovery as ni_found
 from table_io.backends.opendaq import discovery as daq_found
+from table_io.backends.opendaq.discovery import discover_devices as discover_opendaq_devices
 from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
 from twin.cli import devices as command
@@ -41,7 +42,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
         (rigs / f"{name}.toml").write_text((PROFILES_DIR / "rigs" / f"{name}.toml").read_text())
     monkeypatch.setattr(command, "PROFILES_DIR", tmp_path / "shipped")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(command, "_discover_opendaq", lambda addresses: (LASER,))
+    monkeypatch.setattr(daq_found, "discover_devices", lambda addresses: (LASER,))
 
     def invoke(*words: str) -> tuple[int, str]:
         result = CliRunner().invoke(app, ["devices", *words])
@@ -98,9 +99,7 @@ def test_a_library_that_is_missing_is_said_with_the_pip_line(
 ) -> None:
     monkeypatch.setitem(sys.modules, "nidaqmx", None)
     monkeypatch.setitem(sys.modules, "opendaq", None)
-    monkeypatch.setattr(
-        command, "_discover_opendaq", lambda addresses: daq_found.discover_devices()
-    )
+    monkeypatch.setattr(daq_found, "discover_devices", discover_opendaq_devices)
     code, text = run("--json")
     silent = json.loads(text)["not_found"]
     assert code == 0

@@ -38,7 +38,7 @@ def card(folder: Path) -> Path:
         ("machine", "tcp/0.0.0.0:7450", 1.0, "other computers"),
         ("machine", "unix/none/there", 1.0, "--listen unix/none/there"),
         ("machine", None, 0.5, "--time-scale 0.5: allowed: 1 to 20"),
-        ("simulated", None, 1.0, r"no \[machine\] table with an endpoint"),
+        ("simulated", None, 1.0, "backend = 'simulated': .*allowed: .*machine.*--listen"),
         ("machin", None, 1.0, "did you mean 'machine'"),
     ],
 )

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from table_io.backends.opendaq import check_reachable
+from table_io.backends.opendaq.source import check_reachable
 from table_io.config.base import find_config, load_config
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError

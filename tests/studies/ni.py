@@ -26,7 +26,7 @@ import numpy as np
 
 from table_io.acquisition.session import LatenessLog, SessionSetup, run_session
 from table_io.backends.command_buffer import CommandBuffer
-from table_io.backends.ni import NiBackend
+from table_io.backends.ni.backend import NiBackend
 from table_io.block import Block, Float1D, Float2D
 from table_io.clock import Clock, RealClock
 from table_io.config.base import PROFILES_DIR, parse_toml

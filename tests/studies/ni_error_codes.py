@@ -16,8 +16,8 @@ import numpy as np
 from nidaqmx.error_codes import DAQmxErrors
 
 from table_io.backends import MachineLost
+from table_io.backends.ni.config import NiFault
 from table_io.block import Float1D
-from table_io.config.wiring.ni import NiFault
 from table_io.sim.machine.flight_recorder import FlightRecorder, RecordedSession, read_flight_record
 from tests.table_io.backends.ni_wire import Bed
 

@@ -22,8 +22,9 @@ from table_io.channels import CHANNEL_BY_NAME
 from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.profile import Profile
-from table_io.config.rig import FAULT_KINDS, RigConfig
+from table_io.config.rig import RigConfig
 from table_io.records import Event, Record, RunStart, RunStop, SampleGap, Trip
+from table_io.sim.config import FAULT_KINDS
 from table_io.sim.simulated_table import SimulatedBackend
 from tests.table_io.safety.guarded import RIG, machine
 

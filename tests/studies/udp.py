@@ -24,7 +24,7 @@ import numpy as np
 
 from table_io.acquisition.output_queue import DECISION_S
 from table_io.acquisition.session import SessionSetup, run_session
-from table_io.backends.udp import UdpBackend
+from table_io.backends.udp.backend import UdpBackend
 from table_io.clock import RealClock
 from table_io.config.base import PROFILES_DIR, load_config, parse_toml
 from table_io.config.profile import Profile

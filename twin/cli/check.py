@@ -60,7 +60,7 @@ def _plan_lines(config: RunConfig) -> list[tuple[str, str]]:
     right, left = (f"{gap * 1e3:g} mm" for gap in profile.specimen.gaps_m)
     bumpers = f"gap right {right}, left {left}" if "inf mm" not in (right, left) else "no bumpers"
     replace_after = 0  # with an external controller
-    if rig.backend != "follow":
+    if not rig.under_external_control:
         replace_after = open_backend(rig, profile, ManualClock()).replace_after
     block = profile.acquisition.block_samples
     lead = rig.output.lead_samples(rate, replace_after)

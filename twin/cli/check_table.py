@@ -14,8 +14,15 @@ from typing import Protocol, TypeGuard
 
 import numpy as np
 
-from table_io.backends import AcquisitionSource, Backend, MachineLost, open_backend, open_source
-from table_io.backends.digital_inputs import DigitalInputs, open_digital_inputs
+from table_io.backends import (
+    AcquisitionSource,
+    Backend,
+    MachineLost,
+    find_descriptor,
+    open_backend,
+    open_source,
+)
+from table_io.backends.digital_inputs import DigitalInputs
 from table_io.block import Float2D
 from table_io.clock import Clock, ManualClock, RealClock, local_datetime
 from table_io.config.base import PROFILES_DIR, find_config, load_config
@@ -102,7 +109,7 @@ def make_machine(rig: RigConfig, clock: Clock) -> Backend | AcquisitionSource:
     profile, _ = load_config(PROFILES_DIR / "tests" / "quickstart.toml", Profile, "test profile")
     default_rate_hz = profile.acquisition.rate_hz
     rate_hz = default_rate_hz if default_rate_hz in rig.rates_hz else max(rig.rates_hz)
-    if rig.backend in ("opendaq", "follow"):
+    if not find_descriptor(rig).drives:
         return open_source(rig, rate_hz, clock)
     rest_profile = profile.model_copy(update={"acquisition": AcquisitionConfig(rate_hz=rate_hz)})
     return open_backend(rig, rest_profile, clock)
@@ -122,11 +129,12 @@ def examine_wiring(
     result = WiringCheckResult(
         rig, warnings=find_overdue_calibrations(rig, local_datetime().date())
     )
+    open_digital_inputs = find_descriptor(rig).open_digital_inputs
     later_lines: list[CheckLine] = []
     inputs, released_levels = None, []
     try:
         machine.open()
-        inputs = open_digital_inputs(rig)
+        inputs = open_digital_inputs(rig) if open_digital_inputs else None
         read_samples = _hold_output(machine, result)
         if read_samples is not None:
             later_lines.append(_measure_rest(result, clock, machine, read_samples, inputs))
@@ -153,7 +161,7 @@ def examine_wiring(
         if inputs is not None:
             released_levels = _sample_released_levels(inputs, clock)
     later_lines += check_digital_inputs(
-        result.levels, REST_S, released_levels, rig.ni is not None, rig.simulated is not None
+        result.levels, REST_S, released_levels, open_digital_inputs is not None, rig.is_simulated
     )
     result.lines = [
         *(check_resting_inputs(result.resting) if result.resting is not None else ()),

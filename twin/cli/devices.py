@@ -5,18 +5,19 @@ All machines are queried in parallel with one timeout.
 
 import queue
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from table_io.backends import check_reachable
-from table_io.backends.discovery import DiscoveredDevice
+from table_io.backends import check_reachable, get_descriptor
+from table_io.backends.discovery import DeviceSearch, DiscoveredDevice
 from table_io.clock import RealClock
+from table_io.config.backend import BACKEND_GROUP, list_entry_points
 from table_io.config.base import PROFILES_DIR
 from table_io.config.rig import RigConfig
 from table_io.config.rig_file import load_rig
@@ -42,23 +43,15 @@ class MachineStatus:
 def print_devices(ni: str | None, as_json: bool) -> None:
     """Print the rig files with the state of their machines, and discovered devices."""
     rigs, unreadable = _read_rigs(list_rig_files(Path.cwd()))
-    servers = {rig.ni.endpoint for rig in rigs.values() if rig.ni and rig.ni.endpoint} - {ni}
-    searches: dict[str, Callable[[], tuple[DiscoveredDevice, ...]]] = {
-        "NI, local driver": lambda: _discover_ni(None)
-    }
-    for server in (*([ni] if ni else []), *sorted(servers)):
-        searches[f"NI, server {server}"] = partial(_discover_ni, server)
-    addresses = sorted({rig.opendaq.device for rig in rigs.values() if rig.opendaq})
-    searches["openDAQ"] = partial(_discover_opendaq, tuple(addresses))
+    searches, rig_searches = _list_searches(rigs.values(), {"ni": [ni] if ni else []})
     questions = {name: partial(check_reachable, rig) for name, rig in rigs.items()}
     replies = ask_all({**questions, **searches}, ANSWER_TIMEOUT_S)
     statuses = [_make_status(name, rig, replies[name]) for name, rig in rigs.items()] + unreadable
     # A silent server of a rig file is reported with that file already.
-    card_searches = {f"NI, server {server}" for server in servers}
     discovered = {
         name: replies[name]
         for name in searches
-        if not (name in card_searches and isinstance(replies[name], InputError))
+        if not (name in rig_searches and isinstance(replies[name], InputError))
     }
     if as_json:
         print(dump_strict_json(_to_json(statuses, discovered)))
@@ -128,23 +121,36 @@ def ask_all(questions: Mapping[str, Callable[[], object]], timeout_s: float) -> 
 
 def machine_address(rig: RigConfig) -> str:
     """Return the address of a rig's machine, or "" if it has none."""
-    connection = rig.opendaq if rig.follow is not None else getattr(rig, rig.backend, None)
-    for key in ("endpoint", "target", "server", "device"):
-        if address := getattr(connection, key, None):
-            return str(address)
-    return IN_PROCESS if rig.runs_at_any_speed else ""
+    return rig.backend_section.find_address(rig) or (IN_PROCESS if rig.runs_at_any_speed else "")
 
 
-def _discover_ni(server: str | None) -> tuple[DiscoveredDevice, ...]:
-    from table_io.backends.ni.discovery import discover_devices
+def _list_searches(
+    rigs: Collection[RigConfig], given: Mapping[str, list[str]]
+) -> tuple[dict[str, DeviceSearch], set[str]]:
+    """Return (searches by label, labels of those that only a rig file asks for).
 
-    return discover_devices(server)
+    `given` has the addresses that the user gives, by backend.
+    """
+    searches: dict[str, DeviceSearch] = {}
+    rig_searches: set[str] = set()
+    for name in list_entry_points(BACKEND_GROUP):
+        try:
+            list_searches = get_descriptor(name, BACKEND_GROUP, name).list_searches
+        except InputError as error:
+            searches[f"backend {name}"] = partial(_refuse, error)
+            continue
+        if list_searches is not None:
+            sections = [(rig, rig.sections[name]) for rig in rigs if name in rig.sections]
+            addresses = {section.find_address(rig) for rig, section in sections}
+            addresses -= {"", *given.get(name, ())}
+            backend_searches = list_searches([*given.get(name, ()), *sorted(addresses)])
+            rig_searches |= backend_searches.keys() - list_searches(given.get(name, ())).keys()
+            searches |= backend_searches
+    return searches, rig_searches
 
 
-def _discover_opendaq(addresses: tuple[str, ...]) -> tuple[DiscoveredDevice, ...]:
-    from table_io.backends.opendaq.discovery import discover_devices
-
-    return discover_devices(addresses)
+def _refuse(error: InputError) -> NoReturn:
+    raise error
 
 
 def _to_json(statuses: list[MachineStatus], discovered: Mapping[str, object]) -> dict[str, Any]:

@@ -7,16 +7,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
-from table_io.backends.machine.endpoint import open_listener, parse_endpoint
+from table_io.backends import find_descriptor
 from table_io.clock import RealClock
 from table_io.config.base import find_config, load_config
 from table_io.config.profile import Profile
-from table_io.config.rig import RigConfig
+from table_io.config.rig_file import load_rig
 from table_io.errors import InputError
-from table_io.sim.machine.flight_recorder import FlightRecorder
-from table_io.sim.machine.table import SimulatedMachine
+from table_io.sim.machine.server import serve_machine_table
+from table_io.sim.table_service import PlaybackPlan, TableService, find_simulator
 from twin.live.scheduling import request_realtime
 
 TABLE_PRIORITY = 60  # above the rig: a real machine does not depend on its load
@@ -50,89 +50,55 @@ def serve_table(
 
     The specimen is that of `profile` if the machine's protocol does not transmit it.
     """
-    rig, _ = load_config(find_config(rig_name, "rigs"), RigConfig, "machine card")
+    rig, _ = load_rig(find_config(rig_name, "rigs"))
     if not 1.0 <= time_scale <= MAX_TIME_SCALE:
         raise InputError(f"--time-scale {time_scale:g}: allowed: 1 to {MAX_TIME_SCALE:g}")
+    drives = find_descriptor(rig).drives
+    if drives and controller.play is not None:
+        raise InputError(f"--play: {rig.name!r} is driven by `run`; it belongs to a follow card")
+    if listen is not None and drives:
+        serve: Callable[[TableService], None] = partial(serve_machine_table, listen=listen)
+    else:
+        serve = find_simulator(rig)
+    signals: list[int] = []
 
     def print_status(text: str) -> None:
         if _can_write(out):
             with contextlib.suppress(OSError):
                 print(f"table {rig.name}: {text}", file=out, flush=True)
 
-    if rig.backend in ("opendaq", "follow"):
-        _serve_external(rig, profile, controller, log, RealClock(time_scale), print_status)
-        return
-    if controller.play is not None:
-        raise InputError(f"--play: {rig.name!r} is driven by `run`; it belongs to a follow card")
-    address, listener, serve = _open_listener(rig, listen, profile)
-    with contextlib.closing(listener):
-        box = FlightRecorder(log, print_status) if log is not None else None
-        machine = SimulatedMachine(rig, print_status, box)
-        machine.warm_up()
-        signals = _collect_signals()
+    def begin(address: str) -> None:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda number, _: signals.append(number))
         pace = f", {time_scale:g} times as fast as the clock" if time_scale != 1.0 else ""
         scheduler = request_realtime(TABLE_PRIORITY)
         print_status(f"{rig.title}, at rest; waiting at {address} (scheduling: {scheduler}){pace}")
-        serve(listener, machine, RealClock(time_scale), lambda: not signals)
-        print_status("switched off at rest")
+
+    service = TableService(
+        rig=rig,
+        specimen=load_config(find_config(profile, "tests"), Profile, "test profile")[0].specimen,
+        clock=RealClock(time_scale),
+        notify=print_status,
+        begin=begin,
+        keep_running=lambda: not signals,
+        log=log,
+        plan=None if drives else _plan_playback(controller),
+    )
+    serve(service)
+    print_status("switched off at rest")
 
 
-def _collect_signals() -> list[int]:
-    """Return a list that collects SIGINT and SIGTERM, empty until the first."""
-    signals: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: signals.append(number))
-    return signals
-
-
-def _serve_external(
-    rig: RigConfig,
-    profile: str,
-    controller: ExternalController,
-    log: Path | None,
-    clock: RealClock,
-    print_status: Callable[[str], None],
-) -> None:
-    """Serve the table of a followed rig, with the external controller that drives it."""
-    from table_io.sim.opendaq import PlaybackPlan, serve_opendaq
-    from twin.exchange.drive_file import read_drive
-
+def _plan_playback(controller: ExternalController) -> PlaybackPlan | None:
+    """Return what an external controller plays; None if it stays at rest."""
     if not controller.after_s >= MIN_START_DELAY_S:
         raise InputError(
             f"--after {controller.after_s:g}: allowed: {MIN_START_DELAY_S:g} s and more"
         )
-    specimen = load_config(find_config(profile, "tests"), Profile, "test profile")[0].specimen
-    drive = read_drive(controller.play) if controller.play is not None else None
-    script = PlaybackPlan(*drive, controller.ppm, controller.after_s) if drive is not None else None
-    box = FlightRecorder(log, print_status) if log is not None else None
-    signals = _collect_signals()
-    request_realtime(TABLE_PRIORITY)
-    serve_opendaq(rig, specimen, script, box, clock, print_status, lambda: not signals)
-    print_status("switched off at rest")
+    if controller.play is None:
+        return None
+    from twin.exchange.drive_file import read_drive
 
-
-ServeFunction = Callable[[Any, SimulatedMachine, RealClock, Callable[[], bool]], None]
-
-
-def _open_listener(
-    rig: RigConfig, listen: str | None, profile: str
-) -> tuple[str, Any, ServeFunction]:
-    """Open the listener of a machine; return (address, listener, serve function)."""
-    if listen is None and rig.backend == "udp" and rig.udp is not None:
-        from table_io.sim.udp.server import bind_socket, serve_udp_target
-
-        return rig.udp.target, bind_socket(rig.udp.address), serve_udp_target
-    if listen is None and rig.backend == "ni" and rig.ni is not None:
-        from table_io.sim.ni.server import ServerEndpoint, serve_ni_device
-
-        specimen = load_config(find_config(profile, "tests"), Profile, "test profile")[0].specimen
-        return rig.ni.endpoint, ServerEndpoint(rig.ni), partial(serve_ni_device, specimen)
-    from table_io.sim.machine.server import serve_machine
-
-    if listen is None and rig.machine is None:
-        raise InputError(f"rig {rig.name}: no [machine] table with an endpoint; add it or --listen")
-    address = parse_endpoint(listen or (rig.machine.endpoint if rig.machine else ""))
-    return address.text, open_listener(address), serve_machine
+    return PlaybackPlan(*read_drive(controller.play), controller.ppm, controller.after_s)
 
 
 def _can_write(out: TextIO) -> bool:

@@ -69,7 +69,7 @@ def run_rig(config: ProcessConfig, _: str) -> None:
     latency.start()
     start = run_config.make_start_factory(config.run, "table")
     session_args = (clock, start, commands.poll_command, punctuality)
-    if run_config.rig.backend == "follow":
+    if run_config.rig.under_external_control:
         device = open_source(run_config.rig, run_config.drive.rate_hz, clock)
         source = record_external(run_config.session_setup, device, *session_args)
     else:

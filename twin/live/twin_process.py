@@ -53,7 +53,7 @@ def run_pipeline(
     block_s = run_config.profile.acquisition.block_samples / run_config.drive.rate_hz
     latency = LatencyHistogram("twin", clock, block_s, scheduler)
     twin = _TwinProcess(config.run, link, run_config.prepare_twin(), latency, clock, missed_from)
-    twin.external_clock = run_config.rig.backend == "follow"
+    twin.external_clock = run_config.rig.under_external_control
     twin.run(control, blocks, is_abandoned)
     deadline_s = clock.now() + LINGER_S
     while clock.now() < deadline_s and not is_abandoned():

@@ -26,8 +26,7 @@ def bytes_per_s(config: RunConfig) -> float:
 def planned_bytes(config: RunConfig) -> float:
     """Return the upper bound in bytes of what the planned test writes to the disk."""
     seconds = config.drive.planned_end / config.drive.rate_hz
-    if config.rig.follow is not None:
-        seconds += config.rig.follow.wait_s  # until the controller is started
+    seconds += config.rig.backend_section.max_start_wait_s
     return bytes_per_s(config) * (seconds + RESERVE_S) + REPORT_BYTES
 
 

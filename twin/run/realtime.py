@@ -4,7 +4,8 @@ import math
 from pathlib import Path
 
 from table_io.acquisition.external_control import plan_open_loop_drive
-from table_io.backends import check_reachable
+from table_io.backends import check_reachable, open_backend
+from table_io.clock import RealClock
 from table_io.errors import InputError
 from twin.run.run_config import RunConfig
 
@@ -24,7 +25,9 @@ def check_realtime(config: RunConfig, profile_path: Path) -> None:
             f"Hz a block may have {min_samples} to {max_samples} samples; change it, or use "
             "--speed max"
         )
-    if config.rig.backend == "follow":
-        # Raises now if the test cannot be played by an external controller.
+    # Raises now if the test cannot be played by an external controller, or by the backend.
+    if config.rig.under_external_control:
         plan_open_loop_drive(config.profile, config.rig)
+    else:
+        open_backend(config.rig, config.profile, RealClock())
     check_reachable(config.rig)

@@ -167,24 +167,21 @@ def compile_rig_kernels(config: RunConfig) -> None:
     """Compile or load the kernels of the rig, its protection and its simulated table.
 
     The start of a real session is run, so that every kernel is called. The quickstart profile
-    replaces a rig that has no simulated table or no command channel.
+    replaces a rig that keeps its own time.
     """
     from contextlib import closing
     from itertools import islice
 
     from table_io.acquisition.session import run_session
+    from table_io.backends import open_backend
     from table_io.clock import ManualClock
-    from table_io.sim.simulated_table import SimulatedBackend
 
-    if config.rig.simulated is None or "drive_disp_m" not in config.rig.channels:
+    if not config.rig.runs_at_any_speed:
         config = read_run_config(find_config("quickstart", "tests"))
     clock = ManualClock()
-    backend = SimulatedBackend(
-        config.rig, config.profile.specimen, config.profile.acquisition.rate_hz, clock
-    )
     session = run_session(
         config.session_setup,
-        backend,
+        open_backend(config.rig, config.profile, clock),
         clock,
         config.make_start_factory("warm", "table"),
         lambda: None,

@@ -13,6 +13,7 @@ from typing import NoReturn
 import numpy as np
 
 from table_io.backends import SAMPLE_TIMEOUT_S, MachineLost
+from table_io.backends.machine.config import MachineConfig
 from table_io.backends.machine.endpoint import connect, parse_endpoint
 from table_io.backends.machine.protocol import (
     REPLACE_AFTER_S,
@@ -28,7 +29,7 @@ from table_io.backends.machine.protocol import (
 from table_io.block import Float1D, Float2D
 from table_io.clock import Clock
 from table_io.config.profile import Specimen
-from table_io.config.rig import MachineConfig, RigConfig
+from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 
 HEARTBEAT_PERIOD_S = 0.03  # between heartbeats
@@ -40,8 +41,9 @@ RECEIVE_BYTES = 1 << 18
 
 def check_reachable(rig: RigConfig) -> None:
     """Raise InputError if the machine of the rig file does not answer; claim nothing."""
-    if rig.machine is not None:
-        _connect(rig, rig.machine).close()
+    machine = rig.get_section(MachineConfig)
+    if machine is not None:
+        _connect(rig, machine).close()
 
 
 def _connect(rig: RigConfig, machine: MachineConfig) -> socket.socket:
@@ -60,7 +62,8 @@ class MachineBackend:
     """Controller's side of one connection to the machine."""
 
     def __init__(self, rig: RigConfig, specimen: Specimen, rate_hz: float, clock: Clock) -> None:
-        if rig.machine is None:
+        machine = rig.get_section(MachineConfig)
+        if machine is None:
             raise InputError(
                 "no [machine] table",
                 where=f"rig {rig.name}",
@@ -72,7 +75,7 @@ class MachineBackend:
         self._rig = rig
         self._specimen = specimen
         self._clock = clock
-        self._machine = rig.machine
+        self._machine = machine
         self._socket: socket.socket | None = None
         self._parser = MessageParser()
         self._answers: list[MachineMessage] = []

@@ -50,7 +50,9 @@ def connect_server(rig: RigConfig, endpoint: str) -> Any:
         grpc.channel_ready_future(channel).result(timeout=CONNECT_TIMEOUT_S)
     except grpc.FutureTimeoutError:
         channel.close()
-        hint = f", in another terminal: shaketwin table --rig {rig.name}" if rig.simulated else ""
+        hint = (
+            f", in another terminal: shaketwin table --rig {rig.name}" if rig.is_simulated else ""
+        )
         raise InputError(
             f"no NI gRPC Device Server answers at {endpoint}", remedy=f"start it there{hint}"
         ) from None

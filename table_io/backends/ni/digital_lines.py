@@ -12,7 +12,7 @@ from nidaqmx.stream_readers import DigitalMultiChannelReader
 
 from table_io.backends import MachineLost
 from table_io.backends.ni.channel import open_channel
-from table_io.config.wiring.ni import NiWiring
+from table_io.backends.ni.config import NiWiring
 from table_io.errors import InputError
 
 READ_TIMEOUT_S = 1.0

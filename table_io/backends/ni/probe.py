@@ -7,10 +7,10 @@ from nidaqmx.system import System
 
 from table_io.backends import MachineLost
 from table_io.backends.ni.channel import connect_server
+from table_io.backends.ni.config import NiWiring
 from table_io.backends.ni.digital_lines import NiDigitalInputs
 from table_io.backends.ni.errors import describe_error
 from table_io.config.rig import RigConfig
-from table_io.config.wiring.ni import NiWiring
 from table_io.errors import InputError
 
 
@@ -32,11 +32,12 @@ def check_reachable(rig: RigConfig) -> None:
 
 def require_ni_wiring(rig: RigConfig) -> NiWiring:
     """Return the [ni] wiring of a rig; InputError if it does not match the sensors."""
-    if rig.ni is None:
+    wiring = rig.get_section(NiWiring)
+    if wiring is None:
         raise InputError(
             "no [ni] table", where=f"rig {rig.name}", remedy="add it, or set another backend"
         )
-    inputs = {analog_input.channel for analog_input in rig.ni.inputs}
+    inputs = {analog_input.channel for analog_input in wiring.inputs}
     for names, problem in (
         (set(rig.channels) - inputs, "no input for sensor"),
         (inputs - set(rig.channels), "no sensor for input"),
@@ -48,7 +49,7 @@ def require_ni_wiring(rig: RigConfig) -> NiWiring:
                 key="ni.inputs",
                 allowed="exactly one input for each sensor",
             )
-    return rig.ni
+    return wiring
 
 
 def describe_interlock_fault(wiring: NiWiring, channel: Any) -> str:

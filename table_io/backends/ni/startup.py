@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from nidaqmx.errors import DaqError, Error
 
+from table_io.backends.ni.config import NiWiring
 from table_io.backends.ni.errors import describe_error
 from table_io.backends.ni.tasks import BUFFER_S, HEARTBEAT_PERIOD_S, RigTasks, find_leftover_tasks
 from table_io.block import Float1D, Float2D
@@ -113,7 +114,8 @@ def verify_output_replacement(rig: RigConfig, tasks: RigTasks, rate_hz: float) -
     Raises InputError if the device holds more output than the rig file states, or if the command
     wired back does not show the pulse. The tasks cannot be used again afterwards.
     """
-    assert rig.ni is not None
+    wiring = rig.get_section(NiWiring)
+    assert wiring is not None
     required_lead = replace_after_samples(rig, rate_hz)
     count = round((BASELINE_S + BUFFER_S / 4) * rate_hz)
     tasks.write(0, np.zeros(count))
@@ -143,7 +145,7 @@ def verify_output_replacement(rig: RigConfig, tasks: RigTasks, rate_hz: float) -
             f"the device holds about {lead / rate_hz * 1e3:.0f} ms of output, which delays a stop",
             where=f"rig {rig.name}",
             key="ni.held_by_device_ms",
-            value=rig.ni.held_by_device_ms,
+            value=wiring.held_by_device_ms,
             remedy="use a device that holds less, or enter the larger value in the rig file",
         )
     last = at + round((NUDGE_S + MAX_LOOPBACK_LAG_S) * rate_hz)
@@ -177,8 +179,9 @@ def _verify_nudge(
 
 def replace_after_samples(rig: RigConfig, rate_hz: float) -> int:
     """Return the number of samples after the newest taken one that cannot be replaced safely."""
-    assert rig.ni is not None
-    return rig.ni.device_buffer_samples(rate_hz) + round(WRITE_TRANSIT_S * rate_hz)
+    wiring = rig.get_section(NiWiring)
+    assert wiring is not None
+    return wiring.device_buffer_samples(rate_hz) + round(WRITE_TRANSIT_S * rate_hz)
 
 
 def verify_sample_rate(tasks: RigTasks, rate_hz: float) -> None:

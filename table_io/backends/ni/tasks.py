@@ -24,6 +24,7 @@ from nidaqmx.errors import DaqError
 from nidaqmx.stream_readers import AnalogMultiChannelReader
 from nidaqmx.stream_writers import AnalogSingleChannelWriter, DigitalSingleChannelWriter
 
+from table_io.backends.ni.config import NiWiring
 from table_io.block import Float1D, Float2D
 from table_io.config.rig import RigConfig
 
@@ -66,8 +67,9 @@ class RigTasks:
 
     def _configure(self) -> None:
         rig, rate = self._rig, self._rate_hz
-        assert rig.ni is not None
-        inputs = {analog_input.channel: analog_input for analog_input in rig.ni.inputs}
+        wiring = rig.get_section(NiWiring)
+        assert wiring is not None
+        inputs = {analog_input.channel: analog_input for analog_input in wiring.inputs}
         for sensor in rig.sensors:
             analog_input, full_scale_v = (
                 inputs[sensor.channel],
@@ -87,22 +89,22 @@ class RigTasks:
         )
         span_v = rig.output.span_v
         command = self.output.ao_channels.add_ao_voltage_chan(
-            rig.ni.output, min_val=-span_v, max_val=span_v
+            wiring.output, min_val=-span_v, max_val=span_v
         )
         self.output.timing.cfg_samp_clk_timing(
-            rate, rig.ni.output_clock, sample_mode=continuous, samps_per_chan=samples
+            rate, wiring.output_clock, sample_mode=continuous, samps_per_chan=samples
         )
         stream = self.output.out_stream
         stream.output_buf_size = samples
         stream.regen_mode = RegenerationMode.DONT_ALLOW_REGENERATION
         stream.relative_to = WriteRelativeTo.FIRST_SAMPLE
         with contextlib.suppress(DaqError):  # not every device allows a smaller onboard buffer
-            stream.output_onbrd_buf_size = rig.ni.device_buffer_samples(rate)
+            stream.output_onbrd_buf_size = wiring.device_buffer_samples(rate)
         with contextlib.suppress(DaqError):
             command.ao_data_xfer_req_cond = OutputDataTransferCondition.ON_BOARD_MEMORY_EMPTY
-        self.output.triggers.start_trigger.cfg_dig_edge_start_trig(rig.ni.trigger)
+        self.output.triggers.start_trigger.cfg_dig_edge_start_trig(wiring.trigger)
         self.heartbeat.do_channels.add_do_chan(
-            rig.ni.heartbeat, line_grouping=LineGrouping.CHAN_PER_LINE
+            wiring.heartbeat, line_grouping=LineGrouping.CHAN_PER_LINE
         )
         self.input.control(TaskMode.TASK_RESERVE)
         try:
@@ -162,8 +164,9 @@ class RigTasks:
 
 def session_name(rig: RigConfig, kind: str) -> str:
     """Return the session name of a task; it depends on the device, not on the name of the rig."""
-    assert rig.ni is not None
-    return f"shaketwin_{rig.ni.output.split('/')[0]}_{kind}"
+    wiring = rig.get_section(NiWiring)
+    assert wiring is not None
+    return f"shaketwin_{wiring.output.split('/')[0]}_{kind}"
 
 
 def find_leftover_tasks(rig: RigConfig, channel: Any) -> dict[str, Task]:

@@ -1,26 +1,38 @@
 """Acquisition from an openDAQ device by its native streaming."""
 
-import socket
+from collections.abc import Collection
 
-from table_io.backends.opendaq.source import OpenDaqSource, require_opendaq_wiring
+from table_io.backends import AcquisitionSource, BackendDescriptor
+from table_io.backends.discovery import DeviceSearch, DiscoveredDevice
+from table_io.backends.opendaq.config import OpenDaqWiring
+from table_io.clock import Clock
 from table_io.config.rig import RigConfig
-from table_io.errors import InputError
-
-__all__ = ["OpenDaqSource", "check_reachable"]
-
-CONNECT_TIMEOUT_S = 2.0
 
 
-def check_reachable(rig: RigConfig) -> None:
-    """Raise InputError if the device does not answer or the library is not installed."""
-    wiring = require_opendaq_wiring(rig)
-    try:
-        socket.create_connection(wiring.address, CONNECT_TIMEOUT_S).close()
-    except (OSError, UnicodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        hint = f"for a simulated one: shaketwin table --rig {rig.name}" if rig.simulated else ""
-        raise InputError(
-            f"no openDAQ device answers at {wiring.device} ({reason})",
-            remedy="switch it on, or correct opendaq.device in the rig file"
-            f"{'; ' if hint else ''}{hint}",
-        ) from None
+def _open_source(rig: RigConfig, rate_hz: float, clock: Clock) -> AcquisitionSource:
+    from table_io.backends.opendaq.source import OpenDaqSource
+
+    return OpenDaqSource(rig, rate_hz, clock)
+
+
+def _check_reachable(rig: RigConfig) -> None:
+    from table_io.backends.opendaq.source import check_reachable
+
+    check_reachable(rig)
+
+
+def _list_searches(addresses: Collection[str]) -> dict[str, DeviceSearch]:
+    def search() -> tuple[DiscoveredDevice, ...]:
+        from table_io.backends.opendaq.discovery import discover_devices
+
+        return discover_devices(tuple(addresses))
+
+    return {"openDAQ": search}
+
+
+BACKEND = BackendDescriptor(
+    config=OpenDaqWiring,
+    open_source=_open_source,
+    check_reachable=_check_reachable,
+    list_searches=_list_searches,
+)

@@ -5,6 +5,7 @@ this sensor would give. Time stamps assign every sample to its index, so samples
 or the network are NaN. `read` polls; there is no thread.
 """
 
+import socket
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from table_io.backends.opendaq.assembly import (
     UnevenClockError,
     sample_indices,
 )
+from table_io.backends.opendaq.config import OpenDaqWiring
 from table_io.backends.opendaq.timestamps import (
     TickClock,
     require_common_clock,
@@ -24,9 +26,9 @@ from table_io.backends.opendaq.timestamps import (
 from table_io.block import Float2D
 from table_io.clock import Clock
 from table_io.config.rig import RigConfig
-from table_io.config.wiring.opendaq import OpenDaqWiring
 from table_io.errors import InputError
 
+CONNECT_TIMEOUT_S = 2.0
 POLL_S = 0.001
 FIRST_SAMPLE_TIMEOUT_S = 3.0
 MAX_READ_SAMPLES = 1 << 16  # per channel and poll
@@ -38,7 +40,7 @@ UNIT_SYNONYMS = {"m/s²": "m/s2", "m/s^2": "m/s2", "g_n": "g", "gn": "g", "µm":
 
 def require_opendaq_wiring(rig: RigConfig) -> OpenDaqWiring:
     """Return the [opendaq] wiring; InputError if it is incomplete or the library is missing."""
-    wiring = rig.opendaq
+    wiring = rig.get_section(OpenDaqWiring)
     if wiring is None:
         raise InputError(
             "no [opendaq] table",
@@ -66,6 +68,21 @@ def load_library() -> Any:
             f"openDAQ is not installed ({error})", remedy="pip install shaketwin[opendaq]"
         ) from None
     return opendaq
+
+
+def check_reachable(rig: RigConfig) -> None:
+    """Raise InputError if the device does not answer or the library is not installed."""
+    wiring = require_opendaq_wiring(rig)
+    try:
+        socket.create_connection(wiring.address, CONNECT_TIMEOUT_S).close()
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        hint = f"for a simulated one: shaketwin table --rig {rig.name}" if rig.is_simulated else ""
+        raise InputError(
+            f"no openDAQ device answers at {wiring.device} ({reason})",
+            remedy="switch it on, or correct opendaq.device in the rig file"
+            f"{'; ' if hint else ''}{hint}",
+        ) from None
 
 
 class OpenDaqSource:

@@ -4,7 +4,23 @@ Rig side: backend.py, link.py, transfer.py. Packets: packets.py. Target side: ta
 simulated target in table_io/sim/udp.
 """
 
-from table_io.backends.udp.backend import UdpBackend
-from table_io.backends.udp.link import check_reachable
+from table_io.backends import Backend, BackendDescriptor
+from table_io.backends.udp.config import UdpWiring
+from table_io.clock import Clock
+from table_io.config.profile import Specimen
+from table_io.config.rig import RigConfig
 
-__all__ = ["UdpBackend", "check_reachable"]
+
+def _open(rig: RigConfig, specimen: Specimen, rate_hz: float, clock: Clock) -> Backend:
+    from table_io.backends.udp.backend import UdpBackend
+
+    return UdpBackend(rig, specimen, rate_hz, clock)
+
+
+def _check_reachable(rig: RigConfig) -> None:
+    from table_io.backends.udp.link import check_reachable
+
+    check_reachable(rig)
+
+
+BACKEND = BackendDescriptor(config=UdpWiring, open=_open, check_reachable=_check_reachable)

@@ -11,6 +11,7 @@ from typing import NoReturn
 import numpy as np
 
 from table_io.backends import SAMPLE_TIMEOUT_S, MachineLost
+from table_io.backends.udp.config import UdpWiring
 from table_io.backends.udp.link import (
     ANSWER_TIMEOUT_S,
     REASON_TEXTS,
@@ -45,15 +46,16 @@ class UdpBackend:
     """Rig's side of one connection to the target."""
 
     def __init__(self, rig: RigConfig, specimen: Specimen, rate_hz: float, clock: Clock) -> None:
-        if rig.udp is None:
+        wiring = rig.get_section(UdpWiring)
+        if wiring is None:
             raise InputError(
                 "no [udp] table", where=f"rig {rig.name}", remedy="add it, or set another backend"
             )
         self.channels = rig.channels
         self.rate_hz = rate_hz
-        self.replace_after = math.ceil(rig.udp.replace_after_ms * 1e-3 * rate_hz)
+        self.replace_after = math.ceil(wiring.replace_after_ms * 1e-3 * rate_hz)
         self._rig = rig
-        self._wiring = rig.udp
+        self._wiring = wiring
         self._specimen = specimen
         self._clock = clock
         self._link: UdpLink | None = None

@@ -7,6 +7,7 @@ import socket
 import zlib
 from dataclasses import replace
 
+from table_io.backends.udp.config import UdpWiring
 from table_io.backends.udp.packets import (
     TARGET_PACKET_BYTES,
     PacketKind,
@@ -18,7 +19,6 @@ from table_io.backends.udp.packets import (
 )
 from table_io.clock import Clock, RealClock
 from table_io.config.rig import RigConfig
-from table_io.config.wiring.udp import UdpWiring
 from table_io.errors import InputError
 
 ANSWER_TIMEOUT_S = 1.0  # of a request
@@ -127,5 +127,6 @@ def _poll_target(link: UdpLink, clock: Clock, timeout_s: float) -> TargetState |
 
 def check_reachable(rig: RigConfig) -> None:
     """Raise InputError if the target of the rig file does not answer; claim nothing."""
-    if rig.udp is not None:
-        query_target(rig.udp, RealClock())
+    wiring = rig.get_section(UdpWiring)
+    if wiring is not None:
+        query_target(wiring, RealClock())

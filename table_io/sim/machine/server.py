@@ -6,6 +6,8 @@ import socket
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from table_io.backends.machine.config import MachineConfig
+from table_io.backends.machine.endpoint import open_listener, parse_endpoint
 from table_io.backends.machine.protocol import (
     MachineMessage,
     MessageKind,
@@ -16,6 +18,7 @@ from table_io.backends.machine.protocol import (
 )
 from table_io.clock import Clock
 from table_io.sim.machine.table import SimulatedMachine
+from table_io.sim.table_service import TableService
 
 TICK_S = 0.005  # of real time, between two updates of the plant
 IDLE_TICK_S = 0.1  # the same while nothing moves
@@ -36,6 +39,16 @@ class _Client:
     out: bytearray = field(default_factory=bytearray)
     close_deadline_s: float | None = None
     read_closed: bool = False  # the client has closed its side
+
+
+def serve_machine_table(service: TableService, listen: str | None = None) -> None:
+    """Serve the machine of a rig file at its endpoint, or at `listen`."""
+    machine_config = service.rig.get_section(MachineConfig)
+    address = parse_endpoint(listen or (machine_config.endpoint if machine_config else ""))
+    with contextlib.closing(open_listener(address)) as listener:
+        machine = service.make_machine()
+        service.begin(address.text)
+        serve_machine(listener, machine, service.clock, service.keep_running)
 
 
 def serve_machine(

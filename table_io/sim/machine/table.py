@@ -29,6 +29,7 @@ from table_io.config.profile import Specimen
 from table_io.config.rig import OutputConfig, RigConfig
 from table_io.config.sensor import SensorConfig
 from table_io.errors import InputError
+from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.machine.connection import MachineSession
 from table_io.sim.machine.flight_recorder import FlightRecorder
 
@@ -50,7 +51,7 @@ class SimulatedMachine:
     def __init__(
         self, rig: RigConfig, notify: Callable[[str], None], recorder: FlightRecorder | None = None
     ) -> None:
-        if rig.simulated is None:
+        if rig.get_section(SimulatedTableConfig) is None:
             raise InputError(
                 "no [simulated] table, so there is no plant to simulate",
                 where=f"rig {rig.name}",

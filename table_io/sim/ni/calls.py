@@ -8,9 +8,9 @@ import grpc
 from nidaqmx._stubs import nidaqmx_pb2 as pb
 from nidaqmx._stubs import nidaqmx_pb2_grpc as rpc
 
+from table_io.backends.ni.config import NiWiring
 from table_io.backends.ni.errors import error_name
 from table_io.clock import Clock
-from table_io.config.wiring.ni import NiWiring
 from table_io.sim.ni import inventory
 from table_io.sim.ni.device import SimulatedDaqDevice
 from table_io.sim.ni.task import DriverError, ErrorCode, Task

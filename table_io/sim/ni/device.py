@@ -13,8 +13,8 @@ from typing import Protocol
 import numpy as np
 
 from table_io.backends.command_buffer import CommandBuffer
+from table_io.backends.ni.config import NiFault
 from table_io.block import Float1D, Float2D
-from table_io.config.wiring.ni import NiFault
 from table_io.sim.ni.task import FIRST_SAMPLE, DriverError, ErrorCode, Task
 
 MAX_STEP_S = 0.01  # between two transfers to the device; `onboard_samples` last longer

@@ -1,6 +1,6 @@
 """Inventory of the simulated device: names, ranges and rates for discovery."""
 
-from table_io.config.wiring.ni import NiWiring
+from table_io.backends.ni.config import NiWiring
 
 # DAQmx attribute numbers.
 DEVICE_NAMES, PRODUCT_TYPE, SERIAL_NUMBER, IS_SIMULATED = 0x193B, 0x0631, 0x0632, 0x22CA

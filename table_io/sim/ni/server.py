@@ -1,5 +1,6 @@
 """Server of the simulated DAQ device and its table, with NI's gRPC protocol."""
 
+import contextlib
 import socket
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -8,14 +9,15 @@ from typing import Any
 import grpc
 from nidaqmx._stubs import nidaqmx_pb2_grpc as rpc
 
+from table_io.backends.ni.config import NiWiring
 from table_io.clock import Clock
 from table_io.config.profile import Specimen
-from table_io.config.wiring.ni import NiWiring
 from table_io.errors import InputError
 from table_io.sim.machine.table import SimulatedMachine
 from table_io.sim.ni.device import SimulatedDaqDevice
 from table_io.sim.ni.interlock import InterlockedTable
 from table_io.sim.ni.service import NiDeviceService
+from table_io.sim.table_service import TableService
 
 TICK_S = 0.005  # between two updates of the device
 IDLE_TICK_S = 0.1  # the same while nothing moves
@@ -60,6 +62,16 @@ class ServerEndpoint:
     def close(self) -> None:
         if self._server is not None:
             self._server.stop(0)
+
+
+def serve_ni_table(service: TableService) -> None:
+    """Serve the device of a rig file."""
+    wiring = service.rig.get_section(NiWiring)
+    assert wiring is not None  # the rig's own section
+    with contextlib.closing(ServerEndpoint(wiring)) as endpoint:
+        machine = service.make_machine()
+        service.begin(wiring.endpoint)
+        serve_ni_device(service.specimen, endpoint, machine, service.clock, service.keep_running)
 
 
 def serve_ni_device(

@@ -5,10 +5,12 @@ import select
 import socket
 from collections.abc import Callable
 
+from table_io.backends.udp.config import UdpWiring
 from table_io.backends.udp.packets import RIG_PACKET_BYTES
 from table_io.clock import Clock
 from table_io.errors import InputError
 from table_io.sim.machine.table import SimulatedMachine
+from table_io.sim.table_service import TableService
 from table_io.sim.udp.target import Address, UdpTarget
 
 TICK_S = 0.004  # of real time, between two updates of the plant
@@ -34,6 +36,16 @@ def bind_socket(address: Address) -> socket.socket:
             "and a free port",
         ) from None
     return server_socket
+
+
+def serve_udp_table(service: TableService) -> None:
+    """Serve the target of a rig file."""
+    wiring = service.rig.get_section(UdpWiring)
+    assert wiring is not None  # the rig's own section
+    with contextlib.closing(bind_socket(wiring.address)) as server_socket:
+        machine = service.make_machine()
+        service.begin(wiring.target)
+        serve_udp_target(server_socket, machine, service.clock, service.keep_running)
 
 
 def serve_udp_target(

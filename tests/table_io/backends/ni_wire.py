@@ -8,7 +8,7 @@ from typing import Any
 import grpc
 from nidaqmx._stubs import nidaqmx_pb2 as pb
 
-from table_io.backends.ni import NiBackend
+from table_io.backends.ni.backend import NiBackend
 from table_io.clock import Clock, ManualClock
 from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.profile import Specimen

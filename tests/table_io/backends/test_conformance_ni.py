@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from table_io.backends.ni import NiBackend
+from table_io.backends.ni.backend import NiBackend
 from table_io.clock import RealClock
 from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from table_io.backends import MachineLost
-from table_io.backends.opendaq import OpenDaqSource, check_reachable
+from table_io.backends.opendaq.source import OpenDaqSource, check_reachable
 from table_io.block import Float1D
 from table_io.clock import RealClock
 from table_io.config.base import parse_toml

@@ -12,6 +12,7 @@ import pytest
 
 from table_io.backends import SAMPLE_TIMEOUT_S, MachineLost, check_reachable
 from table_io.backends.machine.client import MachineBackend
+from table_io.backends.machine.config import MachineConfig
 from table_io.backends.machine.endpoint import Endpoint, open_listener, parse_endpoint
 from table_io.backends.machine.protocol import (
     MachineMessage,
@@ -21,7 +22,7 @@ from table_io.backends.machine.protocol import (
     values_message,
 )
 from table_io.clock import RealClock
-from table_io.config.rig import MachineConfig, RigConfig
+from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.sim.machine import server
 from table_io.sim.machine.flight_recorder import FlightRecorder, read_flight_record

@@ -12,7 +12,8 @@ import pytest
 from nidaqmx._stubs import nidaqmx_pb2 as pb
 
 from table_io.backends import MachineLost
-from table_io.backends.ni import NiBackend, check_reachable
+from table_io.backends.ni.backend import NiBackend
+from table_io.backends.ni.probe import check_reachable
 from table_io.block import Float1D
 from table_io.clock import RealClock
 from table_io.config.base import parse_toml

@@ -18,7 +18,7 @@ from table_io.backends import (
     check_reachable,
     open_backend,
 )
-from table_io.backends.udp import UdpBackend
+from table_io.backends.udp.backend import UdpBackend
 from table_io.backends.udp.link import query_target
 from table_io.backends.udp.packets import (
     PacketKind,

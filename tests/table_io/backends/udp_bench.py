@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from table_io.backends import udp
-from table_io.backends.udp import UdpBackend
+from table_io.backends.udp.backend import UdpBackend
 from table_io.clock import Clock
 from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.profile import Specimen

@@ -208,7 +208,7 @@ def test_every_shipped_card_is_valid_and_named_as_its_file(path: Path) -> None:
     rig, _ = load_rig(path)
     assert rig.name == path.stem
     assert rig.title
-    assert find_overdue_calibrations(rig, TODAY) == [] or rig.simulated is None
+    assert find_overdue_calibrations(rig, TODAY) == [] or not rig.is_simulated
 
 
 def test_simulated_cards_differ_from_the_first_only_in_how_they_are_reached() -> None:

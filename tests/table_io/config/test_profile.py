@@ -260,7 +260,6 @@ def without_sensor(text: str, channel: str, times: int = 1) -> str:
         ('"table_acc_m_s2"', '"rel_disp_m"', "sensors.2.unit", "does not measure rel_disp_m"),
         ("volts_per_unit = 5.0", "volts_per_unit = 0.0", "sensors.2.volts_per_unit", "not 0"),
         ("noise_rms = 0.0005", "noise = 0.0005", "sensors.2.noise", "mean 'noise_rms'?"),
-        ('backend = "simulated"', 'backend = "labview"', "backend", "should be 'simulated'"),
         ("stroke_mm = 60.0", "stroke_mm = inf", "limits.stroke_mm", "finite"),
         ("bits = 18", "bits = 40", "output.bits", "less than or equal to 32"),
         ("seed = 1", "sead = 1", "simulated.sead", "did you mean 'seed'?"),

@@ -8,13 +8,12 @@ import grpc
 import pytest
 from nidaqmx._stubs import nidaqmx_pb2_grpc as rpc
 
-from table_io.backends import MachineLost
-from table_io.backends.digital_inputs import open_digital_inputs
+from table_io.backends import MachineLost, find_descriptor
+from table_io.backends.ni.config import NiWiring
 from table_io.backends.ni.digital_lines import NiDigitalInputs
 from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.rig import RigConfig
-from table_io.config.wiring.ni import NiWiring
 from table_io.errors import InputError
 from table_io.safety.wiring_check import CheckLine, check_digital_inputs
 from table_io.sim.ni.device import SimulatedDaqDevice
@@ -70,13 +69,12 @@ def test_what_no_card_names_is_not_tested_and_what_to_do_is_said() -> None:
 
 
 def test_a_card_without_such_inputs_opens_none() -> None:
-    assert open_digital_inputs(parse_toml(TEXT, RigConfig, "card")) is None
-    assert (
-        open_digital_inputs(
-            parse_toml((PROFILES_DIR / "rigs" / "simulated.toml").read_text(), RigConfig, "c")
-        )
-        is None
-    )
+    rig = parse_toml(TEXT, RigConfig, "card")
+    open_digital_inputs = find_descriptor(rig).open_digital_inputs
+    assert open_digital_inputs is not None
+    assert open_digital_inputs(rig) is None
+    text = (PROFILES_DIR / "rigs" / "simulated.toml").read_text()
+    assert find_descriptor(parse_toml(text, RigConfig, "c")).open_digital_inputs is None
 
 
 class Nothing:

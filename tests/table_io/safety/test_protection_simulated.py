@@ -152,6 +152,6 @@ def test_a_session_records_what_was_found_and_comes_to_rest() -> None:
 
 
 def test_the_study_plants_every_kind() -> None:
-    from table_io.config.rig import FAULT_KINDS
+    from table_io.sim.config import FAULT_KINDS
 
     assert {fault["kind"] for fault in faults()} == set(FAULT_KINDS)

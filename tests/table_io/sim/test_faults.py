@@ -11,8 +11,9 @@ from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.calibration import command_to_volts
 from table_io.config.profile import Specimen
-from table_io.config.rig import FAULT_KINDS, RigConfig
+from table_io.config.rig import RigConfig
 from table_io.errors import InputError
+from table_io.sim.config import FAULT_KINDS
 from table_io.sim.faults import CONVERTER_NOISE_RATIO, VALVE_CLOSING_S
 from table_io.sim.simulated_table import SimulatedBackend
 from tests.table_io.safety.guarded import RIG, machine

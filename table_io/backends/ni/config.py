@@ -6,7 +6,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
+from table_io.config.backend import BackendConfig
 from table_io.config.base import ConfigModel, NonNegative, Positive
+from table_io.config.rig import RigConfig
 
 HEARTBEAT_NAME = "heartbeat"  # name of the line that reads the heartbeat back
 LINE_PATTERN = r"^([^/\s]+/port\d+/line\d+)?$"
@@ -32,7 +34,7 @@ class NiFault(ConfigModel):
     at_s: NonNegative = Field(0.0, description="Time from sample 0; unused for start.")
 
 
-class NiWiring(ConfigModel):
+class NiWiring(BackendConfig):
     """Wiring of an NI-DAQmx device: endpoint, output, inputs, timing and digital lines."""
 
     endpoint: str = Field(
@@ -98,6 +100,9 @@ class NiWiring(ConfigModel):
         if terminal and not re.fullmatch(r"/[^/\s]+(/[^/\s]+)+", terminal):
             raise ValueError(f"{terminal!r} is no terminal; give e.g. /Dev1/ai/StartTrigger")
         return terminal
+
+    def find_address(self, rig: RigConfig) -> str:
+        return self.endpoint
 
     @property
     def trigger(self) -> str:

@@ -2,10 +2,12 @@
 
 from pydantic import Field, field_validator
 
-from table_io.config.base import ConfigModel, Positive
+from table_io.config.backend import BackendConfig
+from table_io.config.base import Positive
+from table_io.config.rig import RigConfig
 
 
-class UdpWiring(ConfigModel):
+class UdpWiring(BackendConfig):
     """Address and timing of the target; the wiring of its converters is configured there."""
 
     target: str = Field(description="HOST:PORT of the target.")
@@ -24,6 +26,9 @@ class UdpWiring(ConfigModel):
                 "192.168.7.5:7460"
             )
         return target
+
+    def find_address(self, rig: RigConfig) -> str:
+        return self.target
 
     @property
     def address(self) -> tuple[str, int]:

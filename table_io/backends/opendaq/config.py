@@ -3,12 +3,13 @@
 from pydantic import Field, field_validator
 
 from table_io.channels import CHANNEL_BY_NAME
-from table_io.config.base import ConfigModel
+from table_io.config.backend import BackendConfig
+from table_io.config.rig import RigConfig
 
 NATIVE_SCHEME = "daq.nd://"
 
 
-class OpenDaqWiring(ConfigModel):
+class OpenDaqWiring(BackendConfig):
     """Address of the device, and its signal for each channel."""
 
     device: str = Field(description="Native streaming: daq.nd://HOST or daq.nd://HOST:PORT.")
@@ -43,6 +44,9 @@ class OpenDaqWiring(ConfigModel):
                 f"signals wire {', '.join(duplicates)} to two channels; give each channel its own"
             )
         return signals
+
+    def find_address(self, rig: RigConfig) -> str:
+        return self.device
 
     @property
     def address(self) -> tuple[str, int]:

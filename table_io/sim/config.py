@@ -1,0 +1,118 @@
+"""Section `[simulated]` of a rig file: the simulated table, its specimen and injected faults."""
+
+import difflib
+from typing import Literal, NamedTuple
+
+from pydantic import Field, ValidationInfo, field_validator
+
+from table_io.config.backend import BackendConfig
+from table_io.config.base import ConfigModel, Finite, NonNegative, Positive
+from table_io.config.rig import RigConfig
+
+
+class FaultKind(NamedTuple):
+    """Keys of a fault kind: channel needed, meaning of its size ("": none), its duration."""
+
+    channel: bool
+    size: str
+    duration: Literal["must", "may", "no"]  # for_s required, optional (else permanent), forbidden
+
+
+FAULT_KINDS = {
+    "dropped": FaultKind(False, "", "must"),
+    "repeated": FaultKind(False, "", "must"),
+    "replayed": FaultKind(False, "", "must"),
+    "late": FaultKind(False, "seconds", "no"),
+    "stall": FaultKind(False, "", "no"),
+    "stuck": FaultKind(True, "", "may"),
+    "cable_off": FaultKind(True, "", "may"),
+    "gain": FaultKind(True, "relative error, 0.1 reads a tenth too much", "may"),
+    "polarity": FaultKind(True, "", "may"),
+    "rail": FaultKind(True, "", "may"),
+    "drift": FaultKind(True, "units of the sensor a second", "may"),
+    "spike": FaultKind(True, "units of the sensor", "no"),
+    "nan": FaultKind(True, "", "may"),
+    "power_loss": FaultKind(False, "", "no"),
+    "oil_loss": FaultKind(False, "share of the servo's bandwidth that is left", "no"),
+}
+
+
+class InjectedFault(ConfigModel):
+    """Fault injected into the simulated machine; `sim/faults.py` describes each kind.
+
+    Keys that a kind does not use must be omitted.
+    """
+
+    at_s: NonNegative = Field(description="Time from the start of the run.")
+    for_s: Positive | None = None
+    channel: str | None = None
+    size: Finite | None = None
+    kind: str = Field(description="Last key: it decides which others are needed.")
+
+    @field_validator("kind")
+    @classmethod
+    def _complete(cls, kind: str, info: ValidationInfo) -> str:
+        if kind not in FAULT_KINDS:
+            near = difflib.get_close_matches(kind, FAULT_KINDS, 1, 0.4)
+            raise ValueError(
+                f"kind {kind!r} is unknown"
+                + (f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(FAULT_KINDS)}")
+            )
+        requirements = FAULT_KINDS[kind]
+        keys = (
+            ("channel", requirements.channel, requirements.channel, "one of the rig's sensors"),
+            ("size", bool(requirements.size), bool(requirements.size), requirements.size),
+            ("for_s", requirements.duration == "must", requirements.duration != "no", "seconds"),
+        )
+        for key, required, permitted, meaning in keys:
+            given = info.data.get(key) is not None
+            if required and key in info.data and not given:
+                raise ValueError(f"kind {kind!r} needs {key} ({meaning}); add it")
+            if given and not permitted:
+                raise ValueError(f"kind {kind!r} has no {key}; leave it out")
+        size = info.data.get("size")
+        if kind in ("late", "oil_loss") and size is not None and size <= 0:
+            raise ValueError(
+                f"kind {kind!r} has size {size:g}; allowed: above 0 ({requirements.size})"
+            )
+        return kind
+
+
+class SimulatedTableConfig(BackendConfig):
+    """Simulated machine: servo, payload reaction and the true specimen on it."""
+
+    servo_bandwidth_hz: Positive = Field(description="-3 dB of the closed displacement loop.")
+    servo_delay_ms: NonNegative
+    moving_mass_kg: Positive
+    payload_reaction: bool = True
+    seed: int = 0
+    damper_stiffness_n_m: Positive
+    damper_damping_n_s_m: NonNegative
+    bumper_stiffness_n_m: Positive
+    bumper_damping_n_s_m: Positive
+    faults: tuple[InjectedFault, ...] = ()
+    truth: str | None = Field(None, description="Path of a sealed file, see `sim/ground_truth.py`.")
+    truth_sha256: str | None = Field(None, pattern=r"^[0-9a-fA-F]{64}$", validate_default=True)
+
+    @field_validator("truth_sha256")
+    @classmethod
+    def _check_truth_pair(cls, sha256: str | None, info: ValidationInfo) -> str | None:
+        if "truth" in info.data and (info.data["truth"] is None) != (sha256 is None):
+            raise ValueError("truth and truth_sha256 go together; give both or neither")
+        return sha256
+
+    def list_faults(self, rig: RigConfig) -> list[str]:
+        """List injected faults of channels that the rig does not have."""
+        faults = []
+        for fault in self.faults:
+            if fault.channel is not None and fault.channel not in rig.channels:
+                near = difflib.get_close_matches(fault.channel, rig.channels, 1, 0.4)
+                faults.append(
+                    f"fault {fault.kind!r}: the rig has no sensor {fault.channel!r}"
+                    + (
+                        f"; did you mean {near[0]!r}?"
+                        if near
+                        else f"; it has: {', '.join(rig.channels)}"
+                    )
+                )
+        return faults
