@@ -1,0 +1,279 @@
+"""A backend in a package of its own: CONNECT.md's example, installed, runs; without it, refused."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from table_io.backends import find_descriptor, open_backend, open_source
+from table_io.clock import ManualClock
+from table_io.config.backend import BACKEND_GROUP, list_entry_points, load_backend
+from table_io.config.base import PROFILES_DIR, load_config, parse_toml
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.config.rig_file import load_rig
+from table_io.errors import InputError
+from table_io.sim.table_service import SIMULATOR_GROUP, find_simulator
+
+ROOT = Path(__file__).resolve().parents[3]
+SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
+PAGE = (ROOT / "table_io" / "CONNECT.md").read_text(encoding="utf-8").partition("## 9.")[2]
+MODULE, PROJECT = (
+    re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)[0] for language in ("python", "toml")
+)
+UDP_RIG = (PROFILES_DIR / "rigs" / "udp_example.toml").read_text(encoding="utf-8")
+RIG = re.sub(r"\[udp\].*?(?=\[limits\])", "[ideal]\ngain = 1.0\n\n", UDP_RIG, flags=re.DOTALL)
+RIG = RIG.replace('"udp"', '"ideal"').replace("udp_example", "ideal")
+PROFILE = """
+title = "Two steps"
+[specimen]
+mass_kg = 550.0
+gap_mm = 4.0
+[sweep]
+start_hz = 2.4
+stop_hz = 2.8
+step_hz = 0.4
+cycles = 5
+measured_cycles = 2
+"""
+ACQUIRES = """
+from table_io.backends import BackendDescriptor
+from table_io.config.backend import BackendConfig
+
+class Inputs:
+    def __init__(self, rig, rate_hz, clock):
+        self.channels, self.rate_hz = rig.channels, rate_hz
+
+BACKEND = BackendDescriptor(config=BackendConfig, open_source=Inputs)
+"""
+ENTRY = "ideal = ideal_table:BACKEND"
+
+
+def install(
+    site: Path, module: str = MODULE, entry: str = ENTRY, name: str = "ideal_table"
+) -> Path:
+    """Install a module with one entry point, as pip does."""
+    info = site / f"{name}-0.1.dist-info"
+    info.mkdir(parents=True)
+    (site / f"{name}.py").write_text(module)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.1\n")
+    (info / "entry_points.txt").write_text(f"[{BACKEND_GROUP}]\n{entry}\n")
+    return site
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder of packages that this process finds too; what it imports from there is forgotten."""
+
+    def forget() -> None:
+        load_backend.cache_clear()
+        list_entry_points.cache_clear()
+        sys.modules.pop("ideal_table", None)
+
+    folder = tmp_path / "site"
+    monkeypatch.syspath_prepend(folder)
+    forget()
+    yield folder
+    forget()
+
+
+def shaketwin(folder: Path, *words: str, site: Path | None = None) -> tuple[int, str]:
+    """Exit code and output of a command in a folder, with or without the packages of a site."""
+    paths = [*([str(site)] if site else []), os.environ.get("PYTHONPATH", "")]
+    process = subprocess.run(
+        [SHAKETWIN, *words],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))},
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    return process.returncode, process.stdout + process.stderr
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a rig file of the example, a short test, and the package next to them."""
+    folder = tmp_path_factory.mktemp("lab")
+    entries = tomllib.loads(PROJECT)["project"]["entry-points"][BACKEND_GROUP]
+    ((name, value),) = entries.items()
+    install(folder / "site", entry=f"{name} = {value}")
+    (folder / "rig.toml").write_text(RIG)
+    (folder / "two.toml").write_text(PROFILE)
+    return folder
+
+
+def test_the_example_is_checked_runs_and_is_replayed_without_its_package(lab: Path) -> None:
+    site = lab / "site"
+    table = ("two.toml", "--table", "rig.toml")
+    code, text = shaketwin(lab, "check", *table, "--out", "checked", site=site)
+    assert code == 0, text
+    code, text = shaketwin(lab, "run", *table, "--speed", "max", "--out", "run", site=site)
+    assert code == 0, text
+    summary = json.loads((lab / "run" / "summary.json").read_text())
+    assert (summary["verdict"], summary["gaps"], len(summary["steps"])) == ("complete", 0, 4)
+    peaks = [step["table_acc_peak_m_s2"] for step in summary["steps"]]
+    assert peaks == pytest.approx([0.05 * 9.80665] * 4, rel=0.02)
+    code, text = shaketwin(lab, "replay", "run/run.mcap", "--out", "replayed")
+    assert code == 0, text
+
+
+def test_without_the_package_every_command_refuses_the_rig_file(lab: Path) -> None:
+    for words in (
+        ("check", "two.toml", "--table", "rig.toml"),
+        ("run", "two.toml", "--table", "rig.toml", "--speed", "max", "--out", "none"),
+        ("table", "--rig", "rig.toml"),
+    ):
+        code, text = shaketwin(lab, *words)
+        assert code == 2, text
+        assert text.count("\n") == 1, text
+    assert not (lab / "none").exists()
+
+
+def test_a_backend_that_is_not_installed_is_named_with_file_and_choice(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG)
+    with pytest.raises(InputError) as caught:
+        load_rig(path)
+    error = caught.value
+    assert (error.where, error.key, error.value) == (str(path), "backend", "ideal")
+    assert error.allowed.split(", ") == sorted(list_entry_points(BACKEND_GROUP))
+    assert "install" in error.remedy
+    rig = parse_toml(RIG, RigConfig, "a recording")  # is read all the same
+    assert rig.model_extra == {"ideal": {"gain": 1.0}}
+    assert not rig.runs_at_any_speed
+    with pytest.raises(InputError) as caught:
+        find_descriptor(rig)
+    assert (caught.value.key, caught.value.value) == ("backend", "ideal")
+
+
+def test_the_section_of_a_plugin_is_read_as_strictly_as_ours(site: Path) -> None:
+    install(site)
+    rig = parse_toml(RIG, RigConfig, "rig.toml")
+    assert rig.runs_at_any_speed
+    assert rig.is_simulated
+    assert rig.sections["ideal"].model_dump() == {"gain": 1.0}
+    with pytest.raises(InputError) as caught:
+        parse_toml(RIG.replace("gain = 1.0", "gan = 1").replace("span_v", "spam"), RigConfig, "x")
+    faults = [fault.strip() for fault in str(caught.value).splitlines()]
+    assert "ideal.gan: unknown key; did you mean 'gain'?" in faults
+    assert "output.spam: unknown key; did you mean 'span_mm'?" in faults
+    with pytest.raises(InputError, match=r"ideal: backend 'ideal' needs a \[ideal\] table"):
+        parse_toml(RIG.replace("[ideal]\ngain = 1.0", ""), RigConfig, "x")
+
+
+def test_what_only_acquires_does_not_drive_and_is_a_source_of_follow(
+    site: Path, tmp_path: Path
+) -> None:
+    install(site, ACQUIRES)
+    profile = parse_toml(PROFILE, Profile, "two.toml")
+    rig = parse_toml(RIG.replace("gain = 1.0", ""), RigConfig, "rig.toml")
+    assert not rig.under_external_control
+    with pytest.raises(InputError) as caught:
+        open_backend(rig, profile, ManualClock())
+    assert (caught.value.key, caught.value.value) == ("backend", "ideal")
+    assert "follow" in caught.value.remedy
+    followed = RIG.replace("gain = 1.0", '[follow]\nsource = "ideal"').replace(
+        'backend = "ideal"', 'backend = "follow"'
+    )
+    rig = parse_toml(followed, RigConfig, "rig.toml")
+    assert rig.under_external_control
+    assert open_source(rig, 2000.0, ManualClock()).channels == rig.channels
+    # The same files in other processes: a run of the first is refused, before anything starts.
+    (tmp_path / "rig.toml").write_text(RIG.replace("gain = 1.0", ""))
+    (tmp_path / "two.toml").write_text(PROFILE)
+    words = ("run", "two.toml", "--table", "rig.toml", "--out", "none")
+    code, text = shaketwin(tmp_path, *words, site=site)
+    assert code == 2, text
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_recording_that_followed_a_plugin_is_read_without_it(tmp_path: Path) -> None:
+    followed = RIG.replace("gain = 1.0", '[follow]\nsource = "ideal"').replace(
+        'backend = "ideal"', 'backend = "follow"'
+    )
+    assert parse_toml(followed, RigConfig, "a recording").under_external_control
+    path = tmp_path / "rig.toml"
+    path.write_text(followed)
+    with pytest.raises(InputError) as caught:
+        load_rig(path)
+    assert (caught.value.key, caught.value.value) == ("[ideal]", "ideal")
+
+
+def test_a_source_that_drives_is_refused(site: Path) -> None:
+    install(site)
+    followed = RIG.replace("gain = 1.0", 'gain = 1.0\n[follow]\nsource = "ideal"').replace(
+        'backend = "ideal"', 'backend = "follow"'
+    )
+    with pytest.raises(InputError, match=r"follow: source 'ideal'.*allowed: opendaq"):
+        parse_toml(followed, RigConfig, "rig.toml")
+
+
+@pytest.mark.parametrize(
+    ("module", "part"),
+    [
+        ("import a_library_that_is_not_there", "ModuleNotFoundError"),
+        ("BACKEND = 3", "is a int"),
+        (MODULE.replace("open=IdealTable, ", ""), "neither drives nor acquires"),
+    ],
+)
+def test_an_unusable_plugin_is_an_error_of_input(site: Path, module: str, part: str) -> None:
+    install(site, module)
+    with pytest.raises(InputError, match=part):
+        find_descriptor(parse_toml(RIG, RigConfig, "rig.toml"))
+
+
+def test_two_packages_with_one_name_are_refused(site: Path) -> None:
+    install(site, entry="simulated = ideal_table:BACKEND")
+    with pytest.raises(InputError) as caught:
+        list_entry_points(BACKEND_GROUP)
+    assert caught.value.key == "simulated"
+    assert "provided twice" in caught.value.problem
+
+
+def test_rig_files_are_read_without_any_vendor_library() -> None:
+    code = (
+        "import sys\n"
+        "from table_io.config.base import PROFILES_DIR\n"
+        "from table_io.config.rig_file import load_rig\n"
+        "rigs = [load_rig(path)[0] for path in (PROFILES_DIR / 'rigs').glob('*.toml')]\n"
+        "assert len({rig.backend for rig in rigs}) == 5\n"
+        "late = {'nidaqmx', 'grpc', 'opendaq', 'table_io.sim.simulated_table', 'numba'}\n"
+        "print(sorted(late & set(sys.modules)))\n"
+    )
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    assert process.stdout == "[]\n", process.stderr
+
+
+@pytest.mark.parametrize("group", [BACKEND_GROUP, SIMULATOR_GROUP])
+def test_the_installed_metadata_are_those_of_the_source(group: str) -> None:
+    """If this fails alone, install again: `pip install -e .`"""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    installed = metadata.distribution("shaketwin").entry_points.select(group=group)
+    assert {entry.name: entry.value for entry in installed} == project["entry-points"][group]
+
+
+def test_every_backend_of_ours_opens_one_thing_and_says_what_it_serves() -> None:
+    profile, _ = load_config(PROFILES_DIR / "tests" / "quickstart.toml", Profile, "profile")
+    served = set()
+    for path in (PROFILES_DIR / "rigs").glob("*.toml"):
+        rig, _ = load_rig(path)
+        descriptor = find_descriptor(rig)
+        assert descriptor.drives == (descriptor.open_source is None)
+        assert rig.runs_at_any_speed == descriptor.any_speed
+        if descriptor.drives:
+            assert open_backend(rig, profile, ManualClock()).replace_after > 0
+        if not descriptor.any_speed:
+            served.add(rig.backend)
+            assert callable(find_simulator(rig))
+    assert served == {"machine", "ni", "udp", "follow"}
