@@ -103,6 +103,45 @@ def test_one_foreign_library_one_package(library: str) -> None:
     assert [user for user in users if not user.startswith(OWNERS[library])] == []
 
 
+def backend_questions(source: str) -> list[str]:
+    """Comparisons and matches of a rig's `backend` in a source: they should ask a capability."""
+
+    def names_backend(node: ast.AST) -> bool:
+        return isinstance(node, ast.Attribute) and node.attr == "backend" and is_rig(node.value)
+
+    def is_rig(node: ast.AST) -> bool:
+        name = node.attr if isinstance(node, ast.Attribute) else getattr(node, "id", "")
+        return name.strip("_") == "rig"
+
+    return [
+        ast.unparse(node)
+        for node in ast.walk(ast.parse(source))
+        if (isinstance(node, ast.Compare) and any(map(names_backend, ast.walk(node))))
+        or (isinstance(node, ast.Match) and names_backend(node.subject))
+    ]
+
+
+def test_nobody_asks_which_backend_a_rig_has() -> None:
+    questions = {
+        str(path.relative_to(ROOT)): backend_questions(path.read_text())
+        for room in ("table_io", "twin")
+        for path in (ROOT / room).rglob("*.py")
+    }
+    assert {path: asked for path, asked in questions.items() if asked} == {}
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        'rig.backend == "ni"',
+        'x = config.rig.backend in ("opendaq", "follow")',
+        'match self._rig.backend:\n    case "ni": pass',
+    ],
+)
+def test_a_question_for_the_backend_is_found(source: str) -> None:
+    assert len(backend_questions(source)) == 1
+
+
 def test_top_level_holds_only_what_was_given() -> None:
     tracked = subprocess.run(
         ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True
