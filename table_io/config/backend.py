@@ -4,7 +4,7 @@ A backend registers under its name in the entry-point group `shaketwin.backends`
 imported when a rig file names it, not before.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import metadata
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
@@ -58,26 +58,27 @@ class InstalledBackend(Protocol):
 
 
 @cache
-def list_entry_points(group: str) -> Mapping[str, metadata.EntryPoint]:
-    """Return the entry points of a group by name; InputError if two packages use one name."""
-    entries: dict[str, metadata.EntryPoint] = {}
+def list_entry_points(group: str) -> Mapping[str, Sequence[metadata.EntryPoint]]:
+    """Return the entry points of a group by name, sorted; several if packages use one name."""
+    entries: dict[str, list[metadata.EntryPoint]] = {}
     for entry in sorted(metadata.entry_points(group=group), key=lambda entry: entry.name):
-        if entry.name in entries:
-            raise InputError(
-                f"provided twice, by {entries[entry.name].value} and by {entry.value}",
-                where=group,
-                key=entry.name,
-                remedy="remove one of the two packages",
-            )
-        entries[entry.name] = entry
+        entries.setdefault(entry.name, []).append(entry)
     return entries
 
 
 def load_entry_point(group: str, name: str) -> Any:
     """Import the object registered under `name`, None if there is none; InputError if it fails."""
-    entry = list_entry_points(group).get(name)
-    if entry is None:
+    entries = list_entry_points(group).get(name)
+    if entries is None:
         return None
+    entry, *others = entries
+    if others:
+        raise InputError(
+            f"provided by {entry.value} and by {', '.join(other.value for other in others)}",
+            where=group,
+            key=name,
+            remedy="remove all but one of these packages",
+        )
     try:
         return entry.load()
     except Exception as error:  # a plug-in module may raise anything

@@ -125,12 +125,12 @@ class RigConfig(ConfigModel):
         sources = own_section.values() if isinstance(own_section, Mapping) else ()
         for name in [key for key in values if key not in cls.model_fields]:
             backend = load_backend(name)
-            if backend is not None and values[name] is not None:
+            if backend is not None:
                 try:
                     values[name] = backend.config.model_validate(values[name])
                 except ValidationError as error:
                     faults += _list_faults(error, (name,))
-            elif backend is None and is_installed and name not in sources:
+            elif is_installed and name not in sources:
                 faults.append(
                     InitErrorDetails(type="extra_forbidden", loc=(name,), input=values[name])
                 )
