@@ -1,6 +1,8 @@
-"""Table of all channels: name, unit, positive direction and meaning.
+"""Registry of channels: name, unit, positive direction, meaning, quantity and body.
 
-Right is positive everywhere. The names are also the column names of CSV and Parquet files.
+Right is positive everywhere. The names are also the column names of CSV and Parquet files. A rig
+file declares further channels (`table_io/config/channel.py`); `RigConfig.channel_by_name` holds
+both.
 """
 
 from dataclasses import dataclass
@@ -9,30 +11,50 @@ import numpy as np
 
 from table_io.block import Block, Float1D
 
+DIRECTION_SIGNS = {"right": 1.0, "compression": 1.0, "left": -1.0, "tension": -1.0}
+
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """Measured quantity with its SI unit and sign convention."""
+    """Measured quantity of a body with its SI unit and sign convention."""
 
     name: str
     unit: str
     positive: str
     meaning: str
+    quantity: str
+    body: str
+
+    @property
+    def sign(self) -> float | None:
+        """Factor to the project's convention, right and compression positive; None: other axis."""
+        return DIRECTION_SIGNS.get(self.positive)
 
 
 CHANNELS: tuple[Channel, ...] = (
-    Channel("drive_disp_m", "m", "right", "Commanded table displacement, read back."),
-    Channel("table_disp_m", "m", "right", "Table displacement in the laboratory frame."),
-    Channel("table_acc_m_s2", "m/s2", "right", "Table acceleration in the laboratory frame."),
-    Channel("mass_disp_m", "m", "right", "Total displacement of the mass, laboratory frame."),
-    Channel("mass_acc_m_s2", "m/s2", "right", "Total acceleration of the mass, laboratory frame."),
-    Channel("force_r1_n", "N", "compression", "First load cell on the right bumper."),
-    Channel("force_r2_n", "N", "compression", "Second load cell on the right bumper."),
-    Channel("force_l1_n", "N", "compression", "First load cell on the left bumper."),
-    Channel("force_l2_n", "N", "compression", "Second load cell on the left bumper."),
-    Channel("damper_force_n", "N", "resists motion to the right", "Damper force, component tests."),
-    Channel("rel_disp_m", "m", "right", "Mass minus table, measured directly."),
-)
+    Channel("drive_disp_m", "m", "right", "Commanded table displacement, read back.",
+            "displacement", "command"),
+    Channel("table_disp_m", "m", "right", "Table displacement in the laboratory frame.",
+            "displacement", "table"),
+    Channel("table_acc_m_s2", "m/s2", "right", "Table acceleration in the laboratory frame.",
+            "acceleration", "table"),
+    Channel("mass_disp_m", "m", "right", "Total displacement of the mass, laboratory frame.",
+            "displacement", "mass"),
+    Channel("mass_acc_m_s2", "m/s2", "right", "Total acceleration of the mass, laboratory frame.",
+            "acceleration", "mass"),
+    Channel("force_r1_n", "N", "compression", "First load cell on the right bumper.",
+            "force", "right_bumper"),
+    Channel("force_r2_n", "N", "compression", "Second load cell on the right bumper.",
+            "force", "right_bumper"),
+    Channel("force_l1_n", "N", "compression", "First load cell on the left bumper.",
+            "force", "left_bumper"),
+    Channel("force_l2_n", "N", "compression", "Second load cell on the left bumper.",
+            "force", "left_bumper"),
+    Channel("damper_force_n", "N", "resists motion to the right", "Damper force, component tests.",
+            "force", "damper"),
+    Channel("rel_disp_m", "m", "right", "Mass minus table, measured directly.",
+            "relative_displacement", "mass"),
+)  # fmt: skip
 CHANNEL_BY_NAME = {channel.name: channel for channel in CHANNELS}
 
 RIGHT_CELLS = ("force_r1_n", "force_r2_n")

@@ -1,9 +1,18 @@
-"""Units allowed in config files, each with its SI unit and conversion factor."""
+"""Units allowed in config files, each with its SI unit and conversion factor.
+
+Temperatures are recorded in degrees Celsius, the only recorded unit that is not SI.
+"""
 
 GRAVITY_M_S2 = 9.80665
 
 UNITS: dict[str, tuple[str, float]] = {
     "m": ("m", 1.0), "mm": ("m", 1e-3), "um": ("m", 1e-6),
+    "m/s": ("m/s", 1.0), "mm/s": ("m/s", 1e-3),
     "m/s2": ("m/s2", 1.0), "g": ("m/s2", GRAVITY_M_S2),
     "N": ("N", 1.0), "kN": ("N", 1e3),
+    "rad": ("rad", 1.0), "mrad": ("rad", 1e-3), "rad/s": ("rad/s", 1.0), "mrad/s": ("rad/s", 1e-3),
+    "m/m": ("m/m", 1.0), "um/m": ("m/m", 1e-6),
+    "degC": ("degC", 1.0),
+    "Pa": ("Pa", 1.0), "kPa": ("Pa", 1e3), "bar": ("Pa", 1e5), "MPa": ("Pa", 1e6),
+    "V": ("V", 1.0), "mV": ("V", 1e-3),
 }  # fmt: skip

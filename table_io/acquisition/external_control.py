@@ -144,7 +144,8 @@ class _ExternalSession:
         self.source.open()
         volts = self.source.tare(int(TARE_S * self.rate_hz))
         self._protection = PassiveProtection(self.setup, volts)
-        self._tare = compute_tare(volts, self.setup.rig.sensors)
+        rig = self.setup.rig
+        self._tare = compute_tare(volts, rig.sensors) | rig.stated_offsets
         sensor = self.setup.rig.sensors[self._command_row]
         refuse_motion(self._command_m(volts), sensor, self.drive, self.rate_hz)
         lsb, noise = (

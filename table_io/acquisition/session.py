@@ -140,7 +140,7 @@ class _Session:
         if self._state.stage.kind != "check":
             self.event_log.enter_state("armed")
         self.output_queue.start()
-        return compute_tare(volts, sensors)
+        return compute_tare(volts, sensors) | self.setup.rig.stated_offsets
 
     def acquire(self, tare: dict[str, float]) -> tuple[Block, Bool2D]:
         """Read (next block in SI, mask of clipped samples (channel, sample))."""

@@ -36,12 +36,18 @@ class ConfigModel(BaseModel):
     @classmethod
     def list_keys(cls) -> list[str]:
         """List the allowed keys."""
-        return list(cls.model_fields)
+        return list(cls.fields_by_key())
+
+    @classmethod
+    def fields_by_key(cls) -> dict[str, Any]:
+        """Return the fields by their key in the file."""
+        return {field.alias or name: field for name, field in cls.model_fields.items()}
 
     @classmethod
     def find_table_model(cls, key: str) -> "type[ConfigModel] | None":
         """Return the model of the table or tables at `key`; None if it holds no table."""
-        stack: list[Any] = [cls.model_fields[key].annotation] if key in cls.model_fields else []
+        fields = cls.fields_by_key()
+        stack: list[Any] = [fields[key].annotation] if key in fields else []
         while stack:
             item = stack.pop()
             if isinstance(item, type) and issubclass(item, ConfigModel):

@@ -3,6 +3,7 @@
 Keys carry their unit in the name (`span_mm`, `lead_s`); properties return SI.
 """
 
+import difflib
 from collections.abc import Mapping
 from typing import Any, Self, TypeVar
 
@@ -15,12 +16,14 @@ from pydantic import (
     field_validator,
     model_validator,
 )
-from pydantic_core import InitErrorDetails
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from table_io.channels import CHANNEL_BY_NAME, Channel
 from table_io.config.backend import BACKEND_GROUP, BackendConfig, list_entry_points, load_backend
 from table_io.config.base import ConfigModel, Number, Positive
 from table_io.config.calibration_record import CalibrationRecord
-from table_io.config.sensor import SensorConfig
+from table_io.config.channel import ChannelConfig
+from table_io.config.sensor import SensorConfig, check_sensor_unit
 from table_io.errors import InputError
 
 SectionT = TypeVar("SectionT", bound=BackendConfig)
@@ -61,14 +64,14 @@ class OutputConfig(ConfigModel):
 
 
 class RigConfig(ConfigModel):
-    """Rig file of a shaking table: its limits, output, sensors and the sections of backends.
+    """Rig file of a shaking table: its limits, output, channels, sensors, sections of backends.
 
     A section is a table named like an installed backend and validated by its config model. Sections
     of a backend that is not installed are kept unread, so that a recording can be read without the
     package that drove its table; `load_rig` refuses them.
     """
 
-    model_config = ConfigDict(extra="allow")  # the sections
+    model_config = ConfigDict(extra="allow", populate_by_name=True)  # the extras are sections
 
     name: str = Field(pattern=r"^[a-z0-9_]+$")
     title: str
@@ -77,16 +80,30 @@ class RigConfig(ConfigModel):
     moving_mass_kg: Positive = Field(description="Table without payload, for the force margin.")
     limits: MachineLimits
     output: OutputConfig
+    extra_channels: tuple[ChannelConfig, ...] = Field(
+        (), alias="channels", description="Channels declared next to the canonical ones."
+    )
     sensors: tuple[SensorConfig, ...] = Field(min_length=1)
     calibrations: tuple[CalibrationRecord, ...] = Field(
         (), description="Records of `shaketwin calibrate`, appended when the file is read."
     )
+
+    @field_validator("extra_channels")
+    @classmethod
+    def _check_duplicates(cls, channels: tuple[ChannelConfig, ...]) -> tuple[ChannelConfig, ...]:
+        names = [channel.name for channel in channels]
+        duplicates = sorted({name for name in names if names.count(name) > 1})
+        if duplicates:
+            raise ValueError(f"channels declare {', '.join(duplicates)} more than once; keep one")
+        return channels
 
     @field_validator("sensors")
     @classmethod
     def _complete(
         cls, sensors: tuple[SensorConfig, ...], info: ValidationInfo
     ) -> tuple[SensorConfig, ...]:
+        if "extra_channels" in info.data:  # else their faults are reported
+            _check_sensor_channels(sensors, _build_registry(info.data["extra_channels"]))
         names = [sensor.channel for sensor in sensors]
         duplicates = sorted({name for name in names if names.count(name) > 1})
         if duplicates:
@@ -123,7 +140,7 @@ class RigConfig(ConfigModel):
             )
         # A section may name that of another backend, as [follow] does.
         sources = own_section.values() if isinstance(own_section, Mapping) else ()
-        for name in [key for key in values if key not in cls.model_fields]:
+        for name in [key for key in values if key not in {*cls.fields_by_key(), *cls.model_fields}]:
             backend = load_backend(name)
             if backend is not None:
                 try:
@@ -190,7 +207,23 @@ class RigConfig(ConfigModel):
 
     @property
     def channels(self) -> tuple[str, ...]:
+        """Names of the acquired channels, in the order of the sensors."""
         return tuple(sensor.channel for sensor in self.sensors)
+
+    @property
+    def channel_by_name(self) -> dict[str, Channel]:
+        """Registry of this rig: the canonical channels and those that it declares."""
+        return _build_registry(self.extra_channels)
+
+    @property
+    def stated_offsets(self) -> dict[str, float]:
+        """Stated offset in SI of each sensor whose zero is absolute, so that it is never tared."""
+        absolute = {channel.name for channel in self.extra_channels if not channel.is_tared}
+        return {
+            sensor.channel: sensor.offset * sensor.si_per_unit
+            for sensor in self.sensors
+            if sensor.channel in absolute
+        }
 
     def check_rate(self, rate_hz: float) -> None:
         """Raise InputError if the rig does not support this sampling rate in Hz."""
@@ -221,3 +254,32 @@ def _list_faults(error: ValidationError, location: tuple[str, ...] = ()) -> list
         )
         for fault in error.errors(include_url=False)
     ]
+
+
+def _build_registry(declared: tuple[ChannelConfig, ...]) -> dict[str, Channel]:
+    return CHANNEL_BY_NAME | {channel.name: channel.channel for channel in declared}
+
+
+def _check_sensor_channels(sensors: tuple[SensorConfig, ...], registry: dict[str, Channel]) -> None:
+    """Raise ValidationError for each sensor of an unknown channel, or in a unit not of it."""
+    errors: list[InitErrorDetails] = []
+
+    def add(row: int, key: str, value: str, message: str) -> None:
+        kind = PydanticCustomError("value_error", "{message}", {"message": message})
+        errors.append(InitErrorDetails(type=kind, loc=(row, key), input=value))
+
+    for row, sensor in enumerate(sensors):
+        channel = registry.get(sensor.channel)
+        if channel is None:
+            near = difflib.get_close_matches(sensor.channel, registry, 1)
+            hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(registry)}"
+            remedy = "or declare it in a [[channels]] table"
+            message = f"channel {sensor.channel!r} is unknown; {hint} {remedy}"
+            add(row, "channel", sensor.channel, message)
+            continue
+        try:
+            check_sensor_unit(sensor.unit, channel)
+        except ValueError as error:
+            add(row, "unit", sensor.unit, str(error))
+    if errors:
+        raise ValidationError.from_exception_data("sensors", errors)

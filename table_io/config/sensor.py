@@ -4,13 +4,12 @@ Dates are ISO (2026-03-01). Dates never stop a test; `calibration_due.py` report
 """
 
 import calendar
-import difflib
 import re
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator
 
-from table_io.channels import CHANNEL_BY_NAME
+from table_io.channels import CHANNEL_BY_NAME, Channel
 from table_io.config.base import ConfigModel, Count, Finite, NonNegative, Positive
 from table_io.units import UNITS
 
@@ -40,10 +39,20 @@ def _add_months(day: str, months: int) -> str | None:
 IsoDate = Annotated[str, BeforeValidator(_parse_day)]
 
 
+def check_sensor_unit(unit: str, channel: Channel) -> None:
+    """Raise ValueError if a sensor in this unit does not measure the channel."""
+    allowed = [name for name, (si, _) in UNITS.items() if si == channel.unit]
+    if unit not in allowed:
+        raise ValueError(
+            f"unit {unit!r} does not measure {channel.name} ({channel.unit}); allowed: "
+            f"{', '.join(allowed)}"
+        )
+
+
 class SensorConfig(ConfigModel):
     """Sensor of one channel: volts = (value + offset) * volts_per_unit."""
 
-    channel: str
+    channel: str = Field(description="Canonical, or declared in [[channels]] of the rig file.")
     unit: str
     range: Positive = Field(description="Full scale on either side, in `unit`.")
     volts_per_unit: Finite = Field(description="Sensitivity; negative if the sensor is reversed.")
@@ -67,34 +76,14 @@ class SensorConfig(ConfigModel):
     filter_hz: Positive | None = Field(None, description="-3 dB of its filter; information only.")
     delay_ms: NonNegative = Field(0.0, description="Of its electronics; information only.")
 
-    @field_validator("channel")
-    @classmethod
-    def _check_channel(cls, channel: str) -> str:
-        if channel not in CHANNEL_BY_NAME:
-            near = difflib.get_close_matches(channel, CHANNEL_BY_NAME, 1)
-            raise ValueError(
-                f"channel {channel!r} is unknown"
-                + (
-                    f"; did you mean {near[0]!r}?"
-                    if near
-                    else f"; known: {', '.join(CHANNEL_BY_NAME)}"
-                )
-            )
-        return channel
-
     @field_validator("unit")
     @classmethod
     def _check_unit(cls, unit: str, info: ValidationInfo) -> str:
-        channel = info.data.get("channel")
-        if channel is None:
-            return unit
-        si_unit = CHANNEL_BY_NAME[channel].unit
-        allowed = [name for name, (si, _) in UNITS.items() if si == si_unit]
-        if unit not in allowed:
-            raise ValueError(
-                f"unit {unit!r} does not measure {channel} ({si_unit}); allowed: "
-                f"{', '.join(allowed)}"
-            )
+        channel = CHANNEL_BY_NAME.get(info.data.get("channel", ""))
+        if channel is not None:
+            check_sensor_unit(unit, channel)
+        elif unit not in UNITS:  # of a channel that the rig file declares
+            raise ValueError(f"unit {unit!r} is unknown; allowed: {', '.join(UNITS)}")
         return unit
 
     @field_validator("volts_per_unit")

@@ -102,8 +102,14 @@ class SimulatedTableConfig(BackendConfig):
         return sha256
 
     def list_faults(self, rig: RigConfig) -> list[str]:
-        """List injected faults of channels that the rig does not have."""
-        faults = []
+        """List channels without a simulated signal, and faults of channels without a sensor."""
+        faults = [
+            f"the simulated table has no signal for {channel.name}; add `simulated = {{ ... }}` to "
+            "its [[channels]] table (factors of canonical channels, or `constant`), or remove its "
+            "[[sensors]] table"
+            for channel in rig.extra_channels
+            if channel.name in rig.channels and channel.simulated is None
+        ]
         for fault in self.faults:
             if fault.channel is not None and fault.channel not in rig.channels:
                 near = difflib.get_close_matches(fault.channel, rig.channels, 1, 0.4)

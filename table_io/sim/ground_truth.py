@@ -24,7 +24,6 @@ from typing import NamedTuple
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from table_io.channels import CHANNEL_BY_NAME
 from table_io.config.base import ConfigModel, Finite, NonNegative, Number, Positive, parse_toml
 from table_io.errors import InputError
 
@@ -200,8 +199,8 @@ class HiddenEffect(ConfigModel):
         faults, channel = _find_parameter_faults(definition, given), info.data.get("channel")
         if not definition.is_sensor_effect and channel is not None:
             faults.append("has no channel; leave it out")
-        elif definition.is_sensor_effect and channel not in CHANNEL_BY_NAME:
-            faults.append(f"needs a channel; {_suggest(str(channel), list(CHANNEL_BY_NAME))}")
+        elif definition.is_sensor_effect and channel is None:
+            faults.append("needs a channel, one of the rig's sensors; add it")
         if faults:
             raise ValueError(f"{definition.id}: " + "; ".join(faults))
         return {

@@ -15,6 +15,7 @@ import numpy as np
 from table_io.backends import SAMPLE_TIMEOUT_S, MachineLost
 from table_io.block import Float1D, Float2D
 from table_io.clock import Clock
+from table_io.config.channel import CONSTANT
 from table_io.config.profile import Specimen
 from table_io.config.rig import OutputConfig, RigConfig
 from table_io.config.sensor import SensorConfig
@@ -150,7 +151,8 @@ class SimulatedBackend:
     def tare(self, samples: int) -> Float2D:
         """Return volts at rest before precompression, (channel, sample)."""
         self._require(self._is_open, "open() comes first")
-        return self._digitizer.digitize(np.zeros((len(self.channels), samples)), self._tare_noise)
+        at_rest = self._true_values(np.zeros(samples), np.zeros((len(SIGNALS), samples)))
+        return self._digitizer.digitize(at_rest, self._tare_noise)
 
     def queue(self, index: int, volts: Float1D) -> None:
         """Replace the command from sample `index` on, in V, (sample,); the last value is held."""
@@ -255,7 +257,10 @@ class SimulatedBackend:
         return np.concatenate([self._command[start:], tail])
 
     def _true_values(self, drive: Float1D, signals: Float2D) -> Float2D:
-        """Return true values in SI, (channel, sample); the two cells of a side share its force."""
+        """Return true values in SI, (channel, sample); the two cells of a side share its force.
+
+        A declared channel is the sum of those above that the rig file states for it.
+        """
         y, y_acc, x, x_acc, right, left, *hidden = signals
         balance = -self._plant.mass_kg * x_acc - right - left
         true = {
@@ -270,5 +275,11 @@ class SimulatedBackend:
             "force_l2_n": -0.5 * left,
             "damper_force_n": hidden[0] if hidden else balance,
             "rel_disp_m": x - y,
+            CONSTANT: np.ones(drive.size),
         }
+        for channel in self._rig.extra_channels:
+            factors = channel.simulated or {}
+            true[channel.name] = sum(
+                (factor * true[name] for name, factor in factors.items()), np.zeros(drive.size)
+            )
         return np.array([true[name] for name in self.channels])

@@ -2,7 +2,6 @@
 
 from pydantic import Field, field_validator
 
-from table_io.channels import CHANNEL_BY_NAME
 from table_io.config.backend import BackendConfig
 from table_io.config.rig import RigConfig
 
@@ -31,12 +30,6 @@ class OpenDaqWiring(BackendConfig):
     @field_validator("signals")
     @classmethod
     def _check_signals(cls, signals: dict[str, str]) -> dict[str, str]:
-        unknown = [name for name in signals if name not in CHANNEL_BY_NAME]
-        if unknown:
-            raise ValueError(
-                f"signals name unknown channels {', '.join(unknown)}; known: "
-                f"{', '.join(CHANNEL_BY_NAME)}"
-            )
         ids = list(signals.values())
         duplicates = sorted({signal for signal in ids if ids.count(signal) > 1})
         if duplicates:
@@ -44,6 +37,14 @@ class OpenDaqWiring(BackendConfig):
                 f"signals wire {', '.join(duplicates)} to two channels; give each channel its own"
             )
         return signals
+
+    def list_faults(self, rig: RigConfig) -> list[str]:
+        """List signals of channels that the rig does not know."""
+        unknown = [name for name in self.signals if name not in rig.channel_by_name]
+        if not unknown:
+            return []
+        known = ", ".join(rig.channel_by_name)
+        return [f"signals name unknown channels {', '.join(unknown)}; known: {known}"]
 
     def find_address(self, rig: RigConfig) -> str:
         return self.device

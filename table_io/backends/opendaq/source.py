@@ -35,7 +35,9 @@ MAX_READ_SAMPLES = 1 << 16  # per channel and poll
 MAX_CLOCK_JUMP_S = 5.0  # a longer jump of the stamps means that their clock was set
 DRIFT_GAIN = 0.1  # of the filter that follows the drift of a disciplined clock, per poll
 CLOCK_WINDOW_S = 10.0  # over which the device's clock is compared with the session's
-UNIT_SYNONYMS = {"m/s²": "m/s2", "m/s^2": "m/s2", "g_n": "g", "gn": "g", "µm": "um", "μm": "um"}
+UNIT_SYNONYMS = {
+    "m/s²": "m/s2", "m/s^2": "m/s2", "g_n": "g", "gn": "g", "µm": "um", "μm": "um", "°C": "degC",
+}  # fmt: skip
 
 
 def require_opendaq_wiring(rig: RigConfig) -> OpenDaqWiring:

@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from table_io.block import Block, Float1D, Label
-from table_io.channels import CHANNEL_BY_NAME
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.order_tracking import track_channels, track_harmonics
@@ -143,7 +142,7 @@ class LoopCheckData:
         """Return the factor from an amplitude of the channel to its tone."""
         level = hold.level0 * hold.correction0
         return (
-            -((2 * math.pi * hold.f0) ** 2) if CHANNEL_BY_NAME[name].unit == "m" else 1.0
+            -((2 * math.pi * hold.f0) ** 2) if self.rig.channel_by_name[name].unit == "m" else 1.0
         ) / level
 
     def noise(self, name: str) -> float:

@@ -174,7 +174,7 @@ def inspect_samples(
             state.thresholds, state.sample_state, rows,
         )  # fmt: skip
         for index, code, row, value, limit in rows[:count].tolist():
-            channel = block.channels[int(row)]
+            channel = state.context.rig.channel_by_name[block.channels[int(row)]]
             arguments = int(code), int(index), channel, value, limit
             findings.append(to_finding(*arguments, state.context.profile))
         if offset > first:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from table_io.channels import CHANNEL_BY_NAME
+from table_io.channels import Channel
 from table_io.config.profile import Profile
 from table_io.records import Event, Trip
 from table_io.safety.protection import sample_checks
@@ -123,19 +123,19 @@ WORDINGS = {
 
 
 def to_finding(
-    code: int, index: int, channel: str, value: float, limit: float, profile: Profile
+    code: int, index: int, channel: Channel, value: float, limit: float, profile: Profile
 ) -> Finding:
     """Make the finding of a sample check, with its message."""
     wording = WORDINGS[code]
-    unit = wording.unit or CHANNEL_BY_NAME[channel].unit
+    unit = wording.unit or channel.unit
     text = wording.sentence.format(
-        channel=channel,
+        channel=channel.name,
         at=index,
         value=format_si(value * wording.scale, unit),
         limit=format_si(limit * wording.scale, unit),
     )
-    stop = _is_stop(wording.severity, channel, profile)
-    return Finding(index, wording.kind, channel, value, limit, text, stop)
+    stop = _is_stop(wording.severity, channel.name, profile)
+    return Finding(index, wording.kind, channel.name, value, limit, text, stop)
 
 
 def confirm_suspicion(suspicion: Suspicion, index: int, profile: Profile) -> Finding:

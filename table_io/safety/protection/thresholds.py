@@ -39,6 +39,7 @@ MIN_MOTION_LSB = 20.0  # expected motion within which a sensor without noise mus
 MIN_SPIKE_SIGMA = 10.0  # white noise: once in 1e14 samples
 MIN_SPIKE_RANGE = 1e-3
 HALF_MIN_LAG_S = 1e-3  # half the shortest lag: such a stiff table follows every step of its output
+TABLE_ACCELERATION = ("acceleration", "table")  # quantity and body
 # Consecutive samples equal to earlier ones: noise never repeats itself.
 MIN_REPEAT_SAMPLES = 5
 # Consecutive samples with an error of the command: more than MIN_REPEAT_SAMPLES, so that a
@@ -126,7 +127,9 @@ def compute_thresholds(
     needed = ("drive_disp_m", "table_disp_m", "table_acc_m_s2")
     drive, table, acceleration = (names.index(name) for name in needed)
     spike_limit = np.maximum(MIN_SPIKE_SIGMA * sigma, MIN_SPIKE_RANGE * full_scale)
-    spike_limit[acceleration] += rig.output.lsb_m / HALF_MIN_LAG_S**2
+    measured = [rig.channel_by_name[name] for name in names]
+    on_table = [(channel.quantity, channel.body) == TABLE_ACCELERATION for channel in measured]
+    spike_limit[on_table] += rig.output.lsb_m / HALF_MIN_LAG_S**2
     steps = lsb.copy()
     steps[[drive, table]] = np.maximum(lsb[[drive, table]], rig.output.lsb_m)
     return Thresholds(

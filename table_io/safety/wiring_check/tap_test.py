@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from table_io.block import Float1D, Float2D
-from table_io.channels import CHANNEL_BY_NAME, LEFT_CELLS, RIGHT_CELLS
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.config.rig import RigConfig
 from table_io.safety.wiring_check.check_line import CheckLine, check_value, mark_untested
 
@@ -44,16 +44,25 @@ STIMULI = (
 
 def list_stimuli(rig: RigConfig) -> tuple[Stimulus, ...]:
     """List the stimuli for a rig: taps and presses, then the shunts stated in the rig file."""
-    taps = (
-        Stimulus(stimulus.prompt, tuple(name for name in stimulus.channels if name in rig.channels))
-        for stimulus in STIMULI
-    )
+    taps = (Stimulus(stimulus.prompt, _list_moved(stimulus, rig)) for stimulus in STIMULI)
     shunts = (
         Stimulus(f"switch the shunt of {sensor.channel} on", (sensor.channel,), shunt=True)
         for sensor in rig.sensors
         if sensor.shunt is not None
     )
     return (*(stimulus for stimulus in taps if stimulus.channels), *shunts)
+
+
+def _list_moved(stimulus: Stimulus, rig: RigConfig) -> tuple[str, ...]:
+    """List the rig's channels that a stimulus moves: its own, then declared ones alike."""
+    registry = rig.channel_by_name
+    alike = {(registry[name].quantity, registry[name].body) for name in stimulus.channels}
+    declared = (
+        channel.name
+        for channel in (registry[extra.name] for extra in rig.extra_channels)
+        if (channel.quantity, channel.body) in alike and channel.sign is not None
+    )
+    return tuple(name for name in (*stimulus.channels, *declared) if name in rig.channels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +120,7 @@ class TapResponse:
         rest_swing = self.swing(channel)[: self.rest_samples]
         if np.abs(rest_swing).max(initial=0.0) >= self.min_swing(channel):
             return True
-        if self.rest_means is None or CHANNEL_BY_NAME[channel].unit != "N":
+        if self.rest_means is None or self.rig.channel_by_name[channel].unit != "N":
             return False
         min_shift = max(MIN_PRESS_RANGE * self.rig.sensors[row].range, self.min_swing(channel))
         return abs(self._rest_mean(channel) - float(self.rest_means[row])) >= min_shift
@@ -163,8 +172,9 @@ def evaluate_tap(
 
 def _same_unit_channels(stimulus: Stimulus, rig: RigConfig) -> tuple[str, ...]:
     """List the channels of the stimulus and all others of the same unit (none for lengths)."""
-    unit = CHANNEL_BY_NAME[stimulus.channels[0]].unit
-    channels = (name for name in rig.channels if CHANNEL_BY_NAME[name].unit == unit and unit != "m")
+    registry = rig.channel_by_name
+    unit = registry[stimulus.channels[0]].unit
+    channels = (name for name in rig.channels if registry[name].unit == unit and unit != "m")
     return tuple(dict.fromkeys((*stimulus.channels, *channels)))
 
 
@@ -173,7 +183,8 @@ def _check_tap(stimulus: Stimulus, response: TapResponse) -> Iterator[CheckLine]
 
     The delay of load cells is not checked: a press may load two cells one after the other.
     """
-    unit = CHANNEL_BY_NAME[stimulus.channels[0]].unit
+    registry = response.rig.channel_by_name
+    unit = registry[stimulus.channels[0]].unit
     earliest = min(
         (swing[0] for name in stimulus.channels if (swing := response.find_first_swing(name))),
         default=0,
@@ -182,7 +193,7 @@ def _check_tap(stimulus: Stimulus, response: TapResponse) -> Iterator[CheckLine]
     for name in stimulus.channels:
         sensor = response.rig.sensors[response.rig.channels.index(name)]
         first_swing = response.find_first_swing(name)
-        if largest_channel not in stimulus.channels and CHANNEL_BY_NAME[name].unit == unit:
+        if largest_channel not in stimulus.channels and registry[name].unit == unit:
             size = response.largest_swing(name)
             remedy = (
                 f"{largest_channel} responds more: check whether their cables, or their channels "
@@ -194,7 +205,9 @@ def _check_tap(stimulus: Stimulus, response: TapResponse) -> Iterator[CheckLine]
             yield mark_untested("polarity", name, reason)
             continue
         remedy = "turn the sensor around, or change the sign of volts_per_unit in the rig file"
-        yield check_value("polarity", name, first_swing[1], (0.0, math.inf), sensor.unit, remedy)
+        # Left and tension are negative; the damper's cell has a convention of its own.
+        value = first_swing[1] * (registry[name].sign or 1.0)
+        yield check_value("polarity", name, value, (0.0, math.inf), sensor.unit, remedy)
         if unit != "N":
             delay_ms = 1e3 * (first_swing[0] - earliest) / response.rate_hz
             remedy = "it responds late: check its filter and the clock of its device"
@@ -206,12 +219,13 @@ def _find_largest_swing(stimulus: Stimulus, response: TapResponse) -> tuple[str,
 
     `size` is in the unit of the first channel of the stimulus.
     """
+    registry = response.rig.channel_by_name
     unit = response.rig.sensors[response.rig.channels.index(stimulus.channels[0])].si_per_unit
     sizes = {
         name: response.rig.sensors[response.rig.channels.index(name)].si_per_unit
         * response.largest_swing(name)
         for name in _same_unit_channels(stimulus, response.rig)
-        if CHANNEL_BY_NAME[name].unit == CHANNEL_BY_NAME[stimulus.channels[0]].unit
+        if registry[name].unit == registry[stimulus.channels[0]].unit
     }
     largest_channel = max(sizes, key=sizes.__getitem__)
     return largest_channel, sizes[largest_channel] / unit

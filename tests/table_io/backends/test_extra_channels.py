@@ -1,0 +1,61 @@
+"""A declared channel comes through every kind of hardware as any other one."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from table_io.backends import AcquisitionSource
+from table_io.backends.ni.probe import require_ni_wiring
+from table_io.backends.udp import UdpBackend
+from table_io.clock import RealClock
+from table_io.config.base import parse_toml
+from table_io.config.rig import RigConfig
+from table_io.errors import InputError
+from tests.table_io.backends.ni_wire import CARD, Bed
+from tests.table_io.backends.udp_bench import SPECIMEN, card, python_target
+from tests.table_io.lab_rig import DECLARED, EXTRA, TEMPERATURE, lab_rig
+
+RATE = 2000.0
+LAST_WIRE = '{ channel = "force_l2_n", physical = "Dev1/ai8" },'
+WIRES = [f'{{ channel = "{name}", physical = "Dev1/ai{9 + k}" }},' for k, name in enumerate(EXTRA)]
+NI_TEXT = CARD.replace(LAST_WIRE, "\n".join([LAST_WIRE, *WIRES])) + DECLARED
+
+
+def read_at_rest(source: AcquisitionSource) -> None:
+    """Read some samples at rest and look at those of the thermometer, in V."""
+    row = source.channels.index(TEMPERATURE)
+    source.open()
+    try:
+        for volts in (source.tare(400), _start_and_read(source)):
+            assert volts.shape[0] == len(lab_rig().channels)
+            assert volts[row].mean() == pytest.approx(0.05 * (50.0 + 21.5), abs=1e-3)
+            assert np.ptp(volts[row]) > 0.0
+    finally:
+        source.close()
+
+
+def _start_and_read(source: AcquisitionSource) -> np.ndarray:
+    queue: Callable[[int, np.ndarray], None] | None = getattr(source, "queue", None)
+    if queue is not None:
+        queue(0, np.zeros(400))
+    source.start()
+    return source.read(200)
+
+
+def test_ni_reads_it_at_its_terminals() -> None:
+    read_at_rest(Bed(NI_TEXT).backend(RATE))
+
+
+def test_ni_needs_its_terminals() -> None:
+    rig = parse_toml(NI_TEXT.replace(WIRES[1], ""), RigConfig, "ni")
+    with pytest.raises(InputError) as caught:
+        require_ni_wiring(rig)
+    assert TEMPERATURE in caught.value.problem
+
+
+def test_a_udp_target_sends_it_in_the_order_of_the_sensors(tmp_path: Path) -> None:
+    with python_target(tmp_path, DECLARED) as address:
+        rig = parse_toml(card(address, DECLARED), RigConfig, "udp")
+        read_at_rest(UdpBackend(rig, SPECIMEN, RATE, RealClock()))

@@ -1,0 +1,128 @@
+"""Channels of a laboratory: what a rig file declares next to the canonical ones."""
+
+import pytest
+
+from table_io.channels import CHANNEL_BY_NAME, Channel
+from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.channel import CONSTANT, QUANTITIES, read_channels
+from table_io.config.rig import RigConfig
+from table_io.errors import InputError
+from table_io.units import UNITS
+from tests.table_io.lab_rig import EXTRA, LAB_TEXT, SECOND_ACC, TEMPERATURE, lab_rig
+from twin.recording.tabular import LABEL_UNITS, TIME_COLUMN, TWIN_PREFIX
+
+
+def faults(text: str) -> list[str]:
+    """The faults of a rig file, one a line."""
+    with pytest.raises(InputError) as caught:
+        parse_toml(text, RigConfig, "lab.toml")
+    return [line.strip() for line in str(caught.value).splitlines()[1:]]
+
+
+def test_a_declared_channel_is_one_of_the_rig() -> None:
+    rig = lab_rig()
+    assert rig.channels[-3:] == EXTRA
+    assert rig.channel_by_name == {
+        **CHANNEL_BY_NAME,
+        **{name: rig.channel_by_name[name] for name in EXTRA},
+    }
+    assert rig.channel_by_name[SECOND_ACC] == Channel(
+        SECOND_ACC, "m/s2", "left", "Second accelerometer on the mass.", "acceleration", "mass"
+    )
+    signs = [rig.channel_by_name[name].sign for name in ("mass_acc_m_s2", *EXTRA)]
+    assert signs == [1.0, -1.0, None, None]
+    sensor = rig.sensors[rig.channels.index(TEMPERATURE)]
+    assert (sensor.range_si, sensor.volts_per_si) == (200.0, 0.05)
+    assert rig.stated_offsets == {TEMPERATURE: 50.0}
+
+
+def test_a_rig_without_declared_channels_has_the_canonical_ones() -> None:
+    for path in sorted((PROFILES_DIR / "rigs").glob("*.toml")):
+        rig = parse_toml(path.read_text(), RigConfig, path.name)
+        assert rig.channel_by_name == CHANNEL_BY_NAME
+        assert rig.stated_offsets == {}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "key", "part"),
+    [
+        ('"acceleration"', '"accelerating"', "channels.0.quantity", "mean 'acceleration'?"),
+        ('unit = "m/s2"', 'unit = "g"', "channels.0.unit", "'m/s2'"),
+        ('name = "mass_acc_2_m_s2"', 'name = "mass_acc_2_m"', "channels.0.name", "..._m_s2"),
+        ('name = "mass_acc_2_m_s2"', 'name = "Mass_m_s2"', "channels.0.name", "a to z"),
+        ('name = "mass_acc_2_m_s2"', 'name = "a/b_m_s2"', "channels.0.name", "a to z"),
+        ('name = "mass_acc_2_m_s2"', 'name = "mass_acc_m_s2"', "channels.0.name", "already"),
+        ('name = "mass_acc_2_m_s2"', 'name = "twin_m_s2"', "channels.0.name", "export"),
+        ('name = "mass_edge_acc_m_s2"', 'name = "mass_acc_2_m_s2"', "channels", "more than once"),
+        ('body = "mass"', 'body = "mas"', "channels.0.body", "'mass'"),
+        ('positive = "left"', 'positive = "compression"', "channels.0.positive", "right, left"),
+        ('positive = "left"', "", "channels.0.positive", "right, left"),
+        ('body = "other"', 'body = "other"\npositive = "up"', "channels.1.positive", "leave it"),
+        ("constant = 21.5", "constant = inf", "channels.1.simulated.constant", "finite"),
+        ("{ constant = 21.5 }", "{}", "channels.1.simulated", "at least 1"),
+        ("{ constant = 21.5 }", "{ table_dis_m = 1.0 }", "channels.1.simulated", "'table_disp_m'"),
+        ('meaning = "Air', 'meanin = "Air', "channels.1.meanin", "mean 'meaning'?"),
+        ("simulated = { constant = 21.5 }", "", "simulated", TEMPERATURE),
+        ('channel = "air_temp_degc"', 'channel = "air_temp"', "sensors.10.channel", "_degc'?"),
+        ('unit = "degC"\nrange', 'unit = "V"\nrange', "sensors.10.unit", "allowed: degC"),
+        ('unit = "degC"\nrange', 'unit = "K"\nrange', "sensors.10.unit", "unknown"),
+    ],
+)
+def test_each_fault_names_its_key(old: str, new: str, key: str, part: str) -> None:
+    assert old in LAB_TEXT
+    found = faults(LAB_TEXT.replace(old, new, 1))
+    assert found[0].split(" ")[0].rstrip(":") == key
+    assert part in found[0]
+
+
+@pytest.mark.parametrize("quantity", QUANTITIES)
+def test_every_quantity_has_a_unit_and_a_sensor_for_it(quantity: str) -> None:
+    unit, directions, _ = QUANTITIES[quantity]
+    suffix = unit.lower().replace("/", "_")
+    positive = f'positive = "{directions[0]}"' if directions else ""
+    assert UNITS[unit] == (unit, 1.0)
+    text = f"""
+[[channels]]
+name = "lab_{suffix}"
+quantity = "{quantity}"
+unit = "{unit}"
+body = "other"
+{positive}
+simulated = {{ {CONSTANT} = 0.0 }}
+[[sensors]]
+channel = "lab_{suffix}"
+unit = "{unit}"
+range = 1.0
+volts_per_unit = 1.0
+bits = 16
+"""
+    rig = parse_toml(LAB_TEXT + text, RigConfig, "lab.toml")
+    assert rig.channel_by_name[rig.channels[-1]].quantity == quantity
+
+
+def test_no_name_is_that_of_another_column_of_an_export() -> None:
+    for name in (TIME_COLUMN, *LABEL_UNITS, f"{TWIN_PREFIX}free_mass_acc_m_s2"):
+        text = LAB_TEXT.replace(f'"{SECOND_ACC}"', f'"{name}"')
+        assert faults(text)[0].startswith("channels.0.name"), name
+
+
+def test_opendaq_wires_declared_channels_and_no_others() -> None:
+    wiring = """
+[opendaq]
+device = "daq.nd://127.0.0.1"
+[opendaq.signals]
+air_temp_degc = "AI9"
+"""
+    rig = parse_toml(LAB_TEXT + wiring, RigConfig, "lab.toml")
+    assert rig.opendaq is not None
+    assert rig.opendaq.signals == {TEMPERATURE: "AI9"}
+    (fault,) = faults(LAB_TEXT + wiring.replace("air_temp_degc", "oil_temp_degc"))
+    assert fault.startswith("opendaq: signals name unknown channels oil_temp_degc")
+
+
+def test_channels_of_a_foreign_rig_file_are_read_as_far_as_they_are_valid() -> None:
+    assert read_channels("") == read_channels("= no toml") == CHANNEL_BY_NAME
+    assert read_channels("channels = 3") == CHANNEL_BY_NAME
+    text = LAB_TEXT.replace('body = "other"', 'body = "moon"')
+    assert [*read_channels(text)] == [*CHANNEL_BY_NAME, EXTRA[0], EXTRA[2]]
+    assert read_channels(LAB_TEXT) == lab_rig().channel_by_name
