@@ -159,6 +159,7 @@ def describe_replay(
         "recorded_comparison": summaries.channel_nrmse(
             tuple(item for item in recorded_items if isinstance(item, Comparison)),
             config.parameters,
+            config.rig.channel_by_name,
         ),
     }
 

@@ -4,13 +4,14 @@ Pure: the same samples give bit-identical items for any division into blocks. Li
 `--speed max` call this same function.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
 
 from table_io.block import Block, Float1D, Label, join_blocks
-from table_io.channels import contact_forces, relative_displacement
+from table_io.channels import Channel, contact_forces, relative_displacement
 from table_io.config.profile import Profile
 from table_io.records import CycleExtremes, Params, Record, Step, StepAdded
 from twin.compare import monitoring
@@ -22,6 +23,7 @@ from twin.compare.cycles import (
     build_prc_point,
     cycle_extremes,
 )
+from twin.compare.extra_channels import select_predicted
 from twin.compare.monitoring import MonitoringState
 from twin.compare.monitoring.cycle import CycleData, MonitoringSetup
 from twin.compare.monitoring.jumps import JumpPrediction, predict_jumps
@@ -83,9 +85,13 @@ class PipelineState:
 
 
 def prepare_pipeline(
-    profile: Profile, model: Model, steps: tuple[Step, ...], from_rest: bool = False
+    profile: Profile,
+    model: Model,
+    steps: tuple[Step, ...],
+    from_rest: bool = False,
+    extra_channels: Iterable[Channel] = (),
 ) -> PipelineSetup:
-    """Prepare the setup of a run.
+    """Prepare the setup of a run; of the extra channels those that the model predicts are compared.
 
     u* and a* are the free-flight maxima, continuous in frequency, of the model's linear part: one
     scale, independent of its effects.
@@ -101,6 +107,7 @@ def prepare_pipeline(
         profile.acquisition.block_samples,
         contact_n,
         from_rest,
+        select_predicted(extra_channels),
     )
     scale = PrcScale(model.parameters, rate_hz, contact_n, u_star, a_star, profile.specimen.gaps_m)
     jump_prediction = predict_jumps(profile, model, steps)

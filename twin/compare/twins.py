@@ -11,9 +11,10 @@ from functools import cached_property
 import numpy as np
 
 from table_io.block import Block, Float1D, Float2D
-from table_io.channels import contact_forces, relative_displacement
+from table_io.channels import Channel, contact_forces, relative_displacement
 from table_io.records import Comparison
-from twin.compare import COMPARED_CHANNELS, TWIN_CHANNELS, TWIN_NAMES
+from twin.compare import COMPARED_CHANNELS, PREDICTED_CHANNELS, TWIN_CHANNELS, TWIN_NAMES
+from twin.compare.extra_channels import TABLE_INPUTS, predict_channel
 from twin.compare.sensors import apply_sensors, keep_last, lag_samples, remove_sensor_errors
 from twin.model.model import Model
 from twin.model.parameters import Parameters
@@ -25,7 +26,11 @@ MEMORY_RELAXATION_TIMES = 8.0  # after which a bumper has forgotten a contact
 
 @dataclass(frozen=True)
 class TwinSetup:
-    """Model of the twins and settings of the comparison; `from_rest` if nothing is measured."""
+    """Model of the twins and settings of the comparison; `from_rest` if nothing is measured.
+
+    `extra_channels` are declared in the rig file, predicted by the model, and compared after
+    COMPARED_CHANNELS.
+    """
 
     model: Model
     rate_hz: float
@@ -33,6 +38,12 @@ class TwinSetup:
     grid_samples: int  # samples per Comparison
     contact_n: float
     from_rest: bool = False
+    extra_channels: tuple[Channel, ...] = ()
+
+    @property
+    def compared_channels(self) -> tuple[str, ...]:
+        """Names of the compared channels, in the order of a Comparison."""
+        return (*COMPARED_CHANNELS, *(channel.name for channel in self.extra_channels))
 
     @property
     def parameters(self) -> Parameters:
@@ -76,7 +87,7 @@ class TwinStates:
 def start_twins(setup: TwinSetup, index: int) -> TwinStates:
     """Return twins without history that start at sample `index`."""
     free = setup.solver.rest_state(index - 1) if setup.from_rest else None
-    no_squares = np.empty((3, len(COMPARED_CHANNELS), 0))
+    no_squares = np.empty((3, len(setup.compared_channels), 0))
     return TwinStates(
         index, free, None, np.empty((5, 0)), no_squares, np.empty((len(TWIN_CHANNELS), 0))
     )
@@ -241,7 +252,8 @@ def advance_twins(
         block.label,
         block.cycle,
     )
-    squares, comparisons = _compare_twins(setup, twins.squares, block, predicted)
+    new_squares = _square_errors(setup, block, predicted, true_values)
+    squares, comparisons = _compare_cells(setup, twins.squares, block.end, new_squares)
     after = replace(
         twins,
         index=block.end,
@@ -295,17 +307,46 @@ _ROWS = [
 ]
 
 
-def _compare_twins(
-    setup: TwinSetup, pending: Float2D, block: Block, predicted: Block
-) -> tuple[Float2D, list[Comparison]]:
-    """Return (squares of the unfinished grid cell, Comparisons of the completed ones)."""
+def _square_errors(
+    setup: TwinSetup, block: Block, predicted: Block, true_values: Float2D
+) -> Float2D:
+    """Return squares of measurement, free and window error, (3, channel, sample).
+
+    `true_values` are the TWIN_CHANNELS without sensor errors.
+    """
     measured = compared_values(block)
-    free, window = (measured - predicted.values[rows] for rows in _ROWS)
-    new = np.array([measured**2, free**2, window**2])
+    free, window = (predicted.values[rows] for rows in _ROWS)
+    if setup.extra_channels:
+        count = len(PREDICTED_CHANNELS)
+        measured, free, window = (
+            np.vstack([canonical, *extra])
+            for canonical, extra in (
+                (measured, [_channel_or_nan(block, c.name) for c in setup.extra_channels]),
+                (free, _predict_extra_channels(setup, block, true_values[:count])),
+                (window, _predict_extra_channels(setup, block, true_values[count:])),
+            )
+        )
+    return np.array([measured**2, (measured - free) ** 2, (measured - window) ** 2])
+
+
+def _predict_extra_channels(setup: TwinSetup, block: Block, twin: Float2D) -> list[Float1D]:
+    """Return the extra channels as predicted from one twin's rows, (sample,) each."""
+    sources = dict(zip(PREDICTED_CHANNELS, twin, strict=True))
+    sources |= {name: _channel_or_nan(block, name) for name in TABLE_INPUTS}
+    return [predict_channel(channel, sources) for channel in setup.extra_channels]
+
+
+def _compare_cells(
+    setup: TwinSetup, pending: Float2D, end: int, new: Float2D
+) -> tuple[Float2D, list[Comparison]]:
+    """Return (squares of the unfinished grid cell, Comparisons of the completed ones).
+
+    `pending` and `new` are (3, channel, sample); sample `end` follows the last of `new`.
+    """
     squares = np.concatenate([pending, new], axis=2)
     # the first cell is shorter if the twin started inside it
-    first, comparisons = block.end - squares.shape[2], []
-    for size, max_cells in ((-first % setup.grid_samples, 1), (setup.grid_samples, block.end)):
+    first, comparisons = end - squares.shape[2], []
+    for size, max_cells in ((-first % setup.grid_samples, 1), (setup.grid_samples, end)):
         cells = min(squares.shape[2] // size, max_cells) if size else 0
         if not cells:
             continue
@@ -313,7 +354,7 @@ def _compare_twins(
         sums = np.add.reduce(used.reshape(*used.shape[:2], cells, size), axis=3)
         for m, f, w in sums.transpose(2, 0, 1).tolist():
             comparisons.append(
-                Comparison(first, size, COMPARED_CHANNELS, tuple(m), tuple(f), tuple(w))
+                Comparison(first, size, setup.compared_channels, tuple(m), tuple(f), tuple(w))
             )
             first += size
         squares = squares[:, :, cells * size :]

@@ -4,6 +4,7 @@ Units are declared, never inferred; a unit that looks wrong causes a warning onl
 """
 
 import difflib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
 
 from table_io.block import Float1D, Int1D
-from table_io.channels import CHANNEL_BY_NAME
+from table_io.channels import CHANNEL_BY_NAME, Channel
 from table_io.config.base import ConfigModel, Finite, Positive, load_config
 from table_io.errors import InputError
 from table_io.units import GRAVITY_M_S2, UNITS
@@ -19,17 +20,12 @@ from twin.exchange.formats import MAX_LISTED_COLUMNS, SampleTable, check_size
 from twin.exchange.sampling import fit_uniform_rate, resolve_stated_rate
 from twin.recording.tabular import LABEL_UNITS, TIME_COLUMN, TWIN_PREFIX
 
-KNOWN_COLUMNS = (TIME_COLUMN, *CHANNEL_BY_NAME, *LABEL_UNITS)
-UNIT_BY_COLUMN = {
-    TIME_COLUMN: "s",
-    **{name: channel.unit for name, channel in CHANNEL_BY_NAME.items()},
-    **LABEL_UNITS,
-}
 UNIT_SPELLINGS = {
     "meter": "m", "meters": "m", "metre": "m", "metres": "m",
     "millimeter": "mm", "millimetre": "mm",
     "m/s/s": "m/s2", "ms-2": "m/s2", "m*s-2": "m/s2", "gn": "g", "newton": "N", "newtons": "N",
-    "n": "N", "kn": "kN", "sec": "s", "second": "s", "seconds": "s", "hz": "Hz",
+    "n": "N", "kn": "kN", "°c": "degC", "degc": "degC", "celsius": "degC",
+    "sec": "s", "second": "s", "seconds": "s", "hz": "Hz",
 }  # fmt: skip
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 SUSPECT_FACTORS = {1e3: "1000", 1e-3: "1/1000", GRAVITY_M_S2: "g", 1 / GRAVITY_M_S2: "1/g"}
@@ -61,10 +57,13 @@ class ColumnSource(ConfigModel):
             raise ValueError("gain is 0, so the channel would be constant; allowed: not 0")
         return gain
 
-    def to_si(self, name: str, values: Float1D) -> Float1D:
-        """Return the channel in SI, (row,); bit-identical without gain, unit and offset."""
+    def to_si(self, name: str, values: Float1D, factors: Mapping[str, float]) -> Float1D:
+        """Return the channel in SI, (row,); bit-identical without gain, unit and offset.
+
+        `factors` are those of the allowed units.
+        """
         with np.errstate(all="ignore"):  # no warnings for signaling NaNs
-            scaled = self.gain * _unit_factors(name).get(self.unit, 1.0) * values
+            scaled = self.gain * factors.get(self.unit, 1.0) * values
             scaled = scaled + self.offset if self.offset else scaled
         if np.isinf(scaled).any():
             raise InputError(
@@ -85,33 +84,61 @@ class ColumnMap(ConfigModel):
     def _check_columns(
         cls, columns: dict[str, ColumnSource], info: ValidationInfo
     ) -> dict[str, ColumnSource]:
-        for name, column in columns.items():
-            if name not in KNOWN_COLUMNS:
-                raise ValueError(f"{name!r} is not a channel; {_suggest_name(name)}")
-            allowed = _unit_factors(name)
-            if column.unit and column.unit not in allowed:
-                raise ValueError(
-                    f"{name}: unit {column.unit!r} does not fit; "
-                    f"allowed: {', '.join(allowed) or 'none'}"
-                )
         if TIME_COLUMN in columns and info.data.get("rate_hz") is not None:
             raise ValueError(f"{TIME_COLUMN} and rate_hz both state the sampling times; keep one")
         return columns
 
 
-def _suggest_name(name: str) -> str:
-    near = difflib.get_close_matches(name, KNOWN_COLUMNS, 1, 0.5)
-    return f"did you mean {near[0]!r}?" if near else f"known: {', '.join(KNOWN_COLUMNS)}"
+@dataclass(frozen=True)
+class ImportColumns:
+    """Columns that an import knows: the channels of the rig, the time and the labels."""
+
+    channels: Mapping[str, Channel]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (TIME_COLUMN, *self.channels, *LABEL_UNITS)
+
+    def recorded_unit(self, name: str) -> str:
+        """Return the unit in which a column is recorded, "" without one."""
+        units = {TIME_COLUMN: "s", **LABEL_UNITS}
+        return self.channels[name].unit if name in self.channels else units[name]
+
+    def unit_factors(self, name: str) -> dict[str, float]:
+        """Return the allowed units of a column and their factors to SI."""
+        if name == TIME_COLUMN:
+            return TIME_UNITS
+        si = self.recorded_unit(name)
+        return {unit: factor for unit, (si_unit, factor) in UNITS.items() if si_unit == si} or (
+            {si: 1.0} if si else {}
+        )
+
+    def suggest(self, name: str) -> str:
+        """Return the known column nearest to a name, or all of them, as a hint."""
+        near = difflib.get_close_matches(name, self.names, 1, 0.5)
+        return f"did you mean {near[0]!r}?" if near else f"known: {', '.join(self.names)}"
+
+    def check_map(self, column_map: ColumnMap) -> None:
+        """Raise InputError for a mapped name that is no column, or a unit that does not fit."""
+        for name, column in column_map.columns.items():
+            if name not in self.names:
+                raise InputError(
+                    f"{name!r} is not a channel; {self.suggest(name)}",
+                    where="column map",
+                    key="columns",
+                    remedy="other channels are declared by [[channels]] in a rig file, see --rig",
+                )
+            allowed = self.unit_factors(name)
+            if column.unit and column.unit not in allowed:
+                raise InputError(
+                    f"{name}: unit {column.unit!r} does not fit",
+                    where="column map",
+                    key="columns",
+                    allowed=", ".join(allowed) or "none",
+                )
 
 
-def _unit_factors(name: str) -> dict[str, float]:
-    """Return the allowed units of a column and their factors to SI."""
-    if name == TIME_COLUMN:
-        return TIME_UNITS
-    si = CHANNEL_BY_NAME[name].unit if name in CHANNEL_BY_NAME else LABEL_UNITS[name]
-    return {unit: factor for unit, (si_unit, factor) in UNITS.items() if si_unit == si} or (
-        {si: 1.0} if si else {}
-    )
+CANONICAL_COLUMNS = ImportColumns(CHANNEL_BY_NAME)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,18 +155,22 @@ class ImportedSamples:
     labels: dict[str, Float1D] = field(default_factory=dict)
 
 
-def read_samples(table: SampleTable, column_map: ColumnMap | None) -> ImportedSamples:
+def read_samples(
+    table: SampleTable, column_map: ColumnMap | None, known: ImportColumns = CANONICAL_COLUMNS
+) -> ImportedSamples:
     """Convert a table to samples; raise InputError for unknown columns or nonuniform time."""
-    sources, notes = _select_columns(table, column_map)
+    if column_map is not None:
+        known.check_map(column_map)
+    sources, notes = _select_columns(table, column_map, known)
     for name, column in sources.items():
-        _check_unit(table, name, column)
+        _check_unit(table, name, column, known.recorded_unit(name))
     _check_lengths(table, sources)
     values = {
-        name: column.to_si(name, table.read_column(column.column))
+        name: column.to_si(name, table.read_column(column.column), known.unit_factors(name))
         for name, column in sources.items()
     }
     time = values.pop(TIME_COLUMN, _read_file_time(table, sources, column_map))
-    order = [name for name in CHANNEL_BY_NAME if name in values]
+    order = [name for name in known.channels if name in values]
     channels = {name: values[name] for name in order}
     if time is not None:
         rate, index, rate_notes = fit_uniform_rate(time, table)
@@ -151,7 +182,7 @@ def read_samples(table: SampleTable, column_map: ColumnMap | None) -> ImportedSa
         )
         index = np.arange(infos[0].size)
         notes += rate_notes
-    missing = [name for name in CHANNEL_BY_NAME if name not in channels]
+    missing = [name for name in known.channels if name not in channels]
     notes.append(f"not in the file: {', '.join(missing)}")
     notes += [f"{name}: all samples lost" for name in order if np.isnan(channels[name]).all()]
     labels = {name: values[name] for name in LABEL_UNITS if name in values}
@@ -182,7 +213,7 @@ def _read_file_time(
 
 
 def _select_columns(
-    table: SampleTable, column_map: ColumnMap | None
+    table: SampleTable, column_map: ColumnMap | None, known: ImportColumns
 ) -> tuple[dict[str, ColumnSource], list[str]]:
     """Select the source of each channel, by the map and by name; return (sources, notes)."""
     mapped = dict(column_map.columns) if column_map is not None else {}
@@ -196,26 +227,27 @@ def _select_columns(
             continue
         if name.startswith(TWIN_PREFIX):
             twins += 1
-        elif name in KNOWN_COLUMNS and (
+        elif name in known.names and (
             name != TIME_COLUMN or column_map is None or column_map.rate_hz is None
         ):
             mapped[name] = ColumnSource(column=name)
         elif column_map is None:
             raise InputError(
-                f"column {name!r} is unknown; {_suggest_name(name)}",
+                f"column {name!r} is unknown; {known.suggest(name)}",
                 where=table.path,
-                remedy="rename it, or map the columns with --columns MAP (others are left out)",
+                remedy="rename it, map the columns with --columns MAP (others are left out), or "
+                "declare it by [[channels]] in a rig file and give that by --rig",
             )
         else:
             left_out.append(name)
     present_labels = [name for name in LABEL_UNITS if name in mapped]
     if len(present_labels) < len(LABEL_UNITS):
         left_out += [mapped.pop(name).column for name in present_labels]
-    if not mapped.keys() & CHANNEL_BY_NAME.keys():
+    if not mapped.keys() & known.channels.keys():
         raise InputError(
             f"no channel in it; its columns: {_abbreviate([*table.columns])}",
             where=table.path,
-            allowed=f"one or more of {', '.join(CHANNEL_BY_NAME)}",
+            allowed=f"one or more of {', '.join(known.channels)}",
         )
     notes = [
         f"{name} = column {source.column!r}"
@@ -251,12 +283,12 @@ def _abbreviate(names: list[str]) -> str:
     return ", ".join(names[:MAX_LISTED_COLUMNS]) + more
 
 
-def _check_unit(table: SampleTable, name: str, column: ColumnSource) -> None:
+def _check_unit(table: SampleTable, name: str, column: ColumnSource, recorded_unit: str) -> None:
     """Raise InputError if the unit in the file differs from that of the map or channel."""
     file_unit = table.columns[column.column].unit
     if not file_unit or (column.file_unit is not None and column.file_unit == file_unit):
         return
-    stated = column.file_unit or column.unit or UNIT_BY_COLUMN.get(name, "")
+    stated = column.file_unit or column.unit or recorded_unit
     if _normalize_unit(file_unit) == stated:
         return
     declared_by = "the map" if column.file_unit or column.unit else "its name"

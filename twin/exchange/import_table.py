@@ -10,11 +10,12 @@ import numpy as np
 
 from table_io.block import Block, Float1D, Float2D
 from table_io.config.base import find_config, load_config, parse_toml
+from table_io.config.channel import read_channels
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.records import Event, RunStart, RunStop, SampleGap, Step
-from twin.exchange.columns import ImportedSamples, read_column_map, read_samples
+from twin.exchange.columns import ImportColumns, ImportedSamples, read_column_map, read_samples
 from twin.exchange.formats import TOML_TEXTS, SampleTable, read_table
 from twin.exchange.labels import read_labels, typical_cycles
 from twin.exchange.sampling import find_holes
@@ -99,9 +100,10 @@ def import_samples(
     if profile is not None:
         load_config(profile, Profile, "test profile")  # report errors before reading a long table
     table = read_table(file, column_map.group if column_map is not None else "")
-    samples_read = read_samples(table, column_map)
+    rig_toml = _read_rig_toml(table, profile, rig)
+    samples_read = read_samples(table, column_map, ImportColumns(read_channels(rig_toml)))
     file_labels = read_labels(table, samples_read) if samples_read.labels else None
-    config = _build_run_config(table, profile, rig, samples_read.rate_hz, file_labels)
+    config = _build_run_config(table, profile, rig_toml, samples_read.rate_hz, file_labels)
     grid = _to_grid(file, samples_read)
     if file_labels is not None:
         labels = file_labels
@@ -154,40 +156,45 @@ def _has_config_texts(table: SampleTable) -> bool:
     return len(table.texts) == len(TOML_TEXTS)
 
 
+def _read_rig_toml(table: SampleTable, profile: Path | None, rig: str | None) -> str:
+    """Read the text of the rig file: the one given, else of the table, else of the profile."""
+    if rig is None and profile is None and _has_config_texts(table):
+        return table.texts["rig_toml"]
+    if rig is None:
+        rig = (
+            "simulated" if profile is None else load_config(profile, Profile, "test profile")[0].rig
+        )
+    return load_config(find_config(rig, "rigs", profile), RigConfig, "rig file")[1]
+
+
 def _build_run_config(
     table: SampleTable,
     profile: Path | None,
-    rig: str | None,
+    rig_toml: str,
     rate_hz: float,
     labels: DetectedSteps | None,
 ) -> RunConfig:
     """Build the run config of the log, with the sampling rate of the file."""
     file = table.path
     if profile is None and _has_config_texts(table):
-        profile_toml, rig_toml, model_toml = (table.texts[name] for name in TOML_TEXTS)
+        profile_toml, model_toml = table.texts["profile_toml"], table.texts["model_toml"]
         file_profile = parse_toml(profile_toml, Profile, f"profile in {file}")
         if file_profile.acquisition.rate_hz != rate_hz:
             profile_toml = _set_rate(profile_toml, rate_hz)
-        if rig is not None:
-            rig_toml = load_config(find_config(rig, "rigs"), RigConfig, "rig file")[1]
         return from_texts(file.stem, profile_toml, rig_toml, model_toml, f"config in {file}")
     if profile is None:
         hz = min(1.0, rate_hz / 100)  # placeholder that passes profile validation
         cycles, measured = typical_cycles(labels) if labels is not None else (3, 3)
         text = PLAIN_PROFILE.format(
             title=json.dumps(f"Imported: {file.name}"),
-            rig=json.dumps(rig or "simulated"),
+            rig=json.dumps(parse_toml(rig_toml, RigConfig, "rig file").name),
             rate_hz=rate_hz,
             hz=hz,
             cycles=cycles,
             measured=measured,
         )
-        rig_toml = load_config(find_config(rig or "simulated", "rigs"), RigConfig, "rig file")[1]
         return from_texts(file.stem, text, rig_toml, PLAIN_MODEL, f"{file} without a profile")
     test_profile, text = load_config(profile, Profile, "test profile")
-    rig_toml = load_config(
-        find_config(rig or test_profile.rig, "rigs", profile), RigConfig, "rig file"
-    )[1]
     model_toml = read_model(test_profile.model, profile)[1]
     source = f"{profile}, at the {rate_hz:g} Hz of {file}"
     if test_profile.acquisition.rate_hz != rate_hz:

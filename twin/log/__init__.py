@@ -32,6 +32,7 @@ import numpy as np
 
 from table_io.block import Block, Float1D, Float2D, Int1D
 from table_io.config.base import parse_toml
+from table_io.config.channel import read_channels
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
@@ -255,9 +256,10 @@ class Log:
 
     @cached_property
     def units(self) -> dict[str, str]:
-        """SI unit by channel, "" if unknown."""
+        """Recorded unit by channel, "" if unknown."""
         twins = (name.partition("/")[2] for name in TWIN_CHANNELS)
-        return {name: channel_unit(name) for name in (*self.channels, *twins)}
+        channels = read_channels(self.start.rig_toml)
+        return {name: channel_unit(name, channels) for name in (*self.channels, *twins)}
 
     def to_xarray(self) -> "Dataset":
         """Return all channels over `time` in s, the twins' as twin_free_... and twin_window_... .

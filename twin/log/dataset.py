@@ -3,7 +3,8 @@
 from typing import TYPE_CHECKING
 
 from table_io.block import Label
-from table_io.channels import CHANNEL_BY_NAME
+from table_io.channels import Channel
+from table_io.config.channel import read_channels
 from table_io.errors import InputError
 from twin.compare import TWIN_CHANNELS
 from twin.recording.tabular import channel_unit
@@ -25,12 +26,13 @@ def build_dataset(log: "Log") -> "Dataset":
             "to_xarray needs xarray, which is not installed",
             remedy="pip install 'shaketwin[notebook]'",
         ) from None
-    data = {name: ("time", log[name], _channel_attributes(name)) for name in log.channels}
+    channels = read_channels(log.start.rig_toml)
+    data = {name: ("time", log[name], _channel_attributes(name, channels)) for name in log.channels}
     for row, name in zip(log.predicted, TWIN_CHANNELS, strict=True):
         data[f"twin_{name.replace('/', '_')}"] = (
             "time",
             row,
-            _channel_attributes(name.split("/")[1]),
+            _channel_attributes(name.split("/")[1], channels),
         )
     coordinates = {
         "time": ("time", log.time_s, {"units": "s"}),
@@ -47,7 +49,7 @@ def build_dataset(log: "Log") -> "Dataset":
     return xarray.Dataset(data, coordinates, attributes)
 
 
-def _channel_attributes(name: str) -> dict[str, str]:
-    channel = CHANNEL_BY_NAME.get(name)
+def _channel_attributes(name: str, channels: dict[str, Channel]) -> dict[str, str]:
+    channel = channels.get(name)
     details = {"positive": channel.positive, "meaning": channel.meaning} if channel else {}
-    return {"units": channel_unit(name), **details}
+    return {"units": channel_unit(name, channels), **details}

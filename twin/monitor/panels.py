@@ -36,6 +36,11 @@ DISPLAY_NAMES = {
     "stiffness": "stiffness", "damping": "damping", "gap_r": "gap R", "gap_l": "gap L",
     "bumper_stiffness_r": "bumper R", "bumper_stiffness_l": "bumper L",
 }  # fmt: skip
+# By the end of a channel's name; the last one is that of all other names.
+DISPLAY_UNITS = (
+    ("_m_s2", "m/s²", 1.0), ("_m_s", "mm/s", 1e-3), ("_m", "mm", 1e-3), ("_n", "N", 1.0),
+    ("_degc", "°C", 1.0), ("_pa", "kPa", 1e3), ("", "", 1.0),
+)  # fmt: skip
 PARAMETER_UNITS = {
     "stiffness": ("kN/m", 1e3), "damping": ("kNs/m", 1e3), "gap_r": ("mm", 1e-3),
     "gap_l": ("mm", 1e-3), "bumper_stiffness_r": ("kN/m", 1e3), "bumper_stiffness_l": ("kN/m", 1e3),
@@ -70,11 +75,9 @@ def format_percent(share: float) -> str:
 
 def describe_channel(name: str) -> tuple[str, str, float]:
     """Return (display name, unit, SI value of the unit) of a channel."""
-    label = DISPLAY_NAMES.get(name, name[:10])
-    for suffix, unit, size in (("_m_s2", "m/s²", 1.0), ("_m", "mm", 1e-3), ("_n", "N", 1.0)):
-        if name.endswith(suffix):
-            return label, unit, size
-    return label, "", 1.0
+    suffix, unit, size = next(entry for entry in DISPLAY_UNITS if name.endswith(entry[0]))
+    label = name.removesuffix(suffix).replace("_", " ")
+    return DISPLAY_NAMES.get(name, label)[:10], unit, size
 
 
 def draw_level(run_state: LiveRunState, width: int, height: int) -> list[Text]:
@@ -125,7 +128,7 @@ def draw_limits(run_state: LiveRunState, width: int, height: int) -> list[Text]:
         peak, share = format_number(row.peak) if is_known else "lost", format_percent(row.share)
         text = f" {peak:>6}/{row.limit:<4.4g} {row.unit:<4} "
         bar_width = max(width - 11 - len(text) - max(len(share), 5), 1)
-        line = Text(f"{DISPLAY_NAMES.get(row.name, row.name[:10]):<10} ")
+        line = Text(f"{describe_channel(row.name)[0]:<10} ")
         line.append_text(
             draw_bar(min(row.share, 1.0) if is_known else 0.0, bar_width, style)
         ).append(text)

@@ -6,7 +6,7 @@ twin columns are NaN where the twin has no output. Invalid items are left out by
 `reader.read_recording`.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from table_io.block import Block, Float1D, Float2D, Int1D
-from table_io.channels import CHANNEL_BY_NAME
+from table_io.channels import Channel
+from table_io.config.channel import read_channels
 from table_io.errors import InputError
 from table_io.records import Event, PrcPoint, Record, RunStart, RunStop, Step, StepAdded
 from twin.recording.mcap_log import iter_messages
@@ -218,12 +219,16 @@ def _build_table(
         nearest = np.minimum(np.searchsorted(twin_index, index), twin_index.size - 1)
         twin_rows = np.where(twin_index[nearest] == index, twin_positions[nearest], -1)
     twins = tuple(TWIN_PREFIX + name.replace("/", "_") for name in pred.channels)
+    channels = read_channels(start.rig_toml)
     units = {
         TIME_COLUMN: "s",
-        **dict(zip(meas.channels, map(channel_unit, meas.channels), strict=True)),
+        **{name: channel_unit(name, channels) for name in meas.channels},
         **LABEL_UNITS,
     }
-    units |= dict(zip(twins, map(channel_unit, pred.channels), strict=True))
+    units |= {
+        column: channel_unit(name, channels)
+        for column, name in zip(twins, pred.channels, strict=True)
+    }
     return LogTable(
         start,
         units,
@@ -248,12 +253,12 @@ def collect_steps(start: RunStart, items: Iterable[Item]) -> dict[int, Step]:
     return steps
 
 
-def channel_unit(name: str) -> str:
-    """Return the SI unit of a measured or twin channel, "" if unknown."""
+def channel_unit(name: str, channels: Mapping[str, Channel]) -> str:
+    """Return the recorded unit of a measured or twin channel of a registry, "" if unknown."""
     base_name = name.rpartition("/")[2]
     return (
-        CHANNEL_BY_NAME[base_name].unit
-        if base_name in CHANNEL_BY_NAME
+        channels[base_name].unit
+        if base_name in channels
         else {"rel_vel_m_s": "m/s"}.get(base_name, "")
     )
 

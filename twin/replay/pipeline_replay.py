@@ -226,7 +226,7 @@ def _compare_item(
         new.channels, old_comparison.window_error_ss, new.window_error_ss, strict=False
     ):
         if math.isfinite(old_sum) and math.isfinite(new_sum):
-            result.largest[name] = max(result.largest[name], abs(old_sum - new_sum))
+            result.largest[name] = max(result.largest.get(name, 0.0), abs(old_sum - new_sum))
 
 
 def _decode_comparison(payload: bytes) -> Comparison | None:

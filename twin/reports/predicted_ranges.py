@@ -14,6 +14,7 @@ from table_io.config.rig import RigConfig
 from table_io.config.sensor import SensorConfig
 from table_io.safety.preflight import CORRECTION_HEADROOM
 from table_io.units import GRAVITY_M_S2
+from twin.compare.extra_channels import PREDICTED_SUMS, select_predicted
 from twin.model.ideal_response import simulate_sweep
 from twin.run.run_config import RunConfig
 
@@ -83,6 +84,10 @@ def _compute_peaks(run_config: RunConfig) -> dict[str, Float1D]:
     for cells, force in ((RIGHT_CELLS, right), (LEFT_CELLS, left)):
         present = [name for name in cells if name in run_config.rig.channels]
         peaks |= {name: force / len(present) for name in present}
+    for channel in select_predicted(run_config.rig.channel_by_name.values()):
+        names = PREDICTED_SUMS[channel.quantity, channel.body]
+        if channel.name not in peaks and all(name in peaks for name in names):
+            peaks[channel.name] = np.sum([peaks[name] for name in names], axis=0)
     return peaks
 
 

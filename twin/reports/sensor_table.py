@@ -5,9 +5,9 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from table_io.channels import CHANNEL_BY_NAME
 from table_io.config.base import ConfigT
 from table_io.config.calibration_record import CalibrationRecord
+from table_io.config.channel import read_channels
 from table_io.config.sensor import SensorConfig
 from table_io.records import RunStart
 from twin.reports.report_data import parse_toml_tables
@@ -44,8 +44,10 @@ def build_sensor_rows(start: RunStart) -> list[SensorRow]:
         _build_row(sensor, records.get(sensor.channel), start) for sensor in sensors.values()
     ]  # fmt: skip
     unlisted = (name for name in start.tare if name not in sensors)
+    channels = read_channels(start.rig_toml)
+    units = {name: channel.unit for name, channel in channels.items()}
     return rows + [
-        SensorRow(name, "", "", "", "", "", False, "", "", start.tare[name], _si_unit(name))
+        SensorRow(name, "", "", "", "", "", False, "", "", start.tare[name], units.get(name, ""))
         for name in unlisted
     ]
 
@@ -68,10 +70,6 @@ def _build_row(
         None if tare is None else tare / sensor.si_per_unit,
         sensor.unit,
     )
-
-
-def _si_unit(channel: str) -> str:
-    return CHANNEL_BY_NAME[channel].unit if channel in CHANNEL_BY_NAME else ""
 
 
 def _parse_valid(config_class: type[ConfigT], raw: Any) -> list[ConfigT]:

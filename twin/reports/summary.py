@@ -2,14 +2,16 @@
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from table_io.channels import CHANNEL_BY_NAME, Channel
 from table_io.config.base import parse_toml
+from table_io.config.channel import read_channels
 from table_io.config.profile import Profile
 from table_io.records import (
     Check,
@@ -27,6 +29,7 @@ from table_io.records import (
 )
 from twin.compare import COMPARED_CHANNELS
 from twin.compare.curves import detect_hysteresis
+from twin.compare.extra_channels import select_predicted
 from twin.compare.monitoring import EVENT_KINDS as MONITOR_KINDS
 from twin.model.model import Model
 from twin.model.parameters import Parameters, free_flight_resonance
@@ -91,7 +94,9 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         "twin_jumps": [asdict(jump) for jump in twin_jumps],
         "twin_hysteresis": [asdict(interval) for interval in twin_intervals],
         "timing": _timing(recording.records(Timing)),
-        "comparison": channel_nrmse(recording.records(Comparison), parameters),
+        "comparison": channel_nrmse(
+            recording.records(Comparison), parameters, read_channels(start.rig_toml)
+        ),
         "estimates": _estimates_entry(recording.records(Estimate)),
         "warnings": [
             {"at_s": event.index / start.rate_hz, "kind": event.kind, "text": event.text}
@@ -186,22 +191,24 @@ def _timing(records: tuple[Timing, ...]) -> Json:
     }
 
 
-def channel_nrmse(comparisons: tuple[Comparison, ...], parameters: Parameters) -> Json:
+def channel_nrmse(
+    comparisons: tuple[Comparison, ...], parameters: Parameters, channels: Mapping[str, Channel]
+) -> Json:
     """Return the NRMSE by channel: `nrmse` of the restarted twin, `free_nrmse` of the free one.
 
     NRMSE = sqrt(sum of squared errors / sum of squared measurements). The restarted twin shows the
-    model error; the free one also the divergence between solutions. None for the load cells of an
-    absent bumper, which measure noise only.
+    model error; the free one also the divergence between solutions. None for the force on an absent
+    bumper, which is noise only. `channels` is the registry of the rig.
     """
+    gaps = {"right_bumper": parameters.gap_r, "left_bumper": parameters.gap_l}
     absent = {
-        cell
-        for cells, gap in ((RIGHT_CELLS, parameters.gap_r), (LEFT_CELLS, parameters.gap_l))
-        for cell in cells
-        if math.isinf(gap)
+        name
+        for name, channel in channels.items()
+        if channel.quantity == "force" and math.isinf(gaps.get(channel.body, 0.0))
     }
-    comparisons = tuple(
-        comparison for comparison in comparisons if comparison.channels == COMPARED_CHANNELS
-    )
+    extra = (channel.name for channel in select_predicted(channels.values()))
+    names = (*COMPARED_CHANNELS, *(name for name in extra if name not in CHANNEL_BY_NAME))
+    comparisons = tuple(comparison for comparison in comparisons if comparison.channels == names)
     if not comparisons:
         return {}
     measured, free, window = (
@@ -209,7 +216,7 @@ def channel_nrmse(comparisons: tuple[Comparison, ...], parameters: Parameters) -
         for name in ("measured_ss", "free_error_ss", "window_error_ss")
     )
     entries: Json = {}
-    for column, name in enumerate(COMPARED_CHANNELS):
+    for column, name in enumerate(names):
         values = {}
         for key, error in (("nrmse", window), ("free_nrmse", free)):
             is_known = np.isfinite(error[:, column]) & np.isfinite(measured[:, column])

@@ -54,7 +54,8 @@ class RunConfig:
         """Return the twin's setup; the import compiles kernels that are not cached."""
         from twin.compare import pipeline
 
-        setup = pipeline.prepare_pipeline(self.profile, self.model, self.steps, from_rest)
+        extra = [channel.channel for channel in self.rig.extra_channels]
+        setup = pipeline.prepare_pipeline(self.profile, self.model, self.steps, from_rest, extra)
         setup.twin.solver  # noqa: B018  compiles now, not at the first sample
         return setup
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from table_io.block import Block
-from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from table_io.channels import CHANNEL_BY_NAME, LEFT_CELLS, RIGHT_CELLS
 from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.errors import InputError
@@ -126,6 +126,8 @@ def _list_notes(
         yield f"{name}: only one frequency; {alike}"
     yield from _check_loads(recording, name, profile, blocks, dead)
     for channel in blocks[0].channels if blocks else ():
+        if channel not in CHANNEL_BY_NAME:
+            continue  # declared in the rig file: not used
         if _is_clipped(blocks, channel):
             yield (
                 f"{name}: {channel} stays at its extreme value; it may be clipped: check its range"
