@@ -16,7 +16,7 @@ from pydantic import (
     field_validator,
     model_validator,
 )
-from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic_core import InitErrorDetails
 
 from table_io.channels import CHANNEL_BY_NAME, Channel
 from table_io.config.backend import BACKEND_GROUP, BackendConfig, list_entry_points, load_backend
@@ -133,7 +133,7 @@ class RigConfig(ConfigModel):
         if is_installed and own_section is None:
             faults.append(
                 _make_fault(
-                    own_name,
+                    (own_name,),
                     f"backend {own_name!r} needs a [{own_name}] table with its settings; see "
                     "CONNECT.md",
                 )
@@ -157,7 +157,7 @@ class RigConfig(ConfigModel):
             faults = _list_faults(error) + faults
         else:
             for name, section in rig.sections.items():
-                faults += [_make_fault(name, fault) for fault in section.list_faults(rig)]
+                faults += [_make_fault((name,), fault) for fault in section.list_faults(rig)]
         if faults:
             raise ValidationError.from_exception_data(cls.__name__, faults)
         return rig
@@ -238,9 +238,9 @@ class RigConfig(ConfigModel):
             )
 
 
-def _make_fault(name: str, message: str) -> InitErrorDetails:
+def _make_fault(location: tuple[int | str, ...], message: str) -> InitErrorDetails:
     error = {"error": ValueError(message)}
-    return InitErrorDetails(type="value_error", loc=(name,), input=None, ctx=error)
+    return InitErrorDetails(type="value_error", loc=location, input=None, ctx=error)
 
 
 def _list_faults(error: ValidationError, location: tuple[str, ...] = ()) -> list[InitErrorDetails]:
@@ -262,12 +262,7 @@ def _build_registry(declared: tuple[ChannelConfig, ...]) -> dict[str, Channel]:
 
 def _check_sensor_channels(sensors: tuple[SensorConfig, ...], registry: dict[str, Channel]) -> None:
     """Raise ValidationError for each sensor of an unknown channel, or in a unit not of it."""
-    errors: list[InitErrorDetails] = []
-
-    def add(row: int, key: str, value: str, message: str) -> None:
-        kind = PydanticCustomError("value_error", "{message}", {"message": message})
-        errors.append(InitErrorDetails(type=kind, loc=(row, key), input=value))
-
+    faults: list[InitErrorDetails] = []
     for row, sensor in enumerate(sensors):
         channel = registry.get(sensor.channel)
         if channel is None:
@@ -275,11 +270,11 @@ def _check_sensor_channels(sensors: tuple[SensorConfig, ...], registry: dict[str
             hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(registry)}"
             remedy = "or declare it in a [[channels]] table"
             message = f"channel {sensor.channel!r} is unknown; {hint} {remedy}"
-            add(row, "channel", sensor.channel, message)
+            faults.append(_make_fault((row, "channel"), message))
             continue
         try:
             check_sensor_unit(sensor.unit, channel)
         except ValueError as error:
-            add(row, "unit", sensor.unit, str(error))
-    if errors:
-        raise ValidationError.from_exception_data("sensors", errors)
+            faults.append(_make_fault((row, "unit"), str(error)))
+    if faults:
+        raise ValidationError.from_exception_data("sensors", faults)

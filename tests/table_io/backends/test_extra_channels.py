@@ -8,7 +8,7 @@ import pytest
 
 from table_io.backends import AcquisitionSource
 from table_io.backends.ni.probe import require_ni_wiring
-from table_io.backends.udp import UdpBackend
+from table_io.backends.udp.backend import UdpBackend
 from table_io.clock import RealClock
 from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
