@@ -55,8 +55,8 @@ TESTS = {
            "directions": ["forward", "backward"]},
 }  # fmt: skip
 COARSE = """
-from twin.reports import figures
-figures.RC_PARAMS.update({"savefig.dpi": 30, "figure.constrained_layout.use": False})
+from twin.reports import plot_style
+plot_style.RC_PARAMS.update({"savefig.dpi": 30, "figure.constrained_layout.use": False})
 """  # in every process of it: pictures are not what is tried here
 EQUAL = 0.025  # of a curve: the level is only held within 2 %, and noise goes on elsewhere
 

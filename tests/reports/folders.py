@@ -11,7 +11,7 @@ import pytest
 from tests.reports.recordings import blocks, start_record, summary
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import read_recording
-from twin.reports import figures
+from twin.reports import figures, plot_style
 from twin.reports.report import render_report
 from twin.reports.report_data import build_report_data
 from twin.transport.codec import Item
@@ -26,7 +26,7 @@ class Drawn:
     """A whole run, its pictures and its page, as a user gets them."""
 
     folder: Path
-    pictures: list[figures.Picture]
+    pictures: list[plot_style.Picture]
     html: str
 
 
@@ -56,4 +56,4 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
 @pytest.fixture
 def draft(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every line of every picture, but coarse and without ticks: in a third of the time."""
-    monkeypatch.setattr(figures, "RC_PARAMS", {**figures.RC_PARAMS, **COARSE, **BARE})
+    monkeypatch.setattr(plot_style, "RC_PARAMS", {**plot_style.RC_PARAMS, **COARSE, **BARE})

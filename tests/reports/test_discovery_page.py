@@ -25,7 +25,7 @@ from twin.reports.discovery.free_running import compute_misfits, run_log_free, r
 from twin.reports.discovery.loading import load_logs, name_logs
 from twin.reports.discovery.page import count_digits, format_rounded, format_verdict
 from twin.reports.discovery.serialize import Json, verdict_to_json
-from twin.reports.figures import RC_PARAMS
+from twin.reports.plot_style import RC_PARAMS
 from twin.run.run_config import read_model_template, read_run_config
 from twin.run.unpaced import play_unpaced
 

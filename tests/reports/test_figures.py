@@ -13,7 +13,8 @@ from tests.reports.folders import Drawn, Maker
 from tests.reports.recordings import STEPS, blocks, one_step, signals, summary
 from twin.model.parameters import Parameters
 from twin.recording.reader import read_recording
-from twin.reports.figures import PRECOMPRESSION_COLOUR, draw_run_figures
+from twin.reports.figures import draw_run_figures
+from twin.reports.plot_style import PRECOMPRESSION_COLOUR
 from twin.reports.report_data import (
     ReportData,
     build_report_data,

@@ -11,7 +11,7 @@ from table_io.records import Comparison, Event, Fault, PrcPoint, StepAdded
 from twin.recording.reader import Recording, read_recording
 from twin.replay.pipeline_replay import RecordedRun, replay_recording
 from twin.reports.report import format_headline
-from twin.reports.report_data import build_report_data, extract_run_prc
+from twin.reports.report_data import build_report_data, extract_prc
 from twin.reports.summary import format_summary, summarise
 from twin.run.run_config import RunConfig, from_texts
 from twin.run.unpaced import play_unpaced
@@ -62,7 +62,7 @@ def test_visits_stand_beside_the_steps_with_their_reasons(run: tuple) -> None:
     assert summary["found"] == [found]
     assert "6 cycles held in 2 visits" in format_summary(summary)
     shown = build_report_data(recording, summary)
-    assert extract_run_prc(shown, "measured", "forward", "eta_d")[0].tolist() == [3.8, 4.0]
+    assert extract_prc(shown.points, "measured", "forward", "eta_d")[0].tolist() == [3.8, 4.0]
     assert format_headline(shown).startswith("2 of 2 steps")
     assert found in format_headline(shown)
     assert len(bundle.steps) == 2

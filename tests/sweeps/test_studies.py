@@ -18,7 +18,6 @@ import pytest
 from table_io.config.base import load_config
 from table_io.config.profile import Profile
 from table_io.errors import InputError
-from tests.reports.folders import BARE, COARSE
 from twin.cli.report import write_folder_report
 from twin.cli.simulate import simulate_profile
 from twin.model.effects.effect import Effect, EffectParameter
@@ -52,11 +51,6 @@ def profile(tmp_path: Path) -> Path:
     path = tmp_path / "through.toml"
     path.write_text(TEST)
     return path
-
-
-@pytest.fixture
-def draft(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(figures, "RC_PARAMS", {**figures.RC_PARAMS, **COARSE, **BARE})
 
 
 def model(folder: Path, name: str, effects: str = "", **changed: float) -> str:
@@ -298,7 +292,7 @@ def test_the_pictures_name_what_is_in_them(profile: Path) -> None:
     ]  # fmt: skip
     cases = figures._group_cases(read_batch_rows(out / "batch.csv"))
     own = {gap: curves for (label, gap), curves in cases.items() if label == "snm"}
-    *_, family = figures._draw_family("snm", own)
+    family = figures._draw_family("snm", own).figure
     words = [text.get_text() for text in family.legends[0].get_texts()]
     assert words == ["no bumpers", "G = 4 mm", "G = 0 mm", "G = −1 mm", "forward", "backward"]
     for ax in family.axes:
@@ -307,19 +301,19 @@ def test_the_pictures_name_what_is_in_them(profile: Path) -> None:
         assert {line.get_linestyle() for line in drawn} == {"-", "--"}
     top = max(max(line.get_ydata()) for line in family.axes[1].lines)
     assert top < family.axes[1].get_ylim()[1] < 1.3 * top
-    *_, beside = figures._draw_models(4.0, {label: one for (label, gap), one in cases.items()
-                                       if gap == 4.0})  # fmt: skip
+    beside = figures._draw_models(4.0, {label: one for (label, gap), one in cases.items()
+                                       if gap == 4.0}).figure  # fmt: skip
     words = [text.get_text() for text in beside.legends[0].get_texts()]
     assert words == ["snm", "hard", "forward", "backward"]
     (gaps,) = over_gap.draw_gap_figure(
         "snm", [one for one in summary(out)["cases"] if one["model"] == "snm"]
     )
-    assert all(ax.get_ylabel() for ax in gaps[-1].axes)
+    assert all(ax.get_ylabel() for ax in gaps.figure.axes)
 
 
 def test_many_gaps_are_read_off_a_scale(profile: Path) -> None:
     cases = figures._group_cases(read_batch_rows(simulated(profile, [], ["0:20:2"]) / "batch.csv"))
-    *_, family = figures._draw_family("snm", {gap: curves for (_, gap), curves in cases.items()})
+    family = figures._draw_family("snm", {gap: curves for (_, gap), curves in cases.items()}).figure
     assert family.axes[-1].get_ylabel() == "total gap in mm"
     colours = {line.get_color() for line in family.axes[0].lines}
     assert len(colours) == 11

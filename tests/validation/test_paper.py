@@ -15,9 +15,10 @@ from typer.testing import CliRunner
 from table_io.errors import InputError
 from tests.reports.folders import BARE, COARSE
 from twin.cli.main import app
+from twin.reports import plot_style
 from twin.reports.measured_campaign import load_measured_campaign
-from twin.reports.paper_cases import extract_prc
-from twin.validation.paper import command, page
+from twin.reports.report_data import extract_prc
+from twin.validation.paper import command
 from twin.validation.paper.findings import count_onsets_per_cycle, find_bands
 from twin.validation.paper.rows import ComparisonRow
 from twin.validation.paper.study import CHAOS_SCAN_HZ, PaperStudy, run_paper_study
@@ -130,7 +131,7 @@ def test_impacts_are_cut_where_they_are_rare():
 @pytest.fixture
 def draft(monkeypatch: pytest.MonkeyPatch, found: PaperStudy) -> None:
     """Every picture, but coarse; the study of this module."""
-    monkeypatch.setattr(page, "PAPER_RC_PARAMS", {**page.PAPER_RC_PARAMS, **COARSE, **BARE})
+    monkeypatch.setattr(plot_style, "RC_PARAMS", {**plot_style.RC_PARAMS, **COARSE, **BARE})
     monkeypatch.setattr(command, "run_paper_study", lambda *_: found)
 
 

@@ -12,11 +12,12 @@ from table_io.errors import InputError
 from tests.reports.folders import BARE, COARSE
 from twin.model.model import Model
 from twin.model.parameters import Parameters
+from twin.reports import plot_style
 from twin.reports.paper_cases import load_paper_cases
 from twin.reports.players import ClosedFormSimulator, NumericalSimulator, make_simulator
 from twin.reports.slow_passage import COARSE_EFFORT, SlowSweep
 from twin.run.run_config import read_model
-from twin.validation.paper import command, findings, page, study
+from twin.validation.paper import command, findings, study
 from twin.validation.paper.rows import DEPARTS
 from twin.validation.paper.table import make_comparison_table
 
@@ -150,7 +151,7 @@ def test_hysteresis_of_an_integrated_model_is_that_of_slow_passage(tmp_path: Pat
 def test_every_figure_of_an_integrated_model(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(page, "PAPER_RC_PARAMS", {**page.PAPER_RC_PARAMS, **COARSE, **BARE})
+    monkeypatch.setattr(plot_style, "RC_PARAMS", {**plot_style.RC_PARAMS, **COARSE, **BARE})
     out = tmp_path / "out"
     command.compare_with_paper(out, [], card(tmp_path, "bumper_hardening", "k2 = 6e7"))
     told = json.loads((out / "paper.json").read_text())

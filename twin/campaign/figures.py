@@ -1,51 +1,44 @@
 """Figures of a campaign: PRC families as in the paper's Figs. 2 and 5, and level errors."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from table_io.config.profile import Sweep
 from table_io.records import PrcPoint
 from table_io.units import GRAVITY_M_S2
-from twin.campaign.merge import prc_points
 from twin.campaign.summary import CampaignData, CampaignRunData, describe_normalization
-from twin.reports.figures import Picture
 from twin.reports.measured_campaign import MeasuredCampaign
 from twin.reports.paper_cases import PaperCase, PaperTest
 from twin.reports.plot_style import (
     DIRECTION_COLOURS,
-    DIRECTIONS,
     GUIDE_COLOUR,
-    PAPER_RC_PARAMS,
     TRANSITION_COLOURS,
-    PaperFigure,
+    CaptionedFigure,
+    CaptionedFigures,
+    LineStyle,
+    Picture,
+    direction_handles,
     format_minus,
+    save_figures,
 )
 from twin.reports.prc_families import draw_all_gaps, draw_transition
+from twin.reports.report_data import DIRECTIONS
+from twin.reports.summary import prc_points
 
 NEAR_HZ = 1e-9
 
 
 def draw_campaign_figures(campaign: CampaignData, folder: Path) -> list[Picture]:
     """Draw the figures as PNG files in `folder`; return them with titles and captions."""
-    folder.mkdir(parents=True, exist_ok=True)
-    pictures = []
-    with mpl.rc_context(PAPER_RC_PARAMS):
-        for drawing in _draw_each(campaign):
-            path = folder / f"{drawing.name}.png"
-            drawing.figure.savefig(path)
-            pictures.append(Picture(path, drawing.title, drawing.caption))
-    return pictures
+    return save_figures(_draw_each(campaign), folder)
 
 
-def _draw_each(campaign: CampaignData) -> Iterator[PaperFigure]:
+def _draw_each(campaign: CampaignData) -> CaptionedFigures:
     cases, measured_campaign = prc_families(campaign)
     drawn = [draw_all_gaps(cases, measured_campaign)]
     if sum(name in cases for name in TRANSITION_COLOURS) > 1:
@@ -110,7 +103,7 @@ def prc_families(campaign: CampaignData) -> tuple[dict[str, PaperCase], Measured
     return cases, measured_campaign
 
 
-def _draw_levels(campaign: CampaignData) -> PaperFigure:
+def _draw_levels(campaign: CampaignData) -> CaptionedFigure:
     """Draw the level error: fundamental of the table acceleration over the demand, minus 1."""
     figure = Figure(figsize=(11, 3.4))
     ax = figure.subplots()
@@ -124,30 +117,24 @@ def _draw_levels(campaign: CampaignData) -> PaperFigure:
             ]
             f = np.array([point.frequency_hz for point in direction_points])
             measured = np.array([point.table_acc_fundamental_m_s2 for point in direction_points])
-            ax.plot(
-                f,
-                100 * (measured / level - 1),
-                "o",
-                ms=2.8,
-                mew=0,
-                color=DIRECTION_COLOURS[direction],
-            )
+            ax.plot(f, 100 * (measured / level - 1), **_dot_style(direction))
     ax.axhline(0, color=GUIDE_COLOUR, lw=0.8)
     low, high = ax.get_ylim()
     ax.set_ylim(min(low, -1.2 * band), max(high, 1.2 * band))
-    ax.set_xlabel("$f$ in Hz")
+    ax.set_xlabel("frequency in Hz")
     ax.set_ylabel("level error in %")
-    handles = [
-        Line2D([], [], color=c, marker="o", ls="", label=direction)
-        for direction, c in DIRECTION_COLOURS.items()
-    ]
+    handles = direction_handles(_dot_style)
     figure.legend(handles=handles, loc="outside upper center", ncols=2)
-    return PaperFigure(
-        "level", "", "Level of the table at every measured step of every run",
+    return CaptionedFigure(
+        "level", "Level of the table at every measured step of every run",
         "Fundamental of the measured table acceleration over the demanded one, minus one. Green: "
         f"the tolerance of ±{band:g} %.",
         figure,
     )  # fmt: skip
+
+
+def _dot_style(direction: str) -> LineStyle:
+    return {"color": DIRECTION_COLOURS[direction], "ls": "", "marker": "o", "ms": 2.8, "mew": 0}
 
 
 def format_gap(gap_mm: float) -> str:

@@ -5,19 +5,16 @@ the beginning of its direction.
 """
 
 import json
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 from table_io.config.profile import Profile
-from table_io.records import NormalizedResponse, PrcPoint
 from table_io.units import GRAVITY_M_S2
 from twin.campaign.state import RunState
 from twin.compare.curves import detect_hysteresis
-from twin.reports.summary import Json
+from twin.reports.summary import Json, number_or_nan, prc_points
 
 NORMALIZED_BY_U_STAR, NORMALIZED_BY_A_STAR = (
     ("eta_d", "eta_r", "eta_l"),
@@ -74,34 +71,6 @@ def _merged_verdict(run: RunState) -> str:
     return "halted" if ended == "complete" else ended
 
 
-def prc_points(steps: Iterable[Json]) -> list[PrcPoint]:
-    """Return the PRC points of a summary's steps."""
-    return [
-        PrcPoint(
-            0, step["index"], step["direction"], step["frequency_hz"],
-            _parse_response(step["measured"]), _parse_response(step["twin"]),
-            _number_or_nan(step["table_acc_peak_m_s2"]),
-            _number_or_nan(step["table_acc_fundamental_m_s2"]),
-            _number_or_nan(step["thd"]),
-        )
-        for step in steps
-    ]  # fmt: skip
-
-
-def _parse_response(values: Json | None) -> NormalizedResponse | None:
-    if values is None:
-        return None
-    known: Json = {
-        name: tuple(value) if isinstance(value, list) else _number_or_nan(value)
-        for name, value in values.items()
-    }
-    return NormalizedResponse(**known)
-
-
-def _number_or_nan(value: Any) -> float:
-    return math.nan if value is None else value
-
-
 def _describe_branch(run: RunState, profile: Profile, steps: list[Json], direction: str) -> Json:
     """Return the recordings of a branch with their frequency ranges in Hz, and its history."""
     begins = {part.folder: part.first_step for part in run.parts}
@@ -123,7 +92,7 @@ def _describe_branch(run: RunState, profile: Profile, steps: list[Json], directi
 def _summarize_quality(profile: Profile, steps: list[Json], summaries: Sequence[Json]) -> Json:
     """Return quality figures of a run: level errors, checks, trips, faults, latency, gaps."""
     demanded = profile.sweep.acceleration_g * GRAVITY_M_S2
-    errors = [_number_or_nan(step["table_acc_fundamental_m_s2"]) / demanded - 1 for step in steps]
+    errors = [number_or_nan(step["table_acc_fundamental_m_s2"]) / demanded - 1 for step in steps]
     worst = max(range(len(steps)), key=lambda k: abs(errors[k]), default=None)
     levels = [step["level"] for step in steps if step.get("level")]
     latencies = [(summary.get("timing") or {}).get("latency_ms") or {} for summary in summaries]

@@ -6,8 +6,8 @@ from pathlib import Path
 from twin.campaign.figures import draw_campaign_figures, format_gap
 from twin.campaign.summary import CampaignData, read_campaign
 from twin.reports import summary as summaries
-from twin.reports.figures import Picture
 from twin.reports.page import embed_images, render_page
+from twin.reports.plot_style import Picture
 
 
 def write_campaign_report(folder: Path) -> Path:

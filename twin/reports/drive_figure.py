@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,7 +27,6 @@ LIMIT_COLOUR = "#b22222"
 MAX_BLEND_RATIO = 1.05  # largest amplitude in a blend over the level
 SHOWN_STEPS = 2  # steps whose waveform is plotted
 POINTS_PER_SEGMENT = 25
-RC_PARAMS: dict[Any, Any] = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
 
 
 def draw_drive(run_config: RunConfig, out: Path) -> Path:
@@ -36,8 +35,10 @@ def draw_drive(run_config: RunConfig, out: Path) -> Path:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    from twin.reports.plot_style import RC_PARAMS
+
     with rc_context(RC_PARAMS):
-        figure = Figure(figsize=(10, 9.5), layout="constrained")
+        figure = Figure(figsize=(10, 9.5))
         FigureCanvasAgg(figure)
         axes = figure.subplots(4, 1, height_ratios=(1, 1.3, 1.1, 1.1))
         traces = [
@@ -50,10 +51,9 @@ def draw_drive(run_config: RunConfig, out: Path) -> Path:
         end_s = run_config.drive.planned_end / run_config.drive.rate_hz
         for axis in axes[:3]:
             axis.set_xlim(0, end_s)
-            axis.grid(alpha=0.25)
         title = f"{run_config.profile.title}\nThe drive {_format_usage(run_config)}"
         figure.suptitle(title, x=0.01, ha="left", fontsize=10)
-        figure.savefig(out, dpi=120)
+        figure.savefig(out)
     return out
 
 
@@ -103,8 +103,8 @@ def _plot_frequency(axis: "Axes", traces: list[_SegmentTrace]) -> None:
     for direction in (name for name in SWEEP_COLOURS if name in directions):
         axis.plot([], [], color=SWEEP_COLOURS[direction], lw=2, label=direction or "loop check")
     axis.set_ylim(0, None)
-    axis.set_ylabel("frequency [Hz]")
-    axis.legend(frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    axis.set_ylabel("frequency in Hz")
+    axis.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
 
 
 def _plot_amplitude(axis: "Axes", traces: list[_SegmentTrace], run_config: RunConfig) -> None:
@@ -133,7 +133,7 @@ def _plot_amplitude(axis: "Axes", traces: list[_SegmentTrace], run_config: RunCo
     axis.set_yscale("log")
     axis.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axis.set_ylim(lsb_mm * output.least_lsb / 3, max_amplitude_mm * 3)
-    axis.set_ylabel("amplitude of the\ncommand [mm]")
+    axis.set_ylabel("amplitude of the\ncommand in mm")
 
 
 def _annotate_limit(
@@ -162,11 +162,11 @@ def _plot_level(axis: "Axes", traces: list[_SegmentTrace], run_config: RunConfig
         MAX_BLEND_RATIO * level,
     )
     axis.set_ylim(0, 1.3 * level)
-    axis.set_ylabel("level [g]")
-    axis.set_xlabel("time [s]")
+    axis.set_ylabel("level in g")
+    axis.set_xlabel("time in s")
     for kind, colour in SEGMENT_COLOURS.items():
         axis.fill_between([], [], color=colour, label=kind)
-    axis.legend(frameon=False, ncols=5, loc="upper left", fontsize=8)
+    axis.legend(ncols=5, loc="upper left", fontsize=8)
 
 
 def _plot_beginning(axis: "Axes", run_config: RunConfig) -> None:
@@ -189,9 +189,8 @@ def _plot_beginning(axis: "Axes", run_config: RunConfig) -> None:
     for sign in (-1, 1):
         axis.axhline(sign * MAX_BLEND_RATIO * level, color=LIMIT_COLOUR, lw=1, ls=":")
     axis.set_xlim(0, end / drive.rate_hz)
-    axis.set_ylabel("acceleration [g]")
-    axis.set_xlabel(f"time [s], first {min(SHOWN_STEPS, len(drive.steps))} steps")
-    axis.grid(alpha=0.25)
+    axis.set_ylabel("acceleration in g")
+    axis.set_xlabel(f"time in s, first {min(SHOWN_STEPS, len(drive.steps))} steps")
 
 
 def _format_usage(run_config: RunConfig) -> str:

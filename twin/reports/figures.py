@@ -1,13 +1,8 @@
-"""Figures of a run, arranged and colored as in Stefani, De Angelis, Andreaus, Figs. 2 to 12.
+"""Figures of a run, arranged and colored as in Stefani, De Angelis, Andreaus, Figs. 2 to 12."""
 
-Import this module and `step_figures` only to draw: matplotlib is slow to import.
-"""
-
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -16,7 +11,35 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from table_io.block import Block
-from twin.reports.level_figure import draw_level_figure
+from table_io.records import Level, PrcPoint
+from table_io.units import GRAVITY_M_S2
+from twin.compare.curves import Hysteresis, PrcJump
+from twin.reports.motion_drawing import draw_rest_lines
+from twin.reports.plot_style import (
+    DIRECTION_COLOURS,
+    FIGURE_WIDTH_IN,
+    GUIDE_COLOUR,
+    HYSTERESIS_COLOURS,
+    PRECOMPRESSION_COLOUR,
+    TWIN_COLOUR,
+    CaptionedFigure,
+    CaptionedFigures,
+    LineStyle,
+    Picture,
+    measured_style,
+    save_figures,
+    twin_style,
+)
+from twin.reports.prc_drawing import (
+    FREE_PANELS,
+    PRC_PANELS,
+    draw_jumps,
+    format_mirrored_axis,
+    make_prc_panels,
+    plot_prc,
+    shade_hysteresis,
+    shade_precompression,
+)
 from twin.reports.report_data import (
     DIRECTIONS,
     IMPACT_KEYS,
@@ -24,114 +47,48 @@ from twin.reports.report_data import (
     compute_envelopes,
     compute_prestress,
     compute_step_errors,
-    extract_run_prc,
+    extract_prc,
 )
-from twin.reports.step_figures import (
-    DIRECTION_COLOURS,
-    DIRECTION_DASHES,
-    FIGURE_WIDTH_IN,
-    GUIDE_COLOUR,
-    REST_LINE_STYLE,
-    TWIN_COLOUR,
-    CaptionedFigures,
-    draw_gap_lines,
-    draw_histories,
-    draw_legend,
-    draw_loop_figures,
-)
+from twin.reports.step_figures import draw_histories, draw_legend, draw_loop_figures
 
 MARKER_SIZES = {"forward": 4.6, "backward": 2.6}  # both show where they coincide
-HYSTERESIS_COLOURS = {"right": "#fff0a8", "left": "#b9f0f4"}
-PRECOMPRESSION_COLOUR = "#d4d4d4"
-MAX_LABELLED_JUMPS = 4
-RC_PARAMS: dict[Any, Any] = {
-    "font.size": 9, "axes.titlesize": 9.5, "axes.titlelocation": "left", "axes.linewidth": 0.7,
-    "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True,
-    "grid.color": "#e4e4e4", "grid.linewidth": 0.6, "axes.axisbelow": True, "savefig.dpi": 150,
-    "legend.frameon": False, "lines.linewidth": 1.1, "lines.markersize": 3.6,
-    "figure.constrained_layout.use": True, "figure.constrained_layout.hspace": 0.06,
-}  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """PNG file with title and caption."""
-
-    path: Path
-    title: str
-    caption: str
 
 
 def draw_run_figures(run: ReportData, folder: Path) -> list[Picture]:
     """Draw all figures for which the run has data into PNG files; return them in report order."""
-    folder.mkdir(parents=True, exist_ok=True)
     for stale in folder.glob("histories_*hz.png"):
         stale.unlink()
-    pictures = []
-    with mpl.rc_context(RC_PARAMS):
-        for draw in (
-            _draw_prc,
-            _draw_impacts,
-            draw_histories,
-            draw_loop_figures,
-            _draw_errors,
-            _draw_overview,
-            draw_level_figure,
-        ):
-            for name, title, caption, figure in draw(run):
-                figure.savefig(folder / f"{name}.png")
-                pictures.append(Picture(folder / f"{name}.png", title, caption))
-    return pictures
-
-
-def _format_mirrored_axis(ax: Axes) -> None:
-    """Format a mirrored axis: right side above zero, left below, both labelled positive."""
-    ax.axhline(0, color="#333333", lw=0.7)
-    ax.yaxis.set_major_formatter(lambda value, _: f"{abs(value):g}")
-    for y, va, text in ((0.98, "top", "right"), (0.02, "bottom", "left")):
-        ax.text(0.99, y, text, transform=ax.transAxes, ha="right", va=va, color=GUIDE_COLOUR)
+    draws = (
+        _draw_prc,
+        _draw_impacts,
+        draw_histories,
+        draw_loop_figures,
+        _draw_errors,
+        _draw_overview,
+        _draw_level,
+    )
+    return save_figures((figure for draw in draws for figure in draw(run)), folder)
 
 
 def _draw_prc(run: ReportData) -> CaptionedFigures:
     """Draw the pseudo-resonance curves (Figs. 2 and 11)."""
-    panels = [
-        (r"$\eta_d$, relative displacement", {"eta_d": 1}),
-        (r"$\eta_a$, total acceleration", {"eta_a": 1}),
-    ]
-    if run.has_bumpers:
-        panels += [
-            (r"$\eta_j$, bumper deformation", {"eta_r": 1, "eta_l": -1}),
-            (r"$r_j$, contact force over weight", {"r_r": 1, "r_l": -1}),
-        ]
-    if not any(
-        np.isfinite(extract_run_prc(run, run.source, direction, "eta_d")[1]).any()
-        for direction in DIRECTIONS
-    ):
+    measured, twin = (partial(extract_prc, run.points, source) for source in ("measured", "twin"))
+    curves = measured if run.source == "measured" else twin
+    if not any(np.isfinite(curves(direction, "eta_d")[1]).any() for direction in DIRECTIONS):
         return
-    figure = Figure(figsize=(FIGURE_WIDTH_IN, 3.6 * len(panels) / 2 + 0.3))
-    axes = figure.subplots(len(panels) // 2, 2, sharex=True, squeeze=False)
-    intervals = run.summary.get("hysteresis") or []
+    contents = PRC_PANELS if run.has_bumpers else FREE_PANELS
+    figure = Figure(figsize=(FIGURE_WIDTH_IN, 3.6 * len(contents) / 2 + 0.3))
+    axes = figure.subplots(len(contents) // 2, 2, sharex=True, squeeze=False)
+    panels = make_prc_panels(axes, contents)
+    intervals = [Hysteresis(**interval) for interval in run.summary.get("hysteresis") or []]
     prestress = compute_prestress(run)
-    for ax, (label, names) in zip(axes.flat, panels, strict=True):
-        for interval in intervals:
-            ax.axvspan(
-                interval["from_hz"],
-                interval["to_hz"],
-                color=HYSTERESIS_COLOURS[interval["kind"]],
-                lw=0,
-            )
-        for name, sign in names.items():
-            _shade_precompression(ax, sign * prestress.get(name, 0.0))
-            _plot_prc(run, ax, name, sign)
-            _annotate_jumps(run, ax, name, sign)
-        ax.set_ylabel(label)
-        if len(names) == 2:
-            _format_mirrored_axis(ax)
-        else:
-            ax.set_ylim(bottom=0)
-    for ax in axes[-1]:
-        ax.set_xlabel("frequency in Hz")
-    kinds = sorted({interval["kind"] for interval in intervals})
+    shade_hysteresis(panels, intervals)
+    shade_precompression(panels, prestress)
+    plot_prc(panels, measured, _dotted_style)
+    plot_prc(panels, twin, twin_style)
+    jumps = [PrcJump(**jump) for jump in run.summary.get("jumps") or []]
+    draw_jumps(panels, curves, jumps, label_in="eta_d")
+    kinds = sorted({interval.kind for interval in intervals})
     patches = [Patch(color=HYSTERESIS_COLOURS[kind], label=f"{kind} hysteresis") for kind in kinds]
     if prestress:
         patches.append(
@@ -147,60 +104,11 @@ def _draw_prc(run: ReportData) -> CaptionedFigures:
     )
     if prestress:
         caption += " Grey: deformation and force of a precompressed bumper at rest, from the model."
-    yield "prc", "Pseudo-resonance curves", caption, figure
+    yield CaptionedFigure("prc", "Pseudo-resonance curves", caption, figure)
 
 
-def _shade_precompression(ax: Axes, y: float) -> None:
-    """Shade from zero to the value `y` of a precompressed bumper at rest (Fig. 5)."""
-    if y:
-        ax.axhspan(0, y, color=PRECOMPRESSION_COLOUR, lw=0)
-        ax.axhline(y, **REST_LINE_STYLE)
-
-
-def _plot_prc(run: ReportData, ax: Axes, name: str, sign: int) -> None:
-    for direction in DIRECTIONS:
-        f, y = extract_run_prc(run, "measured", direction, name)
-        ax.plot(
-            f,
-            sign * y,
-            "o-",
-            color=DIRECTION_COLOURS[direction],
-            ms=MARKER_SIZES[direction],
-            lw=2.2,
-        )
-    for direction in DIRECTIONS:
-        f, y = extract_run_prc(run, "twin", direction, name)
-        ax.plot(
-            f,
-            sign * y,
-            color=TWIN_COLOUR,
-            ls=DIRECTION_DASHES[direction],
-            lw=0.8,
-            marker="." if f.size == 1 else "",
-        )
-
-
-def _annotate_jumps(run: ReportData, ax: Axes, name: str, sign: int) -> None:
-    jumps = run.summary.get("jumps") or []
-    for number, jump in enumerate(jumps, 1):
-        f, y = extract_run_prc(run, run.source, jump["direction"], name)
-        ends = [y[np.isclose(f, jump[end])] for end in ("from_hz", "to_hz")]
-        if not all(end.size and np.isfinite(end[0]) for end in ends):
-            continue
-        x, (start, stop) = (jump["from_hz"] + jump["to_hz"]) / 2, (sign * end[0] for end in ends)
-        colour = DIRECTION_COLOURS[jump["direction"]]
-        style = {"arrowstyle": "-|>", "color": colour, "lw": 1.6, "shrinkA": 0, "shrinkB": 0}
-        ax.annotate("", (x, stop), (x, start), arrowprops=style)
-        if name == "eta_d":
-            is_labelled = len(jumps) <= MAX_LABELLED_JUMPS
-            low, high = sorted((jump["from_hz"], jump["to_hz"]))
-            text = f"{low:g}–{high:g} Hz" if is_labelled else f"{number}"
-            right = jump["to_hz"] >= jump["from_hz"] and x < f[0] + 0.85 * (f[-1] - f[0])
-            ax.annotate(
-                text, (x, (start + stop) / 2), (5 if right else -5, 0), color=colour, size=8,
-                textcoords="offset points", ha="left" if right else "right", va="center",
-                bbox={"facecolor": "white", "alpha": 0.85, "lw": 0, "pad": 1}, zorder=5,
-            )  # fmt: skip
+def _dotted_style(direction: str) -> LineStyle:
+    return {**measured_style(direction), "marker": "o", "ms": MARKER_SIZES[direction]}
 
 
 def _draw_impacts(run: ReportData) -> CaptionedFigures:
@@ -208,10 +116,10 @@ def _draw_impacts(run: ReportData) -> CaptionedFigures:
     directions = [
         direction
         for direction in DIRECTIONS
-        if extract_run_prc(run, run.source, direction, IMPACT_KEYS[0])[0].size
+        if extract_prc(run.points, run.source, direction, IMPACT_KEYS[0])[0].size
     ]
     counts = [
-        extract_run_prc(run, run.source, direction, side)[1]
+        extract_prc(run.points, run.source, direction, side)[1]
         for direction in directions
         for side in IMPACT_KEYS
     ]
@@ -221,15 +129,15 @@ def _draw_impacts(run: ReportData) -> CaptionedFigures:
     rows = figure.subplots(len(directions), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     for ax, direction in zip(rows, directions, strict=True):
         for side, sign in zip(IMPACT_KEYS, (1, -1), strict=True):
-            f, y = extract_run_prc(run, "measured", direction, side)
+            f, y = extract_prc(run.points, "measured", direction, side)
             ax.vlines(f, 0, sign * y, color=DIRECTION_COLOURS[direction], lw=3, alpha=0.35)
             ax.plot(f, sign * y, "o", color=DIRECTION_COLOURS[direction])
-            f, y = extract_run_prc(run, "twin", direction, side)
+            f, y = extract_prc(run.points, "twin", direction, side)
             ax.plot(f, sign * y, "o", ms=6.5, mfc="none", mec=TWIN_COLOUR, mew=0.8)
         ax.set_ylabel("impacts per cycle")
         ax.set_title(direction)
         ax.yaxis.set_major_locator(MaxNLocator(integer=True))
-        _format_mirrored_axis(ax)
+        format_mirrored_axis(ax)
     rows[-1].set_xlabel("frequency in Hz")
     handles = [
         Line2D([], [], color=TWIN_COLOUR, marker="o", ms=6.5, mfc="none", ls="", label="twin")
@@ -250,7 +158,7 @@ def _draw_impacts(run: ReportData) -> CaptionedFigures:
         "Mean over the measured cycles of a step; a fractional value means that the count varies "
         "from cycle to cycle."
     )
-    yield "impacts", "Impacts per forcing cycle", caption, figure
+    yield CaptionedFigure("impacts", "Impacts per forcing cycle", caption, figure)
 
 
 def _draw_errors(run: ReportData) -> CaptionedFigures:
@@ -304,7 +212,7 @@ def _draw_errors(run: ReportData) -> CaptionedFigures:
         "constant zero would give 1. The restarted twin starts every window from the measured "
         "state. Contact forces only with contact."
     )
-    yield "comparison", "Error of the twin", caption, figure
+    yield CaptionedFigure("comparison", "Error of the twin", caption, figure)
 
 
 def _draw_overview(run: ReportData) -> CaptionedFigures:
@@ -320,8 +228,8 @@ def _draw_overview(run: ReportData) -> CaptionedFigures:
             ax.fill_between(time, low, high, color="#8b929c", lw=0)
         ax.set_ylabel(label)
         _shade_steps(run, ax, blocks, ax is axes[0])
-        if label.startswith("$u$"):
-            draw_gap_lines(run, ax.axhline)
+        if label.startswith("$u$") and run.gaps_m is not None:
+            draw_rest_lines(run.gaps_m, ax.axhline)
         for peak in peaks if label == "table in m/s²" else ():
             ax.axhline(peak, color="#111111", ls="--", lw=0.9)
             ax.axhline(-peak, color="#111111", ls="--", lw=0.9)
@@ -331,7 +239,7 @@ def _draw_overview(run: ReportData) -> CaptionedFigures:
         "Envelopes. Shading: steps, red forward, blue backward, with their frequencies in Hz on "
         "top. Dashed: demanded peak acceleration and positions of the bumpers at rest."
     )
-    yield "overview", "Drive and response over the run", caption, figure
+    yield CaptionedFigure("overview", "Drive and response over the run", caption, figure)
 
 
 def _shade_steps(run: ReportData, ax: Axes, blocks: tuple[Block, ...], show_labels: bool) -> None:
@@ -357,3 +265,55 @@ def _shade_steps(run: ReportData, ax: Axes, blocks: tuple[Block, ...], show_labe
                     ha="center", size=8, color=GUIDE_COLOUR,
                 )  # fmt: skip
                 next_label_s = start + duration_s / 22
+
+
+def _draw_level(run: ReportData) -> CaptionedFigures:
+    """Draw the level error of the measured cycles, the error without control, and the correction.
+
+    The uncorrected level is the measured level divided by the correction.
+    """
+    accepted = {level.step: level for level in run.recording.records(Level) if level.accepted}
+    points = [point for point in run.recording.records(PrcPoint) if point.step in accepted]
+    if not points:
+        return
+    demand = accepted[points[0].step].demanded_m_s2
+    figure = Figure(figsize=(9.5, 4.6))
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
+    for direction in DIRECTIONS:
+        direction_points = [point for point in points if point.direction == direction]
+        if not direction_points:
+            continue
+        f = np.array([point.frequency_hz for point in direction_points])
+        reached = np.array([point.table_acc_fundamental_m_s2 for point in direction_points])
+        demanded = np.array([accepted[point.step].demanded_m_s2 for point in direction_points])
+        correction = np.array([accepted[point.step].correction for point in direction_points])
+        order = np.argsort(f)
+        colour = DIRECTION_COLOURS[direction]
+        error, uncorrected_error = (
+            100 * (reached / demanded - 1),
+            100 * (reached / correction / demanded - 1),
+        )
+        upper.plot(f[order], error[order], "o-", color=colour, ms=3, label=f"{direction}")
+        upper.plot(
+            f[order],
+            uncorrected_error[order],
+            ":",
+            color=colour,
+            lw=1.2,
+            label=f"{direction}, uncorrected",
+        )
+        lower.plot(f[order], correction[order], "o-", color=colour, ms=3)
+    for tolerance_percent in (-2, 2):
+        upper.axhline(tolerance_percent, color="#777777", lw=0.8, ls="--")
+    upper.set_ylabel("level error in %")
+    upper.legend(ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    lower.set_ylabel("correction")
+    lower.set_xlabel("frequency in Hz")
+    yield CaptionedFigure(
+        "level",
+        "Level of the table",
+        f"Error of the fundamental of the measured table acceleration relative to the demanded "
+        f"{demand / GRAVITY_M_S2:.3g} g over the measured cycles of each step (dashed: ±2 %), the "
+        "same without correction of the command (dotted), and the correction factor.",
+        figure,
+    )

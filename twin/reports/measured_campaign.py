@@ -1,6 +1,6 @@
 """Measured PRC points and motions of a campaign, by gap."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -34,8 +34,8 @@ class MeasuredCampaign:
 
     def extract_motion(
         self, name: str, frequency_hz: float, direction: str, cycles: int
-    ) -> tuple[SystemMotion, float] | None:
-        """Return (last measured cycles of a step, contact threshold in N), or None if not measured.
+    ) -> SystemMotion | None:
+        """Return the last measured cycles of a step, or None if not measured.
 
         Time starts at the first zero upcrossing of the table acceleration, as in the model.
         """
@@ -49,9 +49,8 @@ class MeasuredCampaign:
                 motion = report_data.extract_step_motion(run, "meas", step["index"])
                 if motion is not None and np.isfinite(motion.u).any():
                     delay_s = _upcrossing_s(run, step["index"], frequency_hz, cycles)
-                    return _to_system_motion(
-                        motion.select_last(cycles), run.contact_n, delay_s
-                    ), run.contact_n
+                    motion = motion.select_last(cycles)
+                    return replace(motion, time=motion.time - delay_s)
         return None
 
 
@@ -66,25 +65,6 @@ def _upcrossing_s(run: ReportData, step: int, frequency_hz: float, cycles: int) 
     rotation = np.exp(-2j * np.pi * frequency_hz * np.arange(table_acc.size) / rate)
     phase = np.angle(np.sum(table_acc * rotation)) + np.pi / 2  # of A = a sin(w t + phase)
     return float((-phase / (2 * np.pi)) % 1.0 / frequency_hz)
-
-
-def _to_system_motion(
-    motion: report_data.StepMotion, contact_n: float, delay_s: float
-) -> SystemMotion:
-    """Convert to a SystemMotion; bumper positions equal u in contact and are NaN otherwise."""
-    v_r, v_l = (
-        np.where(force > contact_n, motion.u, np.nan) for force in (motion.force_r, -motion.force_l)
-    )
-    return SystemMotion(
-        motion.time - delay_s,
-        motion.u,
-        motion.v,
-        motion.a,
-        motion.force_r,
-        motion.force_l,
-        v_r,
-        v_l,
-    )
 
 
 def find_logs(paths: list[Path]) -> list[Path]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from twin.reports.figures import Picture
+from twin.reports.plot_style import Picture
 
 TEMPLATE_DIR = Path(__file__).parent  # contains the shared style.html
 

@@ -5,11 +5,8 @@ The three sweeps of G4 are merged as in Sect. 4.3 of the paper, each where its g
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-
-import numpy as np
 
 from table_io.block import Float1D
 from table_io.config.base import find_config, load_config
@@ -101,6 +98,11 @@ class PaperCase:
         return self.tests[0].parameters
 
     @property
+    def gaps_m(self) -> tuple[float, float]:
+        """Initial gaps (right, left) in m, negative when the bumpers are precompressed."""
+        return self.parameters.gap_r, self.parameters.gap_l
+
+    @property
     def simulator(self) -> HarmonicSimulator:
         return self.tests[0].simulator
 
@@ -145,22 +147,6 @@ class PaperCase:
                 if step.direction == direction and abs(step.frequency_hz - frequency_hz) < 1e-9:
                     return test, step.index
         raise ValueError(f"{self.name} has no step at {frequency_hz} Hz {direction}")
-
-
-def extract_prc(
-    points: Sequence[PrcPoint], source: str, direction: str, name: str
-) -> tuple[Float1D, Float1D]:
-    """Return (frequency in Hz, quantity), (point,) each, of one direction in ascending frequency.
-
-    `source` is "twin" or "measured".
-    """
-    rows = sorted(
-        (point.frequency_hz, getattr(getattr(point, source), name))
-        for point in points
-        if point.direction == direction and getattr(point, source) is not None
-    )
-    table = np.array(rows, dtype=np.float64).reshape(-1, 2)
-    return table[:, 0], table[:, 1]
 
 
 def load_paper_cases(

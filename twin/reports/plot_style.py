@@ -1,65 +1,116 @@
-"""Plot style of the paper's figures: colors, panel letters, contact bands, guide lines."""
+"""Plot style of every figure: colors, line styles, figure size, and how figures are saved.
 
-from collections.abc import Callable, Iterator
+Measured: red forward, blue backward. Twin: black, solid forward, dashed backward.
+Import only to draw: matplotlib is slow to import.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-import numpy as np
+import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from table_io.block import Float1D
-from twin.model.parameters import Parameters
-from twin.reports.figures import HYSTERESIS_COLOURS, RC_PARAMS
-from twin.reports.players import SystemMotion
-from twin.reports.step_figures import (
-    DIRECTION_COLOURS,
-    DIRECTION_DASHES,
-    GUIDE_COLOUR,
-    REST_LINE_STYLE,
-    TWIN_COLOUR,
-)
+from twin.reports.report_data import DIRECTIONS
 
-__all__ = [
-    "DIRECTIONS",
-    "DIRECTION_COLOURS",
-    "DIRECTION_DASHES",
-    "GUIDE_COLOUR",
-    "HYSTERESIS_COLOURS",
-    "REST_LINE_STYLE",
-    "TWIN_COLOUR",
-]
-
-DIRECTIONS = ("forward", "backward")
+FIGURE_WIDTH_IN = 10.0
+RC_PARAMS: dict[Any, Any] = {
+    "font.size": 9, "axes.titlesize": 9.5, "axes.titlelocation": "left", "axes.linewidth": 0.7,
+    "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True,
+    "grid.color": "#e4e4e4", "grid.linewidth": 0.6, "axes.axisbelow": True, "savefig.dpi": 150,
+    "legend.frameon": False, "lines.linewidth": 1.1, "lines.markersize": 3.6,
+    "figure.constrained_layout.use": True, "figure.constrained_layout.hspace": 0.06,
+}  # fmt: skip
+DIRECTION_COLOURS = {"forward": "#c4161c", "backward": "#1559b0"}
+SIDE_COLOURS = {"right": "#c4161c", "left": "#1559b0"}
+DIRECTION_DASHES: dict[str, Any] = {"forward": "-", "backward": (0, (4, 1.8))}
+TWIN_COLOUR, GUIDE_COLOUR, ZERO_COLOUR = "#111111", "#555555", "#333333"
+HYSTERESIS_COLOURS = {"right": "#fff0a8", "left": "#b9f0f4"}
+PRECOMPRESSION_COLOUR = "#d4d4d4"
+FREE_FLIGHT_COLOUR = "#2e9e5b"
 GAP_COLOURS = {
-    "G∞": "#2e9e5b", "G30": "#14296b", "G16": "#2f6fb3", "G10": "#63b4dd", "G4": "#7a3b9b",
-    "G0": "#c4161c", "G-1": "#f4ac3d", "G-2": "#9ccf4f", "G-10": "#1b6e35",
+    "G∞": FREE_FLIGHT_COLOUR, "G30": "#14296b", "G16": "#2f6fb3", "G10": "#63b4dd",
+    "G4": "#7a3b9b", "G0": "#c4161c", "G-1": "#f4ac3d", "G-2": "#9ccf4f", "G-10": "#1b6e35",
 }  # fmt: skip
 TRANSITION_COLOURS = {
     "G4": "#111111", "G0": "#c4161c", "G-1": "#1559b0", "G-2": "#8fcf4a", "G-10": "#1b6e35",
 }  # fmt: skip
+REST_LINE_STYLE: dict[str, Any] = {"color": GUIDE_COLOUR, "ls": (0, (5, 3)), "lw": 0.8}
 UNSTABLE_STYLE: dict[str, Any] = {"color": "#777777", "ls": (0, (1, 1.4)), "lw": 1.1}
-PAPER_RC_PARAMS = {
-    **RC_PARAMS,
-    "axes.titlelocation": "center",
-    "axes.grid": True,
-    "figure.dpi": 100,
-}
+LineStyle = dict[str, Any]
+DirectionStyle = Callable[[str], LineStyle]  # line style of a direction
 
 
 @dataclass(frozen=True, slots=True)
-class PaperFigure:
-    """Figure with its file name, number in the paper, title and caption."""
+class CaptionedFigure:
+    """Figure with its file name, title, caption and, where it has one, number in the paper."""
 
     name: str
-    number: str
     title: str
     caption: str
     figure: Figure
+    number: str = ""
 
 
-PaperFigures = Iterator[PaperFigure]
+CaptionedFigures = Iterator[CaptionedFigure]
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """PNG file with title and caption."""
+
+    path: Path
+    title: str
+    caption: str
+
+
+def save_figures(figures: Iterable[CaptionedFigure], folder: Path) -> list[Picture]:
+    """Save figures as PNG files in `folder`; return them in order.
+
+    The figures are drawn while they are iterated over: `figures` must be a generator, so that
+    the style applies.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    pictures = []
+    with mpl.rc_context(RC_PARAMS):
+        for drawing in figures:
+            path = folder / f"{drawing.name}.png"
+            drawing.figure.savefig(path)
+            pictures.append(Picture(path, drawing.title, drawing.caption))
+    return pictures
+
+
+def measured_style(direction: str, width: float = 2.2) -> LineStyle:
+    """Return a solid line in the color of the direction, visible under a coincident twin line."""
+    return {"color": DIRECTION_COLOURS[direction], "lw": width}
+
+
+def twin_style(direction: str, width: float = 0.8) -> LineStyle:
+    """Return the line style of a twin or model: black, solid forward, dashed backward."""
+    return {"color": TWIN_COLOUR, "ls": DIRECTION_DASHES[direction], "lw": width}
+
+
+def experiment_style(direction: str, width: float = 1.2) -> LineStyle:
+    """Return the line style of the paper's experiments: solid red forward, dashed blue backward."""
+    return {"color": DIRECTION_COLOURS[direction], "ls": DIRECTION_DASHES[direction], "lw": width}
+
+
+def guide_style(direction: str) -> LineStyle:
+    """Return the line style of a direction in legends whose colors mean something else."""
+    return {"color": GUIDE_COLOUR, "ls": DIRECTION_DASHES[direction]}
+
+
+def direction_handles(
+    make_style: DirectionStyle, prefix: str = "", directions: Sequence[str] = DIRECTIONS
+) -> list[Line2D]:
+    """Return a legend handle per direction, labelled "<prefix><direction>"."""
+    return [
+        Line2D([], [], **make_style(direction), label=f"{prefix}{direction}")
+        for direction in directions
+    ]
 
 
 def format_minus(name: str) -> str:
@@ -68,76 +119,9 @@ def format_minus(name: str) -> str:
 
 
 def label_panel(ax: Axes, panel_letter: str, text: str = "") -> None:
-    """Write the panel letter and a title above a panel."""
-    ax.set_title(text)
+    """Write the panel letter and a centered title above a panel."""
+    ax.set_title(text, loc="center")
     ax.text(
-        0,
-        1.02,
-        panel_letter,
-        transform=ax.transAxes,
-        weight="bold",
-        ha="left",
-        va="bottom",
+        0, 1.02, panel_letter, transform=ax.transAxes, weight="bold", ha="left", va="bottom",
         size=10,
-    )
-
-
-def experiment_style(direction: str, width: float = 1.2) -> dict[str, Any]:
-    """Return the line style of the paper's experiments: solid red forward, dashed blue backward."""
-    return {"color": DIRECTION_COLOURS[direction], "ls": DIRECTION_DASHES[direction], "lw": width}
-
-
-def model_style(direction: str, width: float = 1.1) -> dict[str, Any]:
-    """Return the line style of the paper's model: black, solid forward, dashed backward."""
-    return {"color": TWIN_COLOUR, "ls": DIRECTION_DASHES[direction], "lw": width}
-
-
-def direction_handles(
-    make_style: Callable[[str], dict[str, Any]], prefix: str = ""
-) -> list[Line2D]:
-    return [
-        Line2D([], [], **make_style(direction), label=f"{prefix}{direction} sweep")
-        for direction in DIRECTIONS
-    ]
-
-
-def close_loop(values: Float1D) -> Float1D:
-    """Return the values with the first one appended, so that a plotted loop is closed."""
-    return np.append(values, values[0])
-
-
-def plot_phase_portrait(ax: Axes, motion: SystemMotion, **style: Any) -> None:
-    """Plot the phase portrait, velocity in mm/s over u in mm."""
-    ax.plot(motion.u * 1e3, motion.v * 1e3, **style)
-
-
-def plot_inertia_loop(
-    ax: Axes, motion: SystemMotion, mass: float, closed: bool, **style: Any
-) -> None:
-    """Plot the inertia force -M a in kN over u in mm; `closed` joins the ends of the loop."""
-    u, force = motion.u * 1e3, -mass * motion.a / 1e3
-    ax.plot(*((close_loop(u), close_loop(force)) if closed else (u, force)), **style)
-
-
-def plot_bumper_loops(ax: Axes, motion: SystemMotion, closed: bool, **style: Any) -> None:
-    """Plot the contact force in kN over the bumper position in mm, both sides."""
-    for position, force in ((motion.v_r, motion.force_r), (motion.v_l, motion.force_l)):
-        x, y = position * 1e3, force / 1e3
-        ax.plot(*((close_loop(x), close_loop(y)) if closed else (x, y)), **style)
-
-
-def draw_obstacles(parameters: Parameters, draw: Callable[..., Any], **style: Any) -> None:
-    """Draw dashed lines at the bumpers at rest, or where contact of a precompressed one ends."""
-    for side, gap_m in ((1, parameters.gap_r), (-1, parameters.gap_l)):
-        draw(side * abs(gap_m) * 1e3, **{**REST_LINE_STYLE, **style})
-
-
-def shade_contact(
-    ax: Axes, motion: SystemMotion, colour: str, contact_n: float = 0.0, alpha: float = 0.16
-) -> None:
-    """Shade each contact as a vertical band, darker where both bumpers are in contact."""
-    for force in (motion.force_r, -motion.force_l):
-        ax.fill_between(
-            motion.time, 0, 1, where=force > contact_n, transform=ax.get_xaxis_transform(),
-            color=colour, alpha=alpha, lw=0, zorder=0.5,
-        )  # fmt: skip
+    )  # fmt: skip

@@ -24,8 +24,9 @@ from table_io.records import (
 )
 from twin.compare.monitoring import EVENT_KINDS as MONITOR_KINDS
 from twin.recording.reader import Recording, read_recording
-from twin.reports.figures import Picture, draw_run_figures
+from twin.reports.figures import draw_run_figures
 from twin.reports.page import TEMPLATE_DIR, embed_images, format_significant, render_page
+from twin.reports.plot_style import Picture
 from twin.reports.report_data import (
     ReportData,
     Summary,

@@ -5,8 +5,9 @@ Also selects the steps that are shown in detail.
 
 import math
 import tomllib
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,13 +17,16 @@ from scipy.signal import savgol_filter
 from table_io.block import Block, Float1D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS, contact_forces, relative_displacement
 from table_io.config.profile import ComparisonConfig, Specimen
-from table_io.records import Comparison, Params
+from table_io.records import Comparison, Params, PrcPoint
 from table_io.units import GRAVITY_M_S2
 from twin.model.config import ModelConfig
 from twin.model.model import Model
 from twin.recording.reader import Recording
+from twin.reports.players import SystemMotion
+from twin.reports.summary import prc_points
 
 Summary = dict[str, Any]
+Curve = tuple[Float1D, Float1D]  # frequency in Hz, ascending, and quantity
 Envelope = tuple[Float1D, Float1D, Float1D]
 DIRECTIONS = ("forward", "backward")
 IMPACT_KEYS = ("impacts_right", "impacts_left")
@@ -35,7 +39,7 @@ COMPARED_CHANNELS: dict[str, tuple[str, ...]] = {
 MAX_INTERVALS, SLOPE_WINDOW_S, MAX_ENVELOPE_BINS = 2, 0.020, 1600
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ReportData:
     """Recording and summary of a run, with the blocks and the specimen that every figure needs."""
 
@@ -48,6 +52,10 @@ class ReportData:
     @property
     def steps(self) -> list[dict[str, Any]]:
         return self.summary["steps"] or []
+
+    @cached_property
+    def points(self) -> list[PrcPoint]:
+        return prc_points(self.steps)
 
     @property
     def source(self) -> str:
@@ -66,22 +74,16 @@ class ReportData:
         return self.specimen is None or self.gaps_m is not None
 
 
-@dataclass(frozen=True, slots=True)
-class StepMotion:
-    """Motion over the measured cycles of a step, SI, right positive, (sample,); NaN if missing."""
+@dataclass(frozen=True, slots=True, eq=False)
+class StepMotion(SystemMotion):
+    """Motion over the measured cycles of a step; NaN where a sample is missing."""
 
-    time: Float1D
     cycle: Float1D
-    u: Float1D
-    v: Float1D
-    a: Float1D
-    force_r: Float1D
-    force_l: Float1D
 
     def select_last(self, cycles: int) -> "StepMotion":
         """Return the last `cycles` cycles, with time counted from their start."""
         first = int(np.argmax(self.cycle > np.nanmax(self.cycle) - cycles))
-        arrays = {name: getattr(self, name)[first:] for name in self.__slots__}
+        arrays = {field.name: getattr(self, field.name)[first:] for field in fields(self)}
         return StepMotion(**{**arrays, "time": arrays["time"] - arrays["time"][0]})
 
 
@@ -113,20 +115,24 @@ def step_quantity(step: dict[str, Any], source: str, name: str) -> float:
     return math.nan if value is None else float(value)
 
 
-def extract_run_prc(
-    run: ReportData, source: str, direction: str, name: str
-) -> tuple[Float1D, Float1D]:
-    """Return (frequency in Hz, quantity), (step,) each, of one direction in ascending frequency.
+def extract_prc(points: Sequence[PrcPoint], source: str, direction: str, name: str) -> Curve:
+    """Return (frequency in Hz, quantity), (point,) each, of one direction in ascending frequency.
 
-    NaN where the quantity is absent.
+    `source` is "twin" or "measured". Impacts are means per cycle. NaN where there is no value.
     """
-    points = sorted(
-        (step["frequency_hz"], step_quantity(step, source, name))
-        for step in run.steps
-        if step["direction"] == direction
+    rows = sorted(
+        (point.frequency_hz, _mean_quantity(point, source, name))
+        for point in points
+        if point.direction == direction
     )
-    table = np.array(points, dtype=np.float64).reshape(-1, 2)
+    table = np.array(rows, dtype=np.float64).reshape(-1, 2)
     return table[:, 0], table[:, 1]
+
+
+def _mean_quantity(point: PrcPoint, source: str, name: str) -> float:
+    values = getattr(point, source)
+    value = np.nan if values is None else getattr(values, name)
+    return float(np.mean(value)) if np.size(value) else np.nan
 
 
 def compute_prestress(run: ReportData) -> dict[str, float]:
@@ -218,9 +224,10 @@ def extract_step_motion(run: ReportData, stream: str, step: int) -> StepMotion |
         else _differentiate(u, step_block.rate_hz)
     )
     a = step_block.channel("mass_acc_m_s2") if "mass_acc_m_s2" in names else missing
-    return StepMotion(
-        step_block.time_s - step_block.time_s[0], cycle, u, v, a, *contact_forces(step_block)
-    )
+    force_r, force_l = contact_forces(step_block)
+    v_r, v_l = (np.where(force > run.contact_n, u, np.nan) for force in (force_r, -force_l))
+    time_s = step_block.time_s - step_block.time_s[0]
+    return StepMotion(time_s, u, v, a, force_r, force_l, v_r, v_l, cycle)
 
 
 def _differentiate(u: Float1D, rate_hz: float) -> Float1D:

@@ -1,10 +1,9 @@
-"""Figures of selected steps: time histories, phase portraits, force loops; and the line styles.
+"""Figures of selected steps: time histories, phase portraits and force loops.
 
-Measured: red forward, blue backward. Twin: black, solid forward, dashed backward. Steps come from
-`report_data.select_frequencies`: at most four frequencies, both directions each.
+Steps come from `report_data.select_frequencies`: at most four frequencies, both directions each.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,25 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from twin.reports.motion_drawing import (
+    draw_rest_lines,
+    plot_bumper_loops,
+    plot_history,
+    plot_inertia_loop,
+    plot_phase_portrait,
+    shade_contact,
+)
+from twin.reports.plot_style import (
+    DIRECTION_COLOURS,
+    FIGURE_WIDTH_IN,
+    GUIDE_COLOUR,
+    REST_LINE_STYLE,
+    CaptionedFigure,
+    CaptionedFigures,
+    direction_handles,
+    measured_style,
+    twin_style,
+)
 from twin.reports.report_data import (
     DIRECTIONS,
     ReportData,
@@ -21,12 +39,8 @@ from twin.reports.report_data import (
     select_frequencies,
 )
 
-DIRECTION_COLOURS = {"forward": "#c4161c", "backward": "#1559b0"}
-DIRECTION_DASHES: dict[str, Any] = {"forward": "-", "backward": (0, (4, 1.8))}
-TWIN_COLOUR, GUIDE_COLOUR = "#111111", "#555555"
-REST_LINE_STYLE: dict[str, Any] = {"color": GUIDE_COLOUR, "ls": (0, (5, 3)), "lw": 0.8}
-FIGURE_WIDTH_IN, HISTORY_CYCLES = 10.0, 3
-CaptionedFigures = Iterator[tuple[str, str, str, Figure]]
+HISTORY_CYCLES = 3
+CONTACT_ALPHAS = 0.22, 0.10  # right, left
 
 
 def draw_legend(
@@ -40,28 +54,13 @@ def draw_legend(
         if any(step["direction"] == direction for step in run.steps)
     ]
     if run.source == "measured":
-        lines += [
-            Line2D(
-                [],
-                [],
-                color=DIRECTION_COLOURS[direction],
-                marker=marker,
-                label=f"measured {direction}",
-            )
-            for direction in directions
-        ]
-    lines += [
-        Line2D([], [], color=TWIN_COLOUR, ls=DIRECTION_DASHES[direction], label=f"twin {direction}")
-        for direction in directions
-    ]
+        lines += direction_handles(
+            lambda direction: measured_style(direction) | {"marker": marker},
+            "measured ",
+            directions,
+        )
+    lines += direction_handles(twin_style, "twin ", directions)
     figure.legend(handles=[*lines, *handles], loc="outside upper center", ncols=6)
-
-
-def draw_gap_lines(run: ReportData, draw: Callable[..., Any]) -> None:
-    """Draw dashed lines at the positions of the bumpers at rest."""
-    if run.gaps_m is not None:
-        for position_mm in {run.gaps_m[0] * 1e3, -run.gaps_m[1] * 1e3}:
-            draw(position_mm, **REST_LINE_STYLE)
 
 
 def draw_histories(run: ReportData) -> CaptionedFigures:
@@ -77,20 +76,21 @@ def draw_histories(run: ReportData) -> CaptionedFigures:
             column[0].set_title(f"{direction}, {hz:g} Hz")
             column[-1].set_xlabel("time in s")
             for motion, style in (
-                (measured, _measured_style(direction)),
-                (twin, _twin_style(direction)),
+                (measured, measured_style(direction)),
+                (twin, twin_style(direction)),
             ):
                 if motion is not None:
-                    _plot_history(run, column, motion.select_last(HISTORY_CYCLES), style)
+                    plot_history(column, motion.select_last(HISTORY_CYCLES), **style)
             contact_motion = twin if run.source == "twin" or measured is None else measured
             if contact_motion is not None:
-                _shade_contact(
-                    run,
-                    column,
+                shown, colour = (
                     contact_motion.select_last(HISTORY_CYCLES),
                     DIRECTION_COLOURS[direction],
                 )
-            draw_gap_lines(run, column[0].axhline)
+                for ax in column:
+                    shade_contact(ax, shown, colour, CONTACT_ALPHAS, run.contact_n)
+            if run.gaps_m is not None:
+                draw_rest_lines(run.gaps_m, column[0].axhline)
         labels = ("$u$ in mm", "$a$ in m/s²", "$F_R$, $F_L$ in kN")
         for ax, label in zip(axes[:, 0], labels, strict=False):
             ax.set_ylabel(label)
@@ -100,16 +100,8 @@ def draw_histories(run: ReportData) -> CaptionedFigures:
             "The twin is free-running on the measured table acceleration; a chaotic motion cannot "
             "be reproduced sample by sample."
         )
-        yield f"histories_{hz:g}hz", f"Histories at {hz:g} Hz: {reason}", caption, figure
-
-
-def _measured_style(direction: str) -> dict[str, Any]:
-    """Return a wide line style, visible under a coincident twin line."""
-    return {"color": DIRECTION_COLOURS[direction], "lw": 2.2}
-
-
-def _twin_style(direction: str) -> dict[str, Any]:
-    return {"color": TWIN_COLOUR, "ls": DIRECTION_DASHES[direction], "lw": 0.8}
+        title = f"Histories at {hz:g} Hz: {reason}"
+        yield CaptionedFigure(f"histories_{hz:g}hz", title, caption, figure)
 
 
 def _gap_line_handles(run: ReportData) -> list[Line2D | Patch]:
@@ -119,41 +111,17 @@ def _gap_line_handles(run: ReportData) -> list[Line2D | Patch]:
     return [Line2D([], [], **REST_LINE_STYLE, label=name)]
 
 
-def _plot_history(run: ReportData, column: Any, motion: StepMotion, style: dict[str, Any]) -> None:
-    column[0].plot(motion.time, motion.u * 1e3, **style)
-    column[1].plot(motion.time, motion.a, **style)
-    for force in (motion.force_r, motion.force_l) if run.has_bumpers else ():
-        column[2].plot(motion.time, force / 1e3, **style)
-
-
-def _shade_contact(run: ReportData, column: Any, motion: StepMotion, colour: str) -> None:
-    """Shade the contact phases in every row."""
-    for force, alpha in ((motion.force_r, 0.22), (-motion.force_l, 0.10)):
-        for ax in column:
-            ax.fill_between(
-                motion.time, 0, 1, where=force > run.contact_n, transform=ax.get_xaxis_transform(),
-                color=colour, alpha=alpha, lw=0,
-            )  # fmt: skip
-
-
 def draw_loop_figures(run: ReportData) -> CaptionedFigures:
     """Draw phase portraits, inertia force loops and bumper loops (Figs. 3, 6, 9 and 11)."""
     mass = run.specimen.mass_kg if run.specimen else None
     columns = {hz: motions for hz in select_frequencies(run) if (motions := pair_motions(run, hz))}
 
-    def plot_portrait(ax: Axes, motion: StepMotion, style: dict[str, Any]) -> None:
-        ax.plot(motion.u * 1e3, motion.v * 1e3, **style)
-
-    def plot_inertia(ax: Axes, motion: StepMotion, style: dict[str, Any]) -> None:
-        ax.plot(motion.u * 1e3, -(mass or np.nan) * motion.a / 1e3, **style)
-
-    def plot_bumper(ax: Axes, motion: StepMotion, style: dict[str, Any]) -> None:
-        for force in (motion.force_r, motion.force_l):
-            touching = np.abs(force) > run.contact_n
-            ax.plot(motion.u * 1e3, np.where(touching, force, np.nan) / 1e3, **style)
+    def plot_inertia(ax: Axes, motion: StepMotion, **style: Any) -> None:
+        plot_inertia_loop(ax, motion, mass or np.nan, **style)
 
     yield from _draw_grid(
-        run, columns, plot_portrait, ("portraits", "Phase portraits", "$u$ in mm", "$u'$ in mm/s"),
+        run, columns, plot_phase_portrait,
+        ("portraits", "Phase portraits", "$u$ in mm", "$u'$ in mm/s"),
         "Relative velocity u' over relative displacement u, all measured cycles. The measured u' "
         "is a Savitzky-Golay derivative of u over 20 ms, used only in this figure.",
     )  # fmt: skip
@@ -165,7 +133,8 @@ def draw_loop_figures(run: ReportData) -> CaptionedFigures:
         )  # fmt: skip
     if run.has_bumpers:
         yield from _draw_grid(
-            run, columns, plot_bumper, ("bumpers", "Bumper loops", "$v_j$ in mm", "$F_j$ in kN"),
+            run, columns, plot_bumper_loops,
+            ("bumpers", "Bumper loops", "$v_j$ in mm", "$F_j$ in kN"),
             "Contact force over bumper position, right positive, left negative. In contact the "
             "bumper moves with the mass, v_j = u; flight is not shown.",
         )  # fmt: skip
@@ -174,7 +143,7 @@ def draw_loop_figures(run: ReportData) -> CaptionedFigures:
 def _draw_grid(
     run: ReportData,
     columns: dict[float, list[tuple[str, StepMotion | None, StepMotion | None]]],
-    plot: Callable[[Axes, StepMotion, dict[str, Any]], None],
+    plot: Callable[..., None],
     names: tuple[str, str, str, str],
     caption: str,
 ) -> CaptionedFigures:
@@ -196,19 +165,20 @@ def _draw_grid(
             ax.axhline(0, color=GUIDE_COLOUR, lw=0.5)
             ax.set_title(f"{hz:g} Hz {direction}")
             for motion, style in (
-                (measured, _measured_style(direction)),
-                (twin, _twin_style(direction)),
+                (measured, measured_style(direction)),
+                (twin, twin_style(direction)),
             ):
                 if motion is not None:
-                    plot(ax, motion, style)
-            if not any(np.isfinite(line.get_ydata()).any() for line in ax.lines[1:]):
+                    plot(ax, motion, **style)
+            if not any(np.isfinite(line.get_xydata()).all(axis=1).any() for line in ax.lines[1:]):
                 ax.text(
                     0.5, 0.6, "no contact", transform=ax.transAxes, ha="center", color=GUIDE_COLOUR
                 )
                 ax.set_yticks([0])
-            draw_gap_lines(run, ax.axvline)
+            if run.gaps_m is not None:
+                draw_rest_lines(run.gaps_m, ax.axvline)
         column[-1].set_xlabel(names[2])
     for ax in axes[:, 0]:
         ax.set_ylabel(names[3])
     draw_legend(run, figure, *_gap_line_handles(run))
-    yield names[0], names[1], caption, figure
+    yield CaptionedFigure(names[0], names[1], caption, figure)

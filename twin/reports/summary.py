@@ -2,8 +2,8 @@
 
 import json
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -148,6 +148,38 @@ def _step_entry(point: PrcPoint) -> Json:
         "table_acc_fundamental_m_s2": point.table_acc_fundamental_m_s2,
         "thd": point.thd,
     }
+
+
+def prc_points(steps: Iterable[Json]) -> list[PrcPoint]:
+    """Return the PRC points of a summary's steps; a number that is missing or null is NaN."""
+    return [
+        PrcPoint(
+            0, step["index"], step["direction"], step["frequency_hz"],
+            _parse_response(step.get("measured")), _parse_response(step.get("twin")),
+            *(
+                number_or_nan(step.get(name))
+                for name in ("table_acc_peak_m_s2", "table_acc_fundamental_m_s2", "thd")
+            ),
+        )
+        for step in steps
+    ]  # fmt: skip
+
+
+def _parse_response(values: Json | None) -> NormalizedResponse | None:
+    if values is None:
+        return None
+    known: Json = {
+        field.name: tuple(values.get(field.name) or ())
+        if field.name.startswith("impacts")
+        else number_or_nan(values.get(field.name))
+        for field in fields(NormalizedResponse)
+    }
+    return NormalizedResponse(**known)
+
+
+def number_or_nan(value: float | None) -> float:
+    """Return a number of a summary; NaN for null, as JSON has no NaN."""
+    return math.nan if value is None else value
 
 
 def _level_entry(point: PrcPoint, levels: tuple[Level, ...]) -> Json:

@@ -1,6 +1,5 @@
 """Figure of resonance, hysteresis and jumps of a model over the gap."""
 
-from collections.abc import Iterator
 from itertools import pairwise
 
 from matplotlib.axes import Axes
@@ -8,8 +7,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from twin.reports.figures import HYSTERESIS_COLOURS
-from twin.reports.step_figures import DIRECTION_COLOURS
+from twin.reports.plot_style import (
+    DIRECTION_COLOURS,
+    HYSTERESIS_COLOURS,
+    TWIN_COLOUR,
+    CaptionedFigure,
+    CaptionedFigures,
+)
 from twin.reports.summary import Json
 
 MIN_GAPS = 3  # fewest finite gaps for which the figure is drawn
@@ -21,7 +25,7 @@ CAPTION = (
 )
 
 
-def draw_gap_figure(label: str, entries: list[Json]) -> Iterator[tuple[str, str, str, Figure]]:
+def draw_gap_figure(label: str, entries: list[Json]) -> CaptionedFigures:
     """Draw one figure from the summary entries of the cases of one model."""
     cases = sorted((entry for entry in entries if entry["gap_mm"] != "inf" and entry["peak"]),
                    key=lambda entry: float(entry["gap_mm"]))  # fmt: skip
@@ -30,18 +34,18 @@ def draw_gap_figure(label: str, entries: list[Json]) -> Iterator[tuple[str, str,
     figure = Figure(figsize=(11, 6.4))
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1, 2))
     gaps = [case["gap_mm"] for case in cases]
-    top.plot(gaps, [case["peak"]["eta_d"] for case in cases], "o-", color="#111111")
+    top.plot(gaps, [case["peak"]["eta_d"] for case in cases], "o-", color=TWIN_COLOUR)
     top.set_ylabel(r"largest $\eta_d$")
     top.set_ylim(bottom=0)
     width = 0.7 * min(b - a for a, b in pairwise(gaps))
     for case in cases:
         _plot_branches(bottom, case, width)
     bottom.plot(gaps, [case["peak"]["frequency_hz"] for case in cases], "o-", ms=3, lw=0.8,
-                color="#111111", zorder=3)  # fmt: skip
+                color=TWIN_COLOUR, zorder=3)  # fmt: skip
     bottom.set_ylabel("frequency in Hz")
     bottom.set_xlabel("total gap in mm")
     figure.legend(handles=_legend_handles(cases), loc="outside upper center", ncols=4)
-    yield f"gaps_{label}", f"{label} over the gap", CAPTION, figure
+    yield CaptionedFigure(f"gaps_{label}", f"{label} over the gap", CAPTION, figure)
 
 
 def _plot_branches(ax: Axes, case: Json, width: float) -> None:
@@ -74,7 +78,7 @@ def _plot_branches(ax: Axes, case: Json, width: float) -> None:
 def _legend_handles(cases: list[Json]) -> list[Line2D | Patch]:
     """Return legend handles of the plotted kinds only."""
     handles: list[Line2D | Patch] = [
-        Line2D([], [], color="#111111", marker="o", ms=3, label=r"largest $\eta_d$")
+        Line2D([], [], color=TWIN_COLOUR, marker="o", ms=3, label=r"largest $\eta_d$")
     ]
     kinds = sorted({interval["kind"] for case in cases for interval in case["hysteresis"]})
     handles += [

@@ -7,7 +7,6 @@ twin of `twin_figures`.
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
@@ -27,12 +26,15 @@ from twin.reports.discovery.force_figures import draw_force_histories, draw_resi
 from twin.reports.discovery.free_running import FreeRuns
 from twin.reports.discovery.serialize import Json
 from twin.reports.discovery.twin_figures import draw_free_running
-from twin.reports.figures import RC_PARAMS, Picture
-from twin.reports.step_figures import (
+from twin.reports.plot_style import (
     DIRECTION_COLOURS,
     FIGURE_WIDTH_IN,
     GUIDE_COLOUR,
+    TWIN_COLOUR,
+    CaptionedFigure,
     CaptionedFigures,
+    Picture,
+    save_figures,
 )
 
 MAX_LOGS, MAX_BARS, MAX_TICKS = 6, 24, 24
@@ -55,24 +57,16 @@ def draw_discovery_figures(
     view: DiscoveryView, verdict: Json, runs: dict[int, FreeRuns], folder: Path
 ) -> dict[str, list[Picture]]:
     """Draw all figures as PNG files in `folder`; return them by section of the page."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with mpl.rc_context(RC_PARAMS):
-        drawn = {
+    return {
+        section: save_figures(figures, folder)
+        for section, figures in {
             "where": _draw_maps(view), "candidates": _draw_candidates(verdict),
             "forces": draw_residual_forces(view),
             "histories": draw_force_histories(view),
             "twin": draw_free_running(view, runs, select_logs(view)),
             "time": _draw_time(view),
-        }  # fmt: skip
-        return {
-            section: [_save_figure(folder, *drawing) for drawing in pictures]
-            for section, pictures in drawn.items()
-        }
-
-
-def _save_figure(folder: Path, name: str, title: str, caption: str, figure: Figure) -> Picture:
-    figure.savefig(folder / f"{name}.png")
-    return Picture(folder / f"{name}.png", title, caption)
+        }.items()
+    }  # fmt: skip
 
 
 def select_logs(view: DiscoveryView) -> list[int]:
@@ -100,7 +94,8 @@ def _draw_maps(view: DiscoveryView) -> CaptionedFigures:
                 "standard errors). Hatched: the measured motion is aperiodic (chaos, transient); "
                 "forces on the measured motion remain comparable."
             )
-            yield f"map_{number}", f"Residual map{view.title_suffix(number)}", caption, figure
+            title = f"Residual map{view.title_suffix(number)}"
+            yield CaptionedFigure(f"map_{number}", title, caption, figure)
 
 
 def _draw_map(
@@ -127,7 +122,7 @@ def _draw_map(
                 shaded, norm=norm, cmap="YlOrRd", aspect="auto", interpolation="nearest"
             )
             y, x = np.nonzero((errors > MIN_CELL_SIGMA) & (excess > 0))
-            ax.plot(x, y, "o", color="#111111", ms=1.8)
+            ax.plot(x, y, "o", color=TWIN_COLOUR, ms=1.8)
             _style_map_axes(ax, residuals, steps, phases)
         axes[0, column].set_title(("before: the model alone", "after")[column], pad=14)
         _label_map_rows(axes[:, column].tolist(), list(rows))
@@ -214,7 +209,7 @@ def _draw_candidates(verdict: Json) -> CaptionedFigures:
             f"{candidate['held_out_error']:.3g}{_format_doubts(candidate)}",
             (candidate["held_out_error"], y),
             (-4 if inside else 4, 0), textcoords="offset points", va="center", size=7.5,
-            ha="right" if inside else "left", color="#111111" if inside else GUIDE_COLOUR,
+            ha="right" if inside else "left", color=TWIN_COLOUR if inside else GUIDE_COLOUR,
         )  # fmt: skip
     ax.set_yticks(
         range(len(sets)),
@@ -228,14 +223,14 @@ def _draw_candidates(verdict: Json) -> CaptionedFigures:
         ax.set_xlim(0.7 * min(best, floor), 2 * sets[-1]["held_out_error"])
     else:
         ax.set_xlim(0, 1.15 * max(sets[-1]["held_out_error"], floor))
-    ax.axvline(floor, color="#111111", ls="--", lw=1)
+    ax.axvline(floor, color=TWIN_COLOUR, ls="--", lw=1)
     ax.grid(visible=False, axis="y")
     ax.set_xlabel("rms of measured minus model over the noise, held out")
     kinds = {"nothing added": BEFORE_COLOUR, "selected": BEST_COLOUR,
              "other effects": "#9db7d5", "with a generic term": GENERIC_COLOUR}  # fmt: skip
     colours = {_bar_colour(candidate, null, added_ids) for candidate in sets}
     handles = [Patch(color=c, label=text) for text, c in kinds.items() if c in colours]
-    all_handles = [*handles, Line2D([], [], color="#111111", ls="--", label="noise floor")]
+    all_handles = [*handles, Line2D([], [], color=TWIN_COLOUR, ls="--", label="noise floor")]
     figure.legend(handles=all_handles, loc="outside upper center", ncols=5)
     hidden_count = len(candidates) - len(sets)
     caption = (
@@ -245,7 +240,7 @@ def _draw_candidates(verdict: Json) -> CaptionedFigures:
         "significant."
     )
     caption += f" {hidden_count} worse sets are not drawn." if hidden_count > 0 else ""
-    yield "candidates", "Candidate effects", caption, figure
+    yield CaptionedFigure("candidates", "Candidate effects", caption, figure)
 
 
 def _format_doubts(candidate: Json) -> str:
@@ -286,14 +281,14 @@ def _draw_time(view: DiscoveryView) -> CaptionedFigures:
                 ax.yaxis.set_minor_formatter("")
         for ax, name in zip(axes, rows, strict=True):
             floor, (low, high) = view.discovery.verdict.floor, ax.get_ylim()
-            ax.axhline(floor, color="#111111", ls="--", lw=0.9)
+            ax.axhline(floor, color=TWIN_COLOUR, ls="--", lw=0.9)
             ax.set_ylim(min(low, 0.08 * floor), max(high, 12 * floor))
             ax.set_ylabel(name)
         axes[-1].set_xlabel("time in s")
         handles = [
             Line2D([], [], color=BEFORE_COLOUR, marker="o", mfc="none", ls="", label="before"),
             Line2D([], [], color=AFTER_COLOUR, marker="o", ls="", label="after"),
-            Line2D([], [], color="#111111", ls="--", label="noise floor"),
+            Line2D([], [], color=TWIN_COLOUR, ls="--", label="noise floor"),
         ]
         figure.legend(handles=handles, loc="outside upper center", ncols=3)
         caption = (
@@ -302,7 +297,7 @@ def _draw_time(view: DiscoveryView) -> CaptionedFigures:
             "a variation with the steps does not."
         )
         title = f"Residual over time{view.title_suffix(number)}"
-        yield f"time_{number}", title, caption, figure
+        yield CaptionedFigure(f"time_{number}", title, caption, figure)
 
 
 def _block_means(

@@ -21,16 +21,17 @@ from twin.reports.discovery.figure_data import (
     measured_forces,
     select_close_ups,
 )
-from twin.reports.step_figures import (
+from twin.reports.plot_style import (
     DIRECTION_COLOURS,
     FIGURE_WIDTH_IN,
     GUIDE_COLOUR,
+    SIDE_COLOURS,
     TWIN_COLOUR,
+    CaptionedFigure,
     CaptionedFigures,
 )
 
-LEFT_COLOUR = "#1559b0"  # of a bumper loop; the right side is red
-Curve = tuple[Float1D, Float1D]
+SIDES = ("right", "left")  # of residual rows 1 and 2
 
 
 def draw_residual_forces(view: DiscoveryView) -> CaptionedFigures:
@@ -112,7 +113,8 @@ def _draw_damper(
     for ax, (label, *_) in zip(axes[-1], columns, strict=True):
         ax.set_xlabel(label)
     _add_legend(figure, view, [("measured minus model", DIRECTION_COLOURS["forward"])])
-    yield "damper_force", "Damper force, measured minus model", _format_caption(view), figure
+    title = "Damper force, measured minus model"
+    yield CaptionedFigure("damper_force", title, _format_caption(view), figure)
 
 
 def _draw_bumpers(
@@ -133,7 +135,7 @@ def _draw_bumpers(
                 entries_to_samples(residuals, row, values, parameters)[close_up.samples]
                 for values in entries
             )
-            colour = (DIRECTION_COLOURS["forward"], LEFT_COLOUR)[row - 1]
+            colour = SIDE_COLOURS[SIDES[row - 1]]
             x = depth[close_up.samples]
             for ax, y in zip(pair, (wanted, remaining), strict=True):
                 _draw_loop(ax, (x, y), colour)
@@ -143,13 +145,13 @@ def _draw_bumpers(
         for ax, text in zip(pair, ("before", "after"), strict=True):
             ax.set_title(text, loc="right", color=GUIDE_COLOUR)
             ax.set_xlabel("depth in mm")
-    names = [("right bumper", DIRECTION_COLOURS["forward"]), ("left bumper", LEFT_COLOUR)]
-    _add_legend(figure, view, [names[row - 1] for row in sides])
+    names = [SIDES[row - 1] for row in sides]
+    _add_legend(figure, view, [(f"{side} bumper", SIDE_COLOURS[side]) for side in names])
     caption = f"{_format_caption(view)} Depth: u beyond the gap stated in the log."
-    yield "bumper_force", "Bumper forces, measured minus model", caption, figure
+    yield CaptionedFigure("bumper_force", "Bumper forces, measured minus model", caption, figure)
 
 
-def _draw_loop(ax: Axes, curve: Curve, colour: str) -> None:
+def _draw_loop(ax: Axes, curve: tuple[Float1D, Float1D], colour: str) -> None:
     ax.axhline(0, color=GUIDE_COLOUR, lw=0.6)
     ax.plot(*curve, ".", color=colour, ms=3.2, alpha=0.6, mew=0)
 
@@ -206,7 +208,7 @@ def draw_force_histories(view: DiscoveryView) -> CaptionedFigures:
         "without these samples. Samples that are not used have no line: near contact and "
         "release, and bumper forces without contact."
     )
-    yield "histories", "Force histories, held out", caption, figure
+    yield CaptionedFigure("histories", "Force histories, held out", caption, figure)
 
 
 def _find_best_close_up(view: DiscoveryView, residuals: LogResiduals) -> CloseUp | None:

@@ -12,12 +12,17 @@ from twin.identification.identify import IdentificationResult
 from twin.identification.parameters import ZERO_PREFIX
 from twin.identification.residuals import LogResiduals
 from twin.reports.discovery.serialize import INTERVAL_SIGMA
-from twin.reports.figures import RC_PARAMS
-from twin.reports.step_figures import DIRECTION_COLOURS, FIGURE_WIDTH_IN, GUIDE_COLOUR, TWIN_COLOUR
+from twin.reports.plot_style import (
+    DIRECTION_COLOURS,
+    FIGURE_WIDTH_IN,
+    GUIDE_COLOUR,
+    RC_PARAMS,
+    SIDE_COLOURS,
+    TWIN_COLOUR,
+)
 
 MAX_POINTS = 6000  # of a scatter plot
 CLOUD_STYLE = {"ls": "", "marker": ".", "ms": 1.6, "mew": 0, "alpha": 0.6, "rasterized": True}
-SIDE_COLOUR = {"right": DIRECTION_COLOURS["forward"], "left": DIRECTION_COLOURS["backward"]}
 
 
 def draw_identification_figures(result: IdentificationResult, folder: Path) -> None:
@@ -79,10 +84,10 @@ def _draw_bumpers(result: IdentificationResult, residuals: LogResiduals, ax: Axe
         if not samples.size:
             continue
         depth = sign * m.u[samples] - fitted_gap(residuals, result.fit, side)
-        ax.plot(1e3 * depth, force[samples], color=SIDE_COLOUR[side], **CLOUD_STYLE | {"ms": 3.2})  # type: ignore[arg-type]
+        ax.plot(1e3 * depth, force[samples], color=SIDE_COLOURS[side], **CLOUD_STYLE | {"ms": 3.2})  # type: ignore[arg-type]
         law = k * depth + c * sign * m.v[samples]
         ax.plot(1e3 * depth, law, color=TWIN_COLOUR, **CLOUD_STYLE | {"ms": 0.8})  # type: ignore[arg-type]
-        ax.plot([], [], ".", color=SIDE_COLOUR[side], label=f"{side}, measured")
+        ax.plot([], [], ".", color=SIDE_COLOURS[side], label=f"{side}, measured")
         deepest = max(deepest, float(depth.max()))
     if deepest:
         line = np.array([0.0, deepest])
@@ -109,13 +114,13 @@ def _draw_onsets(result: IdentificationResult, residuals: LogResiduals, ax: Axes
         is_onset = gaps.kind == "onset"
         ax.hist(
             1e3 * near, 30, histtype="stepfilled" if is_onset else "step",
-            color=SIDE_COLOUR[gaps.side],
+            color=SIDE_COLOURS[gaps.side],
             alpha=0.45 if is_onset else 1.0, label=f"{gaps.side} {gaps.kind}s, {gaps.gaps.size}",
         )  # fmt: skip
     for side in ("right", "left"):
         gap = 1e3 * fitted_gap(residuals, result.fit, side)
         if np.isfinite(gap) and log_gaps:
-            ax.axvline(gap, color=SIDE_COLOUR[side], ls="--" if side == "left" else "-", lw=1.2)
+            ax.axvline(gap, color=SIDE_COLOURS[side], ls="--" if side == "left" else "-", lw=1.2)
     if log_gaps:
         ax.legend(loc="upper left", fontsize=7)
     else:

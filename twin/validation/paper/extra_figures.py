@@ -7,8 +7,8 @@ from twin.reports.measured_campaign import MeasuredCampaign
 from twin.reports.plot_style import (
     GUIDE_COLOUR,
     HYSTERESIS_COLOURS,
-    PaperFigure,
-    PaperFigures,
+    CaptionedFigure,
+    CaptionedFigures,
     label_panel,
 )
 from twin.validation.paper.study import CHAOS_SCAN_HZ, DETAIL_HZ, PaperStudy
@@ -16,7 +16,7 @@ from twin.validation.paper.study import CHAOS_SCAN_HZ, DETAIL_HZ, PaperStudy
 MAX_BARS = 6  # impact combinations shown in a panel
 
 
-def draw_chaos_figure(study: PaperStudy, campaign: MeasuredCampaign | None) -> PaperFigures:
+def draw_chaos_figure(study: PaperStudy, campaign: MeasuredCampaign | None) -> CaptionedFigures:
     """Draw Lyapunov exponents and impact distributions of G4, for the model only."""
     if campaign is not None:
         return
@@ -41,8 +41,8 @@ def draw_chaos_figure(study: PaperStudy, campaign: MeasuredCampaign | None) -> P
         label_panel(ax_share, "bcde"[index], f"{hz:g} Hz")
         if index == 0:
             ax_share.set_ylabel("share of cycles in %")
-    yield PaperFigure(
-        "beside_chaos", "", "In addition to the paper: chaos and impacts of G4",
+    yield CaptionedFigure(
+        "beside_chaos", "In addition to the paper: chaos and impacts of G4",
         "a Largest Lyapunov exponent of the model over frequency; dashed: the paper's frequencies. "
         "b–e Impacts right/left per forcing cycle, over 3000 cycles from rest. Two solvers, or a "
         "solver and a rig, can agree here in distribution only.",

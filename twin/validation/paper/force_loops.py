@@ -8,26 +8,28 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from twin.reports.measured_campaign import MeasuredCampaign
-from twin.reports.paper_cases import PaperCase
-from twin.reports.players import SystemMotion
-from twin.reports.plot_style import (
-    DIRECTION_COLOURS,
-    DIRECTIONS,
-    GAP_COLOURS,
-    GUIDE_COLOUR,
-    REST_LINE_STYLE,
-    UNSTABLE_STYLE,
-    PaperFigure,
-    PaperFigures,
-    direction_handles,
-    draw_obstacles,
-    experiment_style,
-    format_minus,
-    label_panel,
+from twin.reports.motion_drawing import (
+    draw_rest_lines,
     plot_bumper_loops,
     plot_inertia_loop,
     shade_contact,
 )
+from twin.reports.paper_cases import PaperCase
+from twin.reports.players import SystemMotion
+from twin.reports.plot_style import (
+    DIRECTION_COLOURS,
+    GAP_COLOURS,
+    GUIDE_COLOUR,
+    REST_LINE_STYLE,
+    UNSTABLE_STYLE,
+    CaptionedFigure,
+    CaptionedFigures,
+    direction_handles,
+    experiment_style,
+    format_minus,
+    label_panel,
+)
+from twin.reports.report_data import DIRECTIONS
 from twin.validation.paper.findings import find_coexisting_orbits
 from twin.validation.paper.study import COEXISTING_HZ, PaperStudy
 
@@ -53,7 +55,9 @@ class ResonantMotions:
         return f"{name}, $f$ = {self.hz:.4g} Hz{note}"
 
 
-def draw_paper_loop_figures(study: PaperStudy, campaign: MeasuredCampaign | None) -> PaperFigures:
+def draw_paper_loop_figures(
+    study: PaperStudy, campaign: MeasuredCampaign | None
+) -> CaptionedFigures:
     """Draw Figs. 3, 6, 7 and 8, for the model only."""
     if campaign is not None:
         return
@@ -98,7 +102,7 @@ def _take_first_cycle(motion: SystemMotion) -> SystemMotion:
     return SystemMotion(*(getattr(motion, name)[:end] for name in SystemMotion.__slots__))
 
 
-def _draw_gap_comparison(study: PaperStudy) -> PaperFigure:
+def _draw_gap_comparison(study: PaperStudy) -> CaptionedFigure:
     figure = Figure(figsize=(11, 5.6))
     mass_ax, bumper_ax = figure.subplots(1, 2)
     insets = [
@@ -117,14 +121,14 @@ def _draw_gap_comparison(study: PaperStudy) -> PaperFigure:
                 continue
             plot_bumper_loops(ax, motion, True, **style)
             if case.parameters.gap_r > 0:
-                draw_obstacles(case.parameters, ax.axvline, **{**style, "lw": 0.8})
+                draw_rest_lines(case.gaps_m, ax.axvline, **{**style, "lw": 0.8})
         if 0 < case.parameters.gap_r < 1:
-            draw_obstacles(case.parameters, mass_ax.axvline, **{**style, "lw": 0.8})
+            draw_rest_lines(case.gaps_m, mass_ax.axvline, **{**style, "lw": 0.8})
     for inset in insets:
         inset.set_xlim(-ZOOM_MM, ZOOM_MM)
         inset.set_ylim(-3.9, 3.9)
         inset.tick_params(labelsize=7)
-        inset.set_title("small gaps", size=8)
+        inset.set_title("small gaps", size=8, loc="center")
         inset.set_zorder(3)
     label_panel(mass_ax, "a", "Mass")
     label_panel(bumper_ax, "b", "Bumpers")
@@ -136,11 +140,11 @@ def _draw_gap_comparison(study: PaperStudy) -> PaperFigure:
     handles.append(Line2D([], [], **REST_LINE_STYLE, label="bumper at rest"))
     figure.legend(handles=handles, loc="outside upper center", ncols=10)
     peaks = ", ".join(f"{format_minus(n)} {study.slow_sweeps[n].peak_hz:.2f}" for n in study.cases)
-    return PaperFigure(
-        "fig03_loops", "3", "Loops in primary resonance, all gaps",
+    return CaptionedFigure(
+        "fig03_loops", "Loops in primary resonance, all gaps",
         "Force-displacement cycles in steady primary resonance: a mass, b bumpers. Dashed: initial "
         f"position of the bumpers for G > 0. Frequencies of the largest η_d in Hz: {peaks}.",
-        figure,
+        figure, "3",
     )  # fmt: skip
 
 
@@ -152,7 +156,7 @@ def _label_axes(ax: Axes, x_label: str, y_label: str) -> None:
 
 def _draw_loops(
     study: PaperStudy, resonances: list[ResonantMotions], names: tuple[str, str]
-) -> PaperFigure:
+) -> CaptionedFigure:
     """Draw loops of the mass (top row) and the bumpers (bottom row), one column per gap."""
     figure = Figure(figsize=(3.9 * len(resonances) + (0 if len(resonances) > 2 else 1), 7.4))
     axes = figure.subplots(2, len(resonances), squeeze=False)
@@ -178,8 +182,8 @@ def _draw_loops(
             plot_inertia_loop(top, motion, p.mass, True, **UNSTABLE_STYLE)
             plot_bumper_loops(bottom, motion, True, **UNSTABLE_STYLE)
         if p.gap_r > 0:
-            draw_obstacles(p, top.axvline)
-            draw_obstacles(p, bottom.axvline)
+            draw_rest_lines(resonance.case.gaps_m, top.axvline)
+            draw_rest_lines(resonance.case.gaps_m, bottom.axvline)
         _label_axes(top, "$u$ in mm", "$F_I$ in kN" if column == 0 else "")
         _label_axes(bottom, "$v_j$ in mm", "$F_j$ in kN" if column == 0 else "")
     handles = direction_handles(experiment_style)
@@ -187,8 +191,8 @@ def _draw_loops(
         handles.append(Line2D([], [], **UNSTABLE_STYLE, label="unstable, between the two"))
     figure.legend(handles=handles, loc="outside upper center", ncols=3)
     gap_names = ", ".join(format_minus(resonance.case.name) for resonance in resonances)
-    return PaperFigure(
-        names[1], names[0], f"Loops in resonance: {gap_names}",
+    return CaptionedFigure(
+        names[1], f"Loops in resonance: {gap_names}",
         "Force-displacement cycles in steady resonance, forward (red) and backward (blue): top mass"
         ", bottom bumpers. "
         + ("Dotted: the unstable motion between two stable ones, which an open-loop test cannot "
@@ -196,7 +200,7 @@ def _draw_loops(
            if study.is_exact else "")
         + "Where the model's resonance differs from the experiment's, the model is drawn at its "
         "own frequency and the paper's is given in the title.",
-        figure,
+        figure, names[0],
     )  # fmt: skip
 
 
@@ -209,16 +213,16 @@ def _describe_forward_motion(resonances: list[ResonantMotions]) -> str:
     return "exceeds it, and leaves a bumper for a moment" if detaches else "does so too"
 
 
-def _draw_histories(resonances: list[ResonantMotions]) -> PaperFigure:
+def _draw_histories(resonances: list[ResonantMotions]) -> CaptionedFigure:
     figure = Figure(figsize=(11, 8.4))
     for row, (ax, resonance) in enumerate(zip(figure.subplots(3, 1), resonances, strict=True)):
         label_panel(ax, "abc"[row], resonance.title)
         for direction in DIRECTIONS:
             motion = resonance.motions[direction]
             ax.plot(motion.time, motion.u * 1e3, **experiment_style(direction, 1.8))
-            shade_contact(ax, motion, DIRECTION_COLOURS[direction], alpha=0.13)
+            shade_contact(ax, motion, DIRECTION_COLOURS[direction], (0.13, 0.13))
         if resonance.case.parameters.gap_r:
-            draw_obstacles(resonance.case.parameters, ax.axhline)
+            draw_rest_lines(resonance.case.gaps_m, ax.axhline)
         else:
             ax.axhline(0, **REST_LINE_STYLE)
         ax.set_xlim(0, HISTORY_CYCLES / resonance.hz)
@@ -229,12 +233,12 @@ def _draw_histories(resonances: list[ResonantMotions]) -> PaperFigure:
         Line2D([], [], **REST_LINE_STYLE, label="gap, or pre-strain"),
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=3)
-    return PaperFigure(
-        "fig07_histories", "7", "Relative displacement in resonance",
+    return CaptionedFigure(
+        "fig07_histories", "Relative displacement in resonance",
         "Time histories of u in steady condition: a G4 in the right hysteresis, b G0, c G−1 in the "
         "left hysteresis. Dashed: a, b the initial gap, c the pre-strain of the bumpers. Vertical "
         "bands: contact with each bumper, red forward, blue backward, darker where both touch. In "
         "the paper's c the forward motion stays within the pre-strain; the model's "
         f"{_describe_forward_motion(resonances)}.",
-        figure,
+        figure, "7",
     )  # fmt: skip

@@ -1,23 +1,20 @@
 """Figures, HTML page and paper.json of the comparison."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
-
 from twin.model.config import ModelConfig
-from twin.reports.figures import Picture
 from twin.reports.measured_campaign import MeasuredCampaign
 from twin.reports.page import embed_images, render_page
-from twin.reports.plot_style import PAPER_RC_PARAMS, PaperFigure
+from twin.reports.plot_style import CaptionedFigures, Picture, save_figures
+from twin.reports.prc_families import draw_all_gaps, draw_transition
 from twin.reports.summary import dump_strict_json
 from twin.run.run_config import read_model
 from twin.validation.paper.extra_figures import draw_chaos_figure
 from twin.validation.paper.force_loops import draw_paper_loop_figures
 from twin.validation.paper.frequency_figures import draw_frequency_figures
-from twin.validation.paper.prc_figures import draw_prc_figures
 from twin.validation.paper.rows import ComparisonRow
 from twin.validation.paper.secondary_resonances import draw_secondary_resonance_figure
 from twin.validation.paper.study import PaperStudy
@@ -31,26 +28,33 @@ def draw_paper_figures(
     study: PaperStudy, campaign: MeasuredCampaign | None, folder: Path, report: ProgressReporter
 ) -> list[Picture]:
     """Draw the figures in the paper's order: of the model, or with the points of a campaign."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with mpl.rc_context(PAPER_RC_PARAMS):
-        figures: list[PaperFigure] = []
+    pictures = save_figures(_draw_in_order(study, campaign), folder)
+    for picture in pictures:
+        report(f"{picture.path}")
+    return pictures
+
+
+def _draw_in_order(study: PaperStudy, campaign: MeasuredCampaign | None) -> CaptionedFigures:
+    figures = [
+        figure
         for draw in (
-            draw_prc_figures,
+            _draw_prc_families,
             draw_paper_loop_figures,
             draw_secondary_resonance_figure,
             draw_frequency_figures,
             draw_chaos_figure,
-        ):
-            figures += draw(study, campaign)
-        figures.sort(key=lambda figure: FIGURE_ORDER.index(figure.number))
-        pictures = []
-        for figure in figures:
-            path = folder / f"{figure.name}.png"
-            figure.figure.savefig(path)
-            report(f"{path}")
-            title = f"Figure {figure.number}. {figure.title}" if figure.number else figure.title
-            pictures.append(Picture(path, title, figure.caption))
-    return pictures
+        )
+        for figure in draw(study, campaign)
+    ]
+    for figure in sorted(figures, key=lambda figure: FIGURE_ORDER.index(figure.number)):
+        prefix = f"Figure {figure.number}. " if figure.number else ""
+        yield replace(figure, title=f"{prefix}{figure.title}")
+
+
+def _draw_prc_families(study: PaperStudy, campaign: MeasuredCampaign | None) -> CaptionedFigures:
+    """Draw Figs. 2 and 5; with a campaign, its measured points on the model's curves."""
+    yield draw_all_gaps(study.cases, campaign)
+    yield draw_transition(study.cases, campaign)
 
 
 @dataclass(frozen=True, slots=True)

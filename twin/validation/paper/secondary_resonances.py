@@ -1,27 +1,36 @@
 """Secondary resonances of G4 in the low frequency range (Fig. 9)."""
 
+from functools import partial
 from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from twin.reports.measured_campaign import MeasuredCampaign
-from twin.reports.paper_cases import PaperCase, extract_prc
+from twin.reports.motion_drawing import (
+    draw_rest_lines,
+    plot_bumper_loops,
+    plot_history,
+    plot_inertia_loop,
+    plot_phase_portrait,
+    shade_contact,
+)
+from twin.reports.paper_cases import PaperCase
 from twin.reports.players import SystemMotion
 from twin.reports.plot_style import (
     DIRECTION_COLOURS,
-    DIRECTIONS,
     GUIDE_COLOUR,
-    PaperFigure,
-    PaperFigures,
+    CaptionedFigure,
+    CaptionedFigures,
+    LineStyle,
     direction_handles,
-    draw_obstacles,
     experiment_style,
     label_panel,
-    plot_bumper_loops,
-    plot_inertia_loop,
-    plot_phase_portrait,
+    measured_style,
 )
+from twin.reports.prc_drawing import ETA_A, make_prc_panels, plot_prc
+from twin.reports.report_data import DIRECTIONS, extract_prc
 from twin.validation.paper.study import SECONDARY_HZ, PaperStudy
 
 SWEEP_RANGES = (  # name, start and stop in Hz, colour, position of the label in Hz
@@ -34,7 +43,7 @@ SHOWN_CYCLES = 2  # cycles shown in the histories
 
 def draw_secondary_resonance_figure(
     study: PaperStudy, campaign: MeasuredCampaign | None
-) -> PaperFigures:
+) -> CaptionedFigures:
     """Draw Fig. 9, for the model only."""
     if campaign is not None:
         return
@@ -57,14 +66,14 @@ def draw_secondary_resonance_figure(
     for column, pair in enumerate(motions):
         _draw_histories(axes[:, column], pair, case, column)
     figure.legend(handles=direction_handles(experiment_style), loc="outside upper center", ncols=2)
-    yield PaperFigure(
-        "fig09_secondary", "9", "Secondary resonances of G4",
+    yield CaptionedFigure(
+        "fig09_secondary", "Secondary resonances of G4",
         "a PRC of η_a with the ranges of the three sweeps and the three observed resonances; "
         "b–d phase portraits, e–g inertia force against u, h–j contact force against bumper "
         f"position, over the {MEASURED_CYCLES} measured cycles; k–m u, n–p total acceleration, "
         "q–s contact forces over time. Red bands: the contacts within one forcing cycle of the "
         f"forward sweep. Dashed: the gap. {_describe_chaos(study)}",
-        figure,
+        figure, "9",
     )  # fmt: skip
 
 
@@ -83,17 +92,8 @@ def _draw_prc(ax: Axes, case: PaperCase) -> None:
             name, (label_hz, 0.06), xycoords=("data", "axes fraction"), ha="center", size=9,
             color="#333333",
         )  # fmt: skip
-    for direction, size in (("forward", 4.2), ("backward", 2.4)):
-        frequencies, values = extract_prc(case.points, "twin", direction, "eta_a")
-        ax.plot(
-            frequencies,
-            values,
-            "o-",
-            color=DIRECTION_COLOURS[direction],
-            ms=size,
-            lw=size / 3,
-            mew=0,
-        )
+    panels = make_prc_panels(np.array([[ax]]), (ETA_A,))
+    plot_prc(panels, partial(extract_prc, case.points, "twin"), _dotted_style)
     for number, hz in enumerate(SECONDARY_HZ, 1):
         ax.axvline(hz, color="#111111", ls=(0, (4, 2)), lw=1)
         ax.annotate(
@@ -101,21 +101,22 @@ def _draw_prc(ax: Axes, case: PaperCase) -> None:
             textcoords="offset points", va="top", size=9,
         )  # fmt: skip
     ax.set_xlim(0.4, 5.05)
-    ax.set_ylim(bottom=0)
-    ax.set_xlabel("$f$ in Hz")
-    ax.set_ylabel(r"$\eta_a$")
     label_panel(ax, "a")
+
+
+def _dotted_style(direction: str) -> LineStyle:
+    size = 4.2 if direction == "forward" else 2.4
+    return {**measured_style(direction, size / 3), "marker": "o", "ms": size, "mew": 0}
 
 
 def _draw_loops(
     rows: list[Axes], pair: dict[str, SystemMotion], case: PaperCase, column: int
 ) -> None:
-    p = case.parameters
     for direction in DIRECTIONS:
         style = experiment_style(direction, 1.0)
         plot_phase_portrait(rows[0], pair[direction], **style)
-        plot_inertia_loop(rows[1], pair[direction], p.mass, False, **style)
-        plot_bumper_loops(rows[2], pair[direction], False, **style)
+        plot_inertia_loop(rows[1], pair[direction], case.parameters.mass, **style)
+        plot_bumper_loops(rows[2], pair[direction], **style)
     names = ("bcd", "efg", "hij")
     labels = (
         ("$u$ in mm", "$u'$ in mm/s"), ("$u$ in mm", "$F_I$ in kN"), ("$v_j$ in mm", "$F_j$ in kN"),
@@ -123,7 +124,7 @@ def _draw_loops(
     for ax, letters, (x_label, y_label) in zip(rows, names, labels, strict=True):
         title = f"$f_{column + 1}$ = {SECONDARY_HZ[column]:g} Hz" if letters == "bcd" else ""
         label_panel(ax, letters[column], title)
-        draw_obstacles(p, ax.axvline)
+        draw_rest_lines(case.gaps_m, ax.axvline)
         ax.axhline(0, color=GUIDE_COLOUR, lw=0.5, zorder=0.6)
         ax.set_xlabel(x_label)
         ax.set_ylabel(y_label if column == 0 else "")
@@ -132,25 +133,17 @@ def _draw_loops(
 def _draw_histories(axes: Any, pair: dict[str, SystemMotion], case: PaperCase, column: int) -> None:
     hz = SECONDARY_HZ[column]
     for direction in DIRECTIONS:
-        style, motion = experiment_style(direction, 1.0), pair[direction]
-        axes[0].plot(motion.time, motion.u * 1e3, **style)
-        axes[1].plot(motion.time, motion.a, **style)
-        for force in (motion.force_r, motion.force_l):
-            axes[2].plot(motion.time, force / 1e3, **style)
+        plot_history(axes, pair[direction], **experiment_style(direction, 1.0))
     forward = pair["forward"]
     start_s = _find_longest_flight_end(forward, hz)
     inside = (forward.time >= start_s) & (forward.time < start_s + 1 / hz)
     for ax, letters in zip(axes, ("klm", "nop", "qrs"), strict=True):
-        for in_contact in (forward.force_r > 0, forward.force_l < 0):
-            ax.fill_between(
-                forward.time, 0, 1, where=in_contact & inside, transform=ax.get_xaxis_transform(),
-                color=DIRECTION_COLOURS["forward"], alpha=0.20, lw=0,
-            )  # fmt: skip
+        shade_contact(ax, forward, DIRECTION_COLOURS["forward"], (0.2, 0.2), within=inside)
         label_panel(
             ax, letters[column], f"$f_{column + 1}$ = {hz:g} Hz" if letters == "klm" else ""
         )
         ax.set_xlim(0, SHOWN_CYCLES / hz)
-    draw_obstacles(case.parameters, axes[0].axhline)
+    draw_rest_lines(case.gaps_m, axes[0].axhline)
     axes[2].set_xlabel("$t$ in s")
     if column == 0:
         for ax, label in zip(axes, ("$u$ in mm", "$a$ in m/s²", "$F_j$ in kN"), strict=True):

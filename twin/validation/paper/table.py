@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from twin.model.parameters import free_flight_resonance
-from twin.reports.paper_cases import extract_prc
+from twin.reports.report_data import extract_prc
 from twin.validation.paper import findings
 from twin.validation.paper.rows import (
     AGREES,
