@@ -11,11 +11,11 @@ from table_io.config.profile import SetUpConfirmation
 from table_io.errors import InputError
 from tests.campaign.campaigns import LISTED, Players, asked, files, prepared, statuses
 from twin.campaign import command
-from twin.campaign.campaign_state import append_sections
 from twin.campaign.command import run_campaign
 from twin.campaign.config import CampaignPlan
 from twin.campaign.state import (
     LOCK_FILE,
+    append_sections,
     copy_configs,
     hold_lock,
     read_state,

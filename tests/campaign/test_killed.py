@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from tests.campaign.campaigns import Players
-from twin.campaign import report, run_recordings
+from twin.campaign import report, state
 from twin.campaign.command import CampaignOptions, run_campaign
 from twin.campaign.figures import prc_families
 from twin.campaign.summary import read_campaign
@@ -68,7 +68,7 @@ class Here(Players):
         self.playing.append(run)
         log = Path(spec.folder) / "run.mcap"
         play_unpaced(spec.make_run_config(), spec.run, log, lambda: None, lambda _: None)
-        run_recordings.write_summary_and_report(log.parent)
+        state.write_summary_and_report(log.parent)
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
     whole, killed = folder / "whole", folder / "killed"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("twin.campaign.offline.WorkerPool", Here)
-        patch.setattr(run_recordings, "write_report", lambda *_: None)
+        patch.setattr(state, "write_report", lambda *_: None)
         patch.setattr(report, "draw_campaign_figures", lambda *_: [])
         assert (
             run_campaign(

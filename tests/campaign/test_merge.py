@@ -8,8 +8,7 @@ import pytest
 from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from twin.campaign.merge import find_most_impacts, find_peak, merge_summaries, renormalize
-from twin.campaign.run_recordings import first_step, is_complete, missing_steps
-from twin.campaign.state import RunPart, RunState
+from twin.campaign.state import RunPart, RunState, first_step, is_complete, missing_steps
 
 PROFILE = parse_toml(
     """

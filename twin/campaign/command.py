@@ -8,12 +8,17 @@ from pathlib import Path
 from table_io.clock import local_datetime
 from table_io.config.calibration_due import find_overdue_calibrations
 from table_io.errors import InputError
-from twin.campaign.campaign_state import ActiveCampaign, begin_campaign, resume_campaign
 from twin.campaign.config import list_campaign_warnings, read_plan
 from twin.campaign.offline import play_offline
 from twin.campaign.realtime import play_realtime
 from twin.campaign.report import write_campaign_report
-from twin.campaign.state import LOCK_FILE, hold_lock
+from twin.campaign.state import (
+    LOCK_FILE,
+    ActiveCampaign,
+    begin_campaign,
+    hold_lock,
+    resume_campaign,
+)
 from twin.reports.finalize import EXIT_GAPS
 from twin.run.disk import require_disk_space
 from twin.run.folders import RUNS_FOLDER, make_output_folder

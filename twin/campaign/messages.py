@@ -4,10 +4,9 @@ import getpass
 from typing import Literal
 
 from table_io.clock import local_datetime
-from twin.campaign.campaign_state import ActiveCampaign
 from twin.campaign.config import PlannedRun
 from twin.campaign.merge import merge_summaries, read_summary
-from twin.campaign.state import OperatorAnswer
+from twin.campaign.state import ActiveCampaign, OperatorAnswer
 from twin.reports.summary import format_summary
 from twin.run.terminal import console, print_line
 

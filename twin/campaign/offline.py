@@ -2,7 +2,6 @@
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 
-from twin.campaign.campaign_state import ActiveCampaign
 from twin.campaign.config import PlannedRun
 from twin.campaign.messages import (
     format_run_end,
@@ -10,6 +9,7 @@ from twin.campaign.messages import (
     format_run_start,
     unattended_answer,
 )
+from twin.campaign.state import ActiveCampaign
 from twin.campaign.worker_pool import WorkerPool
 from twin.reports.finalize import EXIT_ABORTED, EXIT_INTERRUPTED
 from twin.run.terminal import catch_interrupts, console, print_line

@@ -5,7 +5,6 @@ from pathlib import Path
 
 from table_io.clock import RealClock
 from table_io.errors import InputError
-from twin.campaign.campaign_state import ActiveCampaign
 from twin.campaign.config import PlannedRun
 from twin.campaign.messages import (
     ask_operator,
@@ -15,8 +14,7 @@ from twin.campaign.messages import (
     unattended_answer,
 )
 from twin.campaign.report import write_campaign_report
-from twin.campaign.run_recordings import write_summary_and_report
-from twin.campaign.state import OperatorAnswer
+from twin.campaign.state import ActiveCampaign, OperatorAnswer, write_summary_and_report
 from twin.live.supervisor import Supervisor
 from twin.reports.finalize import EXIT_ABORTED, EXIT_INTERRUPTED
 from twin.run.merge_parts import merge_run_parts
