@@ -192,7 +192,7 @@ def test_what_goes_on_says_of_what_and_from_where(both: Both) -> None:
         assert f'of = "{run["parts"][0]["run"]}"' in start.profile_toml
         assert len(start.steps) == 8
         page = (both.killed / "02-g4-2" / "report.html").read_text()
-        assert f"run {run['parts'][0]['run']}, interrupted; from step 5 on" in page
+        assert f"run {run['parts'][0]['run']} from step 5" in page
     else:
         assert used == {"02-g4-2"}
 
