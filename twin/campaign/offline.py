@@ -1,5 +1,16 @@
 """Play a campaign offline: simulated runs at maximum speed, several in parallel."""
 
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from types import TracebackType
+from typing import Any
+
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 
 from twin.campaign.config import PlannedRun
@@ -10,9 +21,11 @@ from twin.campaign.messages import (
     unattended_answer,
 )
 from twin.campaign.state import ActiveCampaign
-from twin.campaign.worker_pool import WorkerPool
+from twin.live.process_config import ProcessConfig
 from twin.reports.finalize import EXIT_ABORTED, EXIT_INTERRUPTED
 from twin.run.terminal import catch_interrupts, console, print_line
+
+MAX_WORKERS = 2  # each holds a whole recording in memory while it writes the report
 
 
 def play_offline(campaign: ActiveCampaign, lock: int) -> int:
@@ -55,3 +68,100 @@ def _finish_run(campaign: ActiveCampaign, run: PlannedRun, message: dict[str, st
     is_complete = campaign.finish_recording(run)
     print_line(format_run_end(campaign, run))
     return is_complete
+
+
+@dataclass(slots=True)
+class RunWorker:
+    """A process and the run that it plays; `partial_line` is its last, unfinished output line."""
+
+    process: subprocess.Popen[bytes]
+    run: str = ""
+    partial_line: bytes = b""
+
+    @property
+    def pipe(self) -> int:
+        """File descriptor of its standard output."""
+        assert self.process.stdout is not None
+        return self.process.stdout.fileno()
+
+
+class WorkerPool:
+    """Worker processes that play runs; use as a context manager."""
+
+    def __init__(self, lock: int) -> None:
+        self._lock = lock
+        self._workers: list[RunWorker] = []
+
+    def __enter__(self) -> "WorkerPool":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Stop all workers; the table of a run in progress comes to rest."""
+        self.stop()
+        for worker in self._workers:
+            assert worker.process.stdin is not None
+            worker.process.stdin.close()
+            worker.process.wait()
+
+    @property
+    def free(self) -> bool:
+        """Whether another run can be submitted."""
+        limit = min(MAX_WORKERS, len(os.sched_getaffinity(0)))
+        return sum(bool(worker.run) for worker in self._workers) < limit
+
+    @property
+    def busy(self) -> bool:
+        """Whether a run is in progress."""
+        return any(worker.run for worker in self._workers)
+
+    def submit(self, run: str, spec: ProcessConfig) -> None:
+        """Start a run on an idle worker, or on a new one."""
+        idle = (
+            worker for worker in self._workers if not worker.run and worker.process.poll() is None
+        )
+        worker = next(idle, None) or self._start_worker()
+        worker.run = run
+        assert worker.process.stdin is not None
+        worker.process.stdin.write(json.dumps(asdict(spec)).encode() + b"\n")
+        worker.process.stdin.flush()
+
+    def stop(self) -> None:
+        """Bring every table to rest; a worker that is writing its report finishes it."""
+        for worker in self._workers:
+            if worker.run and worker.process.poll() is None:
+                worker.process.send_signal(signal.SIGTERM)
+
+    def messages(self, seconds: float) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Yield (run, message) of each message received; wait for at most `seconds`."""
+        by_pipe = {worker.pipe: worker for worker in self._workers if worker.run}
+        for pipe in select.select(list(by_pipe), [], [], seconds)[0]:
+            worker = by_pipe[pipe]
+            new = os.read(pipe, 65536)
+            *lines, worker.partial_line = (worker.partial_line + new).split(b"\n")
+            for line in lines:
+                message = json.loads(line)
+                run = worker.run
+                if "reported" in message or "failed" in message:
+                    worker.run = ""
+                yield run, message
+            if not new:
+                run, code = worker.run, worker.process.wait()
+                self._workers.remove(worker)
+                outcome = signal.Signals(-code).name if code < 0 else f"exit {code}"
+                yield run, {"failed": f"its worker process died ({outcome})"}
+
+    def _start_worker(self) -> RunWorker:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "twin.campaign.worker"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            pass_fds=(self._lock,),
+            start_new_session=True,
+        )
+        self._workers.append(RunWorker(process))
+        return self._workers[-1]
