@@ -25,7 +25,7 @@ from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
 from twin.reports.finalize import EXIT_INTERRUPTED
 from twin.run.run_config import read_model
-from twin.studies import figures, over_gap
+from twin.studies import figures
 from twin.studies.cases import parse_gaps_mm
 from twin.studies.rows import COLUMNS, read_batch_rows
 
@@ -305,7 +305,7 @@ def test_the_pictures_name_what_is_in_them(profile: Path) -> None:
                                        if gap == 4.0}).figure  # fmt: skip
     words = [text.get_text() for text in beside.legends[0].get_texts()]
     assert words == ["snm", "hard", "forward", "backward"]
-    (gaps,) = over_gap.draw_gap_figure(
+    (gaps,) = figures._draw_gap_figure(
         "snm", [one for one in summary(out)["cases"] if one["model"] == "snm"]
     )
     assert all(ax.get_ylabel() for ax in gaps.figure.axes)
