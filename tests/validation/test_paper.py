@@ -20,9 +20,8 @@ from twin.reports.measured_campaign import load_measured_campaign
 from twin.reports.report_data import extract_prc
 from twin.validation.paper import command
 from twin.validation.paper.findings import count_onsets_per_cycle, find_bands
-from twin.validation.paper.rows import ComparisonRow
 from twin.validation.paper.study import CHAOS_SCAN_HZ, PaperStudy, run_paper_study
-from twin.validation.paper.table import make_comparison_table
+from twin.validation.paper.table import ComparisonRow, make_comparison_table
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,7 @@ from twin.reports.players import ClosedFormSimulator, NumericalSimulator, make_s
 from twin.reports.slow_passage import COARSE_EFFORT, SlowSweep
 from twin.run.run_config import read_model
 from twin.validation.paper import command, findings, study
-from twin.validation.paper.rows import DEPARTS
-from twin.validation.paper.table import make_comparison_table
+from twin.validation.paper.table import DEPARTS, make_comparison_table
 
 AG = 0.05 * 9.80665
 G4 = Parameters(550.0, 36e3, 1100.0, 510e3, 900.0, 510e3, 900.0, 2e-3, 2e-3)

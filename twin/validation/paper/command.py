@@ -17,9 +17,8 @@ from twin.validation.paper.page import (
     write_paper_json,
     write_paper_page,
 )
-from twin.validation.paper.rows import DEPARTS
 from twin.validation.paper.study import JOB_COUNT, PaperStudy, run_paper_study
-from twin.validation.paper.table import make_comparison_table
+from twin.validation.paper.table import DEPARTS, make_comparison_table
 
 
 def compare_with_paper(out: Path | None, campaign_paths: list[Path], model: str | None) -> None:

@@ -15,9 +15,9 @@ from twin.run.run_config import read_model
 from twin.validation.paper.extra_figures import draw_chaos_figure
 from twin.validation.paper.force_loops import draw_paper_loop_figures
 from twin.validation.paper.frequency_figures import draw_frequency_figures
-from twin.validation.paper.rows import ComparisonRow
 from twin.validation.paper.secondary_resonances import draw_secondary_resonance_figure
 from twin.validation.paper.study import PaperStudy
+from twin.validation.paper.table import ComparisonRow
 
 PAPER_MODEL = "snm"
 FIGURE_ORDER = ("2", "3", "5", "6", "7", "8", "9", "11", "12", "")
