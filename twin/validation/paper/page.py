@@ -12,9 +12,8 @@ from twin.reports.plot_style import CaptionedFigures, Picture, save_figures
 from twin.reports.prc_families import draw_all_gaps, draw_transition
 from twin.reports.summary import dump_strict_json
 from twin.run.run_config import read_model
-from twin.validation.paper.extra_figures import draw_chaos_figure
 from twin.validation.paper.force_loops import draw_paper_loop_figures
-from twin.validation.paper.frequency_figures import draw_frequency_figures
+from twin.validation.paper.frequency_figures import draw_chaos_figure, draw_frequency_figures
 from twin.validation.paper.secondary_resonances import draw_secondary_resonance_figure
 from twin.validation.paper.study import PaperStudy
 from twin.validation.paper.table import ComparisonRow
