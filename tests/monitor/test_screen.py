@@ -11,7 +11,7 @@ from table_io.records import Agreement, Estimate, Event, RunStop, Trip
 from tests.monitor.monitored import RUN, point, records, start, stream
 from tests.monitor.test_run_state import board
 from twin.monitor import curves, panels
-from twin.monitor.braille import MIN_MARK_SPACING, PlotCurve, plot_curves
+from twin.monitor.curves import MIN_MARK_SPACING, PlotCurve, plot_curves
 from twin.monitor.panels import SessionStatus, format_number, format_percent
 from twin.monitor.run_state import LiveRunState, update_run_state
 from twin.monitor.screen import (
