@@ -24,8 +24,7 @@ from table_io.records import RunStop
 from tests.live.test_live import endpoint
 from tests.monitor.monitored import RUN, block, point, records, start, stream
 from twin.monitor import app
-from twin.monitor.app import MonitorClient, run_event_loop, run_monitor
-from twin.monitor.display import TerminalDisplay
+from twin.monitor.app import MonitorClient, TerminalDisplay, run_event_loop, run_monitor
 from twin.monitor.panels import SessionStatus
 from twin.monitor.run_state import LiveRunState
 from twin.transport.codec import TOPIC_TYPES, Item, encode_item, topic_for
