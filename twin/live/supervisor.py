@@ -1,9 +1,12 @@
-"""Supervisor: starts, monitors, restarts and finally ends the processes of a live run."""
+"""Supervisor: starts, monitors, restarts and finally ends the child processes of a live run."""
 
 import contextlib
 import fcntl
+import os
 import shutil
+import signal
 import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,7 +15,6 @@ from table_io.clock import Clock
 from table_io.config.profile import OnDeathConfig
 from table_io.errors import InputError
 from table_io.records import Comparison, Event, Fault, RunStop, Timing
-from twin.live.child_process import ChildProcess, start_process
 from twin.live.process_config import ProcessConfig, make_private_folder, process_token
 from twin.recording.run_paths import PARTS_FOLDER
 from twin.run.merge_parts import LOCK_FILE
@@ -29,6 +31,41 @@ SUPERVISED_COMPONENTS = ("recorder", "gate")
 DRAIN_S = 0.1  # after a process died, to receive its last messages
 MAX_RESTARTS = 5
 WATCHED_TOPICS = tuple(RECORD_TOPICS.values())
+
+
+@dataclass(slots=True)
+class ChildProcess:
+    """Child process of the run; its output goes to a log file in the run's folder."""
+
+    component: str
+    process: subprocess.Popen[bytes]
+    log_path: Path
+    restarts: int = 0
+
+    @property
+    def has_exited(self) -> bool:
+        return self.process.poll() is not None
+
+    @property
+    def exit_reason(self) -> str:
+        """Signal name or exit code with which the process ended."""
+        code = self.process.returncode
+        return signal.Signals(-code).name if code < 0 else f"exit {code}"
+
+    @property
+    def last_output_line(self) -> str:
+        """Last line that the process wrote to its log file."""
+        lines = self.log_path.read_text(errors="replace").strip().splitlines()
+        return lines[-1] if lines else "it said nothing"
+
+    def close_input(self) -> None:
+        """Close the standard input of the process, which tells it to finish."""
+        stdin = self.process.stdin
+        if stdin is not None and not stdin.closed:
+            stdin.close()
+
+    def kill(self) -> None:
+        os.killpg(self.process.pid, signal.SIGKILL)
 
 
 @dataclass(slots=True)
@@ -289,3 +326,15 @@ class _InterruptedBeforeStartError(Exception):
 
 class _RigDiedError(Exception):
     """The rig process died or hangs; the recording is kept."""
+
+
+def start_process(component: str, parts_folder: Path, argument: str) -> ChildProcess:
+    """Start a process in its own session, so that Ctrl-C does not reach it."""
+    log_path = parts_folder / f"{component}.log"
+    command = [sys.executable, "-m", "twin.live.processes", component]
+    command += [str(parts_folder / "spec.json"), argument]
+    with log_path.open("ab") as out:
+        process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=out, stderr=out, start_new_session=True
+        )
+    return ChildProcess(component, process, log_path)
