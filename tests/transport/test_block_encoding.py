@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from table_io.block import Block
 from twin.transport import shaketwin_pb2 as pb
-from twin.transport.block_encoding import encode_block
-from twin.transport.codec import decode_item, encode_item
+from twin.transport.codec import decode_item, encode_block, encode_item
 
 NAMES = ("mass_disp_m", "force_r1_n", "x", "ü" * 70)
 LABELS = st.sampled_from((-1, 0, 1, 5, 63, 64, 300, 2**40))
