@@ -25,8 +25,7 @@ from tests.transport.test_codec import any_block
 from twin.recording.mcap_records import CHUNK, MAGIC, MAX_RECORD_BYTES, RECORD_HEADER
 from twin.recording.merge import merge
 from twin.recording.reader import read_recording
-from twin.recording.recovery import recover_log
-from twin.recording.size_limits import work_limit
+from twin.recording.recovery import recover_log, work_limit
 from twin.transport.block_decoding import decode_blocks
 from twin.transport.codec import Item, WireError, decode_item, encode_item, topic_for
 
@@ -202,7 +201,7 @@ def test_every_packing_of_the_format_is_read(packing: CompressionType, tmp_path:
 
 @pytest.mark.parametrize("kind", range(len(BOMBS)))
 def test_no_bomb_goes_off(kind: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twin.recording.size_limits.MIN_WORK_BYTES", COST)
+    monkeypatch.setattr("twin.recording.recovery.MIN_WORK_BYTES", COST)
     path = tmp_path / "bomb.mcap"
     path.write_bytes(bomb(kind))
     tracemalloc.start()
@@ -224,9 +223,9 @@ def test_a_sound_file_is_read_whole_however_long_it_is(
     """Work is limited by the size of the file alone, and a sound one needs a small part of it."""
     path = tmp_path / "a.mcap"
     path.write_bytes(content)
-    monkeypatch.setattr("twin.recording.size_limits.MIN_WORK_BYTES", 0)
+    monkeypatch.setattr("twin.recording.recovery.MIN_WORK_BYTES", 0)
     assert recover_log(path).is_intact
-    monkeypatch.setattr("twin.recording.size_limits.WORK_PER_BYTE", 100)
+    monkeypatch.setattr("twin.recording.recovery.WORK_PER_BYTE", 100)
     assert recover_log(path).is_intact
     assert work_limit(2**50) == 2**50 * 100
 

@@ -4,6 +4,7 @@ Invalid records are skipped. Reading resumes after a damaged chunk at the end th
 after other damage at the next valid record. Work and memory are limited from the start.
 """
 
+import os
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -37,16 +38,18 @@ from twin.recording.mcap_records import (
     parse_string_map,
     read_uncompressed_size,
 )
-from twin.recording.size_limits import (
-    ENTRY_OVERHEAD_BYTES,
-    WORK_PER_RECORD,
-    memory_limit_bytes,
-    work_limit,
-)
 
 UNFINISHED_REASON = "the file was never finished: its recorder was killed, or still writes"
 SEARCH_WINDOW_BYTES = 2**20  # searched at once for the next record
 UNNAMED_TOPIC_PREFIX = "?"  # placeholder topic of messages whose channel record is lost
+# Limits for untrusted files (decompression bombs). Work is in bytes read again or decompressed and
+# proportional to the file size, so that long recordings are accepted: a valid recording of constant
+# channels decompresses to about 60 times its size. A file beyond the memory limit is refused, not
+# reported as damaged.
+WORK_PER_BYTE, MIN_WORK_BYTES = 250, 256 * 2**20
+WORK_PER_RECORD = 512  # minimum cost of a record
+ENTRY_OVERHEAD_BYTES = 400  # memory of a message or damage entry in addition to its payload
+DEFAULT_MEMORY_BYTES = 4 * 2**30
 
 
 class LogMessage(NamedTuple):
@@ -325,3 +328,20 @@ class _Scanner:
             for channel, sequence, log_time, publish_time, payload in self.raw_messages
             if channel not in self.skipped_channels
         ]
+
+
+def work_limit(size: int) -> int:
+    """Return the work allowed for reading a file of `size` bytes, in bytes."""
+    return max(MIN_WORK_BYTES, WORK_PER_BYTE * size)
+
+
+def memory_limit_bytes() -> int:
+    """Return the memory allowed for the content of a file, in bytes: half of the physical memory.
+
+    The other half is for evaluating it. Total memory counts, not free memory: the system releases
+    its file cache on demand.
+    """
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
+    except (AttributeError, ValueError, OSError):  # unknown on this system
+        return DEFAULT_MEMORY_BYTES
