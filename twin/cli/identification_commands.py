@@ -1,4 +1,4 @@
-"""Commands `discover` and `identify`; they import slow modules only when run."""
+"""Commands `discover`, `identify` and `study`; they import slow modules only when run."""
 
 from pathlib import Path
 from typing import Annotated

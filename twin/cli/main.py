@@ -14,7 +14,6 @@ from twin.cli.file_commands import StepsOption, files_app
 from twin.cli.hardware_commands import hardware_app
 from twin.cli.identification_commands import identification_app
 from twin.cli.live_commands import live_app
-from twin.cli.monitor_command import monitor_app
 
 # The matrices are small: BLAS threads cost more than they gain and delay the processes of a run.
 # Set before numpy is imported; child processes inherit it.
@@ -309,7 +308,6 @@ def view_command(
 
 
 app.add_typer(hardware_app)
-app.add_typer(monitor_app)
 app.add_typer(live_app)
 app.add_typer(identification_app)
 app.add_typer(files_app)
