@@ -116,7 +116,7 @@ def router_command(
     rig: Annotated[str, typer.Option("--rig", help="Name of the rig.")] = "simulated",
 ) -> None:
     """Print the configuration of a zenoh router (zenohd) with the same access control."""
-    from twin.cli.router import print_router_settings
+    from twin.cli.credentials import print_router_settings
 
     print_router_settings(folder, name, listen, rig)
 

@@ -11,12 +11,14 @@ Folders have mode 0700 and private keys 0600. Nothing is ever overwritten, and a
 reused for another person: its old certificate would become valid again.
 """
 
+import json
 import os
 import re
 import secrets
 import socket
 import tempfile
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from ipaddress import ip_address
 from itertools import count
 from pathlib import Path
@@ -27,7 +29,7 @@ from table_io.clock import local_datetime
 from table_io.config.base import parse_toml
 from table_io.errors import InputError
 from twin.run.terminal import console, print_line, print_table
-from twin.security.access_control import NO_ROLE, RIG_NAME, ROLES, ROUTER_ROLE
+from twin.security.access_control import NO_ROLE, RIG_NAME, ROLES, ROUTER_ROLE, build_router_access
 from twin.security.certificate_authority import (
     CertificateKeyPair,
     certificate_expiry,
@@ -42,8 +44,15 @@ from twin.security.credentials import (
     EXPIRY_WARNING_DAYS,
     KEY_FILE,
     AccessList,
+    Credentials,
     check_name,
     read_people,
+)
+from twin.transport.endpoint import (
+    PUBLIC_HUB_SETTINGS,
+    check_endpoint,
+    merge_settings,
+    session_settings,
 )
 
 AUTHORITY_KEY = "ca.key.pem"
@@ -314,3 +323,29 @@ def _validate_host(host: str) -> str:
             "192.168.1.20, without port"
         )
     return host
+
+
+def print_router_settings(folder: Path, name: str, listen: str, rig: str) -> None:
+    """Print the settings for a zenohd started in the router's folder, FOLDER/people/NAME.
+
+    They contain the current access list: print them again when it changes.
+    """
+    people = read_people(folder)
+    if people.get(name) != ROUTER_ROLE:
+        routers = [router for router, role in people.items() if role == ROUTER_ROLE]
+        raise InputError(
+            f"{name}: no router in {folder}; known: {', '.join(routers) or 'none'}; add one by "
+            f"`shaketwin keys add {folder} NAME --role router --host HOST`"
+        )
+    check_endpoint(rig, listen, has_keys=True)
+    router_keys = Credentials(Path(), name, datetime.now(UTC), None)
+    router_settings = merge_settings(
+        PUBLIC_HUB_SETTINGS,
+        merge_settings(router_keys.tls_settings(), build_router_access(rig, people)),
+    )
+    print(
+        json.dumps(
+            merge_settings(session_settings("router", "listen", listen, 0), router_settings),
+            indent=1,
+        )
+    )
