@@ -130,6 +130,14 @@ def test_damaged_summary_is_one_message(run_folder: Maker, text: str) -> None:
     assert refused.value.remedy
 
 
+def test_a_missing_key_of_the_contract_is_named(run_folder: Maker) -> None:
+    told = summary()
+    del told["steps"][2]["direction"]
+    with pytest.raises(InputError) as refused:
+        write_report(run_folder(told=told))
+    assert refused.value.key == "steps.2.direction"
+
+
 @pytest.mark.parametrize("name", ["summary.json", "run.mcap"])
 def test_missing_file_is_named(run_folder: Maker, name: str) -> None:
     folder = run_folder()

@@ -3,13 +3,11 @@
 Values from the summary are shown unchanged; the page loads nothing from outside.
 """
 
-import json
 from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 
-from table_io.errors import InputError
 from table_io.records import (
     Agreement,
     Check,
@@ -29,12 +27,12 @@ from twin.reports.page import TEMPLATE_DIR, embed_images, format_significant, re
 from twin.reports.plot_style import Picture
 from twin.reports.report_data import (
     ReportData,
-    Summary,
     build_report_data,
     parse_toml_tables,
     step_quantity,
 )
 from twin.reports.sensor_table import build_sensor_rows
+from twin.reports.summary import RunSummary, load_summary
 
 MAX_ROWS = 200
 
@@ -44,30 +42,12 @@ def write_report(folder: Path, recording: Recording | None = None) -> Path:
 
     A `recording` already in memory is not read again.
     """
-    summary = _read_summary(folder / "summary.json")
+    remedy = "give a folder written by run, replay or simulate"
+    summary = load_summary(folder / "summary.json", RunSummary, remedy)
     run = build_report_data(recording or read_recording(folder / "run.mcap"), summary)
     path = folder / "report.html"
     path.write_text(render_report(run, draw_run_figures(run, folder / "figures")), encoding="utf-8")
     return path
-
-
-def _read_summary(path: Path) -> Summary:
-    """Read the summary of a run; raise InputError if it is missing, damaged or of another kind."""
-    remedy = "give a folder written by run, replay or simulate"
-    try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
-        for step in summary["steps"]:
-            _ = step["index"], step["frequency_hz"], step["direction"]
-        _ = summary["run"].get("name"), summary["verdict"]
-    except FileNotFoundError:
-        raise InputError("file not found", where=path, remedy=remedy) from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot read the summary: {error}", where=path, remedy=remedy) from None
-    except (KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"not the summary of a run (missing: {error})", where=path, remedy=remedy
-        ) from None
-    return dict(summary)
 
 
 def render_report(run: ReportData, pictures: list[Picture]) -> str:

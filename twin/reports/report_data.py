@@ -23,9 +23,8 @@ from twin.model.config import ModelConfig
 from twin.model.model import Model
 from twin.recording.reader import Recording
 from twin.reports.players import SystemMotion
-from twin.reports.summary import prc_points
+from twin.reports.summary import Json, prc_points
 
-Summary = dict[str, Any]
 Curve = tuple[Float1D, Float1D]  # frequency in Hz, ascending, and quantity
 Envelope = tuple[Float1D, Float1D, Float1D]
 DIRECTIONS = ("forward", "backward")
@@ -44,7 +43,7 @@ class ReportData:
     """Recording and summary of a run, with the blocks and the specimen that every figure needs."""
 
     recording: Recording
-    summary: Summary
+    summary: Json
     streams: dict[str, tuple[Block, ...]]
     specimen: Specimen | None
     contact_n: float
@@ -87,7 +86,7 @@ class StepMotion(SystemMotion):
         return StepMotion(**{**arrays, "time": arrays["time"] - arrays["time"][0]})
 
 
-def build_report_data(recording: Recording, summary: Summary) -> ReportData:
+def build_report_data(recording: Recording, summary: Json) -> ReportData:
     """Build the report data of a run; an imported run without a profile has no specimen."""
     profile = parse_toml_tables(recording.start.profile_toml)
     try:

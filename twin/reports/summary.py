@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel, ValidationError
 
 from table_io.channels import CHANNEL_BY_NAME, Channel
 from table_io.config.base import parse_toml
 from table_io.config.channel import read_channels
 from table_io.config.profile import Profile
+from table_io.errors import InputError
 from table_io.records import (
     Check,
     Comparison,
@@ -37,6 +39,22 @@ from twin.recording.reader import Recording
 
 Json = dict[str, Any]
 ESTIMATE_KEYS = ("value", "sd", "drift", "drift_sd")
+
+
+class StepEntry(BaseModel):
+    """Keys that every step of a summary.json has; it may have more."""
+
+    index: int
+    direction: str
+    frequency_hz: float
+
+
+class RunSummary(BaseModel):
+    """Keys that every summary.json of a run has, in old files too; it may have more."""
+
+    run: dict[str, Any]
+    verdict: str
+    steps: list[StepEntry]
 
 
 def summarise(recording: Recording, parameters: Parameters) -> Json:
@@ -291,6 +309,22 @@ def format_summary(summary: Json) -> str:
 def write_summary(summary: Json, path: Path) -> None:
     """Write a summary as strict JSON; non-finite numbers become null."""
     path.write_text(dump_strict_json(summary) + "\n")
+
+
+def load_summary(path: Path, contract: type[BaseModel], remedy: str) -> Json:
+    """Return the content of a summary.json; InputError if it is missing or breaks the contract."""
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+        contract.model_validate(summary)
+    except FileNotFoundError:
+        raise InputError("file not found", where=path, remedy=remedy) from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(map(str, first["loc"]))
+        raise InputError(first["msg"], where=path, key=key, remedy=remedy) from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read the summary: {error}", where=path, remedy=remedy) from None
+    return dict(summary)
 
 
 def dump_strict_json(summary: Json) -> str:
