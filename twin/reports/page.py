@@ -10,7 +10,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from twin.reports.plot_style import Picture
 
-TEMPLATE_DIR = Path(__file__).parent  # contains the shared style.html
+TEMPLATE_DIR = Path(__file__).parent  # contains the shared parts.html and style.html
 
 
 def format_significant(value: Any, digits: int = 3) -> str:
