@@ -14,7 +14,13 @@ from twin.identification.identify import WINDOW_S, IdentificationResult, identif
 from twin.identification.least_squares import FitResult
 from twin.identification.parameters import GAP_PREFIX, ZERO_PREFIX, ParameterSet, parse_log_number
 from twin.reports.discovery.loading import load_recordings
-from twin.reports.discovery.serialize import INTERVAL_SIGMA, Json, model_to_toml, parameter_to_json
+from twin.reports.discovery.serialize import (
+    INTERVAL_SIGMA,
+    Json,
+    interval_to_json,
+    model_to_toml,
+    parameter_to_json,
+)
 from twin.reports.summary import dump_strict_json
 from twin.run.folders import make_output_folder, make_run_folder
 from twin.run.run_config import read_model_template
@@ -116,7 +122,7 @@ def identification_to_json(result: IdentificationResult, notes: Sequence[str]) -
             for parameter in fit.free
             if parameter.name.startswith(ZERO_PREFIX)
         },
-        "gap_offset": _interval_json(*result.asymmetry, "m") if result.asymmetry else None,
+        "gap_offset": interval_to_json(*result.asymmetry, "m") if result.asymmetry else None,
         "correlations": [{"of": [a, b], "value": value} for a, b, value in result.correlated_pairs],
         "rms_over_noise": math.sqrt(fit.cost),
         "converged": fit.converged,
@@ -128,13 +134,13 @@ def identification_to_json(result: IdentificationResult, notes: Sequence[str]) -
                 "entries": part.entry_count,
                 "converged": part.converged,
                 "parameters": {
-                    name: _interval_json(*pair, units[name]) for name, pair in part.values.items()
+                    name: interval_to_json(*pair, units[name]) for name, pair in part.values.items()
                 },
             }
             for part in result.subsets
         ],
         "contacts": [
-            _interval_json(gaps.value, gaps.std_error, "m")
+            interval_to_json(gaps.value, gaps.std_error, "m")
             | {
                 "log": names[gaps.log], "side": gaps.side, "kind": gaps.kind,
                 "scatter": gaps.scatter,
@@ -150,15 +156,6 @@ def identification_to_json(result: IdentificationResult, notes: Sequence[str]) -
         "warnings": [*result.warnings],
         "notes": [*notes],
     }  # fmt: skip
-
-
-def _interval_json(value: float, sd: float, unit: str) -> Json:
-    return {
-        "value": value,
-        "low": value - INTERVAL_SIGMA * sd,
-        "high": value + INTERVAL_SIGMA * sd,
-        "unit": unit,
-    }
 
 
 def _compare_with_start(result: IdentificationResult, name: str, key: str) -> Json:
@@ -178,7 +175,7 @@ def _gap_json(result: IdentificationResult, log: int) -> Json:
     sides = {side: fitted_gap(residuals, result.fit, side) for side in ("right", "left")}
     gap: Json = {"stated": sum(residuals.signals.gaps_m), "unit": "m", **sides}
     if name in result.fit.std_errors:
-        gap |= _interval_json(sum(sides.values()), 2 * result.fit.std_errors[name], "m")
+        gap |= interval_to_json(sum(sides.values()), 2 * result.fit.std_errors[name], "m")
     return gap
 
 

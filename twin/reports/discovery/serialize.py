@@ -101,7 +101,11 @@ def effect_to_json(candidate: Candidate, fit: FitResult, confidence: float) -> J
 
 def parameter_to_json(fit: FitResult, name: str, unit: str) -> Json:
     """Return a fitted value with its 95 % interval and unit."""
-    value, sd = fit.values[name], fit.std_errors[name]
+    return interval_to_json(fit.values[name], fit.std_errors[name], unit)
+
+
+def interval_to_json(value: float, sd: float, unit: str) -> Json:
+    """Return a value with its 95 % interval and unit."""
     return {
         "value": value,
         "low": value - INTERVAL_SIGMA * sd,
