@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from twin.recording.reader import Recording
     from twin.run.run_config import RunConfig
 
+SLOW_TIMEOUT_S = 3600.0
 PROFILE = """
 title = "Across the down-jump and back"
 [specimen]
@@ -31,6 +32,13 @@ enabled = false
 [acquisition]
 rate_hz = 1000.0
 """
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give the long studies more time than a test has."""
+    for item in items:
+        if item.get_closest_marker("slow"):
+            item.add_marker(pytest.mark.timeout(SLOW_TIMEOUT_S))
 
 
 @pytest.fixture(scope="session")

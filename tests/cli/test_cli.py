@@ -35,7 +35,6 @@ def shaketwin(*words: object, cwd: Path | None = None) -> subprocess.CompletedPr
         [SHAKETWIN, *map(str, words)],
         capture_output=True,
         text=True,
-        timeout=120,
         cwd=cwd,
         check=False,
     )

@@ -42,7 +42,7 @@ def test_a_dead_gate_leaves_no_gap_here_nor_there(tmp_path: Path) -> None:
     assert "gate died (SIGKILL); restarting it, the table goes on" in said
     assert "order: hold: a look by " in said
     assert_whole(recording)
-    attending.communicate(timeout=90)
+    attending.communicate()
     assert attending.returncode == 0
     here, beside = (
         Counter((one.topic, one.payload) for one in recover_log(folder / "run.mcap").messages)

@@ -139,7 +139,7 @@ class Group:
             assert first.startswith("started"), f"{first}{rig.stdout.read()} ({rig.wait()})"
             time.sleep(case.after_s / self.pace)
             done_s = self._do(case, rig)
-            said, _ = rig.communicate(timeout=120)
+            said, _ = rig.communicate()
         return Outcome(case, done_s, said)
 
     def _do(self, case: Case, rig: subprocess.Popen[str]) -> float:

@@ -93,7 +93,6 @@ def shaketwin(folder: Path, *words: str, site: Path | None = None) -> tuple[int,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))},
         capture_output=True,
         text=True,
-        timeout=240,
         check=False,
     )
     return process.returncode, process.stdout + process.stderr
