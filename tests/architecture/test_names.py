@@ -70,9 +70,9 @@ def is_participle(name: str) -> bool:
 def find_violations(tree: ast.Module) -> Iterator[Finding]:
     """Bare participles as functions, vague variables, one-word limits in a module."""
     for node in ast.walk(tree):
-        participle = isinstance(node, ast.FunctionDef) and is_participle(node.name)
-        if participle and node.name not in PUBLIC_ATTRIBUTES:
-            yield "participle", node.name
+        function = node.name if isinstance(node, ast.FunctionDef) else ""
+        if is_participle(function) and function not in PUBLIC_ATTRIBUTES:
+            yield "participle", function
         if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id in VAGUE:
             yield "vague variable", node.id
         if isinstance(node, ast.arg) and node.arg in VAGUE:

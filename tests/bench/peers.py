@@ -37,8 +37,8 @@ def scipy_sweep(frequencies, cycles: int, rtol: float = 1e-6) -> tuple[np.ndarra
     def left(t, x):
         return -CJ * x[1] - KJ * (x[0] + GAP) if mode[0] == 2 else GAP + x[0] - x[3]
 
-    for event in (right, left):
-        event.terminal, event.direction = True, -1
+    for event in (right, left):  # solve_ivp reads attributes of its events
+        vars(event).update(terminal=True, direction=-1)
     for frequency in frequencies:
         w[0], t, end = 2 * math.pi * frequency, 0.0, cycles / frequency
         while t < end:

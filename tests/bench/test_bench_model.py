@@ -43,8 +43,8 @@ def scipy_seconds() -> float:
     def left(t, x):
         return x[0] + 2e-3 if contact == 0 else 1.0
 
-    for event in (right, left):
-        event.terminal, event.direction = True, -1
+    for event in (right, left):  # solve_ivp reads attributes of its events
+        vars(event).update(terminal=True, direction=-1)
     begin = time.perf_counter()
     contact, t, x = 0, 0.0, list(impacting()[:2])
     while t < SECONDS:
@@ -114,7 +114,7 @@ EFFECTS = {
 def test_sampled_driver_with_effects(benchmark, kind):
     model = Model(G4)
     for effect, values in EFFECTS[kind].items():
-        model = model.with_effect(effect, **values)
+        model = model.with_effect(effect, "", **values)
     solver, base, out = shaken(model)
     benchmark(lambda: solver.advance(solver.rest_state(), base, base, out))
     assert np.isfinite(out).all()

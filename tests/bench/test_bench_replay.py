@@ -5,6 +5,7 @@ pytest tests/bench/test_bench_replay.py -n 0 --benchmark-enable -s
 
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -37,11 +38,15 @@ def log(bundle: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def read_by_protobuf(log: Path) -> int:
     """Every message parsed and its values listed, one by one: what a reader has to do at least."""
     count = 0
-    kinds = {"/rig/meas": pb.Block, "/twin/pred": pb.Block, "/twin/cmp": pb.Comparison}
+    kinds: dict[str, Any] = {
+        "/rig/meas": pb.Block,
+        "/twin/pred": pb.Block,
+        "/twin/cmp": pb.Comparison,
+    }
     for one in recover_log(log).messages:
         if kind := kinds.get(one.topic):
             message = kind.FromString(one.payload)
-            if kind is pb.Block:
+            if isinstance(message, pb.Block):
                 count += sum(len(list(channel.values)) for channel in message.channels)
     return count
 

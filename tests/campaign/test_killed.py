@@ -103,7 +103,8 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
     size = (whole / "02-g4" / "run.mcap").stat().st_size
     (folder / "sitecustomize.py").write_text(COARSE)
     environment = {**os.environ, "PYTHONPATH": str(folder)}
-    command = [SHAKETWIN, "campaign", str(folder / "c.toml"), "--speed", "max", "--out", killed]
+    command = [SHAKETWIN, "campaign", str(folder / "c.toml"), "--speed", "max"]
+    command += ["--out", str(killed)]
     _kill(command, environment, killed / "02-g4" / "run.mcap", share * size)
     left = {one.parent.name: one.read_bytes() for one in killed.rglob("run.mcap")}
     done = subprocess.run(
@@ -113,7 +114,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
     return Both(whole, killed, share, left, done.stdout)
 
 
-def _kill(command: list[Any], environment: dict[str, str], log: Path, size: float) -> None:
+def _kill(command: list[str], environment: dict[str, str], log: Path, size: float) -> None:
     """Start a campaign, and kill it and all that it started once the log is so large."""
     process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
     while process.poll() is None and not (log.exists() and log.stat().st_size >= size):

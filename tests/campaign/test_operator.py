@@ -7,7 +7,7 @@ import pytest
 
 from table_io.errors import InputError
 from tests.campaign.campaigns import Players, asked, prepared, record, statuses
-from twin.campaign import command, messages, realtime
+from twin.campaign import command, realtime
 from twin.campaign.command import run_campaign
 from twin.campaign.state import read_state
 
@@ -46,7 +46,7 @@ def attended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def answers(monkeypatch: pytest.MonkeyPatch, *told: str) -> Operator:
     operator = Operator(*told)
-    monkeypatch.setattr(messages.console, "input", operator)
+    monkeypatch.setattr("twin.campaign.messages.console.input", operator)
     return operator
 
 

@@ -156,7 +156,8 @@ class Struck(Watched):
 
     def __init__(self, rig: RigConfig, swings: dict[str, dict[str, float]]) -> None:
         super().__init__(rig)
-        self._swings, self._now, self._asked = swings, {}, 0
+        self._swings, self._asked = swings, 0
+        self._now: dict[str, float] = {}
         self.asked: list[str] = []
         self.tired = False
 
@@ -208,7 +209,7 @@ def test_a_person_who_taps_as_asked_proves_every_polarity() -> None:
 
 def test_a_planted_polarity_is_found_by_the_tap() -> None:
     rig = planted('kind = "polarity"\nchannel = "mass_acc_m_s2"\nat_s = 0.0')
-    assert rig.simulated is not None
+    assert rig.is_simulated
     hands = {"mass_acc_m_s2": -0.3, "mass_disp_m": 0.5}  # the fault turns what the sensor gives
     _, found = struck(rig, tap_the_mass=hands)
     assert failing(found) == [("polarity", "mass_acc_m_s2")]
@@ -388,11 +389,11 @@ def test_on_a_table_of_its_own_every_line_passes_and_its_black_box_saw_no_motion
     text = text.replace("[ni]\n", f"[ni]{lines}")
     card.write_text(re.sub(r"127\.0\.0\.1:\d+", f"127.0.0.1:{port}", text))
     shaketwin = Path(sys.executable).parent / "shaketwin"
-    command = [shaketwin, "table", "--rig", card, "--log", box]
+    command: list[str | Path] = [shaketwin, "table", "--rig", card, "--log", box]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as table:
         assert table.stdout is not None
         assert "waiting at" in table.stdout.readline()
-        words = [shaketwin, "check", "--table", card, "--json"]
+        words: list[str | Path] = [shaketwin, "check", "--table", card, "--json"]
         result = subprocess.run(words, capture_output=True, text=True, check=False)
         table.terminate()
     assert result.returncode == 0, result.stdout + result.stderr

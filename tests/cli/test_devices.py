@@ -132,13 +132,13 @@ def test_all_are_asked_at_once() -> None:
     assert set(command.ask_all(asked, 20.0).values()) == {True}
 
 
-class Lab(rpc.NiDAQmxServicer):
+class Lab(rpc.NiDAQmxServicer):  # type: ignore[misc]  # untyped: its package is skipped
     """A device server with one device that has two inputs, one output and no digital lines."""
 
-    def GetSystemInfoAttributeString(self, request, context):  # type: ignore[no-untyped-def]
+    def GetSystemInfoAttributeString(self, request, context):
         return pb.GetSystemInfoAttributeStringResponse(value="Dev1")
 
-    def GetDeviceAttributeString(self, request, context):  # type: ignore[no-untyped-def]
+    def GetDeviceAttributeString(self, request, context):
         name = pb.DeviceStringAttribute.Name(request.attribute_raw)
         known = {
             "DEVICE_ATTRIBUTE_PRODUCT_TYPE": "PCIe-6363",
@@ -147,10 +147,10 @@ class Lab(rpc.NiDAQmxServicer):
         }
         return pb.GetDeviceAttributeStringResponse(value=known.get(name, ""))
 
-    def GetDeviceAttributeDoubleArray(self, request, context):  # type: ignore[no-untyped-def]
+    def GetDeviceAttributeDoubleArray(self, request, context):
         return pb.GetDeviceAttributeDoubleArrayResponse(value=[-10.0, 10.0])
 
-    def GetDeviceAttributeUInt32(self, request, context):  # type: ignore[no-untyped-def]
+    def GetDeviceAttributeUInt32(self, request, context):
         return pb.GetDeviceAttributeUInt32Response(value=0x1A2B)
 
 

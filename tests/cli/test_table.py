@@ -64,7 +64,7 @@ def test_a_terminal_that_is_held_or_gone_does_not_hold_the_machine(
 ) -> None:
     path = card(tmp_path)
     ours, its = os.pipe()
-    command = [SHAKETWIN, "table", "--rig", path, "--log", tmp_path / "box"]
+    command: list[str | Path] = [SHAKETWIN, "table", "--rig", path, "--log", tmp_path / "box"]
     with subprocess.Popen(command, stdout=its) as machine:
         assert b"waiting at" in os.read(ours, 4096)
         if gone:

@@ -21,7 +21,7 @@ def model(*ids: str) -> Model:
     found = Model(G4)
     for name in ids:
         effect = find_effect(name)
-        found = found.with_effect(name, **{p.name: p.typical for p in effect.parameters})
+        found = found.with_effect(name, "", **{p.name: p.typical for p in effect.parameters})
     return found
 
 

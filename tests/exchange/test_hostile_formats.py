@@ -54,7 +54,7 @@ def fewer(path: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"       400", b"       500", 1))
 
 
-HOSTILE: dict[str, tuple[str, Callable[[Path], None], str]] = {
+HOSTILE: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "complex": ("a.h5", lambda p: with_dataset(p, data=1j * TIME), "complex"),
     "text": ("a.h5", lambda p: with_dataset(p, data=[b"a"] * N), "text"),
     "cube": ("a.h5", lambda p: with_dataset(p, data=np.zeros((9, 9, 9))), "9 x 9 x 9"),

@@ -13,6 +13,7 @@ from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.records import RunStart
+from table_io.sim.config import SimulatedTableConfig
 from twin.identification.discover import PreparedLog
 from twin.identification.signals import build_signals
 from twin.model.model import Model
@@ -42,7 +43,7 @@ def profile(gap_mm: float = 4.0, start_hz: float = 1.4, stop_hz: float = 4.4) ->
 def blocks(truth: str = "", noise: float = 1.0, gap_mm: float = 4.0) -> tuple[Block, ...]:
     """Measured blocks of a rig that hides a truth, with so many times the card's noise."""
     sensors = [one.model_copy(update={"noise_rms": one.noise_rms * noise}) for one in RIG.sensors]
-    simulated = RIG.simulated
+    simulated = RIG.get_section(SimulatedTableConfig)
     assert simulated is not None
     with tempfile.TemporaryDirectory() as folder:
         if truth:

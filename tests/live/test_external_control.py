@@ -3,9 +3,12 @@
 import platform
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from table_io.backends.follow import FollowWiring
+from table_io.backends.opendaq.config import OpenDaqWiring
 from table_io.backends.opendaq.source import check_reachable
 from table_io.config.base import find_config, load_config
 from table_io.config.rig import RigConfig
@@ -41,16 +44,20 @@ def test_a_card_without_a_command_is_warmed_up(tmp_path: Path) -> None:
 def test_the_time_that_is_waited_for_the_controller_needs_room() -> None:
     here = read_run_config(find_config("quickstart", "tests"), "simulated")
     followed = read_run_config(find_config("quickstart", "tests"), "follow_simulated")
-    assert followed.rig.follow is not None
-    more = bytes_per_s(followed) * followed.rig.follow.wait_s
+    wiring = followed.rig.get_section(FollowWiring)
+    assert wiring is not None
+    more = bytes_per_s(followed) * wiring.wait_s
     assert planned_bytes(followed) - planned_bytes(here) == pytest.approx(more)
 
 
 @pytest.mark.parametrize("follows", [False, True])
 def test_no_latency_is_told_of_blocks_that_were_held_back(follows: bool) -> None:
-    twin = _TwinProcess("r", *[None] * 4, "", external_clock=follows)  # type: ignore[arg-type]
-    table = "r", "n", "table", "", "", "", 2000.0, 20, (), (), 0, {}, {}
-    twin.handle_record(RunStart(0, *table, platform.node(), "", 5.0))
+    absent: Any = None
+    twin = _TwinProcess("r", absent, absent, absent, absent, "", external_clock=follows)
+    start = RunStart(
+        0, "r", "n", "table", "", "", "", 2000.0, 20, (), (), 0, {}, {}, platform.node(), "", 5.0
+    )
+    twin.handle_record(start)
     assert twin.epoch_s == (None if follows else 5.0)
 
 
@@ -62,8 +69,9 @@ def test_a_stopwatch_that_saw_nothing_says_no_latency() -> None:
 def test_an_address_that_is_no_name_is_told() -> None:
     pytest.importorskip("opendaq")
     rig, _ = load_config(find_config("follow_simulated", "rigs"), RigConfig, "card")
-    assert rig.opendaq is not None
-    wiring = rig.opendaq.model_copy(update={"device": "daq.nd://a..b"})
+    wiring = rig.get_section(OpenDaqWiring)
+    assert wiring is not None
+    wiring = wiring.model_copy(update={"device": "daq.nd://a..b"})
     with pytest.raises(InputError, match=r"no openDAQ device answers at daq\.nd://a\.\.b"):
         check_reachable(rig.model_copy(update={"opendaq": wiring}))
 

@@ -17,6 +17,7 @@ from tests.live.test_live import endpoint
 from twin.live import join
 from twin.live.join import join_as_recorder
 from twin.recording.recovery import recover_log
+from twin.reports.finalize import EXIT_GAPS, EXIT_INTERRUPTED
 from twin.run.run_config import read_run_config
 from twin.security.access_control import build_open_access
 from twin.transport.codec import TOPIC_TYPES, Item, encode_item, topic_for
@@ -117,7 +118,7 @@ def test_a_test_that_goes_silent_leaves_what_came_and_says_so(
     monkeypatch.setattr(join, "MAX_SILENCE_S", 0.5)
     start = BUNDLE.make_start_factory(RUN, "table")({}, 0.0)
     where = gate(start, *map(block, range(10)))
-    assert join_as_recorder(where, RIG, tmp_path / "copy", None) == join.EXIT_GAPS
+    assert join_as_recorder(where, RIG, tmp_path / "copy", None) == EXIT_GAPS
     assert len(recover_log(tmp_path / "copy" / "run.mcap").messages) == 11
 
 
@@ -142,7 +143,7 @@ def test_ctrl_c_ends_the_recording(
 
     monkeypatch.setattr(join, "_record_run", interrupted)
     code = join_as_recorder(where, RIG, tmp_path / "copy", None)
-    assert code == join.EXIT_INTERRUPTED
+    assert code == EXIT_INTERRUPTED
     assert (tmp_path / "copy" / "run.mcap").exists()
 
 

@@ -265,7 +265,7 @@ def test_a_sync_that_failed_is_not_believed_to_be_mended(
             raise OSError(errno.EIO, "Input/output error", "part.mcap")
 
     monkeypatch.setattr(module, "SYNC_INTERVAL_S", 0.2)
-    monkeypatch.setattr(module.LogWriter, "sync", sync)
+    monkeypatch.setattr(LogWriter, "sync", sync)
     monkeypatch.setattr(module, "is_orphaned", lambda: False)
     recorder.run()
     recorder.finish()

@@ -202,7 +202,11 @@ def test_a_twin_outside_is_heard_inside_and_by_everybody_once(rig: Rig) -> None:
     said: list[Item] = [replace(PARAMS, index=n, reason="x" * 60_000) for n in range(5)]
     said += [TIMING, Event(0, "drift", "of the stiffness")]
     twin.publish("/twin/params", b"garbage")
-    far = [replace(PARAMS, index=2**50), replace(TIMING, component="rig"), Event(0, "order", "")]
+    far: list[Item] = [
+        replace(PARAMS, index=2**50),
+        replace(TIMING, component="rig"),
+        Event(0, "order", ""),
+    ]
     for item in (*far, *said):
         twin.publish(topic_for(item), encode_item(item, RUN))
     with serving(twin):

@@ -115,7 +115,7 @@ class Group:
             text += f"\n[[simulated.faults]]\nat_s = 2.5\n{self.fault}\n"
         (self.folder / "card.toml").write_text(text)
         (self.folder / "test.toml").write_text(TEST.format(check=str(self.check).lower()))
-        command = [SHAKETWIN, "table", "--rig", self.folder / "card.toml"]
+        command: list[str | Path] = [SHAKETWIN, "table", "--rig", self.folder / "card.toml"]
         command += ["--log", self.folder / "box", "--time-scale", str(self.pace)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as machine:
             assert machine.stdout is not None
@@ -128,7 +128,7 @@ class Group:
         return self
 
     def _one(self, case: Case) -> Outcome:
-        command = [sys.executable, CONTROLLER, self.folder / "card.toml"]
+        command: list[str | Path] = [sys.executable, CONTROLLER, self.folder / "card.toml"]
         command += [self.folder / "test.toml", str(self.pace)]
         pipe = subprocess.PIPE
         with subprocess.Popen(

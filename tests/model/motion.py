@@ -11,7 +11,9 @@ from twin.model.parameters import Parameters
 U, V, A, F_R, F_L, U_R, U_L = range(7)
 
 
-def run(p: Parameters, rate: float, base: np.ndarray, state: np.ndarray | None = None):
+def run(
+    p: Parameters, rate: float, base: np.ndarray, state: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(state, out, events) after the samples `base` from `state` or from rest."""
     state = closed_form.rest_state(p) if state is None else state.copy()
     out, events = np.empty((7, base.size)), np.zeros((4 * base.size + 10, 5))

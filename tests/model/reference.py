@@ -52,8 +52,8 @@ def guards(p: Parameters, contact: list[bool]):
             return -p.bumper_damping_l * v - p.bumper_stiffness_l * (u + p.gap_l)
         return u - ul + p.gap_l if math.isfinite(p.gap_l) else 1.0
 
-    for event in (right, left):
-        event.terminal, event.direction = True, -1
+    for event in (right, left):  # solve_ivp reads attributes of its events
+        vars(event).update(terminal=True, direction=-1)
     return right, left
 
 

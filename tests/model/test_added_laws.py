@@ -54,7 +54,7 @@ def plugins(package, monkeypatch) -> None:
 
 def add(effect_id: str, base=None, **values: float) -> Model:
     effect = find_effect(effect_id)
-    return Model(base or snm()).with_effect(effect_id, **(values or typical(effect)))
+    return Model(base or snm()).with_effect(effect_id, "", **(values or typical(effect)))
 
 
 @pytest.mark.usefixtures("plugins")
@@ -67,8 +67,8 @@ class TestInstalled:
     def test_the_same_law_gives_the_same_motion(self, theirs, ours, names, base):
         values = list(typical(find_effect(ours)).values())
         their_names = [parameter.name for parameter in find_effect(theirs).parameters]
-        own = Model(base).with_effect(ours, **dict(zip(names, values, strict=True)))
-        added = Model(base).with_effect(theirs, **dict(zip(their_names, values, strict=True)))
+        own = Model(base).with_effect(ours, "", **dict(zip(names, values, strict=True)))
+        added = Model(base).with_effect(theirs, "", **dict(zip(their_names, values, strict=True)))
         expected, out = drive(own, KICK)[1], drive(added, KICK)[1]
         scale = np.abs(expected).max(axis=1, keepdims=True)
         assert (np.abs(out - expected) <= 2e-6 * scale).all()
@@ -79,8 +79,8 @@ class TestInstalled:
     def test_the_same_law_gives_the_same_forces_along_a_motion(self, theirs, ours, names):
         values = list(typical(find_effect(ours)).values())
         their_names = [parameter.name for parameter in find_effect(theirs).parameters]
-        own = SNM.with_effect(ours, **dict(zip(names, values, strict=True)))
-        added = SNM.with_effect(theirs, **dict(zip(their_names, values, strict=True)))
+        own = SNM.with_effect(ours, "", **dict(zip(names, values, strict=True)))
+        added = SNM.with_effect(theirs, "", **dict(zip(their_names, values, strict=True)))
         u, v, _, right, left = drive(own, 2.0 * sine(2.6, RATE, 4.0), StateEstimate(0, 0.0, 0.0))[
             1
         ][:5]
@@ -176,7 +176,7 @@ LAW = laboratory_laws.ZENER_BUMPER
     ("effect", "problem"),
     [
         (replace(LAW, force=None), "no `force`"),
-        (replace(LAW, place="table"), "'table'"),
+        (replace(LAW, place="table"), "'table'"),  # type: ignore[arg-type]
         (replace(LAW, rates=None), "belong together"),
         (replace(LAW, rates=lambda q, w, s, c: (0.0, 0.0)), "2 values for 1 states"),
         (replace(LAW, force=lambda q, w, s, c: w * abs(w)), "linear in the rate"),

@@ -3,10 +3,11 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from twin.model import closed_form_kernel, contact_regime, periodic_orbit, stepped_sine
+from twin.model import closed_form_kernel, contact_regime, periodic_orbit, stepped_sine_kernel
 from twin.model.compilation import jit_helper, jit_kernel, source_revision
 
 
@@ -81,29 +82,30 @@ def test_revision_of_the_phase_is_part_of_every_cache_key():
     )
     cached = {
         kernel
-        for module in (periodic_orbit, contact_regime, closed_form_kernel, stepped_sine)
+        for module in (periodic_orbit, contact_regime, closed_form_kernel, stepped_sine_kernel)
         for kernel in vars(module).values()
         if hasattr(kernel, "py_func") and kernel.stats.cache_path is not None
     }
     assert cached == {
         closed_form_kernel.advance_samples,
-        stepped_sine.run_stepped_sine,
+        stepped_sine_kernel.run_stepped_sine,
         periodic_orbit.advance_cycles,
     }
-    for kernel in (
+    kernels: tuple[Any, ...] = (
         closed_form_kernel.advance_samples,
-        stepped_sine.run_stepped_sine,
+        stepped_sine_kernel.run_stepped_sine,
         periodic_orbit.advance_cycles,
-    ):
+    )
+    for kernel in kernels:
         assert str(contact_regime.REVISION) in str(kernel.signatures)
 
 
 def test_the_integrators_key_holds_the_revision_of_all_it_calls():
     from twin.model import event_integrator_kernel, event_location, force_laws
 
-    assert event_integrator_kernel.integrate_samples.stats.cache_path is not None
-    kernel = event_integrator_kernel.integrate_samples.py_func
-    assert kernel.__closure__[0].cell_contents == event_integrator_kernel.REVISION
+    kernel: Any = event_integrator_kernel.integrate_samples
+    assert kernel.stats.cache_path is not None
+    assert kernel.py_func.__closure__[0].cell_contents == event_integrator_kernel.REVISION
     names = {k: v for k, v in vars(force_laws).items() if k != "REVISION"}
     assert source_revision(names) == force_laws.REVISION
     assert (

@@ -58,7 +58,7 @@ def phase_integral(p, con, begin: np.ndarray, dt: float, drive) -> np.ndarray:
     base, slope, (peak, w, phase) = drive
     for node, weight in zip(NODES, WEIGHTS, strict=True):
         t, state = 0.5 * dt * (node + 1), begin.copy()
-        advance_to_event(state, con, t, *drive, False)
+        advance_to_event(state, con, t, base, slope, (peak, w, phase), False)
         now = base + slope * t + peak * math.sin(phase + w * t)
         total += 0.5 * dt * weight * powers(p, state, now)
     return total
@@ -75,12 +75,12 @@ def balance(p, frequency: float, rate: float, sampled: bool) -> tuple[np.ndarray
             assert attempt + 1 < MAX_EVENTS_PER_STEP
             if sampled:
                 slope = (after - before) / h
-                drive = before + slope * t, slope, still
+                base, wave = before + slope * t, still
             else:
-                drive = 0.0, 0.0, (AG, w, w * (i * h + t))
+                base, slope, wave = 0.0, 0.0, (AG, w, w * (i * h + t))
             begin = state.copy()
-            dt, side, *_ = advance_to_event(state, con, h - t, *drive, True)
-            total += phase_integral(p, con, begin, dt, drive)
+            dt, side, *_ = advance_to_event(state, con, h - t, base, slope, wave, True)
+            total += phase_integral(p, con, begin, dt, (base, slope, wave))
             t += dt
             if side < 0:
                 break

@@ -18,6 +18,7 @@ from twin.model.closed_form import ClosedFormSolver
 from twin.model.config import ModelConfig
 from twin.model.effects import EFFECTS, find_effect
 from twin.model.effects.effect import Effect, EffectParameter
+from twin.model.event_integrator import EventDrivenSolver
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model, SensorModel
 from twin.model.solver import StateEstimate
@@ -72,7 +73,10 @@ def test_a_plug_in_adds_a_force(monkeypatch):
     assert np.abs(p.mass * out[2] + force).max() < 1e-9 * np.abs(force).max()
     plain = drive(Model(snm()), noisy(0.5))[1]
     assert np.abs(out[0] - plain[0]).max() > 1e-5
-    assert model.prepare(RATE).laws is model.prepare(2 * RATE).laws  # compiled once
+    solvers = model.prepare(RATE), model.prepare(2 * RATE)
+    assert isinstance(solvers[0], EventDrivenSolver)
+    assert isinstance(solvers[1], EventDrivenSolver)
+    assert solvers[0].laws is solvers[1].laws  # compiled once
     with pytest.raises(InputError, match="did you mean 'quintic_spring'"):
         find_effect("quintic_sprin")
 
@@ -216,7 +220,8 @@ def test_restart_takes_hidden_states_and_refuses_nan():
     model = everything()
     solver = model.prepare(RATE)
     state, _ = drive(model, noisy(0.5))
-    again = solver.restart_state(StateEstimate(int(state[-1]), *state[:4], hidden=state))
+    u, v, u_r, u_l = state[:4]
+    again = solver.restart_state(StateEstimate(int(state[-1]), u, v, u_r, u_l, hidden=state))
     assert np.array_equal(again[7:11], state[7:11])
     assert again[-1] == state[-1]
     assert not solver.restart_state(StateEstimate(0, 0.0, 0.1)).take(range(7, 11)).any()
@@ -237,7 +242,7 @@ def test_the_plain_model_starts_without_the_integrator():
 def test_sampled_sweep_of_a_model_is_near_the_closed_one(effect):
     """A vanishingly small effect takes the other road to the same extremes."""
     parameter = find_effect(effect).parameters[0].name
-    model = Model(snm()).with_effect(effect, **{parameter: 1e-12})
+    model = Model(snm()).with_effect(effect, "", **{parameter: 1e-12})
     frequencies = [2.0, 2.2, 3.0]
     got = simulate_sweep(model, frequencies, AG, 6)
     want = simulate_sweep(Model(snm()), frequencies, AG, 6)

@@ -69,6 +69,7 @@ def test_flight_multipliers_are_the_oscillators():
     """exp(lambda T), lambda = -a +- i wd: size exp(-C T / 2M)."""
     p = snm(math.inf)
     orbit = find_periodic_orbit(p, 2.0, AG, closed_form.rest_state(p))
+    assert orbit is not None
     assert np.abs(orbit.multipliers[:2]) == pytest.approx(math.exp(-1100 / 1100 / 2.0), rel=1e-12)
     w = 4 * math.pi
     size = AG / abs(36e3 / 550 - w * w + 2j * w)
@@ -82,9 +83,12 @@ def test_the_three_solutions_at_g4():
         settle_to_orbit(p, 3.4, AG, arrived(p, 2.6, 3.4)),
         settle_to_orbit(p, 3.4, AG, arrived(p, 5, 3.4)),
     )
+    assert up is not None
+    assert down is not None
     assert up.u_max == pytest.approx(5.123e-3, abs=5e-7)
     assert down.u_max == pytest.approx(1.247e-3, abs=5e-7)
     unstable = find_unstable_orbit(p, AG, up, down)
+    assert unstable is not None
     assert not unstable.stable
     assert unstable.u_max == pytest.approx(3.297e-3, abs=5e-7)
     assert np.abs(unstable.multipliers[:2]) == pytest.approx([3.115, 0.138], abs=5e-4)
@@ -101,10 +105,12 @@ FOLDS = [
 def test_folds_by_continuation(gap, start, low, high, forward, backward):
     """The forward branch ends above, the backward one below, each with a multiplier near +1."""
     p = snm(gap)
-    up = continue_branch(p, AG, settle_to_orbit(p, low, AG, arrived(p, start, low)), high, 0.02)
-    down = continue_branch(
-        p, AG, settle_to_orbit(p, high, AG, arrived(p, high + 1, high, 0.1)), start, 0.02
-    )
+    lower = settle_to_orbit(p, low, AG, arrived(p, start, low))
+    upper = settle_to_orbit(p, high, AG, arrived(p, high + 1, high, 0.1))
+    assert lower is not None
+    assert upper is not None
+    up = continue_branch(p, AG, lower, high, 0.02)
+    down = continue_branch(p, AG, upper, start, 0.02)
     assert (up.end_hz, down.end_hz) == pytest.approx((forward, backward), abs=6e-4)
     for branch in (up, down):
         assert 0.8 < branch.orbits[-1].multipliers[0].real < 1
@@ -112,7 +118,9 @@ def test_folds_by_continuation(gap, start, low, high, forward, backward):
 
 def test_a_branch_without_a_fold_reaches_its_goal():
     p = snm(-0.010)
-    branch = continue_branch(p, AG, settle_to_orbit(p, 6.0, AG), 8.0, 0.05)
+    orbit = settle_to_orbit(p, 6.0, AG)
+    assert orbit is not None
+    branch = continue_branch(p, AG, orbit, 8.0, 0.05)
     assert branch.end_hz is None
     assert branch.orbits[-1].frequency_hz == 8.0
 
@@ -126,6 +134,7 @@ def test_largest_exponents_in_chaos(frequency, want):
 def test_exponent_of_a_periodic_motion_is_its_multiplier():
     p = snm()
     orbit = settle_to_orbit(p, 2.4, AG, arrived(p, 2.0, 2.4))
+    assert orbit is not None
     found, _ = lyapunov_exponent(p, 2.4, AG, orbit.state, 4000)
     assert found == pytest.approx(math.log(abs(orbit.multipliers[0])), abs=2e-3)
 

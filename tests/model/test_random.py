@@ -45,7 +45,7 @@ def sampled(seed: int) -> tuple[float, float, int]:
     p, w, fast = drawn(random)
     rate = 10 * fast / math.pi * 10 ** random.uniform(-1.5, 0.3)
     t = np.arange(round(np.clip(random.uniform(2, 6) * 2 * math.pi / w * rate, 20, LONGEST))) / rate
-    base = sum(random.normal() * np.sin(w * random.uniform(0.2, 3) * t) for _ in range(4))
+    base = np.sum([random.normal() * np.sin(w * random.uniform(0.2, 3) * t) for _ in range(4)], 0)
     base = base * SIZE * w**2 * random.uniform(0.3, 3)
     start, drive = start_of(p, w, random), linear_between(t, base)
     touch = bool(start[4]), bool(start[5])

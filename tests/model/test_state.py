@@ -89,7 +89,8 @@ def test_restart_from_the_models_own_state_goes_on_as_before():
     state = kicked(p, 0.1)
     for first in range(0, 4000, 37):
         out, other = np.empty((7, 37)), np.empty((7, 37))
-        again = closed_form.restart_state(*state[:4], state[4] > 0, state[5] > 0, state[6], p)
+        u, v, u_r, u_l, right, left, acceleration = state[:7]
+        again = closed_form.restart_state(u, v, u_r, u_l, right > 0, left > 0, acceleration, p)
         again[7:] = state[7:]
         part = base[first : first + 37]
         closed_form.advance_state(state, con, part, out[:, : part.size])

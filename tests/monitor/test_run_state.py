@@ -111,7 +111,7 @@ def test_a_replay_that_begins_again_is_shown_from_its_beginning() -> None:
 
 
 def test_it_stays_small() -> None:
-    flood = [Event(k, "warning", f"number {k}") for k in range(5 * MAX_EVENTS)]
+    flood: list[Item] = [Event(k, "warning", f"number {k}") for k in range(5 * MAX_EVENTS)]
     flood += [Timing(k, f"c{k}", 1.0, 1.0, 1.0, 0, 1, 0.0, "") for k in range(5 * MAX_COMPONENTS)]
     flood += [SampleGap(k, 1, f"c{k}", "lost") for k in range(5 * MAX_COMPONENTS)]
     found = board([start(), *flood])
@@ -167,10 +167,11 @@ def test_a_start_whose_cards_cannot_be_read_is_still_a_start() -> None:
 def test_what_cannot_be_in_a_run_is_left_out() -> None:
     whole = board([start()])
     one = block(0)
-    by_kind = {type(record): record for record in records()}
+    (agreement,) = (record for record in records() if isinstance(record, Agreement))
+    (estimate,) = (record for record in records() if isinstance(record, Estimate))
     for bad in (
-        replace(by_kind[Agreement], band=(1.0,)),
-        replace(by_kind[Estimate], sd=()),
+        replace(agreement, band=(1.0,)),
+        replace(estimate, sd=()),
         replace(point(0), frequency_hz=0.0),
         replace(compared(0), measured_ss=(1.0,)),
         replace(one, label=one.label + 77),

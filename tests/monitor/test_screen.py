@@ -22,6 +22,7 @@ from twin.monitor.screen import (
     draw_screen,
 )
 from twin.transport.codec import WireError, decode_item, encode_item, topic_for
+from twin.viewer.plots import nice_ceil
 
 SIZES = [
     (36, 8),
@@ -252,7 +253,7 @@ def test_the_curve_grows_with_the_points(watched: LiveRunState) -> None:
 
 
 def test_the_end_of_an_axis_is_round() -> None:
-    assert [curves.nice_ceil(one) for one in (0.9, 0.21, 3.2, 1000.0)] == pytest.approx(
+    assert [nice_ceil(one) for one in (0.9, 0.21, 3.2, 1000.0)] == pytest.approx(
         [1.0, 0.3, 4.0, 1000.0]
     )
 

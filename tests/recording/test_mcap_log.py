@@ -51,7 +51,7 @@ def test_the_log_carries_texts_versions_schemas_and_times(log: Path) -> None:
         reader = make_reader(stream)
         texts = {one.name: one.data for one in reader.iter_attachments()}
         about = {one.name: one.metadata for one in reader.iter_metadata()}
-        times = {}
+        times: dict[str, list[tuple[int, int]]] = {}
         for schema, channel, message in reader.iter_messages():
             assert schema is not None
             assert (schema.encoding, channel.message_encoding) == ("protobuf", "protobuf")

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -328,7 +329,7 @@ def test_what_cannot_be_is_left_out_and_told(words: str, tmp_path: Path) -> None
     ],
 )
 def test_a_start_that_cannot_be_is_refused(
-    changed: dict[str, object], words: str, tmp_path: Path
+    changed: dict[str, Any], words: str, tmp_path: Path
 ) -> None:
     start = replace(START, **changed)
     path = tmp_path / "run.mcap"

@@ -12,6 +12,7 @@ from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.excitation.trajectory import plan_sweep
+from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.simulated_table import SimulatedBackend
 from twin.identification.discover import PreparedLog
 from twin.identification.signals import build_signals
@@ -50,8 +51,9 @@ def profile(right_mm: float, left_mm: float) -> Profile:
 @cache
 def clean(right_mm: float, left_mm: float) -> Float2D:
     """(channel, sample) what truly happened, in SI."""
-    assert RIG.simulated is not None
-    table = RIG.simulated.model_copy(
+    simulated = RIG.get_section(SimulatedTableConfig)
+    assert simulated is not None
+    table = simulated.model_copy(
         update={
             "damper_stiffness_n_m": TRUTH["stiffness"],
             "damper_damping_n_s_m": TRUTH["damping"],

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from table_io.errors import InputError
+from table_io.records import Comparison
 from twin.cli.replay import ReplayRequest, replay_logs
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import read_recording
@@ -90,12 +91,9 @@ def test_one_that_is_not_identical_is_told_by_the_exit_code(
 ) -> None:
     recording = read_recording(logs[0] / "run.mcap")
     items = list(recording.items)
-    place = max(k for k, one in enumerate(items) if type(one).__name__ == "Comparison")
-    items[place] = type(items[place])(  # one error sum, by one unit in the last place
-        *(getattr(items[place], name) for name in ("index", "count", "channels", "measured_ss")),
-        tuple(math.nextafter(one, 1e9) for one in items[place].free_error_ss),  # type: ignore[union-attr]
-        items[place].window_error_ss,  # type: ignore[union-attr]
-    )
+    last = recording.records(Comparison)[-1]
+    sums = tuple(math.nextafter(value, 1e9) for value in last.free_error_ss)  # by one last place
+    items[items.index(last)] = replace(last, free_error_ss=sums)
     write_items(tmp_path / "bent.mcap", items, recording.start)
     out = tmp_path / "out"
     asked = ReplayRequest([logs[1], tmp_path / "bent.mcap"], [], out)

@@ -119,7 +119,8 @@ def test_steps_are_equal_to_the_recorded_ones_for_both_twins(
     assert told(made, PrcPoint) == [
         encode_item(one, "") for one in recording.records(PrcPoint)[2:4]
     ]
-    for kind in (Agreement, Estimate):
+    kinds: tuple[type[Agreement | Estimate], ...] = (Agreement, Estimate)
+    for kind in kinds:
         inside = [one for one in recording.records(kind) if one.step in (2, 3)]
         assert told(made, kind) == [encode_item(one, "") for one in inside], kind
     assert [(one.step, one.cycle) for one in made.records(CycleExtremes)] == [

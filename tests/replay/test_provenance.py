@@ -17,6 +17,7 @@ from twin.replay.pipeline_replay import ReplayComparison, SampleRange, replay_re
 from twin.reports.finalize import EXIT_NOT_IDENTICAL
 from twin.run.run_config import RunConfig
 from twin.run.versions import read_installed_versions
+from twin.transport.codec import Item
 
 
 def again(
@@ -31,7 +32,7 @@ def notes(recording: Recording, kind: str) -> list[str]:
 
 
 def without_comparisons(recording: Recording, path: Path, *, ended: bool) -> Path:
-    items = [
+    items: list[Item] = [
         one for one in recording.items
         if not isinstance(one, Comparison) and (ended or one is not recording.stop)
     ]  # fmt: skip

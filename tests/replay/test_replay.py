@@ -104,13 +104,13 @@ def test_a_bit_in_the_recording_is_noticed(
 ) -> None:
     """One sample of one channel, changed by one unit in the last place."""
     items = list(recording.items)
-    place = next(
-        k for k, one in enumerate(items)
-        if isinstance(one, Block) and one.stream == "meas" and one.index >= 3000
+    place, block = next(
+        (k, item) for k, item in enumerate(items)
+        if isinstance(item, Block) and item.stream == "meas" and item.index >= 3000
     )  # fmt: skip
-    values = items[place].values.copy()
+    values = block.values.copy()
     values[recording.start.channels.index("mass_disp_m"), 3] *= 1 + 2**-52
-    items[place] = replace(items[place], values=values)
+    items[place] = replace(block, values=values)
     write_items(tmp_path / "bent.mcap", items, recording.start)
     identity, _ = again(read_recording(tmp_path / "bent.mcap"), bundle, tmp_path)
     assert not identity.is_identical
@@ -202,7 +202,7 @@ def test_a_fault_of_another_component_leaves_the_twin_alive(
 def test_missing_samples_are_replayed_as_they_were(
     recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
-    kept = [
+    kept: list[Item] = [
         one
         for one in recording.items
         if isinstance(one, (RunStart, RunStop))

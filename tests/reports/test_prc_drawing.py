@@ -44,7 +44,9 @@ def test_left_is_drawn_below_zero_and_amplitudes_start_at_zero(
     bottom, top = eta_d.get_ylim()
     assert bottom == 0
     assert top > 9
-    means = [float(np.mean(line.get_ydata())) for line in eta_j.lines[1:5]]  # after the zero line
+    means = [
+        float(np.mean(np.asarray(line.get_ydata()))) for line in eta_j.lines[1:5]
+    ]  # after the zero line
     assert [mean > 0 for mean in means] == [True, True, False, False]
     assert [line.get_marker() for line in eta_d.lines] == ["", "", "o", "o"]
     assert all(ax.get_ylabel() for ax, _ in panels)

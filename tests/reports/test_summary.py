@@ -118,6 +118,7 @@ def test_the_keys_of_the_contract(recording: Recording, bundle: RunConfig, tmp_p
     assert summary["u_star_m"] == pytest.approx(30.537e-3, abs=1e-6)
     assert summary["a_star_m_s2"] == pytest.approx(2.057, abs=1e-3)
     assert summary["run"]["id"] == "two"
+    assert recording.stop is not None
     assert summary["run"]["samples"] == recording.stop.index
     assert summary["run"]["duration_s"] == recording.stop.index / 1000
     assert "continuous in frequency" in summary["run"]["normalisation"]
@@ -143,6 +144,8 @@ def test_steps_are_the_recorded_points(
 ) -> None:
     summary = summary_of(list(recording.items), recording, bundle, tmp_path)
     for step, one in zip(summary["steps"], recording.records(PrcPoint), strict=True):
+        assert one.measured is not None
+        assert one.twin is not None
         assert step["measured"] == json.loads(json.dumps(asdict(one.measured)))
         assert step["twin"] == json.loads(json.dumps(asdict(one.twin)))
 
@@ -276,6 +279,7 @@ def test_a_stopped_run_without_a_point(bundle: RunConfig, tmp_path: Path) -> Non
     assert summary["verdict"] == "stopped"
     assert summary["reason"] == "asked to stop"
     assert summary["steps"] == summary["jumps"] == summary["hysteresis"] == []
+    assert recording.stop is not None
     assert summary["run"]["samples"] == recording.stop.index
 
 

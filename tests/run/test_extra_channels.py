@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
-from table_io.records import Comparison, RunStart
+from table_io.records import Comparison
 from tests.table_io.lab_rig import EXTRA, LAB_TEXT, SECOND_ACC, TEMPERATURE, UPWARD_ACC
 from tests.viewer.example_run import scalars
 from twin.cli.main import app
@@ -25,6 +25,7 @@ from twin.recording.reader import read_recording
 from twin.reports.predicted_ranges import predict_peaks
 from twin.reports.sensor_table import build_sensor_rows
 from twin.run.run_config import read_run_config
+from twin.transport.codec import Item
 
 PROFILE = """
 title = "Three steps upwards"
@@ -194,8 +195,9 @@ def test_the_monitor_lists_them(run: Path) -> None:
     recording = read_recording(run / "run.mcap")
     state = LiveRunState()
     comparisons = [item for item in recording.items if isinstance(item, Comparison)]
-    for item in (recording.start, *recording.blocks("meas"), *comparisons):
-        assert isinstance(item, RunStart) or item.index >= 0
+    items: list[Item] = [recording.start, *recording.blocks("meas"), *comparisons]
+    for item in items:
+        assert item.index >= 0
         state = update_run_state(state, recording.run, item)
     limits = [line.plain for line in draw_limits(state, 80, 40)]
     assert any(line.startswith("mass acc 2") and " g " in line for line in limits)
@@ -214,7 +216,7 @@ def test_a_fault_of_one_is_in_the_recording_and_its_summary(
 ) -> None:
     fault = f'\n[[simulated.faults]]\nkind = "{kind}"\nat_s = 12.0\nchannel = "{channel}"\n'
     text = LAB_TEXT.replace("\n[[channels]]", f"{fault}\n[[channels]]", 1)
-    assert parse_toml(text, RigConfig, "lab").simulated is not None
+    assert parse_toml(text, RigConfig, "lab").is_simulated
     path = laboratory(tmp_path, text)
     path.write_text(PROFILE.replace('"warn"', '"stop"'))
     shaketwin("run", path, "--out", tmp_path / "run", "--speed", "max", code=3)

@@ -46,7 +46,7 @@ def found(path: Path) -> list[bytes]:
 
 
 def expected() -> list[bytes]:
-    return sorted(encode_item(item, ITEMS[0].run) for item in ITEMS)
+    return sorted(encode_item(item, start_record().run) for item in ITEMS)
 
 
 def test_one_whole_part_is_the_log_as_it_is(run: Path) -> None:
@@ -133,7 +133,7 @@ def test_parts_that_a_disk_has_damaged_inside_are_kept(run: Path, bit: int) -> N
     path.write_bytes(raw)
     out = merge_run_parts(run)
     assert verify_log(out)
-    behind = {encode_item(item, ITEMS[0].run) for item in ITEMS[40:]}
+    behind = {encode_item(item, start_record().run) for item in ITEMS[40:]}
     assert behind <= {*found(out)}
     assert sorted(one.name for one in run.iterdir()) == ["damaged", "run.mcap"]
     assert [one.read_bytes() for one in (run / "damaged").iterdir()] == [bytes(raw)]

@@ -206,7 +206,8 @@ def test_the_first_prediction_is_at_the_first_restart(run: tuple) -> None:
 def test_the_run_is_the_same_to_the_bit_every_time(tmp_path: Path) -> None:
     """Noise has a seed and time is the sample index: nothing of the clock is in the samples."""
     short = QUICK.replace("2.6", "4.2")
-    (tmp_path / "a").mkdir(), (tmp_path / "b").mkdir()
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
     a, b = (read_recording(played(tmp_path / name, short)[1]) for name in ("a", "b"))
     for stream in ("meas", "pred"):
         assert a.contiguous_blocks(stream)[0].is_identical(b.contiguous_blocks(stream)[0])

@@ -18,7 +18,6 @@ import numpy as np
 
 from table_io.acquisition.drive_follower import DriveFollower, advance_follower, take_drive_indices
 from table_io.acquisition.external_control import plan_open_loop_drive
-from table_io.block import Float1D
 from table_io.config.base import find_config, load_config
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
@@ -53,7 +52,7 @@ def followed(
     motion = begins + first.start
     count = int(motion + (LATER[-1] + 0.5) * RATE)
     played = DrivePlayback(drive.command(0, count), RATE, RATE, begins, ppm)
-    now, found_s, errors = DriveFollower(drive, RATE, sigma, LSB), math.nan, []
+    now, found_s, errors = DriveFollower(drive, RATE, sigma, LSB), math.nan, list[float]()
     for at in range(0, count, 500):
         command = played.command(at, 500) + sigma * rng.standard_normal(500)
         now = advance_follower(now, np.rint(command / LSB) * LSB)
@@ -112,7 +111,7 @@ def labels(ppm: float = 50.0) -> None:
         )
 
 
-def _told(drive: Drive, ppm: float, begins: float, noise: float) -> tuple[np.ndarray, Float1D]:
+def _told(drive: Drive, ppm: float, begins: float, noise: float) -> tuple[np.ndarray, np.ndarray]:
     """(places told, true places) of every sample."""
     file, rng = drive.command(0, drive.rest_start + 1000), np.random.default_rng(3)
     first = drive.segments[0]
@@ -136,7 +135,15 @@ def live() -> None:
         file, out = Path(folder) / "drive.csv", Path(folder) / "run"
         card = ["--table", "follow_simulated"]
         subprocess.run([PROGRAM, "drive", profile, *card, "-o", file], check=True)
-        words = ["table", "--rig", "follow_simulated", "--play", file, "--ppm", "50"]
+        words: list[str | Path] = [
+            "table",
+            "--rig",
+            "follow_simulated",
+            "--play",
+            file,
+            "--ppm",
+            "50",
+        ]
         with subprocess.Popen([PROGRAM, *words], stdout=subprocess.PIPE, text=True) as table:
             assert table.stdout is not None
             assert "at rest" in table.stdout.readline()

@@ -157,7 +157,7 @@ def work(first: int, last: int) -> None:
     from twin.cli import main
 
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
-    main.app = get_command(main.app)  # built once, not for each of thousands of calls
+    vars(main)["app"] = get_command(main.app)  # built once, not for each of thousands of calls
     with TemporaryDirectory() as folder:
         trials = Trials(Path(folder))
         for number in range(first, last):

@@ -194,7 +194,7 @@ def one_run(number: int, chains: int, bundle: RunConfig, folder: Path) -> dict[s
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     texts = (bundle.profile_toml, bundle.rig_toml, bundle.model_toml)
     spec = ProcessConfig(f"kill-{number}", bundle.name, str(folder), "", *texts, endpoint=endpoint)
-    ProcessConfig.make_run_config = lambda _: bundle  # type: ignore[method-assign]
+    ProcessConfig.make_run_config = lambda _: bundle  # type: ignore[method-assign, assignment]
     turns = run_items(bundle, spec.run)
     pipe = os.pipe()
     times = folder / "times.npy"

@@ -30,18 +30,19 @@ TRUTH = '[[effects]]\nid = "stiffness_drift"\nparameters = {{ rate = {:.9f} }}\n
 
 def said(name: str, truth: str, folder: Path) -> Iterator[tuple[RunConfig, Record | Block]]:
     """Every item of a session with that truth."""
-    texts = [(PROFILES_DIR / one).read_text() for one in (
-        f"tests/{name}.toml", "rigs/simulated.toml", "models/snm.toml")]  # fmt: skip
+    files = (f"tests/{name}.toml", "rigs/simulated.toml", "models/snm.toml")
+    profile, rig, model = ((PROFILES_DIR / file).read_text() for file in files)
     if truth:
         sealed = folder / "truth.toml"
         sealed.write_text(truth)
         digest = hashlib.sha256(truth.encode()).hexdigest()
         more = f'[simulated]\ntruth = "{sealed}"\ntruth_sha256 = "{digest}"'
-        texts[1] = texts[1].replace("[simulated]", more)
-    bundle, clock = from_texts(name, *texts, name), ManualClock()
+        rig = rig.replace("[simulated]", more)
+    bundle, clock = from_texts(name, profile, rig, model, name), ManualClock()
     backend = open_backend(bundle.rig, bundle.profile, clock)
-    items = run_session(bundle.session, backend, clock, bundle.describe("r", "table"), lambda: None)
-    for item in add_twin_items(items, bundle.twin()):
+    start = bundle.make_start_factory("r", "table")
+    items = run_session(bundle.session_setup, backend, clock, start, lambda: None)
+    for item in add_twin_items(items, bundle.prepare_twin()):
         yield bundle, item
 
 

@@ -16,6 +16,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from tests.live.namespaces import HERE, THERE, Cable, cable, enclosed
 from twin.recording.reader import read_recording
@@ -144,7 +145,7 @@ def play(case: str, line: Cable, folder: Path) -> dict[str, object]:
     return figures(folder) | {"case": case, "exit": codes}
 
 
-def wait_for(path: Path, words: str, process: "subprocess.Popen[str]") -> None:
+def wait_for(path: Path, words: str, process: "subprocess.Popen[Any]") -> None:
     """Return once these words are said."""
     end = time.monotonic() + 90
     while words not in path.read_text():

@@ -27,6 +27,7 @@ import numpy as np
 from table_io.acquisition.session import LatenessLog, SessionSetup, run_session
 from table_io.backends.command_buffer import CommandBuffer
 from table_io.backends.ni.backend import NiBackend
+from table_io.backends.ni.config import NiWiring
 from table_io.block import Block, Float1D, Float2D
 from table_io.clock import Clock, RealClock
 from table_io.config.base import PROFILES_DIR, parse_toml
@@ -49,7 +50,7 @@ def served(
     text = CARD.replace("127.0.0.1:7470", free_address())
     card = folder / "ni_study.toml"
     card.write_text(text)
-    command = [SHAKETWIN, "table", "--rig", card, "--time-scale", f"{pace:g}"]
+    command: list[str | Path] = [SHAKETWIN, "table", "--rig", card, "--time-scale", f"{pace:g}"]
     command += ["--log", folder / "box"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -186,10 +187,11 @@ def decisions(count: int) -> None:
         wrong = backend.wrong
         backend.queue(backend.samples + 400, np.zeros(2))
         backend.close()
-        assert rig.ni is not None
+        wiring = rig.get_section(NiWiring)
+        assert wiring is not None
         print(
             f"decisions: {ms.size}: p50 {np.median(ms):.1f} ms, p99 {np.quantile(ms, 0.99):.1f}, "
-            f"max {ms.max():.1f}, of which {rig.ni.held_by_device_ms:g} ms lie in the device; "
+            f"max {ms.max():.1f}, of which {wiring.held_by_device_ms:g} ms lie in the device; "
             f"{refused} came too late and were tried again; {wrong} of {backend.samples} samples "
             "acquired back are not what was queued"
         )
@@ -205,7 +207,13 @@ def killed(whom: str) -> None:
     """A run whose server or rig is killed in motion."""
     with tempfile.TemporaryDirectory() as name, served(Path(name)) as (card, _, server):
         folder = Path(name)
-        command = [SHAKETWIN, "run", PROFILES_DIR / "tests" / "quickstart.toml", "--table", card]
+        command: list[str | Path] = [
+            SHAKETWIN,
+            "run",
+            PROFILES_DIR / "tests" / "quickstart.toml",
+            "--table",
+            card,
+        ]
         command += ["--out", folder / "out", "--listen", f"tcp/{free_address()}"]
         with subprocess.Popen(
             command, stdout=subprocess.DEVNULL, stderr=subprocess.STDOUT, start_new_session=True

@@ -30,7 +30,7 @@ from tests.table_io.safety.guarded import RIG, machine
 
 TOLD = frozenset({"sensor", "alarm", "late", "level"})  # kinds of events that tell of a fault
 # Large enough to matter: a tenth of the test's level, or of what a sensor shows in it.
-SIZES = {
+SIZES: dict[str, dict[str, tuple[float, ...]]] = {
     "gain": {"m": (0.15, -0.3), "m/s2": (0.15, -0.3), "N": (0.3, -0.5)},
     "drift": {"m": (1.0,), "m/s2": (0.01,), "N": (0.02,)},  # mm/s, g/s, kN/s
     "spike": {"m": (1.0, 30.0), "m/s2": (0.1, 0.5), "N": (0.1, 1.0)},  # mm, g, kN

@@ -46,10 +46,10 @@ def main() -> None:
         except zenoh.ZError as error:
             row("zenoh, no certificate", str(error).split(" at /")[0], doors)
         context = ssl.create_default_context(cafile=doors.lab / "ca.pem")
-        where = split_host_port(doors.keyed)
+        address = split_host_port(doors.keyed)
         with (
-            socket.create_connection(where) as plain,
-            context.wrap_socket(plain, server_hostname=where[0]) as secure,
+            socket.create_connection(address) as plain,
+            context.wrap_socket(plain, server_hostname=address[0]) as secure,
         ):
             try:
                 row("TLS, no certificate", f"LET IN, {secure.recv(1)!r}", doors)

@@ -158,11 +158,11 @@ def kills(folder: Path) -> None:
     rests, peaks = [], []
     for at, life in zip(killed, read_flight_record(folder / "box"), strict=True):
         count = round((at - life.epoch_s) * RATE)
-        command, table = life.command_m, life.row("table_disp")
-        rests.append((np.flatnonzero(np.abs(command) > 1e-6)[-1] - count) / RATE)
+        drive, table = life.command_m, life.row("table_disp")
+        rests.append((np.flatnonzero(np.abs(drive) > 1e-6)[-1] - count) / RATE)
         table_s = (np.flatnonzero(np.abs(table) > STILL_M)[-1] - count) / RATE
-        peaks.append(np.abs(np.diff(command, 2)).max() * RATE**2 / 9.80665)
-        assert command[-1] == 0.0, "the command rests at its mean"
+        peaks.append(np.abs(np.diff(drive, 2)).max() * RATE**2 / 9.80665)
+        assert drive[-1] == 0.0, "the command rests at its mean"
         print(
             f"kills: command at rest {rests[-1]:.2f} s after, table within 0.2 mm {table_s:.2f} s"
         )
@@ -195,7 +195,15 @@ def _run(folder: Path, title: str, meanwhile: Callable[[], None]) -> None:
     """`shaketwin run` of the quickstart on this card; what came of it."""
     out = folder / title
     profile = PROFILES_DIR / "tests" / "quickstart.toml"
-    command = [SHAKETWIN, "run", str(profile), "--table", str(folder / "card.toml"), "--out", out]
+    command = [
+        SHAKETWIN,
+        "run",
+        str(profile),
+        "--table",
+        str(folder / "card.toml"),
+        "--out",
+        str(out),
+    ]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         meanwhile()
         said = process.communicate()[0]

@@ -76,6 +76,11 @@ def summary(folder: Path) -> dict[str, Any]:
     return json.loads((folder / "summary.json").read_text())
 
 
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """The rows of a batch, in whose columns some are texts and the others numbers."""
+    return list(map(dict[str, Any], read_batch_rows(path)))
+
+
 def whole(profile: Path, name: str) -> Model:
     return read_model(name)[0].build_model(load_config(profile, Profile, "test")[0].specimen)
 
@@ -120,7 +125,7 @@ def test_a_gap_that_is_none_is_refused(words: list[str], said: str) -> None:
 def test_the_table_holds_the_motion_of_every_case(profile: Path, draft: None) -> None:
     hard = model(profile.parent, "hard", HARDENING)
     out = simulated(profile, ["snm", hard], ["4", "-1", "inf"])
-    rows = read_batch_rows(out / "batch.csv")
+    rows = read_rows(out / "batch.csv")
     assert (out / "batch.csv").read_text().splitlines()[0] == ",".join(COLUMNS)
     assert len(rows) == 2 * 3 * 22
     sweep = load_config(profile, Profile, "test")[0].sweep
@@ -168,7 +173,7 @@ def test_models_without_a_gap_keep_the_gaps_of_the_profile(profile: Path, draft:
         TEST.replace("gap_mm = 4.0", "gap_mm = 4.0\ngap_right_mm = 1.0\ngap_left_mm = 2.5")
     )
     soft = model(profile.parent, "soft", stiffness_n_m=30e3)
-    rows = read_batch_rows(simulated(profile, ["snm", soft], []) / "batch.csv")
+    rows = read_rows(simulated(profile, ["snm", soft], []) / "batch.csv")
     assert {row["gap_mm"] for row in rows} == {3.5}
     mine = [row for row in rows if row["model"] == "snm" and row["r_l"] > 0]
     sweep = load_config(profile, Profile, "test")[0].sweep
@@ -180,7 +185,7 @@ def test_models_without_a_gap_keep_the_gaps_of_the_profile(profile: Path, draft:
 
 def test_a_drifting_gap_is_the_one_of_its_time(profile: Path, draft: None) -> None:
     drift = model(profile.parent, "drift", EFFECT.format("gap_drift", "rate = 1e-5"))
-    rows = read_batch_rows(simulated(profile, [drift], ["4"]) / "batch.csv")
+    rows = read_rows(simulated(profile, [drift], ["4"]) / "batch.csv")
     deep = {row["frequency_hz"]: row for row in rows if row["direction"] == "forward"}[3.4]
     # 510 kN/m on this deformation, and little from the dashpot, is this force
     force = 510e3 * deep["eta_r"] * 30.5371e-3 / 550 / 9.80665
@@ -204,7 +209,7 @@ def test_a_plug_in_effect_is_played_like_any_other(
     monkeypatch.setattr(metadata, "entry_points", lambda group: [Entry()])
     mine = model(profile.parent, "mine", EFFECT.format("my_cubic", "k3 = 5e6"))
     ours = model(profile.parent, "ours", EFFECT.format("cubic_stiffness", "k3 = 5e6"))
-    rows = read_batch_rows(simulated(profile, [mine, ours], []) / "batch.csv")
+    rows = read_rows(simulated(profile, [mine, ours], []) / "batch.csv")
     eta = {one: [r["eta_d"] for r in rows if r["model"] == one] for one in ("mine", "ours")}
     np.testing.assert_allclose(eta["mine"], eta["ours"], rtol=1e-9)
 
@@ -238,7 +243,7 @@ def test_one_model_at_its_gap_is_a_run_as_ever(profile: Path) -> None:
     assert not (out / "batch.csv").exists()
 
 
-def refused(profile: Path, models: list[str], gaps: list[str], said: str, **more: object) -> None:
+def refused(profile: Path, models: list[str], gaps: list[str], said: str, **more: Any) -> None:
     out = profile.parent / "out"
     with pytest.raises(InputError, match=said):
         simulate_profile(profile, models, gaps, more.get("workers"), out, bool(more.get("view")))
@@ -277,7 +282,7 @@ def test_ctrl_c_keeps_the_sweeps_that_are_done(tmp_path: Path) -> None:
     told = summary(tmp_path / "out")
     assert told["verdict"] == "stopped"
     assert 2 <= len(told["cases"]) < 60
-    rows = read_batch_rows(tmp_path / "out" / "batch.csv")
+    rows = read_rows(tmp_path / "out" / "batch.csv")
     assert len(rows) == 22 * len(told["cases"])
     assert (tmp_path / "out" / "report.html").exists()
 
@@ -297,9 +302,9 @@ def test_the_pictures_name_what_is_in_them(profile: Path) -> None:
     assert words == ["no bumpers", "G = 4 mm", "G = 0 mm", "G = −1 mm", "forward", "backward"]
     for ax in family.axes:
         assert ax.get_ylabel()
-        drawn = [line for line in ax.lines if len(line.get_xdata()) == 11]
+        drawn = [line for line in ax.lines if np.size(line.get_xdata()) == 11]
         assert {line.get_linestyle() for line in drawn} == {"-", "--"}
-    top = max(max(line.get_ydata()) for line in family.axes[1].lines)
+    top = max(float(np.max(np.asarray(line.get_ydata()))) for line in family.axes[1].lines)
     assert top < family.axes[1].get_ylim()[1] < 1.3 * top
     beside = figures._draw_models(4.0, {label: one for (label, gap), one in cases.items()
                                        if gap == 4.0}).figure  # fmt: skip

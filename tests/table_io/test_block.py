@@ -1,5 +1,7 @@
 """Blocks: nobody changes one, and no way of cutting the samples changes a bit."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -120,7 +122,8 @@ def test_cut_refuses_samples_that_it_does_not_have(window: tuple[int, int]) -> N
 @pytest.mark.parametrize("name", ["stream", "index", "rate_hz", "values", "step", "label", "cycle"])
 def test_identical_sees_every_field(name: str) -> None:
     one = block(20)
-    other = {"stream": "pred", "index": 41, "rate_hz": 1000.0}.get(name)
+    others: dict[str, Any] = {"stream": "pred", "index": 41, "rate_hz": 1000.0}
+    other = others.get(name)
     if other is None:
         changed = getattr(one, name).copy()
         changed[..., -1] += 1

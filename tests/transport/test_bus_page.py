@@ -67,6 +67,8 @@ def test_the_example_runs_as_it_stands() -> None:
     lines = said.splitlines()[:3]
     assert len(lines) == 3, said
     for line in lines:
-        second, name, value = re.fullmatch(r"([\d.]+) \[\('(\w+)', ([\d.]+)\)\]", line).groups()
+        match = re.fullmatch(r"([\d.]+) \[\('(\w+)', ([\d.]+)\)\]", line)
+        assert match is not None, line
+        second, name, value = match.groups()
         assert name == "mass_disp_m"
         assert float(value) == pytest.approx(100 * float(second))

@@ -43,7 +43,7 @@ def anything_like(hint: Any) -> st.SearchStrategy[Any]:
         return st.lists(anything_like(get_args(hint)[0]), max_size=4).map(tuple)
     if get_origin(hint) is dict:
         return st.dictionaries(*(anything_like(arg) for arg in get_args(hint)), max_size=4)
-    if is_dataclass(hint):
+    if isinstance(hint, type) and is_dataclass(hint):
         hints = get_type_hints(hint)
         return st.builds(hint, **{one.name: anything_like(hints[one.name]) for one in fields(hint)})
     return {
@@ -197,8 +197,9 @@ def test_the_schema_has_the_fields_of_a_block_and_no_other() -> None:
     message = pb.DESCRIPTOR.message_types_by_name["Block"]
     names = {one.name for one in fields(Block)} - {"values"}  # they stand in the channels
     assert {field.name for field in message.fields} == {*names, "run"}
-    channel = {field.name for field in message.fields_by_name["channels"].message_type.fields}
-    assert channel == {"name", "values"}
+    channel = message.fields_by_name["channels"].message_type
+    assert channel is not None
+    assert {field.name for field in channel.fields} == {"name", "values"}
     messages = {codec.MESSAGE_NAMES[kind] for kind in cards()} | {"Block", "Channel"}
     assert set(pb.DESCRIPTOR.message_types_by_name) == messages
 

@@ -30,7 +30,7 @@ TOPIC, SOURCE = "/rig/meas", "00112233445566ff"
 class Bytes(bytes):
     """As zenoh hands them over."""
 
-    def to_bytes(self) -> bytes:  # type: ignore[override]
+    def to_bytes(self) -> bytes:
         return bytes(self)
 
 

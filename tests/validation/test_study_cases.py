@@ -11,7 +11,7 @@ import pytest
 from table_io.block import Label
 from table_io.config.base import parse_toml
 from table_io.errors import InputError
-from table_io.sim.ground_truth import GroundTruth
+from table_io.sim.ground_truth import EFFECT_DEFINITIONS, GroundTruth
 from twin.recording.reader import read_recording as read_log
 from twin.run.recordings import read_recorded_config
 from twin.validation.study import amplitude_search, generation, strata
@@ -258,7 +258,7 @@ def test_every_kind_that_can_be_hidden_has_what_the_generator_needs() -> None:
         for hidden in cell.effects:
             assert hidden.amplitudes, hidden.name
     for (effect, name), (low, high) in strata.SHAPE_RANGES.items():
-        kinds = [one for one in strata.EFFECT_DEFINITIONS if one.id == effect]
+        kinds = [one for one in EFFECT_DEFINITIONS if one.id == effect]
         found = [q for kind in kinds for q in kind.parameters if q.name == name]
         assert found, (effect, name)
         assert all(q.low <= low < high <= q.high for q in found), (effect, name)

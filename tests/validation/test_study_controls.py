@@ -77,7 +77,7 @@ def test_shuffled_truths_fall_to_chance() -> None:
 
 
 def test_the_page_has_the_controls_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    good = {"said": "unexplained", "named": [], "confidence": None, "fooled": False}
+    good: dict[str, Any] = {"said": "unexplained", "named": [], "confidence": None, "fooled": False}
     bad = {"said": "named", "named": ["table_tilt"], "confidence": 0.9, "fooled": True}
     rows: list[dict[str, Any]] = [
         {"number": 7000, "reversed": good, "without": bad, "right": False},

@@ -13,6 +13,7 @@ from tests.validation import study_work
 from tests.validation.test_study_scores import OTHER, TRUE, about, verdict
 from twin.validation.study import evaluation, worker_pool
 from twin.validation.study.command import run_cases, run_discovery_study
+from twin.validation.study.generation import CasePaths
 from twin.validation.study.report import RESULTS_FILE, TABLE_FILE, read_rows
 from twin.validation.study.strata import draw_case
 from twin.validation.study.worker_pool import map_in_processes
@@ -69,7 +70,7 @@ def test_a_verdict_that_fails_is_a_miss_that_says_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     case = draw_case(3000)
-    places = evaluation.CasePaths(tmp_path, case.label)
+    places = CasePaths(tmp_path, case.label)
     for folder in (places.case_dir, places.sealed_dir):
         folder.mkdir(parents=True)
     places.about.write_text(json.dumps(about("single", TRUE, number=3000)))
@@ -101,7 +102,7 @@ def test_of_two_effects_the_row_says_what_mark_the_lesser_leaves(
 ) -> None:
     """The factor by which the error grows without it; a verdict that fails has one too."""
     number = 294000
-    places = evaluation.CasePaths(tmp_path, draw_case(number).label)
+    places = CasePaths(tmp_path, draw_case(number).label)
     for folder in (places.case_dir, places.sealed_dir):
         folder.mkdir(parents=True)
     places.about.write_text(json.dumps(about("pair", TRUE, OTHER, number=number)))

@@ -18,9 +18,13 @@ from twin.validation.study.scoring import format_effect_name, score_verdict, sel
 
 Json = dict[str, Any]
 REGION = {"frequency_hz": [2.0, 3.2], "phase": ["contact_right", "contact_left"]}
-TRUE = {"name": "bumper_hardening", "parameters": {"k2": 1e8}, "vanishing": {"k2": 0.0}}
-LAG = {"name": "sensor_lag.mass_disp_m", "parameters": {"lag": 1e-3}, "vanishing": {"lag": 0.0}}
-OTHER = {"name": "table_tilt", "parameters": {"tilt": 0.1}, "vanishing": {"tilt": 0.0}}
+TRUE: Json = {"name": "bumper_hardening", "parameters": {"k2": 1e8}, "vanishing": {"k2": 0.0}}
+LAG: Json = {
+    "name": "sensor_lag.mass_disp_m",
+    "parameters": {"lag": 1e-3},
+    "vanishing": {"lag": 0.0},
+}
+OTHER: Json = {"name": "table_tilt", "parameters": {"tilt": 0.1}, "vanishing": {"tilt": 0.0}}
 
 
 def about(kind: str = "single", *effects: Json, **more: Any) -> Json:

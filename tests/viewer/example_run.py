@@ -130,7 +130,7 @@ def recording(items: Sequence[Block | Record], begin: RunStart | None = None) ->
 
 
 @cache
-def content(path: Path) -> dict[str, dict[str, tuple[Any, Any]]]:
+def content(path: Path) -> dict[str, dict[str, tuple[Any, ...]]]:
     """{entity: {component: (times in ns, rows as lists)}} of what changes over time."""
     found: dict[str, dict[str, list[tuple[int, Any]]]] = {}
     for chunk in RrdReader(path).stream():

@@ -170,7 +170,12 @@ def test_the_command_says_where_it_serves_and_how_it_ended(
     hub, spoke = ends
     opened: list[str] = []
     monkeypatch.setattr(view, "open_spoke", lambda *_: spoke)
-    monkeypatch.setattr(view, "open_viewer", lambda url: opened.append(url) or "opened")
+
+    def open_viewer(url: str) -> str:
+        opened.append(url)
+        return "opened"
+
+    monkeypatch.setattr(view, "open_viewer", open_viewer)
     over = threading.Event()
 
     def rig() -> None:

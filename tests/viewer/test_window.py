@@ -47,7 +47,7 @@ def test_file_and_server_at_once(tmp_path: Path) -> None:
 def test_without_a_display_it_says_what_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(window.sys, "platform", "linux")
+    monkeypatch.setattr("sys.platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     assert "--bind 127.0.0.1" in open_viewer("rerun+http://127.0.0.1:9876/proxy")

@@ -46,7 +46,7 @@ class Heard:
     """A measured command, m, and where each sample truly lies in the drive."""
 
     command: Float1D
-    place: Float1D
+    place: np.ndarray
 
 
 def heard(drive: Drive, seconds: float = 0.0, ppm: float = 0.0, noise: float = 0.0) -> Heard:
@@ -78,7 +78,7 @@ def places(now: DriveFollower) -> Int1D:
 
 def test_a_drive_is_evaluated_between_its_samples(drive: Drive) -> None:
     """Against its own closed form, by the same drive planned at four times the rate."""
-    at = np.arange(3000, 3400) + 0.25
+    at = np.linspace(3000.25, 3399.25, 400)
     value, slope = interpolate_drive(drive, at)
     fine = replace(
         drive,
@@ -191,6 +191,7 @@ def test_what_is_not_the_drive_is_told(drive: Drive, share: float, words: str) -
     now = followed(drive, command)
     assert now.state == "other"
     assert words in now.reason
+    assert now.onset is not None
     assert now.processed_end - now.onset > 0
     assert (places(now) == REST_INDEX).all()
 

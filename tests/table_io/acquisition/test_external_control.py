@@ -1,6 +1,6 @@
 """A session that follows: what it records, what it says, and that it stops nothing."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -45,7 +45,7 @@ def start(tare: dict[str, float], epoch_s: float) -> RunStart:
 class Followed:
     """Everything that a session said, and the drive that it planned."""
 
-    items: list[object]
+    items: Sequence[object]
     drive: Drive
 
     def of(self, kind: type) -> list:

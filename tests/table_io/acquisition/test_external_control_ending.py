@@ -1,6 +1,7 @@
 """When a session that follows ends, and what it says then: stops, noise, and who played before."""
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -78,8 +79,9 @@ class Before(Bystander):
 class Early(Before):
     """The same, well in the drive."""
 
-    def __init__(self, *words: object) -> None:
-        super().__init__(*words[:5], -9000.4, words[6])  # type: ignore[arg-type]
+    def __init__(self, *words: Any) -> None:
+        rig, specimen, rate_hz, clock, file_m, _, ppm = words
+        super().__init__(rig, specimen, rate_hz, clock, file_m, -9000.4, ppm)
 
 
 def test_a_controller_that_plays_before_the_start_is_refused() -> None:

@@ -7,11 +7,11 @@ the contract's language.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
-from table_io.backends import AcquisitionSource, Backend
+from table_io.backends import Backend
 from table_io.block import Float1D, Float2D
 from table_io.clock import Clock
 from table_io.config.calibration import compute_tare, volts_to_si
@@ -38,7 +38,7 @@ class Bench:
     clock: Clock
     make: Callable[[float], Backend]
     repeatable: bool = False
-    play: Callable[[AcquisitionSource, Float1D], None] | None = None
+    play: Callable[[Any, Float1D], None] | None = None
 
     def begin(self, backend: Backend, volts: Float1D) -> None:
         """Have it play `volts` from its next sample on."""

@@ -9,6 +9,7 @@ import grpc
 from nidaqmx._stubs import nidaqmx_pb2 as pb
 
 from table_io.backends.ni.backend import NiBackend
+from table_io.backends.ni.config import NiWiring
 from table_io.clock import Clock, ManualClock
 from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.profile import Specimen
@@ -22,7 +23,13 @@ SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
 CARD = (PROFILES_DIR / "rigs" / "ni_simulated.toml").read_text()
 
 
-class Answer(grpc.RpcError):
+def wired(rig: RigConfig) -> NiWiring:
+    wiring = rig.get_section(NiWiring)
+    assert wiring is not None
+    return wiring
+
+
+class Answer(grpc.RpcError):  # type: ignore[misc]  # grpc is skipped
     """What a client sees of an error: its code, its words, its metadata."""
 
     def __init__(self, code: Any, details: str, trailing: Any) -> None:
@@ -98,9 +105,9 @@ class Bed:
         self.table = InterlockedTable(self.rig, SPECIMEN, self.told.append, self.box)
         self.table.warm_up()
         self.device = SimulatedDaqDevice(self.table, self.rig.rates_hz, self.clock.now())
-        assert self.rig.ni is not None
-        self.device.faults = list(self.rig.ni.faults)
-        self.service = NiDeviceService(self.device, self.rig.ni, self.clock)
+        wiring = wired(self.rig)
+        self.device.faults = list(wiring.faults)
+        self.service = NiDeviceService(self.device, wiring, self.clock)
         self.wire = Wire(self.service)
 
     def backend(self, rate_hz: float = 2000.0) -> NiBackend:
@@ -111,3 +118,16 @@ class Bed:
         while self.device.moving:
             self.clock.wait_until(self.clock.now() + 0.1)
             self.service.advance()
+
+
+def note_heartbeats(bed: Bed) -> list[float]:
+    """The times in s, to be, at which the table receives an edge of the heartbeat."""
+    times: list[float] = []
+    receive = bed.table.receive_heartbeat
+
+    def note(now_s: float) -> None:
+        times.append(now_s)
+        receive(now_s)
+
+    bed.table.receive_heartbeat = note  # type: ignore[method-assign]
+    return times

@@ -17,6 +17,7 @@ from table_io.config.base import parse_toml
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.config.sensor import SensorConfig
+from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.machine.connection import MachineSession
 from table_io.sim.opendaq import NS_PER_S, TICK_S, OpenDaqServer
 
@@ -40,9 +41,9 @@ class InUnits(OpenDaqServer):
 
 def main(path: str, unit: str) -> None:
     rig = parse_toml(Path(path).read_text(), RigConfig, path)
-    quiet = rig.model_copy(
-        update={"simulated": rig.simulated and rig.simulated.model_copy(update={"faults": ()})}
-    )
+    table = rig.get_section(SimulatedTableConfig)
+    assert table is not None
+    quiet = rig.model_copy(update={"simulated": table.model_copy(update={"faults": ()})})
     device, clock = (OpenDaqServer if unit == "V" else InUnits)(rig, RATE), RealClock()
     life, base = MachineSession(quiet, SPECIMEN, RATE, None), 0
     life.start(clock.now())

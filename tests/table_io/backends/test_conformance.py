@@ -45,7 +45,7 @@ def machine(folder: Path) -> Iterator[Bench]:
     path = folder / "card.toml"
     path.write_text(text)
     rig, clock = parse_toml(text, RigConfig, str(path)), RealClock()
-    command = [Path(sys.executable).parent / "shaketwin", "table", "--rig", path]
+    command: list[str | Path] = [Path(sys.executable).parent / "shaketwin", "table", "--rig", path]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert "waiting at" in process.stdout.readline()

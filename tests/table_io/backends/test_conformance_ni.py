@@ -43,7 +43,7 @@ def server(folder: Path) -> Iterator[Bench]:
     path.write_text(text)
     rig, clock = parse_toml(text, RigConfig, str(path)), RealClock(PACE)
     program = Path(sys.executable).parent / "shaketwin"
-    command = [program, "table", "--rig", path, "--time-scale", f"{PACE:g}"]
+    command: list[str | Path] = [program, "table", "--rig", path, "--time-scale", f"{PACE:g}"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert "waiting at" in process.stdout.readline()

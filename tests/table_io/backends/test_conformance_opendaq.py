@@ -7,11 +7,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 
-from table_io.backends import MachineLost
+from table_io.backends import Backend, MachineLost
+from table_io.backends.opendaq.config import OpenDaqWiring
 from table_io.backends.opendaq.source import OpenDaqSource, check_reachable
 from table_io.block import Float1D
 from table_io.clock import RealClock
@@ -28,11 +30,11 @@ FAR_SIDE = Path(__file__).with_name("opendaq_far_side.py")
 RATE = 2000.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Device(Bench):
     """A Bench and the process behind it."""
 
-    process: subprocess.Popen[str] | None = None
+    process: subprocess.Popen[str]
 
 
 @contextmanager
@@ -42,11 +44,19 @@ def far_side(folder: Path, unit: str = "V") -> Iterator[Device]:
     path = folder / "card.toml"
     path.write_text(text)
     clock = RealClock()
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen([sys.executable, FAR_SIDE, path, unit], **pipes) as process:
+    command: list[str | Path] = [sys.executable, FAR_SIDE, path, unit]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
         assert "waiting" in process.stdout.readline()
 
+        def make(rate: float) -> Backend:
+            return cast(Backend, OpenDaqSource(rig, rate, clock))  # the clauses need no output
+
         def play(source: OpenDaqSource, volts: Float1D) -> None:
+            assert process.stdin is not None
+            assert process.stdout is not None
             source.start()
             process.stdin.write(json.dumps(volts.tolist()) + "\n")
             process.stdin.flush()
@@ -54,9 +64,7 @@ def far_side(folder: Path, unit: str = "V") -> Iterator[Device]:
             source.read(round((stamp - source._first_tick) / source._ticks_per_sample))
 
         try:
-            yield Device(
-                rig, clock, lambda rate: OpenDaqSource(rig, rate, clock), play=play, process=process
-            )
+            yield Device(rig, clock, make, play=play, process=process)
         finally:
             process.kill()
 
@@ -72,9 +80,16 @@ def test_the_client_keeps_the_contract(clause: str, bench: Bench) -> None:
     ACQUIRING[clause](bench)
 
 
+def wired(rig: RigConfig) -> OpenDaqWiring:
+    wiring = rig.get_section(OpenDaqWiring)
+    assert wiring is not None
+    return wiring
+
+
 def changed(rig: RigConfig, **signals: str) -> RigConfig:
     """The card with other signals wired."""
-    wiring = rig.opendaq.model_copy(update={"signals": {**rig.opendaq.signals, **signals}})
+    wiring = wired(rig)
+    wiring = wiring.model_copy(update={"signals": {**wiring.signals, **signals}})
     return rig.model_copy(update={"opendaq": wiring})
 
 
@@ -100,7 +115,7 @@ def test_another_rate_than_the_devices_is_refused(bench: Bench) -> None:
 
 
 def test_who_does_not_answer_is_named(bench: Bench) -> None:
-    away = bench.rig.opendaq.model_copy(update={"device": "daq.nd://127.0.0.1:7499"})
+    away = wired(bench.rig).model_copy(update={"device": "daq.nd://127.0.0.1:7499"})
     with pytest.raises(InputError, match=r"no openDAQ device answers.*shaketwin table --rig"):
         check_reachable(bench.rig.model_copy(update={"opendaq": away}))
     check_reachable(bench.rig)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from table_io.backends import AcquisitionSource
+from table_io.backends import AcquisitionSource, Backend
 from table_io.backends.ni.probe import require_ni_wiring
 from table_io.backends.udp.backend import UdpBackend
 from table_io.clock import RealClock
@@ -23,7 +23,7 @@ WIRES = [f'{{ channel = "{name}", physical = "Dev1/ai{9 + k}" }},' for k, name i
 NI_TEXT = CARD.replace(LAST_WIRE, "\n".join([LAST_WIRE, *WIRES])) + DECLARED
 
 
-def read_at_rest(source: AcquisitionSource) -> None:
+def read_at_rest(source: Backend | AcquisitionSource) -> None:
     """Read some samples at rest and look at those of the thermometer, in V."""
     row = source.channels.index(TEMPERATURE)
     source.open()
@@ -36,7 +36,7 @@ def read_at_rest(source: AcquisitionSource) -> None:
         source.close()
 
 
-def _start_and_read(source: AcquisitionSource) -> np.ndarray:
+def _start_and_read(source: Backend | AcquisitionSource) -> np.ndarray:
     queue: Callable[[int, np.ndarray], None] | None = getattr(source, "queue", None)
     if queue is not None:
         queue(0, np.zeros(400))

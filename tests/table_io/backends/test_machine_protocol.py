@@ -103,7 +103,7 @@ def test_a_landing_from_a_large_motion_stays_within_the_span(
 def test_what_cannot_keep_within_the_span_stops_dead_and_goes_home_gently(
     x: float, v: float
 ) -> None:
-    landed = plan_stop(x + v / RATE * np.arange(-2, 1), RATE, SPAN_M)
+    landed = plan_stop(x + v / RATE * np.array([-2.0, -1.0, 0.0]), RATE, SPAN_M)
     assert np.abs(landed).max() <= max(abs(x), SPAN_M)
     assert landed[-1] == 0.0
     if x * v > 0:

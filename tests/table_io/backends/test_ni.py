@@ -27,7 +27,7 @@ from table_io.sim.ni.device import SimulatedDaqDevice
 from table_io.sim.ni.server import ServerEndpoint
 from table_io.sim.ni.task import DriverError, ErrorCode, Task
 from tests.studies.ni_error_codes import CALLS, RATE, judged, met, motion
-from tests.table_io.backends.ni_wire import CARD, SPECIMEN, Answer, Bed
+from tests.table_io.backends.ni_wire import CARD, SPECIMEN, Answer, Bed, note_heartbeats, wired
 
 NOTHING = RunStart(0, "", "", "table", "", "", "", RATE, 20, (), (), 0, {}, {}, "", "", 0.0)
 SHORT = """
@@ -191,9 +191,7 @@ def test_close_waits_for_rest_before_it_stops_the_output(tmp_path: Path) -> None
 
 def test_the_heartbeat_is_10_hz_while_the_rig_reads_and_not_after_it() -> None:
     bed = Bed()
-    beats: list[float] = []
-    beat = bed.table.receive_heartbeat
-    bed.table.receive_heartbeat = lambda now: (beats.append(now), beat(now))[1]  # type: ignore[method-assign]
+    beats = note_heartbeats(bed)
     backend = started(bed)
     for _ in range(100):
         backend.read(20)
@@ -356,9 +354,8 @@ def test_a_card_says_what_is_wrong_with_it(ours: str, theirs: str, part: str) ->
 
 def test_the_trigger_is_that_of_the_inputs_chassis() -> None:
     rig = parse_toml(CARD.replace("Dev1/ai", "cDAQ1Mod3/ai"), RigConfig, "card")
-    assert rig.ni is not None
-    assert rig.ni.trigger == "/cDAQ1/ai/StartTrigger"
-    assert parse_toml(CARD, RigConfig, "card").ni.trigger == "/Dev1/ai/StartTrigger"  # type: ignore[union-attr]
+    assert wired(rig).trigger == "/cDAQ1/ai/StartTrigger"
+    assert wired(parse_toml(CARD, RigConfig, "card")).trigger == "/Dev1/ai/StartTrigger"
 
 
 def test_nobody_there_is_said_with_what_to_do() -> None:
@@ -372,9 +369,8 @@ def test_nobody_there_is_said_with_what_to_do() -> None:
 
 def test_the_local_driver_is_warned_of() -> None:
     local = parse_toml(CARD.replace('endpoint = "127.0.0.1:7470"\n', ""), RigConfig, "card")
-    assert local.ni is not None
-    assert "freezes in motion" in local.ni.warnings[0]
-    assert not parse_toml(CARD, RigConfig, "card").ni.warnings  # type: ignore[union-attr]
+    assert "freezes in motion" in wired(local).warnings[0]
+    assert not wired(parse_toml(CARD, RigConfig, "card")).warnings
 
 
 @pytest.mark.parametrize("ppm", [-150.0, 0.0, 150.0])
@@ -518,7 +514,6 @@ def test_an_address_that_is_taken_is_said() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         rig = parse_toml(CARD.replace("127.0.0.1:7470", address), RigConfig, "card")
-        assert rig.ni is not None
         with pytest.raises(InputError) as error:
-            ServerEndpoint(rig.ni)
+            ServerEndpoint(wired(rig))
         assert (error.value.key, error.value.value) == ("ni.endpoint", address)

@@ -25,7 +25,7 @@ from table_io.sim.ni.server import ServerEndpoint
 from table_io.sim.ni.task import DriverError, ErrorCode, Task
 from tests.studies.ni import served
 from tests.studies.ni_error_codes import RATE, motion
-from tests.table_io.backends.ni_wire import CARD, SPECIMEN, Answer, Bed
+from tests.table_io.backends.ni_wire import CARD, SPECIMEN, Answer, Bed, note_heartbeats, wired
 
 AT_MOST_S = 60.0  # until a server that holds everybody is let go, so that a test ends
 
@@ -40,19 +40,6 @@ def opened(bed: Bed) -> NiBackend:
 def reads(backend: NiBackend, blocks: int) -> None:
     for _ in range(blocks):
         backend.read(20)
-
-
-def edges(bed: Bed) -> list[float]:
-    """When the heartbeat line changes, from now on."""
-    times: list[float] = []
-    beat = bed.table.receive_heartbeat
-
-    def noted(now: float) -> None:
-        times.append(now)
-        beat(now)
-
-    bed.table.receive_heartbeat = noted  # type: ignore[method-assign]
-    return times
 
 
 def test_a_server_that_stands_still_in_motion_holds_neither_read_nor_close(tmp_path: Path) -> None:
@@ -91,7 +78,7 @@ def answers_and_opens(rig: RigConfig) -> None:
 
 def test_the_heart_beats_before_the_start_so_that_a_latch_can_be_reset() -> None:
     bed = Bed()
-    times = edges(bed)
+    times = note_heartbeats(bed)
     backend = bed.backend()
     backend.open()
     assert times == [bed.clock.now()]
@@ -315,6 +302,5 @@ def test_a_run_ends_before_the_driver_cannot_count_on(monkeypatch: pytest.Monkey
 
 def test_a_served_card_needs_an_address() -> None:
     local = parse_toml(CARD.replace('endpoint = "127.0.0.1:7470"\n', ""), RigConfig, "card")
-    assert local.ni is not None
     with pytest.raises(InputError, match=r"ni\.endpoint: empty"):
-        ServerEndpoint(local.ni)
+        ServerEndpoint(wired(local))

@@ -19,6 +19,7 @@ from table_io.backends import (
     open_backend,
 )
 from table_io.backends.udp.backend import UdpBackend
+from table_io.backends.udp.config import UdpWiring
 from table_io.backends.udp.link import query_target
 from table_io.backends.udp.packets import (
     PacketKind,
@@ -144,7 +145,8 @@ def test_a_target_that_answers_one_port_only_is_asked_from_that_one() -> None:
             "replace_after", f"rig_port = {own}\nreplace_after"
         )
         rig, over = parse_toml(text, RigConfig, "udp"), threading.Event()
-        assert rig.udp is not None
+        wiring = rig.get_section(UdpWiring)
+        assert wiring is not None
 
         def answer() -> None:
             far.settimeout(0.1)
@@ -157,7 +159,7 @@ def test_a_target_that_answers_one_port_only_is_asked_from_that_one() -> None:
         thread = threading.Thread(target=answer)
         thread.start()
         try:
-            assert query_target(rig.udp, CLOCK, 0.3).phase is Phase.FREE
+            assert query_target(wiring, CLOCK, 0.3).phase is Phase.FREE
         finally:
             over.set()
             thread.join()
@@ -329,8 +331,9 @@ def test_the_c_target_survives_whatever_comes(tmp_path: Path) -> None:
                 if sequence % 100 == 1:
                     kind, values = PacketKind.CLAIM, np.array([RATE, 9.0, 0.0, 1.0, 1.0, 1.0, 1.0])
                 queue = sequence - int(chance.integers(2))
+                index, want_from, want_to = large
                 word = RigPacket(
-                    kind, 1, sequence, large[0], queue, piece, samples, *large[1:], values
+                    kind, 1, sequence, index, queue, piece, samples, want_from, want_to, values
                 )
                 packet = bytearray(encode_rig_packet(word))
                 if sequence % 5 == 0:
@@ -339,7 +342,7 @@ def test_the_c_target_survives_whatever_comes(tmp_path: Path) -> None:
                 one.send(chance.bytes(int(chance.integers(1200))))
                 if sequence % 50 == 0:
                     CLOCK.wait_until(CLOCK.now() + 0.005)
-        wiring = rig_at(("127.0.0.1", port)).udp
+        wiring = rig_at(("127.0.0.1", port)).get_section(UdpWiring)
         assert wiring is not None
         state = query_target(wiring, CLOCK)
         assert process.poll() is None

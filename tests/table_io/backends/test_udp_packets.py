@@ -123,7 +123,7 @@ def test_the_document_says_where_every_field_is() -> None:
 
 
 @given(st.lists(st.integers(1, 20), min_size=1, max_size=30), st.randoms(use_true_random=False))
-def test_samples_keep_their_place_in_whatever_order_they_come(cuts: list[int], chance) -> None:  # type: ignore[no-untyped-def]
+def test_samples_keep_their_place_in_whatever_order_they_come(cuts: list[int], chance) -> None:
     whole = np.arange(2.0 * sum(cuts)).reshape(-1, 2).T
     edges = np.cumsum([0, *cuts])
     pieces = [(int(a), whole[:, a:b]) for a, b in itertools.pairwise(edges)]

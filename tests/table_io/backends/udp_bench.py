@@ -34,6 +34,7 @@ for_s = {len(LOST) / RATE}
 """
 SOURCES = Path(udp.__file__).parent
 FLAGS = ["-std=c99", "-O1", "-g", "-Wall", "-Wextra", "-Werror", "-Wconversion", "-pedantic"]
+EVILS = ("lost", "doubled", "reordered", "spoilt")
 SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 
 
@@ -177,9 +178,6 @@ class Relay:
                 return after
             case _:
                 return [data, *after]
-
-
-EVILS = ("lost", "doubled", "reordered", "spoilt")
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 import pytest
 
+from table_io.backends.opendaq.config import OpenDaqWiring
 from table_io.channels import CHANNEL_BY_NAME, Channel
 from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.channel import CONSTANT, QUANTITIES, read_channels
@@ -114,8 +115,9 @@ device = "daq.nd://127.0.0.1"
 air_temp_degc = "AI9"
 """
     rig = parse_toml(LAB_TEXT + wiring, RigConfig, "lab.toml")
-    assert rig.opendaq is not None
-    assert rig.opendaq.signals == {TEMPERATURE: "AI9"}
+    section = rig.get_section(OpenDaqWiring)
+    assert section is not None
+    assert section.signals == {TEMPERATURE: "AI9"}
     (fault,) = faults(LAB_TEXT + wiring.replace("air_temp_degc", "oil_temp_degc"))
     assert fault.startswith("opendaq: signals name unknown channels oil_temp_degc")
 

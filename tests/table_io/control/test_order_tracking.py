@@ -13,7 +13,7 @@ RATE = 2000.0
 
 def wave(
     frequency_hz: float, cycles: float, amplitudes: list[complex], offset: float = 0.0
-) -> tuple[Float1D, Float1D]:
+) -> tuple[Float1D, np.ndarray]:
     """(samples, phase in cycles) of a sum of harmonics."""
     phase = 0.3 + np.arange(round(cycles * RATE / frequency_hz)) * frequency_hz / RATE
     orders = np.arange(1, len(amplitudes) + 1)

@@ -113,7 +113,7 @@ def test_blends_last_at_least_one_and_a_half_cycles(name: str) -> None:
 def test_coarse_grids_get_longer_blends_instead_of_harder_ones(
     step_hz: float, directions: tuple[str, ...]
 ) -> None:
-    sweep = {"start_hz": 0.5, "stop_hz": 10.0, "step_hz": step_hz, "cycles": 2}
+    sweep: dict[str, object] = {"start_hz": 0.5, "stop_hz": 10.0, "step_hz": step_hz, "cycles": 2}
     sweep |= {"measured_cycles": 1, "directions": directions}
     raw = {"title": "coarse", "specimen": {"mass_kg": 550.0, "gap_mm": 4.0}, "sweep": sweep}
     one = plan_sweep(Profile.model_validate(raw))
@@ -182,8 +182,8 @@ def test_measured_samples_are_the_last_cycles_of_a_step_and_never_in_a_blend(nam
         assert np.array_equal(label[window] == Label.SETTLE, ~measured)
         assert (step[window] == segment.step).all()
         assert np.unique(cycle[window][measured]).size == sweep.measured_cycles
-    moving = np.arange(label.size)
-    moving = (moving >= one.segments[0].start) & (moving < one.planned_end)
+    index = np.arange(label.size)
+    moving = (index >= one.segments[0].start) & (index < one.planned_end)
     assert (label[moving & ~seen] == Label.BLEND).all()
     assert (label[~moving] == Label.REST).all()
     assert (step[~moving] == -1).all()

@@ -89,7 +89,9 @@ class Nothing:
 @pytest.fixture
 def lab() -> Iterator[tuple[NiWiring, NiDeviceService, grpc.Server]]:
     """A device server with the card's digital inputs, and the way to it."""
-    wiring = parse_toml(TEXT.replace("[ni]\n", f"[ni]{WATCHED}"), RigConfig, "card").ni
+    wiring = parse_toml(TEXT.replace("[ni]\n", f"[ni]{WATCHED}"), RigConfig, "card").get_section(
+        NiWiring
+    )
     assert wiring is not None
     clock = ManualClock()
     service = NiDeviceService(SimulatedDaqDevice(Nothing(), (2000.0,), 0.0), wiring, clock)  # type: ignore[arg-type]

@@ -343,7 +343,7 @@ def test_a_load_cell_shows_its_sign_and_its_death_in_contact_only(cell: str) -> 
 
 def test_a_load_cell_that_does_not_even_flicker_is_dead_without_contact() -> None:
     profile, block, drive, _ = recorded("ginf")
-    changes = {"force_r1_n": dead}
+    changes: dict[str, Change] = {"force_r1_n": dead}
     checks, _ = evaluate(altered(block, changes), drive, profile, RIG)
     assert failed(checks) == {("alive, noise at rest", "force_r1_n")}
 

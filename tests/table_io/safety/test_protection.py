@@ -35,7 +35,7 @@ AT = 5000  # in the held cycles of the first step, 2 Hz
 CYCLE = 1000
 A = 0.05 * GRAVITY_M_S2
 AMPLITUDE = A / (4 * np.pi) ** 2
-Change = Callable[[Float2D], None]
+Change = Callable[[Any], None]  # of values, or of what is at its range, (channel, sample)
 
 
 def profile(sensor: str = "stop", gap_mm: float = 4.0, **sweep: Any) -> Profile:
@@ -135,18 +135,18 @@ def steady(drive: Drive) -> tuple[Any, Any, Any]:
     return 2 * np.pi * phase, level, f
 
 
-def put(row: int, first: int, value: Any, count: int | None = None) -> Change:
+def put(rows: Any, first: int, value: Any, count: int | None = None) -> Change:
     """Sets samples of a channel."""
 
     def change(values: Float2D) -> None:
-        values[row, first : None if count is None else first + count] = value
+        values[rows, first : None if count is None else first + count] = value
 
     return change
 
 
-def add(row: int, first: int, value: Any, count: int | None = None) -> Change:
+def add(rows: Any, first: int, value: Any, count: int | None = None) -> Change:
     def change(values: Float2D) -> None:
-        values[row, first : None if count is None else first + count] += value
+        values[rows, first : None if count is None else first + count] += value
 
     return change
 

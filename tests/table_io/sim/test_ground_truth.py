@@ -15,6 +15,7 @@ from table_io.config.calibration import compute_tare, volts_to_si
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
+from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.ground_truth import (
     DEFINITION_BY_ID,
     EFFECT_DEFINITIONS,
@@ -273,8 +274,9 @@ def test_a_recording_holds_the_hash_and_nothing_else_of_the_truth(tmp_path: Path
     recording = read_recording(tmp_path / "run.mcap")
     assert recording.stop is not None
     again = read_recorded_config(recording)  # no truth needed to read, to parse or to replay it
-    assert again.rig.simulated is not None
-    assert again.rig.simulated.truth_sha256 == keys["truth_sha256"]
+    table = again.rig.get_section(SimulatedTableConfig)
+    assert table is not None
+    assert table.truth_sha256 == keys["truth_sha256"]
     log = tmp_path / "run.mcap"
     held = b"".join([log.read_bytes(), *(one.payload for one in recover_log(log).messages)])
     truth = parse_toml(PHYSICS, GroundTruth, "truth")

@@ -216,7 +216,7 @@ def test_pressed_in_nonlinear_bumpers_rest(gaps: tuple[float, float]) -> None:
 
 
 def test_the_base_of_a_truth_stands_in_place_of_the_cards() -> None:
-    base = {
+    base: dict[str, Any] = {
         "mass_kg": 500.0, "damper_stiffness_n_m": 30e3, "damper_damping_n_s_m": 1e3,
         "bumper_stiffness_n_m": 4e5, "bumper_damping_n_s_m": 800.0, "gap_right_m": 1e-3,
         "gap_left_m": 3e-3,
