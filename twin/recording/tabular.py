@@ -7,11 +7,11 @@ twin columns are NaN where the twin has no output. Invalid items are left out by
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -24,7 +24,6 @@ from twin.recording.mcap_log import iter_messages
 from twin.recording.reader import START_TOPIC, iter_valid_items, read_start
 from twin.transport.block_decoding import BATCH_PAYLOADS
 from twin.transport.codec import (
-    BLOCK_TOPICS,
     MEAS_TOPIC,
     PRED_TOPIC,
     TOPIC_TYPES,
@@ -50,9 +49,9 @@ Columns = dict[str, Any]  # arrays (row,), float64 or int64
 class _ScratchFile:
     """Blocks of one stream in order of arrival: (sample, SCRATCH_COLUMNS + channels), float64."""
 
+    file: IO[bytes]
     channels: tuple[str, ...] = ()
     size: int = 0  # samples
-    file: Any = field(default_factory=TemporaryFile)
 
     def add(self, block: Block, path: Path) -> None:
         """Append the samples of a block."""
@@ -152,8 +151,14 @@ class LogTable:
 
 def read_log_table(path: Path) -> LogTable:
     """Read the rows of a log; raise InputError if it is no log or has no start record."""
+    with TemporaryFile() as meas, TemporaryFile() as pred:  # the arrays outlive the open files
+        return _read_log_table(
+            path, {MEAS_TOPIC: _ScratchFile(meas), PRED_TOPIC: _ScratchFile(pred)}
+        )
+
+
+def _read_log_table(path: Path, scratch_files: dict[str, _ScratchFile]) -> LogTable:
     start = read_start(path)
-    scratch_files = {topic: _ScratchFile() for topic in BLOCK_TOPICS.values()}
     pending: dict[str, list[bytes]] = {topic: [] for topic in scratch_files}
     records: dict[bytes, Record] = {}
     problems: list[str] = []
