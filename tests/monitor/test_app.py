@@ -250,13 +250,13 @@ def test_without_a_terminal_it_is_a_line_a_step_until_the_end() -> None:
     place = endpoint()
     with hub_at(place) as hub:
         publish(hub, [*records(), RunStop(8000, "complete", "all driven")])
-        process = subprocess.Popen(
+        with subprocess.Popen(
             [SHAKETWIN, "monitor", "--connect", place],
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        )  # fmt: skip
-        while process.poll() is None:
-            hub.serve()
-        said = process.stdout.read() if process.stdout else ""
+        ) as process:  # fmt: skip
+            while process.poll() is None:
+                hub.serve()
+            said = process.stdout.read() if process.stdout else ""
     assert process.returncode == 0, said
     assert [line.split()[0] for line in said.splitlines() if "forward" in line] == [
         "1/10", "2/10", "3/10",
