@@ -14,6 +14,7 @@ import pytest
 
 from table_io.records import Fault
 from twin.recording.reader import Recording, read_recording
+from twin.run.diagnostics import LEVEL_VARIABLE
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
 PROFILE = """
@@ -255,6 +256,22 @@ def test_a_second_run_at_the_same_endpoint_is_refused_and_harms_nothing(tmp_path
     assert_whole(recording)
     assert len(summary["steps"]) == 3
     assert replayed(tmp_path).returncode == 0
+
+
+def test_the_log_tells_the_starts_and_ends_of_the_processes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(LEVEL_VARIABLE, "info")
+    code, said, *_ = finish(start(tmp_path), tmp_path)
+    assert code == 0, said
+    lines = re.findall(r"^\d{4}-\S+ \S+ (shaketwin run|\w+) INFO (.*)$", said, re.M)
+    processes = ("rig", "gate", "twin", "recorder")
+    starts = re.compile(r"(\w+) started, process \d+")
+    found = [starts.fullmatch(text) for process, text in lines if process == "shaketwin run"]
+    assert [match[1] for match in found if match] == list(processes)
+    ended = {process for process, text in lines if re.fullmatch(r"process \d+ ends", text)}
+    assert ended == set(processes)
+    assert ("rig", "command start, accepted") in lines
 
 
 def test_an_interrupt_before_the_start_moves_nothing(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from twin.cli.file_commands import StepsOption, files_app
 from twin.cli.hardware_commands import hardware_app
 from twin.cli.identification_commands import identification_app
 from twin.cli.live_commands import live_app
+from twin.run.diagnostics import configure_logging
 
 # The matrices are small: BLAS threads cost more than they gain and delay the processes of a run.
 # Set before numpy is imported; child processes inherit it.
@@ -318,6 +319,7 @@ def main() -> None:
     """Run the command line; an input error is one message on standard error and exit code 2."""
     with contextlib.suppress(BrokenPipeError):
         try:
+            configure_logging(" ".join(["shaketwin", *sys.argv[1:2]]))
             app()
         except ValueError as error:
             from table_io.errors import InputError

@@ -8,6 +8,7 @@ of a remote twin.
 """
 
 import contextlib
+import logging
 import os
 import re
 from collections.abc import Callable
@@ -49,6 +50,7 @@ from twin.transport.reliable_subscriber import ReliableSubscriber
 from twin.transport.requests import Request, RequestQueue
 from twin.transport.zenoh_link import BusLink, open_hub, open_spoke
 
+log = logging.getLogger(__name__)
 GATEWAY_NICENESS = 5  # observers yield processor time to the rig and the twin
 POLL_INTERVAL_S = 0.005
 MAX_RELAYED_PER_TURN = 32  # fragments relayed before the next request is answered
@@ -276,6 +278,7 @@ def run_gateway(config: ProcessConfig, _: str) -> None:
         check_endpoint(rig_name, config.router, keys is not None)
         settings = merge_settings(settings, router_settings(config.router))
     external = open_hub(rig_name, config.listen, settings, keys)
+    log.info("observers reach the run at %s", config.listen)
     internal.declare(tuple(TOPIC_TYPES))
     external.declare(tuple(TOPIC_TYPES))
     inbox = internal.subscribe(tuple(TOPIC_TYPES), history=True, capacity=INBOX_CAPACITY)

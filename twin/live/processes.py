@@ -6,6 +6,7 @@ means that the supervisor has ended.
 """
 
 import contextlib
+import logging
 import os
 import signal
 import sys
@@ -31,12 +32,14 @@ from twin.live.process_config import (
 )
 from twin.live.recorder import run_recorder
 from twin.live.scheduling import request_realtime
+from twin.run.diagnostics import configure_logging
 from twin.run.run_config import compile_rig_kernels
 from twin.transport.codec import TOPIC_TYPES, Item, encode_item, topic_for
 from twin.transport.endpoint import LOCAL_SOCKET_PREFIX
 from twin.transport.requests import RequestQueue
 from twin.transport.zenoh_link import open_hub, open_spoke
 
+log = logging.getLogger("twin.live.processes")  # not __main__, as which it runs
 RIG_PRIORITY = 50  # real-time scheduling priority, if permitted
 RIG_TOPICS = (
     *(name for name in TOPIC_TYPES if name.startswith("/rig/")),
@@ -53,6 +56,7 @@ def run_rig(config: ProcessConfig, _: str) -> None:
     compile_rig_kernels(run_config)
     clock = RealClock()
     scheduler = request_realtime(RIG_PRIORITY)
+    log.info("scheduling: %s", scheduler)
     link = open_hub(run_config.rig.name, config.endpoint)
     link.declare(RIG_TOPICS)
     commands = _CommandQueue(
@@ -104,6 +108,7 @@ class _CommandQueue:
             return None
         run, _, reason = request.text.partition("\n")
         accepted = run == self.run and request.name in ("start", *COMMAND_NAMES)
+        log.info("command %s, %s", request.name, "accepted" if accepted else "refused")
         request.reply("yes" if accepted else f"refused: this is run {self.run}")
         return (request.name, reason) if accepted else None
 
@@ -167,9 +172,11 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     component, config_path, *arguments = sys.argv[1:]
     try:
+        configure_logging(component)
         PROCESSES[component](
             ProcessConfig.read(Path(config_path)), arguments[0] if arguments else ""
         )
+        log.info("process %d ends", os.getpid())
     except InputError as error:
         print(error, file=sys.stderr)
         raise SystemExit(2) from None

@@ -2,6 +2,7 @@
 
 import contextlib
 import fcntl
+import logging
 import os
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -27,6 +28,7 @@ from twin.transport.codec import TOPIC_TYPES, Item, WireError, decode_item, enco
 from twin.transport.reliable_subscriber import ReliableSubscriber
 from twin.transport.zenoh_link import BusLink, open_spoke
 
+log = logging.getLogger(__name__)
 RECORDER_NICENESS = -10  # ahead of other programs, behind the rig and the twin
 FLUSH_INTERVAL_S = 0.15  # so that a crash loses at most 0.25 s, on a busy computer too
 SYNC_INTERVAL_S = 5.0
@@ -163,6 +165,7 @@ class _Recorder:
         self.reserve.release()
         if not self.disk_error:
             self.disk_error = f"{error.strerror}: {error.filename}"
+            log.error("cannot write the recording (%s)", self.disk_error)
             self.stop_reason = self.stop_reason or f"cannot write the recording ({self.disk_error})"
             self._publish_event(
                 f"{self.stop_reason}: the table is stopped; what was written stays readable, and "

@@ -2,6 +2,7 @@
 
 import contextlib
 import fcntl
+import logging
 import os
 import shutil
 import signal
@@ -23,6 +24,7 @@ from twin.transport.endpoint import LOCAL_SOCKET_PREFIX, check_can_listen
 from twin.transport.reliable_subscriber import ReliableSubscriber
 from twin.transport.zenoh_link import BusLink, open_spoke
 
+log = logging.getLogger(__name__)
 READY_TIMEOUT_S = 30.0
 FINISH_TIMEOUT_S = 15.0  # after the last sample, for all processes to finish
 MAX_RIG_SILENCE_S = 5.0  # the rig reports every second; after this it hangs
@@ -53,9 +55,14 @@ class ChildProcess:
         return signal.Signals(-code).name if code < 0 else f"exit {code}"
 
     @property
+    def output(self) -> str:
+        """What the process and its predecessors wrote to their log file."""
+        return self.log_path.read_text(errors="replace").strip()
+
+    @property
     def last_output_line(self) -> str:
         """Last line that the process wrote to its log file."""
-        lines = self.log_path.read_text(errors="replace").strip().splitlines()
+        lines = self.output.splitlines()
         return lines[-1] if lines else "it said nothing"
 
     def close_input(self) -> None:
@@ -137,6 +144,7 @@ class Supervisor:
         link.declare(("/run/event", "/run/fault"))
         if self._send_command(link, "start") != "yes":
             raise InputError("the rig does not answer; nothing moved")
+        log.info("run %s has started", self.config.run)
         return link, inbox
 
     def _other_components(self) -> tuple[str, ...]:
@@ -165,6 +173,7 @@ class Supervisor:
             argument = str(self.parts_folder / f"part-{self._part_count:03d}.mcap")
         predecessor = self.children.get(component)
         self.children[component] = start_process(component, self.parts_folder, argument)
+        log.info("%s started, process %d", component, self.children[component].process.pid)
         if predecessor is not None:
             self.children[component].restarts = predecessor.restarts + 1
 
@@ -218,7 +227,9 @@ class Supervisor:
         """Send the stop request to the rig, repeated until the rig accepts it."""
         self.stop_reason = self.stop_reason or self.poll_interrupt() or ""
         if self.stop_reason and not self._stop_accepted and self.run_stop is None:
-            self._stop_accepted = self._send_command(link, "stop", self.stop_reason) == "yes"
+            answer = self._send_command(link, "stop", self.stop_reason)
+            log.info("stop requested (%s): %s", self.stop_reason, answer or "no answer")
+            self._stop_accepted = answer == "yes"
 
     def _kill_hung(self) -> None:
         """Kill a recorder or gateway that hangs; a second hung recorder stops the table."""
@@ -227,6 +238,7 @@ class Supervisor:
             if component not in self.children or silence_s < MAX_COMPONENT_SILENCE_S:
                 continue
             self.print_line(f"the {component} has been silent for {silence_s:.0f} s; ending it")
+            log.warning("%s killed: silent for %.0f s", component, silence_s)
             self.children[component].kill()
             self.last_message_s[component] = self.clock.now()  # restarts the timeout
             if component == "recorder":
@@ -258,6 +270,7 @@ class Supervisor:
         child = self.children[component]
         cause = f"{component} died ({child.exit_reason})"
         if component == "rig":
+            log.warning("%s; what was recorded is kept", cause)
             raise _RigDiedError(
                 f"the rig process died ({child.exit_reason}): {child.last_output_line}"
             )
@@ -268,6 +281,7 @@ class Supervisor:
         must_stop = getattr(self.on_death, component, "") == "stop"
         must_stop = must_stop or (given_up and component == "recorder")
         outcome = f"it stays down after {MAX_RESTARTS} restarts" if given_up else "restarting it"
+        log.warning("%s; %s", cause, outcome)
         self.print_line(f"{cause}; {outcome}, the table {'stops' if must_stop else 'goes on'}")
         if child.process.returncode > 0:
             self.print_line(f"  its last words: {child.last_output_line}")
@@ -318,6 +332,8 @@ class Supervisor:
                 child.kill()
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     child.process.wait(5.0)  # a process on a failed disk may never end
+            if log.isEnabledFor(logging.INFO):
+                log.info("%s ended; its output:\n%s", child.component, child.output)
 
 
 class _InterruptedBeforeStartError(Exception):

@@ -1,5 +1,6 @@
 """Twin of a live run, local or remote: runs the model on the measured blocks."""
 
+import logging
 import platform
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from twin.transport.codec import MEAS_TOPIC, Item, decode_item, encode_item, top
 from twin.transport.reliable_subscriber import ReliableSubscriber
 from twin.transport.zenoh_link import BusLink, open_spoke
 
+log = logging.getLogger(__name__)
 TWIN_PRIORITY = 40  # real-time scheduling priority, if permitted
 CONTROL_TOPICS = ("/run/start", "/run/stop", "/rig/decided")
 
@@ -44,6 +46,7 @@ def run_pipeline(
     compile_twin_kernels()
     clock = RealClock()
     scheduler = request_realtime(TWIN_PRIORITY)
+    log.info("run %s, scheduling: %s", config.run, scheduler)
     link = remote_link or open_spoke(run_config.rig.name, config.endpoint, CONNECT_TIMEOUT_S)
     link.declare(TWIN_TOPICS, offered=remote_link is not None)
     control = link.subscribe(CONTROL_TOPICS, history=True, capacity=INBOX_CAPACITY)
