@@ -194,10 +194,9 @@ def test_ctrl_c_decays_to_rest_and_closes_the_recording(tmp_path: Path) -> None:
 def test_a_dead_supervisor_leaves_a_table_at_rest_and_a_readable_recording(
     tmp_path: Path,
 ) -> None:
-    process = start(tmp_path)
-    running(process)
-    process.kill()
-    process.wait()
+    with start(tmp_path) as process:
+        running(process)
+        process.kill()
     parts = tmp_path / "out" / ".parts"
     until = time.monotonic() + 30
     while time.monotonic() < until and pids(tmp_path):
