@@ -2,10 +2,12 @@
 
 import difflib
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
 
 from table_io.errors import InputError
 
@@ -39,9 +41,14 @@ class ConfigModel(BaseModel):
         return list(cls.fields_by_key())
 
     @classmethod
-    def fields_by_key(cls) -> dict[str, Any]:
-        """Return the fields by their key in the file."""
-        return {field.alias or name: field for name, field in cls.model_fields.items()}
+    def fields_by_key(cls) -> dict[str, FieldInfo]:
+        """Return the fields by each of their keys in the file."""
+        fields = {}
+        for name, field in cls.model_fields.items():
+            alias = field.validation_alias
+            keys = alias.choices if isinstance(alias, AliasChoices) else [alias or name]
+            fields |= {str(key): field for key in keys}
+        return fields
 
     @classmethod
     def find_table_model(cls, key: str) -> "type[ConfigModel] | None":
@@ -55,24 +62,32 @@ class ConfigModel(BaseModel):
             stack.extend(getattr(item, "__args__", ()))
         return None
 
+    @classmethod
+    def select_class(cls, table: Mapping[str, Any]) -> "type[ConfigModel]":
+        """Return the class that reads a table: this one, unless the table states a kind."""
+        return cls
+
 
 ConfigT = TypeVar("ConfigT", bound=ConfigModel)
 
 
-def _known_keys(model: type[ConfigModel], location: tuple[int | str, ...]) -> list[str]:
+def _known_keys(model: type[ConfigModel], location: tuple[int | str, ...], raw: Any) -> list[str]:
     """Return the keys allowed in the table that holds the last key of `location`."""
     for key in location[:-1]:
+        raw = raw[key]
         # An index of a list, or a name that the user chooses, has no model of its own.
-        model = (model.find_table_model(key) if isinstance(key, str) else None) or model
+        table_model = model.find_table_model(key) if isinstance(key, str) else None
+        if table_model is not None:
+            model = table_model.select_class(raw) if isinstance(raw, Mapping) else table_model
     return model.list_keys()
 
 
-def _format_error(model: type[ConfigModel], error: Any) -> str:
+def _format_error(model: type[ConfigModel], error: Any, raw: Any) -> str:
     """Describe one validation error: key, value, what is allowed, what to do."""
     location: tuple[int | str, ...] = error["loc"]
     key = ".".join(str(part) for part in location) or "file"
     if error["type"] == "extra_forbidden":
-        known = _known_keys(model, location)
+        known = _known_keys(model, location, raw)
         near = difflib.get_close_matches(str(location[-1]), known, 1, 0.4)
         hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
         return f"{key}: unknown key; {hint}"
@@ -99,9 +114,7 @@ def parse_toml(text: str, model: type[ConfigT], source: str) -> ConfigT:
     try:
         return model.model_validate(raw)
     except ValidationError as error:
-        faults = [
-            _format_error(model, error_details) for error_details in error.errors(include_url=False)
-        ]
+        faults = [_format_error(model, details, raw) for details in error.errors(include_url=False)]
         raise InputError("\n".join([f"{source}:", *(f"  {fault}" for fault in faults)])) from None
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from table_io.config.profile import Sweep
+from table_io.config.excitation.stepped_sine import Sweep
 from table_io.records import PrcPoint
 from table_io.units import GRAVITY_M_S2
 from twin.campaign.summary import CampaignData, CampaignRunData, describe_normalization

@@ -58,7 +58,7 @@ def run_test(
     for sentence in (*messages, *find_overdue_calibrations(config.rig, local_datetime().date())):
         print_line(f"warning: {sentence}")
     print_line(
-        f"{config.profile.title}: {len(config.steps)} steps, "
+        f"{config.profile.title}: {config.extent}, "
         f"{config.drive.planned_end / config.drive.rate_hz:.0f} s on {config.rig.title} "
         f"-> {folder}"
     )

@@ -239,13 +239,17 @@ def _draw_progress(run_state: LiveRunState, width: int) -> Text:
 def _format_step(run_state: LiveRunState, show_cycle: bool) -> str:
     """Format the current step with a fixed width, so that the text after it does not move."""
     step = run_state.step
+    if step is None and run_state.start and not run_state.start.steps:
+        windows = run_state.profile.plan.windows if run_state.profile else 0
+        number = run_state.position[0] + 1
+        return f"{f'window {number}/{windows}' if number else 'outside the history':<33}"
     if step is None:
         phase = "after" if run_state.stop else "between" if run_state.points else "before"
         return f"{f'{phase} the steps':<33}"
     text = f"step {step.index + 1:>2}/{run_state.step_count}  {step.frequency_hz:6.3f} Hz "
     text += f"{ARROWS.get(step.direction, '')} {step.direction:<8}"
     cycle_text = f"cycle {run_state.position[2] + 1}" if run_state.position[2] >= 0 else ""
-    if cycle_text and run_state.profile:
+    if cycle_text and run_state.profile and run_state.profile.steps:
         cycle_text += f"/{run_state.profile.sweep.cycles}"
     return f"{text:<33}" + (f"  {cycle_text:<13}" if show_cycle else "")
 

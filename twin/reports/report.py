@@ -106,6 +106,10 @@ def worst_level(run: ReportData) -> dict[str, float] | None:
 
 def format_headline(run: ReportData) -> str:
     """Format the headline: steps completed, hysteresis, findings and largest excursion."""
+    if run.windows:
+        planned = parse_toml_tables(run.recording.start.profile_toml).get("excitation") or {}
+        kind = planned.get("kind", "history")
+        return f"{len(run.windows)} windows of a displacement history ({kind}), open loop."
     done_count = sum(1 for step in run.steps if step.get("measured") or step.get("twin"))
     parts = [f"{done_count} of {len(run.recording.start.steps) or len(run.steps)} steps"]
     parts += [

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 from table_io.acquisition.session import SessionSetup
 from table_io.clock import local_datetime
 from table_io.config.base import find_config, load_config, parse_toml, resolve_config
-from table_io.config.profile import Profile, Specimen
+from table_io.config.profile import Profile, Specimen, load_profile
 from table_io.config.rig import RigConfig
 from table_io.config.rig_file import load_rig
 from table_io.errors import InputError
 from table_io.excitation.drive import Drive
-from table_io.excitation.trajectory import plan_sweep
+from table_io.excitation.trajectory import plan_excitation
 from table_io.records import RunStart, Step
 from table_io.safety.preflight import StepDemand, check_limits, compute_demands
 from table_io.sequencer import make_test_plan, nominal_drive
@@ -61,8 +61,8 @@ class RunConfig:
 
     @property
     def ideal_drive(self) -> Drive:
-        """Drive of an ideal table: the sweep without loop check and tuning."""
-        return plan_sweep(self.profile)
+        """Drive of an ideal table: the excitation without loop check and tuning."""
+        return plan_excitation(self.profile)
 
     @property
     def parameters(self) -> Parameters:
@@ -72,6 +72,11 @@ class RunConfig:
     @property
     def steps(self) -> tuple[Step, ...]:
         return self.drive.steps
+
+    @property
+    def extent(self) -> str:
+        """Number of steps, or of windows of a displacement history, as text."""
+        return f"{len(self.steps)} steps" if self.steps else f"{self.profile.plan.windows} windows"
 
     def make_start_factory(
         self, run: str, source: str
@@ -135,7 +140,7 @@ def from_texts(
 def read_run_config(path: Path, table: str | None = None, model: str | None = None) -> RunConfig:
     """Read the `RunConfig` of a test profile; InputError if the test exceeds the table's limits."""
     path = resolve_config(path, "tests")
-    profile, profile_toml = load_config(path, Profile, "test profile")
+    profile, profile_toml = load_profile(path)
     _, rig_toml = load_rig(find_config(table or profile.rig, "rigs", path))
     _, model_toml = read_model(model or profile.model, path)
     config = from_texts(path.stem, profile_toml, rig_toml, model_toml, str(path))

@@ -106,6 +106,12 @@ def simulate_ideal(config: RunConfig, run: str, path: Path, on_item: ItemHandler
     record_items(items, path, run, config.drive.rate_hz, on_item)
 
 
+def generate_ideal_twin(config: RunConfig) -> Iterator[Block]:
+    """Yield the blocks of an ideal table, each followed by the twin's block for it."""
+    items = add_twin_items(_generate_ideal(config, ""), config.prepare_twin(from_rest=True))
+    return (item for item in items if isinstance(item, Block))
+
+
 def _generate_ideal(config: RunConfig, run: str) -> Iterator[Item]:
     """Yield the items of an ideal table, which follows the drive exactly."""
     drive = config.ideal_drive

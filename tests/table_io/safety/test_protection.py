@@ -109,13 +109,14 @@ def shaken(
 
 @cache
 def asked(drive: Drive) -> tuple[Any, ...]:
-    """Labels, command, phase and level of every sample that is measured."""
+    """Labels, command, phase, level and acceleration of every sample that is measured."""
     where = 0, drive.rest_start + 1000
     return (
         drive.labels(*where),
         drive.command(*where),
         np.unwrap(drive.phase(*where), period=1.0),
         drive.level(*where),
+        drive.demanded_acceleration(*where),
     )
 
 
