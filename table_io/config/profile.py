@@ -222,7 +222,8 @@ class Profile(ConfigModel):
     @classmethod
     def _check_control(cls, control: ControlConfig, info: ValidationInfo) -> ControlConfig:
         excitation = info.data.get("excitation")
-        if excitation is not None and not isinstance(excitation, Sweep):
+        is_history = excitation is not None and not isinstance(excitation, Sweep)
+        if is_history and control.enabled and control != ControlConfig():
             raise ValueError(
                 f"the amplitude of kind {excitation.kind!r} is not tuned: it is played open loop; "
                 "remove [control]"

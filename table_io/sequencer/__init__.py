@@ -20,7 +20,7 @@ from table_io.adaptive import make_policy
 from table_io.block import Block, Label
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
-from table_io.excitation.drive import Drive
+from table_io.excitation.drive import Drive, Segment
 from table_io.excitation.trajectory import start_trajectory
 from table_io.records import Record
 from table_io.safety import loop_check
@@ -81,10 +81,10 @@ def hold_test(state: SequencerState, index: int) -> SequencerState:
     if not state.steps or state.stage.kind in ("check", "open") or index >= state.drive.planned_end:
         return state
     trajectory = state.trajectory.cut(index)
-    if trajectory.end < index or not trajectory.segments or trajectory.segments[-1].step < 0:
+    last = trajectory.segments[-1] if trajectory.segments else None
+    if trajectory.end < index or not isinstance(last, Segment) or last.step < 0:
         return state  # the drive is already ending, or the sweep has not begun
-    step = trajectory.segments[-1].step
-    return hold_step(replace(state, trajectory=trajectory, changed_from=trajectory.end), step)
+    return hold_step(replace(state, trajectory=trajectory, changed_from=trajectory.end), last.step)
 
 
 def resume_test(state: SequencerState, index: int) -> SequencerState:

@@ -321,7 +321,6 @@ def test_what_cannot_be_is_left_out_and_told(words: str, tmp_path: Path) -> None
         ({"channels": ("a", "a")}, "duplicate channels"),
         ({"block_samples": 0}, "block_samples = 0"),
         ({"planned_samples": 2**52}, "planned_samples"),
-        ({"steps": ()}, "no steps"),
         ({"steps": (Step(0, "up", 2.0, 0.5),)}, "invalid steps"),
         ({"steps": (Step(0, "forward", float("inf"), 0.5),)}, "invalid steps"),
         ({"steps": (Step(1, "forward", 2.0, 0.5), Step(0, "forward", 3.0, 0.5))}, "out of order"),

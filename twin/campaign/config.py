@@ -183,8 +183,8 @@ def _format_faults(faults: dict[str, list[str]]) -> list[str]:
 
 
 def is_free_flight(bundle: RunConfig) -> bool:
-    """Return whether the specimen has no bumpers."""
-    return bundle.profile.specimen.gap_mm == float("inf")
+    """Return whether a stepped sine is played without bumpers, which gives u* and a*."""
+    return bundle.profile.specimen.gap_mm == float("inf") and bool(bundle.steps)
 
 
 def list_campaign_warnings(plan: CampaignPlan) -> list[str]:

@@ -31,7 +31,7 @@ SLOW = {"start_hz": 0.5, "stop_hz": 0.6, "step_hz": 0.1, "cycles": 3, "direction
 def planned(sweep: dict[str, object], check: bool) -> Drive:
     profile, _ = load_config(find_config("quickstart", "tests"), Profile, "profile")
     rig, _ = load_config(find_config("follow_simulated", "rigs"), RigConfig, "card")
-    raw = profile.model_dump() | {"sweep": {**sweep, "measured_cycles": 2}}
+    raw = profile.model_dump() | {"excitation": {**sweep, "measured_cycles": 2}}
     raw["loop_check"] = {"enabled": check}
     return nominal_drive(make_test_plan(Profile.model_validate(raw), rig))
 

@@ -29,7 +29,7 @@ SWEEP = {
 
 def setup(check: bool = False, text: str = "", **changes: object) -> SessionSetup:
     profile, _ = load_config(find_config("quickstart", "tests"), Profile, "profile")
-    raw = profile.model_dump() | {"sweep": SWEEP, "loop_check": {"enabled": check}, **changes}
+    raw = profile.model_dump() | {"excitation": SWEEP, "loop_check": {"enabled": check}, **changes}
     path = find_config("follow_simulated", "rigs")
     rig = parse_toml(text or path.read_text(), RigConfig, "card")
     return SessionSetup(Profile.model_validate(raw), rig)

@@ -169,7 +169,10 @@ def test_a_rehearsal_is_what_a_perfect_table_plays(name: str) -> None:
     test = load_config(PROFILES_DIR / "tests" / f"{name}.toml", Profile, "test")[0]
     sweep = test.sweep.model_copy(update={"stop_hz": test.sweep.start_hz + test.sweep.step_hz})
     test = test.model_copy(
-        update={"sweep": sweep, "loop_check": test.loop_check.model_copy(update={"enabled": False})}
+        update={
+            "excitation": sweep,
+            "loop_check": test.loop_check.model_copy(update={"enabled": False}),
+        }
     )
     table = played(test, gain=np.ones_like)
     assert table.now.drive == nominal_drive(make_test_plan(test, RIG, 40))
