@@ -138,7 +138,7 @@ def _format_duration(config: RunConfig) -> str:
 
 def sum_durations_s(drive: Drive) -> dict[str, float]:
     """Return the duration in s of each part: loop check, held cycles, ..., rest."""
-    parts = dict.fromkeys(("loop check", "held cycles", "tuning", "blends", "history"), 0.0)
+    parts = dict.fromkeys(("loop check", "held cycles", "tuning", "blends"), 0.0)
     for segment in drive.segments:
         if isinstance(segment, HistorySegment):
             part = "history"
@@ -148,7 +148,7 @@ def sum_durations_s(drive: Drive) -> dict[str, float]:
             part = "held cycles"
         else:
             part = "blends" if segment.label == Label.BLEND else "tuning"
-        parts[part] += segment.count / drive.rate_hz
+        parts[part] = parts.get(part, 0.0) + segment.count / drive.rate_hz
     return parts | {"rest": drive.planned_end / drive.rate_hz - sum(parts.values())}
 
 

@@ -14,7 +14,6 @@ from importlib import metadata
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
-from pydantic import Field
 
 from table_io.block import Float1D
 from table_io.config.base import ConfigModel, Count
@@ -47,11 +46,14 @@ class ExcitationPlan:
 
 
 class Excitation(ConfigModel):
-    """Base class of every kind. `files` holds the texts of its files by name, once attached."""
+    """Base class of every kind.
+
+    FILE_KEYS are its keys that name a file next to the profile. Loading reads them: a kind that has
+    some also has the field `files`, which then holds their texts by name.
+    """
 
     kind: str = DEFAULT_KIND
-    files: dict[str, str] = Field(default_factory=dict)
-    FILE_KEYS: ClassVar[tuple[str, ...]] = ()  # keys that name a file next to the profile
+    FILE_KEYS: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def select_class(cls, table: Mapping[str, Any]) -> "type[Excitation]":

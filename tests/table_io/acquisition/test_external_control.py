@@ -168,7 +168,7 @@ def test_a_controller_that_stops_early_is_seen_and_recorded_to_rest() -> None:
 
 def test_another_drive_is_not_taken_for_ours() -> None:
     other = plan_open_loop_drive(
-        setup(sweep=SWEEP | {"start_hz": 2.6, "stop_hz": 3.4}).profile, setup().rig
+        setup(excitation=SWEEP | {"start_hz": 2.6, "stop_hz": 3.4}).profile, setup().rig
     )
     one = run(setup(), lambda _: whole(other))
     assert one.stop.verdict == "aborted"
@@ -204,7 +204,7 @@ def test_hold_and_resume_are_refused_with_words(name: str) -> None:
 @pytest.mark.parametrize(("name", "verdict"), [("stop", "stopped"), ("abort", "aborted")])
 def test_a_stop_says_where_to_stop_and_ends_the_recording(name: str, verdict: str) -> None:
     """The controller plays on: ten seconds later the recording ends, and says that it moves."""
-    long = setup(sweep=SWEEP | {"cycles": 20})
+    long = setup(excitation=SWEEP | {"cycles": 20})
     one = run(long, orders=partial(order, name, 500))
     assert one.stop.verdict == verdict
     assert any("STOP THE TABLE AT ITS CONTROLLER" in line for line in one.said("stop"))

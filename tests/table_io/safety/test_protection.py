@@ -130,7 +130,7 @@ def seen(values: Float2D, clipped: Any, drive: Drive, first: int, cut: int) -> O
 
 def steady(drive: Drive) -> tuple[Any, Any, Any]:
     """(phase in rad, level, frequency in Hz where it is held, else inf), (sample,) each."""
-    labels, _, phase, level = asked(drive)
+    labels, _, phase, level, _ = asked(drive)
     held = np.isin(labels[1], (Label.SETTLE, Label.MEASURE))
     f = np.where(held, np.abs(np.gradient(phase)) * RATE, np.inf)
     return 2 * np.pi * phase, level, f
