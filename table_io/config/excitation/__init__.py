@@ -14,6 +14,7 @@ from importlib import metadata
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
+from pydantic import Field
 
 from table_io.block import Float1D
 from table_io.config.base import ConfigModel, Count
@@ -69,7 +70,7 @@ class Excitation(ConfigModel):
 class History(Excitation):
     """Base class of the kinds that play a displacement history: they return it in m."""
 
-    windows: Count = 8  # equal parts in time by which the results are given
+    windows: Count = Field(8, ge=1, le=1000, description="Equal parts in time, for the results.")
 
     @abstractmethod
     def displacement(self, rate_hz: float) -> Float1D:
