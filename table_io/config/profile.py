@@ -36,7 +36,8 @@ from table_io.config.excitation.stepped_sine import Sweep
 from table_io.errors import InputError
 from table_io.records import Step
 
-MAX_FILE_BYTES = 8 * 2**20  # of a file of the excitation: it travels with the profile
+# Of a file of the excitation: it travels with the profile in one message of the bus, 4 MiB at most.
+MAX_FILE_BYTES = 2 * 2**20
 
 
 class Specimen(ConfigModel):
@@ -222,8 +223,8 @@ class Profile(ConfigModel):
     @classmethod
     def _check_control(cls, control: ControlConfig, info: ValidationInfo) -> ControlConfig:
         excitation = info.data.get("excitation")
-        is_history = excitation is not None and not isinstance(excitation, Sweep)
-        if is_history and control.enabled and control != ControlConfig():
+        is_changed = control.enabled and control != ControlConfig()
+        if excitation is not None and not isinstance(excitation, Sweep) and is_changed:
             raise ValueError(
                 f"the amplitude of kind {excitation.kind!r} is not tuned: it is played open loop; "
                 "remove [control]"

@@ -175,7 +175,7 @@ def test_a_file_too_large_to_travel_with_the_profile_is_refused(tmp_path: Path) 
     with pytest.raises(InputError) as refusal:
         load_profile(path)
     assert refusal.value.where == str(tmp_path / "motion.csv")
-    assert "8 MB" in refusal.value.allowed
+    assert "2 MB" in refusal.value.allowed
 
 
 @pytest.mark.parametrize(
