@@ -11,8 +11,7 @@ from typing import TextIO
 
 from table_io.backends import find_descriptor
 from table_io.clock import RealClock
-from table_io.config.base import find_config, load_config
-from table_io.config.profile import load_profile
+from table_io.config.base import find_config
 from table_io.config.rig_file import load_rig
 from table_io.errors import InputError
 from table_io.sim.machine.server import serve_machine_table
@@ -76,7 +75,7 @@ def serve_table(
 
     service = TableService(
         rig=rig,
-        specimen=load_config(find_config(profile, "tests"), Profile, "test profile")[0].specimen,
+        specimen=load_profile(find_config(profile, "tests"))[0].specimen,
         clock=RealClock(time_scale),
         notify=print_status,
         begin=begin,

@@ -10,20 +10,12 @@ import numpy as np
 
 from table_io.block import Block, Float1D, Float2D
 from table_io.config.base import find_config, load_config, parse_toml
-<<<<<<< HEAD
 from table_io.config.channel import read_channels
-from table_io.config.profile import Profile
-from table_io.config.rig import RigConfig
-from table_io.errors import InputError
-from table_io.records import Event, RunStart, RunStop, SampleGap, Step
-from twin.exchange.columns import ImportColumns, ImportedSamples, read_column_map, read_samples
-=======
 from table_io.config.profile import Profile, load_profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.records import Event, RunStart, RunStop, SampleGap
-from twin.exchange.columns import ImportedSamples, read_column_map, read_samples
->>>>>>> c381619 (Let campaigns, imports and prc treat displacement histories)
+from twin.exchange.columns import ImportColumns, ImportedSamples, read_column_map, read_samples
 from twin.exchange.formats import TOML_TEXTS, SampleTable, read_table
 from twin.exchange.labels import read_labels, typical_cycles
 from twin.exchange.sampling import find_holes
@@ -203,14 +195,7 @@ def _build_run_config(
             measured=measured,
         )
         return from_texts(file.stem, text, rig_toml, PLAIN_MODEL, f"{file} without a profile")
-<<<<<<< HEAD
-    test_profile, text = load_config(profile, Profile, "test profile")
-=======
     test_profile, text = load_profile(profile)
-    rig_toml = load_config(
-        find_config(rig or test_profile.rig, "rigs", profile), RigConfig, "rig file"
-    )[1]
->>>>>>> c381619 (Let campaigns, imports and prc treat displacement histories)
     model_toml = read_model(test_profile.model, profile)[1]
     source = f"{profile}, at the {rate_hz:g} Hz of {file}"
     if test_profile.acquisition.rate_hz != rate_hz:

@@ -65,7 +65,8 @@ def render_report(run: ReportData, pictures: list[Picture]) -> str:
         images=embed_images(pictures),
         demand={step.index: step.acceleration_m_s2 for step in start.steps},
         texts=[
-            (name, sha256(text.encode()).hexdigest(), _shorten(text)) for name, text in texts.items()
+            (name, sha256(text.encode()).hexdigest(), _shorten(text))
+            for name, text in texts.items()
         ],
         timings={timing.component: timing for timing in recording.records(Timing)},
         gaps=recording.records(SampleGap),

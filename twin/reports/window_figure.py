@@ -3,7 +3,7 @@
 from matplotlib.figure import Figure
 
 from table_io.channels import contact_forces, relative_displacement
-from twin.reports.report_data import ReportData
+from twin.reports.motion_drawing import draw_rest_lines
 from twin.reports.plot_style import (
     DIRECTION_COLOURS,
     FIGURE_WIDTH_IN,
@@ -12,7 +12,7 @@ from twin.reports.plot_style import (
     CaptionedFigure,
     CaptionedFigures,
 )
-from twin.reports.motion_drawing import draw_rest_lines
+from twin.reports.report_data import ReportData
 from twin.reports.windows import cut_blocks, extract_free_twin, join_channel
 
 MAX_PLOTTED_SAMPLES = 20_000
@@ -36,7 +36,9 @@ def draw_window_histories(run: ReportData) -> CaptionedFigures:
     stride = max(1, (end - first) // MAX_PLOTTED_SAMPLES)
     for block in measured:
         axes[0].plot(
-            block.time_s[::stride], block.channel("table_disp_m")[::stride] * 1e3, color=GUIDE_COLOUR
+            block.time_s[::stride],
+            block.channel("table_disp_m")[::stride] * 1e3,
+            color=GUIDE_COLOUR,
         )
     for blocks, colour, width in sources:
         for block in blocks:
