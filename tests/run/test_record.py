@@ -289,10 +289,11 @@ def test_the_model_alone_plays_the_record(tmp_path: Path) -> None:
     assert summary["windows"][1]["twin"]["impacts_right"] > 2
 
 
-def test_an_export_comes_back_with_its_windows(run: Run, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["parquet", "csv"])  # the second one without its profile
+def test_an_export_comes_back_with_its_windows(run: Run, kind: str, tmp_path: Path) -> None:
     _, recording, summary = run
-    table = tmp_path / "samples.parquet"
-    assert export_log(recording.path, ["parquet"], tmp_path / "samples", (), None) == 0
+    table = tmp_path / f"samples.{kind}"
+    assert export_log(recording.path, [kind], tmp_path / "samples", (), None) == 0
     assert import_samples(table, tmp_path / "back.mcap", None, None, None) == 0
     back = read_recording(tmp_path / "back.mcap")
     assert back.start.steps == ()
