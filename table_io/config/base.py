@@ -43,7 +43,7 @@ class ConfigModel(BaseModel):
     @classmethod
     def fields_by_key(cls) -> dict[str, FieldInfo]:
         """Return the fields by each of their keys in the file."""
-        fields = {}
+        fields: dict[str, FieldInfo] = {}
         for name, field in cls.model_fields.items():
             alias = field.validation_alias
             keys = alias.choices if isinstance(alias, AliasChoices) else [alias or name]

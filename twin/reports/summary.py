@@ -140,8 +140,10 @@ def _windows_entry(recording: Recording, parameters: Parameters, profile: Profil
     if recording.start.steps:
         return {}
 
+    channels = read_channels(recording.start.rig_toml)
+
     def compare(comparisons: tuple[Comparison, ...]) -> Json:
-        return channel_nrmse(comparisons, parameters)
+        return channel_nrmse(comparisons, parameters, channels)
 
     return {"windows": summarise_windows(recording, profile.comparison.contact_n, compare)}
 
