@@ -6,6 +6,7 @@ pytest tests/bench/test_bench_replay.py -n 0 --benchmark-enable -s
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from table_io.config.base import find_config
@@ -42,7 +43,7 @@ def read_by_protobuf(log: Path) -> int:
         if kind := kinds.get(one.topic):
             message = kind.FromString(one.payload)
             if kind is pb.Block:
-                count += sum(len(list(channel.values)) for channel in message.channels)
+                count += np.frombuffer(message.values).size
     return count
 
 

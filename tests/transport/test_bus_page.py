@@ -67,6 +67,6 @@ def test_the_example_runs_as_it_stands() -> None:
     lines = said.splitlines()[:3]
     assert len(lines) == 3, said
     for line in lines:
-        second, name, value = re.fullmatch(r"([\d.]+) \[\('(\w+)', ([\d.]+)\)\]", line).groups()
+        second, name, value = re.fullmatch(r"([\d.]+) \{'(\w+)': ([\d.]+)\}", line).groups()
         assert name == "mass_disp_m"
         assert float(value) == pytest.approx(100 * float(second))
