@@ -137,8 +137,11 @@ def read_text(path: Path, kind: str) -> str:
         raise InputError(f"cannot read this {kind}: {error}", where=path) from None
 
 
-def find_config(name: str, folder: str, profile_path: Path | None = None) -> Path:
-    """Return the path of config `name`: a path, or a name in `folder` next to a profile or ours."""
+def find_config(name: str, folder: str, profile_path: Path | None = None, option: str = "") -> Path:
+    """Return the path of config `name`: a path, or a name in `folder` next to a profile or ours.
+
+    InputError names the option that gave the name, without one the profile.
+    """
     direct = Path(name)
     if direct.suffix == ".toml":
         by_profile = profile_path.parent / direct if profile_path is not None else direct
@@ -154,8 +157,8 @@ def find_config(name: str, folder: str, profile_path: Path | None = None) -> Pat
     hint = f"did you mean {near[0]!r}? " if near else ""
     raise InputError(
         f"not found in {folder}",
-        where="" if profile_path is None else profile_path,
-        key=name,
+        where=f"{option} {name}" if option else profile_path or "",
+        key="" if option else name,
         remedy=f"{hint}known: {', '.join(known) or 'none'}; or give the path of a .toml file",
     )
 

@@ -48,6 +48,7 @@ def test_what_all_have_in_common_is_said_once(tmp_path: Path) -> None:
         read_plan(tmp_path / "campaign.toml", "nowhere", None, anything)
     assert str(error.value).count("not found in rigs") == 1
     assert "free.toml, g4.toml" in str(error.value)
+    assert "--table nowhere: " in str(error.value)
 
 
 @pytest.mark.parametrize("text", ['title = "C"\n', 'title = "C"\nruns = []\n'])

@@ -84,7 +84,7 @@ def _describe_branch(run: RunState, profile: Profile, steps: list[Json], directi
     if pieces and begins[pieces[0]["part"]] > first:
         broken.insert(0, pieces[0]["from_hz"])
     anew = bool(pieces) and begins[pieces[0]["part"]] == first > 0
-    history = "broken" if broken else "begun anew from rest" if anew else "whole"
+    history = "broken" if broken else "restarted from rest" if anew else "whole"
     return {"direction": direction, "history": history, "broken_at_hz": broken, "pieces": pieces}
 
 

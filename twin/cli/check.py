@@ -51,7 +51,7 @@ def print_plan(console: Console, config: RunConfig) -> None:
     ]
     for sentence in messages:
         console.print(f"warning: {sentence}", highlight=False, soft_wrap=True)
-    console.print("ready: nothing exceeds the machine card", highlight=False)
+    console.print("ready: nothing exceeds the limits of the rig file", highlight=False)
 
 
 def _plan_lines(config: RunConfig) -> list[tuple[str, str]]:

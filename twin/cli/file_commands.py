@@ -68,13 +68,19 @@ def import_command(
         if out is not None:
             from table_io.errors import InputError
 
-            raise InputError(f"{out}: --list only says what {file} holds; leave -o out, or --list")
+            raise InputError(
+                f"--list writes no log, it only prints the contents of {file}",
+                where=f"-o {out}",
+                remedy="omit -o or --list",
+            )
         import_table.print_contents(file, columns)
         return
     if out is None:
         from table_io.errors import InputError
 
-        raise InputError(f"{file}: no -o LOG; say where the new log goes, as -o run.mcap")
+        raise InputError(
+            "the name of the new log is missing", where=file, remedy="add it, such as -o run.mcap"
+        )
     raise typer.Exit(import_table.import_samples(file, out, profile, rig, columns))
 
 

@@ -79,7 +79,7 @@ def calibrate_command(
 ) -> None:
     """Calibrate a sensor: measure sensitivity and offset, compare with the rig file.
 
-    Leaves a dated record, which goes into every recording from then on; edits no card.
+    Leaves a dated record, which goes into every recording from then on; the rig file is not edited.
     """
     from twin.cli.calibrate import CalibrationRequest
     from twin.cli.calibrate import calibrate_sensor as command

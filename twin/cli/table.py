@@ -50,12 +50,20 @@ def serve_table(
 
     The specimen is that of `profile` if the machine's protocol does not transmit it.
     """
-    rig, _ = load_rig(find_config(rig_name, "rigs"))
+    rig, _ = load_rig(find_config(rig_name, "rigs", option="--rig"))
     if not 1.0 <= time_scale <= MAX_TIME_SCALE:
-        raise InputError(f"--time-scale {time_scale:g}: allowed: 1 to {MAX_TIME_SCALE:g}")
+        raise InputError(
+            "out of range",
+            where=f"--time-scale {time_scale:g}",
+            allowed=f"1 to {MAX_TIME_SCALE:g}",
+        )
     drives = find_descriptor(rig).drives
     if drives and controller.play is not None:
-        raise InputError(f"--play: {rig.name!r} is driven by `run`; it belongs to a follow card")
+        raise InputError(
+            f"the table {rig.name!r} is driven by `run`, not by an external controller",
+            where=f"--play {controller.play}",
+            remedy="omit it, or give a rig file with backend = 'follow'",
+        )
     if listen is not None and drives:
         serve: Callable[[TableService], None] = partial(serve_machine_table, listen=listen)
     else:

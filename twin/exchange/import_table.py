@@ -161,11 +161,12 @@ def _read_rig_toml(table: SampleTable, profile: Path | None, rig: str | None) ->
     """Read the text of the rig file: the one given, else of the table, else of the profile."""
     if rig is None and profile is None and _has_config_texts(table):
         return table.texts["rig_toml"]
+    option = "" if rig is None else "--rig"
     if rig is None:
         rig = (
             "simulated" if profile is None else load_config(profile, Profile, "test profile")[0].rig
         )
-    return load_config(find_config(rig, "rigs", profile), RigConfig, "rig file")[1]
+    return load_config(find_config(rig, "rigs", profile, option), RigConfig, "rig file")[1]
 
 
 def _build_run_config(

@@ -31,6 +31,7 @@ STATE_STYLES = {
     "at rest": "", "idle": "", "fault": BAD_STYLE,
     "waiting": WARN_STYLE, "following": GOOD_STYLE, "astray": BAD_STYLE, "left": BAD_STYLE,
 }  # fmt: skip
+STATE_TEXTS = {"astray": "drive lost", "left": "ended in motion"}  # shown for recorded states
 COMMAND_KEYS = {"h": "hold", "r": "resume", "s": "stop", "a": "abort"}
 ARROWS = {"forward": "↑", "backward": "↓"}
 DrawPanel = Callable[[LiveRunState, int, int], list[Text]]
@@ -211,7 +212,8 @@ def _draw_state(run_state: LiveRunState, status: SessionStatus) -> Text:
         return Text("waiting for a run", DIM_STYLE)
     activity = LABEL_TEXTS.get(Label(run_state.position[1]), "") if run_state.recent.blocks else ""
     style = STATE_STYLES.get(run_state.rig_state, "")
-    right = Text(f"● {run_state.rig_state or 'joined'}", style)
+    state = STATE_TEXTS.get(run_state.rig_state, run_state.rig_state)
+    right = Text(f"● {state or 'joined'}", style)
     if activity and activity != run_state.rig_state:
         right.append(f", {activity}", "")
     return right.append(f"  {format_duration(run_state.index / run_state.rate_hz)}", DIM_STYLE)

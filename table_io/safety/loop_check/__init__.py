@@ -76,7 +76,7 @@ REMEDIES = {
     "motion left": "let the servo come to rest, or raise loop_check.rest_s",
     "cross-talk": "check that the gap is as large as stated; if so, the cell responds to the "
     "motion of the table",
-    "force beside": "check that both load cells of this side are connected and loaded",
+    "force ratio": "check that both load cells of this side are connected and loaded",
 }
 
 

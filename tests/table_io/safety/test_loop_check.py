@@ -339,7 +339,7 @@ def test_a_planted_fault_fails_its_own_lines(fault: str) -> None:
 def test_a_load_cell_shows_its_sign_and_its_death_in_contact_only(cell: str) -> None:
     for change, name in ((flipped, "polarity in contact"), (white(1.0), "")):
         changes = {cell: change if name else lambda values, noise=change: noise(0 * values)}
-        line = name or "force beside its neighbour"
+        line = name or "force ratio to its neighbour"
         assert failed(judged(recorded("gm1"), changes)) == {(line, cell)}
         # Nothing touches here, so a cell without force and a reversed one look like a sound one.
         assert failed(judged(recorded("ginf"), changes)) == set()
