@@ -1,6 +1,5 @@
 """Loading of TOML files into validated, frozen models; one message lists all faults of a file."""
 
-import difflib
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Annotated, Any, Self, TypeVar
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
-from table_io.errors import InputError
+from table_io.errors import InputError, suggest
 
 # In a wheel the profiles lie inside this package, in a source tree next to it.
 PROFILES_DIR = next(
@@ -95,9 +94,7 @@ def _format_error(model: type[ConfigModel], error: Any, raw: Any) -> str:
     key = ".".join(str(part) for part in location) or "file"
     if error["type"] == "extra_forbidden":
         known = _known_keys(model, location, raw)
-        near = difflib.get_close_matches(str(location[-1]), known, 1, 0.4)
-        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
-        return f"{key}: unknown key; {hint}"
+        return f"{key}: unknown key; {suggest(str(location[-1]), known)}"
     if error["type"] == "missing":
         return f"{key}: missing; add it"
     message = str(error["msg"]).removeprefix("Value error, ")
@@ -153,13 +150,11 @@ def find_config(name: str, folder: str, profile_path: Path | None = None, option
         if (folder_path / f"{name}.toml").is_file():
             return folder_path / f"{name}.toml"
     known = sorted({path.stem for place in folders for path in place.glob("*.toml")})
-    near = difflib.get_close_matches(name, known, 1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
     raise InputError(
         f"not found in {folder}",
         where=f"{option} {name}" if option else profile_path or "",
         key="" if option else name,
-        remedy=f"{hint}known: {', '.join(known) or 'none'}; or give the path of a .toml file",
+        remedy=f"{suggest(name, known)} or give the path of a .toml file",
     )
 
 

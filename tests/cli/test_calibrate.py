@@ -186,7 +186,7 @@ def test_a_second_record_lies_beside_the_first(
         (("--shunt", "--tolerance", "1"), "table_disp_m", "--tolerance: does not apply"),
         (("--points", "0,1", "--shunt"), "table_disp_m", "--points: does not apply"),
         (("--shunt",), "mass_disp_m", "add shunt and shunt_tolerance"),
-        (("--points", "0,10"), "tabel_disp_m", "allowed: drive_disp_m"),
+        (("--points", "0,10"), "tabel_disp_m", "did you mean 'table_disp_m'?"),
         (("--points", "0,10", "--out", "/proc/none/x"), "table_disp_m", "another file with --out"),
         (("--points", "0,74.9"), "table_disp_m", "allowed: below +-75 mm"),
         (("--points", "0,10"), "mass_disp_m", "mass_disp_m: the readings differ"),

@@ -18,7 +18,7 @@ from table_io.config.calibration_record import CalibrationRecord, format_calibra
 from table_io.config.rig import RigConfig
 from table_io.config.rig_file import calibrations_dir, load_rig
 from table_io.config.sensor import SensorConfig
-from table_io.errors import InputError
+from table_io.errors import InputError, suggest
 from twin.cli.check_table import EXIT_FAILED, make_machine
 from twin.run.terminal import print_line
 from twin.security.credentials import user_name
@@ -62,7 +62,7 @@ def calibrate_sensor(request: CalibrationRequest) -> int:
         raise InputError(
             f"rig {rig.name} has no sensor of this channel",
             where=request.channel,
-            allowed=", ".join(rig.channels),
+            remedy=suggest(request.channel, rig.channels),
         )
     applied, prompts = _plan_points(request, sensor)
     timestamp = f"{local_datetime():%Y%m%d-%H%M%S}"

@@ -27,7 +27,7 @@ from rich.table import Table
 
 from table_io.clock import local_datetime
 from table_io.config.base import parse_toml
-from table_io.errors import InputError
+from table_io.errors import InputError, suggest
 from twin.run.terminal import console, print_line, print_table
 from twin.security.access_control import NO_ROLE, RIG_NAME, ROLES, ROUTER_ROLE, build_router_access
 from twin.security.certificate_authority import (
@@ -139,7 +139,7 @@ def renew_keys(folder: Path, name: str | None, hosts: Sequence[str]) -> None:
     people = read_people(folder)
     certificates = _list_issued(folder, name) if name in people else []
     if not certificates:
-        raise InputError(_unknown_name_message(folder, name))
+        raise _unknown_name_error(folder, name)
     if hosts and people[name] != ROUTER_ROLE:
         raise InputError(
             f"{name} has the role {people[name]}; only a router has hosts",
@@ -180,7 +180,7 @@ def remove_person(folder: Path, name: str) -> None:
     """Revoke a person's role; the gateway rejects the certificate from its next start on."""
     people = read_people(folder)
     if name not in people:
-        raise InputError(_unknown_name_message(folder, name))
+        raise _unknown_name_error(folder, name)
     line = re.compile(rf"""^\s*["']?{re.escape(name)}["']?\s*=.*\n?""", re.MULTILINE)
     text = line.sub("", (folder / ACCESS_FILE).read_text())
     _check_access(folder, text, {other: role for other, role in people.items() if other != name})
@@ -320,9 +320,12 @@ def _next_free_path(folder: Path, name: str, suffix: str = "") -> Path:
     )
 
 
-def _unknown_name_message(folder: Path, name: str) -> str:
-    known = ", ".join(sorted(read_people(folder))) or "none"
-    return f"{folder / ACCESS_FILE}: no user {name!r}; known: {known}"
+def _unknown_name_error(folder: Path, name: str) -> InputError:
+    return InputError(
+        f"no user {name!r}",
+        where=folder / ACCESS_FILE,
+        remedy=suggest(name, sorted(read_people(folder))),
+    )
 
 
 def _is_host(host: str) -> bool:
@@ -352,9 +355,10 @@ def print_router_settings(folder: Path, name: str, listen: str, rig: str) -> Non
     if people.get(name) != ROUTER_ROLE:
         routers = [router for router, role in people.items() if role == ROUTER_ROLE]
         raise InputError(
-            f"{name} is not a router; known: {', '.join(routers) or 'none'}",
+            f"{name} is not a router",
             where=folder / ACCESS_FILE,
-            remedy=f"add one: shaketwin keys add {folder} NAME --role router --host HOST",
+            remedy=f"{suggest(name, routers)} or add one: shaketwin keys add {folder} NAME "
+            "--role router --host HOST",
         )
     check_endpoint(rig, listen, has_keys=True)
     router_keys = Credentials(Path(), name, datetime.now(UTC), None)

@@ -6,7 +6,6 @@ imports of `table_io/config/profile.py`. Other packages add kinds through entry 
 `shaketwin.excitations`: the name is the kind, the value the class.
 """
 
-import difflib
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -18,7 +17,7 @@ from pydantic import Field
 
 from table_io.block import Float1D
 from table_io.config.base import ConfigModel, Count
-from table_io.errors import InputError
+from table_io.errors import InputError, suggest
 from table_io.records import Step
 
 ENTRY_POINT_GROUP = "shaketwin.excitations"
@@ -133,9 +132,7 @@ def find_excitation(kind: object) -> type[Excitation]:
         if entry.name == kind:
             return _load_plugin(entry)
     known = [*EXCITATIONS, *(entry.name for entry in plugins)]
-    near = difflib.get_close_matches(str(kind), known, 1, 0.4)
-    hint = f"did you mean {near[0]!r}? " if near else ""
-    raise ValueError(f"kind {kind!r} is unknown; {hint}known: {', '.join(known)}")
+    raise ValueError(f"kind {kind!r} is unknown; {suggest(str(kind), known)}")
 
 
 def _load_plugin(entry: metadata.EntryPoint) -> type[Excitation]:
