@@ -151,10 +151,11 @@ def find_config(name: str, folder: str, profile_path: Path | None = None, option
             return folder_path / f"{name}.toml"
     known = sorted({path.stem for place in folders for path in place.glob("*.toml")})
     raise InputError(
-        f"not found in {folder}",
+        "not found",
         where=f"{option} {name}" if option else profile_path or "",
         key="" if option else name,
-        remedy=f"{suggest(name, known)} or give the path of a .toml file",
+        allowed=f"a name in {folder} or the path of a .toml file",
+        remedy=suggest(name, known),
     )
 
 

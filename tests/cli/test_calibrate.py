@@ -173,8 +173,8 @@ def test_a_second_record_lies_beside_the_first(
     ("words", "channel", "said"),
     [
         ((), "table_disp_m", "at least two different numbers in mm"),
-        (("--points", "10"), "table_disp_m", "--points '10'"),
-        (("--points", "10,10"), "table_disp_m", "--points '10,10'"),
+        (("--points", "10"), "table_disp_m", "--points 10: "),
+        (("--points", "10,10"), "table_disp_m", "--points 10,10: "),
         (("--points", "0,ten"), "table_disp_m", "0,ten"),
         (("--points", "0,nan"), "table_disp_m", "0,nan"),
         (("--points", "0,76"), "table_disp_m", "within +-75"),

@@ -127,7 +127,7 @@ def _plan_points(
     if len(set(applied)) < 2 or not all(abs(value) <= sensor.range for value in applied):
         raise InputError(
             "not a list of applied values",
-            where=f"--points {request.points!r}",
+            where=f"--points {request.points}".rstrip(),
             allowed=f"at least two different numbers in {sensor.unit}, within "
             f"+-{sensor.range:g}, such as 0,{0.5 * sensor.range:g}",
             remedy="or calibrate by the shunt with --shunt",

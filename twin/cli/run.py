@@ -15,6 +15,7 @@ from twin.run.run_config import RunConfig, make_run_id, read_run_config
 from twin.run.terminal import catch_interrupts, console, print_line
 from twin.run.warm_up import compile_kernels
 from twin.security.credentials import Credentials, credentials_folder
+from twin.transport.endpoint import check_endpoint
 from twin.viewer.address import VIEW_ADDRESS, find_free_address, format_live_view
 
 
@@ -46,6 +47,7 @@ def run_test(
     if unpaced:
         check_full_speed(config.rig)
     else:
+        check_endpoint(config.rig.name, listen, has_keys=keys is not None)
         check_realtime(config, profile)
     compile_kernels(config, table=True)
     require_disk_space([config], out or RUNS_FOLDER)

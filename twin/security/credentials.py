@@ -186,7 +186,11 @@ def _check_file_mode(path: Path, bits: int, reason: str, remedy: str) -> None:
     try:
         mode = path.stat().st_mode
     except OSError as error:
-        raise InputError(f"cannot read: {error.strerror}", where=path) from None
+        raise InputError(
+            f"cannot read: {error.strerror}",
+            where=path,
+            remedy="give a folder made by `shaketwin keys`",
+        ) from None
     if mode & bits:
         raise InputError(f"{path}: mode {mode & 0o777:04o}, {reason}; chmod {remedy} {path}")
 
