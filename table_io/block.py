@@ -24,7 +24,7 @@ class Label(IntEnum):
     REST = 0  # no motion commanded
     BLEND = 1  # soft start, soft stop or change of step; never measured
     SETTLE = 2  # held at the step but not measured: settling, tuning or an operator's hold
-    MEASURE = 3  # held cycle that enters the PRC point
+    MEASURE = 3  # held cycle that enters the PRC point, or a sample of a displacement history
     STOP = 4  # decay to rest after a stop or a trip
     CHECK = 5  # held cycle of the loop check, at low level, before the sweep
 
@@ -33,8 +33,9 @@ class Label(IntEnum):
 class Block:
     """Samples index .. index + n - 1 of one stream: `values` in SI, float64 (channel, sample).
 
-    `step`, `label` and `cycle` are int64 (sample,): the sweep step (-1 outside the sweep), the
-    Label, and the number of the held cycle within the step (-1 outside held cycles).
+    `step`, `label` and `cycle` are int64 (sample,): the sweep step or the window of a displacement
+    history (-1 outside), the Label, and the number of the held cycle within the step (-1 outside
+    held cycles).
     """
 
     stream: str

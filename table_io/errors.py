@@ -1,5 +1,11 @@
 """Errors that a user can correct."""
 
+import difflib
+from collections.abc import Iterable
+
+MIN_SIMILARITY = 0.5  # of a known name that is suggested, 1 for the same
+MAX_LISTED_NAMES = 40
+
 
 class InputError(ValueError):
     """A file, value or option that a user must correct; commands end with exit code 2.
@@ -31,3 +37,14 @@ class InputError(ValueError):
         if remedy:
             message += f"; {remedy}"
         super().__init__(message)
+
+
+def suggest(name: str, known: Iterable[str]) -> str:
+    """Return the remedy for an unknown name: the known name closest to it, or all of them."""
+    known_names = list(known)
+    matches = difflib.get_close_matches(name, known_names, 1, MIN_SIMILARITY)
+    if matches:
+        return f"did you mean {matches[0]!r}?"
+    hidden_count = len(known_names[MAX_LISTED_NAMES:])
+    suffix = f" and {hidden_count} more" if hidden_count else ""
+    return f"known: {', '.join(known_names[:MAX_LISTED_NAMES]) or 'none'}{suffix}"

@@ -1,1 +1,1 @@
-"""The model beside the rig: predicts, compares, learns, streams."""
+"""Digital twin of the specimen: predicts, compares, identifies, records, streams."""

@@ -51,11 +51,7 @@ class PassiveProtection:
         if self._protection is None:
             return ()
         first, count, positions = drive_span(places)
-        nominal = (
-            drive.command(first, count),
-            drive.phase(first, count),
-            drive.level(first, count),
-        )
+        nominal = protection.sample_demand(drive, first, count)
         observation = Observation(block, clipped, *(row[positions] for row in nominal))
         self._protection, findings = protection.inspect_samples(self._protection, observation)
         records: list[Record] = []

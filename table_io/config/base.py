@@ -1,13 +1,14 @@
 """Loading of TOML files into validated, frozen models; one message lists all faults of a file."""
 
-import difflib
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
 
-from table_io.errors import InputError
+from table_io.errors import InputError, suggest
 
 # In a wheel the profiles lie inside this package, in a source tree next to it.
 PROFILES_DIR = next(
@@ -39,9 +40,14 @@ class ConfigModel(BaseModel):
         return list(cls.fields_by_key())
 
     @classmethod
-    def fields_by_key(cls) -> dict[str, Any]:
-        """Return the fields by their key in the file."""
-        return {field.alias or name: field for name, field in cls.model_fields.items()}
+    def fields_by_key(cls) -> dict[str, FieldInfo]:
+        """Return the fields by each of their keys in the file."""
+        fields: dict[str, FieldInfo] = {}
+        for name, field in cls.model_fields.items():
+            alias = field.validation_alias
+            keys = alias.choices if isinstance(alias, AliasChoices) else [alias or name]
+            fields |= {str(key): field for key in keys}
+        return fields
 
     @classmethod
     def find_table_model(cls, key: str) -> "type[ConfigModel] | None":
@@ -55,27 +61,40 @@ class ConfigModel(BaseModel):
             stack.extend(getattr(item, "__args__", ()))
         return None
 
+    @classmethod
+    def select_class(cls, table: Mapping[str, Any]) -> "type[ConfigModel]":
+        """Return the class that reads a table: this one, unless the table states a kind."""
+        return cls
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """Return a copy with other values, without cached properties of the old ones."""
+        copy = super().model_copy(update=update, deep=deep)
+        for name in copy.__dict__.keys() - type(copy).model_fields.keys():
+            del copy.__dict__[name]
+        return copy
+
 
 ConfigT = TypeVar("ConfigT", bound=ConfigModel)
 
 
-def _known_keys(model: type[ConfigModel], location: tuple[int | str, ...]) -> list[str]:
+def _known_keys(model: type[ConfigModel], location: tuple[int | str, ...], raw: Any) -> list[str]:
     """Return the keys allowed in the table that holds the last key of `location`."""
     for key in location[:-1]:
+        raw = raw[key]
         # An index of a list, or a name that the user chooses, has no model of its own.
-        model = (model.find_table_model(key) if isinstance(key, str) else None) or model
+        table_model = model.find_table_model(key) if isinstance(key, str) else None
+        if table_model is not None:
+            model = table_model.select_class(raw) if isinstance(raw, Mapping) else table_model
     return model.list_keys()
 
 
-def _format_error(model: type[ConfigModel], error: Any) -> str:
+def _format_error(model: type[ConfigModel], error: Any, raw: Any) -> str:
     """Describe one validation error: key, value, what is allowed, what to do."""
     location: tuple[int | str, ...] = error["loc"]
     key = ".".join(str(part) for part in location) or "file"
     if error["type"] == "extra_forbidden":
-        known = _known_keys(model, location)
-        near = difflib.get_close_matches(str(location[-1]), known, 1, 0.4)
-        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
-        return f"{key}: unknown key; {hint}"
+        known = _known_keys(model, location, raw)
+        return f"{key}: unknown key; {suggest(str(location[-1]), known)}"
     if error["type"] == "missing":
         return f"{key}: missing; add it"
     message = str(error["msg"]).removeprefix("Value error, ")
@@ -99,9 +118,7 @@ def parse_toml(text: str, model: type[ConfigT], source: str) -> ConfigT:
     try:
         return model.model_validate(raw)
     except ValidationError as error:
-        faults = [
-            _format_error(model, error_details) for error_details in error.errors(include_url=False)
-        ]
+        faults = [_format_error(model, details, raw) for details in error.errors(include_url=False)]
         raise InputError("\n".join([f"{source}:", *(f"  {fault}" for fault in faults)])) from None
 
 
@@ -117,8 +134,11 @@ def read_text(path: Path, kind: str) -> str:
         raise InputError(f"cannot read this {kind}: {error}", where=path) from None
 
 
-def find_config(name: str, folder: str, profile_path: Path | None = None) -> Path:
-    """Return the path of config `name`: a path, or a name in `folder` next to a profile or ours."""
+def find_config(name: str, folder: str, profile_path: Path | None = None, option: str = "") -> Path:
+    """Return the path of config `name`: a path, or a name in `folder` next to a profile or ours.
+
+    InputError names the option that gave the name, without one the profile.
+    """
     direct = Path(name)
     if direct.suffix == ".toml":
         by_profile = profile_path.parent / direct if profile_path is not None else direct
@@ -130,13 +150,12 @@ def find_config(name: str, folder: str, profile_path: Path | None = None) -> Pat
         if (folder_path / f"{name}.toml").is_file():
             return folder_path / f"{name}.toml"
     known = sorted({path.stem for place in folders for path in place.glob("*.toml")})
-    near = difflib.get_close_matches(name, known, 1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
     raise InputError(
-        f"not found in {folder}",
-        where="" if profile_path is None else profile_path,
-        key=name,
-        remedy=f"{hint}known: {', '.join(known) or 'none'}; or give the path of a .toml file",
+        "not found",
+        where=f"{option} {name}" if option else profile_path or "",
+        key="" if option else name,
+        allowed=f"a name in {folder} or the path of a .toml file",
+        remedy=suggest(name, known),
     )
 
 

@@ -13,16 +13,15 @@ A `[[sensors]]` table of this channel makes it one of the rig. `simulated` is wh
 table gives: a sum of canonical channels times factors, plus `constant`, in SI.
 """
 
-import difflib
 import re
 import tomllib
-from collections.abc import Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from pydantic import Field, ValidationError, ValidationInfo, field_validator
 
 from table_io.channels import CHANNEL_BY_NAME, Channel
 from table_io.config.base import ConfigModel, Finite
+from table_io.errors import suggest
 
 NAME_PATTERN = r"[a-z][a-z0-9]*(_[a-z0-9]+)+"
 MAX_NAME_LENGTH = 60
@@ -59,11 +58,6 @@ QUANTITIES: dict[str, Quantity] = {
 Body = Literal["table", "mass", "damper", "right_bumper", "left_bumper", "ground", "other"]
 
 
-def _suggest(name: str, known: Mapping[str, Any]) -> str:
-    near = difflib.get_close_matches(name, known, 1, 0.5)
-    return f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
-
-
 class ChannelConfig(ConfigModel):
     """Declared channel; the module describes each key."""
 
@@ -79,7 +73,7 @@ class ChannelConfig(ConfigModel):
     @classmethod
     def _check_quantity(cls, quantity: str) -> str:
         if quantity not in QUANTITIES:
-            raise ValueError(f"quantity {quantity!r} is unknown; {_suggest(quantity, QUANTITIES)}")
+            raise ValueError(f"quantity {quantity!r} is unknown; {suggest(quantity, QUANTITIES)}")
         return quantity
 
     @field_validator("unit")
@@ -129,7 +123,7 @@ class ChannelConfig(ConfigModel):
         known = {**CHANNEL_BY_NAME, CONSTANT: None}
         for name in factors or {}:
             if name not in known:
-                raise ValueError(f"{name!r} is not a signal of the table; {_suggest(name, known)}")
+                raise ValueError(f"{name!r} is not a signal of the table; {suggest(name, known)}")
         return factors
 
     @property

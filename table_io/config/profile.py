@@ -1,17 +1,43 @@
-"""Test profile: specimen, sweep, acquisition, comparison, control and protection.
+"""Test profile: specimen, excitation, acquisition, comparison, control and protection.
 
 Keys carry their unit in the name (`gap_mm`, `start_hz`); properties return SI.
 """
 
+import json
 import math
-from typing import Literal
+import tomllib
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
 
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import (
+    AliasChoices,
+    Field,
+    SerializeAsAny,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    field_validator,
+    model_validator,
+)
 
 from table_io.config.adaptive import DwellConfig, RefineConfig, SweepGrid, TrackConfig
-from table_io.config.base import ConfigModel, Count, Finite, Number, Positive
+from table_io.config.base import (
+    ConfigModel,
+    Count,
+    Finite,
+    Number,
+    Positive,
+    parse_toml,
+    read_text,
+)
+from table_io.config.excitation import Excitation, ExcitationPlan, record  # noqa: F401  registers
+from table_io.config.excitation.stepped_sine import Sweep
+from table_io.errors import InputError
 from table_io.records import Step
-from table_io.units import GRAVITY_M_S2
+
+# Of a file of the excitation: it travels with the profile in one message of the bus, 4 MiB at most.
+MAX_FILE_BYTES = 2 * 2**20
 
 
 class Specimen(ConfigModel):
@@ -47,87 +73,6 @@ class Specimen(ConfigModel):
         if self.gap_right_mm is None or self.gap_left_mm is None:
             return self.gap_mm / 2e3, self.gap_mm / 2e3
         return self.gap_right_mm / 1e3, self.gap_left_mm / 1e3
-
-
-class Sweep(ConfigModel):
-    """Stepped sine sweep of constant peak table acceleration, up and down one frequency grid."""
-
-    start_hz: float = Field(ge=0.01, allow_inf_nan=False)
-    stop_hz: Positive
-    step_hz: Positive
-    cycles: Count = Field(ge=2, le=1000, description="Held cycles per step.")
-    measured_cycles: Count = Field(
-        3, ge=1, validate_default=True, description="Last held cycles, which enter the PRC point."
-    )
-    acceleration_g: Positive = 0.05
-    directions: tuple[Literal["forward", "backward"], ...] = ("forward", "backward")
-    blend_cycles: Number = Field(1.5, ge=1.5, le=20, description="Shortest blend between steps.")
-
-    @field_validator("stop_hz")
-    @classmethod
-    def _check_ascending(cls, stop: float, info: ValidationInfo) -> float:
-        start = info.data.get("start_hz", 0.0)
-        if stop < start:
-            raise ValueError(
-                f"stop_hz {stop} lies below start_hz {start}; give the grid in "
-                "ascending order and set the order of the sweep in `directions`"
-            )
-        return stop
-
-    @field_validator("step_hz")
-    @classmethod
-    def _check_step(cls, step: float, info: ValidationInfo) -> float:
-        if not {"start_hz", "stop_hz"} <= info.data.keys():
-            return step
-        start, stop = info.data["start_hz"], info.data["stop_hz"]
-        if (stop - start) / step > 5000.5:
-            raise ValueError(
-                f"step_hz {step} makes more than 5001 steps from {start} to {stop} Hz; "
-                f"allowed: at least {(stop - start) / 5000:.6g}"
-            )
-        step_count = round((stop - start) / step)
-        if abs(start + step_count * step - stop) > 1e-6:
-            raise ValueError(
-                f"step_hz {step} does not divide {start} to {stop} Hz; "
-                f"nearest: {(stop - start) / max(step_count, 1):.6g}"
-            )
-        return step
-
-    @field_validator("measured_cycles")
-    @classmethod
-    def _check_measured_cycles(cls, measured: int, info: ValidationInfo) -> int:
-        cycles = info.data.get("cycles", measured)
-        if measured > cycles:
-            raise ValueError(f"measured_cycles {measured} is more than cycles {cycles}; reduce it")
-        return measured
-
-    @field_validator("directions")
-    @classmethod
-    def _check_directions(cls, directions: tuple[str, ...]) -> tuple[str, ...]:
-        if not directions:
-            raise ValueError("directions is empty; allowed: 'forward', 'backward', in any order")
-        if len(set(directions)) < len(directions):
-            raise ValueError("directions contains one twice; allowed: each once, in any order")
-        return directions
-
-    @property
-    def frequencies_hz(self) -> tuple[float, ...]:
-        """Frequency grid in Hz, ascending, rounded to the decimal value."""
-        step_count = round((self.stop_hz - self.start_hz) / self.step_hz)
-        return tuple(round(self.start_hz + k * self.step_hz, 9) for k in range(step_count + 1))
-
-    @property
-    def steps(self) -> tuple[Step, ...]:
-        """All planned steps in driving order; both directions use the identical grid."""
-        acceleration = self.acceleration_g * GRAVITY_M_S2
-        return tuple(
-            Step(index, direction, frequency, acceleration)
-            for index, (direction, frequency) in enumerate(
-                (direction, frequency)
-                for direction in self.directions
-                for frequency in self.frequencies_hz[:: 1 if direction == "forward" else -1]
-            )
-        )
 
 
 class AcquisitionConfig(ConfigModel):
@@ -216,7 +161,10 @@ class Profile(ConfigModel):
     rig: str = "simulated"
     model: str = "snm"
     specimen: Specimen
-    sweep: Sweep
+    excitation: SerializeAsAny[Excitation] = Field(
+        validation_alias=AliasChoices("excitation", "sweep"),
+        description="What the table plays; [sweep] is the older name of kind stepped_sine.",
+    )
     acquisition: AcquisitionConfig = Field(AcquisitionConfig(), validate_default=True)
     comparison: ComparisonConfig = ComparisonConfig()
     loop_check: LoopCheckConfig = LoopCheckConfig()
@@ -234,6 +182,55 @@ class Profile(ConfigModel):
         """Index of the first driven step."""
         return self.resume.first_step if self.resume is not None else 0
 
+    @property
+    def sweep(self) -> Sweep:
+        """Stepped sine of the test; InputError if its excitation is of another kind."""
+        if isinstance(self.excitation, Sweep):
+            return self.excitation
+        raise InputError(
+            "this needs a stepped sine, with steps of one frequency each",
+            where=self.title,
+            key="excitation.kind",
+            value=self.excitation.kind,
+            allowed="stepped_sine",
+        )
+
+    @cached_property
+    def plan(self) -> ExcitationPlan:
+        """What the excitation plays at the sampling rate of the test."""
+        return self.excitation.plan(self.acquisition.rate_hz)
+
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        """Planned steps in driving order; none if a displacement history is played."""
+        return self.plan.steps
+
+    @model_validator(mode="before")
+    @classmethod
+    def _check_one_excitation(cls, tables: Any) -> Any:
+        if isinstance(tables, Mapping) and {"sweep", "excitation"} <= tables.keys():
+            raise ValueError("[sweep] and [excitation] are given; allowed: one of them")
+        return tables
+
+    @field_validator("excitation", mode="wrap")
+    @classmethod
+    def _read_kind(cls, table: Any, handler: ValidatorFunctionWrapHandler) -> Excitation:
+        if not isinstance(table, Mapping):
+            return handler(table)
+        return Excitation.select_class(table).model_validate(table)
+
+    @field_validator("control")
+    @classmethod
+    def _check_control(cls, control: ControlConfig, info: ValidationInfo) -> ControlConfig:
+        excitation = info.data.get("excitation")
+        is_changed = control.enabled and control != ControlConfig()
+        if excitation is not None and not isinstance(excitation, Sweep) and is_changed:
+            raise ValueError(
+                f"the amplitude of kind {excitation.kind!r} is not tuned: it is played open loop; "
+                "remove [control]"
+            )
+        return control
+
     @field_validator("dwell", "track", "refine")
     @classmethod
     def _check_adaptive(
@@ -242,9 +239,11 @@ class Profile(ConfigModel):
         tables = [name for name in ("dwell", "track") if info.data.get(name) is not None]
         if tool is not None and tables:
             raise ValueError(f"[{tables[0]}] is given too; allowed: one of dwell, track, refine")
-        sweep = info.data.get("sweep")
-        if tool is not None and sweep is not None:
+        sweep = info.data.get("excitation")
+        if tool is not None and isinstance(sweep, Sweep):
             tool.check_sweep(SweepGrid(sweep.start_hz, sweep.stop_hz, sweep.step_hz))
+        elif tool is not None and sweep is not None:
+            raise ValueError(f"kind {sweep.kind!r} has no steps; remove [{info.field_name}]")
         return tool
 
     @field_validator("resume")
@@ -252,7 +251,9 @@ class Profile(ConfigModel):
     def _check_resume(
         cls, resume: ResumeConfig | None, info: ValidationInfo
     ) -> ResumeConfig | None:
-        sweep = info.data.get("sweep")
+        sweep = info.data.get("excitation")
+        if resume is not None and sweep is not None and not isinstance(sweep, Sweep):
+            raise ValueError(f"kind {sweep.kind!r} has no steps; run the test from its beginning")
         if resume is not None and sweep is not None and resume.first_step >= len(sweep.steps):
             raise ValueError(
                 f"first_step {resume.first_step} is beyond the last step; allowed: 0 to "
@@ -263,10 +264,64 @@ class Profile(ConfigModel):
     @field_validator("acquisition")
     @classmethod
     def _check_rate(cls, acquisition: AcquisitionConfig, info: ValidationInfo) -> AcquisitionConfig:
-        sweep = info.data.get("sweep")
-        if sweep is not None and acquisition.rate_hz < 100 * sweep.stop_hz:
+        sweep = info.data.get("excitation")
+        if isinstance(sweep, Sweep) and acquisition.rate_hz < 100 * sweep.stop_hz:
             raise ValueError(
                 f"rate_hz {acquisition.rate_hz:g} gives fewer than 100 samples per cycle at "
                 f"sweep.stop_hz {sweep.stop_hz:g}; allowed: at least {100 * sweep.stop_hz:g}"
             )
         return acquisition
+
+
+def load_profile(path: Path) -> tuple[Profile, str]:
+    """Load a test profile and the files of its excitation: return (profile, text with the files).
+
+    The text holds all that the test needs, so a recording that keeps it needs no other file.
+    """
+    text = _attach_files(read_text(path, "test profile"), path)
+    return parse_toml(text, Profile, str(path)), text
+
+
+def _attach_files(text: str, path: Path) -> str:
+    """Return the text of a profile with a table of its excitation's files appended."""
+    try:
+        table = tomllib.loads(text)["excitation"]
+        names = [table[key] for key in Excitation.select_class(table).FILE_KEYS]
+    except (KeyError, TypeError, AttributeError, ValueError, RecursionError):
+        return text  # which is reported when it is parsed
+    if "files" in table or not names:
+        return text
+    lines = [f"{json.dumps(name)} = '''\n{_read_file(str(name), path)}'''" for name in names]
+    attached = "\n".join([text, "[excitation.files]", *lines, ""])
+    try:
+        tomllib.loads(attached)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(
+            f"its file cannot be attached ({error})",
+            where=path,
+            key="excitation",
+            remedy="write it as a table, [excitation], and the file as plain text",
+        ) from None
+    return attached
+
+
+def _read_file(name: str, profile_path: Path) -> str:
+    """Read a file named in a profile, next to which it lies."""
+    path = profile_path.parent / name
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise InputError(
+                f"{path.stat().st_size / 2**20:.1f} MB are too large",
+                where=path,
+                allowed=f"at most {MAX_FILE_BYTES / 2**20:g} MB",
+                remedy="resample it, or write fewer digits",
+            )
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"cannot read this file: {getattr(error, 'strerror', None) or error}",
+            where=profile_path,
+            key="excitation.file",
+            value=name,
+            remedy="give its path relative to the profile",
+        ) from None

@@ -3,7 +3,6 @@
 Keys carry their unit in the name (`span_mm`, `lead_s`); properties return SI.
 """
 
-import difflib
 from collections.abc import Mapping
 from typing import Any, Self, TypeVar
 
@@ -24,7 +23,7 @@ from table_io.config.base import ConfigModel, Number, Positive
 from table_io.config.calibration_record import CalibrationRecord
 from table_io.config.channel import ChannelConfig
 from table_io.config.sensor import SensorConfig, check_sensor_unit
-from table_io.errors import InputError
+from table_io.errors import InputError, suggest
 
 SectionT = TypeVar("SectionT", bound=BackendConfig)
 
@@ -266,10 +265,8 @@ def _check_sensor_channels(sensors: tuple[SensorConfig, ...], registry: dict[str
     for row, sensor in enumerate(sensors):
         channel = registry.get(sensor.channel)
         if channel is None:
-            near = difflib.get_close_matches(sensor.channel, registry, 1)
-            hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(registry)}"
-            remedy = "or declare it in a [[channels]] table"
-            message = f"channel {sensor.channel!r} is unknown; {hint} {remedy}"
+            hint = f"{suggest(sensor.channel, registry)} or declare it in a [[channels]] table"
+            message = f"channel {sensor.channel!r} is unknown; {hint}"
             faults.append(_make_fault((row, "channel"), message))
             continue
         try:

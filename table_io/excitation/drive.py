@@ -1,11 +1,11 @@
-"""Drive: displacement command of a phase-continuous stepped sine of constant peak acceleration.
+"""Drive: displacement command, made of segments of a sine and of displacement histories.
 
-A drive is an immutable tuple of segments, each a closed form of the sample index, so any sample can
-be computed at any time and cutting it into blocks changes no bit. The phase is continuous;
-amplitude and frequency change by quintic blends (C2), because switching at a zero crossing would
-cause a jump of the table velocity.
+A drive is an immutable tuple of segments, each a pure function of the sample index, so any sample
+can be computed at any time and cutting it into blocks changes no bit.
 
-In a segment, with s(x) = 6x^5 - 15x^4 + 10x^3 over its length,
+A stepped sine has constant peak acceleration and a continuous phase; amplitude and frequency change
+by quintic blends (C2), because switching at a zero crossing would cause a jump of the table
+velocity. In a segment of it, with s(x) = 6x^5 - 15x^4 + 10x^3 over its length,
     f = f0 + (f1 - f0) s,   level = l0 + (l1 - l0) s,   theta = 2 pi (phase0 + integral f dt)
     displacement = -level / (2 pi f)^2 sin(theta), so that in a held segment the acceleration is
     level sin(theta).
@@ -26,6 +26,8 @@ from table_io.records import Step
 
 RAMP_CYCLES = 2.0  # a soft start over one cycle would peak at 1.12, over two at 1.02
 RAMP_S = 0.5
+MAX_BLEND_SLOPE, MAX_BLEND_CURVATURE = 1.875, 5.7736  # of the quintic blend over its length
+MAX_STOP_RATIO = 1.25  # peak acceleration of a history that is stopped, over its own
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +58,114 @@ class Segment:
         """Return the phase in cycles at the fractions x of the segment, (x,)."""
         ramp = x**4 * (2.5 + x * (-3.0 + x))
         return self.phase0 + self.count / rate_hz * (self.f0 * x + (self.f1 - self.f0) * ramp)
+
+    def displacement(self, x: Float1D, rate_hz: float) -> Float1D:
+        """Return the commanded displacement in m at the fractions x, (x,)."""
+        return segment_displacement(self, x, rate_hz)
+
+    def motion(self, x: Float1D, rate_hz: float) -> tuple[Float1D, Float1D]:
+        """Return (velocity in m/s, acceleration in m/s2) of an ideal table at the fractions x."""
+        return segment_motion(self, x, rate_hz)
+
+    def level(self, x: Float1D) -> Float1D:
+        """Return the demanded peak acceleration in m/s2 at the fractions x, (x,)."""
+        return self.level0 + (self.level1 - self.level0) * smoothstep(x)
+
+    def demanded_acceleration(self, x: Float1D, rate_hz: float) -> Float1D:
+        """Return the acceleration in m/s2 at the fractions x as in a held motion, (x,)."""
+        return self.level(x) * np.sin(2.0 * math.pi * self.phase(x, rate_hz))
+
+    def labels(self, x: Float1D, rate_hz: float) -> tuple[Int1D, Int1D, Int1D]:
+        """Return (step, label, held cycle) at the fractions x, (x,) each."""
+        step = np.full(x.size, self.step, dtype=np.int64)
+        label = np.full(x.size, int(self.label), dtype=np.int64)
+        cycle = np.full(x.size, -1, dtype=np.int64)
+        if self.cycles:
+            turns = x * self.count * self.f0 / rate_hz
+            # A cycle may begin exactly on a sample: the tolerance absorbs rounding.
+            done = np.floor(turns + 1e-9).astype(np.int64)
+            cycle = np.minimum(done, self.cycles - 1)
+            label = np.where(cycle >= self.settle, int(Label.MEASURE), int(Label.SETTLE))
+        return step, label, cycle
+
+    def decay_samples(self, x: float, rate_hz: float) -> int:
+        """Return the length of a decay from fraction x: max(2 cycles, 0.5 s) at its frequency."""
+        f = self.f0 + (self.f1 - self.f0) * float(smoothstep(np.array([x]))[0])
+        return math.ceil(max(RAMP_CYCLES / f, RAMP_S) * rate_hz)
+
+
+@dataclass(frozen=True, eq=False)
+class HistorySegment:
+    """Displacement history in m from rest to rest, (sample,), from sample `start`.
+
+    It has no phase. `windows` equal parts of it count as steps 0, 1, ... and are measured.
+    """
+
+    start: int
+    history_m: Float1D
+    windows: int
+
+    @property
+    def count(self) -> int:
+        return self.history_m.size
+
+    @property
+    def end(self) -> int:
+        return self.start + self.count
+
+    @cached_property
+    def peaks(self) -> tuple[float, float, float]:
+        """Peak displacement, velocity and acceleration per sample interval, in m."""
+        padded = np.concatenate([np.zeros(2), self.history_m, np.zeros(2)])
+        d, v, a = (float(np.abs(np.diff(padded, order)).max()) for order in (0, 1, 2))
+        return d, v, a
+
+    def displacement(self, x: Float1D, _: float) -> Float1D:
+        """Return the commanded displacement in m at the fractions x, (x,)."""
+        return self._at(x)
+
+    def motion(self, x: Float1D, rate_hz: float) -> tuple[Float1D, Float1D]:
+        """Return (velocity in m/s, acceleration in m/s2) at the fractions x, by differences."""
+        before, here, after = (self._at(x, shift) for shift in (-1, 0, 1))
+        return 0.5 * (after - before) * rate_hz, (after - 2.0 * here + before) * rate_hz**2
+
+    def demanded_acceleration(self, x: Float1D, rate_hz: float) -> Float1D:
+        """Return the acceleration in m/s2 at the fractions x, (x,)."""
+        return self.motion(x, rate_hz)[1]
+
+    def level(self, x: Float1D) -> Float1D:
+        """Return 0: a history has no constant level, (x,)."""
+        return np.zeros(x.size)
+
+    def phase(self, x: Float1D, _: float) -> Float1D:
+        """Return 0: a history has no phase, (x,)."""
+        return np.zeros(x.size)
+
+    def labels(self, x: Float1D, _: float) -> tuple[Int1D, Int1D, Int1D]:
+        """Return (window, label, -1 for no held cycle) at the fractions x, (x,) each."""
+        window = self._indices(x) * self.windows // self.count
+        label = np.full(x.size, int(Label.MEASURE), dtype=np.int64)
+        return window, label, np.full(x.size, -1, dtype=np.int64)
+
+    def decay_samples(self, _: float, rate_hz: float) -> int:
+        """Return the length of a decay that raises the peak acceleration by a quarter at most.
+
+        With the decay factor g over n samples, |(d g)''| <= A + 2 V max|g'| / n + D max|g''| / n^2.
+        """
+        d, v, a = self.peaks
+        b = 2.0 * MAX_BLEND_SLOPE * v
+        room = (MAX_STOP_RATIO - 1.0) * a
+        n = (b + math.sqrt(b**2 + 4.0 * room * MAX_BLEND_CURVATURE * d)) / (2.0 * room)
+        return math.ceil(max(n, RAMP_S * rate_hz))
+
+    def _indices(self, x: Float1D) -> Int1D:
+        return np.rint(x * self.count).astype(np.int64)
+
+    def _at(self, x: Float1D, shift: int = 0) -> Float1D:
+        """Return the history `shift` samples after the fractions x, 0 outside it, (x,)."""
+        index = self._indices(x) + shift
+        inside = (index >= 0) & (index < self.count)
+        return np.where(inside, self.history_m[np.clip(index, 0, self.count - 1)], 0.0)
 
 
 def smoothstep(x: Float1D) -> Float1D:
@@ -143,7 +253,7 @@ class Drive:
     """
 
     rate_hz: float
-    segments: tuple[Segment, ...]
+    segments: tuple[Segment | HistorySegment, ...]
     steps: tuple[Step, ...]
     decay_start: int | None = None
 
@@ -151,7 +261,12 @@ class Drive:
     def _starts(self) -> list[int]:
         return [segment.start for segment in self.segments]
 
-    def segment_at(self, index: int) -> Segment:
+    @property
+    def sine_segments(self) -> tuple[Segment, ...]:
+        """Segments of the loop check and of a stepped sine."""
+        return tuple(segment for segment in self.segments if isinstance(segment, Segment))
+
+    def segment_at(self, index: int) -> Segment | HistorySegment:
         """Return the segment that contains sample `index`; outside, the first or last one."""
         return self.segments[max(bisect_right(self._starts, index) - 1, 0)]
 
@@ -162,7 +277,7 @@ class Drive:
 
     @cached_property
     def decay_samples(self) -> int:
-        """Length of the decay in samples: max(2 cycles, 0.5 s) at the frequency where it begins.
+        """Length of the decay in samples, by the segment where it begins.
 
         One sample if it begins before the soft start, so that the table never starts to move.
         """
@@ -171,9 +286,8 @@ class Drive:
         if not self.segments or self.decay_start < self.segments[0].start:
             return 1
         segment = self.segment_at(self.decay_start)
-        x = np.clip(np.array([(self.decay_start - segment.start) / segment.count]), 0.0, 1.0)
-        f = segment.f0 + (segment.f1 - segment.f0) * float(smoothstep(x)[0])
-        return math.ceil(max(RAMP_CYCLES / f, RAMP_S) * self.rate_hz)
+        x = min(max((self.decay_start - segment.start) / segment.count, 0.0), 1.0)
+        return segment.decay_samples(x, self.rate_hz)
 
     @property
     def rest_start(self) -> int:
@@ -192,14 +306,14 @@ class Drive:
         """Return the displacement in m of samples first .. first + count - 1; 0 outside."""
         displacement_m = np.zeros(count)
         for segment, window, x in self._overlaps(first, count):
-            displacement_m[window] = segment_displacement(segment, x, self.rate_hz)
+            displacement_m[window] = segment.displacement(x, self.rate_hz)
         return displacement_m * self._decay_factor(first, count)
 
     def acceleration(self, first: int, count: int) -> Float1D:
         """Return the acceleration in m/s2 of an ideal table, without decay, (count,)."""
         acceleration = np.zeros(count)
         for segment, window, x in self._overlaps(first, count):
-            acceleration[window] = segment_motion(segment, x, self.rate_hz)[1]
+            acceleration[window] = segment.motion(x, self.rate_hz)[1]
         return acceleration
 
     def phase(self, first: int, count: int) -> Float1D:
@@ -213,9 +327,15 @@ class Drive:
         """Return the demanded peak acceleration in m/s2, decay included, (count,)."""
         level = np.zeros(count)
         for segment, window, x in self._overlaps(first, count):
-            low, high = segment.level0, segment.level1
-            level[window] = low + (high - low) * smoothstep(x)
+            level[window] = segment.level(x)
         return level * self._decay_factor(first, count)
+
+    def demanded_acceleration(self, first: int, count: int) -> Float1D:
+        """Return the acceleration in m/s2 that sensors should show, decay included, (count,)."""
+        acceleration = np.zeros(count)
+        for segment, window, x in self._overlaps(first, count):
+            acceleration[window] = segment.demanded_acceleration(x, self.rate_hz)
+        return acceleration * self._decay_factor(first, count)
 
     def _decay_factor(self, first: int, count: int) -> Float1D:
         """Return the factor of the decay on the command, 1 before it, (count,)."""
@@ -230,16 +350,7 @@ class Drive:
         label = np.full(count, int(Label.REST), dtype=np.int64)
         cycle = np.full(count, -1, dtype=np.int64)
         for segment, window, x in self._overlaps(first, count):
-            step[window] = segment.step
-            label[window] = segment.label
-            if segment.cycles:
-                turns = x * segment.count * segment.f0 / self.rate_hz
-                # A cycle may begin exactly on a sample: the tolerance absorbs rounding.
-                done = np.floor(turns + 1e-9).astype(np.int64)
-                cycle[window] = np.minimum(done, segment.cycles - 1)
-                label[window] = np.where(
-                    cycle[window] >= segment.settle, int(Label.MEASURE), int(Label.SETTLE)
-                )
+            step[window], label[window], cycle[window] = segment.labels(x, self.rate_hz)
         if self.decay_start is not None:
             index = np.arange(first, first + count)
             stopping = (index >= self.decay_start) & (index < self.rest_start)
@@ -249,7 +360,9 @@ class Drive:
             step[index >= self.rest_start] = -1
         return step, label, cycle
 
-    def _overlaps(self, first: int, count: int) -> list[tuple[Segment, slice, Float1D]]:
+    def _overlaps(
+        self, first: int, count: int
+    ) -> list[tuple[Segment | HistorySegment, slice, Float1D]]:
         """List (segment, window in the requested samples, segment fractions) of each overlap."""
         last = first + count
         overlaps = []

@@ -9,9 +9,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from table_io.block import Label
+from table_io.block import Float1D, Label
 from table_io.config.profile import Profile
-from table_io.excitation.drive import RAMP_CYCLES, RAMP_S, Drive, Segment, peak_acceleration_ratio
+from table_io.excitation.drive import (
+    RAMP_CYCLES,
+    RAMP_S,
+    Drive,
+    HistorySegment,
+    Segment,
+    peak_acceleration_ratio,
+)
 from table_io.records import Step
 
 PEAK_RATIO = 1.05  # largest acceleration of a blend, over the larger level
@@ -39,7 +46,7 @@ class Trajectory:
     end: int
     target: SineTarget
     phase: float = 0.0  # in cycles, at `end`
-    segments: tuple[Segment, ...] = ()
+    segments: tuple[Segment | HistorySegment, ...] = ()
 
     def append_rest(self, count: int) -> "Trajectory":
         """Append `count` samples of rest; ValueError if the motion is not at rest."""
@@ -106,14 +113,25 @@ class Trajectory:
         )
         return self._append(segment, target)
 
+    def append_history(self, history_m: Float1D, windows: int) -> "Trajectory":
+        """Append a displacement history in m from rest to rest; ValueError if not at rest."""
+        at_rest = self.append_rest(history_m.size)
+        segment = HistorySegment(self.end, history_m, windows)
+        return replace(at_rest, segments=(*self.segments, segment))
+
     def cut(self, index: int) -> "Trajectory":
-        """Return the trajectory cut at sample `index`, or at the end of a blend around it."""
+        """Return the trajectory cut at sample `index`, or at the end of a blend around it.
+
+        ValueError at a history, which is played whole.
+        """
         segments = tuple(segment for segment in self.segments if segment.start < index)
         if not segments:
             return replace(
                 self, end=index, segments=(), phase=0.0, target=replace(self.target, level_m_s2=0)
             )
         last = segments[-1]
+        if isinstance(last, HistorySegment):
+            raise ValueError(f"a history is played at sample {index}; it cannot be cut")
         if last.end <= index or not _is_steady(last):
             index = last.end
         x = np.array([(index - last.start) / last.count])
@@ -123,11 +141,11 @@ class Trajectory:
 
     def to_drive(self, steps: tuple[Step, ...]) -> Drive:
         """Return the drive of the trajectory with a soft stop at its end."""
-        step = self.segments[-1].step if self.segments else -1
+        last = self.segments[-1] if self.segments else None
         at_rest = replace(self.target, level_m_s2=0.0)
         trajectory = (
-            self.append_blend(at_rest, step, RAMP_CYCLES, Label.BLEND)
-            if self.target.level_m_s2
+            self.append_blend(at_rest, last.step, RAMP_CYCLES, Label.BLEND)
+            if self.target.level_m_s2 and isinstance(last, Segment)
             else self
         )
         return Drive(self.rate_hz, trajectory.segments, steps)
@@ -151,13 +169,21 @@ def start_trajectory(profile: Profile) -> Trajectory:
     return Trajectory(
         rate_hz,
         math.ceil(profile.acquisition.rest_s * rate_hz),
-        SineTarget(profile.sweep.start_hz, 0.0),
+        SineTarget(profile.plan.low_hz, 0.0),
     )
 
 
 def cycles_to_samples(step: Step, cycles: int, rate_hz: float) -> int:
     """Convert a number of cycles of a step to samples, rounded up."""
     return math.ceil(cycles * rate_hz / step.frequency_hz)
+
+
+def plan_excitation(profile: Profile) -> Drive:
+    """Return the drive of the excitation alone, as an ideal table plays it."""
+    plan = profile.plan
+    if plan.steps:
+        return plan_sweep(profile)
+    return start_trajectory(profile).append_history(plan.history_m, plan.windows).to_drive(())
 
 
 def plan_sweep(profile: Profile) -> Drive:

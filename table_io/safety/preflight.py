@@ -6,17 +6,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from table_io.block import Float2D
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.amplitude_control import MAX_CORRECTION
 from table_io.control.frf import evaluate_gain
 from table_io.errors import InputError
-from table_io.excitation.drive import Drive, Segment, segment_displacement, segment_motion
+from table_io.excitation.drive import Drive, HistorySegment, Segment, smoothstep
 from table_io.records import FrequencyResponse, Step
 from table_io.safety.loop_check import plan_targets
 from table_io.units import GRAVITY_M_S2
 
 LOOP_CHECK = "loop check"
+STOP_POINTS = 1000  # stops of a history, and points of each, that are evaluated
 CORRECTION_HEADROOM = 1.2  # factor of amplitude correction for which stroke should remain
 PAYLOAD_RATIO_RANGE = (0.01, 2.0)  # plausible mass of a specimen over the table's moving mass
 
@@ -25,7 +27,9 @@ PAYLOAD_RATIO_RANGE = (0.01, 2.0)  # plausible mass of a specimen over the table
 class StepDemand:
     """Peak demands of one step, its blends included; SI, `amplitude_lsb` in DAC steps.
 
-    The motions of the loop check have step -1 and direction "loop check".
+    The motions of the loop check have step -1 and direction "loop check". Of a displacement
+    history, `step` is a window, or for the worst stop in motion the number of windows, `direction`
+    names it, and the frequency is NaN.
     """
 
     step: int
@@ -42,6 +46,8 @@ class StepDemand:
         """Label of the step for messages."""
         if self.step < 0:
             return f"{self.direction} ({self.frequency_hz:g} Hz)"
+        if math.isnan(self.frequency_hz):
+            return self.direction
         return f"step {self.step} ({self.frequency_hz:g} Hz {self.direction})"
 
 
@@ -80,7 +86,7 @@ def compute_demands(drive: Drive, profile: Profile, rig: RigConfig) -> tuple[Ste
     """
     check_peaks: dict[float, list[tuple[float, float, float]]] = {}
     step_peaks: dict[int, list[tuple[float, float, float]]] = {}
-    for segment in drive.segments:
+    for segment in drive.sine_segments:
         peaks = _segment_peaks(segment, drive.rate_hz)
         if segment.step < 0:
             check_peaks.setdefault(segment.f1, []).append(peaks)
@@ -89,7 +95,7 @@ def compute_demands(drive: Drive, profile: Profile, rig: RigConfig) -> tuple[Ste
     mass = rig.moving_mass_kg + profile.specimen.mass_kg
     check_levels = {
         segment.f1: segment.level1
-        for segment in drive.segments
+        for segment in drive.sine_segments
         if segment.step < 0 and segment.level1
     }
     rows = [
@@ -100,7 +106,49 @@ def compute_demands(drive: Drive, profile: Profile, rig: RigConfig) -> tuple[Ste
         rows.append(
             _build_demand(step, step_peaks.get(step.index, [_steady_peaks(step)]), mass, rig)
         )
+    for history in drive.segments:
+        if isinstance(history, HistorySegment):
+            rows += _history_demands(history, drive.rate_hz, mass, rig)
     return tuple(rows)
+
+
+def _history_demands(
+    history: HistorySegment, rate_hz: float, mass: float, rig: RigConfig
+) -> list[StepDemand]:
+    """Return the demands of each window of a history, then those of the worst stop in it."""
+    x = np.arange(history.count) / history.count
+    motion = (history.displacement(x, rate_hz), *history.motion(x, rate_hz))
+    window, _, _ = history.labels(x, rate_hz)
+    peaks = [
+        tuple(float(np.abs(row[window == k]).max()) for row in motion)
+        for k in range(history.windows)
+    ]
+    names = [f"window {k}" for k in range(history.windows)]
+    worst_stop = _worst_stop(history, np.array(motion), rate_hz)
+    return [
+        StepDemand(step, name, math.nan, d, v, a, mass * a, d / rig.output.lsb_m)
+        for step, (name, (d, v, a)) in enumerate(
+            zip((*names, "a stop"), (*peaks, worst_stop), strict=True)
+        )
+    ]
+
+
+def _worst_stop(
+    history: HistorySegment, motion: Float2D, rate_hz: float
+) -> tuple[float, float, float]:
+    """Return the peak (displacement, velocity, acceleration) of a decay from anywhere, SI."""
+    length = history.decay_samples(0.0, rate_hz)
+    stops = np.arange(0, history.count, max(history.count // STOP_POINTS, 1))
+    peaks = np.zeros(3)
+    for x in np.arange(STOP_POINTS + 1) / STOP_POINTS:
+        at = np.rint(stops + x * length).astype(np.int64)
+        d, v, a = np.where(at < history.count, motion[:, np.minimum(at, history.count - 1)], 0.0)
+        factor = 1.0 - float(smoothstep(np.array([x]))[0])
+        slope = -30.0 * x**2 * (1.0 - x) ** 2 * rate_hz / length
+        curvature = -60.0 * x * (1.0 - x) * (1.0 - 2.0 * x) * (rate_hz / length) ** 2
+        stopped = d * factor, v * factor + d * slope, a * factor + 2 * v * slope + d * curvature
+        peaks = np.maximum(peaks, np.abs(stopped).max(axis=1))
+    return float(peaks[0]), float(peaks[1]), float(peaks[2])
 
 
 def _build_demand(
@@ -122,8 +170,8 @@ def _segment_peaks(segment: Segment, rate_hz: float) -> tuple[float, float, floa
     """Return the peak (displacement, velocity, acceleration) of a segment, SI."""
     points = int(min(segment.count, 200 * max(segment.cycles, 4)))
     x = np.linspace(0.0, 1.0, points + 1)
-    v, a = segment_motion(segment, x, rate_hz)
-    d = segment_displacement(segment, x, rate_hz)
+    v, a = segment.motion(x, rate_hz)
+    d = segment.displacement(x, rate_hz)
     return float(abs(d).max()), float(abs(v).max()), float(abs(a).max())
 
 
@@ -136,8 +184,9 @@ def check_limits(
         *_find_exceeded_limits(rows, rig),
         *_find_clipped_sensors(rows, rig),
     ]
-    coarsest = min((row for row in rows if row.step >= 0), key=lambda row: row.amplitude_lsb)
-    if coarsest.amplitude_lsb < rig.output.least_lsb:
+    steps = [row for row in rows if row.step >= 0 and row.frequency_hz > 0]
+    coarsest = min(steps, key=lambda row: row.amplitude_lsb, default=None)
+    if coarsest is not None and coarsest.amplitude_lsb < rig.output.least_lsb:
         faults.append(
             f"step {coarsest.step} ({coarsest.frequency_hz:g} Hz): amplitude is "
             f"{coarsest.amplitude_lsb:.1f} steps of the DAC; allowed: at least "
@@ -156,7 +205,8 @@ def _find_rate_faults(profile: Profile, rig: RigConfig) -> list[str]:
         rates = ", ".join(f"{rate:g}" for rate in rig.rates_hz)
         faults.append(f"acquisition.rate_hz {profile.acquisition.rate_hz:g} Hz; allowed: {rates}")
     max_hz = rig.limits.frequency_hz
-    requested_hz = {"sweep.stop_hz": profile.sweep.stop_hz}
+    top_key = "sweep.stop_hz" if profile.steps else "upper end of the excitation's band"
+    requested_hz = {top_key: profile.plan.high_hz}
     if profile.loop_check.enabled and profile.loop_check.frequencies_hz:
         requested_hz["loop_check.frequencies_hz"] = max(profile.loop_check.frequencies_hz)
     faults += [
@@ -178,6 +228,8 @@ def _find_exceeded_limits(rows: tuple[StepDemand, ...], rig: RigConfig) -> list[
             remedy = (
                 "Raise loop_check.frequencies_hz or lower loop_check.level"
                 if first.step < 0
+                else "Scale the history down"
+                if math.isnan(first.frequency_hz)
                 else "Lower sweep.acceleration_g or raise sweep.start_hz"
             )
             faults.append(
@@ -198,8 +250,8 @@ def _find_clipped_sensors(rows: tuple[StepDemand, ...], rig: RigConfig) -> list[
         if peak > sensor.range:
             faults.append(
                 f"{worst.name}: {sensor.channel} {peak:.4g} {sensor.unit}; allowed: at most its "
-                f"range, {sensor.range:g} {sensor.unit}. Lower sweep.acceleration_g, or use a "
-                "sensor with a larger range"
+                f"range, {sensor.range:g} {sensor.unit}. Lower the level, or use a sensor with a "
+                "larger range"
             )
     return faults
 
@@ -214,7 +266,7 @@ TABLE_SENSORS: dict[str, Callable[[StepDemand], float]] = {
 def list_drive_warnings(rows: tuple[StepDemand, ...], rig: RigConfig) -> list[str]:
     """List warnings about low DAC resolution and missing headroom for amplitude correction."""
     messages = []
-    steps = [row for row in rows if row.step >= 0]
+    steps = [row for row in rows if row.step >= 0 and row.frequency_hz > 0]
     coarse = [row for row in steps if row.amplitude_lsb < rig.output.warn_lsb]
     if coarse:
         lowest = min(coarse, key=lambda row: row.amplitude_lsb)
@@ -251,7 +303,7 @@ def list_setup_warnings(profile: Profile, rig: RigConfig) -> list[str]:
             f"{rig.limits.stroke_mm:g} mm; is it in mm?"
         )
     targets = plan_targets(profile, rig) if profile.loop_check.enabled else ()
-    requested_hz = max(profile.loop_check.frequencies_hz, default=profile.sweep.stop_hz)
+    requested_hz = max(profile.loop_check.frequencies_hz, default=profile.plan.high_hz)
     if targets and max(target.frequency_hz for target in targets) < 0.999 * requested_hz:
         highest_hz = max(target.frequency_hz for target in targets)
         messages.append(

@@ -1,4 +1,4 @@
-"""Test sequencer: state machine that runs the loop check, then tunes and measures each step.
+"""Test sequencer: runs the loop check, then tunes and measures each step, or plays a history.
 
 The state is an immutable value. `advance_test(state, block)` adds measured samples; at fixed
 samples it evaluates whole cycles and decides, and the decision changes the command `margin` samples
@@ -9,6 +9,7 @@ ends at rest.
     check --(passes)--> tune --(level accepted)---> hold, then tune at the next step, ...
                         tune --(not accepted)-----> blend to the corrected level, tune again
                         hold --(policy decides)---> the next step, or the end
+    check --(passes)--> the end, with a displacement history played as it is, if that is the test
     open: the operator holds the test at its step; on resume the step is tuned and measured again.
 """
 
@@ -19,11 +20,11 @@ from table_io.adaptive import make_policy
 from table_io.block import Block, Label
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
-from table_io.excitation.drive import Drive
+from table_io.excitation.drive import Drive, Segment
 from table_io.excitation.trajectory import start_trajectory
 from table_io.records import Record
 from table_io.safety import loop_check
-from table_io.sequencer.actions import approach_step, hold_step
+from table_io.sequencer.actions import approach_step, begin_excitation, hold_step
 from table_io.sequencer.decisions import DECISION_FUNCTIONS, accept_level
 from table_io.sequencer.state import SequencerState, Stage, TestPlan
 
@@ -45,18 +46,19 @@ def make_test_plan(profile: Profile, rig: RigConfig, replace_after: int = 0) -> 
 def start_test(plan: TestPlan) -> SequencerState:
     """Return the state of a test at rest; a loop check comes first if the profile enables it."""
     profile = plan.profile
-    trajectory, steps = start_trajectory(profile), profile.sweep.steps
+    trajectory, steps = start_trajectory(profile), profile.steps
+    blend_cycles = profile.plan.blend_cycles
     targets = loop_check.plan_targets(profile, plan.rig) if profile.loop_check.enabled else ()
     if not targets:
         initial = SequencerState(plan, trajectory, trajectory.to_drive(steps), Stage("end"), steps)
-        return replace(approach_step(initial, profile.first_step), changed_from=0)
+        return replace(begin_excitation(initial), changed_from=0)
     for target in targets:
-        trajectory = trajectory.append_blend(target, -1, profile.sweep.blend_cycles, Label.BLEND)
+        trajectory = trajectory.append_blend(target, -1, blend_cycles, Label.BLEND)
         cycles = loop_check.count_hold_cycles(target, profile)
         count = math.ceil(cycles * trajectory.rate_hz / target.frequency_hz)
         trajectory = trajectory.append_hold(count, -1, Label.CHECK)
     trajectory = trajectory.append_blend(
-        replace(trajectory.target, level_m_s2=0.0), -1, profile.sweep.blend_cycles, Label.BLEND
+        replace(trajectory.target, level_m_s2=0.0), -1, blend_cycles, Label.BLEND
     )
     trajectory = trajectory.append_rest(
         math.ceil(profile.loop_check.rest_s * trajectory.rate_hz) + plan.margin
@@ -75,14 +77,14 @@ def advance_test(state: SequencerState, block: Block) -> tuple[SequencerState, t
 
 
 def hold_test(state: SequencerState, index: int) -> SequencerState:
-    """Hold the step that contains sample `index`; return the state unchanged outside the sweep."""
-    if state.stage.kind in ("check", "open") or index >= state.drive.planned_end:
+    """Hold the step that contains sample `index`; return the state unchanged without one."""
+    if not state.steps or state.stage.kind in ("check", "open") or index >= state.drive.planned_end:
         return state
     trajectory = state.trajectory.cut(index)
-    if trajectory.end < index or not trajectory.segments or trajectory.segments[-1].step < 0:
+    last = trajectory.segments[-1] if trajectory.segments else None
+    if trajectory.end < index or not isinstance(last, Segment) or last.step < 0:
         return state  # the drive is already ending, or the sweep has not begun
-    step = trajectory.segments[-1].step
-    return hold_step(replace(state, trajectory=trajectory, changed_from=trajectory.end), step)
+    return hold_step(replace(state, trajectory=trajectory, changed_from=trajectory.end), last.step)
 
 
 def resume_test(state: SequencerState, index: int) -> SequencerState:
@@ -98,7 +100,7 @@ def nominal_drive(plan: TestPlan) -> Drive:
     state = start_test(plan)
     while not state.is_finished:
         if state.stage.kind == "check":
-            state = approach_step(state, plan.profile.first_step)
+            state = begin_excitation(state)
         elif state.stage.kind == "tune":
             state = accept_level(state)
         elif state.stage.step + 1 < len(state.steps):

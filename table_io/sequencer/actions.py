@@ -14,6 +14,22 @@ MIN_SETTLE_S = 0.3  # from a blend to the window; at least one cycle
 MAX_HOLD_S = 3600.0  # an operator's hold times out after this
 
 
+def begin_excitation(state: SequencerState) -> SequencerState:
+    """Approach the first step, or play the displacement history to its end."""
+    profile, changed = state.plan.profile, state.trajectory.end
+    if state.steps:
+        return approach_step(state, profile.first_step)
+    plan = profile.plan
+    trajectory = state.trajectory.append_history(plan.history_m, plan.windows)
+    return replace(
+        state,
+        trajectory=trajectory,
+        drive=trajectory.to_drive(()),
+        stage=Stage("end"),
+        changed_from=changed,
+    )
+
+
 def approach_step(state: SequencerState, position: int) -> SequencerState:
     """Blend to the step at `position` and tune there; without control, measure it at once."""
     profile, changed = state.plan.profile, state.trajectory.end

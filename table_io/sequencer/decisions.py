@@ -14,12 +14,12 @@ from table_io.control.order_tracking import HARMONIC_COUNT, HarmonicFit, track_h
 from table_io.records import Check, Event, Level, Record, Step, StepAdded
 from table_io.safety import loop_check
 from table_io.safety.preflight import check_corrected_drive
-from table_io.sequencer.actions import approach_step, measure_step, start_tuning
+from table_io.sequencer.actions import approach_step, begin_excitation, measure_step, start_tuning
 from table_io.sequencer.state import SequencerState, Stage
 
 
 def decide_after_check(state: SequencerState) -> SequencerState:
-    """Start the sweep if the loop check passed, else end the test with a refusal."""
+    """Start the excitation if the loop check passed, else end the test with a refusal."""
     plan, index = state.plan, state.stage.last
     block = join_blocks(state.blocks).cut(0, index)
     checks, response = loop_check.evaluate(block, state.drive, plan.profile, plan.rig, state.noise)
@@ -37,7 +37,7 @@ def decide_after_check(state: SequencerState) -> SequencerState:
         )
     tuning = Tuning(response)
     state = replace(state, tuning=tuning, records=(*state.records, *records))
-    return approach_step(state, plan.profile.first_step)
+    return begin_excitation(state)
 
 
 def _format_failure(check: Check) -> str:

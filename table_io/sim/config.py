@@ -1,6 +1,5 @@
 """Section `[simulated]` of a rig file: the simulated table, its specimen and injected faults."""
 
-import difflib
 from typing import Literal, NamedTuple
 
 from pydantic import Field, ValidationInfo, field_validator
@@ -8,6 +7,7 @@ from pydantic import Field, ValidationInfo, field_validator
 from table_io.config.backend import BackendConfig
 from table_io.config.base import ConfigModel, Finite, NonNegative, Positive
 from table_io.config.rig import RigConfig
+from table_io.errors import suggest
 
 
 class FaultKind(NamedTuple):
@@ -53,11 +53,7 @@ class InjectedFault(ConfigModel):
     @classmethod
     def _complete(cls, kind: str, info: ValidationInfo) -> str:
         if kind not in FAULT_KINDS:
-            near = difflib.get_close_matches(kind, FAULT_KINDS, 1, 0.4)
-            raise ValueError(
-                f"kind {kind!r} is unknown"
-                + (f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(FAULT_KINDS)}")
-            )
+            raise ValueError(f"kind {kind!r} is unknown; {suggest(kind, FAULT_KINDS)}")
         requirements = FAULT_KINDS[kind]
         keys = (
             ("channel", requirements.channel, requirements.channel, "one of the rig's sensors"),
@@ -112,13 +108,8 @@ class SimulatedTableConfig(BackendConfig):
         ]
         for fault in self.faults:
             if fault.channel is not None and fault.channel not in rig.channels:
-                near = difflib.get_close_matches(fault.channel, rig.channels, 1, 0.4)
                 faults.append(
-                    f"fault {fault.kind!r}: the rig has no sensor {fault.channel!r}"
-                    + (
-                        f"; did you mean {near[0]!r}?"
-                        if near
-                        else f"; it has: {', '.join(rig.channels)}"
-                    )
+                    f"fault {fault.kind!r}: the rig has no sensor {fault.channel!r}; "
+                    f"{suggest(fault.channel, rig.channels)}"
                 )
         return faults

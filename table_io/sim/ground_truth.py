@@ -17,7 +17,6 @@ of the same name in the model library; the functional forms differ (`hidden_plan
 model can reproduce the truth exactly.
 """
 
-import difflib
 import hashlib
 import math
 from typing import NamedTuple
@@ -25,7 +24,7 @@ from typing import NamedTuple
 from pydantic import Field, ValidationInfo, field_validator
 
 from table_io.config.base import ConfigModel, Finite, NonNegative, Number, Positive, parse_toml
-from table_io.errors import InputError
+from table_io.errors import InputError, suggest
 
 
 class HiddenParameter(NamedTuple):
@@ -134,16 +133,11 @@ DEFINITION_BY_ID: dict[tuple[str, str], EffectDefinition] = {
 }
 
 
-def _suggest(name: str, known_names: list[str]) -> str:
-    matches = difflib.get_close_matches(name, known_names, 1, 0.4)
-    return f"did you mean {matches[0]!r}?" if matches else f"known: {', '.join(known_names)}"
-
-
 def _find_parameter_faults(definition: EffectDefinition, given: dict[str, float]) -> list[str]:
     """List a message for each unknown, missing or out-of-range parameter of an effect."""
     known_names = [parameter.name for parameter in definition.parameters]
     faults = [
-        f"no parameter {name!r}; {_suggest(name, known_names)}"
+        f"no parameter {name!r}; {suggest(name, known_names)}"
         for name in given
         if name not in known_names
     ]
@@ -171,7 +165,7 @@ class HiddenEffect(ConfigModel):
     def _check_id(cls, name: str) -> str:
         ids = list(dict.fromkeys(definition.id for definition in EFFECT_DEFINITIONS))
         if name not in ids:
-            raise ValueError(f"effect {name!r} is unknown; {_suggest(name, ids)}")
+            raise ValueError(f"effect {name!r} is unknown; {suggest(name, ids)}")
         return name
 
     @field_validator("form")
@@ -185,7 +179,7 @@ class HiddenEffect(ConfigModel):
         if not forms:
             return form
         if form and form not in forms:
-            raise ValueError(f"{info.data['id']} has no form {form!r}; {_suggest(form, forms)}")
+            raise ValueError(f"{info.data['id']} has no form {form!r}; {suggest(form, forms)}")
         return form or forms[0]
 
     @field_validator("parameters")

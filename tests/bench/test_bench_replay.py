@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from table_io.config.base import find_config
@@ -47,7 +48,7 @@ def read_by_protobuf(log: Path) -> int:
         if kind := kinds.get(one.topic):
             message = kind.FromString(one.payload)
             if isinstance(message, pb.Block):
-                count += sum(len(list(channel.values)) for channel in message.channels)
+                count += np.frombuffer(message.values).size
     return count
 
 

@@ -46,8 +46,9 @@ def test_what_all_have_in_common_is_said_once(tmp_path: Path) -> None:
     (tmp_path / "campaign.toml").write_text(listed("free", "g4"))
     with pytest.raises(InputError) as error:
         read_plan(tmp_path / "campaign.toml", "nowhere", None, anything)
-    assert str(error.value).count("not found in rigs") == 1
+    assert str(error.value).count("not found") == 1
     assert "free.toml, g4.toml" in str(error.value)
+    assert "--table nowhere: " in str(error.value)
 
 
 @pytest.mark.parametrize("text", ['title = "C"\n', 'title = "C"\nruns = []\n'])

@@ -186,7 +186,7 @@ def test_what_goes_on_says_of_what_and_from_where(both: Both) -> None:
     assert len(run["parts"]) == 2
     assert run["parts"][1]["folder"] == "02-g4-2"
     assert run["parts"][1]["first_step"] in {0, 4}  # from the beginning of a direction
-    assert {branch["history"] for branch in run["branches"]} <= {"whole", "begun anew from rest"}
+    assert {branch["history"] for branch in run["branches"]} <= {"whole", "restarted from rest"}
     if run["parts"][1]["first_step"]:
         assert used == {"02-g4", "02-g4-2"}
         start = read_recording(both.killed / "02-g4-2" / "run.mcap").start

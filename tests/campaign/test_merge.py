@@ -111,7 +111,7 @@ def test_a_branch_says_where_it_comes_from_and_what_became_of_its_history() -> N
     whole = together(part(1, 0, 7, "complete"))
     assert [one["history"] for one in whole["branches"]] == ["whole", "whole"]
     anew = together(part(1, 0, 5), part(2, 4, 7, "complete"))["branches"]
-    assert [one["history"] for one in anew] == ["whole", "begun anew from rest"]
+    assert [one["history"] for one in anew] == ["whole", "restarted from rest"]
     assert anew[1]["pieces"] == [{"part": "01-g4-2", "from_hz": 4.0, "to_hz": 1.0}]
     broken = together(part(1, 0, 5), part(2, 6, 7, "complete"))["branches"]
     assert [one["history"] for one in broken] == ["whole", "broken"]

@@ -161,7 +161,7 @@ def test_a_second_record_lies_beside_the_first(
     calibrate: Calibrate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calibrate("--points", "0,10", "--out", "first.toml")
-    with pytest.raises(InputError, match="nothing is overwritten"):
+    with pytest.raises(InputError, match=r"first\.toml: .*--out"):
         calibrate("--points", "0,10", "--out", "first.toml")
     calibrate("--points", "0,10")
     assert len(records(tmp_path)) == 1
@@ -172,24 +172,24 @@ def test_a_second_record_lies_beside_the_first(
 @pytest.mark.parametrize(
     ("words", "channel", "said"),
     [
-        ((), "table_disp_m", "at least two numbers in mm"),
-        (("--points", "10"), "table_disp_m", "at least two numbers"),
-        (("--points", "10,10"), "table_disp_m", "at least two numbers"),
+        ((), "table_disp_m", "at least two different numbers in mm"),
+        (("--points", "10"), "table_disp_m", "--points 10: "),
+        (("--points", "10,10"), "table_disp_m", "--points 10,10: "),
         (("--points", "0,ten"), "table_disp_m", "0,ten"),
         (("--points", "0,nan"), "table_disp_m", "0,nan"),
         (("--points", "0,76"), "table_disp_m", "within +-75"),
         (("--points", "0,10", "--tolerance", "0"), "table_disp_m", "--tolerance"),
         (("--points", "0,10", "--applied-sd", "nan"), "table_disp_m", "--applied-sd"),
         (("--points", "0,10", "--tolerance", "inf"), "table_disp_m", "--tolerance"),
-        (("--points", "0,10", "--applied-sd", "1e200"), "table_disp_m", "0 to the range, 75 mm"),
+        (("--points", "0,10", "--applied-sd", "1e200"), "table_disp_m", "allowed: 0 to 75 mm"),
         (("--points", "1.0,1.00000001"), "table_disp_m", "at least 0.075 mm"),
-        (("--shunt", "--tolerance", "1"), "table_disp_m", "shunt_tolerance on the sensor card"),
-        (("--points", "0,1", "--shunt"), "table_disp_m", "no --points"),
-        (("--shunt",), "mass_disp_m", "shunt and shunt_tolerance"),
-        (("--points", "0,10"), "tabel_disp_m", "no such sensor; it has: drive_disp_m"),
-        (("--points", "0,10", "--out", "/proc/none/x"), "table_disp_m", "give another --out"),
-        (("--points", "0,74.9"), "table_disp_m", "at the end of its range"),
-        (("--points", "0,10"), "mass_disp_m", "did not follow what was applied"),
+        (("--shunt", "--tolerance", "1"), "table_disp_m", "--tolerance: does not apply"),
+        (("--points", "0,1", "--shunt"), "table_disp_m", "--points: does not apply"),
+        (("--shunt",), "mass_disp_m", "add shunt and shunt_tolerance"),
+        (("--points", "0,10"), "tabel_disp_m", "did you mean 'table_disp_m'?"),
+        (("--points", "0,10", "--out", "/proc/none/x"), "table_disp_m", "another file with --out"),
+        (("--points", "0,74.9"), "table_disp_m", "allowed: below +-75 mm"),
+        (("--points", "0,10"), "mass_disp_m", "mass_disp_m: the readings differ"),
     ],
 )
 def test_what_cannot_be_is_refused_and_leaves_no_record(

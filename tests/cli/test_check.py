@@ -57,7 +57,7 @@ def test_the_plan_of_a_shipped_test_is_whole_and_fits_a_terminal(name: str) -> N
     tables = text[text.index("peaks of the drive") :]
     assert max(map(len, tables.splitlines())) <= 80
     assert "warning" not in text
-    assert text.rstrip().endswith("ready: nothing exceeds the machine card")
+    assert text.rstrip().endswith("ready: nothing exceeds the limits of the rig file")
     assert len(tables.splitlines()) < 50
 
 

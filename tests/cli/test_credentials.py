@@ -173,7 +173,7 @@ def test_nothing_is_overwritten_and_a_name_is_given_once(lab: Path) -> None:
     assert contents(lab) == before
     shutil.rmtree(lab / "people")  # as one does that was handed over
     remove_person(lab, "anna")
-    with pytest.raises(InputError, match=r"was given out, .* choose another one"):
+    with pytest.raises(InputError, match=r"^anna: .*keys renew"):
         add_person(lab, "anna", "observe", [])
     add_person(lab, "anna-2", "observe", [])
     renew_keys(lab, "anna-2", [])
@@ -234,7 +234,7 @@ def test_without_the_authoritys_key_nothing_is_issued(lab: Path) -> None:
     key = lab / "ca.key.pem"
     away = key.rename(lab.parent / "safe.pem")
     assert read_credentials(lab).name == "rig"
-    with pytest.raises(InputError, match=r"ca\.key\.pem: cannot read it"):
+    with pytest.raises(InputError, match=r"ca\.key\.pem: cannot read"):
         add_person(lab, "bob", "observe", [])
     for wrong in (b"x", (lab / "key.pem").read_bytes()):
         key.write_bytes(wrong)
@@ -276,7 +276,7 @@ def test_keys_that_expire_soon_say_so(
         "twin.security.credentials.local_datetime", lambda: local_datetime() + timedelta(days=360)
     )
     credential_commands.read_keys_option(lab / "people" / "anna")
-    assert "good for 4 more days; then every link with it ends" in capsys.readouterr().out
+    assert "expires in 4 days" in capsys.readouterr().out
     with pytest.raises(InputError, match="keys of anna"):
         credential_commands.read_keys_option(lab / "people" / "anna", rig=True)
 
@@ -322,5 +322,5 @@ def test_a_fault_is_one_message_and_exit_code_2(tmp_path: Path) -> None:
         check=False,
     )
     assert (result.returncode, result.stdout) == (2, "")
-    assert "access.toml: cannot read it: No such file" in result.stderr
+    assert "access.toml: cannot read: No such file" in result.stderr
     assert "Traceback" not in result.stderr

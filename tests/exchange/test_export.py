@@ -271,7 +271,7 @@ def test_the_commands(log: Path, tmp_path: Path) -> None:
     assert "mass_disp_m: " in told.output
     assert isinstance(run.invoke(app, ["import", str(new)]).exception, InputError)
     both = run.invoke(app, ["import", str(new), "--list", "-o", str(tmp_path / "b.mcap")])
-    assert "leave -o out" in str(both.exception)
+    assert "omit -o or --list" in str(both.exception)
     assert run.invoke(app, ["import", str(new), "-o", str(tmp_path / "a.mcap")]).exit_code == 4
     assert (
         len(read_recording(tmp_path / "a.mcap").start.steps) == 2

@@ -2,7 +2,7 @@
 
 import pytest
 
-from table_io.config.profile import Sweep
+from table_io.config.excitation.stepped_sine import Sweep
 from twin.identification.step_detection import Hold, _split_turns
 
 RATE = 1000.0

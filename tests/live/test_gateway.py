@@ -344,10 +344,10 @@ def test_garbage_harms_nothing(observer: BusLink, rig: Rig, spec: ProcessConfig)
         ("hold", "anna", "command", f"{RUN}\nwhy", ""),
         ("abort", "anna", "command", RUN, ""),
         ("start", "anna", "command", RUN, "known: hold, resume, stop, abort"),
-        ("hold", "a b", "command", RUN, "is no name"),
-        ("hold", "a" * 65, "command", RUN, "is no name"),
-        ("hold", "../rig", "command", RUN, "is no name"),
-        ("hold", "anna", "observe", RUN, "has the role observe; this takes the role command"),
+        ("hold", "a b", "command", RUN, "allowed: up to 64"),
+        ("hold", "a" * 65, "command", RUN, "allowed: up to 64"),
+        ("hold", "../rig", "command", RUN, "allowed: up to 64"),
+        ("hold", "anna", "observe", RUN, "role observe"),
         ("hold", "anna", "twin", RUN, "has the role twin"),
         ("hold", "anna", "command", "other\nwhy", f"this is run {RUN}"),
         ("hold", "anna", "command", f"{RUN}\n{'x' * 1001}", "1001 characters"),
@@ -369,7 +369,7 @@ def test_refusals_are_told_again_after_a_while() -> None:
     assert [one for one in told if one] == ["no"] * MAX_REFUSAL_BURST
     assert (
         refusals.limit("no", 11.0)
-        == f"no (and {1000 - MAX_REFUSAL_BURST} more since the last one told)"
+        == f"no (and {1000 - MAX_REFUSAL_BURST} more since the last one recorded)"
     )
     assert refusals.limit("no", 11.1) == ""
 

@@ -144,7 +144,7 @@ def test_a_card_with_sensors():
     "entry, says",
     [
         ('id = "boucwen"\nparameters = {}', "did you mean 'bouc_wen'"),
-        ('id = "sensor_gain"\nparameters = { gain = 1.1 }', "channel '' is not predicted"),
+        ('id = "sensor_gain"\nparameters = { gain = 1.1 }', "known: rel_disp_m"),
         ('id = "sensor_gain"\nparameters = { channel = "mass_ac_m_s2", gain = 1.1 }',
          "did you mean 'mass_acc_m_s2'"),
         ('id = "coulomb_friction"\nparameters = { channel = "mass_acc_m_s2", fc = 1.0 }',

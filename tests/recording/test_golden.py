@@ -39,6 +39,11 @@ WRITTEN = {  # version: (sha256 of the content, messages, measured eta_d of each
         129,
         (0.10615427913608139, 0.0819036788347143, 0.09453897270552923),
     ),
+    3: (
+        "02b81ec808ca97a864cf3b7fb903590f3eaac7daacf9e28104c4af8b55e97ac2",
+        129,
+        (0.10615427913608139, 0.0819036788347143, 0.09453897270552923),
+    ),
 }
 
 
@@ -121,7 +126,7 @@ def test_a_newer_version_is_refused_by_its_number(
     with monkeypatch.context() as newer:
         newer.setattr(mcap_log, "SCHEMA_VERSION", SCHEMA_VERSION + 1)
         write_items(tmp_path / "new.mcap", run(), START)
-    with pytest.raises(InputError, match=r"new.mcap: written in schema version 3; allowed: 1 to 2"):
+    with pytest.raises(InputError, match=r"new.mcap: written in schema version 4; allowed: 1 to 3"):
         reader(tmp_path / "new.mcap")
     assert not (tmp_path / "out.mcap").exists()
 

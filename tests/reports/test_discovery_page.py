@@ -161,7 +161,7 @@ def test_the_first_sentence(every: dict[str, Left]) -> None:
     heads = {word: re.search("<h1>(.*)</h1>", left.page)[1] for word, left in every.items()}  # type: ignore[index]
     assert "agree to within the noise" in heads["none"]
     assert heads["named"] == "The model lacks bumper_hardening."
-    assert "cannot tell which" in heads["ambiguous"]
+    assert "do not determine which" in heads["ambiguous"]
     for names in every["ambiguous"].told["ambiguous"]:
         assert " with ".join(names) in heads["ambiguous"]
     assert "no effect of the library explains" in heads["unexplained"]

@@ -73,7 +73,7 @@ def test_a_whole_that_is_not_what_was_written_leaves_the_parts(
     before = kept.read_bytes()
     with monkeypatch.context() as patch:
         patch.setattr(merge_parts, "verify_log", lambda _: False)
-        with pytest.raises(InputError, match="not what was written; the parts are kept beside it"):
+        with pytest.raises(InputError, match="its parts are kept next to it"):
             merge_run_parts(run)
     assert not (run / "run.mcap").exists()
     assert kept.read_bytes() == before
@@ -101,7 +101,7 @@ def test_parts_of_a_run_that_goes_on_are_not_touched(run: Path) -> None:
     part(run, 1, 0, 61, killed=False)
     with (run / PARTS_FOLDER / LOCK_FILE).open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_SH)
-        with pytest.raises(InputError, match="a run is still going on in this folder; wait"):
+        with pytest.raises(InputError, match="still recording"):
             merge_run_parts(run)
     merge_run_parts(run)
 
@@ -114,7 +114,7 @@ def test_a_run_without_a_recording_says_so(run: Path) -> None:
 def test_a_log_that_is_there_already_is_never_replaced(run: Path) -> None:
     kept = part(run, 1, 0, 61, killed=False)
     (run / "run.mcap").write_text("somebody's")
-    with pytest.raises(InputError, match="not a whole log; move it away, the parts are in"):
+    with pytest.raises(InputError, match=r"run\.mcap: not a complete log; its parts are in"):
         merge_run_parts(run)
     assert (run / "run.mcap").read_text() == "somebody's"
     (run / "run.mcap").write_bytes(kept.read_bytes())  # died after the parts had become it

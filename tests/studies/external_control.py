@@ -23,6 +23,7 @@ from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.excitation.drive import Drive
 from table_io.sim.controller import DrivePlayback
+from tests.table_io.excitation.sine_segments import sine_segments
 
 RATE = 2000.0
 LSB = 2 * 0.06 / 2**24
@@ -47,7 +48,7 @@ def followed(
     drive: Drive, ppm: float, begins: float, rng: np.random.Generator
 ) -> tuple[float, list[float]]:
     """(s from the motion's begin until it is found, error in samples at each of LATER)."""
-    first = drive.segments[0]
+    first = sine_segments(drive)[0]
     sigma = 0.01 * first.level1 / (2 * math.pi * first.f1) ** 2
     motion = begins + first.start
     count = int(motion + (LATER[-1] + 0.5) * RATE)
@@ -94,7 +95,7 @@ def labels(ppm: float = 50.0) -> None:
     drive, begins = drive_of("g4_ss3", True), 7000.37
     for noise in (0.0, 0.01):
         told, true = _told(drive, ppm, begins, noise)
-        moving = true >= drive.segments[0].start
+        moving = true >= sine_segments(drive)[0].start
         off = np.abs(told - true)[moving]
         low = int(min(told.min(), true.min())) - 1
         rows = drive.labels(low, int(max(told.max(), true.max())) + 4 - low)
@@ -114,7 +115,7 @@ def labels(ppm: float = 50.0) -> None:
 def _told(drive: Drive, ppm: float, begins: float, noise: float) -> tuple[np.ndarray, np.ndarray]:
     """(places told, true places) of every sample."""
     file, rng = drive.command(0, drive.rest_start + 1000), np.random.default_rng(3)
-    first = drive.segments[0]
+    first = sine_segments(drive)[0]
     sigma = noise * first.level1 / (2 * math.pi * first.f1) ** 2
     played = DrivePlayback(file, RATE, RATE, begins, ppm)
     now, count, told = DriveFollower(drive, RATE, sigma, LSB), played.end // 500 * 500, []

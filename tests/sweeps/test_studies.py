@@ -251,7 +251,7 @@ def refused(profile: Path, models: list[str], gaps: list[str], said: str, **more
 
 
 def test_a_batch_that_cannot_be_is_refused_before_it_begins(profile: Path) -> None:
-    refused(profile, ["snm", "snn"], [], "snn: not found in models; did you mean 'snm'")
+    refused(profile, ["snm", "snn"], [], "did you mean 'snm'")
     refused(profile, ["snm", "snm"], ["4"], "--model snm: given twice")
     same = model(profile.parent, "same")
     refused(profile, ["snm", same], ["4", "6"], "models snm and same are identical")

@@ -67,7 +67,7 @@ def test_the_example_runs_as_it_stands() -> None:
     lines = said.splitlines()[:3]
     assert len(lines) == 3, said
     for line in lines:
-        match = re.fullmatch(r"([\d.]+) \[\('(\w+)', ([\d.]+)\)\]", line)
+        match = re.fullmatch(r"([\d.]+) \{'(\w+)': ([\d.]+)\}", line)
         assert match is not None, line
         second, name, value = match.groups()
         assert name == "mass_disp_m"

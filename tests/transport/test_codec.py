@@ -62,7 +62,7 @@ def any_block(draw: st.DrawFn) -> Block:
     size = len(channels) * samples
     numbers = st.one_of(st.sampled_from(ODD), st.floats())
     values = draw(st.lists(numbers, min_size=size, max_size=size))
-    whole = st.lists(st.integers(-1, 2**40), min_size=samples, max_size=samples)
+    whole = st.lists(st.integers(-1, codec.MAX_LABEL), min_size=samples, max_size=samples)
     labels = [np.array(draw(whole), dtype=np.int64) for _ in range(3)]
     return Block(
         draw(st.sampled_from(sorted(codec.BLOCK_TOPICS))),
@@ -195,8 +195,8 @@ def test_the_schema_has_the_fields_of_the_record_and_no_other(kind: type) -> Non
 
 def test_the_schema_has_the_fields_of_a_block_and_no_other() -> None:
     message = pb.DESCRIPTOR.message_types_by_name["Block"]
-    names = {one.name for one in fields(Block)} - {"values"}  # they stand in the channels
-    assert {field.name for field in message.fields} == {*names, "run"}
+    names = {field.name for field in fields(Block)}  # the lists of schema 1 and 2
+    assert {field.name for field in message.fields} == {*names, "run", "names", "labels"}
     channel = message.fields_by_name["channels"].message_type
     assert channel is not None
     assert {field.name for field in channel.fields} == {"name", "values"}

@@ -22,7 +22,7 @@ from twin.campaign.state import (
 from twin.reports.finalize import EXIT_GAPS
 from twin.run.disk import require_disk_space
 from twin.run.folders import RUNS_FOLDER, make_output_folder
-from twin.run.realtime import check_realtime
+from twin.run.realtime import check_full_speed, check_realtime
 from twin.run.run_config import RunConfig, make_run_id
 from twin.run.terminal import print_line
 from twin.run.warm_up import compile_kernels
@@ -93,14 +93,7 @@ def run_campaign(options: CampaignOptions) -> int:
 
 
 def _require_any_speed(bundle: RunConfig, _: Path) -> None:
-    if not bundle.rig.runs_at_any_speed:
-        raise InputError(
-            "this rig runs in real time only",
-            where=bundle.rig.name,
-            key="--speed",
-            value="max",
-            remedy="omit --speed",
-        )
+    check_full_speed(bundle.rig)
 
 
 def _prepare_folder(options: CampaignOptions) -> Path:

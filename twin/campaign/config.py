@@ -1,6 +1,5 @@
 """Campaign file: configuration models, and checks of every run before anything moves."""
 
-import difflib
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from table_io.config.base import (
     read_text,
     resolve_config,
 )
-from table_io.errors import InputError
+from table_io.errors import InputError, suggest
 from table_io.safety.preflight import list_drive_warnings as coarse
 from twin.run.run_config import RunConfig, read_run_config
 
@@ -155,13 +154,13 @@ def _find_profile(name: str, path: Path) -> Path:
     if place.is_file():
         return place
     candidate = path.parent / name
-    profiles_by_name = {
-        profile_path.name: profile_path for profile_path in candidate.parent.glob("*.toml")
-    }
-    near = difflib.get_close_matches(candidate.name, profiles_by_name, 1, 0.4)
-    included = sorted(profile_path.stem for profile_path in (PROFILES_DIR / "tests").glob("*.toml"))
-    hint = f"did you mean {near[0]!r}?" if near else f"included tests: {', '.join(included)}"
-    raise InputError(f"no such test profile in {candidate.parent}", where=name, remedy=hint)
+    known = [profile_path.name for profile_path in sorted(candidate.parent.glob("*.toml"))]
+    known += sorted(profile_path.stem for profile_path in (PROFILES_DIR / "tests").glob("*.toml"))
+    raise InputError(
+        f"no such test profile in {candidate.parent}",
+        where=name,
+        remedy=suggest(candidate.name, known),
+    )
 
 
 def _refuse_own_sections(bundle: RunConfig) -> None:
@@ -183,8 +182,8 @@ def _format_faults(faults: dict[str, list[str]]) -> list[str]:
 
 
 def is_free_flight(bundle: RunConfig) -> bool:
-    """Return whether the specimen has no bumpers."""
-    return bundle.profile.specimen.gap_mm == float("inf")
+    """Return whether a stepped sine is played without bumpers, which gives u* and a*."""
+    return bundle.profile.specimen.gap_mm == float("inf") and bool(bundle.steps)
 
 
 def list_campaign_warnings(plan: CampaignPlan) -> list[str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from table_io.config.profile import Sweep
+from table_io.config.excitation.stepped_sine import Sweep
 from table_io.records import PrcPoint
 from table_io.units import GRAVITY_M_S2
 from twin.campaign.summary import CampaignData, CampaignRunData, describe_normalization
@@ -40,6 +40,8 @@ def draw_campaign_figures(campaign: CampaignData, folder: Path) -> list[Picture]
 
 def _draw_each(campaign: CampaignData) -> CaptionedFigures:
     cases, measured_campaign = prc_families(campaign)
+    if not cases:
+        return
     drawn = [draw_all_gaps(cases, measured_campaign)]
     if sum(name in cases for name in TRANSITION_COLOURS) > 1:
         drawn.append(draw_transition(cases, measured_campaign))
@@ -74,11 +76,16 @@ def _is_covered_finer(hz: float, of: Sweep, sweeps: list[Sweep]) -> bool:
     )
 
 
+def list_swept_runs(campaign: CampaignData) -> list[CampaignRunData]:
+    """List the runs of a stepped sine, which have curves over frequency."""
+    return [run for run in campaign.runs if run.profile.steps]
+
+
 def prc_families(campaign: CampaignData) -> tuple[dict[str, PaperCase], MeasuredCampaign]:
     """Return the model's curves and the measured points by gap, the largest gap first."""
     stars = (campaign.stars["u_star_m"], campaign.stars["a_star_m_s2"]) if campaign.stars else None
     by_gap: dict[float, list[CampaignRunData]] = {}
-    for run in campaign.runs:
+    for run in list_swept_runs(campaign):
         by_gap.setdefault(run.profile.specimen.gap_mm, []).append(run)
     cases: dict[str, PaperCase] = {}
     measured_campaign = MeasuredCampaign()
@@ -109,7 +116,7 @@ def _draw_levels(campaign: CampaignData) -> CaptionedFigure:
     ax = figure.subplots()
     band = 100 * max(run.profile.control.tolerance for run in campaign.runs)
     ax.axhspan(-band, band, color="#1a7f37", alpha=0.10, lw=0)
-    for run in campaign.runs:
+    for run in list_swept_runs(campaign):
         level = run.profile.sweep.acceleration_g * GRAVITY_M_S2
         for direction in DIRECTIONS:
             direction_points = [

@@ -11,7 +11,6 @@ from itertools import groupby
 from pathlib import Path
 
 from table_io.config.profile import Profile
-from table_io.units import GRAVITY_M_S2
 from twin.campaign.state import RunState
 from twin.compare.curves import detect_hysteresis
 from twin.reports.summary import Json, number_or_nan, prc_points
@@ -54,9 +53,9 @@ def merge_summaries(run: RunState, profile: Profile, summaries: Sequence[Json]) 
         "parts": [part.model_dump(exclude={"measured"}) for part in run.parts],
         "branches": [
             _describe_branch(run, profile, ordered, direction)
-            for direction in profile.sweep.directions
+            for direction in (profile.sweep.directions if profile.steps else ())
         ],
-        "planned_steps": len(profile.sweep.steps),
+        "planned_steps": len(profile.steps),
         "u_star_m": last.get("u_star_m"),
         "a_star_m_s2": last.get("a_star_m_s2"),
         "steps": ordered,
@@ -80,18 +79,18 @@ def _describe_branch(run: RunState, profile: Profile, steps: list[Json], directi
         several = list(group)
         ends = several[0]["frequency_hz"], several[-1]["frequency_hz"]
         pieces.append({"part": folder, "from_hz": ends[0], "to_hz": ends[1]})
-    first = next(step.index for step in profile.sweep.steps if step.direction == direction)
+    first = next(step.index for step in profile.steps if step.direction == direction)
     broken = [piece["from_hz"] for piece in pieces[1:]]
     if pieces and begins[pieces[0]["part"]] > first:
         broken.insert(0, pieces[0]["from_hz"])
     anew = bool(pieces) and begins[pieces[0]["part"]] == first > 0
-    history = "broken" if broken else "begun anew from rest" if anew else "whole"
+    history = "broken" if broken else "restarted from rest" if anew else "whole"
     return {"direction": direction, "history": history, "broken_at_hz": broken, "pieces": pieces}
 
 
 def _summarize_quality(profile: Profile, steps: list[Json], summaries: Sequence[Json]) -> Json:
     """Return quality figures of a run: level errors, checks, trips, faults, latency, gaps."""
-    demanded = profile.sweep.acceleration_g * GRAVITY_M_S2
+    demanded = profile.plan.level_m_s2
     errors = [number_or_nan(step["table_acc_fundamental_m_s2"]) / demanded - 1 for step in steps]
     worst = max(range(len(steps)), key=lambda k: abs(errors[k]), default=None)
     levels = [step["level"] for step in steps if step.get("level")]

@@ -20,10 +20,12 @@ def format_run_name(campaign: ActiveCampaign, run: PlannedRun) -> str:
 
 def format_run_start(campaign: ActiveCampaign, run: PlannedRun) -> str:
     """Return one line that describes the run about to be played."""
-    steps, first = run.bundle.profile.sweep.steps, campaign.starting_step(run)
+    steps, first = run.bundle.steps, campaign.starting_step(run)
     text = f"{format_run_name(campaign, run)}: {run.bundle.profile.title}"
     if not campaign.run_state(run).parts:
-        return f"{text}; {len(steps)} steps"
+        return f"{text}; {run.bundle.extent}"
+    if not steps:
+        return f"{text}; {run.bundle.extent}, again from the beginning"
     where = f"{steps[first].frequency_hz:g} Hz {steps[first].direction}"
     return f"{text}; continues from step {first + 1} of {len(steps)}, {where}"
 

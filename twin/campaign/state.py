@@ -409,21 +409,23 @@ def is_unaltered(folder: Path, part: RunPart) -> bool:
 
 
 def is_complete(run: RunState, profile: Profile) -> bool:
-    """Return whether every step is measured."""
+    """Return whether every step is measured, or the whole history is played."""
     if run.parts and run.parts[-1].verdict == "complete":
         return True
+    if not profile.steps:
+        return False
     return make_policy(profile) is None and not missing_steps(run, profile)
 
 
 def missing_steps(run: RunState, profile: Profile) -> list[int]:
     """Return the indices of the steps that no recording of a run has measured."""
     measured = {step for part in run.parts for step in part.measured}
-    return [step.index for step in profile.sweep.steps if step.index not in measured]
+    return [step.index for step in profile.steps if step.index not in measured]
 
 
 def first_step(run: RunState, profile: Profile, mode: ResumeMode) -> int:
     """Return the index of the step from which an interrupted run continues."""
-    missing, steps = missing_steps(run, profile), profile.sweep.steps
+    missing, steps = missing_steps(run, profile), profile.steps
     if mode == "run" or not missing or make_policy(profile) is not None:
         return 0  # an adaptive test needs the results of all its steps
     if mode == "step":

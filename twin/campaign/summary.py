@@ -83,7 +83,8 @@ def measured_maxima(run: CampaignRunData) -> Json | None:
     Maxima over the grid of the run, as the laboratory reports them: (u_max - u_min)/2 of the
     relative displacement and (a_max - a_min)/2 of the total acceleration of the mass.
     """
-    if run.profile.specimen.gap_mm != float("inf") or run.state.status != "complete":
+    in_free_flight = run.profile.specimen.gap_mm == float("inf") and run.profile.steps
+    if not in_free_flight or run.state.status != "complete":
         return None
     summary, sweep = run.summary, run.profile.sweep
     stars: dict[str, Any] = {"run": run.state.label, "step_hz": sweep.step_hz}

@@ -18,7 +18,7 @@ from table_io.config.calibration_record import CalibrationRecord, format_calibra
 from table_io.config.rig import RigConfig
 from table_io.config.rig_file import calibrations_dir, load_rig
 from table_io.config.sensor import SensorConfig
-from table_io.errors import InputError
+from table_io.errors import InputError, suggest
 from twin.cli.check_table import EXIT_FAILED, make_machine
 from twin.run.terminal import print_line
 from twin.security.credentials import user_name
@@ -53,21 +53,26 @@ class CalibrationRequest:
 
 def calibrate_sensor(request: CalibrationRequest) -> int:
     """Measure each point and write the record; return 0, or 2 if out of tolerance."""
-    path = find_config(request.table, "rigs")
+    path = find_config(request.table, "rigs", option="--table")
     rig, _ = load_rig(path)
     sensor = next(
         (candidate for candidate in rig.sensors if candidate.channel == request.channel), None
     )
     if sensor is None:
         raise InputError(
-            f"{request.channel}: rig {rig.name} has no such sensor; it has: "
-            f"{', '.join(rig.channels)}"
+            f"rig {rig.name} has no sensor of this channel",
+            where=request.channel,
+            remedy=suggest(request.channel, rig.channels),
         )
     applied, prompts = _plan_points(request, sensor)
     timestamp = f"{local_datetime():%Y%m%d-%H%M%S}"
     record_path = request.out or calibrations_dir(path) / f"{timestamp}-{sensor.channel}.toml"
     if record_path.exists():
-        raise InputError(f"{record_path}: exists; nothing is overwritten, give another --out")
+        raise InputError(
+            "exists; records are never overwritten",
+            where=record_path,
+            remedy="give the name of a new file with --out",
+        )
     means = []
     for prompt in prompts:
         _wait_for_person(prompt, request.unattended)
@@ -83,20 +88,34 @@ def _plan_points(
     request: CalibrationRequest, sensor: SensorConfig
 ) -> tuple[tuple[float, ...], list[str]]:
     """Return (applied values in the sensor's unit, prompts to the operator), by point."""
-    if not (0 < request.tolerance < math.inf and 0 <= request.applied_sd <= sensor.range):
+    if not 0 < request.tolerance < math.inf:
         raise InputError(
-            "--tolerance and --applied-sd: allowed: above 0 %, and 0 to the range, "
-            f"{sensor.range:g} {sensor.unit}"
+            "out of range", where=f"--tolerance {request.tolerance:g}", allowed="above 0 %"
+        )
+    if not 0 <= request.applied_sd <= sensor.range:
+        raise InputError(
+            "out of range",
+            where=f"--applied-sd {request.applied_sd:g}",
+            allowed=f"0 to {sensor.range:g} {sensor.unit}, the range of the sensor",
         )
     if request.shunt:
         if request.tolerance_percent is not None:
             raise InputError(
-                "--shunt: what it may depart is shunt_tolerance on the sensor card; no --tolerance"
+                "does not apply to a shunt calibration",
+                where="--tolerance",
+                remedy="omit it: shunt_tolerance in the [[sensors]] table of the rig file applies",
             )
-        if request.points or sensor.shunt is None:
+        if request.points:
             raise InputError(
-                f"--shunt: {sensor.channel} needs shunt and shunt_tolerance on its sensor card, "
-                "and no --points"
+                "does not apply to a shunt calibration",
+                where="--points",
+                remedy="give either --points or --shunt",
+            )
+        if sensor.shunt is None:
+            raise InputError(
+                f"the rig file states no shunt of {sensor.channel}",
+                where="--shunt",
+                remedy="add shunt and shunt_tolerance to its [[sensors]] table, or use --points",
             )
         prompts = [f"switch the shunt of {sensor.channel} {state}" for state in ("off", "on")]
         _check_span((0.0, sensor.shunt), sensor, "shunt")
@@ -107,8 +126,11 @@ def _plan_points(
         applied = ()
     if len(set(applied)) < 2 or not all(abs(value) <= sensor.range for value in applied):
         raise InputError(
-            f"--points {request.points!r}: allowed: at least two numbers in {sensor.unit}, within "
-            f"+-{sensor.range:g}, as 0,{0.5 * sensor.range:g}; or --shunt"
+            "not a list of applied values",
+            where=f"--points {request.points}".rstrip(),
+            allowed=f"at least two different numbers in {sensor.unit}, within "
+            f"+-{sensor.range:g}, such as 0,{0.5 * sensor.range:g}",
+            remedy="or calibrate by the shunt with --shunt",
         )
     _check_span(applied, sensor, "--points")
     return applied, [f"apply {value:g} {sensor.unit} to {sensor.channel}" for value in applied]
@@ -119,8 +141,9 @@ def _check_span(applied: tuple[float, ...], sensor: SensorConfig, option: str) -
     min_span = MIN_SPAN_SHARE * sensor.range
     if max(applied) - min(applied) < min_span:
         raise InputError(
-            f"{option}: too near together; allowed: at least {min_span:g} {sensor.unit} from the "
-            "smallest to the largest"
+            "the applied values are too close together",
+            where=option,
+            allowed=f"at least {min_span:g} {sensor.unit} from the smallest to the largest",
         )
 
 
@@ -134,7 +157,9 @@ def _wait_for_person(prompt: str, unattended: bool) -> None:
     try:
         input(f"{prompt}, press Enter ")
     except EOFError:
-        raise InputError("nobody presses Enter; use a terminal, or --unattended") from None
+        raise InputError(
+            "no terminal to prompt the operator", remedy="use a terminal, or give --unattended"
+        ) from None
 
 
 def _measure_mean(rig: RigConfig, sensor: SensorConfig, prompt: str) -> MeanVoltage:
@@ -147,19 +172,26 @@ def _measure_mean(rig: RigConfig, sensor: SensorConfig, prompt: str) -> MeanVolt
         machine.open()
         volts = machine.tare(round(MEASURING_S * machine.rate_hz))
     except MachineLost as error:
-        raise InputError(f"{prompt}: {error}") from None
+        raise InputError(str(error), where=prompt) from None
     finally:
         machine.close()
     channel_volts: Float1D = volts[rig.channels.index(sensor.channel)]
     mean = mean_voltage(channel_volts)
     if math.isnan(mean.volts):
         raise InputError(
-            f"{prompt}: no sample of {sensor.channel} comes; look at its cable, its card"
+            f"no samples of {sensor.channel} arrive",
+            where=prompt,
+            remedy="check its cable, its [[sensors]] table and its input in the rig file",
         )
     if np.nanmax(np.abs(channel_volts)) >= MAX_RANGE_SHARE * abs(
         sensor.range * sensor.volts_per_unit
     ):
-        raise InputError(f"{prompt}: it is at the end of its range; apply less, or mend its card")
+        raise InputError(
+            f"{sensor.channel} saturates",
+            where=prompt,
+            allowed=f"below +-{sensor.range:g} {sensor.unit}",
+            remedy="apply less, or correct range or volts_per_unit in its [[sensors]] table",
+        )
     return mean
 
 
@@ -177,9 +209,10 @@ def make_calibration(
     lsb_v = sensor.lsb * abs(sensor.volts_per_unit)
     if span_v <= MIN_SPAN_SIGMA * max(noise_v, lsb_v):
         raise InputError(
-            f"{sensor.channel}: {span_v:.3g} V between the points, {noise_v:.2g} V of doubt: it "
-            "did not follow what was applied; look at its cable, and that all was applied to this "
-            "one"
+            f"the readings differ by {span_v:.3g} V between the points, with {noise_v:.2g} V of "
+            "uncertainty: the sensor did not respond to the applied values",
+            where=sensor.channel,
+            remedy="check its cable, and that the values were applied to this sensor",
         )
     min_sd_v = lsb_v / math.sqrt(12.0)  # quantization error of each point
     weighted_means = tuple(MeanVoltage(mean.volts, max(mean.sd, min_sd_v)) for mean in means)
@@ -221,7 +254,9 @@ def _write_record(path: Path, record: CalibrationRecord) -> None:
         with path.open("x", encoding="utf-8") as stream:
             stream.write(format_calibration_toml(record))
     except OSError as error:
-        raise InputError(f"{path}: cannot write it: {error.strerror}; give another --out") from None
+        raise InputError(
+            f"cannot write: {error.strerror}", where=path, remedy="give another file with --out"
+        ) from None
 
 
 def _print_record(record: CalibrationRecord, sensor: SensorConfig, path: Path) -> None:
@@ -237,12 +272,12 @@ def _print_record(record: CalibrationRecord, sensor: SensorConfig, path: Path) -
     )
     sigma_text = "" if record.departure_sd is None else f", {record.departure_sd:.1f} sd"
     print_line(
-        f"{record.departure_percent:+.3g} % from its card ({record.card_volts_per_unit:.6g} "
+        f"{record.departure_percent:+.3g} % from the rig file ({record.card_volts_per_unit:.6g} "
         f"V/{unit}){sigma_text}; allowed: {record.tolerance_percent:.3g} %: "
-        f"{'pass' if record.passed else 'FAIL: mend the sensor, its supply, or its card'}"
+        f"{'pass' if record.passed else 'FAIL: check the sensor, its supply and the rig file'}"
     )
     print_line(f"recorded: {path}")
-    print_line(f"for the sensor card of {sensor.channel}, if this is to hold from now on:")
+    print_line(f"to use it from now on, put into the [[sensors]] table of {sensor.channel}:")
     day = record.at[:10]
     for line in (
         f"volts_per_unit = {record.volts_per_unit!r}",

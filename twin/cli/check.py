@@ -12,7 +12,8 @@ from table_io.backends import open_backend
 from table_io.block import Label
 from table_io.clock import ManualClock, local_datetime
 from table_io.config.calibration_due import find_overdue_calibrations
-from table_io.excitation.drive import Drive
+from table_io.config.profile import Profile
+from table_io.excitation.drive import Drive, HistorySegment
 from table_io.safety.loop_check import plan_targets
 from table_io.safety.preflight import (
     CORRECTION_HEADROOM,
@@ -50,13 +51,13 @@ def print_plan(console: Console, config: RunConfig) -> None:
     ]
     for sentence in messages:
         console.print(f"warning: {sentence}", highlight=False, soft_wrap=True)
-    console.print("ready: nothing exceeds the machine card", highlight=False)
+    console.print("ready: nothing exceeds the limits of the rig file", highlight=False)
 
 
 def _plan_lines(config: RunConfig) -> list[tuple[str, str]]:
     """Return (name, text) of each line above the tables."""
     profile, rig = config.profile, config.rig
-    sweep, rate = profile.sweep, config.drive.rate_hz
+    rate = config.drive.rate_hz
     right, left = (f"{gap * 1e3:g} mm" for gap in profile.specimen.gaps_m)
     bumpers = f"gap right {right}, left {left}" if "inf mm" not in (right, left) else "no bumpers"
     replace_after = 0  # with an external controller
@@ -74,14 +75,7 @@ def _plan_lines(config: RunConfig) -> list[tuple[str, str]]:
         )
     return [
         ("specimen", f"{profile.specimen.mass_kg:g} kg, {bumpers}"),
-        (
-            "sweep",
-            f"{sweep.start_hz:g} to {sweep.stop_hz:g} Hz by {sweep.step_hz:g}, "
-            f"{' then '.join(sweep.directions)}, {sweep.cycles} cycles a step, "
-            f"the last {sweep.measured_cycles} measured",
-        ),
-        *([("then", describe_adaptive_test(profile))] if describe_adaptive_test(profile) else []),
-        ("level", f"{sweep.acceleration_g:g} g peak table acceleration"),
+        *(_sweep_lines(profile) if profile.steps else _history_lines(profile)),
         ("loop check", check),
         ("duration", _format_duration(config)),
         (
@@ -92,6 +86,38 @@ def _plan_lines(config: RunConfig) -> list[tuple[str, str]]:
         ("sampling", f"{rate:g} Hz"),
         ("recording", f"at most {planned_bytes(config) / 1e6:.0f} MB"),
         ("table", rig.title),
+    ]
+
+
+def _sweep_lines(profile: Profile) -> list[tuple[str, str]]:
+    sweep = profile.sweep
+    then = describe_adaptive_test(profile)
+    return [
+        (
+            "sweep",
+            f"{sweep.start_hz:g} to {sweep.stop_hz:g} Hz by {sweep.step_hz:g}, "
+            f"{' then '.join(sweep.directions)}, {sweep.cycles} cycles a step, "
+            f"the last {sweep.measured_cycles} measured",
+        ),
+        *([("then", then)] if then else []),
+        ("level", f"{sweep.acceleration_g:g} g peak table acceleration"),
+    ]
+
+
+def _history_lines(profile: Profile) -> list[tuple[str, str]]:
+    plan = profile.plan
+    seconds = plan.history_m.size / profile.acquisition.rate_hz
+    return [
+        (
+            profile.excitation.kind,
+            f"a displacement history of {seconds:.1f} s, {plan.low_hz:.3g} to {plan.high_hz:.3g} "
+            f"Hz, results in {plan.windows} windows of {seconds / plan.windows:.3g} s",
+        ),
+        (
+            "level",
+            f"{plan.level_m_s2 / GRAVITY_M_S2:.3g} g peak table acceleration, open loop: no "
+            "amplitude is tuned, only the checks of every sample protect it",
+        ),
     ]
 
 
@@ -107,20 +133,22 @@ def _format_duration(config: RunConfig) -> str:
     )
     total = _format_time(drive.planned_end / drive.rate_hz)
     prefix = "at least " if describe_adaptive_test(config.profile) else ""
-    return f"{prefix}{total} for {len(config.steps)} steps: {text}"
+    return f"{prefix}{total} for {config.extent}: {text}"
 
 
 def sum_durations_s(drive: Drive) -> dict[str, float]:
-    """Return the duration in s of each part: loop check, held cycles, tuning, blends, rest."""
+    """Return the duration in s of each part: loop check, held cycles, ..., rest."""
     parts = dict.fromkeys(("loop check", "held cycles", "tuning", "blends"), 0.0)
     for segment in drive.segments:
-        if segment.step < 0:
+        if isinstance(segment, HistorySegment):
+            part = "history"
+        elif segment.step < 0:
             part = "loop check"
         elif segment.cycles:
             part = "held cycles"
         else:
             part = "blends" if segment.label == Label.BLEND else "tuning"
-        parts[part] += segment.count / drive.rate_hz
+        parts[part] = parts.get(part, 0.0) + segment.count / drive.rate_hz
     return parts | {"rest": drive.planned_end / drive.rate_hz - sum(parts.values())}
 
 
@@ -135,14 +163,15 @@ def _make_steps_table(config: RunConfig) -> Table:
     "used" is the largest share of any limit, the last column that of the stroke after a correction.
     """
     limits = list_limits(config.rig)
-    all_rows = find_worst_rows([row for row in config.margins if row.step >= 0])
-    rows = select_rows(all_rows, limits)
+    all_rows = [row for row in config.margins if row.step >= 0]
+    all_rows = find_worst_rows(all_rows) if config.steps else all_rows
+    rows = select_rows(all_rows, limits) if config.steps else all_rows
     title = "peaks of the drive, blends included"
     if len(rows) < len(all_rows):
         title += f": {len(rows)} of {len(all_rows)} frequencies"
     table = Table(title=title, box=SIMPLE_HEAD, title_justify="left")
     headers = (
-        "Hz",
+        "Hz" if config.steps else "",
         *(limit.unit for limit in limits),
         "DAC steps",
         "used",
@@ -154,7 +183,7 @@ def _make_steps_table(config: RunConfig) -> Table:
     for row in (*check_rows, *rows):
         used = [limit.demand(row) / limit.allowed for limit in limits]
         table.add_row(
-            f"check {row.frequency_hz:.3g}" if row.step < 0 else f"{row.frequency_hz:g}",
+            _format_row_name(row),
             *(f"{limit.demand(row):.4g}" for limit in limits),
             f"{row.amplitude_lsb:.0f}",
             _format_percent(max(used)),
@@ -173,6 +202,12 @@ def _make_steps_table(config: RunConfig) -> Table:
         _format_percent(CORRECTION_HEADROOM * max_shares[0]),
     )
     return table
+
+
+def _format_row_name(row: StepDemand) -> str:
+    if row.step < 0:
+        return f"check {row.frequency_hz:.3g}"
+    return row.direction if math.isnan(row.frequency_hz) else f"{row.frequency_hz:g}"
 
 
 def _format_percent(share: float) -> str:
@@ -216,7 +251,7 @@ def _make_sensors_table(config: RunConfig, rows: tuple[PredictedPeak, ...]) -> T
         table.add_row(
             row.sensor.channel,
             f"{row.peak:.4g} {row.sensor.unit}",
-            f"{row.frequency_hz:g} Hz {row.direction}" if row.peak else "",
+            row.place if row.peak else "",
             f"{row.sensor.range:g} {row.sensor.unit}",
             _format_percent(row.range_share),
         )

@@ -90,7 +90,7 @@ def check_wiring(table: str, unattended: bool, as_json: bool) -> int:
     from twin.live.scheduling import request_realtime
     from twin.run.terminal import print_line
 
-    rig, _ = load_rig(find_config(table, "rigs"))
+    rig, _ = load_rig(find_config(table, "rigs", option="--table"))
     clock: Clock = ManualClock() if rig.runs_at_any_speed else RealClock()
     has_operator = sys.stdin.isatty() and not (unattended or as_json or rig.runs_at_any_speed)
     if not as_json:
@@ -140,20 +140,22 @@ def examine_wiring(
             later_lines.append(_measure_rest(result, clock, machine, read_samples, inputs))
         else:
             reason = (
-                "the command wired back is not at 0 V, so a start could move the table: mend that"
+                "the command wired back is not at 0 V, so a start could move the table: correct it"
             )
             later_lines.append(mark_untested("samples on time", "", reason))
         for stimulus in list_stimuli(rig):
             if read_samples is None or isinstance(operator, bool):
                 reason = (
-                    "the output is not held" if read_samples is None else "nobody is there to ask"
+                    "the output is not held" if read_samples is None else "no operator to prompt"
                 )
                 later_lines += evaluate_tap(stimulus, None, f"{reason}: {stimulus.prompt}")
             else:
                 response = _record_response(
                     stimulus, result, machine.rate_hz, read_samples, operator
                 )
-                later_lines += evaluate_tap(stimulus, response, f"nobody did: {stimulus.prompt}")
+                later_lines += evaluate_tap(
+                    stimulus, response, f"skipped by the operator: {stimulus.prompt}"
+                )
     except MachineLost as error:
         later_lines.append(check_value("machine answers", "", 0.0, (1.0, 1.0), "", str(error)))
     finally:
@@ -286,7 +288,7 @@ class TerminalOperator:
     def ask(self, what: str) -> None:
         from twin.run.terminal import print_line
 
-        print_line(f"now: {what} (Enter: leave it out)")
+        print_line(f"now: {what} (Enter: skip)")
 
     def declines(self) -> bool:
         return bool(select.select([sys.stdin], [], [], 0.0)[0]) and bool(sys.stdin.readline())

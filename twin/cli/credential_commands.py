@@ -27,7 +27,7 @@ KeysOption = Annotated[
 
 
 def read_keys_option(folder: Path | None, *, rig: bool = False) -> "Credentials | None":
-    """The keys in the folder of --keys, looked at; None without it. Says when they expire soon."""
+    """Read and verify the credentials of --keys, None without it; warn if they expire soon."""
     if folder is None:
         return None
     from twin.run.terminal import print_line
@@ -40,7 +40,8 @@ def read_keys_option(folder: Path | None, *, rig: bool = False) -> "Credentials 
     keys = (read_rig_credentials if rig else read_credentials)(folder)
     if keys.days_left < EXPIRY_WARNING_DAYS:
         print_line(
-            f"warning: {folder}: good for {keys.days_left} more days; then every link with it ends"
+            f"warning: {folder}: the certificate expires in {keys.days_left} days and then ends "
+            "every connection; renew it with `shaketwin keys renew`"
         )
     return keys
 

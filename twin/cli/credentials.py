@@ -27,7 +27,7 @@ from rich.table import Table
 
 from table_io.clock import local_datetime
 from table_io.config.base import parse_toml
-from table_io.errors import InputError
+from table_io.errors import InputError, suggest
 from twin.run.terminal import console, print_line, print_table
 from twin.security.access_control import NO_ROLE, RIG_NAME, ROLES, ROUTER_ROLE, build_router_access
 from twin.security.certificate_authority import (
@@ -60,8 +60,8 @@ PEOPLE_FOLDER, ISSUED_FOLDER, REPLACED_FOLDER = "people", "issued", "replaced"
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
 HOST_LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
 ACCESS_TEXT = f"""\
-# Who may come in, by the name in the certificate. `shaketwin keys add` and `remove` write here; a
-# role may be changed by hand: {", ".join(ROLES)}. Whoever is not here is refused.
+# Role of each user, by the name in the certificate. `shaketwin keys add` and `remove` edit this
+# file; a role may be changed by hand: {", ".join(ROLES)}. A name that is missing here is refused.
 [people]
 """
 
@@ -73,7 +73,9 @@ def create_keys(folder: Path, hosts: Sequence[str]) -> None:
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(
-            f"{folder}: exists and has content; keys are never overwritten; name another"
+            "exists and has content; keys are never overwritten",
+            where=folder,
+            remedy="give a new folder",
         )
     hostnames = [socket.gethostname(), socket.getfqdn()]
     names = [
@@ -103,13 +105,17 @@ def add_person(folder: Path, name: str, role: str, hosts: Sequence[str]) -> None
         raise InputError(str(error)) from None
     if (role == ROUTER_ROLE) != bool(hosts):
         raise InputError(
-            f"--role {role}: a router, and nobody else, answers at a --host; give both"
+            "the role router and --host go together",
+            where=f"--role {role}",
+            remedy="give both for a router, and omit --host for a user",
         )
     people = read_people(folder)
     if _list_issued(folder, name) or name in people:
         raise InputError(
-            f"{name}: this name was given out, and its old certificate would be good again; choose "
-            f"another one, or for new keys of the same person: shaketwin keys renew {folder} {name}"
+            "this name has been used, and its old certificate would become valid again",
+            where=name,
+            remedy="choose another name, or renew the keys of the same person: "
+            f"shaketwin keys renew {folder} {name}",
         )
     pair = _issue(folder, name, [_validate_host(host) for host in hosts])
     text = f'{(folder / ACCESS_FILE).read_text().rstrip()}\n{name} = "{role}"\n'
@@ -117,8 +123,8 @@ def add_person(folder: Path, name: str, role: str, hosts: Sequence[str]) -> None
     _write_handover(folder, name, pair)
     _write_access(folder, text)
     print_line(
-        f"{folder / PEOPLE_FOLDER / name}: keys of {name}, role {role}; hand the folder over by a "
-        "safe way, and delete it here"
+        f"{folder / PEOPLE_FOLDER / name}: keys of {name}, role {role}; hand the folder over "
+        "securely, and delete it here"
     )
 
 
@@ -133,16 +139,20 @@ def renew_keys(folder: Path, name: str | None, hosts: Sequence[str]) -> None:
     people = read_people(folder)
     certificates = _list_issued(folder, name) if name in people else []
     if not certificates:
-        raise InputError(_unknown_name_message(folder, name))
+        raise _unknown_name_error(folder, name)
     if hosts and people[name] != ROUTER_ROLE:
-        raise InputError(f"--host: {name} may {people[name]}; only a router answers at a host")
+        raise InputError(
+            f"{name} has the role {people[name]}; only a router has hosts",
+            where="--host",
+            remedy="omit it",
+        )
     names = [_validate_host(host) for host in hosts] or certificate_hosts(_read(certificates[-1]))
     pair = _issue(folder, name, names)
     person_folder = folder / PEOPLE_FOLDER / name
     if person_folder.exists():
         person_folder.rename(_next_replaced_folder(folder, name))
     _write_handover(folder, name, pair)
-    print_line(f"{person_folder}: new keys; the old ones stay good until they expire")
+    print_line(f"{person_folder}: new keys; the old ones stay valid until they expire")
 
 
 def _renew_rig(folder: Path, hosts: Sequence[str]) -> None:
@@ -161,7 +171,7 @@ def _renew_rig(folder: Path, hosts: Sequence[str]) -> None:
         for file in (KEY_FILE, CERTIFICATE_FILE):
             (Path(new_folder) / file).replace(folder / file)
     print_line(
-        f"{folder}: new keys of the rig; the old ones, in {replaced_folder}, stay good until "
+        f"{folder}: new keys of the rig; the old ones, in {replaced_folder}, stay valid until "
         "they expire"
     )
 
@@ -170,14 +180,14 @@ def remove_person(folder: Path, name: str) -> None:
     """Revoke a person's role; the gateway rejects the certificate from its next start on."""
     people = read_people(folder)
     if name not in people:
-        raise InputError(_unknown_name_message(folder, name))
+        raise _unknown_name_error(folder, name)
     line = re.compile(rf"""^\s*["']?{re.escape(name)}["']?\s*=.*\n?""", re.MULTILINE)
     text = line.sub("", (folder / ACCESS_FILE).read_text())
     _check_access(folder, text, {other: role for other, role in people.items() if other != name})
     _write_access(folder, text)
     print_line(
-        f"{name}: has no role any more. Commands are refused at once; a run that is on lets "
-        "connected people watch until its gate starts anew"
+        f"{name}: role revoked. Commands are refused from now on; in a running test {name} can "
+        "still watch until its gateway restarts"
     )
 
 
@@ -185,7 +195,7 @@ def list_keys(folder: Path) -> None:
     """Print role and expiry of every name, of the rig and of the authority."""
     people = read_people(folder)
     table = Table(box=None, padding=(0, 2, 0, 0))
-    for title in ("name", "role", "good until", ""):
+    for title in ("name", "role", "valid until", ""):
         table.add_column(title)
     table.add_row("(authority)", "", *_describe_expiry(folder / AUTHORITY_FILE))
     table.add_row("(rig)", "", *_describe_expiry(folder / CERTIFICATE_FILE))
@@ -219,7 +229,9 @@ def _issue(folder: Path, name: str, hosts: Sequence[str]) -> CertificateKeyPair:
         raise InputError(f"{folder}: {error}") from None
     except (ValueError, TypeError):
         raise InputError(
-            f"{folder}: {AUTHORITY_FILE} or {AUTHORITY_KEY} is damaged; restore them"
+            f"{AUTHORITY_FILE} or {AUTHORITY_KEY} is damaged",
+            where=folder,
+            remedy="restore both from a backup",
         ) from None
 
 
@@ -244,8 +256,9 @@ def _read(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise InputError(
-            f"{path}: cannot read it: {error.strerror}; give the folder that `shaketwin keys new` "
-            "made, with the authority's key in it"
+            f"cannot read: {error.strerror}",
+            where=path,
+            remedy="give the folder made by `shaketwin keys new`, with the authority's key",
         ) from None
 
 
@@ -274,7 +287,11 @@ def _check_access(folder: Path, text: str, people: Mapping[str, str]) -> None:
     """Raise InputError if an edited, perhaps hand-written access list is not as intended."""
     path = folder / ACCESS_FILE
     if parse_toml(text, AccessList, str(path)).people != people:
-        raise InputError(f"{path}: not written as `shaketwin keys` would; change it by hand")
+        raise InputError(
+            "this access list was edited so that it cannot be changed automatically",
+            where=path,
+            remedy="edit it by hand",
+        )
 
 
 def _write_access(folder: Path, text: str) -> None:
@@ -303,9 +320,12 @@ def _next_free_path(folder: Path, name: str, suffix: str = "") -> Path:
     )
 
 
-def _unknown_name_message(folder: Path, name: str) -> str:
-    known = ", ".join(sorted(read_people(folder))) or "nobody"
-    return f"{folder / ACCESS_FILE}: knows no {name!r}; known: {known}"
+def _unknown_name_error(folder: Path, name: str) -> InputError:
+    return InputError(
+        f"no user {name!r}",
+        where=folder / ACCESS_FILE,
+        remedy=suggest(name, sorted(read_people(folder))),
+    )
 
 
 def _is_host(host: str) -> bool:
@@ -319,8 +339,9 @@ def _is_host(host: str) -> bool:
 def _validate_host(host: str) -> str:
     if not _is_host(host):
         raise InputError(
-            f"--host {host!r}: no name or address of a machine; allowed: as rig.lab.example or "
-            "192.168.1.20, without port"
+            "not a host name or address",
+            where=f"--host {host!r}",
+            allowed="a name or an IP address without port, such as rig.lab.example or 192.168.1.20",
         )
     return host
 
@@ -334,8 +355,10 @@ def print_router_settings(folder: Path, name: str, listen: str, rig: str) -> Non
     if people.get(name) != ROUTER_ROLE:
         routers = [router for router, role in people.items() if role == ROUTER_ROLE]
         raise InputError(
-            f"{name}: no router in {folder}; known: {', '.join(routers) or 'none'}; add one by "
-            f"`shaketwin keys add {folder} NAME --role router --host HOST`"
+            f"{name} is not a router",
+            where=folder / ACCESS_FILE,
+            remedy=f"{suggest(name, routers)} or add one: shaketwin keys add {folder} NAME "
+            "--role router --host HOST",
         )
     check_endpoint(rig, listen, has_keys=True)
     router_keys = Credentials(Path(), name, datetime.now(UTC), None)

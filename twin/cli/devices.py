@@ -167,8 +167,8 @@ def _to_json(statuses: list[MachineStatus], discovered: Mapping[str, object]) ->
 
 
 def _print_tables(statuses: list[MachineStatus], discovered: Mapping[str, object]) -> None:
-    table = Table(title="machine cards", box=SIMPLE_HEAD, title_justify="left")
-    for header in ("card", "backend", "where", "answers"):
+    table = Table(title="rig files", box=SIMPLE_HEAD, title_justify="left")
+    for header in ("rig", "backend", "address", "responds"):
         table.add_column(header)
     for status in statuses:
         table.add_row(status.card, status.backend, status.where, "yes" if status.answers else "no")
@@ -180,7 +180,7 @@ def _print_tables(statuses: list[MachineStatus], discovered: Mapping[str, object
         if isinstance(result, tuple) and result:
             print_table(console, _make_device_table(name, result))
         else:
-            print_line(f"{name}: {result or 'answers, and has no device'}")
+            print_line(f"{name}: {result or 'responds, but has no device'}")
 
 
 def _make_device_table(name: str, devices: tuple[DiscoveredDevice, ...]) -> Table:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-FILES_PANEL = "Keep and pass on what was recorded"
+FILES_PANEL = "Recording files"
 files_app = typer.Typer()
 
 StepsOption = Annotated[
@@ -52,13 +52,19 @@ def import_command(
     profile: Annotated[
         Path | None, typer.Option("--profile", help="Test profile with specimen, gaps and sweep.")
     ] = None,
-    rig: Annotated[str | None, typer.Option("--rig", help="Rig file or name.")] = None,
+    rig: Annotated[
+        str | None, typer.Option("--rig", help="Rig file or name, instead of the profile's.")
+    ] = None,
     columns: Annotated[
         Path | None,
-        typer.Option("--columns", metavar="MAP", help="Column map, a .toml file."),
+        typer.Option(
+            "--columns",
+            metavar="MAP",
+            help="Column map (channel, unit, gain of each column), a .toml file.",
+        ),
     ] = None,
     contents: Annotated[
-        bool, typer.Option("--list", help="List the contents of the file only.")
+        bool, typer.Option("--list", help="Only list the contents of the file.")
     ] = False,
 ) -> None:
     """Import a table of samples as a log; steps come from its labels or its motion."""
@@ -68,13 +74,19 @@ def import_command(
         if out is not None:
             from table_io.errors import InputError
 
-            raise InputError(f"{out}: --list only says what {file} holds; leave -o out, or --list")
+            raise InputError(
+                f"--list writes no log, it only prints the contents of {file}",
+                where=f"-o {out}",
+                remedy="omit -o or --list",
+            )
         import_table.print_contents(file, columns)
         return
     if out is None:
         from table_io.errors import InputError
 
-        raise InputError(f"{file}: no -o LOG; say where the new log goes, as -o run.mcap")
+        raise InputError(
+            "the name of the new log is missing", where=file, remedy="add it, such as -o run.mcap"
+        )
     raise typer.Exit(import_table.import_samples(file, out, profile, rig, columns))
 
 

@@ -31,7 +31,8 @@ def check_command(
 ) -> None:
     """Check a test before anything moves: print plan and margins, plot the drive.
 
-    Without PROFILE: the wiring of --table NAME at rest, and by a tap; nothing is moved.
+    Without PROFILE: check the wiring of --table NAME at rest and, with an operator, by tapping the
+    table and the mass; the table is not driven.
     """
     if profile is not None and not (unattended or json):
         from twin.cli.run import check_profile as preflight
@@ -45,8 +46,10 @@ def check_command(
         from table_io.errors import InputError
 
         raise InputError(
-            "check: give a PROFILE, with --out, for the pre-flight of a test; or only --table "
-            "NAME, with --unattended or --json, for the wiring of a table"
+            "these arguments do not go together",
+            where="check",
+            allowed="PROFILE [--table NAME] [--out DIR] to check a test, or "
+            "--table NAME [--unattended] [--json] to check the wiring of a table",
         )
 
 
@@ -61,11 +64,13 @@ def calibrate_command(
         ),
     ] = "",
     shunt: Annotated[
-        bool, typer.Option("--shunt", help="Calibrate by its shunt: off, then on.")
+        bool, typer.Option("--shunt", help="Calibrate by the shunt of the sensor: off, then on.")
     ] = False,
     tolerance: Annotated[
         float | None,
-        typer.Option("--tolerance", help="Allowed deviation of the sensitivity in per cent: 1."),
+        typer.Option(
+            "--tolerance", help="Allowed deviation of the sensitivity in per cent; default: 1."
+        ),
     ] = None,
     applied_sd: Annotated[
         float, typer.Option("--applied-sd", help="Standard uncertainty of the applied values.")
@@ -74,12 +79,13 @@ def calibrate_command(
         bool, typer.Option("--unattended", help="Five seconds per point, without prompts.")
     ] = False,
     out: Annotated[
-        Path | None, typer.Option("--out", help="New file for the record, instead of the default.")
+        Path | None,
+        typer.Option("--out", help="New file for the record; default: next to the rig file."),
     ] = None,
 ) -> None:
     """Calibrate a sensor: measure sensitivity and offset, compare with the rig file.
 
-    Leaves a dated record, which goes into every recording from then on; edits no card.
+    Leaves a dated record, which goes into every recording from then on; the rig file is not edited.
     """
     from twin.cli.calibrate import CalibrationRequest
     from twin.cli.calibrate import calibrate_sensor as command

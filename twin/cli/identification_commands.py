@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 LEARN_PANEL = "Identification from recordings"
-LogPaths = Annotated[list[Path], typer.Argument(metavar="LOG...", help="Give logs or run folders.")]
+LogPaths = Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs or folders of runs.")]
 
 
 identification_app = typer.Typer()

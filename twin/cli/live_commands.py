@@ -8,7 +8,7 @@ import typer
 
 from twin.cli.credential_commands import KeysOption, read_keys_option
 
-LIVE_PANEL = "Drive and compute"
+LIVE_PANEL = "Run a test"
 live_app = typer.Typer()
 
 
@@ -58,7 +58,9 @@ def monitor_command(
 @live_app.command("join", rich_help_panel=LIVE_PANEL)
 @live_app.command("attend", hidden=True)  # the former name
 def join_command(
-    part: Annotated[RemoteRole, typer.Argument(help="Role of this machine.")],
+    part: Annotated[
+        RemoteRole, typer.Argument(metavar="recorder|twin", help="Role of this machine.")
+    ],
     connect: Annotated[
         str, typer.Option("--connect", help="Endpoint of the running test.")
     ] = "tcp/127.0.0.1:7447",
@@ -66,7 +68,7 @@ def join_command(
     out: Annotated[Path | None, typer.Option("--out", help="New folder for the recording.")] = None,
     keys: KeysOption = None,
 ) -> None:
-    """Record, or run the twin for, a test on another machine (`run --remote-twin`)."""
+    """Take part in a test on another machine: record it, or run its twin (`run --remote-twin`)."""
     from twin.live import join
 
     credentials = read_keys_option(keys)
@@ -78,7 +80,10 @@ def join_command(
 @live_app.command("control", rich_help_panel=LIVE_PANEL)
 @live_app.command("tell", hidden=True)  # the former name
 def control_command(
-    order: Annotated[RunCommand, typer.Argument(help="Command to the running test.")],
+    order: Annotated[
+        RunCommand,
+        typer.Argument(metavar="hold|resume|stop|abort", help="Command to the running test."),
+    ],
     why: Annotated[str, typer.Option("--why", help="Reason, recorded with the command.")] = "",
     connect: Annotated[
         str, typer.Option("--connect", help="Endpoint of the running test.")

@@ -31,7 +31,7 @@ app = typer.Typer(
 
 PLAN_PANEL, DRIVE_PANEL, LOOK_PANEL = (
     "Before a test",
-    "Drive and compute",
+    "Run a test",
     "Inspect recordings",
 )
 
@@ -66,7 +66,8 @@ def run_command(
     profile: ProfileArgument,
     out: OutOption = None,
     speed: Annotated[
-        Speed, typer.Option("--speed", help="Pace; max requires a simulated table.")
+        Speed,
+        typer.Option("--speed", help="In real time, or as fast as possible (simulated tables)."),
     ] = Speed.realtime,
     model: ModelOption = None,
     table: Annotated[
@@ -82,7 +83,9 @@ def run_command(
     ] = "",
     remote_twin: Annotated[
         bool,
-        typer.Option("--remote-twin", help="Start no twin here; expect `join twin` elsewhere."),
+        typer.Option(
+            "--remote-twin", help="Start no twin here; another machine runs it: `join twin`."
+        ),
     ] = False,
 ) -> None:
     """Run a test: drive the table, acquire, run the twin, publish, record, report."""
@@ -107,7 +110,9 @@ def campaign_command(
     ] = False,
     speed: Annotated[
         Speed,
-        typer.Option("--speed", help="Pace; max is unattended and requires a simulated table."),
+        typer.Option(
+            "--speed", help="In real time, or unattended as fast as possible (simulated tables)."
+        ),
     ] = Speed.realtime,
     model: ModelOption = None,
     table: Annotated[

@@ -44,7 +44,9 @@ def replay_all(request: ReplayRequest) -> int:
     """
     if parse_speed(request.speed) is not None:
         raise InputError(
-            f"--speed {request.speed}: several replays go at full speed; leave it away"
+            "several replays run at full speed only",
+            where=f"--speed {request.speed}",
+            remedy="omit it",
         )
     models, names = request.models or [RECORDED], _name_logs(request.logs)
     _check_replays(request, models, names)

@@ -18,7 +18,7 @@ def print_recording_prc(log: Path, as_json: bool) -> None:
     if (log / STATE_FILE).is_file():
         from twin.campaign.summary import read_campaign
 
-        runs = [run.summary for run in read_campaign(log).runs]
+        runs = [run.summary for run in read_campaign(log).runs if run.profile.steps]
         if as_json:
             print(
                 summaries.dump_strict_json(
@@ -29,6 +29,13 @@ def print_recording_prc(log: Path, as_json: bool) -> None:
             print_prc(console, run)
         return
     recording = open_recording(log)
+    if not recording.start.steps:
+        raise InputError(
+            "a displacement history has no curves over frequency",
+            where=recording.path,
+            allowed="recordings of a stepped sine",
+            remedy="see the windows in summary.json, or in report.html by `shaketwin report`",
+        )
     summary = summaries.summarise(recording, read_recorded_config(recording).parameters)
     if as_json:
         print(summaries.dump_strict_json({key: summary[key] for key in keys}))

@@ -5,17 +5,17 @@ from pathlib import Path
 
 from table_io.clock import RealClock, local_datetime
 from table_io.config.calibration_due import find_overdue_calibrations
-from table_io.errors import InputError
 from table_io.safety.preflight import list_drive_warnings, list_setup_warnings
 from twin.reports.finalize import EXIT_ABORTED, EXIT_INTERRUPTED, finalize_run
 from twin.run.disk import require_disk_space
 from twin.run.folders import RUNS_FOLDER, make_output_folder, make_run_folder
 from twin.run.progress import RunProgress
-from twin.run.realtime import check_realtime
+from twin.run.realtime import check_full_speed, check_realtime
 from twin.run.run_config import RunConfig, make_run_id, read_run_config
 from twin.run.terminal import catch_interrupts, console, print_line
 from twin.run.warm_up import compile_kernels
 from twin.security.credentials import Credentials, credentials_folder
+from twin.transport.endpoint import check_endpoint
 from twin.viewer.address import VIEW_ADDRESS, find_free_address, format_live_view
 
 
@@ -44,9 +44,10 @@ def run_test(
 ) -> int:
     """Run a test on the table, in real time or at full speed; return the exit code."""
     config = read_run_config(profile, table, model)
-    if unpaced and not config.rig.runs_at_any_speed:
-        raise InputError(f"--speed max: {config.rig.name!r} keeps its own time; leave --speed away")
-    if not unpaced:
+    if unpaced:
+        check_full_speed(config.rig)
+    else:
+        check_endpoint(config.rig.name, listen, has_keys=keys is not None)
         check_realtime(config, profile)
     compile_kernels(config, table=True)
     require_disk_space([config], out or RUNS_FOLDER)
@@ -58,7 +59,7 @@ def run_test(
     for sentence in (*messages, *find_overdue_calibrations(config.rig, local_datetime().date())):
         print_line(f"warning: {sentence}")
     print_line(
-        f"{config.profile.title}: {len(config.steps)} steps, "
+        f"{config.profile.title}: {config.extent}, "
         f"{config.drive.planned_end / config.drive.rate_hz:.0f} s on {config.rig.title} "
         f"-> {folder}"
     )

@@ -24,7 +24,9 @@ def simulate_profile(
     if len(models) <= 1 and not gaps:
         return _simulate_one(profile, models[0] if models else None, out, view)
     if view:
-        raise InputError("--view shows one run; leave it away, or give one --model and no --gap")
+        raise InputError(
+            "shows one run only", where="--view", remedy="omit it, or give one --model and no --gap"
+        )
     from twin.studies.command import simulate_all
 
     return simulate_all(profile, models, gaps, workers, out)

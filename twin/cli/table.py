@@ -11,8 +11,8 @@ from typing import TextIO
 
 from table_io.backends import find_descriptor
 from table_io.clock import RealClock
-from table_io.config.base import find_config, load_config
-from table_io.config.profile import Profile
+from table_io.config.base import find_config
+from table_io.config.profile import load_profile
 from table_io.config.rig_file import load_rig
 from table_io.errors import InputError
 from table_io.sim.machine.server import serve_machine_table
@@ -50,12 +50,20 @@ def serve_table(
 
     The specimen is that of `profile` if the machine's protocol does not transmit it.
     """
-    rig, _ = load_rig(find_config(rig_name, "rigs"))
+    rig, _ = load_rig(find_config(rig_name, "rigs", option="--rig"))
     if not 1.0 <= time_scale <= MAX_TIME_SCALE:
-        raise InputError(f"--time-scale {time_scale:g}: allowed: 1 to {MAX_TIME_SCALE:g}")
+        raise InputError(
+            "out of range",
+            where=f"--time-scale {time_scale:g}",
+            allowed=f"1 to {MAX_TIME_SCALE:g}",
+        )
     drives = find_descriptor(rig).drives
     if drives and controller.play is not None:
-        raise InputError(f"--play: {rig.name!r} is driven by `run`; it belongs to a follow card")
+        raise InputError(
+            f"the table {rig.name!r} is driven by `run`, not by an external controller",
+            where=f"--play {controller.play}",
+            remedy="omit it, or give a rig file with backend = 'follow'",
+        )
     if listen is not None and drives:
         serve: Callable[[TableService], None] = partial(serve_machine_table, listen=listen)
     else:
@@ -76,7 +84,7 @@ def serve_table(
 
     service = TableService(
         rig=rig,
-        specimen=load_config(find_config(profile, "tests"), Profile, "test profile")[0].specimen,
+        specimen=load_profile(find_config(profile, "tests"))[0].specimen,
         clock=RealClock(time_scale),
         notify=print_status,
         begin=begin,

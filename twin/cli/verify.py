@@ -271,7 +271,7 @@ def print_verification(report: Json, advise: bool = True) -> None:
 
 def _describe_content(report: Json) -> str:
     return {
-        "same": "as its hash says",
+        "same": "matches its hash",
         "differs": "differs from its hash",
         "unknown": "without a hash (an unfinished log, or one of version 1)",
     }[report["content"]]

@@ -32,7 +32,11 @@ def show_view(
     if log is not None:
         view_log(resolve_log_path(log), save, picture)
     elif save is not None:
-        raise InputError(f"--save {save}: of a recording only; give its LOG, or leave --save away")
+        raise InputError(
+            "only a recording can be saved",
+            where=f"--save {save}",
+            remedy="give its LOG, or omit --save",
+        )
     else:
         view_live(connect, rig, picture, keys)
 

@@ -115,7 +115,7 @@ def _interval_jumps(pairs: list[_DirectionPair], first: int, last: int, sign: in
 
 
 def describe_sudden_change(before: PrcPoint | None, after: PrcPoint) -> str | None:
-    """Describe a leap of measured eta_d between neighbors of one direction; None without one.
+    """Describe a jump of measured eta_d between neighbors of one direction; None without one.
 
     Only a hint during the test: `detect_hysteresis` decides on jumps, with both directions.
     """

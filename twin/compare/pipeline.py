@@ -97,8 +97,8 @@ def prepare_pipeline(
     scale, independent of its effects.
     """
     rate_hz = profile.acquisition.rate_hz
-    max_acceleration = max(step.acceleration_m_s2 for step in steps)
-    u_star, a_star, _ = free_flight_resonance(model.parameters, max_acceleration)
+    level = max((step.acceleration_m_s2 for step in steps), default=profile.plan.level_m_s2)
+    u_star, a_star, _ = free_flight_resonance(model.parameters, level)
     contact_n = profile.comparison.contact_n
     twin = TwinSetup(
         model,
@@ -110,6 +110,8 @@ def prepare_pipeline(
         select_predicted(extra_channels),
     )
     scale = PrcScale(model.parameters, rate_hz, contact_n, u_star, a_star, profile.specimen.gaps_m)
+    if not steps:  # a displacement history: no cycles, no curves
+        return PipelineSetup(twin, scale, steps, measured_cycles=0)
     jump_prediction = predict_jumps(profile, model, steps)
     return PipelineSetup(twin, scale, steps, profile.sweep.measured_cycles, jump_prediction)
 

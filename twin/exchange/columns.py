@@ -3,7 +3,6 @@
 Units are declared, never inferred; a unit that looks wrong causes a warning only.
 """
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ from pydantic import Field, ValidationInfo, field_validator
 from table_io.block import Float1D, Int1D
 from table_io.channels import CHANNEL_BY_NAME, Channel
 from table_io.config.base import ConfigModel, Finite, Positive, load_config
-from table_io.errors import InputError
+from table_io.errors import InputError, suggest
 from table_io.units import GRAVITY_M_S2, UNITS
 from twin.exchange.formats import MAX_LISTED_COLUMNS, SampleTable, check_size
 from twin.exchange.sampling import fit_uniform_rate, resolve_stated_rate
@@ -113,17 +112,12 @@ class ImportColumns:
             {si: 1.0} if si else {}
         )
 
-    def suggest(self, name: str) -> str:
-        """Return the known column nearest to a name, or all of them, as a hint."""
-        near = difflib.get_close_matches(name, self.names, 1, 0.5)
-        return f"did you mean {near[0]!r}?" if near else f"known: {', '.join(self.names)}"
-
     def check_map(self, column_map: ColumnMap) -> None:
         """Raise InputError for a mapped name that is no column, or a unit that does not fit."""
         for name, column in column_map.columns.items():
             if name not in self.names:
                 raise InputError(
-                    f"{name!r} is not a channel; {self.suggest(name)}",
+                    f"{name!r} is not a channel; {suggest(name, self.names)}",
                     where="column map",
                     key="columns",
                     remedy="other channels are declared by [[channels]] in a rig file, see --rig",
@@ -233,7 +227,7 @@ def _select_columns(
             mapped[name] = ColumnSource(column=name)
         elif column_map is None:
             raise InputError(
-                f"column {name!r} is unknown; {known.suggest(name)}",
+                f"column {name!r} is unknown; {suggest(name, known.names)}",
                 where=table.path,
                 remedy="rename it, map the columns with --columns MAP (others are left out), or "
                 "declare it by [[channels]] in a rig file and give that by --rig",
@@ -265,12 +259,10 @@ def _missing_column_error(table: SampleTable, name: str, column: str) -> InputEr
             f"{column!r}, mapped to {name}, cannot be imported: {table.skipped[column]}",
             where=table.path,
         )
-    near = difflib.get_close_matches(column, table.columns, 1, 0.4)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
     return InputError(
-        f"no column {column!r} for {name}{hint}",
+        f"no column {column!r} for {name}",
         where=table.path,
-        allowed=_abbreviate([*table.columns]),
+        remedy=suggest(column, table.columns),
     )
 
 

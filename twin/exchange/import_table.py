@@ -11,10 +11,10 @@ import numpy as np
 from table_io.block import Block, Float1D, Float2D
 from table_io.config.base import find_config, load_config, parse_toml
 from table_io.config.channel import read_channels
-from table_io.config.profile import Profile
+from table_io.config.profile import Profile, load_profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
-from table_io.records import Event, RunStart, RunStop, SampleGap, Step
+from table_io.records import Event, RunStart, RunStop, SampleGap
 from twin.exchange.columns import ImportColumns, ImportedSamples, read_column_map, read_samples
 from twin.exchange.formats import TOML_TEXTS, SampleTable, read_table
 from twin.exchange.labels import read_labels, typical_cycles
@@ -98,7 +98,7 @@ def import_samples(
         raise InputError("not the name of a log", where=out, allowed="names that end in .mcap")
     column_map = read_column_map(columns)
     if profile is not None:
-        load_config(profile, Profile, "test profile")  # report errors before reading a long table
+        load_profile(profile)  # report errors before reading a long table
     table = read_table(file, column_map.group if column_map is not None else "")
     rig_toml = _read_rig_toml(table, profile, rig)
     samples_read = read_samples(table, column_map, ImportColumns(read_channels(rig_toml)))
@@ -116,10 +116,11 @@ def import_samples(
             is_acc=is_acc,
             on_grid=profile is not None,
         )
-    steps = labels.steps or config.steps
+    is_history = not labels.steps and bool((labels.step >= 0).any())
+    steps = () if is_history else labels.steps or config.steps
     config = replace(config, drive=replace(config.drive, steps=steps))
     missing_profile = (NO_PROFILE,) if profile is None and not _has_config_texts(table) else ()
-    notes = (*missing_profile, *samples_read.notes, *labels.messages, _describe_steps(labels.steps))
+    notes = (*missing_profile, *samples_read.notes, *labels.messages, _describe_steps(labels))
     gaps = 0
     with RunProgress(console, len(steps), grid.size) as progress:
 
@@ -160,11 +161,12 @@ def _read_rig_toml(table: SampleTable, profile: Path | None, rig: str | None) ->
     """Read the text of the rig file: the one given, else of the table, else of the profile."""
     if rig is None and profile is None and _has_config_texts(table):
         return table.texts["rig_toml"]
+    option = "" if rig is None else "--rig"
     if rig is None:
         rig = (
             "simulated" if profile is None else load_config(profile, Profile, "test profile")[0].rig
         )
-    return load_config(find_config(rig, "rigs", profile), RigConfig, "rig file")[1]
+    return load_config(find_config(rig, "rigs", profile, option), RigConfig, "rig file")[1]
 
 
 def _build_run_config(
@@ -194,7 +196,7 @@ def _build_run_config(
             measured=measured,
         )
         return from_texts(file.stem, text, rig_toml, PLAIN_MODEL, f"{file} without a profile")
-    test_profile, text = load_config(profile, Profile, "test profile")
+    test_profile, text = load_profile(profile)
     model_toml = read_model(test_profile.model, profile)[1]
     source = f"{profile}, at the {rate_hz:g} Hz of {file}"
     if test_profile.acquisition.rate_hz != rate_hz:
@@ -237,8 +239,11 @@ def _motion_signal(grid: _SampleGrid) -> tuple[Float1D, bool]:
     return np.full(grid.size, np.nan), False
 
 
-def _describe_steps(steps: tuple[Step, ...]) -> str:
-    """Describe the detected steps in one line."""
+def _describe_steps(labels: DetectedSteps) -> str:
+    """Describe the detected steps, or the windows of a displacement history, in one line."""
+    steps = labels.steps
+    if not steps and (labels.step >= 0).any():
+        return f"{int(labels.step.max()) + 1} windows of a displacement history"
     if not steps:
         return "no steps found: no PRC can be computed"
     frequencies = [step.frequency_hz for step in steps]

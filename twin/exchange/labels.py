@@ -18,7 +18,8 @@ MAX_CYCLES_PER_STEP = 1000  # allowed in a profile
 def read_labels(table: SampleTable, samples: ImportedSamples) -> DetectedSteps:
     """Return the table's labels on the time grid; raise InputError that names an invalid row.
 
-    Samples in a hole are at rest. Steps are renumbered from 0 in order.
+    Samples in a hole are at rest. Steps, or windows of a displacement history, are renumbered from
+    0 in order.
     """
     columns = samples.labels
     step = _read_integers(table, columns, "step", -1, MAX_COUNT)
@@ -28,7 +29,9 @@ def read_labels(table: SampleTable, samples: ImportedSamples) -> DetectedSteps:
     numbers, firsts, place = np.unique(step, return_index=True, return_inverse=True)
     notes = ["steps, labels and cycles are taken from the file"]
     steps: list[Step] = []
-    for row in firsts[numbers >= 0].tolist():
+    # Windows of a displacement history have neither direction nor frequency nor level.
+    is_history = not sign.any() and not np.isfinite(columns["frequency_hz"]).any()
+    for row in firsts[numbers >= 0].tolist() if not is_history else ():
         plan = {name: float(columns[name][row]) for name in ("frequency_hz", "level_m_s2")}
         if sign[row] == 0 or not plan["frequency_hz"] > 0 or not plan["level_m_s2"] >= 0:
             raise InputError(
@@ -38,7 +41,7 @@ def read_labels(table: SampleTable, samples: ImportedSamples) -> DetectedSteps:
             )
         direction = {number: name for name, number in DIRECTION_SIGNS.items()}[int(sign[row])]
         steps.append(Step(len(steps), direction, plan["frequency_hz"], plan["level_m_s2"]))
-    for name in ("direction", "frequency_hz", "level_m_s2"):
+    for name in ("direction", "frequency_hz", "level_m_s2") if not is_history else ():
         differs = (columns[name] != columns[name][firsts][place]) & (step >= 0)
         if differs.any():
             row = int(np.argmax(differs))
@@ -49,7 +52,7 @@ def read_labels(table: SampleTable, samples: ImportedSamples) -> DetectedSteps:
                 allowed="one value per step",
             )
     outside = int((numbers < 0).any())
-    if numbers[outside:].tolist() != list(range(len(steps))):
+    if numbers[outside:].tolist() != list(range(numbers.size - outside)):
         notes.append(f"steps {numbers[outside]} to {numbers[-1]} of the file are numbered from 0")
     size = int(samples.index[-1]) + 1
 

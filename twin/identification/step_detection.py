@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from table_io.block import Float1D, Int1D, Label
-from table_io.config.profile import Sweep
+from table_io.config.excitation.stepped_sine import Sweep
 from table_io.records import Step
 from twin.identification.phase_segments import (
     PhaseLine,

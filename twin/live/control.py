@@ -20,8 +20,10 @@ def find_run(link: BusLink, connect: str, rig: str) -> str:
     runs = list_runs(link.list_components())
     if not runs or not re.fullmatch(r"\w[\w.-]{0,100}", runs[0]):
         raise InputError(
-            f"endpoint {connect}: no test runs there on rig {rig!r}; `shaketwin run` starts one, "
-            "--rig NAME names another rig (`name` in its machine card)"
+            f"no test is running there on rig {rig!r}",
+            where=f"endpoint {connect}",
+            remedy="start one with `shaketwin run`, or give the `name` in the rig file of the "
+            "running rig with --rig",
         )
     return runs[0]
 
@@ -40,7 +42,8 @@ def send_command(
         link.close()
     if answer != "yes":
         raise InputError(
-            f"{command}: {answer or f'the rig did not answer within {ANSWER_TIMEOUT_S:g} s'}; "
-            "in need use the machine's own emergency stop"
+            answer or f"the rig did not respond within {ANSWER_TIMEOUT_S:g} s",
+            where=command,
+            remedy="in an emergency use the machine's own emergency stop",
         )
-    print_line(f"{run}: told to {command}")
+    print_line(f"{run}: {command} accepted")

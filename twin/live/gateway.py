@@ -105,11 +105,11 @@ def validate_command(command: str, sender: str, role: str, run: str, text: str) 
     """
     requested_run, _, reason = text.partition("\n")
     if not NAME_PATTERN.fullmatch(sender):
-        return f"{sender[:64]!r} is no name; allowed: up to 64 letters, digits and _ . -"
+        return f"{sender[:64]!r} is not a valid name; allowed: up to 64 letters, digits and _ . -"
     if command not in COMMAND_NAMES:
         return f"no such command; known: {', '.join(COMMAND_NAMES)}"
     if role != "command":
-        return f"{sender} has the role {role}; this takes the role command"
+        return f"{sender} has the role {role}; commands need the role command"
     if requested_run != run:
         return f"this is run {run}"
     if not is_readable(reason):
@@ -133,7 +133,9 @@ class RefusalLimiter:
         if self.tokens == 0:
             self.suppressed += 1
             return ""
-        suffix = f" (and {self.suppressed} more since the last one told)" if self.suppressed else ""
+        suffix = (
+            f" (and {self.suppressed} more since the last one recorded)" if self.suppressed else ""
+        )
         self.tokens, self.suppressed = self.tokens - 1, 0
         return sentence + suffix
 

@@ -47,7 +47,7 @@ def join_as_recorder(connect: str, rig: str, out: Path | None, keys: Credentials
             interrupted = poll_interrupt() is not None
     finally:
         link.close()
-    print_line(f"{merge_run_parts(folder)}; shaketwin report {folder} makes its report")
+    print_line(f"{merge_run_parts(folder)}; for its report: shaketwin report {folder}")
     return EXIT_INTERRUPTED if interrupted else 0 if is_complete else EXIT_GAPS
 
 
@@ -78,13 +78,21 @@ def _fetch_config(link: BusLink, connect: str, rig_name: str) -> tuple[ProcessCo
     def fetch(path: str) -> str:
         answer = link.query(path, timeout_s=CONNECT_TIMEOUT_S)
         if answer is None:
-            raise InputError(f"endpoint {connect}: does not say what runs there ({path})")
+            raise InputError(
+                f"the running test does not send its configuration ({path})",
+                where=f"endpoint {connect}",
+                remedy="try again",
+            )
         return answer.decode(errors="replace")
 
     run = find_run(link, connect, rig_name)
     status = json.loads(fetch("state/status"))
     if not status.get("remote_twin"):
-        raise InputError(f"{run} has a twin of its own; start it with --remote-twin for one here")
+        raise InputError(
+            "this run computes its own twin",
+            where=run,
+            remedy="start it with --remote-twin to compute the twin here",
+        )
     profile, rig, model = (fetch(f"config/{section}") for section in ("profile", "rig", "model"))
     name = str(json.loads(fetch("config/run"))["name"])
     compared_to = int(status.get("compared", 0))

@@ -46,7 +46,7 @@ class ReplayPublisher:
             self._link.declare_alive(f"{run}.{component}")
         # At full speed the beginning would have left the cache before anyone subscribed.
         if not (at_once or self._link.subscriber_progress.positions):
-            print_line("waiting for somebody to listen, as `shaketwin view`; Ctrl-C ends it")
+            print_line("waiting for a subscriber, such as `shaketwin view`; Ctrl-C to quit")
         while not (at_once or self._link.subscriber_progress.positions):
             self._serve()
 

@@ -63,10 +63,10 @@ class ChildProcess:
     def last_output_line(self) -> str:
         """Last line that the process wrote to its log file."""
         lines = self.output.splitlines()
-        return lines[-1] if lines else "it said nothing"
+        return lines[-1] if lines else "no output"
 
     def close_input(self) -> None:
-        """Close the standard input of the process, which tells it to finish."""
+        """Close the standard input of the process, which ends it in order."""
         stdin = self.process.stdin
         if stdin is not None and not stdin.closed:
             stdin.close()
@@ -284,7 +284,7 @@ class Supervisor:
         log.warning("%s; %s", cause, outcome)
         self.print_line(f"{cause}; {outcome}, the table {'stops' if must_stop else 'goes on'}")
         if child.process.returncode > 0:
-            self.print_line(f"  its last words: {child.last_output_line}")
+            self.print_line(f"  its last output: {child.last_output_line}")
         if must_stop:
             self.stop_reason = self.stop_reason or cause
         if component == "twin":

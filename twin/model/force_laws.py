@@ -80,7 +80,7 @@ class Coefficients(NamedTuple):
 
     `rate_1` and `rate_b` are 1/tau; gaps are those at sample 0; `step` is one of `substeps` of the
     sampling period. `has_reversals`: reversals of u' are events. `laws` are the parameters of the
-    added laws, `has_bumper_states` tells that one in a bumper has states.
+    added laws, `has_bumper_states` is true if one in a bumper has states.
     """
 
     m: float

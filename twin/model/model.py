@@ -1,6 +1,5 @@
 """`Model`: base parameters and the effects added to them; selects its solver."""
 
-import difflib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -8,7 +7,7 @@ from functools import cached_property
 from typing import Any, overload
 
 from table_io.block import Float1D
-from table_io.errors import InputError
+from table_io.errors import InputError, suggest
 from twin.model.effects import find_effect
 from twin.model.effects.effect import Effect
 from twin.model.parameters import Parameters
@@ -35,15 +34,21 @@ class EffectInstance:
     ) -> "EffectInstance":
         """Create a validated instance; InputError names unknown, missing, out-of-bounds values."""
         if effect.acts == "sensor" and channel not in SENSOR_CHANNELS:
-            matches = difflib.get_close_matches(channel, SENSOR_CHANNELS, 1, 0.4)
-            hint = (
-                f"did you mean {matches[0]!r}?"
-                if matches
-                else f"allowed: {', '.join(SENSOR_CHANNELS)}"
+            raise InputError(
+                "the model does not predict this channel",
+                where=f"effect {effect.id!r}",
+                key="channel",
+                value=channel,
+                remedy=suggest(channel, SENSOR_CHANNELS),
             )
-            raise InputError(f"effect {effect.id!r}: channel {channel!r} is not predicted; {hint}")
         if effect.acts != "sensor" and channel:
-            raise InputError(f"effect {effect.id!r} has no channel; remove {channel!r}")
+            raise InputError(
+                "this effect has no channel",
+                where=f"effect {effect.id!r}",
+                key="channel",
+                value=channel,
+                remedy="omit it",
+            )
         effect.validate(values)
         return cls(effect, dict(values), channel)
 

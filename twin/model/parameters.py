@@ -1,11 +1,10 @@
 """`Parameters` of the SNM in SI, and its free-flight resonance."""
 
-import difflib
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 
-from table_io.errors import InputError
+from table_io.errors import InputError, suggest
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,21 +52,13 @@ class Parameters:
         known = [field.name for field in fields(cls)]
         for name in values:
             if name not in known:
-                raise InputError(
-                    "unknown model parameter", key=name, remedy=suggest_name(name, known)
-                )
+                raise InputError("unknown model parameter", key=name, remedy=suggest(name, known))
         missing = [name for name in known if name not in values]
         if missing:
             raise InputError(
                 f"model parameters lack {', '.join(missing)}", remedy="add them in SI units"
             )
         return cls(**{name: float(values[name]) for name in known})
-
-
-def suggest_name(name: str, known: list[str]) -> str:
-    """Return the remedy for an unknown name: the nearest known name, or all."""
-    matches = difflib.get_close_matches(name, known, 1, 0.4)
-    return f"did you mean {matches[0]!r}?" if matches else f"known: {', '.join(known)}"
 
 
 def free_flight_resonance(

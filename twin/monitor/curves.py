@@ -65,6 +65,8 @@ def draw_prc(
     frequencies_hz = [point.frequency_hz for point in points]
     if run_state.start is not None:
         frequencies_hz += [step.frequency_hz for step in run_state.start.steps]
+    if run_state.start is not None and not frequencies_hz:
+        return [Text("a displacement history has no curves over frequency", DIM_STYLE)]
     if not frequencies_hz:
         return [Text("waiting for the test plan", DIM_STYLE)]
     curves, max_value = [], 0.0

@@ -31,6 +31,7 @@ STATE_STYLES = {
     "at rest": "", "idle": "", "fault": BAD_STYLE,
     "waiting": WARN_STYLE, "following": GOOD_STYLE, "astray": BAD_STYLE, "left": BAD_STYLE,
 }  # fmt: skip
+STATE_TEXTS = {"astray": "drive lost", "left": "ended in motion"}  # shown for recorded states
 COMMAND_KEYS = {"h": "hold", "r": "resume", "s": "stop", "a": "abort"}
 ARROWS = {"forward": "↑", "backward": "↓"}
 DrawPanel = Callable[[LiveRunState, int, int], list[Text]]
@@ -211,7 +212,8 @@ def _draw_state(run_state: LiveRunState, status: SessionStatus) -> Text:
         return Text("waiting for a run", DIM_STYLE)
     activity = LABEL_TEXTS.get(Label(run_state.position[1]), "") if run_state.recent.blocks else ""
     style = STATE_STYLES.get(run_state.rig_state, "")
-    right = Text(f"● {run_state.rig_state or 'joined'}", style)
+    state = STATE_TEXTS.get(run_state.rig_state, run_state.rig_state)
+    right = Text(f"● {state or 'joined'}", style)
     if activity and activity != run_state.rig_state:
         right.append(f", {activity}", "")
     return right.append(f"  {format_duration(run_state.index / run_state.rate_hz)}", DIM_STYLE)
@@ -239,13 +241,17 @@ def _draw_progress(run_state: LiveRunState, width: int) -> Text:
 def _format_step(run_state: LiveRunState, show_cycle: bool) -> str:
     """Format the current step with a fixed width, so that the text after it does not move."""
     step = run_state.step
+    if step is None and run_state.start and not run_state.start.steps:
+        windows = run_state.profile.plan.windows if run_state.profile else 0
+        number = run_state.position[0] + 1
+        return f"{f'window {number}/{windows}' if number else 'outside the history':<33}"
     if step is None:
         phase = "after" if run_state.stop else "between" if run_state.points else "before"
         return f"{f'{phase} the steps':<33}"
     text = f"step {step.index + 1:>2}/{run_state.step_count}  {step.frequency_hz:6.3f} Hz "
     text += f"{ARROWS.get(step.direction, '')} {step.direction:<8}"
     cycle_text = f"cycle {run_state.position[2] + 1}" if run_state.position[2] >= 0 else ""
-    if cycle_text and run_state.profile:
+    if cycle_text and run_state.profile and run_state.profile.steps:
         cycle_text += f"/{run_state.profile.sweep.cycles}"
     return f"{text:<33}" + (f"  {cycle_text:<13}" if show_cycle else "")
 

@@ -24,9 +24,7 @@ from twin.recording.validation import (
     validate_record,
     validate_start,
 )
-from twin.transport.block_decoding import decode_blocks
 from twin.transport.codec import (
-    BLOCK_TOPICS,
     RECORD_TOPICS,
     TOPIC_TYPES,
     Item,
@@ -228,31 +226,18 @@ def _rejection_reason(item: Item, run: str, before: Block | None, start: RunStar
 _Entry = tuple[LogMessage, Item, str]  # message, decoded item, run id
 
 
-def _decode_messages(messages: list[LogMessage]) -> tuple[list[_Entry], list[str]]:
+def _decode_messages(messages: Iterable[LogMessage]) -> tuple[list[_Entry], list[str]]:
     """Return (decoded messages, errors of those that do not decode)."""
     entries: list[_Entry] = []
     errors = []
-    by_topic: dict[str, list[LogMessage]] = {}
     for message in messages:
-        by_topic.setdefault(message.topic, []).append(message)
-    for name, topic_messages in by_topic.items():
-        payloads = [message.payload for message in topic_messages]
-        blocks = name in BLOCK_TOPICS.values()
-        results = decode_blocks(name, payloads) if blocks else _decode_records(name, payloads)
-        for message, result in zip(topic_messages, results, strict=True):
-            if isinstance(result, WireError):
-                errors.append(str(result))
-            else:
-                entries.append((message, result[1], result[0]))
-    return entries, errors
-
-
-def _decode_records(name: str, payloads: list[bytes]) -> Iterable[tuple[str, Item] | WireError]:
-    for payload in payloads:
         try:
-            yield decode_item(name, payload)
+            run, item = decode_item(message.topic, message.payload)
         except WireError as error:
-            yield error
+            errors.append(str(error))
+        else:
+            entries.append((message, item, run))
+    return entries, errors
 
 
 def _find_start(
@@ -265,11 +250,12 @@ def _find_start(
             if not (reason := validate_start(item)):
                 return item
             problems.append(f"{START_TOPIC}: {reason}")
-    for result in _decode_records(START_TOPIC, [copy] if copy is not None else []):
-        if not isinstance(result, WireError) and isinstance(result[1], RunStart):
-            entries.append((LogMessage(START_TOPIC, 0, copy or b""), result[1], result[0]))
+    copies = [] if copy is None else [LogMessage(START_TOPIC, 0, copy)]
+    for entry in _decode_messages(copies)[0]:
+        if isinstance(entry[1], RunStart):
+            entries.append(entry)
             errors.append(f"{START_TOPIC}: lost; its copy is used")
-            return result[1]
+            return entry[1]
     if problems:
         raise InputError(f"{path}: damaged or foreign: {problems[0]}")
     raise InputError(f"{path}: holds no start record, so profile and model are unknown")

@@ -101,7 +101,11 @@ def recover_log(path: Path, topics: frozenset[str] | None = None) -> RecoveredLo
                 )
             return scanner.run()
     except OSError as error:
-        raise InputError(f"cannot read this log: {error.strerror}", where=path) from None
+        raise InputError(
+            f"cannot read this log: {error.strerror}",
+            where=path,
+            remedy="give a run.mcap or the folder of a run",
+        ) from None
     except MemoryError:
         raise InputError(
             "needs more memory than is available",

@@ -22,7 +22,6 @@ from table_io.errors import InputError
 from table_io.records import Event, PrcPoint, Record, RunStart, RunStop, Step, StepAdded
 from twin.recording.mcap_log import iter_messages
 from twin.recording.reader import START_TOPIC, iter_valid_items, read_start
-from twin.transport.block_decoding import BATCH_PAYLOADS
 from twin.transport.codec import (
     MEAS_TOPIC,
     PRED_TOPIC,
@@ -159,27 +158,17 @@ def read_log_table(path: Path) -> LogTable:
 
 def _read_log_table(path: Path, scratch_files: dict[str, _ScratchFile]) -> LogTable:
     start = read_start(path)
-    pending: dict[str, list[bytes]] = {topic: [] for topic in scratch_files}
     records: dict[bytes, Record] = {}
     problems: list[str] = []
 
-    def flush(topic: str, payloads: list[bytes]) -> None:
-        for block in iter_valid_items(topic, payloads, start, problems):
-            assert isinstance(block, Block)
-            scratch_files[topic].add(block, path)
-        payloads.clear()
-
     for message in iter_messages(path):
-        payloads = pending.get(message.topic)
-        if payloads is not None:
-            payloads.append(message.payload)
-            if len(payloads) == BATCH_PAYLOADS:
-                flush(message.topic, payloads)
-        elif issubclass(TOPIC_TYPES.get(message.topic, object), KEPT_RECORDS):
-            for record in iter_valid_items(message.topic, [message.payload], start, problems):
-                records[message.payload] = record  # type: ignore[assignment]
-    for topic, payloads in pending.items():
-        flush(topic, payloads)
+        is_kept = issubclass(TOPIC_TYPES.get(message.topic, object), (Block, *KEPT_RECORDS))
+        items = [message.payload] if is_kept else []
+        for item in iter_valid_items(message.topic, items, start, problems):
+            if isinstance(item, Block):
+                scratch_files[message.topic].add(item, path)
+            else:
+                records[message.payload] = item
     sorted_records = sorted(records.values(), key=lambda record: record.index)
     table = _build_table(
         start, sorted_records, scratch_files[MEAS_TOPIC], scratch_files[PRED_TOPIC]

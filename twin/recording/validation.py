@@ -41,8 +41,6 @@ def validate_start(start: RunStart) -> str:
         return f"block_samples = {start.block_samples}"
     if max(start.index, start.planned_samples) > start.rate_hz * MAX_DURATION_S:
         return f"index = {start.index}, planned_samples = {start.planned_samples}"
-    if not start.steps:
-        return "no steps"
     if len(start.steps) > MAX_STEPS or not all(map(_is_valid_step, start.steps)):
         return "too many or invalid steps"
     if [step.index for step in start.steps] != sorted({step.index for step in start.steps}):

@@ -1,4 +1,4 @@
-"""Figure of a planned drive: frequency, amplitude, level and limits over time."""
+"""Figures of a planned drive: frequency, amplitude, level or motion, and limits over time."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,19 +30,24 @@ POINTS_PER_SEGMENT = 25
 
 
 def draw_drive(run_config: RunConfig, out: Path) -> Path:
-    """Draw frequency, amplitude, level and the first waveforms into `out`; return `out`."""
+    """Draw frequency, amplitude, level and the first waveforms into `out`; return `out`.
+
+    Of a displacement history draw displacement, velocity and acceleration.
+    """
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     from twin.reports.plot_style import RC_PARAMS
 
+    if not run_config.steps:
+        return _draw_history(run_config, out)
     with rc_context(RC_PARAMS):
         figure = Figure(figsize=(10, 9.5))
         FigureCanvasAgg(figure)
         axes = figure.subplots(4, 1, height_ratios=(1, 1.3, 1.1, 1.1))
         traces = [
-            _trace_segment(segment, run_config.drive) for segment in run_config.drive.segments
+            _trace_segment(segment, run_config.drive) for segment in run_config.drive.sine_segments
         ]
         _plot_frequency(axes[0], traces)
         _plot_amplitude(axes[1], traces, run_config)
@@ -54,6 +59,48 @@ def draw_drive(run_config: RunConfig, out: Path) -> Path:
         title = f"{run_config.profile.title}\nThe drive {_format_usage(run_config)}"
         figure.suptitle(title, x=0.01, ha="left", fontsize=10)
         figure.savefig(out)
+    return out
+
+
+def _draw_history(run_config: RunConfig, out: Path) -> Path:
+    """Draw displacement, velocity and acceleration of the whole drive into `out`; return `out`."""
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from twin.reports.plot_style import RC_PARAMS
+
+    drive, limits = run_config.drive, list_limits(run_config.rig)[:3]
+    count = drive.planned_end
+    displacement = drive.command(0, count)
+    motion = (
+        displacement * 1e3,
+        np.gradient(displacement) * drive.rate_hz * 1e3,
+        drive.acceleration(0, count) / GRAVITY_M_S2,
+    )
+    time_s, (window, _, _) = np.arange(count) / drive.rate_hz, drive.labels(0, count)
+    with rc_context(RC_PARAMS):
+        figure = Figure(figsize=(10, 8), layout="constrained")
+        FigureCanvasAgg(figure)
+        for axis, limit, values in zip(
+            figure.subplots(3, 1, sharex=True), limits, motion, strict=True
+        ):
+            axis.plot(time_s, np.where(window < 0, values, np.nan), color=SWEEP_COLOURS[""], lw=0.9)
+            for parity, colour in enumerate(
+                (SEGMENT_COLOURS["measured"], SWEEP_COLOURS["backward"])
+            ):
+                is_shown = (window >= 0) & (window % 2 == parity)
+                axis.plot(time_s, np.where(is_shown, values, np.nan), color=colour, lw=0.9)
+            peak = 1.2 * float(np.abs(values).max())
+            axis.set_ylim(-peak, peak)
+            axis.set_ylabel(f"{limit.name} [{limit.unit}]")
+            axis.set_title(f"limit of the table {limit.allowed:g} {limit.unit}", fontsize=8)
+            axis.grid(alpha=0.25)
+        axis.set_xlabel("time [s]; grey: loop check; the colors change from window to window")
+        axis.set_xlim(0, count / drive.rate_hz)
+        title = f"{run_config.profile.title}\nThe drive {_format_usage(run_config)}"
+        figure.suptitle(title, x=0.01, ha="left", fontsize=10)
+        figure.savefig(out, dpi=120)
     return out
 
 
@@ -172,7 +219,7 @@ def _plot_level(axis: "Axes", traces: list[_SegmentTrace], run_config: RunConfig
 def _plot_beginning(axis: "Axes", run_config: RunConfig) -> None:
     """Plot the ideal table acceleration during the loop check and the first steps."""
     drive = run_config.drive
-    end = max(segment.end for segment in drive.segments if segment.step < SHOWN_STEPS)
+    end = max(segment.end for segment in drive.sine_segments if segment.step < SHOWN_STEPS)
     acceleration = drive.acceleration(0, end) / GRAVITY_M_S2
     time_s = np.arange(end) / drive.rate_hz
     colours = {

@@ -50,6 +50,7 @@ from twin.reports.report_data import (
     extract_prc,
 )
 from twin.reports.step_figures import draw_histories, draw_legend, draw_loop_figures
+from twin.reports.window_figure import draw_window_histories
 
 MARKER_SIZES = {"forward": 4.6, "backward": 2.6}  # both show where they coincide
 
@@ -62,6 +63,7 @@ def draw_run_figures(run: ReportData, folder: Path) -> list[Picture]:
         _draw_prc,
         _draw_impacts,
         draw_histories,
+        draw_window_histories,
         draw_loop_figures,
         _draw_errors,
         _draw_overview,
@@ -168,7 +170,7 @@ def _draw_errors(run: ReportData) -> CaptionedFigures:
         for part, step_nrmse in compute_step_errors(run).items()
         if np.isfinite(list(step_nrmse.values())).any()
     }
-    if not errors:
+    if not errors or run.windows:
         return
     figure = Figure(figsize=(FIGURE_WIDTH_IN, 2.5 * ((len(errors) + 1) // 2) + 0.4))
     axes = figure.subplots((len(errors) + 1) // 2, 2, sharex=True, sharey=True, squeeze=False)

@@ -1,9 +1,10 @@
-"""Predicted peaks of every sensor compared with its range, from a simulation of the sweep.
+"""Predicted peaks of every sensor compared with its range, from a simulation of the test.
 
 A prediction beyond a range gives a warning only, because the model may be wrong. The demand of the
 drive on the sensors of the table is checked in `table_io.safety.preflight`.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ from table_io.units import GRAVITY_M_S2
 from twin.compare.extra_channels import PREDICTED_SUMS, select_predicted
 from twin.model.ideal_response import simulate_sweep
 from twin.run.run_config import RunConfig
+from twin.run.unpaced import generate_ideal_twin
 
 MAX_RANGE_SHARE = (
     1.0 / CORRECTION_HEADROOM
@@ -25,12 +27,22 @@ MAX_RANGE_SHARE = (
 
 @dataclass(frozen=True, slots=True)
 class PredictedPeak:
-    """Predicted peak of a sensor over the sweep, in the sensor's unit, and the step of the peak."""
+    """Predicted peak of a sensor over the test, in the sensor's unit, and the step of the peak.
+
+    In a displacement history the frequency is NaN and `direction` names the window.
+    """
 
     sensor: SensorConfig
     peak: float
     frequency_hz: float
     direction: str
+
+    @property
+    def place(self) -> str:
+        """Step or window of the peak as text."""
+        if math.isnan(self.frequency_hz):
+            return self.direction
+        return f"{self.frequency_hz:g} Hz {self.direction}"
 
     @property
     def range_share(self) -> float:
@@ -41,13 +53,17 @@ class PredictedPeak:
 def predict_peaks(run_config: RunConfig) -> tuple[PredictedPeak, ...]:
     """Predict the peak of each sensor of the rig that the model covers."""
     predictions = []
-    peaks = _compute_peaks(run_config)
+    if run_config.steps:
+        peaks = _compute_peaks(run_config)
+        places = [(step.frequency_hz, step.direction) for step in run_config.steps]
+    else:
+        peaks = _simulate_peaks(run_config)
+        places = [(math.nan, f"window {k}") for k in range(run_config.profile.plan.windows)]
     for sensor in run_config.rig.sensors:
         if sensor.channel in peaks:
             values = peaks[sensor.channel]
-            step = run_config.steps[int(np.argmax(values))]
             peak = float(values.max()) / sensor.si_per_unit
-            predictions.append(PredictedPeak(sensor, peak, step.frequency_hz, step.direction))
+            predictions.append(PredictedPeak(sensor, peak, *places[int(np.argmax(values))]))
     return tuple(predictions)
 
 
@@ -91,11 +107,32 @@ def _compute_peaks(run_config: RunConfig) -> dict[str, Float1D]:
     return peaks
 
 
+def _simulate_peaks(run_config: RunConfig) -> dict[str, Float1D]:
+    """Simulate the model on the ideal history; return the peak of each channel by window, SI."""
+    specimen, windows = run_config.profile.specimen, run_config.profile.plan.windows
+    peaks: dict[str, Float1D] = {}
+    for block in generate_ideal_twin(run_config):
+        values = {name.removeprefix("free/"): block.channel(name) for name in block.channels}
+        if block.stream == "pred":
+            right, left = 2 * values["force_r1_n"], 2 * values["force_l1_n"]
+            values["damper_force_n"] = np.abs(specimen.mass_kg * values["mass_acc_m_s2"]) + np.abs(
+                right + left
+            )
+            for cells, force in ((RIGHT_CELLS, right), (LEFT_CELLS, left)):
+                present = [name for name in cells if name in run_config.rig.channels]
+                values |= {name: force / len(present) for name in present}
+        for name, samples in values.items():
+            peak = peaks.setdefault(name, np.zeros(windows))
+            is_played = block.step >= 0
+            np.fmax.at(peak, block.step[is_played], np.abs(samples[is_played]))
+    return peaks
+
+
 def format_clipping_warnings(predictions: tuple[PredictedPeak, ...], rig: RigConfig) -> list[str]:
     """Format a warning for each sensor predicted near or beyond the end of its range."""
     return [
         f"{prediction.sensor.channel}: the model predicts {prediction.peak:.4g} "
-        f"{prediction.sensor.unit} at {prediction.frequency_hz:g} Hz {prediction.direction}, "
+        f"{prediction.sensor.unit} at {prediction.place}, "
         f"{100 * prediction.range_share:.0f} % of its range on "
         f"{rig.name!r}; use a sensor with a larger range"
         for prediction in predictions

@@ -35,6 +35,7 @@ from twin.reports.sensor_table import build_sensor_rows
 from twin.reports.summary import RunSummary, load_summary
 
 MAX_ROWS = 200
+MAX_TEXT_LENGTH = 20_000  # of a configuration as recorded
 
 
 def write_report(folder: Path, recording: Recording | None = None) -> Path:
@@ -63,7 +64,10 @@ def render_report(run: ReportData, pictures: list[Picture]) -> str:
         configs={name: parse_toml_tables(text) for name, text in texts.items()},
         images=embed_images(pictures),
         demand={step.index: step.acceleration_m_s2 for step in start.steps},
-        texts=[(name, sha256(text.encode()).hexdigest(), text) for name, text in texts.items()],
+        texts=[
+            (name, sha256(text.encode()).hexdigest(), _shorten(text))
+            for name, text in texts.items()
+        ],
         timings={timing.component: timing for timing in recording.records(Timing)},
         gaps=recording.records(SampleGap),
         faults=recording.records(Fault),
@@ -88,6 +92,14 @@ def render_report(run: ReportData, pictures: list[Picture]) -> str:
     )
 
 
+def _shorten(text: str) -> str:
+    """Return the beginning of a long text: a profile may hold a file of its excitation."""
+    if len(text) <= MAX_TEXT_LENGTH:
+        return text
+    rest = len(text) - MAX_TEXT_LENGTH
+    return f"{text[:MAX_TEXT_LENGTH]}\n... {rest} more characters, see the recording"
+
+
 def worst_level(run: ReportData) -> dict[str, float] | None:
     """Return the largest level errors (relative) with and without control, and most updates.
 
@@ -106,6 +118,10 @@ def worst_level(run: ReportData) -> dict[str, float] | None:
 
 def format_headline(run: ReportData) -> str:
     """Format the headline: steps completed, hysteresis, findings and largest excursion."""
+    if run.windows:
+        planned = parse_toml_tables(run.recording.start.profile_toml).get("excitation") or {}
+        kind = planned.get("kind", "history")
+        return f"{len(run.windows)} windows of a displacement history ({kind}), open loop."
     done_count = sum(1 for step in run.steps if step.get("measured") or step.get("twin"))
     parts = [f"{done_count} of {len(run.recording.start.steps) or len(run.steps)} steps"]
     parts += [

@@ -59,7 +59,13 @@ class ReportData:
     @property
     def source(self) -> str:
         """Source of the results: "measured", or "twin" if nothing was measured."""
-        return "measured" if any(step.get("measured") for step in self.steps) else "twin"
+        results = [*self.steps, *self.windows]
+        return "measured" if any(result.get("measured") for result in results) else "twin"
+
+    @property
+    def windows(self) -> list[dict[str, Any]]:
+        """Windows of a displacement history; none in a stepped sine."""
+        return self.summary.get("windows") or []
 
     @property
     def gaps_m(self) -> tuple[float, float] | None:

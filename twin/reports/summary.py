@@ -25,6 +25,7 @@ from table_io.records import (
     NormalizedResponse,
     PrcPoint,
     SampleGap,
+    Step,
     StepAdded,
     Timing,
     Trip,
@@ -36,6 +37,7 @@ from twin.compare.monitoring import EVENT_KINDS as MONITOR_KINDS
 from twin.model.model import Model
 from twin.model.parameters import Parameters, free_flight_resonance
 from twin.recording.reader import Recording
+from twin.reports.windows import summarise_windows
 
 Json = dict[str, Any]
 ESTIMATE_KEYS = ("value", "sd", "drift", "drift_sd")
@@ -61,8 +63,7 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
     """Compute the summary of a recording whose twin ran with these parameters."""
     start = recording.start
     profile = parse_toml(start.profile_toml, Profile, "recorded profile")
-    level = max(step.acceleration_m_s2 for step in start.steps)
-    u_star, a_star, peak_hz = free_flight_resonance(parameters, level)
+    u_star, a_star, normalisation = _find_normalisation(start.steps, parameters)
     points = _collect_points(recording, parameters, profile)
     source = "twin" if start.source == "model" else "measured"
     reasons = {addition.step: addition.reason for addition in recording.records(StepAdded)}
@@ -84,10 +85,7 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
             "rate_hz": start.rate_hz,
             "samples": samples,
             "duration_s": samples / start.rate_hz,
-            "normalisation": (
-                f"u* and a* are the maxima of the model in free flight, continuous in frequency "
-                f"(at {peak_hz:.3f} Hz, {level:.4g} m/s2)"
-            ),
+            "normalisation": normalisation,
             "branches_from": source,
         },
         "verdict": stop.verdict if stop else "halted",
@@ -100,6 +98,7 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         "checks": [asdict(check) for check in recording.records(Check)],
         "trips": [asdict(trip) for trip in recording.records(Trip)],
         "steps": [_step_entry(point) | _level_entry(point, levels) for point in planned],
+        **_windows_entry(recording, parameters, profile),
         # Steps added during the test are not part of the PRC grid.
         "visits": [
             {**_step_entry(point), "reason": reasons[point.step]}
@@ -124,6 +123,31 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
     }
 
 
+def _find_normalisation(
+    steps: tuple[Step, ...], parameters: Parameters
+) -> tuple[float | None, float | None, str]:
+    """Return (u* in m, a* in m/s2, how they are found); None for a displacement history."""
+    if not steps:
+        return None, None, "none: peaks and rms of a displacement history are given in SI"
+    level = max(step.acceleration_m_s2 for step in steps)
+    u_star, a_star, peak_hz = free_flight_resonance(parameters, level)
+    text = "u* and a* are the maxima of the model in free flight, continuous in frequency"
+    return u_star, a_star, f"{text} (at {peak_hz:.3f} Hz, {level:.4g} m/s2)"
+
+
+def _windows_entry(recording: Recording, parameters: Parameters, profile: Profile) -> Json:
+    """Return the windows of a displacement history; {} for a stepped sine."""
+    if recording.start.steps:
+        return {}
+
+    channels = read_channels(recording.start.rig_toml)
+
+    def compare(comparisons: tuple[Comparison, ...]) -> Json:
+        return channel_nrmse(comparisons, parameters, channels)
+
+    return {"windows": summarise_windows(recording, profile.comparison.contact_n, compare)}
+
+
 def _estimates_entry(estimates: tuple[Estimate, ...]) -> Json:
     """Return the last parameter estimates of the run, SI; `drift` since the start."""
     if not estimates:
@@ -138,7 +162,7 @@ def _collect_points(
 ) -> tuple[PrcPoint, ...]:
     """Return the recorded PRC points; recompute the measured part of those lost to a fault."""
     points = {point.step: point for point in recording.records(PrcPoint)}
-    if recording.records(Fault):
+    if recording.start.steps and recording.records(Fault):
         from twin.compare import pipeline
 
         setup = pipeline.prepare_pipeline(profile, Model(parameters), recording.start.steps)
@@ -282,7 +306,9 @@ def channel_nrmse(
 
 def format_summary(summary: Json) -> str:
     """Format the result of a run in one line."""
-    parts = [f"{summary['verdict']}: {len(summary['steps'])} steps"]
+    windows = summary.get("windows")
+    done = f"{len(summary['steps'])} steps" if windows is None else f"{len(windows)} windows"
+    parts = [f"{summary['verdict']}: {done}"]
     if summary.get("visits"):
         parts.append(f"{len(summary['visits'])} steps added during the test")
     parts += summary.get("found", [])

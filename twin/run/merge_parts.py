@@ -28,7 +28,9 @@ def merge_run_parts(folder: Path) -> Path:
             if out.exists():  # an earlier call ended before it deleted the parts
                 if not verify_log(out):
                     raise InputError(
-                        f"{out}: not a whole log; move it away, the parts are in {parts_folder}"
+                        f"not a complete log; its parts are in {parts_folder}",
+                        where=out,
+                        remedy=f"move it to another folder, then: shaketwin report {folder}",
                     )
             elif not parts:
                 raise InputError(f"{folder}: the recorder wrote nothing")
@@ -37,11 +39,14 @@ def merge_run_parts(folder: Path) -> Path:
                 _sync(folder)
             shutil.rmtree(parts_folder)
     except BlockingIOError:
-        raise InputError(f"{folder}: a run is still going on in this folder; wait") from None
+        raise InputError(
+            "a run is still recording into this folder", where=folder, remedy="wait until it ends"
+        ) from None
     except OSError as error:
         raise InputError(
-            f"{error.filename or folder}: {error.strerror}; what was recorded is kept in "
-            f"{parts_folder} and readable. Once this is mended: shaketwin report {folder}"
+            f"{error.strerror}; the recording is kept in {parts_folder} and readable",
+            where=error.filename or folder,
+            remedy=f"correct the cause, then: shaketwin report {folder}",
         ) from None
     return out
 
@@ -55,7 +60,11 @@ def _merge_verified(parts: list[Path], new: Path, folder: Path) -> Path:
         new.unlink(missing_ok=True)  # left by an interrupted attempt
         merge(parts, new)
         if not verify_log(new):
-            raise InputError(f"{new}: not what was written; the parts are kept beside it")
+            raise InputError(
+                "the merged log differs from what was written; its parts are kept next to it",
+                where=new,
+                remedy=f"check the disk, then: shaketwin report {folder}",
+            )
         # Before the log is renamed: once run.mcap exists, the parts are deleted.
         _keep_damaged(
             [part for part in parts if part not in intact and _has_inner_damage(part)],

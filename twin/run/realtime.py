@@ -6,6 +6,7 @@ from pathlib import Path
 from table_io.acquisition.external_control import plan_open_loop_drive
 from table_io.backends import check_reachable, open_backend
 from table_io.clock import RealClock
+from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from twin.run.run_config import RunConfig
 
@@ -21,9 +22,12 @@ def check_realtime(config: RunConfig, profile_path: Path) -> None:
     min_samples, max_samples = math.ceil(rate_hz * MIN_BLOCK_S), math.floor(rate_hz * MAX_BLOCK_S)
     if not min_samples <= samples <= max_samples:
         raise InputError(
-            f"{profile_path}: acquisition.block_samples = {samples}: in real time at {rate_hz:g} "
-            f"Hz a block may have {min_samples} to {max_samples} samples; change it, or use "
-            "--speed max"
+            f"not possible in real time at {rate_hz:g} Hz",
+            where=profile_path,
+            key="acquisition.block_samples",
+            value=samples,
+            allowed=f"{min_samples} to {max_samples}",
+            remedy="change it, or use --speed max",
         )
     # Raises now if the test cannot be played by an external controller, or by the backend.
     if config.rig.under_external_control:
@@ -31,3 +35,14 @@ def check_realtime(config: RunConfig, profile_path: Path) -> None:
     else:
         open_backend(config.rig, config.profile, RealClock())
     check_reachable(config.rig)
+
+
+def check_full_speed(rig: RigConfig) -> None:
+    """Raise InputError if a rig cannot run at full speed, because it is not simulated."""
+    if not rig.runs_at_any_speed:
+        raise InputError(
+            "this rig runs in real time only",
+            where="--speed max",
+            key=rig.name,
+            remedy="omit --speed, or give a simulated table with --table",
+        )

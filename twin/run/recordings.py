@@ -33,7 +33,7 @@ def warn_if_damaged(recording: Recording) -> None:
         )
         Console(stderr=True).print(
             f"warning: {recording.path} is cut off or damaged; it is readable to sample {end}; "
-            f"`shaketwin verify {recording.path}` says what is lost",
+            f"`shaketwin verify {recording.path}` lists what is lost",
             highlight=False,
             soft_wrap=True,
         )
@@ -42,7 +42,7 @@ def warn_if_damaged(recording: Recording) -> None:
 def read_recorded_config(recording: Recording, model: str | None = None) -> RunConfig:
     """Return the `RunConfig` stored in a recording, optionally with another model."""
     start = recording.start
-    model_toml = read_model(model)[1] if model else start.model_toml
+    model_toml = read_model(model, option="--model")[1] if model else start.model_toml
     config = from_texts(
         start.name, start.profile_toml, start.rig_toml, model_toml, str(recording.path)
     )

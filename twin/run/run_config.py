@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 from table_io.acquisition.session import SessionSetup
 from table_io.clock import local_datetime
 from table_io.config.base import find_config, load_config, parse_toml, resolve_config
-from table_io.config.profile import Profile, Specimen
+from table_io.config.profile import Profile, Specimen, load_profile
 from table_io.config.rig import RigConfig
 from table_io.config.rig_file import load_rig
 from table_io.errors import InputError
 from table_io.excitation.drive import Drive
-from table_io.excitation.trajectory import plan_sweep
+from table_io.excitation.trajectory import plan_excitation
 from table_io.records import RunStart, Step
 from table_io.safety.preflight import StepDemand, check_limits, compute_demands
 from table_io.sequencer import make_test_plan, nominal_drive
@@ -61,8 +61,8 @@ class RunConfig:
 
     @property
     def ideal_drive(self) -> Drive:
-        """Drive of an ideal table: the sweep without loop check and tuning."""
-        return plan_sweep(self.profile)
+        """Drive of an ideal table: the excitation without loop check and tuning."""
+        return plan_excitation(self.profile)
 
     @property
     def parameters(self) -> Parameters:
@@ -72,6 +72,11 @@ class RunConfig:
     @property
     def steps(self) -> tuple[Step, ...]:
         return self.drive.steps
+
+    @property
+    def extent(self) -> str:
+        """Number of steps, or of windows of a displacement history, as text."""
+        return f"{len(self.steps)} steps" if self.steps else f"{self.profile.plan.windows} windows"
 
     def make_start_factory(
         self, run: str, source: str
@@ -108,14 +113,15 @@ def from_texts(
 ) -> RunConfig:
     """Build a `RunConfig` from TOML texts; InputError lists all faults of a text."""
     profile = parse_toml(profile_toml, Profile, source)
-    rig = parse_toml(rig_toml, RigConfig, f"machine card of {source}")
-    model_config = parse_toml(model_toml, ModelConfig, f"model of {source}")
+    rig = parse_toml(rig_toml, RigConfig, f"rig file of {source}")
+    model_config = parse_toml(model_toml, ModelConfig, f"model file of {source}")
     try:
         drive = nominal_drive(make_test_plan(profile, rig))
     except ArithmeticError as error:
         raise InputError(
-            f"{source}: no drive follows from these numbers ({error}); look for a wrong power of "
-            "ten"
+            f"no drive can be computed from these numbers ({error})",
+            where=source,
+            remedy="look for a wrong power of ten",
         ) from None
     model = model_config.build_model(profile.specimen)
     model.check_rate(profile.acquisition.rate_hz)
@@ -135,17 +141,25 @@ def from_texts(
 def read_run_config(path: Path, table: str | None = None, model: str | None = None) -> RunConfig:
     """Read the `RunConfig` of a test profile; InputError if the test exceeds the table's limits."""
     path = resolve_config(path, "tests")
-    profile, profile_toml = load_config(path, Profile, "test profile")
-    _, rig_toml = load_rig(find_config(table or profile.rig, "rigs", path))
-    _, model_toml = read_model(model or profile.model, path)
+    profile, profile_toml = load_profile(path)
+    _, rig_toml = load_rig(
+        find_config(table or profile.rig, "rigs", path, option="--table" if table else "")
+    )
+    _, model_toml = read_model(model or profile.model, path, option="--model" if model else "")
     config = from_texts(path.stem, profile_toml, rig_toml, model_toml, str(path))
     check_limits(config.margins, config.profile, config.rig, str(path))
     return config
 
 
-def read_model(name: str, relative_to: Path | None = None) -> tuple[ModelConfig, str]:
-    """Read a model file by its name in models/ or its path; return (config, text)."""
-    return load_config(find_config(name, "models", relative_to), ModelConfig, "model")
+def read_model(
+    name: str, relative_to: Path | None = None, option: str = ""
+) -> tuple[ModelConfig, str]:
+    """Read a model file by its name in models/ or its path; return (config, text).
+
+    InputError names the option that gave the name, as in `find_config`.
+    """
+    path = find_config(name, "models", relative_to, option)
+    return load_config(path, ModelConfig, "model file")
 
 
 def make_run_id(name: str) -> str:
@@ -168,7 +182,7 @@ def compile_rig_kernels(config: RunConfig) -> None:
     """Compile or load the kernels of the rig, its protection and its simulated table.
 
     The start of a real session is run, so that every kernel is called. The quickstart profile
-    replaces a rig that keeps its own time.
+    replaces a rig that runs in real time only.
     """
     from contextlib import closing
     from itertools import islice
@@ -197,5 +211,5 @@ def read_model_template(name: str) -> tuple[Model, ModelConfig]:
 
     Mass and gaps are set from each log.
     """
-    card, _ = read_model(name)
-    return card.build_model(Specimen(mass_kg=1.0, gap_mm=float("inf"))), card
+    config, _ = read_model(name, option="--model")
+    return config.build_model(Specimen(mass_kg=1.0, gap_mm=float("inf"))), config

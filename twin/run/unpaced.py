@@ -10,7 +10,6 @@ from table_io.acquisition.session import OperatorCommand, run_session
 from table_io.backends import open_backend
 from table_io.block import Block
 from table_io.clock import ManualClock
-from table_io.errors import InputError
 from table_io.records import (
     Record,
     RunStart,
@@ -19,6 +18,7 @@ from table_io.records import (
 )
 from twin.compare import pipeline
 from twin.recording.mcap_log import LogWriter
+from twin.run.realtime import check_full_speed
 from twin.run.run_config import RunConfig
 from twin.transport.codec import Item, encode_item, topic_for
 
@@ -82,10 +82,7 @@ def play_unpaced(
     on_item: ItemHandler,
 ) -> None:
     """Run the test on a simulated table at full speed, recorded to `path`."""
-    if not config.rig.runs_at_any_speed:
-        raise InputError(
-            f"--speed max: table {config.rig.name!r} keeps its own time; use --speed realtime"
-        )
+    check_full_speed(config.rig)
     clock = ManualClock()
     backend = open_backend(config.rig, config.profile, clock)
 
@@ -104,6 +101,12 @@ def simulate_ideal(config: RunConfig, run: str, path: Path, on_item: ItemHandler
     """Simulate the model on the ideal drive, without table and noise, recorded to `path`."""
     items = add_twin_items(_generate_ideal(config, run), config.prepare_twin(from_rest=True))
     record_items(items, path, run, config.drive.rate_hz, on_item)
+
+
+def generate_ideal_twin(config: RunConfig) -> Iterator[Block]:
+    """Yield the blocks of an ideal table, each followed by the twin's block for it."""
+    items = add_twin_items(_generate_ideal(config, ""), config.prepare_twin(from_rest=True))
+    return (item for item in items if isinstance(item, Block))
 
 
 def _generate_ideal(config: RunConfig, run: str) -> Iterator[Item]:

@@ -33,7 +33,7 @@ Grant = tuple[str, list[str] | None, tuple[Rule, ...]]
 STATE_KEYS = ("state/status", "state/role/*", "state/held")
 KNOWN_PERSON_RULES: tuple[Rule, ...] = (
     ("listen", "ingress", ("declare_subscriber",), ("stream/**", "event/**")),
-    ("hear", "egress", ("put",), ("stream/**", "event/**")),
+    ("receive", "egress", ("put",), ("stream/**", "event/**")),
     ("ask", "ingress", ("query",), (*STATE_KEYS, "config/**")),
     ("answered", "egress", ("reply",), (*STATE_KEYS, "config/**", "cmd/**")),
     ("offered", "egress", ("declare_queryable",), (*STATE_KEYS, "config/**", "cmd/**")),

@@ -51,7 +51,7 @@ def check_name(name: str) -> str:
     """
     if not (set(name) <= NAME_ALPHABET and 0 < len(name) <= MAX_NAME_LENGTH and name[0].isalnum()):
         raise ValueError(
-            f"{name!r} is no name for a certificate; allowed: up to {MAX_NAME_LENGTH} of a-z 0-9 "
+            f"{name!r} is not a valid user name; allowed: up to {MAX_NAME_LENGTH} of a-z 0-9 "
             "_ -, starting with a letter or digit"
         )
     if name in (RIG_NAME, NO_ROLE):
@@ -136,8 +136,9 @@ def read_credentials(folder: Path) -> Credentials:
     for name in (AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE):
         if not (folder / name).is_file():
             raise InputError(
-                f"--keys {folder}: {name} is missing; give a folder that `shaketwin keys new` or "
-                "`shaketwin keys add` made"
+                f"{name} is missing",
+                where=f"--keys {folder}",
+                remedy="give a folder made by `shaketwin keys new` or `shaketwin keys add`",
             )
     _check_file_mode(
         folder / KEY_FILE, OTHERS_MODE_BITS, "others on this machine may read it", "go-rwx"
@@ -185,7 +186,11 @@ def _check_file_mode(path: Path, bits: int, reason: str, remedy: str) -> None:
     try:
         mode = path.stat().st_mode
     except OSError as error:
-        raise InputError(f"{path}: cannot read it: {error.strerror}") from None
+        raise InputError(
+            f"cannot read: {error.strerror}",
+            where=path,
+            remedy="give a folder made by `shaketwin keys`",
+        ) from None
     if mode & bits:
         raise InputError(f"{path}: mode {mode & 0o777:04o}, {reason}; chmod {remedy} {path}")
 
@@ -247,4 +252,4 @@ def user_name(keys: Credentials | None) -> str:
     """Return the name in the certificate; without keys the login name on this machine."""
     if keys is not None:
         return keys.name
-    return re.sub(r"[^A-Za-z0-9_.-]", "_", getpass.getuser())[:64] or "somebody"
+    return re.sub(r"[^A-Za-z0-9_.-]", "_", getpass.getuser())[:64] or "unknown"

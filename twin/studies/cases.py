@@ -100,7 +100,7 @@ def _parse_range(word: str) -> list[float]:
 
 def read_models(words: Sequence[str], profile: Path) -> dict[str, tuple[ModelConfig, str]]:
     """Read (model config, TOML text) by label; the label of a file is its name without .toml."""
-    paths = [find_config(word, "models", profile).resolve() for word in words]
+    paths = [find_config(word, "models", profile, "--model").resolve() for word in words]
     configs: dict[str, tuple[ModelConfig, str]] = {}
     for index, (word, path) in enumerate(zip(words, paths, strict=True)):
         if path in paths[:index]:

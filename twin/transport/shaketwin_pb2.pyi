@@ -15,7 +15,7 @@ class Channel(_message.Message):
     def __init__(self, name: _Optional[str] = ..., values: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Block(_message.Message):
-    __slots__ = ("run", "stream", "index", "rate_hz", "channels", "step", "label", "cycle")
+    __slots__ = ("run", "stream", "index", "rate_hz", "channels", "step", "label", "cycle", "names", "values", "labels")
     RUN_FIELD_NUMBER: _ClassVar[int]
     STREAM_FIELD_NUMBER: _ClassVar[int]
     INDEX_FIELD_NUMBER: _ClassVar[int]
@@ -24,6 +24,9 @@ class Block(_message.Message):
     STEP_FIELD_NUMBER: _ClassVar[int]
     LABEL_FIELD_NUMBER: _ClassVar[int]
     CYCLE_FIELD_NUMBER: _ClassVar[int]
+    NAMES_FIELD_NUMBER: _ClassVar[int]
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    LABELS_FIELD_NUMBER: _ClassVar[int]
     run: str
     stream: str
     index: int
@@ -32,7 +35,10 @@ class Block(_message.Message):
     step: _containers.RepeatedScalarFieldContainer[int]
     label: _containers.RepeatedScalarFieldContainer[int]
     cycle: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, run: _Optional[str] = ..., stream: _Optional[str] = ..., index: _Optional[int] = ..., rate_hz: _Optional[float] = ..., channels: _Optional[_Iterable[_Union[Channel, _Mapping]]] = ..., step: _Optional[_Iterable[int]] = ..., label: _Optional[_Iterable[int]] = ..., cycle: _Optional[_Iterable[int]] = ...) -> None: ...
+    names: _containers.RepeatedScalarFieldContainer[str]
+    values: bytes
+    labels: bytes
+    def __init__(self, run: _Optional[str] = ..., stream: _Optional[str] = ..., index: _Optional[int] = ..., rate_hz: _Optional[float] = ..., channels: _Optional[_Iterable[_Union[Channel, _Mapping]]] = ..., step: _Optional[_Iterable[int]] = ..., label: _Optional[_Iterable[int]] = ..., cycle: _Optional[_Iterable[int]] = ..., names: _Optional[_Iterable[str]] = ..., values: _Optional[bytes] = ..., labels: _Optional[bytes] = ...) -> None: ...
 
 class Step(_message.Message):
     __slots__ = ("index", "direction", "frequency_hz", "acceleration_m_s2")

@@ -9,7 +9,7 @@ from twin.viewer.plots import PLANE_WIDTH, AxisRange, PlotAxes
 from twin.viewer.sink import RerunSink
 
 RANGE_HOLD_S = 4.0  # before an axis shrinks
-AXES_RESEND_STRIPS = 400  # the axes are sent again after so many strips, for late viewers
+AXES_RESEND_STRIPS = 400  # strips after which the axes are sent again, for viewers that join late
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from table_io.block import Float1D, Float2D
+from table_io.config.excitation import ExcitationPlan
 from table_io.config.profile import Profile
+from table_io.units import GRAVITY_M_S2
 from twin.viewer.motion import BlockMotion
 from twin.viewer.plots import nice_floor
 from twin.viewer.style import CONTACT_COLOUR, IDLE_COLOUR, MASS_COLOUR, RUBBER_COLOUR, STEEL_COLOUR
@@ -36,6 +38,14 @@ class BoxFrames:
     colours: Colours
 
 
+def _table_amplitude(plan: ExcitationPlan) -> float:
+    """Return the largest displacement in m of the commanded table motion."""
+    if not plan.steps:
+        return float(np.abs(plan.history_m).max())
+    slowest = min(plan.steps, key=lambda step: step.frequency_hz)
+    return slowest.acceleration_m_s2 / (2 * math.pi * slowest.frequency_hz) ** 2
+
+
 @dataclass(frozen=True, slots=True)
 class Scene:
     """Scene parameters: gaps in m (right, left), contact threshold in N, magnifications."""
@@ -52,9 +62,8 @@ class Scene:
         Expected motions: the commanded table amplitude; the gap plus a bumper deformation, limited
         by free flight.
         """
-        slowest = min(profile.sweep.steps, key=lambda step: step.frequency_hz)
-        table = slowest.acceleration_m_s2 / (2 * math.pi * slowest.frequency_hz) ** 2
-        level = profile.sweep.acceleration_g / 0.05
+        table = _table_amplitude(profile.plan)
+        level = profile.plan.level_m_s2 / GRAVITY_M_S2 / 0.05
         u = min(max(*profile.specimen.gaps_m, 0.0) + 5e-3 * level, 30e-3 * level)
         gaps = profile.specimen.gaps_m
         return cls(

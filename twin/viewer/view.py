@@ -69,7 +69,7 @@ class RerunView:
         self._styled: set[str] = set()
         self._logged: set[tuple[int, str, str]] = set()
         self._sweep_position = SweepPosition()
-        self._curves = PrcCurves(profile.sweep.start_hz, profile.sweep.stop_hz)
+        self._curves = PrcCurves(profile.plan.low_hz, profile.plan.high_hz)
         self._errors = RelativeError(start.rate_hz)
         self._sink = RerunSink(start, save, serve, make_blueprint(start, self._scene, bool(serve)))
         self.url = viewer_url(serve) if serve else ""

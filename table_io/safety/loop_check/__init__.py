@@ -66,31 +66,31 @@ REMEDIES = {
     "the output",
     "polarity": "turn the sensor around, or change the sign of volts_per_unit in the rig file",
     "gain off": "check for a loose sensor or a resonance of the table",
-    "gain at": "lower sweep.stop_hz or tune the servo",
+    "gain at": "lower the frequencies of the excitation or tune the servo",
     "gain": "check unit and volts_per_unit in the rig file against the sensor, then the servo",
     "delay": "check filters and the clocks of output and input",
     "second derivative": "check gain, unit, sign, filter and input of both sensors; they may be "
     "swapped",
-    "noise": "check for ground loops and the range, or raise sweep.acceleration_g",
+    "noise": "check for ground loops and the range, or raise the level of the excitation",
     "offset": "tare again with the table at rest and the bumpers unloaded",
     "motion left": "let the servo come to rest, or raise loop_check.rest_s",
     "cross-talk": "check that the gap is as large as stated; if so, the cell responds to the "
     "motion of the table",
-    "force beside": "check that both load cells of this side are connected and loaded",
+    "force ratio": "check that both load cells of this side are connected and loaded",
 }
 
 
 def plan_targets(profile: Profile, rig: RigConfig) -> tuple[SineTarget, ...]:
     """Plan the steady motions of the check as sine targets, lowest frequency first.
 
-    Three frequencies in equal ratios between the ends of the sweep (from 1 Hz if the sweep starts
-    below and ends above it); two more, up to the fifth harmonic of the highest frequency, if
+    Three frequencies in equal ratios between the ends of the excitation's band (from 1 Hz if it
+    starts below and ends above it); two more, up to the fifth harmonic of the highest frequency, if
     harmonics are canceled. Where an amplitude has fewer DAC steps than `output.least_lsb`, the
     level is raised to at most a tenth of the test level; beyond that the frequency is lowered, and
     the response above it is extrapolated.
     """
-    sweep, settings = profile.sweep, profile.loop_check
-    test_level = sweep.steps[0].acceleration_m_s2
+    plan, settings = profile.plan, profile.loop_check
+    test_level = plan.level_m_s2
     min_amplitude_m = rig.output.least_lsb * rig.output.lsb_m
 
     def limit_frequency(f: float) -> float:
@@ -99,13 +99,13 @@ def plan_targets(profile: Profile, rig: RigConfig) -> tuple[SineTarget, ...]:
 
     requested_hz = list(settings.frequencies_hz)
     if not requested_hz:
-        high_hz = limit_frequency(sweep.stop_hz)
+        high_hz = limit_frequency(plan.high_hz)
         low_hz = min(
-            max(sweep.start_hz, MIN_CHECK_HZ) if high_hz > MIN_CHECK_HZ else sweep.start_hz, high_hz
+            max(plan.low_hz, MIN_CHECK_HZ) if high_hz > MIN_CHECK_HZ else plan.low_hz, high_hz
         )
         requested_hz = [low_hz, math.sqrt(low_hz * high_hz), high_hz]
-        if profile.control.harmonics:
-            top_hz = limit_frequency(MAX_CANCELLED_ORDER * sweep.stop_hz)
+        if plan.steps and profile.control.harmonics:
+            top_hz = limit_frequency(MAX_CANCELLED_ORDER * plan.high_hz)
             requested_hz += [math.sqrt(high_hz * top_hz), top_hz]
     targets: list[SineTarget] = []
     for f in sorted(map(limit_frequency, requested_hz)):

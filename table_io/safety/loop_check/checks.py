@@ -104,7 +104,7 @@ def check_table_response(data: LoopCheckData) -> Iterator[Check]:
         polarity = float(np.cos(np.angle(tones[0])))
         yield make_check(data, "polarity against the command", name, polarity, 0.0, 1.0, "")
         yield make_check(data, "gain", name, abs(tones[0]), *GAIN_RANGE, "")
-        swept = np.flatnonzero(frequencies_hz <= data.profile.sweep.stop_hz * (1 + 1e-9))
+        swept = np.flatnonzero(frequencies_hz <= data.profile.plan.high_hz * (1 + 1e-9))
         if swept.size > 1:
             top_gain = abs(tones[swept[-1]])
             yield make_check(
@@ -228,13 +228,13 @@ def check_derivative_consistency(data: LoopCheckData) -> Iterator[Check]:
 
 
 def check_noise(data: LoopCheckData) -> Iterator[Check]:
-    """Check that the noise at rest is 20 dB below the test level at every frequency of the sweep.
+    """Check that the noise at rest is 20 dB below the test level at every frequency of the test.
 
-    Displacements are compared with the smallest amplitude, that at the end of the sweep, load cells
-    with a fifth of the contact threshold `comparison.contact_n`.
+    Displacements are compared with the smallest amplitude, that at the upper end of its band, load
+    cells with a fifth of the contact threshold `comparison.contact_n`.
     """
     test_level = data.test_level
-    min_displacement = test_level / (2 * math.pi * data.profile.sweep.stop_hz) ** 2
+    min_displacement = test_level / (2 * math.pi * data.profile.plan.high_hz) ** 2
     for name in filter(data.has, MOTION_CHANNELS):
         amplitude = min_displacement if CHANNEL_BY_NAME[name].unit == "m" else test_level
         margin_db = 20.0 * math.log10(amplitude / math.sqrt(2.0) / data.noise(name))
@@ -252,9 +252,9 @@ def check_rest(data: LoopCheckData) -> Iterator[Check]:
     Precompressed bumpers (negative gap) may shift the mass, so its position is not checked then;
     the ring-down of the mass is reported without a limit.
     """
-    test_level, sweep = data.test_level, data.profile.sweep
+    test_level = data.test_level
     min_gap = min(data.profile.specimen.gaps_m)
-    max_displacement = test_level / (2 * math.pi * sweep.start_hz) ** 2
+    max_displacement = test_level / (2 * math.pi * data.profile.plan.low_hz) ** 2
     max_displacement = min(max_displacement, min_gap) if min_gap > 0 else max_displacement
     for name in filter(data.has, MOTION_CHANNELS):
         is_displacement = CHANNEL_BY_NAME[name].unit == "m"

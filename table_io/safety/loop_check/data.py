@@ -41,7 +41,7 @@ class LoopCheckData:
         """The held motions, lowest frequency first."""
         segments = [
             segment
-            for segment in self.drive.segments
+            for segment in self.drive.sine_segments
             if segment.step < 0 and segment.label == Label.CHECK
         ]
         inside = [
@@ -75,13 +75,13 @@ class LoopCheckData:
 
     @cached_property
     def _motion_span(self) -> tuple[int, int]:
-        segments = [segment for segment in self.drive.segments if segment.step < 0]
+        segments = [segment for segment in self.drive.sine_segments if segment.step < 0]
         return segments[0].start, max(segment.end for segment in segments)
 
     @property
     def test_level(self) -> float:
         """Peak acceleration of the test, m/s2."""
-        return self.profile.sweep.steps[0].acceleration_m_s2
+        return self.profile.plan.level_m_s2
 
     def has(self, *names: str) -> bool:
         """Return True if all these channels exist and none is lost entirely."""

@@ -114,5 +114,5 @@ def _check_force_share(data: LoopCheckData, name: str) -> Iterator[Check]:
             shares = np.abs(data.tones(name)[loaded] / data.tones(neighbour)[loaded])
             share = float(shares.max())
             yield make_check(
-                data, "force beside its neighbour", name, share, MIN_FORCE_SHARE, math.inf, ""
+                data, "force ratio to its neighbour", name, share, MIN_FORCE_SHARE, math.inf, ""
             )

@@ -8,10 +8,13 @@ acceleration and forces.
     state = start_protection(profile, rig, noise_from(tare_volts, rig.sensors))
     state, findings = inspect_samples(state, Observation.from_drive(block, clipped, drive))
 
+A displacement history has no cycles: of it only the samples are checked.
+
 Findings do not depend on how the samples are divided into blocks. A fault of a sensor that the
 controller needs stops the table; for other sensors `protection.sensor` of the profile decides.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -50,11 +53,13 @@ __all__ = [
     "Observation",
     "ProtectionState",
     "inspect_samples",
+    "sample_demand",
     "set_response",
     "start_protection",
 ]
 
 MAX_FINDINGS = 256  # per call of `check_samples`
+HISTORY_KEY = 0.5  # motion without cycles
 HELD_LABELS = (Label.SETTLE, Label.MEASURE, Label.CHECK)
 _LABEL_KEYS = np.array(
     [float(FIRST_HOLD_KEY if label in HELD_LABELS else label != Label.REST) for label in Label]
@@ -69,13 +74,20 @@ class Observation:
     clipped: Bool2D  # (channel, sample): True at the sensor's range
     command_m: Float1D  # displacement, as queued
     phase: Float1D  # of the drive, in cycles
-    level_m_s2: Float1D  # demanded peak acceleration
+    level_m_s2: Float1D  # demanded peak acceleration, 0 in a history
+    acceleration_m_s2: Float1D  # demanded, with its sign
 
     @classmethod
     def from_drive(cls, block: Block, clipped: Bool2D, drive: Drive) -> "Observation":
         """Make an observation from a block and the drive during it."""
         span = block.index, len(block)
-        return cls(block, clipped, drive.command(*span), drive.phase(*span), drive.level(*span))
+        return cls(block, clipped, *sample_demand(drive, *span))
+
+
+def sample_demand(drive: Drive, first: int, count: int) -> tuple[Float1D, ...]:
+    """Return (command, phase, level, acceleration) that a drive demands of samples, (count,)."""
+    quantities = drive.command, drive.phase, drive.level, drive.demanded_acceleration
+    return tuple(quantity(first, count) for quantity in quantities)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,7 +146,10 @@ def _warm_up_kernel(state: ProtectionState) -> None:
 
 def set_response(state: ProtectionState, response: FrequencyResponse) -> ProtectionState:
     """Return the state with the response of the loop check as reference for the table."""
-    frequency_hz = state.context.profile.sweep.steps[0].frequency_hz
+    plan = state.context.profile.plan
+    frequency_hz = (
+        plan.steps[0].frequency_hz if plan.steps else math.sqrt(plan.low_hz * plan.high_hz)
+    )
     cycle_state = replace(state.cycle_state, response=response)
     return _update_table_response(
         state,
@@ -152,9 +167,9 @@ def inspect_samples(
     values = np.ascontiguousarray(np.concatenate([state.history[0], block.values], axis=1))
     command = np.concatenate([state.history[1], observation.command_m])
     phase = np.concatenate([state.history[2], observation.phase])
-    clipped, level = (
+    clipped, demanded = (
         np.ascontiguousarray(observation.clipped),
-        np.ascontiguousarray(observation.level_m_s2),
+        np.ascontiguousarray(observation.acceleration_m_s2),
     )
     keys = _motion_keys(block)
     sample_state = state.sample_state
@@ -170,18 +185,18 @@ def inspect_samples(
     while offset < len(block):
         first = offset
         offset, mark, count = check_samples(
-            values, clipped, command, phase, level, keys, block.index, offset,
+            values, clipped, command, phase, demanded, keys, block.index, offset,
             state.thresholds, state.sample_state, rows,
         )  # fmt: skip
         for index, code, row, value, limit in rows[:count].tolist():
             channel = state.context.rig.channel_by_name[block.channels[int(row)]]
             arguments = int(code), int(index), channel, value, limit
             findings.append(to_finding(*arguments, state.context.profile))
-        if offset > first:
+        if offset > first and keys[first] != HISTORY_KEY:
             span = slice(history + first, history + offset)
             part = values[:, span], command[span], phase[span]
             last_sample = (
-                float(level[offset - 1]),
+                float(observation.level_m_s2[offset - 1]),
                 int(block.label[offset - 1]),
                 int(keys[offset - 1]),
             )
@@ -225,9 +240,11 @@ def _update_table_response(state: ProtectionState, cycle_state: CycleCheckState)
 def _motion_keys(block: Block) -> Float1D:
     """Return the key of each sample's motion, (sample,): 0 rest, 1 blend, 2 and up a held step.
 
-    Motions before the first step have key -1: the loop check judges the sensors itself, so the
-    protection must not stop it first.
+    A history has the key HISTORY_KEY: it has no cycles, so there are no cycle checks. Motions
+    before the first step have key -1: the loop check judges the sensors itself, so the protection
+    must not stop it first.
     """
     keys = _LABEL_KEYS[block.label]
     keys = np.where(keys == FIRST_HOLD_KEY, FIRST_HOLD_KEY + block.step, keys)
+    keys = np.where((block.label == Label.MEASURE) & (block.cycle < 0), HISTORY_KEY, keys)
     return np.where((block.step < 0) & (keys != 0), LOOP_CHECK_KEY, keys)

@@ -73,9 +73,7 @@ WORDINGS = {
         "kN",
         1e-3,
     ),
-    sample_checks.RAIL: Wording(
-        "rail", "sensor", "{channel} is at the end of its range, {limit}, at sample {at}"
-    ),
+    sample_checks.RAIL: Wording("rail", "sensor", "{channel} saturates at {limit} at sample {at}"),
     sample_checks.LOST: Wording("lost", "alarm", "{channel} is lost at sample {at}"),
     sample_checks.DROPPED: Wording("lost", "alarm", "all channels are lost at sample {at}"),
     sample_checks.BLIND: Wording(

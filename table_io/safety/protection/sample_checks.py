@@ -381,14 +381,14 @@ def _find_mark(command, phase, i, key, scalars, limits):  # type: ignore[no-unty
 
 @njit(cache=True, nogil=True)
 def check_samples(  # type: ignore[no-untyped-def]
-    values, clipped, command, phase, level, keys, index, start, limits, state, findings
+    values, clipped, command, phase, demanded, keys, index, start, limits, state, findings
 ):
     """Check samples from `start` to the end or the next mark: return (sample, mark, finding count).
 
     If the mark is not 0, the returned sample is not checked yet; the next call starts there.
     values (channel, history + sample), command and phase (history + sample,), clipped (channel,
-    sample), level and keys (sample,); `index` is that of the first sample after the history. Rows
-    of `findings`: sample, code, channel, value, limit.
+    sample), demanded acceleration and keys (sample,); `index` is that of the first sample after the
+    history. Rows of `findings`: sample, code, channel, value, limit.
     """
     count, scalars = 0, state.scalars
     for k in range(start, keys.size):
@@ -398,13 +398,12 @@ def check_samples(  # type: ignore[no-untyped-def]
             if mark:
                 scalars[LAST_MARK] = sample
                 return k, mark, count
-        demanded_acceleration = level[k] * math.sin(2.0 * math.pi * phase[i])
         repeated = _is_repeated(values, i, limits, scalars)
         count = _check_delivery(
             values, clipped[:, k], i, sample, repeated, limits, state, findings, count
         )
         count = _check_stuck(
-            values, i, sample, command[i], demanded_acceleration, limits, state, findings, count
+            values, i, sample, command[i], demanded[k], limits, state, findings, count
         )
         count = _check_silence(values, i, sample, limits, state, findings, count)
         if repeated:

@@ -98,7 +98,7 @@ def check_resting_inputs(resting: RestingInputs) -> tuple[CheckLine, ...]:
 
 
 def _check_delivery(resting: RestingInputs, row: int, sensor: SensorConfig) -> Iterator[CheckLine]:
-    """Check for lost samples and samples at the end of the range."""
+    """Check for lost samples and saturated samples."""
     values = resting.values[row]
     lost_percent = 100.0 * float(np.isnan(values).mean())
     remedy = "check its cable, its channel in the rig file, and the acquisition device"
@@ -107,9 +107,7 @@ def _check_delivery(resting: RestingInputs, row: int, sensor: SensorConfig) -> I
     )
     if not resting.is_lost[row]:
         railed_percent = 100.0 * float(np.mean(np.abs(values) >= RAIL_RATIO * sensor.range))
-        remedy = (
-            "it is at the end of its range: check its cable, supply, mounting position and range"
-        )
+        remedy = "it saturates: check its cable, supply, mounting position and range"
         yield check_value("at the rail", sensor.channel, railed_percent, (0.0, 0.0), "%", remedy)
 
 

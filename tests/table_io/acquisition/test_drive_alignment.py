@@ -20,6 +20,7 @@ from table_io.config.rig import RigConfig
 from table_io.excitation.drive import Drive
 from table_io.sequencer import make_test_plan, nominal_drive
 from table_io.sim.controller import DrivePlayback
+from tests.table_io.excitation.sine_segments import sine_segments
 
 RATE = 2000.0
 LSB = 2 * 0.06 / 2**24
@@ -31,7 +32,7 @@ SLOW = {"start_hz": 0.5, "stop_hz": 0.6, "step_hz": 0.1, "cycles": 3, "direction
 def planned(sweep: dict[str, object], check: bool) -> Drive:
     profile, _ = load_config(find_config("quickstart", "tests"), Profile, "profile")
     rig, _ = load_config(find_config("follow_simulated", "rigs"), RigConfig, "card")
-    raw = profile.model_dump() | {"sweep": {**sweep, "measured_cycles": 2}}
+    raw = profile.model_dump() | {"excitation": {**sweep, "measured_cycles": 2}}
     raw["loop_check"] = {"enabled": check}
     return nominal_drive(make_test_plan(Profile.model_validate(raw), rig))
 
@@ -84,7 +85,7 @@ def test_a_drive_is_evaluated_between_its_samples(drive: Drive) -> None:
         drive,
         rate_hz=4 * RATE,
         segments=tuple(
-            replace(one, start=4 * one.start, count=4 * one.count) for one in drive.segments
+            replace(one, start=4 * one.start, count=4 * one.count) for one in sine_segments(drive)
         ),
     )
     near = fine.command(int(4 * at[0]) - 1, 4 * 400 + 2)
@@ -136,9 +137,9 @@ def test_the_soft_start_is_in_the_drive_though_it_was_seen_late(drive: Drive) ->
     now = followed(drive, one.command, sigma)
     assert now.onset is not None
     told = places(now)
-    first = int(np.ceil(BEGINS)) + drive.segments[0].start
+    first = int(np.ceil(BEGINS)) + sine_segments(drive)[0].start
     assert now.onset > first + now.chunk_samples
-    assert abs(told[first] - drive.segments[0].start - 1) <= 3
+    assert abs(told[first] - sine_segments(drive)[0].start - 1) <= 3
     end = one.place.size
     assert np.abs(told[first:end] - one.place[first:].round()).max() <= 4
 

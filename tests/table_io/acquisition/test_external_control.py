@@ -19,6 +19,7 @@ from table_io.errors import InputError
 from table_io.excitation.drive import Drive
 from table_io.records import Check, Event, FrequencyResponse, RunStart, RunStop, Trip
 from tests.table_io.acquisition.external_controller import Bystander, whole
+from tests.table_io.excitation.sine_segments import sine_segments
 
 BEGINS = 4000.37
 SWEEP = {
@@ -29,7 +30,7 @@ SWEEP = {
 
 def setup(check: bool = False, text: str = "", **changes: object) -> SessionSetup:
     profile, _ = load_config(find_config("quickstart", "tests"), Profile, "profile")
-    raw = profile.model_dump() | {"sweep": SWEEP, "loop_check": {"enabled": check}, **changes}
+    raw = profile.model_dump() | {"excitation": SWEEP, "loop_check": {"enabled": check}, **changes}
     path = find_config("follow_simulated", "rigs")
     rig = parse_toml(text or path.read_text(), RigConfig, "card")
     return SessionSetup(Profile.model_validate(raw), rig)
@@ -83,7 +84,7 @@ def run(
 def stopped_early(drive: Drive) -> Float1D:
     """The controller's own stop in the second step: a decay of half a second."""
     values = whole(drive)
-    at = next(one.end for one in drive.segments if one.step == 1) - 300
+    at = next(one.end for one in sine_segments(drive) if one.step == 1) - 300
     left = np.clip(1.0 - np.arange(values.size - at) / 1000.0, 0.0, 1.0)
     values[at:] *= left**3 * (10.0 + left * (-15.0 + 6.0 * left))
     return values
@@ -153,7 +154,7 @@ def test_what_protection_sees_is_in_the_record_and_the_table_goes_on() -> None:
 
 def test_a_controller_that_stops_early_is_seen_and_recorded_to_rest() -> None:
     one = run(setup(), stopped_early)
-    left = next(s.end for s in one.drive.segments if s.step == 1) - 300 + BEGINS
+    left = next(s.end for s in sine_segments(one.drive) if s.step == 1) - 300 + BEGINS
     (trip,) = [trip for trip in one.of(Trip) if trip.kind == "plan"]
     assert left - 500 <= trip.index <= trip.decided <= left + 2000
     assert "off the drive" in trip.text
@@ -168,7 +169,7 @@ def test_a_controller_that_stops_early_is_seen_and_recorded_to_rest() -> None:
 
 def test_another_drive_is_not_taken_for_ours() -> None:
     other = plan_open_loop_drive(
-        setup(sweep=SWEEP | {"start_hz": 2.6, "stop_hz": 3.4}).profile, setup().rig
+        setup(excitation=SWEEP | {"start_hz": 2.6, "stop_hz": 3.4}).profile, setup().rig
     )
     one = run(setup(), lambda _: whole(other))
     assert one.stop.verdict == "aborted"
@@ -204,7 +205,7 @@ def test_hold_and_resume_are_refused_with_words(name: str) -> None:
 @pytest.mark.parametrize(("name", "verdict"), [("stop", "stopped"), ("abort", "aborted")])
 def test_a_stop_says_where_to_stop_and_ends_the_recording(name: str, verdict: str) -> None:
     """The controller plays on: ten seconds later the recording ends, and says that it moves."""
-    long = setup(sweep=SWEEP | {"cycles": 20})
+    long = setup(excitation=SWEEP | {"cycles": 20})
     one = run(long, orders=partial(order, name, 500))
     assert one.stop.verdict == verdict
     assert any("STOP THE TABLE AT ITS CONTROLLER" in line for line in one.said("stop"))
@@ -215,7 +216,7 @@ def test_a_stop_says_where_to_stop_and_ends_the_recording(name: str, verdict: st
 
 def test_a_stop_that_is_followed_at_the_controller_is_recorded_to_rest() -> None:
     one = run(setup(), stopped_early, orders=partial(order, "stop", 500))
-    left = next(s.end for s in one.drive.segments if s.step == 1) - 300 + BEGINS
+    left = next(s.end for s in sine_segments(one.drive) if s.step == 1) - 300 + BEGINS
     assert left - 4000 < 500 * 20 < left
     assert one.stop.verdict == "stopped"
     assert one.stop.reason == "asked to stop"

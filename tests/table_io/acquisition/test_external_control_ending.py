@@ -21,6 +21,7 @@ from tests.table_io.acquisition.test_external_control import (
     setup,
     stopped_early,
 )
+from tests.table_io.excitation.sine_segments import sine_segments
 
 
 class Floating(Bystander):
@@ -46,9 +47,9 @@ def test_a_command_that_never_rests_again_ends_the_recording() -> None:
 
 
 def test_a_stop_in_the_rest_before_the_sweep_does_not_end_a_controller_that_plays_on() -> None:
-    long = setup(check=True, sweep=SWEEP | {"cycles": 12})
+    long = setup(check=True, excitation=SWEEP | {"cycles": 12})
     drive = plan_open_loop_drive(long.profile, long.rig)
-    sweep = next(one.start for one in drive.segments if one.step == 0)
+    sweep = next(one.start for one in sine_segments(drive) if one.step == 0)
     asked = round((BEGINS + sweep - 900) / 20)
     one = run(long, orders=partial(order, "stop", asked))
     assert one.stop.verdict == "stopped"

@@ -72,7 +72,7 @@ def test_a_drive_is_exported_played_followed_recorded_and_replayed(tmp_path: Pat
 
 
 def test_only_a_followed_table_is_played_by_somebody_else() -> None:
-    with pytest.raises(InputError, match="belongs to a follow card"):
+    with pytest.raises(InputError, match="--play "):
         serve_table(
             "simulated",
             None,

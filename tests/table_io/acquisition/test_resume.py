@@ -13,6 +13,7 @@ from table_io.errors import InputError
 from table_io.excitation.trajectory import plan_sweep
 from table_io.safety.preflight import compute_demands
 from table_io.sequencer import make_test_plan, nominal_drive, start_test
+from tests.table_io.excitation.sine_segments import sine_segment_at, sine_segments
 
 RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 TEXT = """
@@ -45,7 +46,7 @@ def test_it_goes_on_from_rest_at_its_step_after_a_loop_check(control: bool) -> N
     begins = int(np.flatnonzero(step == 3)[0])
     assert np.flatnonzero(label == Label.CHECK)[-1] < begins
     assert not drive.command(begins - 2000, 2000).any()  # rest, then a soft start
-    first = drive.segment_at(begins)
+    first = sine_segment_at(drive, begins)
     assert (first.level0, first.f1) == (0.0, 4.0)
 
 
@@ -57,12 +58,12 @@ def test_its_steps_are_those_of_the_whole_test() -> None:
 def test_without_a_loop_check_it_goes_on_at_its_step_too() -> None:
     none = profile().loop_check.model_copy(update={"enabled": False})
     drive = nominal_drive(make_test_plan(profile(4, loop_check=none), RIG))
-    assert {one.step for one in drive.segments} == {4, 5}
+    assert {one.step for one in sine_segments(drive)} == {4, 5}
 
 
 def test_its_plan_and_its_margins_are_those_of_what_is_driven() -> None:
     one = profile(4)
-    assert {segment.step for segment in plan_sweep(one).segments} == {4, 5}
+    assert {segment.step for segment in sine_segments(plan_sweep(one))} == {4, 5}
     rows, whole = (
         {
             row.step: row

@@ -22,6 +22,7 @@ from table_io.excitation.trajectory import plan_sweep
 from table_io.records import Event, Record, RunStart, RunStop, SampleGap, Trip
 from table_io.sim.simulated_table import SimulatedBackend
 from table_io.units import GRAVITY_M_S2
+from tests.table_io.excitation.sine_segments import sine_segment_at, sine_segments
 
 RATE = 2000.0
 A = 0.05 * GRAVITY_M_S2
@@ -290,17 +291,17 @@ def test_a_stop_changes_the_command_within_50_ms_and_ends_at_rest(after: int) ->
     items = list(session(subject, Stop(after)))
     decided = after * 20 - 1  # the newest sample when the stop was asked for
     changed = subject.changed
-    frequency = min(subject.drive.segment_at(decided + at).f0 for at in (0, 100))
-    frequency = min(frequency, subject.drive.segment_at(decided + 100).f1)
+    frequency = min(sine_segment_at(subject.drive, decided + at).f0 for at in (0, 100))
+    frequency = min(frequency, sine_segment_at(subject.drive, decided + 100).f1)
     if changed:  # a stop while the table still rests has nothing to change
         assert changed[0] - decided <= ALLOWED_DECISION * RATE
         assert subject.moved_until <= changed[0] + math.ceil(max(2 / frequency, 0.5) * RATE)
     else:
-        assert subject.drive.segments[0].start > decided + 100
+        assert sine_segments(subject.drive)[0].start > decided + 100
     assert subject.peak_acceleration() <= TAIL_PEAK
     stop = stop_record(items)
     assert (stop.verdict, stop.reason) == ("stopped", "asked to stop")
-    moved = ("running",) if decided >= subject.drive.segments[0].start else ()
+    moved = ("running",) if decided >= sine_segments(subject.drive)[0].start else ()
     assert stop.states == ("idle", "checking", "armed", *moved, "stopping", "at rest")
     assert stop.index == join_blocks(blocks(items)).end
     (event,) = (item for item in items if isinstance(item, Event) and item.kind == "stop")

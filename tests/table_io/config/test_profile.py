@@ -218,14 +218,14 @@ def test_find_knows_names_paths_and_neighbours(tmp_path: Path) -> None:
     (tmp_path / "rigs" / "simulated.toml").write_text(RIG_TEXT)
     (tmp_path / "rigs" / "big_table.toml").write_text(RIG_TEXT)
     assert find_config("simulated", "rigs", beside) == tmp_path / "rigs" / "simulated.toml"
-    with pytest.raises(InputError, match=r"did you mean 'g4_ss1'\? known: .*quickstart"):
+    with pytest.raises(InputError, match=r"did you mean 'g4_ss1'\?"):
         find_config("g4_s1", "tests")
-    with pytest.raises(
-        InputError, match=r"did you mean 'big_table'\? known: big_table, .*simulated"
-    ):
+    with pytest.raises(InputError, match=r"did you mean 'big_table'\?"):
         find_config("bigtable", "rigs", beside)
-    with pytest.raises(InputError, match=r"xyz: not found in tests; known: .*\.toml file"):
+    with pytest.raises(InputError) as raised:
         find_config("xyz", "tests")
+    assert raised.value.key == "xyz"
+    assert "quickstart" in raised.value.remedy
 
 
 @pytest.mark.parametrize("channel", sorted(CHANNEL_BY_NAME))

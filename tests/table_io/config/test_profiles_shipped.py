@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from table_io.config.base import PROFILES_DIR, find_config, load_config
-from table_io.config.profile import Profile
+from table_io.config.profile import Profile, load_profile
 from table_io.config.rig import RigConfig
-from table_io.excitation.trajectory import plan_sweep
+from table_io.excitation.trajectory import plan_excitation
 from table_io.safety.preflight import check_limits, compute_demands, list_drive_warnings
 
 SHIPPED = sorted((PROFILES_DIR / "tests").glob("*.toml"))
@@ -30,7 +30,7 @@ TOOLS = {"dwell", "track", "refine_g4"}
 
 
 def read(path: Path) -> Profile:
-    return load_config(path, Profile, "test")[0]
+    return load_profile(path)[0]
 
 
 @pytest.mark.parametrize("name", PAPER)
@@ -69,7 +69,7 @@ def test_the_files_that_users_script_against_are_there(name: str) -> None:
 
 
 def test_no_shipped_test_goes_unmentioned() -> None:
-    assert {path.stem for path in SHIPPED} == {*PAPER, "quickstart", *TOOLS}
+    assert {path.stem for path in SHIPPED} == {*PAPER, "quickstart", "record_example", *TOOLS}
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
@@ -77,7 +77,8 @@ def test_a_shipped_test_passes_its_pre_flight_without_a_warning(path: Path) -> N
     profile = read(path)
     rig = load_config(find_config(profile.rig, "rigs", path), RigConfig, "machine card")[0]
     assert find_config(profile.model, "models", path).is_file()
-    rows = compute_demands(plan_sweep(profile), profile, rig)
+    rows = compute_demands(plan_excitation(profile), profile, rig)
     check_limits(rows, profile, rig, path.name)
     assert list_drive_warnings(rows, rig) == []
-    assert len(rows) == len(profile.sweep.steps)
+    windows_and_stop = profile.plan.windows + 1
+    assert len(rows) == (len(profile.steps) or windows_and_stop)

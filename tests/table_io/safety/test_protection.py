@@ -109,13 +109,14 @@ def shaken(
 
 @cache
 def asked(drive: Drive) -> tuple[Any, ...]:
-    """Labels, command, phase and level of every sample that is measured."""
+    """Labels, command, phase, level and acceleration of every sample that is measured."""
     where = 0, drive.rest_start + 1000
     return (
         drive.labels(*where),
         drive.command(*where),
         np.unwrap(drive.phase(*where), period=1.0),
         drive.level(*where),
+        drive.demanded_acceleration(*where),
     )
 
 
@@ -129,7 +130,7 @@ def seen(values: Float2D, clipped: Any, drive: Drive, first: int, cut: int) -> O
 
 def steady(drive: Drive) -> tuple[Any, Any, Any]:
     """(phase in rad, level, frequency in Hz where it is held, else inf), (sample,) each."""
-    labels, _, phase, level = asked(drive)
+    labels, _, phase, level, _ = asked(drive)
     held = np.isin(labels[1], (Label.SETTLE, Label.MEASURE))
     f = np.where(held, np.abs(np.gradient(phase)) * RATE, np.inf)
     return 2 * np.pi * phase, level, f

@@ -209,5 +209,5 @@ def test_a_shunt_that_nobody_switched() -> None:
     rig = with_shunt(1.0)
     hand = list_stimuli(rig)[-1]
     assert find_tap_onset(hand, felt({"force_l2_n": press(0.2)}, rig)) is None
-    (line,) = evaluate_tap(hand, None, "nobody is there to ask")
-    assert (line.name, line.verdict, line.do) == ("shunt", "not tested", "nobody is there to ask")
+    (line,) = evaluate_tap(hand, None, "no operator")
+    assert (line.name, line.verdict, line.do) == ("shunt", "not tested", "no operator")

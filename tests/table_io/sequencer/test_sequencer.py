@@ -25,6 +25,7 @@ from table_io.sequencer import (
     start_test,
 )
 from table_io.units import GRAVITY_M_S2
+from tests.table_io.excitation.sine_segments import sine_segment_at, sine_segments
 
 RATE = 2000.0
 A = 0.05 * GRAVITY_M_S2
@@ -75,7 +76,7 @@ class Table:
 
 
 def _frequency(drive: Drive, index: int) -> float:
-    segment = drive.segment_at(index)
+    segment = sine_segment_at(drive, index)
     x = min(max((index - segment.start) / segment.count, 0.0), 1.0)
     return segment.f0 + (segment.f1 - segment.f0) * x**3 * (10 - 15 * x + 6 * x * x)
 
@@ -109,7 +110,7 @@ def test_the_cut_of_the_samples_changes_nothing(samples: int) -> None:
 
 def test_the_level_is_reached_at_every_step_and_frozen_while_it_is_measured() -> None:
     table = played(profile())
-    held = [one for one in table.now.drive.segments if one.cycles]
+    held = [one for one in sine_segments(table.now.drive) if one.cycles]
     assert len(held) == 6
     for segment in held:
         assert levels(table, segment) == pytest.approx(A, rel=0.02)
@@ -121,7 +122,7 @@ def test_the_level_is_reached_at_every_step_and_frozen_while_it_is_measured() ->
     assert not [one for one in table.said if isinstance(one, Event)]
     # Without control the same table is far off.
     off = played(profile({"enabled": False}))
-    least = min(float(levels(off, one)[0]) for one in off.now.drive.segments if one.cycles)
+    least = min(float(levels(off, one)[0]) for one in sine_segments(off.now.drive) if one.cycles)
     assert least < 0.75 * A
 
 
@@ -155,7 +156,7 @@ def test_a_level_that_cannot_be_reached_is_said_and_the_test_goes_on() -> None:
     assert said
     assert said[0].kind == "level"
     assert "demanded" in said[0].text
-    assert len([one for one in table.now.drive.segments if one.cycles]) == 6
+    assert len([one for one in sine_segments(table.now.drive) if one.cycles]) == 6
 
 
 def test_without_control_the_drive_is_the_plan() -> None:
@@ -169,7 +170,10 @@ def test_a_rehearsal_is_what_a_perfect_table_plays(name: str) -> None:
     test = load_config(PROFILES_DIR / "tests" / f"{name}.toml", Profile, "test")[0]
     sweep = test.sweep.model_copy(update={"stop_hz": test.sweep.start_hz + test.sweep.step_hz})
     test = test.model_copy(
-        update={"sweep": sweep, "loop_check": test.loop_check.model_copy(update={"enabled": False})}
+        update={
+            "excitation": sweep,
+            "loop_check": test.loop_check.model_copy(update={"enabled": False}),
+        }
     )
     table = played(test, gain=np.ones_like)
     assert table.now.drive == nominal_drive(make_test_plan(test, RIG, 40))

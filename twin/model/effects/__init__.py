@@ -3,10 +3,9 @@
 Other packages add effects through entry points of the group `shaketwin.effects`, each an `Effect`.
 """
 
-import difflib
 from importlib import metadata
 
-from table_io.errors import InputError
+from table_io.errors import InputError, suggest
 from twin.model.effects.bouc_wen import BOUC_WEN
 from twin.model.effects.bumper_asymmetry import BUMPER_ASYMMETRY
 from twin.model.effects.bumper_hardening import BUMPER_HARDENING
@@ -97,6 +96,4 @@ def find_effect(name: str) -> Effect:
         if effect.id == name:
             return effect
     ids = [effect.id for effect in (*EFFECTS, *plugins)]
-    matches = difflib.get_close_matches(name, ids, 1, 0.4)
-    hint = f"did you mean {matches[0]!r}?" if matches else f"known: {', '.join(ids)}"
-    raise InputError(f"effect {name!r} is unknown; {hint}")
+    raise InputError(f"effect {name!r} is unknown", remedy=suggest(name, ids))

@@ -1,11 +1,10 @@
 """Description of a physical effect: its term, its parameters, the residual of its absence."""
 
-import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-from table_io.errors import InputError
+from table_io.errors import InputError, suggest
 
 if TYPE_CHECKING:
     from twin.model.parameters import Parameters
@@ -82,9 +81,10 @@ class Effect:
         known = [parameter.name for parameter in self.parameters]
         for name in values:
             if name not in known:
-                matches = difflib.get_close_matches(name, known, 1, 0.4) or known
                 raise InputError(
-                    f"effect {self.id!r} has no parameter {name!r}; did you mean {matches[0]!r}?"
+                    f"no parameter {name!r}",
+                    where=f"effect {self.id!r}",
+                    remedy=suggest(name, known),
                 )
         for parameter in self.parameters:
             name, unit = parameter.name, parameter.unit

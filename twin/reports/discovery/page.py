@@ -22,7 +22,7 @@ MIN_DIGITS, MAX_DIGITS = 4, 8  # significant digits of a fitted value
 VERDICT_SENTENCES = {
     "none": "Model and measurement agree to within the noise.",
     "named": "The model lacks {names}.",
-    "ambiguous": "The model lacks an effect, but these recordings cannot tell which: {names}.",
+    "ambiguous": "The model lacks an effect, but these recordings do not determine which: {names}.",
     "unexplained": "The model lacks an effect, and no effect of the library explains the gap.",
 }
 SECTIONS = {

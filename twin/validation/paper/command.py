@@ -24,7 +24,7 @@ from twin.validation.paper.table import DEPARTS, make_comparison_table
 def compare_with_paper(out: Path | None, campaign_paths: list[Path], model: str | None) -> None:
     """Run the paper study and write its results into a new folder."""
     campaign = load_measured_campaign(campaign_paths) if campaign_paths else None
-    config, toml_text = read_model(model or PAPER_MODEL)
+    config, toml_text = read_model(model or PAPER_MODEL, option="--model")
     source = ModelSource(model or PAPER_MODEL, config, toml_text)
     with announce_if_slow(COMPILING_MESSAGE):
         load_paper_cases(model)["G4"].simulator.bumper_preload()

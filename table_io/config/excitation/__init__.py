@@ -1,0 +1,149 @@
+"""Kinds of the profile's [excitation]: what the table plays.
+
+A kind is an `Excitation` whose fields are the keys of its table and whose `plan(rate_hz)` says what
+is played. To add one: a file here with a class under `@register_excitation`, and its module in the
+imports of `table_io/config/profile.py`. Other packages add kinds through entry points of the group
+`shaketwin.excitations`: the name is the kind, the value the class.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib import metadata
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+from pydantic import Field
+
+from table_io.block import Float1D
+from table_io.config.base import ConfigModel, Count
+from table_io.errors import InputError, suggest
+from table_io.records import Step
+
+ENTRY_POINT_GROUP = "shaketwin.excitations"
+DEFAULT_KIND = "stepped_sine"
+MIN_BLEND_CYCLES = 1.5  # between two steady sine motions
+BAND_ENERGY_SHARES = 0.05, 0.95  # of the acceleration, below the ends of the band of a history
+MAX_REST_RATIO = 1e-3  # of the peaks of a history: largest motion at its ends
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExcitationPlan:
+    """What an excitation plays: held sine steps, or a displacement history.
+
+    `steps` are approached, tuned and measured one by one. Without steps `history_m`, (sample,), is
+    played as it is, from rest to rest, open loop and without a phase, in `windows` equal parts. The
+    loop check takes its motions from the peak table acceleration and the frequency band.
+    """
+
+    level_m_s2: float
+    low_hz: float
+    high_hz: float
+    steps: tuple[Step, ...] = ()
+    history_m: Float1D = field(default_factory=lambda: np.empty(0))
+    windows: int = 0
+    blend_cycles: float = MIN_BLEND_CYCLES
+
+
+class Excitation(ConfigModel):
+    """Base class of every kind.
+
+    FILE_KEYS are its keys that name a file next to the profile. Loading reads them: a kind that has
+    some also has the field `files`, which then holds their texts by name.
+    """
+
+    kind: str = DEFAULT_KIND
+    FILE_KEYS: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def select_class(cls, table: Mapping[str, Any]) -> "type[Excitation]":
+        """Return the class of the table's kind; ValueError lists the known kinds."""
+        return find_excitation(table.get("kind", DEFAULT_KIND))
+
+    @abstractmethod
+    def plan(self, rate_hz: float) -> ExcitationPlan:
+        """Return what is played at a sampling rate."""
+        raise NotImplementedError
+
+
+class History(Excitation):
+    """Base class of the kinds that play a displacement history: they return it in m."""
+
+    windows: Count = Field(8, ge=1, le=1000, description="Equal parts in time, for the results.")
+
+    @abstractmethod
+    def displacement(self, rate_hz: float) -> Float1D:
+        """Return the displacement in m, right positive, at rest at both ends, (sample,)."""
+        raise NotImplementedError
+
+    def plan(self, rate_hz: float) -> ExcitationPlan:
+        """Return the history with its peak acceleration and band; InputError if it has no rest."""
+        history = np.ascontiguousarray(self.displacement(rate_hz), dtype=np.float64)
+        where = f"excitation {self.kind!r}"
+        if history.size <= self.windows or not np.isfinite(history).all() or not history.any():
+            raise InputError("its history is empty, at rest throughout, or not finite", where=where)
+        steps = np.abs(np.diff(history))
+        ends = max(abs(history[0]), abs(history[-1])), max(steps[0], steps[-1])
+        if ends[0] > MAX_REST_RATIO * np.abs(history).max() or ends[1] > 0.1 * steps.max():
+            raise InputError(
+                "its history does not begin and end at rest",
+                where=where,
+                remedy="blend it in and out",
+            )
+        acceleration = history_acceleration(history, rate_hz)
+        low_hz, high_hz = _find_band(acceleration, rate_hz)
+        level = float(np.abs(acceleration).max())
+        return ExcitationPlan(level, low_hz, high_hz, history_m=history, windows=self.windows)
+
+
+def history_acceleration(history_m: Float1D, rate_hz: float) -> Float1D:
+    """Return the acceleration in m/s2 of a displacement history with rest around it, (sample,)."""
+    return np.diff(history_m, 2, prepend=history_m[:1], append=history_m[-1:]) * rate_hz**2
+
+
+def _find_band(acceleration: Float1D, rate_hz: float) -> tuple[float, float]:
+    """Return the frequencies in Hz below which 5 % and 95 % of the energy lie."""
+    energy = np.cumsum(np.abs(np.fft.rfft(acceleration)) ** 2)
+    low, high = np.searchsorted(energy, np.multiply(BAND_ENERGY_SHARES, energy[-1])) + 0.5
+    resolution_hz = rate_hz / acceleration.size
+    return float(low * resolution_hz), float(high * resolution_hz)
+
+
+EXCITATIONS: dict[str, type[Excitation]] = {}
+ExcitationT = TypeVar("ExcitationT", bound=type[Excitation])
+
+
+def register_excitation(kind: str) -> Callable[[ExcitationT], ExcitationT]:
+    """Return a class decorator that registers an excitation under its kind."""
+
+    def register(excitation: ExcitationT) -> ExcitationT:
+        EXCITATIONS[kind] = excitation
+        return excitation
+
+    return register
+
+
+def find_excitation(kind: object) -> type[Excitation]:
+    """Return the class of a kind, built-in before plug-in; ValueError lists the known kinds."""
+    if kind in EXCITATIONS:
+        return EXCITATIONS[str(kind)]
+    plugins = metadata.entry_points(group=ENTRY_POINT_GROUP)
+    for entry in plugins:
+        if entry.name == kind:
+            return _load_plugin(entry)
+    known = [*EXCITATIONS, *(entry.name for entry in plugins)]
+    raise ValueError(f"kind {kind!r} is unknown; {suggest(str(kind), known)}")
+
+
+def _load_plugin(entry: metadata.EntryPoint) -> type[Excitation]:
+    """Load the kind of an installed package; InputError if it is not an excitation."""
+    label, remedy = f"plug-in {entry.value} of {ENTRY_POINT_GROUP}", "fix or remove the package"
+    try:
+        excitation = entry.load()
+    except Exception as error:  # a plug-in module may raise anything
+        raise InputError(f"cannot load: {error}", where=label, remedy=remedy) from error
+    if not (isinstance(excitation, type) and issubclass(excitation, Excitation)):
+        raise InputError(
+            f"expected a subclass of Excitation, got {excitation!r}", where=label, remedy=remedy
+        )
+    return excitation
