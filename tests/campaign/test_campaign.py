@@ -193,7 +193,7 @@ def test_a_table_that_keeps_its_own_time_is_refused_at_full_speed(
     )
     with pytest.raises(InputError) as error:
         run_campaign(asked(folder))
-    assert "--speed = 'max'" in str(error.value)  # of each profile, in one message
+    assert "--speed max" in str(error.value)  # of each profile, in one message
     assert not (folder / "out").exists()
 
 

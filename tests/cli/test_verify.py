@@ -86,7 +86,7 @@ def test_a_whole_log_is_whole(log: Path, recording: Recording) -> None:
     code, found = verify(log)
     assert (code, found["sound"]) == (0, True)
     assert found["damage"] == found["gaps"] == found["altered"] == []
-    assert (found["content"], found["schema"]) == ("same", 2)
+    assert (found["content"], found["schema"]) == ("same", 3)
     assert found["samples"]["acquired"] == 1000
     assert found["topics"]["/rig/meas"] == {"messages": 50, "missing": 0}
     assert found["replay"] == {"possible": True, "identical": True, "because": []}

@@ -153,6 +153,6 @@ def test_no_folder_is_named_by_a_peer_that_sends_no_run(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     where = gate(run=run)
-    with pytest.raises(InputError, match=rf"no test runs there on rig '{RIG}'.*--rig NAME"):
+    with pytest.raises(InputError, match=rf"'{RIG}'.*--rig"):
         join_as_recorder(where, RIG, None, None)
     assert not list(tmp_path.iterdir())

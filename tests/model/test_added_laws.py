@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
 from tests.identification.played import SNM, hidden, log
 from tests.model import laboratory_laws
@@ -192,7 +193,7 @@ def test_a_law_that_cannot_work_is_told_why(effect, problem):
 
 def test_commands_take_it(package, tmp_path):
     """`simulate` with both kinds of law, in a process that finds the installed package."""
-    snm_file = (Path(__file__).parents[2] / "profiles/models/snm.toml").read_text()
+    snm_file = (PROFILES_DIR / "models" / "snm.toml").read_text()
     model = tmp_path / "model.toml"
     model.write_text(
         snm_file
@@ -204,7 +205,10 @@ def test_commands_take_it(package, tmp_path):
         f"import sys; sys.path.insert(0, {str(package)!r}); from twin.cli.main import main; "
         f"sys.exit(main())"
     )
-    arguments = ["simulate", "quickstart", "--model", str(model), "--out", str(tmp_path / "out")]
+    profile = tmp_path / "short.toml"
+    quickstart = (PROFILES_DIR / "tests" / "quickstart.toml").read_text()
+    profile.write_text(quickstart.replace("start_hz = 2.4", "start_hz = 4.2"))
+    arguments = ["simulate", str(profile), "--model", str(model), "--out", str(tmp_path / "out")]
     done = subprocess.run(
         [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False
     )

@@ -157,7 +157,7 @@ def test_only_a_twin_publishes_and_only_what_a_twin_computes(
 def test_a_command_bears_the_name_of_who_gives_it(person: Any, who: str) -> None:
     session = person(who)
     (answer,) = answers(session, f"cmd/stop/{who}")
-    assert (b"this takes the role command" in answer) == (PEOPLE[who] != "command")
+    assert (b"need the role command" in answer) == (PEOPLE[who] != "command")
     others = [other for other in PEOPLE if other != who]
     for forged in (*others, "*", f"{who}/{who}", f"{who}$*", "rig"):
         assert answers(session, f"cmd/stop/{forged}") == []

@@ -199,7 +199,7 @@ def test_a_refusal_says_which_it_is_and_what_to_do(what: str, doors: Doors) -> N
 
 @pytest.mark.parametrize("who", ["bob", "rec", "tina"])
 def test_an_order_without_the_role_is_refused_by_name_and_role(doors: Doors, who: str) -> None:
-    with pytest.raises(InputError, match=f"{who} has the role .*; this takes the role command"):
+    with pytest.raises(InputError, match=f"{who} has the role .*need the role command"):
         send_command("stop", "", doors.keyed, RIG, doors.keys(who))
 
 

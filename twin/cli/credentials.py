@@ -357,7 +357,7 @@ def print_router_settings(folder: Path, name: str, listen: str, rig: str) -> Non
         raise InputError(
             f"{name} is not a router",
             where=folder / ACCESS_FILE,
-            remedy=f"{suggest(name, routers)} or add one: shaketwin keys add {folder} NAME "
+            remedy=f"{suggest(name, routers)}; or add one: shaketwin keys add {folder} NAME "
             "--role router --host HOST",
         )
     check_endpoint(rig, listen, has_keys=True)
