@@ -1,6 +1,7 @@
 """One thread for matrices, as in a run; and a short run with a jump, for who needs a recording."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,6 +40,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.get_closest_marker("slow"):
             item.add_marker(pytest.mark.timeout(SLOW_TIMEOUT_S))
+
+
+@pytest.fixture(autouse=True)
+def forget_entry_points() -> Iterator[None]:
+    """Scan the installed packages anew: a test may install some, which no other sees."""
+    from table_io.config.plugins import list_entry_points
+
+    list_entry_points.cache_clear()
+    yield
+    list_entry_points.cache_clear()
 
 
 @pytest.fixture(scope="session")

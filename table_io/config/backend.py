@@ -4,12 +4,11 @@ A backend registers under its name in the entry-point group `shaketwin.backends`
 imported when a rig file names it, not before.
 """
 
-from collections.abc import Mapping, Sequence
 from functools import cache
-from importlib import metadata
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from table_io.config.base import ConfigModel
+from table_io.config.plugins import list_entry_points, load_entry_point
 from table_io.errors import InputError
 
 if TYPE_CHECKING:
@@ -55,39 +54,6 @@ class InstalledBackend(Protocol):
     def is_simulated(self) -> bool: ...
     @property
     def external_control(self) -> bool: ...
-
-
-@cache
-def list_entry_points(group: str) -> Mapping[str, Sequence[metadata.EntryPoint]]:
-    """Return the entry points of a group by name, sorted; several if packages use one name."""
-    entries: dict[str, list[metadata.EntryPoint]] = {}
-    for entry in sorted(metadata.entry_points(group=group), key=lambda entry: entry.name):
-        entries.setdefault(entry.name, []).append(entry)
-    return entries
-
-
-def load_entry_point(group: str, name: str) -> Any:
-    """Import the object registered under `name`, None if there is none; InputError if it fails."""
-    entries = list_entry_points(group).get(name)
-    if entries is None:
-        return None
-    entry, *others = entries
-    if others:
-        raise InputError(
-            f"provided by {entry.value} and by {', '.join(other.value for other in others)}",
-            where=group,
-            key=name,
-            remedy="remove all but one of these packages",
-        )
-    try:
-        return entry.load()
-    except Exception as error:  # a plug-in module may raise anything
-        raise InputError(
-            f"cannot load {entry.value}: {type(error).__name__}: {error}",
-            where=group,
-            key=name,
-            remedy="fix or remove the package",
-        ) from error
 
 
 @cache

@@ -18,10 +18,11 @@ from pydantic import (
 from pydantic_core import InitErrorDetails
 
 from table_io.channels import CHANNEL_BY_NAME, Channel
-from table_io.config.backend import BACKEND_GROUP, BackendConfig, list_entry_points, load_backend
+from table_io.config.backend import BACKEND_GROUP, BackendConfig, load_backend
 from table_io.config.base import ConfigModel, Number, Positive
 from table_io.config.calibration_record import CalibrationRecord
 from table_io.config.channel import ChannelConfig
+from table_io.config.plugins import list_entry_points
 from table_io.config.sensor import SensorConfig, check_sensor_unit
 from table_io.errors import InputError, suggest
 

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from table_io.block import Float1D
 from table_io.clock import Clock
-from table_io.config.backend import REINSTALL, list_entry_points, load_entry_point
+from table_io.config.backend import REINSTALL
+from table_io.config.plugins import list_entry_points, load_entry_point
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError

@@ -53,7 +53,7 @@ def plugged(monkeypatch, *effects):
 
     class Entry:
         def __init__(self, effect):
-            self.effect, self.value = effect, "their.module:EFFECT"
+            self.effect, self.name, self.value = effect, "theirs", "their.module:EFFECT"
 
         def load(self):
             if isinstance(self.effect, Exception):

@@ -201,6 +201,7 @@ def test_a_plug_in_effect_is_played_like_any_other(
 
     @dataclass
     class Entry:
+        name: str = "mine"
         value: str = "mine:CUBIC"
 
         def load(self) -> Effect:

@@ -17,8 +17,9 @@ from rich.table import Table
 from table_io.backends import check_reachable, get_descriptor
 from table_io.backends.discovery import DeviceSearch, DiscoveredDevice
 from table_io.clock import RealClock
-from table_io.config.backend import BACKEND_GROUP, list_entry_points
+from table_io.config.backend import BACKEND_GROUP
 from table_io.config.base import PROFILES_DIR
+from table_io.config.plugins import list_entry_points
 from table_io.config.rig import RigConfig
 from table_io.config.rig_file import load_rig
 from table_io.errors import InputError

@@ -98,15 +98,21 @@ def _add_law(
 ) -> Any:
     """Return the laws `before` and one more, whose parameters and states begin at these numbers."""
     p, n = first_parameter, first_state
+    P, S = LAW_PARAMETERS, LAW_STATES
 
     def laws(place, q, w, s, c):  # type: ignore[no-untyped-def]
         total = before(place, q, w, s, c)
         if place != own_place:
             return total
-        own_s = (s[n % 6], s[(n + 1) % 6], s[(n + 2) % 6], s[(n + 3) % 6], s[(n + 4) % 6],
-                 s[(n + 5) % 6])  # fmt: skip
-        own_c = (c[p], c[(p + 1) % 8], c[(p + 2) % 8], c[(p + 3) % 8], c[(p + 4) % 8],
-                 c[(p + 5) % 8], c[(p + 6) % 8], c[(p + 7) % 8])  # fmt: skip
+        # Numba unpacks no tuples: all states and parameters in turn, from the law's own on.
+        own_s = (
+            s[n % S], s[(n + 1) % S], s[(n + 2) % S], s[(n + 3) % S], s[(n + 4) % S],
+            s[(n + 5) % S],
+        )  # fmt: skip
+        own_c = (
+            c[p % P], c[(p + 1) % P], c[(p + 2) % P], c[(p + 3) % P], c[(p + 4) % P],
+            c[(p + 5) % P], c[(p + 6) % P], c[(p + 7) % P],
+        )  # fmt: skip
         own = rates(q, w, own_s, own_c)
         return (
             total[0] + force(q, w, own_s, own_c),

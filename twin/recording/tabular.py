@@ -162,9 +162,9 @@ def _read_log_table(path: Path, scratch_files: dict[str, _ScratchFile]) -> LogTa
     problems: list[str] = []
 
     for message in iter_messages(path):
-        is_kept = issubclass(TOPIC_TYPES.get(message.topic, object), (Block, *KEPT_RECORDS))
-        items = [message.payload] if is_kept else []
-        for item in iter_valid_items(message.topic, items, start, problems):
+        if not issubclass(TOPIC_TYPES.get(message.topic, object), (Block, *KEPT_RECORDS)):
+            continue
+        for item in iter_valid_items(message.topic, [message.payload], start, problems):
             if isinstance(item, Block):
                 scratch_files[message.topic].add(item, path)
             else:

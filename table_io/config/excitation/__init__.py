@@ -9,7 +9,7 @@ imports of `table_io/config/profile.py`. Other packages add kinds through entry 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib import metadata
+from importlib.metadata import EntryPoint
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -17,6 +17,7 @@ from pydantic import Field
 
 from table_io.block import Float1D
 from table_io.config.base import ConfigModel, Count
+from table_io.config.plugins import list_entry_points, load_entry, make_plugin_error
 from table_io.errors import InputError, suggest
 from table_io.records import Step
 
@@ -127,23 +128,16 @@ def find_excitation(kind: object) -> type[Excitation]:
     """Return the class of a kind, built-in before plug-in; ValueError lists the known kinds."""
     if kind in EXCITATIONS:
         return EXCITATIONS[str(kind)]
-    plugins = metadata.entry_points(group=ENTRY_POINT_GROUP)
-    for entry in plugins:
-        if entry.name == kind:
-            return _load_plugin(entry)
-    known = [*EXCITATIONS, *(entry.name for entry in plugins)]
-    raise ValueError(f"kind {kind!r} is unknown; {suggest(str(kind), known)}")
+    plugins = list_entry_points(ENTRY_POINT_GROUP)
+    if kind in plugins:
+        return _load_plugin(plugins[str(kind)][0])
+    raise ValueError(f"kind {kind!r} is unknown; {suggest(str(kind), [*EXCITATIONS, *plugins])}")
 
 
-def _load_plugin(entry: metadata.EntryPoint) -> type[Excitation]:
+def _load_plugin(entry: EntryPoint) -> type[Excitation]:
     """Load the kind of an installed package; InputError if it is not an excitation."""
-    label, remedy = f"plug-in {entry.value} of {ENTRY_POINT_GROUP}", "fix or remove the package"
-    try:
-        excitation = entry.load()
-    except Exception as error:  # a plug-in module may raise anything
-        raise InputError(f"cannot load: {error}", where=label, remedy=remedy) from error
+    excitation = load_entry(entry, ENTRY_POINT_GROUP)
     if not (isinstance(excitation, type) and issubclass(excitation, Excitation)):
-        raise InputError(
-            f"expected a subclass of Excitation, got {excitation!r}", where=label, remedy=remedy
-        )
+        problem = f"expected a subclass of Excitation, got {excitation!r}"
+        raise make_plugin_error(entry, ENTRY_POINT_GROUP, problem)
     return excitation

@@ -14,8 +14,9 @@ import pytest
 
 from table_io.backends import find_descriptor, open_backend, open_source
 from table_io.clock import ManualClock
-from table_io.config.backend import BACKEND_GROUP, list_entry_points, load_backend
+from table_io.config.backend import BACKEND_GROUP, load_backend
 from table_io.config.base import PROFILES_DIR, load_config, parse_toml
+from table_io.config.plugins import list_entry_points
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.config.rig_file import load_rig

@@ -3,8 +3,9 @@
 Other packages add effects through entry points of the group `shaketwin.effects`, each an `Effect`.
 """
 
-from importlib import metadata
+from itertools import chain
 
+from table_io.config.plugins import list_entry_points, load_entry, make_plugin_error
 from table_io.errors import InputError, suggest
 from twin.model.effects.bouc_wen import BOUC_WEN
 from twin.model.effects.bumper_asymmetry import BUMPER_ASYMMETRY
@@ -50,23 +51,14 @@ EFFECTS: tuple[Effect, ...] = (
 def load_plugins() -> tuple[Effect, ...]:
     """Load the effects that installed packages add; InputError names an unusable one."""
     plugins = []
-    for entry in metadata.entry_points(group=ENTRY_POINT_GROUP):
-        label = f"plug-in {entry.value} of {ENTRY_POINT_GROUP}"
-        try:
-            effect = entry.load()
-        except Exception as error:  # a plug-in module may raise anything
-            raise InputError(
-                f"cannot load: {error}", where=label, remedy="fix or remove the package"
-            ) from error
+    for entry in chain.from_iterable(list_entry_points(ENTRY_POINT_GROUP).values()):
+        effect = load_entry(entry, ENTRY_POINT_GROUP)
         if not isinstance(effect, Effect):
-            raise InputError(
-                f"expected an Effect, got {type(effect).__name__}",
-                where=label,
-                remedy="fix or remove the package",
-            )
-        problem = _find_plugin_problem(effect)
+            problem = f"expected an Effect, got {type(effect).__name__}"
+        else:
+            problem = _find_plugin_problem(effect)
         if problem:
-            raise InputError(problem, where=label, remedy="fix or remove the package")
+            raise make_plugin_error(entry, ENTRY_POINT_GROUP, problem)
         plugins.append(effect)
     return tuple(plugins)
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 from twin.model.effects.effect import Effect
 
@@ -55,8 +56,12 @@ def evaluate_law(
     return lambda q, w, s: law(q, w, s, c), lambda q, w, s: law_rates(q, w, s, c)
 
 
+@cache
 def find_law_problem(effect: Effect) -> str:
-    """Return what is wrong with the law of an effect, "" if nothing; calls it in plain Python."""
+    """Return what is wrong with the law of an effect, "" if nothing; calls it in plain Python.
+
+    Cached: a fit looks its effects up for every set of parameters.
+    """
     if effect.force is None:
         return "acts as a force but has no `force` function"
     if effect.place not in PLACES:
