@@ -187,6 +187,17 @@ class RigConfig(ConfigModel):
         sections = self.sections.values()
         return next((section for section in sections if isinstance(section, model)), None)
 
+    def require_section(self, name: str, model: type[SectionT]) -> SectionT:
+        """Return the section `name` of this config model; InputError if the rig file has none."""
+        section = self.get_section(model)
+        if section is None:
+            raise InputError(
+                f"no [{name}] table",
+                where=f"rig {self.name}",
+                remedy="add it, or give another rig file",
+            )
+        return section
+
     @property
     def runs_at_any_speed(self) -> bool:
         """True if any clock may pace the machine: it is simulated in the process of the rig."""

@@ -106,13 +106,7 @@ class SimulatedBackend:
     """Backend of the simulated table; sample i is taken at start + i / rate_hz."""
 
     def __init__(self, rig: RigConfig, specimen: Specimen, rate_hz: float, clock: Clock) -> None:
-        table = rig.get_section(SimulatedTableConfig)
-        if table is None:
-            raise InputError(
-                "the rig file has no section [simulated]",
-                where=f"rig {rig.name}",
-                remedy="add it, or choose another backend",
-            )
+        table = rig.require_section("simulated", SimulatedTableConfig)
         self.channels = rig.channels
         self.rate_hz = rate_hz
         self.replace_after = round(MIN_REPLACE_AHEAD_S * rate_hz)

@@ -62,13 +62,7 @@ class MachineBackend:
     """Controller's side of one connection to the machine."""
 
     def __init__(self, rig: RigConfig, specimen: Specimen, rate_hz: float, clock: Clock) -> None:
-        machine = rig.get_section(MachineConfig)
-        if machine is None:
-            raise InputError(
-                "no [machine] table",
-                where=f"rig {rig.name}",
-                remedy="add it, or set another backend",
-            )
+        machine = rig.require_section("machine", MachineConfig)
         self.channels = rig.channels
         self.rate_hz = rate_hz
         self.replace_after = round(REPLACE_AFTER_S * rate_hz)

@@ -32,11 +32,7 @@ def check_reachable(rig: RigConfig) -> None:
 
 def require_ni_wiring(rig: RigConfig) -> NiWiring:
     """Return the [ni] wiring of a rig; InputError if it does not match the sensors."""
-    wiring = rig.get_section(NiWiring)
-    if wiring is None:
-        raise InputError(
-            "no [ni] table", where=f"rig {rig.name}", remedy="add it, or set another backend"
-        )
+    wiring = rig.require_section("ni", NiWiring)
     inputs = {analog_input.channel for analog_input in wiring.inputs}
     for names, problem in (
         (set(rig.channels) - inputs, "no input for sensor"),

@@ -114,8 +114,7 @@ def verify_output_replacement(rig: RigConfig, tasks: RigTasks, rate_hz: float) -
     Raises InputError if the device holds more output than the rig file states, or if the command
     wired back does not show the pulse. The tasks cannot be used again afterwards.
     """
-    wiring = rig.get_section(NiWiring)
-    assert wiring is not None
+    wiring = rig.require_section("ni", NiWiring)
     required_lead = replace_after_samples(rig, rate_hz)
     count = round((BASELINE_S + BUFFER_S / 4) * rate_hz)
     tasks.write(0, np.zeros(count))
@@ -179,8 +178,7 @@ def _verify_nudge(
 
 def replace_after_samples(rig: RigConfig, rate_hz: float) -> int:
     """Return the number of samples after the newest taken one that cannot be replaced safely."""
-    wiring = rig.get_section(NiWiring)
-    assert wiring is not None
+    wiring = rig.require_section("ni", NiWiring)
     return wiring.device_buffer_samples(rate_hz) + round(WRITE_TRANSIT_S * rate_hz)
 
 

@@ -67,8 +67,7 @@ class RigTasks:
 
     def _configure(self) -> None:
         rig, rate = self._rig, self._rate_hz
-        wiring = rig.get_section(NiWiring)
-        assert wiring is not None
+        wiring = rig.require_section("ni", NiWiring)
         inputs = {analog_input.channel: analog_input for analog_input in wiring.inputs}
         for sensor in rig.sensors:
             analog_input, full_scale_v = (
@@ -164,8 +163,7 @@ class RigTasks:
 
 def session_name(rig: RigConfig, kind: str) -> str:
     """Return the session name of a task; it depends on the device, not on the name of the rig."""
-    wiring = rig.get_section(NiWiring)
-    assert wiring is not None
+    wiring = rig.require_section("ni", NiWiring)
     return f"shaketwin_{wiring.output.split('/')[0]}_{kind}"
 
 

@@ -42,13 +42,7 @@ UNIT_SYNONYMS = {
 
 def require_opendaq_wiring(rig: RigConfig) -> OpenDaqWiring:
     """Return the [opendaq] wiring; InputError if it is incomplete or the library is missing."""
-    wiring = rig.get_section(OpenDaqWiring)
-    if wiring is None:
-        raise InputError(
-            "no [opendaq] table",
-            where=f"rig {rig.name}",
-            remedy="add it, with the signal of each sensor",
-        )
+    wiring = rig.require_section("opendaq", OpenDaqWiring)
     missing = [name for name in rig.channels if name not in wiring.signals]
     if missing:
         raise InputError(

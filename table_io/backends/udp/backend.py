@@ -46,11 +46,7 @@ class UdpBackend:
     """Rig's side of one connection to the target."""
 
     def __init__(self, rig: RigConfig, specimen: Specimen, rate_hz: float, clock: Clock) -> None:
-        wiring = rig.get_section(UdpWiring)
-        if wiring is None:
-            raise InputError(
-                "no [udp] table", where=f"rig {rig.name}", remedy="add it, or set another backend"
-            )
+        wiring = rig.require_section("udp", UdpWiring)
         self.channels = rig.channels
         self.rate_hz = rate_hz
         self.replace_after = math.ceil(wiring.replace_after_ms * 1e-3 * rate_hz)

@@ -51,12 +51,7 @@ class SimulatedMachine:
     def __init__(
         self, rig: RigConfig, notify: Callable[[str], None], recorder: FlightRecorder | None = None
     ) -> None:
-        if rig.get_section(SimulatedTableConfig) is None:
-            raise InputError(
-                "no [simulated] table, so there is no plant to simulate",
-                where=f"rig {rig.name}",
-                remedy="add it, or give another rig file",
-            )
+        rig.require_section("simulated", SimulatedTableConfig)  # there is a plant to simulate
         self.rig = rig
         self.latched_reason = ""  # why the last controller was lost
         self.notify = notify

@@ -66,8 +66,7 @@ class ServerEndpoint:
 
 def serve_ni_table(service: TableService) -> None:
     """Serve the device of a rig file."""
-    wiring = service.rig.get_section(NiWiring)
-    assert wiring is not None  # the rig's own section
+    wiring = service.rig.require_section("ni", NiWiring)
     with contextlib.closing(ServerEndpoint(wiring)) as endpoint:
         machine = service.make_machine()
         service.begin(wiring.endpoint)

@@ -40,8 +40,7 @@ def bind_socket(address: Address) -> socket.socket:
 
 def serve_udp_table(service: TableService) -> None:
     """Serve the target of a rig file."""
-    wiring = service.rig.get_section(UdpWiring)
-    assert wiring is not None  # the rig's own section
+    wiring = service.rig.require_section("udp", UdpWiring)
     with contextlib.closing(bind_socket(wiring.address)) as server_socket:
         machine = service.make_machine()
         service.begin(wiring.target)
