@@ -1,0 +1,117 @@
+"""Contracts of summary.json and verdict.json: only their keys are written, each is described."""
+
+import copy
+from dataclasses import fields
+from typing import Any
+
+import pytest
+from pydantic import BaseModel, ValidationError
+
+from table_io.records import Check, Fault, NormalizedResponse, Timing, Trip
+from twin.compare.curves import Hysteresis, PrcJump
+from twin.reports import contracts
+from twin.reports.contracts import RunSummary, SummaryKeys, Verdict, build_json_schema
+from twin.reports.summary import dump_contract, dump_strict_json
+
+NAN = float("nan")
+INTERVAL = {"value": 60.0, "low": 58.0, "high": NAN, "unit": "N"}
+VERDICT: dict[str, Any] = {
+    "verdict": "named", "why": "the residual is noise",
+    "effects": [
+        {"id": "coulomb_friction", "confidence": 0.9, "parameters": {"fc": INTERVAL},
+         "slip_speed": INTERVAL},
+    ],
+    "ambiguous": [], "candidates": [{"id": "gap_drift", "held_out_error": 2, "converged": True}],
+    "where": {"frequency_hz": (2.8, 4.4), "direction": "both", "phase": "all",
+              "channels": ["damper"], "harmonics": [1, 3]},
+    "gap": {"metric": "rms", "before": 9.0, "after": 1.0, "noise_floor": 1.0,
+            "held_out_before": 9.0, "held_out_after": 1.0, "closed_fraction": 1.0},
+    "remainder": {"unexplained": False, "evidence": None},
+    "base": {"stiffness": INTERVAL}, "fell_away": {}, "notes": (), "next_run": "none",
+    "seconds": 1.0, "held_out_logs": [],
+}  # fmt: skip
+
+
+def properties(schema: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    """(object, its properties) of a schema and all objects in it."""
+    return [
+        (name, part["properties"])
+        for name, part in {**schema["$defs"], "file": schema}.items()
+        if "properties" in part
+    ]
+
+
+def test_a_verdict_is_written_as_it_is() -> None:
+    assert dump_contract(Verdict, VERDICT) == dump_strict_json(VERDICT)
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("extra",), 1),
+        (("gap", "extra"), 1.0),
+        (("effects", 0, "parameters", "fc", "extra"), 1.0),
+        (("verdict",), "perhaps"),
+        (("seconds",), "1.0"),
+        (("seconds",), NAN),
+        (("where", "frequency_hz"), (2.8,)),
+        (("candidates", 0, "converged"), 1),
+    ],
+)
+def test_what_is_unknown_or_of_another_type_is_not_written(
+    path: tuple[Any, ...], value: Any
+) -> None:
+    content = copy.deepcopy(VERDICT)
+    target: Any = content
+    for key in path[:-1]:
+        target = target[key]
+    target[path[-1]] = value
+    with pytest.raises(ValidationError) as error:
+        dump_contract(Verdict, content)
+    assert error.value.errors()[0]["loc"][: len(path)] == path
+
+
+@pytest.mark.parametrize("key", VERDICT)
+def test_without_one_of_its_keys_it_is_not_written(key: str) -> None:
+    with pytest.raises(ValidationError) as error:
+        dump_contract(Verdict, {name: value for name, value in VERDICT.items() if name != key})
+    assert [(e["loc"], e["type"]) for e in error.value.errors()] == [((key,), "missing")]
+
+
+def test_a_summary_of_another_version_is_read() -> None:
+    step = {"index": 0, "direction": "forward", "frequency_hz": 2.0, "later": 1}
+    SummaryKeys.model_validate({"run": {"x": 1}, "verdict": "complete", "steps": [step], "y": 2})
+    with pytest.raises(ValidationError):
+        SummaryKeys.model_validate({"run": {}, "verdict": "complete", "steps": [{"index": 0}]})
+
+
+@pytest.mark.parametrize("contract", [RunSummary, Verdict])
+def test_a_schema_describes_every_key_and_gives_a_unit_to_every_number(
+    contract: type[BaseModel],
+) -> None:
+    schema = build_json_schema(contract)
+    assert schema["$schema"].startswith("https://json-schema.org/")
+    assert schema["additionalProperties"] is False
+    for name, keys in properties(schema):
+        for key, part in keys.items():
+            assert part["description"], (name, key)
+            types = {part.get("type"), *(kind.get("type") for kind in part.get("anyOf", ()))}
+            assert "number" not in types or "unit" in part or "unit" in keys, (name, key)
+
+
+@pytest.mark.parametrize(
+    ("contract", "record", "without"),
+    [
+        (contracts.Response, NormalizedResponse, set()),
+        (contracts.FaultEntry, Fault, set()),
+        (contracts.CheckEntry, Check, set()),
+        (contracts.TripEntry, Trip, set()),
+        (contracts.Jump, PrcJump, set()),
+        (contracts.HysteresisInterval, Hysteresis, set()),
+        (contracts.ComponentTiming, Timing, {"component"}),
+    ],
+)
+def test_what_is_written_from_a_record_has_its_fields(
+    contract: type[BaseModel], record: Any, without: set[str]
+) -> None:
+    assert contract.model_fields.keys() == {field.name for field in fields(record)} - without

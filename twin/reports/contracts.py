@@ -1,0 +1,457 @@
+"""Contracts of summary.json and verdict.json: each key with its meaning and its unit.
+
+The writers accept nothing else (`twin.reports.summary.dump_contract`). A number that is not finite
+is null in a file, as JSON has no NaN.
+"""
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+def _declare_unit(unit: str) -> Any:
+    """Return the annotation that adds a unit to the schema of a number."""
+    return Field(json_schema_extra={"unit": unit})
+
+
+Number = float | None
+Ratio = Annotated[Number, _declare_unit("1")]
+Metres = Annotated[Number, _declare_unit("m")]
+Acceleration = Annotated[Number, _declare_unit("m/s2")]
+Seconds = Annotated[float, _declare_unit("s")]
+Milliseconds = Annotated[Number, _declare_unit("ms")]
+Hertz = Annotated[float, _declare_unit("Hz")]
+Index = Annotated[int, _declare_unit("sample")]
+SI = Annotated[Number, _declare_unit("SI unit of the quantity")]
+Direction = Literal["forward", "backward"]
+
+
+class Contract(BaseModel):
+    """Object with exactly these keys; those with a default may be absent."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+def build_json_schema(contract: type[BaseModel]) -> dict[str, Any]:
+    """Build the JSON Schema (draft 2020-12) of a contract."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **contract.model_json_schema(),
+    }
+
+
+class RunInfo(Contract):
+    """Origin and length of a recording."""
+
+    id: str = Field(description="unique name of the run")
+    name: str = Field(description="name of its profile")
+    title: str = Field(description="title in the profile")
+    source: str = Field(description="origin of the measured samples: table or model")
+    started_at: str = Field(description="local time, ISO 8601")
+    host: str = Field(description="computer that recorded it")
+    rate_hz: Hertz = Field(description="sampling rate")
+    samples: Index = Field(description="length in samples")
+    duration_s: Seconds = Field(description="length in time")
+    normalisation: str = Field(description="how u* and a* are found")
+    branches_from: str = Field(description="source of `jumps` and `hysteresis`: measured or twin")
+
+
+class Response(Contract):
+    """Normalized response at a step: mean over the measured cycles of the ratio of each cycle.
+
+    Eq. 1 of Stefani et al. takes one largest and one smallest value of the steady motion, which is
+    the same where every cycle is alike and more where they differ.
+    """
+
+    eta_d: Ratio = Field(description="half range of u over u*")
+    eta_a: Ratio = Field(description="half range of the total acceleration of the mass over a*")
+    eta_r: Ratio = Field(description="deformation of the right bumper over u*")
+    eta_l: Ratio = Field(description="deformation of the left bumper over u*")
+    r_r: Ratio = Field(description="force of the right bumper over the weight of the mass")
+    r_l: Ratio = Field(description="force of the left bumper over the weight of the mass")
+    impacts_right: list[int] = Field(description="impacts on the right bumper in each cycle")
+    impacts_left: list[int] = Field(description="impacts on the left bumper in each cycle")
+    drift: Ratio = Field(description="change of eta_d over the measured cycles, of its mean")
+    spread: Ratio = Field(description="range of eta_d over the measured cycles, of its mean")
+    spread_a: Ratio = Field(
+        None, description="range of eta_a over the measured cycles, of its mean; null in old files"
+    )
+
+
+class LevelResult(Contract):
+    """Amplitude control at a step."""
+
+    demanded_m_s2: Acceleration = Field(description="demanded fundamental of the table")
+    error: Ratio = Field(description="relative error of the measured fundamental")
+    error_uncorrected: Ratio = Field(description="the same without the correction")
+    correction: Ratio = Field(description="factor on the command")
+    updates: int = Field(description="changes of the correction at this step")
+    accepted: bool = Field(description="whether the correction was frozen for the measured cycles")
+
+
+class StepKey(BaseModel):
+    """Keys that a step has in every file, old ones too; it may have more."""
+
+    index: int = Field(description="number of the step in the test, from 0")
+    direction: Direction = Field(description="direction of the sweep")
+    frequency_hz: Hertz = Field(description="frequency of the step")
+
+
+class StepEntry(StepKey, Contract):
+    """Results of a step."""
+
+    measured: Response | None = Field(description="null without a measurement")
+    twin: Response | None = Field(description="null without a twin")
+    table_acc_peak_m_s2: Acceleration = Field(description="peak of the table acceleration")
+    table_acc_fundamental_m_s2: Acceleration = Field(description="its fundamental amplitude")
+    thd: Ratio = Field(description="its total harmonic distortion")
+
+
+class PlannedStep(StepEntry):
+    """Results of a step of the sweep."""
+
+    level: LevelResult | None = Field(None, description="absent without amplitude control")
+
+
+class AddedStep(StepEntry):
+    """Results of a step that an adaptive policy added."""
+
+    reason: str = Field(description="why it was added")
+
+
+class Jump(Contract):
+    """Jump of one direction between two neighbouring grid frequencies."""
+
+    direction: Direction = Field(description="direction of the sweep")
+    from_hz: Hertz = Field(description="frequency before the jump, in driving order")
+    to_hz: Hertz = Field(description="frequency after the jump")
+    kind: Literal["up", "down"] = Field(
+        description="change of eta_d, or of eta_a if that tells the solutions apart more clearly"
+    )
+
+
+class HysteresisInterval(Contract):
+    """Interval of at least two grid frequencies at which the directions differ.
+
+    They differ in eta_d, eta_a or in these and the impact counts, beyond the scatter over cycles.
+    """
+
+    kind: Literal["right", "left"] = Field(description="right: the forward branch is larger")
+    from_hz: Hertz = Field(description="first grid frequency at which the directions differ")
+    to_hz: Hertz = Field(description="last grid frequency at which the directions differ")
+
+
+class FaultEntry(Contract):
+    """Failure of a component."""
+
+    index: Index = Field(description="when it was recorded")
+    component: str = Field(description="process that failed")
+    from_index: Index = Field(description="first sample without its output")
+    to_index: Index = Field(description="first sample with its output again")
+    reason: str = Field(description="cause")
+
+
+class CheckEntry(Contract):
+    """Result line of the loop check."""
+
+    index: Index = Field(description="when it was checked")
+    name: str = Field(description="name of the check")
+    channel: str = Field(description="channel that was checked")
+    value: Number = Field(description="measured value, in `unit`")
+    low: Number = Field(description="lowest allowed value, in `unit`")
+    high: Number = Field(description="highest allowed value, in `unit`")
+    unit: str = Field(description="unit of the three numbers")
+    passed: bool = Field(description="whether the value is allowed")
+
+
+class TripEntry(Contract):
+    """Trip of the protection."""
+
+    index: Index = Field(description="sample that tripped")
+    decided: Index = Field(description="sample up to which the session had read")
+    kind: str = Field(description="stroke, velocity, acceleration, force, lost, stuck, level, ...")
+    channel: str = Field(description="channel that tripped")
+    value: SI = Field(description="value that tripped")
+    limit: SI = Field(description="limit that it exceeded")
+    text: str = Field(description="message to the user")
+
+
+class PeakAndRms(Contract):
+    """Peak and rms over a window; null without known samples."""
+
+    peak: SI = Field(description="largest magnitude")
+    rms: SI = Field(description="root mean square")
+
+
+class MotionResult(Contract):
+    """Motion and contact of the specimen over a window."""
+
+    u: PeakAndRms = Field(description="relative displacement in m")
+    a: PeakAndRms = Field(description="total acceleration of the mass in m/s2")
+    force_r: PeakAndRms = Field(description="force of the right bumper in N")
+    force_l: PeakAndRms = Field(description="force of the left bumper in N")
+    impacts_right: int | None = Field(description="contacts that begin on the right")
+    impacts_left: int | None = Field(description="contacts that begin on the left")
+
+
+class ChannelError(Contract):
+    """Errors of the twin in a channel; null where there is nothing to compare."""
+
+    nrmse: Ratio = Field(description="of the twin restarted from the measured state")
+    free_nrmse: Ratio = Field(description="of the free-running twin")
+
+
+class WindowResult(Contract):
+    """Results of a window of a displacement history."""
+
+    index: int = Field(description="number of the window")
+    from_s: Seconds = Field(description="begin")
+    to_s: Seconds = Field(description="end")
+    table_disp: PeakAndRms = Field(description="table displacement in m")
+    table_acc: PeakAndRms = Field(description="table acceleration in m/s2")
+    measured: MotionResult | None = Field(description="null without a measurement")
+    twin: MotionResult | None = Field(description="null without a twin")
+    comparison: dict[str, ChannelError] = Field(description="errors of the twin by channel")
+
+
+class PlannedOrbitKeys(Contract):
+    """Orbit of the twin at a planned point."""
+
+    frequency_hz: Hertz = Field(description="its frequency")
+    amplitude_m: Metres = Field(description="half of max u - min u")
+    multiplier: Ratio = Field(description="magnitude of its largest Floquet multiplier")
+
+
+class OrbitResult(Contract):
+    """Periodic orbit that a continuation held by feedback."""
+
+    index: int = Field(description="planned point")
+    frequency_hz: Hertz = Field(description="frequency")
+    acceleration_m_s2: Acceleration = Field(description="fundamental of the table, measured")
+    amplitude_m: Metres = Field(description="half of max u - min u")
+    fundamental_m: Metres = Field(description="fundamental of u")
+    feedback_m: Metres = Field(description="root of the sum of squares of its harmonics")
+    feedback_share: Ratio = Field(description="the same over the amplitude of the command")
+    feedback_harmonics_m: list[Metres] = Field(description="amplitudes of harmonics 0, 1, ...")
+    noise_m: Metres = Field(description="part of `feedback_m` that sensor noise explains")
+    periods: int = Field(description="since the change of point")
+    updates: int = Field(description="changes of the reference")
+    accepted: bool = Field(description="the feedback has vanished, on the sought branch")
+    reason: str = Field(description="why it is not accepted; empty if it is")
+    stable: bool = Field(description="without feedback, by the plan")
+    multiplier: Ratio = Field(description="measured Floquet multiplier; null if it was not")
+    planned: PlannedOrbitKeys = Field(description="orbit of the twin")
+
+
+class Latency(Contract):
+    """Latency of the twin: scheduled last sample of a block to its published Comparison."""
+
+    p50: Milliseconds = Field(description="median")
+    p99: Milliseconds = Field(description="99th percentile")
+    max: Milliseconds = Field(description="largest")
+
+
+class ComponentTiming(Contract):
+    """Latency of a component of the run."""
+
+    index: Index = Field(description="when it was recorded")
+    p50_ms: Milliseconds = Field(description="median latency")
+    p99_ms: Milliseconds = Field(description="99th percentile of the latency")
+    max_ms: Milliseconds = Field(description="largest latency")
+    missed: int = Field(description="missed deadlines")
+    blocks: int = Field(description="blocks processed")
+    cpu_share: Ratio = Field(description="share of one core")
+    scheduler: str = Field(description="scheduling policy")
+
+
+class TimingResult(Contract):
+    """Timing of a run; null where nothing was timed."""
+
+    latency_ms: Latency = Field(description="latency of the twin")
+    missed_deadlines: int | None = Field(description="of all components")
+    components: dict[str, ComponentTiming] = Field(description="timing of each component")
+
+
+class ParameterEstimate(Contract):
+    """Last estimate of a parameter by the condition monitoring, SI."""
+
+    value: SI = Field(description="estimate")
+    sd: SI = Field(description="its standard deviation")
+    drift: SI = Field(description="change since the first estimate")
+    drift_sd: SI = Field(description="standard deviation of the drift")
+
+
+class WarningEntry(Contract):
+    """Warning of the condition monitoring."""
+
+    at_s: Seconds = Field(description="time in the test")
+    kind: str = Field(description="kind of the event")
+    text: str = Field(description="message to the user")
+
+
+class VersionPair(Contract):
+    """Versions of a package."""
+
+    recorded: str | None = Field(description="in the recording")
+    installed: str | None = Field(description="here")
+
+
+class ReplayResult(Contract):
+    """Comparison of a replay with its recording."""
+
+    of: str = Field(description="path of the recording")
+    run: str = Field(description="its name")
+    model: str | None = Field(description="model of the replay, or `recorded`")
+    identical: bool | None = Field(description="null if it cannot be judged")
+    beginning: str | None = Field(description="run with the earlier samples")
+    comparisons: int = Field(description="comparisons in the recording")
+    compared: int = Field(description="comparisons of both")
+    differing: int = Field(description="comparisons that differ")
+    missing: int = Field(description="recorded, but not made by the replay")
+    unrecorded: int = Field(description="made by the replay, but not recorded")
+    first_difference_index: Index | None = Field(description="first sample that differs")
+    largest_difference_of_error_sums: dict[str, SI] = Field(description="by channel, SI squared")
+    relative_difference: dict[str, Ratio] = Field(
+        description="rms(new - old) / rms(old) by predicted channel; empty if identical"
+    )
+    versions_differing: dict[str, VersionPair] = Field(description="by package")
+    recorded_comparison: dict[str, ChannelError] = Field(description="errors as recorded")
+
+
+class SummaryKeys(BaseModel):
+    """Keys that every summary.json of a run has, old ones too; it may have more."""
+
+    run: BaseModel = Field(description="origin and length of the recording")
+    verdict: str = Field(description="how the test ended: complete, stopped, aborted or halted")
+    steps: Sequence[StepKey] = Field(description="planned steps that were measured, in order")
+
+
+class RunSummary(SummaryKeys, Contract):
+    """summary.json of a run, a replay or a simulation."""
+
+    run: RunInfo = Field(description="origin and length of the recording")
+    steps: list[PlannedStep] = Field(description="planned steps that were measured, in order")
+    reason: str = Field(description="why the test ended")
+    gaps: int = Field(description="gaps in the recording")
+    lost_samples: Index = Field(description="samples missing in the file")
+    faults: list[FaultEntry] = Field(description="failures of components")
+    u_star_m: Metres = Field(description="u* that normalizes displacements; null without steps")
+    a_star_m_s2: Acceleration = Field(description="a* that normalizes accelerations")
+    checks: list[CheckEntry] = Field(description="loop check")
+    trips: list[TripEntry] = Field(description="trips of the protection")
+    windows: list[WindowResult] | None = Field(
+        None, description="of a displacement history; absent for a stepped sine"
+    )
+    orbits: list[OrbitResult] | None = Field(
+        None, description="of a continuation, in order of measurement; absent otherwise"
+    )
+    visits: list[AddedStep] = Field(description="steps added during the test, not in the PRC")
+    findings: list[str] = Field(alias="found", description="of the adaptive policies")
+    jumps: list[Jump] = Field(description="jumps of `run.branches_from`")
+    hysteresis: list[HysteresisInterval] = Field(description="hysteresis of `run.branches_from`")
+    twin_jumps: list[Jump] = Field(description="jumps of the twin")
+    twin_hysteresis: list[HysteresisInterval] = Field(description="hysteresis of the twin")
+    timing: TimingResult = Field(description="latencies")
+    comparison: dict[str, ChannelError] = Field(description="errors of the twin by channel")
+    estimates: dict[str, ParameterEstimate] = Field(description="by parameter")
+    warnings: list[WarningEntry] = Field(description="warnings of the condition monitoring")
+    replay: ReplayResult | None = Field(None, description="absent unless it is a replay")
+    sha256: str | None = Field(None, description="hash of run.mcap; only in a campaign")
+
+
+class Interval(Contract):
+    """Fitted value with its 95 % interval."""
+
+    value: Number = Field(description="estimate, in `unit`")
+    low: Number = Field(description="lower end, in `unit`")
+    high: Number = Field(description="upper end, in `unit`")
+    unit: str = Field(description="unit of the three numbers; empty for a ratio")
+
+
+class EffectResult(Contract):
+    """Effect that the model lacks."""
+
+    id: str = Field(description="id in the library of effects")
+    channel: str | None = Field(None, description="of a sensor effect; absent for others")
+    confidence: Ratio = Field(description="confidence in the effects, 0 to 1")
+    parameters: dict[str, Interval] = Field(description="fitted parameters")
+    slip_speed: Interval | None = Field(None, description="only of Coulomb friction")
+
+
+class CandidateResult(Contract):
+    """Set of effects that was refitted."""
+
+    id: str = Field(description="its effects, joined by +, or `nothing added`")
+    held_out_error: Ratio = Field(description="rms cross-validation residual over the noise")
+    converged: bool = Field(description="whether the fit converged")
+    at_bound: list[str] | None = Field(None, description="parameters at a bound; absent if none")
+
+
+class Location(Contract):
+    """Where model and measurement disagree; empty or null if nowhere."""
+
+    frequency_hz: Annotated[list[Hertz], Field(min_length=2, max_length=2)] | None = Field(
+        description="lowest and highest frequency"
+    )
+    direction: str = Field(description="forward, backward or both")
+    phase: str = Field(description="flight, contact_right, contact_left, contact_both or all")
+    channels: list[str] = Field(description="residual rows")
+    harmonics: list[int] = Field(description="orders of the forcing frequency")
+
+
+class Gap(Contract):
+    """Gap between model and measurement: rms residual over the sensor noise."""
+
+    metric: str = Field(description="definition of the numbers")
+    before: Ratio = Field(description="of the model, on all data")
+    after: Ratio = Field(description="with the effects added, on all data")
+    noise_floor: Ratio = Field(description="residual that noise alone leaves")
+    held_out_before: Ratio = Field(description="of the model, cross-validation")
+    held_out_after: Ratio = Field(description="with the effects added, cross-validation")
+    closed_fraction: Ratio = Field(description="share of the gap that the effects close")
+
+
+class GenericTerm(Contract):
+    """Generic term that fits better than every library effect."""
+
+    term: str = Field(description="its formula")
+    meaning: str = Field(description="scales of the symbols")
+    held_out_error: Ratio = Field(description="rms cross-validation residual over the noise")
+    parameters: dict[str, Interval] = Field(description="fitted parameters")
+
+
+class Remainder(Contract):
+    """Part of the gap that remains."""
+
+    unexplained: bool = Field(description="whether it exceeds an inexact force law")
+    evidence: GenericTerm | None = Field(description="null without a better generic term")
+
+
+class HeldOutLog(Contract):
+    """Errors of the damper force on a log that was held out entirely."""
+
+    log: str = Field(description="name of the log")
+    nrmse_before: Ratio = Field(description="of the model")
+    nrmse_after: Ratio = Field(description="with the effects added")
+
+
+class Verdict(Contract):
+    """verdict.json of a discovery."""
+
+    verdict: Literal["none", "named", "ambiguous", "unexplained"] = Field(
+        description="whether the missing effects could be named"
+    )
+    why: str = Field(description="reason of the verdict")
+    effects: list[EffectResult] = Field(description="effects added to the model")
+    ambiguous: list[list[str]] = Field(description="sets of effects that fit as well")
+    candidates: list[CandidateResult] = Field(description="every refitted set, best first")
+    where: Location = Field(description="where model and measurement disagree")
+    gap: Gap = Field(description="gap before and after")
+    remainder: Remainder = Field(description="part of the gap that remains")
+    base: dict[str, Interval] = Field(description="refitted parameters of the given model")
+    fell_away: dict[str, str] = Field(description="reason of each effect that was not tested")
+    notes: list[str] = Field(description="notes to the user")
+    next_run: str = Field(description="test that would decide or confirm")
+    seconds: Seconds = Field(description="computing time")
+    held_out_logs: list[HeldOutLog] = Field(description="of the logs given to judge the result")
