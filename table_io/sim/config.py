@@ -7,7 +7,7 @@ from pydantic import Field, ValidationInfo, field_validator
 from table_io.config.backend import BackendConfig
 from table_io.config.base import ConfigModel, Finite, NonNegative, Positive
 from table_io.config.rig import RigConfig
-from table_io.errors import suggest
+from table_io.errors import InputError, suggest
 
 
 class FaultKind(NamedTuple):
@@ -53,7 +53,7 @@ class InjectedFault(ConfigModel):
     @classmethod
     def _complete(cls, kind: str, info: ValidationInfo) -> str:
         if kind not in FAULT_KINDS:
-            raise ValueError(f"kind {kind!r} is unknown; {suggest(kind, FAULT_KINDS)}")
+            raise InputError(f"kind {kind!r} is unknown", remedy=suggest(kind, FAULT_KINDS))
         requirements = FAULT_KINDS[kind]
         keys = (
             ("channel", requirements.channel, requirements.channel, "one of the rig's sensors"),
@@ -63,13 +63,13 @@ class InjectedFault(ConfigModel):
         for key, required, permitted, meaning in keys:
             given = info.data.get(key) is not None
             if required and key in info.data and not given:
-                raise ValueError(f"kind {kind!r} needs {key} ({meaning}); add it")
+                raise InputError(f"kind {kind!r} needs {key} ({meaning})", remedy="add it")
             if given and not permitted:
-                raise ValueError(f"kind {kind!r} has no {key}; leave it out")
+                raise InputError(f"kind {kind!r} has no {key}", remedy="leave it out")
         size = info.data.get("size")
         if kind in ("late", "oil_loss") and size is not None and size <= 0:
-            raise ValueError(
-                f"kind {kind!r} has size {size:g}; allowed: above 0 ({requirements.size})"
+            raise InputError(
+                f"kind {kind!r} has size {size:g}", allowed=f"above 0 ({requirements.size})"
             )
         return kind
 
@@ -94,7 +94,7 @@ class SimulatedTableConfig(BackendConfig):
     @classmethod
     def _check_truth_pair(cls, sha256: str | None, info: ValidationInfo) -> str | None:
         if "truth" in info.data and (info.data["truth"] is None) != (sha256 is None):
-            raise ValueError("truth and truth_sha256 go together; give both or neither")
+            raise InputError("truth and truth_sha256 go together", remedy="give both or neither")
         return sha256
 
     def list_faults(self, rig: RigConfig) -> list[str]:

@@ -10,6 +10,9 @@
     id = "sensor_gain"
     channel = "mass_acc_m_s2"
     parameters = { gain = 1.05 }
+    [[imperfections]]           # of instruments and set-up, see `imperfections.py`
+    id = "channel_skew"
+    parameters = { skew = 20e-6 }
 
 The rig file states the path and hash of this file; only the simulated backend reads it.
 `DEFINITION_BY_ID` lists the effects that can be hidden. Signs and meanings are those of the effects
@@ -19,27 +22,15 @@ model can reproduce the truth exactly.
 
 import hashlib
 import math
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple, TypeVar
 
 from pydantic import Field, ValidationInfo, field_validator
 
 from table_io.config.base import ConfigModel, Finite, NonNegative, Number, Positive, parse_toml
-from table_io.errors import InputError, suggest
-
-
-class HiddenParameter(NamedTuple):
-    """Parameter of an effect in SI; at `vanishing` the effect is absent.
-
-    `vanishing` None: the parameter only shapes the effect. `default` None: it must be given.
-    """
-
-    name: str
-    unit: str
-    low: float
-    high: float
-    vanishing: float | None
-    typical: float
-    default: float | None = None
+from table_io.errors import InputError
+from table_io.sim.hidden_entry import HiddenEntry, HiddenParameter
+from table_io.sim.imperfections import Imperfection
 
 
 class EffectDefinition(NamedTuple):
@@ -133,78 +124,33 @@ DEFINITION_BY_ID: dict[tuple[str, str], EffectDefinition] = {
 }
 
 
-def _find_parameter_faults(definition: EffectDefinition, given: dict[str, float]) -> list[str]:
-    """List a message for each unknown, missing or out-of-range parameter of an effect."""
-    known_names = [parameter.name for parameter in definition.parameters]
-    faults = [
-        f"no parameter {name!r}; {suggest(name, known_names)}"
-        for name in given
-        if name not in known_names
-    ]
-    for parameter in definition.parameters:
-        value = given.get(parameter.name, parameter.default)
-        allowed = f"allowed: {parameter.low:g} to {parameter.high:g} {parameter.unit}".rstrip()
-        if value is None:
-            faults.append(f"lacks {parameter.name!r}; add it, {allowed}")
-        elif not parameter.low <= value <= parameter.high:
-            faults.append(f"{parameter.name} = {value:g}; {allowed}")
-    return faults
-
-
-class HiddenEffect(ConfigModel):
+class HiddenEffect(HiddenEntry):
     """One entry of [[effects]]; `parameters` is completed with defaults."""
 
-    id: str
-    form: str = Field("", validate_default=True, description="Empty: first form of the id.")
-    channel: str | None = None
-    # Declared last: its validation needs the other fields.
+    noun = "effect"
+    definitions = DEFINITION_BY_ID
+
     parameters: dict[str, Finite] = Field(description="Parameters of the effect, in SI.")
 
-    @field_validator("id")
     @classmethod
-    def _check_id(cls, name: str) -> str:
-        ids = list(dict.fromkeys(definition.id for definition in EFFECT_DEFINITIONS))
-        if name not in ids:
-            raise ValueError(f"effect {name!r} is unknown; {suggest(name, ids)}")
-        return name
-
-    @field_validator("form")
-    @classmethod
-    def _check_form(cls, form: str, info: ValidationInfo) -> str:
-        forms = [
-            definition.form
-            for definition in EFFECT_DEFINITIONS
-            if definition.id == info.data.get("id")
-        ]
-        if not forms:
-            return form
-        if form and form not in forms:
-            raise ValueError(f"{info.data['id']} has no form {form!r}; {suggest(form, forms)}")
-        return form or forms[0]
-
-    @field_validator("parameters")
-    @classmethod
-    def _complete_parameters(
-        cls, given: dict[str, float], info: ValidationInfo
-    ) -> dict[str, float]:
-        definition = DEFINITION_BY_ID.get((info.data.get("id", ""), info.data.get("form", "")))
-        if definition is None:
-            return given
-        faults, channel = _find_parameter_faults(definition, given), info.data.get("channel")
-        if not definition.is_sensor_effect and channel is not None:
-            faults.append("has no channel; leave it out")
-        elif definition.is_sensor_effect and channel is None:
-            faults.append("needs a channel, one of the rig's sensors; add it")
-        if faults:
-            raise ValueError(f"{definition.id}: " + "; ".join(faults))
-        return {
-            parameter.name: given.get(parameter.name, parameter.default or 0.0)
-            for parameter in definition.parameters
-        }
+    def find_faults(
+        cls, definition: EffectDefinition, given: Mapping[str, float], place: Mapping[str, Any]
+    ) -> list[str]:
+        has_channel = place.get("channel") is not None
+        if not definition.is_sensor_effect and has_channel:
+            return ["has no channel; leave it out"]
+        if definition.is_sensor_effect and not has_channel:
+            return ["needs a channel, one of the rig's sensors; add it"]
+        return []
 
     @property
     def definition(self) -> EffectDefinition:
         return DEFINITION_BY_ID[self.id, self.form]
+
+    @property
+    def place(self) -> str | None:
+        """Channel on which it acts; None if on the motion."""
+        return self.channel
 
 
 class BaseOverrides(ConfigModel):
@@ -222,26 +168,30 @@ class BaseOverrides(ConfigModel):
     @classmethod
     def _check_gap(cls, gap: float | None, info: ValidationInfo) -> float | None:
         if gap is not None and (math.isnan(gap) or gap == -math.inf):
-            raise ValueError(
-                f"{info.field_name} is {gap}; allowed: m, or inf without a bumper on this side"
+            raise InputError(
+                f"{info.field_name} is {gap}", allowed="m, or inf without a bumper on this side"
             )
         return gap
 
 
+EntryT = TypeVar("EntryT", HiddenEffect, Imperfection)
+
+
 class GroundTruth(ConfigModel):
-    """Ground-truth file: overridden parameters of the rig and its hidden effects."""
+    """Ground-truth file: overridden parameters, hidden effects and imperfections of the rig."""
 
     base: BaseOverrides = BaseOverrides()
     effects: tuple[HiddenEffect, ...] = ()
+    imperfections: tuple[Imperfection, ...] = ()
 
-    @field_validator("effects")
+    @field_validator("effects", "imperfections")
     @classmethod
-    def _check_unique(cls, effects: tuple[HiddenEffect, ...]) -> tuple[HiddenEffect, ...]:
-        names = [(effect.id, effect.channel or "") for effect in effects]
+    def _check_unique(cls, entries: tuple[EntryT, ...]) -> tuple[EntryT, ...]:
+        names = [(entry.id, entry.place or "") for entry in entries]
         duplicates = sorted({" ".join(name).strip() for name in names if names.count(name) > 1})
         if duplicates:
-            raise ValueError(f"{', '.join(duplicates)} more than once; keep one of each")
-        return effects
+            raise InputError(f"{', '.join(duplicates)} more than once", remedy="keep one of each")
+        return entries
 
 
 def parse_ground_truth(raw: bytes, sha256: str, source: str) -> GroundTruth:

@@ -7,12 +7,11 @@ import math
 from dataclasses import fields
 from typing import Any
 
-import numpy as np
-
-from table_io.block import Float1D, Float2D
-from table_io.errors import InputError
+from table_io.block import Float2D
+from table_io.sim.filters import FractionalDelay
 from table_io.sim.ground_truth import GroundTruth
 from table_io.sim.hidden_plant import HiddenCoefficients, HiddenPlant
+from table_io.sim.imperfections import resolve_sides
 from table_io.sim.plant import Plant
 
 # Parameters whose coefficient has a different name.
@@ -26,7 +25,6 @@ COEFFICIENT_NAMES = {
     "adhesion": {"force": "pull"},
     "appendage": {"mass": "m2", "frequency": "w2", "damping_ratio": "z2"},
 }
-CUBIC_POINTS = 4  # samples of the interpolation
 
 
 def build_hidden_plant(plant: Plant, truth: GroundTruth) -> HiddenPlant:
@@ -50,6 +48,18 @@ def build_hidden_plant(plant: Plant, truth: GroundTruth) -> HiddenPlant:
             case _ if not effect.definition.is_sensor_effect:
                 names = COEFFICIENT_NAMES.get(effect.id, {})
                 coefficients |= {names.get(key, key): value for key, value in p.items()}
+    for imperfection in truth.imperfections:
+        p = imperfection.parameters
+        match imperfection.id:
+            case "mass_reading":
+                parameters["mass_kg"] *= p["ratio"]
+            case "table_pitch":
+                coefficients["tilt"] = coefficients.get("tilt", 0.0) + p["per_travel"]
+                coefficients["pitch"] = p["per_acceleration"]
+            case "time_base":
+                parameters["rate_hz"] *= 1.0 + 1e-6 * p["deviation"]
+    for side, p in resolve_sides(truth.imperfections, "gap_reading").items():
+        parameters[f"gap_{side}_m"] += p["offset"]
     if "fc" in coefficients:
         coefficients.setdefault("fs", coefficients["fc"])
     if "w2" in coefficients:
@@ -61,22 +71,18 @@ class SensorDistortion:
     """Distortion of sensor readings by gain, lag and offset; samples must come in order."""
 
     def __init__(self, truth: GroundTruth, channels: tuple[str, ...], rate_hz: float) -> None:
-        self._rate_hz = rate_hz
         for effect in truth.effects:
-            if effect.channel is not None and effect.channel not in channels:
-                raise InputError(
-                    "the rig has no sensor of this channel",
-                    where=f"ground truth, effect {effect.id}",
-                    key="channel",
-                    value=effect.channel,
-                    allowed=", ".join(channels),
-                )
+            effect.check_channel(channels, "the rig has no sensor of this channel")
         self._errors = [
             (effect.id, channels.index(str(effect.channel)), next(iter(effect.parameters.values())))
             for effect in sorted(truth.effects, key=lambda effect: effect.id == "sensor_offset")
             if effect.definition.is_sensor_effect
         ]
-        self._history: dict[int, Float1D] = {}
+        self._delays = {
+            row: FractionalDelay(size * rate_hz)
+            for effect_id, row, size in self._errors
+            if effect_id == "sensor_lag"
+        }
 
     def apply(self, values: Float2D) -> Float2D:
         """Return distorted readings without noise from true values, (channel, sample) each."""
@@ -88,23 +94,5 @@ class SensorDistortion:
                 case "sensor_offset":
                     values[row] += size
                 case "sensor_lag":
-                    values[row] = self._delay(row, values[row], size * self._rate_hz)
+                    values[row] = self._delays[row].apply(values[row])
         return values
-
-    def _delay(self, row: int, values: Float1D, lag: float) -> Float1D:
-        """Return values(t - lag), lag in samples, by causal cubic interpolation, (sample,)."""
-        whole_samples = max(math.floor(lag) - 1, 0)
-        depth = whole_samples + CUBIC_POINTS - 1
-        if values.size == 0:
-            return values
-        history = self._history.get(row, np.full(depth, values[0]))  # constant before sample 0
-        known = np.concatenate([history, values])
-        self._history[row] = known[known.size - depth :]
-        positions = (
-            whole_samples + np.arange(CUBIC_POINTS) - lag
-        )  # of the four samples, relative to the delayed time
-        weights = [math.prod(a / (a - b) for a in positions if a != b) for b in positions]
-        delayed: Float1D = np.zeros(values.size)
-        for back, weight in enumerate(weights):
-            delayed += weight * known[depth - whole_samples - back :][: values.size]
-        return delayed

@@ -1,9 +1,10 @@
 """Hidden plant: the plant of `plant.py` with all effects of `ground_truth.DEFINITION_BY_ID`.
 
-    R + damper + N_R - N_L + M g sin(tilt y) = m2 p,  R = M x''   (p: pull of the appendage over m2)
+    R + damper + N_R - N_L + M g sin(tilt y + pitch y'') = m2 p,  R = M x''
     free face:     static_j + dashpot_j d_j' = 0
     touched face:  d_j' = +-u' - drift, N_j = static_j + dashpot_j d_j', for as long as N_j > -pull
 
+p is the pull of the appendage over m2, tilt and pitch are those of the table.
 Force laws are smooth versions of their textbook forms, so classical Runge-Kutta with steps divided
 at contact changes keeps its fourth order (except for z of Bouc-Wen at z = 0, where it is once
 differentiable only). The table bears R of the mass and of the appendage. Without a ground truth
@@ -37,6 +38,7 @@ from table_io.units import GRAVITY_M_S2
 # Continues the state of `plant.py`, float64 (15,): z, Maxwell forces of damper and bumpers in N,
 # position and velocity of the appendage, time in s.
 Z, F, B, W, VW, T, STATE_SIZE = 8, 9, 10, 12, 13, 14, 15
+PITCH_ITERATIONS = 4  # reduce the error of the pitch to 1e-8 of it
 BISECTION_STEPS = 45  # reduce a sub-step to rounding error
 ROUNDING_SPEED_M_S = 1e-3  # below it |u'| is smoothed
 STRETCH_SCALE_M, HARDENING_SCALE_M, DAMPING_SCALE_M = (
@@ -79,6 +81,7 @@ class HiddenCoefficients(NamedTuple):
     gap_rate: float = 0.0
     stiffness_rate: float = 0.0
     tilt: float = 0.0
+    pitch: float = 0.0
     stiffness_ratio: tuple[float, float] = (1.0, 1.0)  # K_R and K_L over the mean
     m2: float = 0.0
     w2: float = 0.0
@@ -163,16 +166,22 @@ def _rates(s, command, params, hidden, rate):  # type: ignore[no-untyped-def]
     right, right_rate = _face_state(s, 0, params, hidden)
     left, left_rate = _face_state(s, 1, params, hidden)
     specimen_force = _damper_force(s, params, hidden) + right - left
-    if hidden.tilt != 0.0:
+    servo = params.p * (params.p * (command - s[Y]) - 2.0 * s[VY])
+    if hidden.pitch != 0.0:
+        # Table acceleration and pitch cause each other; their loop gain is below 0.01.
+        table_acc, thrust = servo + specimen_force * params.inv_table_mass, 0.0
+        for _ in range(PITCH_ITERATIONS):
+            angle = hidden.tilt * s[Y] + hidden.pitch * table_acc
+            thrust = params.m * GRAVITY_M_S2 * math.sin(angle)
+            table_acc = servo + (specimen_force + thrust) * params.inv_table_mass
+        specimen_force += thrust
+    elif hidden.tilt != 0.0:
         specimen_force += params.m * GRAVITY_M_S2 * math.sin(hidden.tilt * s[Y])
     swing = hidden.w2 * (hidden.w2 * (s[W] - s[X]) + 2.0 * hidden.z2 * (s[VW] - s[VX]))
     rate[X] = s[VX]
     rate[VX] = (hidden.m2 * swing - specimen_force) / params.m
     rate[Y] = s[VY]
-    rate[VY] = (
-        params.p * (params.p * (command - s[Y]) - 2.0 * s[VY])
-        + specimen_force * params.inv_table_mass
-    )
+    rate[VY] = servo + specimen_force * params.inv_table_mass
     rate[D], rate[D + 1] = right_rate, left_rate
     rate[TOUCHED], rate[TOUCHED + 1] = 0.0, 0.0
     rate[Z] = 0.0

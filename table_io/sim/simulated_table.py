@@ -24,6 +24,8 @@ from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.faults import build_faults
 from table_io.sim.ground_truth import GroundTruth, parse_ground_truth
 from table_io.sim.ground_truth_applied import SensorDistortion, build_hidden_plant
+from table_io.sim.imperfections import Imperfection
+from table_io.sim.laboratory import Laboratory
 from table_io.sim.plant import SIGNALS, Plant
 
 MIN_REPLACE_AHEAD_S = 0.02
@@ -74,7 +76,7 @@ def quantize_command(volts: Float1D, output: OutputConfig) -> Float1D:
 
 
 class Digitizer:
-    """Digitizer: adds offset and noise to true values, clips and quantizes them to volts."""
+    """Digitizer: adds offset and noise to sensor values, clips and quantizes them to volts."""
 
     def __init__(self, sensors: tuple[SensorConfig, ...]) -> None:
         def column(values: list[float]) -> Float2D:
@@ -91,13 +93,17 @@ class Digitizer:
         self._half = column([2.0 ** (s.bits - 1) for s in sensors])
         self._step = column([abs(s.range * s.volts_per_unit) for s in sensors]) / self._half
 
-    def digitize(self, values: Float2D, noise: np.random.Generator) -> Float2D:
+    def digitize(
+        self, values: Float2D, noise: np.random.Generator, laboratory: Laboratory
+    ) -> Float2D:
         """Return volts, (channel, sample), from SI values of the same shape.
 
-        Noise is drawn sample by sample, so it does not depend on the division into calls.
+        Noise is drawn sample by sample, so it does not depend on the division into calls; it passes
+        the filters of the laboratory.
         """
         samples = noise.standard_normal(values.shape[::-1]).T
-        codes = np.rint((values + self._offset + self._noise * samples) * self._gain / self._step)
+        analog = laboratory.condition(values + self._offset, self._noise * samples)
+        codes = np.rint(analog * self._gain / self._step)
         digitised: Float2D = np.clip(codes, -self._half, self._half - 1) * self._step
         return digitised
 
@@ -114,15 +120,20 @@ class SimulatedBackend:
         self._clock = clock
         self._plant = build_plant(table, specimen, rate_hz)
         self._distortion: SensorDistortion | None = None
+        self._imperfections: tuple[Imperfection, ...] = ()
         if truth := load_ground_truth(table):
             self._plant = build_hidden_plant(self._plant, truth)
-            self._distortion = SensorDistortion(truth, rig.channels, rate_hz)
+            self._distortion = SensorDistortion(truth, rig.channels, self._plant.rate_hz)
+            self._imperfections = truth.imperfections
         self._plant_with_share = lru_cache(2)(self._build_plant_with_share)
         self._faults = build_faults(table.faults, rig, rate_hz, table.seed)
         self._state = self._plant.rest_state()
-        self._digitizer = Digitizer(rig.sensors)
+        self._seed = table.seed
+        self._laboratory = self._build_laboratory(np.random.default_rng([table.seed, 4]), 0)
+        self._digitizer = Digitizer(self._laboratory.sensors)
         self._noise = np.random.default_rng([table.seed, 0])
         self._tare_noise = np.random.default_rng([table.seed, 1])
+        self._tare_laboratory_noise = np.random.default_rng([table.seed, 5])
         # Played command in m from sample `_origin` on; the output is at 0 V before sample 0.
         self._history = self._plant.history_samples + self._faults.history_samples
         self._command = np.zeros(self._history)
@@ -143,10 +154,12 @@ class SimulatedBackend:
         self._is_open = True
 
     def tare(self, samples: int) -> Float2D:
-        """Return volts at rest before precompression, (channel, sample)."""
+        """Return volts at rest before precompression, (channel, sample), just before sample 0."""
         self._require(self._is_open, "open() comes first")
-        at_rest = self._true_values(np.zeros(samples), np.zeros((len(SIGNALS), samples)))
-        return self._digitizer.digitize(at_rest, self._tare_noise)
+        laboratory = self._build_laboratory(self._tare_laboratory_noise, -samples)
+        signals = np.zeros((len(SIGNALS), samples))
+        at_rest = laboratory.measure(self._true_values(np.zeros(samples), signals), signals)
+        return self._digitizer.digitize(at_rest, self._tare_noise, laboratory)
 
     def queue(self, index: int, volts: Float1D) -> None:
         """Replace the command from sample `index` on, in V, (sample,); the last value is held."""
@@ -201,10 +214,11 @@ class SimulatedBackend:
         played_m = drive[self._plant.history_samples :]
         if self.observer is not None:
             self.observer(first, played_m, signals[: len(SIGNALS)])
-        values = self._true_values(played_m, signals)
+        values = self._laboratory.measure(self._true_values(played_m, signals), signals)
         if self._distortion is not None:
             values = self._distortion.apply(values)
-        return self._faults.apply_to_inputs(first, self._digitizer.digitize(values, self._noise))
+        volts = self._digitizer.digitize(values, self._noise, self._laboratory)
+        return self._faults.apply_to_inputs(first, volts)
 
     def scheduled_time_s(self, index: int) -> float:
         """Return the time on the session's clock at which sample `index` is taken, in s."""
@@ -232,6 +246,11 @@ class SimulatedBackend:
         elapsed_s = self._clock.now() - self.scheduled_time_s(0)
         return max(self._next - 1, math.floor(elapsed_s * self.rate_hz + 1e-6))
 
+    def _build_laboratory(self, noise: np.random.Generator, first: int) -> Laboratory:
+        """Return the laboratory at rest, its next sample being `first`."""
+        rate_hz = self._plant.rate_hz
+        return Laboratory(self._imperfections, self._rig, rate_hz, self._seed, noise, first)
+
     def _build_plant_with_share(self, share: float) -> Plant:
         """Return the plant with this fraction of its servo's bandwidth."""
         bandwidth = share * self._plant.servo_bandwidth_hz
@@ -251,7 +270,7 @@ class SimulatedBackend:
         return np.concatenate([self._command[start:], tail])
 
     def _true_values(self, drive: Float1D, signals: Float2D) -> Float2D:
-        """Return true values in SI, (channel, sample); the two cells of a side share its force.
+        """Return true values in SI, (channel, sample); the cells of a side share its force.
 
         A declared channel is the sum of those above that the rig file states for it.
         """
@@ -263,10 +282,7 @@ class SimulatedBackend:
             "table_acc_m_s2": y_acc,
             "mass_disp_m": x,
             "mass_acc_m_s2": x_acc,
-            "force_r1_n": 0.5 * right,
-            "force_r2_n": 0.5 * right,
-            "force_l1_n": -0.5 * left,
-            "force_l2_n": -0.5 * left,
+            **self._laboratory.cell_forces(signals),
             "damper_force_n": hidden[0] if hidden else balance,
             "rel_disp_m": x - y,
             CONSTANT: np.ones(drive.size),

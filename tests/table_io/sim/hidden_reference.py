@@ -98,7 +98,7 @@ class Reference:
 
     def samples(self, s: Float1D, count: int) -> Float2D:
         """(8, count) states at the samples; the first comes H after the start."""
-        at, t, on, found = np.arange(1, count + 1) * H, 0.0, [False, False], []
+        at, t, on, solutions = np.arange(1, count + 1) * H, 0.0, [False, False], []
         while at[-1] > t:
             events: list[Any] = [lambda t, s, j=j: self.margin(t, s, j, on) for j in (0, 1)]
             for event in events:
@@ -107,9 +107,9 @@ class Reference:
                 lambda t, s: self.rates(t, s, on), (t, at[-1]), s, "DOP853", at[at > t],
                 events=events, rtol=1e-10, atol=1e-13, max_step=5e-3,
             )  # fmt: skip
-            found.append(np.array(part.y).reshape(8, -1))
+            solutions.append(np.array(part.y).reshape(8, -1))
             if part.status != 1:
                 break
             j = 0 if part.t_events[0].size else 1
             t, s, on[j] = part.t_events[j][0], part.y_events[j][0].copy(), not on[j]
-        return np.concatenate(found, axis=1)
+        return np.concatenate(solutions, axis=1)

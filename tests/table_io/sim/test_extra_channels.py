@@ -17,9 +17,9 @@ from table_io.sim.simulated_table import SimulatedBackend
 from tests.table_io.lab_rig import EXTRA, SECOND_ACC, TEMPERATURE, UPWARD_ACC, lab_rig
 from tests.table_io.safety.guarded import play
 from tests.table_io.safety.test_tap_test import tap
-from tests.table_io.sim.test_ground_truth import sealed
+from tests.table_io.sim.test_ground_truth import seal_truth
 
-RATE = 2000.0
+RATE_HZ = 2000.0
 PROFILE = Profile.model_validate(
     {
         "title": "short",
@@ -30,16 +30,16 @@ PROFILE = Profile.model_validate(
 )  # fmt: skip
 
 
-def measured(rig: RigConfig, samples: int = 2000) -> Block:
+def acquire_sine(rig: RigConfig, samples: int = 2000) -> Block:
     """Tared samples of a sine of 1 mm at 3 Hz."""
-    backend = SimulatedBackend(rig, PROFILE.specimen, RATE, ManualClock())
+    backend = SimulatedBackend(rig, PROFILE.specimen, RATE_HZ, ManualClock())
     backend.open()
     tare = compute_tare(backend.tare(2000), rig.sensors) | rig.stated_offsets
-    command = 1e-3 * np.sin(6 * np.pi * np.arange(samples) / RATE)
+    command = 1e-3 * np.sin(6 * np.pi * np.arange(samples) / RATE_HZ)
     backend.queue(0, command_to_volts(command, rig.output))
     backend.start()
     values = volts_to_si(backend.read(samples), rig.sensors, tare)
-    return Block("meas", 0, RATE, rig.channels, values, *[np.full(samples, -1)] * 3)
+    return Block("meas", 0, RATE_HZ, rig.channels, values, *[np.full(samples, -1)] * 3)
 
 
 def quiet(rig: RigConfig) -> RigConfig:
@@ -48,7 +48,7 @@ def quiet(rig: RigConfig) -> RigConfig:
 
 
 def test_a_declared_channel_is_the_stated_sum_and_absolute_values_are_not_tared() -> None:
-    block = measured(quiet(lab_rig()))
+    block = acquire_sine(quiet(lab_rig()))
     mass, table = block.channel("mass_acc_m_s2"), block.channel("table_acc_m_s2")
     assert np.ptp(mass) > 0.1
     np.testing.assert_allclose(block.channel(SECOND_ACC), -mass, atol=2e-5)
@@ -59,7 +59,7 @@ def test_a_declared_channel_is_the_stated_sum_and_absolute_values_are_not_tared(
 
 def test_noise_offset_range_and_steps_are_those_of_its_sensor() -> None:
     rig = lab_rig()
-    backend = SimulatedBackend(rig, PROFILE.specimen, RATE, ManualClock())
+    backend = SimulatedBackend(rig, PROFILE.specimen, RATE_HZ, ManualClock())
     backend.open()
     volts = backend.tare(20_000)
     row = rig.channels.index(TEMPERATURE)
@@ -76,14 +76,14 @@ id = "sensor_gain"
 channel = "{SECOND_ACC}"
 parameters = {{ gain = 2.0 }}
 """
-    block = measured(quiet(lab_rig(**sealed(tmp_path, truth))))
+    block = acquire_sine(quiet(lab_rig(**seal_truth(tmp_path, truth))))
     np.testing.assert_allclose(
         block.channel(SECOND_ACC), -2 * block.channel("mass_acc_m_s2"), atol=4e-5
     )
 
 
 @pytest.mark.parametrize(
-    ("channel", "kind", "found"),
+    ("channel", "kind", "finding_kind"),
     [
         (SECOND_ACC, "rail", "rail"),
         (SECOND_ACC, "stuck", "stuck"),
@@ -93,14 +93,14 @@ parameters = {{ gain = 2.0 }}
         (TEMPERATURE, "spike", "spike"),
     ],
 )
-def test_a_fault_of_a_declared_channel_is_found(channel: str, kind: str, found: str) -> None:
+def test_a_fault_of_a_declared_channel_is_found(channel: str, kind: str, finding_kind: str) -> None:
     fault = {"kind": kind, "at_s": 1.0, "channel": channel}
     fault |= {"size": 100.0} if kind == "spike" else {}
     assert play(PROFILE, lab_rig()).findings == []
     findings = [finding for _, finding in play(PROFILE, lab_rig(faults=(fault,))).findings]
-    assert {(finding.channel, finding.kind) for finding in findings} >= {(channel, found)}
+    assert {(finding.channel, finding.kind) for finding in findings} >= {(channel, finding_kind)}
     assert {finding.channel for finding in findings} == {channel}
-    assert min(finding.index for finding in findings) == pytest.approx(RATE, abs=50)
+    assert min(finding.index for finding in findings) == pytest.approx(RATE_HZ, abs=50)
 
 
 def test_every_table_accelerometer_may_show_the_steps_of_a_stiff_table() -> None:
@@ -112,16 +112,16 @@ def test_every_table_accelerometer_may_show_the_steps_of_a_stiff_table() -> None
     on_table = RigConfig.model_validate(rig.model_dump() | {"extra_channels": channels})
     row, table = rig.channels.index(SECOND_ACC), rig.channels.index("table_acc_m_s2")
     elsewhere = compute_thresholds(PROFILE, rig, {}).spike_limit
-    there = compute_thresholds(PROFILE, on_table, {}).spike_limit
-    assert there[row] > elsewhere[row]
-    assert there[row] - elsewhere[row] == pytest.approx(there[table] - 1e-3 * 2.0 * 9.80665)
+    limits = compute_thresholds(PROFILE, on_table, {}).spike_limit
+    assert limits[row] > elsewhere[row]
+    assert limits[row] - elsewhere[row] == pytest.approx(limits[table] - 1e-3 * 2.0 * 9.80665)
 
 
 def test_the_wiring_check_knows_them() -> None:
     rig = lab_rig()
-    backend = SimulatedBackend(rig, PROFILE.specimen, RATE, ManualClock())
+    backend = SimulatedBackend(rig, PROFILE.specimen, RATE_HZ, ManualClock())
     backend.open()
-    lines = check_resting_inputs(RestingInputs(rig, RATE, backend.tare(8000)))
+    lines = check_resting_inputs(RestingInputs(rig, RATE_HZ, backend.tare(8000)))
     assert [line for line in lines if line.verdict == "fail"] == []
     tested = {(line.name, line.channel) for line in lines}
     assert {("noise", name) for name in EXTRA} <= tested
@@ -138,7 +138,7 @@ def test_a_tap_proves_the_polarity_of_a_declared_sensor(sign: float, verdict: st
     assert mass.channels == ("mass_acc_m_s2", "mass_disp_m", SECOND_ACC)  # not the upward one
     noise = np.array([sensor.noise_rms for sensor in rig.sensors])
     swings = {"mass_acc_m_s2": tap(0.1), "mass_disp_m": tap(0.2), SECOND_ACC: sign * tap(0.12)}
-    response = TapResponse(rig, RATE, np.zeros((len(rig.sensors), tap(1.0).size)), noise, 800)
+    response = TapResponse(rig, RATE_HZ, np.zeros((len(rig.sensors), tap(1.0).size)), noise, 800)
     values = noise[:, None] * np.random.default_rng(1).standard_normal(response.values.shape)
     for name, swing in swings.items():
         values[rig.channels.index(name)] += swing

@@ -29,7 +29,7 @@ from table_io.errors import InputError
 from table_io.sim.machine.flight_recorder import FlightRecorder, read_flight_record
 from table_io.sim.machine.table import SimulatedMachine
 
-RATE = 2000.0
+RATE_HZ = 2000.0
 TEXT = (PROFILES_DIR / "rigs" / "machine.toml").read_text()
 RIG = parse_toml(TEXT, RigConfig, "machine")
 SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
@@ -55,20 +55,20 @@ size = 0.05
 """
 
 
-def claim(rig: RigConfig = RIG, rate_hz: float = RATE, **changes: object) -> MachineMessage:
+def claim(rig: RigConfig = RIG, rate_hz: float = RATE_HZ, **changes: object) -> MachineMessage:
     """What a controller says first."""
-    told = {
+    fields = {
         "rate_hz": rate_hz,
         "specimen": SPECIMEN.model_dump(),
         "output": rig.output.model_dump(),
         "sensors": [sensor.model_dump() for sensor in rig.sensors],
     }
-    return text_message(MessageKind.CLAIM, json.dumps(told | changes))
+    return text_message(MessageKind.CLAIM, json.dumps(fields | changes))
 
 
 def sine(seconds: float, amplitude_m: float = 5e-3, f: float = 2.0) -> Float1D:
     """Volts of a motion that grows smoothly and goes on: its end is in motion."""
-    t = np.arange(round(seconds * RATE)) / RATE
+    t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
     x = np.clip(t / 0.5, 0.0, 1.0)
     grows = x**3 * (10.0 + x * (-15.0 + 6.0 * x))
     metres: Float1D = amplitude_m * grows * np.sin(2 * np.pi * f * t)
@@ -77,7 +77,7 @@ def sine(seconds: float, amplitude_m: float = 5e-3, f: float = 2.0) -> Float1D:
 
 def acceleration(metres: Float1D) -> float:
     """Largest acceleration of a command in m/s2, rest before it included."""
-    return float(np.abs(np.diff(np.concatenate([np.zeros(2), metres]), 2)).max() * RATE**2)
+    return float(np.abs(np.diff(np.concatenate([np.zeros(2), metres]), 2)).max() * RATE_HZ**2)
 
 
 @dataclass
@@ -86,33 +86,39 @@ class Desk:
 
     folder: Path
     card: str = TEXT
-    now: float = 100.0
-    told: list[str] = field(default_factory=list)
-    heard: list[MachineMessage] = field(default_factory=list)
+    time_s: float = 100.0
+    notices: list[str] = field(default_factory=list)
+    answers: list[MachineMessage] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.box = FlightRecorder(self.folder / "box", self.told.append)
+        self.box = FlightRecorder(self.folder / "box", self.notices.append)
         self.table = SimulatedMachine(
-            parse_toml(self.card, RigConfig, "card"), self.told.append, self.box
+            parse_toml(self.card, RigConfig, "card"), self.notices.append, self.box
         )
 
     def say(self, *messages: MachineMessage) -> list[MachineMessage]:
         """The answers."""
-        return [answer for one in messages for answer in self.table.handle_message(one, self.now)]
+        return [
+            answer
+            for message in messages
+            for answer in self.table.handle_message(message, self.time_s)
+        ]
 
     def drive(self, volts: Float1D) -> None:
         """Claim, queue, start."""
-        kinds = [one.kind for one in self.say(claim(), values_message(MessageKind.QUEUE, volts))]
+        kinds = [
+            answer.kind for answer in self.say(claim(), values_message(MessageKind.QUEUE, volts))
+        ]
         assert kinds == [MessageKind.GRANTED, MessageKind.QUEUED]
-        assert self.say(MachineMessage(MessageKind.START))[0].values.tolist() == [self.now]
+        assert self.say(MachineMessage(MessageKind.START))[0].values.tolist() == [self.time_s]
 
     def wait(self, seconds: float, beats: bool = True) -> None:
         """Time passes."""
         for _ in range(round(seconds / TICK_S)):
-            self.now += TICK_S
+            self.time_s += TICK_S
             if beats:
                 self.say(MachineMessage(MessageKind.BEAT))
-            self.heard += self.table.tick(self.now)
+            self.answers += self.table.tick(self.time_s)
 
     def rest(self) -> None:
         """Time passes without a controller until the table is free; it has ten seconds."""
@@ -123,7 +129,7 @@ class Desk:
         raise AssertionError("it did not come to rest")
 
     def kinds(self) -> list[MessageKind]:
-        return [one.kind for one in self.heard]
+        return [answer.kind for answer in self.answers]
 
 
 @pytest.fixture
@@ -143,8 +149,8 @@ def test_it_plays_and_hands_over_every_sample_once(desk: Desk) -> None:
     desk.drive(sine(0.5))
     desk.wait(0.3)
     assert set(desk.kinds()) == {MessageKind.TAKEN}
-    counts = [one.values.size // len(RIG.sensors) for one in desk.heard]
-    assert [one.index for one in desk.heard] == np.cumsum([0, *counts[:-1]]).tolist()
+    counts = [answer.values.size // len(RIG.sensors) for answer in desk.answers]
+    assert [answer.index for answer in desk.answers] == np.cumsum([0, *counts[:-1]]).tolist()
     assert sum(counts) == 601  # sample 0 is that of the start
 
 
@@ -156,10 +162,10 @@ def test_a_silent_controller_is_lost_in_time_and_what_is_queued_plays_to_rest(de
     assert not desk.table.latched_reason
     desk.wait(3 * TICK_S, beats=False)
     assert "no message from the controller for 0.3 s" in desk.table.latched_reason
-    assert desk.heard[-1].kind is MessageKind.LOST
+    assert desk.answers[-1].kind is MessageKind.LOST
     desk.rest()
-    assert "controller lost" in desk.told[-1]
-    assert "at rest" in desk.told[-1]
+    assert "controller lost" in desk.notices[-1]
+    assert "at rest" in desk.notices[-1]
     (life,) = read_flight_record(desk.folder / "box")
     command = life.command_m
     np.testing.assert_array_equal(command[: volts.size], volts / SCALE)
@@ -188,7 +194,7 @@ def test_a_queue_that_ends_in_motion_is_brought_home_and_replaced_in_time(desk: 
         is MessageKind.QUEUED
     )
     desk.wait(3.0)
-    desk.table.drop_controller("it is over", desk.now)
+    desk.table.drop_controller("it is over", desk.time_s)
     desk.rest()
     (life,) = read_flight_record(desk.folder / "box")
     np.testing.assert_array_equal(life.command_m[:2000], volts / SCALE)
@@ -212,30 +218,30 @@ def test_a_table_that_stands_still_in_the_middle_of_its_queue_is_not_at_rest(des
     volts = np.concatenate([np.zeros(1500), 64.0 * (x * (1.0 - x)) ** 3])
     desk.drive(volts)
     desk.wait(0.1)
-    desk.table.drop_controller("gone", desk.now)
+    desk.table.drop_controller("gone", desk.time_s)
     desk.rest()
     (life,) = read_flight_record(desk.folder / "box")
     np.testing.assert_array_equal(life.command_m[:2500], volts / SCALE)
-    assert life.notes[-1][0] >= 2500 + 0.2 * RATE
+    assert life.notes[-1][0] >= 2500 + 0.2 * RATE_HZ
 
 
 def test_a_table_without_oil_pressure_is_given_the_time_that_it_needs(tmp_path: Path) -> None:
     desk = Desk(tmp_path, TEXT + OIL_LOSS)
     desk.drive(sine(4.0, f=1.0))
     desk.wait(4.0)
-    desk.table.drop_controller("gone", desk.now)
+    desk.table.drop_controller("gone", desk.time_s)
     desk.rest()
     (life,) = read_flight_record(desk.folder / "box")
     quiet = life.row("table_disp")[-400:]
     assert np.ptp(quiet) <= 1e-4
     late = np.flatnonzero(np.abs(life.row("table_disp")) > 1e-4)[-1]
-    assert late > np.flatnonzero(life.command_m)[-1] + 0.2 * RATE  # or this shows nothing
+    assert late > np.flatnonzero(life.command_m)[-1] + 0.2 * RATE_HZ  # or this shows nothing
 
 
 def test_time_that_passed_without_a_tick_is_past(desk: Desk) -> None:
     desk.drive(sine(1.0))
     desk.wait(0.1)
-    desk.now += 0.05
+    desk.time_s += 0.05
     (answer,) = desk.say(values_message(MessageKind.QUEUE, np.zeros(9), 201 + 60))
     assert (answer.kind, answer.index) == (MessageKind.REFUSED, Refusal.VALUE)
 
@@ -247,7 +253,7 @@ def test_nobody_else_gets_a_table_that_moves(desk: Desk) -> None:
     assert busy is not None
     assert (busy.index, "has a controller already" in busy.text) == (Refusal.INPUT, True)
     desk.wait(0.6)
-    desk.table.drop_controller("gone", desk.now)
+    desk.table.drop_controller("gone", desk.time_s)
     busy = desk.table.busy_refusal()
     assert busy is not None
     assert (busy.index, "still coming to rest" in busy.text) == (Refusal.RESTING, True)
@@ -342,7 +348,7 @@ def test_nonsense_does_not_reach_the_table(
         (answer,) = desk.say(message)
         assert (answer.kind, answer.index) == (MessageKind.REFUSED, refusal)
     desk.wait(0.2)
-    desk.table.drop_controller("enough", desk.now)
+    desk.table.drop_controller("enough", desk.time_s)
     desk.rest()
     (life,) = read_flight_record(desk.folder / "box")
     np.testing.assert_array_equal(life.command_m[: volts.size], volts / SCALE)
@@ -379,23 +385,23 @@ def test_late_samples_are_handed_over_late_and_in_order(tmp_path: Path) -> None:
     desk.drive(sine(1.0))
     came: list[tuple[int, float]] = []
     for _ in range(100):
-        desk.heard.clear()
+        desk.answers.clear()
         desk.wait(TICK_S)
-        came += [(one.index, desk.now) for one in desk.heard]
+        came += [(answer.index, desk.time_s) for answer in desk.answers]
     indices = [index for index, _ in came]
     assert indices == sorted(indices)
-    at = next(now for index, now in came if index + 10 > 400)
+    at = next(time_s for index, time_s in came if index + 10 > 400)
     assert at - 100.2 == pytest.approx(0.1, abs=2 * TICK_S)
-    after = next(now for index, now in came if index > 800)
-    assert after - 100.0 - 801 / RATE < 2 * TICK_S
+    after = next(time_s for index, time_s in came if index > 800)
+    assert after - 100.0 - 801 / RATE_HZ < 2 * TICK_S
 
 
 def test_a_machine_that_stalls_still_plays_and_remembers(tmp_path: Path) -> None:
     desk = Desk(tmp_path, TEXT + STALL)
     desk.drive(sine(1.0))
     desk.wait(0.6)
-    assert sum(one.values.size for one in desk.heard) // len(RIG.sensors) <= 400
-    desk.table.drop_controller("it heard nothing", desk.now)
+    assert sum(answer.values.size for answer in desk.answers) // len(RIG.sensors) <= 400
+    desk.table.drop_controller("it heard nothing", desk.time_s)
     desk.rest()
     (life,) = read_flight_record(desk.folder / "box")
     assert life.missing == 0
@@ -419,10 +425,14 @@ def test_a_black_box_that_is_cut_off_is_readable(desk: Desk) -> None:
 def test_a_black_box_overwrites_nothing_and_names_what_is_none(tmp_path: Path) -> None:
     path = tmp_path / "box"
     path.write_text("something else, long enough for a header")
-    with pytest.raises(InputError, match="will not be overwritten"):
+    before = path.read_bytes()
+    with pytest.raises(InputError) as error:
         FlightRecorder(path, print)
-    with pytest.raises(InputError, match="not a flight record") as error:
+    assert error.value.where == f"--log {path}"
+    assert path.read_bytes() == before
+    with pytest.raises(InputError) as error:
         read_flight_record(path)
     assert error.value.where == str(path)
-    with pytest.raises(InputError, match="cannot write"):
+    with pytest.raises(InputError) as error:
         FlightRecorder(tmp_path / "none" / "box", print)
+    assert error.value.where == f"--log {tmp_path / 'none' / 'box'}"

@@ -17,9 +17,9 @@ from table_io.sim.ni.task import (
     Task,
 )
 
-RATE = 2000.0
-HELD = 40  # samples in the device, where it is told to hold few
-START = 10.0
+RATE_HZ = 2000.0
+HELD_SAMPLES = 40  # samples in the device, where it is told to hold few
+START_S = 10.0
 
 
 class Plotter:
@@ -43,24 +43,24 @@ class Plotter:
         held = np.full(max(index - self.volts.size, 0), self.volts[-1])
         self.volts = np.concatenate([self.volts[:index], held, volts])
 
-    def start(self, now: float) -> None:
-        self.since, self.given = now, 0
+    def start(self, now_s: float) -> None:
+        self.since, self.given = now_s, 0
 
     def freeze(self, why: str) -> None:
         self.why = why
 
-    def receive_heartbeat(self, now: float) -> None:
-        self.beats.append(now)
+    def receive_heartbeat(self, now_s: float) -> None:
+        self.beats.append(now_s)
 
-    def played(self, count: int) -> Float1D:
+    def take_played(self, count: int) -> Float1D:
         return np.pad(self.volts, (0, max(count - self.volts.size, 0)), "edge")[:count]
 
-    def play(self, now: float) -> list[Float2D]:
+    def play(self, now_s: float) -> list[Float2D]:
         if not self.moving:
             return []
-        due = int((now - self.since) * RATE + 1e-6) + 1
+        due = int((now_s - self.since) * RATE_HZ + 1e-6) + 1
         first, self.given = self.given, due
-        return [self.played(due)[None, first:]]
+        return [self.take_played(due)[None, first:]]
 
     def read_at_rest(self, rate_hz: float, samples: int) -> Float2D:
         return np.zeros((1, samples))
@@ -71,7 +71,7 @@ class Bank:
 
     def __init__(self, **output: Any) -> None:
         self.table = Plotter()
-        self.device = SimulatedDaqDevice(self.table, (RATE,), START)
+        self.device = SimulatedDaqDevice(self.table, (RATE_HZ,), START_S)
         self.input = self._task("ai", "Dev1/ai0", 4000)
         self.output = self._task("ao", "Dev1/ao0", 10000)
         self.line = self.device.create_task("line", 0)[0]
@@ -86,17 +86,17 @@ class Bank:
         task, new = self.device.create_task(kind, 0)
         assert new
         self.device.add_channel(task, kind, physical)
-        self.device.configure_timing(task, RATE, "", buffer)
+        self.device.configure_timing(task, RATE_HZ, "", buffer)
         return task
 
-    def write(self, first: int, volts: Float1D, now: float = START) -> None:
+    def write(self, first: int, volts: Float1D, now_s: float = START_S) -> None:
         self.output.offset = first
-        self.device.write(self.output, volts, now)
+        self.device.write(self.output, volts, now_s)
 
     def go(self, volts: Float1D) -> None:
         self.write(0, volts)
-        self.device.start(self.output, START)
-        self.device.start(self.input, START)
+        self.device.start(self.output, START_S)
+        self.device.start(self.input, START_S)
 
 
 def code_of(call: Callable[[], object]) -> int:
@@ -111,60 +111,61 @@ RAMP = np.arange(1000) / 1000.0
 def test_the_output_waits_for_the_trigger_of_the_input_and_shares_its_sample_0() -> None:
     bank = Bank()
     bank.write(0, RAMP)
-    bank.device.start(bank.output, START)
-    bank.device.advance(START + 1.0)
+    bank.device.start(bank.output, START_S)
+    bank.device.advance(START_S + 1.0)
     assert not bank.table.moving
-    bank.device.start(bank.input, START + 1.0)
-    assert bank.device.samples_ready(bank.input, 200, START + 1.1)
+    bank.device.start(bank.input, START_S + 1.0)
+    assert bank.device.samples_ready(bank.input, 200, START_S + 1.1)
     assert (bank.device.read(bank.input, 200)[0] == RAMP[:200]).all()
 
 
 def test_what_lies_in_the_buffer_is_replaced_and_what_lies_in_the_device_is_not() -> None:
     bank = Bank()
     bank.go(RAMP)
-    now = START + 0.1  # 201 samples have left, the next 40 lie in the device
-    bank.device.advance(now)
-    last = bank.output.generated_samples(now) + HELD - 1
-    assert code_of(lambda: bank.write(last, np.ones(500), now)) == ErrorCode.NO_LONGER_WRITEABLE
-    bank.write(last + 1, np.ones(500), now)
-    bank.device.advance(START + 0.3)
-    assert (bank.table.played(last + 1) == RAMP[: last + 1]).all()
-    assert bank.table.played(last + 2)[-1] == 1.0
+    now_s = START_S + 0.1  # 201 samples have left, the next 40 lie in the device
+    bank.device.advance(now_s)
+    last = bank.output.generated_samples(now_s) + HELD_SAMPLES - 1
+    assert code_of(lambda: bank.write(last, np.ones(500), now_s)) == ErrorCode.NO_LONGER_WRITEABLE
+    bank.write(last + 1, np.ones(500), now_s)
+    bank.device.advance(START_S + 0.3)
+    assert (bank.table.take_played(last + 1) == RAMP[: last + 1]).all()
+    assert bank.table.take_played(last + 2)[-1] == 1.0
 
 
 def test_by_default_the_device_swallows_all_that_its_memory_holds() -> None:
     bank = Bank(transfer_condition=WHEN_NOT_FULL)
     bank.go(np.zeros(9000))
-    bank.device.advance(START + 0.1)
+    bank.device.advance(START_S + 0.1)
     assert (
-        code_of(lambda: bank.write(8000, np.ones(2), START + 0.1)) == ErrorCode.NO_LONGER_WRITEABLE
+        code_of(lambda: bank.write(8000, np.ones(2), START_S + 0.1))
+        == ErrorCode.NO_LONGER_WRITEABLE
     )
-    bank.write(8450, np.ones(2), START + 0.1)
+    bank.write(8450, np.ones(2), START_S + 0.1)
 
 
 def test_without_regeneration_an_output_that_is_not_fed_stops_and_freezes() -> None:
     bank = Bank()
     bank.go(RAMP)
-    bank.device.advance(START + 1.0)
+    bank.device.advance(START_S + 1.0)
     assert bank.table.why == "output ran out at sample 1000"
-    assert bank.table.played(2000)[-1] == RAMP[-1]
-    assert code_of(lambda: bank.device.is_done(bank.output, START + 1.0)) == -200290
-    assert code_of(lambda: bank.write(1000, RAMP, START + 1.0)) == -200290
+    assert bank.table.take_played(2000)[-1] == RAMP[-1]
+    assert code_of(lambda: bank.device.is_done(bank.output, START_S + 1.0)) == -200290
+    assert code_of(lambda: bank.write(1000, RAMP, START_S + 1.0)) == -200290
 
 
 def test_with_regeneration_it_begins_anew() -> None:
     bank = Bank(regenerates=True)
     bank.go(RAMP)
-    bank.device.advance(START + 1.2)
-    assert (bank.table.played(2400) == np.tile(RAMP, 3)[:2400]).all()
-    assert not bank.device.is_done(bank.output, START + 1.2)
+    bank.device.advance(START_S + 1.2)
+    assert (bank.table.take_played(2400) == np.tile(RAMP, 3)[:2400]).all()
+    assert not bank.device.is_done(bank.output, START_S + 1.2)
 
 
 def test_what_lies_behind_the_last_write_is_forgotten() -> None:
     bank = Bank()
     bank.go(RAMP)
-    bank.write(300, np.ones(10), START + 0.05)
-    bank.device.advance(START + 0.5)
+    bank.write(300, np.ones(10), START_S + 0.05)
+    bank.device.advance(START_S + 0.5)
     assert bank.table.why == "output ran out at sample 310"
 
 
@@ -172,21 +173,21 @@ def test_a_buffer_has_an_end_and_no_hole() -> None:
     bank = Bank()
     assert code_of(lambda: bank.write(0, np.zeros(10001))) == ErrorCode.NO_MORE_SPACE
     bank.go(RAMP)
-    assert code_of(lambda: bank.write(1000, np.zeros(9100), START)) == ErrorCode.NOT_YET_WRITEABLE
-    assert code_of(lambda: bank.write(1001, np.zeros(10), START)) == ErrorCode.NOT_YET_WRITEABLE
-    assert code_of(lambda: bank.write(-1, np.zeros(10), START)) == ErrorCode.NEGATIVE_WRITE
+    assert code_of(lambda: bank.write(1000, np.zeros(9100), START_S)) == ErrorCode.NOT_YET_WRITEABLE
+    assert code_of(lambda: bank.write(1001, np.zeros(10), START_S)) == ErrorCode.NOT_YET_WRITEABLE
+    assert code_of(lambda: bank.write(-1, np.zeros(10), START_S)) == ErrorCode.NEGATIVE_WRITE
 
 
 def test_an_output_needs_samples_before_it_starts() -> None:
     bank = Bank()
-    bank.write(0, np.zeros(HELD - 1))
-    assert code_of(lambda: bank.device.start(bank.output, START)) == ErrorCode.NOT_ENOUGH_WRITTEN
+    bank.write(0, np.zeros(HELD_SAMPLES - 1))
+    assert code_of(lambda: bank.device.start(bank.output, START_S)) == ErrorCode.NOT_ENOUGH_WRITTEN
 
 
 def test_an_input_that_nobody_reads_ends_and_the_output_goes_on() -> None:
     bank = Bank()
     bank.go(np.tile(RAMP, 9))
-    late = START + 4001 / RATE
+    late = START_S + 4001 / RATE_HZ
     assert (
         code_of(lambda: bank.device.samples_ready(bank.input, 1, late))
         == ErrorCode.NO_LONGER_AVAILABLE
@@ -198,24 +199,24 @@ def test_an_input_that_nobody_reads_ends_and_the_output_goes_on() -> None:
 def test_an_output_on_the_clock_of_the_inputs_freezes_with_them() -> None:
     bank = Bank(clock="/Dev1/ai/SampleClock")
     bank.go(np.tile(RAMP, 9))
-    bank.device.stop(bank.input, START + 0.25)
+    bank.device.stop(bank.input, START_S + 0.25)
     assert bank.table.why == "output without a clock at sample 501"
-    assert bank.table.played(3000)[-1] == RAMP[500]
+    assert bank.table.take_played(3000)[-1] == RAMP[500]
 
 
 def test_an_output_that_is_stopped_freezes_where_it_is() -> None:
     bank = Bank()
     bank.go(RAMP)
-    bank.device.clear(bank.output, START + 0.25)
-    assert bank.table.played(3000)[-1] == RAMP[500]
+    bank.device.clear(bank.output, START_S + 0.25)
+    assert bank.table.take_played(3000)[-1] == RAMP[500]
     assert code_of(lambda: bank.device.find_task(bank.output.number)) == ErrorCode.INVALID_TASK
 
 
 def test_samples_are_waited_for_and_read_once() -> None:
     bank = Bank()
     bank.go(RAMP)
-    assert not bank.device.samples_ready(bank.input, 100, START + 98 / RATE)
-    assert bank.device.samples_ready(bank.input, 100, START + 99 / RATE)
+    assert not bank.device.samples_ready(bank.input, 100, START_S + 98 / RATE_HZ)
+    assert bank.device.samples_ready(bank.input, 100, START_S + 99 / RATE_HZ)
     whole = np.concatenate([bank.device.read(bank.input, count) for count in (60, 60)], axis=1)
     assert (whole[0] == RAMP[:100]).all()
 
@@ -225,8 +226,8 @@ def test_a_device_that_is_in_use_is_reserved_and_a_session_is_found_by_its_name(
     bank.go(RAMP)
     other = bank.device.create_task("other", 1)[0]
     bank.device.add_channel(other, "ai", "Dev1/ai0")
-    bank.device.configure_timing(other, RATE, "", 100)
-    assert code_of(lambda: bank.device.start(other, START)) == ErrorCode.RESERVED
+    bank.device.configure_timing(other, RATE_HZ, "", 100)
+    assert code_of(lambda: bank.device.start(other, START_S)) == ErrorCode.RESERVED
     assert bank.device.create_task("ao", 2) == (bank.output, False)
     with pytest.raises(KeyError):
         bank.device.create_task("ao", 1)
@@ -242,7 +243,8 @@ def test_a_rate_that_the_device_has_not_and_a_task_without_channels_are_refused(
     )
     empty = bank.device.create_task("", 0)[0]
     assert (
-        code_of(lambda: bank.device.configure_timing(empty, RATE, "", 10)) == ErrorCode.NO_CHANNELS
+        code_of(lambda: bank.device.configure_timing(empty, RATE_HZ, "", 10))
+        == ErrorCode.NO_CHANNELS
     )
     assert (
         code_of(lambda: bank.device.add_channel(bank.input, "ao", "Dev1/ao0"))

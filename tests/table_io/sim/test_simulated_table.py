@@ -17,7 +17,7 @@ from table_io.sim.simulated_table import SimulatedBackend
 
 RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
-RATE = 2000.0
+RATE_HZ = 2000.0
 
 
 @dataclass
@@ -52,7 +52,7 @@ def backend(
     card: RigConfig = RIG,
     specimen: Specimen = SPECIMEN,
     clock: ManualClock | RealClock | Fixed | None = None,
-    rate_hz: float = RATE,
+    rate_hz: float = RATE_HZ,
 ) -> SimulatedBackend:
     """An open backend that has not started."""
     machine = SimulatedBackend(card, specimen, rate_hz, clock or ManualClock())
@@ -60,14 +60,14 @@ def backend(
     return machine
 
 
-def command(seconds: float, rate_hz: float = RATE) -> Float1D:
+def command(seconds: float, rate_hz: float = RATE_HZ) -> Float1D:
     """Volts of a 1.4 Hz motion that grows from rest over a second; impacts at G4."""
     t = np.arange(round(seconds * rate_hz)) / rate_hz
     metres = 6e-3 * np.minimum(t, 1.0) ** 3 * np.sin(2 * np.pi * 1.4 * t)
     return command_to_volts(metres, RIG.output)
 
 
-def played(volts: Float1D, cuts: list[int], **options: object) -> Float2D:
+def play_run(volts: Float1D, cuts: list[int], **options: object) -> Float2D:
     """Samples of a whole run read in blocks of `cuts`."""
     machine = backend(**options)  # type: ignore[arg-type]
     machine.queue(0, volts)
@@ -81,18 +81,18 @@ def row(values: Float2D, channel: str) -> Float1D:
 
 
 def test_the_cut_into_reads_changes_no_bit() -> None:
-    whole = played(command(2.0), [4000])
+    whole = play_run(command(2.0), [4000])
     assert np.abs(row(whole, "force_r1_n")).max() > 0.1  # it did impact: over 100 N
     for samples in (1, 7, 64, 500):
         cuts = [samples] * (4000 // samples) + [4000 % samples]
-        assert played(command(2.0), cuts).tobytes() == whole.tobytes(), samples
+        assert play_run(command(2.0), cuts).tobytes() == whole.tobytes(), samples
 
 
 def test_every_clock_sees_the_same_samples_and_the_real_one_keeps_time() -> None:
-    fast = played(command(0.5), [20] * 20)
+    fast = play_run(command(0.5), [20] * 20)
     before = time.monotonic()
-    real = played(command(0.5), [20] * 20, clock=RealClock())
-    assert time.monotonic() - before >= 399 / RATE
+    real = play_run(command(0.5), [20] * 20, clock=RealClock())
+    assert time.monotonic() - before >= 399 / RATE_HZ
     assert real.tobytes() == fast.tobytes()
 
 
@@ -105,14 +105,14 @@ def test_read_waits_for_its_last_sample_and_for_nothing_else() -> None:
     assert clock.waited == []
     machine.read(20)
     machine.read(5)
-    assert clock.waited == [100.0 + 19 / RATE, 100.0 + 24 / RATE]
+    assert clock.waited == [100.0 + 19 / RATE_HZ, 100.0 + 24 / RATE_HZ]
     assert machine.scheduled_time_s(2000) == 101.0
 
 
 def test_the_seed_decides_the_noise() -> None:
-    one = played(command(0.1), [200])
-    assert played(command(0.1), [200], card=rig(seed=1)).tobytes() == one.tobytes()
-    assert played(command(0.1), [200], card=rig(seed=2)).tobytes() != one.tobytes()
+    samples = play_run(command(0.1), [200])
+    assert play_run(command(0.1), [200], card=rig(seed=1)).tobytes() == samples.tobytes()
+    assert play_run(command(0.1), [200], card=rig(seed=2)).tobytes() != samples.tobytes()
 
 
 def test_the_command_is_played_in_steps_and_held_at_the_rails() -> None:
@@ -120,7 +120,9 @@ def test_the_command_is_played_in_steps_and_held_at_the_rails() -> None:
     raw["output"]["bits"] = 12
     step_m = 2 * 60e-3 / 2**12
     volts = np.array([0.0, 0.4, 0.6, 10.2, 3000.0, -3000.0]) * step_m * RIG.output.volts_per_m
-    drive = volts_to_si(played(volts, [6], card=RigConfig.model_validate(raw)), RIG.sensors, {})[0]
+    drive = volts_to_si(play_run(volts, [6], card=RigConfig.model_validate(raw)), RIG.sensors, {})[
+        0
+    ]
     adc_m = 2 * 60e-3 / 2**24
     expected = np.array([0.0, 0.0, 1.0, 10.0, 2047.0, -2048.0]) * step_m
     np.testing.assert_allclose(drive, expected, atol=adc_m)
@@ -128,7 +130,7 @@ def test_the_command_is_played_in_steps_and_held_at_the_rails() -> None:
 
 def test_inputs_come_in_whole_steps_within_their_range() -> None:
     coarse = sensors(bits=10, range=0.01)
-    samples = played(command(2.0), [4000], card=coarse)
+    samples = play_run(command(2.0), [4000], card=coarse)
     for line, sensor in zip(samples, coarse.sensors, strict=True):
         step = 2 * 0.01 * sensor.volts_per_unit / 2**10
         codes = line / step
@@ -173,11 +175,11 @@ def test_taring_does_not_change_the_run() -> None:
     machine.tare(777)
     machine.queue(0, command(0.1))
     machine.start()
-    assert machine.read(200).tobytes() == played(command(0.1), [200]).tobytes()
+    assert machine.read(200).tobytes() == play_run(command(0.1), [200]).tobytes()
 
 
 def test_the_cells_of_a_side_share_its_force_in_compression() -> None:
-    samples = played(command(2.0), [4000], card=sensors(noise_rms=0.0, offset=0.0))
+    samples = play_run(command(2.0), [4000], card=sensors(noise_rms=0.0, offset=0.0))
     values = volts_to_si(samples, RIG.sensors, {})
     cells = values[5:]
     np.testing.assert_array_equal(cells[0], cells[1])
@@ -187,13 +189,13 @@ def test_the_cells_of_a_side_share_its_force_in_compression() -> None:
     assert u[np.argmax(cells[0])] > 2e-3
     assert u[np.argmax(cells[2])] < -2e-3
     resisting = 2 * cells[0] - 2 * cells[2]
-    v = np.gradient(u, 1 / RATE)
+    v = np.gradient(u, 1 / RATE_HZ)
     lost = 550.0 * row(values, "mass_acc_m_s2") + 1100.0 * v + 36e3 * u + resisting
     assert np.median(np.abs(lost)) < 0.5
 
 
 def test_beyond_the_queue_the_command_holds_its_last_value() -> None:
-    drive = played(np.array([0.0, 0.5, 1.0]), [2, 3, 40])[0]
+    drive = play_run(np.array([0.0, 0.5, 1.0]), [2, 3, 40])[0]
     np.testing.assert_allclose(drive[2:], drive[2])
     assert drive[2] == pytest.approx(6e-3 * RIG.sensors[0].volts_per_si, rel=1e-4)
 
@@ -209,7 +211,7 @@ def test_a_replaced_command_plays_from_its_index_on() -> None:
     replaced = np.concatenate([head, machine.read(400)], axis=1)
     expected = volts.copy()
     expected[index:] = volts[index]
-    assert replaced.tobytes() == played(expected, [500]).tobytes()
+    assert replaced.tobytes() == play_run(expected, [500]).tobytes()
 
 
 def test_a_gap_in_the_queue_holds_the_value_before_it() -> None:
@@ -218,7 +220,7 @@ def test_a_gap_in_the_queue_holds_the_value_before_it() -> None:
     machine.queue(50, np.array([2.0]))
     machine.start()
     filled = np.concatenate([[0.0], np.full(49, 1.0), [2.0]])
-    assert machine.read(100).tobytes() == played(filled, [100]).tobytes()
+    assert machine.read(100).tobytes() == play_run(filled, [100]).tobytes()
 
 
 @pytest.mark.parametrize("rate_hz", RIG.rates_hz)
@@ -229,7 +231,7 @@ def test_what_is_in_the_device_cannot_be_replaced(rate_hz: float) -> None:
     machine.start()
     machine.read(100)
     earliest = 99 + machine.replace_after
-    with pytest.raises(ValueError, match=f"already in the device; allowed: from {earliest} on"):
+    with pytest.raises(ValueError, match=rf"\b{earliest}\b"):
         machine.queue(earliest - 1, np.zeros(10))
     machine.queue(earliest, np.zeros(10))
 
@@ -242,15 +244,15 @@ def test_the_machine_plays_on_while_nobody_reads(away_s: float) -> None:
     machine.start()
     machine.read(100)
     clock.wait_until(clock.now() + away_s)
-    newest = 99 + round(away_s * RATE)
+    newest = 99 + round(away_s * RATE_HZ)
     earliest = newest + machine.replace_after
-    with pytest.raises(ValueError, match=f"allowed: from {earliest} on"):
+    with pytest.raises(ValueError, match=rf"\b{earliest}\b"):
         machine.queue(earliest - 1, np.zeros(10))
     machine.queue(earliest, np.zeros(10))
     volts = command(1.0)
     volts[earliest:] = 0.0
     behind = machine.read(900)
-    assert behind.tobytes() == played(volts, [100, 900])[:, 100:].tobytes()
+    assert behind.tobytes() == play_run(volts, [100, 900])[:, 100:].tobytes()
 
 
 def test_a_command_that_is_no_number_is_refused() -> None:
@@ -262,16 +264,18 @@ def test_the_queue_does_not_grow_with_the_test() -> None:
     machine = backend()
     machine.queue(0, np.zeros(1000))
     machine.start()
-    for _ in range(300):
+    for taken in range(200, 60_001, 200):
         machine.read(200)
-        machine.queue(machine._next + 100, np.zeros(1000))
+        machine.queue(taken + 100, np.zeros(1000))
     assert machine._command.size < 1300
 
 
 def test_order_of_life_and_rates_are_kept() -> None:
-    with pytest.raises(InputError, match=r"acquisition.rate_hz = 1234.* allowed: 1000, 2000, 4000"):
+    with pytest.raises(InputError) as error:
         backend(rate_hz=1234.0)
-    unopened = SimulatedBackend(RIG, SPECIMEN, RATE, ManualClock())
+    assert (error.value.key, error.value.value) == ("acquisition.rate_hz", 1234.0)
+    assert error.value.allowed == "1000, 2000, 4000 Hz"
+    unopened = SimulatedBackend(RIG, SPECIMEN, RATE_HZ, ManualClock())
     with pytest.raises(RuntimeError, match="open"):
         unopened.queue(0, np.zeros(1))
     machine = backend()

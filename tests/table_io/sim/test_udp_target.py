@@ -41,7 +41,7 @@ from table_io.sim.machine.table import SimulatedMachine
 from table_io.sim.udp.target import UdpTarget
 from tests.table_io.backends.udp_bench import FLAGS, SOURCES, TEXT
 
-RATE = 2000.0
+RATE_HZ = 2000.0
 RIG = parse_toml(TEXT, RigConfig, "udp")
 SCALE = RIG.output.volts_per_m
 TICK_S = 0.002
@@ -72,7 +72,7 @@ class Far(Protocol):
 
     def hear(self, data: bytes, port: int) -> None: ...
     def tick(self) -> Sent: ...
-    def played(self) -> Float1D: ...
+    def read_command(self) -> Float1D: ...
 
 
 class PythonFar:
@@ -94,7 +94,7 @@ class PythonFar:
         sent = self._target.tick(self._now)
         return [(state_in(data), address[1]) for data, address in sent]
 
-    def played(self) -> Float1D:
+    def read_command(self) -> Float1D:
         life = read_flight_record(self._path)[-1]
         return life.command_m * life.volts_per_m
 
@@ -104,7 +104,7 @@ class CFar:
 
     def __init__(self, folder: Path) -> None:
         library = folder / f"target{next(COUNT)}.so"  # its memory is static: one library a life
-        shutil.copy(built(), library)
+        shutil.copy(build_target(), library)
         self.library = ctypes.CDLL(str(library))
         self.library.target_rate_hz.restype = ctypes.c_double
         self.library.target_init()
@@ -122,7 +122,7 @@ class CFar:
             sent.append((state_in(bytes(self._packet)), port))
         return sent
 
-    def played(self) -> Float1D:
+    def read_command(self) -> Float1D:
         plays = ctypes.c_int.in_dll(self.library, "plays").value
         return np.array((ctypes.c_double * (1 << 18)).in_dll(self.library, "played")[:plays])
 
@@ -131,7 +131,7 @@ COUNT = itertools.count()
 
 
 @cache
-def built() -> Path:
+def build_target() -> Path:
     """`target.c` with the hooks, as a library; skips where there is no compiler."""
     compiler = shutil.which("cc")
     if compiler is None:
@@ -159,7 +159,7 @@ class Desk:
     session: int = 7
     sequence: int = 0
     queues: int = 0
-    said: Sent = field(default_factory=list)
+    sent_states: Sent = field(default_factory=list)
 
     def say(self, word: RigPacket, port: int = PORT) -> None:
         self.sequence = (self.sequence + 1) & 0xFFFFFFFF
@@ -171,8 +171,8 @@ class Desk:
         for _ in range(round(seconds / TICK_S)):
             if beats:
                 self.say(RigPacket(PacketKind.BEAT))
-            self.said += self.far.tick()
-        return next(state for state, port in reversed(self.said) if port == PORT)
+            self.sent_states += self.far.tick()
+        return next(state for state, port in reversed(self.sent_states) if port == PORT)
 
     def queue(self, index: int, volts: Float1D, leave_out: int = -1) -> TargetState:
         """Every piece of a command but one, in a mixed order; the state after it."""
@@ -190,7 +190,9 @@ class Desk:
             values=values,
         )  # fmt: skip
 
-    def claim(self, rate: float = RATE, channels: int = 9, card: int = 0, port: int = PORT) -> None:
+    def claim(
+        self, rate: float = RATE_HZ, channels: int = 9, card: int = 0, port: int = PORT
+    ) -> None:
         numbers = [rate, channels, card, 550.0, 4.0, np.nan, np.nan]
         self.say(RigPacket(PacketKind.CLAIM, values=np.array(numbers)), port)
 
@@ -203,26 +205,29 @@ class Desk:
 
     def samples(self) -> dict[int, Float1D]:
         """Samples of the run that were sent, by index; the same where it was sent again."""
-        there: dict[int, Float1D] = {}
-        for state, port in self.said:
+        rows: dict[int, Float1D] = {}
+        for state, port in self.sent_states:
             if state.phase is Phase.RUNNING and port == PORT and state.session == self.session:
                 for k, row in enumerate(state.values.reshape(-1, 9)):
-                    assert np.array_equal(there.setdefault(state.index + k, row), row, True)
-        return there
+                    assert np.array_equal(rows.setdefault(state.index + k, row), row, True)
+        return rows
 
     def rest(self) -> None:
         """Time passes without a rig until the target is free; it has ten seconds."""
         for _ in range(5000):
             self.far.hear(encode_rig_packet(RigPacket(PacketKind.BEAT)), OTHER)
-            self.said += self.far.tick()
-            if next(s for s, port in reversed(self.said) if port == OTHER).phase is Phase.FREE:
+            self.sent_states += self.far.tick()
+            if (
+                next(s for s, port in reversed(self.sent_states) if port == OTHER).phase
+                is Phase.FREE
+            ):
                 return
         raise AssertionError("it did not come to rest")
 
 
 def sine(seconds: float, volts: float = 1.0, f: float = 2.0) -> Float1D:
     """A motion that grows smoothly and goes on: its end is in motion."""
-    t = np.arange(round(seconds * RATE)) / RATE
+    t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
     x = np.clip(t / 0.5, 0.0, 1.0)
     motion: Float1D = volts * x**3 * (10 + x * (-15 + 6 * x)) * np.sin(2 * np.pi * f * t)
     return motion
@@ -230,12 +235,14 @@ def sine(seconds: float, volts: float = 1.0, f: float = 2.0) -> Float1D:
 
 def acceleration(volts: Float1D) -> float:
     """Largest acceleration of a command in m/s2, rest before it included."""
-    return float(np.abs(np.diff(np.concatenate([np.zeros(2), volts]), 2)).max() * RATE**2 / SCALE)
+    return float(
+        np.abs(np.diff(np.concatenate([np.zeros(2), volts]), 2)).max() * RATE_HZ**2 / SCALE
+    )
 
 
 def check_played(desk: Desk, volts: Float1D) -> None:
     """The first of what was played are these; the black box keeps metres, so to a rounding."""
-    np.testing.assert_allclose(desk.far.played()[: volts.size], volts, rtol=1e-14, atol=1e-15)
+    np.testing.assert_allclose(desk.far.read_command()[: volts.size], volts, rtol=1e-14, atol=1e-15)
 
 
 @pytest.fixture(params=[PythonFar, CFar])
@@ -247,12 +254,14 @@ def test_it_plays_its_command_and_sends_every_sample_once(desk: Desk) -> None:
     volts = sine(1.0)
     desk.drive(volts)
     desk.wait(0.5)
-    there = desk.samples()
-    assert sorted(there) == list(range(len(there)))
-    assert len(there) >= 1001 - 4
-    assert sum(s.values.size for s, _ in desk.said if s.phase is Phase.RUNNING) == 9 * len(there)
+    rows = desk.samples()
+    assert sorted(rows) == list(range(len(rows)))
+    assert len(rows) >= 1001 - 4
+    assert sum(s.values.size for s, _ in desk.sent_states if s.phase is Phase.RUNNING) == 9 * len(
+        rows
+    )
     check_played(desk, volts[:1000])
-    drive = np.array([there[i][0] for i in range(len(there))])
+    drive = np.array([rows[i][0] for i in range(len(rows))])
     assert np.abs(drive - volts[: drive.size]).max() <= 0.501 * 20.0 / 2**18 + 20.0 / 2**24
 
 
@@ -261,7 +270,7 @@ def test_at_rest_it_sends_samples_from_the_claim_on(desk: Desk) -> None:
     state = desk.wait(0.1)
     assert state.phase is Phase.CLAIMED
     assert state.taken >= 200 - 4
-    sent = [s.index + k for s, _ in desk.said for k in range(s.values.size // 9)]
+    sent = [s.index + k for s, _ in desk.sent_states for k in range(s.values.size // 9)]
     assert sent == list(range(len(sent)))
     assert len(sent) >= 190
 
@@ -272,7 +281,15 @@ def test_a_command_is_replaced_at_once_and_whole(desk: Desk) -> None:
     desk.wait(0.1)
     other = volts[600] * np.linspace(1.0, 0.0, 700) ** 3
     assert desk.queue(600, other, leave_out=2).verdict is QueueVerdict.ARRIVING
-    assert desk.said[-1][0].pieces[:7].tolist() == [True, True, False, True, True, True, False]
+    assert desk.sent_states[-1][0].pieces[:7].tolist() == [
+        True,
+        True,
+        False,
+        True,
+        True,
+        True,
+        False,
+    ]
     assert desk.wait(0.1).verdict is QueueVerdict.ARRIVING
     desk.say(desk.piece(600, other, 2))
     assert desk.wait(TICK_S).verdict is QueueVerdict.PLAYS
@@ -346,10 +363,10 @@ def test_a_large_motion_is_landed_within_the_span(
     desk.drive(volts)
     desk.wait(0.02, beats=False)
     desk.rest()
-    played = desk.far.played()
+    played = desk.far.read_command()
     assert np.abs(played).max() <= 10.0 * (1.0 + 1e-12)
     assert played[-1] == 0.0
-    landed = plan_stop(volts[-3:] / SCALE, RATE, 0.06) * SCALE
+    landed = plan_stop(volts[-3:] / SCALE, RATE_HZ, 0.06) * SCALE
     after = played[volts.size : volts.size + landed.size]
     np.testing.assert_allclose(after, landed[: after.size], atol=1e-5)
     assert not played[volts.size + landed.size :].any()
@@ -363,14 +380,14 @@ def test_a_gap_between_two_queues_holds_the_last_value_whatever_was_played_befor
     desk.say(RigPacket(PacketKind.RELEASE))
     desk.rest()
     desk.session, desk.queues, desk.sequence = 9, 0, 0
-    desk.said.clear()
+    desk.sent_states.clear()
     desk.claim()
     desk.wait(1.0)  # samples at rest play nothing, and are none of the command
     assert desk.queue(0, np.zeros(2)).verdict is QueueVerdict.PLAYS
     assert desk.queue(4000, np.zeros(10)).verdict is QueueVerdict.PLAYS
     desk.say(RigPacket(PacketKind.START))
     desk.wait(2.2)
-    assert not desk.far.played().any()
+    assert not desk.far.read_command().any()
 
 
 def test_sequence_numbers_wrap(desk: Desk) -> None:
@@ -400,7 +417,7 @@ int main(void) {
 
 
 def test_the_heartbeat_beats_on_after_years(tmp_path: Path) -> None:
-    built()  # or skip
+    build_target()  # or skip
     source, program = tmp_path / "aged.c", tmp_path / "aged"
     source.write_text(AGED)
     command = ["cc", "-O1", f"-I{SOURCES}", str(source), "-lm", "-o", str(program)]
@@ -423,11 +440,11 @@ def test_a_silent_rig_is_lost_in_time_and_the_table_comes_to_rest(desk: Desk) ->
     state = desk.wait(6 * TICK_S, beats=False)
     assert (state.phase, state.reason) == (Phase.ENDING, Reason.SILENCE)
     desk.rest()
-    played = desk.far.played()
+    played = desk.far.read_command()
     check_played(desk, volts)
     assert played[-1] == 0.0
     assert acceleration(played) <= 1.05 * max(acceleration(volts), 0.5)
-    assert played.size < volts.size + 8 * RATE
+    assert played.size < volts.size + 8 * RATE_HZ
 
 
 def test_what_is_held_off_the_mean_goes_home_once_it_is_released(desk: Desk) -> None:
@@ -437,7 +454,7 @@ def test_what_is_held_off_the_mean_goes_home_once_it_is_released(desk: Desk) -> 
     desk.say(RigPacket(PacketKind.RELEASE))
     assert desk.wait(TICK_S).reason is Reason.RELEASED
     desk.rest()
-    played = desk.far.played()
+    played = desk.far.read_command()
     assert played[2000] == pytest.approx(1.0)
     assert played[-1] == 0.0
     assert acceleration(played) < 0.55
@@ -450,8 +467,8 @@ def test_an_old_word_come_again_is_no_sign_of_life(desk: Desk) -> None:
     )
     for _ in range(round((HEARTBEAT_TIMEOUT_S + 4 * TICK_S) / TICK_S)):
         desk.far.hear(old, PORT)
-        desk.said += desk.far.tick()
-    assert desk.said[-1][0].phase is Phase.ENDING
+        desk.sent_states += desk.far.tick()
+    assert desk.sent_states[-1][0].phase is Phase.ENDING
 
 
 def test_strangers_are_answered_counted_and_change_nothing(desk: Desk) -> None:
@@ -472,17 +489,17 @@ def test_strangers_are_answered_counted_and_change_nothing(desk: Desk) -> None:
         spoilt[70] ^= 1
         desk.far.hear(bytes(spoilt), PORT)
         stranger.claim(port=OTHER)
-        told = [s for s, port in desk.far.tick() if port == OTHER]
-        assert told
-        assert {(s.session, s.reason) for s in told} == {(0, Reason.BUSY)}
+        replies = [s for s, port in desk.far.tick() if port == OTHER]
+        assert replies
+        assert {(s.session, s.reason) for s in replies} == {(0, Reason.BUSY)}
         assert desk.wait(TICK_S).ignored == 5 * (number + 1)
     desk.wait(0.1)
     desk.wait(HEARTBEAT_TIMEOUT_S - 4 * TICK_S, beats=False)
     for _ in range(8):
         stranger.say(RigPacket(PacketKind.BEAT), OTHER)
         stranger.say(RigPacket(PacketKind.BEAT), PORT)
-        desk.said += desk.far.tick()
-    ours = [s for s, port in desk.said if port == PORT and s.session]
+        desk.sent_states += desk.far.tick()
+    ours = [s for s, port in desk.sent_states if port == PORT and s.session]
     assert ours[-1].phase is Phase.ENDING, "a stranger is no sign of life"
     check_played(desk, volts[:600])
 
@@ -491,16 +508,16 @@ def test_samples_are_sent_again_where_they_are_asked_for(desk: Desk) -> None:
     desk.drive(sine(1.0))
     desk.wait(0.4)
     before = desk.samples()
-    desk.said.clear()
+    desk.sent_states.clear()
     desk.say(RigPacket(PacketKind.BEAT, want_from=100, want_to=150))
-    desk.said += desk.far.tick()
+    desk.sent_states += desk.far.tick()
     again = desk.samples()
     assert set(range(100, 150)) <= set(again)
     for index in range(100, 150):
         np.testing.assert_array_equal(again[index], before[index])
-    desk.said.clear()
+    desk.sent_states.clear()
     desk.say(RigPacket(PacketKind.BEAT, want_from=0, want_to=2**62))
-    desk.said += desk.far.tick()
+    desk.sent_states += desk.far.tick()
     assert len(desk.samples()) <= 16 * 14 + 20, "one word asks for so many packets at most"
 
 
@@ -535,7 +552,7 @@ def test_a_session_that_has_ended_claims_no_more(desk: Desk) -> None:
     desk.rest()
     desk.claim()  # a packet that was long on its way
     desk.wait(TICK_S, beats=False)
-    assert desk.said[-1][0].phase is Phase.FREE
+    assert desk.sent_states[-1][0].phase is Phase.FREE
     again = Desk(desk.far, session=9)
     again.drive(sine(0.3, 0.2))
     again.wait(0.1)
@@ -558,7 +575,7 @@ def test_lost_inputs_are_nan_and_the_heartbeat_line_beats_ten_times_a_second(
     desk.drive(sine(1.0))
     ctypes.c_int.in_dll(far.library, "lose").value = 1
     beats = ctypes.c_int.in_dll(far.library, "beats")
-    desk.said.clear()
+    desk.sent_states.clear()
     before = beats.value
     desk.wait(1.0)
     assert beats.value - before == pytest.approx(20, abs=1), "edges"
@@ -610,8 +627,8 @@ def test_a_rig_that_lost_its_mind_does_no_harm(
     desk.drive(sine(0.2))
     for word in words:
         desk.far.hear(encode_rig_packet(replace(word, session=desk.session)), PORT)
-        desk.said += desk.far.tick()
+        desk.sent_states += desk.far.tick()
     assert desk.wait(2 * TICK_S).phase is Phase.RUNNING
     desk.say(replace(RigPacket(PacketKind.RELEASE), sequence=2**32 - 1))
     assert desk.wait(2 * TICK_S).phase is Phase.ENDING
-    assert np.isfinite(desk.far.played()).all()
+    assert np.isfinite(desk.far.read_command()).all()
