@@ -22,6 +22,7 @@ from functools import cached_property
 import numpy as np
 
 from table_io.block import Float1D, Int1D, Label
+from table_io.excitation.correction import NO_CORRECTION, Correction
 from table_io.records import Step
 
 RAMP_CYCLES = 2.0  # a soft start over one cycle would peak at 1.12, over two at 1.02
@@ -248,14 +249,16 @@ def peak_acceleration_ratio(segment: Segment, rate_hz: float) -> float:
 class Drive:
     """Displacement command as far as it is known; it always ends at rest.
 
-    Where segments overlap the later one applies, which cuts a hold short. From sample `decay_start`
-    on, if set, the command decays to rest.
+    Where segments overlap the later one applies, which cuts a hold short. The correction of a
+    feedback is added to the command only: levels and accelerations are nominal. From sample
+    `decay_start` on, if set, the command decays to rest.
     """
 
     rate_hz: float
     segments: tuple[Segment | HistorySegment, ...]
     steps: tuple[Step, ...]
     decay_start: int | None = None
+    correction: Correction = NO_CORRECTION
 
     @cached_property
     def _starts(self) -> list[int]:
@@ -307,6 +310,7 @@ class Drive:
         displacement_m = np.zeros(count)
         for segment, window, x in self._overlaps(first, count):
             displacement_m[window] = segment.displacement(x, self.rate_hz)
+        displacement_m += self.correction.displacement(first, count)
         return displacement_m * self._decay_factor(first, count)
 
     def acceleration(self, first: int, count: int) -> Float1D:
@@ -322,6 +326,14 @@ class Drive:
         for segment, window, x in self._overlaps(first, count):
             phase[window] = segment.phase(x, self.rate_hz)
         return phase
+
+    def frequency_hz(self, index: int) -> float:
+        """Return the frequency in Hz at sample `index`; 0 at rest and in a history."""
+        segment = self.segment_at(index)
+        if not isinstance(segment, Segment) or not segment.start <= index < segment.end:
+            return 0.0
+        s = float(smoothstep(np.array([(index - segment.start) / segment.count]))[0])
+        return segment.f0 + (segment.f1 - segment.f0) * s
 
     def level(self, first: int, count: int) -> Float1D:
         """Return the demanded peak acceleration in m/s2, decay included, (count,)."""

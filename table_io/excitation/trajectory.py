@@ -188,15 +188,21 @@ def plan_excitation(profile: Profile) -> Drive:
 
 def plan_sweep(profile: Profile) -> Drive:
     """Return the drive of the sweep alone: rest, soft start, steps with blends, soft stop."""
-    sweep, trajectory = profile.sweep, start_trajectory(profile)
-    for step in sweep.steps[profile.first_step :]:
+    plan, trajectory = profile.plan, start_trajectory(profile)
+    if profile.continuation is not None:  # each orbit as if it were found at once
+        settle = profile.continuation.settle_cycles
+        cycles = settle + profile.continuation.measured_cycles
+    else:
+        cycles = profile.sweep.cycles
+        settle = cycles - profile.sweep.measured_cycles
+    for step in plan.steps[profile.first_step :]:
         target = SineTarget(step.frequency_hz, step.acceleration_m_s2)
-        trajectory = trajectory.append_blend(target, step.index, sweep.blend_cycles, Label.BLEND)
+        trajectory = trajectory.append_blend(target, step.index, plan.blend_cycles, Label.BLEND)
         trajectory = trajectory.append_hold(
-            cycles_to_samples(step, sweep.cycles, trajectory.rate_hz),
+            cycles_to_samples(step, cycles, trajectory.rate_hz),
             step.index,
             Label.MEASURE,
-            sweep.cycles,
-            sweep.cycles - sweep.measured_cycles,
+            cycles,
+            settle,
         )
-    return trajectory.to_drive(sweep.steps)
+    return trajectory.to_drive(plan.steps)

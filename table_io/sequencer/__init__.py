@@ -9,6 +9,7 @@ ends at rest.
     check --(passes)--> tune --(level accepted)---> hold, then tune at the next step, ...
                         tune --(not accepted)-----> blend to the corrected level, tune again
                         hold --(policy decides)---> the next step, or the end
+    check --(passes)--> orbit, evaluated and corrected: a continuation (`orbits.py`)
     check --(passes)--> the end, with a displacement history played as it is, if that is the test
     open: the operator holds the test at its step; on resume the step is tuned and measured again.
 """
@@ -18,14 +19,17 @@ from dataclasses import replace
 
 from table_io.adaptive import make_policy
 from table_io.block import Block, Label
+from table_io.config.excitation.continuation import Continuation
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
+from table_io.errors import InputError
 from table_io.excitation.drive import Drive, Segment
 from table_io.excitation.trajectory import start_trajectory
 from table_io.records import Record
 from table_io.safety import loop_check
 from table_io.sequencer.actions import approach_step, begin_excitation, hold_step
 from table_io.sequencer.decisions import DECISION_FUNCTIONS, accept_level
+from table_io.sequencer.orbits import apply_feedback, begin_continuation, resume_continuation
 from table_io.sequencer.state import SequencerState, Stage, TestPlan
 
 __all__ = [
@@ -34,13 +38,47 @@ __all__ = [
 ]  # fmt: skip
 
 DECISION_HORIZON_S = 0.25  # from an evaluation to the change of the command; a block is shorter
+FEEDBACK_HORIZON_S = 0.01  # from a block to its correction: to compute it, to transfer it, jitter
 
 
 def make_test_plan(profile: Profile, rig: RigConfig, replace_after: int = 0) -> TestPlan:
     """Return the plan of a test on a backend that can change samples `replace_after` ahead."""
     rate = profile.acquisition.rate_hz
     horizon = max(math.ceil(DECISION_HORIZON_S * rate), profile.acquisition.block_samples)
-    return TestPlan(profile, rig, replace_after + horizon + 1, make_policy(profile))
+    feedback_horizon = replace_after + math.ceil(FEEDBACK_HORIZON_S * rate)
+    if profile.continuation is not None:
+        _check_horizon(profile.continuation, feedback_horizon / rate)
+        _check_sensors(rig)
+    return TestPlan(
+        profile, rig, replace_after + horizon + 1, make_policy(profile), feedback_horizon
+    )
+
+
+def _check_horizon(config: Continuation, horizon_s: float) -> None:
+    """Raise InputError if the feedback comes too late even for a table without lag."""
+    plan = config.orbit_plan
+    allowed_s = plan.latency_s + plan.jitter_s
+    if horizon_s > allowed_s:
+        raise InputError(
+            f"the command can be changed {1e3 * horizon_s:.1f} ms ahead at the soonest",
+            where="continuation",
+            key="latency_s",
+            value=plan.latency_s,
+            allowed=f"at most {1e3 * allowed_s:.1f} ms, for which the orbit plan was made",
+            remedy="use a rig whose queue can be replaced later, or make the plan for this one",
+        )
+
+
+def _check_sensors(rig: RigConfig) -> None:
+    """Raise InputError if the rig does not measure the displacement of the mass."""
+    names = set(rig.channels)
+    if not ("mass_disp_m" in names or {"rel_disp_m", "table_disp_m"} <= names):
+        raise InputError(
+            "the displacement of the mass is not measured, but the feedback needs it",
+            where=f"rig {rig.name}",
+            key="sensors",
+            allowed="mass_disp_m, or rel_disp_m with table_disp_m",
+        )
 
 
 def start_test(plan: TestPlan) -> SequencerState:
@@ -51,7 +89,8 @@ def start_test(plan: TestPlan) -> SequencerState:
     targets = loop_check.plan_targets(profile, plan.rig) if profile.loop_check.enabled else ()
     if not targets:
         initial = SequencerState(plan, trajectory, trajectory.to_drive(steps), Stage("end"), steps)
-        return replace(begin_excitation(initial), changed_from=0)
+        begin = begin_continuation if profile.continuation is not None else begin_excitation
+        return replace(begin(initial), changed_from=0)
     for target in targets:
         trajectory = trajectory.append_blend(target, -1, blend_cycles, Label.BLEND)
         cycles = loop_check.count_hold_cycles(target, profile)
@@ -67,11 +106,21 @@ def start_test(plan: TestPlan) -> SequencerState:
     return SequencerState(plan, trajectory, trajectory.to_drive(steps), stage, steps)
 
 
-def advance_test(state: SequencerState, block: Block) -> tuple[SequencerState, tuple[Record, ...]]:
-    """Return (state, new records) after a measured block; blocks must come in order."""
+def advance_test(
+    state: SequencerState, block: Block, earliest: int = 0
+) -> tuple[SequencerState, tuple[Record, ...]]:
+    """Return (state, new records) after a measured block; blocks must come in order.
+
+    A feedback changes the command from sample `earliest` on at the soonest.
+    """
+    drive = state.drive
     state = replace(state, blocks=(*state.blocks, block), records=())
     while state.stage.kind in DECISION_FUNCTIONS and state.stage.last <= block.end:
         state = DECISION_FUNCTIONS[state.stage.kind](state)
+    if state.search is not None:
+        if state.drive is drive:
+            state = replace(state, changed_from=state.drive.planned_end)
+        state = apply_feedback(state, block, earliest)
     blocks = tuple(kept_block for kept_block in state.blocks if kept_block.end > state.stage.first)
     return replace(state, blocks=blocks if not state.is_finished else (), records=()), state.records
 
@@ -92,6 +141,8 @@ def resume_test(state: SequencerState, index: int) -> SequencerState:
     if state.stage.kind != "open":
         return state
     state = replace(state, trajectory=state.trajectory.cut(index))
+    if state.search is not None:
+        return resume_continuation(state)
     return replace(approach_step(state, state.stage.step), changed_from=index)
 
 
@@ -99,10 +150,14 @@ def nominal_drive(plan: TestPlan) -> Drive:
     """Return the nominal drive: every level accepted at once and no operator command."""
     state = start_test(plan)
     while not state.is_finished:
-        if state.stage.kind == "check":
+        if state.stage.kind == "check" and plan.profile.continuation is not None:
+            state = begin_continuation(state)
+        elif state.stage.kind == "check":
             state = begin_excitation(state)
         elif state.stage.kind == "tune":
             state = accept_level(state)
+        elif state.stage.kind == "orbit":
+            state = replace(state, stage=Stage("end"))  # the others depend on what is measured
         elif state.stage.step + 1 < len(state.steps):
             state = approach_step(state, state.stage.step + 1)
         else:

@@ -104,6 +104,6 @@ def hold_step(state: SequencerState, step: int) -> SequencerState:
     return replace(
         state,
         trajectory=trajectory,
-        drive=trajectory.to_drive(state.steps),
+        drive=replace(trajectory.to_drive(state.steps), correction=state.drive.correction),
         stage=Stage("open", position),
     )

@@ -15,6 +15,7 @@ from table_io.records import Check, Event, Level, Record, Step, StepAdded
 from table_io.safety import loop_check
 from table_io.safety.preflight import check_corrected_drive
 from table_io.sequencer.actions import approach_step, begin_excitation, measure_step, start_tuning
+from table_io.sequencer.orbits import begin_continuation, check_latency, decide_orbit
 from table_io.sequencer.state import SequencerState, Stage
 
 
@@ -32,11 +33,16 @@ def decide_after_check(state: SequencerState) -> SequencerState:
         reason = "; ".join(check_corrected_drive(state.steps, response, plan.rig))
     if reason:
         reason = f"the loop check failed: {reason}"
+    elif plan.profile.continuation is not None:
+        reason = check_latency(replace(state, tuning=Tuning(response)))
+    if reason:
         return replace(
             state, stage=Stage("end"), refusal=reason, records=(*state.records, *records)
         )
     tuning = Tuning(response)
     state = replace(state, tuning=tuning, records=(*state.records, *records))
+    if plan.profile.continuation is not None:
+        return begin_continuation(state)
     return begin_excitation(state)
 
 
@@ -158,4 +164,5 @@ DECISION_FUNCTIONS: dict[str, Callable[[SequencerState], SequencerState]] = {
     "check": decide_after_check,
     "tune": decide_tuning,
     "hold": decide_next_step,
+    "orbit": decide_orbit,
 }

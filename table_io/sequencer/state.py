@@ -3,10 +3,12 @@
 from dataclasses import dataclass, field
 
 from table_io.adaptive import Policy, StepResult
+from table_io.adaptive.continuation import MeasuredOrbit, OrbitTarget
 from table_io.block import Block
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.amplitude_control import Tuning
+from table_io.control.orbit_feedback import FeedbackState
 from table_io.control.order_tracking import NO_FIT, HarmonicFit
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import Trajectory
@@ -15,24 +17,49 @@ from table_io.records import Record, Step
 
 @dataclass(frozen=True, slots=True)
 class TestPlan:
-    """Constant part of a test: profile, rig, decision margin in samples and adaptive policy."""
+    """Constant part of a test: profile, rig, margins in samples and adaptive policy.
+
+    A decision changes the command `margin` samples after it, a feedback `feedback_horizon`.
+    """
 
     profile: Profile
     rig: RigConfig
     margin: int
     policy: Policy | None = None
+    feedback_horizon: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class Stage:
     """Next decision; it is made on samples first .. last - 1 once they are acquired."""
 
-    kind: str  # check, tune, hold, open, end
+    kind: str  # check, tune, hold, orbit, open, end
     step: int = -1
     first: int = 0
     last: int = 0
     update: int = 0
     first_fit: HarmonicFit = NO_FIT  # first harmonic fit at this step
+
+
+@dataclass(frozen=True, eq=False)
+class OrbitSearch:
+    """Continuation so far: feedback, the orbit sought and those measured.
+
+    `lag_s` is the lag of the table behind its command, `correction` the factor on the command,
+    `losses` count at this point, `lost_points` since the last accepted orbit, and `periods` since
+    the change of point, up to sample `since`.
+    """
+
+    feedback: FeedbackState
+    target: OrbitTarget
+    measured: tuple[MeasuredOrbit, ...]
+    lag_s: float
+    correction: float
+    losses: int = 0
+    lost_points: int = 0
+    is_captured: bool = False
+    periods: int = 0
+    since: int = 0
 
 
 @dataclass(frozen=True)
@@ -50,6 +77,7 @@ class SequencerState:
     noise: dict[str, float] | None = None  # rms of each channel at the tare, SI
     blocks: tuple[Block, ...] = ()
     results: tuple[StepResult, ...] = ()
+    search: OrbitSearch | None = None
     records: tuple[Record, ...] = field(default=())
 
     @property

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from table_io.config.base import PROFILES_DIR
-from table_io.errors import InputError
+from tests.input_errors import raises_input_error
 from twin.campaign.command import CampaignOptions, run_campaign
 from twin.cli import run
 from twin.run import disk
@@ -42,9 +42,7 @@ def test_tests_that_do_not_fit_together_are_refused(
     needed = planned_bytes(bundle)
     monkeypatch.setattr(disk, "free_bytes", lambda _: 3 * needed - 1)
     require_disk_space([bundle] * 2, Path("runs/a"))
-    with pytest.raises(
-        InputError, match=r"runs/a: .* free on its disk, but the recording takes up"
-    ):
+    with raises_input_error(where="runs/a", remedy="--out"):
         require_disk_space([bundle] * 3, Path("runs/a"))
 
 
@@ -61,15 +59,15 @@ def test_a_full_disk_refuses_run_and_campaign_and_nothing_is_made(
     listed.write_text(f'title = "One"\n[[runs]]\nprofile = "{QUICK}"\n')
     out = tmp_path / "out"
     for unpaced in (True, False):
-        with pytest.raises(InputError, match=r"10 MB free on its disk.*nothing was started"):
+        with raises_input_error(where=out, problem="10 MB"):
             run.run_test(QUICK, out, unpaced, None, None, False, ENDPOINT)
     asked = CampaignOptions(listed, out, False, True, None, None, True, ENDPOINT)
-    with pytest.raises(InputError, match=r"10 MB free on its disk.*nothing was started"):
+    with raises_input_error(where=out, problem="10 MB"):
         run_campaign(asked)
     assert not out.exists()
     out.mkdir()
     (out / "campaign.toml").write_text(listed.read_text())  # one that began
-    with pytest.raises(InputError, match=r"10 MB free on its disk.*nothing was started"):
+    with raises_input_error(where=out, problem="10 MB"):
         run_campaign(replace(asked, resume=True))
 
 
@@ -77,13 +75,13 @@ def test_a_disk_that_fills_up_is_told_twice_in_time() -> None:
     room, rate = DiskForecast(1000.0), 250_000
     assert room.check(0, 0.0, 1) is None  # nothing is known yet
     assert room.check(10 * rate, 10.0, 991 * rate) is None
-    said = room.check(10 * rate, 10.0, 600 * rate)
-    assert said is not None
-    assert "150 MB left on the disk: room for 600 s of recording, the test needs 990 s" in said
+    warning = room.check(10 * rate, 10.0, 600 * rate)
+    assert warning is not None
+    assert "150 MB left on the disk: room for 600 s of recording, the test needs 990 s" in warning
     assert room.check(20 * rate, 20.0, 500 * rate) is None  # said once
-    said = room.check(400 * rate, 400.0, 119 * rate)
-    assert said is not None
-    assert "room for 119 s" in said
+    warning = room.check(400 * rate, 400.0, 119 * rate)
+    assert warning is not None
+    assert "room for 119 s" in warning
     assert room.check(410 * rate, 410.0, 50 * rate) is None
     assert DiskForecast(100.0).check(100 * rate, 100.0, 0) is None  # it is over
 
@@ -105,6 +103,6 @@ def test_a_successor_foresees_as_its_predecessor_would() -> None:
     whole, successor, rate, free = DiskForecast(7200.0), DiskForecast(7200.0), 250_000, 200_000_000
     whole.check(0, 0.0, 10**12)
     successor.check(1000, 3540.0, 10**12)
-    told = whole.check(3600 * rate, 3600.0, free)
-    assert told is not None
-    assert successor.check(1000 + 60 * rate, 3600.0, free) == told
+    warning = whole.check(3600 * rate, 3600.0, free)
+    assert warning is not None
+    assert successor.check(1000 + 60 * rate, 3600.0, free) == warning

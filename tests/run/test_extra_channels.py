@@ -102,7 +102,7 @@ def test_the_summary_compares_what_the_model_predicts(summary: dict[str, Any]) -
         assert comparison[SECOND_ACC][key] == pytest.approx(expected, rel=0.1)
 
 
-def test_a_replay_is_identical_to_the_bit(run: Path, lab: Path) -> None:
+def test_a_replay_is_identical_to_the_bit(run: Path, lab: Path, draft: None) -> None:
     shaketwin("replay", run, "--speed", "max", "--out", lab / "replay")
     replayed = json.loads((lab / "replay" / "summary.json").read_text())
     recorded = json.loads((run / "summary.json").read_text())
@@ -212,7 +212,7 @@ def test_the_monitor_lists_them(run: Path) -> None:
     [("rail", SECOND_ACC, "clipped"), ("nan", TEMPERATURE, "lost")],
 )
 def test_a_fault_of_one_is_in_the_recording_and_its_summary(
-    tmp_path: Path, kind: str, channel: str, gap: str
+    tmp_path: Path, kind: str, channel: str, gap: str, draft: None
 ) -> None:
     fault = f'\n[[simulated.faults]]\nkind = "{kind}"\nat_s = 12.0\nchannel = "{channel}"\n'
     text = LAB_TEXT.replace("\n[[channels]]", f"{fault}\n[[channels]]", 1)

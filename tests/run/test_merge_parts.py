@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from table_io.errors import InputError
+from tests.input_errors import raises_input_error
 from tests.reports.recordings import blocks, start_record
 from twin.recording.mcap_log import LogWriter, iter_messages
 from twin.recording.merge import verify_log
@@ -41,29 +41,29 @@ def part(run: Path, number: int, first: int, last: int, killed: bool) -> Path:
     return path
 
 
-def found(path: Path) -> list[bytes]:
-    return sorted(one.payload for one in iter_messages(path))
+def list_payloads(path: Path) -> list[bytes]:
+    return sorted(message.payload for message in iter_messages(path))
 
 
-def expected() -> list[bytes]:
+def list_expected() -> list[bytes]:
     return sorted(encode_item(item, start_record().run) for item in ITEMS)
 
 
 def test_one_whole_part_is_the_log_as_it_is(run: Path) -> None:
     before = part(run, 1, 0, 61, killed=False).read_bytes()
     assert merge_run_parts(run).read_bytes() == before
-    assert [one.name for one in run.iterdir()] == ["run.mcap"]
+    assert [path.name for path in run.iterdir()] == ["run.mcap"]
 
 
 @pytest.mark.parametrize("killed", [(True,), (True, False), (False, True), (True, True)])
 def test_parts_of_killed_recorders_become_one_whole_log(run: Path, killed: tuple[bool]) -> None:
     edges = [(0, 61)] if len(killed) == 1 else [(0, 35), (20, 61)]
-    for number, (edge, one) in enumerate(zip(edges, killed, strict=True), 1):
-        part(run, number, *edge, killed=one)
+    for number, (edge, killed_part) in enumerate(zip(edges, killed, strict=True), 1):
+        part(run, number, *edge, killed=killed_part)
     out = merge_run_parts(run)
     assert verify_log(out)
-    assert found(out) == expected()
-    assert [one.name for one in run.iterdir()] == ["run.mcap"]
+    assert list_payloads(out) == list_expected()
+    assert [path.name for path in run.iterdir()] == ["run.mcap"]
 
 
 def test_a_whole_that_is_not_what_was_written_leaves_the_parts(
@@ -73,11 +73,11 @@ def test_a_whole_that_is_not_what_was_written_leaves_the_parts(
     before = kept.read_bytes()
     with monkeypatch.context() as patch:
         patch.setattr(merge_parts, "verify_log", lambda _: False)
-        with pytest.raises(InputError, match="its parts are kept next to it"):
+        with raises_input_error(where=run / PARTS_FOLDER / "run.mcap", remedy="shaketwin report"):
             merge_run_parts(run)
     assert not (run / "run.mcap").exists()
     assert kept.read_bytes() == before
-    assert found(merge_run_parts(run)) == expected()  # once that is mended
+    assert list_payloads(merge_run_parts(run)) == list_expected()  # once that is mended
 
 
 def test_a_disk_that_fails_while_merging_leaves_the_parts(
@@ -90,36 +90,36 @@ def test_a_disk_that_fails_while_merging_leaves_the_parts(
     before = kept.read_bytes()
     with monkeypatch.context() as patch:
         patch.setattr(LogWriter, "close", full)
-        with pytest.raises(InputError, match=r"a/run.mcap: No space left .* kept in .*\.parts"):
+        with raises_input_error(where="a/run.mcap", problem=PARTS_FOLDER):
             merge_run_parts(run)
-    assert [one.name for one in run.iterdir()] == [PARTS_FOLDER]
+    assert [path.name for path in run.iterdir()] == [PARTS_FOLDER]
     assert kept.read_bytes() == before
-    assert found(merge_run_parts(run)) == expected()
+    assert list_payloads(merge_run_parts(run)) == list_expected()
 
 
 def test_parts_of_a_run_that_goes_on_are_not_touched(run: Path) -> None:
     part(run, 1, 0, 61, killed=False)
     with (run / PARTS_FOLDER / LOCK_FILE).open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_SH)
-        with pytest.raises(InputError, match="still recording"):
+        with raises_input_error(where=run):
             merge_run_parts(run)
     merge_run_parts(run)
 
 
 def test_a_run_without_a_recording_says_so(run: Path) -> None:
-    with pytest.raises(InputError, match="the recorder wrote nothing"):
+    with raises_input_error(where=run):
         merge_run_parts(run)
 
 
 def test_a_log_that_is_there_already_is_never_replaced(run: Path) -> None:
     kept = part(run, 1, 0, 61, killed=False)
     (run / "run.mcap").write_text("somebody's")
-    with pytest.raises(InputError, match=r"run\.mcap: not a complete log; its parts are in"):
+    with raises_input_error(where=run / "run.mcap", problem=PARTS_FOLDER):
         merge_run_parts(run)
     assert (run / "run.mcap").read_text() == "somebody's"
     (run / "run.mcap").write_bytes(kept.read_bytes())  # died after the parts had become it
     merge_run_parts(run)
-    assert [one.name for one in run.iterdir()] == ["run.mcap"]
+    assert [path.name for path in run.iterdir()] == ["run.mcap"]
 
 
 @pytest.mark.parametrize("bit", [0, 6])
@@ -134,9 +134,9 @@ def test_parts_that_a_disk_has_damaged_inside_are_kept(run: Path, bit: int) -> N
     out = merge_run_parts(run)
     assert verify_log(out)
     behind = {encode_item(item, start_record().run) for item in ITEMS[40:]}
-    assert behind <= {*found(out)}
-    assert sorted(one.name for one in run.iterdir()) == ["damaged", "run.mcap"]
-    assert [one.read_bytes() for one in (run / "damaged").iterdir()] == [bytes(raw)]
+    assert behind <= {*list_payloads(out)}
+    assert sorted(path.name for path in run.iterdir()) == ["damaged", "run.mcap"]
+    assert [path.read_bytes() for path in (run / "damaged").iterdir()] == [bytes(raw)]
 
 
 def test_a_length_that_was_damaged_hides_nothing_behind_it(run: Path) -> None:
@@ -150,14 +150,14 @@ def test_a_length_that_was_damaged_hides_nothing_behind_it(run: Path) -> None:
     raw = bytearray(path.read_bytes())
     raw[edges[9] + 3] ^= 0x40  # of the eleventh chunk's length: it reaches beyond the file
     path.write_bytes(raw)
-    assert len(found(merge_run_parts(run))) == len(ITEMS) - 1
+    assert len(list_payloads(merge_run_parts(run))) == len(ITEMS) - 1
     assert (run / "damaged" / "part-001.mcap").read_bytes() == bytes(raw)
 
 
 def test_a_death_between_the_log_and_its_parts_loses_nothing(run: Path) -> None:
     part(run, 1, 0, 61, killed=False).rename(run / "run.mcap")
-    assert found(merge_run_parts(run)) == expected()
-    assert [one.name for one in run.iterdir()] == ["run.mcap"]
+    assert list_payloads(merge_run_parts(run)) == list_expected()
+    assert [path.name for path in run.iterdir()] == ["run.mcap"]
 
 
 def test_what_is_damaged_is_safe_before_the_log_has_its_name(
@@ -176,10 +176,10 @@ def test_what_is_damaged_is_safe_before_the_log_has_its_name(
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "rename", died)
-        with pytest.raises(InputError, match="died"):
+        with raises_input_error(where="run.mcap", problem="died"):
             merge_run_parts(run)
     kept = run / "damaged" / "part-001.mcap"
     assert kept.read_bytes() == path.read_bytes()
     merge_run_parts(run)
     assert kept.read_bytes() == bytes(raw) + bytes(600)
-    assert sorted(one.name for one in run.iterdir()) == ["damaged", "run.mcap"]
+    assert sorted(path.name for path in run.iterdir()) == ["damaged", "run.mcap"]

@@ -68,7 +68,7 @@ def write_profile(folder: Path, more: str = "", rig: str = "") -> Path:
     return path
 
 
-def played(
+def play_run(
     folder: Path, more: str = "", rig: str = "", stop_at: int | None = None
 ) -> tuple[RunConfig, Recording, dict[str, Any]]:
     config = read_run_config(write_profile(folder, more, rig))
@@ -88,7 +88,7 @@ def played(
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunConfig, Recording, dict[str, Any]]:
     """With its loop check, on a sound table whose specimen is the model."""
-    return played(tmp_path_factory.mktemp("record"))
+    return play_run(tmp_path_factory.mktemp("record"))
 
 
 Run = tuple[RunConfig, Recording, dict[str, Any]]
@@ -201,7 +201,7 @@ def test_a_planted_fault_trips_and_the_table_comes_to_rest(
 ) -> None:
     at_s = 4.0
     rig = f"{RIG}\n[[simulated.faults]]\nat_s = {at_s}\n{fault}\n"
-    config, recording, summary = played(tmp_path, NO_CHECK, rig)
+    config, recording, summary = play_run(tmp_path, NO_CHECK, rig)
     (trip,) = recording.records(Trip)
     assert summary["verdict"] == "aborted"
     assert trip.kind in kinds
@@ -215,7 +215,7 @@ def test_a_planted_fault_trips_and_the_table_comes_to_rest(
 
 @pytest.mark.parametrize("stop_s", [1.0, 3.0, 4.56, 8.0])
 def test_a_stop_in_motion_comes_to_rest_smoothly(stop_s: float, tmp_path: Path) -> None:
-    config, recording, summary = played(tmp_path, NO_CHECK, stop_at=round(stop_s * 2000))
+    config, recording, summary = play_run(tmp_path, NO_CHECK, stop_at=round(stop_s * 2000))
     assert summary["verdict"] == "stopped"
     block = measured(recording)
     command = block.channel("drive_disp_m")
@@ -254,7 +254,7 @@ def test_blocks_of_another_length_give_the_same_record(tmp_path: Path) -> None:
         folder = tmp_path / str(samples)
         folder.mkdir()
         more = f"{NO_CHECK}[acquisition]\nblock_samples = {samples}\n"
-        _, recording, summary = played(folder, more)
+        _, recording, summary = play_run(folder, more)
         assert summary["verdict"] == "complete"
         commands.append(measured(recording).values)
     size = min(values.shape[1] for values in commands)
@@ -280,7 +280,7 @@ def test_a_kind_of_one_file_runs_with_all_that_belongs_to_a_run(tmp_path: Path) 
     assert PulseTrain.model_fields.keys() >= {"height_mm", "windows"}
 
 
-def test_the_model_alone_plays_the_record(tmp_path: Path) -> None:
+def test_the_model_alone_plays_the_record(tmp_path: Path, draft: None) -> None:
     path, out = write_profile(tmp_path), tmp_path / "out"
     assert simulate_profile(path, [], [], None, out, False) == 0
     summary = json.loads((out / "summary.json").read_text())

@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from table_io.config.base import find_config
-from table_io.errors import InputError
 from table_io.records import Event, Fault, NormalizedResponse, PrcPoint
+from tests.input_errors import raises_input_error
 from tests.reports.recordings import summary
 from twin.reports.prc_table import print_prc
 from twin.run import folders, terminal, warm_up
@@ -21,7 +21,7 @@ from twin.run.progress import RunProgress
 from twin.run.run_config import read_run_config
 
 
-def printed(width: int) -> list[str]:
+def print_lines(width: int) -> list[str]:
     """The PRC of the summary at hand, as lines of a terminal of this width."""
     out = io.StringIO()
     print_prc(Console(file=out, width=width), summary())
@@ -30,7 +30,7 @@ def printed(width: int) -> list[str]:
 
 @pytest.mark.parametrize("width", [40, 48, 52, 64, 80, 100, 130, 400])
 def test_curves_are_readable_at_any_width(width: int) -> None:
-    lines = printed(width)
+    lines = print_lines(width)
     assert all(len(line) <= width for line in lines)
     assert not any("…" in line for line in lines)
     steps = [line for line in lines if re.search(r"(forward|backward).* \d\.\d{3}", line)]
@@ -40,14 +40,14 @@ def test_curves_are_readable_at_any_width(width: int) -> None:
 
 
 def test_a_line_each_where_no_table_fits() -> None:
-    lines = printed(24)
+    lines = print_lines(24)
     assert any(line.startswith("  direction forward: f [Hz] 1.000, eta_d 0.123 | 0.136")
                for line in lines)  # fmt: skip
 
 
 def test_what_is_left_out_is_said_and_nothing_is_left_out_in_a_file() -> None:
-    assert any("--json" in line for line in printed(60))
-    wide = printed(terminal.FILE_COLUMNS)
+    assert any("--json" in line for line in print_lines(60))
+    wide = print_lines(terminal.FILE_COLUMNS)
     assert not any("--json" in line for line in wide)
     assert any("impacts L" in line and "eta_R" in line for line in wide)
 
@@ -69,30 +69,28 @@ def test_two_runs_of_one_second_have_folders_and_names_of_their_own(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(folders, "make_run_id", lambda name: f"20250101-000000-{name}")
-    found = [make_run_folder(None, "quick") for _ in range(3)]
+    made = [make_run_folder(None, "quick") for _ in range(3)]
     names = ["20250101-000000-quick", "20250101-000000-quick-2", "20250101-000000-quick-3"]
-    assert [folder for folder, _ in found] == [Path("runs") / name for name in names]
-    assert [run for _, run in found] == names
+    assert [folder for folder, _ in made] == [Path("runs") / name for name in names]
+    assert [run for _, run in made] == names
     assert make_run_folder(tmp_path / "mine", "quick") == (tmp_path / "mine", names[0])
 
 
 def test_a_folder_with_content_is_refused_an_empty_one_taken(tmp_path: Path) -> None:
     assert make_output_folder(tmp_path, "x") == tmp_path
     (tmp_path / "mine").touch()
-    with pytest.raises(InputError, match="exists and has content"):
-        make_output_folder(tmp_path, "x")
+    for folder, problem in ((tmp_path, "has content"), (Path("/dev/null/x"), "cannot write here")):
+        with raises_input_error(key="--out", value=str(folder), problem=problem, remedy="give a"):
+            make_output_folder(folder, "x")
 
 
-def test_only_a_long_wait_is_told(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_a_long_wait_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     before = signal.getsignal(signal.SIGALRM)
-    monkeypatch.setattr(terminal, "ANNOUNCE_AFTER_S", 0.05)
-    with terminal.announce_if_slow("compiling"):
+    with terminal.announce_if_slow("compiling", 0.05):
         pass
     time.sleep(0.1)
     assert capsys.readouterr().out == ""
-    with terminal.announce_if_slow("compiling"):
+    with terminal.announce_if_slow("compiling", 0.05):
         time.sleep(0.2)
     assert capsys.readouterr().out == "compiling\n"
     assert signal.getsignal(signal.SIGALRM) is before
@@ -118,6 +116,6 @@ def test_what_a_twin_elsewhere_writes_gives_no_orders_to_the_terminal() -> None:
     show(PrcPoint(1, 1, evil, 1.0, quantities, quantities, 1.0, 1.0, 0.0))
     show(Fault(1, "twin", 0, 1, evil))
     show(Event(1, "drift", evil))
-    said = out.getvalue().splitlines()
-    assert all(line.isprintable() for line in said)
-    assert [line[:12] for line in said[2:]] == [f"{'':>7}  fau", f"{'':>7}  dri"]
+    lines = out.getvalue().splitlines()
+    assert all(line.isprintable() for line in lines)
+    assert [line[:12] for line in lines[2:]] == [f"{'':>7}  fau", f"{'':>7}  dri"]

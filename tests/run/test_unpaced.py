@@ -47,20 +47,20 @@ enabled = false
 """
 
 
-def played(
+def play_run(
     folder: Path, profile: str = QUICK, stop_at: int | None = None
 ) -> tuple[RunConfig, Path]:
     """The bundle of a profile written to the folder, and the log of its unpaced run."""
     path = folder / "quick.toml"
     path.write_text(profile)
     bundle = read_run_config(path)
-    seen: list[int] = [0]
+    indices: list[int] = [0]
 
     def watch(item: Item) -> None:
-        seen.append(item.index)
+        indices.append(item.index)
 
     def commands() -> str | None:
-        return "asked to stop" if stop_at is not None and seen[-1] >= stop_at else None
+        return "asked to stop" if stop_at is not None and indices[-1] >= stop_at else None
 
     play_unpaced(bundle, "quick", folder / "run.mcap", commands, watch)
     return bundle, folder / "run.mcap"
@@ -68,39 +68,39 @@ def played(
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunConfig, Recording, dict[str, Any]]:
-    bundle, log = played(tmp_path_factory.mktemp("unpaced"))
+    bundle, log = play_run(tmp_path_factory.mktemp("unpaced"))
     recording = read_recording(log)
     return bundle, recording, summarise(recording, bundle.parameters)
 
 
 def amplitude_mm(summary: dict[str, Any], direction: str, hz: float, source: str) -> float:
-    (found,) = [
+    (step,) = [
         step
         for step in summary["steps"]
         if (step["direction"], step["frequency_hz"]) == (direction, hz)
     ]
-    return 1e3 * summary["u_star_m"] * found[source]["eta_d"]
+    return 1e3 * summary["u_star_m"] * step[source]["eta_d"]
 
 
 def level(summary: dict[str, Any], direction: str, hz: float) -> float:
     """Fundamental of the table over the 0.05 g that was asked for."""
-    (found,) = [
+    (step,) = [
         step
         for step in summary["steps"]
         if (step["direction"], step["frequency_hz"]) == (direction, hz)
     ]
-    return found["table_acc_fundamental_m_s2"] / LEVEL
+    return step["table_acc_fundamental_m_s2"] / LEVEL
 
 
 def test_every_measured_sample_is_in_the_log_once(run: tuple) -> None:
     bundle, recording, _ = run
     blocks = recording.blocks("meas")
-    indices = np.concatenate([np.arange(one.index, one.end) for one in blocks])
+    indices = np.concatenate([np.arange(block.index, block.end) for block in blocks])
     assert recording.stop is not None
     np.testing.assert_array_equal(indices, np.arange(recording.stop.index))
     assert recording.is_intact
     assert recording.missing_samples == 0
-    assert all(one.channels == bundle.rig.channels for one in blocks)
+    assert all(block.channels == bundle.rig.channels for block in blocks)
     assert not recording.records(SampleGap)
     assert not recording.records(Fault)
     # the drive was played to its end, and the rest after it was recorded
@@ -111,10 +111,12 @@ def test_every_measured_sample_is_in_the_log_once(run: tuple) -> None:
 def test_every_sample_has_its_prediction_and_its_comparison(run: tuple) -> None:
     _, recording, _ = run
     predicted = recording.contiguous_blocks("pred")
-    assert [(one.index, one.end) for one in predicted] == [(0, recording.stop.index)]
+    assert [(block.index, block.end) for block in predicted] == [(0, recording.stop.index)]
     comparisons = recording.records(Comparison)
-    assert [one.index for one in comparisons] == list(range(0, recording.stop.index - 19, 20))
-    assert {one.count for one in comparisons} == {20}
+    assert [comparison.index for comparison in comparisons] == list(
+        range(0, recording.stop.index - 19, 20)
+    )
+    assert {comparison.count for comparison in comparisons} == {20}
 
 
 def test_the_log_holds_all_that_the_run_was(run: tuple) -> None:
@@ -126,7 +128,7 @@ def test_the_log_holds_all_that_the_run_was(run: tuple) -> None:
     assert recording.records(Params) == (Params(0, bundle.parameters.as_dict(), "start"),)
     assert len(recording.records(RunStop)) == 1
     assert len(recording.records(CycleExtremes)) == 6 * len(bundle.steps)
-    assert [one.step for one in recording.records(PrcPoint)] == list(range(len(bundle.steps)))
+    assert [point.step for point in recording.records(PrcPoint)] == list(range(len(bundle.steps)))
 
 
 @pytest.mark.parametrize("prefix", ["", "twin_"])
@@ -170,9 +172,9 @@ def test_two_solutions_at_3_4_hz(run: tuple) -> None:
 def test_the_twin_is_the_plant_within_its_noise(run: tuple) -> None:
     """Two formulations and two integrators of one physics; the rest is sensor noise."""
     _, recording, summary = run
-    found = summary["comparison"]
-    assert found["rel_disp_m"]["nrmse"] < 0.01
-    for name, values in found.items():
+    comparison = summary["comparison"]
+    assert comparison["rel_disp_m"]["nrmse"] < 0.01
+    for name, values in comparison.items():
         assert values["nrmse"] < 0.02, name
         assert values["free_nrmse"] < 0.02, name
     predicted, block = (
@@ -208,17 +210,17 @@ def test_the_run_is_the_same_to_the_bit_every_time(tmp_path: Path) -> None:
     short = QUICK.replace("2.6", "4.2")
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
-    a, b = (read_recording(played(tmp_path / name, short)[1]) for name in ("a", "b"))
+    a, b = (read_recording(play_run(tmp_path / name, short)[1]) for name in ("a", "b"))
     for stream in ("meas", "pred"):
         assert a.contiguous_blocks(stream)[0].is_identical(b.contiguous_blocks(stream)[0])
-    plain = [one for one in a.items if not isinstance(one, RunStart)]
-    assert [type(one) for one in plain] == [
-        type(one) for one in b.items if not isinstance(one, RunStart)
+    plain = [item for item in a.items if not isinstance(item, RunStart)]
+    assert [type(item) for item in plain] == [
+        type(item) for item in b.items if not isinstance(item, RunStart)
     ]
 
 
 def test_a_stop_ends_at_rest_with_what_was_measured(tmp_path: Path) -> None:
-    bundle, log = played(tmp_path, stop_at=9000)
+    bundle, log = play_run(tmp_path, stop_at=9000)
     recording = read_recording(log)
     summary = summarise(recording, bundle.parameters)
     assert summary["verdict"] == "stopped"
@@ -227,19 +229,19 @@ def test_a_stop_ends_at_rest_with_what_was_measured(tmp_path: Path) -> None:
     assert (whole.label == Label.STOP).any()
     assert abs(whole.channel("drive_disp_m")[-1000:]).max() < 1e-9
     assert [step["frequency_hz"] for step in summary["steps"]] == [2.6]
-    for one in recording.records(CycleExtremes):
-        assert not (whole.label[one.index - one.count : one.index] == Label.STOP).any()
+    for cycle in recording.records(CycleExtremes):
+        assert not (whole.label[cycle.index - cycle.count : cycle.index] == Label.STOP).any()
 
 
 def test_with_loop_check_and_control_every_step_has_its_level(tmp_path: Path) -> None:
     """As the controller drives it by default: within 2 % where the servo alone lost 1.4 %."""
     short = QUICK.replace("enabled = false", "enabled = true").replace("= 4.4", "= 3.0")
-    bundle, log = played(tmp_path, short)
+    bundle, log = play_run(tmp_path, short)
     recording = read_recording(log)
     summary = summarise(recording, bundle.parameters)
     assert summary["verdict"] == "complete"
     assert summary["checks"]
-    assert all(one["passed"] for one in summary["checks"])
+    assert all(check["passed"] for check in summary["checks"])
     assert len(summary["steps"]) == 6
     for step in summary["steps"]:
         assert step["table_acc_fundamental_m_s2"] == pytest.approx(LEVEL, rel=0.02)
@@ -251,7 +253,7 @@ def test_with_loop_check_and_control_every_step_has_its_level(tmp_path: Path) ->
 
 
 def test_free_flight_has_no_bumpers_anywhere(tmp_path: Path) -> None:
-    bundle, log = played(tmp_path, QUICK.replace("= 4.0", "= inf").replace("2.6", "4.2"))
+    bundle, log = play_run(tmp_path, QUICK.replace("= 4.0", "= inf").replace("2.6", "4.2"))
     summary = summarise(read_recording(log), bundle.parameters)
     assert math.isinf(bundle.parameters.gap_r)
     for step in summary["steps"]:

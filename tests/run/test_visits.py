@@ -58,13 +58,13 @@ def test_visits_stand_beside_the_steps_with_their_reasons(run: tuple) -> None:
         assert (visit["frequency_hz"], visit["direction"]) == (4.0, "forward")
         assert visit["reason"] == decided.reason
         assert visit["measured"]["eta_d"] == pytest.approx(visit["twin"]["eta_d"], rel=0.03)
-    (found,) = [one.text for one in recording.records(Event) if one.kind == "found"]
-    assert summary["found"] == [found]
+    (detected,) = [event.text for event in recording.records(Event) if event.kind == "found"]
+    assert summary["found"] == [detected]
     assert "6 cycles held in 2 visits" in format_summary(summary)
     shown = build_report_data(recording, summary)
     assert extract_prc(shown.points, "measured", "forward", "eta_d")[0].tolist() == [3.8, 4.0]
     assert format_headline(shown).startswith("2 of 2 steps")
-    assert found in format_headline(shown)
+    assert detected in format_headline(shown)
     assert len(bundle.steps) == 2
 
 
@@ -77,9 +77,11 @@ def test_a_replay_says_of_the_visits_what_was_said_to_the_bit(run: tuple, tmp_pa
     assert identity.is_identical
     again = read_recording(tmp_path / "run.mcap")
     for kind in (Comparison, PrcPoint, StepAdded, Event):
-        said = [one for one in again.records(kind) if getattr(one, "kind", "") != "replay"]
-        assert [encode_item(one, "") for one in said] == [
-            encode_item(one, "") for one in recording.records(kind)
+        replayed = [
+            record for record in again.records(kind) if getattr(record, "kind", "") != "replay"
+        ]
+        assert [encode_item(record, "") for record in replayed] == [
+            encode_item(record, "") for record in recording.records(kind)
         ]
     assert len(again.records(PrcPoint)) == 4
     assert summarise(again, bundle.parameters)["visits"] == summary["visits"]
@@ -89,9 +91,9 @@ def test_visits_that_a_dead_twin_missed_are_measured_all_the_same(run: tuple) ->
     bundle, recording, summary = run
     end = recording.stop.index
     fault = Fault(end, "twin", 0, end, "it died")
-    kept = tuple(one for one in recording.items if not isinstance(one, PrcPoint))
-    found = summarise(replace(recording, items=(*kept, fault)), bundle.parameters)
-    assert [visit["measured"] for visit in found["visits"]] == [
+    kept = tuple(item for item in recording.items if not isinstance(item, PrcPoint))
+    rebuilt = summarise(replace(recording, items=(*kept, fault)), bundle.parameters)
+    assert [visit["measured"] for visit in rebuilt["visits"]] == [
         visit["measured"] for visit in summary["visits"]
     ]
-    assert {visit["twin"] for visit in found["visits"]} == {None}
+    assert {visit["twin"] for visit in rebuilt["visits"]} == {None}

@@ -25,7 +25,7 @@ def bytes_per_s(config: RunConfig) -> float:
 
 def planned_bytes(config: RunConfig) -> float:
     """Return the upper bound in bytes of what the planned test writes to the disk."""
-    seconds = config.drive.planned_end / config.drive.rate_hz
+    seconds = config.expected_s
     seconds += config.rig.backend_section.max_start_wait_s
     return bytes_per_s(config) * (seconds + RESERVE_S) + REPORT_BYTES
 
@@ -44,9 +44,10 @@ def require_disk_space(configs: Iterable[RunConfig], folder: Path) -> None:
     needed, free = sum(map(planned_bytes, configs)), free_bytes(folder)
     if needed > free:
         raise InputError(
-            f"{folder}: {_format_size(free)} free on its disk, but the recording takes up to "
-            f"{_format_size(needed)}; nothing was started. Make room, or give another disk "
-            "with --out"
+            f"{_format_size(free)} free on its disk, but the recording takes up to "
+            f"{_format_size(needed)}; nothing was started",
+            where=folder,
+            remedy="make room, or give another disk with --out",
         )
 
 

@@ -27,15 +27,22 @@ def make_output_folder(out: Path | None, run_name: str) -> Path:
             folder = _make_free_folder(folder)
         elif out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise InputError(
-                f"--out {out}: exists and has content; nothing recorded is ever overwritten. "
-                "Give a new folder"
+                "exists and has content; nothing recorded is ever overwritten",
+                key="--out",
+                value=str(out),
+                remedy="give a new folder",
             )
         folder.mkdir(parents=True, exist_ok=True)
         probe = folder / ".probe"
         probe.touch()
         probe.unlink()
     except OSError as error:
-        raise InputError(f"--out {folder}: cannot write here: {error.strerror}") from None
+        raise InputError(
+            f"cannot write here: {error.strerror}",
+            key="--out",
+            value=str(folder),
+            remedy="give a folder on a disk that you may write to",
+        ) from None
     return folder
 
 

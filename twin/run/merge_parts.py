@@ -33,7 +33,7 @@ def merge_run_parts(folder: Path) -> Path:
                         remedy=f"move it to another folder, then: shaketwin report {folder}",
                     )
             elif not parts:
-                raise InputError(f"{folder}: the recorder wrote nothing")
+                raise InputError("the recorder wrote nothing", where=folder)
             else:
                 _merge_verified(parts, parts_folder / "run.mcap", folder).rename(out)
                 _sync(folder)

@@ -74,6 +74,13 @@ class RunConfig:
         return self.drive.steps
 
     @property
+    def expected_s(self) -> float:
+        """Expected duration in s; of an adaptive test the part that is known before."""
+        planned_s = self.drive.planned_end / self.drive.rate_hz
+        continuation = self.profile.continuation
+        return planned_s + (continuation.expected_s if continuation is not None else 0.0)
+
+    @property
     def extent(self) -> str:
         """Number of steps, or of windows of a displacement history, as text."""
         return f"{len(self.steps)} steps" if self.steps else f"{self.profile.plan.windows} windows"
@@ -142,10 +149,17 @@ def read_run_config(path: Path, table: str | None = None, model: str | None = No
     """Read the `RunConfig` of a test profile; InputError if the test exceeds the table's limits."""
     path = resolve_config(path, "tests")
     profile, profile_toml = load_profile(path)
-    _, rig_toml = load_rig(
+    rig, rig_toml = load_rig(
         find_config(table or profile.rig, "rigs", path, option="--table" if table else "")
     )
-    _, model_toml = read_model(model or profile.model, path, option="--model" if model else "")
+    model_config, model_toml = read_model(
+        model or profile.model, path, option="--model" if model else ""
+    )
+    if profile.continuation is not None and profile.continuation.file is None:
+        from twin.run.orbit_plan import attach_orbit_plan
+
+        own_model = model_config.build_model(profile.specimen)
+        profile_toml = attach_orbit_plan(profile_toml, profile, rig, own_model, str(path))
     config = from_texts(path.stem, profile_toml, rig_toml, model_toml, str(path))
     check_limits(config.margins, config.profile, config.rig, str(path))
     return config

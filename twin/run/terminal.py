@@ -72,10 +72,10 @@ def catch_interrupts(
 
 
 @contextmanager
-def announce_if_slow(sentence: str) -> Iterator[None]:
-    """Print a sentence if the body takes longer than `ANNOUNCE_AFTER_S`."""
+def announce_if_slow(sentence: str, after_s: float = ANNOUNCE_AFTER_S) -> Iterator[None]:
+    """Print a sentence if the body takes longer than `after_s`."""
     old_handler = signal.signal(signal.SIGALRM, lambda *_: print_line(sentence))
-    signal.setitimer(signal.ITIMER_REAL, ANNOUNCE_AFTER_S)
+    signal.setitimer(signal.ITIMER_REAL, after_s)
     try:
         yield
     finally:

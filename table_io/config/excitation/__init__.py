@@ -131,7 +131,9 @@ def find_excitation(kind: object) -> type[Excitation]:
     plugins = list_entry_points(ENTRY_POINT_GROUP)
     if kind in plugins:
         return _load_plugin(plugins[str(kind)][0])
-    raise ValueError(f"kind {kind!r} is unknown; {suggest(str(kind), [*EXCITATIONS, *plugins])}")
+    raise InputError(
+        f"kind {kind!r} is unknown", remedy=suggest(str(kind), [*EXCITATIONS, *plugins])
+    )
 
 
 def _load_plugin(entry: EntryPoint) -> type[Excitation]:

@@ -17,6 +17,7 @@ from pydantic import Field, ValidationInfo, field_validator
 from table_io.block import Float1D
 from table_io.config.base import Finite, Number
 from table_io.config.excitation import History, register_excitation
+from table_io.errors import InputError
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 MIN_SAMPLES, MAX_SAMPLES = 16, 1_000_000
@@ -43,7 +44,7 @@ class RecordedHistory(History):
     @classmethod
     def _check_scale(cls, scale: float) -> float:
         if scale == 0.0:
-            raise ValueError("scale is 0, so nothing would move; allowed: any other number")
+            raise InputError("scale is 0, so nothing would move", allowed="any other number")
         return scale
 
     @field_validator("file")
@@ -53,7 +54,7 @@ class RecordedHistory(History):
         if files is None:
             return name
         if name not in files:
-            raise ValueError(f"{name!r} is not attached; load the profile from its file")
+            raise InputError(f"{name!r} is not attached", remedy="load the profile from its file")
         if "unit" in info.data:
             parse_history(files[name], name, info.data["unit"])
         return name
@@ -82,14 +83,14 @@ def parse_history(text: str, name: str, unit: str | None) -> tuple[Float1D, floa
     ]
     columns = [column.strip() for column in numbered[0][1].split(",")] if numbered else []
     if len(columns) != 2 or columns[0] != "time_s":
-        raise ValueError(
-            f"{name}: the headers are {', '.join(columns) or 'missing'}; allowed: time_s and one "
-            "displacement, such as time_s,disp_mm"
+        raise InputError(
+            f"{name}: the headers are {', '.join(columns) or 'missing'}",
+            allowed="time_s and one displacement, such as time_s,disp_mm",
         )
     factor = _find_unit(columns[1], name, unit)
     rows = numbered[1:]
     if not MIN_SAMPLES <= len(rows) <= MAX_SAMPLES:
-        raise ValueError(f"{name}: {len(rows)} samples; allowed: {MIN_SAMPLES} to {MAX_SAMPLES}")
+        raise InputError(f"{name}: {len(rows)} samples", allowed=f"{MIN_SAMPLES} to {MAX_SAMPLES}")
     table = np.array([_parse_row(name, number, line) for number, line in rows])
     time_s, displacement = table.T
     intervals = np.diff(time_s)
@@ -111,11 +112,15 @@ def _find_unit(column: str, name: str, unit: str | None) -> float:
     suffix = column.rpartition("_")[2]
     named = suffix if suffix in UNITS_M and "_" in column else None
     if unit is not None and named is not None and unit != named:
-        raise ValueError(f"{name}: unit = {unit!r}, but its column is {column}; remove the unit")
+        raise InputError(
+            f"{name}: unit = {unit!r}, but its column is {column}", remedy="remove the unit"
+        )
     if unit is None and named is None:
-        raise ValueError(
-            f"{name}: the unit of column {column!r} is unknown; set unit, allowed: "
-            f"{', '.join(UNITS_M)}, or end the name with it, such as disp_mm"
+        raise InputError(
+            f"{name}: the unit of column {column!r} is unknown",
+            remedy=(
+                f"set unit, allowed: {', '.join(UNITS_M)}, or end the name with it, such as disp_mm"
+            ),
         )
     return UNITS_M[unit or named or "m"]
 

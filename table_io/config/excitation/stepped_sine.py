@@ -14,6 +14,7 @@ from table_io.config.excitation import (
     ExcitationPlan,
     register_excitation,
 )
+from table_io.errors import InputError
 from table_io.records import Step
 from table_io.units import GRAVITY_M_S2
 
@@ -40,9 +41,12 @@ class Sweep(Excitation):
     def _check_ascending(cls, stop: float, info: ValidationInfo) -> float:
         start = info.data.get("start_hz", 0.0)
         if stop < start:
-            raise ValueError(
-                f"stop_hz {stop} lies below start_hz {start}; give the grid in "
-                "ascending order and set the order of the sweep in `directions`"
+            raise InputError(
+                f"stop_hz {stop} lies below start_hz {start}",
+                remedy=(
+                    "give the grid in ascending order and set the order of the sweep in "
+                    "`directions`"
+                ),
             )
         return stop
 
@@ -53,15 +57,15 @@ class Sweep(Excitation):
             return step
         start, stop = info.data["start_hz"], info.data["stop_hz"]
         if (stop - start) / step > 5000.5:
-            raise ValueError(
-                f"step_hz {step} makes more than 5001 steps from {start} to {stop} Hz; "
-                f"allowed: at least {(stop - start) / 5000:.6g}"
+            raise InputError(
+                f"step_hz {step} makes more than 5001 steps from {start} to {stop} Hz",
+                allowed=f"at least {(stop - start) / 5000:.6g}",
             )
         step_count = round((stop - start) / step)
         if abs(start + step_count * step - stop) > 1e-6:
-            raise ValueError(
-                f"step_hz {step} does not divide {start} to {stop} Hz; "
-                f"nearest: {(stop - start) / max(step_count, 1):.6g}"
+            raise InputError(
+                f"step_hz {step} does not divide {start} to {stop} Hz",
+                remedy=f"nearest: {(stop - start) / max(step_count, 1):.6g}",
             )
         return step
 
@@ -70,16 +74,18 @@ class Sweep(Excitation):
     def _check_measured_cycles(cls, measured: int, info: ValidationInfo) -> int:
         cycles = info.data.get("cycles", measured)
         if measured > cycles:
-            raise ValueError(f"measured_cycles {measured} is more than cycles {cycles}; reduce it")
+            raise InputError(
+                f"measured_cycles {measured} is more than cycles {cycles}", remedy="reduce it"
+            )
         return measured
 
     @field_validator("directions")
     @classmethod
     def _check_directions(cls, directions: tuple[str, ...]) -> tuple[str, ...]:
         if not directions:
-            raise ValueError("directions is empty; allowed: 'forward', 'backward', in any order")
+            raise InputError("directions is empty", allowed="'forward', 'backward', in any order")
         if len(set(directions)) < len(directions):
-            raise ValueError("directions contains one twice; allowed: each once, in any order")
+            raise InputError("directions contains one twice", allowed="each once, in any order")
         return directions
 
     @property

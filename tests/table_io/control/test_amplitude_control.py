@@ -54,11 +54,11 @@ def run(test: Profile) -> list[Block | Record]:
 def cancelling() -> tuple[Level, ...]:
     """Looks at 2.0 and 2.4 Hz, G4: the mass hits both bumpers once a cycle."""
     test = profile(4.0, {"harmonics": True}, start_hz=2.0, stop_hz=2.4, step_hz=0.4)
-    return tuple(one for one in run(test) if isinstance(one, Level))
+    return tuple(record for record in run(test) if isinstance(record, Level))
 
 
 def of_step(items: Any, step: int) -> list[Level]:
-    return [one for one in items if one.step == step]
+    return [level for level in items if level.step == step]
 
 
 @pytest.mark.parametrize("control", [True, False])
@@ -68,7 +68,7 @@ def test_measured_cycles_are_within_2_percent_and_without_control_they_are_not(
     """At 7 to 10 Hz, where the servo has lost a tenth; G-10, both bumpers always touched."""
     test = profile(-10.0, {"enabled": control}, start_hz=7.0, stop_hz=10.0, step_hz=1.5, cycles=10)
     errors = []
-    for step, amplitude in measured(run(test)).items():
+    for step, amplitude in measure_levels(run(test)).items():
         errors.append(abs(amplitude / A - 1.0))
         assert step in (0, 1, 2)
     assert len(errors) == 3
@@ -78,7 +78,7 @@ def test_measured_cycles_are_within_2_percent_and_without_control_they_are_not(
         assert max(errors) > 0.05
 
 
-def measured(items: list[Block | Record]) -> dict[int, float]:
+def measure_levels(items: list[Block | Record]) -> dict[int, float]:
     """Fundamental of the table's acceleration over the measured cycles of each step, m/s2."""
     values: dict[int, list[Float1D]] = {}
     phases: dict[int, list[Float1D]] = {}
@@ -100,12 +100,12 @@ def measured(items: list[Block | Record]) -> dict[int, float]:
 @pytest.mark.parametrize("step", [0, 1])
 def test_harmonics_fall_by_10_db_in_at_most_five_updates(step: int) -> None:
     looks = of_step(cancelling(), step)
-    first, last = (np.linalg.norm(one.harmonics_m_s2) for one in (looks[0], looks[-1]))
+    first, last = (np.linalg.norm(level.harmonics_m_s2) for level in (looks[0], looks[-1]))
     assert first > 0.01 * A  # there is something to cancel
     assert 20 * np.log10(last / first) <= -10.0
     assert looks[-1].update <= 5
     assert looks[-1].accepted
-    assert all(abs(one.measured_m_s2 / A - 1.0) <= 0.02 for one in looks)
+    assert all(abs(level.measured_m_s2 / A - 1.0) <= 0.02 for level in looks)
 
 
 def test_prediction_begins_with_the_identified_response() -> None:

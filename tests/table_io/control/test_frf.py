@@ -34,25 +34,25 @@ def response(
 def test_a_response_goes_smoothly_through_its_points_and_on(
     frequencies_hz: tuple[float, ...], inside: float, beyond: float
 ) -> None:
-    found = response(frequencies_hz, double_pole)
+    fitted = response(frequencies_hz, double_pole)
     for f in np.linspace(0.2, 10.0, 50):
-        assert abs(evaluate_transfer(found, f) / double_pole(f) - 1) < inside
-        assert evaluate_gain(found, f) == pytest.approx(abs(evaluate_transfer(found, f)))
+        assert abs(evaluate_transfer(fitted, f) / double_pole(f) - 1) < inside
+        assert evaluate_gain(fitted, f) == pytest.approx(abs(evaluate_transfer(fitted, f)))
     for f in np.linspace(10.0, 25.0, 20):
-        assert abs(evaluate_transfer(found, f) / double_pole(f) - 1) < beyond
+        assert abs(evaluate_transfer(fitted, f) / double_pole(f) - 1) < beyond
 
 
 def test_one_point_gives_a_constant_gain_and_a_constant_delay() -> None:
-    found = FrequencyResponse(0, (2.0,), (0.9,), (-0.2,))
+    fitted = FrequencyResponse(0, (2.0,), (0.9,), (-0.2,))
     for f in (0.5, 2.0, 8.0):
-        assert evaluate_transfer(found, f) == pytest.approx(0.9 * cmath.exp(-0.1j * f))
+        assert evaluate_transfer(fitted, f) == pytest.approx(0.9 * cmath.exp(-0.1j * f))
 
 
 def test_noise_in_points_close_together_does_not_run_away_beyond_them() -> None:
     generator = np.random.default_rng(3)
     for _ in range(50):
         gain = tuple(1.0 + 0.004 * generator.standard_normal(3))
-        found = FrequencyResponse(0, (0.5, 0.632, 0.8), gain, (-0.047, -0.06, -0.075))
-        assert evaluate_gain(found, 0.05) == pytest.approx(evaluate_gain(found, 0.5))
-        assert 0.9 < evaluate_gain(found, 1.0) < 1.1
-        assert 0.2 < evaluate_gain(found, 4.0) < 5.0
+        fitted = FrequencyResponse(0, (0.5, 0.632, 0.8), gain, (-0.047, -0.06, -0.075))
+        assert evaluate_gain(fitted, 0.05) == pytest.approx(evaluate_gain(fitted, 0.5))
+        assert 0.9 < evaluate_gain(fitted, 1.0) < 1.1
+        assert 0.2 < evaluate_gain(fitted, 4.0) < 5.0

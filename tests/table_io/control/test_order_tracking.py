@@ -8,14 +8,14 @@ from hypothesis import strategies as st
 from table_io.block import Float1D
 from table_io.control.order_tracking import HARMONIC_COUNT, track_channels, track_harmonics
 
-RATE = 2000.0
+RATE_HZ = 2000.0
 
 
 def wave(
     frequency_hz: float, cycles: float, amplitudes: list[complex], offset: float = 0.0
 ) -> tuple[Float1D, np.ndarray]:
     """(samples, phase in cycles) of a sum of harmonics."""
-    phase = 0.3 + np.arange(round(cycles * RATE / frequency_hz)) * frequency_hz / RATE
+    phase = 0.3 + np.arange(round(cycles * RATE_HZ / frequency_hz)) * frequency_hz / RATE_HZ
     orders = np.arange(1, len(amplitudes) + 1)
     turns = np.exp(2j * np.pi * np.outer(orders, phase))
     return offset + np.imag(np.array(amplitudes) @ turns), phase
@@ -28,39 +28,39 @@ def test_without_noise_it_is_exact_whatever_the_frequency(
 ) -> None:
     amplitudes = [np.exp(1j * angle), 0.3j, -0.2, 0.1 + 0.05j]
     values, phase = wave(f, cycles, amplitudes, offset)
-    seen = track_harmonics(values, phase)
-    assert seen.offset == pytest.approx(offset, abs=1e-9)
-    np.testing.assert_allclose(seen.amplitudes[:4], amplitudes, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(seen.amplitudes[4:], 0.0, rtol=0, atol=1e-9)
-    assert seen.residual_rms < 1e-9
-    assert seen.distortion == pytest.approx(np.sqrt(0.09 + 0.04 + 0.0125), rel=1e-9)
+    fit = track_harmonics(values, phase)
+    assert fit.offset == pytest.approx(offset, abs=1e-9)
+    np.testing.assert_allclose(fit.amplitudes[:4], amplitudes, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(fit.amplitudes[4:], 0.0, rtol=0, atol=1e-9)
+    assert fit.residual_rms < 1e-9
+    assert fit.distortion == pytest.approx(np.sqrt(0.09 + 0.04 + 0.0125), rel=1e-9)
 
 
 @pytest.mark.parametrize("f", [0.5, 1.37, 3.4, 10.0])
 def test_bias_below_half_a_percent_and_a_degree_at_40_db(f: float) -> None:
     noise = np.random.default_rng(5)
-    found = []
+    amplitudes = []
     for _ in range(200):
         cycles = max(1, int(np.ceil(0.3 * f)))  # the shortest look of the controller
         values, phase = wave(f, cycles, [1.0, 0.1j], 0.01)
-        seen = track_harmonics(
+        fit = track_harmonics(
             values + 0.01 / np.sqrt(2) * noise.standard_normal(values.size), phase
         )
-        found.append(seen.amplitudes[0])
-    mean = np.mean(found)
+        amplitudes.append(fit.amplitudes[0])
+    mean = np.mean(amplitudes)
     assert abs(abs(mean) - 1.0) < 0.001
     assert abs(np.degrees(np.angle(mean))) < 0.1
-    worst = np.max(np.abs(np.abs(found) - 1.0))
+    worst = np.max(np.abs(np.abs(amplitudes) - 1.0))
     assert worst < 0.005
-    assert np.max(np.abs(np.degrees(np.angle(found)))) < 1.0
+    assert np.max(np.abs(np.degrees(np.angle(amplitudes)))) < 1.0
 
 
 def test_a_phase_that_the_drive_blends_is_followed() -> None:
-    time = np.arange(4000) / RATE
+    time = np.arange(4000) / RATE_HZ
     phase = 2.0 * time + 0.4 * time**2  # a chirp
-    seen = track_harmonics(0.7 * np.sin(2 * np.pi * phase + 0.2), phase)
-    assert seen.fundamental == pytest.approx(0.7, rel=1e-9)
-    assert np.angle(seen.amplitudes[0]) == pytest.approx(0.2, abs=1e-9)
+    fit = track_harmonics(0.7 * np.sin(2 * np.pi * phase + 0.2), phase)
+    assert fit.fundamental == pytest.approx(0.7, rel=1e-9)
+    assert np.angle(fit.amplitudes[0]) == pytest.approx(0.2, abs=1e-9)
 
 
 def test_lost_samples_and_too_few_give_nothing_and_never_a_number() -> None:
@@ -74,15 +74,15 @@ def test_lost_samples_and_too_few_give_nothing_and_never_a_number() -> None:
 
 def test_orders_that_the_samples_cannot_tell_are_left_out() -> None:
     values, phase = wave(100.0, 30, [1.0])  # twenty samples a cycle
-    seen = track_harmonics(values, phase)
-    assert seen.amplitudes.size == HARMONIC_COUNT
-    assert (seen.amplitudes[5:] == 0.0).all()
-    assert seen.fundamental == pytest.approx(1.0, rel=1e-9)
+    fit = track_harmonics(values, phase)
+    assert fit.amplitudes.size == HARMONIC_COUNT
+    assert (fit.amplitudes[5:] == 0.0).all()
+    assert fit.fundamental == pytest.approx(1.0, rel=1e-9)
 
 
 def test_several_channels_at_once_are_each_alone() -> None:
-    one, phase = wave(3.0, 2, [1.0, 0.2])
+    low, phase = wave(3.0, 2, [1.0, 0.2])
     other, _ = wave(3.0, 2, [0.5j])
-    both = track_channels(np.array([one, other]), phase)
-    for seen, alone in zip(both, (one, other), strict=True):
-        np.testing.assert_array_equal(seen.amplitudes, track_harmonics(alone, phase).amplitudes)
+    both = track_channels(np.array([low, other]), phase)
+    for fit, alone in zip(both, (low, other), strict=True):
+        np.testing.assert_array_equal(fit.amplitudes, track_harmonics(alone, phase).amplitudes)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from table_io.block import Float1D, Label
 from table_io.config.base import PROFILES_DIR
+from table_io.config.excitation.stepped_sine import Sweep
 from table_io.config.profile import Profile, load_profile
 from table_io.excitation.drive import Drive, Segment, segment_motion
 from table_io.excitation.trajectory import plan_sweep
@@ -18,12 +19,14 @@ from table_io.units import GRAVITY_M_S2
 from tests.table_io.excitation.sine_segments import sine_segment_at, sine_segments
 
 SHIPPED = sorted(
-    path.stem for path in (PROFILES_DIR / "tests").glob("*.toml") if load_profile(path)[0].steps
+    path.stem
+    for path in (PROFILES_DIR / "tests").glob("*.toml")
+    if isinstance(load_profile(path)[0].excitation, Sweep)
 )
 A = 0.05 * GRAVITY_M_S2
-PEAK = 1.05  # of A: the most that a drive may ask for
+PEAK_RATIO = 1.05  # of A: the most that a drive may ask for
 DECAY_PEAK = 1.06  # of A: the decay multiplies a motion that may itself be at 1.05
-MARGIN = 100  # samples of rest looked at before and after
+MARGIN_SAMPLES = 100  # samples of rest looked at before and after
 
 
 @cache
@@ -32,20 +35,20 @@ def profile(name: str) -> Profile:
 
 
 @cache
-def drive(name: str) -> Drive:
+def plan_drive(name: str) -> Drive:
     return plan_sweep(profile(name))
 
 
 @cache
 def command(name: str) -> Float1D:
     """The whole command in m, with some rest after it; index = sample."""
-    samples = drive(name).command(0, drive(name).planned_end + MARGIN)
+    samples = plan_drive(name).command(0, plan_drive(name).planned_end + MARGIN_SAMPLES)
     samples.setflags(write=False)
     return samples
 
 
-def held(one: Drive) -> list[Segment]:
-    return [segment for segment in sine_segments(one) if segment.cycles]
+def list_holds(drive: Drive) -> list[Segment]:
+    return [segment for segment in sine_segments(drive) if segment.cycles]
 
 
 def differences(samples: Float1D, order: int, rate_hz: float) -> Float1D:
@@ -58,52 +61,52 @@ every_test = pytest.mark.parametrize("name", SHIPPED)
 
 @every_test
 def test_the_table_is_never_asked_for_more_than_105_percent(name: str) -> None:
-    one = drive(name)
-    ideal = one.acceleration(0, one.planned_end + MARGIN)
-    assert np.abs(ideal).max() <= PEAK * A
+    drive = plan_drive(name)
+    ideal = drive.acceleration(0, drive.planned_end + MARGIN_SAMPLES)
+    assert np.abs(ideal).max() <= PEAK_RATIO * A
     # The command itself, not only the formula beside it.
-    commanded = differences(command(name), 2, one.rate_hz)
-    assert np.abs(commanded).max() <= PEAK * A
+    commanded = differences(command(name), 2, drive.rate_hz)
+    assert np.abs(commanded).max() <= PEAK_RATIO * A
     # A second difference is the mean acceleration round a sample: off by its curvature only.
-    curvature = (2 * math.pi * profile(name).sweep.stop_hz / one.rate_hz) ** 2 / 12
+    curvature = (2 * math.pi * profile(name).sweep.stop_hz / drive.rate_hz) ** 2 / 12
     assert np.abs(commanded - ideal[1:-1]).max() <= 3 * curvature * A + 1e-5
 
 
 @every_test
 def test_command_velocity_and_acceleration_never_jump(name: str) -> None:
-    one = drive(name)
+    drive = plan_drive(name)
     stop_hz = profile(name).sweep.stop_hz
     # A jump in the acceleration would show here as A times the rate, 2000 A a second.
-    jerk = np.abs(differences(command(name), 3, one.rate_hz)).max()
+    jerk = np.abs(differences(command(name), 3, drive.rate_hz)).max()
     assert jerk <= 1.1 * 2 * math.pi * stop_hz * A
     # Over one sample the velocity cannot change by more than the acceleration allows, so the
     # command leaves rest and comes back to it without a step, and starts and ends at zero.
-    assert np.abs(np.diff(command(name), 2)).max() <= PEAK * A / one.rate_hz**2
-    first = sine_segments(one)[0].start
+    assert np.abs(np.diff(command(name), 2)).max() <= PEAK_RATIO * A / drive.rate_hz**2
+    first = sine_segments(drive)[0].start
     assert not command(name)[: first + 1].any()
     assert command(name)[first + 1 : first + 50].any()
-    assert not command(name)[one.planned_end :].any()
+    assert not command(name)[drive.planned_end :].any()
 
 
 @every_test
 def test_it_rests_first_and_starts_and_stops_softly(name: str) -> None:
-    one = drive(name)
-    assert sine_segments(one)[0].start == round(profile(name).acquisition.rest_s * one.rate_hz)
-    for ramp in (sine_segments(one)[0], sine_segments(one)[-1]):
+    drive = plan_drive(name)
+    assert sine_segments(drive)[0].start == round(profile(name).acquisition.rest_s * drive.rate_hz)
+    for ramp in (sine_segments(drive)[0], sine_segments(drive)[-1]):
         assert min(ramp.level0, ramp.level1) == 0.0
         assert ramp.f0 == ramp.f1
-        assert ramp.count >= max(2 / ramp.f0, 0.5) * one.rate_hz
+        assert ramp.count >= max(2 / ramp.f0, 0.5) * drive.rate_hz
 
 
 @every_test
 def test_blends_last_at_least_one_and_a_half_cycles(name: str) -> None:
-    one = drive(name)
-    previous = sine_segments(one)[0]
-    assert sine_segments(one)[0].label == Label.BLEND
-    for segment in sine_segments(one)[1:]:
+    drive = plan_drive(name)
+    previous = sine_segments(drive)[0]
+    assert sine_segments(drive)[0].label == Label.BLEND
+    for segment in sine_segments(drive)[1:]:
         assert segment.start == previous.end
         if not segment.cycles:
-            turns = float(segment.phase(np.ones(1), one.rate_hz)[0]) - segment.phase0
+            turns = float(segment.phase(np.ones(1), drive.rate_hz)[0]) - segment.phase0
             assert turns >= 1.5
             assert segment.label == Label.BLEND
         # Between two held steps there is a blend, unless the sweep turns and repeats a frequency.
@@ -119,27 +122,27 @@ def test_coarse_grids_get_longer_blends_instead_of_harder_ones(
     sweep: dict[str, object] = {"start_hz": 0.5, "stop_hz": 10.0, "step_hz": step_hz, "cycles": 2}
     sweep |= {"measured_cycles": 1, "directions": directions}
     raw = {"title": "coarse", "specimen": {"mass_kg": 550.0, "gap_mm": 4.0}, "sweep": sweep}
-    one = plan_sweep(Profile.model_validate(raw))
-    samples = one.command(0, one.planned_end + MARGIN)
-    assert np.abs(differences(samples, 2, one.rate_hz)).max() <= PEAK * A
-    assert np.abs(one.acceleration(0, samples.size)).max() <= PEAK * A
+    drive = plan_sweep(Profile.model_validate(raw))
+    samples = drive.command(0, drive.planned_end + MARGIN_SAMPLES)
+    assert np.abs(differences(samples, 2, drive.rate_hz)).max() <= PEAK_RATIO * A
+    assert np.abs(drive.acceleration(0, samples.size)).max() <= PEAK_RATIO * A
 
 
 @every_test
 def test_every_step_is_held_for_its_cycles_at_its_frequency_and_amplitude(name: str) -> None:
-    one, sweep = drive(name), profile(name).sweep
-    steps = held(one)
+    drive, sweep = plan_drive(name), profile(name).sweep
+    steps = list_holds(drive)
     assert [segment.step for segment in steps] == [step.index for step in sweep.steps]
     for segment, step in zip(steps, sweep.steps, strict=True):
         f = step.frequency_hz
-        spare = segment.count - sweep.cycles * one.rate_hz / f
+        spare = segment.count - sweep.cycles * drive.rate_hz / f
         assert -1e-6 <= spare < 1
         samples = command(name)[segment.start : segment.end]
         part = 2 * segment.count // 5
-        early, amplitude = phasor(samples[:part], 0, f, one.rate_hz)
-        late, again = phasor(samples[-part:], segment.count - part, f, one.rate_hz)
+        early, amplitude = phasor(samples[:part], 0, f, drive.rate_hz)
+        late, again = phasor(samples[-part:], segment.count - part, f, drive.rate_hz)
         slip = ((late - early) / (2 * math.pi) + 0.5) % 1.0 - 0.5
-        measured_hz = f + slip / ((segment.count - part) / one.rate_hz)
+        measured_hz = f + slip / ((segment.count - part) / drive.rate_hz)
         assert measured_hz == pytest.approx(f, rel=1e-4)
         assert amplitude == pytest.approx(A / (2 * math.pi * f) ** 2, rel=1e-9)
         assert again == pytest.approx(amplitude, rel=1e-9)
@@ -156,7 +159,7 @@ def phasor(samples: Float1D, first: int, f: float, rate_hz: float) -> tuple[floa
 
 @every_test
 def test_both_directions_are_driven_on_the_identical_grid(name: str) -> None:
-    steps = drive(name).steps
+    steps = plan_drive(name).steps
     up = [step.frequency_hz for step in steps if step.direction == "forward"]
     down = [step.frequency_hz for step in steps if step.direction == "backward"]
     if len(profile(name).sweep.directions) == 2:
@@ -168,14 +171,14 @@ def test_both_directions_are_driven_on_the_identical_grid(name: str) -> None:
 
 @every_test
 def test_measured_samples_are_the_last_cycles_of_a_step_and_never_in_a_blend(name: str) -> None:
-    one, sweep = drive(name), profile(name).sweep
-    step, label, cycle = one.labels(0, one.planned_end + MARGIN)
-    seen = np.zeros(label.size, dtype=bool)
-    for segment in held(one):
+    drive, sweep = plan_drive(name), profile(name).sweep
+    step, label, cycle = drive.labels(0, drive.planned_end + MARGIN_SAMPLES)
+    is_measured = np.zeros(label.size, dtype=bool)
+    for segment in list_holds(drive):
         window = slice(segment.start, segment.end)
-        seen[window] = True
+        is_measured[window] = True
         # In whole numbers, so that no rounding decides which cycle a sample lies in.
-        f, rate = Fraction(str(segment.f0)), Fraction(one.rate_hz)
+        f, rate = Fraction(str(segment.f0)), Fraction(drive.rate_hz)
         index = np.arange(segment.count)
         turn = (index * f.numerator * rate.denominator) // (f.denominator * rate.numerator)
         expected = np.minimum(turn, sweep.cycles - 1)
@@ -186,11 +189,11 @@ def test_measured_samples_are_the_last_cycles_of_a_step_and_never_in_a_blend(nam
         assert (step[window] == segment.step).all()
         assert np.unique(cycle[window][measured]).size == sweep.measured_cycles
     index = np.arange(label.size)
-    moving = (index >= sine_segments(one)[0].start) & (index < one.planned_end)
-    assert (label[moving & ~seen] == Label.BLEND).all()
+    moving = (index >= sine_segments(drive)[0].start) & (index < drive.planned_end)
+    assert (label[moving & ~is_measured] == Label.BLEND).all()
     assert (label[~moving] == Label.REST).all()
     assert (step[~moving] == -1).all()
-    assert (cycle[~seen] == -1).all()
+    assert (cycle[~is_measured] == -1).all()
 
 
 @every_test
@@ -201,11 +204,11 @@ def test_the_command_is_the_same_to_the_bit_every_time(name: str) -> None:
 
 @pytest.mark.parametrize("samples", [1, 7, 64, 500, 4093])
 def test_no_cut_into_blocks_changes_a_bit(samples: int) -> None:
-    one = drive("quickstart")
+    drive = plan_drive("quickstart")
     # Single samples are slow to make: there, the neighbourhood of a soft start and two blends.
-    last = sine_segments(one)[4].start + 50 if samples == 1 else command("quickstart").size
-    first = sine_segments(one)[1].end - 500 if samples == 1 else 0
-    for subject in (one, one.decay_from(sine_segments(one)[2].start + 100)):
+    last = sine_segments(drive)[4].start + 50 if samples == 1 else command("quickstart").size
+    first = sine_segments(drive)[1].end - 500 if samples == 1 else 0
+    for subject in (drive, drive.decay_from(sine_segments(drive)[2].start + 100)):
         whole = subject.command(first, last - first)
         labels = subject.labels(first, last - first)
         cuts = [(at, min(samples, last - at)) for at in range(first, last, samples)]
@@ -219,48 +222,48 @@ def test_no_cut_into_blocks_changes_a_bit(samples: int) -> None:
 @settings(max_examples=150, deadline=None)
 def test_a_decay_from_any_sample_is_smooth_and_ends_at_rest(data: st.DataObject) -> None:
     name = data.draw(st.sampled_from(["g0", "g4_ss1", "quickstart"]))
-    one = drive(name)
-    at = data.draw(st.integers(0, one.planned_end + MARGIN))
-    stopped = one.decay_from(at)
-    segment = sine_segment_at(one, at)
-    first, last = max(at - 20, 0), stopped.rest_start + MARGIN
+    drive = plan_drive(name)
+    at = data.draw(st.integers(0, drive.planned_end + MARGIN_SAMPLES))
+    stopped = drive.decay_from(at)
+    segment = sine_segment_at(drive, at)
+    first, last = max(at - 20, 0), stopped.rest_start + MARGIN_SAMPLES
     samples = stopped.command(first, last - first)
     # Untouched up to the decision, smooth through it and everywhere after it.
-    before = one.command(first, at - first + 1)
+    before = drive.command(first, at - first + 1)
     assert samples[: at - first + 1].tobytes() == before.tobytes()
-    assert np.abs(differences(samples, 2, one.rate_hz)).max() <= DECAY_PEAK * A
+    assert np.abs(differences(samples, 2, drive.rate_hz)).max() <= DECAY_PEAK * A
     # At rest max(2 cycles, 0.5 s) later, of the lower frequency of a blend at the most.
     slowest = min(segment.f0, segment.f1)
-    assert stopped.rest_start - at <= math.ceil(max(2 / slowest, 0.5) * one.rate_hz)
+    assert stopped.rest_start - at <= math.ceil(max(2 / slowest, 0.5) * drive.rate_hz)
     assert not samples[stopped.rest_start - first :].any()
     assert not stopped.command(stopped.rest_start, 100_000).any()
-    if at < sine_segments(one)[0].start:  # nothing moves yet, so nothing ever does
+    if at < sine_segments(drive)[0].start:  # nothing moves yet, so nothing ever does
         assert not samples.any()
 
 
 def test_a_decay_takes_its_full_time_where_the_drive_goes_on_longer() -> None:
-    one = drive("quickstart")
-    for segment in held(one)[:-2]:
-        stopped = one.decay_from(segment.start + 10)
+    drive = plan_drive("quickstart")
+    for segment in list_holds(drive)[:-2]:
+        stopped = drive.decay_from(segment.start + 10)
         assert stopped.rest_start - (segment.start + 10) == math.ceil(
-            max(2 / segment.f0, 0.5) * one.rate_hz
+            max(2 / segment.f0, 0.5) * drive.rate_hz
         )
-        assert stopped.command(stopped.rest_start - one.decay_samples - 400, 300).any()
+        assert stopped.command(stopped.rest_start - drive.decay_samples - 400, 300).any()
 
 
 def test_a_second_stop_does_not_postpone_the_first() -> None:
-    one = drive("quickstart")
-    stopped = one.decay_from(20_000)
+    drive = plan_drive("quickstart")
+    stopped = drive.decay_from(20_000)
     assert stopped.decay_from(20_500) == stopped
-    assert stopped.decay_from(19_000) == one.decay_from(19_000)
+    assert stopped.decay_from(19_000) == drive.decay_from(19_000)
 
 
 def test_the_labels_of_a_decay_say_stop_and_measure_nothing() -> None:
-    one = drive("quickstart")
-    at = held(one)[3].end - 50  # in a measured cycle
-    stopped = one.decay_from(at)
-    step, label, cycle = stopped.labels(0, one.planned_end)
-    before = [row[:at] for row in one.labels(0, one.planned_end)]
+    drive = plan_drive("quickstart")
+    at = list_holds(drive)[3].end - 50  # in a measured cycle
+    stopped = drive.decay_from(at)
+    step, label, cycle = stopped.labels(0, drive.planned_end)
+    before = [row[:at] for row in drive.labels(0, drive.planned_end)]
     assert all(np.array_equal(a[:at], b) for a, b in zip((step, label, cycle), before, strict=True))
     assert (label[at : stopped.rest_start] == Label.STOP).all()
     assert (label[stopped.rest_start :] == Label.REST).all()

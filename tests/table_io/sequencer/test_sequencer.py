@@ -27,7 +27,7 @@ from table_io.sequencer import (
 from table_io.units import GRAVITY_M_S2
 from tests.table_io.excitation.sine_segments import sine_segment_at, sine_segments
 
-RATE = 2000.0
+RATE_HZ = 2000.0
 A = 0.05 * GRAVITY_M_S2
 RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 CHANNELS = ("drive_disp_m", "table_disp_m", "table_acc_m_s2")
@@ -52,27 +52,27 @@ class Table:
     """Plays a conductor's drive on a table of gain(f), and keeps what was played."""
 
     gain: Any
-    now: SequencerState
-    said: list[Record] = field(default_factory=list)
+    state: SequencerState
+    records: list[Record] = field(default_factory=list)
     command: list[Float1D] = field(default_factory=list)
     at: int = 0
 
     def block(self, samples: int) -> Block:
-        drive, at = self.now.drive, self.at
+        drive, at = self.state.drive, self.at
         metres = drive.command(at - 1, samples + 2)
-        acceleration = np.diff(metres, 2) * RATE**2
+        acceleration = np.diff(metres, 2) * RATE_HZ**2
         f = np.array([_frequency(drive, at + i) for i in range(0, samples)])
         values = np.array([metres[1:-1], metres[1:-1], self.gain(f) * acceleration])
         self.command.append(metres[1:-1])
         self.at += samples
-        return Block("meas", at, RATE, CHANNELS, values, *drive.labels(at, samples))
+        return Block("meas", at, RATE_HZ, CHANNELS, values, *drive.labels(at, samples))
 
     def play(self, samples: int, until: int | None = None) -> None:
         while self.at < (until or 10**9):
-            if until is None and self.now.is_finished and self.at >= self.now.drive.rest_start:
+            if until is None and self.state.is_finished and self.at >= self.state.drive.rest_start:
                 return
-            self.now, said = advance_test(self.now, self.block(samples))
-            self.said += said
+            self.state, records = advance_test(self.state, self.block(samples))
+            self.records += records
 
 
 def _frequency(drive: Drive, index: int) -> float:
@@ -86,7 +86,7 @@ def rolled_off(f: Float1D) -> Float1D:
     return 1.0 / (1.0 + (f / 6.2) ** 2)
 
 
-def played(test: Profile, gain: Any = rolled_off, samples: int = 20) -> Table:
+def play_test(test: Profile, gain: Any = rolled_off, samples: int = 20) -> Table:
     table = Table(gain, start_test(make_test_plan(test, RIG, 40)))
     table.play(samples)
     return table
@@ -100,69 +100,73 @@ def levels(table: Table, segment: Any) -> Float1D:
 @pytest.mark.parametrize("samples", [1, 7, 64, 500])
 def test_the_cut_of_the_samples_changes_nothing(samples: int) -> None:
     test = profile(directions=["forward"], stop_hz=3.0)
-    whole, cut = played(test), played(test, samples=samples)
+    whole, cut = play_test(test), play_test(test, samples=samples)
     size = min(whole.at, cut.at)
-    one, other = np.concatenate(whole.command)[:size], np.concatenate(cut.command)[:size]
-    assert one.tobytes() == other.tobytes()
-    assert whole.said == cut.said
-    assert whole.now.drive == cut.now.drive
+    first, other = np.concatenate(whole.command)[:size], np.concatenate(cut.command)[:size]
+    assert first.tobytes() == other.tobytes()
+    assert whole.records == cut.records
+    assert whole.state.drive == cut.state.drive
 
 
 def test_the_level_is_reached_at_every_step_and_frozen_while_it_is_measured() -> None:
-    table = played(profile())
-    held = [one for one in sine_segments(table.now.drive) if one.cycles]
+    table = play_test(profile())
+    held = [segment for segment in sine_segments(table.state.drive) if segment.cycles]
     assert len(held) == 6
     for segment in held:
         assert levels(table, segment) == pytest.approx(A, rel=0.02)
         assert segment.correction0 == segment.correction1
-        assert segment.count == math.ceil(4 * RATE / segment.f0)
-    looks = [one for one in table.said if isinstance(one, Level)]
-    assert all(one.update <= 3 for one in looks)
-    assert sum(one.accepted for one in looks) == 6
-    assert not [one for one in table.said if isinstance(one, Event)]
+        assert segment.count == math.ceil(4 * RATE_HZ / segment.f0)
+    looks = [record for record in table.records if isinstance(record, Level)]
+    assert all(record.update <= 3 for record in looks)
+    assert sum(record.accepted for record in looks) == 6
+    assert not [record for record in table.records if isinstance(record, Event)]
     # Without control the same table is far off.
-    off = played(profile({"enabled": False}))
-    least = min(float(levels(off, one)[0]) for one in sine_segments(off.now.drive) if one.cycles)
+    off = play_test(profile({"enabled": False}))
+    least = min(
+        float(levels(off, segment)[0])
+        for segment in sine_segments(off.state.drive)
+        if segment.cycles
+    )
     assert least < 0.75 * A
 
 
 def test_a_correction_is_reused_on_the_way_back() -> None:
-    table = played(profile())
+    table = play_test(profile())
     updates: dict[int, int] = {}
-    for one in table.said:
-        if isinstance(one, Level):
-            updates[one.step] = max(updates.get(one.step, 0), one.update)
+    for record in table.records:
+        if isinstance(record, Level):
+            updates[record.step] = max(updates.get(record.step, 0), record.update)
     assert max(updates[step] for step in (0, 1, 2)) >= 1
     assert [updates[step] for step in (3, 4, 5)] == [0, 0, 0]
 
 
 def test_no_update_asks_for_more_than_its_clamp_nor_for_more_than_105_percent() -> None:
-    table = played(profile({"clamp_db": 0.5}), gain=lambda f: 0.8 + 0 * f)
-    looks = [one for one in table.said if isinstance(one, Level) and one.step == 0]
+    table = play_test(profile({"clamp_db": 0.5}), gain=lambda f: 0.8 + 0 * f)
+    looks = [record for record in table.records if isinstance(record, Level) and record.step == 0]
     ratios = np.array([b.correction / a.correction for a, b in itertools.pairwise(looks)])
     assert ratios.size >= 2
     assert ratios.max() <= 10 ** (0.5 / 20) + 1e-12
     command = np.concatenate([*table.command, np.zeros(10)])
-    played_m_s2 = np.abs(np.diff(command, 2)) * RATE**2
-    most = max(one.correction for one in table.said if isinstance(one, Level))
+    played_m_s2 = np.abs(np.diff(command, 2)) * RATE_HZ**2
+    most = max(record.correction for record in table.records if isinstance(record, Level))
     assert played_m_s2.max() <= 1.05 * most * A * 1.001
-    ideal = table.now.drive.acceleration(0, table.now.drive.planned_end)
+    ideal = table.state.drive.acceleration(0, table.state.drive.planned_end)
     assert np.abs(ideal).max() <= 1.05 * A
 
 
 def test_a_level_that_cannot_be_reached_is_said_and_the_test_goes_on() -> None:
-    table = played(profile({"updates": 1, "clamp_db": 0.5}), gain=lambda f: 0.5 + 0 * f)
-    said = [one for one in table.said if isinstance(one, Event)]
-    assert said
-    assert said[0].kind == "level"
-    assert "demanded" in said[0].text
-    assert len([one for one in sine_segments(table.now.drive) if one.cycles]) == 6
+    table = play_test(profile({"updates": 1, "clamp_db": 0.5}), gain=lambda f: 0.5 + 0 * f)
+    events = [record for record in table.records if isinstance(record, Event)]
+    assert events
+    assert events[0].kind == "level"
+    assert "demanded" in events[0].text
+    assert len([segment for segment in sine_segments(table.state.drive) if segment.cycles]) == 6
 
 
 def test_without_control_the_drive_is_the_plan() -> None:
     test = profile({"enabled": False})
-    table = played(test)
-    assert table.now.drive == plan_sweep(test)
+    table = play_test(test)
+    assert table.state.drive == plan_sweep(test)
 
 
 @pytest.mark.parametrize("name", ["quickstart", "g4_ss3", "gm10"])
@@ -175,8 +179,8 @@ def test_a_rehearsal_is_what_a_perfect_table_plays(name: str) -> None:
             "loop_check": test.loop_check.model_copy(update={"enabled": False}),
         }
     )
-    table = played(test, gain=np.ones_like)
-    assert table.now.drive == nominal_drive(make_test_plan(test, RIG, 40))
+    table = play_test(test, gain=np.ones_like)
+    assert table.state.drive == nominal_drive(make_test_plan(test, RIG, 40))
 
 
 @pytest.mark.parametrize("where", [0.2, 0.5, 0.9])
@@ -186,22 +190,22 @@ def test_a_hold_stays_at_its_step_and_the_step_is_measured_anew(where: float) ->
     table = Table(np.ones_like, start_test(make_test_plan(test, RIG, 40)))
     table.play(20, until=round(where * whole.planned_end))
     before = np.concatenate(table.command)
-    table.now = hold_test(table.now, table.at + 100)
-    assert table.now.stage.kind == "open"
+    table.state = hold_test(table.state, table.at + 100)
+    assert table.state.stage.kind == "open"
     table.play(20, until=table.at + 8000)
-    step, label, cycle = table.now.drive.labels(table.at - 2000, 2000)
+    step, label, cycle = table.state.drive.labels(table.at - 2000, 2000)
     assert len(set(step)) == 1
     assert set(label) == {Label.SETTLE}
     assert set(cycle) == {-1}
-    table.now = resume_test(table.now, table.at + 100)
+    table.state = resume_test(table.state, table.at + 100)
     table.play(20)
     command = np.concatenate(table.command)
     assert command[: before.size].tobytes() == before.tobytes()
-    assert np.abs(np.diff(command, 2)).max() * RATE**2 <= 1.051 * A
-    _, labels, cycles = table.now.drive.labels(0, table.at)
-    steps = table.now.drive.labels(0, table.at)[0]
-    for one in range(6):
-        assert set(cycles[(steps == one) & (labels == Label.MEASURE)]) == {2, 3}, one
+    assert np.abs(np.diff(command, 2)).max() * RATE_HZ**2 <= 1.051 * A
+    _, labels, cycles = table.state.drive.labels(0, table.at)
+    steps = table.state.drive.labels(0, table.at)[0]
+    for index in range(6):
+        assert set(cycles[(steps == index) & (labels == Label.MEASURE)]) == {2, 3}, index
     held = int(step[0])
     first = np.flatnonzero((steps == held) & (cycles == 3))[-1]
     assert first > before.size + 8000
@@ -209,9 +213,9 @@ def test_a_hold_stays_at_its_step_and_the_step_is_measured_anew(where: float) ->
 
 def test_a_hold_or_a_resume_out_of_place_changes_nothing() -> None:
     test = profile()
-    now = start_test(make_test_plan(test, RIG, 40))
-    assert resume_test(now, 100) is now
-    table = played(test)
-    assert hold_test(table.now, table.at) is table.now
-    waiting = replace(now, stage=replace(now.stage, kind="check"))
+    state = start_test(make_test_plan(test, RIG, 40))
+    assert resume_test(state, 100) is state
+    table = play_test(test)
+    assert hold_test(table.state, table.at) is table.state
+    waiting = replace(state, stage=replace(state.stage, kind="check"))
     assert hold_test(waiting, 100) is waiting

@@ -1,0 +1,102 @@
+"""Continuation: periodic orbits along one branch, stable or not, each held by feedback.
+
+The orbits come from an orbit plan, which the twin computes before the test (`orbit_plan.py`).
+"""
+
+from functools import cached_property
+from typing import ClassVar
+
+from pydantic import Field, ValidationInfo, field_validator
+
+from table_io.config.base import Count, Number, Positive
+from table_io.config.excitation import (
+    MIN_BLEND_CYCLES,
+    Excitation,
+    ExcitationPlan,
+    register_excitation,
+)
+from table_io.config.excitation.orbit_plan import OrbitPlan, parse_orbit_plan
+from table_io.errors import InputError
+from table_io.records import Step
+
+
+@register_excitation("continuation")
+class Continuation(Excitation):
+    """Control-based continuation along a branch of periodic orbits.
+
+    The first keys say which orbits the plan is made of, if the profile names no `file`.
+    """
+
+    FILE_KEYS: ClassVar[tuple[str, ...]] = ("file",)
+
+    start_hz: Positive
+    stop_hz: Positive
+    acceleration_g: Positive = 0.05
+    points: Count = Field(60, ge=1, le=1000, description="Unstable orbits along the branch.")
+    settle_cycles: Count = Field(10, ge=2, le=1000, description="Before each evaluation.")
+    measured_cycles: Count = Field(10, ge=2, le=1000, description="Of each evaluation.")
+    blend_cycles: Number = Field(4.0, ge=MIN_BLEND_CYCLES, le=50, description="Between orbits.")
+    updates: Count = Field(6, ge=1, le=50, description="Largest number of the reference a point.")
+    tolerance: Number = Field(
+        0.003, gt=0, le=0.05, description="Accepted feedback over the amplitude of the command."
+    )
+    max_feedback: Number = Field(
+        0.5, gt=0, le=1.0, description="Largest feedback over the amplitude of the command."
+    )
+    retries: Count = Field(3, ge=0, le=100, description="Of a point where the orbit is lost.")
+    table_lag_ms: Positive = Field(
+        15.0, le=200, description="Lag of the table behind its command, which the gains allow for."
+    )
+    files: dict[str, str] = Field({}, description="Texts of files by name; loading attaches them.")
+    file: str | None = Field(None, description="Orbit plan; None: `run` computes it.")
+
+    @field_validator("stop_hz")
+    @classmethod
+    def _check_ascending(cls, stop: float, info: ValidationInfo) -> float:
+        if stop < info.data.get("start_hz", 0.0):
+            raise InputError(f"stop_hz {stop} lies below start_hz", remedy="exchange them")
+        return stop
+
+    @field_validator("file")
+    @classmethod
+    def _check_file(cls, name: str | None, info: ValidationInfo) -> str | None:
+        files = info.data.get("files")
+        if name is None or files is None:
+            return name
+        if name not in files:
+            raise InputError(f"{name!r} is not attached", remedy="load the profile from its file")
+        parse_orbit_plan(files[name], name)
+        return name
+
+    @cached_property
+    def orbit_plan(self) -> OrbitPlan:
+        """Orbits to measure; InputError if the profile has no plan yet."""
+        if self.file is None:
+            raise InputError(
+                "the profile has no orbit plan",
+                key="excitation.file",
+                remedy="`shaketwin run` computes it; or name the file of a plan",
+            )
+        return parse_orbit_plan(self.files[self.file], self.file)
+
+    @property
+    def expected_s(self) -> float:
+        """Duration in s if each orbit needs one update of its reference."""
+        cycles = 2 * (self.settle_cycles + self.measured_cycles + self.blend_cycles)
+        return sum(cycles / orbit.frequency_hz for orbit in self.orbit_plan.points)
+
+    def plan(self, rate_hz: float) -> ExcitationPlan:
+        """Return one step per planned orbit; the test adapts its frequency."""
+        orbits = self.orbit_plan.points
+        steps = tuple(
+            Step(index, "forward", orbit.frequency_hz, orbit.acceleration_m_s2)
+            for index, orbit in enumerate(orbits)
+        )
+        frequencies = [orbit.frequency_hz for orbit in orbits]
+        return ExcitationPlan(
+            max(orbit.acceleration_m_s2 for orbit in orbits),
+            min(frequencies),
+            max(frequencies),
+            steps,
+            blend_cycles=self.blend_cycles,
+        )

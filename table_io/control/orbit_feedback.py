@@ -1,0 +1,174 @@
+"""Feedback that holds an unstable periodic orbit, for control-based continuation.
+
+The deviation e = x - x_ref of the mass's displacement in the laboratory frame is fitted by
+Re(E exp(i w t)) over a short window, w being the frequency of the drive. The correction of the
+command answers it a fixed horizon later, so a sine-like deviation is answered at its true phase:
+
+    c(t) = share Re((g + i w d) E exp(i w (t - horizon)))
+
+Every block gives such a function. It replaces the previous one by a quintic blend, so the command
+stays C2, and it fades to zero if no later block replaces it. The amplitude of the correction and
+its change from block to block are limited.
+
+Why x and not u = x - y: at frequencies above its resonance the mass stands still, so u = -y returns
+the correction at a gain of about -g with the delay of the loop, which is close to instability.
+"""
+
+import math
+from bisect import bisect_right
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from table_io.block import Float1D, Int1D
+from table_io.config.excitation.orbit_plan import unpack_harmonics
+from table_io.excitation.correction import Correction
+from table_io.excitation.drive import MAX_BLEND_CURVATURE, Drive, smoothstep
+
+WINDOW_S = 0.03  # of the fit: longer rejects more noise, shorter follows a faster growth
+BLEND_S = 0.02  # from the previous function to the next
+PREDICTION_S = 0.05  # after the horizon, until the function fades if no block replaces it
+FADE_S = 0.15
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceSegment:
+    """Reference that blends from `before` to `after` over `count` samples and stays there.
+
+    The references are harmonics of x in m as a real vector, at the phase of the drive. The gains
+    and `share`, the part of the feedback that acts, blend alike.
+    """
+
+    start: int
+    count: int
+    before: Float1D
+    after: Float1D
+    share0: float
+    share1: float
+    gain: float
+    rate_gain_s: float
+    limit_m: float  # amplitude of the correction
+    max_acceleration_m_s2: float  # that a change of the correction may add
+
+    def share(self, indices: Int1D) -> Float1D:
+        """Return the share at sample indices, (sample,)."""
+        return self.share0 + (self.share1 - self.share0) * self._blend(indices)
+
+    def displacement(self, indices: Int1D, phase: Float1D) -> Float1D:
+        """Return x_ref in m at sample indices, of which `phase` is the drive's in cycles."""
+        before, after = evaluate_harmonics(self.before, phase), self.after
+        if after is self.before:
+            return before
+        return before + (evaluate_harmonics(after, phase) - before) * self._blend(indices)
+
+    def _blend(self, indices: Int1D) -> Float1D:
+        return smoothstep(np.clip((indices - self.start) / max(self.count, 1), 0.0, 1.0))
+
+
+def evaluate_harmonics(vector: Float1D, phase: Float1D) -> Float1D:
+    """Return Re sum_k X_k exp(2 pi i k phase) of a real vector of harmonics, phase in cycles."""
+    rotation = np.exp(2j * math.pi * phase)
+    total = np.zeros(phase.size, dtype=np.complex128)
+    for coefficient in unpack_harmonics(vector)[::-1]:
+        total = total * rotation + coefficient
+    return total.real
+
+
+@dataclass(frozen=True, eq=False)
+class FeedbackState:
+    """State of the feedback: references by sample, recent deviations and the last function."""
+
+    horizon: int  # samples from the end of a block to the first one that it corrects
+    segments: tuple[ReferenceSegment, ...] = ()
+    deviation_m: Float1D = field(default_factory=lambda: np.empty(0))
+    phasor_m: complex = 0j  # of the correction, at sample `index` of the horizon
+    index: int = 0
+    saturated_samples: int = 0  # since the limit was last not reached
+
+    def append(self, segment: ReferenceSegment) -> "FeedbackState":
+        """Return the state with one more reference, which replaces those that start after it."""
+        kept = tuple(earlier for earlier in self.segments if earlier.start < segment.start)
+        return replace(self, segments=(*kept, segment))
+
+    def segment_at(self, index: int) -> ReferenceSegment:
+        """Return the reference at sample `index`."""
+        starts = [segment.start for segment in self.segments]
+        return self.segments[max(bisect_right(starts, index) - 1, 0)]
+
+    def reference(self, first: int, phase: Float1D) -> Float1D:
+        """Return x_ref in m from sample `first` on at the drive's phase in cycles, (sample,)."""
+        indices, values = np.arange(first, first + phase.size), np.empty(phase.size)
+        done = 0
+        while done < phase.size:
+            segment = self.segment_at(first + done)
+            later = [s.start for s in self.segments if s.start > first + done]
+            end = min(min(later, default=first + phase.size) - first, phase.size)
+            values[done:end] = segment.displacement(indices[done:end], phase[done:end])
+            done = end
+        return values
+
+
+def advance_feedback(
+    state: FeedbackState, drive: Drive, first: int, x_m: Float1D, earliest: int, keep_from: int
+) -> tuple[FeedbackState, Correction, int]:
+    """Return (state, correction, first changed sample) after measured x in m, (sample,).
+
+    The correction changes from the later of the horizon and `earliest` on. A window with lost
+    samples changes nothing: the last function fades.
+    """
+    rate_hz, end = drive.rate_hz, first + x_m.size
+    phase = drive.phase(first, x_m.size)
+    window = round(WINDOW_S * rate_hz)
+    deviation = np.concatenate([state.deviation_m, x_m - state.reference(first, phase)])[-window:]
+    state = replace(state, deviation_m=deviation)
+    start = max(end + state.horizon, earliest)
+    segment = state.segment_at(start)
+    w = 2.0 * math.pi * drive.frequency_hz(end)
+    if not w or deviation.size < window or not np.isfinite(deviation).all():
+        return state, drive.correction, start
+    rotation = np.exp(1j * w * np.arange(-window, 0) / rate_hz)
+    demanded = complex(segment.gain, w * segment.rate_gain_s) * _fit_phasor(deviation, rotation)
+    state = _limit_phasor(state, demanded, segment, end, w / rate_hz, rate_hz)
+    count = round((PREDICTION_S + FADE_S) * rate_hz) + max(start - end - state.horizon, 0)
+    indices = np.arange(start, start + count)
+    values = np.real(
+        state.phasor_m * np.exp(1j * w * (indices - end - state.horizon) / rate_hz)
+    ) * (1.0 - smoothstep(np.clip((indices - indices[-1]) / (FADE_S * rate_hz) + 1.0, 0.0, 1.0)))
+    values *= segment.share(indices)
+    blend = smoothstep(np.minimum(np.arange(count) / (BLEND_S * rate_hz), 1.0))
+    previous = drive.correction.displacement(start, count)
+    values = previous + (values - previous) * blend
+    return state, drive.correction.replace_from(start, values, keep_from), start
+
+
+def _fit_phasor(deviation: Float1D, rotation: Float1D) -> complex:
+    """Return E of the least-squares fit Re(E rotation) of a deviation, both (sample,)."""
+    basis = np.column_stack([rotation.real, -rotation.imag])
+    # Not BLAS: on a busy computer its threads can wait seconds for one another.
+    normal, rhs = np.einsum("ij,ik->jk", basis, basis), np.einsum("ij,i->j", basis, deviation)
+    real, imaginary = np.linalg.solve(normal, rhs)
+    return complex(real, imaginary)
+
+
+def _limit_phasor(
+    state: FeedbackState,
+    demanded: complex,
+    segment: ReferenceSegment,
+    end: int,
+    turn: float,
+    rate_hz: float,
+) -> FeedbackState:
+    """Return the state with the demanded phasor in m, limited in size and change.
+
+    `turn` is the angle per sample in rad.
+    """
+    size = abs(demanded)
+    is_saturated = size > segment.limit_m
+    phasor = demanded * segment.limit_m / size if is_saturated else demanded
+    previous = state.phasor_m * np.exp(1j * turn * (end - state.index)) if state.index else 0j
+    max_change = segment.max_acceleration_m_s2 * BLEND_S**2 / MAX_BLEND_CURVATURE
+    change = phasor - previous
+    if abs(change) > max_change:
+        phasor = previous + change * max_change / abs(change)
+    saturated = state.saturated_samples + end - state.index if is_saturated else 0
+    return replace(state, phasor_m=complex(phasor), index=end, saturated_samples=saturated)

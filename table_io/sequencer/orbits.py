@@ -1,0 +1,405 @@
+"""Continuation in the sequencer: hold, evaluate and correct each orbit; retry where it is lost.
+
+    approach --> hold --(window complete)--> update of the reference, hold again, ...
+                                       `---> accepted, or updates used up: the next point
+    lost --> decay to rest, capture of the first orbit, along the measured ones to this point, or
+             to the next one when its retries are used up
+    last point, or three in a row lost --> the end, with the feedback blended out
+
+The feedback acts on every block (`control/orbit_feedback.py`); what is decided here are its
+references, ahead of time, like every other change of the drive.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from table_io.adaptive.continuation import (
+    MeasuredOrbit,
+    OrbitMeasurement,
+    OrbitTarget,
+    correct_target,
+    fundamental,
+    is_on_branch,
+    plan_target,
+    rotate_harmonics,
+)
+from table_io.adaptive.result import mean_swing
+from table_io.block import Block, Float1D, Label, join_blocks
+from table_io.channels import relative_displacement
+from table_io.config.excitation.continuation import Continuation
+from table_io.config.excitation.orbit_plan import pack_harmonics, unpack_harmonics
+from table_io.control.frf import evaluate_transfer
+from table_io.control.orbit_feedback import FeedbackState, ReferenceSegment, advance_feedback
+from table_io.control.order_tracking import HarmonicFit, track_harmonics
+from table_io.excitation.trajectory import SineTarget, Trajectory
+from table_io.records import Event, FrequencyResponse, OrbitPoint
+from table_io.sequencer.state import OrbitSearch, SequencerState, Stage
+
+CAPTURE_CYCLES = 20  # held at the first orbit after a soft start
+UPDATE_BLEND_CYCLES = 2.0  # between references of one point
+RELEASE_S = 0.1  # of the feedback when an orbit is lost
+REST_S = 1.0  # before an orbit is captured again
+MAX_SATURATED_CYCLES = 2.0  # at the limit of the feedback: the orbit is lost
+MAX_DEVIATION = 0.25  # of the amplitude of u from the reference: the orbit is lost
+LEVEL_TOLERANCE = 0.003  # of the fundamental of the table's acceleration
+MAX_LEVEL_FACTOR = 1.25  # of the command in one update
+LATENCY_TOLERANCE_S = 0.003  # of the measured latency, beyond that of the plan
+MAX_LOST_POINTS = 3  # in a row, before the test ends
+NOISE_FACTOR = 1.5  # accepted feedback over what sensor noise explains
+
+
+def begin_continuation(state: SequencerState) -> SequencerState:
+    """Capture the first orbit from rest."""
+    config, response = _config(state), state.tuning.response
+    plan = config.orbit_plan
+    target = plan_target(plan, 0, ())
+    lag_s, correction = 0.0, 1.0
+    if response is not None:
+        transfer = evaluate_transfer(response, target.frequency_hz)
+        lag_s = -math.atan2(transfer.imag, transfer.real) / (2 * math.pi * target.frequency_hz)
+        correction = 1.0 / abs(transfer)
+    search = OrbitSearch(
+        FeedbackState(state.plan.feedback_horizon),
+        target,
+        (),
+        lag_s,
+        correction,
+        since=state.trajectory.end,
+    )
+    return _approach(replace(state, search=search), state.trajectory, (), CAPTURE_CYCLES)
+
+
+def check_latency(state: SequencerState) -> str:
+    """Return why the table answers too late for the plan of the orbits; "" if it does not.
+
+    The latency is that of the feedback's horizon and of the table that the loop check measured.
+    """
+    plan, response = _config(state).orbit_plan, state.tuning.response
+    if response is None:
+        return ""
+    frequency_hz = plan.points[0].frequency_hz
+    transfer = evaluate_transfer(response, frequency_hz)
+    lag_s = -math.atan2(transfer.imag, transfer.real) / (2 * math.pi * frequency_hz)
+    latency_s = state.plan.feedback_horizon / state.trajectory.rate_hz + lag_s
+    allowed_s = plan.latency_s + plan.jitter_s + LATENCY_TOLERANCE_S
+    if latency_s <= allowed_s:
+        return ""
+    return (
+        f"the latency of the feedback is {1e3 * latency_s:.1f} ms, its gains are for at most "
+        f"{1e3 * allowed_s:.1f} ms: compute the orbit plan for this latency"
+    )
+
+
+def _config(state: SequencerState) -> Continuation:
+    config = state.plan.profile.continuation
+    assert config is not None
+    return config
+
+
+def _approach(
+    state: SequencerState,
+    trajectory: Trajectory,
+    waypoints: tuple[MeasuredOrbit, ...],
+    capture_cycles: float = 0.0,
+    blend_cycles: float | None = None,
+) -> SequencerState:
+    """Blend through orbits measured before to the target, and hold it for one evaluation."""
+    search, config, changed = _search(state), _config(state), trajectory.end
+    target, position = search.target, search.target.position
+    path = [(orbit.reference, orbit.frequency_hz, orbit.position) for orbit in waypoints]
+    path.append((target.reference, target.frequency_hz, position))
+    feedback = search.feedback
+    for reference, frequency_hz, step in path:
+        trajectory, feedback = _append_orbit(
+            state, trajectory, feedback, reference, frequency_hz, step,
+            config.blend_cycles if blend_cycles is None else blend_cycles,
+        )  # fmt: skip
+        if capture_cycles:
+            trajectory = _append_cycles(trajectory, capture_cycles, step)
+            capture_cycles = 0.0
+    rate_hz, cycle = trajectory.rate_hz, trajectory.rate_hz / target.frequency_hz
+    first = trajectory.end + math.ceil(config.settle_cycles * cycle)
+    last = first + math.ceil(config.measured_cycles * cycle)
+    trajectory = trajectory.append_hold(
+        last + state.plan.margin - trajectory.end, position, Label.SETTLE
+    )
+    assert trajectory.rate_hz == rate_hz
+    return replace(
+        state,
+        trajectory=trajectory,
+        drive=replace(trajectory.to_drive(state.steps), correction=state.drive.correction),
+        stage=Stage("orbit", position, first, last, target.update),
+        search=replace(search, feedback=feedback),
+        changed_from=changed,
+    )
+
+
+def _append_cycles(trajectory: Trajectory, cycles: float, step: int) -> Trajectory:
+    count = math.ceil(cycles * trajectory.rate_hz / trajectory.target.frequency_hz)
+    return trajectory.append_hold(count, step, Label.SETTLE)
+
+
+def _append_orbit(
+    state: SequencerState,
+    trajectory: Trajectory,
+    feedback: FeedbackState,
+    reference: Float1D,
+    frequency_hz: float,
+    step: int,
+    blend_cycles: float,
+) -> tuple[Trajectory, FeedbackState]:
+    """Return the trajectory and the references with a blend to an orbit appended."""
+    search, config = _search(state), _config(state)
+    orbit, start = config.orbit_plan.points[step], trajectory.end
+    from_rest = trajectory.target.level_m_s2 == 0.0
+    sine = SineTarget(frequency_hz, orbit.acceleration_m_s2, search.correction)
+    trajectory = trajectory.append_blend(sine, step, blend_cycles, Label.BLEND)
+    count = math.ceil(blend_cycles * trajectory.rate_hz / frequency_hz)
+    if not from_rest and trajectory.end - start < count:
+        trajectory = trajectory.append_hold(count - trajectory.end + start, step, Label.BLEND)
+    after = rotate_harmonics(reference, -2 * math.pi * frequency_hz * search.lag_s)
+    command_m = sine.corrected_m_s2 / (2 * math.pi * frequency_hz) ** 2
+    segment = ReferenceSegment(
+        start,
+        trajectory.end - start,
+        np.zeros_like(after) if from_rest or not feedback.segments else feedback.segments[-1].after,
+        after,
+        0.0 if from_rest else 1.0,
+        1.0,
+        orbit.gain,
+        orbit.rate_gain_s,
+        config.max_feedback * command_m,
+        orbit.acceleration_m_s2,
+    )
+    return trajectory, feedback.append(segment)
+
+
+def resume_continuation(state: SequencerState) -> SequencerState:
+    """Evaluate the sought orbit again after an operator's hold."""
+    return _approach(state, state.trajectory, (), blend_cycles=UPDATE_BLEND_CYCLES)
+
+
+def _search(state: SequencerState) -> OrbitSearch:
+    assert state.search is not None
+    return state.search
+
+
+def apply_feedback(state: SequencerState, block: Block, earliest: int) -> SequencerState:
+    """Return the state with the feedback's answer to a block, from `earliest` on at the soonest.
+
+    An orbit that stays at the limit of the feedback is lost.
+    """
+    search, drive = _search(state), state.drive
+    changed = state.changed_from
+    feedback, correction, first = advance_feedback(
+        search.feedback, drive, block.index, measure_mass(block), earliest,
+        min(state.stage.first, block.index) if state.stage.kind == "orbit" else block.index,
+    )  # fmt: skip
+    state = replace(
+        state,
+        search=replace(search, feedback=feedback),
+        drive=replace(drive, correction=correction),
+        changed_from=min(changed, first),
+    )
+    cycles = feedback.saturated_samples * search.target.frequency_hz / drive.rate_hz
+    if cycles > MAX_SATURATED_CYCLES and search.is_captured and state.stage.kind == "orbit":
+        return retry_orbit(state, block.end, "the feedback stayed at its limit")
+    return state
+
+
+def measure_mass(block: Block) -> Float1D:
+    """Return the displacement of the mass in the laboratory frame in m, (sample,)."""
+    if "mass_disp_m" in block.channels:
+        return block.channel("mass_disp_m")
+    return block.channel("rel_disp_m") + block.channel("table_disp_m")
+
+
+def decide_orbit(state: SequencerState) -> SequencerState:
+    """Evaluate the held orbit: accept it, correct its reference, or approach it again."""
+    search, config, stage = _search(state), _config(state), state.stage
+    plan, target = config.orbit_plan, search.target
+    orbit = plan.points[target.position]
+    window = join_blocks(
+        [b for b in state.blocks if b.end > stage.first and b.index < stage.last]
+    ).cut(stage.first, stage.last)
+    phase = state.drive.phase(stage.first, stage.last - stage.first)
+    table = track_harmonics(window.channel("table_acc_m_s2"), phase, plan.harmonics)
+    u_m = relative_displacement(window)
+    fits = [track_harmonics(values, phase, plan.harmonics) for values in (
+        u_m,
+        measure_mass(window),
+        state.drive.correction.displacement(stage.first, stage.last - stage.first),
+    )]  # fmt: skip
+    if not all(np.isfinite(fit.residual_rms) for fit in (table, *fits)):
+        return retry_orbit(state, stage.last, "samples were lost")
+    response = _table_response(state.tuning.response, target.frequency_hz, plan.harmonics)
+    # What the table would do without the feedback: its level and phase define the orbit.
+    w = 2 * math.pi * target.frequency_hz
+    nominal = complex(table.amplitudes[0] + w**2 * response[1] * fits[2].amplitudes[0])
+    lag_angle = math.atan2(nominal.imag, nominal.real)
+    played = rotate_harmonics(
+        target.reference, -2 * math.pi * target.frequency_hz * search.lag_s - lag_angle
+    )
+    target = replace(target, reference=played)
+    u, x, feedback = (rotate_harmonics(_to_vector(fit), -lag_angle) for fit in fits)
+    measured = OrbitMeasurement(u, x, feedback, response)
+    search = replace(
+        search,
+        lag_s=-lag_angle / (2 * math.pi * target.frequency_hz),
+        target=target,
+        is_captured=True,
+        periods=search.periods
+        + round((stage.last - search.since) * target.frequency_hz / window.rate_hz),
+        since=stage.last,
+    )
+    deviation = fundamental(measured.x - target.reference)
+    if deviation > MAX_DEVIATION * fundamental(orbit.harmonics_m):
+        reason = f"it is {1e3 * deviation:.2g} mm from its reference"
+        return retry_orbit(replace(state, search=search), stage.last, reason)
+    command_m = (
+        orbit.acceleration_m_s2 * search.correction / (2 * math.pi * target.frequency_hz) ** 2
+    )
+    noise_m = (
+        abs(orbit.gain)
+        * fits[1].residual_rms
+        * math.sqrt(2 * (2 * plan.harmonics + 1) / len(window))
+    )
+    level_ratio = abs(nominal) / orbit.acceleration_m_s2
+    reason = _find_fault(config, target, measured, command_m, noise_m, level_ratio)
+    has_ended = not reason or target.update >= config.updates
+    if has_ended:
+        point = OrbitPoint(
+            stage.last,
+            target.position,
+            target.frequency_hz,
+            table.fundamental,
+            mean_swing(u_m, phase),
+            tuple(np.array([u[0], 0.0, *u[1:]]).tolist()),
+            tuple(np.abs(unpack_harmonics(feedback)).tolist()),
+            noise_m,
+            command_m,
+            search.periods,
+            target.update,
+            orbit.stable,
+            math.nan,
+            not reason,
+            reason,
+        )
+        if not reason:
+            accepted = MeasuredOrbit(target.position, measured.x, target.frequency_hz)
+            search = replace(search, measured=(*search.measured, accepted), losses=0, lost_points=0)
+        state = replace(state, search=search, records=(*state.records, point))
+        return _next_orbit(state)
+    factor = min(max(1.0 / level_ratio, 1.0 / MAX_LEVEL_FACTOR), MAX_LEVEL_FACTOR)
+    search = replace(
+        search,
+        target=correct_target(plan, target, measured),
+        correction=search.correction * factor,
+    )
+    return _approach(
+        replace(state, search=search), state.trajectory, (), blend_cycles=UPDATE_BLEND_CYCLES
+    )
+
+
+def _to_vector(fit: HarmonicFit) -> Float1D:
+    """Return a fit of Im(c_k exp(i k phi)) as a real vector of harmonics Re(X_k exp(i k phi))."""
+    return pack_harmonics(np.concatenate([[fit.offset], -1j * fit.amplitudes]))
+
+
+def _table_response(
+    response: FrequencyResponse | None, frequency_hz: float, harmonics: int
+) -> np.ndarray:
+    """Return the table's motion over its command at harmonics 0, 1, ..., complex."""
+    if response is None:
+        return np.ones(harmonics + 1, dtype=np.complex128)
+    return np.array(
+        [1.0, *(evaluate_transfer(response, k * frequency_hz) for k in range(1, harmonics + 1))]
+    )
+
+
+def _find_fault(
+    config: Continuation,
+    target: OrbitTarget,
+    measured: OrbitMeasurement,
+    command_m: float,
+    noise_m: float,
+    level_ratio: float,
+) -> str:
+    """Return why a held motion is not an orbit of the table without feedback; "" if it is."""
+    if measured.feedback_m > max(config.tolerance * command_m, NOISE_FACTOR * noise_m):
+        return f"the feedback is {100 * measured.feedback_m / command_m:.2g} % of the command"
+    if not is_on_branch(config.orbit_plan, target, measured):
+        return "the amplitude is not that of the sought branch"
+    if abs(level_ratio - 1.0) > LEVEL_TOLERANCE:
+        return f"the table is at {100 * level_ratio:.4g} % of its level"
+    return ""
+
+
+def _next_orbit(state: SequencerState) -> SequencerState:
+    """Approach the next planned orbit, or end the test."""
+    search, config = _search(state), _config(state)
+    position = search.target.position + 1
+    if position == len(config.orbit_plan.points):
+        return end_continuation(state, state.trajectory)
+    target = plan_target(config.orbit_plan, position, search.measured)
+    search = replace(search, target=target, losses=0, periods=0)
+    return _approach(replace(state, search=search), state.trajectory, ())
+
+
+def retry_orbit(state: SequencerState, index: int, reason: str) -> SequencerState:
+    """Bring the table to rest and approach the lost orbit along those measured before."""
+    search, config = _search(state), _config(state)
+    position = search.target.position
+    is_given_up = search.losses >= config.retries
+    lost_points = search.lost_points + is_given_up
+    next_position = position + is_given_up
+    is_last = lost_points >= MAX_LOST_POINTS or next_position == len(config.orbit_plan.points)
+    action = "it is approached again from rest"
+    if is_given_up:
+        action = "the test ends" if is_last else "the next one is approached from rest"
+    event = Event(index, "lost", f"orbit {position} is lost: {reason}; {action}")
+    feedback = _release(search.feedback, index + state.plan.feedback_horizon, state)
+    trajectory = state.trajectory.cut(index + state.plan.margin)
+    state = replace(state, records=(*state.records, event))
+    search = replace(
+        search,
+        feedback=feedback,
+        losses=0 if is_given_up else search.losses + 1,
+        lost_points=lost_points,
+        is_captured=False,
+    )
+    if is_last:
+        return end_continuation(replace(state, search=search), trajectory)
+    changed = trajectory.end
+    at_rest = replace(trajectory.target, level_m_s2=0.0)
+    trajectory = trajectory.append_blend(at_rest, position, config.blend_cycles, Label.BLEND)
+    trajectory = trajectory.append_rest(round(REST_S * trajectory.rate_hz))
+    target = plan_target(config.orbit_plan, next_position, search.measured)
+    search = replace(search, target=target, periods=0, since=trajectory.end)
+    state = _approach(replace(state, search=search), trajectory, search.measured, CAPTURE_CYCLES)
+    return replace(state, changed_from=changed)
+
+
+def end_continuation(state: SequencerState, trajectory: Trajectory) -> SequencerState:
+    """Blend the feedback out and end the test at rest."""
+    search = _search(state)
+    drive = trajectory.to_drive(state.steps)
+    return replace(
+        state,
+        trajectory=trajectory,
+        drive=replace(drive, correction=state.drive.correction),
+        stage=Stage("end"),
+        search=replace(search, feedback=_release(search.feedback, trajectory.end, state)),
+        changed_from=trajectory.end,
+    )
+
+
+def _release(feedback: FeedbackState, start: int, state: SequencerState) -> FeedbackState:
+    """Return the feedback blended out within RELEASE_S from sample `start` on."""
+    last = feedback.segment_at(start)
+    count = round(RELEASE_S * state.trajectory.rate_hz)
+    return feedback.append(
+        replace(last, start=start, count=count, before=last.after, share0=last.share1, share1=0.0)
+    )

@@ -1,0 +1,118 @@
+"""Measured orbits of a continuation in summary and report, beside those of the plan."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from table_io.config.base import parse_toml
+from table_io.config.excitation.orbit_plan import OrbitPlan, PlannedOrbit
+from table_io.config.profile import Profile
+from table_io.records import OrbitPoint, RunStop
+from tests.model.reference import snm
+from tests.reports.recordings import start_record
+from twin.monitor.curves import draw_prc
+from twin.monitor.run_state import LiveRunState
+from twin.recording.mcap_log import write_items
+from twin.recording.reader import read_recording
+from twin.reports.orbits import read_planned_branch
+from twin.reports.report import write_report
+from twin.reports.report_data import parse_toml_tables
+from twin.reports.summary import summarise, write_summary
+from twin.viewer.plots import OrbitCurves
+
+AMPLITUDE_M = 2e-3
+PROFILE = """
+title = "Three orbits"
+[specimen]
+mass_kg = 550.0
+gap_mm = 4.0
+[excitation]
+kind = "continuation"
+start_hz = 3.0
+stop_hz = 3.4
+file = "plan.json"
+[excitation.files]
+"plan.json" = '''
+{plan}'''
+"""
+
+
+def make_plan() -> OrbitPlan:
+    zeros = ((0.0,) * 3,) * 3
+    orbits = [
+        PlannedOrbit(
+            frequency_hz=3.0 + 0.1 * k, acceleration_m_s2=0.49, stable=k == 0, multiplier=3.0 + k,
+            u_m=((1e-4, 0.0), (0.0, AMPLITUDE_M * (1 + k))), jacobian=zeros, gain=0.8,
+            rate_gain_s=0.01,
+        )
+        for k in range(3)
+    ]  # fmt: skip
+    return OrbitPlan(harmonics=1, latency_s=0.045, points=tuple(orbits))
+
+
+def make_point(step: int, reason: str = "") -> OrbitPoint:
+    return OrbitPoint(
+        1000 * (step + 1), step, 3.01 + 0.1 * step, 0.491, 2.1e-3 * (1 + step),
+        (1e-4, 0.0, 3e-4, 4e-4, 0.0, 0.0), (0.0, 3e-6, 4e-6), 1e-6, 1e-3, 50, 1, step == 0, np.nan,
+        not reason, reason,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("orbits")
+    start = replace(start_record(), profile_toml=PROFILE.format(plan=make_plan().to_json()))
+    points = [make_point(0), make_point(1), make_point(2, "the feedback is 0.5 % of the command")]
+    write_items(path / "run.mcap", [start, *points, RunStop(4000, "complete", "", ())], start)
+    summary = summarise(read_recording(path / "run.mcap"), snm())
+    write_summary(summary, path / "summary.json")
+    return path, summary
+
+
+def test_summary_has_each_orbit_with_its_feedback(folder):
+    orbits = folder[1]["orbits"]
+    assert [orbit["index"] for orbit in orbits] == [0, 1, 2]
+    assert [orbit["accepted"] for orbit in orbits] == [True, True, False]
+    assert orbits[1]["feedback_m"] == pytest.approx(5e-6)
+    assert orbits[1]["feedback_share"] == pytest.approx(5e-3)
+    assert orbits[1]["fundamental_m"] == pytest.approx(5e-4)
+    assert orbits[2]["planned"]["amplitude_m"] == pytest.approx(3 * AMPLITUDE_M, rel=1e-4)
+    assert orbits[2]["planned"]["multiplier"] == 5.0
+
+
+def test_planned_branch_is_read_from_the_recorded_profile():
+    branch = read_planned_branch(parse_toml_tables(PROFILE.format(plan=make_plan().to_json())))
+    assert branch is not None
+    assert branch.frequencies_hz == pytest.approx([3.0, 3.1, 3.2])
+    assert branch.stable.tolist() == [True, False, False]
+    assert read_planned_branch({"sweep": {}}) is None
+
+
+def test_report_shows_branch_and_table(folder):
+    path = write_report(folder[0])
+    text = path.read_text(encoding="utf-8")
+    assert (folder[0] / "figures" / "orbits.png").stat().st_size > 10_000
+    assert "3.1100" in text
+    assert "2 of 3 orbits measured, 1 of them unstable" in text
+
+
+def test_view_draws_accepted_orbits_over_the_planned_ones():
+    curves = OrbitCurves(make_plan())
+    assert curves.get_curves("measured") == []
+    for step in (1, 0, 2):
+        curves.add(make_point(step, "not on the branch" if step == 2 else ""))
+    (_, measured), (_, planned) = *curves.get_curves("measured"), *curves.get_curves("twin")
+    assert measured == pytest.approx(np.array([[3.01, 2.1], [3.11, 4.2]]))
+    assert planned[:, 1] == pytest.approx([2.0, 4.0, 6.0], rel=1e-4)
+    assert curves.axes.y[1] >= 6.0
+
+
+def test_monitor_draws_orbits_in_place_of_the_curves():
+    start = replace(start_record(), profile_toml=PROFILE.format(plan=make_plan().to_json()))
+    run_state = LiveRunState(run=start.run)
+    run_state.profile = parse_toml(start.profile_toml, Profile, "profile")
+    run_state.orbits[1] = make_point(1)
+    text = "\n".join(line.plain for line in draw_prc(run_state, 60, 12))
+    assert text.count("●") == 1
+    assert "3.2" in text

@@ -1,0 +1,143 @@
+"""Orbit plan: points along the unstable branch of G4, their gains, and refusals."""
+
+import math
+
+import numpy as np
+import pytest
+
+from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.profile import Profile
+from tests.input_errors import raises_input_error
+from tests.model.reference import AG, snm
+from twin.dynamics.period_map import make_period_map
+from twin.model.model import Model
+from twin.run.feedback_gains import FeedbackTiming, OpenLoop, closed_loop_multipliers
+from twin.run.orbit_plan import find_unstable_stretch, make_orbit_plan
+from twin.run.run_config import read_run_config
+
+RANGE_HZ = (2.75, 4.1)
+FEEDBACK_TIMING = FeedbackTiming(latency_s=0.046, jitter_s=0.005, block_s=0.01)
+UNSTABLE_POINTS = 24
+
+
+@pytest.fixture(scope="module")
+def plan():
+    return make_orbit_plan(Model(snm()), RANGE_HZ, AG, UNSTABLE_POINTS, FEEDBACK_TIMING)
+
+
+@pytest.fixture(scope="module")
+def stretch():
+    return find_unstable_stretch(make_period_map(Model(snm())), RANGE_HZ, AG)
+
+
+def test_plan_goes_through_both_folds(plan):
+    stable = [point.stable for point in plan.points]
+    unstable = [point for point in plan.points if not point.stable]
+    assert stable == sorted(stable[: len(stable) // 2], reverse=True) + sorted(
+        stable[len(stable) // 2 :]
+    )
+    assert stable[0]
+    assert stable[-1]
+    assert abs(len(unstable) - UNSTABLE_POINTS) <= 1
+    frequencies = [point.frequency_hz for point in unstable]
+    assert frequencies == sorted(frequencies)
+    assert frequencies[0] < 2.81
+    assert 4.02 < frequencies[-1] < 4.0274
+
+
+def test_orbits_of_the_plan_are_those_of_the_model(plan):
+    unstable = [point for point in plan.points if not point.stable]
+    frequencies = [point.frequency_hz for point in unstable]
+    multipliers = np.interp([3.0, 3.4, 3.8], frequencies, [p.multiplier_size for p in unstable])
+    assert multipliers == pytest.approx([5.9259, 3.115, 1.7204], rel=0.02)
+    amplitudes = [abs(complex(*point.u_m[1])) for point in unstable]
+    assert np.interp(3.4, frequencies, amplitudes) == pytest.approx(3.1923e-3, rel=3e-3)
+
+
+def test_gains_hold_every_orbit_with_a_wrong_model(plan):
+    """Every planned gain pair holds the orbit of a model of 3 % more mass at a longer latency."""
+    heavy = make_period_map(Model(snm())).with_parameter("mass", 550.0 * 1.03)
+    varied = find_unstable_stretch(heavy, RANGE_HZ, AG)
+    for point, position in zip(
+        plan.points[3::6], np.arange(UNSTABLE_POINTS)[::6] / UNSTABLE_POINTS, strict=False
+    ):
+        loop = OpenLoop.from_orbit(
+            varied.orbit_at(position + 0.5 / UNSTABLE_POINTS), FEEDBACK_TIMING.block_s
+        )
+        gains = np.array([[point.gain, point.rate_gain_s]])
+        assert closed_loop_multipliers(loop, 0.051, gains)[0] < 0.5
+
+
+def test_without_gains_the_multiplier_is_that_of_the_orbit(stretch):
+    orbit = stretch.orbit_at(0.5)
+    loop = OpenLoop.from_orbit(orbit, FEEDBACK_TIMING.block_s)
+    gains = np.array([[0.0, 0.0], [0.2, 0.0], [0.8, 0.0]])
+    multipliers = closed_loop_multipliers(loop, 0.046, gains)
+    assert multipliers[0] == pytest.approx(abs(orbit.multipliers[0]), rel=1e-3)
+    assert multipliers[1] > 1 > multipliers[2]
+
+
+def test_a_range_without_unstable_orbits_is_refused_with_those_there_are():
+    with raises_input_error(key="excitation.start_hz", allowed="2.7") as error:
+        make_orbit_plan(Model(snm()), (4.1, 4.4), AG, UNSTABLE_POINTS, FEEDBACK_TIMING)
+    assert "4.027" in error.value.allowed
+
+
+def test_a_model_without_folds_is_refused():
+    with raises_input_error(key="excitation.start_hz"):
+        make_orbit_plan(Model(snm(np.inf)), RANGE_HZ, AG, UNSTABLE_POINTS, FEEDBACK_TIMING)
+
+
+def test_too_large_a_latency_is_refused_with_the_largest_allowed():
+    with raises_input_error(key="latency") as error:
+        make_orbit_plan(
+            Model(snm()),
+            RANGE_HZ,
+            AG,
+            UNSTABLE_POINTS,
+            FeedbackTiming(0.2, 0.005, FEEDBACK_TIMING.block_s),
+        )
+    allowed_ms = float(error.value.allowed.split()[2])
+    assert 100 < allowed_ms < 160
+
+
+def test_a_profile_without_a_plan_gets_one_for_its_rig():
+    config = read_run_config(PROFILES_DIR / "tests" / "g4_unstable.toml")
+    continuation = parse_toml(config.profile_toml, Profile, "").continuation
+    assert continuation is not None
+    plan = continuation.orbit_plan
+    assert len(plan.points) == len(config.steps)
+    assert sum(not point.stable for point in plan.points) >= 60
+    assert plan.latency_s == pytest.approx(0.045)  # 20 ms fixed, 10 ms to decide, 15 ms of servo
+    assert max(point.multiplier_size for point in plan.points) > 6.5
+
+
+def test_limits_and_duration_count_the_feedback_and_its_updates():
+    config = read_run_config(PROFILES_DIR / "tests" / "g4_unstable.toml")
+    continuation = config.profile.continuation
+    assert continuation is not None
+    for demand, orbit in zip(config.margins[-len(config.steps) :], config.steps, strict=True):
+        steady_m = orbit.acceleration_m_s2 / (2 * math.pi * orbit.frequency_hz) ** 2
+        least_m = (1 + continuation.max_feedback) * steady_m
+        assert least_m * 0.999 < demand.displacement_m < 1.2 * least_m
+    cycles = 2 * (10 + 10 + 4)
+    planned_s = config.drive.planned_end / config.drive.rate_hz
+    assert config.expected_s - planned_s == pytest.approx(
+        sum(cycles / orbit.frequency_hz for orbit in config.steps)
+    )
+
+
+def test_a_table_under_external_control_is_refused():
+    with raises_input_error(key="backend", value="follow"):
+        read_run_config(PROFILES_DIR / "tests" / "g4_unstable.toml", "follow_simulated")
+
+
+def test_a_profile_that_is_no_table_cannot_take_a_plan(tmp_path):
+    path = tmp_path / "inline.toml"
+    path.write_text(
+        'title = "Inline"\n'
+        'excitation = { kind = "continuation", start_hz = 2.75, stop_hz = 4.1, points = 5 }\n'
+        "[specimen]\nmass_kg = 550.0\ngap_mm = 4.0\n"
+    )
+    with raises_input_error(key="excitation", where=path):
+        read_run_config(path)

@@ -1,0 +1,73 @@
+"""Figure of a continuation: the measured branch over the twin's, and what the feedback leaves."""
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from twin.reports.orbits import read_planned_branch
+from twin.reports.plot_style import (
+    DIRECTION_COLOURS,
+    FIGURE_WIDTH_IN,
+    GUIDE_COLOUR,
+    TWIN_COLOUR,
+    UNSTABLE_STYLE,
+    CaptionedFigure,
+    CaptionedFigures,
+)
+from twin.reports.report_data import ReportData, parse_toml_tables
+
+REFUSED_COLOUR = "#f4ac3d"
+
+
+def draw_orbits(run: ReportData) -> CaptionedFigures:
+    """Draw amplitude and feedback of the measured orbits over frequency."""
+    orbits = run.summary.get("orbits") or []
+    if not orbits:
+        return
+    figure = Figure(figsize=(FIGURE_WIDTH_IN, 6.2))
+    branch_axis, feedback_axis = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1.0))
+    branch = read_planned_branch(parse_toml_tables(run.recording.start.profile_toml))
+    if branch is not None:
+        amplitudes_mm = 1e3 * branch.amplitudes_m
+        stable, unstable = (
+            np.where(mask | np.append(mask[1:], mask[-1]), amplitudes_mm, np.nan)
+            for mask in (branch.stable, ~branch.stable)
+        )
+        frequencies = branch.frequencies_hz
+        branch_axis.plot(frequencies, stable, color=TWIN_COLOUR, lw=1.0, label="twin, stable")
+        branch_axis.plot(frequencies, unstable, **UNSTABLE_STYLE, label="twin, unstable")
+    for is_accepted, colour, label in (
+        (True, DIRECTION_COLOURS["forward"], "measured"),
+        (False, REFUSED_COLOUR, "not accepted"),
+    ):
+        own = [orbit for orbit in orbits if orbit["accepted"] is is_accepted]
+        frequencies = np.array([orbit["frequency_hz"] for orbit in own])
+        amplitudes = np.array([orbit["amplitude_m"] for orbit in own])
+        shares = np.array([orbit["feedback_share"] for orbit in own])
+        if own:
+            branch_axis.plot(frequencies, 1e3 * amplitudes, "o", color=colour, label=label)
+            feedback_axis.plot(frequencies, 100 * shares, "o", color=colour)
+    noise = [
+        orbit["noise_m"] * orbit["feedback_share"] / orbit["feedback_m"]
+        if orbit["feedback_m"]
+        else np.nan
+        for orbit in orbits
+    ]
+    feedback_axis.plot(
+        [orbit["frequency_hz"] for orbit in orbits], 100 * np.array(noise), "_",
+        color=GUIDE_COLOUR, label="explained by sensor noise",
+    )  # fmt: skip
+    branch_axis.set_ylabel("amplitude of $u$ in mm")
+    feedback_axis.set_ylabel("feedback in % of the command")
+    feedback_axis.set_yscale("log")
+    feedback_axis.set_xlabel("frequency in Hz")
+    branch_axis.legend()
+    feedback_axis.legend()
+    accepted = sum(orbit["accepted"] for orbit in orbits)
+    yield CaptionedFigure(
+        "orbits",
+        "Measured branch of periodic orbits",
+        f"{accepted} of {len(orbits)} orbits accepted. Each was held by feedback until the "
+        "feedback had vanished, so it is an orbit of the specimen without feedback, stable or not. "
+        "Lines: orbits of the twin as planned before the test.",
+        figure,
+    )

@@ -1,0 +1,69 @@
+"""Orbits that a continuation measured, beside those of its plan: for the summary and the report."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from table_io.block import Float1D
+from table_io.config.excitation.continuation import Continuation
+from table_io.config.excitation.orbit_plan import OrbitPlan
+from table_io.errors import InputError
+from table_io.records import OrbitPoint
+from twin.recording.reader import Recording
+
+
+def summarise_orbits(recording: Recording, plan: OrbitPlan) -> list[dict[str, Any]]:
+    """Return the entries of the measured orbits in the summary, in order of measurement."""
+    return [_summarise_orbit(orbit, plan) for orbit in recording.records(OrbitPoint)]
+
+
+def _summarise_orbit(orbit: OrbitPoint, plan: OrbitPlan) -> dict[str, Any]:
+    feedback = math.hypot(*orbit.feedback_m)
+    planned = plan.points[orbit.step]
+    return {
+        "index": orbit.step,
+        "frequency_hz": orbit.frequency_hz,
+        "acceleration_m_s2": orbit.acceleration_m_s2,
+        "amplitude_m": orbit.amplitude_m,
+        "fundamental_m": math.hypot(*orbit.u_m[2:4]),
+        "feedback_m": feedback,
+        "feedback_share": feedback / orbit.command_m,
+        "feedback_harmonics_m": list(orbit.feedback_m),
+        "noise_m": orbit.noise_m,
+        "periods": orbit.periods,
+        "updates": orbit.updates,
+        "accepted": orbit.accepted,
+        "reason": orbit.reason,
+        "stable": orbit.stable,
+        "multiplier": orbit.multiplier,
+        "planned": {
+            "frequency_hz": planned.frequency_hz,
+            "amplitude_m": planned.amplitude_m,
+            "multiplier": planned.multiplier_size,
+        },
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedBranch:
+    """Frequencies in Hz, amplitudes in m and stability of the planned orbits, (orbit,) each."""
+
+    frequencies_hz: Float1D
+    amplitudes_m: Float1D
+    stable: np.ndarray[tuple[int], np.dtype[np.bool_]]
+
+
+def read_planned_branch(profile_tables: dict[str, Any]) -> PlannedBranch | None:
+    """Return the branch of the plan in a recorded profile; None without one."""
+    try:
+        plan = Continuation.model_validate(profile_tables.get("excitation")).orbit_plan
+    except (ValidationError, InputError):
+        return None
+    return PlannedBranch(
+        np.array([orbit.frequency_hz for orbit in plan.points]),
+        np.array([orbit.amplitude_m for orbit in plan.points]),
+        np.array([orbit.stable for orbit in plan.points]),
+    )
