@@ -9,7 +9,7 @@ from twin.model.effects import EFFECTS
 from twin.model.model import Model
 from twin.model.solver import StateEstimate
 
-RATE = 2000.0
+RATE_HZ = 2000.0
 FORCES = [e for e in EFFECTS if e.acts in ("force", "linear")]
 
 
@@ -39,7 +39,7 @@ def everything(base=None) -> Model:
     return having(*[e for e in EFFECTS if e.acts != "sensor"], base=base)
 
 
-def noisy(seconds: float, seed: int = 3, rate: float = RATE, peak: float = 4 * AG) -> np.ndarray:
+def noisy(seconds: float, seed: int = 3, rate: float = RATE_HZ, peak: float = 4 * AG) -> np.ndarray:
     """A random drive with a few Hz in it that makes contacts and reversals."""
     n, random = round(seconds * rate), np.random.default_rng(seed)
     t = np.arange(1, n + 1) / rate
@@ -47,7 +47,9 @@ def noisy(seconds: float, seed: int = 3, rate: float = RATE, peak: float = 4 * A
     return peak / 6 * sum(np.sin(2 * math.pi * f * t + phase) for f, phase in parts)
 
 
-def drive(model: Model, base: np.ndarray, start: StateEstimate | None = None, rate: float = RATE):
+def drive(
+    model: Model, base: np.ndarray, start: StateEstimate | None = None, rate: float = RATE_HZ
+):
     """(state, out) after the samples."""
     solver = model.prepare(rate)
     state = solver.rest_state() if start is None else solver.restart_state(start)

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from twin.model.model import Model
 
-SMALL = 1e-7  # s: a step away from the zero of a guard
+SMALL_STEP_S = 1e-7  # s: a step away from the zero of a guard
 
 
 class Witness:
@@ -19,7 +19,7 @@ class Witness:
 
     def __init__(self, model: Model, base: Callable[[float], float]) -> None:
         self.p, self.base = model.parameters, base
-        self.e = {one.effect.id: one.values for one in model.present_effects}
+        self.e = {effect.effect.id: effect.values for effect in model.present_effects}
         self.contact, self.way = [False, False], 1.0
 
     def get(self, effect: str, name: str) -> float:
@@ -43,8 +43,8 @@ class Witness:
         damping = (self.p.bumper_damping_r, self.p.bumper_damping_l)[side]
         if damping == 0 and b == 0 and d < 1e-9:
             return d, 0.0  # back at its face
-        zero, one = (self.bumper(side, d, rate, b) for rate in (0.0, 1.0))
-        return d, -zero / (one - zero) if one > zero else 0.0
+        zero, unit_rate = (self.bumper(side, d, rate, b) for rate in (0.0, 1.0))
+        return d, -zero / (unit_rate - zero) if unit_rate > zero else 0.0
 
     def forces(self, t: float, x: np.ndarray, friction: bool = True) -> float:
         u, v, z = x[0], x[1], x[7]
@@ -73,7 +73,7 @@ class Witness:
         dz = (v - 0.5 * (abs(v) * z * abs(z) + v * z * z)) / uy if uy else 0.0
         return [*out, *rates, df, *branch, dz]
 
-    def needed(self, t: float, x: np.ndarray) -> float:
+    def holding_force(self, t: float, x: np.ndarray) -> float:
         """Friction that would hold the mass."""
         way, self.way = self.way, 0.0
         still = np.array(x, dtype=float)
@@ -95,7 +95,7 @@ class Witness:
 
         def turn(t, x):
             fc = self.get("coulomb_friction", "fc")
-            return self.way * x[1] if self.way else fc - abs(self.needed(t, x))
+            return self.way * x[1] if self.way else fc - abs(self.holding_force(t, x))
 
         events = [side(0), side(1), turn]
         for event in events:
@@ -108,13 +108,13 @@ class Witness:
             if self.contact[which]:
                 x[2 + which] = self.face(which, t, x)[0]
             return
-        need, fc = self.needed(t, x), self.get("coulomb_friction", "fc")
+        need, fc = self.holding_force(t, x), self.get("coulomb_friction", "fc")
         x[1] = 0.0
         self.way = 0.0 if fc and self.way and abs(need) <= fc else math.copysign(1.0, need)
 
     def run(self, x0, times: np.ndarray, tolerance: float = 1e-11) -> np.ndarray:
         """(u, v, d_R, d_L, f, b_R, b_L, z) at `times` (8, n), and the number of events."""
-        x, t, found, self.events = (
+        x, t, solution, self.events = (
             np.array(x0, dtype=float),
             0.0,
             np.full((8, times.size), np.nan),
@@ -129,7 +129,7 @@ class Witness:
             )  # fmt: skip
             inside = (times >= t) & (times <= part.t[-1])
             if inside.any():
-                found[:, inside] = part.sol(times[inside])
+                solution[:, inside] = part.sol(times[inside])
             t, x = part.t[-1], part.y[:, -1].copy()
             if t >= times[-1]:
                 break
@@ -137,6 +137,6 @@ class Witness:
             self.happen(which, t, x)
             self.events += 1
             k1 = np.array(self.rhs(t, x))
-            k2 = np.array(self.rhs(t + SMALL / 2, x + SMALL / 2 * k1))
-            t, x = t + SMALL, x + SMALL * k2
-        return found
+            k2 = np.array(self.rhs(t + SMALL_STEP_S / 2, x + SMALL_STEP_S / 2 * k1))
+            t, x = t + SMALL_STEP_S, x + SMALL_STEP_S * k2
+        return solution

@@ -28,7 +28,7 @@ def sine(frequency: float, rate: float, seconds: float, peak: float = AG) -> np.
     return peak * np.sin(2 * math.pi * frequency * np.arange(1, round(seconds * rate) + 1) / rate)
 
 
-def kicked(p: Parameters, speed: float) -> np.ndarray:
+def kick(p: Parameters, speed: float) -> np.ndarray:
     """Rest, hit by a hammer: contacts that would pull then are released."""
     u, _, ur, ul, right, left, *_ = closed_form.rest_state(p)
     return closed_form.restart_state(u, speed, ur, ul, right > 0, left > 0, 0.0, p)

@@ -8,8 +8,8 @@ from scipy.integrate import solve_ivp
 
 from twin.model.parameters import Parameters
 
-G = 9.80665
-AG = 0.05 * G
+G_M_S2 = 9.80665
+AG = 0.05 * G_M_S2
 SNM = {
     "mass": 550.0, "stiffness": 36e3, "damping": 1100.0,
     "bumper_stiffness_r": 510e3, "bumper_damping_r": 900.0,
@@ -40,21 +40,21 @@ def right_hand_side(p: Parameters, contact: list[bool], base: Callable[[float], 
 def guards(p: Parameters, contact: list[bool]):
     """Clearance or push of both sides as terminal events."""
 
-    def right(t, x):
+    def right_event(t, x):
         u, v, ur, _ = x
         if contact[0]:
             return p.bumper_damping_r * v + p.bumper_stiffness_r * (u - p.gap_r)
         return p.gap_r + ur - u if math.isfinite(p.gap_r) else 1.0
 
-    def left(t, x):
+    def left_event(t, x):
         u, v, _, ul = x
         if contact[1]:
             return -p.bumper_damping_l * v - p.bumper_stiffness_l * (u + p.gap_l)
         return u - ul + p.gap_l if math.isfinite(p.gap_l) else 1.0
 
-    for event in (right, left):  # solve_ivp reads attributes of its events
+    for event in (right_event, left_event):  # solve_ivp reads attributes of its events
         vars(event).update(terminal=True, direction=-1)
-    return right, left
+    return right_event, left_event
 
 
 def linear_between(times, values) -> Callable[[float], float]:
@@ -94,7 +94,7 @@ def reference(p, x0, contact, base: Callable[[float], float], knots, tolerance=1
                 break
             side = 0 if solution.t_events[0].size else 1
             begin, x0 = solution.t[-2], solution.y[:, -2]
-            t, x = polished(rhs, guard[side], begin, x0, solution.t[-1], tolerance)
+            t, x = refine_root(rhs, guard[side], begin, x0, solution.t[-1], tolerance)
             contact[side] = not contact[side]
             x[2 + side] = x[0] - p.gap_r if side == 0 else x[0] + p.gap_l
             events.append((t, side, contact[side]))
@@ -104,7 +104,7 @@ def reference(p, x0, contact, base: Callable[[float], float], knots, tolerance=1
     return np.array(states).T, np.array(events).reshape(-1, 3)
 
 
-def polished(rhs, guard, begin, x0, t, tolerance) -> tuple[float, list[float]]:
+def refine_root(rhs, guard, begin, x0, t, tolerance) -> tuple[float, list[float]]:
     """(time, state) where the guard is zero, by secants near t; each try is a fresh integration."""
 
     def at(time):

@@ -10,13 +10,14 @@ import pytest
 
 from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
-from tests.identification.played import SNM, hidden, log
+from tests.identification.played import SNM, format_truth, log
 from tests.model import laboratory_laws
-from tests.model.cases import RATE, drive, noisy, typical
+from tests.model.cases import RATE_HZ, drive, noisy, typical
 from tests.model.motion import sine
 from tests.model.reference import snm
 from tests.plugin_package import install_package
 from twin.identification.discover import discover_effects
+from twin.identification.parameters import EffectKey
 from twin.model.effects import find_effect, load_plugins
 from twin.model.effects.effect import Effect
 from twin.model.effects.law import find_law_problem
@@ -82,17 +83,17 @@ class TestInstalled:
         their_names = [parameter.name for parameter in find_effect(theirs).parameters]
         own = SNM.with_effect(ours, "", **dict(zip(names, values, strict=True)))
         added = SNM.with_effect(theirs, "", **dict(zip(their_names, values, strict=True)))
-        u, v, _, right, left = drive(own, 2.0 * sine(2.6, RATE, 4.0), StateEstimate(0, 0.0, 0.0))[
-            1
-        ][:5]
-        time = np.arange(1, u.size + 1) / RATE
+        u, v, _, right, left = drive(
+            own, 2.0 * sine(2.6, RATE_HZ, 4.0), StateEstimate(0, 0.0, 0.0)
+        )[1][:5]
+        time = np.arange(1, u.size + 1) / RATE_HZ
         contact = np.array([right > 0, left < 0]).astype(np.int8)
         expected = forces_along(own, u, v, time, contact)
-        found = forces_along(added, u, v, time, contact)
+        forces = forces_along(added, u, v, time, contact)
         plain = forces_along(SNM, u, v, time, contact)
         row = 0 if ours in ("maxwell_damper", "bouc_wen") else 1
         effect_size = np.abs(plain - expected)[row].max()
-        assert np.abs(found - expected)[row].max() < 0.02 * effect_size
+        assert np.abs(forces - expected)[row].max() < 0.02 * effect_size
 
     def test_one_law_on_each_side_is_the_law_on_both(self):
         both = Model(snm()).with_effect("bumper_hardening", k2=1e8)
@@ -121,7 +122,7 @@ class TestInstalled:
         p, out = snm(), drive(model, KICK)[1]
         u, v, acc, right, left = out[:5]
         force = -(p.mass * acc + p.damping * v + p.stiffness * u + right + left)
-        work = np.cumsum(force * v) / RATE
+        work = np.cumsum(force * v) / RATE_HZ
         stored = force**2 / (2 * values["stiffness"])
         assert (work - stored > -0.01 * work.max()).all()
 
@@ -130,7 +131,7 @@ class TestInstalled:
         model = add("zener_bumper").with_effect("slip_damper", force=100.0, yield_displacement=1e-3)
         model = model.with_effect("cubic_bumper", k3=1e10)
         whole, out = drive(model, KICK)
-        solver, cut = model.prepare(RATE), np.empty_like(out)
+        solver, cut = model.prepare(RATE_HZ), np.empty_like(out)
         state = solver.rest_state()
         for first in range(0, KICK.size, size):
             part = KICK[first : first + size]
@@ -145,7 +146,7 @@ class TestInstalled:
         with pytest.raises(InputError) as error:
             model.with_effect("cubic_bumper", k3=1.0).with_effect("rocking", tilt=0.1).with_effect(
                 "deep_dashpot", c=1.0
-            ).prepare(RATE)
+            ).prepare(RATE_HZ)
         assert error.value.allowed.startswith("at most 8")
         with pytest.raises(InputError) as error:
             add("zener_bumper", base=snm(bumper_damping_r=0.0))
@@ -154,9 +155,9 @@ class TestInstalled:
     @pytest.mark.parametrize(
         ("truth", "name", "parameter", "value", "without"),
         [
-            (hidden("bumper_cubic", kc=2e9), "cubic_bumper", "k3", 2e9, ()),
+            (format_truth("bumper_cubic", kc=2e9), "cubic_bumper", "k3", 2e9, ()),
             (
-                hidden("maxwell_damper", k1=8e3, tau=0.05), "zener_damper", "stiffness", 8e3,
+                format_truth("maxwell_damper", k1=8e3, tau=0.05), "zener_damper", "stiffness", 8e3,
                 ("maxwell_damper",),
             ),
         ],
@@ -167,7 +168,7 @@ class TestInstalled:
         verdict = discover_effects([log(truth)], SNM, without=(*without, *others)).verdict
         assert verdict.outcome == "named", verdict.reason
         assert verdict.best.names == (name,)
-        assert verdict.best.fit.values[f"{name}.{parameter}"] == pytest.approx(value, rel=0.05)
+        assert verdict.best.fit.values[EffectKey(name, parameter)] == pytest.approx(value, rel=0.05)
 
 
 LAW = laboratory_laws.ZENER_BUMPER

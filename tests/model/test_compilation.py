@@ -34,29 +34,29 @@ def test_revision_follows_code_and_numbers(decorator):
     )
 
 
-def nested(size: int):
-    def made(x: float) -> float:
+def make_nested(size: int):
+    def multiply(x: float) -> float:
         return x * size
 
-    return made
+    return multiply
 
 
 def test_revision_is_the_same_in_every_process():
     """Else no process would find what another one compiled."""
     code = (
-        "from tests.model.test_compilation import nested;"
+        "from tests.model.test_compilation import make_nested;"
         "from twin.model.compilation import source_revision;"
         "from twin.model import event_integrator_kernel;"
-        "print(source_revision({'f': nested}), event_integrator_kernel.REVISION)"
+        "print(source_revision({'f': make_nested}), event_integrator_kernel.REVISION)"
     )
-    found = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, check=True, text=True,
         cwd=Path(__file__).parents[2],
     )  # fmt: skip
     from twin.model import event_integrator_kernel
 
-    assert found.stdout.split() == [
-        str(source_revision({"f": nested})),
+    assert completed.stdout.split() == [
+        str(source_revision({"f": make_nested})),
         str(event_integrator_kernel.REVISION),
     ]
 

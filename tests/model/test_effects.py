@@ -1,13 +1,12 @@
 """Laws that hold for every effect, and what those that act on parameters do."""
 
 import math
-import re
 
 import numpy as np
 import pytest
 
-from table_io.errors import InputError
-from tests.model.cases import FORCES, RATE, drive, everything, having, noisy, typical, vanishing
+from tests.input_errors import raises_input_error
+from tests.model.cases import FORCES, RATE_HZ, drive, everything, having, noisy, typical, vanishing
 from tests.model.reference import snm
 from twin.model.effects import EFFECTS
 from twin.model.model import Model
@@ -28,8 +27,8 @@ KICK = noisy(1.0)
 
 
 def test_the_table_of_effects_is_whole():
-    found = {e.id: {p.name: p.unit for p in e.parameters} for e in EFFECTS}
-    assert found == TABLE
+    units = {e.id: {p.name: p.unit for p in e.parameters} for e in EFFECTS}
+    assert units == TABLE
 
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.id)
@@ -53,16 +52,16 @@ class TestLaws:
         for parameter in effect.parameters:
             for value in (parameter.high + 1, parameter.low - 1, math.nan):
                 values = {**typical(effect), parameter.name: value}
-                with pytest.raises(
-                    InputError, match=re.escape(f"{parameter.low:g} to {parameter.high:g}")
+                with raises_input_error(
+                    key=parameter.name, allowed=f"{parameter.low:g} to {parameter.high:g}"
                 ):
                     effect.validate(values)
 
     def test_refuses_unknown_and_missing_parameters(self, effect):
         first = effect.parameters[0].name
-        with pytest.raises(InputError, match=f"did you mean '{first}'"):
+        with raises_input_error(where=f"effect {effect.id!r}", key=first + "x", remedy=repr(first)):
             effect.validate({**typical(effect), first + "x": 1.0})
-        with pytest.raises(InputError, match=f"lacks '{first}'"):
+        with raises_input_error(where=f"effect {effect.id!r}", key=first):
             effect.validate({})
 
     def test_tells_what_a_person_needs(self, effect):
@@ -86,7 +85,7 @@ class TestMotion:
     def test_solvable_at_its_bounds(self, effect, end):
         values = {p.name: getattr(p, end) for p in effect.parameters}
         model = having(effect, values=lambda _: values)
-        assert np.isfinite(drive(model, KICK[:200], rate=RATE)[1]).all()
+        assert np.isfinite(drive(model, KICK[:200], rate=RATE_HZ)[1]).all()
 
     def test_small_effects_are_small_and_linear(self, effect):
         """A thousandth of the effect changes the motion by a thousandth, before chaos."""
@@ -111,7 +110,7 @@ class TestMotion:
         self.cut(having(effect), size)
 
     def cut(self, model, size):
-        solver, base = model.prepare(RATE), noisy(0.7)
+        solver, base = model.prepare(RATE_HZ), noisy(0.7)
         whole, out = drive(model, base)
         state, cut = solver.rest_state(), np.empty_like(out)
         for first in range(0, base.size, size):
@@ -132,10 +131,10 @@ class TestMotion:
             other["ratio"] = 1 / values["ratio"]
         if effect.id == "gap_offset":
             other["offset"] = -values["offset"]
-        _, one = drive(having(effect, base=p, values=lambda _: values), base)
+        _, right = drive(having(effect, base=p, values=lambda _: values), base)
         _, two = drive(having(effect, base=q, values=lambda _: other), -base)
-        scale = np.abs(one).max(axis=1, keepdims=True)
-        assert (np.abs(one + two[[0, 1, 2, 4, 3, 6, 5]]) <= 1e-8 * scale).all()
+        scale = np.abs(right).max(axis=1, keepdims=True)
+        assert (np.abs(right + two[[0, 1, 2, 4, 3, 6, 5]]) <= 1e-8 * scale).all()
 
     def test_rest_is_an_equilibrium(self, effect):
         for gap in (0.004, 0.0, -0.002):
@@ -164,14 +163,14 @@ def test_a_lost_sample_makes_everything_after_it_nan(effect, bad):
 
 
 def test_asymmetry_keeps_the_mean_stiffness():
-    found = BY_ID["bumper_asymmetry"].apply(snm(), {"ratio": 1.5})
-    assert found.bumper_stiffness_r / found.bumper_stiffness_l == pytest.approx(1.5)
-    assert found.bumper_stiffness_r + found.bumper_stiffness_l == pytest.approx(1.02e6)
+    applied = BY_ID["bumper_asymmetry"].apply(snm(), {"ratio": 1.5})
+    assert applied.bumper_stiffness_r / applied.bumper_stiffness_l == pytest.approx(1.5)
+    assert applied.bumper_stiffness_r + applied.bumper_stiffness_l == pytest.approx(1.02e6)
 
 
 def test_offset_keeps_the_total_gap():
-    found = BY_ID["gap_offset"].apply(snm(), {"offset": 3e-4})
-    assert (found.gap_r, found.gap_l) == pytest.approx((2.3e-3, 1.7e-3))
+    applied = BY_ID["gap_offset"].apply(snm(), {"offset": 3e-4})
+    assert (applied.gap_r, applied.gap_l) == pytest.approx((2.3e-3, 1.7e-3))
 
 
 def test_mass_error_multiplies_every_force_over_mass():

@@ -12,7 +12,7 @@ import math
 import numpy as np
 import pytest
 
-from tests.model.motion import kicked
+from tests.model.motion import kick
 from tests.model.reference import AG, snm
 from twin.model import closed_form
 from twin.model.contact_regime import (
@@ -28,12 +28,12 @@ from twin.model.contact_regime import (
 )
 from twin.model.stepped_sine import simulate_stepped_sine
 
-CYCLES = 10
+CYCLE_COUNT = 10
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(24)
 SLOW = {"bumper_damping_r": 6e4, "bumper_damping_l": 3e4, "gap_l": -5e-4}
 
 
-def stored(p, state: np.ndarray) -> float:
+def stored_energy(p, state: np.ndarray) -> float:
     """J; in no phase does the energy know which one it is."""
     return 0.5 * (
         p.mass * state[V] ** 2 + p.stiffness * state[U] ** 2
@@ -59,17 +59,17 @@ def phase_integral(p, con, begin: np.ndarray, dt: float, drive) -> np.ndarray:
     for node, weight in zip(NODES, WEIGHTS, strict=True):
         t, state = 0.5 * dt * (node + 1), begin.copy()
         advance_to_event(state, con, t, base, slope, (peak, w, phase), False)
-        now = base + slope * t + peak * math.sin(phase + w * t)
-        total += 0.5 * dt * weight * powers(p, state, now)
+        force = base + slope * t + peak * math.sin(phase + w * t)
+        total += 0.5 * dt * weight * powers(p, state, force)
     return total
 
 
 def balance(p, frequency: float, rate: float, sampled: bool) -> tuple[np.ndarray, np.ndarray, int]:
     """(`powers` integrated over the run from a kick in J, the state at its end, onsets)."""
-    con, state = closed_form.discretized_params(p, rate), kicked(p, 0.1)
+    con, state = closed_form.discretized_params(p, rate), kick(p, 0.1)
     h, w = con[STEP], 2 * math.pi * frequency
     total, onsets, still = np.zeros(3), 0, (0.0, 0.0, 0.0)
-    for i in range(round(CYCLES * rate / frequency)):
+    for i in range(round(CYCLE_COUNT * rate / frequency)):
         t, before, after = 0.0, AG * math.sin(w * i * h), AG * math.sin(w * (i + 1) * h)
         for attempt in range(MAX_EVENTS_PER_STEP):
             assert attempt + 1 < MAX_EVENTS_PER_STEP
@@ -88,12 +88,14 @@ def balance(p, frequency: float, rate: float, sampled: bool) -> tuple[np.ndarray
     return total, state, onsets
 
 
-def driven(p, frequency: float, rate: float, sampled: bool) -> np.ndarray:
+def drive_to_end(p, frequency: float, rate: float, sampled: bool) -> np.ndarray:
     """The end of the same run by the driver itself."""
     if not sampled:
-        return simulate_stepped_sine(p, [frequency], AG, CYCLES, state=kicked(p, 0.1)).states[0]
-    base = AG * np.sin(2 * math.pi * frequency * np.arange(1, CYCLES * rate / frequency + 1) / rate)
-    state, out = kicked(p, 0.1), np.empty((7, base.size))
+        return simulate_stepped_sine(p, [frequency], AG, CYCLE_COUNT, state=kick(p, 0.1)).states[0]
+    base = AG * np.sin(
+        2 * math.pi * frequency * np.arange(1, CYCLE_COUNT * rate / frequency + 1) / rate
+    )
+    state, out = kick(p, 0.1), np.empty((7, base.size))
     closed_form.advance_state(state, closed_form.discretized_params(p, rate), base, out)
     return state
 
@@ -105,12 +107,12 @@ def test_balance_closes_to_1e_9_of_the_work_done(p, frequency, sampled):
     con = closed_form.continuous_params(p)
     rate = frequency * 16 * closed_form.substep_count(con, 1 / (16 * frequency))
     (work, damper, bumpers), end, onsets = balance(p, frequency, rate, sampled)
-    change = stored(p, end) - stored(p, kicked(p, 0.1))
+    change = stored_energy(p, end) - stored_energy(p, kick(p, 0.1))
     assert onsets > 15
     assert min(work, damper, bumpers) > 0.01 * work > 0
     assert abs(work - damper - bumpers - change) < 1e-9 * work
     print(f"{frequency} Hz: {(work - damper - bumpers - change) / work:.1e} of {work:.3g} J")
-    assert np.abs(end - driven(p, frequency, rate, sampled))[[U, U_R, U_L]].max() < 1e-9
+    assert np.abs(end - drive_to_end(p, frequency, rate, sampled))[[U, U_R, U_L]].max() < 1e-9
 
 
 def test_a_released_bumper_loses_all_that_it_holds():
@@ -123,5 +125,5 @@ def test_a_released_bumper_loses_all_that_it_holds():
         here = state.copy()
         lost += phase_integral(p, con, here, con[STEP], (0.0, 0.0, (0.0, 0.0, 0.0)))[2]
         advance_to_event(state, con, con[STEP], 0.0, 0.0, (0.0, 0.0, 0.0), True)
-    assert lost == pytest.approx(stored(p, begin) - stored(p, state), rel=1e-12)
-    assert stored(p, state) < 1e-20
+    assert lost == pytest.approx(stored_energy(p, begin) - stored_energy(p, state), rel=1e-12)
+    assert stored_energy(p, state) < 1e-20

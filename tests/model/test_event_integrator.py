@@ -28,11 +28,11 @@ MODELS += [having(find_effect("bumper_maxwell"), base=snm(-0.001)),
            having(find_effect("hunt_crossley"), base=snm(**BARE)),
            having(find_effect("bumper_hardening"), base=snm(**BARE)),
            having(find_effect("gap_drift"), values=lambda _: {"rate": -1e-4})]  # fmt: skip
-SPEED = 0.15
+SPEED_M_S = 0.15
 
 
 def name(model: Model) -> str:
-    return "+".join(one.name for one in model.effects)
+    return "+".join(effect.name for effect in model.effects)
 
 
 @pytest.mark.parametrize("model", MODELS, ids=name)
@@ -44,13 +44,13 @@ def test_agrees_with_dop853(model):
     times = np.arange(1, base.size + 1) / rate
     witness = Witness(model, lambda t: float(np.interp(t * rate, np.arange(table.size), table)))
     p = model.parameters
-    start = [0.0, SPEED, max(-p.gap_r, 0.0), max(-p.gap_l, 0.0), 0.0, 0.0, 0.0, 0.0]
+    start = [0.0, SPEED_M_S, max(-p.gap_r, 0.0), max(-p.gap_l, 0.0), 0.0, 0.0, 0.0, 0.0]
     witness.contact = [
-        -p.gap_r > 0 and p.bumper_damping_r * SPEED > p.bumper_stiffness_r * p.gap_r,
-        -p.gap_l > 0 and -p.bumper_damping_l * SPEED > p.bumper_stiffness_l * p.gap_l,
+        -p.gap_r > 0 and p.bumper_damping_r * SPEED_M_S > p.bumper_stiffness_r * p.gap_r,
+        -p.gap_l > 0 and -p.bumper_damping_l * SPEED_M_S > p.bumper_stiffness_l * p.gap_l,
     ]
     want = witness.run(start, times)
-    first = StateEstimate(0, 0.0, SPEED, start[2], -start[3], p.gap_r < 0, p.gap_l < 0)
+    first = StateEstimate(0, 0.0, SPEED_M_S, start[2], -start[3], p.gap_r < 0, p.gap_l < 0)
     state, out = drive(model, base, first, rate)
     assert witness.events > 3
     assert np.abs(out[0] - want[0]).max() < 2e-9
@@ -112,9 +112,9 @@ def test_no_effect_creates_energy(model, seed):
     solver.advance(state, np.zeros(1), np.zeros(1), out)
     first = energy(model, state)
     for _ in range(1200):
-        now = energy(model, state)
-        assert now <= before + 1e-9 * first
-        before = now
+        level = energy(model, state)
+        assert level <= before + 1e-9 * first
+        before = level
         solver.advance(state, np.zeros(1), np.zeros(1), out)
     assert before < 0.999 * first
 

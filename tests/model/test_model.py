@@ -11,7 +11,8 @@ import pytest
 from table_io.config.base import parse_toml
 from table_io.config.profile import Specimen
 from table_io.errors import InputError
-from tests.model.cases import RATE, drive, everything, having, noisy
+from tests.input_errors import raises_input_error
+from tests.model.cases import RATE_HZ, drive, everything, having, noisy
 from tests.model.reference import AG, snm
 from tests.model.test_parameters import CARD
 from twin.model.closed_form import ClosedFormSolver
@@ -48,7 +49,7 @@ def cube(u: float, v: float, c: tuple[float, ...]) -> float:
     return c[0] * u * u * u
 
 
-def plugged(monkeypatch, *effects):
+def install_effects(monkeypatch, *effects):
     """Entry points that load these."""
 
     class Entry:
@@ -64,7 +65,7 @@ def plugged(monkeypatch, *effects):
 
 
 def test_a_plug_in_adds_a_force(monkeypatch):
-    plugged(monkeypatch, QUINTIC)
+    install_effects(monkeypatch, QUINTIC)
     text = CARD + '[[effects]]\nid = "quintic_spring"\nparameters = { k5 = 1e12, c = 1e7 }\n'
     model = parse_toml(text, ModelConfig, "x").build_model(G4)
     _, out = drive(model, noisy(0.5))
@@ -73,11 +74,11 @@ def test_a_plug_in_adds_a_force(monkeypatch):
     assert np.abs(p.mass * out[2] + force).max() < 1e-9 * np.abs(force).max()
     plain = drive(Model(snm()), noisy(0.5))[1]
     assert np.abs(out[0] - plain[0]).max() > 1e-5
-    solvers = model.prepare(RATE), model.prepare(2 * RATE)
+    solvers = model.prepare(RATE_HZ), model.prepare(2 * RATE_HZ)
     assert isinstance(solvers[0], EventDrivenSolver)
     assert isinstance(solvers[1], EventDrivenSolver)
     assert solvers[0].laws is solvers[1].laws  # compiled once
-    with pytest.raises(InputError, match="did you mean 'quintic_spring'"):
+    with raises_input_error(remedy="'quintic_spring'"):
         find_effect("quintic_sprin")
 
 
@@ -85,31 +86,30 @@ def test_plug_ins_that_repeat_a_built_in_law_agree_with_it_and_keep_apart(monkey
     ours = find_effect("cubic_stiffness")
     theirs = Effect("their_cubic", "k3 u^3", ours.parameters, "force", "x", ("bouc_wen",),
                     force=cube)  # fmt: skip
-    plugged(monkeypatch, QUINTIC, theirs)
-    one = Model(snm()).with_effect("cubic_stiffness", k3=1e7)
+    install_effects(monkeypatch, QUINTIC, theirs)
+    first = Model(snm()).with_effect("cubic_stiffness", k3=1e7)
     two = Model(snm()).with_effect("their_cubic", k3=1e7)
-    assert np.abs(drive(one, noisy(0.5))[1] - drive(two, noisy(0.5))[1])[0].max() < 1e-12
+    assert np.abs(drive(first, noisy(0.5))[1] - drive(two, noisy(0.5))[1])[0].max() < 1e-12
     three = two.with_effect("quintic_spring", k5=1e12, c=1e7)
-    four = one.with_effect("quintic_spring", k5=1e12, c=1e7)
+    four = first.with_effect("quintic_spring", k5=1e12, c=1e7)
     assert np.abs(drive(three, noisy(0.5))[1] - drive(four, noisy(0.5))[1])[0].max() < 1e-12
 
 
 @pytest.mark.parametrize(
-    "effect, says",
+    "effect, problem",
     [
-        (ImportError("no module"), "cannot load: no module"),
-        ("text", "expected an Effect, got str"),
-        (Effect("x", "x", (), "force", "x", ()), "acts as a force but has no `force`"),
-        (Effect("x", "x", (), "linear", "x", ()), "acts = 'linear' is not available to plug-ins"),
+        (ImportError("no module"), "no module"),
+        ("text", "got str"),
+        (Effect("x", "x", (), "force", "x", ()), "`force`"),
+        (Effect("x", "x", (), "linear", "x", ()), "acts = 'linear'"),
     ],
 )
-def test_a_bad_plug_in_is_named(monkeypatch, effect, says):
-    plugged(monkeypatch, effect)
-    with pytest.raises(
-        InputError, match=r"plug-in their\.module:EFFECT of shaketwin\.effects"
-    ) as e:
+def test_a_bad_plug_in_is_named(monkeypatch, effect, problem):
+    install_effects(monkeypatch, effect)
+    with raises_input_error(
+        where="plug-in their.module:EFFECT of shaketwin.effects", problem=problem
+    ):
         find_effect("not_ours")
-    assert says in str(e.value)
     assert find_effect("bouc_wen").id == "bouc_wen"
 
 
@@ -123,7 +123,7 @@ def test_flat_names_and_back():
     assert flat["gap_r"] == 2e-3  # the base, before gap_offset
     again = Model.from_flat(flat)
     assert again == model
-    with pytest.raises(InputError, match="did you mean 'bouc_wen'"):
+    with raises_input_error(remedy="'bouc_wen'"):
         Model.from_flat({**flat, "bouc_wem.force": 1.0})
 
 
@@ -137,49 +137,52 @@ def test_a_card_with_sensors():
     assert model.sensors == (
         SensorModel("mass_acc_m_s2", gain=1.1, lag=1e-3), SensorModel("force_l1_n", gain=0.9),
     )  # fmt: skip
-    assert isinstance(model.prepare(RATE), ClosedFormSolver)
+    assert isinstance(model.prepare(RATE_HZ), ClosedFormSolver)
 
 
 @pytest.mark.parametrize(
-    "entry, says",
+    "entry, fields",
     [
-        ('id = "boucwen"\nparameters = {}', "did you mean 'bouc_wen'"),
-        ('id = "sensor_gain"\nparameters = { gain = 1.1 }', "known: rel_disp_m"),
+        ('id = "boucwen"\nparameters = {}', {"remedy": "'bouc_wen'"}),
+        ('id = "sensor_gain"\nparameters = { gain = 1.1 }',
+         {"key": "channel", "remedy": "rel_disp_m"}),
         ('id = "sensor_gain"\nparameters = { channel = "mass_ac_m_s2", gain = 1.1 }',
-         "did you mean 'mass_acc_m_s2'"),
+         {"key": "channel", "value": "mass_ac_m_s2", "remedy": "'mass_acc_m_s2'"}),
         ('id = "coulomb_friction"\nparameters = { channel = "mass_acc_m_s2", fc = 1.0 }',
-         "has no channel"),
-        ('id = "coulomb_friction"\nparameters = { fc = "much" }', "allowed: a finite number"),
-        ('id = "coulomb_friction"\nparameters = { fc = inf }', "allowed: a finite number"),
-        ('id = "coulomb_friction"\nparameters = { fc = -1.0 }', "0 to 5000 N"),
-        ('id = "bouc_wen"\nparameters = { force = 1.0 }', "lacks 'yield_displacement'"),
+         {"key": "channel", "value": "mass_acc_m_s2", "remedy": "omit"}),
+        ('id = "coulomb_friction"\nparameters = { fc = "much" }',
+         {"key": "fc", "value": "much", "allowed": "finite"}),
+        ('id = "coulomb_friction"\nparameters = { fc = inf }',
+         {"key": "fc", "value": math.inf, "allowed": "finite"}),
+        ('id = "coulomb_friction"\nparameters = { fc = -1.0 }',
+         {"key": "fc", "value": -1.0, "allowed": "0 to 5000 N"}),
+        ('id = "bouc_wen"\nparameters = { force = 1.0 }', {"key": "yield_displacement"}),
     ],
 )  # fmt: skip
-def test_a_bad_effect_is_refused_in_words(entry, says):
-    with pytest.raises(InputError, match="x:") as caught:
+def test_a_bad_effect_is_refused_in_words(entry, fields):
+    with raises_input_error(**fields):
         parse_toml(CARD + "[[effects]]\n" + entry, ModelConfig, "x")
-    assert says in str(caught.value)
 
 
 @pytest.mark.parametrize("key", ["stiffness_n_m", "bumper_stiffness_n_m", "damping_n_s_m"])
 def test_negative_and_zero_numbers_of_a_card(key):
-    with pytest.raises(InputError, match=key):
+    with raises_input_error(key=f"base.{key}"):
         parse_toml(CARD.replace(f"\n{key} = ", f"\n{key} = -"), ModelConfig, "x")
     no_damping = CARD.replace("bumper_damping_n_s_m = 900.0", "bumper_damping_n_s_m = 0")
     assert parse_toml(no_damping, ModelConfig, "x").build_model(G4).parameters.bumper_damping_l == 0
 
 
 def test_a_rate_too_low_for_the_bumper_is_refused():
-    with pytest.raises(InputError, match="bumper") as error:
+    with pytest.raises(InputError) as error:
         Model(snm()).prepare(50.0)
     assert (error.value.key, error.value.value) == ("rate_hz", 50.0)
     assert error.value.allowed.startswith("100")
     assert Model(snm(math.inf)).prepare(50.0)
     steel = snm(bumper_stiffness_r=5e9)
-    with pytest.raises(InputError, match="raise rate_hz"):
+    with raises_input_error(key="rate_hz", value=2000.0, remedy="rate_hz"):
         Model(steel).prepare(2000.0)
     stiff = having(find_effect("bouc_wen"), base=snm(bumper_damping_r=0.1))
-    with pytest.raises(InputError, match="too low for a relaxation"):
+    with raises_input_error(key="rate_hz", value=2000.0, remedy="tau"):
         stiff.prepare(2000.0)
 
 
@@ -192,7 +195,7 @@ def test_a_rate_that_is_none_is_refused(rate):
 
 @pytest.mark.parametrize("model", [Model(snm()), having(find_effect("cubic_stiffness"))])
 def test_too_little_room_is_refused_before_anything_is_written(model):
-    solver, base = model.prepare(RATE), np.ones(9)
+    solver, base = model.prepare(RATE_HZ), np.ones(9)
     out = np.zeros((7, 8))
     for state, room in ((solver.rest_state(), out), (solver.rest_state()[:6], np.zeros((7, 9))),
                         (solver.rest_state(), np.zeros((6, 9)))):  # fmt: skip
@@ -204,21 +207,21 @@ def test_too_little_room_is_refused_before_anything_is_written(model):
 def test_relaxing_face_without_viscous_damping_is_refused():
     bare = snm(bumper_damping_r=0.0, bumper_damping_l=0.0)
     model = Model(bare).with_effect("hunt_crossley", ch=1e5)
-    with pytest.raises(InputError, match="hunt_crossley and bumper_maxwell together"):
+    with raises_input_error(allowed="bumper damping above 0"):
         model.with_effect("bumper_maxwell", kb=1e5, tau=0.1)
 
 
 def test_a_card_for_those_who_know_only_parameters():
     card = parse_toml(CARD + '[[effects]]\nid = "coulomb_friction"\nparameters = { fc = 5.0 }',
                  ModelConfig, "x")  # fmt: skip
-    with pytest.raises(InputError, match="coulomb_friction") as error:
+    with raises_input_error(problem="coulomb_friction") as error:
         card.build_parameters(G4)
     assert error.value.allowed
 
 
 def test_restart_takes_hidden_states_and_refuses_nan():
     model = everything()
-    solver = model.prepare(RATE)
+    solver = model.prepare(RATE_HZ)
     state, _ = drive(model, noisy(0.5))
     u, v, u_r, u_l = state[:4]
     again = solver.restart_state(StateEstimate(int(state[-1]), u, v, u_r, u_l, hidden=state))
@@ -254,7 +257,7 @@ def test_sampled_sweep_of_a_model_is_near_the_closed_one(effect):
 def test_a_sampled_sweep_takes_as_many_samples_as_a_hard_bumper_needs():
     hard = snm(bumper_stiffness_r=5e8, bumper_stiffness_l=5e8)
     model = Model(hard).with_effect("cubic_stiffness", k3=1e-9)
-    got, want = (simulate_sweep(one, [1.4], AG, 1).extremes for one in (model, Model(hard)))
+    got, want = (simulate_sweep(start, [1.4], AG, 1).extremes for start in (model, Model(hard)))
     assert model.min_rate_hz > 1000 * 1.4
     assert got[..., :2] == pytest.approx(want[..., :2], rel=1e-4)
     assert got[..., 6:].tolist() == want[..., 6:].tolist()

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tests.model.motion import U_R, kicked, run, sine
+from tests.model.motion import U_R, kick, run, sine
 from tests.model.reference import snm
 from twin.model import closed_form
 
@@ -86,7 +86,7 @@ def test_restart_makes_a_state_the_model_allows():
 def test_restart_from_the_models_own_state_goes_on_as_before():
     p, con = snm(), closed_form.discretized_params(snm(), 2000.0)
     base = sine(3.4, 2000.0, 2)
-    state = kicked(p, 0.1)
+    state = kick(p, 0.1)
     for first in range(0, 4000, 37):
         out, other = np.empty((7, 37)), np.empty((7, 37))
         u, v, u_r, u_l, right, left, acceleration = state[:7]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from table_io.errors import InputError
+from tests.input_errors import raises_input_error
 from tests.model.reference import AG, reference, snm
 from twin.model import closed_form
 from twin.model.ideal_response import simulate_sweep
@@ -47,12 +48,12 @@ def test_agrees_with_dop853_over_ten_cycles(frequency):
     assert np.abs(contacts[:, 0] - again[:, 0]).max() < EVENT_S / 10
     sweep = simulate_stepped_sine(p, [frequency], AG, 10, state=start)
     assert np.abs(sweep.states[0, :4] - want[:, -1])[[0, 2, 3]].max() < 1e-13
-    found, state = contact_events(p, frequency, AG, start, 10)
-    assert found[:, 1:].tolist() == contacts[:, 1:].tolist()
-    assert np.abs(found[:, 0] / frequency - contacts[:, 0]).max() < EVENT_S
+    impacts, state = contact_events(p, frequency, AG, start, 10)
+    assert impacts[:, 1:].tolist() == contacts[:, 1:].tolist()
+    assert np.abs(impacts[:, 0] / frequency - contacts[:, 0]).max() < EVENT_S
     assert np.abs(state[:4] - sweep.states[0, :4]).max() < 1e-14
     for side, name in enumerate(("onsets_r", "onsets_l")):
-        onsets = found[(found[:, 1] == side) & (found[:, 2] == 1), 0]
+        onsets = impacts[(impacts[:, 1] == side) & (impacts[:, 2] == 1), 0]
         counts = np.histogram(onsets, np.arange(11))[0]
         assert counts.tolist() == sweep.column(name)[0].tolist()
     assert (start == closed_form.restart_state(0.0, 0.1, 0.0, 0.0, False, False, 0.0, p)).all()
@@ -171,7 +172,7 @@ def test_resonance_is_the_free_flight_maximum():
 
 
 def test_too_few_steps_are_refused():
-    with pytest.raises(InputError, match=f"{MIN_STEPS_PER_CYCLE} or more"):
+    with raises_input_error(key="steps_per_cycle", value=4, allowed=MIN_STEPS_PER_CYCLE):
         simulate_stepped_sine(snm(), [2.0], AG, 1, 4)
 
 

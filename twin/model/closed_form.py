@@ -147,15 +147,19 @@ def continuous_params(parameters: Parameters) -> Float1D:
     return params
 
 
-def substep_count(params: Float1D, step_s: float) -> int:
-    """Return the number of substeps of a step in s, of at most `MAX_PHASE_STEP_RAD` rad each.
+def highest_angular_frequency(params: Float1D) -> float:
+    """Return the angular frequency in 1/s of the stiffest mode that can be reached.
 
-    The stiffest reachable mode counts; both contacts at once are possible only where the total gap
-    is not positive.
+    Both contacts at once are possible only where the total gap is not positive.
     """
     both_contacts = params[G_R] + params[G_L] <= 0
     w2 = max(params[MODES + mode * MODE_SIZE + 4] for mode in ((3,) if both_contacts else (1, 2)))
-    return max(1, math.ceil(step_s * math.sqrt(w2) / MAX_PHASE_STEP_RAD))
+    return math.sqrt(w2)
+
+
+def substep_count(params: Float1D, step_s: float) -> int:
+    """Return the number of substeps of a step in s, of at most `MAX_PHASE_STEP_RAD` rad each."""
+    return max(1, math.ceil(step_s * highest_angular_frequency(params) / MAX_PHASE_STEP_RAD))
 
 
 def discretized_params(parameters: Parameters, rate_hz: float) -> Float1D:

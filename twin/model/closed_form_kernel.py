@@ -10,11 +10,7 @@ from twin.model.contact_regime import (
     BASE,
     C_L,
     C_R,
-    CONTACT_L,
     CONTACT_R,
-    DENORMAL_LIMIT,
-    E_L,
-    E_R,
     G_L,
     G_R,
     IMPULSE_L,
@@ -25,7 +21,6 @@ from twin.model.contact_regime import (
     MAX_EVENTS_PER_STEP,
     MODE_SIZE,
     MODES,
-    R_L,
     R_R,
     REVISION,
     STATE_SIZE,
@@ -36,6 +31,11 @@ from twin.model.contact_regime import (
     U,
     V,
     advance_to_event,
+    bumper_forces,
+    contact_mode,
+    flush_denormal,
+    stays_positive,
+    step_guard,
 )  # fmt: skip
 from twin.model.solver import OUTPUT_COUNT
 
@@ -77,7 +77,7 @@ def advance_through_events(
     h, t = params[STEP], 0.0
     for attempt in range(MAX_EVENTS_PER_STEP):
         u, v, base = state[U], state[V], state[BASE] + slope * t
-        mode = int(state[CONTACT_R] > 0) + 2 * int(state[CONTACT_L] > 0)
+        mode = contact_mode(state)
         search = attempt + 1 < MAX_EVENTS_PER_STEP
         dt, side, _, _, _ = advance_to_event(
             state, params, h - t, base, slope, (0.0, 0.0, 0.0), search
@@ -100,22 +100,20 @@ _WRITE = types.Array(float64, 2, "A")
 
 
 @jit_kernel(int64(float64[::1], _READ, _READ, _WRITE, _WRITE, types.Omitted(REVISION)), cache=True)
-def advance_samples(  # noqa: PLR0915
+def advance_samples(
     state: Float1D, params: Float1D, base_acc: Float1D, out: Float2D, events: Float2D,
     revision: int = REVISION,
 ) -> int:  # fmt: skip
     """Advance `state` through the samples of A in m/s2, (n,), linear between; return the events.
 
     out (7, n), events (m, 5) and their number as in `closed_form.advance_state_logged`. A step
-    whose guards may have turned negative (or are NaN) is repeated in `advance_through_events`:
-    within a substep the slope s of a guard changes sign at most once, so it hides a minimum only
-    from - to +, and not if the guard g begins high enough.
+    whose guards may have turned negative (or are NaN) is repeated in `advance_through_events`.
     """
     if state.size < STATE_SIZE or out.shape[0] < OUTPUT_COUNT or out.shape[1] < base_acc.size:
         raise ValueError("state or out is too small for these samples; see advance_state")
     h, substeps, mass, count = params[STEP], int(params[SUBSTEPS]), params[MASS], 0
     u, v, ur, ul, base = state[U], state[V], state[U_R], state[U_L], state[BASE]
-    mode = int(state[CONTACT_R] > 0) + 2 * int(state[CONTACT_L] > 0)
+    mode = contact_mode(state)
     for i in range(base_acc.size * substeps):
         sample, substep = i // substeps, i % substeps
         slope = (base_acc[sample] - base) / (h * (substeps - substep))
@@ -129,36 +127,18 @@ def advance_samples(  # noqa: PLR0915
         v1 = q1 + params[b + 7] * y + params[b + 8] * z
         d0 = (f0 - c * v - k * u) / mass - base
         d1 = (f0 - c * v1 - k * u1) / mass - next_base
-        if mode & 1:
-            ur1 = u1 - params[G_R]
-            g0, g1 = params[C_R] * v + params[K_R] * ur, params[C_R] * v1 + params[K_R] * ur1
-            s0, s1 = params[C_R] * d0 + params[K_R] * v, params[C_R] * d1 + params[K_R] * v1
-        else:
-            ur1 = ur * params[E_R]
-            g0, g1 = params[G_R] + ur - u, params[G_R] + ur1 - u1
-            s0, s1 = -params[R_R] * ur - v, -params[R_R] * ur1 - v1
-        no_event = g1 >= 0 and (s0 >= 0 or s1 <= 0 or g0 > -2 * h * s0)
-        if mode & 2:
-            ul1 = u1 + params[G_L]
-            g0, g1 = -params[C_L] * v - params[K_L] * ul, -params[C_L] * v1 - params[K_L] * ul1
-            s0, s1 = -params[C_L] * d0 - params[K_L] * v, -params[C_L] * d1 - params[K_L] * v1
-        else:
-            ul1 = ul * params[E_L]
-            g0, g1 = params[G_L] + u - ul, params[G_L] + u1 - ul1
-            s0, s1 = v + params[R_L] * ul, v1 + params[R_L] * ul1
-        if no_event and g1 >= 0 and (s0 >= 0 or s1 <= 0 or g0 > -2 * h * s0):
+        x0, x1 = (u, v, d0), (u1, v1, d1)
+        ur1, r0, r1, rs0, rs1 = step_guard(params, mode, 0, x0, x1, ur)
+        ul1, l0, l1, ls0, ls1 = step_guard(params, mode, 1, x0, x1, ul)
+        if stays_positive(h, r0, r1, rs0, rs1) and stays_positive(h, l0, l1, ls0, ls1):
             if mode:
                 add_impulses(state, params, mode, h, u1 - u, v1 - v, 0.5 * (base + next_base))
-            u, v = u1, v1
-            ur, ul = (
-                ur1 if abs(ur1) > DENORMAL_LIMIT else 0.0,
-                ul1 if abs(ul1) > DENORMAL_LIMIT else 0.0,
-            )
+            u, v, ur, ul = u1, v1, flush_denormal(ur1), flush_denormal(ul1)
         else:
             state[U], state[V], state[U_R], state[U_L], state[BASE] = u, v, ur, ul, base
             count = advance_through_events(state, params, i * h, slope, events, count)
             u, v, ur, ul = state[U], state[V], state[U_R], state[U_L]
-            mode = int(state[CONTACT_R] > 0) + 2 * int(state[CONTACT_L] > 0)
+            mode = contact_mode(state)
             next_base += state[BASE] - base  # propagates NaN
         base = next_base
         if substep + 1 == substeps:
@@ -166,12 +146,7 @@ def advance_samples(  # noqa: PLR0915
             out[0, sample], out[1, sample] = u, v
             out[2, sample] = (params[b + 2] - params[b + 1] * v - params[b] * u) / mass
             flight_force = state[BASE] - state[BASE]  # 0, or NaN once the state is NaN
-            out[3, sample] = (
-                max(0.0, params[C_R] * v + params[K_R] * ur) if mode & 1 else flight_force
-            )
-            out[4, sample] = (
-                min(0.0, params[C_L] * v + params[K_L] * ul) if mode & 2 else flight_force
-            )
+            out[3, sample], out[4, sample] = bumper_forces(params, mode, v, ur, ul, flight_force)
             out[5, sample], out[6, sample] = ur, ul
     state[U], state[V], state[U_R], state[U_L], state[BASE] = u, v, ur, ul, base
     return count

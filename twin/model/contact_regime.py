@@ -18,6 +18,9 @@ Sinusoid = tuple[float, float, float]  # peak in m/s2, angular frequency in 1/s,
 ModeSolution = tuple[float, float, float, float, float, float, Sinusoid, float, float]
 Kinematics = tuple[float, float, float, float]  # u, u', u'', u'''
 Quantity = tuple[float, float, float, float, float]  # q = q0 + qu u + qv u' + qj exp(-r t)
+Motion = tuple[float, float, float]  # u, u', u''
+# u_j at the end of a step; the guard at its start and end; the guard's slope there
+StepGuard = tuple[float, float, float, float, float]
 
 # Indices of `state`
 U, V, U_R, U_L, CONTACT_R, CONTACT_L, BASE, IMPULSE_R, IMPULSE_L, STATE_SIZE = range(10)
@@ -117,6 +120,59 @@ def contact_guard(params: Float1D, mode: int, side: int, uj: float) -> Quantity:
 
 
 @jit_helper()
+def contact_mode(state: Float1D) -> int:
+    """Return the mode of a state, contact_r + 2 contact_l."""
+    return int(state[CONTACT_R] > 0) + 2 * int(state[CONTACT_L] > 0)
+
+
+@jit_helper()
+def bumper_forces(
+    params: Float1D, mode: int, v: float, ur: float, ul: float, flight_force: float
+) -> tuple[float, float]:
+    """Return (F_R, F_L) in N; `flight_force` where there is no contact."""
+    return (
+        max(0.0, params[C_R] * v + params[K_R] * ur) if mode & 1 else flight_force,
+        min(0.0, params[C_L] * v + params[K_L] * ul) if mode & 2 else flight_force,
+    )
+
+
+@jit_helper()
+def step_guard(
+    params: Float1D, mode: int, side: int, x0: Motion, x1: Motion, uj: float
+) -> StepGuard:
+    """Return u_j after a step and the guard of side 0 right, 1 left; motion x at both ends."""
+    (u, v, d0), (u1, v1, d1) = x0, x1
+    k, c, gap, r = params[K_R + side], params[C_R + side], params[G_R + side], params[R_R + side]
+    if side == 0:
+        if mode & 1:
+            g0, g1 = c * v + k * uj, c * v1 + k * (u1 - gap)
+            return u1 - gap, g0, g1, c * d0 + k * v, c * d1 + k * v1
+        uj1 = uj * params[E_R]
+        return uj1, gap + uj - u, gap + uj1 - u1, -r * uj - v, -r * uj1 - v1
+    if mode & 2:
+        g0, g1 = -c * v - k * uj, -c * v1 - k * (u1 + gap)
+        return u1 + gap, g0, g1, -c * d0 - k * v, -c * d1 - k * v1
+    uj1 = uj * params[E_L]
+    return uj1, gap + u - uj, gap + u1 - uj1, v + r * uj, v1 + r * uj1
+
+
+@jit_helper()
+def stays_positive(h: float, g0: float, g1: float, s0: float, s1: float) -> bool:
+    """Return False if a guard g with slope s at both ends of a step of h s may turn negative.
+
+    Within a substep the slope changes sign at most once, so it hides a minimum only from - to +,
+    and not if the guard begins high enough. False for NaN.
+    """
+    return g1 >= 0 and (s0 >= 0 or s1 <= 0 or g0 > -2 * h * s0)
+
+
+@jit_helper()
+def flush_denormal(uj: float) -> float:
+    """Return a bumper deformation in m, 0 if it is below DENORMAL_LIMIT."""
+    return uj if abs(uj) > DENORMAL_LIMIT else 0.0
+
+
+@jit_helper()
 def find_root(
     lo: float, hi: float, start: float, sign: float, m: ModeSolution, q: Quantity, order: int
 ) -> float:
@@ -166,8 +222,10 @@ def contact_event_time(
             return math.inf
     if g0 > 0:
         curvature = (g1 - g0 - d0 * h) / (h * h)
+        # The nearer root of the parabola; without a discriminant, or where d0 rounds it off, hi.
         discriminant = d0 * d0 - 4 * curvature * g0
-        start = 2 * g0 / (math.sqrt(discriminant) - d0) if discriminant > 0 else hi
+        divisor = math.sqrt(discriminant) - d0 if discriminant > 0 else 0.0
+        start = 2 * g0 / divisor if divisor != 0.0 else hi
         return find_root(0.0, hi, start, -1.0, m, q, 0)
     # Just after an event the guard starts at zero, rounded either way: find where it is positive.
     lo = hi
@@ -193,7 +251,7 @@ def advance_to_event(
     Returns (time in s, side of the event, mode solution, motion at both ends); side 0 right, 1
     left, -1 none. Without `search` events are ignored.
     """
-    mode = int(state[CONTACT_R] > 0) + 2 * int(state[CONTACT_L] > 0)
+    mode = contact_mode(state)
     m, x0 = mode_solution(params, mode, state[U], state[V], base, slope, wave)
     x1 = solution_at(h, m)
     dt, side = h, -1

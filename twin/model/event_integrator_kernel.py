@@ -134,11 +134,29 @@ def write_states(state: Float1D, s: Any) -> None:
         state[STATE_S + index] = s[index]
 
 
+@jit_helper_unless_none("events", lambda events, t, guard, start: None)
+def log_event(events: Any, t: float, guard: int, start: Start) -> None:
+    """Append (time in s, guard, contact or direction after it, u in m); see `advance_step`."""
+    log = events[-1]
+    index = int(log[0])
+    if index < events.shape[0] - 1:
+        after = start.direction if guard == REVERSAL_GUARD else float((start.mode >> guard) & 1)
+        events[index, 0], events[index, 1] = log[1] + t, guard
+        events[index, 2], events[index, 3] = after, start.u
+    log[0] += 1.0
+
+
 @jit_helper()
 def advance_step(
-    h: float, x: Motion, start: Start, p: Coefficients, propagators: Float2D, laws: AddedLaws | None
-) -> tuple[StateAndRates, Start]:
-    """Return (state and rates, start of the next step) after h s through any events."""
+    h: float, x: Motion, start: Start, p: Coefficients, propagators: Float2D,
+    laws: AddedLaws | None, events: Float2D | None,
+) -> tuple[StateAndRates, Start]:  # fmt: skip
+    """Return (state and rates, start of the next step) after h s through any events.
+
+    events (m + 1, 4), or None: (time in s, guard 0 right, 1 left or 2 reversal, contact or
+    direction after it, u in m) of up to m events; the last row holds their number, which may be
+    more, and the time at which this step starts.
+    """
     t, motion = 0.0, (x, x)
     for attempt in range(MAX_EVENTS_PER_STEP):
         search = attempt + 1 < MAX_EVENTS_PER_STEP
@@ -149,6 +167,7 @@ def advance_step(
         if guard < 0:
             break
         x, start = apply_event(guard, x, start, p, laws)
+        log_event(events, t, guard, start)
     u, v, u_r, u_l, f, b_r, b_l, s = x
     f, b_r, b_l = flush_value(f), flush_value(b_r), flush_value(b_l)
     s = flush_states(s)
@@ -222,7 +241,7 @@ def _build_kernel(revision: int) -> Callable[..., None]:
                 slope = (base_acc[i] - base) / (p.step * (p.substeps - substep))
                 time = (clock + i + substep / p.substeps) * p.period
                 x, start = set_start(x, start, p, time, base, slope)
-                motion, start = advance_step(p.step, x, start, p, propagators, laws)
+                motion, start = advance_step(p.step, x, start, p, propagators, laws, None)
                 x = motion[0]
                 base = base + slope * p.step if substep + 1 < p.substeps else base_acc[i]
             if not math.isfinite(base) or not math.isfinite(x.u):

@@ -28,7 +28,7 @@ def simulate_sweep(
     where a contact needs it) and extremes are those of the samples; the table displacement is
     -A / w^2. Sensor effects are not applied: this is the true motion.
     """
-    if all(instance.effect.acts in ("parameters", "sensor") for instance in model.present_effects):
+    if model.changes_only_parameters:
         return simulate_stepped_sine(model.parameters, frequencies_hz, acceleration, cycles)
     frequencies = validate_frequencies(frequencies_hz, acceleration, cycles)
     extremes = np.empty((frequencies.size, cycles, len(EXTREME_NAMES)))
@@ -47,13 +47,13 @@ def simulate_sweep(
         table_disp = -acceleration / (2 * math.pi * frequency_hz) ** 2 * wave
         solver.advance(state, acceleration * wave, table_disp, out)
         time += cycles / frequency_hz
-        extremes[index] = _extremes(out, cycles, in_contact)
+        extremes[index] = sampled_extremes(out, cycles, in_contact)
         in_contact = bool(out[3, -1] > 0), bool(out[4, -1] < 0)
         end_states.append(state.copy())
     return SteppedSineResponse(extremes, np.array(end_states))
 
 
-def _extremes(out: Float2D, cycles: int, in_contact: tuple[bool, bool]) -> Float2D:
+def sampled_extremes(out: Float2D, cycles: int, in_contact: tuple[bool, bool]) -> Float2D:
     """Return `EXTREME_NAMES` of each cycle, (cycle, 8); `in_contact` before the first sample."""
     rows = out.reshape(OUTPUT_COUNT, cycles, -1)
     u, a, right, left = rows[0], rows[2], rows[3], rows[4]

@@ -110,6 +110,13 @@ class Model:
         return tuple(instance for instance in self.effects if not instance.is_absent)
 
     @cached_property
+    def changes_only_parameters(self) -> bool:
+        """True if all effects act on parameters or sensors: under a sine it has a closed form."""
+        return all(
+            instance.effect.acts in ("parameters", "sensor") for instance in self.present_effects
+        )
+
+    @cached_property
     def parameters(self) -> Parameters:
         """Base parameters as changed by the effects that act on parameters."""
         result = self.base

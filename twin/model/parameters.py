@@ -56,7 +56,7 @@ class Parameters:
         missing = [name for name in known if name not in values]
         if missing:
             raise InputError(
-                f"model parameters lack {', '.join(missing)}", remedy="add them in SI units"
+                "missing model parameters", key=", ".join(missing), remedy="add them in SI units"
             )
         return cls(**{name: float(values[name]) for name in known})
 

@@ -9,17 +9,9 @@ from numba import float64, int64, types
 from table_io.block import Float1D, Float2D, Int1D
 from twin.model.compilation import jit_helper, jit_kernel
 from twin.model.contact_regime import (
-    C_L,
-    C_R,
-    CONTACT_L,
     CONTACT_R,
-    DENORMAL_LIMIT,
     E_L,
     E_R,
-    G_L,
-    G_R,
-    K_L,
-    K_R,
     MASS,
     MAX_EVENTS_PER_STEP,
     MODE_SIZE,
@@ -35,11 +27,16 @@ from twin.model.contact_regime import (
     U,
     V,
     advance_to_event,
+    bumper_forces,
     contact_guard,
+    contact_mode,
     evaluate_quantity,
     find_root,
+    flush_denormal,
     mode_solution,
     solution_at,
+    stays_positive,
+    step_guard,
     transition_matrix,
 )  # fmt: skip
 
@@ -106,7 +103,7 @@ def widen_through_events(
     """Advance `state` over a step through any events, and widen `row` by its extremes."""
     t = 0.0
     for attempt in range(MAX_EVENTS_PER_STEP):
-        mode = int(state[CONTACT_R] > 0) + 2 * int(state[CONTACT_L] > 0)
+        mode = contact_mode(state)
         search = attempt + 1 < MAX_EVENTS_PER_STEP
         dt, side, m, x0, x1 = advance_to_event(
             state, params, h - t, 0.0, 0.0, (peak, w, phase + w * t), search
@@ -146,12 +143,11 @@ def prepare_frequency(
 @jit_helper()
 def reset_extremes(row: Float1D, state: Float1D, params: Float1D) -> None:
     """Set the extremes of a cycle to the values at its start."""
-    u, v, mode = state[U], state[V], int(state[CONTACT_R] > 0) + 2 * int(state[CONTACT_L] > 0)
+    u, v, mode = state[U], state[V], contact_mode(state)
     b = MODES + mode * MODE_SIZE
     row[0] = row[1] = u
     row[2] = row[3] = (params[b + 2] - params[b + 1] * v - params[b] * u) / params[MASS]
-    row[4] = max(0.0, params[C_R] * v + params[K_R] * state[U_R]) if mode & 1 else 0.0
-    row[5] = min(0.0, params[C_L] * v + params[K_L] * state[U_L]) if mode & 2 else 0.0
+    row[4], row[5] = bumper_forces(params, mode, v, state[U_R], state[U_L], 0.0)
     row[6] = row[7] = 0.0
 
 
@@ -163,14 +159,13 @@ def advance_cycle(
     """Advance `state` through one cycle in `steps` steps; row (8,) becomes its `EXTREME_NAMES`.
 
     A step whose guards r, l (slopes rs, ls) may have turned negative is repeated in
-    `widen_through_events`; the check is that of `closed_form_kernel.advance_samples`. Otherwise a
-    quantity has its extremum at an end of the step, or where its slope changes sign; only then is
-    a root sought.
+    `widen_through_events`. Otherwise a quantity has its extremum at an end of the step, or where
+    its slope changes sign; only then is a root sought.
     """
     h, phase_step, mass = 2 * math.pi / (w * steps), 2 * math.pi / steps, params[MASS]
     reset_extremes(row, state, params)
     u, v, ur, ul = state[U], state[V], state[U_R], state[U_L]
-    mode = int(state[CONTACT_R] > 0) + 2 * int(state[CONTACT_L] > 0)
+    mode = contact_mode(state)
     for i in range(steps):
         b = MODES + mode * MODE_SIZE
         k, c, f0 = params[b], params[b + 1], params[b + 2]
@@ -181,42 +176,24 @@ def advance_cycle(
         v1 = w * (alpha * c1 - beta * s1) + params[b + 7] * y + params[b + 8] * z
         a1 = (f0 - c * v1 - k * u1) / mass
         d0, d1 = (f0 - c * v - k * u) / mass - peak * s0, a1 - peak * s1
-        if mode & 1:
-            ur1 = u1 - params[G_R]
-            r0, r1 = params[C_R] * v + params[K_R] * ur, params[C_R] * v1 + params[K_R] * ur1
-            rs0, rs1 = params[C_R] * d0 + params[K_R] * v, params[C_R] * d1 + params[K_R] * v1
-        else:
-            ur1 = ur * params[E_R]
-            r0, r1 = params[G_R] + ur - u, params[G_R] + ur1 - u1
-            rs0, rs1 = -params[R_R] * ur - v, -params[R_R] * ur1 - v1
-        if mode & 2:
-            ul1 = u1 + params[G_L]
-            l0, l1 = -params[C_L] * v - params[K_L] * ul, -params[C_L] * v1 - params[K_L] * ul1
-            ls0, ls1 = -params[C_L] * d0 - params[K_L] * v, -params[C_L] * d1 - params[K_L] * v1
-        else:
-            ul1 = ul * params[E_L]
-            l0, l1 = params[G_L] + u - ul, params[G_L] + u1 - ul1
-            ls0, ls1 = v + params[R_L] * ul, v1 + params[R_L] * ul1
-        no_event = r1 >= 0 and (rs0 >= 0 or rs1 <= 0 or r0 > -2 * h * rs0)
-        if no_event and l1 >= 0 and (ls0 >= 0 or ls1 <= 0 or l0 > -2 * h * ls0):
+        x0, x1 = (u, v, d0), (u1, v1, d1)
+        ur1, r0, r1, rs0, rs1 = step_guard(params, mode, 0, x0, x1, ur)
+        ul1, l0, l1, ls0, ls1 = step_guard(params, mode, 1, x0, x1, ul)
+        if stays_positive(h, r0, r1, rs0, rs1) and stays_positive(h, l0, l1, ls0, ls1):
             row[0], row[1] = max(row[0], u1), min(row[1], u1)
             row[2], row[3] = max(row[2], a1), min(row[3], a1)
             row[4] = max(row[4], r1) if mode & 1 else row[4]
             row[5] = min(row[5], -l1) if mode & 2 else row[5]
             has_extremum = v * v1 < 0 or (c * d0 + k * v) * (c * d1 + k * v1) < 0
             if has_extremum or (mode & 1) * rs0 > 0 > rs1 or (mode & 2) * ls0 > 0 > ls1:
-                m, x0 = mode_solution(params, mode, u, v, 0.0, 0.0, (peak, w, phase_step * i))
-                widen_extremes(row, params, mode, h, m, x0, solution_at(h, m))
-            u, v = u1, v1
-            ur, ul = (
-                ur1 if abs(ur1) > DENORMAL_LIMIT else 0.0,
-                ul1 if abs(ul1) > DENORMAL_LIMIT else 0.0,
-            )
+                m, start = mode_solution(params, mode, u, v, 0.0, 0.0, (peak, w, phase_step * i))
+                widen_extremes(row, params, mode, h, m, start, solution_at(h, m))
+            u, v, ur, ul = u1, v1, flush_denormal(ur1), flush_denormal(ul1)
         else:
             state[U], state[V], state[U_R], state[U_L] = u, v, ur, ul
             widen_through_events(state, params, h, peak, w, phase_step * i, row)
             u, v, ur, ul = state[U], state[V], state[U_R], state[U_L]
-            mode = int(state[CONTACT_R] > 0) + 2 * int(state[CONTACT_L] > 0)
+            mode = contact_mode(state)
     state[U], state[V], state[U_R], state[U_L] = u, v, ur, ul
 
 

@@ -82,8 +82,9 @@ class Effect:
         for name in values:
             if name not in known:
                 raise InputError(
-                    f"no parameter {name!r}",
+                    "unknown parameter",
                     where=f"effect {self.id!r}",
+                    key=name,
                     remedy=suggest(name, known),
                 )
         for parameter in self.parameters:
@@ -91,7 +92,11 @@ class Effect:
             allowed = f"{parameter.low:g} to {parameter.high:g} {unit}".rstrip()
             if name not in values:
                 raise InputError(
-                    f"effect {self.id!r} lacks {name!r}", allowed=allowed, remedy="add it"
+                    "missing",
+                    where=f"effect {self.id!r}",
+                    key=name,
+                    allowed=allowed,
+                    remedy="add it",
                 )
             if not parameter.low <= values[name] <= parameter.high:
                 raise InputError(
