@@ -31,18 +31,20 @@ def scipy_sweep(frequencies, cycles: int, rtol: float = 1e-6) -> tuple[np.ndarra
             dr, dl = -RATE * ur, -RATE * ul
         return v, -AG * sin(w[0] * t) - force / M, dr, dl
 
-    def right(t, x):
+    def right_event(t, x):
         return CJ * x[1] + KJ * (x[0] - GAP) if mode[0] == 1 else GAP + x[2] - x[0]
 
-    def left(t, x):
+    def left_event(t, x):
         return -CJ * x[1] - KJ * (x[0] + GAP) if mode[0] == 2 else GAP + x[0] - x[3]
 
-    for event in (right, left):  # solve_ivp reads attributes of its events
+    for event in (right_event, left_event):  # solve_ivp reads attributes of its events
         vars(event).update(terminal=True, direction=-1)
     for frequency in frequencies:
         w[0], t, end = 2 * math.pi * frequency, 0.0, cycles / frequency
         while t < end:
-            piece = solve_ivp(rhs, (t, end), x, rtol=rtol, atol=rtol * 1e-3, events=(right, left))
+            piece = solve_ivp(
+                rhs, (t, end), x, rtol=rtol, atol=rtol * 1e-3, events=(right_event, left_event)
+            )
             t, x = piece.t[-1], list(piece.y[:, -1])
             if piece.status != 1:
                 break
@@ -101,12 +103,12 @@ def diffrax_phase(rtol: float, atol: float):
 
     def phase(w, end, loop):
         t, x, mode, count = loop
-        found = diffrax.diffeqsolve(
+        solution = diffrax.diffeqsolve(
             term, solver, t, end, 1e-3, x, (w, mode), stepsize_controller=control, event=event,
             saveat=diffrax.SaveAt(t1=True), max_steps=4096, throw=False,
         )  # fmt: skip
-        t, (u, v, ur, ul) = found.ts[-1], jax.tree.map(lambda y: y[-1], found.ys)
-        hit = found.event_mask[0] | found.event_mask[1]
+        t, (u, v, ur, ul) = solution.ts[-1], jax.tree.map(lambda y: y[-1], solution.ys)
+        hit = solution.event_mask[0] | solution.event_mask[1]
         onset = hit & (mode == 0)
         new = jnp.where(hit, jnp.where(mode == 0, jnp.where(u > 0, 1, 2), 0), mode)
         ur = jnp.where(onset & (new == 1), u - GAP, ur)

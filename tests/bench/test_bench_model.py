@@ -37,18 +37,20 @@ def scipy_seconds() -> float:
             force = 900.0 * v + 510e3 * (u - contact * 2e-3)
         return [v, -AG * math.sin(W * t) - (1100.0 * v + 36e3 * u + force) / 550.0]
 
-    def right(t, x):
+    def right_event(t, x):
         return 2e-3 - x[0] if contact == 0 else contact * (900 * x[1] + 510e3 * x[0]) - 1020.0
 
-    def left(t, x):
+    def left_event(t, x):
         return x[0] + 2e-3 if contact == 0 else 1.0
 
-    for event in (right, left):  # solve_ivp reads attributes of its events
+    for event in (right_event, left_event):  # solve_ivp reads attributes of its events
         vars(event).update(terminal=True, direction=-1)
     begin = time.perf_counter()
     contact, t, x = 0, 0.0, list(impacting()[:2])
     while t < SECONDS:
-        piece = solve_ivp(rhs, (t, SECONDS), x, rtol=1e-6, atol=1e-9, events=(right, left))
+        piece = solve_ivp(
+            rhs, (t, SECONDS), x, rtol=1e-6, atol=1e-9, events=(right_event, left_event)
+        )
         t, x = piece.t[-1] + 1e-6, list(piece.y[:, -1])
         contact = 0 if contact else (1 if x[0] > 0 else -1)
     return time.perf_counter() - begin
@@ -138,11 +140,12 @@ def test_batch_on_all_cores(benchmark):
     benchmark(sweep_models, models, frequencies, AG, 10)
     if benchmark.stats is None:
         return
-    one = min(_seconds(models, frequencies) for _ in range(3))
-    ratio = one / benchmark.stats.stats.min
+    single_core_s = min(_seconds(models, frequencies) for _ in range(3))
+    ratio = single_core_s / benchmark.stats.stats.min
     benchmark.extra_info["cores_ratio"] = round(ratio, 2)
     print(
-        f"\n{len(models) / one:.0f} sweeps a second on one core; all cores {ratio:.2f} times that"
+        f"\n{len(models) / single_core_s:.0f} sweeps a second on one core; "
+        f"all cores {ratio:.2f} times that"
     )
 
 

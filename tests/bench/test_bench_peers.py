@@ -60,12 +60,12 @@ def ratio(benchmark, frequencies: np.ndarray, peer_s: float, name: str, least: f
     benchmark(ours, frequencies)
     if benchmark.stats is None:
         return
-    found = peer_s / benchmark.stats.stats.min
-    benchmark.extra_info[f"{name}_ratio"] = round(found)
+    time_ratio = peer_s / benchmark.stats.stats.min
+    benchmark.extra_info[f"{name}_ratio"] = round(time_ratio)
     motion = float(np.sum(CYCLES / frequencies))
     print(f"\n{name}: {1e3 * peer_s:.1f} ms, ours {1e3 * benchmark.stats.stats.min:.2f} ms for "
-          f"{motion:.0f} s of motion: {found:.0f} times as long")  # fmt: skip
-    assert found >= least
+          f"{motion:.0f} s of motion: {time_ratio:.0f} times as long")  # fmt: skip
+    assert time_ratio >= least
 
 
 @pytest.mark.benchmark(group="peers")

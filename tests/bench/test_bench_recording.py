@@ -55,17 +55,18 @@ def run_items(blocks: int) -> list[list[Item]]:
 
 def costs(turns: list[list[Item]], write: Callable[[int], None]) -> np.ndarray:
     """Seconds of each block's write, every 15th with a flush."""
-    found = []
+    durations = []
     for number in range(len(turns)):
         begin = time.perf_counter()
         write(number)
-        found.append(time.perf_counter() - begin)
-    return np.array(found)
+        durations.append(time.perf_counter() - begin)
+    return np.array(durations)
 
 
 def ours(turns: list[list[Item]], path: Path) -> np.ndarray:
     payloads = [
-        [(topic_for(one), encode_item(one, "bench"), one.index) for one in turn] for turn in turns
+        [(topic_for(item), encode_item(item, "bench"), item.index) for item in turn]
+        for turn in turns
     ]
     writer = LogWriter(path, 2000.0)
 
@@ -75,28 +76,28 @@ def ours(turns: list[list[Item]], path: Path) -> np.ndarray:
         if number % FLUSH_BLOCKS == 0:
             writer.flush()
 
-    found = costs(turns, write)
+    durations = costs(turns, write)
     writer.close()
-    return found
+    return durations
 
 
 def hdf5(turns: list[list[Item]], path: Path) -> np.ndarray:
     h5py = pytest.importorskip("h5py")
-    blocks = [[one for one in turn if isinstance(one, Block)] for turn in turns[1:]]
+    blocks = [[item for item in turn if isinstance(item, Block)] for turn in turns[1:]]
     with h5py.File(path, "x", libver="latest") as file:
         sets = [
             file.create_dataset(
-                one.stream, (len(one.channels), 0), maxshape=(len(one.channels), None),
+                block.stream, (len(block.channels), 0), maxshape=(len(block.channels), None),
                 chunks=(1, 20 * FLUSH_BLOCKS), dtype="f8", compression=4, shuffle=True,
             )
-            for one in blocks[0]
+            for block in blocks[0]
         ]  # fmt: skip
 
         def write(number: int) -> None:
-            for data, one in zip(sets, blocks[number], strict=True):
+            for data, block in zip(sets, blocks[number], strict=True):
                 size = data.shape[1]
-                data.resize(size + len(one), axis=1)
-                data[:, size:] = one.values
+                data.resize(size + len(block), axis=1)
+                data[:, size:] = block.values
             if number % FLUSH_BLOCKS == 0:
                 file.flush()
 
@@ -107,17 +108,17 @@ def test_a_block_is_written_in_less_than_hdf5_takes(
     benchmark: BenchmarkFixture, tmp_path: Path
 ) -> None:
     turns = run_items(MORE if benchmark.enabled else BLOCKS)
-    found = benchmark.pedantic(ours, (turns, tmp_path / "a.mcap"), rounds=1)
+    durations = benchmark.pedantic(ours, (turns, tmp_path / "a.mcap"), rounds=1)
     peer = hdf5(turns, tmp_path / "a.h5")
     hours = (len(turns) - 1) * 0.01 / 3600
     sizes = [(tmp_path / name).stat().st_size / hours / 1e9 for name in ("a.mcap", "a.h5")]
-    raw = sum(one.values.nbytes for turn in turns for one in turn if isinstance(one, Block))
+    raw = sum(item.values.nbytes for turn in turns for item in turn if isinstance(item, Block))
     print()
-    for name, some, size in (("log", found, sizes[0]), ("HDF5", peer, sizes[1])):
+    for name, some, size in (("log", durations, sizes[0]), ("HDF5", peer, sizes[1])):
         p50, p99 = np.quantile(some, (0.5, 0.99)) * 1e3
         print(f"{name:>5}: p50 {p50:.3f} ms, p99 {p99:.3f} ms, worst {some.max() * 1e3:.3f} ms a "
               f"block, {size:.2f} GB an hour")  # fmt: skip
     print(f"  the float64 samples alone, not packed: {raw / hours / 1e9:.2f} GB an hour")
     assert sizes[0] <= SIZE_RATIO * sizes[1]
     if benchmark.enabled:
-        assert np.quantile(found, 0.99) <= P99_RATIO * np.quantile(peer, 0.99)
+        assert np.quantile(durations, 0.99) <= P99_RATIO * np.quantile(peer, 0.99)

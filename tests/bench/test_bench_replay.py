@@ -44,9 +44,9 @@ def read_by_protobuf(log: Path) -> int:
         "/twin/pred": pb.Block,
         "/twin/cmp": pb.Comparison,
     }
-    for one in recover_log(log).messages:
-        if kind := kinds.get(one.topic):
-            message = kind.FromString(one.payload)
+    for logged in recover_log(log).messages:
+        if kind := kinds.get(logged.topic):
+            message = kind.FromString(logged.payload)
             if isinstance(message, pb.Block):
                 count += np.frombuffer(message.values).size
     return count
@@ -63,17 +63,17 @@ def test_replay_beside_reading(benchmark, bundle: RunConfig, log: Path, tmp_path
     """Opening, twin, comparison and writing, against parsing the recording and nothing more."""
     number = 0
 
-    def replayed() -> None:
+    def replay_and_compare() -> None:
         nonlocal number
         number += 1
         recorded = RecordedRun.open(log)
         made = tmp_path / f"{number}.mcap"
         assert replay_recording(recorded, bundle, made, "again", lambda _: None).is_identical
 
-    benchmark.pedantic(cpu_s, (replayed,), rounds=3)
+    benchmark.pedantic(cpu_s, (replay_and_compare,), rounds=3)
     if benchmark.stats is None:
         return
-    ours = min(cpu_s(replayed) for _ in range(3))
+    ours = min(cpu_s(replay_and_compare) for _ in range(3))
     reading = min(cpu_s(read_by_protobuf, log) for _ in range(3))
     stop = open_log(log).stop
     assert stop is not None
@@ -89,13 +89,13 @@ def test_replay_beside_reading(benchmark, bundle: RunConfig, log: Path, tmp_path
 def test_one_channel_of_a_log(benchmark, log: Path) -> None:
     """The first look at a channel through the Python door, file and all."""
 
-    def looked() -> None:
+    def open_and_read() -> None:
         assert open_log(log)["mass_disp_m"].size
 
-    benchmark.pedantic(looked, rounds=3)
+    benchmark.pedantic(open_and_read, rounds=3)
     if benchmark.stats is None:
         return
-    ours = min(cpu_s(looked) for _ in range(3))
+    ours = min(cpu_s(open_and_read) for _ in range(3))
     reading = min(cpu_s(read_by_protobuf, log) for _ in range(3))
     benchmark.extra_info["over_reading"] = round(ours / reading, 2)
     print(f"\none channel {ours / reading:.2f} times reading")

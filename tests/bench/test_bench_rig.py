@@ -32,14 +32,14 @@ def blocks(of: RunConfig, count: int) -> list[Block]:
         of.make_start_factory("bench", "table"),
         lambda: None,
     )
-    found: list[Block] = []
+    drained: list[Block] = []
     for item in source:
         if isinstance(item, Block):
-            found.append(item)
-        if len(found) == count:
+            drained.append(item)
+        if len(drained) == count:
             break
     source.close()
-    return found
+    return drained
 
 
 def test_the_simulated_table_reads_a_block(benchmark: BenchmarkFixture) -> None:

@@ -34,8 +34,8 @@ from table_io.records import (
 from twin.compare import TWIN_CHANNELS
 from twin.recording.reader import Recording
 
-RATE = 2000.0
-SAMPLES = 12000
+RATE_HZ = 2000.0
+SAMPLE_COUNT = 12000
 STEPS = (
     Step(0, "forward", 2.0, 0.49),
     Step(1, "forward", 2.5, 0.49),
@@ -52,17 +52,17 @@ def start(gap_mm: str = "4.0") -> RunStart:
     )
     return RunStart(
         index=0, run="r1", name="synthetic", source="table", profile_toml=profile, rig_toml="",
-        model_toml="", rate_hz=RATE, block_samples=20, channels=MEASURED, steps=STEPS,
-        planned_samples=SAMPLES, tare={}, versions={}, host="here", started_at="", epoch_s=0.0,
+        model_toml="", rate_hz=RATE_HZ, block_samples=20, channels=MEASURED, steps=STEPS,
+        planned_samples=SAMPLE_COUNT, tare={}, versions={}, host="here", started_at="", epoch_s=0.0,
     )  # fmt: skip
 
 
 def samples() -> tuple[Any, Any]:
     """(measured, predicted) values (channel, sample): sines, and a force beyond the gap."""
-    t = np.arange(SAMPLES) / RATE
+    t = np.arange(SAMPLE_COUNT) / RATE_HZ
     table, u = 2e-3 * np.sin(4 * np.pi * t), 4e-3 * np.sin(4 * np.pi * t + 1)
     right, left = 5e5 * np.clip(u - 2e-3, 0, None), 5e5 * np.clip(-u - 2e-3, 0, None)
-    acc, v = -2.0 * np.sin(4 * np.pi * t + 1), np.gradient(u) * RATE
+    acc, v = -2.0 * np.sin(4 * np.pi * t + 1), np.gradient(u) * RATE_HZ
     cells = [right / 2, right / 2, left / 2, left / 2]
     measured = np.stack([table, table, 0.49 * np.sin(4 * np.pi * t), table + u, acc, *cells])
     track = np.stack([u, v, table + u, acc, *cells])
@@ -72,10 +72,10 @@ def samples() -> tuple[Any, Any]:
 def blocks(size: int = 20, skip: Sequence[int] = ()) -> list[Block]:
     """Both streams, block by block; `skip` are the numbers of lost measured blocks."""
     measured, predicted = samples()
-    step = np.minimum(np.arange(SAMPLES) * len(STEPS) // SAMPLES, len(STEPS) - 1)
-    label = np.full(SAMPLES, Label.MEASURE, dtype=np.int64)
-    found = []
-    for number, first in enumerate(range(0, SAMPLES, size)):
+    step = np.minimum(np.arange(SAMPLE_COUNT) * len(STEPS) // SAMPLE_COUNT, len(STEPS) - 1)
+    label = np.full(SAMPLE_COUNT, Label.MEASURE, dtype=np.int64)
+    cut = []
+    for number, first in enumerate(range(0, SAMPLE_COUNT, size)):
         part = slice(first, first + size)
         labels = (step[part].copy(), label[part].copy(), np.zeros_like(step[part]))
         for name, names, values in (
@@ -83,29 +83,30 @@ def blocks(size: int = 20, skip: Sequence[int] = ()) -> list[Block]:
             ("pred", TWIN_CHANNELS, predicted),
         ):
             if name == "pred" or number not in skip:
-                found.append(Block(name, first, RATE, names, values[:, part].copy(), *labels))
-    return found
+                cut.append(Block(name, first, RATE_HZ, names, values[:, part].copy(), *labels))
+    return cut
 
 
 def records() -> list[Record]:
     nan = float("nan")
     extremes = Extremes(4e-3, -4e-3, 2.0, -2.0, 1000.0, 1000.0, (100,), (600, 700))
-    found: list[Record] = [
+    items: list[Record] = [
         Event(10, "step", "2 Hz"),
         SampleGap(400, 20, "", "late"),
         Params(5, {}, "start"),
     ]
     for step in STEPS:
-        end = (step.index + 1) * SAMPLES // len(STEPS)
+        end = (step.index + 1) * SAMPLE_COUNT // len(STEPS)
         eta = 0.2 + 0.1 * step.index
         quantities = NormalizedResponse(eta, eta, eta, eta, eta, nan, (1, 1), (), 0.0, 0.0)
         twin = None if step.index == 1 else quantities
         point = (step.index, step.direction, step.frequency_hz, quantities, twin, 0.49, 0.49, 0.01)
-        found += [PrcPoint(end, *point), CycleExtremes(end, step.index, 0, 3, 1000, extremes, None)]
-    found += [
-        Comparison(k, 20, ("rel_disp_m",), (4.0,), (1.0,), (0.04,)) for k in range(0, SAMPLES, 20)
+        items += [PrcPoint(end, *point), CycleExtremes(end, step.index, 0, 3, 1000, extremes, None)]
+    items += [
+        Comparison(k, 20, ("rel_disp_m",), (4.0,), (1.0,), (0.04,))
+        for k in range(0, SAMPLE_COUNT, 20)
     ]
-    found += [
+    items += [
         Fault(900, "twin", 900, 1000, "killed"),
         Timing(0, "a b/c", 1, 2, 3, 0, 9, 0.1, "other"),
     ]
@@ -113,14 +114,14 @@ def records() -> list[Record]:
         parts = (2 * (error, nan), 2 * (nan, nan), 2 * (2 * error, 3.0))
         names = ("force_r1_n", "force_r2_n", "mass_acc_m_s2", "rel_disp_m")
         errors, bands = (error, 3.0, nan, error), (1.0, 2.0, 1.0, 0.0)
-        found.append(Agreement(index, 0, 0, 1000, names, errors, bands, *parts))
+        items.append(Agreement(index, 0, 0, 1000, names, errors, bands, *parts))
     values = (1e5 + 1e3, 300.0, 1e-3 + 2e-5), (500.0, 3.0, 1e-5), (1e3, 0.0, 2e-5)
-    found.append(Estimate(8000, 1, ("stiffness", "damping", "gap_r"), *values, (200.0, 3.0, 1e-5)))
-    found.append(JumpForecast(4000, 0, "forward", 2.0, "down", 2.4, 2.3, 9.0))
-    found.append(JumpForecast(8000, 1, "forward", 2.5, "", 2.2, 2.1, 2.3))
-    found.append(Level(7000, 1, 0.5, 0.4, 1.1, 1, False, ()))
-    found += [Event(6000, "warning", "u left its band"), Event(6000, "warning", "u left its band")]
-    return [*found, RunStop(SAMPLES, "complete", "played")]
+    items.append(Estimate(8000, 1, ("stiffness", "damping", "gap_r"), *values, (200.0, 3.0, 1e-5)))
+    items.append(JumpForecast(4000, 0, "forward", 2.0, "down", 2.4, 2.3, 9.0))
+    items.append(JumpForecast(8000, 1, "forward", 2.5, "", 2.2, 2.1, 2.3))
+    items.append(Level(7000, 1, 0.5, 0.4, 1.1, 1, False, ()))
+    items += [Event(6000, "warning", "u left its band"), Event(6000, "warning", "u left its band")]
+    return [*items, RunStop(SAMPLE_COUNT, "complete", "played")]
 
 
 def recording(items: Sequence[Block | Record], begin: RunStart | None = None) -> Recording:
@@ -132,7 +133,7 @@ def recording(items: Sequence[Block | Record], begin: RunStart | None = None) ->
 @cache
 def content(path: Path) -> dict[str, dict[str, tuple[Any, ...]]]:
     """{entity: {component: (times in ns, rows as lists)}} of what changes over time."""
-    found: dict[str, dict[str, list[tuple[int, Any]]]] = {}
+    tables: dict[str, dict[str, list[tuple[int, Any]]]] = {}
     for chunk in RrdReader(path).stream():
         if chunk.is_static:
             continue
@@ -140,11 +141,11 @@ def content(path: Path) -> dict[str, dict[str, tuple[Any, ...]]]:
         times = batch.column("time").cast("int64").to_pylist()
         for name in batch.schema.names:
             if ":" in name:
-                rows = found.setdefault(chunk.entity_path, {}).setdefault(name, [])
+                rows = tables.setdefault(chunk.entity_path, {}).setdefault(name, [])
                 rows.extend(zip(times, batch.column(name).to_pylist(), strict=True))
     return {
         entity: {name: tuple(zip(*rows, strict=True)) for name, rows in columns.items()}
-        for entity, columns in found.items()
+        for entity, columns in tables.items()
     }
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from table_io.block import Block
-from table_io.errors import InputError
 from table_io.records import Event, PrcPoint, RunStart, RunStop
+from tests.input_errors import raises_input_error
 from twin.cli import view
 from twin.transport.codec import MEAS_TOPIC, TOPIC_TYPES, Item, encode_item, topic_for
 from twin.transport.zenoh_link import BusLink, open_hub, open_spoke
@@ -25,7 +25,7 @@ START = RunStart(
     versions={}, host="here", started_at="", epoch_s=0.0,
 )  # fmt: skip
 STOP = RunStop(400, "complete", "played")
-TURNS = 200
+MAX_TURNS = 200
 
 
 class Seen:
@@ -43,7 +43,7 @@ class Seen:
         self.closed = True
 
     def of(self, kind: type) -> list[Any]:
-        return [one for one in self.items if isinstance(one, kind)]
+        return [item for item in self.items if isinstance(item, kind)]
 
 
 def block(index: int) -> Block:
@@ -75,14 +75,14 @@ def put(hub: BusLink, *items: Item, run: str = "r1") -> None:
         hub.publish(topic_for(item), encode_item(item, run))
 
 
-def seen(live: LiveView) -> Seen:
+def shown_view(live: LiveView) -> Seen:
     assert isinstance(live.view, Seen)
     return live.view
 
 
 def until(hub: BusLink, live: LiveView, done: Any) -> None:
     """Let both turn until it is so."""
-    for _ in range(TURNS):
+    for _ in range(MAX_TURNS):
         if done():
             return
         live.listen(0.01)
@@ -97,16 +97,16 @@ def test_who_comes_late_has_the_start_the_events_and_the_prc(ends: tuple[BusLink
     put(hub, START, Event(0, "state", "checking"), *points)
     put(hub, *(block(20 * k) for k in range(100)))
     live = LiveView(spoke, "127.0.0.1:1")
-    until(hub, live, lambda: live.view is not None and len(seen(live).of(PrcPoint)) == 90)
-    assert (seen(live).start, seen(live).serve) == (START, "127.0.0.1:1")
-    assert seen(live).of(PrcPoint) == points
-    assert [one.text for one in seen(live).of(Event)] == ["checking"]
+    until(hub, live, lambda: live.view is not None and len(shown_view(live).of(PrcPoint)) == 90)
+    assert (shown_view(live).start, shown_view(live).serve) == (START, "127.0.0.1:1")
+    assert shown_view(live).of(PrcPoint) == points
+    assert [event.text for event in shown_view(live).of(Event)] == ["checking"]
     put(hub, block(2000), block(2020))
-    until(hub, live, lambda: len(seen(live).of(Block)) >= 2)
-    assert [one.index for one in seen(live).of(Block)] == [2000, 2020]  # none of the past
+    until(hub, live, lambda: len(shown_view(live).of(Block)) >= 2)
+    assert [block.index for block in shown_view(live).of(Block)] == [2000, 2020]  # none of the past
     put(hub, block(2040), STOP)
     until(hub, live, lambda: live.is_over)
-    assert [one.index for one in seen(live).of(Block)] == [2000, 2020, 2040]
+    assert [block.index for block in shown_view(live).of(Block)] == [2000, 2020, 2040]
     assert live.end_reason.endswith("complete, played")
 
 
@@ -127,7 +127,7 @@ def test_the_last_blocks_are_waited_for(
     monkeypatch.setattr(live, "_blocks", Slow())
     put(hub, START, STOP)
     until(hub, live, lambda: live.is_over)
-    assert [one.index for one in seen(live).of(Block)] == [20]
+    assert [block.index for block in shown_view(live).of(Block)] == [20]
 
 
 def test_garbage_and_another_run_are_passed_over(ends: tuple[BusLink, BusLink]) -> None:
@@ -142,19 +142,16 @@ def test_garbage_and_another_run_are_passed_over(ends: tuple[BusLink, BusLink]) 
     put(hub, START, block(0), STOP, run="r0")
     put(hub, block(40), STOP)
     until(hub, live, lambda: live.is_over)
-    assert [one.index for one in seen(live).of(Block)] == [20, 40]
-    assert len(seen(live).of(RunStop)) == 1
+    assert [block.index for block in shown_view(live).of(Block)] == [20, 40]
+    assert len(shown_view(live).of(RunStop)) == 1
     assert live.ignored == 5
 
 
-def test_it_ends_where_the_rig_is_gone(
-    ends: tuple[BusLink, BusLink], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_ends_where_the_rig_is_gone(ends: tuple[BusLink, BusLink]) -> None:
     hub, spoke = ends
-    live = LiveView(spoke, "127.0.0.1:1")
+    live = LiveView(spoke, "127.0.0.1:1", max_silence_s=0.0)
     put(hub, START, block(0))
     until(hub, live, lambda: live.view is not None)
-    monkeypatch.setattr(live_view, "MAX_SILENCE_S", 0.0)
     live.listen(0.01)
     assert not live.is_over  # silent, but its process is there
     hub.undeclare_alive("r1.rig")
@@ -192,15 +189,15 @@ def test_the_command_says_where_it_serves_and_how_it_ended(
         view.view_live("tcp/127.0.0.1:1", "rig")
         over.set()
         thread.join()
-    said = capsys.readouterr().out
-    assert "live view: rerun rerun+http://127.0.0.1:" in said
+    output = capsys.readouterr().out
+    assert "live view: rerun rerun+http://127.0.0.1:" in output
     assert opened
     assert taken not in opened[0]
-    assert "complete, played" in said
+    assert "complete, played" in output
 
 
 def test_what_only_a_recording_can_give_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="give its LOG"):
+    with raises_input_error(where=f"--save {tmp_path / 'v.rrd'}", remedy="LOG"):
         view.show_view(None, tmp_path / "v.rrd", None, "tcp/127.0.0.1:1", "rig")
-    with pytest.raises(InputError, match="folder does not exist"):
+    with raises_input_error(where=tmp_path / "no" / "v.png"):
         view.show_view(None, None, tmp_path / "no" / "v.png", "tcp/127.0.0.1:1", "rig")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from table_io.errors import InputError
+from tests.input_errors import raises_input_error
 from tests.viewer.example_run import (
     blocks,
     recording,
@@ -37,7 +38,7 @@ def free_port() -> int:
 def test_file_and_server_at_once(tmp_path: Path) -> None:
     port = free_port()
     view = RerunView(start(), save=tmp_path / "v.rrd", serve=f"127.0.0.1:{port}")
-    with pytest.raises(InputError, match=f"{port}.*in use"):
+    with raises_input_error(key="view address", value=f"127.0.0.1:{port}"):
         RerunView(start(), serve=f"127.0.0.1:{port}")
     view.feed(blocks()[:20])
     view.close()
@@ -51,10 +52,10 @@ def test_without_a_display_it_says_what_to_do(
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     assert "--bind 127.0.0.1" in open_viewer("rerun+http://127.0.0.1:9876/proxy")
-    with pytest.raises(InputError, match="no such file"):
+    with raises_input_error(where=tmp_path / "none.rrd"):
         open_viewer(tmp_path / "none.rrd")
     monkeypatch.setattr(window, "find_spec", lambda _: None)
-    with pytest.raises(InputError, match="pip install rerun-sdk"):
+    with raises_input_error(remedy="pip install rerun-sdk"):
         open_viewer("rerun+http://127.0.0.1:9876/proxy")
 
 
@@ -62,15 +63,15 @@ def test_the_picture_of_a_running_test(tmp_path: Path) -> None:
     address = f"127.0.0.1:{free_port()}"
     view = RerunView(start(), serve=address)
     items = recording([*blocks(), *records()]).items
-    view.feed([one for one in items if one.index < 8000])
-    assert drawn(viewer_url(address), tmp_path / "live.png") == []
+    view.feed([item for item in items if item.index < 8000])
+    assert draw_views(viewer_url(address), tmp_path / "live.png") == []
     view.close()
     picture = pixels(tmp_path / "live.png")
     height, width = picture.shape[:2]
     assert redness(picture[: int(0.8 * height), width // 2 :]) > 300
 
 
-def drawn(source: Path | str, png: Path, at_s: float | None = None) -> list[str]:
+def draw_views(source: Path | str, png: Path, at_s: float | None = None) -> list[str]:
     """What views complain of; skips where nothing can be drawn, and nowhere else."""
     try:
         return take_screenshot(source, png, at_s)
@@ -93,7 +94,7 @@ def redness(picture: Any) -> int:
 
 
 def test_the_picture(whole: Path, tmp_path: Path) -> None:
-    assert drawn(whole, tmp_path / "view.png", 4.0) == []
+    assert draw_views(whole, tmp_path / "view.png", 4.0) == []
     picture = pixels(tmp_path / "view.png")
     height, width = picture.shape[:2]
     for rows in np.array_split(np.arange(int(0.8 * height)), 3):
@@ -104,8 +105,8 @@ def test_the_picture(whole: Path, tmp_path: Path) -> None:
 
 
 def test_a_view_on_a_taken_port_takes_the_next() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as one:
-        port = one.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
         with pytest.raises(InputError) as refused:
             parse_address(f"127.0.0.1:{port}")
         assert refused.value.value == f"127.0.0.1:{port}"

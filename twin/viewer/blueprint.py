@@ -50,6 +50,7 @@ def log_static(sink: RerunSink, scene: Scene, mass_kg: float) -> None:
     for marks in ("prc/now", "phase/gaps", "loop/gaps"):
         sink.log_static(marks, strip(colors=CONTACT_COLOUR, radii=-0.7))
     sink.log_static("prc/ahead", strip(radii=-0.7, draw_order=3))
+    sink.log_static("prc/data/branches", strip(radii=-0.8, draw_order=0.5))
     for plot in ("u", "a", "force", "damper"):
         scale_points = rr.SeriesPoints.from_fields(
             names="scale", colors=DARK_GREY, marker_sizes=0.3
@@ -128,7 +129,8 @@ def _make_left_column(scene: Scene, has_damper: bool) -> Any:
         rrb.TextDocumentView(origin=f"/{origin}", name=name) for origin, name in documents
     ]
     prc = (
-        "PRC, η_d: forward red, backward blue; free twin white, grey; step amber, next jump violet"
+        "PRC, η_d: forward red, backward blue; free twin white, grey; branches thin; step amber, "
+        "next jump violet"
     )
     phase = _make_plane_view("phase", "Phase plane: measured red, twin white")
     loop = _make_plane_view("loop", "Damper force over u")

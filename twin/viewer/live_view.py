@@ -33,12 +33,13 @@ class LiveView:
     Past samples are not fetched, so that the view appears at once.
     """
 
-    def __init__(self, link: BusLink, address: str) -> None:
+    def __init__(self, link: BusLink, address: str, max_silence_s: float = MAX_SILENCE_S) -> None:
         self.view: RerunView | None = None
         self.end_reason = ""  # message for the user once the run has ended
         self.ignored = 0  # invalid payloads and items of other runs
         self._link = link
         self._address = address
+        self._max_silence_s = max_silence_s
         self._run = ""
         self._blocks = link.subscribe(tuple(STREAM_TOPICS), history=False, capacity=QUEUE_CAPACITY)
         self._records = link.subscribe(HISTORY_TOPICS, history=True, capacity=QUEUE_CAPACITY)
@@ -68,7 +69,7 @@ class LiveView:
             while blocks := self._drain(self._blocks, DRAIN_S):
                 arrived += blocks
         self._feed(arrived)
-        if self._clock.now() > self._last_arrival_s + MAX_SILENCE_S:
+        if self._clock.now() > self._last_arrival_s + self._max_silence_s:
             self._last_arrival_s = self._clock.now()
             if not list_runs(self._link.list_components()):
                 self.end_reason = "the rig has disconnected"

@@ -8,7 +8,8 @@ from typing import ClassVar
 import numpy as np
 
 from table_io.block import Float1D, Float2D
-from table_io.records import JumpForecast, PrcPoint
+from table_io.config.excitation.orbit_plan import OrbitPlan
+from table_io.records import JumpForecast, OrbitPoint, PrcPoint
 from twin.viewer.style import PLUM, PRC_COLOURS, VIOLET, Rgb
 
 PRC_WIDTH, PLANE_WIDTH = 2.9, 1.5  # relative to a height of 1
@@ -142,6 +143,35 @@ class PrcCurves:
             if len(curve):
                 curves.append((colour, curve))
         return curves
+
+
+class OrbitCurves:
+    """Orbits of a continuation so far: amplitude of u in mm over frequency, over the planned."""
+
+    def __init__(self, plan: OrbitPlan) -> None:
+        self._planned = np.array([[o.frequency_hz, 1e3 * o.amplitude_m] for o in plan.points])
+        self._measured: dict[int, tuple[float, float]] = {}
+        low_hz, high_hz = self._planned[:, 0].min(), self._planned[:, 0].max()
+        margin = max(0.03 * (high_hz - low_hz), 0.05)
+        self._frequency_range = (float(low_hz - margin), float(high_hz + margin))
+        self._max_mm = nice_ceil(1.1 * float(self._planned[:, 1].max()))
+
+    @property
+    def axes(self) -> PlotAxes:
+        return PlotAxes(
+            self._frequency_range, (0.0, self._max_mm), "f [Hz]", "amplitude of u [mm]", PRC_WIDTH
+        )
+
+    def add(self, orbit: OrbitPoint) -> None:
+        """Add an accepted orbit; one measured again replaces the earlier."""
+        if orbit.accepted:
+            self._measured[orbit.step] = orbit.frequency_hz, 1e3 * orbit.amplitude_m
+
+    def get_curves(self, source: str) -> list[tuple[Rgb, Float2D]]:
+        """Return (color, (orbit, 2) in Hz and mm) of the plan ("twin") or of what is "measured"."""
+        measured = np.array([self._measured[step] for step in sorted(self._measured)])
+        curve = self._planned if source == "twin" else measured.reshape(-1, 2)
+        return [(PRC_COLOURS[source][0], curve)] if len(curve) else []
 
 
 def forecast_lines(axes: PlotAxes, forecast: JumpForecast) -> list[tuple[Rgb, Float2D]]:

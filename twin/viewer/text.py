@@ -19,6 +19,7 @@ from table_io.records import (
     RunStart,
 )
 from table_io.units import GRAVITY_M_S2
+from twin.viewer.model_branches import FoldAhead
 from twin.viewer.style import CHANNEL_LINES
 
 
@@ -89,8 +90,23 @@ def format_status(start: RunStart, step: int, label: int) -> str:
     )
 
 
-def format_forecast(forecast: JumpForecast) -> str:
-    """Format the forecast of the next jump and its distance as Markdown."""
+def format_forecast(forecast: JumpForecast, fold: FoldAhead | None = None) -> str:
+    """Format the forecast of the next jump, its distance and the fold behind it as Markdown."""
+    return f"{_format_jump(forecast)}{_format_fold(fold)}"
+
+
+def _format_fold(fold: FoldAhead | None) -> str:
+    """Format the distance to a fold of the model, and the share of starts that come back."""
+    if fold is None:
+        return ""
+    starts = f"±{1e3 * fold.u_limit:.2g} mm and ±{1e3 * fold.v_limit:.2g} mm/s"
+    return (
+        f"\n\nfold at **{fold.fold_hz:.4g} Hz**, {fold.distance_hz:.2g} Hz ahead; "
+        f"{100 * fold.basin_share:.0f} % of the starts within {starts} lead to this motion"
+    )
+
+
+def _format_jump(forecast: JumpForecast) -> str:
     if not forecast.kind:
         return f"none {forecast.direction} from {forecast.frequency_hz:g} Hz"
     distance_hz = abs(forecast.jump_hz - forecast.frequency_hz)

@@ -22,6 +22,7 @@ from table_io.records import (
     Estimate,
     JumpForecast,
     Level,
+    OrbitPoint,
     PrcPoint,
     Record,
     RunStart,
@@ -31,9 +32,10 @@ from twin.recording.reader import Recording
 from twin.viewer.address import viewer_url
 from twin.viewer.blueprint import log_static, make_blueprint
 from twin.viewer.levels import ReferenceLevels
+from twin.viewer.model_branches import FoldAhead, ModelBranches
 from twin.viewer.motion import BlockMotion, extract_motion, extract_track, join_contiguous
 from twin.viewer.phase_plane import DAMPER_LOOP, PHASE_PLANE, PlanePlot
-from twin.viewer.plots import PrcCurves, forecast_lines
+from twin.viewer.plots import OrbitCurves, PrcCurves, forecast_lines
 from twin.viewer.scene import Scene
 from twin.viewer.sink import RerunSink, escape_path_part
 from twin.viewer.style import LineStyle, disagreement_style, drift_styles
@@ -69,7 +71,9 @@ class RerunView:
         self._styled: set[str] = set()
         self._logged: set[tuple[int, str, str]] = set()
         self._sweep_position = SweepPosition()
-        self._curves = PrcCurves(profile.plan.low_hz, profile.plan.high_hz)
+        self._prc = PrcCurves(profile.plan.low_hz, profile.plan.high_hz)
+        continuation = profile.continuation
+        self._orbits = None if continuation is None else OrbitCurves(continuation.orbit_plan)
         self._errors = RelativeError(start.rate_hz)
         self._sink = RerunSink(start, save, serve, make_blueprint(start, self._scene, bool(serve)))
         self.url = viewer_url(serve) if serve else ""
@@ -82,9 +86,18 @@ class RerunView:
             if has_damper
             else None
         )
-        self._sink.send_axes("prc", 0, self._curves.axes)
+        self._draw_curves(0)
+        self._branches = ModelBranches.from_start(start)
+        if self._branches is not None:
+            self._sink.send_coloured_strips("prc/data/branches", 0, self._branches.draw())
+        self._fold: FoldAhead | None = None
         for entity in ("ahead", "warning"):
             self._sink.send_document(entity, 0, "none so far")
+
+    @property
+    def _curves(self) -> PrcCurves | OrbitCurves:
+        """Curves of the plot over frequency."""
+        return self._prc if self._orbits is None else self._orbits
 
     def feed(self, items: Sequence[Block | Record]) -> None:
         """Draw a batch of items; call about every 100 ms in a live run."""
@@ -176,7 +189,7 @@ class RerunView:
 
     def _draw_record(self, item: Record) -> None:
         match item:
-            case PrcPoint():
+            case PrcPoint() | OrbitPoint():
                 self._draw_point(item)
             case CycleExtremes():
                 self._sink.send_scalars("impacts", [item.index], impact_counts(item))
@@ -203,7 +216,7 @@ class RerunView:
             case JumpForecast():
                 marks = forecast_lines(self._curves.axes, item)
                 self._sink.send_coloured_strips("prc/ahead", item.index, marks)
-                self._sink.send_document("ahead", item.index, format_forecast(item))
+                self._sink.send_document("ahead", item.index, format_forecast(item, self._fold))
             case RunStart():
                 pass
             case _:
@@ -238,14 +251,25 @@ class RerunView:
             self._sink.send_document("warning", item.index, f"**{time_text}** {text}")
             self._sink.send_scalars("disagreement/warnings", [item.index], [1.0])
 
-    def _draw_point(self, point: PrcPoint) -> None:
-        """Draw the PRC so far and the values of its newest point."""
-        self._curves.add(point)
-        self._sink.send_axes("prc", point.index, self._curves.axes)  # sent again for late viewers
+    def _draw_point(self, point: PrcPoint | OrbitPoint) -> None:
+        """Draw the PRC so far, or the orbits over the planned ones, and the newest point."""
+        if isinstance(point, PrcPoint):
+            self._prc.add(point)
+            self._sink.send_document("point", point.index, format_point(point))
+            if self._branches is not None:
+                self._fold = self._branches.find_fold(point)
+        else:
+            if self._orbits is not None:
+                self._orbits.add(point)
+            self._log_event(point)
+        self._draw_curves(point.index)
+
+    def _draw_curves(self, index: int) -> None:
+        """Draw the curves over frequency so far, with their axes again for late viewers."""
+        self._sink.send_axes("prc", index, self._curves.axes)
         for source in ("measured", "twin"):
             if curves := self._curves.get_curves(source):
-                self._sink.send_dotted_strips(f"prc/data/{source}", point.index, curves)
-        self._sink.send_document("point", point.index, format_point(point))
+                self._sink.send_dotted_strips(f"prc/data/{source}", index, curves)
 
 
 def write_rrd(recording: Recording, out: Path) -> None:

@@ -1,0 +1,1 @@
+"""Nonlinear dynamics of the model: periodic orbits, their branches and bifurcations."""

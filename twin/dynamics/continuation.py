@@ -1,0 +1,654 @@
+"""Branches of periodic orbits over frequency, level, gap or any parameter of a model.
+
+A branch is followed by pseudo-arclength through folds. Its step adapts: it falls towards a grazing
+orbit, where the Jacobian jumps, starts small behind it, where the Jacobian changes with the square
+root of the depth, and grows again. Every bifurcation is located on the branch itself, and each end
+of a branch states its reason.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from table_io.block import Float1D, Float2D
+from table_io.errors import InputError
+from twin.dynamics.arclength import (
+    MAX_TURN_COS,
+    MIN_STEP,
+    CurvePoint,
+    NoConvergence,
+    correct,
+    next_step,
+    solve_square,
+    weighted_length,
+)
+from twin.dynamics.bifurcations import (
+    Bifurcation,
+    BifurcationKind,
+    ContactKey,
+    CrossingProblem,
+    GrazingProblem,
+    contact_key,
+    detect_bifurcations,
+    evaluate_criterion,
+)
+from twin.dynamics.orbits import (
+    Complex1D,
+    Evaluation,
+    Orbit,
+    OrbitProblem,
+    floquet_multipliers,
+    motion_size,
+)
+
+EndReason = Literal[
+    "start", "range end", "closed loop", "meets another branch", "no convergence", "inadmissible",
+    "too many points",
+]  # fmt: skip
+Point = CurvePoint[Evaluation]
+
+MAX_POINTS = 3000
+SIZE_MEMORY = 0.9  # by which the size that distances are relative to may fall in a step
+FIRST_STEP, MAX_STEP = 0.02, 0.3  # weighted: a unit is a tenth of the range, or the orbit's size
+GRAZING_STEP = 0.02  # weighted: a larger step over a change of contacts is repeated
+STEP_BEYOND_GRAZING = 2e-3
+PROBE_DISTANCES = (1e-6, 1e-5, 1e-4)  # beyond a grazing orbit, for the Jacobian there
+# x bends where an event passes through the start of the period, even back: at this step a turn is
+# accepted, and a point so many steps, or so far, from its prediction.
+BEND_STEP, MAX_BEND, BEND_REACH = 1e-4, 30.0, 5e-3
+SIMULTANEOUS_TOL = 1e-8  # of the size: guards this near to zero touch in the same orbit
+SAME_GRAZING = 1e-9  # weighted distance of one grazing orbit from itself
+LOCATION_TOL = 1e-11  # weighted length within which a bifurcation is located
+SWITCH_STEP = 0.02  # weighted amplitude of the first orbit of a branch that bifurcates
+CROSSING_TOL = 1e-8  # weighted residual of the orbit equation where two branches cross
+CROSSING_STEP = 0.02  # weighted: a larger step over a crossing is repeated
+MAX_SLOPE_RATIO = 1.5  # of a tangent over a chord, 1 on a straight branch and 2 on a parabola
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BranchPoint:
+    """An orbit of a branch, at `value` of the branch's parameter."""
+
+    value: float
+    orbit: Orbit
+
+
+@dataclass(frozen=True, slots=True)
+class BranchEnd:
+    """Why a branch ends: `value` of its parameter there and, without convergence, the residual."""
+
+    reason: EndReason
+    value: float
+    residual: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Branch:
+    """Orbits in order along a branch, its bifurcations in the same order, and why it ends.
+
+    Located bifurcations are among the points.
+    """
+
+    parameter: str
+    points: tuple[BranchPoint, ...]
+    bifurcations: tuple[Bifurcation, ...]
+    ends: tuple[BranchEnd, BranchEnd]
+
+    @property
+    def values(self) -> Float1D:
+        """Parameter at the points, (points,)."""
+        return np.array([point.value for point in self.points])
+
+    @property
+    def stable(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        """Stability of the points, (points,)."""
+        return np.array([point.orbit.stable for point in self.points])
+
+    def extreme(self, name: str) -> Float1D:
+        """Return one of `stepped_sine.EXTREME_NAMES` at the points, (points,)."""
+        return np.array([point.orbit.extreme(name) for point in self.points])
+
+    @property
+    def folds(self) -> tuple[Bifurcation, ...]:
+        """Folds, and grazings at which the branch turns back."""
+        return tuple(b for b in self.bifurcations if b.turns_back)
+
+    def of_kind(self, *kinds: BifurcationKind) -> tuple[Bifurcation, ...]:
+        """Return the bifurcations of these kinds."""
+        return tuple(b for b in self.bifurcations if b.kind in kinds)
+
+    def orbits_at(self, value: float) -> list[Orbit]:
+        """Return the orbit at this value on each pass of the branch, by Newton's method."""
+        orbits = []
+        for first, second in zip(self.points, self.points[1:], strict=False):
+            if (first.value - value) * (second.value - value) <= 0 and first.value != second.value:
+                orbit = self._interpolate(first, second, value)
+                if orbit is not None:
+                    orbits.append(orbit)
+        return orbits
+
+    def _interpolate(self, first: BranchPoint, second: BranchPoint, value: float) -> Orbit | None:
+        fraction = (value - first.value) / (second.value - first.value)
+        if fraction == 0.0:
+            return None if first is not self.points[0] else first.orbit
+        problem = make_problem(first.orbit, self.parameter)
+        z0, z1 = (np.append(p.orbit.x, p.value) for p in (first, second))
+        axis, weights = np.zeros(z0.size), np.ones(z0.size)
+        axis[-1] = 1.0
+        weights[:-1] = orbit_weights(first.orbit)
+        guess = z0 + fraction * (z1 - z0)
+        guess[-1] = value
+        try:
+            point = correct(problem.evaluate, guess, axis, weights)
+        except NoConvergence:
+            return None
+        return problem.make_orbit(point.z, point.linearization.result)
+
+
+def split_by_stability(stable: Sequence[bool]) -> list[tuple[int, int, bool]]:
+    """Return (first, last, stable) of the pieces of a curve; neighbors share a point.
+
+    The segment between two points is stable if both are: a bifurcation point ends a piece.
+    """
+    pieces: list[tuple[int, int, bool]] = []
+    for index in range(len(stable) - 1):
+        is_stable = bool(stable[index] and stable[index + 1])
+        if pieces and pieces[-1][2] == is_stable:
+            pieces[-1] = (pieces[-1][0], index + 1, is_stable)
+        else:
+            pieces.append((index, index + 1, is_stable))
+    return pieces
+
+
+def make_problem(orbit: Orbit, *names: str) -> OrbitProblem:
+    """Return the equation of an orbit's continuation over these parameters."""
+    return OrbitProblem(
+        orbit.period_map, orbit.frequency_hz, orbit.acceleration_m_s2, orbit.periods, names
+    )
+
+
+def orbit_weights(orbit: Orbit) -> Float1D:
+    """Return the weights of x, (n,), by which its largest coordinate is about 1."""
+    return 1.0 / (orbit.period_map.scales * orbit_size(orbit))
+
+
+def orbit_size(orbit: Orbit) -> float:
+    """Return the largest coordinate in m, at least 1e-12 m."""
+    return max(motion_size(orbit.x, orbit.period_map.scales), 1e-12)
+
+
+def continue_branch(
+    start: Orbit,
+    parameter: str,
+    limits: tuple[float, float],
+    direction: int = 0,
+    *,
+    max_points: int = MAX_POINTS,
+    max_step: float = MAX_STEP,
+    check_admissibility: bool = False,
+) -> Branch:
+    """Follow the branch of an orbit over a parameter within limits; InputError outside of them.
+
+    parameter: "frequency" in Hz, "level" in m/s2, "gap" (total) in m or a name of `Model.flatten`.
+    direction: +1 starts towards larger values, -1 towards smaller ones; 0 follows both ways.
+    max_step: weighted, in tenths of the range and sizes of the orbit.
+    """
+    problem = make_problem(start, parameter)
+    value = float(problem.start()[0])
+    if not limits[0] <= value <= limits[1]:
+        raise InputError(
+            "the orbit lies outside the range",
+            key=parameter,
+            value=value,
+            allowed=f"{limits[0]:.6g} to {limits[1]:.6g}",
+        )
+
+    def trace(sign: int) -> _Trace:
+        tracer = _Trace(problem, limits, max_points, max_step, check_admissibility)
+        axis = np.zeros(start.x.size + 1)
+        axis[-1] = sign
+        return tracer.follow(np.append(start.x, value), axis)
+
+    if direction:
+        return trace(direction).branch(parameter)
+    ahead = trace(+1)
+    if ahead.end.reason == "closed loop":
+        return ahead.branch(parameter)
+    return ahead.branch(parameter, trace(-1))
+
+
+def switch_branch(
+    bifurcation: Bifurcation,
+    parameter: str,
+    limits: tuple[float, float],
+    *,
+    side: int = 1,
+    max_points: int = MAX_POINTS,
+    max_step: float = MAX_STEP,
+    check_admissibility: bool = False,
+) -> Branch:
+    """Follow the branch that leaves at a period doubling or pitchfork, InputError elsewhere.
+
+    `side` -1 leaves the other way: the mirrored orbits at a pitchfork of a symmetric model, the
+    same ones one period later at a period doubling. Other arguments as in `continue_branch`.
+    """
+    orbit = bifurcation.orbit
+    if bifurcation.kind not in ("period doubling", "pitchfork"):
+        raise InputError(
+            "no branch leaves here",
+            key="kind",
+            value=bifurcation.kind,
+            allowed="period doubling or pitchfork",
+        )
+    doubles = bifurcation.kind == "period doubling"
+    values, vectors = np.linalg.eig(orbit.jacobian)
+    vector = vectors[:, np.abs(values - (-1.0 if doubles else 1.0)).argmin()].real
+    problem = OrbitProblem(
+        orbit.period_map, orbit.frequency_hz, orbit.acceleration_m_s2,
+        orbit.periods * (2 if doubles else 1), (parameter,),
+    )  # fmt: skip
+    tracer = _Trace(problem, limits, max_points, max_step, check_admissibility)
+    start = np.append(orbit.x, problem.start())
+    return tracer.follow(start, side * np.append(vector, 0.0), leaves=True).branch(parameter)
+
+
+class _Trace:
+    """A branch while it is followed in one direction."""
+
+    def __init__(
+        self,
+        problem: OrbitProblem,
+        limits: tuple[float, float],
+        max_points: int,
+        max_step: float,
+        check_admissibility: bool,
+    ) -> None:
+        self._problem, self._limits = problem, limits
+        self._max_points, self._max_step = max_points, max_step
+        self._check_admissibility = check_admissibility
+        self._range = max(limits[1] - limits[0], 1e-12)
+        self.points: list[BranchPoint] = []
+        self.bifurcations: list[Bifurcation] = []
+        self.end = BranchEnd("too many points", math.nan)
+        self._finished = False
+        self._size = 1e-12
+
+    def branch(self, parameter: str, before: "_Trace | None" = None) -> Branch:
+        """Return the branch; `before` was followed from the same start the other way."""
+        if before is None:
+            closes = self.end.reason == "closed loop"
+            start = self.end if closes else BranchEnd("start", self.points[0].value)
+            return Branch(
+                parameter, tuple(self.points), tuple(self.bifurcations), (start, self.end)
+            )
+        shift = len(before.points) - 1
+        points = (*before.points[:0:-1], *self.points)
+        bifurcations = (
+            *(replace(b, index=shift - b.index) for b in before.bifurcations[::-1]),
+            *(replace(b, index=shift + b.index) for b in self.bifurcations),
+        )
+        return Branch(parameter, points, bifurcations, (before.end, self.end))
+
+    def follow(self, start: Float1D, direction: Float1D, leaves: bool = False) -> "_Trace":
+        """Follow the branch from z = start until it ends; return this.
+
+        `leaves`: another branch passes through the start, so the direction is its tangent.
+        """
+        weights = self._weights(start)
+        direction = direction / weighted_length(direction, weights)
+        try:
+            first = correct(self._problem.evaluate, start, direction, weights)
+        except NoConvergence as error:
+            if not leaves:
+                self._finish("no convergence", start[-1], error.residual)
+                return self
+            # Singular, as two curves cross there.
+            evaluation = self._problem.evaluate(start)
+            first = CurvePoint(start, direction, weights, 0.0, evaluation, 0)
+        if leaves:
+            first = CurvePoint(start, direction, weights, 0.0, first.linearization, 0)
+        self._start = self._point = first
+        self._step = SWITCH_STEP if leaves else FIRST_STEP
+        self._key = contact_key(first.linearization.result.contacts)
+        self._multipliers = floquet_multipliers(first.linearization.result.jacobian)
+        self._curvature = np.zeros(start.size)
+        self._key_before: ContactKey | None = None  # contacts before the last grazing orbit
+        self._grazing: Float1D | None = None
+        self._append(first)
+        while not self._finished:
+            if len(self.points) >= self._max_points:
+                self._finish("too many points", self._point.z[-1])
+                break
+            self._advance()
+        return self
+
+    def _weights(self, z: Float1D) -> Float1D:
+        """Return the weights of z, by the size of the orbit; it may pass through zero."""
+        scales, weights = self._problem.scales, np.empty(z.size)
+        self._size = max(motion_size(z[:-1], scales), SIZE_MEMORY * self._size)
+        weights[:-1], weights[-1] = 1.0 / (scales * self._size), 10.0 / self._range
+        return weights
+
+    def _finish(self, reason: EndReason, value: float, residual: float = 0.0) -> None:
+        self.end, self._finished = BranchEnd(reason, float(value), residual), True
+
+    def _append(self, point: Point, multipliers: Complex1D | None = None) -> Orbit:
+        orbit = self._problem.make_orbit(point.z, point.linearization.result, multipliers)
+        self.points.append(BranchPoint(float(point.z[-1]), orbit))
+        if self._check_admissibility and not orbit.is_admissible():
+            self._finish("inadmissible", point.z[-1])
+        return orbit
+
+    def _reject(self, factor: float, error: NoConvergence | None = None) -> None:
+        """Repeat with a smaller step; the branch ends where that is too small."""
+        self._step *= factor
+        if self._step < MIN_STEP:
+            residual = error.residual if error else 0.0
+            self._finish("no convergence", self._point.z[-1], residual)
+
+    def _advance(self) -> None:
+        """Take a step, or reject it and reduce the next."""
+        last, step = self._point, self._step
+        weights = self._weights(last.z)
+        tangent = last.tangent / weighted_length(last.tangent, weights)
+        guess = last.z + step * tangent + 0.5 * step * step * self._curvature
+        try:
+            new = self._correct(guess, tangent, weights)
+        except NoConvergence as error:
+            self._retry(last, tangent, weights, error)
+            return
+        turn_cos = float((new.tangent * weights) @ (tangent * weights))
+        if not self._limits[0] <= new.z[-1] <= self._limits[1]:
+            limited = self._at_limit(last, new, weights)
+            if limited is not None:
+                new = limited
+                self._finish("range end", new.z[-1])
+        key = contact_key(new.linearization.result.contacts)
+        if key == self._key_before and last.z is self._grazing:
+            self._key_before = (
+                None  # not through the grazing orbit: the other way along the tangent
+            )
+            self._point = replace(last, tangent=-last.tangent, orientation=-last.orientation)
+            grazing = self.bifurcations[-1]
+            self.bifurcations[-1] = replace(grazing, turns_back=not grazing.turns_back)
+            return
+        if key != self._key:
+            if step > GRAZING_STEP:
+                self._reject(max(0.3, 0.9 * GRAZING_STEP / step))
+            else:
+                self._pass_grazing(last, new, key)
+            return
+        is_outside = not self._limits[0] <= new.z[-1] <= self._limits[1]
+        if is_outside or (turn_cos < MAX_TURN_COS and step > BEND_STEP):
+            self._finished = False
+            self._reject(0.5)
+            return
+        if not self._finished and self._closes(last, new, weights):
+            new = self._start
+            self._finish("closed loop", new.z[-1])
+        try:
+            self._accept(last, new)
+        except NoConvergence:  # too long, or on another branch that comes near but does not cross
+            self._finished = False
+            self._reject(0.3)
+            return
+        bends = turn_cos < MAX_TURN_COS
+        self._curvature = np.zeros(guess.size) if bends else (new.tangent - tangent) / step
+        self._step = next_step(step, turn_cos, new.iterations, self._max_step)
+
+    def _correct(self, guess: Float1D, tangent: Float1D, weights: Float1D) -> Point:
+        """Return the branch's point near a guess; where it bends, at the parameter's value there.
+
+        Raises NoConvergence.
+        """
+        step = self._step
+        reach = max(step, min(MAX_BEND * step, BEND_REACH))
+        try:
+            return correct(self._problem.evaluate, guess, tangent, weights, reach)
+        except NoConvergence:
+            if step > BEND_STEP:
+                raise
+        axis = np.zeros(guess.size)
+        axis[-1] = math.copysign(1.0 / weights[-1], tangent[-1])
+        return correct(self._problem.evaluate, guess, axis, weights, reach)
+
+    def _accept(self, last: Point, new: Point) -> None:
+        multipliers = floquet_multipliers(new.linearization.result.jacobian)
+        if last.orientation:
+            kinds = detect_bifurcations(last, new, (self._multipliers, multipliers))
+            if "pitchfork" in kinds and self._step > CROSSING_STEP:
+                raise NoConvergence(0.0)
+            located = [(kind, self._locate(kind, last, new)) for kind in kinds]
+            located.sort(key=lambda item: last.distance(item[1].z))
+            crossing = dict(located).get("pitchfork")
+            if crossing and self._leaves(last, crossing, "fold" in kinds):
+                self._append(crossing)
+                self._finish("meets another branch", crossing.z[-1])
+                return
+            for kind, point in located:
+                orbit, turns_back = self._append(point), kind == "fold"
+                self.bifurcations.append(
+                    Bifurcation(
+                        kind, float(point.z[-1]), orbit, len(self.points) - 1, turns_back=turns_back
+                    )
+                )
+        self._append(new, multipliers)
+        self._point, self._multipliers = new, multipliers
+
+    def _leaves(self, last: Point, crossing: Point, folds: bool) -> bool:
+        """Return whether this branch is the one that leaves another at a pitchfork ahead.
+
+        Its parameter changes there with the square of the distance, so twice as fast along the
+        tangent as along the chord.
+        """
+        chord = crossing.z - last.z
+        along = float((last.tangent * last.weights) @ (chord * last.weights))
+        return folds or abs(last.tangent[-1] * along) > MAX_SLOPE_RATIO * abs(chord[-1])
+
+    def _locate(self, kind: BifurcationKind, last: Point, new: Point) -> Point:
+        """Return the point between two neighbors at which the branch bifurcates."""
+        if kind == "pitchfork":
+            return self._locate_crossing(last, new)
+
+        def value(point: Point) -> float:
+            if kind == "fold":
+                ahead = (point.tangent * last.weights) @ ((new.z - last.z) * last.weights)
+                return math.copysign(1.0, ahead) * float(point.tangent[-1])
+            return evaluate_criterion(kind, point.linearization.result.jacobian)
+
+        return locate_on_arc(self._problem.evaluate, last, new, value)
+
+    def _locate_crossing(self, last: Point, new: Point) -> Point:
+        """Return the point between two others where another branch crosses.
+
+        Raises NoConvergence if none does: then the two points lie on different branches.
+        """
+        guess = (last.z + new.z) / 2
+        crossing = CrossingProblem(self._problem, guess, last.weights)
+        z, _ = solve_square(
+            crossing.evaluate, np.append(guess, 0.0), np.append(last.weights, last.weights[0])
+        )
+        evaluation = self._problem.evaluate(z[:-1])
+        residual = weighted_length(evaluation.residual, last.weights[:-1])
+        if residual > CROSSING_TOL or last.distance(z[:-1]) > 2 * last.distance(new.z):
+            raise NoConvergence(residual)
+        return CurvePoint(z[:-1], last.tangent, last.weights, 0.0, evaluation, 0)
+
+    def _at_limit(self, last: Point, new: Point, weights: Float1D) -> Point | None:
+        """Return the point at the limit of the range between two points, None if it fails."""
+        limit = self._limits[0] if new.z[-1] < self._limits[0] else self._limits[1]
+        fraction = (limit - last.z[-1]) / (new.z[-1] - last.z[-1])
+        guess = last.z + fraction * (new.z - last.z)
+        guess[-1] = limit
+        axis = np.zeros(guess.size)
+        axis[-1] = math.copysign(1.0, new.z[-1] - last.z[-1])
+        try:
+            point = correct(self._problem.evaluate, guess, axis, weights)
+        except NoConvergence:
+            return None
+        return point if contact_key(point.linearization.result.contacts) == self._key else None
+
+    def _closes(self, last: Point, new: Point, weights: Float1D) -> bool:
+        """Return whether the branch passes its start between two points, in the same direction."""
+        if len(self.points) < 5:
+            return False
+        chord = (new.z - last.z) * weights
+        offset = (self._start.z - last.z) * weights
+        length = math.sqrt(chord @ chord)
+        along = (offset @ chord) / length
+        across = math.sqrt(max(float(offset @ offset - along * along), 0.0))
+        same_way = (self._start.tangent * weights) @ chord > 0.8 * length * weighted_length(
+            self._start.tangent, weights
+        )
+        return bool(0 < along <= length and across < 0.1 * length and same_way)
+
+    def _pass_grazing(self, last: Point, new: Point, key: ContactKey) -> None:
+        """Locate the grazing orbit between two points and go on behind it."""
+        try:
+            located = self._locate_grazing(last, last.z + 0.5 * (new.z - last.z))
+            if not last.distance(located[0]) <= 1.5 * last.distance(new.z):
+                raise NoConvergence(math.nan)
+        except NoConvergence:
+            if self._step > 1e-6:
+                self._reject(0.3)
+                return
+            located = None
+        if located is None or last.distance(located[0]) < SAME_GRAZING:
+            self._key = key
+            self._accept_beyond(new)
+            return
+        self._turn_grazing(last, *located, new.z - last.z)
+
+    def _retry(self, last: Point, tangent: Float1D, weights: Float1D, error: NoConvergence) -> None:
+        """Reduce the step; where it is small, pass a grazing orbit at which the branch turns."""
+        if self._step < BEND_STEP:
+            try:
+                located = self._locate_grazing(last, last.z)
+            except NoConvergence:
+                located = None
+            if located and SAME_GRAZING < last.distance(located[0]) < 10 * self._step:
+                self._turn_grazing(last, *located, tangent)
+                return
+        self._reject(0.4, error)
+
+    def _locate_grazing(self, last: Point, guess: Float1D) -> tuple[Float1D, GrazingProblem]:
+        grazing = GrazingProblem(self._problem)
+        z, _ = solve_square(grazing.evaluate, guess, last.weights)
+        return z, grazing
+
+    def _turn_grazing(
+        self, last: Point, z: Float1D, grazing: GrazingProblem, ahead: Float1D
+    ) -> None:
+        """Add the grazing orbit z and leave it along the tangent on its other side."""
+        assert grazing.minimum is not None
+        evaluation = self._problem.evaluate(z)
+        weights = self._weights(z)
+        approach = z - last.z
+        here = CurvePoint(z, last.tangent, weights, last.orientation, evaluation, 0)
+        self._accept(last, here)
+        if self._finished:
+            return
+        ahead = ahead / weighted_length(ahead, weights)
+        for distance in PROBE_DISTANCES:
+            probe = z + distance * ahead
+            beyond = self._problem.evaluate(probe)
+            key = contact_key(beyond.result.contacts)
+            if key != self._key:
+                break
+        gradient = grazing.evaluate(probe).jacobian[-1]
+        tangent = null_direction(beyond.jacobian, ahead, weights)
+        if (gradient @ tangent) * (gradient @ approach) < 0:
+            tangent = -tangent
+        self._add_grazing(last, tangent, evaluation.result.minima)
+        self._key_before, self._key, self._grazing = self._key, key, z
+        self._step, self._curvature = STEP_BEYOND_GRAZING, np.zeros(z.size)
+        self._multipliers = floquet_multipliers(beyond.result.jacobian)
+        orientation = border_sign(beyond.jacobian, tangent, weights)
+        self._point = CurvePoint(z, tangent, weights, orientation, beyond, 0)
+
+    def _add_grazing(self, last: Point, tangent: Float1D, minima: Float2D) -> None:
+        """Record the grazing orbit that is the last point; it is left along `tangent`."""
+        point, index = self.points[-1], len(self.points) - 1
+        nearest = minima[np.abs(minima[:, 2]).argmin()]
+        limit = abs(nearest[2]) + SIMULTANEOUS_TOL * orbit_size(point.orbit)
+        sides = {int(code) % 2 for code in minima[np.abs(minima[:, 2]) <= limit, 1]}
+        self.bifurcations.append(
+            Bifurcation(
+                "grazing", point.value, point.orbit, index,
+                "both" if len(sides) > 1 else "left" if 1 in sides else "right",
+                "push" if nearest[1] >= 2 else "clearance",
+                turns_back=bool(tangent[-1] * last.tangent[-1] < 0),
+            )
+        )  # fmt: skip
+
+    def _accept_beyond(self, new: Point) -> None:
+        """Accept a point behind a change of contacts that was not located."""
+        self._append(new)
+        self._multipliers = floquet_multipliers(new.linearization.result.jacobian)
+        self._point, self._step, self._curvature = new, STEP_BEYOND_GRAZING, np.zeros(new.z.size)
+
+
+def null_direction(jacobian: Float2D, ahead: Float1D, weights: Float1D) -> Float1D:
+    """Return the unit vector of the null space of a Jacobian (m, m + 1), towards `ahead`."""
+    vector = np.linalg.svd(jacobian / weights)[2][-1] / weights
+    return vector if (vector * weights) @ (ahead * weights) > 0 else -vector
+
+
+def border_sign(jacobian: Float2D, tangent: Float1D, weights: Float1D) -> float:
+    """Return the sign of the determinant of a Jacobian bordered by a tangent."""
+    return float(np.sign(np.linalg.det(np.vstack([jacobian, tangent * weights * weights]))))
+
+
+def locate_on_arc(
+    evaluate: Callable[[Float1D], Evaluation],
+    first: Point,
+    second: Point,
+    value: Callable[[Point], float],
+) -> Point:
+    """Return the point of a branch between two others at which a function of it is zero.
+
+    Each iterate is a point of the branch, in a plane normal to the chord; bracketed secants
+    (Illinois) choose the plane.
+    """
+    chord, weights = second.z - first.z, first.weights
+    length = weighted_length(chord, weights)
+    low, high, low_value, high_value = 0.0, 1.0, value(first), value(second)
+    point, side = second, 0
+    for _ in range(60):
+        if (high - low) * length < LOCATION_TOL or low_value == high_value:
+            break
+        position = low - low_value * (high - low) / (high_value - low_value)
+        if not low < position < high:
+            position = (low + high) / 2
+        near = first if position < 0.5 else second
+        base = near.z + (position - (0.0 if near is first else 1.0)) * chord
+        previous = point
+        try:
+            point = correct(
+                evaluate, base if previous is second else _shift(previous, first, chord, position),
+                chord / length, weights, tolerance=1e-9,
+            )  # fmt: skip
+        except NoConvergence:
+            break
+        here = value(point)
+        if here == 0.0 or point.distance(previous.z) < LOCATION_TOL:
+            break
+        if here * low_value > 0:
+            low, low_value = position, here
+            high_value *= 0.5 if side == -1 else 1.0
+            side = -1
+        else:
+            high, high_value = position, here
+            low_value *= 0.5 if side == 1 else 1.0
+            side = 1
+    return point
+
+
+def _shift(point: Point, first: Point, chord: Float1D, position: float) -> Float1D:
+    """Return the point on a tangent in the plane at `position` of a chord."""
+    normal = chord * first.weights * first.weights
+    distance = position * (normal @ chord) - normal @ (point.z - first.z)
+    return point.z + distance / (normal @ point.tangent) * point.tangent

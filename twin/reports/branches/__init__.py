@@ -1,0 +1,1 @@
+"""Report of periodic branches: figures, tables and a page to explore them."""
