@@ -42,7 +42,9 @@ def profile(gap_mm: float = 4.0, start_hz: float = 1.4, stop_hz: float = 4.4) ->
 @cache
 def blocks(truth: str = "", noise: float = 1.0, gap_mm: float = 4.0) -> tuple[Block, ...]:
     """Measured blocks of a rig that hides a truth, with so many times the card's noise."""
-    sensors = [one.model_copy(update={"noise_rms": one.noise_rms * noise}) for one in RIG.sensors]
+    sensors = [
+        sensor.model_copy(update={"noise_rms": sensor.noise_rms * noise}) for sensor in RIG.sensors
+    ]
     simulated = RIG.get_section(SimulatedTableConfig)
     assert simulated is not None
     with tempfile.TemporaryDirectory() as folder:
@@ -74,7 +76,7 @@ def log(truth: str = "", noise: float = 1.0, gap_mm: float = 4.0) -> PreparedLog
     return PreparedLog(readings, test.comparison.contact_n, test.sweep.steps)
 
 
-def hidden(effect: str, channel: str = "", form: str = "", **parameters: float) -> str:
+def format_truth(effect: str, channel: str = "", form: str = "", **parameters: float) -> str:
     """A sealed truth with one effect."""
     lines = ["[[effects]]", f'id = "{effect}"']
     lines += [f'channel = "{channel}"'] if channel else []

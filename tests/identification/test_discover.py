@@ -4,58 +4,65 @@ The whole study is `shaketwin study discovery`; here stands one case of each kin
 """
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
-from tests.identification.played import SNM, hidden, log
+from tests.identification.played import SNM, format_truth, log
 from twin.identification.discover import (
+    Discovery,
     PreparedLog,
     discover_effects,
     fit_known_effects,
     prepare_problem,
 )
+from twin.identification.parameters import DAMPING, EffectKey, TareKey
 from twin.identification.screening import assign_folds, build_normal_equations, rank_candidates
 from twin.identification.selection import Cancelled, SelectionProgress
 from twin.identification.verdict import closed_fraction, judge_selection
 from twin.model.model import Model
 
 
+@cache
+def discover(truth: str) -> Discovery:
+    """What is discovered in the recording that hides a truth; not to be changed."""
+    return discover_effects([log(truth)], SNM)
+
+
 def test_where_nothing_is_hidden_nothing_is_named() -> None:
-    found = discover_effects([log()], SNM)
-    assert found.verdict.outcome == "none"
-    assert found.verdict.best.effects == ()
-    assert found.selection.null.cost == pytest.approx(1.0, abs=0.06)
+    discovery = discover_effects([log()], SNM)
+    assert discovery.verdict.outcome == "none"
+    assert discovery.verdict.best.effects == ()
+    assert discovery.selection.null.cost == pytest.approx(1.0, abs=0.06)
 
 
 @pytest.mark.parametrize(
-    ("truth", "name", "parameter", "value"),
+    ("truth", "key", "value"),
     [
-        (hidden("bumper_hardening", k2=3e7), "bumper_hardening", "k2", 3e7),
-        (hidden("coulomb_friction", fc=30.0), "coulomb_friction", "fc", 30.0),
-        (hidden("maxwell_damper", k1=8e3, tau=0.05), "maxwell_damper", "k1", 8e3),
-        (hidden("gap_offset", offset=8e-5), "gap_offset", "offset", 8e-5),
+        (format_truth("bumper_hardening", k2=3e7), EffectKey("bumper_hardening", "k2"), 3e7),
+        (format_truth("coulomb_friction", fc=30.0), EffectKey("coulomb_friction", "fc"), 30.0),
+        (format_truth("maxwell_damper", k1=8e3, tau=0.05), EffectKey("maxwell_damper", "k1"), 8e3),
+        (format_truth("gap_offset", offset=8e-5), EffectKey("gap_offset", "offset"), 8e-5),
         (
-            hidden("sensor_gain", "mass_acc_m_s2", gain=1.04),
-            "sensor_gain.mass_acc_m_s2", "gain", 1.04,
+            format_truth("sensor_gain", "mass_acc_m_s2", gain=1.04),
+            EffectKey("sensor_gain", "gain", "mass_acc_m_s2"), 1.04,
         ),
     ],
 )  # fmt: skip
-def test_an_effect_is_named_with_its_parameter(
-    truth: str, name: str, parameter: str, value: float
-) -> None:
-    found = discover_effects([log(truth)], SNM)
-    verdict = found.verdict
+def test_an_effect_is_named_with_its_parameter(truth: str, key: EffectKey, value: float) -> None:
+    discovery = discover(truth)
+    verdict = discovery.verdict
     assert verdict.outcome == "named", verdict.reason
-    assert verdict.best.names == (name,)
+    assert verdict.best.names == (".".join(filter(None, (key.effect, key.channel))),)
     assert verdict.confidence > 0.9
-    assert verdict.best.fit.values[f"{name}.{parameter}"] == pytest.approx(value, rel=0.05)
-    gap = closed_fraction(found.selection.null.cost, verdict.best.cost, verdict.floor)
+    assert verdict.best.fit.values[key] == pytest.approx(value, rel=0.05)
+    gap = closed_fraction(discovery.selection.null.cost, verdict.best.cost, verdict.floor)
     assert gap > 0.95
 
 
 def test_two_effects_are_both_named() -> None:
-    truth = hidden("bumper_hardening", k2=3e7) + hidden("coulomb_friction", fc=30.0)
+    truth = format_truth("bumper_hardening", k2=3e7) + format_truth("coulomb_friction", fc=30.0)
     verdict = discover_effects([log(truth)], SNM).verdict
     assert verdict.outcome == "named"
     assert {*verdict.best.names} == {"bumper_hardening", "coulomb_friction"}
@@ -64,81 +71,85 @@ def test_two_effects_are_both_named() -> None:
 @pytest.mark.parametrize(
     "truth",
     [
-        hidden("cubic_damping", c3=3e4),
-        hidden("bumper_cubic", kc=2e9),
-        hidden("appendage", mass=5.0, frequency=6.0),
+        format_truth("cubic_damping", c3=3e4),
+        format_truth("bumper_cubic", kc=2e9),
+        format_truth("appendage", mass=5.0, frequency=6.0),
     ],
 )
 def test_what_is_not_in_the_library_is_unexplained(truth: str) -> None:
-    found = discover_effects([log(truth)], SNM)
-    assert found.verdict.outcome == "unexplained"
-    assert found.verdict.confidence <= 0.3 or not found.verdict.best.effects
-    assert found.verdict.generic is not None
+    discovery = discover_effects([log(truth)], SNM)
+    assert discovery.verdict.outcome == "unexplained"
+    assert discovery.verdict.confidence <= 0.3 or not discovery.verdict.best.effects
+    assert discovery.verdict.generic is not None
 
 
 def test_friction_that_falls_with_speed_is_not_made_of_two_names() -> None:
     """Coulomb friction and quadratic damping on a smaller dashpot come near it."""
-    truth = hidden("coulomb_friction", form="stribeck", fc=10.0, fs=60.0, stribeck_speed=0.02)
-    found = discover_effects([log(truth)], SNM)
-    assert found.verdict.outcome == "unexplained", found.verdict.reason
-    assert found.verdict.confidence <= 0.3
-    assert found.verdict.generic is not None
-    assert "sign(v)" in found.verdict.generic.names[-1]
+    truth = format_truth("coulomb_friction", form="stribeck", fc=10.0, fs=60.0, stribeck_speed=0.02)
+    discovery = discover_effects([log(truth)], SNM)
+    assert discovery.verdict.outcome == "unexplained", discovery.verdict.reason
+    assert discovery.verdict.confidence <= 0.3
+    assert discovery.verdict.generic is not None
+    assert "sign(v)" in discovery.verdict.generic.names[-1]
 
 
 def test_a_bumper_that_pulls_is_seen_though_it_acts_for_milliseconds() -> None:
-    found = discover_effects([log(hidden("adhesion", force=60.0))], SNM)
-    assert found.verdict.outcome == "unexplained", found.verdict.reason
-    assert {"force_r1_n", "force_l1_n"} <= {*found.localization.channels}
-    assert found.localization.phase == "contact_both"
-    assert sum("bumper pulls" in note for note in found.notes) == 2
-    one = found.prepared.problem.log_residuals[0]
-    rows = one.entry_row, found.selection.null.held_out[0]
+    discovery = discover_effects([log(format_truth("adhesion", force=60.0))], SNM)
+    assert discovery.verdict.outcome == "unexplained", discovery.verdict.reason
+    assert {"force_r1_n", "force_l1_n"} <= {*discovery.localization.channels}
+    assert discovery.localization.phase == "contact_both"
+    assert sum("bumper pulls" in note for note in discovery.notes) == 2
+    residuals = discovery.prepared.problem.log_residuals[0]
+    rows = residuals.entry_row, discovery.selection.null.held_out[0]
     for name in ("right pull", "left pull"):
-        assert np.mean(rows[1][rows[0] == one.rows.index(name)] ** 2) > 10.0
+        assert np.mean(rows[1][rows[0] == residuals.rows.index(name)] ** 2) > 10.0
 
 
 def test_without_the_truth_in_the_library_nothing_is_named_with_confidence() -> None:
-    one = log(hidden("coulomb_friction", fc=30.0))
-    found = discover_effects([one], SNM, without=("coulomb_friction", "bouc_wen"))
-    assert found.verdict.outcome == "unexplained"
+    prepared = log(format_truth("coulomb_friction", fc=30.0))
+    discovery = discover_effects([prepared], SNM, without=("coulomb_friction", "bouc_wen"))
+    assert discovery.verdict.outcome == "unexplained"
 
 
 def test_the_place_of_the_disagreement() -> None:
-    found = discover_effects([log(hidden("bumper_hardening", k2=3e7))], SNM)
-    assert found.localization.phase == "contact_both"
-    assert "force_r1_n" in found.localization.channels
-    one_sided = discover_effects([log(hidden("sensor_gain", "force_l1_n", gain=1.1))], SNM)
+    discovery = discover(format_truth("bumper_hardening", k2=3e7))
+    assert discovery.localization.phase == "contact_both"
+    assert "force_r1_n" in discovery.localization.channels
+    one_sided = discover_effects([log(format_truth("sensor_gain", "force_l1_n", gain=1.1))], SNM)
     assert one_sided.localization.phase == "contact_left"
-    assert sum(cell.excess * cell.count for cell in found.map_after) < 0.1 * sum(
-        cell.excess * cell.count for cell in found.map_before
+    assert sum(cell.excess * cell.count for cell in discovery.map_after) < 0.1 * sum(
+        cell.excess * cell.count for cell in discovery.map_before
     )
 
 
 def test_a_motion_without_steps_has_a_place_too() -> None:
     """In flight, and within the band in which the table was driven."""
-    one = log(hidden("cubic_stiffness", k3=3e8))
-    driven = [step.frequency_hz for step in one.steps]
-    nowhere = np.full(one.signals.step.size, -1)
-    found = discover_effects([PreparedLog(replace(one.signals, step=nowhere), one.contact_n)], SNM)
-    assert found.localization.frequency_hz is not None
-    low, high = found.localization.frequency_hz
+    prepared = log(format_truth("cubic_stiffness", k3=3e8))
+    driven = [step.frequency_hz for step in prepared.steps]
+    nowhere = np.full(prepared.signals.step.size, -1)
+    discovery = discover_effects(
+        [PreparedLog(replace(prepared.signals, step=nowhere), prepared.contact_n)], SNM
+    )
+    assert discovery.localization.frequency_hz is not None
+    low, high = discovery.localization.frequency_hz
     assert 0.8 * min(driven) < low < high < 3.5 * max(driven)  # with the third harmonic
-    assert found.localization.channels == ("mass_acc_m_s2",)
-    assert found.localization.direction == "both"
+    assert discovery.localization.channels == ("mass_acc_m_s2",)
+    assert discovery.localization.direction == "both"
 
 
 def test_where_several_sets_do_as_well_what_they_share_is_named() -> None:
-    found = discover_effects([log(hidden("bumper_hardening", k2=3e7))], SNM)
-    named, bench = found.selection, found.prepared.problem
-    some = [one for one in bench.library if one.name in ("gap_drift", "table_tilt")]
-    sets = [replace(named.best, effects=(*named.best.effects, one)) for one in some]
+    discovery = discover(format_truth("bumper_hardening", k2=3e7))
+    named, bench = discovery.selection, discovery.prepared.problem
+    some = [effect for effect in bench.library if effect.name in ("gap_drift", "table_tilt")]
+    sets = [replace(named.best, effects=(*named.best.effects, effect)) for effect in some]
     also = replace(named, best=sets[0], tried=(named.best, *sets))
     verdict = judge_selection(bench, also, 1.0)
     assert (verdict.outcome, verdict.best.names) == ("named", ("bumper_hardening",))
     assert verdict.has_remainder
-    assert all(one.name in verdict.reason for one in some)
-    apart = [replace(named.best, effects=(one,)) for one in some]  # and nothing where they share it
+    assert all(effect.name in verdict.reason for effect in some)
+    apart = [
+        replace(named.best, effects=(effect,)) for effect in some
+    ]  # and nothing where they share it
     assert (
         judge_selection(bench, replace(named, best=apart[0], tried=tuple(apart)), 1.0).outcome
         == "ambiguous"
@@ -147,58 +158,61 @@ def test_where_several_sets_do_as_well_what_they_share_is_named() -> None:
 
 def test_a_model_that_was_fitted_is_no_second_opinion() -> None:
     """Its damping has taken up the loss of the hysteresis that it lacks, on other recordings."""
-    one = log(hidden("bouc_wen", force=120.0, yield_displacement=4e-4))
-    taken_up = 1.4 * prepare_problem([one], SNM).first_fit.values["damping"]
+    prepared = log(format_truth("bouc_wen", force=120.0, yield_displacement=4e-4))
+    taken_up = 1.4 * prepare_problem([prepared], SNM).first_fit.values[DAMPING]
     assert taken_up > 2.0 * SNM.parameters.damping
     start = Model(replace(SNM.base, damping=taken_up))
-    doubted, believed = discover_effects([one], start), discover_effects([one], start, fitted=True)
+    doubted, believed = (
+        discover_effects([prepared], start),
+        discover_effects([prepared], start, fitted=True),
+    )
     assert doubted.verdict.outcome == "unexplained"
     assert "only if the damping" in doubted.verdict.reason
     assert (believed.verdict.outcome, believed.verdict.best.names) == ("named", ("bouc_wen",))
 
 
 def test_several_logs_count_together() -> None:
-    truth = hidden("bumper_hardening", k2=1e7)
+    truth = format_truth("bumper_hardening", k2=1e7)
     both = discover_effects([log(truth), log(truth, gap_mm=2.0)], SNM).verdict
     alone = discover_effects([log(truth)], SNM).verdict
     assert both.best.names == alone.best.names == ("bumper_hardening",)
-    name = "bumper_hardening.k2"
-    assert both.best.fit.std_errors[name] < alone.best.fit.std_errors[name]
+    key = EffectKey("bumper_hardening", "k2")
+    assert both.best.fit.std_errors[key] < alone.best.fit.std_errors[key]
 
 
 def test_where_too_much_is_recorded_the_last_cycles_say_the_same(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    truth = hidden("bumper_hardening", k2=3e7)
+    truth = format_truth("bumper_hardening", k2=3e7)
     whole = prepare_problem([log(truth)], SNM).problem.log_residuals[0]
     monkeypatch.setattr(
         "twin.identification.residuals.MAX_SAMPLES", int(whole.motion().moving.sum()) // 2
     )
-    found = discover_effects([log(truth)], SNM)
-    (thin,) = found.prepared.problem.log_residuals
+    discovery = discover_effects([log(truth)], SNM)
+    (thin,) = discovery.prepared.problem.log_residuals
     assert thin.entry_row.size < 0.6 * whole.entry_row.size
     m = thin.motion()
     for step in np.unique(m.step[m.step >= 0]):
         cycles = np.unique(m.cycle[thin.row_mask[0] & (m.step == step) & (m.cycle >= 0)])
         held = m.cycle[m.step == step].max() + 1
         assert cycles.tolist() == list(range(held - max(held // thin.thinning, 2), held))
-    assert found.verdict.best.names == ("bumper_hardening",)
-    assert found.verdict.best.fit.values["bumper_hardening.k2"] == pytest.approx(3e7, rel=0.05)
-    assert any("only the last are used" in note for note in found.notes)
+    assert discovery.verdict.best.names == ("bumper_hardening",)
+    assert discovery.verdict.best.fit.values[EffectKey("bumper_hardening", "k2")] == pytest.approx(
+        3e7, rel=0.05
+    )
+    assert any("only the last are used" in note for note in discovery.notes)
 
 
 def test_linear_algebra_foresees_what_a_refit_finds() -> None:
-    prepared = prepare_problem([log(hidden("coulomb_friction", fc=5.0))], SNM)
+    prepared = prepare_problem([log(format_truth("coulomb_friction", fc=5.0))], SNM)
     bench = prepared.problem
-    found = build_normal_equations(
-        bench.log_residuals, prepared.parameters, bench.base, bench.library
-    )
-    (best,) = rank_candidates(found, 1)
+    equations = build_normal_equations(bench.log_residuals, prepared.parameters, bench.library)
+    (best,) = rank_candidates(equations, 1)
     assert best.candidate.name == "coulomb_friction"
     refitted = bench.fit_effects(best.add_to(prepared.parameters), [best.candidate])
-    entries = sum(one.size for one in refitted.held_out)
+    entries = sum(residual.size for residual in refitted.held_out)
     assert best.cost / entries == pytest.approx(refitted.cost, rel=0.02)
-    assert found.base_cost / entries == pytest.approx(
+    assert equations.base_cost / entries == pytest.approx(
         bench.fit_effects(prepared.parameters, ()).cost, rel=1e-3
     )
 
@@ -215,53 +229,53 @@ def test_no_step_is_judged_by_a_fit_that_saw_it() -> None:
 
 
 def test_the_oracle_is_not_far_better() -> None:
-    one = log(hidden("maxwell_damper", k1=8e3, tau=0.05))
-    oracle = fit_known_effects([one], SNM, ["maxwell_damper"])
+    prepared = log(format_truth("maxwell_damper", k1=8e3, tau=0.05))
+    oracle = fit_known_effects([prepared], SNM, ["maxwell_damper"])
     assert oracle is not None
-    assert discover_effects([one], SNM).verdict.best.cost <= 1.05 * oracle.cost
+    assert discover_effects([prepared], SNM).verdict.best.cost <= 1.05 * oracle.cost
 
 
 def test_whoever_has_enough_keeps_what_was_found() -> None:
-    said: list[SelectionProgress] = []
+    reports: list[SelectionProgress] = []
 
-    def tell(now: SelectionProgress) -> None:
-        said.append(now)
-        if now.index == 2:
+    def tell(progress: SelectionProgress) -> None:
+        reports.append(progress)
+        if progress.index == 2:
             raise Cancelled
 
-    truth = hidden("bumper_hardening", k2=3e7) + hidden("coulomb_friction", fc=30.0)
-    found = discover_effects([log(truth)], SNM, tell)
-    assert not found.selection.complete
-    best = said[-1].best  # of the two that it knew then: the model alone, and the first name
+    truth = format_truth("bumper_hardening", k2=3e7) + format_truth("coulomb_friction", fc=30.0)
+    discovery = discover_effects([log(truth)], SNM, tell)
+    assert not discovery.selection.complete
+    best = reports[-1].best  # of the two that it knew then: the model alone, and the first name
     assert best is not None
-    assert best.names == said[-2].names
-    assert found.verdict.best is best
-    assert best.cost < found.selection.null.cost
+    assert best.names == reports[-2].names
+    assert discovery.verdict.best is best
+    assert best.cost < discovery.selection.null.cost
 
 
 def test_whoever_stops_in_a_swap_keeps_what_was_added() -> None:
-    told: list[SelectionProgress] = []
+    reports: list[SelectionProgress] = []
 
-    def tell(now: SelectionProgress) -> None:
-        told.append(now)
-        if "replacing" in now.stage:
+    def tell(progress: SelectionProgress) -> None:
+        reports.append(progress)
+        if "replacing" in progress.stage:
             raise Cancelled
 
-    truth = hidden("bumper_hardening", k2=3e7) + hidden("coulomb_friction", fc=30.0)
-    found = discover_effects([log(truth)], SNM, tell)
-    best = told[-1].best
+    truth = format_truth("bumper_hardening", k2=3e7) + format_truth("coulomb_friction", fc=30.0)
+    discovery = discover_effects([log(truth)], SNM, tell)
+    best = reports[-1].best
     assert best is not None
     assert len(best.effects) == 2
-    assert found.selection.best is best
+    assert discovery.selection.best is best
 
 
 def test_a_rival_that_needs_a_tare_off_beyond_all_doubt_is_none() -> None:
-    found = discover_effects([log(hidden("bumper_hardening", k2=3e7))], SNM)
-    named, bench = found.selection, found.prepared.problem
-    other = next(one for one in bench.library if one.name == "gap_drift")
+    discovery = discover(format_truth("bumper_hardening", k2=3e7))
+    named, bench = discovery.selection, discovery.prepared.problem
+    other = next(effect for effect in bench.library if effect.name == "gap_drift")
     as_good = replace(named.best, effects=(other,))  # the very same residual under another name
     assert judge_selection(bench, replace(named, tried=(as_good,)), 1.0).outcome == "ambiguous"
-    strained = replace(as_good, fit=replace(as_good.fit, at_bound=("zero0.u",)))
+    strained = replace(as_good, fit=replace(as_good.fit, at_bound=(TareKey(0, "u"),)))
     assert judge_selection(bench, replace(named, tried=(strained,)), 1.0).outcome == "named"
     turned = judge_selection(
         bench, replace(named, best=strained, tried=(strained, named.best)), 1.0

@@ -5,7 +5,7 @@ import pytest
 
 from table_io.block import Block
 from table_io.errors import InputError
-from tests.identification.played import TRUE, blocks, hidden, log
+from tests.identification.played import TRUE, blocks, format_truth, log
 from twin.identification.signals import build_signals
 from twin.model.inverse_dynamics import forces_along
 from twin.model.model import Model, SensorModel
@@ -30,14 +30,14 @@ def test_the_fused_motion_is_better_than_the_laser_by_far() -> None:
 @pytest.mark.parametrize("noise", [1.0, 20.0])
 def test_sound_sensors_surprise_nobody(noise: float) -> None:
     motion = log(noise=noise).signals.fuse_motion()
-    assert [one.body for one in motion.consistency_residuals] == [
+    assert [residual.body for residual in motion.consistency_residuals] == [
         "mass",
         "table",
         "right cells",
         "left cells",
     ]
-    for one in motion.consistency_residuals:
-        assert np.mean(one.values[motion.moving] ** 2) == pytest.approx(1.0, abs=0.15)
+    for residual in motion.consistency_residuals:
+        assert np.mean(residual.values[motion.moving] ** 2) == pytest.approx(1.0, abs=0.15)
 
 
 @pytest.mark.parametrize(
@@ -51,13 +51,13 @@ def test_sound_sensors_surprise_nobody(noise: float) -> None:
 def test_the_gate_names_the_body_and_the_belief_closes_it(
     effect: str, channel: str, body: str
 ) -> None:
-    readings = log(hidden(effect, channel, gain=1.05)).signals
+    readings = log(format_truth(effect, channel, gain=1.05)).signals
 
     def odd(sensors: tuple[SensorModel, ...]) -> dict[str, float]:
         motion = readings.fuse_motion(sensors)
         return {
-            one.body: float(np.mean(one.values[motion.moving] ** 2))
-            for one in motion.consistency_residuals
+            residual.body: float(np.mean(residual.values[motion.moving] ** 2))
+            for residual in motion.consistency_residuals
         }
 
     before = odd(())
@@ -67,13 +67,13 @@ def test_the_gate_names_the_body_and_the_belief_closes_it(
 
 
 def test_no_force_law_breaks_the_gate() -> None:
-    motion = log(hidden("bumper_hardening", k2=1e8)).signals.fuse_motion()
-    for one in motion.consistency_residuals:
-        assert np.mean(one.values[motion.moving] ** 2) < 1.2
+    motion = log(format_truth("bumper_hardening", k2=1e8)).signals.fuse_motion()
+    for residual in motion.consistency_residuals:
+        assert np.mean(residual.values[motion.moving] ** 2) < 1.2
 
 
 def test_a_lag_is_taken_back() -> None:
-    late = log(hidden("sensor_lag", "mass_acc_m_s2", lag=2e-3)).signals
+    late = log(format_truth("sensor_lag", "mass_acc_m_s2", lag=2e-3)).signals
     sound = log().signals.fuse_motion()
     mended = late.fuse_motion((SensorModel("mass_acc_m_s2", lag=2e-3),))
     error = (mended.acc - sound.acc)[sound.moving]
@@ -82,32 +82,34 @@ def test_a_lag_is_taken_back() -> None:
 
 
 def test_without_displacement_there_is_nothing_to_learn() -> None:
-    one = blocks()[0]
-    place = one.channels.index("mass_acc_m_s2")
+    measured = blocks()[0]
+    place = measured.channels.index("mass_acc_m_s2")
     poor = Block(
-        one.stream, one.index, one.rate_hz, ("mass_acc_m_s2",), one.values[place : place + 1],
-        one.step, one.label, one.cycle,
+        measured.stream, measured.index, measured.rate_hz, ("mass_acc_m_s2",),
+        measured.values[place : place + 1],
+        measured.step, measured.label, measured.cycle,
     )  # fmt: skip
-    with pytest.raises(InputError, match="rel_disp_m") as error:
+    with pytest.raises(InputError) as error:
         build_signals((poor,), "poor", 550.0, (0.002, 0.002))
     assert error.value.where == "poor"
+    assert "rel_disp_m" in error.value.allowed
 
 
 def test_a_dead_channel_is_no_channel() -> None:
     dead = []
-    for one in blocks():
-        values = one.values.copy()
-        values[one.channels.index("force_r1_n")] = 0.0
+    for block in blocks():
+        values = block.values.copy()
+        values[block.channels.index("force_r1_n")] = 0.0
         dead.append(
             Block(
-                one.stream,
-                one.index,
-                one.rate_hz,
-                one.channels,
+                block.stream,
+                block.index,
+                block.rate_hz,
+                block.channels,
                 values,
-                one.step,
-                one.label,
-                one.cycle,
+                block.step,
+                block.label,
+                block.cycle,
             )
         )
     assert "force_r1_n" not in build_signals(tuple(dead), "dead", 550.0, (0.002, 0.002)).channels

@@ -43,22 +43,22 @@ def motion(profile: Profile, channel: str, noise: float = 0.0) -> Float1D:
     count = drive.planned_end + round(0.5 * drive.rate_hz)
     step = drive.labels(0, count)[0]
     x = drive.command(0, count) if channel == "disp" else drive.acceleration(0, count)
-    scale = np.array([np.abs(x[step == one]).max() for one in range(step.max() + 1)])
+    scale = np.array([np.abs(x[step == number]).max() for number in range(step.max() + 1)])
     rms = noise * np.where(step < 0, scale.min(), scale[step])
     return x + rms * np.random.default_rng(1).standard_normal(count)
 
 
-def late(profile: Profile, found: DetectedSteps) -> Float1D:
+def late(profile: Profile, steps: DetectedSteps) -> Float1D:
     """By how many cycles each step's measured ones begin and end off the true ones."""
     drive = plan_sweep(profile)
-    step, label, _ = drive.labels(0, found.step.size)
+    step, label, _ = drive.labels(0, steps.step.size)
     off = []
-    for one in profile.sweep.steps:
-        true, seen = (
-            np.flatnonzero((s == one.index) & (m == Label.MEASURE))
-            for s, m in ((step, label), (found.step, found.label))
+    for planned in profile.sweep.steps:
+        true, detected = (
+            np.flatnonzero((s == planned.index) & (m == Label.MEASURE))
+            for s, m in ((step, label), (steps.step, steps.label))
         )
-        off.append((seen[[0, -1]] - true[[0, -1]]) * one.frequency_hz / drive.rate_hz)
+        off.append((detected[[0, -1]] - true[[0, -1]]) * planned.frequency_hz / drive.rate_hz)
     return np.abs(np.concatenate(off))
 
 
@@ -68,9 +68,9 @@ def late(profile: Profile, found: DetectedSteps) -> Float1D:
 def test_found_steps_are_the_driven_ones(name: str, channel: str, noise: float) -> None:
     profile = case(name)
     x = motion(profile, channel, noise)
-    found = find_steps(x, profile.acquisition.rate_hz, profile.sweep, is_acc=channel == "acc")
-    assert found.steps == profile.sweep.steps
-    off = late(profile, found)
+    detected = find_steps(x, profile.acquisition.rate_hz, profile.sweep, is_acc=channel == "acc")
+    assert detected.steps == profile.sweep.steps
+    off = late(profile, detected)
     # Large jumps of frequency have longer blends, whose length is seen less well.
     assert off.max() < (0.5 if name == "wide" else 0.15) + 6 * noise
     assert np.median(off) < 0.05 + 2 * noise
@@ -78,13 +78,13 @@ def test_found_steps_are_the_driven_ones(name: str, channel: str, noise: float) 
 
 def test_cycles_are_numbered_and_the_last_are_measured() -> None:
     profile = case("fine")
-    found = find_steps(motion(profile, "disp"), 1000.0, profile.sweep)
+    detected = find_steps(motion(profile, "disp"), 1000.0, profile.sweep)
     for step in profile.sweep.steps:
-        own = found.step == step.index
-        assert set(found.cycle[own]) - {-1} == set(range(5))
-        assert set(found.cycle[own & (found.label == Label.MEASURE)]) == {2, 3, 4}
-    assert set(found.label[found.step < 0]) == {Label.REST, Label.BLEND}
-    assert (found.label[:400] == Label.REST).all()
+        own = detected.step == step.index
+        assert set(detected.cycle[own]) - {-1} == set(range(5))
+        assert set(detected.cycle[own & (detected.label == Label.MEASURE)]) == {2, 3, 4}
+    assert set(detected.label[detected.step < 0]) == {Label.REST, Label.BLEND}
+    assert (detected.label[:400] == Label.REST).all()
 
 
 def test_lost_samples_cost_no_step() -> None:
@@ -92,20 +92,20 @@ def test_lost_samples_cost_no_step() -> None:
     x = motion(profile, "disp", 0.01)
     for first in range(3000, x.size, 9000):
         x[first : first + 150] = np.nan
-    found = find_steps(x, 1000.0, profile.sweep)
-    assert found.steps == profile.sweep.steps
-    assert late(profile, found).max() < 0.5
+    detected = find_steps(x, 1000.0, profile.sweep)
+    assert detected.steps == profile.sweep.steps
+    assert late(profile, detected).max() < 0.5
 
 
 def test_without_a_grid_frequencies_and_levels_are_measured() -> None:
     profile = case("fine")
-    found = find_steps(motion(profile, "disp", 0.01), 1000.0, profile.sweep, on_grid=False)
-    pairs = list(zip(found.steps, profile.sweep.steps, strict=True))
-    assert [one.direction for one, _ in pairs] == [true.direction for _, true in pairs]
-    for one, true in pairs:
-        assert one.frequency_hz == pytest.approx(true.frequency_hz, rel=1e-3)
-        assert one.acceleration_m_s2 == pytest.approx(true.acceleration_m_s2, rel=0.01)
-    assert any(one.frequency_hz != true.frequency_hz for one, true in pairs)
+    detected = find_steps(motion(profile, "disp", 0.01), 1000.0, profile.sweep, on_grid=False)
+    pairs = list(zip(detected.steps, profile.sweep.steps, strict=True))
+    assert [step.direction for step, _ in pairs] == [true.direction for _, true in pairs]
+    for step, true in pairs:
+        assert step.frequency_hz == pytest.approx(true.frequency_hz, rel=1e-3)
+        assert step.acceleration_m_s2 == pytest.approx(true.acceleration_m_s2, rel=0.01)
+    assert any(step.frequency_hz != true.frequency_hz for step, true in pairs)
 
 
 def test_a_burst_of_low_level_before_the_sweep_is_no_step() -> None:
@@ -113,12 +113,12 @@ def test_a_burst_of_low_level_before_the_sweep_is_no_step() -> None:
     x = motion(profile, "disp")
     time = np.arange(9000) / 1000
     check = 2e-3 * np.sin(2 * np.pi * time) * np.clip(np.minimum(time, 9 - time) / 2, 0, 1)
-    found = find_steps(
+    detected = find_steps(
         np.concatenate([np.zeros(1000), check, np.zeros(2000), x]), 1000.0, profile.sweep
     )
-    assert found.steps == profile.sweep.steps
-    assert "loop check" in found.messages[0]
-    assert set(found.label[1000:10000]) <= {Label.REST, Label.BLEND}
+    assert detected.steps == profile.sweep.steps
+    assert "loop check" in detected.messages[0]
+    assert set(detected.label[1000:10000]) <= {Label.REST, Label.BLEND}
 
 
 def shaken(kind: str) -> Float1D:
@@ -139,16 +139,16 @@ def shaken(kind: str) -> Float1D:
 @pytest.mark.parametrize("kind", ["noise", "narrow noise", "earthquake", "chirp", "slow chirp"])
 @pytest.mark.parametrize("on_grid", [True, False])
 def test_what_is_no_stepped_sine_has_no_steps(kind: str, on_grid: bool) -> None:
-    found = find_steps(shaken(kind), 500.0, case("fine").sweep, on_grid=on_grid)
-    assert found.steps == ()
-    assert set(found.step) == set(found.cycle) == {-1}
-    assert Label.SETTLE in found.label
-    assert set(found.label) <= {Label.REST, Label.SETTLE}
-    assert "no stepped sine" in found.messages[-1]
+    detected = find_steps(shaken(kind), 500.0, case("fine").sweep, on_grid=on_grid)
+    assert detected.steps == ()
+    assert set(detected.step) == set(detected.cycle) == {-1}
+    assert Label.SETTLE in detected.label
+    assert set(detected.label) <= {Label.REST, Label.SETTLE}
+    assert "no stepped sine" in detected.messages[-1]
 
 
 @pytest.mark.parametrize("value", [0.0, np.nan])
 def test_a_table_that_never_moved_is_at_rest(value: float) -> None:
-    found = find_steps(np.full(5000, value), 500.0, case("fine").sweep)
-    assert found.steps == ()
-    assert set(found.label) == {Label.REST}
+    detected = find_steps(np.full(5000, value), 500.0, case("fine").sweep)
+    assert detected.steps == ()
+    assert set(detected.label) == {Label.REST}

@@ -11,8 +11,8 @@ import pytest
 import twin.log
 from table_io.block import Block, Label
 from table_io.channels import relative_displacement
-from table_io.errors import InputError
 from table_io.records import CycleExtremes, Event, PrcPoint, StepAdded
+from tests.input_errors import raises_input_error
 from twin.log import Log, open_log
 from twin.log.log_data import ChannelMap
 from twin.recording.mcap_log import write_items
@@ -50,27 +50,27 @@ def test_channels_are_those_of_the_log_to_the_bit(log: Log, recording: Recording
 def test_a_step_is_its_samples(log: Log, recording: Recording) -> None:
     (meas,) = recording.contiguous_blocks("meas")
     inside = meas.step == 3
-    one = log.step(3)
-    assert one.step == recording.start.steps[3]
-    assert np.array_equal(one["mass_acc_m_s2"], meas.channel("mass_acc_m_s2")[inside])
-    assert np.array_equal(one.time_s, meas.time_s[inside])
-    assert len(one.twin["rel_disp_m"]) == len(one) == inside.sum()
+    step = log.step(3)
+    assert step.step == recording.start.steps[3]
+    assert np.array_equal(step["mass_acc_m_s2"], meas.channel("mass_acc_m_s2")[inside])
+    assert np.array_equal(step.time_s, meas.time_s[inside])
+    assert len(step.twin["rel_disp_m"]) == len(step) == inside.sum()
     held = inside & (meas.label == Label.MEASURE)
-    assert np.array_equal(one.held["mass_disp_m"], meas.channel("mass_disp_m")[held])
-    assert set(one.held.cycle.tolist()) == {2, 3}
-    assert one.point == recording.records(PrcPoint)[3]
-    assert one.cycles == tuple(c for c in recording.records(CycleExtremes) if c.step == 3)
+    assert np.array_equal(step.held["mass_disp_m"], meas.channel("mass_disp_m")[held])
+    assert set(step.held.cycle.tolist()) == {2, 3}
+    assert step.point == recording.records(PrcPoint)[3]
+    assert step.cycles == tuple(c for c in recording.records(CycleExtremes) if c.step == 3)
     with pytest.raises(KeyError, match=r"step 6;.* 0 to 5"):
         log.step(6)
 
 
 def test_a_log_and_a_step_are_walked_as_a_dict_of_channels(log: Log) -> None:
     step = log.step(1)
-    for one in (log, step, step.held, log.measured, step.measured, step.twin):
-        assert "mass_disp_m" in one
-        assert "no_such_channel" not in one
-        assert 0 not in one
-        assert list(one) == list(one.keys())
+    for view in (log, step, step.held, log.measured, step.measured, step.twin):
+        assert "mass_disp_m" in view
+        assert "no_such_channel" not in view
+        assert 0 not in view
+        assert list(view) == list(view.keys())
     assert list(log) == list(log.keys()) == list(step) == list(log.channels)
     assert dict(log).keys() == set(log.channels)
     assert {name: len(values) for name, values in dict(step).items()} == dict.fromkeys(
@@ -110,7 +110,7 @@ def test_curves_events_and_what_the_run_was_made_with(
     points = recording.records(PrcPoint)
     assert log.points == points
     assert log.prc["direction"].tolist() == ["forward"] * 3 + ["backward"] * 3
-    assert log.prc["frequency_hz"].tolist() == [one.frequency_hz for one in points]
+    assert log.prc["frequency_hz"].tolist() == [point.frequency_hz for point in points]
     for name, source in (("eta_d", "measured"), ("twin_r_l", "twin")):
         key = name.removeprefix("twin_")
         assert log.prc[name].tolist() == [getattr(getattr(p, source), key) for p in points]
@@ -120,7 +120,7 @@ def test_curves_events_and_what_the_run_was_made_with(
     assert log.profile == bundle.profile
     assert log.rig == bundle.rig
     assert log.model.flatten() == bundle.model.flatten()
-    assert [one.index for one in log.steps] == list(range(6))
+    assert [step.index for step in log.steps] == list(range(6))
     assert log.units["force_r1_n"] == "N"
     assert log.units["rel_vel_m_s"] == "m/s"
     text = repr(log)
@@ -132,11 +132,11 @@ def test_opening_reads_the_start_only(folder: Path, monkeypatch: pytest.MonkeyPa
     """And the first look at a stream reads that stream alone, once."""
     asked: list[tuple[str, ...]] = []
 
-    def counted(path: Path, topics: tuple[str, ...]) -> Recording:
+    def count_reads(path: Path, topics: tuple[str, ...]) -> Recording:
         asked.append(tuple(topics))
         return read_recording(path, topics)
 
-    monkeypatch.setattr(twin.log, "read_recording", counted)
+    monkeypatch.setattr(twin.log, "read_recording", count_reads)
     log = open_log(folder)
     assert "mass_disp_m" in repr(log)
     assert asked == []
@@ -153,9 +153,9 @@ def test_a_gap_is_nan_on_the_one_axis(recording: Recording, tmp_path: Path) -> N
     """Neither sample nor label is invented, and the axis stays even."""
     lost = {"meas": (2000, 2100), "pred": (1500, 2500)}
     kept = [
-        one for one in recording.items
-        if not isinstance(one, Block) or one.end <= lost[one.stream][0]
-        or one.index >= lost[one.stream][1]
+        item for item in recording.items
+        if not isinstance(item, Block) or item.end <= lost[item.stream][0]
+        or item.index >= lost[item.stream][1]
     ]  # fmt: skip
     write_items(tmp_path / "run.mcap", kept, recording.start)
     log = open_log(tmp_path)
@@ -177,19 +177,20 @@ def test_a_step_that_was_decided_on_is_a_step(recording: Recording, tmp_path: Pa
     """The last step as a visit: not in the plan, told by a record."""
     start = replace(recording.start, steps=recording.start.steps[:-1])
     last = recording.start.steps[-1]
-    said = StepAdded(100, last.index, last.direction, last.frequency_hz, 0.49, "tracked")
-    items = [start if one is recording.start else one for one in recording.items]
-    write_items(tmp_path / "run.mcap", [*items, said], start)
+    added_step = StepAdded(100, last.index, last.direction, last.frequency_hz, 0.49, "tracked")
+    items = [start if item is recording.start else item for item in recording.items]
+    write_items(tmp_path / "run.mcap", [*items, added_step], start)
     log = open_log(tmp_path / "run.mcap")
-    assert [one.index for one in log.steps] == list(range(6))
+    assert [step.index for step in log.steps] == list(range(6))
     assert log.step(5).step.frequency_hz == last.frequency_hz
 
 
 def test_what_is_no_log_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no such log; give a run\.mcap"):
-        open_log(tmp_path)
+    for place in (tmp_path, tmp_path / "none.mcap"):
+        with raises_input_error(where=place, remedy="run.mcap"):
+            open_log(place)
     (tmp_path / "run.mcap").write_text("time_s,mass_disp_m\n")
-    with pytest.raises(InputError, match="not an MCAP file"):
+    with raises_input_error(where=tmp_path / "run.mcap", remedy="run.mcap"):
         open_log(tmp_path)
 
 
@@ -230,7 +231,7 @@ def test_the_dataset_has_every_channel_with_its_unit(log: Log, recording: Record
 
 def test_without_xarray_it_says_what_to_install(log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "xarray", None)
-    with pytest.raises(InputError, match=r"pip install 'shaketwin\[notebook\]'"):
+    with raises_input_error(remedy="pip install 'shaketwin[notebook]'"):
         log.to_xarray()
 
 

@@ -66,17 +66,17 @@ def clean(right_mm: float, left_mm: float) -> Float2D:
     count = drive.planned_end + 6000  # until the mass is at rest again
     rig = RIG.model_copy(update={"simulated": table})
     backend = SimulatedBackend(rig, test.specimen, 1000.0, ManualClock())
-    seen: list[Float2D] = []
-    backend.observer = lambda first, command, signals: seen.append(signals.copy())
+    observations: list[Float2D] = []
+    backend.observer = lambda first, command, signals: observations.append(signals.copy())
     backend.open()
     backend.queue(0, drive.command(0, count) * RIG.output.volts_per_m)
     backend.start()
     backend.take(count)
-    y, y_acc, x, x_acc, right, left = seen[0]
+    y, y_acc, x, x_acc, right, left = observations[0]
     return np.array([y, y_acc, x, x_acc, right / 2, right / 2, -left / 2, -left / 2])
 
 
-def recorded(
+def make_noisy_blocks(
     noise: float, seed: int = 0, gaps_mm: tuple[float, float] = (2.0, 2.0),
     channels: tuple[str, ...] = CHANNELS,
 ) -> tuple[Block, ...]:  # fmt: skip
@@ -93,7 +93,7 @@ def recorded(
     return (Block("meas", 0, 1000.0, channels, chosen, *drive.labels(0, true.shape[1])),)
 
 
-def logged(
+def prepare_log(
     blocks: tuple[Block, ...], gaps_mm: tuple[float, float] = (2.0, 2.0), name: str = "short"
 ) -> PreparedLog:
     """The recording as a log that states these gaps."""

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from table_io.config.base import PROFILES_DIR
 from table_io.records import RunStop
-from tests.recovery.recordings import CHANNELS, TRUTH, card, recorded
+from tests.recovery.recordings import CHANNELS, TRUTH, card, make_noisy_blocks
 from twin.cli.main import app
 from twin.model.config import ModelConfig
 from twin.recording.mcap_log import write_items
@@ -27,14 +27,14 @@ def recording(folder: Path) -> Path:
     snm = (PROFILES_DIR / "models" / "snm.toml").read_text(encoding="utf-8")
     bundle = from_texts("short", format_toml(card(*GAPS)), rig, snm, "test")
     start = replace(bundle.make_start_factory("short", "table")({}, 0.0), channels=CHANNELS)
-    (block,) = recorded(0.01, 3, GAPS)
+    (block,) = make_noisy_blocks(0.01, 3, GAPS)
     path = folder / "short.mcap"
     write_items(path, [start, block, RunStop(block.end, "complete", "")], start)
     return path
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+def identification(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """(where the model lies, what the terminal said)."""
     folder = tmp_path_factory.mktemp("identify")
     out = folder / "found.toml"
@@ -43,32 +43,32 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     return out, outcome.output
 
 
-def test_the_model_that_is_left_is_one_that_a_run_takes(done: tuple[Path, str]) -> None:
-    found, _ = read_model(str(done[0]))
-    assert isinstance(found, ModelConfig)
-    assert found.base.stiffness_n_m == pytest.approx(TRUTH["stiffness"], rel=0.003)
-    assert found.base.bumper_damping_n_s_m == pytest.approx(TRUTH["bumper_damping"], rel=0.01)
-    assert found.effects == ()
-    assert found.fitted_on == "short"
+def test_the_model_that_is_left_is_one_that_a_run_takes(identification: tuple[Path, str]) -> None:
+    model, _ = read_model(str(identification[0]))
+    assert isinstance(model, ModelConfig)
+    assert model.base.stiffness_n_m == pytest.approx(TRUTH["stiffness"], rel=0.003)
+    assert model.base.bumper_damping_n_s_m == pytest.approx(TRUTH["bumper_damping"], rel=0.01)
+    assert model.effects == ()
+    assert model.fitted_on == "short"
 
 
-def test_the_evidence_lies_beside_it(done: tuple[Path, str]) -> None:
-    folder = done[0].with_suffix("")
-    told = json.loads((folder / "identify.json").read_text(encoding="utf-8"))
-    one = told["parameters"]["stiffness"]
-    assert one["low"] < TRUTH["stiffness"] < one["high"]
-    assert one["start"] == 36000.0
-    assert one["deviations"] < -10
-    gap = told["gaps"]["short"]
+def test_the_evidence_lies_beside_it(identification: tuple[Path, str]) -> None:
+    folder = identification[0].with_suffix("")
+    evidence = json.loads((folder / "identify.json").read_text(encoding="utf-8"))
+    stiffness = evidence["parameters"]["stiffness"]
+    assert stiffness["low"] < TRUTH["stiffness"] < stiffness["high"]
+    assert stiffness["start"] == 36000.0
+    assert stiffness["deviations"] < -10
+    gap = evidence["gaps"]["short"]
     assert gap["low"] < 4e-3 < gap["high"]
-    assert told["windows"][0]["nrmse_identified"] < 0.5 * told["windows"][0]["nrmse_start"]
+    assert evidence["windows"][0]["nrmse_identified"] < 0.5 * evidence["windows"][0]["nrmse_start"]
     pictures = {path.name for path in folder.glob("*.png") if path.stat().st_size > 20_000}
     assert pictures == {"laws0.png", "correlation.png", "sources.png"}
 
 
-def test_the_terminal_says_it_all(done: tuple[Path, str]) -> None:
+def test_the_terminal_says_it_all(identification: tuple[Path, str]) -> None:
     for text in ("K_j", "gap of short", "free flight", "contact left", "onsets", "windows of 1 s"):
-        assert text in done[1]
+        assert text in identification[1]
 
 
 @pytest.mark.parametrize(
@@ -90,8 +90,8 @@ def test_what_cannot_be_is_refused_before_the_log_is_read(
     assert (tmp_path / "there.toml").read_text(encoding="utf-8") == "title = 'mine'"
 
 
-def test_a_log_given_twice_is_refused(done: tuple[Path, str], tmp_path: Path) -> None:
-    log = str(recording(done[0].parent))
+def test_a_log_given_twice_is_refused(identification: tuple[Path, str], tmp_path: Path) -> None:
+    log = str(recording(identification[0].parent))
     outcome = CliRunner().invoke(app, ["identify", log, log, "--out", str(tmp_path / "m.toml")])
     assert "the same log" in f"{outcome.output}{outcome.exception}"
     assert not [*tmp_path.iterdir()]

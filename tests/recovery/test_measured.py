@@ -42,7 +42,7 @@ def table(path: Path, *columns: int) -> np.ndarray:
     return np.genfromtxt(path, delimiter=",", skip_header=1, usecols=columns)
 
 
-def simulated(model: Model, acceleration: np.ndarray, rate_hz: float) -> np.ndarray:
+def simulate_displacement(model: Model, acceleration: np.ndarray, rate_hz: float) -> np.ndarray:
     """u at the samples of an input that is band-limited: Runge-Kutta between them."""
     p, k3 = model.parameters, model.effect_parameter("cubic_stiffness", "k3") or 0.0
     parts = 8
@@ -71,15 +71,19 @@ def test_silverbox_has_a_cubic_spring() -> None:
     """
     voltage = table(DATA / "silverbox" / "SNLS80mV.csv", 0, 1)
     part = voltage[FIRST_SINE : FIRST_SINE + 26000]
-    one = log("silverbox", SILVERBOX_HZ, {"table_acc_m_s2": -part[:, 0], "rel_disp_m": part[:, 1]})
-    found = discover_effects([one], oscillator(1.5e5, 50.0))
-    assert found.verdict.best.names[0] == "cubic_stiffness"
-    assert found.verdict.outcome == "named"
+    recording = log(
+        "silverbox", SILVERBOX_HZ, {"table_acc_m_s2": -part[:, 0], "rel_disp_m": part[:, 1]}
+    )
+    discovery = discover_effects([recording], oscillator(1.5e5, 50.0))
+    assert discovery.verdict.best.names[0] == "cubic_stiffness"
+    assert discovery.verdict.outcome == "named"
 
     def missed_mv(named: bool) -> float:
-        guess = (found.verdict.best if named else found.selection.null).fit.parameters
+        guess = (discovery.verdict.best if named else discovery.selection.null).fit.parameters
         gain, offset = guess.values[INPUT_GAIN], guess.values[INPUT_OFFSET]
-        u = simulated(guess.to_model(), (-voltage[:45000, 0] - offset) / gain, SILVERBOX_HZ)
+        u = simulate_displacement(
+            guess.to_model(), (-voltage[:45000, 0] - offset) / gain, SILVERBOX_HZ
+        )
         return float(1e3 * (voltage[ARROW, 1] - u[ARROW]).std())
 
     assert missed_mv(named=False) > 10.0
@@ -94,16 +98,18 @@ def test_rubber_bearings_have_hysteresis_and_more() -> None:
         names = ("rel_disp_m", "damper_force_n", "table_acc_m_s2", "mass_acc_m_s2")
         return log(name, 200.0, dict(zip(names, rows.T, strict=True)))
 
-    found = discover_effects([bearing("ICA50"), bearing("ICA140")], oscillator(5.0, 0.5))
-    verdict = found.verdict
+    discovery = discover_effects([bearing("ICA50"), bearing("ICA140")], oscillator(5.0, 0.5))
+    verdict = discovery.verdict
     assert verdict.best.names[0] == "bouc_wen"
     assert verdict.outcome == "named"
-    assert found.localization.channels == ("damper_force_n",)
-    low, high = found.localization.frequency_hz or (0.0, 0.0)
+    assert discovery.localization.channels == ("damper_force_n",)
+    low, high = discovery.localization.frequency_hz or (0.0, 0.0)
     assert 0.1 < low < high < 2.0  # the first mode of the building on its bearings
     assert verdict.has_remainder  # the storeys above bend: no effect of ours is that
-    before, after = found.selection.null.cost, verdict.best.cost
+    before, after = discovery.selection.null.cost, verdict.best.cost
     assert np.sqrt(after) < 0.7 * np.sqrt(before)
     apart = bearing("CNP100")
     assert held_out_log_nrmse(apart, verdict.best) < 0.7 * 0.479
-    assert held_out_log_nrmse(apart, verdict.best) < held_out_log_nrmse(apart, found.selection.null)
+    assert held_out_log_nrmse(apart, verdict.best) < held_out_log_nrmse(
+        apart, discovery.selection.null
+    )

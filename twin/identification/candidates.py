@@ -11,10 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
-from twin.identification.generic_terms import GENERIC_PREFIX, list_term_parameters, list_terms
+from twin.identification.generic_terms import list_term_parameters, list_terms
 from twin.identification.parameters import (
+    GENERIC_PREFIX,
     SLIP_SPEED,
     FreeParameter,
+    ParameterKey,
     ParameterSet,
     list_effect_parameters,
 )
@@ -56,7 +58,6 @@ class Candidate:
         if effect.id == "coulomb_friction":
             slip = FreeParameter(
                 SLIP_SPEED,
-                (SLIP_SPEED,),
                 SLIP_SPEEDS_M_S[0],
                 3.0 * SLIP_SPEEDS_M_S[-1],
                 SLIP_SPEEDS_M_S[0],
@@ -69,11 +70,11 @@ class Candidate:
     def add_to(
         self, parameters: ParameterSet, shape: Sequence[float], amplitude: float | None = None
     ) -> ParameterSet:
-        """Add the candidate to a parameter set, by default with its amplitude vanishing."""
-        shape_parameters = [free for free in self.free if free is not self.amplitude]
-        values = dict(zip((free.name for free in shape_parameters), shape, strict=True))
-        values[self.amplitude.name] = self.vanishing if amplitude is None else amplitude
-        return parameters.with_values(values)
+        """Add the candidate, free, to a parameter set; by default its amplitude vanishes."""
+        shape_keys = [free.key for free in self.free if free is not self.amplitude]
+        values: dict[ParameterKey, float] = dict(zip(shape_keys, shape, strict=True))
+        values[self.amplitude.key] = self.vanishing if amplitude is None else amplitude
+        return parameters.with_values(values).with_free((*parameters.free, *self.free))
 
 
 def list_generic_candidates(has_contact: bool) -> tuple[Candidate, ...]:
@@ -102,7 +103,7 @@ def list_candidates(
             continue
         for channel in sorted(_checkable_channels(channels)) if effect.acts == "sensor" else ("",):
             candidate = Candidate.from_effect(effect, channel, _shape_ladder(effect, log_residuals))
-            already_free = {free.name for free in candidate.free} & fitted.values.keys()
+            already_free = {free.key for free in candidate.free} & fitted.values.keys()
             if (
                 not already_free
                 and not _is_unobservable(candidate, channels)

@@ -69,7 +69,7 @@ def estimate_contact_gaps(
     if not m.has_load_cells:
         return ()
     estimates = []
-    position = m.u - parameters.zero_error(residuals.log_number, "u")
+    position = m.u - parameters.tare_error(residuals.log_number, "u")
     for side, law in enumerate(laws):
         sign = 1.0 if side == 0 else -1.0
         rms = (m.noise.right, m.noise.left)[side]

@@ -10,8 +10,19 @@ from table_io.block import Bool2D
 from table_io.records import Step
 from twin.identification.contact_onsets import ContactGaps
 from twin.identification.least_squares import FitResult, compute_slopes, fit_parameters
-from twin.identification.parameters import GAP_PREFIX, ZERO_PREFIX, FreeParameter, ParameterSet
+from twin.identification.parameters import (
+    BUMPER_DAMPING,
+    BUMPER_STIFFNESS,
+    BaseKey,
+    EffectKey,
+    FreeParameter,
+    GapKey,
+    ParameterKey,
+    ParameterSet,
+    is_correction,
+)
 from twin.identification.residuals import LogResiduals
+from twin.model.effects import find_effect
 
 MIN_SUBSET_BLOCKS = 6  # with fewer blocks the standard error of a subset is unreliable
 # standard deviations at which two estimates disagree; high because about thirty are compared
@@ -29,7 +40,7 @@ class SubsetEstimate:
     """Estimate from a subset of the samples; `values` hold (value, standard deviation) in SI."""
 
     source: str
-    values: Mapping[str, tuple[float, float]]
+    values: Mapping[ParameterKey, tuple[float, float]]
     entry_count: int
     converged: bool
 
@@ -37,15 +48,14 @@ class SubsetEstimate:
 def select_observable(
     log_residuals: Sequence[LogResiduals],
     parameters: ParameterSet,
-    free: Sequence[FreeParameter],
-    train: Sequence[Bool2D] | None,
+    train: Sequence[Bool2D] | None = None,
 ) -> tuple[FreeParameter, ...]:
-    """Return the parameters that change any residual where `train`, (entry,) each, is True."""
+    """Return the free parameters that change a residual where `train`, (entry,) each, is True."""
     before = [residuals.evaluate(parameters) for residuals in log_residuals]
     masks = train or [np.ones(values.size, dtype=bool) for values in before]
     return tuple(
         parameter
-        for parameter in free
+        for parameter in parameters.free
         if any(
             slope[mask].any()
             for slope, mask in zip(
@@ -59,11 +69,9 @@ def estimate_subsets(
     log_residuals: Sequence[LogResiduals], steps: Sequence[Sequence[Step]], joint: FitResult
 ) -> tuple[SubsetEstimate, ...]:
     """Estimate the parameters from free flight, contacts of each side, and opposed halves."""
-    # tare errors are determined by the rest row alone
-    free = [parameter for parameter in joint.free if not parameter.name.startswith(ZERO_PREFIX)]
-    flight = [
-        parameter for parameter in free if not parameter.name.startswith(("bumper_", GAP_PREFIX))
-    ]
+    # errors of instruments are determined by all samples together
+    free = [parameter for parameter in joint.free if not is_correction(parameter.key)]
+    flight = [parameter for parameter in free if not _is_of_contact(parameter.key)]
     estimates = [
         _estimate_subset(
             "free flight", log_residuals, joint, flight, [*map(_flight_mask, log_residuals)]
@@ -71,11 +79,11 @@ def estimate_subsets(
     ]
     for row, side in ((1, "right"), (2, "left")):
         side_free = [
-            replace(parameter, keys=(f"{parameter.name}_{side[0]}",))
-            if parameter.name.startswith("bumper_")
+            replace(parameter, tied=(BaseKey(f"{parameter.name}_{side[0]}"),))
+            if parameter.key in (BUMPER_STIFFNESS, BUMPER_DAMPING)
             else parameter
             for parameter in free
-            if parameter.name.startswith(("bumper_", GAP_PREFIX)) and "." not in parameter.name
+            if _is_of_contact(parameter.key) and not isinstance(parameter.key, EffectKey)
         ]
         side_masks = [residuals.entry_row == row for residuals in log_residuals]
         estimates.append(
@@ -90,6 +98,13 @@ def estimate_subsets(
         if any(mask.any() for mask in masks) and not all(mask.all() for mask in masks):
             estimates.append(_estimate_subset(name, log_residuals, joint, free, masks))
     return tuple(estimate for estimate in estimates if estimate.values)
+
+
+def _is_of_contact(key: ParameterKey) -> bool:
+    """Return True for a parameter of the gaps, of the bumpers, or of an effect in them."""
+    if isinstance(key, EffectKey):
+        return find_effect(key.effect).is_in_bumpers
+    return isinstance(key, GapKey) or key in (BUMPER_STIFFNESS, BUMPER_DAMPING)
 
 
 def _flight_mask(residuals: LogResiduals) -> Bool2D:
@@ -139,39 +154,37 @@ def _estimate_subset(
         np.unique(residuals.entry_block[mask]).size
         for residuals, mask in zip(log_residuals, train, strict=True)
     )
+    start = joint.parameters.with_free(free)
     observable = (
-        select_observable(log_residuals, joint.parameters, free, train)
-        if blocks >= MIN_SUBSET_BLOCKS
-        else ()
+        select_observable(log_residuals, start, train) if blocks >= MIN_SUBSET_BLOCKS else ()
     )
     if not observable:
         return SubsetEstimate(source, {}, entries, True)
-    fit = fit_parameters(log_residuals, joint.parameters, observable, train)
-    values = {
-        parameter.name: (fit.values[parameter.name], fit.std_errors[parameter.name])
-        for parameter in observable
+    fit = fit_parameters(log_residuals, start.with_free(observable), train)
+    determined = {
+        key: (value, fit.std_errors[key])
+        for key, value in fit.values.items()
+        if fit.std_errors[key] > 0
     }
-    determined = {name: pair for name, pair in values.items() if pair[1] > 0}
     return SubsetEstimate(source, determined, entries, fit.converged)
 
 
 def list_fit_warnings(
-    log_residuals: Sequence[LogResiduals], joint: FitResult, fixed: Sequence[str]
+    log_residuals: Sequence[LogResiduals], joint: FitResult, fixed: Sequence[ParameterKey]
 ) -> Iterator[str]:
     """Yield warnings on convergence, bounds and parameters that the logs do not determine."""
     if not joint.converged:
         yield "the fit has not converged: do not use its values"
-    for name in joint.at_bound:
-        yield f"{name}: at its bound, {joint.values[name]:.4g}; its interval is not valid"
-    names = [parameter.name for parameter in joint.free]
-    if "bumper_stiffness" not in names:
+    for key in joint.at_bound:
+        yield f"{key}: at its bound, {joint.values[key]:.4g}; its interval is not valid"
+    if BUMPER_STIFFNESS not in joint.values:
         yield "no log touches a bumper: K_j and C_j are those of the start model, gaps as stated"
     else:
         for residuals in log_residuals:
-            if f"{GAP_PREFIX}{residuals.log_number}" not in names:
+            if GapKey(residuals.log_number) not in joint.values:
                 yield f"{residuals.signals.name}: touches no bumper; its gap is the stated one"
-    for name in fixed:
-        yield f"{name}: not determined by the logs; kept as in the start model"
+    for key in fixed:
+        yield f"{key}: not determined by the logs; kept as in the start model"
 
 
 def list_asymmetry_warnings(asymmetry: tuple[float, float] | None) -> Iterator[str]:
@@ -190,16 +203,16 @@ def list_asymmetry_warnings(asymmetry: tuple[float, float] | None) -> Iterator[s
 def list_disagreements(joint: FitResult, parts: Sequence[SubsetEstimate]) -> Iterator[str]:
     """Yield a warning where opposed subsets, or free flight and the joint fit, disagree."""
     by_name = {part.source: part.values for part in parts}
-    joint_values = {name: (value, joint.std_errors[name]) for name, value in joint.values.items()}
+    joint_values = {key: (value, joint.std_errors[key]) for key, value in joint.values.items()}
     pairs = [(a, b, by_name.get(a, {}), by_name.get(b, {})) for a, b in OPPOSED_SUBSETS]
     pairs.append(("free flight", "the joint fit", by_name.get("free flight", {}), joint_values))
-    units = {parameter.name: parameter.unit for parameter in joint.free}
+    units = {parameter.key: parameter.unit for parameter in joint.free}
     for a, b, first, second in pairs:
-        for name in first.keys() & second.keys():
-            (x, sx), (y, sy) = first[name], second[name]
-            if _disagree(x - y, math.hypot(sx, sy), y, units[name]):
+        for key in [key for key in first if key in second]:
+            (x, sx), (y, sy) = first[key], second[key]
+            if _disagree(x - y, math.hypot(sx, sy), y, units[key]):
                 yield (
-                    f"{name}: {x:.5g} {units[name]} in {a}, {y:.5g} in {b}, "
+                    f"{key}: {x:.5g} {units[key]} in {a}, {y:.5g} in {b}, "
                     f"{abs(x - y) / math.hypot(sx, sy):.0f} standard deviations apart: the "
                     "specimen changed, or the model lacks an effect; run discover to find it"
                 )
@@ -216,7 +229,7 @@ def list_onset_warnings(
     """Yield a warning where the gap from contact onsets or releases differs from the fitted gap."""
     for gaps in contact_gaps:
         gap = fitted_gap(log_residuals[gaps.log], joint, gaps.side)
-        sd = math.hypot(gaps.std_error, joint.std_errors.get(f"{GAP_PREFIX}{gaps.log}", 0.0))
+        sd = math.hypot(gaps.std_error, joint.std_errors.get(GapKey(gaps.log), 0.0))
         if _disagree(gaps.value - gap, sd, gap, "m"):
             yield (
                 f"{log_residuals[gaps.log].signals.name}: {gaps.side} {gaps.kind}s lie at "
@@ -228,4 +241,5 @@ def list_onset_warnings(
 def fitted_gap(residuals: LogResiduals, joint: FitResult, side: str) -> float:
     """Return the fitted gap of a side of a log in m."""
     p = joint.parameters.model_for_log(residuals.log_number, residuals.motion()).parameters
-    return p.gap_r if side == "right" else p.gap_l
+    difference = residuals.gap_reading_error(joint.parameters)
+    return p.gap_r + difference if side == "right" else p.gap_l - difference

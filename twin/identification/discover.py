@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,25 +19,31 @@ from twin.identification.localization import (
     find_pulling_bumpers,
     localize_excess,
 )
+from twin.identification.nuisances import (
+    TYPICAL_LIMITS,
+    linearize_nuisances,
+    list_nuisance_parameters,
+    sensor_mask,
+)
 from twin.identification.parameters import (
-    GAP_PREFIX,
     INPUT_GAIN,
     INPUT_OFFSET,
-    SENSOR_PREFIX,
-    ZERO_PREFIX,
-    FreeParameter,
+    GapKey,
     ParameterSet,
+    TareKey,
+    is_sensor_error,
     list_base_parameters,
     list_model_effect_parameters,
-    parse_log_number,
 )
 from twin.identification.residuals import LogResiduals, build_log_residuals
 from twin.identification.selection import (
+    MAX_EFFECTS,
     FittedSet,
     ProgressCallback,
     SelectionProblem,
     SelectionProgress,
     SelectionResult,
+    count_sensor_errors,
     stepwise_selection,
 )
 from twin.identification.signals import LogSignals, derives_acc
@@ -45,6 +51,12 @@ from twin.identification.verdict import DiscoveryVerdict, judge_selection
 from twin.model.model import Model
 
 MIN_ENTRIES, MIN_BLOCKS = 1000, 9
+MAX_IDEAL_ERRORS = 1  # of sensors: several at once are the small ones that every laboratory has
+MAX_NUISANCE_SAMPLES = 60_000  # moving samples of all logs; limits time and memory
+LINEARIZATION_COUNT = (
+    2  # about the nuisances found before: their products matter in a bad laboratory
+)
+MAX_EXPLAINED_COST = 1.1  # mean square over the noise
 MODEL_LIMITED_RMS = 50.0  # residual rms over the noise above which model error limits the fit
 MAX_PARAMETER_RATIO = 1.5  # ratio to the model's parameter beyond which the specimen is another one
 
@@ -106,10 +118,10 @@ def prepare_problem(
     log_residuals = build_log_residuals(pairs, model)
     for residuals in log_residuals:
         _check_enough_data(residuals)
-    parameters, free = initialize_parameters(log_residuals, model)
-    first = fit_parameters(log_residuals, parameters, free, mapper=mapper)
+    parameters = initialize_parameters(log_residuals, model)
+    first = fit_parameters(log_residuals, parameters, mapper=mapper)
     log_residuals = build_log_residuals(pairs, first.parameters.to_model())
-    first = fit_parameters(log_residuals, first.parameters, free, mapper=mapper)
+    first = fit_parameters(log_residuals, first.parameters, mapper=mapper)
     rms = [_rms(residuals.evaluate(first.parameters)) for residuals in log_residuals]
     notes = []
     if (thinned := log_residuals[0].thinning) > 1:
@@ -125,14 +137,70 @@ def prepare_problem(
         )
     library, excluded = list_candidates(log_residuals, parameters, without)
     return PreparedProblem(
-        SelectionProblem(log_residuals, free, library, mapper), first, excluded, tuple(notes)
+        SelectionProblem(log_residuals, library, mapper, MAX_IDEAL_ERRORS),
+        first,
+        excluded,
+        tuple(notes),
     )
 
 
-def initialize_parameters(
-    log_residuals: Sequence[LogResiduals], model: Model
-) -> tuple[ParameterSet, tuple[FreeParameter, ...]]:
-    """Return (start values of a fit of the model, its free parameters)."""
+def add_nuisances(prepared: PreparedProblem) -> PreparedProblem:
+    """Return the problem with linear terms for the nuisances of instruments and set-up.
+
+    Lasers and accelerometers are compared first, on the rows that no force law enters: that gives
+    their noise in motion, and the nuisances about which the terms are linear.
+    """
+    problem, mapper, first = prepared.problem, prepared.problem.mapper, prepared.parameters
+    moving = sum(int(residuals.motion().moving.sum()) for residuals in problem.log_residuals)
+    thinning = max(math.ceil(moving / MAX_NUISANCE_SAMPLES), problem.log_residuals[0].thinning)
+    log_residuals = tuple(
+        linearize_nuisances(replace(residuals, thinning=thinning), first)
+        for residuals in problem.log_residuals
+    )
+    fit = fit_parameters(
+        log_residuals,
+        _start_nuisances(log_residuals, first.with_free(())),
+        [sensor_mask(residuals) for residuals in log_residuals],
+        mapper=mapper,
+    )
+    for _ in range(LINEARIZATION_COUNT):
+        log_residuals = tuple(
+            linearize_nuisances(residuals, fit.parameters, calibrate=True)
+            for residuals in log_residuals
+        )
+        start = _start_nuisances(log_residuals, fit.parameters.with_free(first.free))
+        fit = fit_parameters(log_residuals, start, mapper=mapper)
+    return replace(
+        prepared,
+        problem=replace(
+            problem,
+            log_residuals=log_residuals,
+            max_sensor_errors=MAX_EFFECTS,
+            amplitude_limits=TYPICAL_LIMITS,
+        ),
+        first_fit=fit,
+    )
+
+
+def _start_nuisances(
+    log_residuals: Sequence[LogResiduals], parameters: ParameterSet
+) -> ParameterSet:
+    """Return the parameters with the nuisances of the logs at their centre, and free."""
+    nuisances = list_nuisance_parameters(log_residuals)
+    start = parameters.with_values({nuisance.key: 0.0 for nuisance in nuisances})
+    return start.with_free((*parameters.free, *nuisances))
+
+
+def explain_with_nuisances(prepared: PreparedProblem) -> PreparedProblem:
+    """Return the problem with nuisances if they, but not ideal sensors, explain the logs."""
+    if prepared.first_fit.cost <= MAX_EXPLAINED_COST:
+        return prepared
+    imperfect = add_nuisances(prepared)
+    return imperfect if imperfect.first_fit.cost <= MAX_EXPLAINED_COST else prepared
+
+
+def initialize_parameters(log_residuals: Sequence[LogResiduals], model: Model) -> ParameterSet:
+    """Return the start of a fit of the model."""
     has_contact = [bool((residuals.contact_state != 0).any()) for residuals in log_residuals]
     fit_input = any(
         derives_acc(residuals.signals.channels)
@@ -144,24 +212,16 @@ def initialize_parameters(
         parameters = parameters.with_values(
             {INPUT_GAIN: _input_gain(log_residuals[0], model), INPUT_OFFSET: 0.0}
         )
-    zero_sigmas = [
-        {
-            quantity: residuals.signals.rest_value(quantity)[1]
-            for quantity in residuals.signals.zero_channels
-        }
-        for residuals in log_residuals
-    ]
-    parameters = parameters.with_values(
-        {
-            f"{ZERO_PREFIX}{number}.{quantity}": 0.0
-            for number, sigmas in enumerate(zero_sigmas)
-            for quantity in sigmas
-        }
-    )
-    return parameters, (
-        *list_base_parameters(model, has_contact, fit_input, zero_sigmas),
+    tare_sigmas = {
+        TareKey(log, quantity): residuals.signals.rest_value(quantity)[1]
+        for log, residuals in enumerate(log_residuals)
+        for quantity in residuals.signals.zero_channels
+    }
+    free = (
+        *list_base_parameters(model, has_contact, fit_input, tare_sigmas),
         *list_model_effect_parameters(model),
     )
+    return parameters.with_values(dict.fromkeys(tare_sigmas, 0.0)).with_free(free)
 
 
 def _input_gain(residuals: LogResiduals, model: Model) -> float:
@@ -186,9 +246,9 @@ def _check_enough_data(residuals: LogResiduals) -> None:
 
 def find_implausible_parameters(model: Model, fit: FitResult) -> list[str]:
     """Return messages on fitted parameters that differ too much for the same specimen."""
-    flat, notes = model.flatten(), []
+    start, notes = ParameterSet.from_model(model, 0).values, []
     for parameter in fit.free:
-        expected, value = flat.get(parameter.keys[0], 0.0), fit.values[parameter.name]
+        expected, value = start.get(parameter.keys[0], 0.0), fit.values[parameter.key]
         differs = (
             expected > 0
             and parameter.unit in ("N/m", "N s/m")
@@ -200,11 +260,7 @@ def find_implausible_parameters(model: Model, fit: FitResult) -> list[str]:
                 f"{expected:.4g} in the model; check that "
                 "the model and the mass are those of this specimen"
             )
-        if (
-            parameter.name.startswith(GAP_PREFIX)
-            and parse_log_number(parameter.name) is not None
-            and abs(value) > 1e-3
-        ):
+        if isinstance(parameter.key, GapKey) and abs(value) > 1e-3:
             notes.append(
                 f"{parameter.name}: each gap differs by {1e3 * value:+.2f} mm from the stated one"
             )
@@ -230,6 +286,34 @@ def discover_effects(
     """
     report(SelectionProgress("the model alone"))
     prepared = prepare_problem(logs, model, without, mapper)
+    discovery = _select_and_judge(prepared, logs, model, report, fitted)
+    if not discovery.selection.complete or _is_explained(discovery.verdict, MAX_IDEAL_ERRORS):
+        return discovery
+    imperfect = add_nuisances(prepared)
+    with_nuisances = _select_and_judge(imperfect, logs, model, report, fitted)
+    if not with_nuisances.selection.complete:
+        return replace(discovery, selection=replace(discovery.selection, complete=False))
+    is_ended_early = count_sensor_errors(discovery.selection.best) > MAX_IDEAL_ERRORS
+    return with_nuisances if is_ended_early or _is_explained(with_nuisances.verdict) else discovery
+
+
+def _is_explained(verdict: DiscoveryVerdict, max_sensor_errors: int = MAX_EFFECTS) -> bool:
+    """Return True if the effects explain the recordings to the noise."""
+    return (
+        verdict.outcome != "unexplained"
+        and not verdict.has_remainder
+        and count_sensor_errors(verdict.best) <= max_sensor_errors
+    )
+
+
+def _select_and_judge(
+    prepared: PreparedProblem,
+    logs: Sequence[PreparedLog],
+    model: Model,
+    report: ProgressCallback,
+    fitted: bool,
+) -> Discovery:
+    """Return the selection from a prepared problem, judged; see `discover_effects`."""
     problem = prepared.problem
     selection = stepwise_selection(problem, prepared.parameters, report)
     steps = [log.steps for log in logs]
@@ -239,9 +323,8 @@ def discover_effects(
         noise_floor * estimate_repeatability_floor(problem.log_residuals, selection.best.held_out),
         selection.best.cost,
     )
-    verdict = judge_selection(
-        problem, selection, floor, {} if fitted else model.flatten(), noise_floor
-    )
+    start = {} if fitted else ParameterSet.from_model(model, 0).values
+    verdict = judge_selection(problem, selection, floor, start, noise_floor)
     # implausible base parameters are reported only if they remain so with the effects added
     pulls = find_pulling_bumpers(problem.log_residuals, verdict.best.held_out)
     notes = (*prepared.notes, *find_implausible_parameters(model, verdict.best.fit), *pulls)
@@ -266,11 +349,7 @@ def fit_known_effects(
         for candidate in effects_fitted:
             shape = candidate.shapes[min(rung, len(candidate.shapes) - 1)]
             parameters = candidate.add_to(parameters, shape, _small_amplitude(candidate))
-        fit = fit_parameters(
-            prepared.problem.log_residuals,
-            parameters,
-            prepared.problem.free_parameters(effects_fitted),
-        )
+        fit = fit_parameters(prepared.problem.log_residuals, parameters)
         if best is None or fit.cost < best.cost:
             best = fit
     return prepared.problem.fit_effects(best.parameters, effects_fitted) if best else None
@@ -284,14 +363,11 @@ def _small_amplitude(candidate: Candidate) -> float:
 def held_out_log_nrmse(log: PreparedLog, fitted: FittedSet) -> float:
     """Return the NRMSE of the damper force on a held-out log, with the gaps stated there."""
     fitted_parameters = fitted.fit.parameters
-    parameters = ParameterSet.from_model(fitted_parameters.to_model(), 1).with_values(
-        {
-            name: value
-            for name, value in fitted_parameters.values.items()
-            if name.startswith(SENSOR_PREFIX)
-        }
+    model = fitted_parameters.to_model()
+    parameters = ParameterSet.from_model(model, 1).with_values(
+        {key: value for key, value in fitted_parameters.values.items() if is_sensor_error(key)}
     )
-    (residuals,) = build_log_residuals([(log.signals, log.contact_n)], fitted_parameters.to_model())
+    (residuals,) = build_log_residuals([(log.signals, log.contact_n)], model)
     motion = residuals.motion(parameters.assumed_sensors())
     mass = parameters.model_for_log(0, motion).parameters.mass
     damper = residuals.entry_row == 0

@@ -15,9 +15,8 @@ from scipy.signal import lfilter
 
 from table_io.block import Float1D, Float2D
 from twin.identification.motion import MeasuredMotion
-from twin.identification.parameters import SLIP_SPEED, FreeParameter
+from twin.identification.parameters import SLIP_SPEED, FreeParameter, ParameterKey, TermKey
 
-GENERIC_PREFIX = "general"
 BasisFunction = Callable[[Float1D, Float1D, float], Float1D]
 TERM_WIDTHS = (0.03, 0.06, 0.12, 0.25, 0.5)
 RESONANCES_HZ = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0, 22.0, 32.0)  # Hz
@@ -75,22 +74,17 @@ def list_terms(has_contact: bool) -> tuple[tuple[str, tuple[float, ...]], ...]:
 
 def list_term_parameters(name: str, ladder: tuple[float, ...]) -> tuple[FreeParameter, ...]:
     """Return the free parameters of a term: amplitude in N, and width if it has one."""
-    force = FreeParameter(*_keys(name, "force"), -np.inf, np.inf, 1.0, "N", vanishing=0.0)
+    force = FreeParameter(TermKey(name, "force"), -np.inf, np.inf, 1.0, "N", vanishing=0.0)
     if not ladder:
         return (force,)
     width = FreeParameter(
-        *_keys(name, "width"), 0.3 * ladder[0], 3.0 * ladder[-1], ladder[0], "", logarithmic=True
+        TermKey(name, "width"), 0.3 * ladder[0], 3.0 * ladder[-1], ladder[0], "", logarithmic=True
     )
     return (force, width)
 
 
-def _keys(name: str, parameter: str) -> tuple[str, tuple[str, ...]]:
-    key = f"{GENERIC_PREFIX}.{name}.{parameter}"
-    return key, (key,)
-
-
 def compute_generic_forces(
-    values: Mapping[str, float],
+    values: Mapping[ParameterKey, float],
     m: MeasuredMotion,
     gaps_m: tuple[float, float],
     touched: npt.NDArray[np.int8],
@@ -99,11 +93,10 @@ def compute_generic_forces(
     """Return the forces that the generic terms add to D, F_R >= 0, -F_L >= 0, (3, sample) in N."""
     out = np.zeros((3, m.u.size))
     for key, force in values.items():
-        if not (key.startswith(GENERIC_PREFIX) and key.endswith(".force")):
+        if not (isinstance(key, TermKey) and key.name == "force"):
             continue
-        name = key[len(GENERIC_PREFIX) + 1 : -len(".force")]
-        width = values.get(f"{GENERIC_PREFIX}.{name}.width", 1.0)
-        location, shape = name.split(" ", 1)
+        width = values.get(TermKey(key.term, "width"), 1.0)
+        location, shape = key.term.split(" ", 1)
         # all dry friction terms share one regularization at zero velocity
         friction_sign = (
             np.tanh(m.v / values[SLIP_SPEED]) * np.where(m.v > 0, 1.0, -1.0)

@@ -27,12 +27,22 @@ from twin.identification.cross_checks import (
     list_onset_warnings,
     select_observable,
 )  # fmt: skip
-from twin.identification.discover import PreparedLog, find_implausible_parameters, prepare_problem
+from twin.identification.discover import (
+    PreparedLog,
+    explain_with_nuisances,
+    find_implausible_parameters,
+    prepare_problem,
+)
 from twin.identification.least_squares import FitResult, compute_slopes, fit_parameters
 from twin.identification.parameters import (
-    ZERO_PREFIX,
-    FreeParameter,
+    DAMPING,
+    STIFFNESS,
+    BaseKey,
+    EffectKey,
+    NuisanceKey,
+    ParameterKey,
     ParameterSet,
+    is_correction,
     list_effect_parameters,
 )
 from twin.identification.residuals import LogResiduals
@@ -42,7 +52,7 @@ from twin.model.effects import find_effect
 from twin.model.model import Model
 
 WINDOW_S = 1.0
-GAP_OFFSET_KEY = "gap_offset.offset"
+GAP_OFFSET = EffectKey("gap_offset", "offset")
 MIN_REPORTED_CORRELATION = 0.7
 
 
@@ -56,7 +66,7 @@ class IdentificationResult:
     problem: SelectionProblem
     start: ParameterSet
     fit: FitResult
-    undetermined: tuple[str, ...]  # not determined by the logs: kept as in the start model
+    undetermined: tuple[ParameterKey, ...]  # not determined by the logs: kept as in the start model
     subsets: tuple[SubsetEstimate, ...]
     # right gap minus half the total gap, and its standard deviation, in m
     asymmetry: tuple[float, float] | None
@@ -68,13 +78,14 @@ class IdentificationResult:
     @property
     def correlated_pairs(self) -> tuple[tuple[str, str, float], ...]:
         """Pairs of strongly correlated parameters, with their correlation."""
-        correlation, names = self.fit.correlation, [parameter.name for parameter in self.fit.free]
+        correlation, free = self.fit.correlation, self.fit.free
         return tuple(
-            (names[i], names[k], float(correlation[i, k]))
-            for i in range(len(names))
+            (free[i].name, free[k].name, float(correlation[i, k]))
+            for i in range(len(free))
             for k in range(i)
             if abs(correlation[i, k]) > MIN_REPORTED_CORRELATION
-            and not names[i].startswith(ZERO_PREFIX)
+            and not is_correction(free[i].key)
+            and not is_correction(free[k].key)
         )
 
 
@@ -85,17 +96,20 @@ def identify_parameters(
 
     Raise InputError if a log holds too few usable samples.
     """
-    prepared = prepare_problem(logs, model)
+    prepared = explain_with_nuisances(prepare_problem(logs, model))
     problem = prepared.problem
     log_residuals = problem.log_residuals
-    joint, fixed = _fit_determined(log_residuals, prepared.parameters, problem.base)
+    joint, fixed = _fit_determined(log_residuals, prepared.parameters)
     joint = correct_bias(log_residuals, joint)
-    flat = joint.parameters.to_model().flatten()
-    law_r, law_l = ((flat[f"bumper_stiffness_{s}"], flat[f"bumper_damping_{s}"]) for s in "rl")
+    p = joint.parameters.to_model().base
+    laws = (
+        (p.bumper_stiffness_r, p.bumper_damping_r),
+        (p.bumper_stiffness_l, p.bumper_damping_l),
+    )
     contact_gaps = tuple(
         gaps
         for residuals, log_blocks in zip(log_residuals, blocks, strict=True)
-        for gaps in estimate_contact_gaps(residuals, log_blocks, (law_r, law_l), joint.parameters)
+        for gaps in estimate_contact_gaps(residuals, log_blocks, laws, joint.parameters)
     )
     asymmetry = _estimate_asymmetry(log_residuals, joint)
     parts = estimate_subsets(log_residuals, [log.steps for log in logs], joint)
@@ -124,12 +138,12 @@ def identify_parameters(
 
 
 def _fit_determined(
-    log_residuals: Sequence[LogResiduals], parameters: ParameterSet, free: Sequence[FreeParameter]
-) -> tuple[FitResult, tuple[str, ...]]:
-    """Fit the parameters that the logs determine; return (fit, names of the other parameters)."""
-    determined = select_observable(log_residuals, parameters, free, None)
-    fixed = tuple(parameter.name for parameter in free if parameter not in determined)
-    return fit_parameters(log_residuals, parameters, determined), fixed
+    log_residuals: Sequence[LogResiduals], start: ParameterSet
+) -> tuple[FitResult, tuple[ParameterKey, ...]]:
+    """Fit the parameters that the logs determine; return (fit, keys of the other parameters)."""
+    determined = select_observable(log_residuals, start)
+    fixed = tuple(parameter.key for parameter in start.free if parameter not in determined)
+    return fit_parameters(log_residuals, start.with_free(determined)), fixed
 
 
 def correct_bias(log_residuals: Sequence[LogResiduals], fit: FitResult) -> FitResult:
@@ -147,7 +161,6 @@ def correct_bias(log_residuals: Sequence[LogResiduals], fit: FitResult) -> FitRe
     """
     bias = np.zeros(len(fit.free))
     hessian = np.zeros((bias.size, bias.size))
-    flat = fit.parameters.to_model().flatten()
     for residuals in log_residuals:
         before = residuals.evaluate(fit.parameters)
         rows = np.array(
@@ -165,53 +178,53 @@ def correct_bias(log_residuals: Sequence[LogResiduals], fit: FitResult) -> FitRe
             m.mass_kg * _shared_noise_variance(residuals.signals) if m.damper is None else 0.0
         )
         n, noise = m.noise, residuals.force_noise(m, m.mass_kg)
-        for row, names in enumerate((("stiffness", "damping"), *_bumper_names())):
+        for row, keys in enumerate(((STIFFNESS, DAMPING), *_bumper_keys())):
             if not counts[row]:
                 continue
-            k, c = (flat[name] for name in names)
+            k, c = (fit.parameters.values[key] for key in keys)
             share = counts[row] / noise[row] ** 2
             biases = (k * n.u**2 - (with_acc if row == 0 else 0.0), c * n.v**2)
-            for name, amount in zip(names, biases, strict=True):
-                bias += [
-                    share * amount if name in parameter.keys else 0.0 for parameter in fit.free
-                ]
+            for key, amount in zip(keys, biases, strict=True):
+                bias += [share * amount if key in parameter.keys else 0.0 for parameter in fit.free]
     size = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
     correction = np.linalg.lstsq(hessian / np.outer(size, size), bias / size, rcond=1e-14)[0] / size
     values = {
-        parameter.name: parameter.to_external(
-            parameter.to_internal(fit.values[parameter.name]) + float(step)
+        parameter.key: parameter.to_external(
+            parameter.to_internal(fit.values[parameter.key]) + float(step)
         )
         for parameter, step in zip(fit.free, correction, strict=True)
-        if parameter.name not in fit.at_bound
+        if parameter.key not in fit.at_bound
     }
-    flat_values = {
-        key: values[parameter.name]
+    set_values = {
+        key: values[parameter.key]
         for parameter in fit.free
-        if parameter.name in values
+        if parameter.key in values
         for key in parameter.keys
     }
     return replace(
-        fit, parameters=fit.parameters.with_values(flat_values), values={**fit.values, **values}
+        fit, parameters=fit.parameters.with_values(set_values), values={**fit.values, **values}
     )
 
 
-def _bumper_names() -> tuple[tuple[str, str], ...]:
-    return tuple((f"bumper_stiffness_{side}", f"bumper_damping_{side}") for side in "rl")
+def _bumper_keys() -> tuple[tuple[BaseKey, BaseKey], ...]:
+    return tuple(
+        (BaseKey(f"bumper_stiffness_{side}"), BaseKey(f"bumper_damping_{side}")) for side in "rl"
+    )
 
 
 def _shared_noise_variance(signals: LogSignals) -> float:
     """Return -cov(u, a) in m2/s2 of the noise that the accelerometer of the mass adds to u."""
-    noise, share = signals.noise_rms, 1.0
+    noise, share = signals.noise, np.ones(signals.omega.size)
     s_x, s_a = noise.get("mass_disp_m"), noise.get("mass_acc_m_s2")
     if s_a is None:
         return 0.0
     if s_x is None or "table_disp_m" not in noise:
         if "table_acc_m_s2" not in noise:
             return 0.0
-        combined = math.hypot(s_a, noise["table_acc_m_s2"])
-        s_x, s_a, share = noise["rel_disp_m"], combined, (s_a / combined) ** 2
-    fused = s_a * s_x / np.hypot(s_a, signals.omega**2 * s_x)
-    return share * signals.grid.white_noise_rms(signals.omega * fused * signals.low_pass) ** 2
+        combined = np.hypot(s_a, noise["table_acc_m_s2"])
+        s_x, s_a, share = noise["rel_disp_m"], combined, s_a / combined
+    fused = share * s_a * s_x / np.hypot(s_a, signals.omega**2 * s_x)
+    return signals.grid.white_noise_rms(signals.omega * fused * signals.low_pass) ** 2
 
 
 def _estimate_asymmetry(
@@ -219,11 +232,17 @@ def _estimate_asymmetry(
 ) -> tuple[float, float] | None:
     """Return (offset of the gaps, standard deviation) in m from the joint fit extended by it."""
     both_sides = all((residuals.contact_state > 0).any(axis=1).all() for residuals in log_residuals)
-    if not both_sides or GAP_OFFSET_KEY in joint.parameters.values:
+    if not both_sides or GAP_OFFSET in joint.parameters.values:
         return None
-    free = (*joint.free, *list_effect_parameters(find_effect("gap_offset")))
-    fit = fit_parameters(log_residuals, joint.parameters.with_values({GAP_OFFSET_KEY: 0.0}), free)
-    return fit.values[GAP_OFFSET_KEY], fit.std_errors[GAP_OFFSET_KEY]
+    # the nuisance of the gaps is the same quantity; the signals have been corrected for a part
+    gaps = [key for key in joint.values if isinstance(key, NuisanceKey) and key.kind == "gap"]
+    kept = [parameter for parameter in joint.free if parameter.key not in gaps]
+    zeros: dict[ParameterKey, float] = dict.fromkeys((GAP_OFFSET, *gaps), 0.0)
+    free = (*kept, *list_effect_parameters(find_effect("gap_offset")))
+    start = joint.parameters.with_values(zeros).with_free(free)
+    fit = fit_parameters(log_residuals, start)
+    corrected = float(np.mean([residuals.gap_correction for residuals in log_residuals]))
+    return corrected + fit.values[GAP_OFFSET], fit.std_errors[GAP_OFFSET]
 
 
 def _compare_windows(

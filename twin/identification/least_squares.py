@@ -7,7 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from table_io.block import Bool2D, Float1D, Float2D, Int1D
-from twin.identification.parameters import FreeParameter, ParameterSet, parse_log_number
+from twin.identification.parameters import (
+    FreeParameter,
+    NuisanceKey,
+    ParameterKey,
+    ParameterSet,
+    get_log,
+)
 from twin.identification.residuals import LogResiduals
 
 MAX_ITERATIONS = 40
@@ -32,31 +38,36 @@ class FitResult:
     """Fitted parameters with standard errors, correlation and held-out residuals."""
 
     parameters: ParameterSet
-    free: tuple[FreeParameter, ...]
-    values: Mapping[str, float]
-    std_errors: Mapping[str, float]  # standard deviations, robust to colored residuals
+    values: Mapping[ParameterKey, float]  # of the free parameters
+    std_errors: Mapping[ParameterKey, float]  # standard deviations, robust to colored residuals
     correlation: Float2D
     cost: float  # mean square of the residual over its noise, on the training samples
     converged: bool
-    at_bound: tuple[str, ...]
+    at_bound: tuple[ParameterKey, ...]
     held_out: tuple[Float1D, ...] = ()  # per log, cross-validation residual, (entry,)
+
+    @property
+    def free(self) -> tuple[FreeParameter, ...]:
+        """The fitted parameters, in the order of the correlation."""
+        return self.parameters.free
 
 
 def fit_parameters(
     log_residuals: Sequence[LogResiduals],
     start: ParameterSet,
-    free: Sequence[FreeParameter],
     train: Sequence[Bool2D] | None = None,
     folds: Sequence[Int1D] = (),
     mapper: MapFunction = map,
 ) -> FitResult:
-    """Fit the free parameters by least squares to the entries where `train`, (entry,), is True.
+    """Fit the free parameters of `start` by least squares.
+
+    Use the entries where `train`, (entry,), is True; all without it.
 
     With `folds`, (entry,) per log, also compute the cross-validation residual: that of each fold
     after refitting to the others, by one step from the full fit. Folds below zero are never held
     out.
     """
-    return _LevenbergMarquardt(log_residuals, start, tuple(free), train, folds, mapper).run()
+    return _LevenbergMarquardt(log_residuals, start, train, folds, mapper).run()
 
 
 def compute_slopes(
@@ -66,12 +77,14 @@ def compute_slopes(
     before: Sequence[Float1D],
 ) -> list[Float1D]:
     """Return d residual / d parameter (internal value) by finite difference, (entry,) per log."""
+    if isinstance(free.key, NuisanceKey):
+        return [residuals.nuisance_slope(free.key) for residuals in log_residuals]
     x = free.to_internal(parameters.values[free.keys[0]])
     step = SLOPE_STEP * (1.0 if free.logarithmic else free.scale)
     if (math.exp(x + step) if free.logarithmic else x + step) > free.high:
         step = -step
     moved = parameters.with_values(dict.fromkeys(free.keys, free.to_external(x + step)))
-    log_number = parse_log_number(free.name)
+    log_number = get_log(free.key)
     return [
         (residuals.evaluate(moved) - old) / step
         if log_number in (None, residuals.log_number)
@@ -97,30 +110,24 @@ class _LevenbergMarquardt:
         self,
         log_residuals: Sequence[LogResiduals],
         start: ParameterSet,
-        free: tuple[FreeParameter, ...],
         train: Sequence[Bool2D] | None,
         folds: Sequence[Int1D],
         mapper: MapFunction,
     ) -> None:
-        self.log_residuals, self.start, self.free, self.folds = log_residuals, start, free, folds
-        self.mapper = mapper
+        self.log_residuals, self.start, self.free = log_residuals, start, start.free
+        self.folds, self.mapper = folds, mapper
         self.train = train or [
             np.ones(residuals.entry_row.size, dtype=bool) for residuals in log_residuals
         ]
         self.count = sum(int(mask.sum()) for mask in self.train)
-        low = [-math.inf if f.low == -math.inf else f.to_internal(f.low) for f in free]
+        low = [-math.inf if f.low == -math.inf else f.to_internal(f.low) for f in self.free]
         self.low = np.array(low)
         self.high = np.array(
-            [math.inf if f.high == math.inf else f.to_internal(f.high) for f in free]
+            [math.inf if f.high == math.inf else f.to_internal(f.high) for f in self.free]
         )
 
-    def parameters_at(self, x: Float1D) -> ParameterSet:
-        values: dict[str, float] = {}
-        for free, value in zip(self.free, x, strict=True):
-            values |= dict.fromkeys(free.keys, free.to_external(float(value)))
-        return self.start.with_values(values)
-
-    def evaluate(self, parameters: ParameterSet) -> list[Float1D]:
+    def evaluate(self, x: Float1D) -> list[Float1D]:
+        parameters = self.start.with_vector(x)
         return [residuals.evaluate(parameters) for residuals in self.log_residuals]
 
     def select_training(self, entries: Sequence[Float1D]) -> Float1D:
@@ -141,20 +148,19 @@ class _LevenbergMarquardt:
         return np.clip(x - step, self.low, self.high)
 
     def run(self) -> FitResult:
-        x = np.array([f.to_internal(self.start.values[f.keys[0]]) for f in self.free])
-        x = np.clip(x, self.low, self.high)
-        current = self.evaluate(self.parameters_at(x))
+        x = np.clip(self.start.to_vector(), self.low, self.high)
+        current = self.evaluate(x)
         r = self.select_training(current)
         cost, damping, converged = float(r @ r), 1e-4, not self.free
         for _ in range(0 if converged else MAX_ITERATIONS):
-            jacobian = self.compute_jacobian(self.parameters_at(x), current)
+            jacobian = self.compute_jacobian(self.start.with_vector(x), current)
             hessian, gradient = jacobian @ jacobian.T, jacobian @ r
             gain = 0.0
             for _ in range(8):
                 trial_x = self.take_step(x, hessian, gradient, damping)
                 if np.array_equal(trial_x, x):
                     break
-                trial_values = self.evaluate(self.parameters_at(trial_x))
+                trial_values = self.evaluate(trial_x)
                 trial_chosen = self.select_training(trial_values)
                 trial_cost = float(trial_chosen @ trial_chosen)
                 if trial_cost < cost:
@@ -172,7 +178,7 @@ class _LevenbergMarquardt:
         self, x: Float1D, current: list[Float1D], cost: float, converged: bool
     ) -> FitResult:
         """Return the fit with standard errors from a sandwich estimator clustered by block."""
-        parameters = self.parameters_at(x)
+        parameters = self.start.with_vector(x)
         jacobian = self.compute_jacobian(parameters, current)
         hessian = jacobian @ jacobian.T
         scale = _curvature_scale(hessian)
@@ -207,13 +213,14 @@ class _LevenbergMarquardt:
         divisor = np.where(sd > 0, sd, 1.0)
         values, std_errors, at_bound = {}, {}, []
         for i, free in enumerate(self.free):
-            values[free.name] = free.to_external(float(x[i]))
-            std_errors[free.name] = float(sd[i] * (values[free.name] if free.logarithmic else 1.0))
+            key = free.key
+            values[key] = free.to_external(float(x[i]))
+            std_errors[key] = float(sd[i] * (values[key] if free.logarithmic else 1.0))
             if x[i] in (self.low[i], self.high[i]):
-                at_bound.append(free.name)
+                at_bound.append(key)
         correlation = covariance / np.outer(divisor, divisor)
         return FitResult(
-            parameters, self.free, values, std_errors, correlation, cost / max(self.count, 1),
+            parameters, values, std_errors, correlation, cost / max(self.count, 1),
             converged,
             tuple(at_bound), self._compute_held_out(x, current, jacobian),
         )  # fmt: skip
@@ -226,14 +233,20 @@ class _LevenbergMarquardt:
             return ()
         fold = np.concatenate(self.folds)
         held_out = [values.copy() for values in current]
+        hessian = jacobian @ jacobian.T
         for k in np.unique(fold[fold >= 0]):
-            refitted = self._refit_without(x, current, jacobian, fold != k)
+            refitted = self._refit_without(x, current, jacobian, hessian, fold != k)
             for target, source, log_fold in zip(held_out, refitted, self.folds, strict=True):
                 target[log_fold == k] = source[log_fold == k]
         return tuple(held_out)
 
     def _refit_without(
-        self, x: Float1D, current: list[Float1D], jacobian: Float2D, training: Bool2D
+        self,
+        x: Float1D,
+        current: list[Float1D],
+        jacobian: Float2D,
+        all_products: Float2D,
+        training: Bool2D,
     ) -> list[Float1D]:
         """Return the residual of each log, (entry,), after one step towards the training-fold fit.
 
@@ -241,21 +254,20 @@ class _LevenbergMarquardt:
         folds do not determine keeps its value; an amplitude among them is set to its vanishing
         value, because otherwise the held-out fold would judge a value fitted to itself.
         """
-        part = jacobian[:, training]
-        hessian = part @ part.T
-        undetermined = np.diag(hessian) < MIN_CURVATURE_SHARE * np.einsum(
-            "ij,ij->i", jacobian, jacobian
-        )
+        held_out = jacobian[:, ~training]  # the smaller part
+        hessian = all_products - held_out @ held_out.T
+        undetermined = np.diag(hessian) < MIN_CURVATURE_SHARE * np.diag(all_products)
         vanishing = np.array([math.nan if f.vanishing is None else f.vanishing for f in self.free])
         dropped = undetermined & np.isfinite(vanishing)
         if dropped.any():
             x = np.where(dropped, vanishing, x)
-            current = self.evaluate(self.parameters_at(x))
-        r = np.concatenate(current)[training]
-        gradient, cost = part @ r, float(r @ r)
+            current = self.evaluate(x)
+        r = np.concatenate(current)
+        gradient = jacobian @ np.where(training, r, 0.0)
+        cost = float(r[training] @ r[training])
         gradient[undetermined], hessian[undetermined], hessian[:, undetermined] = 0.0, 0.0, 0.0
         for damping in HELD_OUT_DAMPINGS:
-            trial = self.evaluate(self.parameters_at(self.take_step(x, hessian, gradient, damping)))
+            trial = self.evaluate(self.take_step(x, hessian, gradient, damping))
             trial_r = np.concatenate(trial)[training]
             if float(trial_r @ trial_r) <= cost:
                 return trial

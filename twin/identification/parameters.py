@@ -1,108 +1,137 @@
 """Parameter set: model parameters, assumed sensor errors, and gap and tare corrections per log.
 
-It is a flat mapping of names to values; a fit varies the free ones.
+Each parameter has a key: `BaseKey`, `EffectKey`, `TermKey`, `SlipKey`, `GapKey`, `TareKey` or
+`NuisanceKey`. The text of a key is the name of the parameter in files and messages.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from table_io.block import Float1D
 from twin.identification.motion import MeasuredMotion
 from twin.model.effects import find_effect
 from twin.model.effects.effect import Effect
-from twin.model.model import Model, SensorModel
+from twin.model.model import EffectInstance, Model, SensorModel
+from twin.model.parameters import Parameters
 
-GAP_PREFIX = "gap"  # + log number: m by which both gaps of that log exceed the stated ones
-# + log number + "." + quantity: tare error of that quantity, SI
-ZERO_PREFIX = "zero"
-MAX_ZERO_SIGMA = 4.0  # bound on a tare error in standard deviations; more is a sensor offset
+GENERIC_PREFIX = "general"  # of the names of generic terms
+# of the names of the corrections per log
+GAP_PREFIX, TARE_PREFIX, NUISANCE_PREFIX = "gap", "zero", "nuisance"
+MAX_TARE_SIGMA = 4.0  # bound on a tare error in standard deviations; more is a sensor offset
 MIN_START_SHARE = 1e-6  # of the start value: lower bound of parameters that must not vanish
-SENSOR_PREFIX = "sensor_"
-SLIP_SPEED = "slip"  # m/s over which friction is regularized; used in fits, not part of a model
-INPUT_GAIN = "sensor_gain.table_acc_m_s2.gain"
-INPUT_OFFSET = "sensor_offset.table_acc_m_s2.offset"
 
 
-@dataclass(frozen=True, eq=False)
-class ParameterSet:
-    """Parameter values by flat name.
+@dataclass(frozen=True, slots=True)
+class BaseKey:
+    """Parameter of the SNM: a field of `Parameters`; without side, that of both bumpers."""
 
-    Names are those of the model, `effect.channel.parameter` for sensors, and e.g. `gap0` per log.
-    """
+    name: str
 
-    values: Mapping[str, float]
-
-    @classmethod
-    def from_model(cls, model: Model, logs: int) -> "ParameterSet":
-        """Return the parameters of the model, with the gaps stated in the logs."""
-        return cls(model.flatten() | {f"{GAP_PREFIX}{k}": 0.0 for k in range(logs)})
-
-    def to_model(self) -> Model:
-        """Return the model of the forces, without sensor errors and corrections per log."""
-        model_values = {
-            name: value
-            for name, value in self.values.items()
-            if not name.startswith((SENSOR_PREFIX, SLIP_SPEED, "general."))
-            and parse_log_number(name) is None
-        }
-        return Model.from_flat(model_values)
-
-    def assumed_sensors(self) -> tuple[SensorModel, ...]:
-        """Return the assumed sensor models that differ from an ideal sensor."""
-        sensors: dict[str, SensorModel] = {}
-        for name, value in self.values.items():
-            if name.startswith(SENSOR_PREFIX):
-                _, channel, parameter = name.split(".")
-                sensor = sensors.get(channel, SensorModel(channel))
-                sensors[channel] = SensorModel(channel, **{**sensor.coefficients, parameter: value})
-        return tuple(sensor for sensor in sensors.values() if sensor != SensorModel(sensor.channel))
-
-    def model_for_log(self, log: int, motion: MeasuredMotion) -> Model:
-        """Return the model with the mass and the gaps of one log."""
-        model = self.to_model()
-        correction = self.values[f"{GAP_PREFIX}{log}"]
-        right, left = (gap + correction for gap in motion.gaps_m)
-        base = replace(model.base, mass=motion.mass_kg, gap_r=right, gap_l=left)
-        return Model(base, model.effects)
-
-    def zero_error(self, log: int, quantity: str) -> float:
-        """Return the tare error of u, acc, table, right or left of a log, SI."""
-        return self.values.get(f"{ZERO_PREFIX}{log}.{quantity}", 0.0)
-
-    def with_values(self, values: Mapping[str, float]) -> "ParameterSet":
-        """Return a copy with values replaced or added."""
-        return ParameterSet({**self.values, **values})
-
-    def without_effect(self, prefix: str) -> "ParameterSet":
-        """Return a copy without the parameters of an effect."""
-        shape_keys = (SLIP_SPEED,) if prefix == "coulomb_friction" else ()
-        kept = {
-            k: v for k, v in self.values.items() if not k.startswith((f"{prefix}.", *shape_keys))
-        }
-        return ParameterSet(kept)
+    def __str__(self) -> str:
+        return self.name
 
 
-def parse_log_number(name: str) -> int | None:
-    """Return the number of the log that a flat name belongs to; None if it applies to all logs."""
-    for prefix in (GAP_PREFIX, ZERO_PREFIX):
-        number = name[len(prefix) :].partition(".")[0]
-        if name.startswith(prefix) and number.isdigit():
-            return int(number)
-    return None
+@dataclass(frozen=True, slots=True)
+class EffectKey:
+    """Parameter of an effect; `channel` is that of a sensor effect."""
+
+    effect: str
+    name: str
+    channel: str = ""
+
+    def __str__(self) -> str:
+        return ".".join(filter(None, (self.effect, self.channel, self.name)))
+
+
+@dataclass(frozen=True, slots=True)
+class TermKey:
+    """Parameter of a generic term; used in fits, not part of a model."""
+
+    term: str
+    name: str
+
+    def __str__(self) -> str:
+        return f"{GENERIC_PREFIX}.{self.term}.{self.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class SlipKey:
+    """Speed in m/s over which friction is regularized; used in fits, not part of a model."""
+
+    def __str__(self) -> str:
+        return "slip"
+
+
+@dataclass(frozen=True, slots=True)
+class GapKey:
+    """Correction of a log: m by which both gaps exceed the stated ones."""
+
+    log: int
+
+    def __str__(self) -> str:
+        return f"{GAP_PREFIX}{self.log}"
+
+
+@dataclass(frozen=True, slots=True)
+class TareKey:
+    """Tare error of a quantity of a log: u, acc, table, right or left, SI."""
+
+    log: int
+    quantity: str
+
+    def __str__(self) -> str:
+        return f"{TARE_PREFIX}{self.log}.{self.quantity}"
+
+
+@dataclass(frozen=True, slots=True)
+class NuisanceKey:
+    """Nuisance of a log, in typical sizes: its kind and its place, see `nuisances`."""
+
+    log: int
+    kind: str
+    place: str = ""
+
+    def __str__(self) -> str:
+        return ".".join(filter(None, (f"{NUISANCE_PREFIX}{self.log}", self.kind, self.place)))
+
+
+ParameterKey = BaseKey | EffectKey | TermKey | SlipKey | GapKey | TareKey | NuisanceKey
+
+STIFFNESS, DAMPING = BaseKey("stiffness"), BaseKey("damping")
+BUMPER_STIFFNESS, BUMPER_DAMPING = BaseKey("bumper_stiffness"), BaseKey("bumper_damping")
+SLIP_SPEED = SlipKey()
+INPUT_GAIN = EffectKey("sensor_gain", "gain", "table_acc_m_s2")
+INPUT_OFFSET = EffectKey("sensor_offset", "offset", "table_acc_m_s2")
 
 
 @dataclass(frozen=True, slots=True)
 class FreeParameter:
-    """Free parameter with bounds, stored under each of `keys`; shapes are fitted as logarithms."""
+    """Free parameter with bounds; shapes are fitted as logarithms.
 
-    name: str
-    keys: tuple[str, ...]
+    `tied` are the keys of the values that are equal in the fit, if not that of `key` alone.
+    """
+
+    key: ParameterKey
     low: float
     high: float
     scale: float
     unit: str
     logarithmic: bool = False
     vanishing: float | None = None  # value at which the effect vanishes; None for shapes
+    tied: tuple[ParameterKey, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Name in files and messages."""
+        return str(self.key)
+
+    @property
+    def keys(self) -> tuple[ParameterKey, ...]:
+        """Keys of the values that the parameter sets."""
+        return self.tied or (self.key,)
 
     def to_internal(self, value: float) -> float:
         """Return the internal (fitted) value: the logarithm if `logarithmic`."""
@@ -113,61 +142,153 @@ class FreeParameter:
         return min(max(math.exp(x) if self.logarithmic else x, self.low), self.high)
 
 
-BASE_PARAMETERS = (
-    ("stiffness", ("stiffness",), "N/m"),
-    ("damping", ("damping",), "N s/m"),
-    ("bumper_stiffness", ("bumper_stiffness_r", "bumper_stiffness_l"), "N/m"),
-    ("bumper_damping", ("bumper_damping_r", "bumper_damping_l"), "N s/m"),
+@dataclass(frozen=True, eq=False)
+class ParameterSet:
+    """Parameter values by key, in order; those not in `free` are fixed in a fit."""
+
+    values: Mapping[ParameterKey, float]
+    free: tuple[FreeParameter, ...] = ()
+
+    @classmethod
+    def from_model(cls, model: Model, logs: int) -> "ParameterSet":
+        """Return the parameters of the model, all fixed, with the gaps stated in the logs."""
+        values: dict[ParameterKey, float] = {
+            BaseKey(name): value for name, value in model.base.as_dict().items()
+        }
+        for instance in model.effects:
+            for name, value in instance.values.items():
+                values[EffectKey(instance.effect.id, name, instance.channel)] = value
+        return cls(values | {GapKey(log): 0.0 for log in range(logs)})
+
+    def to_model(self) -> Model:
+        """Return the model of the forces, without sensor errors and corrections per log."""
+        base: dict[str, float] = {}
+        effects: dict[str, dict[str, float]] = {}
+        for key, value in self.values.items():
+            match key:
+                case BaseKey(name):
+                    base[name] = value
+                case EffectKey(effect, name, ""):
+                    effects.setdefault(effect, {})[name] = value
+        return Model(
+            Parameters.from_dict(base),
+            tuple(
+                EffectInstance.create(find_effect(effect), values)
+                for effect, values in effects.items()
+            ),
+        )
+
+    def assumed_sensors(self) -> tuple[SensorModel, ...]:
+        """Return the assumed sensor models that differ from an ideal sensor."""
+        sensors: dict[str, SensorModel] = {}
+        for key, value in self.values.items():
+            match key:
+                case EffectKey(_, name, channel) if channel:
+                    sensor = sensors.get(channel, SensorModel(channel))
+                    sensors[channel] = SensorModel(channel, **{**sensor.coefficients, name: value})
+        return tuple(sensor for sensor in sensors.values() if sensor != SensorModel(sensor.channel))
+
+    def model_for_log(self, log: int, motion: MeasuredMotion) -> Model:
+        """Return the model with the mass and the gaps of one log."""
+        model = self.to_model()
+        correction = self.values[GapKey(log)]
+        right, left = (gap + correction for gap in motion.gaps_m)
+        base = replace(model.base, mass=motion.mass_kg, gap_r=right, gap_l=left)
+        return Model(base, model.effects)
+
+    def tare_error(self, log: int, quantity: str) -> float:
+        """Return the tare error of u, acc, table, right or left of a log, SI."""
+        return self.values.get(TareKey(log, quantity), 0.0)
+
+    def to_vector(self) -> Float1D:
+        """Return the internal values of the free parameters, (free,)."""
+        return np.array([free.to_internal(self.values[free.keys[0]]) for free in self.free])
+
+    def with_vector(self, x: Float1D) -> "ParameterSet":
+        """Return a copy with the free parameters at these internal values, (free,)."""
+        values = dict(self.values)
+        for free, value in zip(self.free, x, strict=True):
+            values |= dict.fromkeys(free.keys, free.to_external(float(value)))
+        return replace(self, values=values)
+
+    def with_values(self, values: Mapping[ParameterKey, float]) -> "ParameterSet":
+        """Return a copy with values replaced or added."""
+        return replace(self, values={**self.values, **values})
+
+    def with_free(self, free: Iterable[FreeParameter]) -> "ParameterSet":
+        """Return a copy in which exactly these parameters are free."""
+        return replace(self, free=tuple(free))
+
+    def without(self, removed: Sequence[FreeParameter]) -> "ParameterSet":
+        """Return a copy without these parameters."""
+        keys = {key for parameter in removed for key in parameter.keys}
+        return ParameterSet(
+            {key: value for key, value in self.values.items() if key not in keys},
+            tuple(free for free in self.free if keys.isdisjoint(free.keys)),
+        )
+
+
+def is_sensor_error(key: ParameterKey) -> bool:
+    """Return True for a parameter of a sensor effect."""
+    return isinstance(key, EffectKey) and key.channel != ""
+
+
+def is_correction(key: ParameterKey) -> bool:
+    """Return True for an error of instruments or set-up in one log that is no result itself."""
+    return isinstance(key, TareKey | NuisanceKey)
+
+
+def get_log(key: ParameterKey) -> int | None:
+    """Return the number of the log that a parameter belongs to; None if it applies to all logs."""
+    return key.log if isinstance(key, GapKey | TareKey | NuisanceKey) else None
+
+
+BASE_PARAMETERS: tuple[tuple[BaseKey, str, tuple[BaseKey, ...]], ...] = (
+    (STIFFNESS, "N/m", ()),
+    (DAMPING, "N s/m", ()),
+    (BUMPER_STIFFNESS, "N/m", (BaseKey("bumper_stiffness_r"), BaseKey("bumper_stiffness_l"))),
+    (BUMPER_DAMPING, "N s/m", (BaseKey("bumper_damping_r"), BaseKey("bumper_damping_l"))),
 )
 
 
 def list_base_parameters(
     model: Model,
     has_contact: Sequence[bool],
-    fit_input: bool = False,
-    zero_sigmas: Sequence[Mapping[str, float]] = (),
+    fit_input: bool,
+    tare_sigmas: Mapping[TareKey, float],
 ) -> tuple[FreeParameter, ...]:
     """Return the free parameters of the SNM; bumpers and gaps only for logs with contact.
 
-    `zero_sigmas`: standard deviations of the tares of each log, SI.
+    `tare_sigmas`: standard deviations of the tares, SI.
     `fit_input`: also fit gain and offset of the input, where no other channel can check them.
     """
-    flat = model.flatten()
-    free = []
-    for name, keys, unit in BASE_PARAMETERS if any(has_contact) else BASE_PARAMETERS[:2]:
-        scale = flat[keys[0]] or 1.0
+    base, free = model.base.as_dict(), []
+    for key, unit, tied in BASE_PARAMETERS if any(has_contact) else BASE_PARAMETERS[:2]:
+        scale = base[(tied or (key,))[0].name] or 1.0
         # some effects need a bumper dashpot: without it the bumper face does not relax
-        low = 0.0 if name == "damping" else MIN_START_SHARE * scale
-        free.append(FreeParameter(name, keys, low, math.inf, scale, unit))
+        low = 0.0 if key == DAMPING else MIN_START_SHARE * scale
+        free.append(FreeParameter(key, low, math.inf, scale, unit, tied=tied))
     free += [
-        FreeParameter(f"{GAP_PREFIX}{number}", (f"{GAP_PREFIX}{number}",), -0.05, 0.05, 1e-3, "m")
-        for number, touches in enumerate(has_contact)
+        FreeParameter(GapKey(log), -0.05, 0.05, 1e-3, "m")
+        for log, touches in enumerate(has_contact)
         if touches
     ]
-    for number, sigmas in enumerate(zero_sigmas):
-        for quantity, sigma in sigmas.items():
-            name = f"{ZERO_PREFIX}{number}.{quantity}"
-            unit = {"u": "m", "acc": "m/s2", "table": "m/s2"}.get(quantity, "N")
-            free.append(
-                FreeParameter(
-                    name, (name,), -MAX_ZERO_SIGMA * sigma, MAX_ZERO_SIGMA * sigma, sigma, unit
-                )
-            )
-    if fit_input:
+    for tare, sigma in tare_sigmas.items():
+        unit = {"u": "m", "acc": "m/s2", "table": "m/s2"}.get(tare.quantity, "N")
         free.append(
-            FreeParameter(INPUT_GAIN, (INPUT_GAIN,), 1e-12, 1e12, 1.0, "", logarithmic=True)
+            FreeParameter(tare, -MAX_TARE_SIGMA * sigma, MAX_TARE_SIGMA * sigma, sigma, unit)
         )
-        free.append(FreeParameter(INPUT_OFFSET, (INPUT_OFFSET,), -1e9, 1e9, 1.0, "m/s2"))
+    if fit_input:
+        free.append(FreeParameter(INPUT_GAIN, 1e-12, 1e12, 1.0, "", logarithmic=True))
+        free.append(FreeParameter(INPUT_OFFSET, -1e9, 1e9, 1.0, "m/s2"))
     return tuple(free)
 
 
 def list_effect_parameters(effect: Effect, channel: str = "") -> tuple[FreeParameter, ...]:
     """Return the free parameters of an effect, on a channel if it acts on a sensor."""
-    prefix = f"{effect.id}.{channel}." if channel else f"{effect.id}."
     return tuple(
         FreeParameter(
-            prefix + parameter.name,
-            (prefix + parameter.name,),
+            EffectKey(effect.id, parameter.name, channel),
             parameter.low,
             parameter.high,
             abs(parameter.typical - (parameter.vanishing or 0.0)) or 1.0,
@@ -183,8 +304,6 @@ def list_model_effect_parameters(model: Model) -> tuple[FreeParameter, ...]:
     """Return the free parameters of every effect of a model."""
     return tuple(
         free
-        for model_effect in model.effects
-        for free in list_effect_parameters(
-            find_effect(model_effect.effect.id), model_effect.channel
-        )
+        for instance in model.effects
+        for free in list_effect_parameters(instance.effect, instance.channel)
     )

@@ -15,16 +15,16 @@ Residuals of real rigs are autocorrelated (colored): statistics use blocks, neve
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from table_io.block import Bool2D, Float1D, Float2D, Int1D
-from twin.identification.generic_terms import GENERIC_PREFIX, TermScale, compute_generic_forces
+from twin.identification.generic_terms import TermScale, compute_generic_forces
 from twin.identification.motion import ConsistencyResidual, MeasuredMotion
-from twin.identification.parameters import SLIP_SPEED, ParameterSet
+from twin.identification.parameters import SLIP_SPEED, NuisanceKey, ParameterSet, TermKey
 from twin.identification.signals import LogSignals, derives_acc
 from twin.model.inverse_dynamics import forces_along
 from twin.model.model import Model, SensorModel
@@ -39,6 +39,38 @@ PULL_ROWS = ("right pull", "left pull")
 MAX_UNDERSHOOT_SHARE = 0.005
 MAX_CACHED_MOTIONS = 3  # for assumed sensor models other than the nominal one
 MAX_SAMPLES = 500_000  # moving samples of all logs together; limits memory
+
+
+@dataclass(frozen=True, slots=True)
+class Nuisance:
+    """Nuisance of a log: kind and place (channel or side), and typical size in its own unit."""
+
+    kind: str
+    place: str
+    size: float
+
+
+@dataclass(frozen=True, eq=False)
+class NuisanceTerms:
+    """Linear terms of a log: `columns`, (nuisance, entry) without the rest row, per typical size.
+
+    `centre` are the values, (nuisance,), for which the `raw` signals have been corrected already.
+    """
+
+    raw: LogSignals
+    log_number: int
+    nuisances: tuple[Nuisance, ...]
+    columns: npt.NDArray[np.float32]
+    centre: Float1D
+
+    @cached_property
+    def keys(self) -> tuple[NuisanceKey, ...]:
+        """Keys of the nuisances in a parameter set."""
+        return tuple(NuisanceKey(self.log_number, n.kind, n.place) for n in self.nuisances)
+
+    def values(self, parameters: ParameterSet) -> Float1D:
+        """Return the values of the nuisances in a parameter set, (nuisance,)."""
+        return np.array([parameters.values.get(key, 0.0) for key in self.keys])
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,24 +88,26 @@ class LogResiduals:
     scale: TermScale
     weight: float = 1.0  # noise multiplier; above 1 where model error, not noise, limits the fit
     thinning: int = 1  # keep one in `thinning` of the cycles of a step and of the other blocks
-    _motion_cache: list[tuple[tuple[SensorModel, ...], MeasuredMotion]] = field(
-        default_factory=list
-    )
+    nuisances: NuisanceTerms | None = None
+    known_contact: npt.NDArray[np.int8] | None = None  # (2, sample), else from the load cells
+    motion_cache: list[tuple[tuple[SensorModel, ...], MeasuredMotion]] = field(default_factory=list)
 
     def motion(self, sensors: tuple[SensorModel, ...] = ()) -> MeasuredMotion:
         """Return the motion for assumed sensor models; the most recent ones are cached."""
-        motion = next((m for key, m in self._motion_cache if key == sensors), None)
+        motion = next((m for key, m in self.motion_cache if key == sensors), None)
         if motion is None:
             motion = self.signals.fuse_motion(sensors)
-            unmodified = [pair for pair in self._motion_cache if not pair[0]]
-            recent = [pair for pair in self._motion_cache if pair[0]][-MAX_CACHED_MOTIONS + 1 :]
+            unmodified = [pair for pair in self.motion_cache if not pair[0]]
+            recent = [pair for pair in self.motion_cache if pair[0]][-MAX_CACHED_MOTIONS + 1 :]
             # a single assignment, because other threads may be reading
-            self._motion_cache[:] = [*unmodified, *recent, (sensors, motion)]
+            self.motion_cache[:] = [*unmodified, *recent, (sensors, motion)]
         return motion
 
     @cached_property
     def contact_state(self) -> npt.NDArray[np.int8]:
         """Measured contact of right and left, (2, sample): 1 contact, 0 none, -1 unknown."""
+        if self.known_contact is not None:
+            return self.known_contact
         m = self.motion()
         if not m.has_load_cells:
             known = -1 if any(math.isfinite(gap) for gap in m.gaps_m) else 0
@@ -102,10 +136,14 @@ class LogResiduals:
                     m.moving & in_contact & (np.convolve(~in_contact, window, "same") == 0)
                 )
         recent = np.concatenate([np.zeros(margin), np.ones(margin + 1)])
-        change = np.abs(np.diff(self.contact_state, axis=1, prepend=self.contact_state[:, :1])).any(
-            axis=0
-        )
+        contact = self.contact_state
+        if (contact < 0).any():  # without load cells, as the model expects
+            forces = forces_along(self.reference_for(m), m.u, m.v, m.time_s, contact)[1:]
+            contact = np.array([forces[0] > 0, forces[1] < 0], dtype=np.int8)
+        change = np.abs(np.diff(contact, axis=1, prepend=contact[:, :1])).any(axis=0)
         smooth = np.convolve(change, window, "same") == 0
+        if contact is not self.contact_state:
+            used[0] &= smooth
         for row, name in enumerate(self.rows):
             if name in PULL_ROWS:
                 in_contact = self.contact_state[PULL_ROWS.index(name)] > 0
@@ -114,6 +152,12 @@ class LogResiduals:
                 side = {"right cells": 0, "left cells": 1}.get(name)
                 used[row] = m.moving & smooth if side is None else used[1 + side]
         return used & self._thinning_mask
+
+    def reference_for(self, m: MeasuredMotion) -> Model:
+        """Return the reference model with the mass and the stated gaps of this log."""
+        right, left = m.gaps_m
+        base = replace(self.reference.base, mass=m.mass_kg, gap_r=right, gap_l=left)
+        return Model(base, self.reference.effects)
 
     @cached_property
     def _thinning_mask(self) -> Bool2D:
@@ -155,7 +199,8 @@ class LogResiduals:
     @property
     def _rest_entry_count(self) -> int:
         """Number of residual entries in the rest row."""
-        return len(self.rest_channels) + len(self.signals.zero_channels)
+        priors = len(self.nuisances.keys) if self.nuisances is not None else 0
+        return len(self.rest_channels) + len(self.signals.zero_channels) + priors
 
     @cached_property
     def entry_sample(self) -> Int1D:
@@ -189,7 +234,7 @@ class LogResiduals:
     ) -> Float2D:
         """Return (3, sample) in N: damper force from the force balance of the mass, F_R, -F_L."""
         zero_error = {
-            channel: parameters.zero_error(self.log_number, channel) if parameters else 0.0
+            channel: parameters.tare_error(self.log_number, channel) if parameters else 0.0
             for channel in TARED_CHANNELS
         }
         if m.damper is not None:
@@ -245,8 +290,43 @@ class LogResiduals:
     def evaluate(self, parameters: ParameterSet) -> Float1D:
         """Return the residual over its noise, (entry,): measured minus model, row after row."""
         m = self.motion(parameters.assumed_sensors())
+        rows, rest = self.evaluate_rows(parameters, m), self._rest_entries(parameters)
+        if self.nuisances is None:
+            return np.concatenate([rows, rest]) / self.weight
+        values = self.nuisances.values(parameters)
+        rows += values.astype(np.float32) @ self.nuisances.columns
+        # the priors keep their weight where model error limits the fit
+        return np.concatenate(
+            [rows / self.weight, rest / self.weight, self.nuisances.centre + values]
+        )
+
+    @property
+    def gap_correction(self) -> float:
+        """Right gap of the signals minus the stated one, and stated minus left, in m."""
+        raw = self.signals if self.nuisances is None else self.nuisances.raw
+        return self.signals.gaps_m[0] - raw.gaps_m[0] if math.isfinite(raw.gaps_m[0]) else 0.0
+
+    def gap_reading_error(self, parameters: ParameterSet) -> float:
+        """Return true right gap minus that of the signals, and the opposite of the left, in m."""
+        if (terms := self.nuisances) is None:
+            return 0.0
+        values = zip(terms.nuisances, terms.values(parameters), strict=True)
+        return sum(nuisance.size * float(z) for nuisance, z in values if nuisance.kind == "gap")
+
+    def nuisance_slope(self, key: NuisanceKey) -> Float1D:
+        """Return d residual / d nuisance, (entry,); zero for a nuisance of another log."""
+        slope = np.zeros(self.entry_row.size)
+        if self.nuisances is not None and key in self.nuisances.keys:
+            number, count = self.nuisances.keys.index(key), len(self.nuisances.keys)
+            column = self.nuisances.columns[number]
+            slope[: column.size] = column / self.weight
+            slope[slope.size - count + number] = 1.0
+        return slope
+
+    def evaluate_rows(self, parameters: ParameterSet, m: MeasuredMotion) -> Float1D:
+        """Return the residual over its noise on a given motion, (entry,), without the rest row."""
         model = parameters.model_for_log(self.log_number, m)
-        u = m.u - parameters.zero_error(self.log_number, "u")
+        u = m.u - parameters.tare_error(self.log_number, "u")
         d, right, left = forces_along(model, u, m.v, m.time_s, self.contact_state)
         if SLIP_SPEED in parameters.values:
             fc = model.effect_parameter("coulomb_friction", "fc") or 0.0
@@ -259,7 +339,7 @@ class LogResiduals:
         if added is not None:
             d = d + model.parameters.mass * added
         expected = np.array([d, right, -left])
-        if any(name.startswith(GENERIC_PREFIX) for name in parameters.values):
+        if any(isinstance(key, TermKey) for key in parameters.values):
             p = model.parameters
             generic = compute_generic_forces(
                 parameters.values, m, (p.gap_r, p.gap_l), self.contact_state, self.scale
@@ -267,7 +347,8 @@ class LogResiduals:
             expected += generic
         mass = model.parameters.mass
         rows = self.measured_forces(m, mass, parameters) - expected
-        rows /= self.force_noise(m, mass)[:, None]
+        # the noise is that of the nominal mass: a misfit must not shrink by its own denominator
+        rows /= self.force_noise(m, mass * self.signals.mass_kg / m.mass_kg)[:, None]
         if self.whitening is not None:
             rows[0] = self.signals.grid.apply_gain(rows[0], self.whitening)
         all_rows = [
@@ -280,7 +361,7 @@ class LogResiduals:
         if m.has_load_cells and m.damper is None:
             all_rows += [*self._pull_rows(m, parameters)]
         samples = [row[used] for row, used in zip(all_rows, self.row_mask, strict=True)]
-        return np.concatenate([*samples, self._rest_entries(parameters)]) / self.weight
+        return np.concatenate(samples)
 
     def _correct_consistency(
         self, consistency: ConsistencyResidual, parameters: ParameterSet
@@ -288,9 +369,9 @@ class LogResiduals:
         """Return a consistency residual less the tare errors of the accelerometers, (sample,)."""
         signs = {"mass": (1, 0), "table": (0, 1), "mass against table": (1, -1)}
         mass, table = signs.get(consistency.body, (0, 0))
-        zero_error = mass * parameters.zero_error(
+        zero_error = mass * parameters.tare_error(
             self.log_number, "acc"
-        ) + table * parameters.zero_error(self.log_number, "table")
+        ) + table * parameters.tare_error(self.log_number, "table")
         return (
             consistency.values - consistency.acc_sensitivity * zero_error
             if zero_error
@@ -306,7 +387,7 @@ class LogResiduals:
         sides = (m.right, "right", m.noise.right), (m.left, "left", m.noise.left)
         return np.array([
             np.minimum(
-                push - parameters.zero_error(self.log_number, name)
+                push - parameters.tare_error(self.log_number, name)
                 + MAX_UNDERSHOOT_SHARE * np.nanmax(push), 0.0)
             * math.sqrt(2.0) / rms
             for push, name, rms in sides
@@ -323,7 +404,7 @@ class LogResiduals:
             mean, sigma = self.signals.rest_value(quantity)
             offset_sum = sum(sign * offsets.get(name, 0.0) for name, sign in channels)
             entries.append(
-                (mean - offset_sum - parameters.zero_error(self.log_number, quantity)) / sigma
+                (mean - offset_sum - parameters.tare_error(self.log_number, quantity)) / sigma
             )
         return np.array(entries)
 

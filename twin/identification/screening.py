@@ -14,7 +14,7 @@ import numpy as np
 from table_io.block import Float1D, Float2D, Int1D
 from twin.identification.candidates import Candidate
 from twin.identification.least_squares import MapFunction, compute_columns, solve_damped
-from twin.identification.parameters import FreeParameter, ParameterSet
+from twin.identification.parameters import ParameterSet
 from twin.identification.residuals import LogResiduals
 
 FOLD_COUNT, NEVER_HELD_OUT = 3, -1
@@ -35,7 +35,8 @@ class Variant:
 class NormalEquations:
     """Normal equations per unit: slope products, (unit, p, p), and slope x residual, (unit, p).
 
-    The first `base_count` slopes are those of the parameters already in the fit.
+    The first `base_count` slopes are those of the parameters already in the fit. Products of two
+    candidates are left out, 0: candidates are screened one at a time.
     """
 
     hessian: Float2D
@@ -105,14 +106,13 @@ def assign_folds(residuals: LogResiduals) -> Int1D:
 def build_normal_equations(
     log_residuals: Sequence[LogResiduals],
     parameters: ParameterSet,
-    free: Sequence[FreeParameter],
     library: Sequence[Candidate],
     mapper: MapFunction = map,
 ) -> NormalEquations:
     """Build the normal equations at a parameter set; parameters at a bound are held fixed."""
     free = [
         parameter
-        for parameter in free
+        for parameter in parameters.free
         if parameter.low < parameters.values[parameter.keys[0]] < parameter.high
     ]
     before = [residuals.evaluate(parameters) for residuals in log_residuals]
@@ -125,6 +125,7 @@ def build_normal_equations(
             variants.append(Variant(candidate, shape, len(requests), sign))
             requests.append((candidate.add_to(parameters, shape), amplitude))
     columns = compute_columns(log_residuals, requests, before, mapper)
+    base_count = len(free)
     hessians, gradients, squares, folds = [], [], [], []
     for k, residuals in enumerate(log_residuals):
         unit = assign_units(residuals)
@@ -135,15 +136,18 @@ def build_normal_equations(
         has_rest = bool((residuals.entry_row == len(residuals.rows)).any())
         for u, (first, last) in enumerate(pairwise(edges)):
             part, r = rows[:, first:last], residual[first:last]
-            hessians.append((part @ part.T).astype(np.float64))
+            hessian = np.diag(np.einsum("pn,pn->p", part, part, dtype=np.float64))
+            hessian[:base_count] = part[:base_count] @ part.T
+            hessian[:, :base_count] = hessian[:base_count].T
+            hessians.append(hessian)
             gradients.append((part @ r).astype(np.float64))
             squares.append(float(r @ r))
             folds.append(NEVER_HELD_OUT if has_rest and last == unit.size else u % FOLD_COUNT)
-    hessian = np.array(hessians)
-    scale = np.sqrt(np.maximum(np.einsum("upp->p", hessian), 1e-300))
+    products = np.array(hessians)
+    scale = np.sqrt(np.maximum(np.einsum("upp->p", products), 1e-300))
     return NormalEquations(
-        hessian / np.outer(scale, scale), np.array(gradients) / scale, np.array(squares),
-        np.array(folds), len(free), tuple(variants), scale,
+        products / np.outer(scale, scale), np.array(gradients) / scale, np.array(squares),
+        np.array(folds), base_count, tuple(variants), scale,
     )  # fmt: skip
 
 

@@ -5,7 +5,7 @@ refits the best few on all data, and judges each by three-fold cross-validation 
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import takewhile
@@ -15,7 +15,7 @@ import numpy as np
 from table_io.block import Float1D, Int1D
 from twin.identification.candidates import Candidate, list_generic_candidates
 from twin.identification.least_squares import FitResult, MapFunction, fit_parameters
-from twin.identification.parameters import FreeParameter, ParameterSet
+from twin.identification.parameters import ParameterSet
 from twin.identification.residuals import LogResiduals
 from twin.identification.screening import (
     NormalEquations,
@@ -84,27 +84,29 @@ def mean_square(held_out: Sequence[Float1D]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class SelectionProblem:
-    """Selection problem: residuals of the logs, base parameters, and library of candidates."""
+    """Selection problem: residuals of the logs and library of candidates."""
 
     log_residuals: tuple[LogResiduals, ...]
-    base: tuple[FreeParameter, ...]
     library: tuple[Candidate, ...]
     mapper: MapFunction = map
+    # Ideal instruments are no explanation with more errors of sensors: they end the selection.
+    max_sensor_errors: int = MAX_EFFECTS
+    # Smallest deviation of the amplitude from its vanishing value, by effect.
+    amplitude_limits: Mapping[str, float] = field(default_factory=dict)
 
     def fit_effects(self, start: ParameterSet, effects: Sequence[Candidate]) -> FittedSet:
-        """Fit the effects with the base to all data, with cross-validation residuals."""
-        result = fit_parameters(
-            self.log_residuals,
-            start,
-            self.free_parameters(effects),
-            folds=self.folds,
-            mapper=self.mapper,
-        )
+        """Fit `start`, with these effects added, to all data, with cross-validation residuals."""
+        result = fit_parameters(self.log_residuals, start, folds=self.folds, mapper=self.mapper)
         return FittedSet(tuple(effects), result)
 
-    def free_parameters(self, effects: Sequence[Candidate]) -> tuple[FreeParameter, ...]:
-        """Return the free parameters: those of the base and of the effects."""
-        return (*self.base, *(free for effect in effects for free in effect.free))
+    def is_admissible(self, fitted: FittedSet) -> bool:
+        """Return True if every effect exceeds the limit of its amplitude."""
+        return all(
+            abs(fitted.fit.values[effect.amplitude.key] - effect.vanishing)
+            > self.amplitude_limits[effect.effect.id]
+            for effect in fitted.effects
+            if effect.effect is not None and effect.effect.id in self.amplitude_limits
+        )
 
     @cached_property
     def folds(self) -> tuple[Int1D, ...]:
@@ -176,10 +178,17 @@ def stepwise_selection(
             if state.best is previous:  # its exchanges were tried when it was accepted
                 break
             state = _exchange_step(problem, state, report)
+            if count_sensor_errors(state.best) > problem.max_sensor_errors:
+                return state
             state = replace(state, null=_refit_null(problem, state.null, state.best))
         return replace(state, generic_sets=_fit_generic_terms(problem, state, report))
     except Cancelled as cancelled:
         return replace(_accept_best(problem, state, cancelled.fitted), complete=False)
+
+
+def count_sensor_errors(fitted: FittedSet) -> int:
+    """Return the number of errors of sensors in a set of effects."""
+    return sum(bool(effect.channel) for effect in fitted.effects)
 
 
 def _forward_step(
@@ -246,7 +255,7 @@ def _refit_null(problem: SelectionProblem, null: FittedSet, best: FittedSet) -> 
     """Refit the null from the best set's parameters; an unconverged null causes false alarms."""
     parameters = best.fit.parameters
     for effect in best.effects:
-        parameters = parameters.without_effect(effect.name)
+        parameters = parameters.without(effect.free)
     refitted = problem.fit_effects(parameters, ())
     return refitted if refitted.cost < null.cost else null
 
@@ -267,7 +276,7 @@ def _refit_candidates(
         stage += f", replacing {dropped.name}"
     report(SelectionProgress(stage, best=current))
     if dropped is not None:
-        parameters = parameters.without_effect(dropped.name)
+        parameters = parameters.without(dropped.free)
         parameters = problem.fit_effects(parameters, kept).fit.parameters
     kept_names = {effect.name for effect in kept}
     max_refits = MAX_GENERIC_REFITS if generic else MAX_REFITS
@@ -281,13 +290,7 @@ def _refit_candidates(
         return []
     fitted_sets: list[FittedSet] = []
     promising = _select_promising(
-        build_normal_equations(
-            problem.log_residuals,
-            parameters,
-            problem.free_parameters(kept),
-            library,
-            problem.mapper,
-        ),
+        build_normal_equations(problem.log_residuals, parameters, library, problem.mapper),
         max_refits,
     )
     for index, screened in enumerate(promising, 1):
@@ -303,7 +306,9 @@ def _refit_candidates(
         except Cancelled as cancelled:
             cancelled.fitted = completed
             raise
-        fitted_sets.append(problem.fit_effects(screened.add_to(parameters), effects))
+        fitted = problem.fit_effects(screened.add_to(parameters), effects)
+        if problem.is_admissible(fitted):
+            fitted_sets.append(fitted)
     return fitted_sets
 
 

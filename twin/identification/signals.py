@@ -4,7 +4,7 @@ Gain, lag and offset of a sensor are simple operations on its spectrum, so a fit
 """
 
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,11 +13,12 @@ from table_io.block import Block, Bool2D, Float1D, Int1D, Label, join_blocks
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.errors import InputError
 from twin.identification.motion import ConsistencyResidual, MeasuredMotion, MotionNoise
+from twin.identification.noise import compare_with_white, estimate_noise_density
 from twin.identification.spectra import (
     FrequencyGrid,
     Spectrum,
-    estimate_white_noise,
     exclude_margins,
+    find_mains_notches,
 )
 from twin.model.model import SensorModel
 
@@ -27,6 +28,10 @@ BODY_SENSORS = (
     ("mass", "mass_disp_m", "mass_acc_m_s2"),
     ("table", "table_disp_m", "table_acc_m_s2"),
 )
+SENSOR_PAIRS: Mapping[str, tuple[str, ...]] = {
+    **{body: (laser, accelerometer) for body, laser, accelerometer in BODY_SENSORS},
+    "mass against table": ("rel_disp_m", "mass_acc_m_s2", "table_acc_m_s2"),
+}
 USED_CHANNELS = (
     "rel_disp_m", "mass_disp_m", "table_disp_m", "mass_acc_m_s2", "table_acc_m_s2",
     *RIGHT_CELLS, *LEFT_CELLS, "damper_force_n",
@@ -45,7 +50,7 @@ class LogSignals:
     low_pass: Float1D
     unit_spectrum: Spectrum
     spectra: Mapping[str, Spectrum]
-    noise_rms: Mapping[str, float]
+    noise: Mapping[str, Float1D]  # density, (frequency,): white noise of rms s has the density s
     rest_values: Mapping[str, tuple[float, float]]  # (mean, its std error) before the motion, SI
     time_s: Float1D
     step: Int1D
@@ -77,6 +82,18 @@ class LogSignals:
             if channels and {channel for channel, _ in channels} <= self.rest_values.keys()
         }
 
+    def channel_rms(self, channel: str) -> float:
+        """Return the rms of a channel about its mean while the drive moves, SI."""
+        values = self.grid.to_time_domain(self.spectra[channel])[self.label != Label.REST]
+        return float(values.std()) if values.size else 0.0
+
+    @property
+    def relative_spectrum(self) -> Spectrum:
+        """Spectrum of the displacement of the mass relative to the table, from the lasers alone."""
+        if {"mass_disp_m", "table_disp_m"} <= self.spectra.keys():
+            return self.spectra["mass_disp_m"] - self.spectra["table_disp_m"]
+        return self.spectra["rel_disp_m"]
+
     def rest_value(self, name: str) -> tuple[float, float]:
         """Return (mean, standard error) of one of `zero_channels` at rest, SI.
 
@@ -96,12 +113,25 @@ class LogSignals:
         stiffness in N/(m kg) and a damping in N s/(m kg) it is s_u |K - w^2 + i w C|, small where
         the signal is large.
         """
-        displacement = "rel_disp_m" if "rel_disp_m" in self.noise_rms else "mass_disp_m"
-        s_u = self.noise_rms[displacement] * np.abs(
+        displacement = "rel_disp_m" if "rel_disp_m" in self.noise else "mass_disp_m"
+        s_u = self.noise[displacement] * np.abs(
             stiffness - self.omega**2 + 1j * self.omega * damping
         )
-        gain: Float1D = self.low_pass / np.hypot(s_u, self.noise_rms["table_acc_m_s2"])
+        gain: Float1D = self.low_pass / np.hypot(s_u, self.noise["table_acc_m_s2"])
         return gain / self.grid.white_noise_rms(self.low_pass)
+
+    def calibrate_noise(self) -> "LogSignals":
+        """Return the signals with the noise of laser and accelerometer as loud as they disagree.
+
+        No force law can make the two sensors of a body disagree: what exceeds the noise seen at
+        rest is noise in motion (light spot, resolution, drift).
+        """
+        noise = dict(self.noise)
+        for residual in self.fuse_motion().consistency_residuals:
+            channels = SENSOR_PAIRS.get(residual.body, ())
+            ratio = np.sqrt(compare_with_white(residual.values, self.low_pass))
+            noise |= {name: noise[name] * ratio for name in channels if name in noise}
+        return replace(self, noise=noise)
 
     def fuse_motion(self, sensors: Sequence[SensorModel] = ()) -> MeasuredMotion:
         """Return the motion, assuming that these sensors read gain x value(t - lag) + offset."""
@@ -112,10 +142,10 @@ class LogSignals:
                 spectra[sensor.channel] = (
                     shifted * np.exp(1j * self.omega * sensor.lag) / sensor.gain
                 )
-        noise = dict(self.noise_rms)
+        noise = dict(self.noise)
         for sensor in sensors:
             if sensor.channel in noise:
-                noise[sensor.channel] /= abs(sensor.gain)
+                noise[sensor.channel] = noise[sensor.channel] / abs(sensor.gain)
         return _SensorFusion(self, spectra, noise).fuse()
 
 
@@ -128,9 +158,9 @@ class _SensorFusion:
     """Minimum-variance fusion of displacement and acceleration spectra into one motion."""
 
     def __init__(
-        self, signals: LogSignals, spectra: Mapping[str, Spectrum], noise: Mapping[str, float]
+        self, signals: LogSignals, spectra: Mapping[str, Spectrum], noise: Mapping[str, Float1D]
     ) -> None:
-        self.signals, self.spectra, self.noise_rms = signals, spectra, noise
+        self.signals, self.spectra, self.noise = signals, spectra, noise
         self.grid, self.omega, self.low_pass = signals.grid, signals.omega, signals.low_pass
         self.missing = np.full(signals.time_s.size, np.nan)
 
@@ -139,18 +169,14 @@ class _SensorFusion:
         position, noise_u, noise_v, consistency = self._relative_displacement()
         right, noise_right = self._side_force(RIGHT_CELLS)
         left, noise_left = self._side_force(LEFT_CELLS)
-        kept_share = self.grid.white_noise_rms(self.low_pass)
-        acc, noise_acc = (
-            self._time_series("mass_acc_m_s2"),
-            self._channel_noise("mass_acc_m_s2") * kept_share,
-        )
+        acc = self._time_series("mass_acc_m_s2")
         if derives_acc(self.spectra):
             acc = self.grid.to_time_domain(
                 (self.spectra["table_acc_m_s2"] - self.omega**2 * position) * self.low_pass
             )
         noise = MotionNoise(
-            noise_u, noise_v, noise_acc, noise_right * kept_share, noise_left * kept_share,
-            self._channel_noise("damper_force_n") * kept_share,
+            noise_u, noise_v, self._filtered_rms("mass_acc_m_s2"), noise_right, noise_left,
+            self._filtered_rms("damper_force_n"),
         )  # fmt: skip
         consistency += self._load_cell_residuals()
         damper = self._time_series("damper_force_n") if "damper_force_n" in self.spectra else None
@@ -179,18 +205,14 @@ class _SensorFusion:
                 self._velocity_noise(noise_density),
                 consistency,
             )
-        acc, noise = None, 0.0
+        acc, noise = None, np.zeros(self.omega.size)
         if {"mass_acc_m_s2", "table_acc_m_s2"} <= spectra.keys():
             acc = spectra["mass_acc_m_s2"] - spectra["table_acc_m_s2"]
-            noise = float(
-                np.hypot(
-                    self._channel_noise("mass_acc_m_s2"), self._channel_noise("table_acc_m_s2")
-                )
-            )
+            noise = np.hypot(self.noise["mass_acc_m_s2"], self.noise["table_acc_m_s2"])
         spectrum, noise_density, residual = self._fuse(
             "mass against table",
             spectra["rel_disp_m"],
-            self._channel_noise("rel_disp_m"),
+            self.noise["rel_disp_m"],
             acc,
             noise,
         )
@@ -208,17 +230,17 @@ class _SensorFusion:
         return self._fuse(
             body,
             self.spectra[laser],
-            self._channel_noise(laser),
+            self.noise[laser],
             acc,
-            self._channel_noise(accelerometer),
+            self.noise.get(accelerometer, np.zeros(self.omega.size)),
         )
 
     def _fuse(
-        self, body: str, position: Spectrum, s_x: float, acc: Spectrum | None, s_a: float
+        self, body: str, position: Spectrum, s_x: Float1D, acc: Spectrum | None, s_a: Float1D
     ) -> tuple[Spectrum, Float1D, ConsistencyResidual | None]:
-        """Return (fused spectrum, its noise per frequency over white, consistency residual)."""
+        """Return (fused spectrum, density of its noise, consistency residual)."""
         if acc is None:
-            return position, np.full(self.omega.size, s_x), None
+            return position, s_x, None
         w2 = self.omega**2
         variance = s_a**2 + w2**2 * s_x**2
         fused = (s_a**2 * position - w2 * s_x**2 * acc) / variance
@@ -226,7 +248,8 @@ class _SensorFusion:
             (acc + w2 * position) / np.sqrt(variance) * self.low_pass
         )
         kept_share = self.grid.white_noise_rms(self.low_pass)
-        consistency = ConsistencyResidual(body, difference / kept_share, 1.0 / (s_a * kept_share))
+        sensitivity = 1.0 / (float(np.sqrt(variance[0])) * kept_share)
+        consistency = ConsistencyResidual(body, difference / kept_share, sensitivity)
         return fused, s_a * s_x / np.sqrt(variance), consistency
 
     def _load_cell_residuals(self) -> tuple[ConsistencyResidual, ...]:
@@ -235,9 +258,7 @@ class _SensorFusion:
         for side, (first, second) in (("right cells", RIGHT_CELLS), ("left cells", LEFT_CELLS)):
             if {first, second} <= self.spectra.keys():
                 difference = self._time_series(first) - self._time_series(second)
-                noise = np.hypot(
-                    self._channel_noise(first), self._channel_noise(second)
-                ) * self.grid.white_noise_rms(self.low_pass)
+                noise = np.hypot(self._filtered_rms(first), self._filtered_rms(second))
                 residuals.append(ConsistencyResidual(side, difference / noise))
         return tuple(residuals)
 
@@ -254,17 +275,20 @@ class _SensorFusion:
             else self.missing
         )
 
-    def _channel_noise(self, name: str) -> float:
-        return self.noise_rms.get(name, float("nan"))
+    def _filtered_rms(self, name: str) -> float:
+        """Return the rms noise of a channel after the low pass, SI; NaN without the channel."""
+        if name not in self.noise:
+            return float("nan")
+        return self.grid.white_noise_rms(self.noise[name] * self.low_pass)
 
     def _side_force(self, cells: tuple[str, ...]) -> tuple[Float1D, float]:
-        """Return (force of the cells of a side, (sample,) in N, its rms noise before filtering)."""
+        """Return (force of the cells of a side, (sample,) in N, its rms noise)."""
         present = [name for name in cells if name in self.spectra]
         if not present:
             return self.missing, float("nan")
         total = np.sum([self.spectra[name] for name in present], axis=0)
         return self.grid.to_time_domain(total * self.low_pass), float(
-            np.hypot.reduce([*map(self._channel_noise, present)])
+            np.hypot.reduce([*map(self._filtered_rms, present)])
         )
 
 
@@ -294,12 +318,15 @@ def build_signals(
     if block.label[-1] != Label.REST:
         usable[-margin:] = False
     size = -(-len(block) // grid.decimation)
-    noise = {key: estimate_white_noise(values, at_rest) for key, values in columns.items()}
+    spectra = {key: grid.to_spectrum(values) for key, values in columns.items()}
+    low_pass = grid.low_pass * find_mains_notches(grid, spectra.values())
+    frequency = grid.omega / (2 * np.pi * block.rate_hz)
+    noise = {
+        key: estimate_noise_density(values, at_rest, frequency) for key, values in columns.items()
+    }
     return LogSignals(
-        name, mass_kg, gaps_m, grid, grid.omega, grid.low_pass,
-        grid.to_spectrum(np.ones(len(block))),
-        {key: grid.to_spectrum(values) for key, values in columns.items()},
-        noise,
+        name, mass_kg, gaps_m, grid, grid.omega, low_pass,
+        grid.to_spectrum(np.ones(len(block))), spectra, noise,
         _measure_rest(columns, at_rest, noise),
         (block.index + grid.decimation * np.arange(size)) / block.rate_hz,
         block.step[:: grid.decimation], block.label[:: grid.decimation],
@@ -347,12 +374,15 @@ def _find_rest(block: Block) -> Bool2D:
 
 
 def _measure_rest(
-    columns: Mapping[str, Float1D], at_rest: Bool2D, noise: Mapping[str, float]
+    columns: Mapping[str, Float1D], at_rest: Bool2D, noise: Mapping[str, Float1D]
 ) -> dict[str, tuple[float, float]]:
     """Return (mean, std error) of each channel at rest, SI; the tare's own error is included."""
     rest_values = {}
     for key, values in columns.items():
         finite = values[at_rest & np.isfinite(values)]
         if finite.size >= 100:
-            rest_values[key] = float(finite.mean()), noise[key] * float(np.sqrt(2.0 / finite.size))
+            rest_values[key] = (
+                float(finite.mean()),
+                float(noise[key][1]) * float(np.sqrt(2.0 / finite.size)),
+            )
     return rest_values

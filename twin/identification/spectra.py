@@ -1,20 +1,21 @@
-"""Spectra of whole records: low-pass filtering, decimation and noise estimates."""
+"""Spectra of whole records: low-pass filtering and decimation."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
-from scipy.signal import welch
 
 from table_io.block import Bool2D, Float1D
 
 TARGET_RATE_HZ = 500.0  # 50 samples of a contact of 0.1 s; noise above the band is removed
 ROLL_OFF_START = 0.8  # of the new Nyquist frequency: start of the low-pass roll-off
 PAD_S = 2.0
-# samples of a Welch segment; bands of the spectrum, the quietest of which gives the noise
-SEGMENT_SAMPLES, BAND_COUNT = 1024, 8
-MIN_NOISE_SHARE = 1e-4  # of a channel's rms: lower limit of the noise estimate
+MAINS_HZ, MAINS_TOLERANCE = (50.0, 60.0), 0.002  # relative deviation of the mains frequency
+NOTCH_SURROUNDINGS_HZ = 3.0
+MIN_LINE_RATIO = 20.0  # power of a line over the mean around it; noise alone hardly reaches it
+MIN_NOTCH_HZ, NOTCH_LINES = 0.15, 10.0  # half width of a notch: least, and in lines of the record
 Spectrum = npt.NDArray[np.complex128]
 
 
@@ -74,6 +75,10 @@ class FrequencyGrid:
         )
         return samples
 
+    def from_time_domain(self, values: Float1D) -> Spectrum:
+        """Return the spectrum, (frequency,), of values at the decimated rate, (sample,)."""
+        return self.decimation * rfft(values, self.padded_size // self.decimation)
+
     @property
     def neighbour_correlation(self) -> float:
         """Correlation of the noise of two adjacent samples at the decimated rate."""
@@ -87,22 +92,24 @@ class FrequencyGrid:
         return float(np.sqrt(np.sum(gain**2) / (self.padded_size / 2 + 1)))
 
 
-def estimate_white_noise(values: Float1D, rest: Bool2D) -> float:
-    """Return the rms noise of a channel, assumed white: scatter at rest or floor of the spectrum.
+def find_mains_notches(grid: FrequencyGrid, spectra: Iterable[Spectrum]) -> Float1D:
+    """Return a gain, (frequency,): 0 around mains hum that stands out in any spectrum, else 1.
 
-    Where the two agree within the uncertainty of the scatter at rest, the floor is used, which is
-    more accurate.
+    All channels get the same notches, so that a balance of their forces stays one.
     """
-    quiet = values[rest & np.isfinite(values)]
-    finite = values[np.isfinite(values)]
-    _, density = welch(finite, 1.0, nperseg=min(SEGMENT_SAMPLES, finite.size))
-    bands = np.array_split(density[1:-1], BAND_COUNT)
-    floor = float(np.sqrt(0.5 * min(float(np.median(band)) for band in bands)))
-    if quiet.size >= 100:
-        scatter = float(quiet.std())
-        if abs(floor - scatter) > 3.0 * scatter / np.sqrt(2.0 * quiet.size):
-            floor = scatter
-    return max(floor, MIN_NOISE_SHARE * float(finite.std()), 1e-300)
+    hz = grid.omega / (2 * np.pi)
+    notches, duration_s = np.ones(hz.size), grid.size / grid.rate_hz
+    half_width = max(MIN_NOTCH_HZ, NOTCH_LINES / duration_s)
+    powers = [np.abs(spectrum) ** 2 for spectrum in spectra]
+    for mains in MAINS_HZ:
+        for line in np.arange(mains, hz[-1] - NOTCH_SURROUNDINGS_HZ, mains):
+            inside = np.abs(hz - line) < MAINS_TOLERANCE * line + 0.5 * half_width
+            around = (np.abs(hz - line) < NOTCH_SURROUNDINGS_HZ) & ~inside
+            for power in powers:
+                peak = np.flatnonzero(inside)[int(np.argmax(power[inside]))]
+                if power[peak] > MIN_LINE_RATIO * power[around].mean():
+                    notches[np.abs(hz - hz[peak]) < half_width] = 0.0
+    return notches
 
 
 def bridge_gaps(values: Float1D) -> Float1D:

@@ -80,7 +80,7 @@ def find_steps(
         holds = []
     if on_grid:
         holds = [_snap_to_sweep(hold, sweep) for hold in holds]
-    holds = _split_turns(holds, rate_hz, sweep, on_grid)
+    holds = split_turns(holds, rate_hz, sweep, on_grid)
     label = np.where(moving, int(Label.BLEND if holds else Label.SETTLE), int(Label.REST))
     step, cycle = np.full((2, signal.size), -1)
     if not holds:
@@ -190,7 +190,7 @@ def _snap_to_sweep(hold: Hold, sweep: Sweep) -> Hold:
     )
 
 
-def _split_turns(holds: Sequence[Hold], rate_hz: float, sweep: Sweep, on_grid: bool) -> list[Hold]:
+def split_turns(holds: Sequence[Hold], rate_hz: float, sweep: Sweep, on_grid: bool) -> list[Hold]:
     """Split each hold at a turning point of the sweep into its two steps.
 
     On the grid the second step consists of the held cycles; otherwise both are equally long.

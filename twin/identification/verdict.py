@@ -11,7 +11,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from twin.identification.parameters import ZERO_PREFIX, parse_log_number
+from twin.identification.parameters import (
+    BUMPER_STIFFNESS,
+    DAMPING,
+    STIFFNESS,
+    ParameterKey,
+    TareKey,
+)
 from twin.identification.selection import FittedSet, SelectionProblem, SelectionResult
 
 # standard errors by which a rival set must be worse to be excluded
@@ -28,7 +34,7 @@ MIN_VISIBLE_EXCESS = 0.05  # of the floor: excess below which there is no gap
 MAX_BASE_RATIO = 1.6
 # ratio of start and null below which the start is no independent check
 MAX_SAME_BASE_RATIO = 1.2
-NEVER_AT_BOUND = ("stiffness", "damping", "bumper_stiffness")  # positive in a real specimen
+NEVER_AT_BOUND = (STIFFNESS, DAMPING, BUMPER_STIFFNESS)  # positive in a real specimen
 MIN_NAMED_GAP_SHARE = 0.5  # of the gap's excess that the named effects must close
 
 
@@ -50,7 +56,7 @@ def judge_selection(
     problem: SelectionProblem,
     selection: SelectionResult,
     floor: float,
-    start: Mapping[str, float] | None = None,
+    start: Mapping[ParameterKey, float] | None = None,
     noise: float = 1.0,
 ) -> DiscoveryVerdict:
     """Judge the outcome of a selection; `floor` is a mean square over the noise.
@@ -75,7 +81,7 @@ def judge_selection(
         if fitted.cost <= best.cost or errors < MIN_SEPARATION_SIGMA
     ]
     if unstrained := [
-        fitted for fitted in as_good if _zeros_at_bound(fitted) < _zeros_at_bound(best)
+        fitted for fitted in as_good if _tares_at_bound(fitted) < _tares_at_bound(best)
     ]:
         alternative = min(unstrained, key=lambda fitted: fitted.cost)
         return judge_selection(problem, replace(selection, best=alternative), floor, start, noise)
@@ -118,7 +124,7 @@ def _judge_common_core(
     selection: SelectionResult,
     alternatives: Sequence[FittedSet],
     floor: float,
-    start: Mapping[str, float] | None,
+    start: Mapping[ParameterKey, float] | None,
     noise: float,
 ) -> DiscoveryVerdict | None:
     """Return the verdict on the effects common to all equally good sets, if it is "named"."""
@@ -151,7 +157,7 @@ def _judge_common_core(
 def _find_doubt(
     selection: SelectionResult,
     generic: FittedSet | None,
-    start: Mapping[str, float],
+    start: Mapping[ParameterKey, float],
     has_remainder: bool,
     gap: float,
 ) -> str:
@@ -167,7 +173,7 @@ def _find_doubt(
     at_bound = [
         effect.amplitude.name
         for effect in best.effects
-        if effect.amplitude.name in best.fit.at_bound
+        if effect.amplitude.key in best.fit.at_bound
     ]
     return (
         f"{', '.join(at_bound)} is at its bound, and part of the gap remains"
@@ -186,7 +192,7 @@ def _judge_unnamed(
     if null.cost > (1 + 2 * MIN_VISIBLE_EXCESS) * floor:
         reason = "the residual exceeds the noise, and no effect of the library explains it"
         return DiscoveryVerdict("unexplained", null, 0.8, (), None, floor, True, reason)
-    if at_bound := [name for name in NEVER_AT_BOUND if name in null.fit.at_bound]:
+    if at_bound := [str(key) for key in NEVER_AT_BOUND if key in null.fit.at_bound]:
         reason = (
             f"the residual is noise only with {', '.join(at_bound)} at its bound, which is not "
             "physical"
@@ -228,17 +234,17 @@ def _needs_named_effects(selection: SelectionResult, generic: FittedSet, gap: fl
     return min(costs, default=math.inf) - generic.cost > MAX_REMAINDER_SHARE * gap
 
 
-def _describe_absorbed_base(selection: SelectionResult, start: Mapping[str, float]) -> str:
+def _describe_absorbed_base(selection: SelectionResult, start: Mapping[ParameterKey, float]) -> str:
     """Describe the base parameter absorbed by the selected effects; empty if there is none."""
-    for name in ("stiffness", "damping"):
-        given = start.get(name, 0.0)
+    for key in (STIFFNESS, DAMPING):
+        given = start.get(key, 0.0)
         null, best = (
-            fitted.fit.values.get(name, 0.0) for fitted in (selection.null, selection.best)
+            fitted.fit.values.get(key, 0.0) for fitted in (selection.null, selection.best)
         )
         if min(given, null) <= 0 or _ratio(given, null) < MAX_SAME_BASE_RATIO:
             continue
         if best <= 0 or min(_ratio(best, given), _ratio(best, null)) > MAX_BASE_RATIO:
-            return f"the {name} were {best:.4g} instead of {given:.4g} as in the model"
+            return f"the {key} were {best:.4g} instead of {given:.4g} as in the model"
     return ""
 
 
@@ -262,17 +268,13 @@ def _find_rivals(
         and selection.null.cost - rival.cost
         >= MIN_RIVAL_GAP_SHARE * (selection.null.cost - best.cost)
         and not _is_limit_case(rival, best)
-        and not _zeros_at_bound(rival) - _zeros_at_bound(best)
+        and not _tares_at_bound(rival) - _tares_at_bound(best)
     ]
 
 
-def _zeros_at_bound(fitted: FittedSet) -> set[str]:
+def _tares_at_bound(fitted: FittedSet) -> set[ParameterKey]:
     """Return the tare errors at their bound: a fit that needs them is implausible."""
-    return {
-        name
-        for name in fitted.fit.at_bound
-        if name.startswith(ZERO_PREFIX) and parse_log_number(name) is not None
-    }
+    return {key for key in fitted.fit.at_bound if isinstance(key, TareKey)}
 
 
 def _is_limit_case(fitted: FittedSet, best: FittedSet) -> bool:

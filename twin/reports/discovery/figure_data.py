@@ -109,7 +109,7 @@ class DiscoveryView:
         without_law = parameters
         for effect in self.law.effects:
             if self.discovery.verdict.generic is None or effect is self.law.effects[-1]:
-                without_law = without_law.without_effect(effect.name)
+                without_law = without_law.without(effect.free)
         wanted, remaining = residuals.evaluate(without_law), residuals.evaluate(parameters)
         return wanted, wanted - remaining, remaining
 

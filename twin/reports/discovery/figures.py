@@ -16,9 +16,8 @@ from matplotlib.patches import Patch
 
 from table_io.block import Float1D, Float2D
 from table_io.records import Step
-from twin.identification.generic_terms import GENERIC_PREFIX
 from twin.identification.localization import ResidualCell
-from twin.identification.parameters import ZERO_PREFIX
+from twin.identification.parameters import GENERIC_PREFIX, TARE_PREFIX
 from twin.identification.residuals import FORCE_ROWS, LogResiduals
 from twin.identification.selection import MIN_GAP_SHARE
 from twin.reports.discovery.figure_data import DiscoveryView, is_periodic, list_phases
@@ -245,7 +244,7 @@ def _draw_candidates(verdict: Json) -> CaptionedFigures:
 
 def _format_doubts(candidate: Json) -> str:
     """Return remarks on a fit: not converged, parameters at a bound (tare errors do not count)."""
-    at_bound = [name for name in candidate.get("at_bound", ()) if not name.startswith(ZERO_PREFIX)]
+    at_bound = [name for name in candidate.get("at_bound", ()) if not name.startswith(TARE_PREFIX)]
     text = "" if candidate["converged"] else ", not converged"
     return (
         f"{text}, {at_bound[0].removeprefix(f'{GENERIC_PREFIX}.')} at its bound"

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from table_io.block import Float1D
-from twin.identification.parameters import ParameterSet
+from twin.identification.parameters import GENERIC_PREFIX, ParameterSet
 from twin.identification.residuals import LogResiduals
 from twin.reports.discovery.figure_data import (
     CloseUp,
@@ -166,7 +166,9 @@ def _add_legend(figure: Figure, view: DiscoveryView, dots: list[tuple[str, str]]
     ]
     if view.law is not None:
         handles.append(
-            Line2D([], [], color=TWIN_COLOUR, label=view.law_name.removeprefix("general."))
+            Line2D(
+                [], [], color=TWIN_COLOUR, label=view.law_name.removeprefix(f"{GENERIC_PREFIX}.")
+            )
         )
     figure.legend(handles=handles, loc="outside upper center", ncols=4)
 

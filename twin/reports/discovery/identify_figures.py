@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from twin.identification.cross_checks import fitted_gap
 from twin.identification.identify import IdentificationResult
-from twin.identification.parameters import ZERO_PREFIX
+from twin.identification.parameters import is_correction
 from twin.identification.residuals import LogResiduals
 from twin.reports.discovery.serialize import INTERVAL_SIGMA
 from twin.reports.plot_style import (
@@ -129,11 +129,7 @@ def _draw_onsets(result: IdentificationResult, residuals: LogResiduals, ax: Axes
 
 
 def _draw_correlation(result: IdentificationResult) -> Figure:
-    kept = [
-        k
-        for k, parameter in enumerate(result.fit.free)
-        if not parameter.name.startswith(ZERO_PREFIX)
-    ]
+    kept = [k for k, parameter in enumerate(result.fit.free) if not is_correction(parameter.key)]
     names = [result.fit.free[k].name for k in kept]
     matrix = result.fit.correlation[np.ix_(kept, kept)]
     figure = Figure(figsize=(0.55 * len(kept) + 3.2, 0.55 * len(kept) + 2.2))
@@ -154,13 +150,13 @@ def _draw_subsets(result: IdentificationResult) -> Figure:
     free = [
         parameter
         for parameter in result.fit.free
-        if any(parameter.name in p.values for p in result.subsets)
+        if any(parameter.key in p.values for p in result.subsets)
     ]
     figure = Figure(figsize=(FIGURE_WIDTH_IN, 0.28 * len(result.subsets) + 1.6))
     axes = figure.subplots(1, len(free), sharey=True, squeeze=False)[0]
     for ax, parameter in zip(axes, free, strict=True):
         scale = 1e3 if parameter.unit == "m" else 1.0
-        value, sd = result.fit.values[parameter.name], result.fit.std_errors[parameter.name]
+        value, sd = result.fit.values[parameter.key], result.fit.std_errors[parameter.key]
         ax.axvspan(
             scale * (value - INTERVAL_SIGMA * sd),
             scale * (value + INTERVAL_SIGMA * sd),
@@ -169,8 +165,8 @@ def _draw_subsets(result: IdentificationResult) -> Figure:
         )
         ax.axvline(scale * value, color=GUIDE_COLOUR, lw=0.9)
         for row, part in enumerate(result.subsets):
-            if parameter.name in part.values:
-                x, sx = part.values[parameter.name]
+            if parameter.key in part.values:
+                x, sx = part.values[parameter.key]
                 ax.errorbar(
                     scale * x,
                     row,

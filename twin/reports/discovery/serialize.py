@@ -5,19 +5,22 @@ from collections.abc import Sequence
 from typing import Any
 
 from twin.identification.candidates import Candidate
-from twin.identification.discover import Discovery
+from twin.identification.discover import Discovery, PreparedLog, held_out_log_nrmse
 from twin.identification.least_squares import FitResult
 from twin.identification.parameters import (
-    GAP_PREFIX,
-    SENSOR_PREFIX,
     SLIP_SPEED,
-    ZERO_PREFIX,
+    BaseKey,
+    EffectKey,
     FreeParameter,
-    parse_log_number,
+    GapKey,
+    SlipKey,
+    TareKey,
+    TermKey,
+    is_correction,
+    is_sensor_error,
 )
 from twin.identification.selection import FittedSet
 from twin.identification.verdict import closed_fraction, suggest_next_run
-from twin.model.effects import find_effect
 from twin.model.model import SENSOR_CHANNELS
 
 Json = dict[str, Any]
@@ -31,8 +34,13 @@ REFITTED_SUFFIX = ", but with other parameters than the model has: see the notes
 INTERVAL_SIGMA = 1.96  # standard deviations either side: 95 %
 
 
-def verdict_to_json(discovery: Discovery, seconds: float = 0.0, notes: Sequence[str] = ()) -> Json:
-    """Return the content of verdict.json: the keys of the documented format and further details."""
+def verdict_to_json(
+    discovery: Discovery,
+    seconds: float = 0.0,
+    notes: Sequence[str] = (),
+    held_out_logs: Sequence[PreparedLog] = (),
+) -> Json:
+    """Return the content of verdict.json, see `twin.reports.contracts.Verdict`."""
     verdict, selection = discovery.verdict, discovery.selection
     best, null = verdict.best, selection.null
     where = discovery.localization
@@ -77,31 +85,36 @@ def verdict_to_json(discovery: Discovery, seconds: float = 0.0, notes: Sequence[
         ],
         "next_run": suggest_next_run(verdict.outcome, names, alternatives),
         "seconds": seconds,
+        "held_out_logs": [
+            {
+                "log": log.signals.name,
+                "nrmse_before": held_out_log_nrmse(log, null),
+                "nrmse_after": held_out_log_nrmse(log, best),
+            }
+            for log in held_out_logs
+        ],
     }
 
 
 def effect_to_json(candidate: Candidate, fit: FitResult, confidence: float) -> Json:
     """Return an effect with its confidence and its parameters, each with its 95 % interval."""
+    slip = next((free for free in candidate.free if free.key == SLIP_SPEED), None)
     return {
         "id": candidate.effect.id if candidate.effect else candidate.name,
         **({"channel": candidate.channel} if candidate.channel else {}),
         "confidence": confidence,
         "parameters": {
-            free.name.rsplit(".", 1)[1]: parameter_to_json(fit, free.name, free.unit)
+            free.key.name: parameter_to_json(fit, free)
             for free in candidate.free
-            if "." in free.name
+            if isinstance(free.key, EffectKey | TermKey)
         },
-        **(
-            {"slip_speed": parameter_to_json(fit, SLIP_SPEED, "m/s")}
-            if candidate.name == "coulomb_friction"
-            else {}
-        ),
+        **({"slip_speed": parameter_to_json(fit, slip)} if slip else {}),
     }
 
 
-def parameter_to_json(fit: FitResult, name: str, unit: str) -> Json:
+def parameter_to_json(fit: FitResult, free: FreeParameter) -> Json:
     """Return a fitted value with its 95 % interval and unit."""
-    return interval_to_json(fit.values[name], fit.std_errors[name], unit)
+    return interval_to_json(fit.values[free.key], fit.std_errors[free.key], free.unit)
 
 
 def interval_to_json(value: float, sd: float, unit: str) -> Json:
@@ -117,39 +130,34 @@ def interval_to_json(value: float, sd: float, unit: str) -> Json:
 def base_to_json(fitted: FittedSet) -> Json:
     """Return the refitted base parameters and the gap corrections of each log."""
     fit = fitted.fit
-    return {
-        free.name: parameter_to_json(fit, free.name, free.unit) for free in _base_parameters(fitted)
-    }
+    return {free.name: parameter_to_json(fit, free) for free in _base_parameters(fitted)}
 
 
 def _base_parameters(fitted: FittedSet) -> list[FreeParameter]:
     """Return the free parameters without added effects, tare errors and sensor corrections."""
-    added = {free.name for effect in fitted.effects for free in effect.free}
+    added = {free.key for effect in fitted.effects for free in effect.free}
     return [
         free
         for free in fitted.fit.free
-        if free.name not in added and not free.name.startswith((ZERO_PREFIX, SENSOR_PREFIX))
+        if free.key not in added and not is_correction(free.key) and not is_sensor_error(free.key)
     ]
 
 
 def find_suspicious_parameters(fitted: FittedSet) -> list[str]:
     """Return notes on parameters at a bound and on effects of the model that vanish."""
     fit, notes = fitted.fit, []
-    at_bound = [name for name in fit.at_bound if not name.startswith((ZERO_PREFIX, SLIP_SPEED))]
     notes += [
-        f"{name} = {fit.values[name]:.4g} is at its bound: do not trust it" for name in at_bound
+        f"{key} = {fit.values[key]:.4g} is at its bound: do not trust it"
+        for key in fit.at_bound
+        if not isinstance(key, TareKey | SlipKey)
     ]
     for free in _base_parameters(fitted):
-        identity, _, parameter = free.name.rpartition(".")
-        if not identity:
+        key, vanishing = free.key, free.vanishing
+        if not isinstance(key, EffectKey) or vanishing is None:
             continue
-        vanishing = next(
-            p for p in find_effect(identity).parameters if p.name == parameter
-        ).vanishing
-        deviation = math.inf if vanishing is None else abs(fit.values[free.name] - vanishing)
-        if deviation < INTERVAL_SIGMA * fit.std_errors[free.name]:
+        if abs(fit.values[key] - vanishing) < INTERVAL_SIGMA * fit.std_errors[key]:
             notes.append(
-                f"{identity} of the model vanishes in these recordings; remove it from the model"
+                f"{key.effect} of the model vanishes in these recordings; remove it from the model"
             )
     return notes
 
@@ -172,7 +180,7 @@ def candidates_to_json(null: FittedSet, tried: Sequence[FittedSet]) -> list[Json
             "id": " + ".join(fitted.names) or "nothing added",
             "held_out_error": math.sqrt(fitted.cost),
             "converged": fitted.fit.converged,
-            **({"at_bound": list(fitted.fit.at_bound)} if fitted.fit.at_bound else {}),
+            **({"at_bound": [*map(str, fitted.fit.at_bound)]} if fitted.fit.at_bound else {}),
         }
         for fitted in sorted(best.values(), key=lambda fitted: fitted.cost)
     ]
@@ -188,8 +196,9 @@ def generic_term_to_json(general: FittedSet | None) -> Json | None:
         "meaning": "u, v, d relative to their largest measured values, w likewise (resonator: Hz)",
         "held_out_error": math.sqrt(general.cost),
         "parameters": {
-            free.name.rsplit(".", 1)[1]: parameter_to_json(general.fit, free.name, free.unit)
+            free.key.name: parameter_to_json(general.fit, free)
             for free in term.free
+            if isinstance(free.key, TermKey)
         },
     }
 
@@ -198,51 +207,42 @@ def model_to_toml(
     fit: FitResult, title: str, citation: str, fitted_on: str
 ) -> tuple[str, list[str]]:
     """Return (text of a model file, notes on what it omits); gaps belong to the test profiles."""
-    flat = fit.parameters.to_model().flatten()
+    base = fit.parameters.to_model().base
     lines = [
         f"title = {_quote_toml(title)}",
         f"citation = {_quote_toml(citation)}",
         f"fitted_on = {_quote_toml(fitted_on)}",
         "[base]",
-        f"stiffness_n_m = {flat['stiffness']!r}",
-        f"damping_n_s_m = {flat['damping']!r}",
-        f"bumper_stiffness_n_m = {flat['bumper_stiffness_r']!r}",
-        f"bumper_damping_n_s_m = {flat['bumper_damping_r']!r}",
+        f"stiffness_n_m = {base.stiffness!r}",
+        f"damping_n_s_m = {base.damping!r}",
+        f"bumper_stiffness_n_m = {base.bumper_stiffness_r!r}",
+        f"bumper_damping_n_s_m = {base.bumper_damping_r!r}",
     ]
     omitted = []
-    effects: dict[str, dict[str, float]] = {}
-    for name, value in fit.parameters.values.items():
-        if "." in name and not name.startswith(("general.", ZERO_PREFIX)):
-            effect, parameter = name.rsplit(".", 1)
-            effects.setdefault(effect, {})[parameter] = value
-    for effect, values in effects.items():
-        identity, _, channel = effect.partition(".")
+    effects: dict[tuple[str, str], dict[str, float]] = {}
+    for key, value in fit.parameters.values.items():
+        if isinstance(key, EffectKey):
+            effects.setdefault((key.effect, key.channel), {})[key.name] = value
+    for (effect, channel), values in effects.items():
         if channel and channel not in SENSOR_CHANNELS:
             omitted.append(
-                f"{effect}: not in the model file, because the twin is driven by this channel and "
-                "does not predict it; repair or calibrate the sensor"
+                f"{effect}.{channel}: not in the model file, because the twin is driven by this "
+                "channel and does not predict it; repair or calibrate the sensor"
             )
             continue
-        numbers = [f"{key} = {value!r}" for key, value in values.items()]
+        numbers = [f"{name} = {value!r}" for name, value in values.items()]
         numbers += [f"channel = {_quote_toml(channel)}"] if channel else []
         lines += [
             "[[effects]]",
-            f"id = {_quote_toml(identity)}",
+            f"id = {_quote_toml(effect)}",
             f"parameters = {{ {', '.join(numbers)} }}",
         ]
     lines += ["[intervals]  # 95 %"]
-    for name in fit.values:
-        is_reported = fit.std_errors.get(name, 0.0) > 0 and not name.startswith(
-            (ZERO_PREFIX, "general.")
-        )
-        if is_reported and parse_log_number(name) is None:
-            low, high = (parameter_to_json(fit, name, "")[key] for key in ("low", "high"))
-            lines.append(f"{_quote_toml(name)} = [{low!r}, {high!r}]")
-    gaps = {
-        k: v
-        for k, v in fit.values.items()
-        if k.startswith(GAP_PREFIX) and parse_log_number(k) is not None
-    }
+    for free in fit.free:
+        if isinstance(free.key, BaseKey | EffectKey | SlipKey) and fit.std_errors[free.key] > 0:
+            interval = parameter_to_json(fit, free)
+            lines.append(f"{_quote_toml(free.name)} = [{interval['low']!r}, {interval['high']!r}]")
+    gaps = {key: value for key, value in fit.values.items() if isinstance(key, GapKey)}
     if any(
         abs(v) > max(INTERVAL_SIGMA * fit.std_errors[k], MIN_GAP_ERROR_M) for k, v in gaps.items()
     ):

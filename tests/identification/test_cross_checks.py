@@ -1,0 +1,25 @@
+"""Warnings of an identification on estimates that disagree."""
+
+import math
+
+import numpy as np
+
+from twin.identification.cross_checks import SubsetEstimate, list_disagreements
+from twin.identification.least_squares import FitResult
+from twin.identification.parameters import FreeParameter, GapKey, ParameterKey, ParameterSet
+
+KEYS: list[ParameterKey] = [GapKey(log) for log in range(12)]
+
+
+def test_disagreements_come_in_the_order_of_the_parameters() -> None:
+    free = tuple(FreeParameter(key, -math.inf, math.inf, 1.0, "m") for key in KEYS)
+    joint = FitResult(
+        ParameterSet(dict.fromkeys(KEYS, 0.0), free), dict.fromkeys(KEYS, 0.0),
+        dict.fromkeys(KEYS, 1e-5), np.eye(len(KEYS)), 1.0, True, (),
+    )  # fmt: skip
+    apart = [
+        SubsetEstimate(source, dict.fromkeys(keys, (value, 1e-5)), 1000, True)
+        for source, value, keys in (("early", 0.0, KEYS), ("late", 1e-3, [*KEYS[::-1]][:-1]))
+    ]
+    names = [text.split(":")[0] for text in list_disagreements(joint, apart)]
+    assert names == [str(key) for key in KEYS[1:]]

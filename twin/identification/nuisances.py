@@ -1,0 +1,238 @@
+"""Nuisance parameters: the small errors of instruments and set-up that every laboratory has.
+
+A nuisance z is in units of its typical size (its prior is a standard normal distribution) and
+enters the residual of a log linearly: r + sum of z x column. What it explains is no evidence for an
+effect of the specimen. Kinds, by channel or side:
+
+    gain, lag            of a channel: reading = (1 + gain) x value(t - lag)
+    offset               of a channel, after its tare; constant, and slow with time (offset1, ...)
+    chebyshev2 to 7      of a laser, in position: terms of its linearity error, 0 at position 0
+    share, share_slope   of the force of a side between its two cells: constant, and with position
+    plate                mass in front of the cells of a side, which the table accelerates
+    cross                part of the acceleration of the table in the accelerometer of the mass
+    gap, mass            readings of the set-up: right gap against left gap, and mass
+"""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.polynomial import Chebyshev
+
+from table_io.block import Bool2D, Float1D
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from twin.identification.parameters import FreeParameter, ParameterSet
+from twin.identification.residuals import LogResiduals, Nuisance, NuisanceTerms
+from twin.identification.signals import SENSOR_PAIRS, LogSignals
+from twin.identification.spectra import Spectrum
+
+LASERS = ("rel_disp_m", "mass_disp_m", "table_disp_m")
+SIDES = {"right": RIGHT_CELLS, "left": LEFT_CELLS}
+LINEARITY_DEGREES = range(2, 8)
+SLOW_TERMS = 2  # cosines over the length of the record, besides the constant offset
+# Typical sizes (one standard deviation).
+TYPICAL_GAIN = 0.005  # calibration and temperature
+TYPICAL_LAG_S = 5e-4  # multiplexed channels, different anti-alias filters
+TYPICAL_OFFSET = 0.005  # of the rms of the channel: drift since the tare
+TYPICAL_LINEARITY = 0.002  # of the largest excursion, each term of the error of a laser
+TYPICAL_SHARE, TYPICAL_SHARE_SLOPE = 0.05, 0.02  # of the force; at the largest excursion
+TYPICAL_PLATE = 0.005  # of the specimen's mass
+TYPICAL_CROSS = 0.01  # cross-axis sensitivity and pitch
+TYPICAL_GAP_M, TYPICAL_MASS = 1e-4, 0.005  # of the readings of the set-up
+GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+MAX_SIZE = 4.0  # typical sizes; a larger error is a fault, and an effect of its own
+# Smaller than these, effects that are errors of instruments or set-up are those of any laboratory.
+TYPICAL_LIMITS: Mapping[str, float] = {
+    "sensor_gain": MAX_SIZE * TYPICAL_GAIN,
+    "sensor_lag": MAX_SIZE * TYPICAL_LAG_S,
+    "mass_error": MAX_SIZE * TYPICAL_MASS,
+    "gap_offset": MAX_SIZE * TYPICAL_GAP_M,
+}
+SLOPE_STEP = 0.1  # of a typical size, for the finite difference
+MIN_COLUMN_NORM = 1.0  # a nuisance that changes the residual by less at its typical size is dropped
+
+
+def list_nuisances(signals: LogSignals) -> tuple[Nuisance, ...]:
+    """Return the nuisances that the channels of a log can have."""
+    channels = signals.channels
+    # No measurement contradicts the scale of all displacements together, nor their common lag; that
+    # of all forces is the mass, or a force sensor of the damper.
+    references = ("rel_disp_m", "mass_disp_m", "damper_force_n")
+    checkable = [channel for channel in channels if channel not in references]
+    pairs = {side: cells for side, cells in SIDES.items() if {*cells} <= {*channels}}
+    paired = {cell for cells in pairs.values() for cell in cells}
+    # The gains of two cells are that of their sum, and their shares.
+    scaled = [channel for channel in checkable if channel not in paired] + [*pairs]
+    nuisances = [Nuisance("gain", place, TYPICAL_GAIN) for place in scaled]
+    nuisances += [Nuisance("lag", channel, TYPICAL_LAG_S) for channel in checkable]
+    for channel in channels:
+        size = TYPICAL_OFFSET * signals.channel_rms(channel)
+        nuisances += [
+            Nuisance("offset" + (str(term) if term else ""), channel, size)
+            for term in range(SLOW_TERMS + 1)
+        ]
+    for channel in channels:
+        if channel in LASERS:
+            nuisances += [
+                Nuisance(f"chebyshev{degree}", channel, TYPICAL_LINEARITY)
+                for degree in LINEARITY_DEGREES
+            ]
+    for side in pairs:
+        nuisances += [
+            Nuisance("share", side, TYPICAL_SHARE),
+            Nuisance("share_slope", side, TYPICAL_SHARE_SLOPE),
+        ]
+        if "table_acc_m_s2" in channels:
+            nuisances.append(Nuisance("plate", side, TYPICAL_PLATE * signals.mass_kg))
+    if {"mass_acc_m_s2", "table_acc_m_s2"} <= {*channels}:
+        nuisances.append(Nuisance("cross", "mass_acc_m_s2", TYPICAL_CROSS))
+    if any(math.isfinite(gap) for gap in signals.gaps_m):
+        nuisances.append(Nuisance("gap", "", TYPICAL_GAP_M))
+    return tuple(nuisances)
+
+
+def correct_signals(signals: LogSignals, nuisance: Nuisance, z: float) -> LogSignals:
+    """Return the signals corrected for a nuisance of z typical sizes."""
+    amount, place = z * nuisance.size, nuisance.place
+    match nuisance.kind:
+        case "gap":
+            right, left = signals.gaps_m
+            return replace(signals, gaps_m=(right + amount, left - amount))
+        case _ if place in SIDES:
+            return _with_spectra(signals, _correct_cells(signals, nuisance.kind, place, amount))
+    spectrum = signals.spectra[place]
+    match nuisance.kind:
+        case "gain":
+            corrected = spectrum / (1.0 + amount)
+        case "lag":
+            corrected = spectrum * np.exp(1j * signals.omega * amount)
+        case "cross":
+            corrected = spectrum - amount * signals.spectra["table_acc_m_s2"]
+        case kind if kind.startswith("chebyshev"):
+            x = signals.grid.to_time_domain(spectrum)
+            largest = float(np.abs(x).max()) or 1.0
+            shape = Chebyshev.basis(int(kind.removeprefix("chebyshev")))
+            error = amount * largest * (shape(x / largest) - shape(0.0))
+            corrected = spectrum - signals.grid.from_time_domain(error)
+        case _:  # offset, offset1, ...
+            term = int(nuisance.kind.removeprefix("offset") or 0)
+            phase = np.pi * term * np.arange(signals.time_s.size) / signals.time_s.size
+            corrected = spectrum - signals.grid.from_time_domain(amount * np.cos(phase))
+    return _with_spectra(signals, {place: corrected})
+
+
+def _correct_cells(signals: LogSignals, kind: str, side: str, amount: float) -> dict[str, Spectrum]:
+    """Return the spectra of the two cells of a side, corrected."""
+    cells = SIDES[side]
+    first, second = (signals.spectra[cell] for cell in cells)
+    if kind == "gain":
+        return {cell: signals.spectra[cell] / (1.0 + amount) for cell in cells}
+    if kind == "plate":
+        inertia = 0.5 * amount * signals.spectra["table_acc_m_s2"]
+        return dict(zip(cells, (first + inertia, second + inertia), strict=True))
+    moved = amount * (first + second)
+    if kind == "share_slope":
+        u = signals.grid.to_time_domain(signals.relative_spectrum)
+        moved = signals.grid.from_time_domain(
+            u / float(np.abs(u).max() or 1.0) * signals.grid.to_time_domain(moved)
+        )
+    return dict(zip(cells, (first - moved, second + moved), strict=True))
+
+
+def _with_spectra(signals: LogSignals, spectra: Mapping[str, Spectrum]) -> LogSignals:
+    return replace(signals, spectra={**signals.spectra, **spectra})
+
+
+def linearize_nuisances(
+    residuals: LogResiduals,
+    parameters: ParameterSet,
+    calibrate: bool = False,
+    mapper: Callable[..., Iterable[Float1D]] = map,
+) -> LogResiduals:
+    """Return the residuals of a log with its nuisances as linear terms.
+
+    The signals are corrected for the nuisances in `parameters`, about which the terms are linear.
+    With `calibrate` the noise of the corrected sensors is taken from their disagreement.
+    """
+    terms = residuals.nuisances
+    signals = raw = residuals.signals if terms is None else terms.raw
+    nuisances = list_nuisances(raw)
+    centre = dict.fromkeys(nuisances, 0.0)
+    if terms is not None:
+        centre |= dict(zip(terms.nuisances, terms.centre + terms.values(parameters), strict=True))
+    for nuisance, z in centre.items():
+        signals = correct_signals(signals, nuisance, z) if z else signals
+    if calibrate:
+        signals = signals.calibrate_noise()
+    bare = replace(
+        residuals, signals=signals, nuisances=None, motion_cache=[],
+        known_contact=residuals.contact_state,
+    )  # fmt: skip
+    before = bare.evaluate_rows(parameters, bare.motion())
+    noise_shares = _compute_noise_shares(bare, parameters, before)
+
+    def slope(nuisance: Nuisance) -> Float1D:
+        corrected = correct_signals(signals, nuisance, SLOPE_STEP)
+        rows = bare.evaluate_rows(parameters, corrected.fuse_motion())
+        # A gain scales the noise too, so that a large one would seem to reduce the misfit: the
+        # share of the noise in the slope is taken out.
+        slope: Float1D = (rows - before) / SLOPE_STEP
+        if nuisance.kind == "gain":
+            scaled = SIDES.get(nuisance.place, (nuisance.place,))
+            slope += nuisance.size * sum(noise_shares[channel] for channel in scaled) * before
+        return slope
+
+    columns = [*mapper(slope, nuisances)]
+    kept = [
+        (nuisance, column)
+        for nuisance, column in zip(nuisances, columns, strict=True)
+        if column @ column > MIN_COLUMN_NORM**2 or centre[nuisance]
+    ]
+    table = np.array([column for _, column in kept], dtype=np.float32).reshape(-1, before.size)
+    terms = NuisanceTerms(
+        raw, residuals.log_number, tuple(nuisance for nuisance, _ in kept), table,
+        np.array([centre[nuisance] for nuisance, _ in kept]),
+    )  # fmt: skip
+    return replace(bare, nuisances=terms)
+
+
+def _compute_noise_shares(
+    residuals: LogResiduals, parameters: ParameterSet, before: Float1D
+) -> dict[str, Float1D]:
+    """Return the share of each channel in the noise of the row of each entry, (entry,)."""
+    signals = residuals.signals
+    phase = np.cumsum(np.arange(signals.omega.size) * GOLDEN_ANGLE)  # as good as random
+    rows = residuals.entry_row[: before.size]
+    shares = {}
+    for channel in signals.channels:
+        density = signals.noise[channel] * math.sqrt(signals.grid.size)
+        noisy = _with_spectra(
+            signals, {channel: signals.spectra[channel] + density * np.exp(1j * phase)}
+        )
+        noise = residuals.evaluate_rows(parameters, noisy.fuse_motion()) - before
+        counts = np.maximum(np.bincount(rows), 1)
+        shares[channel] = np.bincount(rows, weights=noise**2) / counts
+    total = np.maximum(np.sum([*shares.values()], axis=0), 1e-300)
+    return {channel: (share / total)[rows] for channel, share in shares.items()}
+
+
+def sensor_mask(residuals: LogResiduals) -> Bool2D:
+    """Return the entries that compare sensors with each other, or with their tare, (entry,)."""
+    rows = [
+        number
+        for number, name in enumerate((*residuals.rows, "rest"))
+        if name in SENSOR_PAIRS or name == "rest"
+    ]
+    mask: Bool2D = np.isin(residuals.entry_row, rows)
+    return mask
+
+
+def list_nuisance_parameters(log_residuals: Sequence[LogResiduals]) -> tuple[FreeParameter, ...]:
+    """Return the free parameters of the nuisances of all logs."""
+    return tuple(
+        FreeParameter(key, -MAX_SIZE - centre, MAX_SIZE - centre, 1.0, "")
+        for residuals in log_residuals
+        if residuals.nuisances is not None
+        for key, centre in zip(residuals.nuisances.keys, residuals.nuisances.centre, strict=True)
+    )
