@@ -10,14 +10,23 @@ from table_io.records import NormalizedResponse, PrcPoint
 from twin.compare.curves import Hysteresis, PrcJump, describe_sudden_change, detect_hysteresis
 from twin.model.parameters import Parameters, free_flight_resonance
 from twin.model.stepped_sine import simulate_stepped_sine
+from twin.reports.paper_cases import load_paper_cases
 
 GRID = tuple(round(2.0 + 0.1 * k, 9) for k in range(21))
 LEVEL = 0.05 * 9.80665
 Curve = Callable[[float], float]
 
 
-def measured(eta_d: float, spread: float = 0.002) -> NormalizedResponse:
-    return NormalizedResponse(eta_d, eta_d, 0.0, 0.0, 0.0, 0.0, (0,), (0,), 0.0, spread)
+def measured(
+    eta_d: float,
+    spread: float = 0.002,
+    eta_a: float = 1.0,
+    spread_a: float | None = 0.002,
+    impacts: tuple[int, ...] = (0, 0, 0),
+) -> NormalizedResponse:
+    return NormalizedResponse(
+        eta_d, eta_a, 0.0, 0.0, 0.0, 0.0, impacts, impacts, 0.0, spread, spread_a
+    )
 
 
 def point(
@@ -124,9 +133,9 @@ def test_hysteresis_that_reaches_the_upper_edge() -> None:
 
 def test_missing_points_are_bridged() -> None:
     points = [
-        one
-        for one in sweep(hardening(3.55), hardening(2.65))
-        if (one.direction, one.frequency_hz) not in {("forward", 3.0), ("backward", 2.6)}
+        point
+        for point in sweep(hardening(3.55), hardening(2.65))
+        if (point.direction, point.frequency_hz) not in {("forward", 3.0), ("backward", 2.6)}
     ]
     points.append(point("forward", 3.0, None))
     jumps, intervals = detect_hysteresis(points, "measured")
@@ -137,7 +146,9 @@ def test_missing_points_are_bridged() -> None:
 @pytest.mark.parametrize("direction", ["forward", "backward"])
 def test_one_direction_alone_has_no_hysteresis(direction: str) -> None:
     points = sweep(hardening(3.55), hardening(2.65))
-    assert detect_hysteresis([one for one in points if one.direction == direction], "measured") == (
+    assert detect_hysteresis(
+        [point for point in points if point.direction == direction], "measured"
+    ) == (
         [],
         [],
     )
@@ -159,6 +170,109 @@ def test_chaotic_scatter_is_no_hysteresis(seed: int) -> None:
                 point(direction, hz, measured(etas.mean(), float(np.ptp(etas) / etas.mean())))
             )
     assert detect_hysteresis(points, "measured") == ([], [])
+
+
+# Judged by eta_a and by impact counts as well
+
+Motion = Callable[[float], NormalizedResponse]
+
+
+def both(forward: Motion, backward: Motion, grid: Sequence[float] = GRID) -> list[PrcPoint]:
+    return [
+        point(direction, hz, motion(hz))
+        for direction, motion, ordered in (
+            ("forward", forward, grid),
+            ("backward", backward, grid[::-1]),
+        )
+        for hz in ordered
+    ]
+
+
+def branches(
+    jump_hz: float, above: NormalizedResponse, below: NormalizedResponse
+) -> Callable[[float], NormalizedResponse]:
+    return lambda hz: below if hz < jump_hz else above
+
+
+def test_a_hysteresis_of_eta_a_alone() -> None:
+    """eta_d differs by 8 %, eta_a by 18 %: below the jump the smaller acceleration."""
+    below, above = measured(0.108, eta_a=0.69), measured(0.1175, eta_a=0.84)
+    points = both(branches(3.55, above, below), branches(2.65, above, below))
+    assert detect_hysteresis(points, "measured") == (
+        [PrcJump("forward", 3.5, 3.6, "up"), PrcJump("backward", 2.7, 2.6, "down")],
+        [Hysteresis("left", 2.7, 3.5)],
+    )
+
+
+@pytest.mark.parametrize(
+    ("below", "above", "is_found"),
+    [
+        # 5 % in eta_a, and one impact more in every cycle
+        (measured(0.115, eta_a=0.80, impacts=(2, 2, 2)),
+         measured(0.116, eta_a=0.84, impacts=(1, 1, 1)), True),
+        # the same with a cycle that has as many impacts as the others
+        (measured(0.115, eta_a=0.80, impacts=(2, 1, 2)),
+         measured(0.116, eta_a=0.84, impacts=(1, 1, 1)), False),
+        # a grazing contact more: the count, but neither eta
+        (measured(0.115, eta_a=0.80, impacts=(1, 1, 1)),
+         measured(0.116, eta_a=0.81, impacts=(0, 0, 0)), False),
+        # 5 % in eta_a are within its scatter
+        (measured(0.115, eta_a=0.80, spread_a=0.03, impacts=(2, 2, 2)),
+         measured(0.116, eta_a=0.84, spread_a=0.03, impacts=(1, 1, 1)), False),
+        # an old recording without the scatter of eta_a: eta_d alone
+        (measured(0.115, eta_a=0.50, spread_a=None), measured(0.116, eta_a=0.84), False),
+        # a lost load cell: no counts
+        (measured(0.115, eta_a=0.80, impacts=()), measured(0.116, eta_a=0.84), False),
+        # a lost accelerometer
+        (measured(0.115, eta_a=math.nan, spread_a=math.nan), measured(0.116, eta_a=0.84), False),
+    ],
+)  # fmt: skip
+def test_impact_counts_decide_on_a_small_difference_beyond_its_scatter(
+    below: NormalizedResponse, above: NormalizedResponse, is_found: bool
+) -> None:
+    points = both(branches(3.55, above, below), branches(2.65, above, below))
+    assert bool(detect_hysteresis(points, "measured")[1]) == is_found
+
+
+def test_one_grid_frequency_is_no_interval_but_its_two_jumps_are_jumps() -> None:
+    jumps, intervals = detect_hysteresis(sweep(hardening(3.05), hardening(2.95)), "measured")
+    assert intervals == []
+    assert jumps == [PrcJump("forward", 3.0, 3.1, "down"), PrcJump("backward", 3.0, 2.9, "up")]
+
+
+def test_one_outlying_point_is_nothing() -> None:
+    """The backward sweep is low at one frequency: it changes twice, the forward sweep never."""
+    points = sweep(upper, lambda hz: (0.7 if hz == 3.0 else 1.0) * upper(hz))
+    assert detect_hysteresis(points, "measured") == ([], [])
+
+
+def test_a_difference_that_fades_on_a_steep_flank_is_no_hysteresis() -> None:
+    """A specimen that warmed up: its resonance is lower on the way back, and nothing jumps."""
+
+    def resonance(peak_hz: float) -> Curve:
+        return lambda hz: 0.02 / math.hypot(1 - (hz / peak_hz) ** 2, 0.25 * hz / peak_hz)
+
+    points = sweep(resonance(3.0), resonance(2.9), [round(2.0 + 0.1 * k, 9) for k in range(21)])
+    pairs = {hz: resonance(3.0)(hz) / resonance(2.9)(hz) for hz in (2.7, 3.3)}
+    assert pairs[3.3] > 1.1
+    assert detect_hysteresis(points, "measured") == ([], [])
+
+
+@pytest.mark.parametrize("seed", range(100))
+@pytest.mark.parametrize("noise", [0.002, 0.03, 0.15])
+def test_noise_of_a_healthy_sweep_is_no_hysteresis_of_eta_a(seed: int, noise: float) -> None:
+    """Three noisy cycles a point, and a grazing contact that is counted or not."""
+    rng = np.random.default_rng(seed)
+
+    def noisy(hz: float) -> NormalizedResponse:
+        eta_d = 0.1 * hz * (1 + 0.1 * noise * rng.standard_normal(3))
+        eta_a = 0.3 * hz * (1 + noise * rng.standard_normal(3))
+        return measured(
+            float(eta_d.mean()), float(np.ptp(eta_d) / eta_d.mean()), float(eta_a.mean()),
+            float(np.ptp(eta_a) / eta_a.mean()), tuple(rng.integers(1, 3, 3).tolist()),
+        )  # fmt: skip
+
+    assert detect_hysteresis(both(noisy, noisy), "measured") == ([], [])
 
 
 # The model's own sweeps: ten cycles a step, the last three measured
@@ -190,6 +304,17 @@ def test_g4_has_the_right_hysteresis_of_the_paper_and_none_in_its_chaos() -> Non
     assert up.to_hz == pytest.approx(up.from_hz - 0.1)
 
 
+def test_g4_has_a_left_hysteresis_at_its_secondary_resonance() -> None:
+    """The model's 0.902 to 1.010 Hz on the grid of SS2, in which eta_d differs by 8 % at 1.0 Hz."""
+    test = load_paper_cases()["G4"].tests[1]
+    jumps, intervals = detect_hysteresis(test.points, "twin")
+    assert intervals == [Hysteresis("left", 0.95, 1.0)]
+    assert jumps == [
+        PrcJump("forward", 1.0, 1.05, "up"),
+        PrcJump("backward", 0.95, 0.9, "down"),
+    ]
+
+
 def test_g0_has_none() -> None:
     assert detect_hysteresis(swept(0.0, 3.0, 7.0), "measured") == ([], [])
 
@@ -200,7 +325,10 @@ def test_gm2_has_a_left_one_in_the_model() -> None:
     assert interval.kind == "left"
     assert 5.7 <= interval.from_hz <= 5.9
     assert 6.0 <= interval.to_hz <= 6.2
-    assert {(one.direction, one.kind) for one in jumps} == {("forward", "up"), ("backward", "down")}
+    assert {(jump.direction, jump.kind) for jump in jumps} == {
+        ("forward", "up"),
+        ("backward", "down"),
+    }
 
 
 # The hint while a test runs

@@ -7,7 +7,7 @@ import pytest
 
 from table_io.block import Block, Float1D, recut_blocks
 from table_io.channels import CHANNELS, Channel
-from tests.compare.test_twins import G4, followed, measured, shaken, twin
+from tests.compare.test_twins import G4, measured, run_twins, shaken, twin
 from twin.compare import COMPARED_CHANNELS
 from twin.compare.extra_channels import select_predicted
 from twin.compare.twins import TwinSetup
@@ -33,7 +33,7 @@ def lab_block(noise: float = 0.0) -> Block:
     """A block with a row for each declared channel, exact but for the noise of the others."""
     block = measured(G4, shaken(seconds=1.5), noise=noise)
     exact = measured(G4, shaken(seconds=1.5))
-    speed = followed(setup(), [exact])[0].channel("free/rel_vel_m_s")
+    speed = run_twins(setup(), [exact])[0].channel("free/rel_vel_m_s")
     force = exact.channel("force_r1_n") + exact.channel("force_r2_n")
     assert force.max() > 100.0
     return with_rows(
@@ -60,7 +60,7 @@ def test_only_what_the_model_predicts_is_selected() -> None:
 
 def test_each_is_compared_with_its_sign() -> None:
     block = lab_block()
-    _, comparisons = followed(setup(*PREDICTED), [block])
+    _, comparisons = run_twins(setup(*PREDICTED), [block])
     assert comparisons[0].channels == (*COMPARED_CHANNELS, *(c.name for c in PREDICTED))
     late = comparisons[-40:]
     for column in range(len(COMPARED_CHANNELS), len(comparisons[0].channels)):
@@ -69,7 +69,7 @@ def test_each_is_compared_with_its_sign() -> None:
             error = sum(getattr(comparison, errors)[column] for comparison in late)
             assert error < 1e-4 * signal, (comparisons[0].channels[column], errors)
     wrong = replace(ACC, positive="right")
-    _, comparisons = followed(setup(wrong), [block])
+    _, comparisons = run_twins(setup(wrong), [block])
     last = comparisons[-1]
     assert last.window_error_ss[-1] == pytest.approx(4 * last.measured_ss[-1], rel=0.05)
 
@@ -77,7 +77,7 @@ def test_each_is_compared_with_its_sign() -> None:
 def test_each_twin_is_compared_with_its_own_prediction() -> None:
     block = measured(G4, shaken(seconds=1.5), noise=1.0)
     block = with_rows(block, mass_acc_2_m_s2=-block.channel("mass_acc_m_s2"))
-    _, comparisons = followed(setup(ACC), [block])
+    _, comparisons = run_twins(setup(ACC), [block])
     column, last = COMPARED_CHANNELS.index("mass_acc_m_s2"), comparisons[-1]
     assert last.free_error_ss[-1] == last.free_error_ss[column]
     assert last.window_error_ss[-1] == last.window_error_ss[column] != last.free_error_ss[column]
@@ -85,8 +85,8 @@ def test_each_twin_is_compared_with_its_own_prediction() -> None:
 
 def test_the_canonical_comparison_keeps_its_bits() -> None:
     block = lab_block(noise=1.0)
-    plain = followed(setup(), [block])
-    extra = followed(setup(*PREDICTED), [block])
+    plain = run_twins(setup(), [block])
+    extra = run_twins(setup(*PREDICTED), [block])
     assert extra[0].is_identical(plain[0])
     count = len(COMPARED_CHANNELS)
     for ours, theirs in zip(plain[1], extra[1], strict=True):
@@ -98,8 +98,8 @@ def test_the_canonical_comparison_keeps_its_bits() -> None:
 def test_the_cut_changes_no_bit(samples: int) -> None:
     block = lab_block(noise=1.0)
     model = Model(G4).with_effect("sensor_lag", "mass_acc_m_s2", lag=1.3e-3)
-    _, whole = followed(setup(*PREDICTED, model=model), [block])
-    _, cut = followed(setup(*PREDICTED, model=model), [*recut_blocks([block], samples)])
+    _, whole = run_twins(setup(*PREDICTED, model=model), [block])
+    _, cut = run_twins(setup(*PREDICTED, model=model), [*recut_blocks([block], samples)])
     assert repr(cut) == repr(whole)
 
 
@@ -108,12 +108,12 @@ def test_an_error_of_a_canonical_sensor_is_not_that_of_another_on_the_same_body(
     model = Model(G4).with_effect("sensor_gain", "mass_acc_m_s2", gain=2.0)
     values = block.values.copy()
     values[block.channels.index("mass_acc_m_s2")] *= 2.0
-    _, comparisons = followed(setup(ACC, model=model), [replace(block, values=values)])
+    _, comparisons = run_twins(setup(ACC, model=model), [replace(block, values=values)])
     last = comparisons[-1]
     assert last.window_error_ss[-1] < 1e-4 * last.measured_ss[-1]
 
 
 def test_a_missing_channel_is_unknown() -> None:
     block = measured(G4, shaken(seconds=1.0))
-    _, comparisons = followed(setup(ACC, LASER), [block])
+    _, comparisons = run_twins(setup(ACC, LASER), [block])
     assert np.isnan([comparison.window_error_ss[-2:] for comparison in comparisons]).all()

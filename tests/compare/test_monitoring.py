@@ -39,7 +39,9 @@ from twin.compare.monitoring.jumps import (
     predict_jumps,
     track_jumps,
 )
-from twin.model.continuation import continue_branch, settle_to_orbit
+from twin.dynamics.continuation import continue_branch
+from twin.dynamics.orbits import settle_to_orbit
+from twin.dynamics.period_map import make_period_map
 from twin.model.ideal_response import simulate_sweep
 from twin.run.run_config import RunConfig, from_texts
 from twin.transport.codec import encode_item
@@ -72,9 +74,11 @@ def session(truth: str = "", gap: float = 4.0) -> tuple[RunConfig, Block]:
         rig = (PROFILES_DIR / "rigs/simulated.toml").read_text()
         sealed = Path(folder) / "truth.toml"
         sealed.write_text(truth)
-        told = f'truth = "{sealed}"\ntruth_sha256 = "{hashlib.sha256(truth.encode()).hexdigest()}"'
+        sealed_lines = (
+            f'truth = "{sealed}"\ntruth_sha256 = "{hashlib.sha256(truth.encode()).hexdigest()}"'
+        )
         if truth:
-            rig = rig.replace("[simulated]", f"[simulated]\n{told}")
+            rig = rig.replace("[simulated]", f"[simulated]\n{sealed_lines}")
         bundle = from_texts(
             "x", PROFILE.format(gap=gap), rig, (PROFILES_DIR / "models/snm.toml").read_text(), "x"
         )
@@ -87,39 +91,41 @@ def session(truth: str = "", gap: float = 4.0) -> tuple[RunConfig, Block]:
             bundle.make_start_factory("r", "table"),
             lambda: None,
         )
-        return bundle, join_blocks([one for one in items if isinstance(one, Block)])
+        return bundle, join_blocks([item for item in items if isinstance(item, Block)])
 
 
 @cache
-def watched(truth: str = "", gap: float = 4.0) -> tuple[Record, ...]:
+def monitor_session(truth: str = "", gap: float = 4.0) -> tuple[Record, ...]:
     """What the twin says about such a session."""
     bundle, measured = session(truth, gap)
     setup = bundle.prepare_twin()
     state, _ = pipeline.start_pipeline(setup)
     _, items = pipeline.step(setup, state, measured)
-    return tuple(one for one in items if not isinstance(one, Block))
+    return tuple(item for item in items if not isinstance(item, Block))
 
 
 def warnings(items: Sequence[Record], *but: str) -> list[Event]:
-    return [one for one in items if isinstance(one, Event) and one.kind not in but]
+    return [item for item in items if isinstance(item, Event) and item.kind not in but]
 
 
 def estimates(items: Sequence[Record], name: str) -> list[tuple[float, float, float, float]]:
     """(value, sd, drift, sd of the drift) of a parameter, each time it was told."""
     return [
-        tuple(getattr(one, field)[one.names.index(name)] for field in
+        tuple(getattr(item, field)[item.names.index(name)] for field in
               ("values", "sd", "drift", "drift_sd"))
-        for one in items if isinstance(one, Estimate) and name in one.names
+        for item in items if isinstance(item, Estimate) and name in item.names
     ]  # fmt: skip
 
 
 @pytest.mark.parametrize("gap", [4.0, math.inf, -2.0])
 def test_with_the_right_model_there_is_nothing_to_say_but_the_jumps_it_expects(gap: float) -> None:
-    items = watched("", gap)
-    assert all("where the model expects it" in one.text for one in warnings(items))
-    agreed = [one for one in items if isinstance(one, Agreement)]
+    items = monitor_session("", gap)
+    assert all("where the model expects it" in warning.text for warning in warnings(items))
+    agreed = [item for item in items if isinstance(item, Agreement)]
     assert len(agreed) == 2 * 5 * 8, "one for every held cycle"
-    shares = np.array([one.error for one in agreed]) / np.array([one.band for one in agreed])
+    shares = np.array([agreement.error for agreement in agreed]) / np.array(
+        [agreement.band for agreement in agreed]
+    )
     assert np.nanmax(shares) < 0.8
 
 
@@ -130,19 +136,19 @@ def test_the_specimen_is_identified_within_its_spread(gap: float) -> None:
         truths |= {"bumper_stiffness_r": 510e3, "bumper_stiffness_l": 510e3}
         truths |= {"gap_r": GAP, "gap_l": GAP}
     for name, truth in truths.items():
-        value, sd, *_ = estimates(watched("", gap), name)[-1]
+        value, sd, *_ = estimates(monitor_session("", gap), name)[-1]
         assert 0 < sd < 0.02 * truth
         assert abs(value - truth) < 5 * sd, name
     if math.isinf(gap):
-        assert not estimates(watched("", gap), "gap_r")
+        assert not estimates(monitor_session("", gap), "gap_r")
 
 
 @pytest.mark.parametrize("rate", [1.5e-3, -1.5e-3])
 def test_a_stiffness_that_drifts_is_seen_and_measured(rate: float) -> None:
     truth = EFFECT.format("stiffness_drift", "", f"rate = {rate}")
-    items = watched(truth)
-    told = [one for one in warnings(items) if one.kind == "drift"]
-    assert [one.text.split()[0] for one in told] == ["stiffness"]
+    items = monitor_session(truth)
+    drifts = [warning for warning in warnings(items) if warning.kind == "drift"]
+    assert [drift.text.split()[0] for drift in drifts] == ["stiffness"]
     _, measured = session(truth)
     held = np.flatnonzero(measured.cycle >= 0) / measured.rate_hz
     value, _, drift, sd = estimates(items, "stiffness")[-1]
@@ -153,9 +159,9 @@ def test_a_stiffness_that_drifts_is_seen_and_measured(rate: float) -> None:
 
 
 def test_gaps_that_open_are_seen_on_both_sides_and_the_stiffness_is_left_alone() -> None:
-    items = watched(EFFECT.format("gap_drift", "", "rate = 3e-6"))
-    told = {one.text.split()[0] for one in warnings(items) if one.kind == "drift"}
-    assert told == {"gap_r", "gap_l"}
+    items = monitor_session(EFFECT.format("gap_drift", "", "rate = 3e-6"))
+    drifting = {warning.text.split()[0] for warning in warnings(items) if warning.kind == "drift"}
+    assert drifting == {"gap_r", "gap_l"}
     drift = estimates(items, "gap_r")[-1][2]
     assert 0.5 * 3e-6 * 20 < drift < 3e-6 * 60
 
@@ -172,21 +178,23 @@ def test_gaps_that_open_are_seen_on_both_sides_and_the_stiffness_is_left_alone()
 def test_sensors_that_contradict_each_other_are_named(
     channel: str, gain: float, named: str, number: float
 ) -> None:
-    items = watched(EFFECT.format("sensor_gain", f'channel = "{channel}"', f"gain = {gain}"))
-    (told,) = (one for one in warnings(items) if one.kind == "instrument")
-    assert named in told.text
-    numbers = [float(one) for one in re.findall(r"\b\d+\.?\d*\b", told.text)]
-    assert any(abs(one - number) < 0.02 * number for one in numbers), told.text
+    items = monitor_session(
+        EFFECT.format("sensor_gain", f'channel = "{channel}"', f"gain = {gain}")
+    )
+    (event,) = (warning for warning in warnings(items) if warning.kind == "instrument")
+    assert named in event.text
+    numbers = [float(number) for number in re.findall(r"\b\d+\.?\d*\b", event.text)]
+    assert any(abs(value - number) < 0.02 * number for value in numbers), event.text
 
 
 def test_a_model_that_is_wrong_disagrees_where_it_is_wrong() -> None:
-    items = watched("[base]\nbumper_stiffness_n_m = 700e3\n")
-    told = [one for one in warnings(items) if one.kind == "disagreement"]
-    assert told
-    assert "force" in told[0].text
-    assert "in contact" in told[0].text
-    assert "Hz forward" in told[0].text
-    assert len(told) < 10, "said once, and again only after they have agreed"
+    items = monitor_session("[base]\nbumper_stiffness_n_m = 700e3\n")
+    disagreements = [warning for warning in warnings(items) if warning.kind == "disagreement"]
+    assert disagreements
+    assert "force" in disagreements[0].text
+    assert "in contact" in disagreements[0].text
+    assert "Hz forward" in disagreements[0].text
+    assert len(disagreements) < 10, "said once, and again only after they have agreed"
 
 
 def test_warnings_are_of_the_kinds_that_a_replay_says_anew() -> None:
@@ -195,7 +203,9 @@ def test_warnings_are_of_the_kinds_that_a_replay_says_anew() -> None:
         "",
         EFFECT.format("gap_drift", "", "rate = 3e-6"),
     )
-    assert {one.kind for truth in truths for one in warnings(watched(truth))} <= set(EVENT_KINDS)
+    assert {
+        warning.kind for truth in truths for warning in warnings(monitor_session(truth))
+    } <= set(EVENT_KINDS)
 
 
 # Jumps
@@ -206,16 +216,16 @@ def test_the_jumps_of_the_model_lie_at_the_folds_of_its_branches() -> None:
     text = PROFILE.format(gap=4.0).replace("step_hz = 0.5", "step_hz = 0.1")
     rig, model = (PROFILES_DIR / name for name in ("rigs/simulated.toml", "models/snm.toml"))
     bundle = from_texts("x", text, rig.read_text(), model.read_text(), "x")
-    found = predict_jumps(bundle.profile, bundle.model, bundle.steps).jumps
-    assert [(one.after.direction, one.kind) for one in found] == [
+    jumps = predict_jumps(bundle.profile, bundle.model, bundle.steps).jumps
+    assert [(jump.after.direction, jump.kind) for jump in jumps] == [
         ("forward", "down"), ("backward", "up"),
     ]  # fmt: skip
     level = bundle.steps[0].acceleration_m_s2
-    for jump, from_hz, to_hz in ((found[0], 3.0, 4.4), (found[1], 4.4, 2.4)):
-        start = settle_to_orbit(bundle.parameters, from_hz, level)
+    period_map = make_period_map(bundle.model)
+    for jump, from_hz, direction in ((jumps[0], 3.0, 1), (jumps[1], 4.4, -1)):
+        start = settle_to_orbit(period_map, from_hz, level)
         assert start is not None
-        fold = continue_branch(bundle.parameters, level, start, to_hz, 0.05).end_hz
-        assert fold is not None
+        fold = continue_branch(start, "frequency", (2.4, 4.4), direction).folds[0].value
         assert abs(jump.at_hz - fold) < 1.5 * MAX_STEP_HZ
         ends = sorted((jump.before.frequency_hz, jump.after.frequency_hz))
         assert ends[0] <= fold <= ends[1]
@@ -227,7 +237,7 @@ def point(index: int, eta: float, direction: str = "forward") -> PrcPoint:
     return PrcPoint(1000 * index, index, direction, 3.0 + 0.1 * index, own, None, n, n, n)
 
 
-def driven(etas: Sequence[float | None], jump_after: int | None) -> list[Record]:
+def track_sweep(etas: Sequence[float | None], jump_after: int | None) -> list[Record]:
     """What is said about a forward sweep; the model jumps down into step `jump_after`."""
     steps = [Step(i, "forward", 3.0 + 0.1 * i, 0.5) for i in range(len(etas))]
     jumps: tuple[ExpectedJump, ...] = ()
@@ -238,8 +248,8 @@ def driven(etas: Sequence[float | None], jump_after: int | None) -> list[Record]
     passing, items = JumpTracking(upcoming=jumps), list[Record]()
     for place, eta in enumerate(etas):
         if eta is not None:
-            passing, said = track_jumps(passing, point(place, eta))
-            items.extend(said)
+            passing, new_items = track_jumps(passing, point(place, eta))
+            items.extend(new_items)
     return items
 
 
@@ -260,9 +270,9 @@ def driven(etas: Sequence[float | None], jump_after: int | None) -> list[Record]
 def test_a_jump_comes_or_not(
     etas: list[float | None], jump: int | None, kinds: list[str], words: str
 ) -> None:
-    told = warnings(driven(etas, jump))
-    assert [one.kind for one in told] == kinds
-    assert not told or words in told[-1].text
+    events = warnings(track_sweep(etas, jump))
+    assert [event.kind for event in events] == kinds
+    assert not events or words in events[-1].text
 
 
 @pytest.mark.parametrize(
@@ -276,7 +286,9 @@ def test_a_model_with_effects_foresees_in_a_bounded_time(
     model: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """However fine and long the test: by the cycles that are computed, not by a clock."""
-    texts = [(PROFILES_DIR / one).read_text() for one in ("rigs/simulated.toml", "models/snm.toml")]
+    texts = [
+        (PROFILES_DIR / name).read_text() for name in ("rigs/simulated.toml", "models/snm.toml")
+    ]
     long = PROFILE.format(gap=4.0).replace("step_hz = 0.5", "step_hz = 0.01")
     bundle = from_texts("x", long, texts[0], texts[1] + "\n" + model, "x")
     cycles = []
@@ -292,8 +304,8 @@ def test_a_model_with_effects_foresees_in_a_bounded_time(
 
 
 def test_the_next_jump_is_ahead_until_it_is_passed() -> None:
-    ahead = [one for one in driven([5, 5, 5, 1, 1], 3) if isinstance(one, JumpForecast)]
-    assert [one.kind for one in ahead] == ["down", "down", "down", "", ""]
+    ahead = [item for item in track_sweep([5, 5, 5, 1, 1], 3) if isinstance(item, JumpForecast)]
+    assert [forecast.kind for forecast in ahead] == ["down", "down", "down", "", ""]
     assert ahead[0].jump_hz == pytest.approx(3.25)
     assert (ahead[0].low_hz, ahead[0].high_hz) == (pytest.approx(3.2), pytest.approx(3.3))
     assert math.isnan(ahead[-1].jump_hz)
@@ -310,13 +322,13 @@ def cycles(amplitudes: Sequence[float]) -> list[Record]:
         u = amplitude * np.sin(2 * np.pi * np.arange(400) / 400)
         labels = (np.full(400, 3), np.full(400, 2), np.full(400, number))
         block = Block("meas", 400 * number, 1000.0, ("rel_disp_m",), u[None], *labels)
-        was, said = detect_attractor_change(was, CycleData(step, number, block, block, block))
-        items.extend(said)
+        was, new_items = detect_attractor_change(was, CycleData(step, number, block, block, block))
+        items.extend(new_items)
     return items
 
 
 @pytest.mark.parametrize(
-    "amplitudes, said",
+    "amplitudes, count",
     [
         ([1.0] * 8, 0),
         ([0.2, 0.5, 0.8, 0.9, 0.97, 1.0, 1.0, 1.0, 1.0], 0),  # a transient
@@ -326,9 +338,9 @@ def cycles(amplitudes: Sequence[float]) -> list[Record]:
         ([1.0, 2.0] * 6, 0),  # was never steady
     ],
 )
-def test_a_change_of_attractor_is_said_once(amplitudes: list[float], said: int) -> None:
-    told = warnings(cycles([1e-3 * one for one in amplitudes]))
-    assert [one.kind for one in told] == ["attractor"] * said
+def test_a_change_of_attractor_is_said_once(amplitudes: list[float], count: int) -> None:
+    events = warnings(cycles([1e-3 * amplitude for amplitude in amplitudes]))
+    assert [event.kind for event in events] == ["attractor"] * count
 
 
 def test_visits_to_one_frequency_are_one_motion() -> None:
@@ -339,8 +351,8 @@ def test_visits_to_one_frequency_are_one_motion() -> None:
         u = amplitude * np.sin(2 * np.pi * np.arange(400) / 400)
         labels = (np.full(400, step.index), np.full(400, 2), np.full(400, number % 3))
         block = Block("meas", 400 * number, 1000.0, ("rel_disp_m",), u[None], *labels)
-        was, said = detect_attractor_change(was, CycleData(step, number, block, block, block))
-        items.extend(said)
+        was, new_items = detect_attractor_change(was, CycleData(step, number, block, block, block))
+        items.extend(new_items)
     (event,) = items
     assert isinstance(event, Event)
     assert event.kind == "attractor"
@@ -356,17 +368,17 @@ def test_a_twin_that_begins_in_motion_says_nothing_wrong_and_the_same_however_cu
     """It knows no noise; the run's last rest comes after its last cycle and must not reach back."""
     bundle, measured = session()
     setup, begins = bundle.prepare_twin(), int(part * len(measured))
-    found = []
+    encoded = []
     for samples in (len(measured), 1000, 20):
         state, _ = pipeline.start_pipeline(setup, begins)
         items: list[Record] = []
         for first in range(begins, measured.end, samples):
             cut = measured.cut(first, min(first + samples, measured.end))
             state, made = pipeline.step(setup, state, cut)
-            items += [one for one in made if not isinstance(one, Block)]
-        found.append(sorted(encode_item(one, "") for one in items))
-        assert {one.kind for one in warnings(items)} <= {"jump"}
-    assert found[0] == found[1] == found[2]
+            items += [item for item in made if not isinstance(item, Block)]
+        encoded.append(sorted(encode_item(item, "") for item in items))
+        assert {warning.kind for warning in warnings(items)} <= {"jump"}
+    assert encoded[0] == encoded[1] == encoded[2]
 
 
 @pytest.mark.parametrize(
@@ -387,20 +399,22 @@ def test_what_the_model_has_is_not_found_again(truth: str, expected: dict[str, f
             f'channel = "{name.partition(".")[2]}"' if "." in name else "",
             number.replace("=", " = "),
         )
-        for name, number in (one.split() for one in truth.split("; "))
+        for name, number in (line.split() for line in truth.split("; "))
     )
     bundle, measured = session(text)
-    told = re.sub(r'channel = ("\w+")\nparameters = \{', r"parameters = { channel = \1,", text)
-    card = (PROFILES_DIR / "models/snm.toml").read_text() + "\n" + told
+    effect_tables = re.sub(
+        r'channel = ("\w+")\nparameters = \{', r"parameters = { channel = \1,", text
+    )
+    card = (PROFILES_DIR / "models/snm.toml").read_text() + "\n" + effect_tables
     same = from_texts("x", bundle.profile_toml, bundle.rig_toml, card, "x")
     setup = same.prepare_twin()
     state, _ = pipeline.start_pipeline(setup)
     _, made = pipeline.step(setup, state, measured)
-    items = [one for one in made if not isinstance(one, Block)]
+    items = [item for item in made if not isinstance(item, Block)]
     for name, value in expected.items():
-        found, sd, *_ = estimates(items, name)[-1]
-        assert abs(found - value) < 0.02 * value + 5 * sd, (name, found)
-    assert "drift" not in {one.kind for one in warnings(items)}
+        estimate, sd, *_ = estimates(items, name)[-1]
+        assert abs(estimate - value) < 0.02 * value + 5 * sd, (name, estimate)
+    assert "drift" not in {warning.kind for warning in warnings(items)}
 
 
 def test_a_bumper_where_none_should_be_is_no_crash() -> None:
@@ -410,7 +424,7 @@ def test_a_bumper_where_none_should_be_is_no_crash() -> None:
     setup = bundle.prepare_twin()
     state, _ = pipeline.start_pipeline(setup)
     _, made = pipeline.step(setup, state, measured)
-    assert "disagreement" in {one.kind for one in made if isinstance(one, Event)}
+    assert "disagreement" in {item.kind for item in made if isinstance(item, Event)}
 
 
 def test_cells_that_read_nothing_in_contact_are_beyond_their_band() -> None:
@@ -423,15 +437,19 @@ def test_cells_that_read_nothing_in_contact_are_beyond_their_band() -> None:
     setup = bundle.prepare_twin()
     state, _ = pipeline.start_pipeline(setup)
     _, made = pipeline.step(setup, state, block)
-    told = [one for one in made if isinstance(one, Event) and one.kind == "disagreement"]
-    assert told
-    assert "force_r" in told[0].text
+    disagreements = [
+        item for item in made if isinstance(item, Event) and item.kind == "disagreement"
+    ]
+    assert disagreements
+    assert "force_r" in disagreements[0].text
 
 
 def test_a_lost_sample_now_and_then_hides_no_disagreement_and_repeats_none() -> None:
     truth = "[base]\nbumper_stiffness_n_m = 700e3\n"
     bundle, measured = session(truth)
-    whole = [one for one in warnings(watched(truth)) if one.kind == "disagreement"]
+    whole = [
+        warning for warning in warnings(monitor_session(truth)) if warning.kind == "disagreement"
+    ]
     values = measured.values.copy()
     values[measured.channels.index("mass_disp_m"), ::1000] = np.nan
     labels = measured.step, measured.label, measured.cycle
@@ -439,8 +457,10 @@ def test_a_lost_sample_now_and_then_hides_no_disagreement_and_repeats_none() -> 
     setup = bundle.prepare_twin()
     state, _ = pipeline.start_pipeline(setup)
     _, made = pipeline.step(setup, state, block)
-    told = [one for one in made if isinstance(one, Event) and one.kind == "disagreement"]
-    assert 1 <= len(told) <= len(whole) + 1
+    disagreements = [
+        item for item in made if isinstance(item, Event) and item.kind == "disagreement"
+    ]
+    assert 1 <= len(disagreements) <= len(whole) + 1
 
 
 # What stands below
@@ -487,5 +507,5 @@ def test_without_sensors_it_says_less_and_nothing_wrong() -> None:
         block = Block("meas", 0, measured.rate_hz, measured.channels, values, *labels)
         state, _ = pipeline.start_pipeline(setup)
         _, items = pipeline.step(setup, state, block)
-        records = [one for one in items if not isinstance(one, Block)]
-        assert all("where the model expects" in one.text for one in warnings(records)), lost
+        records = [item for item in items if not isinstance(item, Block)]
+        assert all("where the model expects" in warning.text for warning in warnings(records)), lost

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from table_io.block import recut_blocks
-from tests.compare.test_twins import G4, RATE, followed, measured, shaken, track
+from tests.compare.test_twins import G4, RATE_HZ, measured, run_twins, shaken, track
 from twin.compare.sensors import delay_signal
 from twin.compare.twins import TwinSetup, advance_twins
 from twin.model.effects import find_effect
@@ -18,15 +18,15 @@ EVERYTHING = ("bouc_wen", "maxwell_damper", "bumper_hardening", "bumper_maxwell"
 
 
 def model(*ids: str) -> Model:
-    found = Model(G4)
+    built = Model(G4)
     for name in ids:
         effect = find_effect(name)
-        found = found.with_effect(name, "", **{p.name: p.typical for p in effect.parameters})
-    return found
+        built = built.with_effect(name, "", **{p.name: p.typical for p in effect.parameters})
+    return built
 
 
-def setup(one: Model) -> TwinSetup:
-    return TwinSetup(one, RATE, 500, 20, 10.0)
+def setup(model: Model) -> TwinSetup:
+    return TwinSetup(model, RATE_HZ, 500, 20, 10.0)
 
 
 @pytest.mark.parametrize("samples", [0.0, 0.3, 1.0, 2.0, 2.7, 40.5])
@@ -44,21 +44,21 @@ def test_a_cubic_is_delayed_exactly(samples: float) -> None:
 
 @pytest.mark.parametrize("samples", [1, 7, 64, 500])
 def test_the_cut_changes_no_bit_with_effects_and_sensors(samples: int) -> None:
-    one = model(*EVERYTHING).with_effect("sensor_lag", "mass_acc_m_s2", lag=1.3e-3)
-    one = one.with_effect("sensor_gain", "mass_disp_m", gain=1.02)
+    full_model = model(*EVERYTHING).with_effect("sensor_lag", "mass_acc_m_s2", lag=1.3e-3)
+    full_model = full_model.with_effect("sensor_gain", "mass_disp_m", gain=1.02)
     block = measured(G4, shaken(seconds=1.2), noise=1.0)
-    whole, comparisons = followed(setup(one), [block])
-    cut, others = followed(setup(one), list(recut_blocks([block], samples)))
+    whole, comparisons = run_twins(setup(full_model), [block])
+    cut, others = run_twins(setup(full_model), list(recut_blocks([block], samples)))
     assert cut.is_identical(whole)
     assert [encode_item(c, "r") for c in comparisons] == [encode_item(c, "r") for c in others]
 
 
 def test_sensors_change_the_reading_and_nothing_else() -> None:
     block = measured(G4, shaken(seconds=1.0))
-    plain = followed(setup(Model(G4)), [block])[0]
+    plain = run_twins(setup(Model(G4)), [block])[0]
     bent = Model(G4).with_effect("sensor_gain", "force_r1_n", gain=1.1)
-    bent = bent.with_effect("sensor_lag", "mass_acc_m_s2", lag=2 / RATE)
-    got = followed(setup(bent), [block])[0]
+    bent = bent.with_effect("sensor_lag", "mass_acc_m_s2", lag=2 / RATE_HZ)
+    got = run_twins(setup(bent), [block])[0]
     a, b = (plain.channel("free/mass_acc_m_s2"), got.channel("free/mass_acc_m_s2"))
     # the lag stays in what a restart sees, and so the free twin starts a little off
     np.testing.assert_allclose(b[600:], a[598:-2], atol=2e-2 * np.nanmax(a))
@@ -72,8 +72,8 @@ def test_an_offset_is_taken_out_of_the_restart_and_put_into_the_reading() -> Non
     values[block.channels.index("mass_disp_m")] += 5e-4
     off = replace(block, values=values)
     knows = Model(G4).with_effect("sensor_offset", "mass_disp_m", offset=5e-4)
-    good = followed(setup(Model(G4)), [block])[0]
-    got = followed(setup(knows), [off])[0]
+    good = run_twins(setup(Model(G4)), [block])[0]
+    got = run_twins(setup(knows), [off])[0]
     names = ("rel_disp_m", "mass_disp_m")
     for name in names:
         shift = got.channel(f"window/{name}") - good.channel(f"window/{name}")
@@ -82,8 +82,8 @@ def test_an_offset_is_taken_out_of_the_restart_and_put_into_the_reading() -> Non
 
 def test_hidden_states_go_on_over_a_restart() -> None:
     """With the right model the windowed twin stays on the measured motion, memory included."""
-    one = model("bouc_wen", "maxwell_damper")
-    solver, base = one.prepare(RATE), shaken(seconds=2.5)
+    memory_model = model("bouc_wen", "maxwell_damper")
+    solver, base = memory_model.prepare(RATE_HZ), shaken(seconds=2.5)
     out, state = np.empty((7, base.size)), solver.rest_state()
     solver.advance(state, base, base, out)
     block = measured(G4, base)
@@ -93,7 +93,7 @@ def test_hidden_states_go_on_over_a_restart() -> None:
                       ("force_l1_n", -out[4] / 2), ("force_l2_n", -out[4] / 2)):  # fmt: skip
         rows[block.channels.index(name)] = row
     block = replace(block, values=rows)
-    predicted, _ = followed(setup(one), [block])
+    predicted, _ = run_twins(setup(memory_model), [block])
     u = track(predicted, "window")[0]
     error = np.abs(u - out[0])
     assert np.abs(out[0]).max() > 4e-3
@@ -102,10 +102,10 @@ def test_hidden_states_go_on_over_a_restart() -> None:
 
 
 def test_tracks_of_a_model_with_effects_are_values() -> None:
-    one = setup(model("bouc_wen"))
+    twin_setup = setup(model("bouc_wen"))
     from twin.compare.twins import start_twins
 
     block = measured(G4, shaken(seconds=0.8))
-    tracks = start_twins(one, 0)
-    first = advance_twins(one, tracks, block)[1]
-    assert advance_twins(one, tracks, block)[1].is_identical(first)
+    tracks = start_twins(twin_setup, 0)
+    first = advance_twins(twin_setup, tracks, block)[1]
+    assert advance_twins(twin_setup, tracks, block)[1].is_identical(first)

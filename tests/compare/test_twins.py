@@ -30,8 +30,8 @@ from twin.model.model import Model
 from twin.model.parameters import Parameters
 from twin.transport.codec import encode_item
 
-RATE = 2000.0
-H = round(HISTORY_S * RATE)  # samples that a restart needs
+RATE_HZ = 2000.0
+H = round(HISTORY_S * RATE_HZ)  # samples that a restart needs
 LEVEL = 0.05 * 9.80665
 G4 = Parameters(550.0, 36e3, 1.1e3, 510e3, 900.0, 510e3, 900.0, 0.002, 0.002)
 FREE = replace(G4, gap_r=math.inf, gap_l=math.inf)
@@ -45,7 +45,7 @@ CHANNELS = (
 
 def shaken(hz: float = 2.6, seconds: float = 3.0, ramp_s: float = 0.5) -> Float1D:
     """Table acceleration of a sine that comes up smoothly, m/s2."""
-    t = np.arange(round(seconds * RATE)) / RATE
+    t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
     return LEVEL * np.minimum(t / ramp_s, 1.0) ** 2 * np.sin(2 * np.pi * hz * t)
 
 
@@ -53,7 +53,7 @@ def motion(parameters: Parameters, base_acc: Float1D, state: Float1D | None = No
     """The solver's rows (7, sample) from rest, or from `state`, which moves on."""
     out = np.empty((len(OUTPUT_NAMES), base_acc.size))
     state = rest_state(parameters) if state is None else state
-    advance_state(state, discretized_params(parameters, RATE), base_acc, out)
+    advance_state(state, discretized_params(parameters, RATE_HZ), base_acc, out)
     return out
 
 
@@ -75,7 +75,7 @@ def measured(
     kept = [place for place, name in enumerate(CHANNELS) if name not in without]
     outside = np.full(base_acc.size, -1)
     names = tuple(CHANNELS[place] for place in kept)
-    return Block("meas", index, RATE, names, values[kept], outside, outside, outside)
+    return Block("meas", index, RATE_HZ, names, values[kept], outside, outside, outside)
 
 
 def spoilt(block: Block, channel: str, first: int, last: int) -> Block:
@@ -86,25 +86,25 @@ def spoilt(block: Block, channel: str, first: int, last: int) -> Block:
 
 
 def twin(parameters: Parameters = G4, window: int = 500, grid: int = 20) -> TwinSetup:
-    return TwinSetup(Model(parameters), RATE, window, grid, 10.0)
+    return TwinSetup(Model(parameters), RATE_HZ, window, grid, 10.0)
 
 
-def followed(
+def run_twins(
     setup: TwinSetup, blocks: Sequence[Block], tracks: TwinStates | None = None
 ) -> tuple[Block, list[Comparison]]:
     """(joined predicted block, all comparisons) of consecutive measured blocks."""
     tracks = start_twins(setup, blocks[0].index) if tracks is None else tracks
     predicted, comparisons = [], []
     for block in blocks:
-        tracks, one, made = advance_twins(setup, tracks, block)
-        predicted.append(one)
+        tracks, predicted_block, made = advance_twins(setup, tracks, block)
+        predicted.append(predicted_block)
         comparisons.extend(made)
     return join_blocks(predicted), comparisons
 
 
 def track(predicted: Block, name: str) -> Float2D:
     """The channels of one track, (PREDICTED_CHANNELS, sample)."""
-    return np.array([predicted.channel(f"{name}/{one}") for one in PREDICTED_CHANNELS])
+    return np.array([predicted.channel(f"{name}/{channel}") for channel in PREDICTED_CHANNELS])
 
 
 def nrmse(measured: Float1D, predicted: Float1D) -> float:
@@ -118,7 +118,7 @@ def nrmse(measured: Float1D, predicted: Float1D) -> float:
 
 def swing(hz: float) -> tuple[Float1D, Float1D, float, float]:
     """(u, u'' over the history, true u and u' at its end) of a swing about an offset."""
-    t = (np.arange(H) - (H - 1)) / RATE
+    t = (np.arange(H) - (H - 1)) / RATE_HZ
     w = 2 * math.pi * hz
     u = 1e-3 + 5e-3 * np.sin(w * t + 0.7)
     return u, -5e-3 * w**2 * np.sin(w * t + 0.7), float(u[-1]), 5e-3 * w * math.cos(0.7)
@@ -128,17 +128,17 @@ def swing(hz: float) -> tuple[Float1D, Float1D, float, float]:
 def test_state_of_a_clean_swing(hz: float) -> None:
     """An acceleration that is linear between samples lacks (w h)^2 / 12 of a sine."""
     u, acc, u0, v0 = swing(hz)
-    got = estimate_motion(u, acc, RATE)
+    got = estimate_motion(u, acc, RATE_HZ)
     w = 2 * math.pi * hz
-    lacking = (w / RATE) ** 2 / 12
+    lacking = (w / RATE_HZ) ** 2 / 12
     assert got[0] == pytest.approx(u0, abs=2 * lacking * 5e-3)
     assert got[1] == pytest.approx(v0, abs=2 * lacking * 5e-3 * w)
 
 
 def test_state_of_a_thrown_body_is_exact() -> None:
-    t = (np.arange(H) - (H - 1)) / RATE
+    t = (np.arange(H) - (H - 1)) / RATE_HZ
     u = 0.003 - 0.2 * t + 0.5 * 4.0 * t**2
-    got = estimate_motion(u, np.full(H, 4.0), RATE)
+    got = estimate_motion(u, np.full(H, 4.0), RATE_HZ)
     np.testing.assert_allclose(got, (0.003, -0.2), rtol=1e-12)
 
 
@@ -147,26 +147,26 @@ def test_noise_of_the_laser_costs_what_least_squares_theory_says() -> None:
     rng, sigma = np.random.default_rng(3), 7e-6
     u, acc, u0, v0 = swing(3.4)
     got = np.array(
-        [estimate_motion(u + sigma * rng.standard_normal(H), acc, RATE) for _ in range(1500)]
+        [estimate_motion(u + sigma * rng.standard_normal(H), acc, RATE_HZ) for _ in range(1500)]
     )
     want = (
         sigma * math.sqrt(2 * (2 * H - 1) / (H * (H + 1))),
-        sigma * RATE * math.sqrt(12 / (H * (H**2 - 1))),
+        sigma * RATE_HZ * math.sqrt(12 / (H * (H**2 - 1))),
     )
     np.testing.assert_allclose(got.std(axis=0), want, rtol=0.08)
     np.testing.assert_allclose(got.mean(axis=0), (u0, v0), atol=4 * max(want) / math.sqrt(1500))
     # a difference of two samples would be 600 times worse
-    assert want[1] < sigma * RATE / 500
+    assert want[1] < sigma * RATE_HZ / 500
 
 
 def test_noise_of_the_accelerometer_is_integrated_not_amplified() -> None:
     """The estimate is linear, so its spread follows exactly from its answer to unit samples."""
     rng, sigma = np.random.default_rng(4), NOISE[1]
     still = np.zeros(H)
-    answers = np.array([estimate_motion(still, one, RATE) for one in np.eye(H)])
+    answers = np.array([estimate_motion(still, eye, RATE_HZ) for eye in np.eye(H)])
     want = sigma * np.sqrt((answers**2).sum(axis=0))
     got = np.array(
-        [estimate_motion(still, sigma * rng.standard_normal(H), RATE) for _ in range(1500)]
+        [estimate_motion(still, sigma * rng.standard_normal(H), RATE_HZ) for _ in range(1500)]
     )
     np.testing.assert_allclose(got.std(axis=0), want, rtol=0.08)
     assert want[0] < 2e-6
@@ -180,13 +180,13 @@ def test_state_across_impacts() -> None:
     ends = np.arange(3000, u.size, 7)
     got = np.array(
         [
-            estimate_motion(u[end - H : end], (a - base_acc)[end - H : end], RATE)
+            estimate_motion(u[end - H : end], (a - base_acc)[end - H : end], RATE_HZ)
             for end in ends.tolist()
         ]
     )
     touched = (force_r[3000:] > 0).any() and (force_l[3000:] < 0).any()
     assert touched, "the sweep must reach both bumpers"
-    jump = G4.bumper_damping_r * abs(v).max() / G4.mass / RATE / 2
+    jump = G4.bumper_damping_r * abs(v).max() / G4.mass / RATE_HZ / 2
     assert abs(got[:, 0] - u[ends - 1]).max() < jump * HISTORY_S / 2
     assert abs(got[:, 1] - v[ends - 1]).max() < 1.5 * jump
 
@@ -206,7 +206,7 @@ def reference(setup: TwinSetup, block: Block) -> tuple[Float2D, Float2D]:
         if at < setup.history_samples - 1:
             continue
         past = slice(at + 1 - H, at + 1)
-        u0, v0 = estimate_motion(u[past], acc[past], RATE)
+        u0, v0 = estimate_motion(u[past], acc[past], RATE_HZ)
         state = restart_state(u0, v0, 0.0, 0.0, False, False, base[at], p)
         if first:
             free[:, at + 1 :] = motion(p, base[at + 1 :].copy(), state.copy())[:3]
@@ -222,7 +222,7 @@ def test_restarts_are_at_multiples_of_the_window_and_nowhere_else(index: int, sa
     """With a wrong model, so that a restart elsewhere would show."""
     setup = twin(replace(FREE, stiffness=33e3))
     block = measured(FREE, shaken(seconds=1.5), index=index, noise=1.0)
-    predicted, _ = followed(setup, list(recut_blocks([block], samples)))
+    predicted, _ = run_twins(setup, list(recut_blocks([block], samples)))
     for name, want in zip(("free", "window"), reference(setup, block), strict=True):
         np.testing.assert_array_equal(track(predicted, name)[[0, 1, 3]], want)
 
@@ -230,8 +230,8 @@ def test_restarts_are_at_multiples_of_the_window_and_nowhere_else(index: int, sa
 def test_predictions_are_causal() -> None:
     block = measured(G4, shaken(), noise=1.0)
     other = replace(block, values=np.where(np.arange(len(block)) < 4000, block.values, 1.0))
-    a, _ = followed(twin(), [block])
-    b, _ = followed(twin(), [other])
+    a, _ = run_twins(twin(), [block])
+    b, _ = run_twins(twin(), [other])
     assert a.cut(0, 4000).is_identical(b.cut(0, 4000))
     assert not a.is_identical(b)
 
@@ -240,7 +240,7 @@ def test_a_wrong_model_errs_boundedly_in_windows_and_more_when_free() -> None:
     """10 % off in stiffness, in flight near resonance: the free twin keeps its own amplitude."""
     block = measured(FREE, shaken(hz=1.25, seconds=8.0), noise=1.0)
     u = block.channel("mass_disp_m") - block.channel("table_disp_m")
-    predicted, _ = followed(twin(replace(FREE, stiffness=1.1 * 36e3), window=200), [block])
+    predicted, _ = run_twins(twin(replace(FREE, stiffness=1.1 * 36e3), window=200), [block])
     error = abs(predicted.channel("window/rel_disp_m") - u)[1000:]
     # within a window only the wrong part of the spring force acts: dK u_max / M * t^2 / 2
     bound = 3600 * abs(u).max() / 550 * 0.1**2 / 2
@@ -250,7 +250,7 @@ def test_a_wrong_model_errs_boundedly_in_windows_and_more_when_free() -> None:
 
 def test_a_right_model_stays_with_the_measurement() -> None:
     block = measured(G4, shaken(), noise=1.0)
-    predicted, _ = followed(twin(), [block])
+    predicted, _ = run_twins(twin(), [block])
     u = block.channel("mass_disp_m") - block.channel("table_disp_m")
     for name in ("free", "window"):
         assert nrmse(u, predicted.channel(f"{name}/rel_disp_m")) < 0.01
@@ -260,7 +260,7 @@ def test_a_right_model_stays_with_the_measurement() -> None:
 
 def test_mass_displacement_is_that_of_the_measured_table_and_the_predicted_u() -> None:
     block = measured(G4, shaken(seconds=1.0))
-    predicted, _ = followed(twin(), [block])
+    predicted, _ = run_twins(twin(), [block])
     np.testing.assert_array_equal(
         predicted.channel("window/mass_disp_m"),
         block.channel("table_disp_m") + predicted.channel("window/rel_disp_m"),
@@ -277,7 +277,7 @@ def restarted_errors(
     base_acc = shaken()
     _, _, _, force_r, force_l, *_ = motion(truth, base_acc)
     block = measured(truth, base_acc, without=without)
-    predicted, _ = followed(twin(model, window), [block])
+    predicted, _ = run_twins(twin(model, window), [block])
     return (
         nrmse(force_r, 2 * predicted.channel("window/force_r1_n")),
         nrmse(-force_l, 2 * predicted.channel("window/force_l1_n")),
@@ -308,7 +308,7 @@ def test_memory_of_a_slow_bumper_needs_its_history() -> None:
     """History is eight relaxation times: 0.8 s here, so no restart comes before that."""
     setup = twin(SLOW, window=100)
     assert setup.history_samples == 1600
-    predicted, _ = followed(setup, [measured(SLOW, shaken())])
+    predicted, _ = run_twins(setup, [measured(SLOW, shaken())])
     known = np.flatnonzero(np.isfinite(predicted.channel("window/rel_disp_m")))
     assert known[0] == 1601
 
@@ -316,7 +316,7 @@ def test_memory_of_a_slow_bumper_needs_its_history() -> None:
 def test_negative_gap_at_rest_stays_in_both_contacts() -> None:
     """Precompressed by 1 mm a side: 510 N each, and no motion after a restart."""
     pressed = replace(G4, gap_r=-0.001, gap_l=-0.001)
-    predicted, _ = followed(twin(pressed), [measured(pressed, np.zeros(2000))])
+    predicted, _ = run_twins(twin(pressed), [measured(pressed, np.zeros(2000))])
     window = track(predicted, "window")[:, 501:]
     np.testing.assert_allclose(window[0], 0.0, atol=1e-12)
     np.testing.assert_allclose(2 * window[4:].reshape(4, -1)[[0, 2]], 510.0, rtol=1e-9)
@@ -332,13 +332,13 @@ def test_negative_gap_in_motion() -> None:
 
 def test_without_an_accelerometer_nothing_is_predicted() -> None:
     block = measured(G4, shaken(seconds=1.0), without=("mass_acc_m_s2",))
-    predicted, comparisons = followed(twin(), [block])
+    predicted, comparisons = run_twins(twin(), [block])
     assert np.isnan(predicted.values).all()
     assert len(comparisons) == 100
     place = COMPARED_CHANNELS.index("rel_disp_m")
-    for one in comparisons:
-        assert np.isfinite(one.measured_ss[place])
-        assert np.isnan([*one.free_error_ss, *one.window_error_ss]).all()
+    for comparison in comparisons:
+        assert np.isfinite(comparison.measured_ss[place])
+        assert np.isnan([*comparison.free_error_ss, *comparison.window_error_ss]).all()
 
 
 @pytest.mark.parametrize("samples", [1, 64, 10_000])
@@ -347,7 +347,7 @@ def test_lost_table_acceleration_silences_both_twins_until_a_whole_history(
     window: int, samples: int
 ) -> None:
     block = spoilt(measured(G4, shaken(), noise=1.0), "table_acc_m_s2", 3120, 3131)
-    predicted, _ = followed(twin(window=window), list(recut_blocks([block], samples)))
+    predicted, _ = run_twins(twin(window=window), list(recut_blocks([block], samples)))
     again = -(-(3130 + H) // window) * window  # the first restart index with H clean samples
     for name in ("free", "window"):
         silent = np.isnan(predicted.channel(f"{name}/rel_disp_m"))
@@ -359,7 +359,7 @@ def test_lost_table_acceleration_silences_both_twins_until_a_whole_history(
 @pytest.mark.parametrize("channel", ["mass_disp_m", "mass_acc_m_s2"])
 def test_lost_motion_silences_only_the_windows_that_would_start_from_it(channel: str) -> None:
     block = spoilt(measured(G4, shaken(), noise=1.0), channel, 3490, 3495)
-    predicted, _ = followed(twin(), [block])
+    predicted, _ = run_twins(twin(), [block])
     silent = np.isnan(predicted.channel("window/rel_disp_m"))
     assert np.flatnonzero(silent[501:]).tolist() == list(range(3000, 3500))
     assert not np.isnan(predicted.channel("free/rel_disp_m")[501:]).any()
@@ -369,7 +369,7 @@ def test_lost_load_cell_samples_do_not_stop_a_restart() -> None:
     block = measured(G4, shaken(), noise=1.0)
     for cell in CHANNELS[4:]:
         block = spoilt(block, cell, 2900, 3600)
-    predicted, _ = followed(twin(), [block])
+    predicted, _ = run_twins(twin(), [block])
     assert np.isfinite(predicted.values[:, 501:]).all()
     u = block.channel("mass_disp_m") - block.channel("table_disp_m")
     assert nrmse(u, predicted.channel("window/rel_disp_m")) < 0.01
@@ -379,10 +379,12 @@ def test_missing_samples_are_a_fresh_start() -> None:
     setup, block = twin(), measured(G4, shaken(), noise=1.0)
     tracks, _, _ = advance_twins(setup, start_twins(setup, 0), block.cut(0, 2713))
     after = block.cut(2750, len(block))
-    predicted, comparisons = followed(setup, [after], tracks)
-    fresh, again = followed(setup, [after])
+    predicted, comparisons = run_twins(setup, [after], tracks)
+    fresh, again = run_twins(setup, [after])
     assert predicted.is_identical(fresh)
-    assert [encode_item(one, "") for one in comparisons] == [encode_item(one, "") for one in again]
+    assert [encode_item(comparison, "") for comparison in comparisons] == [
+        encode_item(comparison, "") for comparison in again
+    ]
     assert np.flatnonzero(np.isfinite(predicted.channel("free/rel_disp_m")))[0] == 3000 + 1 - 2750
 
 
@@ -390,7 +392,7 @@ def test_a_twin_from_rest_never_restarts() -> None:
     """The model alone: no measurement is read, the free twin runs from rest at once."""
     setup = replace(twin(), from_rest=True)
     block = measured(G4, shaken(seconds=1.0), without=CHANNELS[2:])
-    predicted, _ = followed(setup, [block])
+    predicted, _ = run_twins(setup, [block])
     want = motion(G4, block.channel("table_acc_m_s2").copy())
     np.testing.assert_array_equal(predicted.channel("free/rel_disp_m"), want[0])
     assert np.isnan(track(predicted, "window")).all()
@@ -405,7 +407,7 @@ def direct(block: Block, predicted: Block, name: str) -> tuple[Float1D, Float1D,
         x = block.channel("mass_disp_m") - block.channel("table_disp_m")
     else:
         x = block.channel(name)
-    free, window = (x - predicted.channel(f"{one}/{name}") for one in ("free", "window"))
+    free, window = (x - predicted.channel(f"{kind}/{name}") for kind in ("free", "window"))
     return x**2, free**2, window**2
 
 
@@ -415,22 +417,28 @@ def test_one_comparison_per_grid_cell_with_the_sums_of_its_samples(
     index: int, samples: int
 ) -> None:
     block = measured(G4, shaken(seconds=1.0), index=index, noise=1.0)
-    predicted, comparisons = followed(twin(), list(recut_blocks([block], samples)))
+    predicted, comparisons = run_twins(twin(), list(recut_blocks([block], samples)))
     edges = [index, *range(20 * (index // 20 + 1), block.end + 1, 20)]
-    assert [(one.index, one.index + one.count) for one in comparisons] == [*pairwise(edges)]
+    assert [
+        (comparison.index, comparison.index + comparison.count) for comparison in comparisons
+    ] == [*pairwise(edges)]
     for name in COMPARED_CHANNELS:
         sums = direct(block, predicted, name)
         place = COMPARED_CHANNELS.index(name)
-        for one in comparisons:
-            cell = slice(one.index - index, one.index - index + one.count)
-            got = (one.measured_ss[place], one.free_error_ss[place], one.window_error_ss[place])
+        for comparison in comparisons:
+            cell = slice(comparison.index - index, comparison.index - index + comparison.count)
+            got = (
+                comparison.measured_ss[place],
+                comparison.free_error_ss[place],
+                comparison.window_error_ss[place],
+            )
             np.testing.assert_allclose(got, [row[cell].sum() for row in sums], rtol=1e-12)
     assert np.isfinite(comparisons[-1].window_error_ss).all()
 
 
 def test_a_comparison_of_a_missing_channel_is_nan_and_leaves_the_others() -> None:
     block = measured(G4, shaken(seconds=1.0), without=("force_l1_n",))
-    _, comparisons = followed(twin(), [block])
+    _, comparisons = run_twins(twin(), [block])
     place = COMPARED_CHANNELS.index("force_l1_n")
     last = asdict(comparisons[-1])
     for sums in ("measured_ss", "free_error_ss", "window_error_ss"):
@@ -442,6 +450,6 @@ def test_a_comparison_of_a_missing_channel_is_nan_and_leaves_the_others() -> Non
 def test_a_comparison_holds_no_wall_clock() -> None:
     """Two runs over the same samples say the same bytes."""
     block = measured(G4, shaken(seconds=0.6), noise=1.0)
-    a, b = (followed(twin(), [block])[1] for _ in range(2))
-    assert [encode_item(one, "run") for one in a] == [encode_item(one, "run") for one in b]
+    a, b = (run_twins(twin(), [block])[1] for _ in range(2))
+    assert [encode_item(item, "run") for item in a] == [encode_item(item, "run") for item in b]
     assert len(a) == 60

@@ -15,15 +15,18 @@ def test_a_batch_is_what_its_sweeps_are_one_by_one() -> None:
     models = make_gap_variants(Model(G4), [0.03, 0.01, 0.004, -0.002])
     models.append(Model(G4).with_effect("cubic_stiffness", k3=1e6))
     frequencies = [1.8, 2.0]
-    one = sweep_models(models, frequencies, AG, 4, cores=1)
+    single_core = sweep_models(models, frequencies, AG, 4, cores=1)
     two = sweep_models(models, frequencies, AG, 4, cores=2)
-    for a, b in zip(one, two, strict=True):
+    for a, b in zip(single_core, two, strict=True):
         assert a.extremes.tobytes() == b.extremes.tobytes()
-    for model, found in zip(models[:4], one, strict=False):
+    for model, sweep in zip(models[:4], single_core, strict=False):
         want = simulate_stepped_sine(model.parameters, frequencies, AG, 4)
-        assert np.array_equal(found.extremes, want.extremes)
+        assert np.array_equal(sweep.extremes, want.extremes)
     assert [m.parameters.gap_r for m in models[:4]] == [0.015, 0.005, 0.002, -0.001]
-    assert sweep_models([G4], frequencies, AG, 4)[0].extremes.tobytes() == one[2].extremes.tobytes()
+    assert (
+        sweep_models([G4], frequencies, AG, 4)[0].extremes.tobytes()
+        == single_core[2].extremes.tobytes()
+    )
 
 
 def test_once_asked_to_stop_no_sweep_begins_and_those_under_way_are_handed_out() -> None:

@@ -17,7 +17,7 @@ import pytest
 
 from table_io.config.base import load_config
 from table_io.config.profile import Profile
-from table_io.errors import InputError
+from tests.input_errors import raises_input_error
 from twin.cli.report import write_folder_report
 from twin.cli.simulate import simulate_profile
 from twin.model.effects.effect import Effect, EffectParameter
@@ -63,7 +63,7 @@ def model(folder: Path, name: str, effects: str = "", **changed: float) -> str:
     return str(path)
 
 
-def simulated(
+def simulate_batch(
     profile: Path, models: list[str], gaps: list[str], workers: int | None = None
 ) -> Path:
     """The folder of a batch."""
@@ -101,30 +101,30 @@ def test_gaps_are_read_as_they_are_written(words: list[str], gaps: list[float]) 
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "fields"),
     [
-        (["4 m"], "--gap 4 m: allowed: a number of mm, inf for no bumpers, or FROM:TO:STEP"),
-        ([""], "allowed"),
-        (["nan"], "allowed"),
-        (["-inf"], "allowed"),
-        (["0:30"], "allowed"),
-        (["0:inf:2"], "allowed"),
-        (["0:30:7"], "step 7 does not divide 0 to 30 mm; nearest: 7.5"),
-        (["0:30:-2"], "step -2 does not lead from 0 to 30"),
-        (["0:30:0"], "step 0 does not lead"),
-        (["0:30:1e-9"], "more than 10000 gaps"),
-        (["4", "0:8:2"], "4 mm is also in --gap 4; keep one"),
-        (["inf", "inf"], "inf mm is also in --gap inf"),
+        (["4 m"], {"allowed": "FROM:TO:STEP"}),
+        ([""], {"allowed": "FROM:TO:STEP"}),
+        (["nan"], {"allowed": "FROM:TO:STEP"}),
+        (["-inf"], {"allowed": "FROM:TO:STEP"}),
+        (["0:30"], {"allowed": "FROM:TO:STEP"}),
+        (["0:inf:2"], {"allowed": "FROM:TO:STEP"}),
+        (["0:30:7"], {"problem": "step 7 ", "remedy": "7.5"}),
+        (["0:30:-2"], {"problem": "step -2 "}),
+        (["0:30:0"], {"problem": "step 0 "}),
+        (["0:30:1e-9"], {"problem": "10000"}),
+        (["4", "0:8:2"], {"problem": "--gap 4"}),
+        (["inf", "inf"], {"problem": "--gap inf"}),
     ],
 )
-def test_a_gap_that_is_none_is_refused(words: list[str], said: str) -> None:
-    with pytest.raises(InputError, match=re.escape(said)):
+def test_a_gap_that_is_none_is_refused(words: list[str], fields: dict[str, str]) -> None:
+    with raises_input_error(where=f"--gap {words[-1]}", **fields):
         parse_gaps_mm(words)
 
 
 def test_the_table_holds_the_motion_of_every_case(profile: Path, draft: None) -> None:
     hard = model(profile.parent, "hard", HARDENING)
-    out = simulated(profile, ["snm", hard], ["4", "-1", "inf"])
+    out = simulate_batch(profile, ["snm", hard], ["4", "-1", "inf"])
     rows = read_rows(out / "batch.csv")
     assert (out / "batch.csv").read_text().splitlines()[0] == ",".join(COLUMNS)
     assert len(rows) == 2 * 3 * 22
@@ -155,12 +155,12 @@ def test_the_table_holds_the_motion_of_every_case(profile: Path, draft: None) ->
 
 
 def test_the_summary_tells_jumps_and_hysteresis_of_each_case(profile: Path, draft: None) -> None:
-    told = summary(simulated(profile, [], ["4", "inf"]))
-    assert told["verdict"] == "complete"
-    g4, free = told["cases"]
+    values = summary(simulate_batch(profile, [], ["4", "inf"]))
+    assert values["verdict"] == "complete"
+    g4, free = values["cases"]
     assert (g4["model"], g4["gap_mm"], free["gap_mm"]) == ("snm", 4.0, "inf")
-    assert [one["kind"] for one in g4["hysteresis"]] == ["right"]
-    assert [(one["direction"], one["kind"]) for one in g4["jumps"]] == [
+    assert [interval["kind"] for interval in g4["hysteresis"]] == ["right"]
+    assert [(jump["direction"], jump["kind"]) for jump in g4["jumps"]] == [
         ("forward", "down"), ("backward", "up"),
     ]  # fmt: skip
     assert g4["peak"]["frequency_hz"] == 4.0
@@ -173,7 +173,7 @@ def test_models_without_a_gap_keep_the_gaps_of_the_profile(profile: Path, draft:
         TEST.replace("gap_mm = 4.0", "gap_mm = 4.0\ngap_right_mm = 1.0\ngap_left_mm = 2.5")
     )
     soft = model(profile.parent, "soft", stiffness_n_m=30e3)
-    rows = read_rows(simulated(profile, ["snm", soft], []) / "batch.csv")
+    rows = read_rows(simulate_batch(profile, ["snm", soft], []) / "batch.csv")
     assert {row["gap_mm"] for row in rows} == {3.5}
     mine = [row for row in rows if row["model"] == "snm" and row["r_l"] > 0]
     sweep = load_config(profile, Profile, "test")[0].sweep
@@ -185,7 +185,7 @@ def test_models_without_a_gap_keep_the_gaps_of_the_profile(profile: Path, draft:
 
 def test_a_drifting_gap_is_the_one_of_its_time(profile: Path, draft: None) -> None:
     drift = model(profile.parent, "drift", EFFECT.format("gap_drift", "rate = 1e-5"))
-    rows = read_rows(simulated(profile, [drift], ["4"]) / "batch.csv")
+    rows = read_rows(simulate_batch(profile, [drift], ["4"]) / "batch.csv")
     deep = {row["frequency_hz"]: row for row in rows if row["direction"] == "forward"}[3.4]
     # 510 kN/m on this deformation, and little from the dashpot, is this force
     force = 510e3 * deep["eta_r"] * 30.5371e-3 / 550 / 9.80665
@@ -210,8 +210,8 @@ def test_a_plug_in_effect_is_played_like_any_other(
     monkeypatch.setattr(metadata, "entry_points", lambda group: [Entry()])
     mine = model(profile.parent, "mine", EFFECT.format("my_cubic", "k3 = 5e6"))
     ours = model(profile.parent, "ours", EFFECT.format("cubic_stiffness", "k3 = 5e6"))
-    rows = read_rows(simulated(profile, [mine, ours], []) / "batch.csv")
-    eta = {one: [r["eta_d"] for r in rows if r["model"] == one] for one in ("mine", "ours")}
+    rows = read_rows(simulate_batch(profile, [mine, ours], []) / "batch.csv")
+    eta = {name: [r["eta_d"] for r in rows if r["model"] == name] for name in ("mine", "ours")}
     np.testing.assert_allclose(eta["mine"], eta["ours"], rtol=1e-9)
 
 
@@ -220,7 +220,7 @@ def test_a_motion_without_bound_is_said_and_drawn(profile: Path, draft: None) ->
         profile.parent, "soft", EFFECT.format("cubic_stiffness", "k3 = -3e7"), damping_n_s_m=50.0
     )
     profile.write_text(TEST.replace("start_hz = 2.4", "start_hz = 1.0"))
-    out = simulated(profile, [soft], ["inf"])
+    out = simulate_batch(profile, [soft], ["inf"])
     (case,) = summary(out)["cases"]
     assert case["unbounded_from"]["direction"] == "forward"
     assert "unbounded from" in (out / "report.html").read_text()
@@ -233,35 +233,47 @@ def test_workers_change_nothing(profile: Path, draft: None) -> None:
         folder.mkdir()
         own = folder / "through.toml"
         own.write_text(TEST)
-        tables.append((simulated(own, [], ["0:8:2"], cores) / "batch.csv").read_bytes())
+        tables.append((simulate_batch(own, [], ["0:8:2"], cores) / "batch.csv").read_bytes())
     assert tables[0] == tables[1]
 
 
-def test_one_model_at_its_gap_is_a_run_as_ever(profile: Path) -> None:
+def test_one_model_at_its_gap_is_a_run_as_ever(profile: Path, draft: None) -> None:
     out = profile.parent / "out"
     assert simulate_profile(profile, ["snm"], [], 1, out, False) == 0
     assert (out / "run.mcap").exists()
     assert not (out / "batch.csv").exists()
 
 
-def refused(profile: Path, models: list[str], gaps: list[str], said: str, **more: Any) -> None:
+def require_refused(
+    profile: Path,
+    models: list[str],
+    gaps: list[str],
+    fields: dict[str, object],
+    **more: Any,
+) -> None:
     out = profile.parent / "out"
-    with pytest.raises(InputError, match=said):
+    with raises_input_error(**fields):
         simulate_profile(profile, models, gaps, more.get("workers"), out, bool(more.get("view")))
     assert not out.exists()
 
 
 def test_a_batch_that_cannot_be_is_refused_before_it_begins(profile: Path) -> None:
-    refused(profile, ["snm", "snn"], [], "did you mean 'snm'")
-    refused(profile, ["snm", "snm"], ["4"], "--model snm: given twice")
+    require_refused(profile, ["snm", "snn"], [], {"where": "--model snn", "remedy": "'snm'"})
+    require_refused(profile, ["snm", "snm"], ["4"], {"where": "--model snm"})
     same = model(profile.parent, "same")
-    refused(profile, ["snm", same], ["4", "6"], "models snm and same are identical")
+    require_refused(
+        profile, ["snm", same], ["4", "6"], {"where": profile, "problem": "snm and same"}
+    )
     hard = model(profile.parent, "hard", bumper_stiffness_n_m=5e9)
-    refused(profile, ["snm", hard], ["4"], "hard, G = 4 mm: rate_hz = 2000.*bumper")
-    refused(profile, [], ["4"], "--workers 0: allowed: 1 or more", workers=0)
-    refused(profile, [], ["4"], "--view", view=True)
+    case = f"{profile}: hard, G = 4 mm"
+    require_refused(
+        profile, ["snm", hard], ["4"], {"where": case, "key": "rate_hz", "value": 2000.0}
+    )
+    require_refused(profile, [], ["4"], {"key": "--workers", "value": 0}, workers=0)
+    require_refused(profile, [], ["4"], {"where": "--view"}, view=True)
     undamped = model(profile.parent, "undamped", damping_n_s_m=0.0)
-    refused(profile, [undamped], ["inf"], "undamped, no bumpers: damping = 0")
+    case = f"{profile}: undamped, no bumpers"
+    require_refused(profile, [undamped], ["inf"], {"where": case, "key": "damping", "value": 0})
 
 
 def test_ctrl_c_keeps_the_sweeps_that_are_done(tmp_path: Path) -> None:
@@ -277,28 +289,28 @@ def test_ctrl_c_keeps_the_sweeps_that_are_done(tmp_path: Path) -> None:
         if "2/60" in line:
             break
     process.send_signal(signal.SIGINT)
-    said, _ = process.communicate()
-    assert process.returncode == EXIT_INTERRUPTED, said
-    assert "stopping" in said
-    told = summary(tmp_path / "out")
-    assert told["verdict"] == "stopped"
-    assert 2 <= len(told["cases"]) < 60
+    output, _ = process.communicate()
+    assert process.returncode == EXIT_INTERRUPTED, output
+    assert "stopping" in output
+    values = summary(tmp_path / "out")
+    assert values["verdict"] == "stopped"
+    assert 2 <= len(values["cases"]) < 60
     rows = read_rows(tmp_path / "out" / "batch.csv")
-    assert len(rows) == 22 * len(told["cases"])
+    assert len(rows) == 22 * len(values["cases"])
     assert (tmp_path / "out" / "report.html").exists()
 
 
 def test_the_pictures_name_what_is_in_them(profile: Path) -> None:
     hard = model(profile.parent, "hard", HARDENING)
-    out = simulated(profile, ["snm", hard], ["4", "0", "-1", "inf"])
+    out = simulate_batch(profile, ["snm", hard], ["4", "0", "-1", "inf"])
     names = sorted(path.stem for path in (out / "figures").glob("*.png"))
     assert names == [
         "gaps_hard", "gaps_snm", "models_g-1", "models_g0", "models_g4", "models_ginf",
         "prc_hard", "prc_snm",
     ]  # fmt: skip
-    cases = figures._group_cases(read_batch_rows(out / "batch.csv"))
+    cases = figures.group_cases(read_batch_rows(out / "batch.csv"))
     own = {gap: curves for (label, gap), curves in cases.items() if label == "snm"}
-    family = figures._draw_family("snm", own).figure
+    family = figures.draw_family("snm", own).figure
     words = [text.get_text() for text in family.legends[0].get_texts()]
     assert words == ["no bumpers", "G = 4 mm", "G = 0 mm", "G = −1 mm", "forward", "backward"]
     for ax in family.axes:
@@ -307,26 +319,28 @@ def test_the_pictures_name_what_is_in_them(profile: Path) -> None:
         assert {line.get_linestyle() for line in drawn} == {"-", "--"}
     top = max(float(np.max(np.asarray(line.get_ydata()))) for line in family.axes[1].lines)
     assert top < family.axes[1].get_ylim()[1] < 1.3 * top
-    beside = figures._draw_models(4.0, {label: one for (label, gap), one in cases.items()
+    beside = figures.draw_models(4.0, {label: case for (label, gap), case in cases.items()
                                        if gap == 4.0}).figure  # fmt: skip
     words = [text.get_text() for text in beside.legends[0].get_texts()]
     assert words == ["snm", "hard", "forward", "backward"]
-    (gaps,) = figures._draw_gap_figure(
-        "snm", [one for one in summary(out)["cases"] if one["model"] == "snm"]
+    (gaps,) = figures.draw_gap_figure(
+        "snm", [case for case in summary(out)["cases"] if case["model"] == "snm"]
     )
     assert all(ax.get_ylabel() for ax in gaps.figure.axes)
 
 
-def test_many_gaps_are_read_off_a_scale(profile: Path) -> None:
-    cases = figures._group_cases(read_batch_rows(simulated(profile, [], ["0:20:2"]) / "batch.csv"))
-    family = figures._draw_family("snm", {gap: curves for (_, gap), curves in cases.items()}).figure
+def test_many_gaps_are_read_off_a_scale(profile: Path, draft: None) -> None:
+    cases = figures.group_cases(
+        read_batch_rows(simulate_batch(profile, [], ["0:20:2"]) / "batch.csv")
+    )
+    family = figures.draw_family("snm", {gap: curves for (_, gap), curves in cases.items()}).figure
     assert family.axes[-1].get_ylabel() == "total gap in mm"
     colours = {line.get_color() for line in family.axes[0].lines}
     assert len(colours) == 11
 
 
 def test_the_page_is_written_anew_from_what_is_in_the_folder(profile: Path, draft: None) -> None:
-    out = simulated(profile, [], ["4", "6", "8"])
+    out = simulate_batch(profile, [], ["4", "6", "8"])
     html = (out / "report.html").read_text()
     assert html.count("data:image/png;base64,") == len(list((out / "figures").iterdir())) == 2
     assert not re.search(r"(?:src|href)=[\"'](?!data:)", html)
@@ -337,17 +351,17 @@ def test_the_page_is_written_anew_from_what_is_in_the_folder(profile: Path, draf
     assert (out / "report.html").read_text() == html
     assert ((out / "batch.csv").read_bytes(), (out / "summary.json").read_bytes()) == before
     (out / "batch.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(InputError, match=r"batch\.csv: not the table of a batch"):
+    with raises_input_error(where=out / "batch.csv"):
         write_folder_report(out)
 
 
 def test_files_of_models_with_odd_names_do_not_meet(tmp_path: Path, draft: None) -> None:
-    one, other = tmp_path / "a", tmp_path / "b"
-    for folder in (one, other):
+    first, other = tmp_path / "a", tmp_path / "b"
+    for folder in (first, other):
         folder.mkdir()
-    cards = [model(one, "soft", stiffness_n_m=30e3), model(other, "soft", stiffness_n_m=33e3)]
+    cards = [model(first, "soft", stiffness_n_m=30e3), model(other, "soft", stiffness_n_m=33e3)]
     (tmp_path / "through.toml").write_text(TEST)
-    out = simulated(tmp_path / "through.toml", cards, ["4", "6"])
+    out = simulate_batch(tmp_path / "through.toml", cards, ["4", "6"])
     with (out / "batch.csv").open() as file:
         labels = {row["model"] for row in csv.DictReader(file)}
     assert labels == {card.removesuffix(".toml") for card in cards}

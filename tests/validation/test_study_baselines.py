@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.identification.played import SNM, hidden, log
+from tests.identification.played import SNM, format_truth, log
 from tests.validation.test_study_scores import about, verdict
 from twin.validation.study import baselines
 from twin.validation.study.baseline_terms import make_regression_problem
@@ -26,9 +26,9 @@ def test_where_nothing_is_hidden_the_base_makes_the_forces() -> None:
     """Rows, noise and states are those of discovery: with the true base, noise is left."""
     bench = make_regression_problem(log(), SNM)
     left = []
-    for one in bench.regressions:
-        found = np.linalg.lstsq(one.base, one.force, rcond=None)[0]
-        left.append(one.force - one.base @ found)
+    for regression in bench.regressions:
+        fitted = np.linalg.lstsq(regression.base, regression.force, rcond=None)[0]
+        left.append(regression.force - regression.base @ fitted)
     gap = bench.gap(left)
     assert gap["held_out_after"] == pytest.approx(gap["held_out_before"], rel=0.01)
     assert gap["held_out_after"] == pytest.approx(1.0, abs=0.1)
@@ -44,17 +44,17 @@ def test_where_nothing_is_hidden_the_base_makes_the_forces() -> None:
 )
 def test_sparse_regression_names_what_the_state_makes(effect: str, values: Any) -> None:
     sindy = pytest.importorskip("twin.validation.study.baseline_sindy", exc_type=ImportError)
-    found = sindy.select_terms(make_regression_problem(log(hidden(effect, **values)), SNM))
-    assert found["effects"][0]["id"] == effect
-    assert found["gap"]["held_out_after"] < 0.7 * found["gap"]["held_out_before"]
+    fitted = sindy.select_terms(make_regression_problem(log(format_truth(effect, **values)), SNM))
+    assert fitted["effects"][0]["id"] == effect
+    assert fitted["gap"]["held_out_after"] < 0.7 * fitted["gap"]["held_out_before"]
 
 
 def test_boosted_trees_close_a_gap_that_has_no_name() -> None:
     blackbox = pytest.importorskip("twin.validation.study.baseline_blackbox", exc_type=ImportError)
-    truth = hidden("cubic_stiffness", k3=1e9)
-    found = blackbox.fit_boosted_trees(make_regression_problem(log(truth), SNM))
-    assert found["effects"] == []
-    assert found["gap"]["held_out_after"] < 0.7 * found["gap"]["held_out_before"]
+    truth = format_truth("cubic_stiffness", k3=1e9)
+    fitted = blackbox.fit_boosted_trees(make_regression_problem(log(truth), SNM))
+    assert fitted["effects"] == []
+    assert fitted["gap"]["held_out_after"] < 0.7 * fitted["gap"]["held_out_before"]
 
 
 def test_the_table_lays_them_side_by_side() -> None:
@@ -69,5 +69,5 @@ def test_the_table_lays_them_side_by_side() -> None:
     ]  # fmt: skip
     lines = list(format_baseline_table(rows))
     assert "| table_tilt | 1/1 | 0/1 | 1.010 | 1.500 | 2.250 |" in lines
-    assert not any("(nothing)" in one for one in lines), "no rival saw that case"
+    assert not any("(nothing)" in line for line in lines), "no rival saw that case"
     assert list(format_baseline_table(rows[1:])) == []

@@ -1,5 +1,6 @@
 """The blind cases: drawn from their numbers alone, of the size asked for, and silent about it."""
 
+import hashlib
 import json
 import re
 from collections.abc import Mapping
@@ -36,12 +37,12 @@ from twin.validation.study.strata import CELLS, NUMBERS_PER_CELL, Case, draw_cas
 
 
 def case_in(cell: str, place: int = 0) -> Case:
-    names = [one.name for one in CELLS]
+    names = [cell.name for cell in CELLS]
     return draw_case(NUMBERS_PER_CELL * names.index(cell) + place)
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Case, CasePaths]:
+def generated_case(tmp_path_factory: pytest.TempPathFactory) -> tuple[Case, CasePaths]:
     case = case_in("single/coulomb_friction/3/1%")
     return case, generate_case(case, tmp_path_factory.mktemp("study"))
 
@@ -54,8 +55,8 @@ def test_a_case_is_drawn_from_its_number_alone() -> None:
     assert draw_case(numbers[100]) == alone
     assert draw_case(numbers[100]).base == alone.base
     every = [draw_case(number) for number in numbers]
-    assert len({one.label for one in every}) == len({one.salt for one in every}) == len(every)
-    assert {len(one.label) for one in every} == {10}
+    assert len({case.label for case in every}) == len({case.salt for case in every}) == len(every)
+    assert {len(case.label) for case in every} == {10}
 
 
 def test_every_effect_size_noise_and_kind_has_its_cells() -> None:
@@ -82,7 +83,7 @@ def test_the_base_is_scattered_within_five_per_cent_in_clean_cases_too() -> None
 
 def test_a_pair_is_two_effects_of_the_library() -> None:
     drawn = [case_in("pair/3/1%", k).planted for k in range(50)]
-    names = [tuple(one.effect.name for one in pair) for pair in drawn]
+    names = [tuple(effect.effect.name for effect in pair) for pair in drawn]
     assert all(len(set(pair)) == 2 for pair in names)
     assert len(set(names)) > 30
 
@@ -93,13 +94,13 @@ def test_a_pair_is_two_effects_of_the_library() -> None:
 def test_sizes_land_where_they_were_asked(cell: str) -> None:
     """The residual of a refitted baseline over the noise, from signals with that noise on."""
     case = case_in(cell)
-    shares, left = generation._find_shares(case)
+    shares, left = generation.find_shares(case)
     assert left.size == pytest.approx(case.cell.size, rel=0.1)
     assert noisy_size(case, shares[0]) == pytest.approx(case.cell.size, rel=0.25)
 
 
-def test_the_size_of_the_case_that_was_made(made: tuple[Case, CasePaths]) -> None:
-    case, places = made
+def test_the_size_of_the_case_that_was_made(generated_case: tuple[Case, CasePaths]) -> None:
+    case, places = generated_case
     about = json.loads(places.about.read_text())
     assert about["reached"] == pytest.approx(3.0, rel=0.1)
     fc = about["effects"][0]["parameters"]["fc"]
@@ -114,42 +115,42 @@ def test_noise_alone_has_size_one() -> None:
 
 
 def noisy_size(case: Case, share: float) -> float:
-    (one,) = case.planted
-    signals = generation._simulate_truth(case, case.planted, [share])
+    (planted,) = case.planted
+    signals = generation.simulate_truth(case, case.planted, [share])
     return noisy(
-        apply_sensor_effect(one, share, signals), signals, compute_noise_rms(case.cell.noise)
+        apply_sensor_effect(planted, share, signals), signals, compute_noise_rms(case.cell.noise)
     ).rms
 
 
-def noisy(seen: StudySignals, truly: StudySignals, rms: Mapping[str, float]) -> BaselineResidual:
+def noisy(signals: StudySignals, truly: StudySignals, rms: Mapping[str, float]) -> BaselineResidual:
     """What the baseline leaves of noisy readings over their noise; the noise is white to 225 Hz."""
-    draw, size = np.random.default_rng(1), seen.step.size
+    draw, size = np.random.default_rng(1), signals.step.size
     inside = np.fft.rfftfreq(size, 1e-3) <= amplitude_search.BANDWIDTH_HZ
     noise = {
         name: np.fft.irfft(np.fft.rfft(draw.normal(0.0, s, size)) * inside, size)
         for name, s in rms.items()
     }
-    right = seen.right + noise["force_r1_n"] + noise["force_r2_n"]
-    left = seen.left - noise["force_l1_n"] - noise["force_l2_n"]
-    channels = {name: values + noise[name] for name, values in seen.channels.items()}
+    right = signals.right + noise["force_r1_n"] + noise["force_r2_n"]
+    left = signals.left - noise["force_l1_n"] - noise["force_l2_n"]
+    channels = {name: values + noise[name] for name, values in signals.channels.items()}
     return evaluate_residual(
-        StudySignals(channels, right, left, seen.step, seen.moving), truly, rms
+        StudySignals(channels, right, left, signals.step, signals.moving), truly, rms
     )
 
 
 def test_an_effect_that_cannot_reach_its_size_says_what_it_reaches() -> None:
-    (one,) = case_in("single/gap_offset/10/1%").planted
+    (planted,) = case_in("single/gap_offset/10/1%").planted
     asked: list[float] = []
 
     def saturates(share: float) -> BaselineResidual:
         asked.append(share)
         return BaselineResidual(min(share, 2.0), {1.0: 1.0}, {"flight": 1.0})
 
-    share, left = find_share(one, 10.0, saturates)
+    share, left = find_share(planted, 10.0, saturates)
     assert left.size == pytest.approx(np.hypot(1.0, 2.0))
-    assert max(asked) <= max_share(one)
-    bounds = one.effect.amplitudes[0]
-    assert bounds.low <= scale_parameters(one, share)["offset"] <= bounds.high
+    assert max(asked) <= max_share(planted)
+    bounds = planted.effect.amplitudes[0]
+    assert bounds.low <= scale_parameters(planted, share)["offset"] <= bounds.high
 
 
 def test_what_does_not_have_its_size_is_not_played(
@@ -157,7 +158,7 @@ def test_what_does_not_have_its_size_is_not_played(
 ) -> None:
     case = case_in("single/gap_offset/10/1%")
     little = BaselineResidual(2.0, {1.0: 1.0}, {"flight": 1.0})
-    monkeypatch.setattr(generation, "_find_shares", lambda case: ([1.0], little))
+    monkeypatch.setattr(generation, "find_shares", lambda case: ([1.0], little))
     places = generate_case(case, tmp_path)
     about = json.loads(places.about.read_text())
     assert about["ended"] == "not played: the effect reaches size 2.24"
@@ -168,9 +169,9 @@ def test_what_does_not_have_its_size_is_not_played(
 
 
 def test_a_residual_that_falls_again_is_sought_before_it_falls() -> None:
-    (one,) = case_in("single/coulomb_friction/10/1%").planted
+    (planted,) = case_in("single/coulomb_friction/10/1%").planted
     share, left = find_share(
-        one,
+        planted,
         3.0,
         lambda s: BaselineResidual(0.2 * s**2 if s < 4 else 0.1, {1.0: 1.0}, {"flight": 1.0}),
     )
@@ -183,13 +184,13 @@ def test_the_test_shows_flight_both_branches_and_irregular_impacts() -> None:
     assert 55 < signals.moving.sum() / 1000 < 65
     steps = PROFILE.sweep.steps
     share = {
-        (one.direction, one.frequency_hz): (signals.right[signals.step == one.index] > 0).mean()
-        for one in steps
+        (step.direction, step.frequency_hz): (signals.right[signals.step == step.index] > 0).mean()
+        for step in steps
     }
     assert share["forward", 3.6] > 0.25
     assert share["backward", 3.6] == 0.0
     peaks = []
-    slow = signals.step == next(one.index for one in steps if one.frequency_hz == 1.2)
+    slow = signals.step == next(step.index for step in steps if step.frequency_hz == 1.2)
     right = signals.right[slow]
     onsets = np.flatnonzero((right[1:] > 0) & (right[:-1] <= 0))
     peaks = [right[a:b].max() for a, b in zip(onsets, [*onsets[1:], right.size], strict=True)]
@@ -206,8 +207,10 @@ def test_noise_is_the_same_whatever_is_hidden() -> None:
     assert len(texts) == 1
 
 
-def test_the_recording_is_whole_and_has_the_noise_of_its_cell(made: tuple[Case, CasePaths]) -> None:
-    case, places = made
+def test_the_recording_is_whole_and_has_the_noise_of_its_cell(
+    generated_case: tuple[Case, CasePaths],
+) -> None:
+    case, places = generated_case
     recording = read_log(places.log)
     assert recording.stop is not None
     assert recording.stop.verdict == "complete"
@@ -219,29 +222,31 @@ def test_the_recording_is_whole_and_has_the_noise_of_its_cell(made: tuple[Case, 
     assert read_recorded_config(recording).model.effects == ()
 
 
-def test_nothing_that_is_shown_holds_the_truth(made: tuple[Case, CasePaths]) -> None:
-    case, places = made
+def test_nothing_that_is_shown_holds_the_truth(generated_case: tuple[Case, CasePaths]) -> None:
+    case, places = generated_case
     text = (places.sealed_dir / "truth.toml").read_text()
     truth = parse_toml(text, GroundTruth, "truth")
     assert truth.effects[0].id == "coulomb_friction"
     numbers = [n for n in re.findall(r"= ([-\d.e]+)$", text, re.M) if len(n) > 4]
     assert len(numbers) >= 6
     words = ["coulomb", case.salt, case.cell.name]
-    secrets = [*map(re.escape, words), *(rf"\b{one}\b" for one in (*numbers, case.number))]
+    secrets = [*map(re.escape, words), *(rf"\b{word}\b" for word in (*numbers, case.number))]
     shown = list(places.case_dir.iterdir())
     assert {path.name for path in shown} == {"log.mcap", "profile.toml", "model.toml"}
     start = read_log(places.log).start
     texts = [*(path.read_bytes() for path in shown), *(
-        one.encode() for one in (start.rig_toml, start.profile_toml, start.model_toml, start.run)
+        text.encode() for text in (start.rig_toml, start.profile_toml, start.model_toml, start.run)
     )]  # fmt: skip
     for secret in secrets:
         where = [k for k, held in enumerate(texts) if re.search(secret.encode(), held)]
         assert not where, secret
-    assert f'truth_sha256 = "{generation._sha256(text)}"' in start.rig_toml
+    assert f'truth_sha256 = "{hashlib.sha256(text.encode()).hexdigest()}"' in start.rig_toml
 
 
-def test_a_case_that_was_cut_off_is_made_anew_and_the_same(made: tuple[Case, CasePaths]) -> None:
-    case, places = made
+def test_a_case_that_was_cut_off_is_made_anew_and_the_same(
+    generated_case: tuple[Case, CasePaths],
+) -> None:
+    case, places = generated_case
     before, samples = places.about.read_text(), read_log(places.log).contiguous_blocks("meas")[0]
     sealed = (places.sealed_dir / "truth.toml").read_text()
     assert generate_case(case, places.root) == places
@@ -258,10 +263,10 @@ def test_every_kind_that_can_be_hidden_has_what_the_generator_needs() -> None:
         for hidden in cell.effects:
             assert hidden.amplitudes, hidden.name
     for (effect, name), (low, high) in strata.SHAPE_RANGES.items():
-        kinds = [one for one in EFFECT_DEFINITIONS if one.id == effect]
-        found = [q for kind in kinds for q in kind.parameters if q.name == name]
-        assert found, (effect, name)
-        assert all(q.low <= low < high <= q.high for q in found), (effect, name)
+        kinds = [definitions for definitions in EFFECT_DEFINITIONS if definitions.id == effect]
+        parameters = [q for kind in kinds for q in kind.parameters if q.name == name]
+        assert parameters, (effect, name)
+        assert all(q.low <= low < high <= q.high for q in parameters), (effect, name)
 
 
 def test_the_root_may_be_anywhere(tmp_path: Path) -> None:

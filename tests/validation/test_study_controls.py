@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.identification.played import SNM, hidden, log
+from tests.identification.played import SNM, format_truth, log
 from tests.validation import study_work
 from tests.validation.test_study_scores import about, verdict
 from twin.validation.study.command import run_cases
@@ -16,7 +16,7 @@ from twin.validation.study.controls import discover_without, reverse_log, summar
 from twin.validation.study.report import CONTROLS_FILE, RESULTS_FILE, TABLE_FILE, write_study_pages
 from twin.validation.study.scoring import score_verdict
 
-QUADRATIC = hidden("quadratic_damping", c2=6e3)
+QUADRATIC = format_truth("quadratic_damping", c2=6e3)
 # Left out of every run of the test, for its length; the study itself leaves out nothing.
 LONG = (
     "bouc_wen",
@@ -31,13 +31,13 @@ EFFECTS = ("bumper_hardening", "table_tilt", "gap_drift")
 
 def test_a_log_backwards_is_the_same_motion_with_its_velocity_turned() -> None:
     played = log()
-    there, back = played.signals.fuse_motion(), reverse_log(played).signals.fuse_motion()
+    forward, back = played.signals.fuse_motion(), reverse_log(played).signals.fuse_motion()
     for name, sign in (("u", 1), ("v", -1), ("acc", 1), ("table_disp", 1), ("right", 1)):
-        was, now = getattr(there, name), getattr(back, name)
-        np.testing.assert_allclose(now, sign * was[::-1], atol=1e-9 * np.abs(was).max())
-    np.testing.assert_array_equal(back.step, there.step[::-1])
+        was, reversed_ = getattr(forward, name), getattr(back, name)
+        np.testing.assert_allclose(reversed_, sign * was[::-1], atol=1e-9 * np.abs(was).max())
+    np.testing.assert_array_equal(back.step, forward.step[::-1])
     again = reverse_log(reverse_log(played)).signals.fuse_motion()
-    np.testing.assert_allclose(again.u, there.u, atol=1e-12)
+    np.testing.assert_allclose(again.u, forward.u, atol=1e-12)
 
 
 def test_no_control_is_given_a_confident_name() -> None:
@@ -72,8 +72,8 @@ def test_shuffled_truths_fall_to_chance() -> None:
     own, others, guess = compute_shuffled_rates(rows)
     assert (own, guess) == (1.0, pytest.approx(1 / 3))
     assert others == pytest.approx(6 / 30), "each case has one other of five with its truth"
-    told = [row | {"said": "none"} for row in rows]
-    assert compute_shuffled_rates(told)[:2] == (0.0, 0.0)
+    unnamed = [row | {"said": "none"} for row in rows]
+    assert compute_shuffled_rates(unnamed)[:2] == (0.0, 0.0)
 
 
 def test_the_page_has_the_controls_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
@@ -84,10 +84,10 @@ def test_the_page_has_the_controls_and_goes_on_where_it_stopped(tmp_path: Path) 
         {"number": 16000, "reversed": good, "without": good, "right": True},
         {"number": 25000, "failed": "why"},
     ]
-    (tmp_path / CONTROLS_FILE).write_text("".join(json.dumps(one) + "\n" for one in rows))
+    (tmp_path / CONTROLS_FILE).write_text("".join(json.dumps(row) + "\n" for row in rows))
     lines = write_study_pages(tmp_path).read_text().splitlines()
-    assert any("time reversed" in one and "(0/2;" in one for one in lines)
-    assert any("not in the library: confident" in one and "(1/2;" in one for one in lines)
+    assert any("time reversed" in line and "(0/2;" in line for line in lines)
+    assert any("not in the library: confident" in line and "(1/2;" in line for line in lines)
     assert run_cases(tmp_path, [7000, 16000], 1, study_work.fine, CONTROLS_FILE) == 0
     assert (tmp_path / CONTROLS_FILE).read_text().count("\n") == 3
     assert not (tmp_path / RESULTS_FILE).exists()

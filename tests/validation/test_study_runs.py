@@ -2,16 +2,22 @@
 
 import json
 import math
+import multiprocessing
+import subprocess
+import sys
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from table_io.clock import RealClock
 from table_io.errors import InputError
+from tests.input_errors import raises_input_error
 from tests.validation import study_work
 from tests.validation.test_study_scores import OTHER, TRUE, about, verdict
-from twin.validation.study import evaluation, worker_pool
+from twin.validation.study import evaluation
 from twin.validation.study.command import run_cases, run_discovery_study
 from twin.validation.study.generation import CasePaths
 from twin.validation.study.report import RESULTS_FILE, TABLE_FILE, read_rows
@@ -23,34 +29,59 @@ Json = dict[str, Any]
 
 def test_a_study_goes_on_after_a_line_that_was_cut(tmp_path: Path) -> None:
     """Done ones are not done again, failed and cut ones are; nothing that was found is lost."""
-    there = [study_work.fine(0), study_work.fine(2) | {"failed": "why"}]
-    text = "".join(json.dumps(one) + "\n" for one in there) + '{"number": 4, "ri'
+    rows = [study_work.fine(0), study_work.fine(2) | {"failed": "why"}]
+    text = "".join(json.dumps(row) + "\n" for row in rows) + '{"number": 4, "ri'
     (tmp_path / RESULTS_FILE).write_text(text)
     assert run_cases(tmp_path, [0, 2, 4], 1, study_work.fine) == 0
     after = read_rows(tmp_path / RESULTS_FILE)
-    assert [one["number"] for one in after] == [0, 2, 2, 4]
-    assert after[0]["process"] == there[0]["process"]
+    assert [row["number"] for row in after] == [0, 2, 2, 4]
+    assert after[0]["process"] == rows[0]["process"]
     assert "failed" not in after[2]
     assert (tmp_path / RESULTS_FILE).read_text().startswith(text)
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_process_that_dies_loses_only_its_case(workers: int) -> None:
-    found = {
-        one["number"]: one
-        for one in map_in_processes(range(4), workers, study_work.deadly, lambda: False)
+    rows = {
+        row["number"]: row
+        for row in map_in_processes(range(4), workers, study_work.deadly, lambda: False)
     }
-    assert sorted(found) == [0, 1, 2, 3]
-    for number, row in found.items():
+    assert sorted(rows) == [0, 1, 2, 3]
+    for number, row in rows.items():
         assert ("failed" in row) == bool(number % 2)
-    assert found[1]["failed"] == "its process died (exit code -9)"
+    assert rows[1]["failed"] == "its process died (exit code -9)"
 
 
-def test_a_case_that_does_not_end_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker_pool, "MAX_CASE_S", 0.3)
-    found = list(map_in_processes([1, 3], 1, study_work.endless, lambda: False))
-    assert [one["number"] for one in found] == [1, 3]
-    assert all(one["failed"] == "took longer than 0.3 s" for one in found)
+def test_a_case_that_does_not_end_is_ended() -> None:
+    rows = list(map_in_processes([1, 3], 1, study_work.endless, lambda: False, 0.3))
+    assert [row["number"] for row in rows] == [1, 3]
+    assert all(row["failed"] == "took longer than 0.3 s" for row in rows)
+
+
+def test_leaving_early_ends_the_processes_at_once() -> None:
+    max_case_s, clock = 20.0, RealClock()  # of the case that is left behind
+    rows = map_in_processes([0, 1], 2, study_work.endless_if_odd, lambda: False, max_case_s)
+    assert next(rows)["number"] == 0
+    left_s = clock.now()
+    assert isinstance(rows, Generator)
+    rows.close()
+    assert clock.now() - left_s < 10.0
+    assert not multiprocessing.active_children()
+
+
+def test_a_killed_study_leaves_no_processes() -> None:
+    """A worker that has nothing to do ends, although nobody tells it to."""
+    with subprocess.Popen(
+        [sys.executable, study_work.__file__], stdout=subprocess.PIPE, text=True
+    ) as study:
+        assert study.stdout is not None
+        worker = Path("/proc", study.stdout.readline().strip())
+        assert worker.is_dir()
+        study.kill()
+    deadline_s = RealClock().now() + 20.0
+    while worker.is_dir() and RealClock().now() < deadline_s:
+        RealClock().wait_until(RealClock().now() + 0.05)
+    assert not worker.is_dir()
 
 
 def test_a_stop_hands_out_what_is_under_way() -> None:
@@ -59,11 +90,11 @@ def test_a_stop_hands_out_what_is_under_way() -> None:
     def stop() -> bool:
         return len(asked) > 0
 
-    found = []
+    numbers = []
     for row in map_in_processes(range(100), 1, study_work.fine, stop):
-        found.append(row["number"])
+        numbers.append(row["number"])
         asked.append(1)
-    assert found == [0, 1]
+    assert numbers == [0, 1]
 
 
 def test_a_verdict_that_fails_is_a_miss_that_says_why(
@@ -82,13 +113,13 @@ def test_a_verdict_that_fails_is_a_miss_that_says_why(
     assert row["failed"] == "ValueError: no way"
     assert (row["top1"], row["right"], row["sized"]) == (False, False, True)
 
-    def told(shown: Path) -> Json:
+    def answer(shown: Path) -> Json:
         assert shown == places.case_dir, "a method sees only what is shown"
         return verdict("named", "bumper_hardening", seconds=math.nan)
 
     monkeypatch.setattr(evaluation, "BASELINES", {"rival": broken})
     monkeypatch.setattr(evaluation, "fit_true_structure", lambda shown, effects: 1.05)
-    row = evaluation.evaluate_case(tmp_path, 3000, told)
+    row = evaluation.evaluate_case(tmp_path, 3000, answer)
     assert row["right"]
     assert row["after_oracle"] == 1.0
     assert row["rivals"]["rival"]["top1"] is False
@@ -110,16 +141,16 @@ def test_of_two_effects_the_row_says_what_mark_the_lesser_leaves(
     monkeypatch.setattr(evaluation, "fit_true_structure", lambda shown, names: errors[tuple(names)])
     monkeypatch.setattr(evaluation, "BASELINES", {})
 
-    def told(shown: Path) -> Json:
+    def answer(shown: Path) -> Json:
         if fails:
             raise ValueError("no way")
         return verdict("named", TRUE["name"])
 
-    row = evaluation.evaluate_case(tmp_path, number, told)
+    row = evaluation.evaluate_case(tmp_path, number, answer)
     assert row["mark"] == 1.2
     assert (row["both"], row["one"]) == (False, not fails)
     del errors[(OTHER["name"],)]  # no model of the library has it alone
-    assert evaluation.evaluate_case(tmp_path, number, told)["mark"] is None
+    assert evaluation.evaluate_case(tmp_path, number, answer)["mark"] is None
 
 
 def test_bad_input_is_told(tmp_path: Path) -> None:
@@ -136,5 +167,5 @@ def test_bad_input_is_told(tmp_path: Path) -> None:
         assert (error.value.key, error.value.value) == (key, value)
     (tmp_path / "there").mkdir()
     (tmp_path / "there" / TABLE_FILE).touch()
-    with pytest.raises(InputError, match="has content"):
+    with raises_input_error(key="--out", value=str(tmp_path / "there")):
         run_discovery_study(tmp_path / "there", 1, ["none/1%"], 1, False)

@@ -34,7 +34,7 @@ def about(kind: str = "single", *effects: Json, **more: Any) -> Json:
     } | more  # fmt: skip
 
 
-def verdict(said: str, *names: str, **more: Any) -> Json:
+def verdict(kind: str, *names: str, **more: Any) -> Json:
     value = {"value": 1.02e8, "low": 0.99e8, "high": 1.05e8, "unit": "N/m2"}
     effects = [
         {"id": name, "confidence": 0.9 - 0.1 * k, "parameters": {"k2": value}}
@@ -43,7 +43,7 @@ def verdict(said: str, *names: str, **more: Any) -> Json:
     where = {"frequency_hz": [3.0, 4.0], "direction": "both", "phase": "contact_right"}
     gap = {"held_out_before": 3.0, "held_out_after": 1.05, "noise_floor": 1.0}
     return {
-        "verdict": said, "effects": effects, "ambiguous": [], "where": where, "gap": gap,
+        "verdict": kind, "effects": effects, "ambiguous": [], "where": where, "gap": gap,
         "candidates": [
             {"id": "gap_offset", "held_out_error": 1.4, "converged": True},
             {"id": "hunt_crossley", "held_out_error": 1.2, "converged": True},
@@ -107,10 +107,10 @@ def test_what_all_sets_of_an_ambiguous_verdict_have_is_named() -> None:
 
 def test_none_where_nothing_is_and_where_something_is() -> None:
     assert score_verdict(verdict("none"), about("none", region=None))["false_alarm"] is False
-    for said in ("named", "ambiguous", "unexplained", "failed"):
-        found = score_verdict(verdict(said, "table_tilt"), about("none", region=None))
-        assert found["false_alarm"] is True
-        assert not found["right"]
+    for kind in ("named", "ambiguous", "unexplained", "failed"):
+        score = score_verdict(verdict(kind, "table_tilt"), about("none", region=None))
+        assert score["false_alarm"] is True
+        assert not score["right"]
     missed = score_verdict(verdict("none"), about("single", TRUE))
     assert (missed["top1"], missed["two"], missed["region"]) == (False, False, False)
 
@@ -125,13 +125,13 @@ def test_what_is_not_in_the_library() -> None:
 
 def test_two_effects() -> None:
     pair = about("pair", TRUE, OTHER)
-    for names, both, one in (
+    for names, both, either in (
         (("table_tilt", "bumper_hardening"), True, True),
         (("table_tilt", "gap_drift"), False, True),
         (("gap_drift",), False, False),
     ):
         row = score_verdict(verdict("named", *names), pair)
-        assert (row["both"], row["one"], row["right"]) == (both, one, both), names
+        assert (row["both"], row["one"], row["right"]) == (both, either, both), names
     assert score_verdict(verdict("unexplained", "table_tilt"), pair)["one"]
 
 
@@ -162,8 +162,8 @@ def test_a_region_is_right_where_band_and_phase_overlap(
     band: list[float], phase: str, right: bool
 ) -> None:
     where = {"frequency_hz": band, "direction": "both", "phase": phase}
-    found = score_verdict(verdict("unexplained", where=where), about("unknown", TRUE))
-    assert found["region"] is right
+    score = score_verdict(verdict("unexplained", where=where), about("unknown", TRUE))
+    assert score["region"] is right
     everywhere = about("unknown", TRUE, region={**REGION, "phase": ["flight", "contact_left"]})
     all_over = {**where, "frequency_hz": [2.0, 3.0], "phase": "all"}
     assert score_verdict(verdict("unexplained", where=all_over), everywhere)["region"]
@@ -172,14 +172,14 @@ def test_a_region_is_right_where_band_and_phase_overlap(
 def test_errors_are_relative_to_what_an_effect_departs() -> None:
     gain = {"name": "sensor_gain.mass_acc_m_s2", "parameters": {"gain": 1.05},
             "vanishing": {"gain": 1.0}}  # fmt: skip
-    told = verdict("named")
-    told["effects"] = [
+    values = verdict("named")
+    values["effects"] = [
         {"id": "sensor_gain", "channel": "mass_acc_m_s2", "confidence": 1.0,
          "parameters": {"gain": {"value": 1.06, "low": 1.055, "high": 1.065, "unit": ""}}}
     ]  # fmt: skip
-    (found,) = score_verdict(told, about("sensor", gain))["parameters"]
-    assert found["error"] == pytest.approx(0.2)
-    assert found["covered"] is False
+    (score,) = score_verdict(values, about("sensor", gain))["parameters"]
+    assert score["error"] == pytest.approx(0.2)
+    assert score["covered"] is False
 
 
 @pytest.mark.parametrize(("hits", "count"), [(0, 10), (1, 150), (9, 10), (57, 60), (10, 10)])
@@ -197,7 +197,7 @@ def test_wilson_intervals_are_where_the_score_test_just_rejects(hits: int, count
 def test_nothing_counted_says_nothing() -> None:
     assert Rate(0, 0).interval == (0.0, 1.0)
     assert str(Rate(0, 0)) == "-"
-    assert all(one.is_reached is None for one in compute_metrics([]))
+    assert all(metric.is_reached is None for metric in compute_metrics([]))
 
 
 def rows() -> list[Json]:
@@ -219,44 +219,60 @@ def rows() -> list[Json]:
 
 
 def test_figures_count_what_has_its_size_and_failures_as_misses() -> None:
-    found = {one.name: one for one in compute_metrics(rows())}
-    top = found["top-1, size >= 3, noise <= 1 %"]
+    metrics = {metric.name: metric for metric in compute_metrics(rows())}
+    top = metrics["top-1, size >= 3, noise <= 1 %"]
     assert top.value.startswith("76.9 % (10/13;")
     assert top.is_reached is False
-    assert found["nothing hidden: false alarm"].value.startswith("25.0 % (1/4;")
-    assert found["held-out after / floor, named correctly"].is_reached is True
-    assert found["parameters within 5 %, noise 1 %, all forms"].value.startswith("100.0 % (10/10;")
-    assert found["parameters within 5 %, noise 1 %, the library's form"].value == "-"
+    assert metrics["nothing hidden: false alarm"].value.startswith("25.0 % (1/4;")
+    assert metrics["held-out after / floor, named correctly"].is_reached is True
+    assert metrics["parameters within 5 %, noise 1 %, all forms"].value.startswith(
+        "100.0 % (10/10;"
+    )
+    assert metrics["parameters within 5 %, noise 1 %, the library's form"].value == "-"
     # stated 0.9, ten of twelve there: 0.9 - 0.8333
-    assert found["stated confidence against hit rate"].value.startswith("6.7 points")
+    assert metrics["stated confidence against hit rate"].value.startswith("6.7 points")
     again = [
         *rows(),
         score_verdict(verdict("named", "bumper_hardening"), about("single", TRUE, number=13)),
     ]
     assert len(select_usable(again)) == len(select_usable(rows()))
-    assert {one.name: one for one in compute_metrics(again)}[top.name].value.startswith(
+    assert {metric.name: metric for metric in compute_metrics(again)}[top.name].value.startswith(
         "84.6 % (11/13;"
     )
 
 
+def test_one_effect_is_counted_by_its_size_and_the_noise() -> None:
+    def row(number: int, noise: float, size: float, name: str = "bumper_hardening") -> Json:
+        case = about("single", TRUE, number=number, noise=noise, size=size)
+        return score_verdict(verdict("named", name), case)
+
+    rows = [row(1, 0.01, 3.0), row(2, 0.01, 1.5, "gap_drift"), row(3, 0.002, 1.5)]
+    rows += [row(4, 0.05, 10.0), row(5, 0.05, 1.5), row(6, 0.05, 1.5, "gap_drift")]
+    values = {metric.name: metric.value for metric in compute_metrics(rows)}
+    assert values["top-1, size >= 3, noise <= 1 %"].startswith("100.0 % (1/1;")
+    assert values["top-1, size 1.5, noise <= 1 %"].startswith("50.0 % (1/2;")
+    assert values["top-1, noise 5 %"].startswith("66.7 % (2/3;")
+    assert values["gap closed >= 0.95, size >= 3"].endswith("(2/2; 34.2 to 100.0)")
+
+
 def test_two_effects_are_counted_whole_and_where_both_leave_a_mark() -> None:
     def pair(number: int, mark: float | None, *names: str) -> Json:
-        said = verdict("named", *names) if names else verdict("failed")
-        return score_verdict(said, about("pair", TRUE, OTHER, number=number)) | {"mark": mark}
+        answer = verdict("named", *names) if names else verdict("failed")
+        return score_verdict(answer, about("pair", TRUE, OTHER, number=number)) | {"mark": mark}
 
     both = (TRUE["name"], OTHER["name"])
     some = [pair(1, 2.0, *both), pair(2, 1.01, both[0]), pair(3, 1.3), pair(4, None, both[1])]
-    found = {one.name: one.value for one in compute_metrics(some)}
-    assert found["two effects: both"].startswith("25.0 % (1/4;")
-    assert found["two effects: at least one"].startswith("75.0 % (3/4;")
-    assert found["two effects, both identifiable: both"].startswith("50.0 % (1/2;")
-    assert found["two effects, both identifiable: at least one"].startswith("50.0 % (1/2;")
+    values = {metric.name: metric.value for metric in compute_metrics(some)}
+    assert values["two effects: both"].startswith("25.0 % (1/4;")
+    assert values["two effects: at least one"].startswith("75.0 % (3/4;")
+    assert values["two effects, both identifiable: both"].startswith("50.0 % (1/2;")
+    assert values["two effects, both identifiable: at least one"].startswith("50.0 % (1/2;")
 
 
 def test_calibration_is_in_bins_of_what_was_stated() -> None:
-    ((stated, found),) = compute_calibration(select_usable(rows()))
+    ((stated, rate),) = compute_calibration(select_usable(rows()))
     assert stated == pytest.approx(0.9)
-    assert (found.hits, found.count) == (10, 12)
+    assert (rate.hits, rate.count) == (10, 12)
 
 
 def test_confusion_counts_each_truth_by_what_was_said() -> None:
@@ -270,12 +286,12 @@ def test_confusion_counts_each_truth_by_what_was_said() -> None:
 
 
 def test_the_page_has_counts_misses_and_a_picture(tmp_path: Path) -> None:
-    (tmp_path / RESULTS_FILE).write_text("".join(json.dumps(one) + "\n" for one in rows()))
+    (tmp_path / RESULTS_FILE).write_text("".join(json.dumps(row) + "\n" for row in rows()))
     text = write_study_pages(tmp_path).read_text()
     assert "| top-1, size >= 3, noise <= 1 % | >= 95 % | 76.9 % (10/13;" in text
     assert "| bumper_hardening | 10/13 | 76.9 %" in text
     assert "1 without a verdict" in text
     assert "not played 1 (" in text
-    assert [one["number"] for one in select_worst_misses(select_usable(rows()))][:2] == [10, 11]
+    assert [miss["number"] for miss in select_worst_misses(select_usable(rows()))][:2] == [10, 11]
     assert "| 10 | single | bumper_hardening | hunt_crossley | 0.90 |" in text
     assert (tmp_path / CONFUSION_FILE).read_bytes().startswith(b"\x89PNG")

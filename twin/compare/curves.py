@@ -1,20 +1,32 @@
 """Hysteresis intervals and jumps of a run, from its PRC points.
 
-The two directions differ at a grid frequency if their eta_d differ by more than a tenth of the
-larger one plus their spread (drift and scatter) over the measured cycles. An interval of such
-frequencies is a right hysteresis (hardening) if the forward branch is larger, a left one
-(softening) if it is smaller. Each end of an interval is a jump of one direction.
+Two steady motions are different solutions if their eta_d or their eta_a differ by more than a tenth
+of the larger one plus their scatter, the sum of both ranges over the measured cycles. With n = 3
+cycles of independent noise the sum of the ranges is 4 standard deviations of the difference of the
+means, so noise stays below the scatter alone. A difference above the scatter that is smaller than a
+tenth counts if it is at least `MIN_COUNTED_DIFFERENCE` and no cycle of the one motion has as many
+impacts on a side as any cycle of the other: a grazing contact changes the count, but neither eta.
+
+The directions differ at a grid frequency if they show different solutions there. Neighbouring
+frequencies of this kind are a right hysteresis (hardening) if the forward branch is larger, a left
+one (softening) if it is smaller, provided that a direction changes its solution at an end of
+them: this change is a jump. A single grid frequency has no extent and is no interval; its jumps
+count if both directions jump.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from typing import NamedTuple
 
 import numpy as np
 
 from table_io.records import NormalizedResponse, PrcPoint
 
-MIN_BRANCH_DIFFERENCE = 0.10  # of the larger eta_d: beyond it the solutions differ
+MIN_BRANCH_DIFFERENCE = 0.10  # of the larger eta: beyond it the solutions differ
+MIN_COUNTED_DIFFERENCE = 0.03  # the same, if the impact counts differ in every cycle
+MAX_REMAINING_DIFFERENCE = 0.5  # of the difference before a jump; a larger rest fades, no jump
 MIN_JUMP_RATIO = 1.6  # ratio of eta_d between neighbors that no smooth branch reaches
 
 
@@ -25,7 +37,7 @@ class PrcJump:
     direction: str
     from_hz: float
     to_hz: float
-    kind: str  # "up" or "down": change of eta_d
+    kind: str  # "up" or "down": change of eta_d, or of eta_a if it changes more
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,17 +56,58 @@ class _DirectionPair:
     backward: NormalizedResponse
 
     @property
-    def sign(self) -> int:
-        """+1 forward branch larger, -1 smaller, 0 the same solution within its scatter."""
-        f, b = self.forward, self.backward
-        larger = max(f.eta_d, b.eta_d)
-        scatter = f.eta_d * f.spread + b.eta_d * b.spread
-        difference = f.eta_d - b.eta_d
-        return (
-            int(np.sign(difference))
-            if abs(difference) > MIN_BRANCH_DIFFERENCE * larger + scatter
-            else 0
+    def difference(self) -> float:
+        """Relative difference, > 0 if the forward branch is larger; 0 for the same solution."""
+        return _compare_solutions(self.forward, self.backward).value
+
+
+class _Difference(NamedTuple):
+    """Relative difference of two solutions, > 0 if the first is larger, and what exceeds scatter.
+
+    Both are relative to the larger one, and 0 for the same solution.
+    """
+
+    value: float
+    excess: float
+
+
+def _compare_solutions(
+    first: NormalizedResponse,
+    second: NormalizedResponse,
+    limit: float | None = None,
+    scatter_factor: float = 1.0,
+) -> _Difference:
+    """Return by how much the first solution is larger; 0 if they are the same.
+
+    Of eta_d and eta_a the one that differs more beyond its scatter decides. A quantity of a lost
+    sensor, or without a known scatter, is left out. `limit`: as in the head of this file.
+    """
+    if limit is None:
+        has_other_counts = _have_other_counts(first, second)
+        limit = MIN_COUNTED_DIFFERENCE if has_other_counts else MIN_BRANCH_DIFFERENCE
+    largest = _Difference(0.0, 0.0)
+    for eta, spread in (("eta_d", "spread"), ("eta_a", "spread_a")):
+        a, b = getattr(first, eta), getattr(second, eta)
+        spread_a, spread_b = getattr(first, spread), getattr(second, spread)
+        larger = max(a, b)
+        if spread_a is None or spread_b is None or not larger > 0:
+            continue
+        difference = (a - b) / larger
+        excess = abs(difference) - limit - scatter_factor * (a * spread_a + b * spread_b) / larger
+        if excess > abs(largest.excess):
+            largest = _Difference(difference, math.copysign(excess, difference))
+    return largest
+
+
+def _have_other_counts(first: NormalizedResponse, second: NormalizedResponse) -> bool:
+    """Return whether the impact counts of a side differ between all cycles of both motions."""
+    return any(
+        bool(a and b) and (max(a) < min(b) or max(b) < min(a))
+        for a, b in (
+            (first.impacts_right, second.impacts_right),
+            (first.impacts_left, second.impacts_left),
         )
+    )
 
 
 def _pair_directions(points: Sequence[PrcPoint], source: str) -> list[_DirectionPair]:
@@ -75,42 +128,50 @@ def detect_hysteresis(
 ) -> tuple[list[PrcJump], list[Hysteresis]]:
     """Detect jumps and hysteresis intervals of the "measured" or "twin" points."""
     pairs = _pair_directions(points, source)
+    differences = [pair.difference for pair in pairs]
     jumps: list[PrcJump] = []
     intervals: list[Hysteresis] = []
-    for sign, group in groupby(range(len(pairs)), key=lambda index: pairs[index].sign):
+    for sign, group in groupby(range(len(pairs)), key=lambda index: np.sign(differences[index])):
         indices = list(group)
         first, last = indices[0], indices[-1]
         if sign == 0:
             continue
-        ends = _interval_jumps(pairs, first, last, sign)
-        if not ends:
+        ends = _interval_jumps(pairs, first, last)
+        if not ends or (first == last and len(ends) < 2):
             continue
-        kind = "right" if sign > 0 else "left"
-        intervals.append(Hysteresis(kind, pairs[first].frequency_hz, pairs[last].frequency_hz))
         jumps.extend(ends)
+        if first < last:
+            kind = "right" if sign > 0 else "left"
+            intervals.append(Hysteresis(kind, pairs[first].frequency_hz, pairs[last].frequency_hz))
     return jumps, intervals
 
 
-def _interval_jumps(pairs: list[_DirectionPair], first: int, last: int, sign: int) -> list[PrcJump]:
-    """Return the jumps at the ends of an interval; none if neither direction changes branch.
+def _interval_jumps(pairs: list[_DirectionPair], first: int, last: int) -> list[PrcJump]:
+    """Return the jumps at the ends of an interval; none if neither direction changes solution.
 
-    Without a jump at either end the difference is scatter of an irregular motion, not hysteresis.
+    Without a jump at either end the difference is scatter of an irregular motion, or a slow change
+    of the specimen, not hysteresis.
     """
+    ends = (
+        ("forward", last, last + 1),  # the forward sweep leaves its branch at the upper end
+        ("backward", first, first - 1),  # the backward sweep at the lower one
+    )
     jumps = []
-    if last + 1 < len(pairs):  # the forward sweep leaves its branch at the upper end
-        a, b = pairs[last].forward.eta_d, pairs[last + 1].forward.eta_d
-        if (a - b) * sign > MIN_BRANCH_DIFFERENCE * max(a, b):
-            kind = "down" if sign > 0 else "up"
-            jumps.append(
-                PrcJump("forward", pairs[last].frequency_hz, pairs[last + 1].frequency_hz, kind)
-            )
-    if first > 0:  # the backward sweep leaves its branch at the lower end
-        a, b = pairs[first].backward.eta_d, pairs[first - 1].backward.eta_d
-        if (b - a) * sign > MIN_BRANCH_DIFFERENCE * max(a, b):
-            kind = "up" if sign > 0 else "down"
-            jumps.append(
-                PrcJump("backward", pairs[first].frequency_hz, pairs[first - 1].frequency_hz, kind)
-            )
+    for direction, before, after in ends:
+        if not 0 <= after < len(pairs):
+            continue
+        inside, outside = pairs[before], pairs[after]
+        # The scatter of a point in which the motion is jumping would hide the jump.
+        change = _compare_solutions(
+            getattr(outside, direction), getattr(inside, direction), scatter_factor=0.0
+        ).value
+        sign = 1 if direction == "backward" else -1
+        # What the scatter explains does not remain: a motion that is jumping scatters most.
+        remaining = _compare_solutions(outside.forward, outside.backward, limit=0.0).excess
+        closes = remaining / inside.difference <= MAX_REMAINING_DIFFERENCE
+        if change * inside.difference * sign > 0 and closes:
+            kind = "up" if change > 0 else "down"
+            jumps.append(PrcJump(direction, inside.frequency_hz, outside.frequency_hz, kind))
     return jumps
 
 

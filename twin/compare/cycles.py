@@ -5,12 +5,14 @@ comparison. Peaks come from a short least-squares parabola, a tenth of the short
 the contact, so that noise does not raise them and contacts are not smeared.
 """
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from table_io.block import Float1D, Label
+from table_io.block import Float1D, Float2D, Label
 from table_io.records import CycleExtremes, Extremes, NormalizedResponse, PrcPoint, Step
 from table_io.units import GRAVITY_M_S2
 from twin.model.parameters import Parameters
@@ -27,7 +29,7 @@ class PrcScale:
     contact_n: float
     u_star_m: float
     a_star_m_s2: float
-    gaps_m: tuple[float, float]  # (right, left) of the specimen, not of the model
+    gaps_m: tuple[float, float]  # (right, left) of the specimen as stated, not of the model
 
     @cached_property
     def smoothing_weights(self) -> Float1D:
@@ -127,6 +129,42 @@ def cycle_extremes(
     ), (after[0], after[1])
 
 
+OnsetDepths = tuple[Float2D, Float2D]  # (right, left), each (2, onset) in m
+NO_ONSETS: OnsetDepths = (np.empty((2, 0)), np.empty((2, 0)))
+
+
+def extract_onset_depths(motion: CycleMotion, extremes: Extremes | None, first: int) -> OnsetDepths:
+    """Return u, towards each bumper, at the samples before and at each contact onset.
+
+    `first` is the index of the first sample of the motion.
+    """
+    if extremes is None:
+        return NO_ONSETS
+    depths = []
+    for sign, onsets in ((1, extremes.onsets_r), (-1, extremes.onsets_l)):
+        at = np.array([index - first for index in onsets if index > first], dtype=np.int64)
+        depths.append(sign * np.array([motion.u[at - 1], motion.u[at]]))
+    return depths[0], depths[1]
+
+
+def correct_gaps(scale: PrcScale, onsets: Sequence[OnsetDepths]) -> tuple[float, float]:
+    """Return the gaps (right, left) in m that the contact onsets of a step allow.
+
+    A contact begins between two samples, and later by the deformation at which the force passes the
+    threshold. A stated gap within this interval, averaged over the onsets, stays; another is moved
+    to its nearest end.
+    """
+    p, gaps = scale.parameters, []
+    for side, stiffness in enumerate((p.bumper_stiffness_r, p.bumper_stiffness_l)):
+        depths = np.concatenate([NO_ONSETS[side], *(pair[side] for pair in onsets)], axis=1)
+        gap = scale.gaps_m[side]
+        if depths.size and math.isfinite(gap):
+            before, at = depths.mean(axis=1).tolist()
+            gap = min(max(gap, before - scale.contact_n / stiffness), at)
+        gaps.append(gap)
+    return gaps[0], gaps[1]
+
+
 def _impacts_per_cycle(
     cycles: list[CycleExtremes], all_onsets: list[int], has_cycle_before: bool
 ) -> tuple[int, ...]:
@@ -170,6 +208,7 @@ def normalized_response(
     has_forces = all(np.isfinite(e.force_r + e.force_l) for e in used_extremes)
     p, u_star = scale.parameters, scale.u_star_m
     eta = np.array([(e.u_max - e.u_min) / (2 * u_star) for e in used_extremes])
+    eta_a = np.array([(e.a_max - e.a_min) / (2 * scale.a_star_m_s2) for e in used_extremes])
     weight = p.mass * GRAVITY_M_S2
 
     gap_r, gap_l = scale.gaps_m if source == "measured" else (p.gap_r, p.gap_l)
@@ -182,9 +221,7 @@ def normalized_response(
 
     return NormalizedResponse(
         eta_d=float(eta.mean()),
-        eta_a=float(
-            np.mean([(e.a_max - e.a_min) / (2 * scale.a_star_m_s2) for e in used_extremes])
-        ),
+        eta_a=float(eta_a.mean()),
         eta_r=float(np.mean([deformation(e.u_max - gap_r, e.force_r) for e in used_extremes])),
         eta_l=float(np.mean([deformation(-e.u_min - gap_l, e.force_l) for e in used_extremes])),
         r_r=float(np.mean([ratio(e.force_r) for e in used_extremes])),
@@ -201,6 +238,8 @@ def normalized_response(
         else (),
         drift=float((eta[-1] - eta[0]) / eta.mean()),
         spread=float(np.ptp(eta) / eta.mean()),
+        # a dead accelerometer has no mean to relate to
+        spread_a=float(np.ptp(eta_a) / eta_a.mean()) if eta_a.mean() > 0 else None,
     )
 
 
@@ -233,9 +272,17 @@ def measure_table_motion(
 
 
 def build_prc_point(
-    step: Step, cycles: list[CycleExtremes], base_acc: Float1D, scale: PrcScale
+    step: Step,
+    cycles: list[CycleExtremes],
+    base_acc: Float1D,
+    scale: PrcScale,
+    onsets: Sequence[OnsetDepths] = (),
 ) -> PrcPoint:
-    """Build the PRC point of a step from its held cycles; `base_acc` of the measured ones."""
+    """Build the PRC point of a step from its held cycles; `base_acc` of the measured ones.
+
+    `onsets` are those of the measurement, which correct its gaps and with them eta_j.
+    """
+    scale = replace(scale, gaps_m=correct_gaps(scale, onsets))
     peak, fundamental, thd = measure_table_motion(base_acc, step.frequency_hz, scale.rate_hz)
     return PrcPoint(
         cycles[-1].index,

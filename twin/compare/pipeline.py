@@ -19,9 +19,11 @@ from twin.compare.cycles import (
     UNKNOWN_CONTACT,
     ContactState,
     CycleMotion,
+    OnsetDepths,
     PrcScale,
     build_prc_point,
     cycle_extremes,
+    extract_onset_depths,
 )
 from twin.compare.extra_channels import select_predicted
 from twin.compare.monitoring import MonitoringState
@@ -77,6 +79,7 @@ class PipelineState:
     cycle_blocks: tuple[BlockPair, ...] = ()
     cycles: tuple[CycleExtremes, ...] = ()  # of the current step
     base_acc: tuple[Float1D, ...] = ()  # of its measured cycles
+    onsets: tuple[OnsetDepths, ...] = ()  # of its held cycles, measured
     contact: tuple[ContactState, ContactState] = (
         UNKNOWN_CONTACT,
         UNKNOWN_CONTACT,
@@ -110,7 +113,7 @@ def prepare_pipeline(
         select_predicted(extra_channels),
     )
     scale = PrcScale(model.parameters, rate_hz, contact_n, u_star, a_star, profile.specimen.gaps_m)
-    if not steps:  # a displacement history: no cycles, no curves
+    if not steps or profile.continuation is not None:  # no numbered cycles, no curves
         return PipelineSetup(twin, scale, steps, measured_cycles=0)
     jump_prediction = predict_jumps(profile, model, steps)
     return PipelineSetup(twin, scale, steps, profile.sweep.measured_cycles, jump_prediction)
@@ -277,6 +280,10 @@ def _evaluate_cycle(
         state,
         cycles=(*state.cycles, cycle),
         base_acc=base_acc,
+        onsets=(
+            *state.onsets,
+            extract_onset_depths(measured_motion, measured_extremes, measured.index),
+        ),
         contact=(measured_contact, twin_contact),
         monitoring=monitoring_state,
     ), [cycle, *events]
@@ -292,7 +299,7 @@ def _evaluate_step(
     step = setup.find_step(state.cycles[-1].step)
     if step is not None and measured_cycles == setup.measured_cycles:
         base_acc = np.concatenate(state.base_acc)
-        point = build_prc_point(step, list(state.cycles), base_acc, setup.scale)
+        point = build_prc_point(step, list(state.cycles), base_acc, setup.scale, state.onsets)
         items.append(point)
         if step not in setup.added_steps:
             monitoring_state, events = monitoring.monitor_step(monitoring_state, point)
@@ -302,6 +309,7 @@ def _evaluate_step(
         state,
         cycles=(),
         base_acc=(),
+        onsets=(),
         contact=(UNKNOWN_CONTACT, UNKNOWN_CONTACT),
         monitoring=monitoring_state,
     ), items

@@ -69,7 +69,7 @@ def predict_jumps(profile: Profile, model: Model, steps: tuple[Step, ...]) -> Ju
     coarser ones, so that about `MAX_CYCLES` cycles are computed at most.
     """
     grid = np.array(profile.sweep.frequencies_hz)
-    if all(instance.effect.acts in ("parameters", "sensor") for instance in model.present_effects):
+    if model.changes_only_parameters:
         substeps, cycles = max(1, math.ceil(profile.sweep.step_hz / MAX_STEP_HZ)), CYCLES_PER_STEP
         up = np.interp(
             np.arange((grid.size - 1) * substeps + 1) / substeps, np.arange(grid.size), grid

@@ -2,16 +2,19 @@
 
 import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
 from table_io.block import Float1D
-from twin.model.continuation import continue_branch, find_unstable_orbit, settle_to_orbit
+from twin.dynamics.continuation import continue_branch
+from twin.dynamics.orbits import Orbit, settle_to_orbit
+from twin.dynamics.period_map import FREQUENCY, ClosedFormPeriodMap
+from twin.model.model import Model
 from twin.model.parameters import free_flight_resonance
-from twin.model.periodic_orbit import Orbit
 from twin.reports.paper_cases import PaperCase
+from twin.reports.players import HarmonicSimulator, make_simulator
 from twin.reports.slow_passage import (
     FINE_EFFORT,
     MAX_DIRECTION_DIFFERENCE,
@@ -23,8 +26,10 @@ MIN_GAP_MM, GAP_TOLERANCE_MM = (
     -40.0,
     0.005,
 )  # limit and tolerance of the search for permanent contact
-BRANCH_STEP_HZ = 0.02  # initial step of a continuation
+MAX_HYSTERESIS_HZ = 2.0  # from a frequency within a hysteresis to its end
+BRANCH_MARGIN_HZ = 0.5  # by which a branch is followed beyond a hysteresis
 SETTLE_CYCLES = 400  # cycles until the motion is steady
+FLIGHT_CYCLES = 4  # cycles over which the share of flight is measured
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,19 +67,25 @@ def find_folds(case: PaperCase, sweep: SlowSweep) -> Folds | None:
     if not case.simulator.is_exact:
         resolved = high - low > 2 * choose_effort(case).fine_hz
         return Folds(high, low, kind, "slow passage") if resolved else None
-    p, a = case.parameters, case.acceleration
     low_hz, high_hz = low - 5 * FINE_EFFORT.fine_hz, high + 5 * FINE_EFFORT.fine_hz
-    forward_orbit = settle_to_orbit(p, low_hz, a, sweep.state_at(low_hz, "forward"))
-    backward_orbit = settle_to_orbit(p, high_hz, a, sweep.state_at(high_hz, "backward"))
-    if forward_orbit is None or backward_orbit is None:
-        return None
-    forward_end_hz = continue_branch(p, a, forward_orbit, high_hz + 0.5, BRANCH_STEP_HZ).end_hz
-    backward_end_hz = continue_branch(p, a, backward_orbit, low_hz - 0.5, BRANCH_STEP_HZ).end_hz
-    return (
-        None
-        if forward_end_hz is None or backward_end_hz is None
-        else Folds(float(forward_end_hz), float(backward_end_hz), kind)
-    )
+    limits = low_hz - BRANCH_MARGIN_HZ, high_hz + BRANCH_MARGIN_HZ
+    folds_hz = []
+    for start_hz, direction, sign in ((low_hz, "forward", 1), (high_hz, "backward", -1)):
+        orbit = _settle(case, sweep, start_hz, direction)
+        if orbit is None:
+            return None
+        folds = continue_branch(orbit, FREQUENCY, limits, sign).folds
+        if not folds:
+            return None
+        folds_hz.append(folds[0].value)
+    return Folds(folds_hz[0], folds_hz[1], kind)
+
+
+def _settle(case: PaperCase, sweep: SlowSweep, frequency_hz: float, direction: str) -> Orbit | None:
+    """Return the orbit to which the motion of a slow sweep settles at a frequency."""
+    period_map = ClosedFormPeriodMap(Model(case.parameters))
+    start = period_map.from_state(sweep.state_at(frequency_hz, direction))
+    return settle_to_orbit(period_map, frequency_hz, case.acceleration, start)
 
 
 def _chaos_limit_hz(case: PaperCase) -> float:
@@ -117,21 +128,18 @@ def find_coexisting_orbits(
     case: PaperCase, sweep: SlowSweep, frequency_hz: float
 ) -> CoexistingOrbits | None:
     """Find the coexisting orbits at a frequency; None if both directions lead to the same one."""
-    p, a = case.parameters, case.acceleration
-    states = {
-        direction: sweep.state_at(frequency_hz, direction) for direction in ("forward", "backward")
-    }
     if not case.simulator.is_exact:
         forward_m, backward_m = (
-            steady_amplitude_m(case, sweep, frequency_hz, direction) for direction in states
+            steady_amplitude_m(case, sweep, frequency_hz, direction)
+            for direction in ("forward", "backward")
         )
         return (
             None
             if abs(forward_m - backward_m) < MAX_DIRECTION_DIFFERENCE * forward_m
             else CoexistingOrbits(forward_m, backward_m, None)
         )
-    forward_orbit = settle_to_orbit(p, frequency_hz, a, states["forward"])
-    backward_orbit = settle_to_orbit(p, frequency_hz, a, states["backward"])
+    forward_orbit = _settle(case, sweep, frequency_hz, "forward")
+    backward_orbit = _settle(case, sweep, frequency_hz, "backward")
     if (
         forward_orbit is None
         or backward_orbit is None
@@ -139,12 +147,13 @@ def find_coexisting_orbits(
         < MAX_DIRECTION_DIFFERENCE * forward_orbit.u_max
     ):
         return None
-    unstable = find_unstable_orbit(p, a, forward_orbit, backward_orbit)
-    return (
-        None
-        if unstable is None
-        else CoexistingOrbits(forward_orbit.u_max, backward_orbit.u_max, unstable)
-    )
+    ends = sorted((forward_orbit.u_max, backward_orbit.u_max))
+    limits = frequency_hz - MAX_HYSTERESIS_HZ, frequency_hz + MAX_HYSTERESIS_HZ
+    branch = continue_branch(forward_orbit, FREQUENCY, (max(limits[0], 0.1), limits[1]))
+    for orbit in branch.orbits_at(frequency_hz):
+        if not orbit.stable and ends[0] < orbit.u_max < ends[1]:
+            return CoexistingOrbits(forward_orbit.u_max, backward_orbit.u_max, orbit)
+    return None
 
 
 def steady_amplitude_m(
@@ -205,6 +214,47 @@ def detaches(case: PaperCase, gap_mm: float) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
+class ZeroGapFlight:
+    """Flight at G0: its share of the time, and what the bumper has not yet recovered at release.
+
+    `elastic_share` is the share of flight with a tenth of the bumpers' damping.
+    """
+
+    share: float
+    elastic_share: float
+    remaining: float  # deformation at release, of the largest
+
+
+def measure_zero_gap_flight(case: PaperCase, frequency_hz: float) -> ZeroGapFlight:
+    """Measure the flight between the two contacts of each cycle, in steady motion."""
+    share, remaining = _measure_flight(case.simulator, frequency_hz, case.acceleration)
+    base = case.simulator.model.base
+    elastic = replace(
+        base,
+        bumper_damping_r=base.bumper_damping_r / 10,
+        bumper_damping_l=base.bumper_damping_l / 10,
+    )
+    simulator = make_simulator(Model(elastic, case.simulator.model.effects))
+    return ZeroGapFlight(
+        share, _measure_flight(simulator, frequency_hz, case.acceleration)[0], remaining
+    )
+
+
+def _measure_flight(
+    simulator: HarmonicSimulator, hz: float, acceleration: float
+) -> tuple[float, float]:
+    """Return (share of flight, right deformation at release over its largest)."""
+    state = simulator.sweep([hz], acceleration, SETTLE_CYCLES).states[0]
+    motion = simulator.simulate_motion(hz, acceleration, state, FLIGHT_CYCLES)
+    in_flight = (motion.force_r <= 0) & (motion.force_l >= 0)
+    force, deformation = motion.force_r, motion.v_r - simulator.parameters.gap_r
+    last = np.flatnonzero((force[1:-1] > 0) & (force[2:] <= 0)) + 1  # samples of each contact
+    samples_left = force[last] / (force[last - 1] - force[last])  # until the force is zero
+    remaining = deformation[last] + samples_left * (deformation[last] - deformation[last - 1])
+    return float(in_flight.mean()), float(remaining.mean() / deformation.max())
+
+
+@dataclass(frozen=True, slots=True)
 class ImpactDistribution:
     """Distribution of impacts: share of cycles by (right, left), most frequent first."""
 
@@ -261,7 +311,7 @@ def compute_lyapunov_exponent(
     effort, a = choose_effort(case), case.acceleration
     state = case.simulator.sweep([frequency_hz], a, effort.transient_cycles).states[0]
     cycle_count = min(cycles or effort.lyapunov_cycles, effort.lyapunov_cycles)
-    return case.simulator.lyapunov_exponent(frequency_hz, a, state, cycle_count)
+    return case.simulator.lyapunov_exponent(frequency_hz, a, state, cycle_count)[0]
 
 
 def find_bands(frequency: Float1D, values: Float1D, threshold: float = 0.05) -> list[list[float]]:

@@ -7,6 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from twin.dynamics.period_map import ClosedFormPeriodMap
+from twin.model.model import Model
 from twin.reports.measured_campaign import MeasuredCampaign
 from twin.reports.motion_drawing import (
     draw_rest_lines,
@@ -175,7 +177,7 @@ def _draw_loops(
             resonance.case, study.slow_sweeps[resonance.case.name], resonance.hz
         )
         if orbits is not None and orbits.unstable is not None:
-            state = orbits.unstable.state
+            state = ClosedFormPeriodMap(Model(p)).to_state(orbits.unstable.x)
             motion = resonance.case.simulator.simulate_motion(
                 resonance.hz, resonance.case.acceleration, state, 1
             )

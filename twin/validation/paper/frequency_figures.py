@@ -33,7 +33,8 @@ from twin.reports.plot_style import (
 )
 from twin.reports.prc_drawing import ETA_A, ETA_D, Panel, make_prc_panels, plot_prc
 from twin.reports.report_data import DIRECTIONS, extract_prc
-from twin.validation.paper.study import CHAOS_SCAN_HZ, DETAIL_HZ, PaperStudy
+from twin.validation.paper.low_frequency import simulate_secondary_motion
+from twin.validation.paper.study import CHAOS_SCAN_HZ, DETAIL_HZ, SECONDARY_HZ, PaperStudy
 
 CASE_NAME, MEASURED_CYCLES = "G4", 3
 HISTORIES_HZ = (0.53, 1.4, 3.4)
@@ -44,10 +45,15 @@ MAX_BARS = 6  # impact combinations shown in a panel
 def draw_frequency_figures(
     study: PaperStudy, campaign: MeasuredCampaign | None
 ) -> CaptionedFigures:
-    """Draw Figs. 11 and 12; with a campaign, its measurements as well."""
+    """Draw Figs. 11 and 12; with a campaign, its measurements as well.
+
+    Of the model alone, Fig. 11 also at its own secondary resonances.
+    """
     if campaign is not None and CASE_NAME not in campaign.runs:
         return
-    yield _draw_frequency_figure(study.cases[CASE_NAME], campaign)
+    yield _draw_frequency_figure(study, campaign)
+    if campaign is None and any(study.find_own_hz(hz) for hz in SECONDARY_HZ):
+        yield _draw_frequency_figure(study, None, own=True)
     yield _draw_histories(study.cases[CASE_NAME], campaign)
 
 
@@ -58,17 +64,30 @@ def _make_legend_handles(campaign: MeasuredCampaign | None) -> list[Line2D]:
     return handles
 
 
-def _draw_frequency_figure(case: PaperCase, campaign: MeasuredCampaign | None) -> CaptionedFigure:
+def _draw_frequency_figure(
+    study: PaperStudy, campaign: MeasuredCampaign | None, own: bool = False
+) -> CaptionedFigure:
+    """Draw Fig. 11 at the paper's frequencies, or with the model's own secondary resonances."""
+    case, scan = study.cases[CASE_NAME], study.secondary[CASE_NAME]
+    detail_hz = [
+        (study.find_own_hz(hz) if own and hz in SECONDARY_HZ else None) or hz for hz in DETAIL_HZ
+    ]
+
+    def simulate(hz: float, direction: str) -> SystemMotion:
+        if hz in DETAIL_HZ:
+            return case.simulate_motion(hz, direction, MEASURED_CYCLES)
+        return simulate_secondary_motion(case, scan, hz, direction, MEASURED_CYCLES)
+
     figure = Figure(figsize=(15, 14))
     top, bottom = figure.subfigures(2, 1, squeeze=False, height_ratios=(1, 3))[:, 0]
     panels = make_prc_panels(top.subplots(1, 2, squeeze=False), (ETA_A, ETA_D))
-    _draw_prc(panels, case, campaign)
+    _draw_prc(panels, case, campaign, detail_hz)
     for (ax, _), letter in zip(panels, "ab", strict=True):
         label_panel(ax, letter)
-    axes = bottom.subplots(4, len(DETAIL_HZ))
-    for column, hz in zip(axes.T, DETAIL_HZ, strict=True):
+    axes = bottom.subplots(4, len(detail_hz))
+    for column, hz in zip(axes.T, detail_hz, strict=True):
         for direction in DIRECTIONS:
-            motion, recorded = case.simulate_motion(hz, direction, MEASURED_CYCLES), None
+            motion, recorded = simulate(hz, direction), None
             if campaign is not None:
                 recorded = campaign.extract_motion(CASE_NAME, hz, direction, MEASURED_CYCLES)
                 if recorded is not None:
@@ -80,13 +99,13 @@ def _draw_frequency_figure(case: PaperCase, campaign: MeasuredCampaign | None) -
                 )
     row_titles = ("rig", "model") if campaign is not None else DIRECTIONS
     for index, ax in enumerate(axes.flat):
-        row, column_index = divmod(index, len(DETAIL_HZ))
+        row, column_index = divmod(index, len(detail_hz))
         if not ax.lines:
             ax.text(
                 0.5, 0.7, "not measured", transform=ax.transAxes, ha="center", color=GUIDE_COLOUR
             )
         label_panel(
-            ax, PANEL_LETTERS[index], f"{DETAIL_HZ[column_index]:g} Hz, {row_titles[row % 2]}"
+            ax, PANEL_LETTERS[index], f"{detail_hz[column_index]:g} Hz, {row_titles[row % 2]}"
         )
         draw_rest_lines(case.gaps_m, ax.axvline)
         ax.axhline(0, color=GUIDE_COLOUR, lw=0.5, zorder=0.6)
@@ -96,8 +115,9 @@ def _draw_frequency_figure(case: PaperCase, campaign: MeasuredCampaign | None) -
     _equalize_scales(axes)
     figure.legend(handles=_make_legend_handles(campaign), loc="outside upper center", ncols=4)
     return CaptionedFigure(
-        "fig11_g4" if campaign is None else "rig_fig11_g4", "G4 over frequency",
-        "PRCs of a η_a and b η_d; vertical dashed lines mark 0.53, 0.71, 1.1, 1.4 and 3.4 Hz, the "
+        "fig11_own" if own else "fig11_g4" if campaign is None else "rig_fig11_g4",
+        "G4 over frequency" + (", at the model's own secondary resonances" if own else ""),
+        f"PRCs of a η_a and b η_d; vertical dashed lines mark {_format_list(detail_hz)} Hz, the "
         "columns below: c–l phase portraits, m–v inertia force against u, over the last three "
         "cycles of the step. "
         + ("Red and blue: rig, forward and backward; black: model. " if campaign else
@@ -106,6 +126,11 @@ def _draw_frequency_figure(case: PaperCase, campaign: MeasuredCampaign | None) -
         "range, not single cycles.",
         figure, "11",
     )  # fmt: skip
+
+
+def _format_list(frequencies_hz: list[float]) -> str:
+    *first, last = (f"{hz:g}" for hz in frequencies_hz)
+    return f"{', '.join(first)} and {last}"
 
 
 def _equalize_scales(axes: Any) -> None:
@@ -126,12 +151,17 @@ def _plot_motion(
     plot_inertia_loop(column[2 + row], motion, case.parameters.mass, **style)
 
 
-def _draw_prc(panels: list[Panel], case: PaperCase, campaign: MeasuredCampaign | None) -> None:
+def _draw_prc(
+    panels: list[Panel],
+    case: PaperCase,
+    campaign: MeasuredCampaign | None,
+    detail_hz: list[float],
+) -> None:
     if campaign is not None:
         plot_prc(panels, partial(extract_prc, campaign.points[CASE_NAME], "measured"), _dot_style)
     plot_prc(panels, partial(extract_prc, case.points, "twin"), partial(twin_style, width=1.3))
     for ax, _ in panels:
-        for hz in DETAIL_HZ:
+        for hz in detail_hz:
             ax.axvline(hz, **REST_LINE_STYLE)
             ax.annotate(
                 f"{hz:g} Hz", (hz, 1.0), (2, -2), xycoords=("data", "axes fraction"), size=7.5,

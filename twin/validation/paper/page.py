@@ -15,11 +15,12 @@ from twin.run.run_config import read_model
 from twin.validation.paper.force_loops import draw_paper_loop_figures
 from twin.validation.paper.frequency_figures import draw_chaos_figure, draw_frequency_figures
 from twin.validation.paper.secondary_resonances import draw_secondary_resonance_figure
+from twin.validation.paper.sketches import draw_sketches
 from twin.validation.paper.study import PaperStudy
-from twin.validation.paper.table import ComparisonRow
+from twin.validation.paper.table import VERDICTS, ComparisonRow
 
 PAPER_MODEL = "snm"
-FIGURE_ORDER = ("2", "3", "5", "6", "7", "8", "9", "11", "12", "")
+FIGURE_ORDER = ("2", "3", "4", "5", "6", "7", "8", "9", "10", "11", "12", "")
 ProgressReporter = Callable[[str], None]
 
 
@@ -38,6 +39,7 @@ def _draw_in_order(study: PaperStudy, campaign: MeasuredCampaign | None) -> Capt
         figure
         for draw in (
             _draw_prc_families,
+            draw_sketches,
             draw_paper_loop_figures,
             draw_secondary_resonance_figure,
             draw_frequency_figures,
@@ -77,10 +79,10 @@ def write_paper_json(
     pictures: list[Picture],
     path: Path,
 ) -> None:
-    """Write the table, the PRC points and the impact distributions as strict JSON."""
+    """Write the table, PRC points, exponents, hystereses and impact distributions as JSON."""
     document: dict[str, Any] = {
         "model": {"name": source.name, "title": source.config.title, "toml": source.toml_text},
-        "table": [asdict(row) for row in rows],
+        "table": [asdict(row) | {"paper": row.paper} for row in rows],
         "prc": {
             name: [
                 {"frequency_hz": point.frequency_hz, "direction": point.direction}
@@ -88,6 +90,11 @@ def write_paper_json(
                 for point in case.points
             ]
             for name, case in study.cases.items()
+        },
+        "lyapunov": {f"{hz:g}": asdict(measure) for hz, measure in study.chaos.items()},
+        "secondary_hysteresis": {
+            name: [asdict(interval) for interval in scan.intervals]
+            for name, scan in study.secondary.items()
         },
         "impacts": {
             f"{hz:g}": {f"{r}/{l_}": share for (r, l_), share in distribution.shares}
@@ -107,8 +114,7 @@ def write_paper_page(
 ) -> None:
     """Write a self-contained HTML file: the table, then each set of figures."""
     figure_images = [(title, embed_images(pictures)) for title, pictures in figure_sets]
-    counts = {verdict: sum(row.verdict == verdict for row in rows) for verdict in
-              ("agrees", "agrees in kind", "departs")}  # fmt: skip
+    counts = {verdict: sum(row.verdict == verdict for row in rows) for verdict in VERDICTS}
     text = render_page(
         Path(__file__).with_name("paper.html"),
         rows=rows, sets=figure_images, counts=counts, model=source, exact=study.is_exact,

@@ -1,5 +1,6 @@
 """Secondary resonances of G4 in the low frequency range (Fig. 9)."""
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -31,6 +32,7 @@ from twin.reports.plot_style import (
 )
 from twin.reports.prc_drawing import ETA_A, make_prc_panels, plot_prc
 from twin.reports.report_data import DIRECTIONS, extract_prc
+from twin.validation.paper.low_frequency import simulate_secondary_motion
 from twin.validation.paper.study import SECONDARY_HZ, PaperStudy
 
 SWEEP_RANGES = (  # name, start and stop in Hz, colour, position of the label in Hz
@@ -44,14 +46,10 @@ SHOWN_CYCLES = 2  # cycles shown in the histories
 def draw_secondary_resonance_figure(
     study: PaperStudy, campaign: MeasuredCampaign | None
 ) -> CaptionedFigures:
-    """Draw Fig. 9, for the model only."""
+    """Draw Fig. 9 at the paper's frequencies and at the model's own, for the model only."""
     if campaign is not None:
         return
     case = study.cases["G4"]
-    figure = Figure(figsize=(15.5, 11))
-    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.02, 1))[0]
-    grid = left.add_gridspec(4, 3)
-    _draw_prc(left.add_subplot(grid[0, :]), case)
     motions = [
         {
             direction: case.simulate_motion(hz, direction, MEASURED_CYCLES)
@@ -59,22 +57,58 @@ def draw_secondary_resonance_figure(
         }
         for hz in SECONDARY_HZ
     ]
-    for column, pair in enumerate(motions):
-        rows = [left.add_subplot(grid[1 + row, column]) for row in range(3)]
-        _draw_loops(rows, pair, case, column)
-    axes = right.subplots(3, 3, sharey="row", sharex="col")
-    for column, pair in enumerate(motions):
-        _draw_histories(axes[:, column], pair, case, column)
-    figure.legend(handles=direction_handles(experiment_style), loc="outside upper center", ncols=2)
+    figure = _draw_figure(case, SECONDARY_HZ, motions)
     yield CaptionedFigure(
-        "fig09_secondary", "Secondary resonances of G4",
-        "a PRC of η_a with the ranges of the three sweeps and the three observed resonances; "
-        "b–d phase portraits, e–g inertia force against u, h–j contact force against bumper "
-        f"position, over the {MEASURED_CYCLES} measured cycles; k–m u, n–p total acceleration, "
-        "q–s contact forces over time. Red bands: the contacts within one forcing cycle of the "
-        f"forward sweep. Dashed: the gap. {_describe_chaos(study)}",
+        "fig09_secondary", "Secondary resonances of G4, at the paper's frequencies",
+        f"{_describe_panels('the three observed resonances')} {_describe_chaos(study)}",
         figure, "9",
     )  # fmt: skip
+    own_hz = [hz for paper_hz in SECONDARY_HZ if (hz := study.find_own_hz(paper_hz)) is not None]
+    if not own_hz:
+        return
+    scan = study.secondary["G4"]
+    motions = [
+        {
+            direction: simulate_secondary_motion(case, scan, hz, direction, MEASURED_CYCLES)
+            for direction in DIRECTIONS
+        }
+        for hz in own_hz
+    ]
+    listed = ", ".join(f"{hz:g}" for hz in own_hz)
+    yield CaptionedFigure(
+        "fig09_own", "Secondary resonances of G4, at the model's own frequencies",
+        f"{_describe_panels('the resonances of the model')} The model's resonances lie at {listed} "
+        "Hz, the ends of left hystereses: the forward motion still has the impact that it is about "
+        "to lose, the backward motion has lost it.",
+        _draw_figure(case, own_hz, motions), "9",
+    )  # fmt: skip
+
+
+def _describe_panels(resonances: str) -> str:
+    return (
+        f"a PRC of η_a with the ranges of the three sweeps and {resonances}; b–d phase portraits, "
+        "e–g inertia force against u, h–j contact force against bumper position, over "
+        f"{MEASURED_CYCLES} cycles; k–m u, n–p total acceleration, q–s contact forces over time. "
+        "Red bands: the contacts within one forcing cycle of the forward sweep. Dashed: the gap."
+    )
+
+
+def _draw_figure(
+    case: PaperCase, frequencies_hz: Sequence[float], motions: list[dict[str, SystemMotion]]
+) -> Figure:
+    """Draw the PRC and, a column per frequency, portraits, loops and histories."""
+    count = len(frequencies_hz)
+    figure = Figure(figsize=(15.5, 11))
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.02, 1))[0]
+    grid = left.add_gridspec(4, count)
+    _draw_prc(left.add_subplot(grid[0, :]), case, frequencies_hz)
+    axes = right.subplots(3, count, sharey="row", sharex="col", squeeze=False)
+    for column, (hz, pair) in enumerate(zip(frequencies_hz, motions, strict=True)):
+        rows = [left.add_subplot(grid[1 + row, column]) for row in range(3)]
+        _draw_loops(rows, pair, case, column, hz)
+        _draw_histories(axes[:, column], pair, case, column, hz)
+    figure.legend(handles=direction_handles(experiment_style), loc="outside upper center", ncols=2)
+    return figure
 
 
 def _describe_chaos(study: PaperStudy) -> str:
@@ -85,16 +119,16 @@ def _describe_chaos(study: PaperStudy) -> str:
     return f"The model is chaotic at {where}: cycles and directions differ there."
 
 
-def _draw_prc(ax: Axes, case: PaperCase) -> None:
+def _draw_prc(ax: Axes, case: PaperCase, frequencies_hz: Sequence[float]) -> None:
     for name, low, high, colour, label_hz in SWEEP_RANGES[::-1]:
         ax.axvspan(low, high, color=colour, lw=0, zorder=0.3)
         ax.annotate(
             name, (label_hz, 0.06), xycoords=("data", "axes fraction"), ha="center", size=9,
-            color="#333333",
+            color="#333333", bbox={"facecolor": colour, "lw": 0, "pad": 1},
         )  # fmt: skip
     panels = make_prc_panels(np.array([[ax]]), (ETA_A,))
     plot_prc(panels, partial(extract_prc, case.points, "twin"), _dotted_style)
-    for number, hz in enumerate(SECONDARY_HZ, 1):
+    for number, hz in enumerate(frequencies_hz, 1):
         ax.axvline(hz, color="#111111", ls=(0, (4, 2)), lw=1)
         ax.annotate(
             f"$f_{number}$", (hz, 0.97), (3, 0), xycoords=("data", "axes fraction"),
@@ -110,7 +144,7 @@ def _dotted_style(direction: str) -> LineStyle:
 
 
 def _draw_loops(
-    rows: list[Axes], pair: dict[str, SystemMotion], case: PaperCase, column: int
+    rows: list[Axes], pair: dict[str, SystemMotion], case: PaperCase, column: int, hz: float
 ) -> None:
     for direction in DIRECTIONS:
         style = experiment_style(direction, 1.0)
@@ -122,7 +156,7 @@ def _draw_loops(
         ("$u$ in mm", "$u'$ in mm/s"), ("$u$ in mm", "$F_I$ in kN"), ("$v_j$ in mm", "$F_j$ in kN"),
     )  # fmt: skip
     for ax, letters, (x_label, y_label) in zip(rows, names, labels, strict=True):
-        title = f"$f_{column + 1}$ = {SECONDARY_HZ[column]:g} Hz" if letters == "bcd" else ""
+        title = f"$f_{column + 1}$ = {hz:g} Hz" if letters == "bcd" else ""
         label_panel(ax, letters[column], title)
         draw_rest_lines(case.gaps_m, ax.axvline)
         ax.axhline(0, color=GUIDE_COLOUR, lw=0.5, zorder=0.6)
@@ -130,8 +164,9 @@ def _draw_loops(
         ax.set_ylabel(y_label if column == 0 else "")
 
 
-def _draw_histories(axes: Any, pair: dict[str, SystemMotion], case: PaperCase, column: int) -> None:
-    hz = SECONDARY_HZ[column]
+def _draw_histories(
+    axes: Any, pair: dict[str, SystemMotion], case: PaperCase, column: int, hz: float
+) -> None:
     for direction in DIRECTIONS:
         plot_history(axes, pair[direction], **experiment_style(direction, 1.0))
     forward = pair["forward"]

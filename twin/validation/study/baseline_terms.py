@@ -62,7 +62,7 @@ class RegressionProblem:
     @cached_property
     def u(self) -> Float1D:
         """Relative displacement (sample,) in m, corrected for the estimated tare error."""
-        return self.motion.u - self.parameters.zero_error(self.residuals.log_number, "u")
+        return self.motion.u - self.parameters.tare_error(self.residuals.log_number, "u")
 
     @cached_property
     def regressions(self) -> tuple[ForceRegression, ...]:

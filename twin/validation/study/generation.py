@@ -91,7 +91,7 @@ def generate_case(case: Case, root: Path) -> CasePaths:
     for folder in (paths.case_dir, paths.sealed_dir):
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-    shares, residual = _find_shares(case)
+    shares, residual = find_shares(case)
     truth_path = paths.sealed_dir / "truth.toml"
     text = f"# {case.salt}\n" + format_toml(make_truth(case, case.planted, shares))
     truth_path.write_text(text, encoding="utf-8")
@@ -152,21 +152,21 @@ def make_truth(
     return {"base": _round_values(base)} | ({"effects": effects} if effects else {})
 
 
-def _find_shares(case: Case) -> tuple[list[float], BaselineResidual]:
+def find_shares(case: Case) -> tuple[list[float], BaselineResidual]:
     """Return the share at which each effect alone has the cell's size, and the residual of all."""
     noise = compute_noise_rms(case.cell.noise)
 
     @cache
     def base_signals() -> StudySignals:
         """Simulate once: sensor effects do not change the true signals."""
-        return _simulate_truth(case, [], [])
+        return simulate_truth(case, [], [])
 
     def compute_residual(
         planted_effects: Sequence[PlantedEffect], shares: Sequence[float]
     ) -> BaselineResidual:
         sensors = [planted.effect.definition.is_sensor_effect for planted in planted_effects]
         readings = signals = (
-            base_signals() if all(sensors) else _simulate_truth(case, planted_effects, shares)
+            base_signals() if all(sensors) else simulate_truth(case, planted_effects, shares)
         )
         for planted, share in zip(planted_effects, shares, strict=True):
             readings = apply_sensor_effect(planted, share, readings)
@@ -182,7 +182,7 @@ def _find_shares(case: Case) -> tuple[list[float], BaselineResidual]:
     return shares, searches[0][1] if len(searches) == 1 else compute_residual(case.planted, shares)
 
 
-def _simulate_truth(
+def simulate_truth(
     case: Case, planted: Sequence[PlantedEffect], shares: Sequence[float]
 ) -> StudySignals:
     text = format_toml(make_truth(case, planted, shares))

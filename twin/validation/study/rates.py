@@ -11,6 +11,7 @@ Json = dict[str, Any]
 NORMAL_QUANTILE = 1.959963984540054  # two-sided 95 % quantile of the normal distribution
 CONFIDENCE_BINS = 10  # number of bins of stated confidence
 MIN_NAMEABLE_SIZE = 3.0  # effects of this size or more should be named
+MAX_LOW_NOISE = 0.011  # relative to the rms of each channel: levels of up to 1 %
 MIN_DISTINCT_MARK = (
     1.05  # factor on the held-out error above which each of two effects is identifiable
 )
@@ -96,92 +97,85 @@ def _count_hits(rows: Sequence[Json]) -> Rate:
 def compute_metrics(rows: Sequence[Json]) -> list[StudyMetric]:
     """Return every metric of the study, in the order of its page."""
     usable_rows = select_usable(rows)
-    rows_by_kind = {
-        kind: [row for row in usable_rows if row["kind"] == kind]
-        for kind in ("single", "sensor", "none", "unknown", "pair")
-    }
-    single = [*rows_by_kind["single"], *rows_by_kind["sensor"]]
-    large = [row for row in single if row["size"] >= MIN_NAMEABLE_SIZE]
-    low_noise = [row for row in large if row["noise"] <= 0.011]
-    high_noise = [row for row in single if row["noise"] > 0.011]
-    distinct_pairs = [
-        row for row in rows_by_kind["pair"] if (row.get("mark") or 0.0) >= MIN_DISTINCT_MARK
-    ]
-    named_right = [row for row in usable_rows if row["said"] == "named" and row["right"]]
-    metrics = [
-        _make_min_metric("top-1, size >= 3, noise <= 1 %", compute_rate(low_noise, "top1"), 0.95),
-        _make_min_metric(
-            "set of two, size >= 3, noise <= 1 %", compute_rate(low_noise, "two"), 0.98
-        ),
-        _make_min_metric(
-            "named alone, size >= 3, noise <= 1 %", compute_rate(low_noise, "exact"), None
-        ),
-        _make_min_metric("top-1, noise 5 %", compute_rate(high_noise, "top1"), 0.75),
-        _make_min_metric(
-            "top-1, size 1.5, noise <= 1 %",
-            compute_rate(
-                [
-                    row
-                    for row in single
-                    if row["size"] < MIN_NAMEABLE_SIZE and row["noise"] <= 0.011
-                ],
-                "top1",
-            ),
-            None,
-        ),
-        _make_max_metric(
-            "nothing hidden: false alarm", compute_rate(rows_by_kind["none"], "false_alarm"), 0.02
-        ),
-        _make_min_metric(
-            "not in the library: unexplained",
-            compute_rate(rows_by_kind["unknown"], "unexplained"),
-            0.90,
-        ),
-        _make_max_metric(
-            "not in the library: wrong name",
-            compute_rate(rows_by_kind["unknown"], "wrong_name"),
-            0.05,
-        ),
-        _make_min_metric(
-            "not in the library: region correct",
-            compute_rate(rows_by_kind["unknown"], "region"),
-            0.85,
-        ),
-        _make_min_metric(
-            "one effect: region correct", compute_rate(rows_by_kind["single"], "region"), None
-        ),
-        _make_min_metric("two effects: both", compute_rate(rows_by_kind["pair"], "both"), 0.80),
-        _make_min_metric(
-            "two effects: at least one", compute_rate(rows_by_kind["pair"], "one"), 0.97
-        ),
-        _make_min_metric(
-            "two effects, both identifiable: both",
-            compute_rate(distinct_pairs, "both"),
-            None,
-        ),
-        _make_min_metric(
-            "two effects, both identifiable: at least one",
-            compute_rate(distinct_pairs, "one"),
-            None,
-        ),
+    single = [*_select_kind(usable_rows, "single"), *_select_kind(usable_rows, "sensor")]
+    return [
+        *_make_naming_metrics(single),
+        *_make_rejection_metrics(usable_rows),
+        *_make_pair_metrics(_select_kind(usable_rows, "pair")),
         _make_calibration_metric(compute_calibration(usable_rows)),
-        _make_median_metric(
-            "held-out after / floor, named correctly", named_right, "after_floor", 1.10
-        ),
-        _make_min_metric(
-            "held-out after <= 1.05 oracle, named correctly",
-            _count_within(named_right, "after_oracle", 1.05),
-            0.90,
-        ),
-        _make_min_metric(
-            "gap closed >= 0.95, size >= 3",
-            _count_within([row for row in large if row["right"]], "closed", 0.95, above=True),
-            None,
-        ),
+        *_make_fit_metrics(usable_rows, single),
         *_make_parameter_metrics([row for row in single if abs(row["noise"] - 0.01) < 1e-9]),
         _make_median_metric("CPU time per case in s", usable_rows, "seconds", 10.0),
     ]
-    return metrics
+
+
+def _select_kind(rows: Sequence[Json], kind: str) -> list[Json]:
+    return [row for row in rows if row["kind"] == kind]
+
+
+def _select_nameable(rows: Sequence[Json]) -> list[Json]:
+    return [row for row in rows if row["size"] >= MIN_NAMEABLE_SIZE]
+
+
+def _make_naming_metrics(single: Sequence[Json]) -> list[StudyMetric]:
+    """Return how often one hidden effect is named, by its size and the noise."""
+    low_noise = [row for row in single if row["noise"] <= MAX_LOW_NOISE]
+    high_noise = [row for row in single if row["noise"] > MAX_LOW_NOISE]
+    large = _select_nameable(low_noise)
+    small = [row for row in low_noise if row["size"] < MIN_NAMEABLE_SIZE]
+    top_1, set_of_two, alone = (compute_rate(large, key) for key in ("top1", "two", "exact"))
+    return [
+        _make_min_metric("top-1, size >= 3, noise <= 1 %", top_1, 0.95),
+        _make_min_metric("set of two, size >= 3, noise <= 1 %", set_of_two, 0.98),
+        _make_min_metric("named alone, size >= 3, noise <= 1 %", alone, None),
+        _make_min_metric("top-1, noise 5 %", compute_rate(high_noise, "top1"), 0.75),
+        _make_min_metric("top-1, size 1.5, noise <= 1 %", compute_rate(small, "top1"), None),
+    ]
+
+
+def _make_rejection_metrics(usable_rows: Sequence[Json]) -> list[StudyMetric]:
+    """Return false alarms, and verdicts and regions of effects that the library lacks."""
+    nothing, unknown, one_effect = (
+        _select_kind(usable_rows, kind) for kind in ("none", "unknown", "single")
+    )
+    unexplained, wrong_name, region = (
+        compute_rate(unknown, key) for key in ("unexplained", "wrong_name", "region")
+    )
+    false_alarm = compute_rate(nothing, "false_alarm")
+    return [
+        _make_max_metric("nothing hidden: false alarm", false_alarm, 0.02),
+        _make_min_metric("not in the library: unexplained", unexplained, 0.90),
+        _make_max_metric("not in the library: wrong name", wrong_name, 0.05),
+        _make_min_metric("not in the library: region correct", region, 0.85),
+        _make_min_metric("one effect: region correct", compute_rate(one_effect, "region"), None),
+    ]
+
+
+def _make_pair_metrics(pairs: Sequence[Json]) -> list[StudyMetric]:
+    """Return how often both or one of two hidden effects are named."""
+    distinct = [row for row in pairs if (row.get("mark") or 0.0) >= MIN_DISTINCT_MARK]
+    both, at_least_one = compute_rate(distinct, "both"), compute_rate(distinct, "one")
+    return [
+        _make_min_metric("two effects: both", compute_rate(pairs, "both"), 0.80),
+        _make_min_metric("two effects: at least one", compute_rate(pairs, "one"), 0.97),
+        _make_min_metric("two effects, both identifiable: both", both, None),
+        _make_min_metric("two effects, both identifiable: at least one", at_least_one, None),
+    ]
+
+
+def _make_fit_metrics(usable_rows: Sequence[Json], single: Sequence[Json]) -> list[StudyMetric]:
+    """Return how well the completed model fits where the effect is named correctly."""
+    named_right = [row for row in usable_rows if row["said"] == "named" and row["right"]]
+    large_right = [row for row in _select_nameable(single) if row["right"]]
+    near_oracle = _count_within(named_right, "after_oracle", 1.05)
+    closed = _count_within(large_right, "closed", 0.95, above=True)
+    return [
+        _make_median_metric(
+            "held-out after / floor, named correctly", named_right, "after_floor", 1.10
+        ),
+        _make_min_metric("held-out after <= 1.05 oracle, named correctly", near_oracle, 0.90),
+        _make_min_metric("gap closed >= 0.95, size >= 3", closed, None),
+    ]
 
 
 def _make_min_metric(name: str, hit_rate: Rate, target: float | None) -> StudyMetric:

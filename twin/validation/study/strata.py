@@ -13,7 +13,8 @@ from itertools import combinations
 import numpy as np
 
 from table_io.errors import InputError
-from table_io.sim.ground_truth import EFFECT_DEFINITIONS, EffectDefinition, HiddenParameter
+from table_io.sim.ground_truth import EFFECT_DEFINITIONS, EffectDefinition
+from table_io.sim.hidden_entry import HiddenParameter
 
 NUMBERS_PER_CELL = 1000  # case numbers reserved per cell
 RESIDUAL_SIZES = (1.5, 3.0, 10.0)  # residual of the base model over the noise floor

@@ -3,103 +3,90 @@
 import multiprocessing
 import os
 import signal
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from multiprocessing.connection import Connection, wait
+from itertools import islice
+from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-from table_io.clock import RealClock
-
-POLL_INTERVAL_S = 0.2  # between checks of the stop condition
 MAX_CASE_S = 900.0  # time limit per case; then the process is terminated
-Work = Callable[[int], dict[str, Any]]  # defined at module level, since it is pickled
-
-
-@dataclass(slots=True)
-class _CaseWorker:
-    """A process and the case number that it evaluates."""
-
-    process: BaseProcess
-    pipe: Connection
-    number: int
-    start_s: float
+Row = dict[str, Any]
+Work = Callable[[int], Row]  # defined at module level, since it is pickled
 
 
 def map_in_processes(
-    numbers: Iterable[int], workers: int, work: Work, stop: Callable[[], object]
-) -> Iterator[dict[str, Any]]:
+    numbers: Iterable[int],
+    workers: int,
+    work: Work,
+    stop: Callable[[], object],
+    max_case_s: float = MAX_CASE_S,
+) -> Iterator[Row]:
     """Yield `work(number)` of every number, in the order of completion.
 
+    The process of a case that takes longer than `max_case_s` is terminated.
     After `stop()` is true no case is started; those in progress are completed and yielded.
     """
     os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    pending, clock = deque(numbers), RealClock()
-    running: list[_CaseWorker] = []
-    try:
-        while pending and len(running) < workers and not stop():
-            running.append(_start_worker(work, pending.popleft(), clock.now()))
-        while running:
-            ready = wait([worker.pipe for worker in running], timeout=POLL_INTERVAL_S)
-            for worker in list(running):
-                is_late = clock.now() - worker.start_s > MAX_CASE_S
-                if worker.pipe not in ready and not is_late:
-                    continue
-                row = _receive_row(worker, is_late)
-                running.remove(worker)
-                if pending and not stop():
-                    running.append(_assign_next(worker, work, pending.popleft(), clock.now()))
-                else:
-                    _stop_worker(worker)
-                yield row
-    finally:
-        for worker in running:
-            worker.process.terminate()
+    pending = iter(numbers)
+    running: dict[Future[Row], _CaseWorker] = {}
 
+    def submit(worker: _CaseWorker, number: int) -> None:
+        running[threads.submit(worker.evaluate, number, max_case_s)] = worker
 
-def _receive_row(worker: _CaseWorker, is_late: bool) -> dict[str, Any]:
-    """Return the row of a worker, or a row with the reason why there is none."""
-    if is_late:
-        worker.process.terminate()
-        worker.process.join()
-        reason = f"took longer than {MAX_CASE_S:g} s"
-    else:
+    # One thread waits for each process. A ProcessPoolExecutor loses the cases of all processes with
+    # one, cannot end a case that takes too long, and outlives this process if that is killed.
+    with ThreadPoolExecutor(workers) as threads:
         try:
-            return dict(worker.pipe.recv())
+            for number in islice(pending, 0 if stop() else workers):
+                submit(_start_worker(work), number)
+            while running:
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    worker = running.pop(future)
+                    next_number = None if stop() else next(pending, None)
+                    if next_number is None:
+                        worker.pipe.close()
+                        worker.process.join()
+                    else:
+                        is_alive = worker.process.is_alive()
+                        submit(worker if is_alive else _start_worker(work), next_number)
+                    yield future.result()
+        finally:
+            for worker in running.values():
+                worker.process.terminate()
+
+
+@dataclass(frozen=True, slots=True)
+class _CaseWorker:
+    """A process that evaluates one case after another, until its pipe is closed."""
+
+    process: BaseProcess
+    pipe: Connection
+
+    def evaluate(self, number: int, max_case_s: float) -> Row:
+        """Return the row of a case, or a row with the reason why there is none."""
+        try:
+            self.pipe.send(number)
+            if self.pipe.poll(max_case_s):
+                return dict(self.pipe.recv())
+            self.process.terminate()
+            reason = f"took longer than {max_case_s:g} s"
+            self.process.join()
         except (EOFError, OSError):
-            worker.process.join()
-            reason = f"its process died (exit code {worker.process.exitcode})"
-    return {"number": worker.number, "failed": reason}
+            self.process.join()
+            reason = f"its process died (exit code {self.process.exitcode})"
+        return {"number": number, "failed": reason}
 
 
-def _start_worker(work: Work, number: int, start_s: float) -> _CaseWorker:
-    """Start a process and send it its first case number."""
+def _start_worker(work: Work) -> _CaseWorker:
+    """Start a process without a case."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve_cases, args=(theirs, work), daemon=True)
     process.start()
     theirs.close()  # so that the death of the process closes the pipe
-    ours.send(number)
-    return _CaseWorker(process, ours, number, start_s)
-
-
-def _assign_next(worker: _CaseWorker, work: Work, number: int, start_s: float) -> _CaseWorker:
-    """Send a worker its next case number; start a new worker if its process has died."""
-    if worker.process.is_alive():
-        try:
-            worker.pipe.send(number)
-            return _CaseWorker(worker.process, worker.pipe, number, start_s)
-        except OSError:
-            pass
-    worker.pipe.close()
-    return _start_worker(work, number, start_s)
-
-
-def _stop_worker(worker: _CaseWorker) -> None:
-    """Close the pipe and wait until the process has ended."""
-    worker.pipe.close()
-    worker.process.join()
+    return _CaseWorker(process, ours)
 
 
 def _serve_cases(pipe: Connection, work: Work) -> None:
