@@ -1,7 +1,8 @@
 """Errors that a user can correct."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 MIN_SIMILARITY = 0.5  # of a known name that is suggested, 1 for the same
 MAX_LISTED_NAMES = 40
@@ -11,7 +12,8 @@ class InputError(ValueError):
     """A file, value or option that a user must correct; commands end with exit code 2.
 
     The message is composed of the given fields in this order: `where: key = value: problem;
-    allowed: ...; remedy`. Tests and programs read the fields, users read the message.
+    allowed: ...; remedy`, and then `faults` on lines of their own: the errors of the single keys
+    of a file. Tests and programs read the fields, users read the message.
     """
 
     def __init__(
@@ -23,6 +25,7 @@ class InputError(ValueError):
         value: object = None,
         allowed: str = "",
         remedy: str = "",
+        faults: Sequence["InputError"] = (),
     ) -> None:
         self.problem = problem
         self.where = str(where)
@@ -30,13 +33,34 @@ class InputError(ValueError):
         self.value = value
         self.allowed = allowed
         self.remedy = remedy
+        self.faults = tuple(faults)
         subject = key if value is None else f"{key} = {value!r}" if key else repr(value)
         message = ": ".join(part for part in (self.where, subject, problem) if part)
         if allowed:
             message += f"; allowed: {allowed}"
         if remedy:
             message += f"; {remedy}"
+        if self.faults:
+            lines = (line for fault in self.faults for line in str(fault).splitlines())
+            message = "\n".join([f"{message}:", *(f"  {line}" for line in lines)])
         super().__init__(message)
+
+    def replace(self, **changes: Any) -> "InputError":
+        """Return a copy with other fields."""
+        fields: dict[str, Any] = {
+            "problem": self.problem,
+            "where": self.where,
+            "key": self.key,
+            "value": self.value,
+            "allowed": self.allowed,
+            "remedy": self.remedy,
+            "faults": self.faults,
+        }
+        return InputError(**(fields | changes))
+
+    def add_place(self, place: object) -> "InputError":
+        """Return a copy with `place` before `where`."""
+        return self.replace(where=f"{place}: {self.where}" if self.where else place)
 
 
 def suggest(name: str, known: Iterable[str]) -> str:

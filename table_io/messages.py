@@ -9,6 +9,7 @@ from table_io.records import (
     Fault,
     FrequencyResponse,
     Level,
+    OrbitPoint,
     Params,
     Record,
     RunStop,
@@ -68,6 +69,8 @@ def format_record(record: Record, rate_hz: float) -> tuple[str, str] | None:
             return ("INFO" if record.accepted else "WARN"), _format_level(record)
         case StepAdded(frequency_hz=frequency, reason=reason):
             return "INFO", f"next step at {frequency:g} Hz: {reason}"
+        case OrbitPoint():
+            return ("INFO" if record.accepted else "WARN"), _format_orbit(record)
         case RunStop(verdict=verdict, reason=reason):
             return ("INFO" if verdict == "complete" else "WARN"), f"{verdict}: {reason}"
     return None
@@ -87,3 +90,13 @@ def _format_level(level: Level) -> str:
         f"{level.demanded_m_s2 / GRAVITY_M_S2:.4f} g demanded; command multiplied by "
         f"{level.correction:.4f} after {level.update} updates"
     )
+
+
+def _format_orbit(orbit: OrbitPoint) -> str:
+    feedback = math.hypot(*orbit.feedback_m)
+    share = 100 * feedback / orbit.command_m
+    text = (
+        f"orbit {orbit.step}: +-{1e3 * orbit.amplitude_m:.4g} mm at {orbit.frequency_hz:.5g} Hz; "
+        f"feedback {1e6 * feedback:.2g} um, {share:.2g} % of the command; {orbit.periods} periods"
+    )
+    return text if orbit.accepted else f"{text}; not accepted: {orbit.reason}"

@@ -96,8 +96,12 @@ class CycleExtremes:
 class NormalizedResponse:
     """Normalized response at a step (Stefani et al., Eq. 1); all ratios >= 0.
 
+    Each ratio is the mean over the measured cycles of the ratio of each cycle. Eq. 1 takes one
+    largest and one smallest value of the steady motion: the same where every cycle is alike, more
+    where they differ.
     `drift` is the change of eta_d over the measured cycles relative to its mean (the remaining
-    transient); `spread` is its range over the measured cycles relative to its mean.
+    transient); `spread` and `spread_a` are the ranges of eta_d and eta_a over the measured cycles
+    relative to their means; `spread_a` is None in recordings from before it was recorded.
     """
 
     eta_d: float
@@ -110,6 +114,7 @@ class NormalizedResponse:
     impacts_left: tuple[int, ...]
     drift: float
     spread: float
+    spread_a: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,6 +298,36 @@ class StepAdded:
 
 
 @dataclass(frozen=True, slots=True)
+class OrbitPoint:
+    """Periodic orbit held by feedback at a planned point, over whole cycles before sample `index`.
+
+    The orbit is that of the table without feedback only if the feedback has vanished: `accepted`
+    means that its harmonics are at noise level or below the tolerance, and that the amplitude is
+    that of the sought branch; else `reason` says what is missing. `u_m` are the harmonics U_0,
+    U_1, ... as Re U_0, Im U_0, Re U_1, ... with u(t) = Re sum U_k exp(i k phi), where the table's
+    acceleration is a sin(phi). `feedback_m` are the amplitudes of harmonics 0, 1, ... of the
+    correction, `noise_m` the part of their root sum of squares that sensor noise explains, and
+    `command_m` is the amplitude of the command. `periods` counts from the change of point.
+    """
+
+    index: int
+    step: int
+    frequency_hz: float
+    acceleration_m_s2: float  # fundamental of the table, measured
+    amplitude_m: float  # half of max u - min u
+    u_m: tuple[float, ...]
+    feedback_m: tuple[float, ...]
+    noise_m: float
+    command_m: float
+    periods: int
+    updates: int
+    stable: bool  # by the plan
+    multiplier: float  # measured; NaN if it was not
+    accepted: bool
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
 class Trip:
     """Protection trip in `channel` at sample `index`; latched, the table decays to rest.
 
@@ -332,6 +367,7 @@ Record = (
     | FrequencyResponse
     | Level
     | StepAdded
+    | OrbitPoint
     | Trip
     | Agreement
     | Estimate
@@ -340,5 +376,6 @@ Record = (
 )
 RECORD_TYPES: tuple[type, ...] = (
     RunStart, Params, Comparison, CycleExtremes, PrcPoint, Event, SampleGap, Fault, Timing,
-    Check, FrequencyResponse, Level, StepAdded, Trip, Agreement, Estimate, JumpForecast, RunStop,
+    Check, FrequencyResponse, Level, StepAdded, OrbitPoint, Trip, Agreement, Estimate, JumpForecast,
+    RunStop,
 )  # fmt: skip

@@ -57,14 +57,24 @@ MAX_STOP_WAIT_S = 10.0  # from a stop request until the recording ends in any ca
 def plan_open_loop_drive(profile: Profile, rig: RigConfig) -> Drive:
     """Return the open-loop drive for an external controller, the loop check included.
 
-    InputError for an adaptive test, which decides its steps while it runs.
+    InputError for an adaptive test or a continuation, which decide while they run.
     """
+    if profile.continuation is not None:
+        raise InputError(
+            "orbits are held by a feedback to the command, which another controller cannot give",
+            where=f"rig {rig.name}",
+            key="excitation.kind",
+            value=profile.excitation.kind,
+            remedy="use a rig that this program drives, with a command queue it can replace",
+        )
     plan = sequencer.make_test_plan(profile, rig)
     if make_policy(profile) is not None:
+        tables = [name for name in ("dwell", "track", "refine") if getattr(profile, name)]
         raise InputError(
-            "a test with [dwell], [track] or [refine] decides while it runs which steps follow, so "
-            "another controller cannot play it from a file",
-            remedy="remove that table from the profile",
+            "the test decides while it runs which steps follow, so another controller cannot play "
+            "it from a file",
+            key=f"[{tables[0]}]",
+            remedy="remove this table from the profile",
         )
     return sequencer.nominal_drive(plan)
 

@@ -60,6 +60,26 @@ class OutputQueue:
         self.drive = drive
         self._queued_end = first if fully_queued else min(self._queued_end, first)
 
+    def replace_drive(self, drive: Drive, first: int) -> bool:
+        """Queue another drive from sample `first` on at once; False if the machine played past it.
+
+        For changes that are due within milliseconds: nothing has changed if it is too late.
+        """
+        previous, queued_end = self.drive, self._queued_end
+        if first >= previous.rest_start and drive.rest_start == previous.rest_start:
+            return True  # at rest already
+        if self.has_run_out:
+            return False
+        self.change_drive(drive, first)
+        try:
+            self._queue_lead(self.played_samples())
+        except ValueError:
+            if not self._started:
+                raise
+            self.drive, self._queued_end = previous, queued_end
+            return False
+        return True
+
     def feed(self) -> None:
         """Keep `lead_s` of replaceable drive queued beyond the next block, then a decay to rest.
 
@@ -69,24 +89,38 @@ class OutputQueue:
         if self._queued_end >= rest_start:
             return
         played = self.played_samples()
-        if self._started and self._queued_end < played + self.backend.replace_after:
+        if self.has_run_out:
             raise self._start_underrun_decay()
-        lead = (
-            self._output.lead_samples(self.drive.rate_hz, self.backend.replace_after) + self._block
-        )
-        if self._queued_end - played >= lead:
+        if self._queued_end - played >= self._lead_samples:
             return
-        lead_end = min(played + 2 * lead, rest_start)
         try:
-            self._queue_drive(
-                self._queued_end,
-                self.drive.decay_from(lead_end) if lead_end < rest_start else self.drive,
-            )
+            self._queue_lead(played)
         except ValueError:
             if not self._started:
                 raise
             # the machine played on while this was transferred
             raise self._start_underrun_decay() from None
+
+    @property
+    def has_run_out(self) -> bool:
+        """True if the machine can no longer be kept from the decay behind the lead."""
+        earliest = self.played_samples() + self.backend.replace_after
+        return self._started and self._queued_end < min(earliest, self.drive.rest_start)
+
+    @property
+    def _lead_samples(self) -> int:
+        """Samples of drive that are queued ahead at least."""
+        lead = self._output.lead_samples(self.drive.rate_hz, self.backend.replace_after)
+        return lead + self._block
+
+    def _queue_lead(self, played: int) -> None:
+        """Queue the drive to twice the lead, then a decay to rest; ValueError if too late."""
+        rest_start = self.drive.rest_start
+        lead_end = min(played + 2 * self._lead_samples, rest_start)
+        self._queue_drive(
+            self._queued_end,
+            self.drive.decay_from(lead_end) if lead_end < rest_start else self.drive,
+        )
         self._queued_end = lead_end
 
     def _start_underrun_decay(self) -> BufferUnderrun:

@@ -23,6 +23,7 @@ from table_io.records import FrequencyResponse, Record, RunStart, RunStop, Sampl
 from table_io.safety import protection
 
 TARE_S = 1.0
+MAX_FEEDBACK_TRIES = 5
 COMMAND_DELAY_S = 0.1  # extra margin for hold and resume, which are not urgent
 CLIP_RATIO = 0.999  # of a sensor's range; a sample at or above it is clipped
 
@@ -171,19 +172,39 @@ class _Session:
         if self.output_queue.is_decaying:
             return
         previous = self._state
-        self._state, records = sequencer.advance_test(previous, block)
+        self._state, records = self._advance_sequencer(block)
         self.event_log.pending.extend(records)
         for record in records:
             if isinstance(record, FrequencyResponse):
                 self._protection = protection.set_response(self._protection, record)
-        if self._state.drive is not previous.drive:
-            self.output_queue.change_drive(self._state.drive, self._state.changed_from)
         if self._state.refusal:
             self.verdict, self.reason = "aborted", self._state.refusal
         elif previous.stage.kind == "check" != self._state.stage.kind:
             self.event_log.enter_state("armed")
         if self.event_log.states[-1] == "armed" and block.step[-1] >= 0:
             self.event_log.enter_state("running")
+
+    def _advance_sequencer(
+        self, block: Block
+    ) -> tuple[sequencer.SequencerState, tuple[Record, ...]]:
+        """Return the state and records after a block, its changes of the drive being queued.
+
+        What a feedback changes is due at once: if the machine played past it meanwhile, the
+        feedback answers again from a later sample on, each time with more room.
+        """
+        queue = self.output_queue
+        for attempt in range(MAX_FEEDBACK_TRIES):
+            earliest = queue.first_changeable() + attempt * len(block)
+            state, records = sequencer.advance_test(self._state, block, earliest)
+            if state.search is None:
+                if state.drive is not self._state.drive:
+                    queue.change_drive(state.drive, state.changed_from)
+                return state, records
+            if queue.replace_drive(state.drive, state.changed_from):
+                return state, records
+        if not queue.has_run_out:  # else `feed` reports it
+            self.stop("aborted", f"the feedback came too late {MAX_FEEDBACK_TRIES} times in a row")
+        return self._state, ()
 
     def execute(self, command: OperatorCommand | None) -> None:
         """Execute an operator command if the state allows it."""

@@ -10,6 +10,7 @@ from typing import Literal
 from pydantic import Field, ValidationInfo, field_validator
 
 from table_io.config.base import ConfigModel, Count, Number, Positive
+from table_io.errors import InputError
 
 MAX_REFINEMENT = 128  # largest ratio of the sweep's step to the resolution of a refinement
 
@@ -25,16 +26,17 @@ class SweepGrid:
     def require_inside(self, key: str, value: float | None) -> None:
         """Raise ValueError if a frequency in Hz lies outside the sweep."""
         if value is not None and not self.start_hz <= value <= self.stop_hz:
-            raise ValueError(
-                f"{key} {value:g} lies outside the sweep; allowed: {self.start_hz:g} to "
-                f"{self.stop_hz:g}"
+            raise InputError(
+                f"{key} {value:g} lies outside the sweep",
+                allowed=f"{self.start_hz:g} to {self.stop_hz:g}",
             )
 
     def require_range(self, purpose: str) -> None:
         """Raise ValueError if the sweep has one frequency only."""
         if self.stop_hz <= self.start_hz:
-            raise ValueError(
-                f"the sweep has one frequency; {purpose} needs a range: set stop_hz above start_hz"
+            raise InputError(
+                "the sweep has one frequency",
+                remedy=f"{purpose} needs a range: set stop_hz above start_hz",
             )
 
 
@@ -83,9 +85,9 @@ class TrackConfig(ConfigModel):
     def _check_resolution(cls, resolution: float, info: ValidationInfo) -> float:
         step = info.data.get("step_hz")
         if step is not None and resolution > step / 2:
-            raise ValueError(
-                f"resolution_hz {resolution:g} is more than half of step_hz {step:g}; "
-                f"allowed: at most {step / 2:g}"
+            raise InputError(
+                f"resolution_hz {resolution:g} is more than half of step_hz {step:g}",
+                allowed=f"at most {step / 2:g}",
             )
         return resolution
 
@@ -93,7 +95,7 @@ class TrackConfig(ConfigModel):
     @classmethod
     def _check_phase(cls, phase: float | None, info: ValidationInfo) -> float | None:
         if phase is not None and info.data.get("by") == "peak":
-            raise ValueError("phase_deg does not apply to by = 'peak'; remove it")
+            raise InputError("phase_deg does not apply to by = 'peak'", remedy="remove it")
         return phase
 
     def check_sweep(self, grid: SweepGrid) -> None:
@@ -103,9 +105,9 @@ class TrackConfig(ConfigModel):
         grid.require_inside("highest_hz", self.highest_hz)
         low, high = self.range_hz(grid.start_hz, grid.stop_hz)
         if high - low < 2 * self.step_hz:
-            raise ValueError(
-                f"{low:g} to {high:g} Hz is too narrow for steps of {self.step_hz:g}; allowed: a "
-                "range of at least two steps"
+            raise InputError(
+                f"{low:g} to {high:g} Hz is too narrow for steps of {self.step_hz:g}",
+                allowed="a range of at least two steps",
             )
 
     def range_hz(self, start_hz: float, stop_hz: float) -> tuple[float, float]:
@@ -134,8 +136,8 @@ class RefineConfig(ConfigModel):
         grid.require_range("refining")
         grid.require_inside("approach_hz", self.approach_hz)
         if not grid.step_hz / MAX_REFINEMENT <= self.resolution_hz < grid.step_hz:
-            raise ValueError(
+            raise InputError(
                 f"resolution_hz {self.resolution_hz:g} does not refine a sweep with steps of "
-                f"{grid.step_hz:g}; allowed: {grid.step_hz / MAX_REFINEMENT:.3g} to below "
-                f"{grid.step_hz:g}"
+                f"{grid.step_hz:g}",
+                allowed=f"{grid.step_hz / MAX_REFINEMENT:.3g} to below {grid.step_hz:g}",
             )

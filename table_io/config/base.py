@@ -88,23 +88,28 @@ def _known_keys(model: type[ConfigModel], location: tuple[int | str, ...], raw: 
     return model.list_keys()
 
 
-def _format_error(model: type[ConfigModel], error: Any, raw: Any) -> str:
-    """Describe one validation error: key, value, what is allowed, what to do."""
+def _make_fault(model: type[ConfigModel], error: Any, raw: Any) -> InputError:
+    """Return one validation error with its key, value, what is allowed and what to do."""
     location: tuple[int | str, ...] = error["loc"]
     key = ".".join(str(part) for part in location) or "file"
     if error["type"] == "extra_forbidden":
         known = _known_keys(model, location, raw)
-        return f"{key}: unknown key; {suggest(str(location[-1]), known)}"
+        return InputError("unknown key", key=key, remedy=suggest(str(location[-1]), known))
     if error["type"] == "missing":
-        return f"{key}: missing; add it"
-    message = str(error["msg"]).removeprefix("Value error, ")
-    if error["type"] == "value_error":
-        return f"{key}: {message}"
-    return f"{key} = {error['input']!r}: {message[0].lower()}{message[1:]}"
+        return InputError("missing", key=key, remedy="add it")
+    if error["type"] != "value_error":
+        message = str(error["msg"])
+        return InputError(f"{message[0].lower()}{message[1:]}", key=key, value=error["input"])
+    cause = error["ctx"]["error"]
+    if not isinstance(cause, InputError):
+        return InputError(str(cause), key=key)
+    if cause.key or cause.where:  # a key or place below this key of the file
+        return cause.add_place(key)
+    return cause.replace(key=key)
 
 
 def parse_toml(text: str, model: type[ConfigT], source: str) -> ConfigT:
-    """Parse TOML text into a validated config; InputError lists all faults under `source`."""
+    """Parse TOML text into a validated config; InputError has all `faults`, where is `source`."""
     try:
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -118,8 +123,8 @@ def parse_toml(text: str, model: type[ConfigT], source: str) -> ConfigT:
     try:
         return model.model_validate(raw)
     except ValidationError as error:
-        faults = [_format_error(model, details, raw) for details in error.errors(include_url=False)]
-        raise InputError("\n".join([f"{source}:", *(f"  {fault}" for fault in faults)])) from None
+        faults = [_make_fault(model, details, raw) for details in error.errors(include_url=False)]
+        raise InputError("", where=source, faults=faults) from None
 
 
 def read_text(path: Path, kind: str) -> str:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from table_io.block import Float1D
+from table_io.errors import InputError
 
 CHUNKS_PER_POINT = 10  # of the second at each point; their scatter gives the standard error
 
@@ -62,7 +63,7 @@ def fit_calibration(
     span, centre = float(np.ptp(x)), float(x.mean())
     x = x - centre  # so that slope and constant are nearly uncorrelated
     if span == 0:
-        raise ValueError("all applied values are equal; apply at least two different ones")
+        raise InputError("all applied values are equal", remedy="apply at least two different ones")
     rough_slope = float(np.polyfit(x, y, 1)[0])
     sd = np.sqrt(np.array([mean.sd for mean in means]) ** 2 + (rough_slope * applied_sd) ** 2)
     known = bool((sd > 0).all())

@@ -21,7 +21,7 @@ from pydantic import Field, ValidationError, ValidationInfo, field_validator
 
 from table_io.channels import CHANNEL_BY_NAME, Channel
 from table_io.config.base import ConfigModel, Finite
-from table_io.errors import suggest
+from table_io.errors import InputError, suggest
 
 NAME_PATTERN = r"[a-z][a-z0-9]*(_[a-z0-9]+)+"
 MAX_NAME_LENGTH = 60
@@ -73,7 +73,9 @@ class ChannelConfig(ConfigModel):
     @classmethod
     def _check_quantity(cls, quantity: str) -> str:
         if quantity not in QUANTITIES:
-            raise ValueError(f"quantity {quantity!r} is unknown; {suggest(quantity, QUANTITIES)}")
+            raise InputError(
+                f"quantity {quantity!r} is unknown", remedy=suggest(quantity, QUANTITIES)
+            )
         return quantity
 
     @field_validator("unit")
@@ -81,9 +83,12 @@ class ChannelConfig(ConfigModel):
     def _check_unit(cls, unit: str, info: ValidationInfo) -> str:
         quantity = info.data.get("quantity")
         if quantity is not None and unit != QUANTITIES[quantity].unit:
-            raise ValueError(
-                f"unit {unit!r} does not fit; a channel of {quantity} is recorded in "
-                f"{QUANTITIES[quantity].unit!r}, its sensor may state another unit"
+            raise InputError(
+                f"unit {unit!r} does not fit",
+                remedy=(
+                    f"a channel of {quantity} is recorded in {QUANTITIES[quantity].unit!r}, its "
+                    "sensor may state another unit"
+                ),
             )
         return unit
 
@@ -91,17 +96,19 @@ class ChannelConfig(ConfigModel):
     @classmethod
     def _check_name(cls, name: str, info: ValidationInfo) -> str:
         if name in CHANNEL_BY_NAME:
-            raise ValueError(f"{name} is a channel already; omit this table, or use another name")
+            raise InputError(
+                f"{name} is a channel already", remedy="omit this table, or use another name"
+            )
         if name in RESERVED_NAMES or name.startswith(RESERVED_PREFIX):
-            raise ValueError(f"{name} names a column of an export; use another name")
+            raise InputError(f"{name} names a column of an export", remedy="use another name")
         if not re.fullmatch(NAME_PATTERN, name):
-            raise ValueError(
-                f"{name!r} is no channel name; allowed: words of a to z and 0 to 9 joined by _"
+            raise InputError(
+                f"{name!r} is no channel name", allowed="words of a to z and 0 to 9 joined by _"
             )
         suffix = f"_{info.data['unit'].lower().replace('/', '_')}" if "unit" in info.data else ""
         if not name.endswith(suffix):
-            raise ValueError(
-                f"{name} does not end with its unit {info.data['unit']}; allowed: ...{suffix}"
+            raise InputError(
+                f"{name} does not end with its unit {info.data['unit']}", allowed=f"...{suffix}"
             )
         return name
 
@@ -111,9 +118,9 @@ class ChannelConfig(ConfigModel):
         quantity = info.data.get("quantity")
         allowed = QUANTITIES[quantity].directions if quantity else (positive,)
         if positive not in (allowed or ("",)):
-            raise ValueError(
-                f"positive {positive!r} is not the direction of a positive {quantity}; allowed: "
-                f"{', '.join(allowed) or 'none, leave it out'}"
+            raise InputError(
+                f"positive {positive!r} is not the direction of a positive {quantity}",
+                allowed=", ".join(allowed) or "none, leave it out",
             )
         return positive
 
@@ -123,7 +130,9 @@ class ChannelConfig(ConfigModel):
         known = {**CHANNEL_BY_NAME, CONSTANT: None}
         for name in factors or {}:
             if name not in known:
-                raise ValueError(f"{name!r} is not a signal of the table; {suggest(name, known)}")
+                raise InputError(
+                    f"{name!r} is not a signal of the table", remedy=suggest(name, known)
+                )
         return factors
 
     @property

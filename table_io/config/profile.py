@@ -32,6 +32,7 @@ from table_io.config.base import (
     read_text,
 )
 from table_io.config.excitation import Excitation, ExcitationPlan, record  # noqa: F401  registers
+from table_io.config.excitation.continuation import Continuation
 from table_io.config.excitation.stepped_sine import Sweep
 from table_io.errors import InputError
 from table_io.records import Step
@@ -55,8 +56,8 @@ class Specimen(ConfigModel):
     @classmethod
     def _check_gap(cls, gap: float | None, info: ValidationInfo) -> float | None:
         if gap is not None and (math.isnan(gap) or gap == -math.inf):
-            raise ValueError(
-                f"{info.field_name} is {gap}; allowed: a number in mm, or inf for no bumpers"
+            raise InputError(
+                f"{info.field_name} is {gap}", allowed="a number in mm, or inf for no bumpers"
             )
         return gap
 
@@ -64,7 +65,9 @@ class Specimen(ConfigModel):
     @classmethod
     def _check_gap_pair(cls, left: float | None, info: ValidationInfo) -> float | None:
         if "gap_right_mm" in info.data and (info.data["gap_right_mm"] is None) != (left is None):
-            raise ValueError("gap_right_mm and gap_left_mm go together; give both or neither")
+            raise InputError(
+                "gap_right_mm and gap_left_mm go together", remedy="give both or neither"
+            )
         return left
 
     @property
@@ -195,6 +198,11 @@ class Profile(ConfigModel):
             allowed="stepped_sine",
         )
 
+    @property
+    def continuation(self) -> Continuation | None:
+        """Continuation of the test; None if its excitation is of another kind."""
+        return self.excitation if isinstance(self.excitation, Continuation) else None
+
     @cached_property
     def plan(self) -> ExcitationPlan:
         """What the excitation plays at the sampling rate of the test."""
@@ -209,7 +217,7 @@ class Profile(ConfigModel):
     @classmethod
     def _check_one_excitation(cls, tables: Any) -> Any:
         if isinstance(tables, Mapping) and {"sweep", "excitation"} <= tables.keys():
-            raise ValueError("[sweep] and [excitation] are given; allowed: one of them")
+            raise InputError("[sweep] and [excitation] are given", allowed="one of them")
         return tables
 
     @field_validator("excitation", mode="wrap")
@@ -225,9 +233,9 @@ class Profile(ConfigModel):
         excitation = info.data.get("excitation")
         is_changed = control.enabled and control != ControlConfig()
         if excitation is not None and not isinstance(excitation, Sweep) and is_changed:
-            raise ValueError(
-                f"the amplitude of kind {excitation.kind!r} is not tuned: it is played open loop; "
-                "remove [control]"
+            raise InputError(
+                f"the amplitude of kind {excitation.kind!r} is not tuned: it is played open loop",
+                remedy="remove [control]",
             )
         return control
 
@@ -238,12 +246,14 @@ class Profile(ConfigModel):
     ) -> DwellConfig | TrackConfig | RefineConfig | None:
         tables = [name for name in ("dwell", "track") if info.data.get(name) is not None]
         if tool is not None and tables:
-            raise ValueError(f"[{tables[0]}] is given too; allowed: one of dwell, track, refine")
+            raise InputError(f"[{tables[0]}] is given too", allowed="one of dwell, track, refine")
         sweep = info.data.get("excitation")
         if tool is not None and isinstance(sweep, Sweep):
             tool.check_sweep(SweepGrid(sweep.start_hz, sweep.stop_hz, sweep.step_hz))
         elif tool is not None and sweep is not None:
-            raise ValueError(f"kind {sweep.kind!r} has no steps; remove [{info.field_name}]")
+            raise InputError(
+                f"kind {sweep.kind!r} has no steps", remedy=f"remove [{info.field_name}]"
+            )
         return tool
 
     @field_validator("resume")
@@ -253,11 +263,13 @@ class Profile(ConfigModel):
     ) -> ResumeConfig | None:
         sweep = info.data.get("excitation")
         if resume is not None and sweep is not None and not isinstance(sweep, Sweep):
-            raise ValueError(f"kind {sweep.kind!r} has no steps; run the test from its beginning")
+            raise InputError(
+                f"kind {sweep.kind!r} has no steps", remedy="run the test from its beginning"
+            )
         if resume is not None and sweep is not None and resume.first_step >= len(sweep.steps):
-            raise ValueError(
-                f"first_step {resume.first_step} is beyond the last step; allowed: 0 to "
-                f"{len(sweep.steps) - 1}"
+            raise InputError(
+                f"first_step {resume.first_step} is beyond the last step",
+                allowed=f"0 to {len(sweep.steps) - 1}",
             )
         return resume
 
@@ -266,9 +278,10 @@ class Profile(ConfigModel):
     def _check_rate(cls, acquisition: AcquisitionConfig, info: ValidationInfo) -> AcquisitionConfig:
         sweep = info.data.get("excitation")
         if isinstance(sweep, Sweep) and acquisition.rate_hz < 100 * sweep.stop_hz:
-            raise ValueError(
+            raise InputError(
                 f"rate_hz {acquisition.rate_hz:g} gives fewer than 100 samples per cycle at "
-                f"sweep.stop_hz {sweep.stop_hz:g}; allowed: at least {100 * sweep.stop_hz:g}"
+                f"sweep.stop_hz {sweep.stop_hz:g}",
+                allowed=f"at least {100 * sweep.stop_hz:g}",
             )
         return acquisition
 
@@ -286,7 +299,8 @@ def _attach_files(text: str, path: Path) -> str:
     """Return the text of a profile with a table of its excitation's files appended."""
     try:
         table = tomllib.loads(text)["excitation"]
-        names = [table[key] for key in Excitation.select_class(table).FILE_KEYS]
+        keys = Excitation.select_class(table).FILE_KEYS
+        names = [table[key] for key in keys if key in table]
     except (KeyError, TypeError, AttributeError, ValueError, RecursionError):
         return text  # which is reported when it is parsed
     if "files" in table or not names:

@@ -94,7 +94,9 @@ class RigConfig(ConfigModel):
         names = [channel.name for channel in channels]
         duplicates = sorted({name for name in names if names.count(name) > 1})
         if duplicates:
-            raise ValueError(f"channels declare {', '.join(duplicates)} more than once; keep one")
+            raise InputError(
+                f"channels declare {', '.join(duplicates)} more than once", remedy="keep one"
+            )
         return channels
 
     @field_validator("sensors")
@@ -107,16 +109,18 @@ class RigConfig(ConfigModel):
         names = [sensor.channel for sensor in sensors]
         duplicates = sorted({name for name in names if names.count(name) > 1})
         if duplicates:
-            raise ValueError(
-                f"sensors name {', '.join(duplicates)} more than once; one sensor per channel"
+            raise InputError(
+                f"sensors name {', '.join(duplicates)} more than once",
+                remedy="one sensor per channel",
             )
         missing = {"drive_disp_m", "table_disp_m", "table_acc_m_s2"} - set(names)
         backend = load_backend(info.data.get("backend", ""))
         if backend is None or not backend.drives:
             missing -= {"drive_disp_m"}  # an external controller may have no command output
         if missing:
-            raise ValueError(
-                f"sensors lack {', '.join(sorted(missing))}; the amplitude control needs them"
+            raise InputError(
+                f"sensors lack {', '.join(sorted(missing))}",
+                remedy="the amplitude control needs them",
             )
         return sensors
 
@@ -134,8 +138,10 @@ class RigConfig(ConfigModel):
             faults.append(
                 _make_fault(
                     (own_name,),
-                    f"backend {own_name!r} needs a [{own_name}] table with its settings; see "
-                    "CONNECT.md",
+                    InputError(
+                        f"backend {own_name!r} needs a [{own_name}] table with its settings",
+                        remedy="see CONNECT.md",
+                    ),
                 )
             )
         # A section may name that of another backend, as [follow] does.
@@ -157,7 +163,9 @@ class RigConfig(ConfigModel):
             faults = _list_faults(error) + faults
         else:
             for name, section in rig.sections.items():
-                faults += [_make_fault((name,), fault) for fault in section.list_faults(rig)]
+                faults += [
+                    _make_fault((name,), ValueError(fault)) for fault in section.list_faults(rig)
+                ]
         if faults:
             raise ValidationError.from_exception_data(cls.__name__, faults)
         return rig
@@ -192,8 +200,9 @@ class RigConfig(ConfigModel):
         section = self.get_section(model)
         if section is None:
             raise InputError(
-                f"no [{name}] table",
+                "no such table",
                 where=f"rig {self.name}",
+                key=f"[{name}]",
                 remedy="add it, or give another rig file",
             )
         return section
@@ -249,9 +258,8 @@ class RigConfig(ConfigModel):
             )
 
 
-def _make_fault(location: tuple[int | str, ...], message: str) -> InitErrorDetails:
-    error = {"error": ValueError(message)}
-    return InitErrorDetails(type="value_error", loc=location, input=None, ctx=error)
+def _make_fault(location: tuple[int | str, ...], error: ValueError) -> InitErrorDetails:
+    return InitErrorDetails(type="value_error", loc=location, input=None, ctx={"error": error})
 
 
 def _list_faults(error: ValidationError, location: tuple[str, ...] = ()) -> list[InitErrorDetails]:
@@ -278,12 +286,12 @@ def _check_sensor_channels(sensors: tuple[SensorConfig, ...], registry: dict[str
         channel = registry.get(sensor.channel)
         if channel is None:
             hint = f"{suggest(sensor.channel, registry)} or declare it in a [[channels]] table"
-            message = f"channel {sensor.channel!r} is unknown; {hint}"
-            faults.append(_make_fault((row, "channel"), message))
+            unknown = InputError(f"channel {sensor.channel!r} is unknown", remedy=hint)
+            faults.append(_make_fault((row, "channel"), unknown))
             continue
         try:
             check_sensor_unit(sensor.unit, channel)
         except ValueError as error:
-            faults.append(_make_fault((row, "unit"), str(error)))
+            faults.append(_make_fault((row, "unit"), error))
     if faults:
         raise ValidationError.from_exception_data("sensors", faults)

@@ -11,6 +11,7 @@ from pydantic import BeforeValidator, Field, ValidationInfo, field_validator
 
 from table_io.channels import CHANNEL_BY_NAME, Channel
 from table_io.config.base import ConfigModel, Count, Finite, NonNegative, Positive
+from table_io.errors import InputError
 from table_io.units import UNITS
 
 MAX_YEAR = 9999  # of a four-digit ISO date
@@ -22,7 +23,7 @@ def _parse_day(value: Any) -> Any:
     known = re.fullmatch(r"([0-9]{4})-([0-9]{2})-([0-9]{2})", text)
     year, month, day = map(int, known.groups()) if known else (0, 0, 0)
     if not (year and 1 <= month <= 12 and 1 <= day <= calendar.monthrange(year, month)[1]):
-        raise ValueError(f"{text} is not a date; allowed: year-month-day, e.g. 2026-03-01")
+        raise InputError(f"{text} is not a date", allowed="year-month-day, e.g. 2026-03-01")
     return text
 
 
@@ -43,9 +44,9 @@ def check_sensor_unit(unit: str, channel: Channel) -> None:
     """Raise ValueError if a sensor in this unit does not measure the channel."""
     allowed = [name for name, (si, _) in UNITS.items() if si == channel.unit]
     if unit not in allowed:
-        raise ValueError(
-            f"unit {unit!r} does not measure {channel.name} ({channel.unit}); allowed: "
-            f"{', '.join(allowed)}"
+        raise InputError(
+            f"unit {unit!r} does not measure {channel.name} ({channel.unit})",
+            allowed=", ".join(allowed),
         )
 
 
@@ -83,14 +84,14 @@ class SensorConfig(ConfigModel):
         if channel is not None:
             check_sensor_unit(unit, channel)
         elif unit not in UNITS:  # of a channel that the rig file declares
-            raise ValueError(f"unit {unit!r} is unknown; allowed: {', '.join(UNITS)}")
+            raise InputError(f"unit {unit!r} is unknown", allowed=", ".join(UNITS))
         return unit
 
     @field_validator("volts_per_unit")
     @classmethod
     def _check_sensitivity(cls, sensitivity: float) -> float:
         if sensitivity == 0:
-            raise ValueError("volts_per_unit is 0, so the signal would be lost; allowed: not 0")
+            raise InputError("volts_per_unit is 0, so the signal would be lost", allowed="not 0")
         return sensitivity
 
     @field_validator("due", "interval_months")
@@ -100,26 +101,34 @@ class SensorConfig(ConfigModel):
         if value is None or "calibrated" not in info.data:
             return value
         if isinstance(value, str) and calibrated is not None and value < calibrated:
-            raise ValueError(f"due {value} lies before calibrated {calibrated}; correct one")
+            raise InputError(
+                f"due {value} lies before calibrated {calibrated}", remedy="correct one"
+            )
         if isinstance(value, int) and calibrated is None:
-            raise ValueError("interval_months counts from `calibrated`; add that, or give `due`")
+            raise InputError(
+                "interval_months counts from `calibrated`", remedy="add that, or give `due`"
+            )
         if isinstance(value, int) and info.data.get("due") is not None:
-            raise ValueError("due and interval_months both give the next calibration; keep one")
+            raise InputError(
+                "due and interval_months both give the next calibration", remedy="keep one"
+            )
         if (
             isinstance(value, int)
             and calibrated is not None
             and _add_months(calibrated, value) is None
         ):
-            raise ValueError("its next calibration lies after the year 9999; give fewer months")
+            raise InputError(
+                "its next calibration lies after the year 9999", remedy="give fewer months"
+            )
         return value
 
     @field_validator("shunt_tolerance")
     @classmethod
     def _check_shunt(cls, tolerance: float | None, info: ValidationInfo) -> float | None:
         if "shunt" in info.data and (info.data["shunt"] is None) != (tolerance is None):
-            raise ValueError("shunt and shunt_tolerance go together; give both or neither")
+            raise InputError("shunt and shunt_tolerance go together", remedy="give both or neither")
         if info.data.get("shunt") == 0.0:
-            raise ValueError("shunt is 0, which checks nothing; allowed: not 0")
+            raise InputError("shunt is 0, which checks nothing", allowed="not 0")
         return tolerance
 
     @property

@@ -102,10 +102,14 @@ def compute_demands(drive: Drive, profile: Profile, rig: RigConfig) -> tuple[Ste
         _build_demand(Step(-1, LOOP_CHECK, f, check_levels[f]), segment_peaks, mass, rig)
         for f, segment_peaks in sorted(check_peaks.items())
     ]
+    # Feedback adds to the command, in any phase.
+    share = 1.0 if profile.continuation is None else 1.0 + profile.continuation.max_feedback
     for step in drive.steps:
-        rows.append(
-            _build_demand(step, step_peaks.get(step.index, [_steady_peaks(step)]), mass, rig)
-        )
+        peaks_of_step = [
+            (share * disp, share * speed, share * acceleration)
+            for disp, speed, acceleration in step_peaks.get(step.index, [_steady_peaks(step)])
+        ]
+        rows.append(_build_demand(step, peaks_of_step, mass, rig))
     for history in drive.segments:
         if isinstance(history, HistorySegment):
             rows += _history_demands(history, drive.rate_hz, mass, rig)
@@ -188,37 +192,51 @@ def check_limits(
     coarsest = min(steps, key=lambda row: row.amplitude_lsb, default=None)
     if coarsest is not None and coarsest.amplitude_lsb < rig.output.least_lsb:
         faults.append(
-            f"step {coarsest.step} ({coarsest.frequency_hz:g} Hz): amplitude is "
-            f"{coarsest.amplitude_lsb:.1f} steps of the DAC; allowed: at least "
-            f"{rig.output.least_lsb}. Raise sweep.acceleration_g, lower sweep.stop_hz, or use an "
-            "output with more bits or a smaller span"
+            InputError(
+                f"{coarsest.amplitude_lsb:.1f} steps of the DAC",
+                where=f"step {coarsest.step} ({coarsest.frequency_hz:g} Hz)",
+                key="amplitude",
+                allowed=f"at least {rig.output.least_lsb}",
+                remedy="raise sweep.acceleration_g, lower sweep.stop_hz, or use an output with "
+                "more bits or a smaller span",
+            )
         )
     if faults:
-        heading = f"{source}: the table {rig.name!r} cannot do this test; nothing was started"
-        raise InputError("\n".join([heading, *(f"  {fault}" for fault in faults)]))
+        raise InputError(
+            f"the table {rig.name!r} cannot do this test; nothing was started",
+            where=source,
+            faults=tuple(faults),
+        )
 
 
-def _find_rate_faults(profile: Profile, rig: RigConfig) -> list[str]:
-    """List a message for each rate or frequency that the rig does not support."""
+def _find_rate_faults(profile: Profile, rig: RigConfig) -> list[InputError]:
+    """List a fault for each rate or frequency that the rig does not support."""
     faults = []
     if profile.acquisition.rate_hz not in rig.rates_hz:
         rates = ", ".join(f"{rate:g}" for rate in rig.rates_hz)
-        faults.append(f"acquisition.rate_hz {profile.acquisition.rate_hz:g} Hz; allowed: {rates}")
+        faults.append(
+            InputError(
+                "not a rate of this table",
+                key="acquisition.rate_hz",
+                value=profile.acquisition.rate_hz,
+                allowed=rates,
+            )
+        )
     max_hz = rig.limits.frequency_hz
     top_key = "sweep.stop_hz" if profile.steps else "upper end of the excitation's band"
     requested_hz = {top_key: profile.plan.high_hz}
     if profile.loop_check.enabled and profile.loop_check.frequencies_hz:
         requested_hz["loop_check.frequencies_hz"] = max(profile.loop_check.frequencies_hz)
     faults += [
-        f"{key} {f:g} Hz; allowed: at most {max_hz:g}"
+        InputError("too fast for this table", key=key, value=f, allowed=f"at most {max_hz:g}")
         for key, f in requested_hz.items()
         if f > max_hz
     ]
     return faults
 
 
-def _find_exceeded_limits(rows: tuple[StepDemand, ...], rig: RigConfig) -> list[str]:
-    """List a message per exceeded limit: its first row and the number of further rows."""
+def _find_exceeded_limits(rows: tuple[StepDemand, ...], rig: RigConfig) -> list[InputError]:
+    """List a fault per exceeded limit: its first row and the number of further rows."""
     faults = []
     for limit in list_limits(rig):
         exceeding = [row for row in rows if limit.demand(row) > limit.allowed]
@@ -226,21 +244,26 @@ def _find_exceeded_limits(rows: tuple[StepDemand, ...], rig: RigConfig) -> list[
             first = exceeding[0]
             suffix = f" and {len(exceeding) - 1} more" if len(exceeding) > 1 else ""
             remedy = (
-                "Raise loop_check.frequencies_hz or lower loop_check.level"
+                "raise loop_check.frequencies_hz or lower loop_check.level"
                 if first.step < 0
-                else "Scale the history down"
+                else "scale the history down"
                 if math.isnan(first.frequency_hz)
-                else "Lower sweep.acceleration_g or raise sweep.start_hz"
+                else "lower sweep.acceleration_g or raise sweep.start_hz"
             )
             faults.append(
-                f"{first.name}{suffix}: {limit.name} {limit.demand(first):.4g} {limit.unit}; "
-                f"allowed: at most {limit.allowed:g} {limit.unit}. {remedy}"
+                InputError(
+                    f"{limit.demand(first):.4g} {limit.unit}",
+                    where=f"{first.name}{suffix}",
+                    key=limit.name,
+                    allowed=f"at most {limit.allowed:g} {limit.unit}",
+                    remedy=remedy,
+                )
             )
     return faults
 
 
-def _find_clipped_sensors(rows: tuple[StepDemand, ...], rig: RigConfig) -> list[str]:
-    """List a message for each sensor of the table that the drive would clip."""
+def _find_clipped_sensors(rows: tuple[StepDemand, ...], rig: RigConfig) -> list[InputError]:
+    """List a fault for each sensor of the table that the drive would clip."""
     faults = []
     for sensor in rig.sensors:
         if sensor.channel not in TABLE_SENSORS:
@@ -249,9 +272,13 @@ def _find_clipped_sensors(rows: tuple[StepDemand, ...], rig: RigConfig) -> list[
         peak = TABLE_SENSORS[sensor.channel](worst) / sensor.si_per_unit
         if peak > sensor.range:
             faults.append(
-                f"{worst.name}: {sensor.channel} {peak:.4g} {sensor.unit}; allowed: at most its "
-                f"range, {sensor.range:g} {sensor.unit}. Lower the level, or use a sensor with a "
-                "larger range"
+                InputError(
+                    f"{peak:.4g} {sensor.unit}",
+                    where=worst.name,
+                    key=sensor.channel,
+                    allowed=f"at most its range, {sensor.range:g} {sensor.unit}",
+                    remedy="lower the level, or use a sensor with a larger range",
+                )
             )
     return faults
 

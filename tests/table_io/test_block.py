@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from table_io.block import Block, join_blocks, recut_blocks
 
-RATE = 2000.0
+RATE_HZ = 2000.0
 CHANNELS = ("drive_disp_m", "table_disp_m", "table_acc_m_s2")
 
 
@@ -22,7 +22,7 @@ def block(samples: int = 1200, index: int = 40, **changes: object) -> Block:
     fields: dict[str, object] = {
         "stream": "meas",
         "index": index,
-        "rate_hz": RATE,
+        "rate_hz": RATE_HZ,
         "channels": CHANNELS,
         "values": values,
         "step": count // 500,
@@ -43,25 +43,25 @@ def pieces(whole: Block, sizes: list[int]) -> list[Block]:
 
 
 def test_no_field_and_no_sample_can_be_changed() -> None:
-    one = block()
+    whole = block()
     with pytest.raises(AttributeError):
-        one.index = 3  # type: ignore[misc]
-    for part in (one, one.cut(100, 200), join_blocks(pieces(one, [500]))):
+        whole.index = 3  # type: ignore[misc]
+    for part in (whole, whole.cut(100, 200), join_blocks(pieces(whole, [500]))):
         for array in (part.values, part.step, part.label, part.cycle):
             with pytest.raises(ValueError, match="read-only"):
                 array[..., 0] = 1
 
 
 def test_time_comes_from_the_index() -> None:
-    one = block(index=12_345_679)
-    assert one.time_s[0] == 12_345_679 / RATE
-    assert one.cut(12_345_700, 12_345_701).time_s[0] == one.time_s[21]
-    assert np.array_equal(join_blocks(pieces(one, [7])).time_s, one.time_s)
+    whole = block(index=12_345_679)
+    assert whole.time_s[0] == 12_345_679 / RATE_HZ
+    assert whole.cut(12_345_700, 12_345_701).time_s[0] == whole.time_s[21]
+    assert np.array_equal(join_blocks(pieces(whole, [7])).time_s, whole.time_s)
 
 
 def test_a_channel_that_is_not_there_names_what_there_is() -> None:
     assert np.array_equal(block().channel("table_acc_m_s2"), block().values[2])
-    with pytest.raises(KeyError, match=r"force_r1_n is not in meas: drive_disp_m, table_disp_m"):
+    with pytest.raises(KeyError, match=r"force_r1_n.* drive_disp_m, table_disp_m"):
         block().channel("force_r1_n")
 
 
@@ -75,7 +75,7 @@ def test_values_and_labels_of_different_length_are_refused() -> None:
 def test_recut_and_join_give_back_every_bit(samples: int) -> None:
     whole = block()
     cut = list(recut_blocks([whole], samples))
-    assert [len(one) for one in cut[:-1]] == [samples] * (len(cut) - 1)
+    assert [len(piece) for piece in cut[:-1]] == [samples] * (len(cut) - 1)
     assert 0 < len(cut[-1]) <= samples
     assert join_blocks(cut).is_identical(whole)
 
@@ -115,21 +115,21 @@ def test_join_refuses_what_does_not_continue(second: Block) -> None:
 
 @pytest.mark.parametrize("window", [(39, 45), (45, 61), (0, 3), (50, 45)])
 def test_cut_refuses_samples_that_it_does_not_have(window: tuple[int, int]) -> None:
-    with pytest.raises(ValueError, match="do not lie in the block 40 to 60"):
+    with pytest.raises(ValueError, match=r"\b40\b.*\b60\b"):
         block(20).cut(*window)
 
 
 @pytest.mark.parametrize("name", ["stream", "index", "rate_hz", "values", "step", "label", "cycle"])
 def test_identical_sees_every_field(name: str) -> None:
-    one = block(20)
+    whole = block(20)
     others: dict[str, Any] = {"stream": "pred", "index": 41, "rate_hz": 1000.0}
     other = others.get(name)
     if other is None:
-        changed = getattr(one, name).copy()
+        changed = getattr(whole, name).copy()
         changed[..., -1] += 1
         other = changed
-    assert one.is_identical(block(20))
-    assert not one.is_identical(block(20, **{name: other}))
+    assert whole.is_identical(block(20))
+    assert not whole.is_identical(block(20, **{name: other}))
 
 
 def test_identical_tells_a_negative_zero_from_a_zero() -> None:

@@ -1,5 +1,7 @@
 """Errors that a user can correct: their fields and the suggestion of a name."""
 
+import pickle
+
 from table_io.errors import MAX_LISTED_NAMES, InputError, suggest
 
 
@@ -20,3 +22,31 @@ def test_a_message_has_its_fields_in_order() -> None:
     error = InputError("too low", where="a.toml", key="k", value=1, allowed="2", remedy="raise it")
     places = [str(error).index(part) for part in ("a.toml", "k = 1", "too low", "2", "raise it")]
     assert places == sorted(places)
+
+
+def test_the_faults_of_a_file_keep_their_fields_and_stand_one_a_line() -> None:
+    gap = InputError("missing", key="specimen.gap_mm", remedy="add it")
+    mass = InputError("too small", key="specimen.mass_kg", value=-1.0, allowed="above 0")
+    error = pickle.loads(pickle.dumps(InputError("", where="a.toml", faults=(gap, mass))))
+    assert [(fault.key, fault.value) for fault in error.faults] == [
+        ("specimen.gap_mm", None),
+        ("specimen.mass_kg", -1.0),
+    ]
+    assert str(error).splitlines() == ["a.toml:", f"  {gap}", f"  {mass}"]
+
+
+def test_each_fault_is_on_lines_of_its_own_below_its_place() -> None:
+    inner = InputError("", where="a.toml", faults=[InputError("missing", key="k")])
+    error = InputError("not started", where="all.toml", faults=[inner, InputError("late")])
+    assert str(error).splitlines() == [
+        "all.toml: not started:", "  a.toml:", "    k: missing", "  late",
+    ]  # fmt: skip
+    assert [fault.where for fault in error.faults] == ["a.toml", ""]
+
+
+def test_an_added_place_stands_before_the_others_and_keeps_the_fields() -> None:
+    error = InputError("too low", where="a.toml", key="k", value=1, allowed="2", remedy="raise it")
+    placed = error.add_place("case 3")
+    assert placed.where == "case 3: a.toml"
+    assert str(placed) == f"case 3: {error}"
+    assert (placed.key, placed.value, placed.allowed, placed.remedy) == ("k", 1, "2", "raise it")

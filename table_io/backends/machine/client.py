@@ -53,7 +53,8 @@ def _connect(rig: RigConfig, machine: MachineConfig) -> socket.socket:
         return connect(endpoint, ANSWER_TIMEOUT_S)
     except OSError as error:
         raise InputError(
-            f"no table answers at {endpoint.text} ({error.strerror or error})",
+            f"no table answers there ({error.strerror or error})",
+            where=endpoint.text,
             remedy=f"start it first, in another terminal: shaketwin table --rig {rig.name}",
         ) from None
 
@@ -105,7 +106,7 @@ class MachineBackend:
                 return
             self.close()
             if answer.index != Refusal.RESTING or self._clock.now() > deadline_s:
-                raise InputError(f"{self._machine.endpoint}: {answer.text}")
+                raise InputError(answer.text, where=self._machine.endpoint)
             self._clock.wait_until(self._clock.now() + 0.1)
 
     def tare(self, samples: int) -> Float2D:

@@ -9,6 +9,7 @@ from pydantic import Field, ValidationInfo, field_validator
 from table_io.config.backend import BackendConfig
 from table_io.config.base import ConfigModel, NonNegative, Positive
 from table_io.config.rig import RigConfig
+from table_io.errors import InputError
 
 HEARTBEAT_NAME = "heartbeat"  # name of the line that reads the heartbeat back
 LINE_PATTERN = r"^([^/\s]+/port\d+/line\d+)?$"
@@ -70,15 +71,18 @@ class NiWiring(BackendConfig):
             return endpoint
         host, _, port = endpoint.rpartition(":")
         if not host or not port.isdecimal() or not 0 < int(port) <= 65535:
-            raise ValueError(f"{endpoint!r} is no address; give HOST:PORT, e.g. 127.0.0.1:31763")
+            raise InputError(
+                f"{endpoint!r} is no address", remedy="give HOST:PORT, e.g. 127.0.0.1:31763"
+            )
         try:
             public = ipaddress.ip_address(host.strip("[]")).is_global
         except ValueError:
             public = False  # a host name: trusted to the name server of this network
         if public:
-            raise ValueError(
-                f"{endpoint!r} is a public address, and the connection is neither encrypted nor "
-                "authenticated; allowed: this computer or a private network"
+            raise InputError(
+                f"{endpoint!r} is a public address, and the connection is neither encrypted "
+                "nor authenticated",
+                allowed="this computer or a private network",
             )
         return endpoint
 
@@ -91,14 +95,18 @@ class NiWiring(BackendConfig):
         ):
             duplicates = sorted({name for name in names if names.count(name) > 1})
             if duplicates:
-                raise ValueError(f"{kind} {', '.join(duplicates)} is wired twice; keep one wire")
+                raise InputError(
+                    f"{kind} {', '.join(duplicates)} is wired twice", remedy="keep one wire"
+                )
         return inputs
 
     @field_validator("start_trigger", "output_clock")
     @classmethod
     def _check_terminal(cls, terminal: str, info: ValidationInfo) -> str:
         if terminal and not re.fullmatch(r"/[^/\s]+(/[^/\s]+)+", terminal):
-            raise ValueError(f"{terminal!r} is no terminal; give e.g. /Dev1/ai/StartTrigger")
+            raise InputError(
+                f"{terminal!r} is no terminal", remedy="give e.g. /Dev1/ai/StartTrigger"
+            )
         return terminal
 
     def find_address(self, rig: RigConfig) -> str:

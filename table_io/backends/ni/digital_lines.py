@@ -45,7 +45,9 @@ class NiDigitalInputs:
         except (Error, MachineLost) as error:
             self.close()
             raise InputError(
-                f"ni: cannot read {', '.join(inputs.values())}: {_first_line(error)}",
+                f"cannot be read: {_first_line(error)}",
+                where="ni",
+                key=", ".join(inputs.values()),
                 remedy="correct heartbeat_back and well in the [ni] table of the rig file",
             ) from None
 

@@ -42,11 +42,14 @@ def discover_devices(server: str | None) -> tuple[DiscoveredDevice, ...]:
             return tuple(_device(device, server) for device in system.devices)
         except grpc.FutureTimeoutError:
             raise InputError(
-                f"no gRPC Device Server answers at {server}",
+                "no gRPC Device Server answers there",
+                where=server,
                 remedy="start it there, and check that it listens at this address and port",
             ) from None
         except Error as error:
-            raise InputError(f"{server} cannot list its devices: {_first_line(error)}") from None
+            raise InputError(
+                f"cannot list its devices: {_first_line(error)}", where=server
+            ) from None
 
 
 def _device(device: Any, where: str) -> DiscoveredDevice:

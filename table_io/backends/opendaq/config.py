@@ -4,6 +4,7 @@ from pydantic import Field, field_validator
 
 from table_io.config.backend import BackendConfig
 from table_io.config.rig import RigConfig
+from table_io.errors import InputError
 
 NATIVE_SCHEME = "daq.nd://"
 
@@ -21,9 +22,9 @@ class OpenDaqWiring(BackendConfig):
     def _check_device(cls, device: str) -> str:
         host, colon, port = device.removeprefix(NATIVE_SCHEME).partition(":")
         if not device.startswith(NATIVE_SCHEME) or not host or (colon and not port.isdecimal()):
-            raise ValueError(
-                f"device {device!r} is not an openDAQ native connection; allowed: daq.nd://HOST or "
-                "daq.nd://HOST:PORT"
+            raise InputError(
+                f"device {device!r} is not an openDAQ native connection",
+                allowed="daq.nd://HOST or daq.nd://HOST:PORT",
             )
         return device
 
@@ -33,8 +34,9 @@ class OpenDaqWiring(BackendConfig):
         ids = list(signals.values())
         duplicates = sorted({signal for signal in ids if ids.count(signal) > 1})
         if duplicates:
-            raise ValueError(
-                f"signals wire {', '.join(duplicates)} to two channels; give each channel its own"
+            raise InputError(
+                f"signals wire {', '.join(duplicates)} to two channels",
+                remedy="give each channel its own",
             )
         return signals
 

@@ -75,7 +75,8 @@ def check_reachable(rig: RigConfig) -> None:
         reason = getattr(error, "strerror", None) or error
         hint = f"for a simulated one: shaketwin table --rig {rig.name}" if rig.is_simulated else ""
         raise InputError(
-            f"no openDAQ device answers at {wiring.device} ({reason})",
+            f"no openDAQ device answers there ({reason})",
+            where=wiring.device,
             remedy="switch it on, or correct opendaq.device in the rig file"
             f"{'; ' if hint else ''}{hint}",
         ) from None
@@ -222,7 +223,8 @@ class OpenDaqSource:
         if UNIT_SYNONYMS.get(symbol, symbol) == sensor.unit:
             return sensor.volts_per_unit
         raise InputError(
-            f"signal {signal.global_id} of {sensor.channel} is in {symbol or 'no unit'}",
+            f"signal {signal.global_id} is in {symbol or 'no unit'}",
+            key=sensor.channel,
             allowed=f"V, or {sensor.unit} as for this sensor in the rig file",
             remedy="change the unit in the device, or the sensor in the rig file",
         )

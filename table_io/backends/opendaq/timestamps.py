@@ -68,7 +68,8 @@ def require_simultaneous(newest: dict[str, int], ticks_per_sample: float, device
         misalignment = abs(offset - round(offset))
         if misalignment > MAX_STAMP_ERROR_SAMPLES:
             raise InputError(
-                f"{name} is sampled {misalignment:.2f} samples apart from {names[0]}",
+                f"sampled {misalignment:.2f} samples apart from {names[0]}",
                 where=device,
+                key=name,
                 remedy="start all its channels together, on one clock",
             )

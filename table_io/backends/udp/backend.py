@@ -181,9 +181,11 @@ class UdpBackend:
                 deadline_s = now_s + ANSWER_TIMEOUT_S
                 self._clock.wait_until(now_s + HEARTBEAT_PERIOD_S)
             elif self._has_news and self._state.reason is not Reason.NONE:
-                raise InputError(f"{target} refuses the claim: {REASON_TEXTS[self._state.reason]}")
+                raise InputError(
+                    f"refuses the claim: {REASON_TEXTS[self._state.reason]}", where=target
+                )
             elif now_s > deadline_s:
-                raise InputError(f"{target} does not answer the claim", remedy="restart it")
+                raise InputError("does not answer the claim", where=target, remedy="restart it")
         min_lead = self._state.least_ahead
         if min_lead >= self.replace_after:
             raise InputError(

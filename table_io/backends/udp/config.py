@@ -5,6 +5,7 @@ from pydantic import Field, field_validator
 from table_io.config.backend import BackendConfig
 from table_io.config.base import Positive
 from table_io.config.rig import RigConfig
+from table_io.errors import InputError
 
 
 class UdpWiring(BackendConfig):
@@ -21,9 +22,9 @@ class UdpWiring(BackendConfig):
     def _check_target(cls, target: str) -> str:
         host, _, port = target.rpartition(":")
         if not host or not port.isdecimal() or not 0 < int(port) <= 65535:
-            raise ValueError(
-                f"{target!r} is not an address; give HOST:PORT with a port of 1 to 65535, e.g. "
-                "192.168.7.5:7460"
+            raise InputError(
+                f"{target!r} is not an address",
+                remedy="give HOST:PORT with a port of 1 to 65535, e.g. 192.168.7.5:7460",
             )
         return target
 

@@ -13,7 +13,7 @@ from table_io.errors import InputError
 from table_io.excitation.drive import Drive
 from tests.table_io.acquisition.external_controller import Bystander, whole
 from tests.table_io.acquisition.test_external_control import (
-    BEGINS,
+    DRIVE_START_SAMPLE,
     SWEEP,
     no_command,
     order,
@@ -37,34 +37,34 @@ class Floating(Bystander):
 
 def test_a_command_that_never_rests_again_ends_the_recording() -> None:
     """As long after the motion began as the drive takes, not at the operator's patience."""
-    one = run(
+    recording = run(
         setup(), kind=Floating, orders=lambda n: pytest.fail("for ever") if n > 5000 else None
     )
-    assert one.stop.verdict == "aborted"
-    assert any("drive_disp_m still moves" in line for line in one.said("stop"))
-    assert one.block.end <= BEGINS + one.drive.rest_start + 4000
-    assert one.stop.states[-1] == "left"
+    assert recording.stop.verdict == "aborted"
+    assert any("drive_disp_m still moves" in line for line in recording.event_texts("stop"))
+    assert recording.block.end <= DRIVE_START_SAMPLE + recording.drive.rest_start + 4000
+    assert recording.stop.states[-1] == "left"
 
 
 def test_a_stop_in_the_rest_before_the_sweep_does_not_end_a_controller_that_plays_on() -> None:
     long = setup(check=True, excitation=SWEEP | {"cycles": 12})
     drive = plan_open_loop_drive(long.profile, long.rig)
-    sweep = next(one.start for one in sine_segments(drive) if one.step == 0)
-    asked = round((BEGINS + sweep - 900) / 20)
-    one = run(long, orders=partial(order, "stop", asked))
-    assert one.stop.verdict == "stopped"
-    assert one.block.end == pytest.approx((asked + 1) * 20 + 20000, abs=40)
-    assert one.stop.states[-1] == "left"
-    assert (one.block.label == Label.MEASURE).any()
+    sweep = next(segment.start for segment in sine_segments(drive) if segment.step == 0)
+    asked = round((DRIVE_START_SAMPLE + sweep - 900) / 20)
+    recording = run(long, orders=partial(order, "stop", asked))
+    assert recording.stop.verdict == "stopped"
+    assert recording.block.end == pytest.approx((asked + 1) * 20 + 20000, abs=40)
+    assert recording.stop.states[-1] == "left"
+    assert (recording.block.label == Label.MEASURE).any()
 
 
 def test_a_stop_while_the_drive_is_searched_for_does_not_end_in_motion() -> None:
-    asked = round(BEGINS + 2200) // 20
-    one = run(setup(), stopped_early, orders=partial(order, "stop", asked))
-    assert one.said("motion")
-    assert one.stop.states[-1] == "at rest"
-    assert one.block.end > BEGINS + 8000
-    assert np.abs(one.block.channel("drive_disp_m")[-300:]).max() < 1e-6
+    asked = round(DRIVE_START_SAMPLE + 2200) // 20
+    recording = run(setup(), stopped_early, orders=partial(order, "stop", asked))
+    assert recording.event_texts("motion")
+    assert recording.stop.states[-1] == "at rest"
+    assert recording.block.end > DRIVE_START_SAMPLE + 8000
+    assert np.abs(recording.block.channel("drive_disp_m")[-300:]).max() < 1e-6
 
 
 class Before(Bystander):
@@ -107,15 +107,15 @@ def test_a_lost_command_is_not_said_to_be_no_motion() -> None:
         .read_text()
         .replace("wait_s = 300.0", "wait_s = 6.0")
     )
-    one = run(setup(text=text), kind=Lost)
-    assert one.stop.verdict == "aborted"
-    assert "the command was lost, so it is not known" in one.stop.reason
+    recording = run(setup(text=text), kind=Lost)
+    assert recording.stop.verdict == "aborted"
+    assert "the command was lost, so it is not known" in recording.stop.reason
 
 
 def test_half_the_amplitude_is_told_where_no_command_is_wired() -> None:
     def half(drive: Drive) -> Float1D:
         return 0.5 * whole(drive)
 
-    one = run(setup(text=no_command()), half)
-    assert one.stop.verdict == "aborted"
-    assert "of the drive's; allowed: 0.7 to 1.3" in one.stop.reason
+    recording = run(setup(text=no_command()), half)
+    assert recording.stop.verdict == "aborted"
+    assert "of the drive's; allowed: 0.7 to 1.3" in recording.stop.reason

@@ -72,15 +72,17 @@ def test_a_drive_is_exported_played_followed_recorded_and_replayed(tmp_path: Pat
 
 
 def test_only_a_followed_table_is_played_by_somebody_else() -> None:
-    with pytest.raises(InputError, match="--play "):
+    play = find_config("g0", "tests")
+    with pytest.raises(InputError) as error:
         serve_table(
             "simulated",
             None,
             None,
             1.0,
             sys.stdout,
-            controller=ExternalController(find_config("g0", "tests")),
+            controller=ExternalController(play),
         )
+    assert error.value.where == f"--play {play}"
 
 
 def test_a_run_without_the_device_says_how_to_start_one(tmp_path: Path) -> None:

@@ -37,9 +37,9 @@ def profile(first: int | None = None, **more: Any) -> Profile:
 
 @pytest.mark.parametrize("control", [True, False])
 def test_it_goes_on_from_rest_at_its_step_after_a_loop_check(control: bool) -> None:
-    one = profile(3)
-    one = one.model_copy(update={"control": one.control.model_copy(update={"enabled": control})})
-    drive = nominal_drive(make_test_plan(one, RIG))
+    test = profile(3)
+    test = test.model_copy(update={"control": test.control.model_copy(update={"enabled": control})})
+    drive = nominal_drive(make_test_plan(test, RIG))
     step, label, _ = drive.labels(0, drive.planned_end)
     assert list(dict.fromkeys(step[step >= 0].tolist())) == [3, 4, 5]
     assert (label == Label.CHECK).any()
@@ -58,18 +58,18 @@ def test_its_steps_are_those_of_the_whole_test() -> None:
 def test_without_a_loop_check_it_goes_on_at_its_step_too() -> None:
     none = profile().loop_check.model_copy(update={"enabled": False})
     drive = nominal_drive(make_test_plan(profile(4, loop_check=none), RIG))
-    assert {one.step for one in sine_segments(drive)} == {4, 5}
+    assert {segment.step for segment in sine_segments(drive)} == {4, 5}
 
 
 def test_its_plan_and_its_margins_are_those_of_what_is_driven() -> None:
-    one = profile(4)
-    assert {segment.step for segment in sine_segments(plan_sweep(one))} == {4, 5}
+    resumed = profile(4)
+    assert {segment.step for segment in sine_segments(plan_sweep(resumed))} == {4, 5}
     rows, whole = (
         {
             row.step: row
             for row in compute_demands(nominal_drive(make_test_plan(test, RIG)), test, RIG)
         }
-        for test in (one, profile())
+        for test in (resumed, profile())
     )
     assert rows[5].displacement_m == pytest.approx(whole[5].displacement_m, rel=0.02)
     assert rows[4].displacement_m > 0
@@ -82,7 +82,14 @@ def test_nothing_is_resumed_where_nothing_was_interrupted() -> None:
     )
 
 
-@pytest.mark.parametrize(("first", "said"), [(6, "allowed: 0 to 5"), (-1, "first_step = -1")])
-def test_a_step_that_is_not_there_is_refused(first: int, said: str) -> None:
-    with pytest.raises(InputError, match=said):
+@pytest.mark.parametrize(
+    ("first", "key", "value", "allowed"),
+    [(6, "resume", None, "0 to 5"), (-1, "resume.first_step", -1, "")],
+)
+def test_a_step_that_is_not_there_is_refused(
+    first: int, key: str, value: int | None, allowed: str
+) -> None:
+    with pytest.raises(InputError) as error:
         profile(first)
+    (fault,) = error.value.faults
+    assert (fault.key, fault.value, fault.allowed) == (key, value, allowed)

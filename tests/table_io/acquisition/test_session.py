@@ -24,13 +24,13 @@ from table_io.sim.simulated_table import SimulatedBackend
 from table_io.units import GRAVITY_M_S2
 from tests.table_io.excitation.sine_segments import sine_segment_at, sine_segments
 
-RATE = 2000.0
+RATE_HZ = 2000.0
 A = 0.05 * GRAVITY_M_S2
 TAIL_PEAK = 1.06 * A  # a decay multiplies a motion that may itself be at 1.05
 ALLOWED_DECISION = 0.05  # s from the decision to the first changed sample
 RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 ROUNDING_M = 1e-15  # of volts and back; a decay differs from the drive by more from its start on
-LEAD = round(RIG.output.lead_s * RATE)
+LEAD = round(RIG.output.lead_s * RATE_HZ)
 
 
 def profile(block_samples: int = 20, **sweep: Any) -> Profile:
@@ -67,7 +67,7 @@ class Machine:
     clock: ManualClock
     replace_after: int = 40
     channels: tuple[str, ...] = RIG.channels
-    rate_hz: float = RATE
+    rate_hz: float = RATE_HZ
     faults: dict[tuple[str, int], float] = field(default_factory=dict)  # SI, at (channel, sample)
     fails_at: int | None = None  # read() raises from this sample on
     deaf: bool = False  # queue() raises too once it has failed
@@ -103,7 +103,7 @@ class Machine:
     def peak_acceleration(self, first: int = 0) -> float:
         """Largest acceleration in m/s2 of what is queued, rest before and after it included."""
         padded = np.concatenate([np.zeros(2 if first == 0 else 0), self.command[first:], [0.0] * 2])
-        return float(np.abs(np.diff(padded, 2)).max() * RATE**2)
+        return float(np.abs(np.diff(padded, 2)).max() * RATE_HZ**2)
 
     def start(self) -> None:
         self.calls.append("start")
@@ -121,33 +121,33 @@ class Machine:
             true = self.drive.command(self.next, max(ahead, 0))
             np.testing.assert_allclose(queued, true, rtol=0, atol=ROUNDING_M)
         values = np.zeros((len(self.channels), samples))
-        values[:] = self.sensed(first, self.next)
+        values[:] = self.simulate_sensors(first, self.next)
         for (channel, sample), value in self.faults.items():
             if first <= sample < self.next:
                 values[self.channels.index(channel), sample - first] = value
         return si_to_volts(values, RIG.sensors, {})
 
-    def played(self, first: int, last: int) -> Float1D:
+    def take_command(self, first: int, last: int) -> Float1D:
         """Command in m of samples first .. last - 1; the last value is held."""
         inside = self.command[first:last]
         return np.concatenate([inside, np.full(last - first - inside.size, self.command[-1])])
 
-    def sensed(self, first: int, last: int) -> Float2D:
+    def simulate_sensors(self, first: int, last: int) -> Float2D:
         """What ideal sensors read, SI: the mass moves with the table, the load cells are silent."""
-        metres = self.played(max(first - 2, 0), last)
+        metres = self.take_command(max(first - 2, 0), last)
         metres = np.concatenate([np.zeros(last - first + 2 - metres.size), metres])
-        acceleration = np.diff(metres, 2) * RATE**2
+        acceleration = np.diff(metres, 2) * RATE_HZ**2
         rows = {"force": np.zeros(last - first), "acc": acceleration, "disp": metres[2:]}
         return np.array([rows[next(k for k in rows if k in name)] for name in self.channels])
 
     def scheduled_time_s(self, index: int) -> float:
-        return 10.0 + index / RATE
+        return 10.0 + index / RATE_HZ
 
     def close(self) -> None:
         self.calls.append("close")
 
     @property
-    def changed(self) -> list[int]:
+    def changed_samples(self) -> list[int]:
         """Samples at which the command is not that of the whole drive."""
         apart = self.command - self.drive.command(0, self.command.size)
         return list(np.flatnonzero(np.abs(apart) > ROUNDING_M))
@@ -173,7 +173,7 @@ class Stop:
 
 def start_record(tare: dict[str, float], epoch_s: float) -> RunStart:
     return RunStart(
-        0, "run", "short", "table", "", "", "", RATE, 20, RIG.channels, (), 0, tare, {}, "", "",
+        0, "run", "short", "table", "", "", "", RATE_HZ, 20, RIG.channels, (), 0, tare, {}, "", "",
         epoch_s,
     )  # fmt: skip
 
@@ -203,7 +203,7 @@ class Watched(SimulatedBackend):
 
     def __init__(self, test: Profile) -> None:
         self.clock = ManualClock()
-        super().__init__(RIG, test.specimen, RATE, self.clock)
+        super().__init__(RIG, test.specimen, RATE_HZ, self.clock)
         self.seen: list[Float2D] = []
         self.closed = False
 
@@ -228,7 +228,7 @@ def test_a_complete_run_hands_out_every_sample_once_and_in_order(block_samples: 
     items = list(session(subject, Stop(), block_samples=block_samples))
     assert isinstance(items[0], RunStart)
     whole = join_blocks(blocks(items))  # refuses holes and overlaps
-    rest = round(profile().acquisition.rest_s * RATE)
+    rest = round(profile().acquisition.rest_s * RATE_HZ)
     assert (whole.index, whole.end) == (0, subject.drive.planned_end + rest)
     assert {len(block) for block in blocks(items)[:-1]} == {block_samples}
     assert np.array_equal(whole.label, subject.drive.labels(0, len(whole))[1])
@@ -236,8 +236,8 @@ def test_a_complete_run_hands_out_every_sample_once_and_in_order(block_samples: 
         whole.channel("drive_disp_m"), subject.drive.command(0, len(whole)), rtol=0, atol=ROUNDING_M
     )
     assert not [item for item in items if isinstance(item, (SampleGap, Trip))]
-    said = [item.text for item in items if isinstance(item, Event)]
-    assert said == ["checking", "armed", "running", "at rest"]  # its states and nothing else
+    event_texts = [item.text for item in items if isinstance(item, Event)]
+    assert event_texts == ["checking", "armed", "running", "at rest"]  # its states and nothing else
     states = ("idle", "checking", "armed", "running", "at rest")
     assert stop_record(items) == RunStop(
         whole.end, "complete", "the whole drive was played", states
@@ -290,12 +290,14 @@ def test_a_stop_changes_the_command_within_50_ms_and_ends_at_rest(after: int) ->
     subject = machine()
     items = list(session(subject, Stop(after)))
     decided = after * 20 - 1  # the newest sample when the stop was asked for
-    changed = subject.changed
+    changed_samples = subject.changed_samples
     frequency = min(sine_segment_at(subject.drive, decided + at).f0 for at in (0, 100))
     frequency = min(frequency, sine_segment_at(subject.drive, decided + 100).f1)
-    if changed:  # a stop while the table still rests has nothing to change
-        assert changed[0] - decided <= ALLOWED_DECISION * RATE
-        assert subject.moved_until <= changed[0] + math.ceil(max(2 / frequency, 0.5) * RATE)
+    if changed_samples:  # a stop while the table still rests has nothing to change
+        assert changed_samples[0] - decided <= ALLOWED_DECISION * RATE_HZ
+        assert subject.moved_until <= changed_samples[0] + math.ceil(
+            max(2 / frequency, 0.5) * RATE_HZ
+        )
     else:
         assert sine_segments(subject.drive)[0].start > decided + 100
     assert subject.peak_acceleration() <= TAIL_PEAK
@@ -307,15 +309,15 @@ def test_a_stop_changes_the_command_within_50_ms_and_ends_at_rest(after: int) ->
     (event,) = (item for item in items if isinstance(item, Event) and item.kind == "stop")
     assert event.index == decided + 1
     # The recording goes on to show the rest.
-    assert stop.index - subject.moved_until >= 0.2 * RATE
+    assert stop.index - subject.moved_until >= 0.2 * RATE_HZ
 
 
 def test_a_stop_is_labelled_from_its_first_sample_to_its_rest() -> None:
     subject = machine()
     whole = join_blocks(blocks(list(session(subject, Stop(300)))))
     stopping = np.flatnonzero(whole.label == Label.STOP)
-    changed = subject.changed[0]
-    assert stopping[0] in (changed, changed - 1)  # the first factor of a decay is 1
+    changed_samples = subject.changed_samples[0]
+    assert stopping[0] in (changed_samples, changed_samples - 1)  # the first factor of a decay is 1
     assert np.array_equal(stopping, np.arange(stopping[0], stopping[-1] + 1))
     assert stopping[-1] >= subject.moved_until - 1
     assert (whole.label[stopping[-1] + 1 :] == Label.REST).all()
@@ -327,7 +329,7 @@ def test_a_stop_at_the_very_end_changes_nothing_more() -> None:
     last = math.ceil(subject.drive.planned_end / 20)
     items = list(session(subject, Stop(last)))
     assert stop_record(items).verdict == "stopped"
-    assert subject.changed == []
+    assert subject.changed_samples == []
 
 
 def test_a_stop_brings_the_simulated_table_to_rest() -> None:
@@ -341,13 +343,13 @@ def test_a_machine_that_cannot_be_changed_soon_is_fed_and_stopped_as_soon_as_it_
     late = 1500  # 0.75 s, longer than the lead of the card
     subject = machine(replace_after=late)
     list(session(subject, Stop(300)))
-    assert subject.changed[0] - (300 * 20 - 1) <= late + 0.01 * RATE
+    assert subject.changed_samples[0] - (300 * 20 - 1) <= late + 0.01 * RATE_HZ
     assert subject.command[-1] == 0.0
 
 
 def test_what_lies_in_a_slow_device_is_no_part_of_the_lead() -> None:
     """A device that holds nearly all of a lead: a rig that is a little late is not starved."""
-    late = round(0.48 * RATE)
+    late = round(0.48 * RATE_HZ)
     subject = machine(replace_after=late)
     player = OutputQueue(subject, subject.clock, RIG.output, subject.drive, 20)
     player.start()
@@ -370,7 +372,7 @@ def test_a_stroke_trip_aborts_and_says_sample_and_value() -> None:
     assert "65.5 mm" in trip.text
     known = trip.decided - 1
     assert known - trip.index < 20  # decided at the end of the block
-    assert subject.changed[0] - known <= ALLOWED_DECISION * RATE
+    assert subject.changed_samples[0] - known <= ALLOWED_DECISION * RATE_HZ
 
 
 @pytest.mark.parametrize(
@@ -395,10 +397,10 @@ def test_a_trip_wins_over_a_stop_asked_for_in_the_same_block() -> None:
 def test_a_spike_of_one_sample_is_told_and_stops_nothing() -> None:
     items = list(session(machine(faults={("table_disp_m", 5007): 0.0655}), Stop()))
     assert stop_record(items).verdict == "complete"
-    told = [item for item in items if isinstance(item, Event) and item.kind == "sensor"]
-    assert told
-    assert 5007 <= told[0].index <= 5010
-    assert "table_disp_m" in told[0].text
+    events = [item for item in items if isinstance(item, Event) and item.kind == "sensor"]
+    assert events
+    assert 5007 <= events[0].index <= 5010
+    assert "table_disp_m" in events[0].text
 
 
 def test_lost_samples_stay_lost_and_are_recorded_to_the_sample() -> None:
@@ -444,7 +446,7 @@ def test_a_consumer_that_dies_leaves_a_table_at_rest(items_taken: int) -> None:
     assert subject.peak_acceleration() <= TAIL_PEAK
     if items_taken > 2:
         asked = (items_taken - 1) * 20
-        assert subject.moved_until <= asked + ALLOWED_DECISION * RATE + 1.2 * RATE
+        assert subject.moved_until <= asked + ALLOWED_DECISION * RATE_HZ + 1.2 * RATE_HZ
 
 
 def test_a_consumer_that_dies_leaves_the_simulated_table_at_rest() -> None:
@@ -505,7 +507,7 @@ def test_a_stop_that_comes_too_late_for_its_sample_is_given_again() -> None:
     items = list(session(subject, Stop(310)))
     assert subject.refused == 0
     assert stop_record(items).verdict == "stopped"
-    assert subject.changed[0] - (310 * 20 - 1) <= ALLOWED_DECISION * RATE
+    assert subject.changed_samples[0] - (310 * 20 - 1) <= ALLOWED_DECISION * RATE_HZ
     assert subject.command[-1] == 0.0
 
 
@@ -523,7 +525,7 @@ def test_a_feed_that_comes_too_late_lets_the_queued_decay_play(after: int) -> No
     # What is said to have been played is what was played.
     np.testing.assert_allclose(
         whole.channel("drive_disp_m"),
-        subject.played(0, len(whole)),
+        subject.take_command(0, len(whole)),
         rtol=0,
         atol=ROUNDING_M,
     )
@@ -551,11 +553,12 @@ def test_a_machine_that_fails_before_it_moves_is_released_and_never_moves(call: 
     subject = machine()
 
     def fail(*_: object) -> None:
-        raise InputError("the interlock is open; close it")
+        raise InputError("open", key="interlock", remedy="close it")
 
     setattr(subject, call, fail)
-    with pytest.raises(InputError, match="interlock"):
+    with pytest.raises(InputError) as error:
         list(session(subject, Stop()))
+    assert error.value.key == "interlock"
     assert subject.calls[-1] == "close"
     assert subject.next == 0
     assert "start" not in subject.calls

@@ -18,10 +18,10 @@ from table_io.config.calibration import compute_tare, volts_to_si
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 
-RATE = 2000.0
-COUNT = 240  # samples of a motion; short, for some machines play it in real time
+RATE_HZ = 2000.0
+MOTION_SAMPLES = 240  # samples of a motion; short, for some machines play it in real time
 LOST = range(700, 710)  # samples that a bench's machine loses, in all channels
-ROOM = 200  # samples that a person at a slow computer needs to hand something over
+HANDOVER_SAMPLES = 200  # samples that a person at a slow computer needs to hand something over
 AWAY_S = 0.1  # a rig that is late, but not dead
 
 
@@ -50,11 +50,11 @@ class Bench:
 
     def open(self) -> Backend:
         """An open one."""
-        backend = self.make(RATE)
+        backend = self.make(RATE_HZ)
         backend.open()
         return backend
 
-    def started(self, volts: Float1D) -> Backend:
+    def start_playing(self, volts: Float1D) -> Backend:
         """One that plays `volts` from sample 0."""
         backend = self.open()
         self.begin(backend, volts)
@@ -62,9 +62,9 @@ class Bench:
 
     def newest(self, backend: Backend) -> int:
         """The newest sample that the machine has taken by now, as near as a caller knows."""
-        return int((self.clock.now() - backend.scheduled_time_s(0)) * RATE)
+        return int((self.clock.now() - backend.scheduled_time_s(0)) * RATE_HZ)
 
-    def played(self, samples: Float2D) -> Float1D:
+    def read_back_command(self, samples: Float2D) -> Float1D:
         """The command in V, (sample,), as it was acquired back."""
         drive = self.rig.sensors[self.rig.channels.index("drive_disp_m")]
         metres: Float1D = volts_to_si(samples, self.rig.sensors, {})[
@@ -77,7 +77,7 @@ class Bench:
         drive = self.rig.sensors[self.rig.channels.index("drive_disp_m")]
         output = self.rig.output
         lsb = output.lsb_m + 2 * drive.range_si / 2**drive.bits
-        error = np.abs(self.played(samples) - volts).max() / output.volts_per_m
+        error = np.abs(self.read_back_command(samples) - volts).max() / output.volts_per_m
         assert error <= 0.501 * lsb, f"{why}: {error / output.lsb_m:.1f} LSB off"
 
 
@@ -101,7 +101,7 @@ def acquiring(check: Clause) -> Clause:
 E = TypeVar("E", bound=BaseException)
 
 
-def refused(error: type[E], call: Callable[[], object], why: str) -> E:
+def require_error(error: type[E], call: Callable[[], object], why: str) -> E:
     """The error that a call must raise."""
     try:
         call()
@@ -110,7 +110,7 @@ def refused(error: type[E], call: Callable[[], object], why: str) -> E:
     raise AssertionError(f"{why}: no {error.__name__}")
 
 
-def bump(volts: float, count: int = COUNT) -> Float1D:
+def bump(volts: float, count: int = MOTION_SAMPLES) -> Float1D:
     """A smooth motion away from 0 V and back, (count,), still at both ends."""
     x = np.clip(np.arange(count) / (count - 2), 0.0, 1.0)
     return volts * 64.0 * (x * (1.0 - x)) ** 3
@@ -124,9 +124,9 @@ def rise(volts: float, count: int) -> Float1D:
 
 @acquiring
 def it_says_what_it_is(bench: Bench) -> None:
-    backend = bench.make(RATE)
+    backend = bench.make(RATE_HZ)
     assert backend.channels == bench.rig.channels
-    assert backend.rate_hz == RATE
+    assert backend.rate_hz == RATE_HZ
     if bench.play is not None:
         return
     assert isinstance(backend.replace_after, int)
@@ -136,14 +136,14 @@ def it_says_what_it_is(bench: Bench) -> None:
 @acquiring
 def open_refuses_a_rate_that_the_machine_has_not(bench: Bench) -> None:
     backend = bench.make(1234.5)
-    error = refused(InputError, backend.open, "a rate that the machine does not sample at")
+    error = require_error(InputError, backend.open, "a rate that the machine does not sample at")
     assert "1234.5" in str(error), "the error names the rate"
     backend.close()
 
 
 @acquiring
 def calls_out_of_order_are_refused(bench: Bench) -> None:
-    backend = bench.make(RATE)
+    backend = bench.make(RATE_HZ)
     zero = np.zeros(2)
     for name, call in (
         ("tare", lambda: backend.tare(1)),
@@ -153,16 +153,18 @@ def calls_out_of_order_are_refused(bench: Bench) -> None:
     ):
         if name == "queue" and bench.play is not None:
             continue
-        refused(RuntimeError, call, f"{name} before open")
+        require_error(RuntimeError, call, f"{name} before open")
     backend.open()
-    refused(RuntimeError, lambda: backend.read(1), "read before start")
-    refused(RuntimeError, lambda: backend.scheduled_time_s(0), "scheduled before start")
+    require_error(RuntimeError, lambda: backend.read(1), "read before start")
+    require_error(RuntimeError, lambda: backend.scheduled_time_s(0), "scheduled before start")
     bench.begin(backend, zero)
-    refused(RuntimeError, backend.start, "a second start")
+    require_error(RuntimeError, backend.start, "a second start")
     backend.close()
-    refused(RuntimeError, lambda: backend.read(1), "read after close")
+    require_error(RuntimeError, lambda: backend.read(1), "read after close")
     if bench.play is None:
-        refused(RuntimeError, lambda: backend.queue(ROOM, zero), "queue after close")
+        require_error(
+            RuntimeError, lambda: backend.queue(HANDOVER_SAMPLES, zero), "queue after close"
+        )
 
 
 @acquiring
@@ -178,7 +180,9 @@ def tare_is_the_inputs_at_rest_and_moves_nothing(bench: Bench) -> None:
         assert np.ptp(line) <= 2 * quiet, f"{sensor.channel} moves"
     command = bump(0.1)
     bench.begin(backend, command)
-    bench.check_played(backend.read(COUNT), command, "the run after a tare begins at sample 0")
+    bench.check_played(
+        backend.read(MOTION_SAMPLES), command, "the run after a tare begins at sample 0"
+    )
     backend.close()
 
 
@@ -193,22 +197,22 @@ def sample_0_leaves_when_sample_0_is_taken(bench: Bench) -> None:
     after = bench.clock.now()
     assert before <= backend.scheduled_time_s(0) <= after, "sample 0 is that of the start"
     bench.check_played(backend.read(1), command[:1], "sample 0")
-    bench.check_played(backend.read(COUNT - 1), command[1:], "the samples after it")
+    bench.check_played(backend.read(MOTION_SAMPLES - 1), command[1:], "the samples after it")
     backend.close()
 
 
 @acquiring
 def samples_are_scheduled_at_the_rate(bench: Bench) -> None:
-    backend = bench.started(np.zeros(2))
+    backend = bench.start_playing(np.zeros(2))
     first = backend.scheduled_time_s(0)
     for index in (1, 7, 2000, 7_200_000):
-        assert abs(backend.scheduled_time_s(index) - first - index / RATE) < 1e-6
+        assert abs(backend.scheduled_time_s(index) - first - index / RATE_HZ) < 1e-6
     backend.close()
 
 
 @acquiring
 def read_waits_for_its_last_sample(bench: Bench) -> None:
-    backend = bench.started(np.zeros(2))
+    backend = bench.start_playing(np.zeros(2))
     end = 0
     for samples in (1, 20, 3, 64):
         volts = backend.read(samples)
@@ -222,8 +226,8 @@ def read_waits_for_its_last_sample(bench: Bench) -> None:
 @acquiring
 def how_reads_are_cut_changes_no_sample(bench: Bench) -> None:
     lives = []
-    for cuts in ((COUNT,), (1, 7, 64, 0, COUNT - 72)):
-        backend = bench.started(bump(1.0))
+    for cuts in ((MOTION_SAMPLES,), (1, 7, 64, 0, MOTION_SAMPLES - 72)):
+        backend = bench.start_playing(bump(1.0))
         lives.append(np.concatenate([backend.read(samples) for samples in cuts], axis=1))
         backend.close()
         bench.check_played(lives[-1], bump(1.0), f"read in pieces of {cuts}")
@@ -234,10 +238,10 @@ def how_reads_are_cut_changes_no_sample(bench: Bench) -> None:
 @clause
 def what_is_queued_later_is_replaced_exactly(bench: Bench) -> None:
     """Twice, the second time by less than what was queued: what lay behind is gone too."""
-    volts = np.concatenate([rise(1.0, 2 * ROOM), np.full(400, 1.0)])
-    backend = bench.started(volts)
+    volts = np.concatenate([rise(1.0, 2 * HANDOVER_SAMPLES), np.full(400, 1.0)])
+    backend = bench.start_playing(volts)
     read = [backend.read(20)]
-    index = 20 + backend.replace_after + ROOM
+    index = 20 + backend.replace_after + HANDOVER_SAMPLES
     volts = np.concatenate([volts[:index], volts[index] + rise(-0.5, 300)])
     backend.queue(index, volts[index:])
     read.append(backend.read(1))
@@ -254,7 +258,7 @@ def what_is_queued_later_is_replaced_exactly(bench: Bench) -> None:
 
 @clause
 def the_first_sample_that_may_be_replaced_is(bench: Bench) -> None:
-    backend = bench.started(np.zeros(2))
+    backend = bench.start_playing(np.zeros(2))
     for _ in range(20):  # a clock that goes on by itself may leave too little time for a call
         index = bench.newest(backend) + backend.replace_after
         try:
@@ -270,16 +274,16 @@ def the_first_sample_that_may_be_replaced_is(bench: Bench) -> None:
 @clause
 def what_is_in_the_device_plays_as_it_was_queued(bench: Bench) -> None:
     command = bump(1.0)
-    backend = bench.started(command)
+    backend = bench.start_playing(command)
     head = backend.read(100)
     for index in (-1, 0, 50, 99, 100, 99 + backend.replace_after - 1):
-        error = refused(
+        error = require_error(
             ValueError,
             lambda at=index: backend.queue(at, np.full(500, 0.7)),  # type: ignore[misc]
             f"sample {index} was replaced, 100 are read",
         )
         assert str(index) in str(error), "the error names the sample"
-    whole = np.concatenate([head, backend.read(COUNT - 100)], axis=1)
+    whole = np.concatenate([head, backend.read(MOTION_SAMPLES - 100)], axis=1)
     bench.check_played(whole, command, "after refused replacements")
     backend.close()
 
@@ -287,17 +291,17 @@ def what_is_in_the_device_plays_as_it_was_queued(bench: Bench) -> None:
 @clause
 def a_late_rig_cannot_rewrite_the_past(bench: Bench) -> None:
     command = bump(1.0)
-    backend = bench.started(command)
+    backend = bench.start_playing(command)
     head = backend.read(1)
     bench.clock.wait_until(bench.clock.now() + AWAY_S)
-    late = round(AWAY_S * RATE)
+    late = round(AWAY_S * RATE_HZ)
     for index in (1 + backend.replace_after, late - 1, late + backend.replace_after - 1):
-        refused(
+        require_error(
             ValueError,
             lambda at=index: backend.queue(at, np.full(500, 0.7)),  # type: ignore[misc]
             f"sample {index} was replaced, {late} are taken, 1 is read",
         )
-    whole = np.concatenate([head, backend.read(COUNT - 1)], axis=1)
+    whole = np.concatenate([head, backend.read(MOTION_SAMPLES - 1)], axis=1)
     bench.check_played(whole, command, "read late")
     backend.close()
 
@@ -306,19 +310,19 @@ def a_late_rig_cannot_rewrite_the_past(bench: Bench) -> None:
 def what_is_no_voltage_is_refused(bench: Bench) -> None:
     command = bump(1.0)
     backend = bench.open()
-    refused(ValueError, lambda: backend.queue(0, np.array([0.0, np.nan])), "NaN")
+    require_error(ValueError, lambda: backend.queue(0, np.array([0.0, np.nan])), "NaN")
     backend.queue(0, command)
-    refused(ValueError, lambda: backend.queue(0, np.array([np.inf])), "inf")
+    require_error(ValueError, lambda: backend.queue(0, np.array([np.inf])), "inf")
     backend.start()
-    bench.check_played(backend.read(COUNT), command, "after a refused command")
+    bench.check_played(backend.read(MOTION_SAMPLES), command, "after a refused command")
     backend.close()
 
 
 @clause
 def the_last_value_is_held(bench: Bench) -> None:
     """At the end of the queue, and up to an index that lies beyond it."""
-    backend = bench.started(rise(0.5, 100))
-    beyond = 100 + backend.replace_after + ROOM
+    backend = bench.start_playing(rise(0.5, 100))
+    beyond = 100 + backend.replace_after + HANDOVER_SAMPLES
     down = 0.5 - rise(0.3, 100)
     backend.queue(beyond, down)
     expected = np.concatenate([rise(0.5, 100), np.full(beyond - 100, 0.5), down, np.full(50, 0.2)])
@@ -329,7 +333,7 @@ def the_last_value_is_held(bench: Bench) -> None:
 @acquiring
 def a_lost_sample_is_nan_and_keeps_its_place(bench: Bench) -> None:
     command = bump(1.0, 800)
-    backend = bench.started(command)
+    backend = bench.start_playing(command)
     cuts = (LOST[0] - 10, 15, 40)
     volts = np.concatenate([backend.read(samples) for samples in cuts], axis=1)
     expected = np.isin(np.arange(sum(cuts)), LOST)
@@ -341,13 +345,13 @@ def a_lost_sample_is_nan_and_keeps_its_place(bench: Bench) -> None:
 
 @acquiring
 def close_is_safe_at_any_time(bench: Bench) -> None:
-    unopened = bench.make(RATE)
+    unopened = bench.make(RATE_HZ)
     unopened.close()
     idle = bench.open()
     idle.close()
     idle.close()
-    moving = bench.started(bump(1.0))
-    moving.read(COUNT // 2)
+    moving = bench.start_playing(bump(1.0))
+    moving.read(MOTION_SAMPLES // 2)
     moving.close()
     moving.close()
 
@@ -355,14 +359,14 @@ def close_is_safe_at_any_time(bench: Bench) -> None:
 @acquiring
 def the_next_life_begins_at_rest_at_sample_0(bench: Bench) -> None:
     """Also where the life before was left in motion: open() waits until the machine rests."""
-    moving = bench.started(bump(1.0))
-    moving.read(COUNT // 2)
+    moving = bench.start_playing(bump(1.0))
+    moving.read(MOTION_SAMPLES // 2)
     moving.close()
     backend = bench.open()
     tare = compute_tare(backend.tare(400), bench.rig.sensors)
     command = bump(0.5)
     bench.begin(backend, command)
-    volts = backend.read(COUNT)
+    volts = backend.read(MOTION_SAMPLES)
     bench.check_played(volts, command, "the second life")
     table = volts_to_si(volts, bench.rig.sensors, tare)[bench.rig.channels.index("table_disp_m")]
     assert abs(table[:10]).max() < 1e-4, "the table moves before its command does"

@@ -23,7 +23,7 @@ SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
 CARD = (PROFILES_DIR / "rigs" / "ni_simulated.toml").read_text()
 
 
-def wired(rig: RigConfig) -> NiWiring:
+def get_wiring(rig: RigConfig) -> NiWiring:
     wiring = rig.get_section(NiWiring)
     assert wiring is not None
     return wiring
@@ -95,23 +95,30 @@ class Wire:
 
 
 class Bed:
-    """A device with its table, and backends that reach it."""
+    """A device with its table, and backends that reach it; both on one clock unless stated."""
 
-    def __init__(self, text: str = CARD, box: Path | None = None) -> None:
+    def __init__(
+        self,
+        text: str = CARD,
+        box: Path | None = None,
+        clock: Clock | None = None,
+        device_clock: Clock | None = None,
+    ) -> None:
         self.rig = parse_toml(text, RigConfig, "ni_simulated")
-        self.clock: Clock = ManualClock(100.0)
-        self.told: list[str] = []
-        self.box = FlightRecorder(box, self.told.append) if box is not None else None
-        self.table = InterlockedTable(self.rig, SPECIMEN, self.told.append, self.box)
+        self.clock: Clock = clock or ManualClock(100.0)
+        device_clock = device_clock or self.clock
+        self.notices: list[str] = []
+        self.box = FlightRecorder(box, self.notices.append) if box is not None else None
+        self.table = InterlockedTable(self.rig, SPECIMEN, self.notices.append, self.box)
         self.table.warm_up()
-        self.device = SimulatedDaqDevice(self.table, self.rig.rates_hz, self.clock.now())
-        wiring = wired(self.rig)
+        self.device = SimulatedDaqDevice(self.table, self.rig.rates_hz, device_clock.now())
+        wiring = get_wiring(self.rig)
         self.device.faults = list(wiring.faults)
-        self.service = NiDeviceService(self.device, wiring, self.clock)
+        self.service = NiDeviceService(self.device, wiring, device_clock)
         self.wire = Wire(self.service)
 
-    def backend(self, rate_hz: float = 2000.0) -> NiBackend:
-        return NiBackend(self.rig, SPECIMEN, rate_hz, self.clock, self.wire)
+    def backend(self, rate_hz: float = 2000.0, clock: Clock | None = None) -> NiBackend:
+        return NiBackend(self.rig, SPECIMEN, rate_hz, clock or self.clock, self.wire)
 
     def rest(self) -> None:
         """Let it come to rest."""

@@ -22,14 +22,14 @@ from table_io.sim.machine.connection import MachineSession
 from table_io.sim.opendaq import NS_PER_S, TICK_S, OpenDaqServer
 
 SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
-RATE = 2000.0
+RATE_HZ = 2000.0
 
 
 class InUnits(OpenDaqServer):
     """Its signals are in the units of the card's sensors."""
 
     def __init__(self, rig: RigConfig, rate_hz: float) -> None:
-        self._per_unit = np.array([[one.volts_per_unit] for one in rig.sensors])
+        self._per_unit = np.array([[sensor.volts_per_unit] for sensor in rig.sensors])
         super().__init__(rig, rate_hz)
 
     def unit(self, sensor: SensorConfig) -> str:
@@ -44,21 +44,21 @@ def main(path: str, unit: str) -> None:
     table = rig.get_section(SimulatedTableConfig)
     assert table is not None
     quiet = rig.model_copy(update={"simulated": table.model_copy(update={"faults": ()})})
-    device, clock = (OpenDaqServer if unit == "V" else InUnits)(rig, RATE), RealClock()
-    life, base = MachineSession(quiet, SPECIMEN, RATE, None), 0
+    device, clock = (OpenDaqServer if unit == "V" else InUnits)(rig, RATE_HZ), RealClock()
+    life, base = MachineSession(quiet, SPECIMEN, RATE_HZ, None), 0
     life.start(clock.now())
     print("waiting", flush=True)
     while True:
-        now = clock.now()
+        now_s = clock.now()
         if select.select([sys.stdin], [], [], TICK_S)[0]:
             line = sys.stdin.readline()
             if not line:
                 return
             base += life.taken
-            life = MachineSession(rig, SPECIMEN, RATE, None)
-            life.queue(0, np.array(json.loads(line)), now)
+            life = MachineSession(rig, SPECIMEN, RATE_HZ, None)
+            life.queue(0, np.array(json.loads(line)), now_s)
             life.start(clock.now())
-            print(device._start_ns + base * round(NS_PER_S / RATE), flush=True)
+            print(device._start_ns + base * round(NS_PER_S / RATE_HZ), flush=True)
         life.play(clock.now())
         for message in life.pop_arrived(clock.now()):
             volts = message.values.reshape(-1, len(rig.channels)).T

@@ -16,14 +16,14 @@ from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.sim.simulated_table import SimulatedBackend
-from tests.table_io.backends.conformance import CLAUSES, LOST, RATE, Bench
+from tests.table_io.backends.conformance import CLAUSES, LOST, RATE_HZ, Bench
 
 SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
 LOSS = f"""
 [[simulated.faults]]
 kind = "dropped"
-at_s = {LOST[0] / RATE}
-for_s = {len(LOST) / RATE}
+at_s = {LOST[0] / RATE_HZ}
+for_s = {len(LOST) / RATE_HZ}
 """
 
 
@@ -33,7 +33,7 @@ def card(name: str) -> tuple[RigConfig, str]:
     return parse_toml(text, RigConfig, name), text
 
 
-def simulated(clock: Clock, kind: type[SimulatedBackend] = SimulatedBackend) -> Bench:
+def make_simulated_bench(clock: Clock, kind: type[SimulatedBackend] = SimulatedBackend) -> Bench:
     rig, _ = card("simulated")
     return Bench(rig, clock, lambda rate: kind(rig, SPECIMEN, rate, clock), repeatable=True)
 
@@ -56,8 +56,8 @@ def machine(folder: Path) -> Iterator[Bench]:
 
 
 BENCHES: dict[str, Callable[[Path], AbstractContextManager[Bench]]] = {
-    "simulated, manual clock": lambda _: nullcontext(simulated(ManualClock())),
-    "simulated, real clock": lambda _: nullcontext(simulated(RealClock(2.0))),
+    "simulated, manual clock": lambda _: nullcontext(make_simulated_bench(ManualClock())),
+    "simulated, real clock": lambda _: nullcontext(make_simulated_bench(RealClock(2.0))),
     "machine process": machine,
 }
 
@@ -68,10 +68,12 @@ def bench(
 ) -> Iterator[Bench]:
     """Every backend there is; a new one is one more parameter."""
     if request.param == "machine process":
-        with machine(tmp_path_factory.mktemp("machine")) as one:
-            yield one
+        with machine(tmp_path_factory.mktemp("machine")) as machine_bench:
+            yield machine_bench
     else:
-        yield simulated(ManualClock() if request.param == "manual clock" else RealClock())
+        yield make_simulated_bench(
+            ManualClock() if request.param == "manual clock" else RealClock()
+        )
 
 
 @pytest.mark.parametrize("clause", CLAUSES)
@@ -285,8 +287,10 @@ def test_every_clause_has_its_violation() -> None:
 @pytest.mark.parametrize(
     ("clause", "kind"),
     [(clause, kind) for clause, kinds in BROKEN.items() for kind in kinds],
-    ids=lambda one: one if isinstance(one, str) else one.__name__,
+    ids=lambda clause_or_kind: (
+        clause_or_kind if isinstance(clause_or_kind, str) else clause_or_kind.__name__
+    ),
 )
 def test_a_broken_backend_is_seen(clause: str, kind: type[SimulatedBackend]) -> None:
     with pytest.raises((AssertionError, OSError)):
-        CLAUSES[clause](simulated(ManualClock(), kind))
+        CLAUSES[clause](make_simulated_bench(ManualClock(), kind))

@@ -9,7 +9,7 @@ from table_io.block import Float1D
 from table_io.clock import Clock, ManualClock, RealClock
 from table_io.sim.controller import DrivePlayback
 from tests.table_io.acquisition.external_controller import Bystander
-from tests.table_io.backends.conformance import ACQUIRING, CLAUSES, RATE, Bench
+from tests.table_io.backends.conformance import ACQUIRING, CLAUSES, RATE_HZ, Bench
 from tests.table_io.backends.test_conformance import BROKEN, SPECIMEN, card
 
 
@@ -18,7 +18,7 @@ def following(clock: Clock, kind: type[Bystander] = Bystander) -> Bench:
     rig, _ = card("follow_simulated")
 
     def play(source: Bystander, volts: Float1D) -> None:
-        source.file = DrivePlayback(volts / rig.output.volts_per_m, RATE, RATE, 0.0)
+        source.file = DrivePlayback(volts / rig.output.volts_per_m, RATE_HZ, RATE_HZ, 0.0)
         source.start()
 
     def make(rate: float) -> Bystander:
@@ -35,8 +35,15 @@ def test_what_only_acquires_keeps_the_contract(clause: str, clock: Clock) -> Non
 
 @pytest.mark.parametrize(
     ("clause", "kind"),
-    [(one, kind) for one in ACQUIRING for kind in BROKEN[one] if kind.__name__ != "Anonymous"],
-    ids=lambda one: one if isinstance(one, str) else one.__name__,
+    [
+        (clause, kind)
+        for clause in ACQUIRING
+        for kind in BROKEN[clause]
+        if kind.__name__ != "Anonymous"
+    ],
+    ids=lambda clause_or_kind: (
+        clause_or_kind if isinstance(clause_or_kind, str) else clause_or_kind.__name__
+    ),
 )
 def test_a_broken_source_is_seen(clause: str, kind: type) -> None:
     broken = type(kind.__name__, (kind, Bystander), {"__init__": Bystander.__init__})

@@ -13,15 +13,15 @@ from table_io.backends.ni.backend import NiBackend
 from table_io.clock import RealClock
 from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
-from tests.table_io.backends.conformance import CLAUSES, LOST, RATE, Bench
+from tests.table_io.backends.conformance import CLAUSES, LOST, RATE_HZ, Bench
 from tests.table_io.backends.ni_wire import CARD, SPECIMEN, Bed
 
-PACE = 2.0  # times as fast as the clock
+CLOCK_PACE = 2.0  # times as fast as the clock
 LOSS = f"""
 [[simulated.faults]]
 kind = "dropped"
-at_s = {LOST[0] / RATE}
-for_s = {len(LOST) / RATE}
+at_s = {LOST[0] / RATE_HZ}
+for_s = {len(LOST) / RATE_HZ}
 """
 
 
@@ -41,9 +41,9 @@ def server(folder: Path) -> Iterator[Bench]:
     text = (CARD + LOSS).replace("127.0.0.1:7470", address)
     path = folder / "card.toml"
     path.write_text(text)
-    rig, clock = parse_toml(text, RigConfig, str(path)), RealClock(PACE)
+    rig, clock = parse_toml(text, RigConfig, str(path)), RealClock(CLOCK_PACE)
     program = Path(sys.executable).parent / "shaketwin"
-    command: list[str | Path] = [program, "table", "--rig", path, "--time-scale", f"{PACE:g}"]
+    command: list[str | Path] = [program, "table", "--rig", path, "--time-scale", f"{CLOCK_PACE:g}"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert "waiting at" in process.stdout.readline()
@@ -60,11 +60,11 @@ def bench(
 ) -> Iterator[Bench]:
     """Both ways to a device."""
     if request.param == "server":
-        with server(tmp_path_factory.mktemp("ni")) as one:
-            yield one
+        with server(tmp_path_factory.mktemp("ni")) as ni_bench:
+            yield ni_bench
     else:
-        with one_process() as one:
-            yield one
+        with one_process() as ni_bench:
+            yield ni_bench
 
 
 @pytest.mark.parametrize("clause", CLAUSES)

@@ -27,7 +27,7 @@ from tests.table_io.backends.test_conformance import card
 
 pytest.importorskip("opendaq")
 FAR_SIDE = Path(__file__).with_name("opendaq_far_side.py")
-RATE = 2000.0
+RATE_HZ = 2000.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,8 +71,8 @@ def far_side(folder: Path, unit: str = "V") -> Iterator[Device]:
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    with own_network(), far_side(tmp_path_factory.mktemp("device")) as one:
-        yield one
+    with own_network(), far_side(tmp_path_factory.mktemp("device")) as device_bench:
+        yield device_bench
 
 
 @pytest.mark.parametrize("clause", ACQUIRING)
@@ -80,44 +80,49 @@ def test_the_client_keeps_the_contract(clause: str, bench: Bench) -> None:
     ACQUIRING[clause](bench)
 
 
-def wired(rig: RigConfig) -> OpenDaqWiring:
+def get_wiring(rig: RigConfig) -> OpenDaqWiring:
     wiring = rig.get_section(OpenDaqWiring)
     assert wiring is not None
     return wiring
 
 
-def changed(rig: RigConfig, **signals: str) -> RigConfig:
+def replace_signals(rig: RigConfig, **signals: str) -> RigConfig:
     """The card with other signals wired."""
-    wiring = wired(rig)
+    wiring = get_wiring(rig)
     wiring = wiring.model_copy(update={"signals": {**wiring.signals, **signals}})
     return rig.model_copy(update={"opendaq": wiring})
 
 
 def test_a_signal_that_is_not_there_is_named_with_those_that_are(bench: Bench) -> None:
-    source = OpenDaqSource(changed(bench.rig, force_r1_n="cell_9"), RATE, bench.clock)
-    with pytest.raises(InputError, match=r"signals\.force_r1_n = 'cell_9'.*/Sig/cell_r1"):
+    source = OpenDaqSource(replace_signals(bench.rig, force_r1_n="cell_9"), RATE_HZ, bench.clock)
+    with pytest.raises(InputError) as error:
         source.open()
+    assert (error.value.key, error.value.value) == ("opendaq.signals.force_r1_n", "cell_9")
+    assert "/Sig/cell_r1" in error.value.allowed
     source.close()
 
 
 def test_a_signal_without_time_stamps_is_refused(bench: Bench) -> None:
-    source = OpenDaqSource(changed(bench.rig, force_r1_n="time"), RATE, bench.clock)
-    with pytest.raises(InputError, match=r"signals\.force_r1_n = 'time'.*no time stamps"):
+    source = OpenDaqSource(replace_signals(bench.rig, force_r1_n="time"), RATE_HZ, bench.clock)
+    with pytest.raises(InputError) as error:
         source.open()
+    assert (error.value.key, error.value.value) == ("opendaq.signals.force_r1_n", "time")
     source.close()
 
 
 def test_another_rate_than_the_devices_is_refused(bench: Bench) -> None:
     source = OpenDaqSource(bench.rig, 1000.0, bench.clock)
-    with pytest.raises(InputError, match=r"rate_hz = 1000.*at 2000 Hz"):
+    with pytest.raises(InputError, match="2000 Hz") as error:
         source.open()
+    assert (error.value.key, error.value.value) == ("acquisition.rate_hz", 1000.0)
     source.close()
 
 
 def test_who_does_not_answer_is_named(bench: Bench) -> None:
-    away = wired(bench.rig).model_copy(update={"device": "daq.nd://127.0.0.1:7499"})
-    with pytest.raises(InputError, match=r"no openDAQ device answers.*shaketwin table --rig"):
+    away = get_wiring(bench.rig).model_copy(update={"device": "daq.nd://127.0.0.1:7499"})
+    with pytest.raises(InputError, match="7499") as error:
         check_reachable(bench.rig.model_copy(update={"opendaq": away}))
+    assert "shaketwin table --rig" in error.value.remedy
     check_reachable(bench.rig)
 
 
@@ -138,20 +143,21 @@ def test_signals_in_the_cards_units_are_the_volts_of_its_sensors(tmp_path: Path)
             RigConfig,
             "m",
         )
-        wrong = OpenDaqSource(metres, RATE, bench.clock)
-        with pytest.raises(InputError, match=r"drive_disp_m is in mm; allowed: V, or m"):
+        wrong = OpenDaqSource(metres, RATE_HZ, bench.clock)
+        with pytest.raises(InputError, match=" mm;") as error:
             wrong.open()
+        assert error.value.key == "drive_disp_m"
+        assert error.value.allowed.startswith("V, or m ")
         wrong.close()
 
 
 def test_a_device_that_dies_is_told(tmp_path: Path) -> None:
     """Each time, and no sample is made up."""
     with own_network(), far_side(tmp_path) as bench:
-        source = bench.started(np.zeros(2))
+        source = bench.start_playing(np.zeros(2))
         source.read(400)
         bench.process.kill()
-        with pytest.raises(MachineLost, match="stop it at its controller"):
-            source.read(4000)
-        with pytest.raises(MachineLost, match="sent nothing"):
-            source.read(4000)
+        for _ in range(2):
+            with pytest.raises(MachineLost):
+                source.read(4000)
         source.close()

@@ -7,7 +7,7 @@ import pytest
 
 from table_io.clock import RealClock
 from tests.table_io.backends.conformance import CLAUSES, Bench
-from tests.table_io.backends.udp_bench import bench_of, c_target, python_target, relayed
+from tests.table_io.backends.udp_bench import bench_of, c_target, python_target, relay_packets
 
 FAR_SIDES = {"python": python_target, "c": c_target}
 
@@ -25,7 +25,7 @@ def bench(
         folder = tmp_path_factory.mktemp(side)
         address = stack.enter_context(FAR_SIDES[side](folder))
         if lossy:
-            address = stack.enter_context(relayed(address, seed=1)).address
+            address = stack.enter_context(relay_packets(address, seed=1)).address
         yield bench_of(address, RealClock(), repeatable=side == "python")
 
 

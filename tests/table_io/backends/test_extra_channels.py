@@ -17,7 +17,7 @@ from tests.table_io.backends.ni_wire import CARD, Bed
 from tests.table_io.backends.udp_bench import SPECIMEN, card, python_target
 from tests.table_io.lab_rig import DECLARED, EXTRA, TEMPERATURE, lab_rig
 
-RATE = 2000.0
+RATE_HZ = 2000.0
 LAST_WIRE = '{ channel = "force_l2_n", physical = "Dev1/ai8" },'
 WIRES = [f'{{ channel = "{name}", physical = "Dev1/ai{9 + k}" }},' for k, name in enumerate(EXTRA)]
 NI_TEXT = CARD.replace(LAST_WIRE, "\n".join([LAST_WIRE, *WIRES])) + DECLARED
@@ -45,7 +45,7 @@ def _start_and_read(source: Backend | AcquisitionSource) -> np.ndarray:
 
 
 def test_ni_reads_it_at_its_terminals() -> None:
-    read_at_rest(Bed(NI_TEXT).backend(RATE))
+    read_at_rest(Bed(NI_TEXT).backend(RATE_HZ))
 
 
 def test_ni_needs_its_terminals() -> None:
@@ -58,4 +58,4 @@ def test_ni_needs_its_terminals() -> None:
 def test_a_udp_target_sends_it_in_the_order_of_the_sensors(tmp_path: Path) -> None:
     with python_target(tmp_path, DECLARED) as address:
         rig = parse_toml(card(address, DECLARED), RigConfig, "udp")
-        read_at_rest(UdpBackend(rig, SPECIMEN, RATE, RealClock()))
+        read_at_rest(UdpBackend(rig, SPECIMEN, RATE_HZ, RealClock()))

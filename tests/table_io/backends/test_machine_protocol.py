@@ -18,16 +18,16 @@ from table_io.backends.machine.protocol import (
 )
 from table_io.errors import InputError
 
-RATE = 2000.0
+RATE_HZ = 2000.0
 
 
 @given(st.lists(st.binary(max_size=40), max_size=5), st.integers(1, 30))
 def test_messages_survive_any_cut(payloads: list[bytes], cut: int) -> None:
     sent = [MachineMessage(MessageKind.NOTE, k - 2, payload) for k, payload in enumerate(payloads)]
-    stream = b"".join(encode_message(one) for one in sent)
+    stream = b"".join(encode_message(message) for message in sent)
     parser = MessageParser()
     pieces = [stream[i : i + cut] for i in range(0, len(stream), cut)]
-    assert [one for piece in pieces for one in parser.feed(piece)] == sent
+    assert [message for piece in pieces for message in parser.feed(piece)] == sent
 
 
 @pytest.mark.parametrize(
@@ -68,14 +68,14 @@ def test_what_is_queued_is_what_was_put_last(puts: list[tuple[int, list[float]]]
 @pytest.mark.parametrize("turn", np.arange(8) / 8)
 def test_a_landing_goes_on_smoothly_and_ends_at_rest(f: float, turn: float) -> None:
     a = 0.4903
-    t = turn / f + np.arange(-400, 1) / RATE
+    t = turn / f + np.arange(-400, 1) / RATE_HZ
     motion = a / (2 * np.pi * f) ** 2 * np.sin(2 * np.pi * f * t)
-    landed = plan_stop(motion[-3:], RATE)
+    landed = plan_stop(motion[-3:], RATE_HZ)
     whole = np.concatenate([motion, landed, np.zeros(3)])
-    assert np.abs(np.diff(whole, 2)).max() * RATE**2 <= 1.06 * max(a, 0.5)
-    jerk = np.abs(np.diff(whole, 3)).max() * RATE**3
+    assert np.abs(np.diff(whole, 2)).max() * RATE_HZ**2 <= 1.06 * max(a, 0.5)
+    jerk = np.abs(np.diff(whole, 3)).max() * RATE_HZ**3
     assert jerk <= 60 * a * max(f, 1.0)  # no jump: one of 1 % of a would be 10 A a millisecond
-    assert can_hold(whole[-5:-3], RATE)
+    assert can_hold(whole[-5:-3], RATE_HZ)
     assert np.abs(whole).max() <= 1.6 * a / (2 * np.pi * f) ** 2 + 0.05 * a
 
 
@@ -90,12 +90,12 @@ def test_a_landing_from_a_large_motion_stays_within_the_span(
     size_m: float, f: float, most: float
 ) -> None:
     for turn in np.arange(32) / 32:
-        t = turn / f + np.arange(-3, 1) / RATE
+        t = turn / f + np.arange(-3, 1) / RATE_HZ
         motion = size_m * np.sin(2 * np.pi * f * t)
-        whole = np.concatenate([motion, plan_stop(motion[-3:], RATE, SPAN_M), np.zeros(3)])
+        whole = np.concatenate([motion, plan_stop(motion[-3:], RATE_HZ, SPAN_M), np.zeros(3)])
         assert np.abs(whole).max() <= SPAN_M
         own = max(size_m * (2 * np.pi * f) ** 2, 0.5)
-        assert np.abs(np.diff(whole, 2)).max() * RATE**2 <= most * own
+        assert np.abs(np.diff(whole, 2)).max() * RATE_HZ**2 <= most * own
 
 
 @pytest.mark.parametrize("x", [0.0599, 0.06, 0.07, -0.06])
@@ -103,32 +103,34 @@ def test_a_landing_from_a_large_motion_stays_within_the_span(
 def test_what_cannot_keep_within_the_span_stops_dead_and_goes_home_gently(
     x: float, v: float
 ) -> None:
-    landed = plan_stop(x + v / RATE * np.array([-2.0, -1.0, 0.0]), RATE, SPAN_M)
+    landed = plan_stop(x + v / RATE_HZ * np.array([-2.0, -1.0, 0.0]), RATE_HZ, SPAN_M)
     assert np.abs(landed).max() <= max(abs(x), SPAN_M)
     assert landed[-1] == 0.0
     if x * v > 0:
-        assert np.abs(np.diff(landed, 2)).max() * RATE**2 <= 0.5
+        assert np.abs(np.diff(landed, 2)).max() * RATE_HZ**2 <= 0.5
 
 
 @pytest.mark.parametrize("x", [1e100, 20.0])
 def test_no_number_leaves_a_landing_without_an_end(x: float) -> None:
-    landed = plan_stop(np.array([0.0, 0.0, x]), RATE, SPAN_M)
+    landed = plan_stop(np.array([0.0, 0.0, x]), RATE_HZ, SPAN_M)
     assert np.abs(landed).max() <= x
     assert landed[-1] == 0.0
 
 
 @pytest.mark.parametrize(
-    ("text", "part"),
+    "text",
     [
-        ("tcp/0.0.0.0:7450", "other computers"),
-        ("tcp/192.168.1.5:7450", "other computers"),
-        ("tcp/:7450", "other computers"),
-        ("tcp/127.0.0.1", "allowed: tcp/127.0.0.1:PORT"),
-        ("tcp/127.0.0.1:99999", "allowed"),
-        ("udp/127.0.0.1:1", "allowed"),
-        ("unix/", "allowed"),
+        "tcp/0.0.0.0:7450",
+        "tcp/192.168.1.5:7450",
+        "tcp/:7450",
+        "tcp/127.0.0.1",
+        "tcp/127.0.0.1:99999",
+        "udp/127.0.0.1:1",
+        "unix/",
     ],
 )
-def test_an_endpoint_stays_on_this_computer(text: str, part: str) -> None:
-    with pytest.raises(InputError, match=part):
+def test_an_endpoint_stays_on_this_computer(text: str) -> None:
+    with pytest.raises(InputError) as error:
         parse_endpoint(text)
+    assert (error.value.key, error.value.value) == ("endpoint", text)
+    assert "tcp/127.0.0.1:PORT" in error.value.allowed

@@ -26,10 +26,10 @@ from table_io.sim.machine.flight_recorder import read_flight_record
 from table_io.sim.ni.device import SimulatedDaqDevice
 from table_io.sim.ni.server import ServerEndpoint
 from table_io.sim.ni.task import DriverError, ErrorCode, Task
-from tests.studies.ni_error_codes import CALLS, RATE, judged, met, motion
-from tests.table_io.backends.ni_wire import CARD, SPECIMEN, Answer, Bed, note_heartbeats, wired
+from tests.studies.ni_error_codes import CALLS, RATE_HZ, judge_ending, meet_fault, motion
+from tests.table_io.backends.ni_wire import CARD, SPECIMEN, Answer, Bed, get_wiring, note_heartbeats
 
-NOTHING = RunStart(0, "", "", "table", "", "", "", RATE, 20, (), (), 0, {}, {}, "", "", 0.0)
+NOTHING = RunStart(0, "", "", "table", "", "", "", RATE_HZ, 20, (), (), 0, {}, {}, "", "", 0.0)
 SHORT = """
 title = "short"
 rig = "ni_simulated"
@@ -54,7 +54,7 @@ def bed() -> Bed:
     return Bed()
 
 
-def started(bed: Bed) -> NiBackend:
+def start_backend(bed: Bed) -> NiBackend:
     backend = bed.backend()
     backend.open()
     backend.queue(0, motion())
@@ -72,12 +72,12 @@ def session(bed: Bed) -> list[Any]:
 
 def test_a_session_is_played_without_a_gap() -> None:
     bed = Bed()
-    said = session(bed)
-    assert isinstance(said[-1], RunStop)
-    assert said[-1].verdict == "complete"
-    assert not [one for one in said if isinstance(one, SampleGap)]
-    values = np.concatenate([one.values for one in said if isinstance(one, Block)], axis=1)
-    assert values.shape[1] == said[-1].index
+    items = session(bed)
+    assert isinstance(items[-1], RunStop)
+    assert items[-1].verdict == "complete"
+    assert not [item for item in items if isinstance(item, SampleGap)]
+    values = np.concatenate([item.values for item in items if isinstance(item, Block)], axis=1)
+    assert values.shape[1] == items[-1].index
     assert 2e-3 < np.abs(values[1]).max() < 4e-3  # 0.05 g at 2 Hz: 3.1 mm
 
 
@@ -92,17 +92,17 @@ def test_a_session_in_which_the_driver_errs_says_the_code_and_ends_at_rest(
         planted, bed.device.faults = bed.device.faults, []
         begin = NiBackend.open
 
-        def opened(backend: NiBackend) -> None:
+        def begin_with_fault(backend: NiBackend) -> None:
             begin(backend)
             bed.device.faults = planted
 
         with pytest.MonkeyPatch.context() as patched:
-            patched.setattr(NiBackend, "open", opened)
-            said = session(bed)
+            patched.setattr(NiBackend, "open", begin_with_fault)
+            items = session(bed)
     else:
-        said = session(bed)
+        items = session(bed)
     bed.rest()
-    trip, stop = said[-2], said[-1]
+    trip, stop = items[-2], items[-1]
     assert isinstance(trip, Trip)
     assert isinstance(stop, RunStop)
     assert stop.verdict == "halted"
@@ -111,8 +111,8 @@ def test_a_session_in_which_the_driver_errs_says_the_code_and_ends_at_rest(
     if call != "start":
         assert life.notes[-1][1] == "at rest"
         assert abs(life.row("command_m")[-1]) < 1e-6
-        assert 4200 <= stop.index < 4200 + 0.7 * RATE
-        last = [one for one in said if isinstance(one, Block)][-1]
+        assert 4200 <= stop.index < 4200 + 0.7 * RATE_HZ
+        last = [item for item in items if isinstance(item, Block)][-1]
         assert stop.index == last.end
 
 
@@ -122,38 +122,38 @@ def test_every_error_is_stated_and_ends_safely(
     call: Any, code: int, bed: Bed, tmp_path: Path
 ) -> None:
     fault = NiFault(call=call, code=code, at_s=0.45)
-    said, life = met(bed, fault, tmp_path / "box")
-    assert not judged(said, life, fault)
+    items, life = meet_fault(bed, fault, tmp_path / "box")
+    assert not judge_ending(items, life, fault)
 
 
 def test_an_input_that_fails_lets_the_command_decay_as_it_was_queued(
     bed: Bed, tmp_path: Path
 ) -> None:
-    _, life = met(bed, NiFault(call="read", code=-200279, at_s=0.45), tmp_path / "box")
-    told = motion() / bed.rig.output.volts_per_m
+    _, life = meet_fault(bed, NiFault(call="read", code=-200279, at_s=0.45), tmp_path / "box")
+    queued_m = motion() / bed.rig.output.volts_per_m
     step_m = bed.rig.output.lsb_m
-    assert np.abs(life.row("command_m")[: told.size] - told).max() <= step_m
+    assert np.abs(life.row("command_m")[: queued_m.size] - queued_m).max() <= step_m
     assert not [text for _, text in life.notes if "heartbeat" in text], "the interlock has acted"
 
 
 def test_a_frozen_output_is_landed_by_the_interlock_within_its_time(
     bed: Bed, tmp_path: Path
 ) -> None:
-    _, life = met(bed, NiFault(call="output", code=-200621, at_s=0.45), tmp_path / "box")
+    _, life = meet_fault(bed, NiFault(call="output", code=-200621, at_s=0.45), tmp_path / "box")
     notes = {text.split(" at sample ")[0]: (index, text) for index, text in life.notes}
     frozen = int(notes["output ended by error -200621"][1].rsplit(" ", 1)[1])
     landed = notes["stopped by the machine's interlock"][0]
-    assert landed - frozen <= (0.3 + 0.1) * RATE  # silence, and what the rig needs to see it
+    assert landed - frozen <= (0.3 + 0.1) * RATE_HZ  # silence, and what the rig needs to see it
     assert np.ptp(life.row("command_m")[frozen - 1 : landed]) == 0.0
 
 
 def test_a_rig_that_was_away_is_told_that_the_machine_went_on(bed: Bed) -> None:
-    backend = started(bed)
+    backend = start_backend(bed)
     backend.read(200)
     bed.clock.wait_until(bed.clock.now() + 0.35)
-    with pytest.raises(MachineLost, match=r"no heartbeat from this rig for 0\.35 s"):
+    with pytest.raises(MachineLost, match=r" 0\.35 s"):
         backend.read(20)
-    with pytest.raises(MachineLost, match="no heartbeat from this rig"):
+    with pytest.raises(MachineLost, match=r" 0\.35 s"):
         backend.queue(3000, np.zeros(2))
     backend.close()
     bed.rest()
@@ -162,37 +162,37 @@ def test_a_rig_that_was_away_is_told_that_the_machine_went_on(bed: Bed) -> None:
 def test_samples_that_do_not_come_are_a_loss_after_patience_and_the_command_decays(
     tmp_path: Path,
 ) -> None:
-    bed = Bed(CARD + '[[simulated.faults]]\nkind = "stall"\nat_s = 0.5\n', tmp_path / "box")
-    bed.clock = bed.service._clock = RealClock(4.0)  # which jumps over no heartbeat
-    bed.device._now_s = bed.clock.now()
-    backend = started(bed)
+    stall = '[[simulated.faults]]\nkind = "stall"\nat_s = 0.5\n'
+    clock = RealClock(4.0)  # which jumps over no heartbeat
+    bed = Bed(CARD + stall, tmp_path / "box", clock)
+    backend = start_backend(bed)
     backend.read(980)
-    with pytest.raises(MachineLost, match=r"have not arrived|200284"):
+    with pytest.raises(MachineLost, match=r"samples|200284"):
         backend.read(200)
     backend.close()
     bed.rest()
-    told = motion() / bed.rig.output.volts_per_m
+    queued_m = motion() / bed.rig.output.volts_per_m
     life = read_flight_record(tmp_path / "box")[-1]
-    assert np.abs(life.row("command_m")[: told.size] - told).max() <= bed.rig.output.lsb_m
+    assert np.abs(life.row("command_m")[: queued_m.size] - queued_m).max() <= bed.rig.output.lsb_m
 
 
 def test_close_waits_for_rest_before_it_stops_the_output(tmp_path: Path) -> None:
     bed = Bed(CARD, tmp_path / "box")
-    backend = started(bed)
+    backend = start_backend(bed)
     backend.read(500)
     assert bed.clock.now() < backend.scheduled_time_s(510)
     backend.close()
     assert bed.clock.now() >= backend.scheduled_time_s(motion().size)
     bed.rest()
-    told = motion() / bed.rig.output.volts_per_m
+    queued_m = motion() / bed.rig.output.volts_per_m
     life = read_flight_record(tmp_path / "box")[-1]
-    assert np.abs(life.row("command_m")[: told.size] - told).max() <= bed.rig.output.lsb_m
+    assert np.abs(life.row("command_m")[: queued_m.size] - queued_m).max() <= bed.rig.output.lsb_m
 
 
 def test_the_heartbeat_is_10_hz_while_the_rig_reads_and_not_after_it() -> None:
     bed = Bed()
     beats = note_heartbeats(bed)
-    backend = started(bed)
+    backend = start_backend(bed)
     for _ in range(100):
         backend.read(20)
     between = np.diff(beats)
@@ -208,16 +208,16 @@ def test_a_rig_that_is_gone_leaves_tasks_that_play_to_rest_and_the_next_one_clea
     tmp_path: Path,
 ) -> None:
     bed = Bed(CARD, tmp_path / "box")
-    gone = started(bed)
+    gone = start_backend(bed)
     gone.read(700)
     names = {task.name for task in bed.device.tasks}
     assert names == {f"shaketwin_Dev1_{kind}" for kind in ("input", "output", "heartbeat")}
     following = bed.backend()
     following.open()  # waits until it has been played
     lives = read_flight_record(tmp_path / "box")
-    told = motion() / bed.rig.output.volts_per_m
-    left = next(life for life in lives if life.samples.shape[1] > told.size)
-    assert np.abs(left.row("command_m")[: told.size] - told).max() <= bed.rig.output.lsb_m
+    queued_m = motion() / bed.rig.output.volts_per_m
+    left = next(life for life in lives if life.samples.shape[1] > queued_m.size)
+    assert np.abs(left.row("command_m")[: queued_m.size] - queued_m).max() <= bed.rig.output.lsb_m
     assert any("no heartbeat for 0.3 s" in text for _, text in left.notes)
     following.queue(0, motion())
     following.start()
@@ -226,19 +226,18 @@ def test_a_rig_that_is_gone_leaves_tasks_that_play_to_rest_and_the_next_one_clea
 
 
 def test_a_rig_that_drives_keeps_its_device(bed: Bed) -> None:
-    first = started(bed)
+    first = start_backend(bed)
     first.read(100)
-    second = bed.backend()
     alive = iter(range(10**6))
 
     def waits(when: float) -> None:  # while the second one waits, the first one reads
         next(alive)
-        first.read(max(int((when - bed.clock.now()) * RATE), 1))
+        first.read(max(int((when - bed.clock.now()) * RATE_HZ), 1))
 
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(second, "_clock", Paced(bed.clock, waits))
-        with pytest.raises(InputError, match="another rig drives this device"):
-            second.open()
+    second = bed.backend(clock=Paced(bed.clock, waits))
+    with pytest.raises(InputError) as error:
+        second.open()
+    assert (error.value.where, error.value.remedy) == (f"rig {bed.rig.name}", "end it first")
     first.read(20)
     first.close()
     bed.rest()
@@ -268,13 +267,13 @@ def test_a_driver_that_lets_nothing_be_replaced_is_refused(
 ) -> None:
     write = SimulatedDaqDevice.write
 
-    def only_behind(device: SimulatedDaqDevice, task: Task, volts: Float1D, now: float) -> None:
+    def only_behind(device: SimulatedDaqDevice, task: Task, volts: Float1D, now_s: float) -> None:
         if task.running and task.offset < task.written:
             raise DriverError(ErrorCode.NO_LONGER_WRITEABLE)
-        write(device, task, volts, now)
+        write(device, task, volts, now_s)
 
     monkeypatch.setattr(SimulatedDaqDevice, "write", only_behind)
-    with pytest.raises(InputError, match=r"do not let queued output be replaced .error -200289"):
+    with pytest.raises(InputError, match="-200289"):
         Bed().backend().open()
 
 
@@ -290,8 +289,9 @@ def test_a_rate_that_the_device_only_comes_near_is_refused(
         task.rate_hz = 2048.0
 
     monkeypatch.setattr(SimulatedDaqDevice, "configure_timing", near)
-    with pytest.raises(InputError, match="would sample at 2048 Hz"):
+    with pytest.raises(InputError, match="2048 Hz") as error:
         Bed().backend().open()
+    assert (error.value.key, error.value.value) == ("acquisition.rate_hz", RATE_HZ)
 
 
 def test_a_command_that_does_not_stand_at_zero_is_not_started_from(
@@ -306,8 +306,9 @@ def test_a_command_that_does_not_stand_at_zero_is_not_started_from(
         return volts
 
     monkeypatch.setattr(bed.table, "read_at_rest", off)
-    with pytest.raises(InputError, match=r"3.000 mm \(0.500 V\)"):
+    with pytest.raises(InputError, match=r"3\.000 mm \(0\.500 V\)") as error:
         bed.backend().open()
+    assert error.value.where == f"rig {bed.rig.name}: drive_disp_m"
 
 
 def test_a_table_that_moves_is_waited_for_and_then_refused(
@@ -323,54 +324,59 @@ def test_a_table_that_moves_is_waited_for_and_then_refused(
 
     monkeypatch.setattr(bed.table, "read_at_rest", moves)
     before = bed.clock.now()
-    with pytest.raises(InputError, match="still moves by"):
+    with pytest.raises(InputError, match=r"\d mm after 30 s") as error:
         bed.backend().open()
+    assert error.value.where == f"rig {bed.rig.name}"
     assert bed.clock.now() - before > 30.0
 
 
 def test_what_is_wired_must_be_what_is_sensed() -> None:
     cut = CARD.replace('    { channel = "mass_disp_m", physical = "Dev1/ai3" },\n', "")
-    with pytest.raises(InputError, match=r"ni\.inputs: .*mass_disp_m"):
-        NiBackend(parse_toml(cut, RigConfig, "card"), SPECIMEN, RATE, ManualClock())
+    with pytest.raises(InputError, match="mass_disp_m") as error:
+        NiBackend(parse_toml(cut, RigConfig, "card"), SPECIMEN, RATE_HZ, ManualClock())
+    assert error.value.key == "ni.inputs"
 
 
 @pytest.mark.parametrize(
-    ("ours", "theirs", "part"),
+    ("ours", "theirs", "key"),
     [
-        ("127.0.0.1:7470", "7470", "give HOST:PORT"),
-        ("127.0.0.1:7470", "8.8.8.8:7470", "allowed: this computer"),
+        ("127.0.0.1:7470", "7470", "ni.endpoint"),
+        ("127.0.0.1:7470", "8.8.8.8:7470", "ni.endpoint"),
         ("Dev1/ao0", "ao0", "ni.output"),
         ("Dev1/port0/line0", "Dev1/line0", "ni.heartbeat"),
-        ('"Dev1/ai1"', '"Dev1/ai0"', "physical channel Dev1/ai0"),
+        ('"Dev1/ai1"', '"Dev1/ai0"', "ni.inputs"),
         ("held_by_device_ms = 20.0", "held_by_device_ms = 0.0", "ni.held_by_device_ms"),
-        ("held_by_device_ms = 20.0", "held_by_device = 20.0", "did you mean 'held_by_device_ms'"),
-        ("held_by_device_ms = 20.0", 'start_trigger = "PFI0"', "no terminal"),
+        ("held_by_device_ms = 20.0", "held_by_device = 20.0", "ni.held_by_device"),
+        ("held_by_device_ms = 20.0", 'start_trigger = "PFI0"', "ni.start_trigger"),
     ],
 )
-def test_a_card_says_what_is_wrong_with_it(ours: str, theirs: str, part: str) -> None:
-    with pytest.raises(InputError, match=part):
+def test_a_card_says_what_is_wrong_with_it(ours: str, theirs: str, key: str) -> None:
+    with pytest.raises(InputError) as error:
         parse_toml(CARD.replace(ours, theirs, 1), RigConfig, "card")
+    assert key in [fault.key for fault in error.value.faults]
 
 
 def test_the_trigger_is_that_of_the_inputs_chassis() -> None:
     rig = parse_toml(CARD.replace("Dev1/ai", "cDAQ1Mod3/ai"), RigConfig, "card")
-    assert wired(rig).trigger == "/cDAQ1/ai/StartTrigger"
-    assert wired(parse_toml(CARD, RigConfig, "card")).trigger == "/Dev1/ai/StartTrigger"
+    assert get_wiring(rig).trigger == "/cDAQ1/ai/StartTrigger"
+    assert get_wiring(parse_toml(CARD, RigConfig, "card")).trigger == "/Dev1/ai/StartTrigger"
 
 
 def test_nobody_there_is_said_with_what_to_do() -> None:
     rig = parse_toml(CARD.replace("127.0.0.1:7470", "127.0.0.1:9"), RigConfig, "card")
-    with pytest.raises(InputError, match="shaketwin table --rig ni_simulated"):
+    with pytest.raises(InputError) as error:
         check_reachable(rig)
+    assert "shaketwin table --rig ni_simulated" in error.value.remedy
     local = parse_toml(CARD.replace('endpoint = "127.0.0.1:7470"\n', ""), RigConfig, "card")
-    with pytest.raises(InputError, match="no NI-DAQmx driver"):
+    with pytest.raises(InputError) as error:
         check_reachable(local)
+    assert "ni.endpoint" in error.value.remedy
 
 
 def test_the_local_driver_is_warned_of() -> None:
     local = parse_toml(CARD.replace('endpoint = "127.0.0.1:7470"\n', ""), RigConfig, "card")
-    assert "freezes in motion" in wired(local).warnings[0]
-    assert not wired(parse_toml(CARD, RigConfig, "card")).warnings
+    assert "freezes in motion" in get_wiring(local).warnings[0]
+    assert not get_wiring(parse_toml(CARD, RigConfig, "card")).warnings
 
 
 @pytest.mark.parametrize("ppm", [-150.0, 0.0, 150.0])
@@ -381,8 +387,8 @@ def test_the_schedule_follows_the_clock_of_the_device(ppm: float) -> None:
     off = []
     for last in range(19, 7_200_000, 20):
         taken = start + last / rate
-        now = taken + 0.002 + float(chance.exponential(0.003))
-        pace.update(last, now)
+        now_s = taken + 0.002 + float(chance.exponential(0.003))
+        pace.update(last, now_s)
         off.append(pace.epoch_s + last / 2000.0 - taken)
     assert max(off) < 0.002 + 1e-9  # no sample is scheduled after it has come
     assert min(off) > -0.004  # nor long before it is taken
@@ -412,10 +418,10 @@ def test_what_lay_behind_a_command_that_became_shorter_never_plays(
     """Also on a driver that keeps it, and after the rig has died."""
     write = SimulatedDaqDevice.write
 
-    def keeping(device: SimulatedDaqDevice, task: Task, volts: Float1D, now: float) -> None:
+    def keeping(device: SimulatedDaqDevice, task: Task, volts: Float1D, now_s: float) -> None:
         end = task.offset + volts.size
         behind = task.volts.values(end, max(task.written, end))
-        write(device, task, np.append(volts, behind), now)
+        write(device, task, np.append(volts, behind), now_s)
 
     monkeypatch.setattr(SimulatedDaqDevice, "write", keeping)
     bed = Bed(CARD, tmp_path / "box")
@@ -445,11 +451,8 @@ class Slow:
 
 
 def test_a_device_whose_clock_runs_slow_is_not_late() -> None:
-    bed = Bed()
-    ppm, session_clock = 190.0, ManualClock(100.0)
-    bed.service._clock = Slow(session_clock, ppm)
-    bed.device.advance(bed.service._clock.now())
-    bed.clock = session_clock
+    ppm, clock = 190.0, ManualClock(100.0)
+    bed = Bed(clock=clock, device_clock=Slow(clock, ppm))
     backend = bed.backend()
     backend.open()
     backend.queue(0, motion())
@@ -457,7 +460,9 @@ def test_a_device_whose_clock_runs_slow_is_not_late() -> None:
     start = backend.scheduled_time_s(0)
     for _ in range(1250):
         backend.read(40)
-    taken = start + 49_999 / (RATE * (1.0 - ppm * 1e-6))  # 25 s: 4.75 ms later than told at first
+    taken = start + 49_999 / (
+        RATE_HZ * (1.0 - ppm * 1e-6)
+    )  # 25 s: 4.75 ms later than told at first
     assert abs(backend.scheduled_time_s(49_999) - taken) < 2e-3
     backend.close()
 
@@ -482,7 +487,7 @@ def test_a_command_far_beyond_what_is_queued_finds_the_last_value_held(tmp_path:
 
 def test_a_server_that_is_gone_is_a_lost_connection(monkeypatch: pytest.MonkeyPatch) -> None:
     bed = Bed()
-    backend = started(bed)
+    backend = start_backend(bed)
     backend.read(200)
 
     def gone(request: Any, context: Any) -> None:
@@ -490,7 +495,7 @@ def test_a_server_that_is_gone_is_a_lost_connection(monkeypatch: pytest.MonkeyPa
 
     for call in ("ReadAnalogF64", "WriteAnalogF64", "WriteDigitalLines", "IsTaskDone", "ClearTask"):
         monkeypatch.setattr(bed.service, call, gone)
-    with pytest.raises(MachineLost, match=r"the connection to the device failed: .*UNAVAILABLE"):
+    with pytest.raises(MachineLost, match="UNAVAILABLE"):
         backend.read(200)
     backend.close()
     backend.close()
@@ -506,8 +511,10 @@ def test_without_the_library_it_says_what_to_install() -> None:
         "try: check_reachable(rig)\n"
         "except InputError as error: print(error)\n"
     )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "pip install shaketwin[ni]" in told.stdout
+    completed = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert "pip install shaketwin[ni]" in completed.stdout
 
 
 def test_an_address_that_is_taken_is_said() -> None:
@@ -515,5 +522,5 @@ def test_an_address_that_is_taken_is_said() -> None:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         rig = parse_toml(CARD.replace("127.0.0.1:7470", address), RigConfig, "card")
         with pytest.raises(InputError) as error:
-            ServerEndpoint(wired(rig))
+            ServerEndpoint(get_wiring(rig))
         assert (error.value.key, error.value.value) == ("ni.endpoint", address)

@@ -35,24 +35,24 @@ def test_a_stamp_between_two_samples_is_refused(off: int) -> None:
 
 
 def test_time_that_goes_back_is_refused() -> None:
-    one = Assembly(1)
-    one.put(0, np.array([0, 1, 2]), np.zeros(3))
+    assembly = Assembly(1)
+    assembly.put(0, np.array([0, 1, 2]), np.zeros(3))
     with pytest.raises(UnevenClockError, match="goes back"):
-        one.put(0, np.array([2, 3]), np.zeros(2))
+        assembly.put(0, np.array([2, 3]), np.zeros(2))
     with pytest.raises(UnevenClockError, match="goes back"):
-        one.put(0, np.array([5, 4]), np.zeros(2))
+        assembly.put(0, np.array([5, 4]), np.zeros(2))
 
 
 def test_what_does_not_come_is_nan_and_what_comes_too_late_is_dropped() -> None:
-    one = Assembly(2)
-    one.put(0, np.array([-2, -1, 0, 1, 4]), np.array([9.0, 9.0, 0.0, 1.0, 4.0]))
-    assert (one.complete, one.end) == (0, 5)
-    one.put(1, np.array([3]), np.array([30.0]))
-    assert one.complete == 4
-    first = one.take(4)
+    assembly = Assembly(2)
+    assembly.put(0, np.array([-2, -1, 0, 1, 4]), np.array([9.0, 9.0, 0.0, 1.0, 4.0]))
+    assert (assembly.complete, assembly.end) == (0, 5)
+    assembly.put(1, np.array([3]), np.array([30.0]))
+    assert assembly.complete == 4
+    first = assembly.take(4)
     assert np.array_equal(first[0], [0.0, 1.0, np.nan, np.nan], equal_nan=True)
     assert np.array_equal(first[1], [np.nan, np.nan, np.nan, 30.0], equal_nan=True)
-    behind = one.take(GROWTH_SAMPLES)
+    behind = assembly.take(GROWTH_SAMPLES)
     assert behind[0, 0] == 4.0
     assert np.isnan(behind[0, 1:]).all()
     assert np.isnan(behind[1]).all()
@@ -74,42 +74,43 @@ def test_pieces_and_cuts_change_no_sample(pieces: list[int], cuts: list[int], se
     size = sum(pieces)
     lost = rng.random(size) < 0.1
     values = np.where(lost, np.nan, np.arange(size, dtype=np.float64))
-    one, at = Assembly(2), 0
+    assembly, at = Assembly(2), 0
     for piece in pieces:
         index = at + np.flatnonzero(~lost[at : at + piece])
         for row in (0, 1):
-            one.put(row, index, (row + 1) * values[index])
+            assembly.put(row, index, (row + 1) * values[index])
         at += piece
-    taken = np.concatenate([one.take(cut) for cut in cuts], axis=1)
+    taken = np.concatenate([assembly.take(cut) for cut in cuts], axis=1)
     expected = np.full(taken.shape[1] + size, np.nan)
     expected[:size] = values
     assert np.array_equal(taken[0], expected[: taken.shape[1]], equal_nan=True)
     assert np.array_equal(taken[1], 2 * expected[: taken.shape[1]], equal_nan=True)
-    assert one._values.shape[1] >= GROWTH_SAMPLES
+    assert assembly._values.shape[1] >= GROWTH_SAMPLES
 
 
 def test_a_clock_that_is_set_forward_is_told_and_takes_no_memory() -> None:
-    one = Assembly(2, 10_000)
-    one.put(0, np.arange(100), np.zeros(100))
-    one.put(1, np.arange(100), np.zeros(100))
-    with pytest.raises(ClockJumpError, match="jumped by"):
-        one.put(0, np.array([10**12]), np.zeros(1))
+    assembly = Assembly(2, 10_000)
+    assembly.put(0, np.arange(100), np.zeros(100))
+    assembly.put(1, np.arange(100), np.zeros(100))
+    with pytest.raises(ClockJumpError) as jump:
+        assembly.put(0, np.array([10**12]), np.zeros(1))
+    assert jump.value.samples == 10**12 - 100
     with pytest.raises(ClockJumpError):
-        one.put(1, np.array([100, 101, 10**12]), np.zeros(3))
-    assert one._values.shape[1] <= 2 * GROWTH_SAMPLES
-    one.put(0, np.arange(5000, 5010), np.zeros(10))  # a loss
+        assembly.put(1, np.array([100, 101, 10**12]), np.zeros(3))
+    assert assembly._values.shape[1] <= 2 * GROWTH_SAMPLES
+    assembly.put(0, np.arange(5000, 5010), np.zeros(10))  # a loss
 
 
 def test_a_channel_that_was_given_up_is_waited_for_when_it_speaks_again() -> None:
-    one = Assembly(2, 10_000)
-    one.put(0, np.arange(100), np.zeros(100))
-    assert one.complete == 0
-    one.give_up(100)
-    assert one.complete == 100
-    one.put(0, np.arange(100, 20_000), np.zeros(19_900))
-    assert one.complete == 20_000
-    one.put(1, np.array([19_990]), np.zeros(1))
-    assert one.complete == 19_991
+    assembly = Assembly(2, 10_000)
+    assembly.put(0, np.arange(100), np.zeros(100))
+    assert assembly.complete == 0
+    assembly.give_up(100)
+    assert assembly.complete == 100
+    assembly.put(0, np.arange(100, 20_000), np.zeros(19_900))
+    assert assembly.complete == 20_000
+    assembly.put(1, np.array([19_990]), np.zeros(1))
+    assert assembly.complete == 19_991
 
 
 def test_stamps_that_drift_are_placed_by_what_they_drifted() -> None:
@@ -119,5 +120,6 @@ def test_stamps_that_drift_are_placed_by_what_they_drifted() -> None:
 
 def test_channels_that_lie_between_each_other_are_refused() -> None:
     require_simultaneous({"drive_disp_m": 1000, "force_r1_n": 3010}, 500.0, "d")
-    with pytest.raises(InputError, match=r"force_r1_n .*0\.50 samples .*drive_disp_m"):
+    with pytest.raises(InputError, match=r"0\.50") as error:
         require_simultaneous({"drive_disp_m": 1000, "force_r1_n": 3250}, 500.0, "d")
+    assert (error.value.where, error.value.key) == ("d", "force_r1_n")

@@ -20,10 +20,11 @@ from table_io.backends import (
 )
 from table_io.backends.udp.backend import UdpBackend
 from table_io.backends.udp.config import UdpWiring
-from table_io.backends.udp.link import query_target
+from table_io.backends.udp.link import REASON_TEXTS, query_target
 from table_io.backends.udp.packets import (
     PacketKind,
     Phase,
+    Reason,
     RigPacket,
     TargetState,
     decode_target_state,
@@ -45,12 +46,12 @@ from tests.table_io.backends.udp_bench import (
     Address,
     Relay,
     card,
+    compile_sanitized,
     free_port,
-    relayed,
-    sanitized,
+    relay_packets,
 )
 
-RATE = 2000.0
+RATE_HZ = 2000.0
 CLOCK = RealClock()
 
 
@@ -59,7 +60,7 @@ def rig_at(address: Address) -> RigConfig:
 
 
 def rig_side(address: Address) -> UdpBackend:
-    return UdpBackend(rig_at(address), SPECIMEN, RATE, CLOCK)
+    return UdpBackend(rig_at(address), SPECIMEN, RATE_HZ, CLOCK)
 
 
 @dataclass
@@ -67,21 +68,21 @@ class Served:
     """A target that runs beside the test."""
 
     address: Address
-    told: list[str]
+    notices: list[str]
 
 
 @contextmanager
-def served() -> Iterator[Served]:
-    told: list[str] = []
-    with bind_socket(("127.0.0.1", 0)) as one:
-        address = one.getsockname()
-        table, going = SimulatedMachine(rig_at(address), told.append), [True]
+def serve_target() -> Iterator[Served]:
+    notices: list[str] = []
+    with bind_socket(("127.0.0.1", 0)) as server_socket:
+        address = server_socket.getsockname()
+        table, going = SimulatedMachine(rig_at(address), notices.append), [True]
         table.warm_up()
-        asked = (one, table, CLOCK, lambda: bool(going))
+        asked = (server_socket, table, CLOCK, lambda: bool(going))
         thread = threading.Thread(target=serve_udp_target, args=asked, daemon=True)
         thread.start()
         try:
-            yield Served(address, told)
+            yield Served(address, notices)
         finally:
             going.clear()
             thread.join()
@@ -89,8 +90,8 @@ def served() -> Iterator[Served]:
 
 @pytest.fixture
 def target() -> Iterator[Served]:
-    with served() as one:
-        yield one
+    with serve_target() as server:
+        yield server
 
 
 def driving(address: Address, samples: int = 600) -> UdpBackend:
@@ -114,8 +115,9 @@ def test_the_shipped_card_is_the_simulated_one_behind_a_target() -> None:
 
 def test_nobody_there_says_what_to_look_at() -> None:
     rig = rig_at(("127.0.0.1", free_port()))
-    with pytest.raises(InputError, match=r"no UDP target answers at 127\.0\.0\.1.*shaketwin table"):
-        UdpBackend(rig, SPECIMEN, RATE, CLOCK).open()
+    with pytest.raises(InputError, match=r"127\.0\.0\.1") as error:
+        UdpBackend(rig, SPECIMEN, RATE_HZ, CLOCK).open()
+    assert "shaketwin table --rig udp_simulated" in error.value.remedy
 
 
 def test_the_machine_card_names_the_backend_and_asking_claims_nothing(target: Served) -> None:
@@ -175,7 +177,7 @@ def test_a_target_that_has_sent_very_many_packets_is_heard(
             self._sequence = sequence
 
     monkeypatch.setattr("table_io.sim.udp.server.UdpTarget", Old)
-    with served() as one, closing(driving(one.address)) as backend:
+    with serve_target() as server, closing(driving(server.address)) as backend:
         volts = np.concatenate([backend.read(100) for _ in range(5)], axis=1)
         backend.queue(1200, np.zeros(10))
     assert np.isfinite(volts).all()
@@ -187,30 +189,28 @@ def test_of_two_numbers_the_newer_is_less_than_half_way_round_ahead() -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "says"),
+    ("old", "new", "key"),
     [
-        ('target = "', 'target = "nowhere', r"udp\.target = 'nowhere"),
-        ('"\nreplace', '0000"\nreplace', "give HOST:PORT"),
-        ("replace_after_ms = 40.0", "replace_after_ms = 0", "replace_after_ms"),
-        ("replace_after_ms = 40.0", "rig_port = 70000", "rig_port"),
-        (
-            "replace_after_ms = 40.0",
-            "replace_after_ms = 20.0",
-            r"udp\.replace_after_ms = 20.0: .*needs 20 ms",
-        ),
-        ("[udp]", "[udpp]", r"needs a \[udp\] table"),
-        ("bits = 18", "bits = 16", "another rig file"),
+        ('target = "', 'target = "nowhere', "udp.target"),
+        ('"\nreplace', '0000"\nreplace', "udp.target"),
+        ("replace_after_ms = 40.0", "replace_after_ms = 0", "udp.replace_after_ms"),
+        ("replace_after_ms = 40.0", "rig_port = 70000", "udp.rig_port"),
+        ("replace_after_ms = 40.0", "replace_after_ms = 20.0", "udp.replace_after_ms"),
+        ("[udp]", "[udpp]", "udp"),
+        ("bits = 18", "bits = 16", ""),
     ],
 )
 def test_a_card_that_does_not_fit_says_where_and_what(
-    target: Served, old: str, new: str, says: str
+    target: Served, old: str, new: str, key: str
 ) -> None:
     def claim() -> None:
         rig = parse_toml(card(target.address, "").replace(old, new), RigConfig, "card")
-        UdpBackend(rig, SPECIMEN, RATE, CLOCK).open()
+        UdpBackend(rig, SPECIMEN, RATE_HZ, CLOCK).open()
 
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError) as error:
         claim()
+    assert key in [error.value.key, *(fault.key for fault in error.value.faults)]
+    assert bool(key) == (REASON_TEXTS[Reason.CARD] not in error.value.problem)
     again = rig_side(target.address)
     again.open()
     again.close()
@@ -218,7 +218,7 @@ def test_a_card_that_does_not_fit_says_where_and_what(
 
 def test_one_rig_at_a_time(target: Served) -> None:
     first = driving(target.address)
-    with pytest.raises(InputError, match="has a rig already"):
+    with pytest.raises(InputError, match=REASON_TEXTS[Reason.BUSY]):
         rig_side(target.address).open()
     assert np.isfinite(first.read(1200)).all(), "one that waits is alive"
     first.close()
@@ -234,23 +234,23 @@ def test_a_port_that_is_taken_is_named(target: Served) -> None:
 def test_a_rig_that_was_away_too_long_is_told_so(target: Served) -> None:
     backend = driving(target.address)
     CLOCK.wait_until(CLOCK.now() + HEARTBEAT_TIMEOUT_S + 0.15)
-    with pytest.raises(MachineLost, match=r"no packet.*plays to rest"):
+    with pytest.raises(MachineLost, match=REASON_TEXTS[Reason.SILENCE]):
         backend.read(2000)
-    with pytest.raises(MachineLost, match="no packet"):
+    with pytest.raises(MachineLost, match=REASON_TEXTS[Reason.SILENCE]):
         backend.queue(5000, np.zeros(2))
     backend.close()
     again = rig_side(target.address)
     again.open()  # waits for the rest
-    assert "at rest" in target.told[-1]
+    assert "at rest" in target.notices[-1]
     again.close()
 
 
 def test_a_target_that_is_switched_off_says_so_and_ends_at_rest() -> None:
-    with served() as one:
-        backend = driving(one.address)
-    with pytest.raises(MachineLost, match="switched off"):
+    with serve_target() as server:
+        backend = driving(server.address)
+    with pytest.raises(MachineLost, match=REASON_TEXTS[Reason.SWITCHED_OFF]):
         backend.read(20000)
-    assert "at rest" in one.told[-1]
+    assert "at rest" in server.notices[-1]
 
 
 class Mute(Relay):
@@ -258,7 +258,7 @@ class Mute(Relay):
 
     mute = False
 
-    def _mistreated(self, data: bytes, forth: bool) -> list[bytes]:
+    def _mistreat(self, data: bytes, forth: bool) -> list[bytes]:
         return [] if self.mute else [data]
 
 
@@ -274,7 +274,7 @@ def test_a_target_that_died_is_a_lost_machine_after_what_has_come(target: Served
 class Dropping(Relay):
     """Loses every packet that has sample 300, however often it comes."""
 
-    def _mistreated(self, data: bytes, forth: bool) -> list[bytes]:
+    def _mistreat(self, data: bytes, forth: bool) -> list[bytes]:
         state = None if forth else decode_target_state(data)
         if state is None or state.phase is not Phase.RUNNING:
             return [data]
@@ -296,7 +296,7 @@ def test_samples_that_never_come_are_nan_in_their_place(target: Served) -> None:
 
 def test_at_five_per_cent_of_every_evil_all_samples_come(target: Served) -> None:
     with (
-        relayed(target.address, seed=3, share=0.05) as relay,
+        relay_packets(target.address, seed=3, share=0.05) as relay,
         closing(rig_side(relay.address)) as backend,
     ):
         backend.open()
@@ -311,7 +311,7 @@ def test_at_five_per_cent_of_every_evil_all_samples_come(target: Served) -> None
 
 def test_the_c_target_survives_whatever_comes(tmp_path: Path) -> None:
     """Watched by the compiler's sanitizers: noise, spoilt words, and whole ones without sense."""
-    program, port, chance = sanitized(tmp_path), free_port(), np.random.default_rng(1)
+    program, port, chance = compile_sanitized(tmp_path), free_port(), np.random.default_rng(1)
     odd = [0, 1, 127, 128, 129, 511, 512, 65535, 65536, 65537, 2**31, 2**32 - 1]
     far = [*odd, -1, -(2**63), 2**63 - 1]
     with subprocess.Popen(
@@ -319,8 +319,8 @@ def test_the_c_target_survives_whatever_comes(tmp_path: Path) -> None:
     ) as process:
         assert process.stdout is not None
         assert "waiting" in process.stdout.readline()
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-            one.connect(("127.0.0.1", port))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as rig_socket:
+            rig_socket.connect(("127.0.0.1", port))
             for sequence in range(1, 4000):
                 kind = (PacketKind.QUEUE, PacketKind.BEAT, PacketKind.START)[
                     int(chance.integers(3))
@@ -329,7 +329,10 @@ def test_the_c_target_survives_whatever_comes(tmp_path: Path) -> None:
                 large = [far[i] for i in chance.integers(0, len(far), 3)]
                 values = chance.choice([0.0, 1e300, np.nan, np.inf], chance.integers(0, 129))
                 if sequence % 100 == 1:
-                    kind, values = PacketKind.CLAIM, np.array([RATE, 9.0, 0.0, 1.0, 1.0, 1.0, 1.0])
+                    kind, values = (
+                        PacketKind.CLAIM,
+                        np.array([RATE_HZ, 9.0, 0.0, 1.0, 1.0, 1.0, 1.0]),
+                    )
                 queue = sequence - int(chance.integers(2))
                 index, want_from, want_to = large
                 word = RigPacket(
@@ -338,8 +341,8 @@ def test_the_c_target_survives_whatever_comes(tmp_path: Path) -> None:
                 packet = bytearray(encode_rig_packet(word))
                 if sequence % 5 == 0:
                     packet[int(chance.integers(len(packet)))] ^= 1
-                one.send(packet[: int(chance.integers(1200)) if sequence % 7 == 0 else None])
-                one.send(chance.bytes(int(chance.integers(1200))))
+                rig_socket.send(packet[: int(chance.integers(1200)) if sequence % 7 == 0 else None])
+                rig_socket.send(chance.bytes(int(chance.integers(1200))))
                 if sequence % 50 == 0:
                     CLOCK.wait_until(CLOCK.now() + 0.005)
         wiring = rig_at(("127.0.0.1", port)).get_section(UdpWiring)

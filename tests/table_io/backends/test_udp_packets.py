@@ -41,7 +41,7 @@ from table_io.backends.udp.transfer import (
     ReceiveBuffer,
 )
 
-RATE = 2000.0
+RATE_HZ = 2000.0
 U32 = st.integers(0, 2**32 - 1)
 U64 = st.integers(0, 2**64 - 1)
 I64 = st.integers(-(2**63), 2**63 - 1)
@@ -56,13 +56,13 @@ STATES = st.builds(
 )  # fmt: skip
 
 
-def same(one: RigPacket | TargetState, other: RigPacket | TargetState | None) -> bool:
+def same(packet: RigPacket | TargetState, other: RigPacket | TargetState | None) -> bool:
     """True where every field is the same, NaN included."""
     return other is not None and all(
-        np.array_equal(getattr(one, f.name), getattr(other, f.name), equal_nan=True)
+        np.array_equal(getattr(packet, f.name), getattr(other, f.name), equal_nan=True)
         if f.name == "values"
-        else getattr(one, f.name) == getattr(other, f.name)
-        for f in fields(one)
+        else getattr(packet, f.name) == getattr(other, f.name)
+        for f in fields(packet)
     )
 
 
@@ -129,14 +129,14 @@ def test_samples_keep_their_place_in_whatever_order_they_come(cuts: list[int], c
     pieces = [(int(a), whole[:, a:b]) for a, b in itertools.pairwise(edges)]
     pieces += chance.sample(pieces, len(pieces) // 2)  # some twice
     chance.shuffle(pieces)
-    arriving, taken, there = ReceiveBuffer(2), [], set[int]()
+    arriving, taken, arrived = ReceiveBuffer(2), [], set[int]()
     for index, values in pieces:
         arriving.put(index, values)
-        there |= set(range(index, index + values.shape[1]))
-        missing = [i for i in range(max(there)) if i not in there]
-        assert arriving.complete == (missing[0] if missing else max(there) + 1)
+        arrived |= set(range(index, index + values.shape[1]))
+        missing = [i for i in range(max(arrived)) if i not in arrived]
+        assert arriving.complete == (missing[0] if missing else max(arrived) + 1)
         if missing:
-            known = next(i for i in range(missing[0], max(there) + 1) if i in there)
+            known = next(i for i in range(missing[0], max(arrived) + 1) if i in arrived)
             assert arriving.missing == (missing[0], known)
         taken.append(arriving.take((arriving.complete - arriving.first) // 2))
     taken.append(arriving.take(sum(cuts) - arriving.first))
@@ -167,9 +167,9 @@ def test_a_command_goes_in_a_window_and_what_is_not_heard_of_goes_again() -> Non
     first = delivery.pop_due(0.0)
     assert [piece for piece, _ in first] == list(range(WINDOW_PIECES))
     assert delivery.pop_due(0.5 * RESEND_S) == []
-    there = np.zeros(MAX_PIECES, dtype=np.bool_)
-    there[[0, 2, 3]] = True
-    delivery.confirm(there)
+    confirmed = np.zeros(MAX_PIECES, dtype=np.bool_)
+    confirmed[[0, 2, 3]] = True
+    delivery.confirm(confirmed)
     assert [piece for piece, _ in delivery.pop_due(0.6 * RESEND_S)] == [32, 33, 34]
     again = delivery.pop_due(1.1 * RESEND_S)
     assert [piece for piece, _ in again][:3] == [1, 4, 5]
@@ -177,8 +177,8 @@ def test_a_command_goes_in_a_window_and_what_is_not_heard_of_goes_again() -> Non
         np.testing.assert_array_equal(
             values, volts[VALUES_PER_PACKET * piece : VALUES_PER_PACKET * (piece + 1)]
         )
-    there[:40] = True
-    delivery.confirm(there)
+    confirmed[:40] = True
+    delivery.confirm(confirmed)
     ((piece, values),) = delivery.pop_due(9.0)
     assert (piece, values.tolist()) == (40, volts[-3:].tolist())
     assert CommandTransfer(np.zeros(RING_SAMPLES)).arrived.size == MAX_PIECES
@@ -189,9 +189,9 @@ def test_the_schedule_follows_the_clock_of_the_target(ppm: float) -> None:
     """An hour with 0.2 to 10 ms on the way: its schedule stays within a sample of the truth."""
     chance, pace = np.random.default_rng(1), 1.0 + ppm * 1e-6
     offset = ClockOffset(0.01, 0.0)
-    for now in np.arange(0.02, 60 * CLOCK_WINDOW_S, 0.005):
-        newest = int(now * pace * RATE)
-        offset.update(newest, RATE, float(now + chance.uniform(2e-4, 1e-2)))
-    true = now - newest / RATE
+    for now_s in np.arange(0.02, 60 * CLOCK_WINDOW_S, 0.005):
+        newest = int(now_s * pace * RATE_HZ)
+        offset.update(newest, RATE_HZ, float(now_s + chance.uniform(2e-4, 1e-2)))
+    true = now_s - newest / RATE_HZ
     assert abs(offset.epoch_s - true) < 2e-3
-    assert abs(now * (pace - 1)) > 5e-3 or not ppm, "the clocks have truly drifted apart"
+    assert abs(now_s * (pace - 1)) > 5e-3 or not ppm, "the clocks have truly drifted apart"

@@ -20,7 +20,7 @@ from table_io.clock import Clock
 from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
-from tests.table_io.backends.conformance import LOST, RATE, Bench
+from tests.table_io.backends.conformance import LOST, RATE_HZ, Bench
 
 Address = tuple[str, int]
 SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
@@ -29,8 +29,8 @@ SHIPPED = "127.0.0.1:7460"
 LOSS = f"""
 [[simulated.faults]]
 kind = "dropped"
-at_s = {LOST[0] / RATE}
-for_s = {len(LOST) / RATE}
+at_s = {LOST[0] / RATE_HZ}
+for_s = {len(LOST) / RATE_HZ}
 """
 SOURCES = Path(udp.__file__).parent
 FLAGS = ["-std=c99", "-O1", "-g", "-Wall", "-Wextra", "-Werror", "-Wconversion", "-pedantic"]
@@ -40,9 +40,9 @@ SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 
 def free_port() -> int:
     """A UDP port that nobody has now."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 def card(address: Address, loss: str = LOSS) -> str:
@@ -71,7 +71,7 @@ def python_target(folder: Path, loss: str = LOSS, *more: str) -> Iterator[Addres
             process.terminate()
 
 
-def compiled(folder: Path, *flags: str) -> Path:
+def compile_target(folder: Path, *flags: str) -> Path:
     """The C target, compiled with these flags; skips where there is no compiler."""
     compiler = shutil.which("cc")
     if compiler is None:
@@ -82,18 +82,18 @@ def compiled(folder: Path, *flags: str) -> Path:
     return program
 
 
-def sanitized(folder: Path) -> Path:
+def compile_sanitized(folder: Path) -> Path:
     """The C target, watched by the compiler's sanitizers where it has them."""
     try:
-        return compiled(folder, *SANITIZERS)
+        return compile_target(folder, *SANITIZERS)
     except subprocess.CalledProcessError:
-        return compiled(folder)
+        return compile_target(folder)
 
 
 @contextmanager
 def c_target(folder: Path) -> Iterator[Address]:
     """The C target with its demonstration plant; it ends without a fault."""
-    program = sanitized(folder)
+    program = compile_sanitized(folder)
     address = ("127.0.0.1", free_port())
     command = [str(program), address[0], str(address[1]), str(LOST[0]), str(len(LOST))]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
@@ -137,15 +137,15 @@ class Relay:
 
     def _run(self) -> None:
         while not self._over.is_set():
-            for one in select.select([self.front, self.back], [], [], 0.05)[0]:
+            for source in select.select([self.front, self.back], [], [], 0.05)[0]:
                 try:
-                    data, address = one.recvfrom(4096)
+                    data, address = source.recvfrom(4096)
                 except OSError:
                     continue  # nobody listens there now
-                if one is self.front:
+                if source is self.front:
                     self._rig = address
-                for packet in self._mistreated(data, one is self.front):
-                    self._send(packet, one is self.front)
+                for packet in self._mistreat(data, source is self.front):
+                    self._send(packet, source is self.front)
 
     def _send(self, packet: bytes, to_target: bool) -> None:
         self.passed += 1
@@ -157,7 +157,7 @@ class Relay:
         except OSError:
             pass
 
-    def _mistreated(self, data: bytes, forth: bool) -> list[bytes]:
+    def _mistreat(self, data: bytes, forth: bool) -> list[bytes]:
         """What becomes of a packet; one that is held back comes after the next."""
         draw = self._chance.random()
         evil = next((e for k, e in enumerate(EVILS) if draw < (k + 1) * self.share), "")
@@ -181,6 +181,6 @@ class Relay:
 
 
 @contextmanager
-def relayed(target: Address, seed: int, share: float = 0.01) -> Iterator[Relay]:
+def relay_packets(target: Address, seed: int, share: float = 0.01) -> Iterator[Relay]:
     with closing(Relay(target, seed, share)) as relay:
         yield relay

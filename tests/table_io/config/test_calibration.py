@@ -37,8 +37,8 @@ def test_the_sign_and_the_unit_of_the_convention() -> None:
 def test_both_directions_undo_each_other(offsets: list[float]) -> None:
     tare = dict(zip(RIG.channels, offsets, strict=True))
     values = ramp(len(RIG.sensors))
-    there = si_to_volts(values, RIG.sensors, tare)
-    np.testing.assert_allclose(volts_to_si(there, RIG.sensors, tare), values, rtol=0, atol=1e-12)
+    volts = si_to_volts(values, RIG.sensors, tare)
+    np.testing.assert_allclose(volts_to_si(volts, RIG.sensors, tare), values, rtol=0, atol=1e-12)
     back = si_to_volts(volts_to_si(values, RIG.sensors, tare), RIG.sensors, tare)
     np.testing.assert_allclose(back, values, rtol=0, atol=1e-9)
 

@@ -11,17 +11,18 @@ from table_io.config.calibration_fit import (
     fit_calibration,
     mean_voltage,
 )
+from table_io.errors import InputError
 
 SENSITIVITY, OFFSET = 0.13, -0.4  # volts = SENSITIVITY (value + OFFSET)
 
 
 def volts(applied: tuple[float, ...]) -> list[float]:
-    return [SENSITIVITY * (one + OFFSET) for one in applied]
+    return [SENSITIVITY * (value + OFFSET) for value in applied]
 
 
 def test_two_points_without_noise_are_exact() -> None:
     points = (0.0, 10.0)
-    fit = fit_calibration(points, 0.0, tuple(MeanVoltage(one, 0.0) for one in volts(points)))
+    fit = fit_calibration(points, 0.0, tuple(MeanVoltage(mean, 0.0) for mean in volts(points)))
     assert fit.volts_per_unit == pytest.approx(SENSITIVITY, rel=1e-12)
     assert fit.offset == pytest.approx(OFFSET, rel=1e-12)
     assert fit.linearity_percent is None
@@ -38,16 +39,16 @@ def test_the_uncertainty_is_the_scatter_of_many_calibrations(points: tuple[float
         fits.append(
             fit_calibration(points, 0.0, tuple(map(MeanVoltage, noisy.tolist(), sd.tolist())))
         )
-    stated = min(fits, key=lambda one: one.volts_per_unit_sd)  # not inflated by a chance scatter
-    assert np.std([one.volts_per_unit for one in fits]) == pytest.approx(
+    stated = min(fits, key=lambda fit: fit.volts_per_unit_sd)  # not inflated by a chance scatter
+    assert np.std([fit.volts_per_unit for fit in fits]) == pytest.approx(
         stated.volts_per_unit_sd, rel=0.06
     )
-    assert np.std([one.offset for one in fits]) == pytest.approx(stated.offset_sd, rel=0.06)
-    assert np.mean([one.volts_per_unit for one in fits]) == pytest.approx(SENSITIVITY, abs=2e-5)
+    assert np.std([fit.offset for fit in fits]) == pytest.approx(stated.offset_sd, rel=0.06)
+    assert np.mean([fit.volts_per_unit for fit in fits]) == pytest.approx(SENSITIVITY, abs=2e-5)
 
 
 def test_an_uncertain_reference_counts_as_noise() -> None:
-    points, means = (0.0, 10.0), tuple(MeanVoltage(one, 0.0) for one in volts((0.0, 10.0)))
+    points, means = (0.0, 10.0), tuple(MeanVoltage(mean, 0.0) for mean in volts((0.0, 10.0)))
     fit = fit_calibration(points, 0.05, means)
     # two independent errors of 0.05 over a span of 10
     assert fit.volts_per_unit_sd / SENSITIVITY == pytest.approx(math.sqrt(2) * 0.05 / 10.0)
@@ -55,9 +56,11 @@ def test_an_uncertain_reference_counts_as_noise() -> None:
 
 def test_a_bend_shows_as_linearity_and_widens_the_uncertainty() -> None:
     points = (-10.0, -5.0, 0.0, 5.0, 10.0)
-    bent = [one + 1e-3 * SENSITIVITY * x**2 for one, x in zip(volts(points), points, strict=True)]
-    fit = fit_calibration(points, 0.0, tuple(MeanVoltage(one, 1e-6) for one in bent))
-    straight = fit_calibration(points, 0.0, tuple(MeanVoltage(one, 1e-6) for one in volts(points)))
+    bent = [mean + 1e-3 * SENSITIVITY * x**2 for mean, x in zip(volts(points), points, strict=True)]
+    fit = fit_calibration(points, 0.0, tuple(MeanVoltage(mean, 1e-6) for mean in bent))
+    straight = fit_calibration(
+        points, 0.0, tuple(MeanVoltage(mean, 1e-6) for mean in volts(points))
+    )
     # residual of x^2 about its mean over these points: at most 5e-2 of 20
     assert fit.linearity_percent == pytest.approx(100 * 1e-3 * 50.0 / 20.0)
     assert straight.linearity_percent == pytest.approx(0.0, abs=1e-9)
@@ -66,13 +69,13 @@ def test_a_bend_shows_as_linearity_and_widens_the_uncertainty() -> None:
 
 def test_points_far_from_zero_and_near_together_are_no_trouble() -> None:
     points = (1e6, 1e6 + 1e-3)
-    fit = fit_calibration(points, 0.0, tuple(MeanVoltage(one, 1e-6) for one in volts(points)))
+    fit = fit_calibration(points, 0.0, tuple(MeanVoltage(mean, 1e-6) for mean in volts(points)))
     assert fit.volts_per_unit == pytest.approx(SENSITIVITY, rel=1e-6)
     assert fit.volts_per_unit_sd == pytest.approx(math.sqrt(2) * 1e-3, rel=1e-6)
 
 
 def test_all_alike_is_refused() -> None:
-    with pytest.raises(ValueError, match="equal"):
+    with pytest.raises(InputError):
         fit_calibration((1.0, 1.0), 0.0, (MeanVoltage(0.1, 1e-4), MeanVoltage(0.1, 1e-4)))
 
 
@@ -81,8 +84,8 @@ def test_the_standard_error_is_that_of_the_mean_also_of_slow_noise() -> None:
     slow = np.repeat(draw.standard_normal((400, 20)), 100, axis=1)  # 50 ms long each
     for noise in (draw.standard_normal((400, 2000)), slow):
         means = [mean_voltage(row) for row in noise]
-        scatter = np.std([one.volts for one in means])
-        stated = np.sqrt(np.mean([one.sd**2 for one in means]))
+        scatter = np.std([mean.volts for mean in means])
+        stated = np.sqrt(np.mean([mean.sd**2 for mean in means]))
         assert stated == pytest.approx(scatter, rel=0.1)
 
 

@@ -27,6 +27,7 @@ PAPER = {
     "gm10": (-10.0, TALL),
 }
 TOOLS = {"dwell", "track", "refine_g4"}
+PLANNED_BY_TWIN = {"g4_unstable"}  # without a drive before the twin has made its orbit plan
 
 
 def read(path: Path) -> Profile:
@@ -69,10 +70,16 @@ def test_the_files_that_users_script_against_are_there(name: str) -> None:
 
 
 def test_no_shipped_test_goes_unmentioned() -> None:
-    assert {path.stem for path in SHIPPED} == {*PAPER, "quickstart", "record_example", *TOOLS}
+    assert {path.stem for path in SHIPPED} == {
+        *PAPER, "quickstart", "record_example", *TOOLS, *PLANNED_BY_TWIN,
+    }  # fmt: skip
 
 
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [path for path in SHIPPED if path.stem not in PLANNED_BY_TWIN],
+    ids=lambda path: path.stem,
+)
 def test_a_shipped_test_passes_its_pre_flight_without_a_warning(path: Path) -> None:
     profile = read(path)
     rig = load_config(find_config(profile.rig, "rigs", path), RigConfig, "machine card")[0]

@@ -23,7 +23,7 @@ from table_io.safety.protection import (
 from table_io.sim.simulated_table import SimulatedBackend
 
 RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
-RANGE = 0.999  # of a sensor's range: at it
+AT_RANGE_SHARE = 0.999  # of a sensor's range: at it
 
 
 def machine(
@@ -45,7 +45,7 @@ class Played:
     findings: list[tuple[int, Finding]] = field(default_factory=list)
 
     def since(self, sample: int) -> list[tuple[int, Finding]]:
-        return [one for one in self.findings if one[0] > sample]
+        return [entry for entry in self.findings if entry[0] > sample]
 
 
 def play(
@@ -67,19 +67,19 @@ def play(
     guard = start_protection(profile, rig, measure_noise(volts, rig.sensors))
     if response is not None:
         guard = set_response(guard, response)
-    full = np.array([[abs(one.range_si * one.volts_per_si)] for one in rig.sensors])
+    full = np.array([[abs(sensor.range_si * sensor.volts_per_si)] for sensor in rig.sensors])
     backend.queue(0, command_to_volts(drive.command(0, drive.rest_start + 1), rig.output))
     backend.start()
     out = Played()
     while out.samples < (until or drive.rest_start + round(0.3 * rate)):
         volts, at = backend.read(block), out.samples
         values = volts_to_si(volts, rig.sensors, tare)
-        seen = Block("meas", at, rate, rig.channels, values, *drive.labels(at, block))
-        guard, found = inspect_samples(
-            guard, Observation.from_drive(seen, np.abs(volts) >= RANGE * full, drive)
+        acquired = Block("meas", at, rate, rig.channels, values, *drive.labels(at, block))
+        guard, findings = inspect_samples(
+            guard, Observation.from_drive(acquired, np.abs(volts) >= AT_RANGE_SHARE * full, drive)
         )
         out.samples += block
-        out.findings += [(out.samples, one) for one in found]
+        out.findings += [(out.samples, finding) for finding in findings]
         if stop_after is not None and out.since(stop_after):
             break
     return out

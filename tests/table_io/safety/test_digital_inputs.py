@@ -32,39 +32,39 @@ def beating(hz: float, count: int = LOOKS, well: bool = True) -> list[dict[str, 
     return [{"heartbeat": (2.0 * hz * k / 50.0) % 2.0 >= 1.0, "limit": well} for k in range(count)]
 
 
-def judged(held: list[dict[str, bool]], after: list[dict[str, bool]]) -> dict[str, CheckLine]:
-    return {one.name: one for one in check_digital_inputs(held, SECONDS, after, True, True)}
+def check_inputs(held: list[dict[str, bool]], after: list[dict[str, bool]]) -> dict[str, CheckLine]:
+    return {line.name: line for line in check_digital_inputs(held, SECONDS, after, True, True)}
 
 
 def test_a_heartbeat_that_beats_and_stops_passes() -> None:
-    found = judged(beating(10.0), beating(0.0, 25))
-    assert {one.verdict for one in found.values()} == {"pass"}
-    assert found["heartbeat comes back"].value == pytest.approx(10.0, abs=0.2)
+    lines = check_inputs(beating(10.0), beating(0.0, 25))
+    assert {line.verdict for line in lines.values()} == {"pass"}
+    assert lines["heartbeat comes back"].value == pytest.approx(10.0, abs=0.2)
 
 
 @pytest.mark.parametrize("hz", [0.0, 2.0, 20.0])
 def test_a_heartbeat_that_is_none_of_ours(hz: float) -> None:
-    found = judged(beating(hz), beating(0.0, 25))
-    assert found["heartbeat comes back"].verdict == "fail"
-    assert found["heartbeat comes back"].do
+    lines = check_inputs(beating(hz), beating(0.0, 25))
+    assert lines["heartbeat comes back"].verdict == "fail"
+    assert lines["heartbeat comes back"].do
 
 
 def test_a_heartbeat_that_goes_on_without_the_rig() -> None:
-    assert judged(beating(10.0), beating(10.0, 25))["heartbeat stops"].verdict == "fail"
+    assert check_inputs(beating(10.0), beating(10.0, 25))["heartbeat stops"].verdict == "fail"
 
 
 def test_a_switch_that_says_that_not_all_is_well_even_once() -> None:
     held = beating(10.0)
     held[77]["limit"] = False
-    line = judged(held, beating(0.0, 25))["all is well"]
+    line = check_inputs(held, beating(0.0, 25))["all is well"]
     assert (line.verdict, line.channel) == ("fail", "limit")
 
 
 def test_what_no_card_names_is_not_tested_and_what_to_do_is_said() -> None:
-    found = {one.name: one for one in check_digital_inputs([], SECONDS, [], True, False)}
-    assert {one.verdict for one in found.values()} == {"not tested"}
-    assert "heartbeat_back" in found["heartbeat comes back"].do
-    assert "by hand" in found["stroke limits and emergency stop"].do
+    lines = {line.name: line for line in check_digital_inputs([], SECONDS, [], True, False)}
+    assert {line.verdict for line in lines.values()} == {"not tested"}
+    assert "heartbeat_back" in lines["heartbeat comes back"].do
+    assert "by hand" in lines["stroke limits and emergency stop"].do
     assert check_digital_inputs([], SECONDS, [], False, True) == ()
 
 
@@ -82,7 +82,7 @@ class Nothing:
 
     moving = False
 
-    def play(self, now: float) -> list[Any]:
+    def play(self, now_s: float) -> list[Any]:
         return []
 
 
@@ -120,8 +120,10 @@ def test_the_vendors_client_reads_the_lines_of_the_card(lab: Lab) -> None:
 
 def test_a_line_that_the_device_has_not_is_said(lab: Lab) -> None:
     wiring, service, _ = lab
-    with pytest.raises(InputError, match=r"Dev1/port9/line9.*heartbeat_back and well"):
+    with pytest.raises(InputError) as error:
         NiDigitalInputs(wiring.model_copy(update={"well": {"limit": "Dev1/port9/line9"}}))
+    assert "Dev1/port9/line9" in error.value.key
+    assert "heartbeat_back and well" in error.value.remedy
     assert service.device.tasks == ()
 
 
@@ -129,12 +131,19 @@ def test_a_server_that_goes_is_a_lost_machine(lab: Lab) -> None:
     wiring, _, server = lab
     lines = NiDigitalInputs(wiring)
     server.stop(None).wait()
-    with pytest.raises(MachineLost, match="the digital inputs cannot be read"):
+    with pytest.raises(MachineLost):
         lines.read_levels()
     lines.close()
 
 
-@pytest.mark.parametrize("key", ["heartbeat_back = 'Dev1/ai0'", "well = { limit = 'port0' }"])
-def test_what_is_no_line_is_refused_by_the_card(key: str) -> None:
-    with pytest.raises(InputError, match=key.split(" ", maxsplit=1)[0]):
-        parse_toml(TEXT.replace("[ni]\n", f"[ni]\n{key}\n"), RigConfig, "card")
+@pytest.mark.parametrize(
+    ("line", "key"),
+    [
+        ("heartbeat_back = 'Dev1/ai0'", "ni.heartbeat_back"),
+        ("well = { limit = 'port0' }", "ni.well.limit"),
+    ],
+)
+def test_what_is_no_line_is_refused_by_the_card(line: str, key: str) -> None:
+    with pytest.raises(InputError) as error:
+        parse_toml(TEXT.replace("[ni]\n", f"[ni]\n{line}\n"), RigConfig, "card")
+    assert [fault.key for fault in error.value.faults] == [key]

@@ -16,6 +16,7 @@ from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.calibration import command_to_volts, compute_tare, measure_noise, volts_to_si
+from table_io.config.excitation.stepped_sine import Sweep
 from table_io.config.profile import Profile, load_profile
 from table_io.config.rig import RigConfig
 from table_io.excitation.drive import Drive
@@ -35,7 +36,9 @@ from tests.table_io.excitation.sine_segments import sine_segments
 
 RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 SHIPPED = sorted(
-    path.stem for path in (PROFILES_DIR / "tests").glob("*.toml") if load_profile(path)[0].steps
+    path.stem
+    for path in (PROFILES_DIR / "tests").glob("*.toml")
+    if isinstance(load_profile(path)[0].excitation, Sweep)
 )
 CELLS = RIGHT_CELLS + LEFT_CELLS
 TABLE_TWICE = "second derivative against table_acc_m_s2"
@@ -44,11 +47,11 @@ AGAINST = "polarity against the command"
 LAG = "polarity, lag behind the table"
 ALIVE = "alive, tone over noise"
 
-Heard = tuple[Profile, Block, Drive, dict[str, float]]
+CheckRun = tuple[Profile, Block, Drive, dict[str, float]]
 Change = Callable[[Float1D], Float1D]
 
 
-def shipped(name: str, **tables: dict[str, Any]) -> Profile:
+def load_shipped(name: str, **tables: dict[str, Any]) -> Profile:
     """A shipped test, with other values in some of its tables."""
     raw = load_profile(PROFILES_DIR / "tests" / f"{name}.toml")[0].model_dump()
     for table, values in tables.items():
@@ -64,7 +67,7 @@ def card(**tables: dict[str, Any]) -> RigConfig:
     return RigConfig.model_validate(raw)
 
 
-def checked(profile: Profile, rig: RigConfig = RIG) -> Heard:
+def run_loop_check(profile: Profile, rig: RigConfig = RIG) -> CheckRun:
     """The loop check of a profile as it is played, and what it recorded."""
     course: Trajectory = start_trajectory(profile)
     for aim in plan_targets(profile, rig):
@@ -90,12 +93,12 @@ def checked(profile: Profile, rig: RigConfig = RIG) -> Heard:
 
 
 @cache
-def recorded(name: str, rate_hz: float = 2000.0) -> Heard:
+def record_loop_check(name: str, rate_hz: float = 2000.0) -> CheckRun:
     """The clean check of a shipped test, once a run of the tests."""
-    return checked(shipped(name, acquisition={"rate_hz": rate_hz}))
+    return run_loop_check(load_shipped(name, acquisition={"rate_hz": rate_hz}))
 
 
-def altered(block: Block, changes: dict[str, Change]) -> Block:
+def alter_channels(block: Block, changes: dict[str, Change]) -> Block:
     """The recording with some channels changed."""
     values = block.values.copy()
     for name, change in changes.items():
@@ -104,12 +107,14 @@ def altered(block: Block, changes: dict[str, Change]) -> Block:
     return replace(block, values=values)
 
 
-def judged(heard: Heard, changes: dict[str, Change] | None = None) -> tuple[Check, ...]:
-    profile, block, drive, noise = heard
-    return evaluate(altered(block, changes or {}), drive, profile, RIG, noise)[0]
+def evaluate_checks(
+    check_run: CheckRun, changes: dict[str, Change] | None = None
+) -> tuple[Check, ...]:
+    profile, block, drive, noise = check_run
+    return evaluate(alter_channels(block, changes or {}), drive, profile, RIG, noise)[0]
 
 
-def failed(checks: tuple[Check, ...]) -> set[tuple[str, str]]:
+def list_failures(checks: tuple[Check, ...]) -> set[tuple[str, str]]:
     return {(check.name, check.channel) for check in checks if not check.passed}
 
 
@@ -132,16 +137,16 @@ def white(rms: float) -> Change:
 def test_three_frequencies_between_the_ends_of_the_sweep(
     name: str, frequencies_hz: tuple[float, ...]
 ) -> None:
-    found = plan_targets(shipped(name), RIG)
-    assert [aim.frequency_hz for aim in found] == pytest.approx(list(frequencies_hz))
-    assert [aim.level_m_s2 for aim in found] == pytest.approx([0.1 * 0.05 * 9.80665] * 3)
+    targets = plan_targets(load_shipped(name), RIG)
+    assert [aim.frequency_hz for aim in targets] == pytest.approx(list(frequencies_hz))
+    assert [aim.level_m_s2 for aim in targets] == pytest.approx([0.1 * 0.05 * 9.80665] * 3)
 
 
 def test_given_frequencies_are_taken_upwards_and_a_single_step_needs_one() -> None:
-    given = shipped("g4_ss3", loop_check={"frequencies_hz": (4.0, 0.7), "level": 0.05})
+    given = load_shipped("g4_ss3", loop_check={"frequencies_hz": (4.0, 0.7), "level": 0.05})
     assert [aim.frequency_hz for aim in plan_targets(given, RIG)] == [0.7, 4.0]
     assert plan_targets(given, RIG)[0].level_m_s2 == pytest.approx(0.05 * 0.05 * 9.80665)
-    single = shipped("g4_ss3", excitation={"start_hz": 3.0, "stop_hz": 3.0})
+    single = load_shipped("g4_ss3", excitation={"start_hz": 3.0, "stop_hz": 3.0})
     assert [aim.frequency_hz for aim in plan_targets(single, RIG)] == [3.0]
 
 
@@ -149,9 +154,9 @@ def test_harmonics_to_cancel_are_looked_at_as_far_as_the_machine_allows() -> Non
     fine = {"output": {"bits": 24}}
     for stop_hz, top_hz in ((2.5, 12.5), (10.0, 20.0)):  # five times, and the card's 20 Hz
         sweep = {"start_hz": 0.5, "stop_hz": stop_hz}
-        plain = plan_targets(shipped("gm10", excitation=sweep), card(**fine))
+        plain = plan_targets(load_shipped("gm10", excitation=sweep), card(**fine))
         more = plan_targets(
-            shipped("gm10", excitation=sweep, control={"harmonics": True}), card(**fine)
+            load_shipped("gm10", excitation=sweep, control={"harmonics": True}), card(**fine)
         )
         assert more[:3] == plain
         assert more[-1].frequency_hz == pytest.approx(top_hz)
@@ -163,23 +168,23 @@ def test_harmonics_to_cancel_are_looked_at_as_far_as_the_machine_allows() -> Non
 def test_an_amplitude_below_the_converter_gives_way_never_the_tenth_of_the_level(
     bits: int, level: float
 ) -> None:
-    profile = shipped("gm10", loop_check={"level": level})
+    profile = load_shipped("gm10", loop_check={"level": level})
     rig = card(output={"bits": bits})
-    found = plan_targets(profile, rig)
-    for aim in found:
+    targets = plan_targets(profile, rig)
+    for aim in targets:
         amplitude = aim.level_m_s2 / (2 * math.pi * aim.frequency_hz) ** 2
         assert amplitude >= rig.output.least_lsb * rig.output.lsb_m * (1 - 1e-9)
         assert aim.level_m_s2 <= 0.1 * 0.05 * 9.80665 * (1 + 1e-9)
     # 12 bits of 60 mm are 29 um: 20 of them at a tenth of the level need 1.46 Hz or less.
-    assert found[-1].frequency_hz == pytest.approx(1.4560 if bits == 12 else min(10.0, math.sqrt(
+    assert targets[-1].frequency_hz == pytest.approx(1.4560 if bits == 12 else min(10.0, math.sqrt(
         0.1 * 0.05 * 9.80665 / (20 * 0.12 / 2**bits)) / (2 * math.pi)), rel=1e-4)  # fmt: skip
     if bits == 18 and level == 0.02:
-        assert found[0].level_m_s2 == pytest.approx(0.02 * 0.05 * 9.80665)
-        assert found[-1].level_m_s2 > 3 * found[0].level_m_s2  # raised, for its DAC steps
+        assert targets[0].level_m_s2 == pytest.approx(0.02 * 0.05 * 9.80665)
+        assert targets[-1].level_m_s2 > 3 * targets[0].level_m_s2  # raised, for its DAC steps
 
 
 def test_a_motion_is_held_for_the_cycles_of_the_card_and_two_seconds() -> None:
-    profile = shipped("gm10", loop_check={"cycles": 7})
+    profile = load_shipped("gm10", loop_check={"cycles": 7})
     held = [count_hold_cycles(aim, profile) - SETTLE_CYCLES for aim in plan_targets(profile, RIG)]
     assert held == [7, 7, 20]
 
@@ -193,18 +198,20 @@ def test_a_motion_is_held_for_the_cycles_of_the_card_and_two_seconds() -> None:
     + [(name, rate) for rate in (1000.0, 4000.0) for name in ("ginf", "g4_ss2", "g0", "gm10")],
 )
 def test_a_clean_table_passes_every_line(name: str, rate_hz: float) -> None:
-    checks = judged(recorded(name, rate_hz))
-    assert failed(checks) == set()
+    checks = evaluate_checks(record_loop_check(name, rate_hz))
+    assert list_failures(checks) == set()
     names = {check.name for check in checks}
     assert {AGAINST, LAG, ALIVE, TABLE_TWICE, MASS_TWICE, "gain", "delay", "offset"} <= names
     assert {check.channel for check in checks} >= set(RIG.channels)
 
 
 def test_bumpers_that_are_touched_at_low_level_fail_nothing() -> None:
-    profile, block, *_ = recorded("g4_ss2")
+    profile, block, *_ = record_loop_check("g4_ss2")
     assert block.channel("force_r1_n").max() > 5 * profile.comparison.contact_n
-    checks = judged(recorded("g4_ss2"))
-    assert ("polarity in contact", "force_l2_n") in {(one.name, one.channel) for one in checks}
+    checks = evaluate_checks(record_loop_check("g4_ss2"))
+    assert ("polarity in contact", "force_l2_n") in {
+        (check.name, check.channel) for check in checks
+    }
 
 
 def truth(f: float, stiffness_n_m: float, damping_n_s_m: float, delay_s: float) -> complex:
@@ -225,7 +232,7 @@ def truth(f: float, stiffness_n_m: float, damping_n_s_m: float, delay_s: float) 
 def test_the_response_is_that_of_the_servo(
     name: str, stiffness_n_m: float, damping_n_s_m: float
 ) -> None:
-    profile, block, drive, noise = recorded(name)
+    profile, block, drive, noise = record_loop_check(name)
     response = evaluate(block, drive, profile, RIG, noise)[1]
     assert response is not None
     for place, f in enumerate(response.frequencies_hz):
@@ -234,15 +241,15 @@ def test_the_response_is_that_of_the_servo(
         assert response.phase_rad[place] == pytest.approx(cmath.phase(true), abs=math.radians(1))
     for f in (0.5, 1.7, 3.3, profile.sweep.stop_hz):
         true = truth(f, stiffness_n_m, damping_n_s_m, 5e-3)
-        found = evaluate_transfer(response, f)
-        assert abs(found) == pytest.approx(abs(true), rel=1e-2)
-        assert cmath.phase(found / true) == pytest.approx(0.0, abs=math.radians(2))
+        transfer = evaluate_transfer(response, f)
+        assert abs(transfer) == pytest.approx(abs(true), rel=1e-2)
+        assert cmath.phase(transfer / true) == pytest.approx(0.0, abs=math.radians(2))
 
 
 # ---- planted faults
 
 
-def flipped(values: Float1D) -> Float1D:
+def flip_sign(values: Float1D) -> Float1D:
     return -values
 
 
@@ -252,23 +259,23 @@ def dead(values: Float1D) -> Float1D:
 
 FAULTS: dict[str, tuple[dict[str, Change], set[tuple[str, str]]]] = {
     "table laser reversed": (
-        {"table_disp_m": flipped},
+        {"table_disp_m": flip_sign},
         {(AGAINST, "table_disp_m"), (TABLE_TWICE, "table_disp_m")},
     ),
     "table accelerometer reversed": (
-        {"table_acc_m_s2": flipped},
+        {"table_acc_m_s2": flip_sign},
         {(AGAINST, "table_acc_m_s2"), (TABLE_TWICE, "table_disp_m")},
     ),
     "mass laser looks from the other side": (
-        {"mass_disp_m": flipped},
+        {"mass_disp_m": flip_sign},
         {(LAG, "mass_disp_m"), (MASS_TWICE, "mass_disp_m")},
     ),
     "mass accelerometer reversed": (
-        {"mass_acc_m_s2": flipped},
+        {"mass_acc_m_s2": flip_sign},
         {(LAG, "mass_acc_m_s2"), (MASS_TWICE, "mass_disp_m")},
     ),
     "both sensors of the mass reversed": (
-        {"mass_acc_m_s2": flipped, "mass_disp_m": flipped},
+        {"mass_acc_m_s2": flip_sign, "mass_disp_m": flip_sign},
         {(LAG, "mass_acc_m_s2"), (LAG, "mass_disp_m")},
     ),
     "table laser 25 % too much": (
@@ -333,62 +340,77 @@ FAULTS: dict[str, tuple[dict[str, Change], set[tuple[str, str]]]] = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_planted_fault_fails_its_own_lines(fault: str) -> None:
     changes, lines = FAULTS[fault]
-    assert failed(judged(recorded("g4_ss3"), changes)) == lines
+    assert list_failures(evaluate_checks(record_loop_check("g4_ss3"), changes)) == lines
 
 
 @pytest.mark.parametrize("cell", CELLS)
 def test_a_load_cell_shows_its_sign_and_its_death_in_contact_only(cell: str) -> None:
-    for change, name in ((flipped, "polarity in contact"), (white(1.0), "")):
+    for change, name in ((flip_sign, "polarity in contact"), (white(1.0), "")):
         changes = {cell: change if name else lambda values, noise=change: noise(0 * values)}
         line = name or "force ratio to its neighbour"
-        assert failed(judged(recorded("gm1"), changes)) == {(line, cell)}
+        assert list_failures(evaluate_checks(record_loop_check("gm1"), changes)) == {(line, cell)}
         # Nothing touches here, so a cell without force and a reversed one look like a sound one.
-        assert failed(judged(recorded("ginf"), changes)) == set()
+        assert list_failures(evaluate_checks(record_loop_check("ginf"), changes)) == set()
 
 
 def test_a_load_cell_that_does_not_even_flicker_is_dead_without_contact() -> None:
-    profile, block, drive, _ = recorded("ginf")
+    profile, block, drive, _ = record_loop_check("ginf")
     changes: dict[str, Change] = {"force_r1_n": dead}
-    checks, _ = evaluate(altered(block, changes), drive, profile, RIG)
-    assert failed(checks) == {("alive, noise at rest", "force_r1_n")}
+    checks, _ = evaluate(alter_channels(block, changes), drive, profile, RIG)
+    assert list_failures(checks) == {("alive, noise at rest", "force_r1_n")}
 
 
 def test_the_motion_of_the_table_on_a_load_cell_is_cross_talk() -> None:
-    heard = recorded("g4_ss3")
-    table = heard[1].channel("table_acc_m_s2")
+    check_run = record_loop_check("g4_ss3")
+    table = check_run[1].channel("table_acc_m_s2")
     line = ("cross-talk from the motion", "force_r1_n")
     # Judged at the test's level, ten times that of the check: 0.49 m/s2, allowed half of 10 N.
-    assert failed(judged(heard, {"force_r1_n": lambda values: values + 15 * table})) == {line}
-    assert failed(judged(heard, {"force_r1_n": lambda values: values + 5 * table})) == set()
+    assert list_failures(
+        evaluate_checks(check_run, {"force_r1_n": lambda values: values + 15 * table})
+    ) == {line}
+    assert (
+        list_failures(evaluate_checks(check_run, {"force_r1_n": lambda values: values + 5 * table}))
+        == set()
+    )
 
 
 def test_a_unit_of_the_table_laser_a_thousand_times_wrong_fails_its_gain() -> None:
     changes: dict[str, Change] = {"table_disp_m": lambda values: 1e3 * values}
-    checks = judged(recorded("g4_ss3"), changes)
-    assert {channel for _, channel in failed(checks)} == {"table_disp_m"}
-    (gain,) = (one for one in checks if (one.name, one.channel) == ("gain", "table_disp_m"))
+    checks = evaluate_checks(record_loop_check("g4_ss3"), changes)
+    assert {channel for _, channel in list_failures(checks)} == {"table_disp_m"}
+    (gain,) = (check for check in checks if (check.name, check.channel) == ("gain", "table_disp_m"))
     assert gain.value == pytest.approx(1000.0, rel=0.01)
     assert not gain.passed
 
 
 def test_laser_and_accelerometer_of_the_table_swapped() -> None:
-    heard = recorded("g4_ss3")
-    disp, acc = (heard[1].channel(name) for name in ("table_disp_m", "table_acc_m_s2"))
-    lines = failed(judged(heard, {"table_disp_m": lambda _: acc, "table_acc_m_s2": lambda _: disp}))
+    check_run = record_loop_check("g4_ss3")
+    disp, acc = (check_run[1].channel(name) for name in ("table_disp_m", "table_acc_m_s2"))
+    lines = list_failures(
+        evaluate_checks(
+            check_run, {"table_disp_m": lambda _: acc, "table_acc_m_s2": lambda _: disp}
+        )
+    )
     for channel in ("table_disp_m", "table_acc_m_s2"):
         assert {(AGAINST, channel), ("gain", channel)} <= lines
     assert {channel for _, channel in lines} == {"table_disp_m", "table_acc_m_s2"}
 
 
 def test_a_table_that_answers_too_late_fails_the_delay() -> None:
-    heard = checked(shipped("g4_ss3"), card(simulated={"servo_delay_ms": 120.0}))
-    assert failed(judged(heard)) == {("delay", "table_disp_m"), ("delay", "table_acc_m_s2")}
+    check_run = run_loop_check(load_shipped("g4_ss3"), card(simulated={"servo_delay_ms": 120.0}))
+    assert list_failures(evaluate_checks(check_run)) == {
+        ("delay", "table_disp_m"),
+        ("delay", "table_acc_m_s2"),
+    }
 
 
 def test_a_servo_too_slow_for_the_sweep_fails_at_its_highest_frequency() -> None:
-    heard = checked(shipped("gm10"), card(simulated={"servo_bandwidth_hz": 5.0}))
+    check_run = run_loop_check(load_shipped("gm10"), card(simulated={"servo_bandwidth_hz": 5.0}))
     line = "gain at the highest frequency"
-    assert failed(judged(heard)) == {(line, "table_disp_m"), (line, "table_acc_m_s2")}
+    assert list_failures(evaluate_checks(check_run)) == {
+        (line, "table_disp_m"),
+        (line, "table_acc_m_s2"),
+    }
 
 
 def test_a_table_that_hunts_after_the_check_is_not_quiet() -> None:
@@ -396,7 +418,7 @@ def test_a_table_that_hunts_after_the_check_is_not_quiet() -> None:
         values[-4000:] += 0.05 * np.sin(2 * math.pi * 30 * np.arange(4000) / 2000)
         return values
 
-    lines = failed(judged(recorded("g4_ss3"), {"table_acc_m_s2": hunts}))
+    lines = list_failures(evaluate_checks(record_loop_check("g4_ss3"), {"table_acc_m_s2": hunts}))
     assert lines == {("motion left after the check", "table_acc_m_s2")}
 
 
@@ -405,19 +427,22 @@ def test_how_long_the_mass_rings_is_its_own_affair() -> None:
         values[-2000:] += 0.2 * np.sin(2 * math.pi * 1.3 * np.arange(2000) / 2000)
         return values
 
-    assert failed(judged(recorded("g4_ss3"), {"mass_acc_m_s2": rings})) == set()
+    assert (
+        list_failures(evaluate_checks(record_loop_check("g4_ss3"), {"mass_acc_m_s2": rings}))
+        == set()
+    )
 
 
 def test_a_mass_that_uneven_bumpers_press_aside_is_not_off() -> None:
     gaps = {"gap_mm": -2.0, "gap_right_mm": -3.0, "gap_left_mm": 1.0}
-    heard = checked(shipped("quickstart", specimen=gaps))
-    assert heard[1].channel("mass_disp_m")[:1000].mean() < -1e-3
-    assert failed(judged(heard)) == set()
+    check_run = run_loop_check(load_shipped("quickstart", specimen=gaps))
+    assert check_run[1].channel("mass_disp_m")[:1000].mean() < -1e-3
+    assert list_failures(evaluate_checks(check_run)) == set()
 
 
 def test_a_sensor_that_errs_at_one_frequency_only_leaves_the_smooth_curve() -> None:
-    heard = recorded("gm10")
-    held = [one for one in sine_segments(heard[2]) if one.label == Label.CHECK][1]
+    check_run = record_loop_check("gm10")
+    held = [segment for segment in sine_segments(check_run[2]) if segment.label == Label.CHECK][1]
     middle = slice(held.start, held.end)
 
     def louder(values: Float1D) -> Float1D:
@@ -428,9 +453,9 @@ def test_a_sensor_that_errs_at_one_frequency_only_leaves_the_smooth_curve() -> N
         values[middle] = np.roll(values[middle], 60)
         return values
 
-    loud = failed(judged(heard, {"table_acc_m_s2": louder}))
+    loud = list_failures(evaluate_checks(check_run, {"table_acc_m_s2": louder}))
     assert loud == {("gain off a smooth curve", "table_acc_m_s2"), (TABLE_TWICE, "table_disp_m")}
-    late = failed(judged(heard, {"table_acc_m_s2": later}))
+    late = list_failures(evaluate_checks(check_run, {"table_acc_m_s2": later}))
     assert late == {("delay over the frequencies", "table_acc_m_s2"), (TABLE_TWICE, "table_disp_m")}
 
 
@@ -438,7 +463,7 @@ def test_the_weak_form_needs_neither_a_steady_motion_nor_a_tare() -> None:
     rate, f = 2000.0, 1.0
     t = np.arange(10000) / rate
 
-    def moved(order: int) -> Float1D:
+    def evaluate_motion(order: int) -> Float1D:
         """Order-th derivative of a growing motion at 1 Hz, one at 1.3 Hz, and an offset."""
         growing = np.exp((0.3 + 2j * math.pi * f) * t) * (0.3 + 2j * math.pi * f) ** order
         other = np.exp(2j * math.pi * 1.3 * t) * (2j * math.pi * 1.3) ** order
@@ -446,12 +471,12 @@ def test_the_weak_form_needs_neither_a_steady_motion_nor_a_tare() -> None:
         return 1e-3 * np.imag(growing + 2 * other) + offset
 
     error, scatter = derivative_mismatch(
-        (moved(0), 0.0), (moved(2), 1e-3), f * t, 2 * math.pi * f, rate
+        (evaluate_motion(0), 0.0), (evaluate_motion(2), 1e-3), f * t, 2 * math.pi * f, rate
     )
     assert error < 4e-4
     assert 0 < scatter < 0.01
     error, _ = derivative_mismatch(
-        (1.1 * moved(0), 0.0), (moved(2), 0.0), f * t, 2 * math.pi * f, rate
+        (1.1 * evaluate_motion(0), 0.0), (evaluate_motion(2), 0.0), f * t, 2 * math.pi * f, rate
     )
     assert error == pytest.approx(0.1, abs=1e-3)
 
@@ -462,14 +487,14 @@ def test_a_few_lost_samples_are_borne(share: float, lines: int) -> None:
         values[np.random.default_rng(2).random(values.size) < share] = np.nan
         return values
 
-    found = failed(judged(recorded("g4_ss3"), {"mass_acc_m_s2": holes}))
-    assert found == {("lost samples", "mass_acc_m_s2")} if lines else found == set()
+    failures = list_failures(evaluate_checks(record_loop_check("g4_ss3"), {"mass_acc_m_s2": holes}))
+    assert failures == {("lost samples", "mass_acc_m_s2")} if lines else failures == set()
 
 
 def test_the_noise_at_the_tare_counts_too() -> None:
-    profile, block, drive, noise = recorded("g4_ss3")
+    profile, block, drive, noise = record_loop_check("g4_ss3")
     checks, _ = evaluate(block, drive, profile, RIG, noise | {"mass_acc_m_s2": 0.05})
-    assert failed(checks) == {("noise under the level", "mass_acc_m_s2")}
+    assert list_failures(checks) == {("noise under the level", "mass_acc_m_s2")}
 
 
 # ---- only the channels at hand
@@ -481,16 +506,16 @@ def with_channels(block: Block, names: tuple[str, ...]) -> Block:
 
 
 def test_what_was_not_measured_is_not_judged() -> None:
-    profile, block, drive, noise = recorded("g4_ss3")
+    profile, block, drive, noise = record_loop_check("g4_ss3")
     least = with_channels(block, ("drive_disp_m", "table_disp_m", "table_acc_m_s2"))
     checks, response = evaluate(least, drive, profile, RIG, noise)
-    assert failed(checks) == set()
+    assert list_failures(checks) == set()
     assert {check.channel for check in checks} == set(least.channels)
     assert response == evaluate(block, drive, profile, RIG, noise)[1]
 
 
 def test_a_sensor_of_the_relative_displacement_is_held_against_the_accelerometer() -> None:
-    profile, block, drive, noise = recorded("g4_ss3")
+    profile, block, drive, noise = record_loop_check("g4_ss3")
     u = block.channel("mass_disp_m") - block.channel("table_disp_m")
     kept = tuple(name for name in block.channels if name != "mass_disp_m")
     sensors = [
@@ -504,20 +529,22 @@ def test_a_sensor_of_the_relative_displacement_is_held_against_the_accelerometer
         values = np.vstack([with_channels(block, kept).values, sign * u])
         measured = replace(block, channels=(*kept, "rel_disp_m"), values=values)
         checks, _ = evaluate(measured, drive, profile, rig, noise)
-        assert ("lost samples", "rel_disp_m") in {(one.name, one.channel) for one in checks}
-        assert failed(checks) == lines
+        assert ("lost samples", "rel_disp_m") in {(check.name, check.channel) for check in checks}
+        assert list_failures(checks) == lines
 
 
 def test_no_check_no_lines() -> None:
-    profile, block, _, noise = recorded("g4_ss3")
+    profile, block, _, noise = record_loop_check("g4_ss3")
     drive = start_trajectory(profile).to_drive(())
     assert evaluate(block, drive, profile, RIG, noise) == ((), None)
 
 
 def test_every_line_that_can_fail_says_what_to_do() -> None:
-    seen = {check for name in ("g4_ss2", "gm1") for check in judged(recorded(name))}
-    for check in seen:
+    checks = {
+        check for name in ("g4_ss2", "gm1") for check in evaluate_checks(record_loop_check(name))
+    }
+    for check in checks:
         limited = math.isfinite(check.low) or math.isfinite(check.high)
         assert bool(find_remedy(check)) == limited, check.name
     for start in REMEDIES:
-        assert any(check.name.startswith(start) for check in seen)
+        assert any(check.name.startswith(start) for check in checks)

@@ -47,12 +47,20 @@ def rows(test: Profile, card: RigConfig = RIG) -> tuple[StepDemand, ...]:
     return compute_demands(plan_sweep(test), test, card)
 
 
-def refusal(test: Profile, card: RigConfig) -> list[str]:
+SLOWEST = "step 0 (0.5 Hz forward)"
+
+
+def list_faults(test: Profile, card: RigConfig) -> tuple[InputError, ...]:
+    """The faults of a test that is refused as a whole."""
     with pytest.raises(InputError) as caught:
         check_limits(rows(test, card), test, card, "a.toml")
-    head, *faults = str(caught.value).splitlines()
-    assert head == "a.toml: the table 'simulated' cannot do this test; nothing was started"
-    return [fault.strip() for fault in faults]
+    assert caught.value.where == "a.toml"
+    return caught.value.faults
+
+
+def stated_number(fault: InputError) -> float:
+    """The quantity that a fault states, in its unit."""
+    return float(fault.problem.split()[0])
 
 
 def test_margins_agree_with_closed_forms() -> None:
@@ -87,34 +95,39 @@ def test_a_16_bit_output_of_100_mm_has_41_steps_left_at_10_hz() -> None:
 
 
 @pytest.mark.parametrize(
-    ("table", "changes", "parts"),
+    ("table", "changes", "where", "key", "number", "allowed"),
     [
-        ("limits", {"stroke_mm": 40.0}, ("step 0 (0.5 Hz forward)", "displacement 49.6", "40 mm")),
-        ("output", {"span_mm": 45.0}, ("step 0 (0.5 Hz forward)", "displacement 49.6", "45 mm")),
-        ("limits", {"velocity_mm_s": 100.0}, ("(0.5 Hz ", "velocity 15", "100 mm/s")),
-        ("limits", {"acceleration_g": 0.04}, ("acceleration 0.05", "at most 0.04 g")),
-        ("limits", {"force_kn": 1.0}, ("force 1.2", "at most 1 kN")),
-        ("limits", {"frequency_hz": 9.0}, ("sweep.stop_hz 10 Hz", "at most 9")),
-        ("output", {"bits": 12}, ("step 1 (10 Hz)", "4.2 steps of the DAC", "at least 20")),
+        ("limits", {"stroke_mm": 40.0}, SLOWEST, "displacement", 49.67, "at most 40 mm"),
+        ("output", {"span_mm": 45.0}, SLOWEST, "displacement", 49.67, "at most 45 mm"),
+        ("limits", {"velocity_mm_s": 100.0}, SLOWEST, "velocity", 156.1, "at most 100 mm/s"),
+        ("limits", {"acceleration_g": 0.04}, SLOWEST, "acceleration", 0.05, "at most 0.04 g"),
+        ("limits", {"force_kn": 1.0}, SLOWEST, "force", 1.27, "at most 1 kN"),
+        ("output", {"bits": 12}, "step 1 (10 Hz)", "amplitude", 4.2, "at least 20"),
     ],
-    ids=["stroke", "span", "velocity", "acceleration", "force", "frequency", "resolution"],
+    ids=["stroke", "span", "velocity", "acceleration", "force", "resolution"],
 )
 def test_a_refusal_names_the_step_and_the_limit(
-    table: str, changes: dict[str, float], parts: tuple[str, ...]
+    table: str, changes: dict[str, float], where: str, key: str, number: float, allowed: str
 ) -> None:
-    (fault,) = refusal(profile(), rig(table, **changes))
-    for part in parts:
-        assert part in fault
+    (fault,) = list_faults(profile(), rig(table, **changes))
+    assert (fault.where.split(" and ")[0], fault.key, fault.allowed) == (where, key, allowed)
+    assert stated_number(fault) == pytest.approx(number, rel=0.05)
+
+
+def test_a_frequency_beyond_the_limit_is_refused() -> None:
+    (fault,) = list_faults(profile(), rig(frequency_hz=9.0))
+    assert (fault.key, fault.value, fault.allowed) == ("sweep.stop_hz", 10.0, "at most 9")
 
 
 def test_a_rate_that_the_card_does_not_have_is_refused() -> None:
-    (fault,) = refusal(profile(acquisition={"rate_hz": 1500.0}), RIG)
-    assert fault == "acquisition.rate_hz 1500 Hz; allowed: 1000, 2000, 4000"
+    (fault,) = list_faults(profile(acquisition={"rate_hz": 1500.0}), RIG)
+    assert (fault.key, fault.value) == ("acquisition.rate_hz", 1500.0)
+    assert fault.allowed == "1000, 2000, 4000"
 
 
 def test_all_limits_that_are_exceeded_stand_in_one_refusal() -> None:
     card = rig(stroke_mm=1.0, velocity_mm_s=1.0, acceleration_g=0.01, force_kn=0.1)
-    faults = refusal(profile(acquisition={"rate_hz": 1500.0}), card)
+    faults = list_faults(profile(acquisition={"rate_hz": 1500.0}), card)
     assert len(faults) == 5
 
 
@@ -133,55 +146,58 @@ def with_check(test: Profile, card: RigConfig = RIG) -> tuple[StepDemand, ...]:
 
 
 def test_the_loop_check_has_rows_of_its_own_before_the_steps() -> None:
-    found = with_check(profile())
-    assert [row.step for row in found] == [-1, -1, -1, 0, 1, 2, 3]
-    assert [row.name for row in found[:1]] == ["loop check (1 Hz)"]
-    for row, f in zip(found, (1.0, math.sqrt(10.0), 10.0), strict=False):
+    demands = with_check(profile())
+    assert [row.step for row in demands] == [-1, -1, -1, 0, 1, 2, 3]
+    assert [row.name for row in demands[:1]] == ["loop check (1 Hz)"]
+    for row, f in zip(demands, (1.0, math.sqrt(10.0), 10.0), strict=False):
         assert row.frequency_hz == pytest.approx(f)
         assert row.acceleration_m_s2 == pytest.approx(0.1 * A, rel=0.06)
         assert row.amplitude_lsb == pytest.approx(
             0.1 * A / (2 * math.pi * f) ** 2 / RIG.output.lsb_m
         )
     # The smallest amplitude of the check has 27 DAC steps: neither refused nor warned of.
-    assert found[2].amplitude_lsb < RIG.output.warn_lsb
-    check_limits(found, profile(), RIG, "a.toml")
-    check_limits((replace(found[0], amplitude_lsb=5.0), *found[1:]), profile(), RIG, "a.toml")
-    assert list_drive_warnings(found, RIG) == []
+    assert demands[2].amplitude_lsb < RIG.output.warn_lsb
+    check_limits(demands, profile(), RIG, "a.toml")
+    check_limits((replace(demands[0], amplitude_lsb=5.0), *demands[1:]), profile(), RIG, "a.toml")
+    assert list_drive_warnings(demands, RIG) == []
 
 
 def test_a_loop_check_that_the_table_cannot_do_is_refused_by_name() -> None:
     test = profile(loop_check={"frequencies_hz": (0.05, 30.0)})
     with pytest.raises(InputError) as caught:
         check_limits(with_check(test), test, RIG, "a.toml")
-    text = str(caught.value)
-    assert "loop_check.frequencies_hz 30 Hz; allowed: at most 20" in text
-    assert "loop check (0.05 Hz) and 1 more: displacement 496" in text
-    assert "Raise loop_check.frequencies_hz or lower loop_check.level" in text
+    faults = {fault.key: fault for fault in caught.value.faults}
+    top = faults["loop_check.frequencies_hz"]
+    assert (top.value, top.allowed) == (30.0, "at most 20")
+    assert faults["displacement"].where == "loop check (0.05 Hz) and 1 more"
+    assert stated_number(faults["displacement"]) == pytest.approx(496.9, rel=0.01)
+    assert "loop_check.level" in faults["displacement"].remedy
 
 
 @pytest.mark.parametrize(
-    ("channel", "full", "words"),
+    ("channel", "full", "where", "number"),
     [
-        ("table_disp_m", 40.0, "step 0 (0.5 Hz forward): table_disp_m 49.6"),
-        ("drive_disp_m", 40.0, "step 0 (0.5 Hz forward): drive_disp_m 49.6"),
-        ("table_acc_m_s2", 0.05, "step 1 (10 Hz forward): table_acc_m_s2 0.05"),
+        ("table_disp_m", 40.0, "step 0 (0.5 Hz forward)", 49.67),
+        ("drive_disp_m", 40.0, "step 0 (0.5 Hz forward)", 49.67),
+        ("table_acc_m_s2", 0.05, "step 1 (10 Hz forward)", 0.05),
     ],
 )
 def test_a_sensor_of_the_table_that_would_clip_is_refused(
-    channel: str, full: float, words: str
+    channel: str, full: float, where: str, number: float
 ) -> None:
     sensors = [
-        {**one.model_dump(), "range": full if one.channel == channel else one.range}
-        for one in RIG.sensors
+        {**sensor.model_dump(), "range": full if sensor.channel == channel else sensor.range}
+        for sensor in RIG.sensors
     ]
     card = RigConfig.model_validate(RIG.model_dump() | {"sensors": sensors})
-    (fault,) = refusal(profile(), card)
-    assert fault.startswith(words)
-    assert f"at most its range, {full:g}" in fault
+    (fault,) = list_faults(profile(), card)
+    assert (fault.where, fault.key) == (where, channel)
+    assert stated_number(fault) == pytest.approx(number, rel=0.05)
+    assert f"{full:g}" in fault.allowed.split()
     # What the specimen does to its sensors is not known before the test.
     mass = [
-        {**one.model_dump(), "range": 0.1 if "mass" in one.channel else one.range}
-        for one in RIG.sensors
+        {**sensor.model_dump(), "range": 0.1 if "mass" in sensor.channel else sensor.range}
+        for sensor in RIG.sensors
     ]
     card = RigConfig.model_validate(RIG.model_dump() | {"sensors": mass})
     check_limits(rows(profile(), card), profile(), card, "a.toml")
@@ -190,9 +206,9 @@ def test_a_sensor_of_the_table_that_would_clip_is_refused(
 def test_a_command_without_room_for_a_correction_is_worth_a_warning() -> None:
     asked = rows(profile())
     assert list_drive_warnings(asked, RIG) == []  # 49.7 mm of 60 mm: 20 % more are 59.6 mm
-    (said,) = list_drive_warnings(asked, rig(stroke_mm=59.0))
-    assert said.startswith("step 0 (0.5 Hz forward): 49.6")
-    assert "leave no room to correct the command by 20 %" in said
+    (warning,) = list_drive_warnings(asked, rig(stroke_mm=59.0))
+    assert warning.startswith("step 0 (0.5 Hz forward): 49.6")
+    assert "leave no room to correct the command by 20 %" in warning
 
 
 @pytest.mark.parametrize(
@@ -205,8 +221,8 @@ def test_a_command_without_room_for_a_correction_is_worth_a_warning() -> None:
     ],
 )
 def test_what_hardly_fits_the_machine_is_doubted(tables: dict[str, Any], words: str) -> None:
-    (said,) = list_setup_warnings(profile(**tables), RIG)
-    assert words in said
+    (warning,) = list_setup_warnings(profile(**tables), RIG)
+    assert words in warning
 
 
 def test_a_plain_test_is_not_doubted() -> None:
@@ -216,8 +232,8 @@ def test_a_plain_test_is_not_doubted() -> None:
 
 
 def test_a_loop_check_that_ends_below_the_sweep_is_said() -> None:
-    (said,) = list_setup_warnings(profile(), rig("output", span_mm=100.0, bits=16))
-    assert said.startswith(
+    (warning,) = list_setup_warnings(profile(), rig("output", span_mm=100.0, bits=16))
+    assert warning.startswith(
         "the loop check ends at 4.51 Hz: at 10 Hz a tenth of the level has fewer"
     )
     off = profile(loop_check={"enabled": False})
@@ -233,16 +249,16 @@ def test_the_corrected_command_is_held_against_the_card() -> None:
     steps = profile().sweep.steps
     assert check_corrected_drive(steps, response(0.9), RIG) == []
     flat = FrequencyResponse(5, (1.0,), (0.8,), (0.0,))
-    (said,) = check_corrected_drive(steps, flat, RIG)
-    assert "step 0 (0.5 Hz forward) and 1 more: displacement 62.1 mm" in said
-    assert "allowed: at most 60 mm" in said
-    assert said.startswith("corrected for the table's response")
+    (warning,) = check_corrected_drive(steps, flat, RIG)
+    assert "step 0 (0.5 Hz forward) and 1 more: displacement: 62.1 mm" in warning
+    assert "allowed: at most 60 mm" in warning
+    assert warning.startswith("corrected for the table's response")
     # 0.05 g at 10 Hz asked of a table that gives 0.6 of it.
-    (said,) = check_corrected_drive(steps, response(0.6), rig(acceleration_g=0.08))
-    assert "(10 Hz forward) and 1 more: acceleration 0.08333 g" in said
+    (warning,) = check_corrected_drive(steps, response(0.6), rig(acceleration_g=0.08))
+    assert "(10 Hz forward) and 1 more: acceleration: 0.08333 g" in warning
 
 
 def test_a_correction_beyond_what_control_may_do_is_said_before_the_sweep() -> None:
-    (said,) = check_corrected_drive(profile().sweep.steps, response(0.4), RIG)
-    assert said.startswith("step 1 (10 Hz forward): the table follows with a gain of 0.4")
-    assert "2.5 times as large; allowed: at most 2" in said
+    (warning,) = check_corrected_drive(profile().sweep.steps, response(0.4), RIG)
+    assert warning.startswith("step 1 (10 Hz forward): the table follows with a gain of 0.4")
+    assert "2.5 times as large; allowed: at most 2" in warning

@@ -8,7 +8,7 @@ import pytest
 from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.profile import Profile
 from table_io.records import FrequencyResponse
-from tests.studies.planted_faults import SWEEPS, faults, short, study, tried
+from tests.studies.planted_faults import SWEEPS, faults, short, study, try_fault
 from tests.table_io.safety.guarded import machine, play
 
 SEEDS = (1, 2, 3)
@@ -27,12 +27,14 @@ def profile(gap_mm: float = 4.0, rate_hz: float = 2000.0, **sweep: Any) -> Profi
     )
 
 
-def identified() -> FrequencyResponse:
+def identify_servo() -> FrequencyResponse:
     """The closed-form response of the machine card's servo."""
     f = np.array([1.0, 3.0, 10.0])
     pole = 20.0 / np.sqrt(np.sqrt(2.0) - 1.0)
-    found = np.exp(-2j * np.pi * f * 0.005) / (1 + 1j * f / pole) ** 2
-    return FrequencyResponse(0, tuple(f), tuple(np.abs(found)), tuple(np.unwrap(np.angle(found))))
+    transfer = np.exp(-2j * np.pi * f * 0.005) / (1 + 1j * f / pole) ** 2
+    return FrequencyResponse(
+        0, tuple(f), tuple(np.abs(transfer)), tuple(np.unwrap(np.angle(transfer)))
+    )
 
 
 @pytest.mark.parametrize(
@@ -48,7 +50,7 @@ def identified() -> FrequencyResponse:
 )
 def test_a_sound_table_is_left_alone(rate_hz: float, noise: float, gap_mm: float) -> None:
     rig = machine(noise=noise, seed=round(rate_hz + 10 * noise))
-    assert play(profile(gap_mm, rate_hz), rig, identified()).findings == []
+    assert play(profile(gap_mm, rate_hz), rig, identify_servo()).findings == []
 
 
 @pytest.mark.parametrize(
@@ -60,19 +62,21 @@ def test_a_sound_table_is_left_alone(rate_hz: float, noise: float, gap_mm: float
     ],
 )
 def test_whatever_servo_a_sound_table_has(servo: dict[str, Any]) -> None:
-    found = [one for _, one in play(profile(), machine((), **servo)).findings]
-    assert {(one.kind, one.stop) for one in found} <= {("level", False)}
+    findings = [finding for _, finding in play(profile(), machine((), **servo)).findings]
+    assert {(finding.kind, finding.stop) for finding in findings} <= {("level", False)}
 
 
 def test_fast_and_small_motions_are_left_alone_too() -> None:
     for gap_mm in (4.0, -10.0):
         fast = profile(gap_mm, start_hz=7.0, stop_hz=10.0, step_hz=1.5, cycles=20)
-        found = [one for _, one in play(fast, machine(noise=3.0), identified()).findings]
+        findings = [
+            finding for _, finding in play(fast, machine(noise=3.0), identify_servo()).findings
+        ]
         # Without control the servo's roll-off shows, and is told as what it is.
-        assert {(one.kind, one.stop) for one in found} <= {("level", False)}
+        assert {(finding.kind, finding.stop) for finding in findings} <= {("level", False)}
 
 
-AT = 8.0125  # s: 2.4 Hz is held
+FAULT_TIME_S = 8.0125  # s: 2.4 Hz is held
 FAULTS: tuple[tuple[dict[str, Any], set[str], bool, float], ...] = (
     ({"kind": "dropped", "for_s": 0.01}, {"lost"}, False, 0.02),
     ({"kind": "repeated", "for_s": 0.01}, {"repeated"}, False, 0.02),
@@ -108,25 +112,25 @@ FAULTS: tuple[tuple[dict[str, Any], set[str], bool, float], ...] = (
 @pytest.mark.parametrize(
     ("fault", "kinds", "stops", "within_s"),
     FAULTS,
-    ids=[f"{one[0]['kind']} {one[0].get('channel', '')}" for one in FAULTS],
+    ids=[f"{fault[0]['kind']} {fault[0].get('channel', '')}" for fault in FAULTS],
 )
 def test_a_planted_fault_is_found(
     fault: dict[str, Any], kinds: set[str], stops: bool, within_s: float
 ) -> None:
-    rig = machine(({"at_s": AT, **fault},))
-    at = round(AT * 2000)
-    played = play(profile(cycles=12), rig, identified(), stop_after=at)
-    (known, found), *_ = played.since(at)
+    rig = machine(({"at_s": FAULT_TIME_S, **fault},))
+    at = round(FAULT_TIME_S * 2000)
+    played = play(profile(cycles=12), rig, identify_servo(), stop_after=at)
+    (known, finding), *_ = played.since(at)
     assert played.findings[0][0] > at, "found before it was there"
-    assert found.kind in kinds
-    assert found.stop == stops
+    assert finding.kind in kinds
+    assert finding.stop == stops
     assert (known - at) / 2000 <= within_s
-    if found.kind == "consistency":  # in a motion that never repeats either may be to blame
-        assert found.channel.split("_")[0] == fault["channel"].split("_")[0]
-    elif found.kind == "share":
-        assert found.channel[:-3] == fault["channel"][:-3]
+    if finding.kind == "consistency":  # in a motion that never repeats either may be to blame
+        assert finding.channel.split("_")[0] == fault["channel"].split("_")[0]
+    elif finding.kind == "share":
+        assert finding.channel[:-3] == fault["channel"][:-3]
     elif "channel" in fault:
-        assert found.channel == fault["channel"]
+        assert finding.channel == fault["channel"]
 
 
 @pytest.mark.slow
@@ -134,21 +138,23 @@ def test_a_planted_fault_is_found(
 @pytest.mark.parametrize("seed", SEEDS)
 def test_whole_sweeps_of_a_sound_table_are_left_alone(name: str, seed: int) -> None:
     test = load_config(PROFILES_DIR / "tests" / f"{name}.toml", Profile, "test profile")[0]
-    found = [one for _, one in play(test, machine(seed=seed), identified()).findings]
-    assert {(one.kind, one.stop) for one in found} <= {("level", False)}
+    findings = [finding for _, finding in play(test, machine(seed=seed), identify_servo()).findings]
+    assert {(finding.kind, finding.stop) for finding in findings} <= {("level", False)}
 
 
 @pytest.mark.slow
 def test_every_planted_fault_of_every_size_is_found_by_a_session() -> None:
     outcomes = study(("middle",), 1, seed=3)
-    assert [one for one in outcomes if not one.by] == []
-    assert sum(one.early for one in outcomes) == 0
+    assert [outcome for outcome in outcomes if not outcome.by] == []
+    assert sum(outcome.early for outcome in outcomes) == 0
 
 
 def test_a_session_records_what_was_found_and_comes_to_rest() -> None:
-    one = tried(short("middle"), {"kind": "polarity", "channel": "mass_acc_m_s2"}, 21.0, 3.4)
-    assert (one.by, one.ended, one.early) == ("consistency", "aborted", 0)
-    assert one.cycles < 3.0
+    outcome = try_fault(
+        short("middle"), {"kind": "polarity", "channel": "mass_acc_m_s2"}, 21.0, 3.4
+    )
+    assert (outcome.by, outcome.ended, outcome.early) == ("consistency", "aborted", 0)
+    assert outcome.cycles < 3.0
 
 
 def test_the_study_plants_every_kind() -> None:

@@ -46,7 +46,7 @@ def lines(values: Float2D, rate: float = RATE, rig: RigConfig = RIG) -> tuple[Ch
 
 
 def failing(values: Float2D, rate: float = RATE) -> set[tuple[str, str]]:
-    return {(one.name, one.channel) for one in lines(values, rate) if one.verdict == "fail"}
+    return {(line.name, line.channel) for line in lines(values, rate) if line.verdict == "fail"}
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -55,16 +55,16 @@ def test_what_is_right_passes(seed: int) -> None:
 
 
 def test_every_channel_has_every_line_and_each_says_what_to_do_where_it_is_not_a_pass() -> None:
-    found = lines(still())
+    results = lines(still())
     for sensor in RIG.sensors[1:]:
-        names = [one.name for one in found if one.channel == sensor.channel]
+        names = [line.name for line in results if line.channel == sensor.channel]
         assert names == [
             "lost samples", "at the rail", "stuck", "noise", "bits used", "spikes", "mains hum",
             "offset", "steady", "same noise as another",
         ]  # fmt: skip
-    assert all(bool(one.do) == (one.verdict != "pass") for one in found)
+    assert all(bool(line.do) == (line.verdict != "pass") for line in results)
     # A command that stands still, without noise, cannot be told from one that is stuck.
-    assert [one.channel for one in found if one.verdict == "not tested"] == ["drive_disp_m"]
+    assert [line.channel for line in results if line.verdict == "not tested"] == ["drive_disp_m"]
 
 
 def spoilt(row: int, values: np.ndarray | float) -> Float2D:
@@ -77,7 +77,7 @@ def spoilt(row: int, values: np.ndarray | float) -> Float2D:
 def test_a_lost_channel_is_lost_and_nothing_else_is_said_of_it() -> None:
     values = spoilt(ACC, np.nan)
     assert failing(values) == {("lost samples", "table_acc_m_s2")}
-    assert [one.value for one in lines(values) if one.channel == "table_acc_m_s2"] == [100.0]
+    assert [line.value for line in lines(values) if line.channel == "table_acc_m_s2"] == [100.0]
     values = still()
     values[CELL, 100] = np.nan
     assert failing(values) == {("lost samples", "force_l2_n")}
@@ -95,15 +95,17 @@ def test_a_stuck_channel_from_the_first_sample_or_later() -> None:
 
 def test_noise_below_half_a_step_is_not_taken_for_a_stuck_channel() -> None:
     sensors = tuple(
-        one.model_copy(update={"bits": 12, "noise_rms": 0.005}) if one.unit == "mm" else one
-        for one in RIG.sensors
+        sensor.model_copy(update={"bits": 12, "noise_rms": 0.005})
+        if sensor.unit == "mm"
+        else sensor
+        for sensor in RIG.sensors
     )
     rig = RIG.model_copy(update={"sensors": sensors})
     values = spoilt(LASER, 0.1)
     (line,) = (
-        one
-        for one in lines(values, rig=rig)
-        if one.channel == "table_disp_m" and one.name == "stuck"
+        line
+        for line in lines(values, rig=rig)
+        if line.channel == "table_disp_m" and line.name == "stuck"
     )
     assert line.verdict == "not tested"
 
@@ -118,23 +120,23 @@ def test_a_channel_at_its_rail(sign: float) -> None:
 
 def test_a_cable_that_is_off_is_too_quiet_and_a_bad_earth_too_loud() -> None:
     quiet = 2e-5 * np.random.default_rng(5).standard_normal(SAMPLES)  # 100 dB under 2 g
-    found = {one.channel: one for one in lines(spoilt(ACC, quiet)) if one.name == "noise"}
-    assert found["table_acc_m_s2"].verdict == "fail"
-    assert found["table_acc_m_s2"].value < found["table_acc_m_s2"].low
+    results = {line.channel: line for line in lines(spoilt(ACC, quiet)) if line.name == "noise"}
+    assert results["table_acc_m_s2"].verdict == "fail"
+    assert results["table_acc_m_s2"].value < results["table_acc_m_s2"].low
     loud = still()
     loud[ACC] += 0.002 * np.random.default_rng(5).standard_normal(SAMPLES)
     assert failing(loud) == {("noise", "table_acc_m_s2")}
 
 
 def test_a_card_without_noise_is_told_what_to_put_there() -> None:
-    sensors = tuple(one.model_copy(update={"noise_rms": 0.0}) for one in RIG.sensors)
+    sensors = tuple(sensor.model_copy(update={"noise_rms": 0.0}) for sensor in RIG.sensors)
     rig = RIG.model_copy(update={"sensors": sensors})
-    found = [one for one in lines(still(), rig=rig) if one.name == "noise"]
-    assert {one.verdict for one in found} == {"not tested"}
-    (laser,) = (one.do for one in found if one.channel == "table_disp_m")
+    results = [line for line in lines(still(), rig=rig) if line.name == "noise"]
+    assert {line.verdict for line in results} == {"not tested"}
+    (laser,) = (line.do for line in results if line.channel == "table_disp_m")
     assert "noise_rms" in laser
     assert float(laser.split(" mm")[0].split()[-1]) == pytest.approx(0.005, rel=0.05)
-    assert {one.verdict for one in lines(still(), rig=rig)} == {"pass", "not tested"}
+    assert {line.verdict for line in lines(still(), rig=rig)} == {"pass", "not tested"}
 
 
 @pytest.mark.parametrize(
@@ -146,27 +148,27 @@ def test_hum_is_told_with_its_mains_and_its_size(mains: float, rate: float) -> N
     values = still()
     values[CELL] += 0.004 * np.sqrt(2) * np.sin(2 * np.pi * mains * t + 0.3)
     values[CELL] += 0.001 * np.sqrt(2) * np.sin(2 * np.pi * 3 * mains * t)
-    found = {one.channel: one for one in lines(values, rate) if one.name == "mains hum"}
-    assert found["force_l2_n"].verdict == "fail"
-    assert found["force_l2_n"].value == pytest.approx(np.hypot(0.004, 0.001), rel=0.03)
-    told = float(found["force_l2_n"].do.split(" Hz")[0].split()[-1])
-    assert told == pytest.approx(mains, abs=0.051)
+    results = {line.channel: line for line in lines(values, rate) if line.name == "mains hum"}
+    assert results["force_l2_n"].verdict == "fail"
+    assert results["force_l2_n"].value == pytest.approx(np.hypot(0.004, 0.001), rel=0.03)
+    hum_hz = float(results["force_l2_n"].do.split(" Hz")[0].split()[-1])
+    assert hum_hz == pytest.approx(mains, abs=0.051)
     resting = RestingInputs(RIG, rate, values * GAIN)
     assert resting.hum.frequency_hz == pytest.approx(mains, abs=0.02 * rate / SAMPLES)
     # What every other channel makes of white noise is no hum.
-    assert [one.channel for one in found.values() if one.verdict == "fail"] == ["force_l2_n"]
+    assert [line.channel for line in results.values() if line.verdict == "fail"] == ["force_l2_n"]
 
 
 def test_hum_in_two_channels_is_hum_and_not_one_signal_twice() -> None:
     values = still()
     for row in (CELL, ACC):
         values[row] += 20 * RIG.sensors[row].noise_rms * np.sin(2 * np.pi * 50.02 * TIME)
-    found = failing(values)
-    assert {channel for name, channel in found if name == "mains hum"} == {
+    failures = failing(values)
+    assert {channel for name, channel in failures if name == "mains hum"} == {
         "force_l2_n",
         "table_acc_m_s2",
     }
-    assert not any(name == "same noise as another" for name, _ in found)
+    assert not any(name == "same noise as another" for name, _ in failures)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -174,8 +176,8 @@ def test_one_signal_at_two_inputs(sign: float) -> None:
     values = still()
     other = RIG.channels.index("mass_acc_m_s2")
     values[other] = sign * values[ACC]
-    named = {one.channel: one for one in lines(values) if one.name == "same noise as another"}
-    assert [one.channel for one in named.values() if one.verdict == "fail"] == [
+    named = {line.channel: line for line in lines(values) if line.name == "same noise as another"}
+    assert [line.channel for line in named.values() if line.verdict == "fail"] == [
         "table_acc_m_s2",
         "mass_acc_m_s2",
     ]
@@ -196,16 +198,16 @@ def test_offset_drift_and_spike() -> None:
 def test_the_offset_of_the_card_is_where_the_range_begins() -> None:
     """A laser that stands 40 mm off is right where its card says so."""
     sensors = tuple(
-        one.model_copy(update={"offset": 40.0}) if one.channel == "table_disp_m" else one
-        for one in RIG.sensors
+        sensor.model_copy(update={"offset": 40.0}) if sensor.channel == "table_disp_m" else sensor
+        for sensor in RIG.sensors
     )
     rig = RIG.model_copy(update={"sensors": sensors})
     values = still()
-    assert [one.channel for one in lines(values, rig=rig) if one.verdict == "fail"] == [
+    assert [line.channel for line in lines(values, rig=rig) if line.verdict == "fail"] == [
         "table_disp_m"
     ]
     values[LASER] += 40.0
-    assert not [one for one in lines(values, rig=rig) if one.verdict == "fail"]
+    assert not [line for line in lines(values, rig=rig) if line.verdict == "fail"]
 
 
 def test_the_bits_that_noise_leaves() -> None:
@@ -218,8 +220,8 @@ def test_the_bits_that_noise_leaves() -> None:
     loud = laser.model_copy(update={"noise_rms": 1.0})
     rig = RIG.model_copy(update={"sensors": (RIG.sensors[0], loud, *RIG.sensors[2:])})
     values = spoilt(LASER, np.random.default_rng(5).standard_normal(SAMPLES))
-    failed = [one for one in lines(values, rig=rig) if one.verdict == "fail"]
-    assert [(one.name, one.channel) for one in failed] == [("bits used", "table_disp_m")]
+    failed = [line for line in lines(values, rig=rig) if line.verdict == "fail"]
+    assert [(line.name, line.channel) for line in failed] == [("bits used", "table_disp_m")]
 
 
 @pytest.mark.parametrize(
