@@ -7,3 +7,5 @@ The folder of a campaign:
     NN-label/        a run; NN-label-2, -3 continue one that was interrupted
     summary.json, report.html, figures/   of the whole campaign
 """
+
+STATE_FILE = "campaign.json"

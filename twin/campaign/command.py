@@ -102,7 +102,8 @@ def _prepare_folder(options: CampaignOptions) -> Path:
         try:
             return make_output_folder(options.out, make_run_id(options.path.stem))
         except InputError as error:
-            raise InputError(f"{error}, or add --resume to continue the campaign in it") from None
+            remedy = "give a new folder, or add --resume to continue the campaign in it"
+            raise error.replace(remedy=remedy) from None
     if options.out is None:
         raise InputError(
             "the folder of the campaign is missing", key="--resume", remedy="give it with --out DIR"
@@ -110,7 +111,8 @@ def _prepare_folder(options: CampaignOptions) -> Path:
     if not options.out.is_dir():
         raise InputError(
             "no such folder",
-            where=f"--out {options.out}",
+            key="--out",
+            value=str(options.out),
             remedy="omit --resume to start a campaign there",
         )
     return options.out

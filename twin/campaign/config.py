@@ -99,7 +99,7 @@ def read_plan(
     """Return the plan of a campaign file; one InputError lists every fault in it and its tests."""
     path = resolve_config(path, "campaigns")
     text = read_text(path, "campaign")
-    faults: dict[str, list[str]] = {}
+    faults: dict[str, tuple[InputError, list[str]]] = {}
     bundles: dict[str, RunConfig] = {}
     entries = _list_runs(text)
     for name in dict.fromkeys(run.profile for run in entries):
@@ -110,18 +110,22 @@ def read_plan(
             _refuse_own_sections(bundles[name])
             check_run(bundles[name], place)
         except InputError as error:
-            faults.setdefault(str(error).removeprefix(f"{place}: "), []).append(name)
+            fault = _drop_place(error, place)
+            faults.setdefault(str(fault), (fault, []))[1].append(name)
     labels = [label for run in entries for label in run.labels]
-    if twice := sorted({label for label in labels if labels.count(label) > 1}):
-        faults[f"label {', '.join(map(repr, twice))} is used twice; give each run its own"] = [
-            "runs"
-        ]
+    for label in sorted({label for label in labels if labels.count(label) > 1}):
+        fault = InputError("used twice", key="label", value=label, remedy="give each run its own")
+        faults[str(fault)] = fault, ["runs"]
+    # A fault that several profiles share is listed once.
+    listed = [InputError("", where=", ".join(at), faults=[fault]) for fault, at in faults.values()]
     try:
         config = parse_toml(text, CampaignConfig, str(path))
     except InputError as error:
-        raise InputError("\n".join([str(error), *_format_faults(faults)])) from None
-    if faults:
-        raise InputError("\n".join([f"{path}: nothing was started:", *_format_faults(faults)]))
+        if not error.faults:
+            raise
+        raise InputError("", where=path, faults=[*error.faults, *listed]) from None
+    if listed:
+        raise InputError("nothing was started", where=path, faults=listed)
     runs = [
         (label, run.prompt if k == 0 else "", run.notes, bundles[run.profile])
         for run in config.runs
@@ -173,12 +177,9 @@ def _refuse_own_sections(bundle: RunConfig) -> None:
             )
 
 
-def _format_faults(faults: dict[str, list[str]]) -> list[str]:
-    """Return lines with every fault; a fault shared by several profiles is listed once."""
-    lines = []
-    for message, names in faults.items():
-        lines += [f"  {', '.join(names)}:", *(f"    {line}" for line in message.splitlines())]
-    return lines
+def _drop_place(error: InputError, place: Path) -> InputError:
+    """Return an error without the path of a profile, so that equal faults of several compare."""
+    return error.replace(where="") if error.where == str(place) and error.problem else error
 
 
 def is_free_flight(bundle: RunConfig) -> bool:

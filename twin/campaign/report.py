@@ -13,7 +13,7 @@ from twin.reports.plot_style import Picture
 def write_campaign_report(folder: Path) -> Path:
     """Write summary.json, figures/ and report.html; return the path of report.html."""
     campaign = read_campaign(folder)
-    summaries.write_summary(campaign.summary, folder / "summary.json")
+    summaries.write_json(campaign.summary, folder / "summary.json")
     pictures = draw_campaign_figures(campaign, folder / "figures")
     path = folder / "report.html"
     path.write_text(render_campaign_report(campaign, pictures), encoding="utf-8")

@@ -19,6 +19,7 @@ from table_io.clock import RealClock, local_datetime
 from table_io.config.base import ConfigModel
 from table_io.config.profile import Profile, ResumeConfig, SetUpConfirmation
 from table_io.errors import InputError
+from twin.campaign import STATE_FILE
 from twin.campaign.config import CampaignPlan, PlannedRun, ResumeMode
 from twin.live.process_config import ProcessConfig
 from twin.recording.reader import read_recording
@@ -31,12 +32,7 @@ from twin.run.merge_parts import merge_run_parts
 from twin.run.recordings import read_recorded_config
 from twin.run.run_config import RunConfig, make_run_id
 
-STATE_FILE, CAMPAIGN_FILE, CONFIG_FOLDER, LOCK_FILE = (
-    "campaign.json",
-    "campaign.toml",
-    "cards",
-    ".lock",
-)
+CAMPAIGN_FILE, CONFIG_FOLDER, LOCK_FILE = "campaign.toml", "cards", ".lock"
 CALIBRATION_RECORDS = re.compile(r"^\[\[calibrations\]\].*\n?(?:(?!\[).+\n?|\n)*", re.MULTILINE)
 LOCK_TIMEOUT_S = 20.0  # until the processes of a killed campaign have ended
 Status = Literal["planned", "running", "complete", "interrupted", "skipped"]

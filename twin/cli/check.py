@@ -12,6 +12,7 @@ from table_io.backends import open_backend
 from table_io.block import Label
 from table_io.clock import ManualClock, local_datetime
 from table_io.config.calibration_due import find_overdue_calibrations
+from table_io.config.excitation.continuation import Continuation
 from table_io.config.profile import Profile
 from table_io.excitation.drive import Drive, HistorySegment
 from table_io.safety.loop_check import plan_targets
@@ -75,7 +76,7 @@ def _plan_lines(config: RunConfig) -> list[tuple[str, str]]:
         )
     return [
         ("specimen", f"{profile.specimen.mass_kg:g} kg, {bumpers}"),
-        *(_sweep_lines(profile) if profile.steps else _history_lines(profile)),
+        *_excitation_lines(profile),
         ("loop check", check),
         ("duration", _format_duration(config)),
         (
@@ -86,6 +87,32 @@ def _plan_lines(config: RunConfig) -> list[tuple[str, str]]:
         ("sampling", f"{rate:g} Hz"),
         ("recording", f"at most {planned_bytes(config) / 1e6:.0f} MB"),
         ("table", rig.title),
+    ]
+
+
+def _excitation_lines(profile: Profile) -> list[tuple[str, str]]:
+    if profile.continuation is not None:
+        return _orbit_lines(profile.continuation)
+    return _sweep_lines(profile) if profile.steps else _history_lines(profile)
+
+
+def _orbit_lines(config: Continuation) -> list[tuple[str, str]]:
+    plan = config.orbit_plan
+    orbits = plan.points
+    unstable = [orbit for orbit in orbits if not orbit.stable]
+    return [
+        (
+            "orbits",
+            f"{len(orbits)} along one branch, {len(unstable)} of them unstable, "
+            f"{min(orbit.frequency_hz for orbit in orbits):.5g} to "
+            f"{max(orbit.frequency_hz for orbit in orbits):.5g} Hz, each held by feedback",
+        ),
+        (
+            "feedback",
+            f"at most {100 * config.max_feedback:g} % of the command; planned for a latency of "
+            f"{1e3 * plan.latency_s:.3g} ms and {1e3 * plan.jitter_s:.3g} ms of jitter",
+        ),
+        ("level", f"{orbits[0].acceleration_m_s2 / GRAVITY_M_S2:.4g} g peak table acceleration"),
     ]
 
 
@@ -131,7 +158,7 @@ def _format_duration(config: RunConfig) -> str:
     text = ", ".join(
         f"{name} {_format_time(seconds)}" for name, seconds in parts.items() if seconds
     )
-    total = _format_time(drive.planned_end / drive.rate_hz)
+    total = _format_time(config.expected_s)
     prefix = "at least " if describe_adaptive_test(config.profile) else ""
     return f"{prefix}{total} for {config.extent}: {text}"
 

@@ -5,10 +5,9 @@
     FOLDER/access.toml                   access list: role by name
     FOLDER/people/NAME/                  ca.pem, certificate.pem, key.pem: to be handed over
     FOLDER/issued/NAME.1.pem             every certificate issued to a person
-    FOLDER/replaced/NAME.1/              keys replaced by `renew`
 
-Folders have mode 0700 and private keys 0600. Nothing is ever overwritten, and a name is never
-reused for another person: its old certificate would become valid again.
+Folders have mode 0700 and files 0600. Only `renew` replaces keys, and a name is never reused for
+another person: its old certificate would become valid again.
 """
 
 import json
@@ -17,7 +16,7 @@ import re
 import secrets
 import socket
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from ipaddress import ip_address
 from itertools import count
@@ -32,8 +31,8 @@ from twin.run.terminal import console, print_line, print_table
 from twin.security.access_control import NO_ROLE, RIG_NAME, ROLES, ROUTER_ROLE, build_router_access
 from twin.security.certificate_authority import (
     CertificateKeyPair,
-    certificate_expiry,
     certificate_hosts,
+    certificate_validity,
     create_authority,
     issue_certificate,
 )
@@ -56,7 +55,7 @@ from twin.transport.endpoint import (
 )
 
 AUTHORITY_KEY = "ca.key.pem"
-PEOPLE_FOLDER, ISSUED_FOLDER, REPLACED_FOLDER = "people", "issued", "replaced"
+PEOPLE_FOLDER, ISSUED_FOLDER = "people", "issued"
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
 HOST_LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
 ACCESS_TEXT = f"""\
@@ -89,9 +88,8 @@ def create_keys(folder: Path, hosts: Sequence[str]) -> None:
         f"shaketwin {issued_at:%Y-%m-%d} {secrets.token_hex(4)}", issued_at
     )
     rig = issue_certificate(authority, RIG_NAME, names, issued_at)
-    public = {AUTHORITY_FILE: authority.certificate, CERTIFICATE_FILE: rig.certificate}
-    public[ACCESS_FILE] = ACCESS_TEXT.encode()
-    _make_folder(folder, public, {AUTHORITY_KEY: authority.key, KEY_FILE: rig.key})
+    access = {ACCESS_FILE: ACCESS_TEXT.encode(), AUTHORITY_KEY: authority.key}
+    _write_files(folder, access | _key_files(authority.certificate, rig))
     print_line(f"{folder}: an authority, and the rig's keys as {', '.join(names)}")
     print_line(f"next: shaketwin keys add {folder} NAME --role {'|'.join(ROLES)}")
     print_line(f"then: shaketwin run PROFILE --listen tls/HOST:7447 --keys {folder}")
@@ -99,21 +97,21 @@ def create_keys(folder: Path, hosts: Sequence[str]) -> None:
 
 def add_person(folder: Path, name: str, role: str, hosts: Sequence[str]) -> None:
     """Issue keys to a new name, to be handed over; `hosts` are those of a router."""
-    try:
-        check_name(name)
-    except ValueError as error:
-        raise InputError(str(error)) from None
+    check_name(name)
     if (role == ROUTER_ROLE) != bool(hosts):
         raise InputError(
             "the role router and --host go together",
-            where=f"--role {role}",
+            key="--role",
+            value=role,
             remedy="give both for a router, and omit --host for a user",
         )
-    people = read_people(folder)
-    if _list_issued(folder, name) or name in people:
+    people, person_folder = read_people(folder), folder / PEOPLE_FOLDER / name
+    if _list_issued(folder, name) or name in people or person_folder.exists():
         raise InputError(
             "this name has been used, and its old certificate would become valid again",
-            where=name,
+            where=folder,
+            key="NAME",
+            value=name,
             remedy="choose another name, or renew the keys of the same person: "
             f"shaketwin keys renew {folder} {name}",
         )
@@ -121,58 +119,41 @@ def add_person(folder: Path, name: str, role: str, hosts: Sequence[str]) -> None
     text = f'{(folder / ACCESS_FILE).read_text().rstrip()}\n{name} = "{role}"\n'
     _check_access(folder, text, people | {name: role})
     _write_handover(folder, name, pair)
-    _write_access(folder, text)
+    _write_files(folder, {ACCESS_FILE: text.encode()})
     print_line(
-        f"{folder / PEOPLE_FOLDER / name}: keys of {name}, role {role}; hand the folder over "
-        "securely, and delete it here"
+        f"{person_folder}: keys of {name}, role {role}; hand the folder over securely, and delete "
+        "it here"
     )
 
 
 def renew_keys(folder: Path, name: str | None, hosts: Sequence[str]) -> None:
-    """Renew the keys of a person or, without a name, of the rig; the old ones are kept.
+    """Replace the keys of a person or, without a name, of the rig.
 
     Without `hosts` the new certificate is valid for those of the old one.
     """
+    hosts = [_validate_host(host) for host in hosts]
     if name is None:
-        _renew_rig(folder, [_validate_host(host) for host in hosts])
+        old_hosts = certificate_hosts(_read(folder / CERTIFICATE_FILE))
+        rig = _issue(folder, RIG_NAME, list(dict.fromkeys([*LOCAL_HOSTS, *(hosts or old_hosts)])))
+        _write_files(folder, _key_files(_read(folder / AUTHORITY_FILE), rig))
+        print_line(f"{folder}: new keys of the rig; restart what uses the old ones")
         return
     people = read_people(folder)
     certificates = _list_issued(folder, name) if name in people else []
     if not certificates:
-        raise _unknown_name_error(folder, name)
+        raise _unknown_name_error(folder, name, people)
     if hosts and people[name] != ROUTER_ROLE:
         raise InputError(
             f"{name} has the role {people[name]}; only a router has hosts",
-            where="--host",
+            key="--host",
+            value=hosts[0],
             remedy="omit it",
         )
-    names = [_validate_host(host) for host in hosts] or certificate_hosts(_read(certificates[-1]))
-    pair = _issue(folder, name, names)
-    person_folder = folder / PEOPLE_FOLDER / name
-    if person_folder.exists():
-        person_folder.rename(_next_replaced_folder(folder, name))
-    _write_handover(folder, name, pair)
-    print_line(f"{person_folder}: new keys; the old ones stay valid until they expire")
-
-
-def _renew_rig(folder: Path, hosts: Sequence[str]) -> None:
-    old = {name: _read(folder / name) for name in (CERTIFICATE_FILE, KEY_FILE)}
-    pair = _issue(
-        folder,
-        RIG_NAME,
-        list(dict.fromkeys([*LOCAL_HOSTS, *(hosts or certificate_hosts(old[CERTIFICATE_FILE]))])),
-    )
-    replaced_folder = _next_replaced_folder(folder, RIG_NAME)
-    _make_folder(
-        replaced_folder, {CERTIFICATE_FILE: old[CERTIFICATE_FILE]}, {KEY_FILE: old[KEY_FILE]}
-    )
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".new-") as new_folder:
-        _write_files(Path(new_folder), {CERTIFICATE_FILE: pair.certificate}, {KEY_FILE: pair.key})
-        for file in (KEY_FILE, CERTIFICATE_FILE):
-            (Path(new_folder) / file).replace(folder / file)
+    old_hosts = certificate_hosts(_read(certificates[-1]))
+    _write_handover(folder, name, _issue(folder, name, hosts or old_hosts))
     print_line(
-        f"{folder}: new keys of the rig; the old ones, in {replaced_folder}, stay valid until "
-        "they expire"
+        f"{folder / PEOPLE_FOLDER / name}: new keys, to be handed over; the old ones stay valid "
+        "until they expire"
     )
 
 
@@ -180,11 +161,11 @@ def remove_person(folder: Path, name: str) -> None:
     """Revoke a person's role; the gateway rejects the certificate from its next start on."""
     people = read_people(folder)
     if name not in people:
-        raise _unknown_name_error(folder, name)
+        raise _unknown_name_error(folder, name, people)
     line = re.compile(rf"""^\s*["']?{re.escape(name)}["']?\s*=.*\n?""", re.MULTILINE)
     text = line.sub("", (folder / ACCESS_FILE).read_text())
     _check_access(folder, text, {other: role for other, role in people.items() if other != name})
-    _write_access(folder, text)
+    _write_files(folder, {ACCESS_FILE: text.encode()})
     print_line(
         f"{name}: role revoked. Commands are refused from now on; in a running test {name} can "
         "still watch until its gateway restarts"
@@ -209,7 +190,7 @@ def list_keys(folder: Path) -> None:
 def _describe_expiry(path: Path) -> tuple[str, str]:
     """Return (expiry date of a certificate, remark)."""
     try:
-        expires_at = certificate_expiry(path.read_bytes())
+        expires_at = certificate_validity(path.read_bytes())[1]
     except OSError:
         return "?", "not issued here"
     except ValueError:
@@ -220,19 +201,23 @@ def _describe_expiry(path: Path) -> tuple[str, str]:
 
 
 def _issue(folder: Path, name: str, hosts: Sequence[str]) -> CertificateKeyPair:
-    certificate, key = _read(folder / AUTHORITY_FILE), _read(folder / AUTHORITY_KEY)
+    authority = CertificateKeyPair(_read(folder / AUTHORITY_FILE), _read(folder / AUTHORITY_KEY))
+    time = local_datetime()
     try:
-        return issue_certificate(
-            CertificateKeyPair(certificate, key), name, hosts, local_datetime()
-        )
-    except InputError as error:
-        raise InputError(f"{folder}: {error}") from None
+        expires_at = certificate_validity(authority.certificate)[1]
+        if time < expires_at:
+            return issue_certificate(authority, name, hosts, time)
     except (ValueError, TypeError):
         raise InputError(
-            f"{AUTHORITY_FILE} or {AUTHORITY_KEY} is damaged",
+            f"{AUTHORITY_FILE} or {AUTHORITY_KEY} is damaged, or they do not belong together",
             where=folder,
             remedy="restore both from a backup",
         ) from None
+    raise InputError(
+        f"the authority expired on {expires_at:%Y-%m-%d}",
+        where=folder / AUTHORITY_FILE,
+        remedy="make new keys for everyone in another folder: `shaketwin keys new`",
+    )
 
 
 def _list_issued(folder: Path, name: str) -> list[Path]:
@@ -243,12 +228,17 @@ def _list_issued(folder: Path, name: str) -> list[Path]:
 
 def _write_handover(folder: Path, name: str, pair: CertificateKeyPair) -> None:
     """Write the folder for a person; its certificate is listed in issued/ first."""
-    for subfolder in (PEOPLE_FOLDER, ISSUED_FOLDER):
-        (folder / subfolder).mkdir(mode=0o700, exist_ok=True)
-    copy_path = _next_free_path(folder / ISSUED_FOLDER, name, ".pem")
-    _write_files(copy_path.parent, {copy_path.name: pair.certificate}, {})
-    public = {AUTHORITY_FILE: _read(folder / AUTHORITY_FILE), CERTIFICATE_FILE: pair.certificate}
-    _make_folder(folder / PEOPLE_FOLDER / name, public, {KEY_FILE: pair.key})
+    issued = folder / ISSUED_FOLDER
+    copies = (f"{name}.{number}.pem" for number in count(1))
+    copy_name = next(copy for copy in copies if not (issued / copy).exists())
+    _write_files(issued, {copy_name: pair.certificate})
+    _write_files(folder / PEOPLE_FOLDER, {})
+    files = _key_files(_read(folder / AUTHORITY_FILE), pair)
+    _write_files(folder / PEOPLE_FOLDER / name, files)
+
+
+def _key_files(authority: bytes, pair: CertificateKeyPair) -> dict[str, bytes]:
+    return {AUTHORITY_FILE: authority, KEY_FILE: pair.key, CERTIFICATE_FILE: pair.certificate}
 
 
 def _read(path: Path) -> bytes:
@@ -262,25 +252,25 @@ def _read(path: Path) -> bytes:
         ) from None
 
 
-def _make_folder(folder: Path, public: Mapping[str, bytes], private: Mapping[str, bytes]) -> None:
-    """Create a folder with these files atomically."""
+def _write_files(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write files of mode 0600, each atomically, to a folder that is created with mode 0700."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".new-") as new_folder:
-            staging = Path(new_folder) / folder.name
-            staging.mkdir(mode=0o700)
-            _write_files(staging, public, private)
-            staging.rename(folder)  # fails if the target has content
+        folder.mkdir(mode=0o700, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".new-") as staging:
+            for name, content in files.items():
+                path = Path(staging) / name
+                descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+                with os.fdopen(descriptor, "wb") as file:
+                    file.write(content)
+            for name in files:
+                (Path(staging) / name).replace(folder / name)
     except OSError as error:
-        raise InputError(f"{folder}: cannot write here: {error.strerror}") from None
-
-
-def _write_files(folder: Path, public: Mapping[str, bytes], private: Mapping[str, bytes]) -> None:
-    modes = [(0o644, public), (0o600, private)]
-    for mode, name, content in ((mode, *item) for mode, files in modes for item in files.items()):
-        descriptor = os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(content)
+        raise InputError(
+            f"cannot write here: {error.strerror}",
+            where=folder,
+            remedy="make it writable, or give another folder",
+        ) from None
 
 
 def _check_access(folder: Path, text: str, people: Mapping[str, str]) -> None:
@@ -294,37 +284,13 @@ def _check_access(folder: Path, text: str, people: Mapping[str, str]) -> None:
         )
 
 
-def _write_access(folder: Path, text: str) -> None:
-    """Replace the access list atomically."""
-    try:
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".new-") as new_folder:
-            _write_files(Path(new_folder), {ACCESS_FILE: text.encode()}, {})
-            (Path(new_folder) / ACCESS_FILE).replace(folder / ACCESS_FILE)
-    except OSError as error:
-        raise InputError(f"{folder / ACCESS_FILE}: cannot write: {error.strerror}") from None
-
-
-def _next_replaced_folder(folder: Path, name: str) -> Path:
-    """Return the folder to which the replaced keys of `name` are moved."""
-    replaced_folder = folder / REPLACED_FOLDER
-    try:
-        replaced_folder.mkdir(mode=0o700, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{replaced_folder}: cannot write here: {error.strerror}") from None
-    return _next_free_path(replaced_folder, name)
-
-
-def _next_free_path(folder: Path, name: str, suffix: str = "") -> Path:
-    return next(
-        candidate for n in count(1) if not (candidate := folder / f"{name}.{n}{suffix}").exists()
-    )
-
-
-def _unknown_name_error(folder: Path, name: str) -> InputError:
+def _unknown_name_error(folder: Path, name: str, people: Iterable[str]) -> InputError:
     return InputError(
-        f"no user {name!r}",
+        "no user of this name",
         where=folder / ACCESS_FILE,
-        remedy=suggest(name, sorted(read_people(folder))),
+        key="NAME",
+        value=name,
+        remedy=suggest(name, sorted(people)),
     )
 
 
@@ -340,7 +306,8 @@ def _validate_host(host: str) -> str:
     if not _is_host(host):
         raise InputError(
             "not a host name or address",
-            where=f"--host {host!r}",
+            key="--host",
+            value=host,
             allowed="a name or an IP address without port, such as rig.lab.example or 192.168.1.20",
         )
     return host
@@ -355,8 +322,10 @@ def print_router_settings(folder: Path, name: str, listen: str, rig: str) -> Non
     if people.get(name) != ROUTER_ROLE:
         routers = [router for router, role in people.items() if role == ROUTER_ROLE]
         raise InputError(
-            f"{name} is not a router",
+            "does not have the role router",
             where=folder / ACCESS_FILE,
+            key="NAME",
+            value=name,
             remedy=f"{suggest(name, routers)}; or add one: shaketwin keys add {folder} NAME "
             "--role router --host HOST",
         )

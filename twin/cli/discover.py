@@ -16,17 +16,17 @@ from twin.identification.discover import (
     Discovery,
     PreparedLog,
     discover_effects,
-    held_out_log_nrmse,
 )
 from twin.identification.least_squares import MapFunction
 from twin.identification.selection import Cancelled, ProgressCallback, SelectionProgress
 from twin.model.config import ModelConfig
 from twin.model.effects import find_effect
+from twin.reports.contracts import Verdict
 from twin.reports.discovery.loading import load_logs
 from twin.reports.discovery.page import write_discovery_page
 from twin.reports.discovery.serialize import Json, model_to_toml, verdict_to_json
 from twin.reports.finalize import EXIT_INTERRUPTED
-from twin.reports.summary import dump_strict_json
+from twin.reports.summary import dump_contract
 from twin.run.folders import make_run_folder
 from twin.run.run_config import read_model_template
 from twin.run.terminal import catch_interrupts, console, print_line
@@ -72,15 +72,7 @@ def discover_command(
             raise
         print_line("interrupted before any result; nothing is written")
         return EXIT_INTERRUPTED
-    verdict = verdict_to_json(discovery, clock.now() - start_s, notes)
-    verdict["held_out_logs"] = [
-        {
-            "log": log.signals.name,
-            "nrmse_before": held_out_log_nrmse(log, discovery.selection.null),
-            "nrmse_after": held_out_log_nrmse(log, discovery.verdict.best),
-        }
-        for log in held_out_logs
-    ]
+    verdict = verdict_to_json(discovery, clock.now() - start_s, notes, held_out_logs)
     write_results(folder, discovery, config, logs, verdict)
     print_verdict(verdict)
     print_line(f"{folder}")
@@ -156,7 +148,7 @@ def write_results(
     text, omitted = model_to_toml(discovery.verdict.best.fit, title, config.citation, names)
     verdict["notes"] += omitted
     (folder / "model.toml").write_text(text, encoding="utf-8")
-    (folder / "verdict.json").write_text(dump_strict_json(verdict), encoding="utf-8")
+    (folder / "verdict.json").write_text(dump_contract(Verdict, verdict), encoding="utf-8")
     write_discovery_page(folder, discovery, logs, verdict)
 
 
@@ -180,7 +172,7 @@ def print_verdict(verdict: Json) -> None:
             print_line(
                 f"  {effect['id']} {name} = {value['value']:.5g} +- {half:.2g} {value['unit']}"
             )
-    for log in verdict.get("held_out_logs", []):
+    for log in verdict["held_out_logs"]:
         print_line(
             f"  {log['log']}, held out entirely: NRMSE of the damper force "
             f"{log['nrmse_before']:.3g} -> {log['nrmse_after']:.3g}"

@@ -12,7 +12,7 @@ from table_io.errors import InputError
 from twin.identification.cross_checks import fitted_gap
 from twin.identification.identify import WINDOW_S, IdentificationResult, identify_parameters
 from twin.identification.least_squares import FitResult
-from twin.identification.parameters import GAP_PREFIX, ZERO_PREFIX, ParameterSet, parse_log_number
+from twin.identification.parameters import FreeParameter, GapKey, TareKey, get_log
 from twin.reports.discovery.loading import load_recordings
 from twin.reports.discovery.serialize import (
     INTERVAL_SIGMA,
@@ -92,49 +92,46 @@ def _resolve_target(out: Path | None) -> Path:
 
 
 def _drop_log_parameters(fit: FitResult) -> FitResult:
-    """Return the fit without the parameters of single logs: tare errors and gap corrections."""
-    kept_values = {
-        key: value
-        for key, value in fit.parameters.values.items()
-        if not key.startswith(ZERO_PREFIX)
-    }
-    values = {key: value for key, value in fit.values.items() if parse_log_number(key) is None}
-    return replace(fit, parameters=ParameterSet(kept_values), values=values)
+    """Return the fit without the estimates for single logs: tare errors and gap corrections."""
+    return replace(
+        fit, values={key: value for key, value in fit.values.items() if get_log(key) is None}
+    )
 
 
 def identification_to_json(result: IdentificationResult, notes: Sequence[str]) -> Json:
     """Return the content of identify.json, in SI units."""
     fit, log_residuals = result.fit, result.problem.log_residuals
     names = [residuals.signals.name for residuals in log_residuals]
-    units = {parameter.name: parameter.unit for parameter in fit.free}
+    units = {parameter.key: parameter.unit for parameter in fit.free}
     return {
         "method": METHOD,
         "logs": names,
         "parameters": {
-            parameter.name: parameter_to_json(fit, parameter.name, parameter.unit)
-            | _compare_with_start(result, parameter.name, parameter.keys[0])
+            parameter.name: parameter_to_json(fit, parameter)
+            | _compare_with_start(result, parameter)
             for parameter in fit.free
-            if parse_log_number(parameter.name) is None
+            if get_log(parameter.key) is None
         },
         "gaps": {name: _gap_json(result, k) for k, name in enumerate(names)},
         "zeros": {
-            parameter.name: parameter_to_json(fit, parameter.name, parameter.unit)
+            parameter.name: parameter_to_json(fit, parameter)
             for parameter in fit.free
-            if parameter.name.startswith(ZERO_PREFIX)
+            if isinstance(parameter.key, TareKey)
         },
         "gap_offset": interval_to_json(*result.asymmetry, "m") if result.asymmetry else None,
         "correlations": [{"of": [a, b], "value": value} for a, b, value in result.correlated_pairs],
         "rms_over_noise": math.sqrt(fit.cost),
         "converged": fit.converged,
-        "at_bound": [*fit.at_bound],
-        "not_determined": [*result.undetermined],
+        "at_bound": [*map(str, fit.at_bound)],
+        "not_determined": [*map(str, result.undetermined)],
         "sources": [
             {
                 "source": part.source,
                 "entries": part.entry_count,
                 "converged": part.converged,
                 "parameters": {
-                    name: interval_to_json(*pair, units[name]) for name, pair in part.values.items()
+                    str(key): interval_to_json(*pair, units[key])
+                    for key, pair in part.values.items()
                 },
             }
             for part in result.subsets
@@ -158,24 +155,25 @@ def identification_to_json(result: IdentificationResult, notes: Sequence[str]) -
     }  # fmt: skip
 
 
-def _compare_with_start(result: IdentificationResult, name: str, key: str) -> Json:
+def _compare_with_start(result: IdentificationResult, parameter: FreeParameter) -> Json:
     """Return the value of the start model and the difference from it in standard deviations."""
-    start_value, sd = result.start.values.get(key), result.fit.std_errors[name]
+    start_value = result.start.values.get(parameter.keys[0])
+    value, sd = result.fit.values[parameter.key], result.fit.std_errors[parameter.key]
     if start_value is None:
         return {}
     return {
         "start": start_value,
-        "deviations": (result.fit.values[name] - start_value) / sd if sd else None,
+        "deviations": (value - start_value) / sd if sd else None,
     }
 
 
 def _gap_json(result: IdentificationResult, log: int) -> Json:
     """Return the total gap of a log in m: stated, and with contact the fitted one."""
-    residuals, name = result.problem.log_residuals[log], f"{GAP_PREFIX}{log}"
+    residuals, key = result.problem.log_residuals[log], GapKey(log)
     sides = {side: fitted_gap(residuals, result.fit, side) for side in ("right", "left")}
     gap: Json = {"stated": sum(residuals.signals.gaps_m), "unit": "m", **sides}
-    if name in result.fit.std_errors:
-        gap |= interval_to_json(sum(sides.values()), 2 * result.fit.std_errors[name], "m")
+    if key in result.fit.std_errors:
+        gap |= interval_to_json(sum(sides.values()), 2 * result.fit.std_errors[key], "m")
     return gap
 
 
@@ -225,18 +223,14 @@ def print_identification(report: Json) -> None:
 def _print_subsets(report: Json) -> None:
     """Print the estimates from subsets of the samples, and the gaps from contact onsets."""
     names = [name for name in report["parameters"] if name in SYMBOLS]
-    gaps = [
-        f"{GAP_PREFIX}{k}" for k, log in enumerate(report["logs"]) if "low" in report["gaps"][log]
-    ]
+    gaps = [log for log, name in enumerate(report["logs"]) if "low" in report["gaps"][name]]
     table = Table(title="Estimates from subsets of the samples", title_justify="left")
     table.add_column("")
     for name in names:
         unit = report["parameters"][name]["unit"]
         table.add_column(f"{SYMBOLS[name]} in {unit}", justify="right")
-    for name in gaps:
-        table.add_column(
-            f"gap correction per side, log {name[len(GAP_PREFIX) :]}, mm", justify="right"
-        )
+    for log in gaps:
+        table.add_column(f"gap correction per side, log {log}, mm", justify="right")
     for subset in report["sources"]:
         estimates = subset["parameters"]
         cells = [
@@ -244,7 +238,8 @@ def _print_subsets(report: Json) -> None:
             for name in names
         ]
         cells += [
-            " +- ".join(_format_interval(estimates[g], 1e3)) if g in estimates else "" for g in gaps
+            " +- ".join(_format_interval(estimates[name], 1e3)) if name in estimates else ""
+            for name in map(str, map(GapKey, gaps))
         ]
         table.add_row(subset["source"], *cells)
     print_table(console, table)

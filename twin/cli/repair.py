@@ -37,7 +37,9 @@ def write_repaired(verification: Verification, paths: list[Path], new: Path) -> 
         reread = examine_logs([new])
         if reread.report["damage"] or len(reread.messages) != len(entries):
             raise InputError(
-                f"{new}: differs from what was read; keep {paths[0]} and try another disk"
+                "differs from what was read",
+                where=new,
+                remedy=f"keep {paths[0]} and try another disk",
             )
     except BaseException:
         new.unlink()  # an incomplete file would block the next attempt

@@ -50,7 +50,11 @@ def replay_logs(request: ReplayRequest) -> int:
         parse_step_range(request.steps)
     is_single = len(request.logs) * max(len(request.models), 1) == 1
     if not is_single and (request.view or request.publish):
-        raise InputError("--view and --publish show one replay; give one log and one model")
+        raise InputError(
+            "shows one replay",
+            where="--view" if request.view else "--publish",
+            remedy="give one log and one model",
+        )
     from twin.cli.replay_table import replay_all
 
     try:
@@ -73,8 +77,10 @@ def require_drive_channel(recording: Recording) -> None:
     channels = recording.start.channels
     if "table_acc_m_s2" not in channels:
         raise InputError(
-            f"{recording.path}: no table_acc_m_s2, which drives the twin; there: "
-            f"{', '.join(channels)}; import the table's acceleration too"
+            f"not recorded, but it drives the twin; there: {', '.join(channels)}",
+            where=recording.path,
+            key="table_acc_m_s2",
+            remedy="import the table's acceleration too",
         )
 
 
@@ -192,5 +198,9 @@ def parse_speed(speed: str) -> float | None:
     except ValueError:
         multiple = 0.0
     if not 0 < multiple < 1e6:
-        raise InputError(f"--speed {speed}: allowed: max, or a number above 0 (times real time)")
+        raise InputError(
+            "not a speed",
+            where=f"--speed {speed}",
+            allowed="max, or a number above 0 (times real time)",
+        )
     return multiple

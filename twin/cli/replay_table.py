@@ -88,9 +88,9 @@ def _check_replays(request: ReplayRequest, models: list[str], names: list[str]) 
         folder_name = _folder_name(name, model)
         if folder_name in model_of_folder:
             raise InputError(
-                f"--model {model}: its results would be {folder_name}, as those of "
-                f"{model_of_folder[folder_name]}; "
-                "give each model once, and two of one name under other names"
+                f"its results would be {folder_name}, as those of {model_of_folder[folder_name]}",
+                where=f"--model {model}",
+                remedy="give each model once, and two of one name under other names",
             )
         model_of_folder[folder_name] = model
     for log in request.logs:
@@ -171,7 +171,7 @@ def _format_jumps(jumps: list[summaries.Json]) -> str:
 
 
 def _write_comparison(folder: Path, rows: list[Row]) -> None:
-    summaries.write_summary({"replays": rows}, folder / "comparison.json")
+    summaries.write_json({"replays": rows}, folder / "comparison.json")
     names = list(dict.fromkeys(name for row in rows for name in row))
     with (folder / "comparison.csv").open("x", newline="") as file:
         writer = csv.DictWriter(file, names)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from table_io.errors import InputError
-from twin.campaign.state import STATE_FILE
+from twin.campaign import STATE_FILE
 from twin.reports import summary as summaries
 from twin.run.recordings import open_recording, read_recorded_config
 from twin.run.terminal import console, print_line

@@ -60,7 +60,7 @@ def run_test(
         print_line(f"warning: {sentence}")
     print_line(
         f"{config.profile.title}: {config.extent}, "
-        f"{config.drive.planned_end / config.drive.rate_hz:.0f} s on {config.rig.title} "
+        f"{config.expected_s:.0f} s on {config.rig.title} "
         f"-> {folder}"
     )
     with catch_interrupts() as poll_interrupt:

@@ -100,7 +100,9 @@ def _plan_playback(controller: ExternalController) -> PlaybackPlan | None:
     """Return what an external controller plays; None if it stays at rest."""
     if not controller.after_s >= MIN_START_DELAY_S:
         raise InputError(
-            f"--after {controller.after_s:g}: allowed: {MIN_START_DELAY_S:g} s and more"
+            "too early",
+            where=f"--after {controller.after_s:g}",
+            allowed=f"{MIN_START_DELAY_S:g} s and more",
         )
     if controller.play is None:
         return None

@@ -187,8 +187,9 @@ def _join_parts(paths: list[Path], parts: list[RecoveredLog]) -> RecoveredLog:
     runs = {part.metadata["run"].get("id", "") for part in parts if "run" in part.metadata}
     if len(runs) > 1:
         raise InputError(
-            f"{paths[0]} and {paths[-1]}: of different runs ({', '.join(sorted(runs)[:5])}); give "
-            "the parts of one run, or verify them one by one"
+            f"of different runs ({', '.join(sorted(runs)[:5])})",
+            where=f"{paths[0]} and {paths[-1]}",
+            remedy="give the parts of one run, or verify them one by one",
         )
     joined = RecoveredLog(topics=frozenset().union(*(part.topics for part in parts)))
     messages: dict[tuple[str, bytes], LogMessage] = {}  # without duplicates of two recorders

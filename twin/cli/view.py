@@ -64,7 +64,9 @@ def view_log(log: Path, save: Path | None, picture: Path | None) -> None:
 def _require_parent(path: Path | None) -> None:
     """Raise InputError if the folder of a new file does not exist."""
     if path is not None and not path.absolute().parent.is_dir():
-        raise InputError(f"{path}: its folder does not exist; make it, or give another place")
+        raise InputError(
+            "its folder does not exist", where=path, remedy="make it, or give another place"
+        )
 
 
 def view_live(

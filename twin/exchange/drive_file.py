@@ -96,7 +96,7 @@ def write_drive(path: Path, file_format: str, file: DriveFile) -> None:
         )
         partial_path.rename(path)
     except OSError as error:
-        raise InputError(f"-o {path}: cannot write it: {error.strerror}") from None
+        raise InputError(f"cannot write it: {error.strerror}", where=f"-o {path}") from error
     finally:
         partial_path.unlink(missing_ok=True)
 

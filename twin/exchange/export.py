@@ -51,7 +51,7 @@ def export_log(
             if new.exists():
                 raise InputError("exists already", where=new, remedy="nothing is ever overwritten")
     if "rrd" in paths and (channels or steps):
-        raise InputError("--rrd exports a whole run; omit --channel and --steps")
+        raise InputError("exports a whole run", where="--rrd", remedy="omit --channel and --steps")
     # Check everything before the first file is written, so that a second attempt can succeed.
     writers = {kind: _load_writer(kind) for kind in paths if kind != "rrd"}
     rows = _read_rows(path, channels, steps) if writers else None

@@ -5,7 +5,7 @@ import re
 from table_io.errors import InputError
 from twin.run.terminal import print_line
 from twin.security.credentials import Credentials, user_name
-from twin.transport.endpoint import list_runs
+from twin.transport.endpoint import list_runs, make_endpoint_error
 from twin.transport.zenoh_link import BusLink, open_spoke
 
 CONNECT_TIMEOUT_S = 3.0
@@ -19,10 +19,10 @@ def find_run(link: BusLink, connect: str, rig: str) -> str:
     """
     runs = list_runs(link.list_components())
     if not runs or not re.fullmatch(r"\w[\w.-]{0,100}", runs[0]):
-        raise InputError(
+        raise make_endpoint_error(
+            connect,
             f"no test is running there on rig {rig!r}",
-            where=f"endpoint {connect}",
-            remedy="start one with `shaketwin run`, or give the `name` in the rig file of the "
+            "start one with `shaketwin run`, or give the `name` in the rig file of the "
             "running rig with --rig",
         )
     return runs[0]

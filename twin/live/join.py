@@ -20,6 +20,7 @@ from twin.run.merge_parts import LOCK_FILE, merge_run_parts
 from twin.run.terminal import catch_interrupts, print_line
 from twin.security.credentials import Credentials, user_name
 from twin.transport.codec import TOPIC_TYPES, WireError, decode_item, encode_item, topic_for
+from twin.transport.endpoint import make_endpoint_error
 from twin.transport.reliable_subscriber import ReliableSubscriber
 from twin.transport.zenoh_link import BusLink, open_spoke
 
@@ -43,7 +44,7 @@ def join_as_recorder(connect: str, rig: str, out: Path | None, keys: Credentials
         print_line(f"recording {run} -> {folder}; Ctrl-C ends the recording, not the test")
         with catch_interrupts("ending the recording; the test goes on") as poll_interrupt:
             inbox = link.subscribe(tuple(TOPIC_TYPES), history=True, capacity=INBOX_CAPACITY)
-            is_complete = _record_run(run, inbox, folder, poll_interrupt)
+            is_complete = record_run(run, inbox, folder, poll_interrupt)
             interrupted = poll_interrupt() is not None
     finally:
         link.close()
@@ -78,10 +79,10 @@ def _fetch_config(link: BusLink, connect: str, rig_name: str) -> tuple[ProcessCo
     def fetch(path: str) -> str:
         answer = link.query(path, timeout_s=CONNECT_TIMEOUT_S)
         if answer is None:
-            raise InputError(
+            raise make_endpoint_error(
+                connect,
                 f"the running test does not send its configuration ({path})",
-                where=f"endpoint {connect}",
-                remedy="try again",
+                "try again",
             )
         return answer.decode(errors="replace")
 
@@ -101,7 +102,7 @@ def _fetch_config(link: BusLink, connect: str, rig_name: str) -> tuple[ProcessCo
     ) if compared_to else ""
 
 
-def _record_run(
+def record_run(
     run: str, inbox: ReliableSubscriber, folder: Path, poll_interrupt: Callable[[], str | None]
 ) -> bool:
     """Record a run to a part file in the folder; True if no message is known to be missing."""
@@ -113,7 +114,7 @@ def _record_run(
         recorder.record_until_complete(inbox, poll_interrupt)
         if recorder.writer is None:
             raise InputError(
-                f"{folder}: nothing was recorded: the test's beginning never came; is it over?"
+                "nothing was recorded: the test's beginning never came; is it over?", where=folder
             )
         recorder.finish(inbox.missed)
     return inbox.missed == 0 and recorder.completion.end is not None

@@ -68,7 +68,7 @@ def _make_completed_future() -> Future[None]:
 
 
 @dataclass(slots=True)
-class _Recorder:
+class Recorder:
     """Recorder loop; `disk_error` is the last error of the disk, "" while it works.
 
     `stop_reason` is why the table has to stop. It is never cleared: a disk that was full for a
@@ -84,6 +84,7 @@ class _Recorder:
     reserve: DiskReserve
     rate_hz: float
     clock: Clock
+    sync_interval_s: float = SYNC_INTERVAL_S
     # A sync takes up to 0.2 s; in a thread it does not delay flushing.
     executor: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1))
     pending_sync: Future[None] = field(default_factory=_make_completed_future)
@@ -109,8 +110,8 @@ class _Recorder:
             ):
                 break
             if time_s - flushed_s > FLUSH_INTERVAL_S:
-                self._flush(sync=time_s - synced_s > SYNC_INTERVAL_S)
-                synced_s = time_s if time_s - synced_s > SYNC_INTERVAL_S else synced_s
+                self._flush(sync=time_s - synced_s > self.sync_interval_s)
+                synced_s = time_s if time_s - synced_s > self.sync_interval_s else synced_s
                 flushed_s = time_s
             if time_s - reported_s > REPORT_INTERVAL_S:
                 self._report()
@@ -246,8 +247,8 @@ def run_recorder(config: ProcessConfig, part: str) -> None:
     writer = LogWriter(Path(part), rate_hz)
     clock = RealClock()
     latency = LatencyHistogram("recorder", clock, block_samples / rate_hz)
-    disk_forecast = DiskForecast(run_config.drive.planned_end / rate_hz)
-    recorder = _Recorder(
+    disk_forecast = DiskForecast(run_config.expected_s)
+    recorder = Recorder(
         config, link, inbox, writer, latency, disk_forecast, reserve, rate_hz, clock
     )
     link.declare_alive(process_token(config, "recorder"))

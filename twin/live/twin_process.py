@@ -55,7 +55,7 @@ def run_pipeline(
         link.declare_alive(process_token(config, "twin"))
     block_s = run_config.profile.acquisition.block_samples / run_config.drive.rate_hz
     latency = LatencyHistogram("twin", clock, block_s, scheduler)
-    twin = _TwinProcess(config.run, link, run_config.prepare_twin(), latency, clock, missed_from)
+    twin = TwinProcess(config.run, link, run_config.prepare_twin(), latency, clock, missed_from)
     twin.external_clock = run_config.rig.under_external_control
     twin.run(control, blocks, is_abandoned)
     deadline_s = clock.now() + LINGER_S
@@ -65,7 +65,7 @@ def run_pipeline(
 
 
 @dataclass(slots=True)
-class _TwinProcess:
+class TwinProcess:
     """Twin loop: steps the pipeline and publishes its output."""
 
     run_id: str

@@ -9,7 +9,8 @@ import numpy as np
 from rich.text import Text
 
 from table_io.block import Float2D
-from table_io.records import NormalizedResponse, PrcPoint
+from table_io.config.excitation.orbit_plan import OrbitPlan
+from table_io.records import NormalizedResponse, OrbitPoint, PrcPoint
 from twin.monitor.panels import DIM_STYLE
 from twin.monitor.run_state import LiveRunState
 from twin.viewer.plots import nice_ceil
@@ -61,6 +62,9 @@ def draw_prc(
     run_state: LiveRunState, width: int, height: int, value: ResponseQuantity = eta_d
 ) -> list[Text]:
     """Plot the PRC so far, measured in color, twin in white, with the frequency of the step."""
+    if run_state.profile is not None and run_state.profile.continuation is not None:
+        plan = run_state.profile.continuation.orbit_plan
+        return draw_orbit_curves(plan, list(run_state.orbits.values()), width, height)
     points = sorted(run_state.points.values(), key=lambda point: point.step)
     frequencies_hz = [point.frequency_hz for point in points]
     if run_state.start is not None:
@@ -89,6 +93,22 @@ def draw_prc(
         curves.insert(0, PlotCurve(STEP_COLOUR, [(frequency_hz, 0.0), (frequency_hz, y_max)]))
     x_range = min(frequencies_hz), max(frequencies_hz)
     return plot_curves(curves, x_range, y_max, width, height, "Hz")
+
+
+def draw_orbit_curves(
+    plan: OrbitPlan, orbits: Sequence[OrbitPoint], width: int, height: int
+) -> list[Text]:
+    """Plot the amplitudes of measured orbits in mm over those of the plan, in white."""
+    planned = [(orbit.frequency_hz, 1e3 * orbit.amplitude_m) for orbit in plan.points]
+    curves = [PlotCurve(TWIN_COLOUR, planned)]
+    for orbit in orbits:
+        style = FORWARD_COLOUR if orbit.accepted else BACKWARD_COLOUR
+        curves.append(PlotCurve(style, [(orbit.frequency_hz, 1e3 * orbit.amplitude_m)], "●"))
+    frequencies_hz, amplitudes = zip(
+        *(point for curve in curves for point in curve.points), strict=True
+    )
+    x_range = min(frequencies_hz), max(frequencies_hz)
+    return plot_curves(curves, x_range, nice_ceil(max(amplitudes)), width, height, "Hz")
 
 
 def _select_values(

@@ -26,6 +26,7 @@ from table_io.records import (
     FrequencyResponse,
     JumpForecast,
     Level,
+    OrbitPoint,
     PrcPoint,
     Record,
     RunStart,
@@ -78,6 +79,7 @@ class LiveRunState:
     position: tuple[int, int, int] = (-1, 0, -1)  # step, label, cycle of the last sample seen
     added_steps: dict[int, Step] = field(default_factory=dict)
     points: dict[int, PrcPoint] = field(default_factory=dict)
+    orbits: dict[int, OrbitPoint] = field(default_factory=dict)
     latest: dict[type, Record] = field(default_factory=dict)
     timings: dict[str, Timing] = field(default_factory=dict)
     gaps: dict[tuple[str, str], tuple[int, int]] = field(default_factory=dict)  # end, samples
@@ -179,6 +181,8 @@ def _add_record(run_state: LiveRunState, record: Record) -> None:
             run_state.rig_state, run_state.rig_state_since = record.text, record.index
         case PrcPoint():
             _put_bounded(run_state.points, record.step, record, MAX_POINTS)
+        case OrbitPoint():
+            _put_bounded(run_state.orbits, record.step, record, MAX_POINTS)
         case StepAdded(step=index, direction=direction, frequency_hz=f, acceleration_m_s2=a):
             _put_bounded(run_state.added_steps, index, Step(index, direction, f, a), MAX_POINTS)
         case Timing():

@@ -8,6 +8,7 @@ import numpy as np
 from rich.text import Text
 
 from table_io.block import Label
+from table_io.config.excitation.stepped_sine import Sweep
 from table_io.messages import LABEL_TEXTS, replace_nonprintable
 from twin.monitor import curves, panels
 from twin.monitor.panels import (
@@ -251,7 +252,7 @@ def _format_step(run_state: LiveRunState, show_cycle: bool) -> str:
     text = f"step {step.index + 1:>2}/{run_state.step_count}  {step.frequency_hz:6.3f} Hz "
     text += f"{ARROWS.get(step.direction, '')} {step.direction:<8}"
     cycle_text = f"cycle {run_state.position[2] + 1}" if run_state.position[2] >= 0 else ""
-    if cycle_text and run_state.profile and run_state.profile.steps:
+    if cycle_text and run_state.profile and isinstance(run_state.profile.excitation, Sweep):
         cycle_text += f"/{run_state.profile.sweep.cycles}"
     return f"{text:<33}" + (f"  {cycle_text:<13}" if show_cycle else "")
 

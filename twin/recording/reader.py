@@ -257,8 +257,8 @@ def _find_start(
             errors.append(f"{START_TOPIC}: lost; its copy is used")
             return entry[1]
     if problems:
-        raise InputError(f"{path}: damaged or foreign: {problems[0]}")
-    raise InputError(f"{path}: holds no start record, so profile and model are unknown")
+        raise InputError(f"damaged or foreign: {problems[0]}", where=path, key=START_TOPIC)
+    raise InputError("missing, so profile and model are unknown", where=path, key=START_TOPIC)
 
 
 def _remove_mislabelled(entries: list[_Entry]) -> list[str]:

@@ -8,10 +8,21 @@ PARTS_FOLDER = ".parts"
 
 
 def resolve_log_path(log: Path) -> Path:
-    """Return the log file of a run's folder (or a log itself); raise InputError if unmerged."""
+    """Return the log of a run's folder, or a log itself.
+
+    Raises InputError for a folder without a log, or with unmerged parts of one.
+    """
     if reason := explain_unmerged_parts(log):
         raise InputError(reason)
-    return log / "run.mcap" if log.is_dir() else log
+    if not log.is_dir():
+        return log
+    if not (log / "run.mcap").exists():
+        raise InputError(
+            "no recording (run.mcap) in this folder",
+            where=log,
+            remedy="give the folder of a run, or its run.mcap",
+        )
+    return log / "run.mcap"
 
 
 def explain_unmerged_parts(log: Path) -> str:

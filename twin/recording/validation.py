@@ -17,6 +17,7 @@ from table_io.records import (
     Fault,
     FrequencyResponse,
     Level,
+    OrbitPoint,
     PrcPoint,
     Record,
     RunStart,
@@ -100,6 +101,8 @@ def _has_unequal_lengths(record: Record) -> bool:
         case Estimate():
             known = record.values, record.sd, record.drift, record.drift_sd
             return any(len(column) != len(record.names) for column in known)
+        case OrbitPoint():
+            return len(record.u_m) != 2 * len(record.feedback_m)
         case FrequencyResponse():
             return not len(record.frequencies_hz) == len(record.gain) == len(record.phase_rad)
     return False
@@ -121,6 +124,9 @@ def _validate_fields(record: Record) -> str:
                 return f"step = {record.step}, direction = {record.direction[:20]!r}"
             if not 0 < record.frequency_hz <= MAX_FREQUENCY_HZ:
                 return f"frequency_hz = {record.frequency_hz:g}"
+        case OrbitPoint():
+            is_valid = record.step <= MAX_STEPS and 0 < record.frequency_hz <= MAX_FREQUENCY_HZ
+            return "" if is_valid else f"step = {record.step}, {record.frequency_hz:g} Hz"
         case Fault():
             if record.from_index > record.to_index:
                 return "the end is before the beginning"

@@ -201,7 +201,8 @@ def _plot_level(axis: "Axes", traces: list[_SegmentTrace], run_config: RunConfig
             axis.fill_between(
                 trace.time_s, trace.level_g, where=list(mask), color=SEGMENT_COLOURS[kind], lw=0
             )
-    level, allowed = run_config.profile.sweep.acceleration_g, run_config.rig.limits.acceleration_g
+    level = run_config.profile.plan.level_m_s2 / GRAVITY_M_S2
+    allowed = run_config.rig.limits.acceleration_g
     axis.axhline(MAX_BLEND_RATIO * level, color=LIMIT_COLOUR, lw=1, ls=":")
     _annotate_limit(
         axis,
@@ -232,7 +233,7 @@ def _plot_beginning(axis: "Axes", run_config: RunConfig) -> None:
     _, label, _ = drive.labels(0, end)
     for kind, colour in colours.items():
         axis.plot(time_s, np.where(label == kind, acceleration, np.nan), color=colour, lw=0.9)
-    level = run_config.profile.sweep.acceleration_g
+    level = run_config.profile.plan.level_m_s2 / GRAVITY_M_S2
     for sign in (-1, 1):
         axis.axhline(sign * MAX_BLEND_RATIO * level, color=LIMIT_COLOUR, lw=1, ls=":")
     axis.set_xlim(0, end / drive.rate_hz)

@@ -14,7 +14,11 @@ from table_io.block import Block
 from table_io.records import Level, PrcPoint
 from table_io.units import GRAVITY_M_S2
 from twin.compare.curves import Hysteresis, PrcJump
+from twin.reports.branches.curves import FREE_QUANTITIES
+from twin.reports.branches.figures import branch_handles, plot_branches
+from twin.reports.branches.model_branches import follow_model_branches
 from twin.reports.motion_drawing import draw_rest_lines
+from twin.reports.orbit_figure import draw_orbits
 from twin.reports.plot_style import (
     DIRECTION_COLOURS,
     FIGURE_WIDTH_IN,
@@ -60,7 +64,9 @@ def draw_run_figures(run: ReportData, folder: Path) -> list[Picture]:
     for stale in folder.glob("histories_*hz.png"):
         stale.unlink()
     draws = (
+        draw_orbits,
         _draw_prc,
+        _draw_model_branches,
         _draw_impacts,
         draw_histories,
         draw_window_histories,
@@ -107,6 +113,36 @@ def _draw_prc(run: ReportData) -> CaptionedFigures:
     if prestress:
         caption += " Grey: deformation and force of a precompressed bumper at rest, from the model."
     yield CaptionedFigure("prc", "Pseudo-resonance curves", caption, figure)
+
+
+def _draw_model_branches(run: ReportData) -> CaptionedFigures:
+    """Draw the points over the model's branches, stable and unstable, between the jumps."""
+    branches = follow_model_branches(run)
+    if not branches:
+        return
+    scales = {"eta_d": run.summary["u_star_m"], "eta_a": run.summary["a_star_m_s2"]}
+    figure = Figure(figsize=(FIGURE_WIDTH_IN, 3.9))
+    axes = figure.subplots(1, 2, sharex=True, squeeze=False)
+    panels = make_prc_panels(axes, FREE_PANELS)
+    for (ax, quantities), quantity in zip(panels, FREE_QUANTITIES, strict=True):
+        (name,) = quantities
+        label = ax.get_ylabel()
+        plot_branches(ax, branches, quantity, scale=quantity.si / scales[name])
+        ax.set_ylabel(label)
+        for direction in DIRECTIONS:
+            f, y = extract_prc(run.points, run.source, direction, name)
+            style = {**_dotted_style(direction), "ls": "", "alpha": 0.6}
+            ax.plot(f, y, zorder=1.5, label=f"{run.source} {direction}", **style)
+    handles = [*axes[0, 0].get_legend_handles_labels()[0], *branch_handles(branches)]
+    figure.legend(handles=handles, loc="outside upper center", ncols=7)
+    yield CaptionedFigure(
+        "model_branches",
+        "Branches of the model",
+        "Periodic motions of the model at the nominal level: solid stable, dashed unstable. The "
+        "sweep can follow a stable motion up to a fold, where it must jump. An unstable motion "
+        "separates the starts that lead to the one and to the other stable motion.",
+        figure,
+    )
 
 
 def _dotted_style(direction: str) -> LineStyle:

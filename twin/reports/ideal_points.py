@@ -35,16 +35,17 @@ def compute_prc_points(
         response.extremes[:, -measured_cycles:], 2, 0
     )
     weight = p.mass * GRAVITY_M_S2
-    eta = (u_max - u_min) / (2 * u_star)
+    eta, eta_a = (u_max - u_min) / (2 * u_star), (a_max - a_min) / (2 * a_star)
     means = {
         "eta_d": eta.mean(axis=1),
-        "eta_a": ((a_max - a_min) / (2 * a_star)).mean(axis=1),
+        "eta_a": eta_a.mean(axis=1),
         "eta_r": _bumper_deformation(u_max - p.gap_r - gap_opening_m, f_r).mean(axis=1) / u_star,
         "eta_l": _bumper_deformation(-u_min - p.gap_l - gap_opening_m, -f_l).mean(axis=1) / u_star,
         "r_r": f_r.mean(axis=1) / weight,
         "r_l": np.abs(f_l).mean(axis=1) / weight,
         "drift": (eta[:, -1] - eta[:, 0]) / eta.mean(axis=1),
         "spread": np.ptp(eta, axis=1) / eta.mean(axis=1),
+        "spread_a": np.ptp(eta_a, axis=1) / eta_a.mean(axis=1),
     }
     right, left = impacts_r.astype(int).tolist(), impacts_l.astype(int).tolist()
     return tuple(

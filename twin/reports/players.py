@@ -96,8 +96,8 @@ class HarmonicSimulator(ABC):
     @abstractmethod
     def lyapunov_exponent(
         self, frequency_hz: float, acceleration: float, state: Float1D, cycles: int
-    ) -> float:
-        """Return the largest Lyapunov exponent per cycle, starting from a settled state."""
+    ) -> tuple[float, Float1D]:
+        """Return (largest Lyapunov exponent per cycle, final state) from a settled state."""
 
     def simulate_motion(
         self, frequency_hz: float, acceleration: float, state: Float1D, cycles: int
@@ -159,10 +159,10 @@ class ClosedFormSimulator(HarmonicSimulator):
 
     def lyapunov_exponent(
         self, frequency_hz: float, acceleration: float, state: Float1D, cycles: int
-    ) -> float:
+    ) -> tuple[float, Float1D]:
         return periodic_orbit.lyapunov_exponent(
             self.parameters, frequency_hz, acceleration, state, cycles
-        )[0]
+        )
 
 
 @final
@@ -243,8 +243,8 @@ class NumericalSimulator(HarmonicSimulator):
 
     def lyapunov_exponent(
         self, frequency_hz: float, acceleration: float, state: Float1D, cycles: int
-    ) -> float:
-        """Return the largest Lyapunov exponent per cycle from the growth of a perturbation.
+    ) -> tuple[float, Float1D]:
+        """Return the exponent per cycle from the growth of a perturbation, and the final state.
 
         The neighboring trajectory is renormalized after each cycle.
         """
@@ -259,7 +259,7 @@ class NumericalSimulator(HarmonicSimulator):
             neighbour = _renormalize(
                 reference, neighbour, PERTURBATION_M / distance if distance > 0 else 1.0
             )
-        return growth / cycles
+        return growth / cycles, reference
 
 
 @lru_cache(64)
@@ -301,6 +301,6 @@ def _compute_extremes(out: Float2D, samples: int, in_contact: tuple[bool, bool])
 
 def make_simulator(model: Model) -> HarmonicSimulator:
     """Return the closed-form simulator if the model allows it, else the numerical one."""
-    if all(term.effect.acts in ("parameters", "sensor") for term in model.present_effects):
+    if model.changes_only_parameters:
         return ClosedFormSimulator(model)
     return NumericalSimulator(model)

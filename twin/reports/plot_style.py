@@ -24,6 +24,11 @@ RC_PARAMS: dict[Any, Any] = {
     "legend.frameon": False, "lines.linewidth": 1.1, "lines.markersize": 3.6,
     "figure.constrained_layout.use": True, "figure.constrained_layout.hspace": 0.06,
 }  # fmt: skip
+DARK_RC_PARAMS: dict[Any, Any] = {
+    "figure.facecolor": "#16181d", "savefig.facecolor": "#16181d", "axes.facecolor": "#16181d",
+    "text.color": "#e6e6e6", "axes.labelcolor": "#e6e6e6", "axes.edgecolor": "#9a9a9a",
+    "xtick.color": "#c8c8c8", "ytick.color": "#c8c8c8", "grid.color": "#33363d",
+}  # fmt: skip
 DIRECTION_COLOURS = {"forward": "#c4161c", "backward": "#1559b0"}
 SIDE_COLOURS = {"right": "#c4161c", "left": "#1559b0"}
 DIRECTION_DASHES: dict[str, Any] = {"forward": "-", "backward": (0, (4, 1.8))}
@@ -67,15 +72,17 @@ class Picture:
     caption: str
 
 
-def save_figures(figures: Iterable[CaptionedFigure], folder: Path) -> list[Picture]:
+def save_figures(
+    figures: Iterable[CaptionedFigure], folder: Path, dark: bool = False
+) -> list[Picture]:
     """Save figures as PNG files in `folder`; return them in order.
 
     The figures are drawn while they are iterated over: `figures` must be a generator, so that
-    the style applies.
+    the style applies. `dark`: on a dark ground; only for figures whose colors allow it.
     """
     folder.mkdir(parents=True, exist_ok=True)
     pictures = []
-    with mpl.rc_context(RC_PARAMS):
+    with mpl.rc_context(RC_PARAMS | (DARK_RC_PARAMS if dark else {})):
         for drawing in figures:
             path = folder / f"{drawing.name}.png"
             drawing.figure.savefig(path)

@@ -43,7 +43,7 @@ from twin.reports.report_data import DIRECTIONS, extract_prc
 
 FREE_FLIGHT = "G∞"
 LABEL_OFFSETS_PT = {
-    "G∞": (13, 0),
+    "G∞": (15, -8),
     "G0": (-10, 4),
     "G-1": (4, 10),
     "G-2": (3, 5),
@@ -88,6 +88,8 @@ def draw_all_gaps(
         points = measured_points or (cases[name].points if name in cases else ())
         if _highlight_hysteresis(panels, points, "measured" if measured_points else "twin", kind):
             highlighted[name] = kind
+    if FREE_FLIGHT in cases:
+        _mark_unit(panels)
     _label_peaks(cases, panels)
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=FREE_FLIGHT_COLOUR if name == FREE_FLIGHT else GUIDE_COLOUR,
@@ -111,10 +113,22 @@ def draw_all_gaps(
         + "Yellow: the primary right hysteresis of G4; cyan: the left hysteresis of G−1 "
         "(first to last grid frequency at which the directions differ"
         + (", measured" if campaign else "")
-        + "); arrows: their jumps.",
+        + "); arrows: their jumps."
+        + (" Green dashed: 1.0, the peak of G∞ continuous in frequency, by which η is divided; "
+           "on the grid G∞ stays below it." if FREE_FLIGHT in cases else ""),
         figure,
         "2",
     )  # fmt: skip
+
+
+def _mark_unit(panels: list[Panel]) -> None:
+    """Mark 1.0 in the panels of eta_d and eta_a: u* and a*, continuous in frequency."""
+    for ax, _ in panels[:2]:
+        ax.axhline(1.0, color=FREE_FLIGHT_COLOUR, ls=(0, (4, 2)), lw=0.9, zorder=0.6)
+        ax.annotate(
+            "1.0: u*, a*", (1.0, 1.0), (-2, 2), xycoords=("axes fraction", "data"),
+            textcoords="offset points", ha="right", va="bottom", size=8, color=FREE_FLIGHT_COLOUR,
+        )  # fmt: skip
 
 
 def _family_style(name: str, size: float, direction: str) -> LineStyle:

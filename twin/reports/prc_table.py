@@ -84,7 +84,7 @@ def _format_branches(summary: Json) -> list[str]:
     lines = [
         f"{interval['kind']} hysteresis from {interval['from_hz']:g} to {interval['to_hz']:g} Hz"
         for interval in summary["hysteresis"]
-    ] or ["no hysteresis on this grid"]
+    ] or ["no hysteresis of two or more grid frequencies"]
     return lines + [
         f"jump {jump['kind']}, {jump['direction']}, between {jump['from_hz']:g} and "
         f"{jump['to_hz']:g} Hz"

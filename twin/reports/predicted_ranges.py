@@ -14,12 +14,12 @@ from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.config.rig import RigConfig
 from table_io.config.sensor import SensorConfig
 from table_io.safety.preflight import CORRECTION_HEADROOM
-from table_io.units import GRAVITY_M_S2
 from twin.compare.extra_channels import PREDICTED_SUMS, select_predicted
 from twin.model.ideal_response import simulate_sweep
 from twin.run.run_config import RunConfig
 from twin.run.unpaced import generate_ideal_twin
 
+SETTLING_CYCLES = 30  # at each orbit of a continuation
 MAX_RANGE_SHARE = (
     1.0 / CORRECTION_HEADROOM
 )  # a larger predicted share gives a warning: the specimen may differ from the model
@@ -72,13 +72,13 @@ def _compute_peaks(run_config: RunConfig) -> dict[str, Float1D]:
 
     Total displacement of the mass: upper bound, sum of table and relative displacement.
     """
-    steps, sweep = run_config.steps, run_config.profile.sweep
-    frequencies = np.array([step.frequency_hz for step in steps])
-    level = sweep.acceleration_g * GRAVITY_M_S2
+    profile = run_config.profile
+    frequencies = np.array([step.frequency_hz for step in run_config.steps])
+    level = profile.plan.level_m_s2
+    # Between the orbits of a continuation the motion may fall to any other solution.
+    cycles = SETTLING_CYCLES if profile.continuation is not None else profile.sweep.cycles
     # The first step runs twice and the first run is dropped: the real drive has a soft start.
-    motion = simulate_sweep(
-        run_config.model, np.r_[frequencies[:1], frequencies], level, sweep.cycles
-    )
+    motion = simulate_sweep(run_config.model, np.r_[frequencies[:1], frequencies], level, cycles)
     table = level / (2 * np.pi * frequencies) ** 2
 
     def max_magnitude(*names: str) -> Float1D:

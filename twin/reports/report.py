@@ -5,6 +5,7 @@ Values from the summary are shown unchanged; the page loads nothing from outside
 
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from table_io.records import (
 )
 from twin.compare.monitoring import EVENT_KINDS as MONITOR_KINDS
 from twin.recording.reader import Recording, read_recording
+from twin.reports.contracts import SummaryKeys
 from twin.reports.figures import draw_run_figures
 from twin.reports.page import TEMPLATE_DIR, embed_images, format_significant, render_page
 from twin.reports.plot_style import Picture
@@ -32,7 +34,7 @@ from twin.reports.report_data import (
     step_quantity,
 )
 from twin.reports.sensor_table import build_sensor_rows
-from twin.reports.summary import RunSummary, load_summary
+from twin.reports.summary import load_summary
 
 MAX_ROWS = 200
 MAX_TEXT_LENGTH = 20_000  # of a configuration as recorded
@@ -44,7 +46,7 @@ def write_report(folder: Path, recording: Recording | None = None) -> Path:
     A `recording` already in memory is not read again.
     """
     remedy = "give a folder written by run, replay or simulate"
-    summary = load_summary(folder / "summary.json", RunSummary, remedy)
+    summary = load_summary(folder / "summary.json", SummaryKeys, remedy)
     run = build_report_data(recording or read_recording(folder / "run.mcap"), summary)
     path = folder / "report.html"
     path.write_text(render_report(run, draw_run_figures(run, folder / "figures")), encoding="utf-8")
@@ -116,12 +118,29 @@ def worst_level(run: ReportData) -> dict[str, float] | None:
     }
 
 
+def format_orbit_headline(orbits: list[dict[str, Any]]) -> str:
+    """Format the headline of a continuation: orbits accepted, their range and the feedback."""
+    accepted = [orbit for orbit in orbits if orbit["accepted"]]
+    if not accepted:
+        return f"{len(orbits)} orbits, none accepted."
+    unstable = [orbit for orbit in accepted if not orbit["stable"]] or accepted
+    frequencies = [orbit["frequency_hz"] for orbit in unstable]
+    share = max(orbit["feedback_share"] for orbit in accepted)
+    return (
+        f"{len(accepted)} of {len(orbits)} orbits measured, {len(unstable)} of them unstable from "
+        f"{min(frequencies):.4g} to {max(frequencies):.4g} Hz; feedback at most "
+        f"{100 * share:.2g} % of the command."
+    )
+
+
 def format_headline(run: ReportData) -> str:
     """Format the headline: steps completed, hysteresis, findings and largest excursion."""
     if run.windows:
         planned = parse_toml_tables(run.recording.start.profile_toml).get("excitation") or {}
         kind = planned.get("kind", "history")
         return f"{len(run.windows)} windows of a displacement history ({kind}), open loop."
+    if run.orbits:
+        return format_orbit_headline(run.orbits)
     done_count = sum(1 for step in run.steps if step.get("measured") or step.get("twin"))
     parts = [f"{done_count} of {len(run.recording.start.steps) or len(run.steps)} steps"]
     parts += [

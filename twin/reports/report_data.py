@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
-from scipy.signal import savgol_filter
 
 from table_io.block import Block, Float1D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS, contact_forces, relative_displacement
@@ -60,7 +59,13 @@ class ReportData:
     def source(self) -> str:
         """Source of the results: "measured", or "twin" if nothing was measured."""
         results = [*self.steps, *self.windows]
-        return "measured" if any(result.get("measured") for result in results) else "twin"
+        is_measured = self.orbits or any(result.get("measured") for result in results)
+        return "measured" if is_measured else "twin"
+
+    @property
+    def orbits(self) -> list[dict[str, Any]]:
+        """Measured periodic orbits of a continuation; none in other tests."""
+        return self.summary.get("orbits") or []
 
     @property
     def windows(self) -> list[dict[str, Any]]:
@@ -158,19 +163,24 @@ def compute_prestress(run: ReportData) -> dict[str, float]:
     return {name: size for name, size in ratios.items() if 0 < size < math.inf}
 
 
-def _read_model_values(run: ReportData) -> dict[str, float]:
-    """Return the initial model parameters in SI: recorded, else from the model file; else {}."""
+def read_initial_model(run: ReportData) -> Model | None:
+    """Return the initial model: as recorded, else from the model file; None if it is unknown."""
     recorded = run.recording.records(Params)
-    if recorded:
-        try:
-            return Model.from_flat(recorded[0].values).parameters.as_dict()
-        except ValueError:
-            return recorded[0].values
     try:
+        if recorded:
+            return Model.from_flat(recorded[0].values)
         config = ModelConfig.model_validate(parse_toml_tables(run.recording.start.model_toml))
-        return config.build_model(run.specimen).parameters.as_dict() if run.specimen else {}
+        return config.build_model(run.specimen) if run.specimen else None
     except ValueError:
-        return {}
+        return None
+
+
+def _read_model_values(run: ReportData) -> dict[str, float]:
+    """Return the initial model parameters in SI; of an unknown model as far as recorded."""
+    model, recorded = read_initial_model(run), run.recording.records(Params)
+    if model is not None:
+        return model.parameters.as_dict()
+    return recorded[0].values if recorded else {}
 
 
 def select_frequencies(run: ReportData) -> dict[float, str]:
@@ -226,7 +236,7 @@ def extract_step_motion(run: ReportData, stream: str, step: int) -> StepMotion |
     v = (
         step_block.channel("rel_vel_m_s")
         if "rel_vel_m_s" in names
-        else _differentiate(u, step_block.rate_hz)
+        else differentiate(u, step_block.rate_hz)
     )
     a = step_block.channel("mass_acc_m_s2") if "mass_acc_m_s2" in names else missing
     force_r, force_l = contact_forces(step_block)
@@ -235,13 +245,17 @@ def extract_step_motion(run: ReportData, stream: str, step: int) -> StepMotion |
     return StepMotion(time_s, u, v, a, force_r, force_l, v_r, v_l, cycle)
 
 
-def _differentiate(u: Float1D, rate_hz: float) -> Float1D:
-    """Differentiate u by a Savitzky-Golay filter over 20 ms; for figures only, NaN at both ends."""
+def differentiate(u: Float1D, rate_hz: float) -> Float1D:
+    """Differentiate u by a Savitzky-Golay filter over 20 ms; for figures only, NaN at both ends.
+
+    The slope is that of the cubic fitted to the window. scipy.signal takes a second to import.
+    """
     half = max(2, round(SLOPE_WINDOW_S * rate_hz / 2))
     v = np.full(u.size, np.nan)
     if u.size > 2 * half:
-        slope = savgol_filter(u, 2 * half + 1, 3, deriv=1, delta=1 / rate_hz, mode="nearest")
-        v[half:-half] = slope[half:-half]
+        time_s = np.arange(-half, half + 1) / rate_hz
+        slope_weights = np.linalg.pinv(np.vander(time_s / time_s[-1], 4))[2] / time_s[-1]
+        v[half:-half] = np.correlate(u, slope_weights, "valid")
     return v
 
 

@@ -22,10 +22,11 @@ class SearchEffort:
     counted_cycles: int  # cycles evaluated in a chaotic motion
     lyapunov_cycles: int  # cycles for the Lyapunov exponent
     gap_step_mm: float  # step of a search over the gap
+    secondary_hz: float  # frequency step of the scan for secondary resonances
 
 
-FINE_EFFORT = SearchEffort(0.01, 40, 300, 3000, 3000, 0.05)
-COARSE_EFFORT = SearchEffort(0.02, 20, 100, 1000, 150, 0.25)
+FINE_EFFORT = SearchEffort(0.01, 40, 300, 3000, 3000, 0.05, 0.001)
+COARSE_EFFORT = SearchEffort(0.02, 20, 100, 1000, 150, 0.25, 0.005)
 
 
 def choose_effort(case: PaperCase) -> SearchEffort:

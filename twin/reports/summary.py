@@ -37,26 +37,12 @@ from twin.compare.monitoring import EVENT_KINDS as MONITOR_KINDS
 from twin.model.model import Model
 from twin.model.parameters import Parameters, free_flight_resonance
 from twin.recording.reader import Recording
+from twin.reports.contracts import Contract, RunSummary
+from twin.reports.orbits import summarise_orbits
 from twin.reports.windows import summarise_windows
 
 Json = dict[str, Any]
 ESTIMATE_KEYS = ("value", "sd", "drift", "drift_sd")
-
-
-class StepEntry(BaseModel):
-    """Keys that every step of a summary.json has; it may have more."""
-
-    index: int
-    direction: str
-    frequency_hz: float
-
-
-class RunSummary(BaseModel):
-    """Keys that every summary.json of a run has, in old files too; it may have more."""
-
-    run: dict[str, Any]
-    verdict: str
-    steps: list[StepEntry]
 
 
 def summarise(recording: Recording, parameters: Parameters) -> Json:
@@ -99,6 +85,7 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         "trips": [asdict(trip) for trip in recording.records(Trip)],
         "steps": [_step_entry(point) | _level_entry(point, levels) for point in planned],
         **_windows_entry(recording, parameters, profile),
+        **_orbits_entry(recording, profile),
         # Steps added during the test are not part of the PRC grid.
         "visits": [
             {**_step_entry(point), "reason": reasons[point.step]}
@@ -110,7 +97,7 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         "hysteresis": [asdict(interval) for interval in intervals],
         "twin_jumps": [asdict(jump) for jump in twin_jumps],
         "twin_hysteresis": [asdict(interval) for interval in twin_intervals],
-        "timing": _timing(recording.records(Timing)),
+        "timing": summarise_timing(recording.records(Timing)),
         "comparison": channel_nrmse(
             recording.records(Comparison), parameters, read_channels(start.rig_toml)
         ),
@@ -146,6 +133,13 @@ def _windows_entry(recording: Recording, parameters: Parameters, profile: Profil
         return channel_nrmse(comparisons, parameters, channels)
 
     return {"windows": summarise_windows(recording, profile.comparison.contact_n, compare)}
+
+
+def _orbits_entry(recording: Recording, profile: Profile) -> Json:
+    """Return the measured orbits of a continuation; {} for other tests."""
+    if profile.continuation is None:
+        return {}
+    return {"orbits": summarise_orbits(recording, profile.continuation.orbit_plan)}
 
 
 def _estimates_entry(estimates: tuple[Estimate, ...]) -> Json:
@@ -243,7 +237,7 @@ def _level_entry(point: PrcPoint, levels: tuple[Level, ...]) -> Json:
     }
 
 
-def _timing(records: tuple[Timing, ...]) -> Json:
+def summarise_timing(records: tuple[Timing, ...]) -> Json:
     """Return the twin latency in ms (scheduled last sample of a block to published Comparison).
 
     Also the missed deadlines and the timing of each component.
@@ -307,7 +301,12 @@ def channel_nrmse(
 def format_summary(summary: Json) -> str:
     """Format the result of a run in one line."""
     windows = summary.get("windows")
-    done = f"{len(summary['steps'])} steps" if windows is None else f"{len(windows)} windows"
+    orbits = summary.get("orbits")
+    if orbits is not None:
+        accepted = sum(orbit["accepted"] for orbit in orbits)
+        done = f"{accepted} of {len(orbits)} orbits measured"
+    else:
+        done = f"{len(summary['steps'])} steps" if windows is None else f"{len(windows)} windows"
     parts = [f"{summary['verdict']}: {done}"]
     if summary.get("visits"):
         parts.append(f"{len(summary['visits'])} steps added during the test")
@@ -333,8 +332,23 @@ def format_summary(summary: Json) -> str:
 
 
 def write_summary(summary: Json, path: Path) -> None:
-    """Write a summary as strict JSON; non-finite numbers become null."""
-    path.write_text(dump_strict_json(summary) + "\n")
+    """Write the summary.json of a run."""
+    path.write_text(dump_contract(RunSummary, summary) + "\n")
+
+
+def write_json(content: Json, path: Path) -> None:
+    """Write strict JSON; non-finite numbers become null."""
+    path.write_text(dump_strict_json(content) + "\n")
+
+
+def dump_contract(contract: type[Contract], content: Json) -> str:
+    """Return strict JSON text as the contract demands.
+
+    ValidationError if a key is unknown or missing, or a value of a wrong type.
+    """
+    plain = _replace_nonfinite(content)
+    contract.model_validate(plain, strict=True)
+    return _format_json(plain)
 
 
 def load_summary(path: Path, contract: type[BaseModel], remedy: str) -> Json:
@@ -355,7 +369,11 @@ def load_summary(path: Path, contract: type[BaseModel], remedy: str) -> Json:
 
 def dump_strict_json(summary: Json) -> str:
     """Return a summary as strict JSON text; non-finite numbers become null."""
-    return json.dumps(_replace_nonfinite(summary), indent=1, allow_nan=False)
+    return _format_json(_replace_nonfinite(summary))
+
+
+def _format_json(plain: Any) -> str:
+    return json.dumps(plain, indent=1, allow_nan=False)
 
 
 def _replace_nonfinite(value: Any) -> Any:

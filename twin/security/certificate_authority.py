@@ -20,8 +20,7 @@ from cryptography.hazmat.primitives.serialization import (
     load_pem_private_key,
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
-
-from table_io.errors import InputError
+from cryptography.x509.verification import PolicyBuilder, Store, VerificationError
 
 AUTHORITY_DAYS, LEAF_DAYS = 3652, 365
 MAX_CLOCK_SKEW = timedelta(hours=1)  # by which a verifying clock may be late
@@ -50,25 +49,18 @@ def issue_certificate(
 ) -> CertificateKeyPair:
     """Issue a certificate for `name`, valid for a year; with `hosts` it may serve as one of them.
 
-    Raises InputError if the authority has expired or its key does not match its certificate.
+    Raises ValueError if the authority is damaged, or its key does not match its certificate.
     """
     authority_certificate = x509.load_pem_x509_certificate(authority.certificate)
     signer = load_pem_private_key(authority.key, None)
     if not isinstance(signer, ec.EllipticCurvePrivateKey) or signer.public_key() != (
         authority_certificate.public_key()
     ):
-        raise InputError(
-            "the authority's key does not belong to its certificate",
-            remedy="restore ca.pem and ca.key.pem of the same authority",
-        )
-    authority_expiry = authority_certificate.not_valid_after_utc
-    if valid_from >= authority_expiry:
-        raise InputError(
-            f"the authority expired on {authority_expiry:%Y-%m-%d}; make new ones: `shaketwin "
-            "keys new`"
-        )
+        raise ValueError("the authority's key does not belong to its certificate")
     key = ec.generate_private_key(ec.SECP256R1())
-    valid_until = min(valid_from + timedelta(days=LEAF_DAYS), authority_expiry)
+    valid_until = min(
+        valid_from + timedelta(days=LEAF_DAYS), authority_certificate.not_valid_after_utc
+    )
     builder = _start_builder(name, key, authority_certificate.subject, valid_from, valid_until)
     builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), True)
     builder = builder.add_extension(_key_usage(signs_certificates=False), critical=True)
@@ -91,9 +83,25 @@ def issue_certificate(
     return _to_key_pair(builder.sign(signer, SHA256()), key)
 
 
-def certificate_expiry(certificate: bytes) -> datetime:
-    """Return the expiry time (UTC) of a PEM certificate; raise ValueError if it is not one."""
-    return x509.load_pem_x509_certificate(certificate).not_valid_after_utc
+def verify_certificate(certificate: bytes, authority: bytes, time: datetime) -> str:
+    """Verify that the authority issued a client's certificate; return its common name.
+
+    Raises ValueError if it did not, or if either is not valid at `time` (RFC 5280).
+    """
+    leaf, *intermediates = x509.load_pem_x509_certificates(certificate)
+    policy = PolicyBuilder().store(Store(x509.load_pem_x509_certificates(authority))).time(time)
+    try:
+        policy.build_client_verifier().verify(leaf, intermediates)
+    except VerificationError as error:
+        raise ValueError(str(error)) from None
+    names = leaf.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    return str(names[0].value) if names else ""
+
+
+def certificate_validity(certificate: bytes) -> tuple[datetime, datetime]:
+    """Return (valid from, valid until) in UTC of a PEM certificate; raise ValueError if damaged."""
+    leaf = x509.load_pem_x509_certificate(certificate)
+    return leaf.not_valid_before_utc, leaf.not_valid_after_utc
 
 
 def certificate_hosts(certificate: bytes) -> list[str]:

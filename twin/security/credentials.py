@@ -11,7 +11,7 @@
 | ca.key.pem      | private key of the authority, needed only by `keys`    | the rig's, or at |
 |                 |                                                        | a safer place    |
 
-A certificate is verified as a peer would verify it, by a TLS handshake in memory.
+A certificate is verified against the authority before it is used.
 """
 
 import getpass
@@ -19,7 +19,7 @@ import re
 import ssl
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -38,24 +38,23 @@ AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, ACCESS_FILE = (
 )
 EXPIRY_WARNING_DAYS = 30  # before a certificate expires
 MAX_NAME_LENGTH = 64  # X.509's upper bound of a common name
-# X509_V_FLAG_NO_CHECK_TIME: dates are checked here, for a message that names them
-NO_CHECK_TIME_FLAG = 0x200000
 OTHERS_MODE_BITS, WRITE_BY_OTHERS_MODE_BITS = 0o077, 0o022
 NAME_ALPHABET = frozenset("abcdefghijklmnopqrstuvwxyz0123456789_-")
 
 
 def check_name(name: str) -> str:
-    """Return `name` if it is valid for a person's certificate; raise ValueError otherwise.
+    """Return `name` if it is valid for a person's certificate; raise InputError otherwise.
 
     Dots are not allowed: in alive/observer.<name>.<anything> `a` could pass for `a.b`.
     """
     if not (set(name) <= NAME_ALPHABET and 0 < len(name) <= MAX_NAME_LENGTH and name[0].isalnum()):
-        raise ValueError(
-            f"{name!r} is not a valid user name; allowed: up to {MAX_NAME_LENGTH} of a-z 0-9 "
-            "_ -, starting with a letter or digit"
+        raise InputError(
+            "not a valid user name",
+            value=name,
+            allowed=f"up to {MAX_NAME_LENGTH} of a-z 0-9 _ -, starting with a letter or digit",
         )
     if name in (RIG_NAME, NO_ROLE):
-        raise ValueError(f"{name!r} is a reserved name; choose another")
+        raise InputError("a reserved name", value=name, remedy="choose another")
     return name
 
 
@@ -132,37 +131,44 @@ class Credentials:
 
 def read_credentials(folder: Path) -> Credentials:
     """Read and verify the keys in a folder; raise InputError if they cannot be used."""
+    # imported here, so that a run without keys does not load cryptography
+    from twin.security.certificate_authority import certificate_validity, verify_certificate
+
     folder = folder.absolute()
     for name in (AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE):
         if not (folder / name).is_file():
             raise InputError(
                 f"{name} is missing",
-                where=f"--keys {folder}",
+                key="--keys",
+                value=str(folder),
                 remedy="give a folder made by `shaketwin keys new` or `shaketwin keys add`",
             )
     _check_file_mode(
         folder / KEY_FILE, OTHERS_MODE_BITS, "others on this machine may read it", "go-rwx"
     )
-    certificate = _verify_certificate(folder)
-    valid_from, valid_until = (
-        datetime.fromtimestamp(ssl.cert_time_to_seconds(certificate[when]), UTC)
-        for when in ("notBefore", "notAfter")
-    )
+    create_tls_context(folder, ssl.PROTOCOL_TLS_CLIENT)  # the files are sound, the key matches
+    path = folder / CERTIFICATE_FILE
+    certificate, authority = path.read_bytes(), (folder / AUTHORITY_FILE).read_bytes()
+    valid_from, valid_until = certificate_validity(certificate)
     time = local_datetime()
     if not valid_from <= time < valid_until:
-        remedy = (
-            "ask for new keys (`shaketwin keys renew`)"
-            if time >= valid_until
-            else "check the clock"
-        )
+        is_expired = time >= valid_until
         raise InputError(
-            f"{folder / CERTIFICATE_FILE}: valid from {valid_from:%Y-%m-%d} to "
-            f"{valid_until:%Y-%m-%d}, it is now {time:%Y-%m-%d %H:%M}: "
-            f"{'expired' if time >= valid_until else 'not yet valid'}; {remedy}"
+            f"{'expired' if is_expired else 'not yet valid'}: it is now {time:%Y-%m-%d %H:%M}",
+            where=path,
+            allowed=f"{valid_from:%Y-%m-%d} to {valid_until:%Y-%m-%d}",
+            remedy="ask for new keys (`shaketwin keys renew`)" if is_expired else "check the clock",
         )
-    names = dict(entry for part in certificate["subject"] for entry in part)
+    try:
+        name = verify_certificate(certificate, authority, time)
+    except ValueError as error:
+        raise InputError(
+            f"not issued by the authority in {AUTHORITY_FILE} of the same folder ({error})",
+            where=path,
+            remedy="ask for both together",
+        ) from None
     people = read_people(folder) if (folder / ACCESS_FILE).exists() else None
-    return Credentials(folder, names.get("commonName", ""), valid_until, people)
+    return Credentials(folder, name, valid_until, people)
 
 
 def credentials_folder(keys: Credentials | None) -> str:
@@ -176,7 +182,8 @@ def read_rig_credentials(folder: Path) -> Credentials:
     if keys.people is None:
         raise InputError(
             f"the keys of {keys.name} are a person's and cannot open an endpoint",
-            where=f"--keys {folder}",
+            key="--keys",
+            value=str(folder),
             remedy="give the rig's folder, which holds access.toml",
         )
     return keys
@@ -192,7 +199,13 @@ def _check_file_mode(path: Path, bits: int, reason: str, remedy: str) -> None:
             remedy="give a folder made by `shaketwin keys`",
         ) from None
     if mode & bits:
-        raise InputError(f"{path}: mode {mode & 0o777:04o}, {reason}; chmod {remedy} {path}")
+        raise InputError(
+            reason,
+            where=path,
+            key="mode",
+            value=f"{mode & 0o777:04o}",
+            remedy=f"chmod {remedy} {path}",
+        )
 
 
 def create_tls_context(folder: Path, side: int) -> ssl.SSLContext:
@@ -206,46 +219,26 @@ def create_tls_context(folder: Path, side: int) -> ssl.SSLContext:
             problem = f"{KEY_FILE} does not belong to {CERTIFICATE_FILE}"
         else:
             problem = f"{CERTIFICATE_FILE} or {KEY_FILE} is damaged, encrypted or no PEM file"
-        raise InputError(f"--keys {folder}: {problem}; ask for new keys") from None
+        raise InputError(
+            problem, key="--keys", value=str(folder), remedy="ask for new keys"
+        ) from None
     except OSError as error:
-        raise InputError(f"--keys {folder}: cannot read the keys: {error.strerror}") from None
+        raise InputError(
+            f"cannot read the keys: {error.strerror}",
+            key="--keys",
+            value=str(folder),
+            remedy="check the permissions of the folder and its files",
+        ) from None
     try:
         context.load_verify_locations(folder / AUTHORITY_FILE)
     except (ssl.SSLError, OSError):
         raise InputError(
-            f"{folder / AUTHORITY_FILE}: not the certificate of an authority; ask for it again"
+            "not the certificate of an authority",
+            where=folder / AUTHORITY_FILE,
+            remedy="ask for it again",
         ) from None
     context.verify_mode = ssl.CERT_REQUIRED
     return context
-
-
-def _verify_certificate(folder: Path) -> dict[str, Any]:
-    """Verify the certificate against ca.pem by a handshake in memory; return it as a peer's."""
-    client, server = (
-        create_tls_context(folder, side)
-        for side in (ssl.PROTOCOL_TLS_CLIENT, ssl.PROTOCOL_TLS_SERVER)
-    )
-    client.check_hostname = False
-    client.verify_mode = ssl.CERT_NONE
-    server.verify_flags |= NO_CHECK_TIME_FLAG
-    to_client, to_server = ssl.MemoryBIO(), ssl.MemoryBIO()
-    connections = [
-        client.wrap_bio(to_client, to_server),
-        server.wrap_bio(to_server, to_client, server_side=True),
-    ]
-    try:
-        for connection in (*connections, *connections):
-            try:
-                connection.do_handshake()
-            except ssl.SSLWantReadError:
-                continue
-    except ssl.SSLError as error:
-        reason = getattr(error, "verify_message", "") or error.reason
-        raise InputError(
-            f"{folder / CERTIFICATE_FILE}: not issued by the authority in {AUTHORITY_FILE} of the "
-            f"same folder ({reason}); ask for both together"
-        ) from None
-    return connections[1].getpeercert() or {}
 
 
 def user_name(keys: Credentials | None) -> str:

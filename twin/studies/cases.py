@@ -47,7 +47,7 @@ def parse_gaps_mm(words: Sequence[str]) -> list[float]:
     for word in words:
         for gap in _parse_range(word) if ":" in word else [_parse_number(word, word)]:
             if math.isnan(gap) or gap == -math.inf:
-                raise InputError(f"--gap {word}: {GAP_HELP}")
+                raise _make_gap_error(word)
             duplicate = next(
                 (
                     known_gap
@@ -66,18 +66,22 @@ def parse_gaps_mm(words: Sequence[str]) -> list[float]:
     return list(gaps)
 
 
+def _make_gap_error(word: str) -> InputError:
+    return InputError("not a gap", where=f"--gap {word}", allowed=GAP_HELP)
+
+
 def _parse_number(text: str, word: str) -> float:
     try:
         return float(text) + 0.0  # converts -0 to 0
     except ValueError:
-        raise InputError(f"--gap {word}: {GAP_HELP}") from None
+        raise _make_gap_error(word) from None
 
 
 def _parse_range(word: str) -> list[float]:
     """Expand FROM:TO:STEP to gaps in mm, both ends included."""
     ends = [_parse_number(text, word) for text in word.split(":")]
     if len(ends) != 3 or not all(map(math.isfinite, ends)):
-        raise InputError(f"--gap {word}: {GAP_HELP}")
+        raise _make_gap_error(word)
     start, stop, step = ends
     if step == 0 or (stop - start) * step < 0:
         raise InputError(
@@ -155,7 +159,7 @@ def _models_at_gaps(
             return [(round(1e3 * sum(specimen.gaps_m), 9), model)]
         return list(zip(gaps, make_gap_variants(model, [gap / 1e3 for gap in gaps]), strict=True))
     except InputError as error:
-        raise InputError(f"{context}: {error}") from None
+        raise error.add_place(context) from None
 
 
 def _require_simulable(case: StudyCase, profile: Profile, context: str) -> None:
@@ -169,4 +173,4 @@ def _require_simulable(case: StudyCase, profile: Profile, context: str) -> None:
         model.check_rate(profile.acquisition.rate_hz)
         simulate_sweep(model, [slowest_hz], 0.0, 1)
     except InputError as error:
-        raise InputError(f"{context}: {case.name}: {error}") from None
+        raise error.add_place(f"{context}: {case.name}") from None

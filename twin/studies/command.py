@@ -17,7 +17,7 @@ from twin.compare.curves import detect_hysteresis
 from twin.model.parameters import free_flight_resonance
 from twin.reports import ideal_points
 from twin.reports.finalize import EXIT_INTERRUPTED
-from twin.reports.summary import Json, write_summary
+from twin.reports.summary import Json, write_json
 from twin.run.folders import make_run_folder
 from twin.run.run_config import RunConfig, read_run_config
 from twin.run.terminal import announce_if_slow, catch_interrupts, console, print_line
@@ -40,7 +40,11 @@ def simulate_all(
     """Simulate every model at every gap under the ideal stepped sine; return the exit code."""
     if workers is not None and workers < 1:
         raise InputError(
-            f"--workers {workers}: allowed: 1 or more; omit the option to use all cores"
+            "invalid number of processes",
+            key="--workers",
+            value=workers,
+            allowed="1 or more",
+            remedy="omit --workers to use all cores",
         )
     gaps = parse_gaps_mm(gap_words)
     run_config = read_run_config(profile, None, model_names[0] if model_names else None)
@@ -67,7 +71,7 @@ def simulate_all(
                    in configs.items()},
         "cases": entries,
     }  # fmt: skip
-    write_summary(summary, folder / "summary.json")
+    write_json(summary, folder / "summary.json")
     page = write_study_page(folder)
     print_line(f"{summary['verdict']}: {summary['reason']} in {seconds:.2g} s -> {page}")
     return 0 if summary["verdict"] == "complete" else EXIT_INTERRUPTED

@@ -73,10 +73,10 @@ GAP_CAPTION = (
 
 def draw_study_figures(rows: Sequence[Row], summary: Json, folder: Path) -> list[Picture]:
     """Draw the figures of a batch as PNG files in `folder`; return them in page order."""
-    return save_figures(_draw_figures(_group_cases(rows), summary["cases"]), folder)
+    return save_figures(_draw_figures(group_cases(rows), summary["cases"]), folder)
 
 
-def _group_cases(rows: Sequence[Row]) -> CaseCurves:
+def group_cases(rows: Sequence[Row]) -> CaseCurves:
     cases: CaseCurves = {}
     for row in rows:
         case = str(row["model"]), float(row["gap_mm"])
@@ -103,14 +103,14 @@ def _draw_each(cases: CaseCurves, entries: list[Json]) -> CaptionedFigures:
     for label in labels[:MAX_FIGURES]:
         curves_by_gap = {gap: curves for (model, gap), curves in cases.items() if model == label}
         if len(curves_by_gap) > 1 or len(labels) == 1:
-            yield _draw_family(label, curves_by_gap)
-        yield from _draw_gap_figure(label, [entry for entry in entries if entry["model"] == label])
+            yield draw_family(label, curves_by_gap)
+        yield from draw_gap_figure(label, [entry for entry in entries if entry["model"] == label])
     if len(labels) > 1:
         for gap in _thin_out(gaps):
             curves_by_model = {
                 model: curves for (model, model_gap), curves in cases.items() if model_gap == gap
             }
-            yield _draw_models(gap, curves_by_model)
+            yield draw_models(gap, curves_by_model)
 
 
 def _thin_out(gaps: list[float]) -> list[float]:
@@ -144,7 +144,7 @@ def _draw_case(panels: list[Panel], curves: Curves, colour: str, width: float) -
     plot_prc(panels if _has_contact(curves) else panels[:2], extract_column, make_style)
 
 
-def _draw_family(label: str, curves_by_gap: dict[float, Curves]) -> CaptionedFigure:
+def draw_family(label: str, curves_by_gap: dict[float, Curves]) -> CaptionedFigure:
     figure, panels = _make_panels(curves_by_gap.values())
     finite = sorted(gap for gap in curves_by_gap if math.isfinite(gap))
     is_named = len(finite) <= MAX_NAMED_GAPS
@@ -183,7 +183,7 @@ def _draw_legend(figure: Figure, handles: list[Line2D], curves: Curves) -> None:
     figure.legend(handles=handles, loc="outside upper center", ncols=columns)
 
 
-def _draw_models(gap: float, curves_by_model: dict[str, Curves]) -> CaptionedFigure:
+def draw_models(gap: float, curves_by_model: dict[str, Curves]) -> CaptionedFigure:
     figure, panels = _make_panels(curves_by_model.values())
     handles = []
     for index, (label, curves) in enumerate(curves_by_model.items()):
@@ -200,7 +200,7 @@ def _draw_models(gap: float, curves_by_model: dict[str, Curves]) -> CaptionedFig
     )
 
 
-def _draw_gap_figure(label: str, entries: list[Json]) -> CaptionedFigures:
+def draw_gap_figure(label: str, entries: list[Json]) -> CaptionedFigures:
     """Draw one figure from the summary entries of the cases of one model."""
     cases = sorted((entry for entry in entries if entry["gap_mm"] != "inf" and entry["peak"]),
                    key=lambda entry: float(entry["gap_mm"]))  # fmt: skip

@@ -58,27 +58,46 @@ def check_endpoint(rig: str, endpoint: str, has_keys: bool) -> None:
     Over a network only mutual TLS is allowed: tls/ and keys.
     """
     if not re.fullmatch(r"[\w.-]+", rig):
-        raise InputError(f"rig {rig!r}: not a name for the bus; allowed: letters, digits and _ . -")
+        raise InputError(
+            "not a name for the bus",
+            key="rig",
+            value=rig,
+            allowed="letters, digits and _ . -",
+            remedy="change `name` in the rig file, or --rig",
+        )
     if endpoint.startswith(LOCAL_SOCKET_PREFIX) and not has_keys:
         return
     match = re.fullmatch(r"(tcp|tls)/(\[[0-9A-Fa-f:]+\]|[\w.-]+):(\d{1,5})", endpoint)
     if not match or not 0 < int(match[3]) < 2**16:
-        raise InputError(
-            f"endpoint {endpoint!r}: not understood; write tcp/<host>:<port>, as "
-            "tcp/127.0.0.1:7447, or with --keys FOLDER tls/<host>:<port>"
+        raise make_endpoint_error(
+            endpoint,
+            "not understood",
+            allowed="tcp/<host>:<port>, as tcp/127.0.0.1:7447, or with --keys FOLDER "
+            "tls/<host>:<port>",
         )
     if match[1] == "tls" and not has_keys:
-        raise InputError(
-            f"endpoint {endpoint}: asks for certificates; give yours with --keys FOLDER "
-            "(the keeper of the rig's keys makes them: `shaketwin keys add`)"
+        raise make_endpoint_error(
+            endpoint,
+            "asks for certificates",
+            "give yours with --keys FOLDER (the keeper of the rig's keys makes them: "
+            "`shaketwin keys add`)",
         )
     if match[1] == "tcp" and has_keys:
-        raise InputError(f"endpoint {endpoint}: tcp/ shows no certificate; with --keys write tls/")
+        raise make_endpoint_error(endpoint, "tcp/ shows no certificate", "with --keys write tls/")
     if not has_keys and not re.fullmatch(r"127\.[\d.]+|localhost|\[::1\]", match[2]):
-        raise InputError(
-            f"endpoint {endpoint}: would go over the network, unprotected; allowed: this machine "
-            "only, as tcp/127.0.0.1:7447, or with --keys FOLDER tls/<host>:<port>"
+        raise make_endpoint_error(
+            endpoint,
+            "would go over the network, unprotected",
+            allowed="this machine only, as tcp/127.0.0.1:7447, or with --keys FOLDER "
+            "tls/<host>:<port>",
         )
+
+
+def make_endpoint_error(
+    endpoint: str, problem: str, remedy: str = "", *, allowed: str = ""
+) -> InputError:
+    """Return the error of an endpoint that cannot be used."""
+    return InputError(problem, key="endpoint", value=endpoint, allowed=allowed, remedy=remedy)
 
 
 def key_expression(rig: str, topic: str, *, offered: bool = False) -> str:
@@ -124,7 +143,7 @@ def check_can_listen(rig: str, endpoint: str, has_keys: bool) -> None:
     try:
         socket.create_server((host, port), family=_address_family(host)).close()
     except OSError as error:
-        raise InputError(format_listen_error(endpoint, error.strerror or str(error))) from None
+        raise make_listen_error(endpoint, error.strerror or str(error)) from None
 
 
 def zenoh_error_reason(error: Exception) -> str:
@@ -133,11 +152,12 @@ def zenoh_error_reason(error: Exception) -> str:
     return reason[1] if reason else re.sub(r" at /\S+", "", str(error))
 
 
-def format_listen_error(endpoint: str, reason: str) -> str:
-    """Return the error message for an endpoint at which listening failed."""
-    return (
-        f"endpoint {endpoint}: cannot listen there ({reason}); "
-        "end the run that uses the port, or give another port"
+def make_listen_error(endpoint: str, reason: str) -> InputError:
+    """Return the error of an endpoint at which listening failed."""
+    return make_endpoint_error(
+        endpoint,
+        f"cannot listen there ({reason})",
+        "end the run that uses the port, or give another port",
     )
 
 

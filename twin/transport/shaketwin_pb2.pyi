@@ -182,7 +182,7 @@ class Cycle(_message.Message):
     def __init__(self, index: _Optional[int] = ..., step: _Optional[int] = ..., cycle: _Optional[int] = ..., count: _Optional[int] = ..., measured: _Optional[_Union[Extremes, _Mapping]] = ..., twin: _Optional[_Union[Extremes, _Mapping]] = ..., run: _Optional[str] = ..., label: _Optional[int] = ...) -> None: ...
 
 class Quantities(_message.Message):
-    __slots__ = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l", "impacts_right", "impacts_left", "drift", "spread")
+    __slots__ = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l", "impacts_right", "impacts_left", "drift", "spread", "spread_a")
     ETA_D_FIELD_NUMBER: _ClassVar[int]
     ETA_A_FIELD_NUMBER: _ClassVar[int]
     ETA_R_FIELD_NUMBER: _ClassVar[int]
@@ -193,6 +193,7 @@ class Quantities(_message.Message):
     IMPACTS_LEFT_FIELD_NUMBER: _ClassVar[int]
     DRIFT_FIELD_NUMBER: _ClassVar[int]
     SPREAD_FIELD_NUMBER: _ClassVar[int]
+    SPREAD_A_FIELD_NUMBER: _ClassVar[int]
     eta_d: float
     eta_a: float
     eta_r: float
@@ -203,7 +204,8 @@ class Quantities(_message.Message):
     impacts_left: _containers.RepeatedScalarFieldContainer[int]
     drift: float
     spread: float
-    def __init__(self, eta_d: _Optional[float] = ..., eta_a: _Optional[float] = ..., eta_r: _Optional[float] = ..., eta_l: _Optional[float] = ..., r_r: _Optional[float] = ..., r_l: _Optional[float] = ..., impacts_right: _Optional[_Iterable[int]] = ..., impacts_left: _Optional[_Iterable[int]] = ..., drift: _Optional[float] = ..., spread: _Optional[float] = ...) -> None: ...
+    spread_a: float
+    def __init__(self, eta_d: _Optional[float] = ..., eta_a: _Optional[float] = ..., eta_r: _Optional[float] = ..., eta_l: _Optional[float] = ..., r_r: _Optional[float] = ..., r_l: _Optional[float] = ..., impacts_right: _Optional[_Iterable[int]] = ..., impacts_left: _Optional[_Iterable[int]] = ..., drift: _Optional[float] = ..., spread: _Optional[float] = ..., spread_a: _Optional[float] = ...) -> None: ...
 
 class Point(_message.Message):
     __slots__ = ("index", "step", "direction", "frequency_hz", "measured", "twin", "table_acc_peak_m_s2", "table_acc_fundamental_m_s2", "thd", "run")
@@ -384,6 +386,42 @@ class Decided(_message.Message):
     reason: str
     run: str
     def __init__(self, index: _Optional[int] = ..., step: _Optional[int] = ..., direction: _Optional[str] = ..., frequency_hz: _Optional[float] = ..., acceleration_m_s2: _Optional[float] = ..., reason: _Optional[str] = ..., run: _Optional[str] = ...) -> None: ...
+
+class Orbit(_message.Message):
+    __slots__ = ("index", "step", "frequency_hz", "acceleration_m_s2", "amplitude_m", "u_m", "feedback_m", "noise_m", "command_m", "periods", "updates", "stable", "multiplier", "accepted", "reason", "run")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    FREQUENCY_HZ_FIELD_NUMBER: _ClassVar[int]
+    ACCELERATION_M_S2_FIELD_NUMBER: _ClassVar[int]
+    AMPLITUDE_M_FIELD_NUMBER: _ClassVar[int]
+    U_M_FIELD_NUMBER: _ClassVar[int]
+    FEEDBACK_M_FIELD_NUMBER: _ClassVar[int]
+    NOISE_M_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_M_FIELD_NUMBER: _ClassVar[int]
+    PERIODS_FIELD_NUMBER: _ClassVar[int]
+    UPDATES_FIELD_NUMBER: _ClassVar[int]
+    STABLE_FIELD_NUMBER: _ClassVar[int]
+    MULTIPLIER_FIELD_NUMBER: _ClassVar[int]
+    ACCEPTED_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    step: int
+    frequency_hz: float
+    acceleration_m_s2: float
+    amplitude_m: float
+    u_m: _containers.RepeatedScalarFieldContainer[float]
+    feedback_m: _containers.RepeatedScalarFieldContainer[float]
+    noise_m: float
+    command_m: float
+    periods: int
+    updates: int
+    stable: bool
+    multiplier: float
+    accepted: bool
+    reason: str
+    run: str
+    def __init__(self, index: _Optional[int] = ..., step: _Optional[int] = ..., frequency_hz: _Optional[float] = ..., acceleration_m_s2: _Optional[float] = ..., amplitude_m: _Optional[float] = ..., u_m: _Optional[_Iterable[float]] = ..., feedback_m: _Optional[_Iterable[float]] = ..., noise_m: _Optional[float] = ..., command_m: _Optional[float] = ..., periods: _Optional[int] = ..., updates: _Optional[int] = ..., stable: _Optional[bool] = ..., multiplier: _Optional[float] = ..., accepted: _Optional[bool] = ..., reason: _Optional[str] = ..., run: _Optional[str] = ...) -> None: ...
 
 class Trip(_message.Message):
     __slots__ = ("index", "decided", "kind", "channel", "value", "limit", "text", "run")

@@ -27,7 +27,6 @@ from typing import Any
 
 import zenoh
 
-from table_io.errors import InputError
 from twin.security.credentials import Credentials
 from twin.security.tls_diagnostics import diagnose_missing_role, diagnose_refusal
 from twin.transport.endpoint import (
@@ -35,10 +34,11 @@ from twin.transport.endpoint import (
     OBSERVER_PREFIX,
     Settings,
     check_endpoint,
-    format_listen_error,
     history_query_path,
     key_expression,
     list_observers,
+    make_endpoint_error,
+    make_listen_error,
     merge_settings,
     sanitize_name,
     session_settings,
@@ -284,7 +284,7 @@ def open_hub(
         # "peer" has the same loss and latency; zenoh documents "router" for serving clients.
         return BusLink(rig, _open_session(config))
     except zenoh.ZError as error:
-        raise InputError(format_listen_error(endpoint, zenoh_error_reason(error))) from None
+        raise make_listen_error(endpoint, zenoh_error_reason(error)) from None
 
 
 def open_spoke(
@@ -299,18 +299,17 @@ def open_spoke(
     try:
         session = _open_session(merge_settings(config, {} if keys is None else keys.tls_settings()))
     except zenoh.ZError:
-        reason = (
-            ""
-            if endpoint.startswith(LOCAL_SOCKET_PREFIX)
-            else diagnose_refusal(*split_host_port(endpoint), keys)
+        is_local = endpoint.startswith(LOCAL_SOCKET_PREFIX)
+        refusal = None if is_local else diagnose_refusal(*split_host_port(endpoint), keys)
+        no_answer = (
+            f"no rig answers there within {timeout_s:g} s",
+            "start the run first, or give the endpoint it listens at",
         )
-        hint = "start the run first, or give the endpoint it listens at"
-        no_answer = f"no rig answers there within {timeout_s:g} s; {hint}"
-        raise InputError(f"endpoint {endpoint}: {reason or no_answer}") from None
+        raise make_endpoint_error(endpoint, *(refusal or no_answer)) from None
     link = BusLink(rig, session)
-    if keys is not None and (reason := diagnose_missing_role(link.query, keys.name, rig)):
+    if keys is not None and (refusal := diagnose_missing_role(link.query, keys.name, rig)):
         link.close()
-        raise InputError(f"endpoint {endpoint}: {reason}")
+        raise make_endpoint_error(endpoint, *refusal)
     return link
 
 

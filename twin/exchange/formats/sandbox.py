@@ -24,13 +24,16 @@ MAX_CPU_S = 60
 T = TypeVar("T")
 
 
-def run_isolated(path: Path, work: Callable[[], T]) -> T:
-    """Run `work` on the file at `path` in a child process; raise InputError on any failure."""
+def run_isolated(path: Path, work: Callable[[], T], max_cpu_s: int = MAX_CPU_S) -> T:
+    """Run `work` on the file at `path` in a child process; raise InputError on any failure.
+
+    The child is killed after `max_cpu_s` of CPU time.
+    """
     receiver, sender = Pipe(duplex=False)
     child = os.fork()
     if not child:
         try:
-            _run_in_child(path, work, sender)
+            _run_in_child(path, work, sender, max_cpu_s)
         finally:
             os._exit(0)
     sender.close()
@@ -52,14 +55,14 @@ def run_isolated(path: Path, work: Callable[[], T]) -> T:
     return result
 
 
-def _run_in_child(path: Path, work: Callable[[], T], sender: Connection) -> None:
+def _run_in_child(path: Path, work: Callable[[], T], sender: Connection, max_cpu_s: int) -> None:
     """Send the result of `work`, or an InputError, from the child process."""
     faulthandler.disable()  # the parent reports a crash in one message
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     used_bytes = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     for resource_kind, limit in (
         (resource.RLIMIT_CORE, 0),
-        (resource.RLIMIT_CPU, MAX_CPU_S),
+        (resource.RLIMIT_CPU, max_cpu_s),
         (
             resource.RLIMIT_AS,
             used_bytes
