@@ -29,8 +29,8 @@ acceleration_g = {level}
 
 def write(folder: Path, **gaps: str) -> None:
     """A test profile of each name, of that gap; "4.0 0.02" also has a level."""
-    for name, told in gaps.items():
-        gap, level = (*told.split(), "0.05")[:2]
+    for name, setting in gaps.items():
+        gap, level = (*setting.split(), "0.05")[:2]
         (folder / f"{name}.toml").write_text(TEST.format(name=name, gap=gap, level=level))
 
 
@@ -93,14 +93,14 @@ def record(spec: ProcessConfig) -> None:
     log = Path(spec.folder) / "run.mcap"
     log.write_bytes(f"recorded by {spec.run}".encode())
     steps = [{"index": k, "measured": {"eta_d": 1.0}} for k in range(profile.first_step, measured)]
-    found = {
+    values = {
         "verdict": verdict, "reason": f"it was {verdict}", "steps": steps, "gaps": 0,
         "sha256": hashlib.sha256(log.read_bytes()).hexdigest(),
     }  # fmt: skip
-    (log.parent / "summary.json").write_text(json.dumps(found))
+    (log.parent / "summary.json").write_text(json.dumps(values))
 
 
-def prepared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def prepare_campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder, with a campaign of three runs; nothing is simulated or drawn in it."""
     write(tmp_path, free="inf", g4="4.0")
     (tmp_path / "c.toml").write_text(LISTED)
@@ -108,7 +108,7 @@ def prepared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(Players, "ends", {})
     monkeypatch.setattr(Players, "given", [])
     for room in (command, realtime):
-        monkeypatch.setattr(room, "write_campaign_report", lambda one: one / "report.html")
+        monkeypatch.setattr(room, "write_campaign_report", lambda folder: folder / "report.html")
     for room in (offline, realtime):
         monkeypatch.setattr(room, "format_run_end", lambda *_: "ended")
     monkeypatch.setattr(command, "compile_kernels", lambda *_, **__: None)
@@ -116,21 +116,24 @@ def prepared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def asked(folder: Path, **changes: Any) -> CampaignOptions:
-    told: dict[str, Any] = {
+def make_options(folder: Path, **changes: Any) -> CampaignOptions:
+    options: dict[str, Any] = {
         "path": folder / "c.toml", "out": folder / "out", "resume": False, "unpaced": True,
         "model": None, "table": None, "unattended": False, "listen": "",
     }  # fmt: skip
-    return CampaignOptions(**told | changes)
+    return CampaignOptions(**options | changes)
 
 
 def files(folder: Path) -> dict[str, bytes]:
     """Every file under a folder, as it is."""
-    return {str(one.relative_to(folder)): one.read_bytes() for one in recordings(folder)}
+    return {
+        str(recording.relative_to(folder)): recording.read_bytes()
+        for recording in recordings(folder)
+    }
 
 
 def recordings(folder: Path) -> list[Path]:
-    return [one for one in sorted(folder.rglob("*")) if one.is_file() and one.suffix != ".json"]
+    return [path for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix != ".json"]
 
 
 def statuses(folder: Path) -> list[str]:

@@ -9,7 +9,15 @@ import pytest
 
 from table_io.config.profile import SetUpConfirmation
 from table_io.errors import InputError
-from tests.campaign.campaigns import LISTED, Players, asked, files, prepared, statuses
+from tests.campaign.campaigns import (
+    LISTED,
+    Players,
+    files,
+    make_options,
+    prepare_campaign,
+    statuses,
+)
+from tests.input_errors import raises_input_error
 from twin.campaign import command
 from twin.campaign.command import run_campaign
 from twin.campaign.config import CampaignPlan
@@ -27,28 +35,28 @@ from twin.run.run_config import RunConfig
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    return prepared(tmp_path, monkeypatch)
+    return prepare_campaign(tmp_path, monkeypatch)
 
 
 def test_the_runs_are_played_in_order_each_in_a_folder_of_its_own(folder: Path) -> None:
-    assert run_campaign(asked(folder)) == 0
-    assert [Path(one.folder).name for one in Players.given] == ["01-free", "02-g4", "03-again"]
-    assert [one.name for one in Players.given] == ["free", "g4", "g4"]
+    assert run_campaign(make_options(folder)) == 0
+    assert [Path(run.folder).name for run in Players.given] == ["01-free", "02-g4", "03-again"]
+    assert [run.name for run in Players.given] == ["free", "g4", "g4"]
     assert statuses(folder) == ["complete"] * 3
     assert (folder / "out" / "campaign.toml").read_text() == LISTED
 
 
 def test_a_recording_says_what_was_asked_before_it_and_who_answered(folder: Path) -> None:
-    run_campaign(asked(folder))
-    noted = [tomllib.loads(one.profile_toml)["set_up"] for one in Players.given]
-    assert [one["asked"] for one in noted] == ["Take the bumpers away", "Set 4 mm", ""]
-    assert [one["answer"] for one in noted] == ["unattended", "unattended", "not asked"]
+    run_campaign(make_options(folder))
+    noted = [tomllib.loads(run.profile_toml)["set_up"] for run in Players.given]
+    assert [set_up["asked"] for set_up in noted] == ["Take the bumpers away", "Set 4 mm", ""]
+    assert [set_up["answer"] for set_up in noted] == ["unattended", "unattended", "not asked"]
     assert noted[1]["notes"] == "look at the bolts"
     assert noted[0]["campaign"] == "Three gaps"
-    told = read_state(folder / "out").runs[1].set_up[0]
-    assert (told.who, told.at) == (noted[1]["who"], noted[1]["at"])
-    assert told.who
-    assert told.at.startswith("20")
+    set_up = read_state(folder / "out").runs[1].set_up[0]
+    assert (set_up.who, set_up.at) == (noted[1]["who"], noted[1]["at"])
+    assert set_up.who
+    assert set_up.at.startswith("20")
 
 
 def test_any_text_of_an_operator_is_kept_as_it_is(folder: Path) -> None:
@@ -62,22 +70,22 @@ def test_after_a_protection_no_run_begins_and_it_says_how_to_go_on(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Players.ends["g4"] = ("aborted", 2)
-    assert run_campaign(asked(folder)) == 3
+    assert run_campaign(make_options(folder)) == 3
     assert statuses(folder) == ["complete", "interrupted", "planned"]
-    said = capsys.readouterr().out
-    assert "g4, again" in said
+    output = capsys.readouterr().out
+    assert "g4, again" in output
     again = f"shaketwin campaign {folder}/c.toml --out {folder}/out --resume --speed max"
-    assert again in said.replace("\n", "")
+    assert again in output.replace("\n", "")
 
 
 def test_a_resume_keeps_what_is_complete_and_goes_on_with_the_rest(folder: Path) -> None:
     Players.ends["g4"] = ("aborted", 2)
-    run_campaign(asked(folder))
+    run_campaign(make_options(folder))
     kept = files(folder / "out")
     Players.given.clear()
     Players.ends.clear()
-    assert run_campaign(asked(folder, resume=True)) == 0
-    assert [Path(one.folder).name for one in Players.given] == ["02-g4-2", "03-again"]
+    assert run_campaign(make_options(folder, resume=True)) == 0
+    assert [Path(run.folder).name for run in Players.given] == ["02-g4-2", "03-again"]
     assert statuses(folder) == ["complete"] * 3
     assert {name: files(folder / "out")[name] for name in kept} == kept
     assert "resume" not in tomllib.loads(Players.given[0].profile_toml)  # forward began anew
@@ -85,20 +93,20 @@ def test_a_resume_keeps_what_is_complete_and_goes_on_with_the_rest(folder: Path)
 
 def test_a_run_goes_on_at_the_direction_that_was_interrupted(folder: Path) -> None:
     Players.ends["g4"] = ("stopped", 5)  # three forward, two of three backward
-    run_campaign(asked(folder))
+    run_campaign(make_options(folder))
     first = read_state(folder / "out").runs[1].parts[0].run
     Players.given.clear()
     Players.ends.clear()
-    run_campaign(asked(folder, resume=True))
+    run_campaign(make_options(folder, resume=True))
     assert tomllib.loads(Players.given[0].profile_toml)["resume"] == {"first_step": 3, "of": first}
     assert [part.first_step for part in read_state(folder / "out").runs[1].parts] == [0, 3]
 
 
 def test_a_complete_campaign_is_resumed_by_doing_nothing(folder: Path) -> None:
-    run_campaign(asked(folder))
+    run_campaign(make_options(folder))
     before = files(folder / "out")
     Players.given.clear()
-    assert run_campaign(asked(folder, resume=True)) == 0
+    assert run_campaign(make_options(folder, resume=True)) == 0
     assert Players.given == []
     assert files(folder / "out") == before
 
@@ -106,11 +114,11 @@ def test_a_complete_campaign_is_resumed_by_doing_nothing(folder: Path) -> None:
 def test_what_was_recorded_and_is_no_longer_so_is_measured_anew(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run_campaign(asked(folder))
+    run_campaign(make_options(folder))
     (folder / "out" / "01-free" / "run.mcap").write_bytes(b"damaged")
     Players.given.clear()
-    assert run_campaign(asked(folder, resume=True)) == 0
-    assert [Path(one.folder).name for one in Players.given] == ["01-free-2"]
+    assert run_campaign(make_options(folder, resume=True)) == 0
+    assert [Path(run.folder).name for run in Players.given] == ["01-free-2"]
     assert (folder / "out" / "01-free" / "run.mcap").read_bytes() == b"damaged"
     assert "free: 01-free/run.mcap" in capsys.readouterr().out.replace("\n", "")
 
@@ -134,9 +142,9 @@ def test_a_calibration_record_that_came_in_between_is_told_and_the_campaign_goes
     copy_configs(tmp_path, plan(card))
     assert require_unchanged(tmp_path, plan(card)) == []
     for text in (card + RECORDED, card + RECORDED + RECORDED):
-        (said,) = require_unchanged(tmp_path, plan(text))
-        assert "free" in said
-        assert "calibration records" in said
+        (warning,) = require_unchanged(tmp_path, plan(text))
+        assert "free" in warning
+        assert "calibration records" in warning
     for text in (
         card.replace("60.0", "50.0") + RECORDED,
         card + RECORDED + '[[sensors]]\nchannel = "table_acc_m_s2"\n',
@@ -147,41 +155,39 @@ def test_a_calibration_record_that_came_in_between_is_told_and_the_campaign_goes
 
 
 @pytest.mark.parametrize(
-    ("file", "old", "new", "said"),
+    ("file", "old", "new", "named"),
     [
         ("c.toml", "Set 4 mm", "Set 5 mm", '-prompt = "Set 4 mm"'),
         ("g4.toml", "cycles = 4", "cycles = 6", "+cycles = 6"),
     ],
 )
 def test_another_campaign_is_not_resumed(
-    folder: Path, file: str, old: str, new: str, said: str
+    folder: Path, file: str, old: str, new: str, named: str
 ) -> None:
     Players.ends["free"] = ("aborted", 2)
-    run_campaign(asked(folder))
+    run_campaign(make_options(folder))
     before = files(folder / "out")
     path = folder / file
     path.write_text(path.read_text().replace(old, new))
     Players.given.clear()
-    with pytest.raises(InputError) as error:
-        run_campaign(asked(folder, resume=True))
-    assert error.value.where == str(folder / "out")
-    assert said in str(error.value)
+    with raises_input_error(where=folder / "out", problem=named):
+        run_campaign(make_options(folder, resume=True))
     assert Players.given == []
     assert files(folder / "out") == before
 
 
 def test_a_folder_with_content_is_refused_unless_it_is_resumed(folder: Path) -> None:
-    run_campaign(asked(folder))
-    with pytest.raises(InputError, match=r"has content.*--resume"):
-        run_campaign(asked(folder))
-    with pytest.raises(InputError, match="--out DIR"):
-        run_campaign(asked(folder, resume=True, out=None))
-    with pytest.raises(InputError, match="no such folder"):
-        run_campaign(asked(folder, resume=True, out=folder / "nowhere"))
+    run_campaign(make_options(folder))
+    with raises_input_error(key="--out", value=str(folder / "out"), remedy="--resume"):
+        run_campaign(make_options(folder))
+    with raises_input_error(key="--resume", remedy="--out"):
+        run_campaign(make_options(folder, resume=True, out=None))
+    with raises_input_error(key="--out", value=str(folder / "nowhere"), remedy="--resume"):
+        run_campaign(make_options(folder, resume=True, out=folder / "nowhere"))
     (folder / "other").mkdir()
     (folder / "other" / "mine.txt").write_text("mine")
     with pytest.raises(InputError) as error:
-        run_campaign(asked(folder, resume=True, out=folder / "other"))
+        run_campaign(make_options(folder, resume=True, out=folder / "other"))
     assert error.value.where == str(folder / "other")
 
 
@@ -191,26 +197,25 @@ def test_a_table_that_keeps_its_own_time_is_refused_at_full_speed(
     monkeypatch.setattr(
         "table_io.config.rig.RigConfig.runs_at_any_speed", property(lambda _: False)
     )
-    with pytest.raises(InputError) as error:
-        run_campaign(asked(folder))
-    assert "--speed max" in str(error.value)  # of each profile, in one message
+    with raises_input_error(where="--speed max"):
+        run_campaign(make_options(folder))
     assert not (folder / "out").exists()
 
 
 def test_two_campaigns_do_not_work_in_one_folder(folder: Path) -> None:
     Players.ends["free"] = ("aborted", 2)
-    run_campaign(asked(folder))
+    run_campaign(make_options(folder))
     with (
         hold_lock(folder / "out" / LOCK_FILE),
-        pytest.raises(InputError, match=str(folder / "out")),
+        raises_input_error(where=folder / "out"),
     ):
-        run_campaign(asked(folder, resume=True))
+        run_campaign(make_options(folder, resume=True))
 
 
 def test_a_state_that_cannot_be_written_leaves_the_old_one(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run_campaign(asked(folder))
+    run_campaign(make_options(folder))
     before = read_state(folder / "out")
 
     def full(_: int) -> None:
@@ -233,7 +238,7 @@ def test_every_test_is_judged_before_the_first_one_moves(
             raise InputError("the machine does not answer")
 
     monkeypatch.setattr(command, "_require_any_speed", judge)
-    with pytest.raises(InputError, match="does not answer"):
-        run_campaign(asked(folder))
+    with raises_input_error(where="g4.toml"):
+        run_campaign(make_options(folder))
     assert judged == ["free", "g4"]
     assert not (folder / "out").exists()

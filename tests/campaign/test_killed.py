@@ -47,6 +47,8 @@ measured_cycles = 2
 directions = {directions}
 [loop_check]
 cycles = 3
+[acquisition]
+rate_hz = 1000.0
 """
 TESTS = {
     "free": {"gap": "inf", "start": 1.0, "stop": 1.6, "step": 0.3, "cycles": 3,
@@ -58,7 +60,9 @@ COARSE = """
 from twin.reports import plot_style
 plot_style.RC_PARAMS.update({"savefig.dpi": 30, "figure.constrained_layout.use": False})
 """  # in every process of it: pictures are not what is tried here
-EQUAL = 0.025  # of a curve: the level is only held within 2 %, and noise goes on elsewhere
+RELATIVE_TOLERANCE = (
+    0.025  # of a curve: the level is only held within 2 %, and noise goes on elsewhere
+)
 
 
 class Here(Players):
@@ -79,14 +83,14 @@ class Both:
     killed: Path
     share: float  # of the second recording, when it was killed
     left: dict[str, bytes]  # what the killed one had recorded by then
-    said: str  # by the resumed one
+    output: str  # by the resumed one
 
 
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
     folder = tmp_path_factory.mktemp("campaigns")
-    for name, told in TESTS.items():
-        (folder / f"{name}.toml").write_text(TEST.format(name=name, **told))
+    for name, values in TESTS.items():
+        (folder / f"{name}.toml").write_text(TEST.format(name=name, **values))
     (folder / "c.toml").write_text(LISTED)
     whole, killed = folder / "whole", folder / "killed"
     with pytest.MonkeyPatch.context() as patch:
@@ -106,7 +110,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
     command = [SHAKETWIN, "campaign", str(folder / "c.toml"), "--speed", "max"]
     command += ["--out", str(killed)]
     _kill(command, environment, killed / "02-g4" / "run.mcap", share * size)
-    left = {one.parent.name: one.read_bytes() for one in killed.rglob("run.mcap")}
+    left = {log.parent.name: log.read_bytes() for log in killed.rglob("run.mcap")}
     done = subprocess.run(
         [*command, "--resume"], env=environment, capture_output=True, text=True, check=False
     )
@@ -120,8 +124,8 @@ def _kill(command: list[str], environment: dict[str, str], log: Path, size: floa
     while process.poll() is None and not (log.exists() and log.stat().st_size >= size):
         time.sleep(0.01)
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    for one in (process.pid, *map(int, children)):
-        os.kill(one, signal.SIGKILL)
+    for pid in (process.pid, *map(int, children)):
+        os.kill(pid, signal.SIGKILL)
     process.wait()
 
 
@@ -130,26 +134,26 @@ def summary(folder: Path) -> dict[str, Any]:
 
 
 def test_a_campaign_measures_u_and_a_in_free_flight_and_divides_by_them(both: Both) -> None:
-    found = summary(both.whole)
-    free = found["free_flight"]
+    whole = summary(both.whole)
+    free = whole["free_flight"]
     # physics.md: 29.95 mm at 1.3 Hz on the grid of 0.1 Hz; three cycles do not quite reach it
     assert free["u_star_m"] == pytest.approx(29.95e-3, rel=0.03)
     assert free["model_u_star_m"] == pytest.approx(30.537e-3, rel=1e-3)
     assert free["model_a_star_m_s2"] == pytest.approx(2.057, rel=1e-3)
-    peaks = found["runs"][0]["peak"]
+    peaks = whole["runs"][0]["peak"]
     assert (peaks["eta_d"]["value"], peaks["eta_d"]["frequency_hz"]) == (pytest.approx(1.0), 1.3)
     assert peaks["eta_a"]["value"] == pytest.approx(1.0)
-    assert "free measured in free flight" in found["campaign"]["normalisation"]
+    assert "free measured in free flight" in whole["campaign"]["normalisation"]
     alone = summary(both.whole / "02-g4")
-    for step, was in zip(found["runs"][1]["steps"], alone["steps"], strict=True):
+    for step, was in zip(whole["runs"][1]["steps"], alone["steps"], strict=True):
         by = free["model_u_star_m"] / free["u_star_m"]
         assert step["measured"]["eta_d"] == pytest.approx(by * was["measured"]["eta_d"])
 
 
 def test_a_campaign_finds_what_its_runs_found(both: Both) -> None:
-    found = summary(both.whole)
-    assert (found["verdict"], found["reason"]) == ("complete", "2 of 2 runs complete")
-    free, g4 = found["runs"]
+    whole = summary(both.whole)
+    assert (whole["verdict"], whole["reason"]) == ("complete", "2 of 2 runs complete")
+    free, g4 = whole["runs"]
     assert (free["jumps"], free["gap_mm"], g4["gap_mm"]) == ([], None, 4.0)
     assert g4["hysteresis"] == [{"kind": "right", "from_hz": 3.2, "to_hz": 3.8}]
     assert all(check["passed"] for check in g4["checks"])
@@ -159,16 +163,16 @@ def test_a_campaign_finds_what_its_runs_found(both: Both) -> None:
 
 
 def test_a_campaign_that_was_killed_and_resumed_has_the_same_result(both: Both) -> None:
-    one, other = summary(both.whole), summary(both.killed)
+    whole, other = summary(both.whole), summary(both.killed)
     assert other["verdict"] == "complete"
-    assert other["u_star_m"] == pytest.approx(one["u_star_m"], rel=EQUAL)
-    for a, b in zip(one["runs"], other["runs"], strict=True):
+    assert other["u_star_m"] == pytest.approx(whole["u_star_m"], rel=RELATIVE_TOLERANCE)
+    for a, b in zip(whole["runs"], other["runs"], strict=True):
         assert b["jumps"] == a["jumps"], both.share
         assert b["hysteresis"] == a["hysteresis"], both.share
         assert [step["index"] for step in b["steps"]] == [step["index"] for step in a["steps"]]
         for x, y in zip(a["steps"], b["steps"], strict=True):
             for name in ("eta_d", "eta_a", "r_r"):
-                want = pytest.approx(x["measured"][name], rel=EQUAL, abs=2e-3)
+                want = pytest.approx(x["measured"][name], rel=RELATIVE_TOLERANCE, abs=2e-3)
                 assert y["measured"][name] == want, (both.share, x["index"], name)
             assert y["measured"]["impacts_right"] == x["measured"]["impacts_right"]
 
@@ -177,7 +181,7 @@ def test_what_was_interrupted_is_kept_as_it_was(both: Both) -> None:
     for name, content in both.left.items():
         assert (both.killed / name / "run.mcap").read_bytes() == content, name
     assert "02-g4" in both.left
-    assert "2 of 2 runs complete" in both.said
+    assert "2 of 2 runs complete" in both.output
 
 
 def test_what_goes_on_says_of_what_and_from_where(both: Both) -> None:
@@ -214,10 +218,10 @@ def test_the_report_of_a_campaign_has_every_run(both: Both) -> None:
 
 def test_lines_and_points_of_the_pictures_are_divided_by_the_same(both: Both) -> None:
     cases, rig = prc_families(read_campaign(both.killed))
-    found = summary(both.killed)
+    merged = summary(both.killed)
     assert list(cases) == ["G∞", "G4"]
-    by = found["free_flight"]["model_u_star_m"] / found["u_star_m"]
-    for name, run in zip(cases, found["runs"], strict=True):
+    by = merged["free_flight"]["model_u_star_m"] / merged["u_star_m"]
+    for name, run in zip(cases, merged["runs"], strict=True):
         (test,) = cases[name].tests
         bare = replace(test, scale_override=None)
         for line, own in zip(test.points, bare.points, strict=True):
@@ -225,8 +229,8 @@ def test_lines_and_points_of_the_pictures_are_divided_by_the_same(both: Both) ->
             assert own.twin is not None
             assert line.twin.eta_d == pytest.approx(by * own.twin.eta_d)
             assert line.twin.r_r == own.twin.r_r
-        seen = [point.measured.eta_d for point in rig.points[name] if point.measured]
-        assert seen == [step["measured"]["eta_d"] for step in run["steps"]]
+        eta = [point.measured.eta_d for point in rig.points[name] if point.measured]
+        assert eta == [step["measured"]["eta_d"] for step in run["steps"]]
 
 
 def test_the_report_is_written_anew_from_the_folder_alone(
@@ -244,6 +248,6 @@ def test_the_curves_of_a_campaign_are_those_of_its_joined_runs(
 ) -> None:
     reading.print_recording_prc(both.killed, True)
     runs = json.loads(capsys.readouterr().out)["runs"]
-    found = summary(both.killed)["runs"]
-    assert [run["hysteresis"] for run in runs] == [run["hysteresis"] for run in found]
-    assert [run["steps"] for run in runs] == [run["steps"] for run in found]
+    merged = summary(both.killed)["runs"]
+    assert [run["hysteresis"] for run in runs] == [run["hysteresis"] for run in merged]
+    assert [run["steps"] for run in runs] == [run["steps"] for run in merged]

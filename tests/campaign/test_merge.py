@@ -37,10 +37,10 @@ def part(number: int, first: int, last: int, verdict: str = "halted") -> RunPart
     )  # fmt: skip
 
 
-def summary(one: RunPart, eta: float = 0.5) -> dict[str, Any]:
+def summary(part: RunPart, eta: float = 0.5) -> dict[str, Any]:
     """What the summary of a recording says, every eta_d as given."""
     steps = []
-    for index in one.measured:
+    for index in part.measured:
         quantities = {
             "eta_d": eta, "eta_a": 2 * eta, "eta_r": 0.1, "eta_l": 0.1, "r_r": 0.3, "r_l": 0.3,
             "impacts_right": [1, 1, index], "impacts_left": [1, 1, 1], "drift": 0.0, "spread": 0.0,
@@ -68,8 +68,8 @@ def run(*parts: RunPart) -> RunState:
 
 def together(*parts: RunPart) -> dict[str, Any]:
     etas = [0.1 * (k + 1) for k in range(len(parts))]
-    found = [summary(one, eta) for one, eta in zip(parts, etas, strict=True)]
-    return merge_summaries(run(*parts), PROFILE, found)
+    summaries = [summary(one_part, eta) for one_part, eta in zip(parts, etas, strict=True)]
+    return merge_summaries(run(*parts), PROFILE, summaries)
 
 
 @pytest.mark.parametrize(
@@ -100,39 +100,39 @@ def test_a_run_is_complete_when_nothing_is_left_to_measure() -> None:
 
 
 def test_a_step_comes_from_the_last_recording_that_measured_it() -> None:
-    found = together(part(1, 0, 5), part(2, 4, 7, "complete"))
-    assert [step["index"] for step in found["steps"]] == list(range(8))
-    assert [step["measured"]["eta_d"] for step in found["steps"]] == [0.1] * 4 + [0.2] * 4
-    assert found["gaps"] == 2
-    assert len(found["faults"]) == 2
+    merged = together(part(1, 0, 5), part(2, 4, 7, "complete"))
+    assert [step["index"] for step in merged["steps"]] == list(range(8))
+    assert [step["measured"]["eta_d"] for step in merged["steps"]] == [0.1] * 4 + [0.2] * 4
+    assert merged["gaps"] == 2
+    assert len(merged["faults"]) == 2
 
 
 def test_a_branch_says_where_it_comes_from_and_what_became_of_its_history() -> None:
     whole = together(part(1, 0, 7, "complete"))
-    assert [one["history"] for one in whole["branches"]] == ["whole", "whole"]
+    assert [branch["history"] for branch in whole["branches"]] == ["whole", "whole"]
     anew = together(part(1, 0, 5), part(2, 4, 7, "complete"))["branches"]
-    assert [one["history"] for one in anew] == ["whole", "restarted from rest"]
+    assert [branch["history"] for branch in anew] == ["whole", "restarted from rest"]
     assert anew[1]["pieces"] == [{"part": "01-g4-2", "from_hz": 4.0, "to_hz": 1.0}]
     broken = together(part(1, 0, 5), part(2, 6, 7, "complete"))["branches"]
-    assert [one["history"] for one in broken] == ["whole", "broken"]
+    assert [branch["history"] for branch in broken] == ["whole", "broken"]
     assert broken[1]["broken_at_hz"] == [2.0]
-    assert [one["part"] for one in broken[1]["pieces"]] == ["01-g4-1", "01-g4-2"]
+    assert [piece["part"] for piece in broken[1]["pieces"]] == ["01-g4-1", "01-g4-2"]
     lost = together(part(1, 0, 7), part(2, 0, 7, "complete"))["branches"]
-    assert {one["part"] for branch in lost for one in branch["pieces"]} == {"01-g4-2"}
+    assert {piece["part"] for branch in lost for piece in branch["pieces"]} == {"01-g4-2"}
 
 
 def test_a_branch_of_which_only_the_end_is_left_is_broken_too() -> None:
-    found = together(part(1, 0, -1), part(2, 2, 7, "complete"))["branches"]
-    assert [(one["history"], one["broken_at_hz"]) for one in found] == [
+    branches = together(part(1, 0, -1), part(2, 2, 7, "complete"))["branches"]
+    assert [(branch["history"], branch["broken_at_hz"]) for branch in branches] == [
         ("broken", [3.0]),
         ("whole", []),
     ]
 
 
 def test_the_worst_level_of_all_its_steps_is_told() -> None:
-    found = together(part(1, 0, 5), part(2, 4, 7, "complete"))
-    assert found["level_error"] == pytest.approx(0.007)
-    assert (found["level_error_hz"], found["level_error_direction"]) == (1.0, "backward")
+    merged = together(part(1, 0, 5), part(2, 4, 7, "complete"))
+    assert merged["level_error"] == pytest.approx(0.007)
+    assert (merged["level_error_hz"], merged["level_error_direction"]) == (1.0, "backward")
 
 
 def test_curves_are_divided_by_what_free_flight_gave() -> None:
@@ -148,21 +148,21 @@ def test_curves_are_divided_by_what_free_flight_gave() -> None:
 
 
 def test_what_is_not_known_stays_unknown() -> None:
-    one = part(1, 0, 7)
-    found = summary(one)
-    found["steps"][2]["measured"] = None
-    found["steps"][3]["measured"]["eta_a"] = None
-    told = renormalize(merge_summaries(run(one), PROFILE, [found]), (0.06, 1.0))
-    assert told["steps"][2]["measured"] is None
-    assert told["steps"][3]["measured"]["eta_a"] is None
-    best = find_peak(told, "measured", "eta_a")
+    whole_part = part(1, 0, 7)
+    values = summary(whole_part)
+    values["steps"][2]["measured"] = None
+    values["steps"][3]["measured"]["eta_a"] = None
+    renormalized = renormalize(merge_summaries(run(whole_part), PROFILE, [values]), (0.06, 1.0))
+    assert renormalized["steps"][2]["measured"] is None
+    assert renormalized["steps"][3]["measured"]["eta_a"] is None
+    best = find_peak(renormalized, "measured", "eta_a")
     assert best is not None
     assert math.isfinite(best[0])
-    impacts = find_most_impacts(told)
+    impacts = find_most_impacts(renormalized)
     assert impacts is not None
     assert (impacts["frequency_hz"], impacts["right"]) == (1.0, pytest.approx(3.0))
 
 
 def test_a_run_without_a_recording_is_told_as_planned() -> None:
-    found = merge_summaries(RunState(name="01-g4", label="g4"), PROFILE, [])
-    assert (found["verdict"], found["steps"], found["planned_steps"]) == ("planned", [], 8)
+    merged = merge_summaries(RunState(name="01-g4", label="g4"), PROFILE, [])
+    assert (merged["verdict"], merged["steps"], merged["planned_steps"]) == ("planned", [], 8)

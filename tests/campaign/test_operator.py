@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from table_io.errors import InputError
-from tests.campaign.campaigns import Players, asked, prepared, record, statuses
+from tests.campaign.campaigns import Players, make_options, prepare_campaign, record, statuses
+from tests.input_errors import raises_input_error
 from twin.campaign import command, realtime
 from twin.campaign.command import run_campaign
 from twin.campaign.state import read_state
@@ -28,12 +28,12 @@ class Operator:
 
 
 @pytest.fixture
-def attended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def attended_campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A campaign in real time, at a terminal; a run ends as soon as it begins."""
-    folder = prepared(tmp_path, monkeypatch)
+    folder = prepare_campaign(tmp_path, monkeypatch)
 
-    def play(book: Any, run: Any, said: Any, listen: str, _: Any) -> int:
-        spec = book.begin_recording(run, said, listen)
+    def play(book: Any, run: Any, voice: Any, listen: str, _: Any) -> int:
+        spec = book.begin_recording(run, voice, listen)
         Players.given.append(spec)
         record(spec)
         return 0 if book.finish_recording(run) else 3
@@ -44,64 +44,64 @@ def attended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def answers(monkeypatch: pytest.MonkeyPatch, *told: str) -> Operator:
-    operator = Operator(*told)
+def answers(monkeypatch: pytest.MonkeyPatch, *typed: str) -> Operator:
+    operator = Operator(*typed)
     monkeypatch.setattr("twin.campaign.messages.console.input", operator)
     return operator
 
 
 def test_the_operator_is_asked_where_the_set_up_changes(
-    attended: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    attended_campaign: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     operator = answers(monkeypatch, "", "")
-    assert run_campaign(asked(attended, unpaced=False)) == 0
+    assert run_campaign(make_options(attended_campaign, unpaced=False)) == 0
     assert operator.asked == 2  # the third run is at the same gap
     assert "SET-UP: Set 4 mm" in capsys.readouterr().out
-    told = [run.set_up[0].answer for run in read_state(attended / "out").runs]
-    assert told == ["done", "done", "not asked"]
+    typed = [run.set_up[0].answer for run in read_state(attended_campaign / "out").runs]
+    assert typed == ["done", "done", "not asked"]
 
 
 def test_a_run_is_skipped_and_asked_for_again_on_resume(
-    attended: Path, monkeypatch: pytest.MonkeyPatch
+    attended_campaign: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     answers(monkeypatch, "", "what?", "s")
-    assert run_campaign(asked(attended, unpaced=False)) == 0
-    assert statuses(attended) == ["complete", "skipped", "complete"]
+    assert run_campaign(make_options(attended_campaign, unpaced=False)) == 0
+    assert statuses(attended_campaign) == ["complete", "skipped", "complete"]
     operator = answers(monkeypatch, "")
     Players.given.clear()
-    assert run_campaign(asked(attended, unpaced=False, resume=True)) == 0
+    assert run_campaign(make_options(attended_campaign, unpaced=False, resume=True)) == 0
     assert operator.asked == 1
-    assert [Path(one.folder).name for one in Players.given] == ["02-g4"]
+    assert [Path(run.folder).name for run in Players.given] == ["02-g4"]
 
 
 @pytest.mark.parametrize("answer", ["q", "^C"])
 def test_the_operator_stops_between_runs(
-    attended: Path, monkeypatch: pytest.MonkeyPatch, answer: str
+    attended_campaign: Path, monkeypatch: pytest.MonkeyPatch, answer: str
 ) -> None:
     answers(monkeypatch, "", answer)
-    assert run_campaign(asked(attended, unpaced=False)) == 130
-    assert statuses(attended) == ["complete", "planned", "planned"]
+    assert run_campaign(make_options(attended_campaign, unpaced=False)) == 130
+    assert statuses(attended_campaign) == ["complete", "planned", "planned"]
 
 
 def test_the_first_run_of_a_resume_asks_for_the_set_up_that_it_needs(
-    attended: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    attended_campaign: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Players.ends["again"] = ("aborted", 1)
     answers(monkeypatch, "", "")
-    assert run_campaign(asked(attended, unpaced=False)) == 3
+    assert run_campaign(make_options(attended_campaign, unpaced=False)) == 3
     Players.ends.clear()
     operator = answers(monkeypatch, "")
     capsys.readouterr()
-    assert run_campaign(asked(attended, unpaced=False, resume=True)) == 0
+    assert run_campaign(make_options(attended_campaign, unpaced=False, resume=True)) == 0
     assert operator.asked == 1
     assert "SET-UP: Set 4 mm" in capsys.readouterr().out
 
 
 def test_without_a_terminal_somebody_has_to_say_yes(
-    attended: Path, monkeypatch: pytest.MonkeyPatch
+    attended_campaign: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sys.stdin.isatty", lambda: False, raising=False)
-    with pytest.raises(InputError, match="give --yes"):
-        run_campaign(asked(attended, unpaced=False))
-    assert not (attended / "out").exists()
-    assert run_campaign(asked(attended, unpaced=False, unattended=True)) == 0
+    with raises_input_error(remedy="--yes"):
+        run_campaign(make_options(attended_campaign, unpaced=False))
+    assert not (attended_campaign / "out").exists()
+    assert run_campaign(make_options(attended_campaign, unpaced=False, unattended=True)) == 0

@@ -37,20 +37,20 @@ def bundle(test: str = TEST, rig: str = RIG) -> RunConfig:
     return from_texts("short", test, rig, SNM, "short.toml")
 
 
-def shipped(name: str) -> RunConfig:
+def read_shipped(name: str) -> RunConfig:
     return read_run_config(PROFILES_DIR / "tests" / f"{name}.toml")
 
 
-def said(one: RunConfig) -> str:
+def format_plan(config: RunConfig) -> str:
     console = Console(width=80, record=True, file=StringIO())
-    print_plan(console, one)
+    print_plan(console, config)
     return console.export_text()
 
 
 @pytest.mark.parametrize("name", ["quickstart", "g4_ss3", "gm10", "track"])
 def test_the_plan_of_a_shipped_test_is_whole_and_fits_a_terminal(name: str) -> None:
-    one = shipped(name)
-    text = said(one)
+    config = read_shipped(name)
+    text = format_plan(config)
     assert "…" not in text
     for word in ("specimen", "sweep", "level", "loop check", "duration", "buffer", "DAC steps"):
         assert word in text
@@ -62,54 +62,54 @@ def test_the_plan_of_a_shipped_test_is_whole_and_fits_a_terminal(name: str) -> N
 
 
 def test_the_plan_names_the_loop_check_the_buffer_and_the_room_that_is_left() -> None:
-    text = said(shipped("g4_ss3"))
+    text = format_plan(read_shipped("g4_ss3"))
     assert "1, 2.24, 5 Hz at 0.005 g, then 5 s of rest" in text
     assert "0.52 s of command queued ahead, 52 blocks of 20 samples; 20 ms of it" in text
     (row,) = (line.split() for line in text.splitlines() if line.split()[:1] == ["0.5"])
     assert row[1] == "49.68"
     assert row[-4:] == ["83", "%", "99", "%"]  # of the stroke, as it is and 20 % larger
-    assert "no bumpers" in said(shipped("ginf"))
-    assert "loop check none" in said(bundle(TEST + "[loop_check]\nenabled = false\n"))
+    assert "no bumpers" in format_plan(read_shipped("ginf"))
+    assert "loop check none" in format_plan(bundle(TEST + "[loop_check]\nenabled = false\n"))
 
 
 def test_the_parts_of_a_test_are_its_duration() -> None:
-    one = shipped("quickstart")
-    parts = sum_durations_s(one.drive)
-    assert sum(parts.values()) == pytest.approx(one.drive.planned_end / one.drive.rate_hz)
-    sweep = one.profile.sweep
-    held = sum(sweep.cycles / step.frequency_hz for step in one.steps)
-    assert parts["held cycles"] == pytest.approx(held, abs=len(one.steps) / one.drive.rate_hz)
+    config = read_shipped("quickstart")
+    parts = sum_durations_s(config.drive)
+    assert sum(parts.values()) == pytest.approx(config.drive.planned_end / config.drive.rate_hz)
+    sweep = config.profile.sweep
+    held = sum(sweep.cycles / step.frequency_hz for step in config.steps)
+    assert parts["held cycles"] == pytest.approx(held, abs=len(config.steps) / config.drive.rate_hz)
     assert parts["rest"] == pytest.approx(0.5 + 5.0, abs=0.5)
     assert min(parts.values()) > 0
     assert (
-        sum_durations_s(one.ideal_drive)["loop check"]
-        == sum_durations_s(one.ideal_drive)["tuning"]
+        sum_durations_s(config.ideal_drive)["loop check"]
+        == sum_durations_s(config.ideal_drive)["tuning"]
         == 0
     )
 
 
 def test_of_many_frequencies_the_ends_and_the_worst_are_shown() -> None:
-    one = shipped("gm10")
-    every = find_worst_rows([row for row in one.margins if row.step >= 0])
-    assert [row.frequency_hz for row in every] == list(one.profile.sweep.frequencies_hz)
-    for row in one.margins:
+    config = read_shipped("gm10")
+    every = find_worst_rows([row for row in config.margins if row.step >= 0])
+    assert [row.frequency_hz for row in every] == list(config.profile.sweep.frequencies_hz)
+    for row in config.margins:
         if row.step >= 0:
-            place = one.profile.sweep.frequencies_hz.index(row.frequency_hz)
+            place = config.profile.sweep.frequencies_hz.index(row.frequency_hz)
             assert every[place].velocity_m_s >= row.velocity_m_s
     # A step in the middle that asks most of one limit is never left out.
     every[40] = replace(every[40], force_n=1e4)
-    shown = select_rows(every, list_limits(one.rig))
+    shown = select_rows(every, list_limits(config.rig))
     assert every[0] in shown
     assert every[40] in shown
     assert every[-1] in shown
     assert 10 <= len(shown) <= 16
-    assert select_rows(every[:9], list_limits(one.rig)) == every[:9]
+    assert select_rows(every[:9], list_limits(config.rig)) == every[:9]
 
 
 def test_what_the_sensors_should_see_in_free_flight_is_the_closed_form() -> None:
     test = TEST.replace("gap_mm = 4.0", "gap_mm = inf").replace("stop_hz = 3.4", "stop_hz = 3.0")
-    one = bundle(test.replace("cycles = 4", "cycles = 60"))
-    rows = {row.sensor.channel: row for row in predict_peaks(one)}
+    config = bundle(test.replace("cycles = 4", "cycles = 60"))
+    rows = {row.sensor.channel: row for row in predict_peaks(config)}
     level, w = 0.05 * GRAVITY_M_S2, 2 * math.pi * 3.0
     spring = 36e3 + 1j * w * 1.1e3
     ratio = spring / (spring - 550.0 * w**2)  # acceleration of the mass over that of the table
@@ -126,12 +126,12 @@ def test_what_the_sensors_should_see_in_free_flight_is_the_closed_form() -> None
 
 
 def test_a_load_cell_bears_half_of_its_side_and_the_preload() -> None:
-    one = shipped("gm10")
-    rows = {row.sensor.channel: row for row in predict_peaks(one)}
+    config = read_shipped("gm10")
+    rows = {row.sensor.channel: row for row in predict_peaks(config)}
     preload_kn = 510e3 * 5e-3 / 2 / 1e3
     assert preload_kn < rows["force_r1_n"].peak < 3 * preload_kn
-    cells = [sensor for sensor in one.rig.sensors if sensor.channel != "force_r2_n"]
-    alone = replace(one, rig=one.rig.model_copy(update={"sensors": tuple(cells)}))
+    cells = [sensor for sensor in config.rig.sensors if sensor.channel != "force_r2_n"]
+    alone = replace(config, rig=config.rig.model_copy(update={"sensors": tuple(cells)}))
     single = {row.sensor.channel: row for row in predict_peaks(alone)}
     assert single["force_r1_n"].peak == pytest.approx(2 * rows["force_r1_n"].peak)
     assert single["force_l1_n"].peak == pytest.approx(rows["force_l1_n"].peak)
@@ -139,10 +139,10 @@ def test_a_load_cell_bears_half_of_its_side_and_the_preload() -> None:
 
 def test_a_sensor_that_the_model_drives_out_of_range_is_warned_of_not_refused() -> None:
     small = RIG.replace('unit = "g"\nrange = 5.0', 'unit = "g"\nrange = 0.3')
-    one = bundle(rig=small)
-    (warning,) = format_clipping_warnings(predict_peaks(one), one.rig)
+    config = bundle(rig=small)
+    (warning,) = format_clipping_warnings(predict_peaks(config), config.rig)
     assert warning.startswith("mass_acc_m_s2: ")
-    text = said(one)
+    text = format_plan(config)
     assert f"warning: {warning}" in " ".join(text.split())
     assert "ready" in text
     assert format_clipping_warnings(predict_peaks(bundle()), bundle().rig) == []

@@ -18,9 +18,9 @@ from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
-from table_io.errors import InputError
 from table_io.sim.machine.flight_recorder import read_flight_record
 from table_io.sim.simulated_table import SimulatedBackend
+from tests.input_errors import raises_input_error
 from twin.cli.check_table import WiringCheckResult, examine_wiring
 from twin.cli.main import app
 
@@ -41,7 +41,9 @@ class Watched(SimulatedBackend):
         self.observer = self._see
 
     def _see(self, first: int, command: Float1D, signals: Float2D) -> None:
-        self.moved_m = max(self.moved_m, *(float(np.abs(one).max()) for one in (command, signals)))
+        self.moved_m = max(
+            self.moved_m, *(float(np.abs(values).max()) for values in (command, signals))
+        )
 
     def queue(self, index: int, volts: Float1D) -> None:
         self.calls.append("queue")
@@ -57,22 +59,22 @@ class Watched(SimulatedBackend):
         super().close()
 
 
-def examined(backend: Watched, rig: RigConfig = RIG, person: object = False) -> WiringCheckResult:
+def examine(backend: Watched, rig: RigConfig = RIG, person: object = False) -> WiringCheckResult:
     return examine_wiring(rig, backend.clock, backend, person)  # type: ignore[arg-type]
 
 
-def planted(*faults: str) -> RigConfig:
+def plant_faults(*faults: str) -> RigConfig:
     return parse_toml(TEXT + "\n[[simulated.faults]]\n".join(["", *faults]), RigConfig, "card")
 
 
-def failing(found: WiringCheckResult) -> list[tuple[str, str]]:
-    return [(one.name, one.channel) for one in found.lines if one.verdict == "fail"]
+def failing(result: WiringCheckResult) -> list[tuple[str, str]]:
+    return [(line.name, line.channel) for line in result.lines if line.verdict == "fail"]
 
 
 def test_nothing_is_moved() -> None:
     backend = Watched()
-    found = examined(backend)
-    assert found.has_passed
+    result = examine(backend)
+    assert result.has_passed
     assert backend.calls == ["queue", "start", "close"]
     assert not np.concatenate(backend.queued).any()
     assert backend.moved_m == 0.0
@@ -88,11 +90,11 @@ def test_an_output_that_is_not_at_0_volts_is_not_started(volts_off: float, hz: f
             return volts
 
     backend = Driven()
-    found = examined(backend)
+    result = examine(backend)
     assert backend.calls == ["close"]
-    assert ("command at 0 V", "drive_disp_m") in failing(found)
-    assert {channel for _, channel in failing(found)} == {"drive_disp_m"}
-    untested = {one.name for one in found.lines if one.verdict == "not tested"}
+    assert ("command at 0 V", "drive_disp_m") in failing(result)
+    assert {channel for _, channel in failing(result)} == {"drive_disp_m"}
+    untested = {line.name for line in result.lines if line.verdict == "not tested"}
     assert {"samples on time", "polarity"} <= untested
 
 
@@ -114,30 +116,30 @@ def test_an_output_that_is_not_at_0_volts_is_not_started(volts_off: float, hz: f
 def test_what_is_broken_is_found_by_its_line_and_no_other_channel_is_blamed(
     fault: str, line: str, channel: str
 ) -> None:
-    rig = planted(fault.format(channel))
-    found = examined(Watched(rig), rig)
-    assert (line, channel) in failing(found)
-    assert {one for _, one in failing(found)} == {channel}
-    assert all(one.do for one in found.lines if one.verdict == "fail")
+    rig = plant_faults(fault.format(channel))
+    result = examine(Watched(rig), rig)
+    assert (line, channel) in failing(result)
+    assert {channel for _, channel in failing(result)} == {channel}
+    assert all(line.do for line in result.lines if line.verdict == "fail")
 
 
 def test_what_needs_a_motion_is_not_said_to_be_right() -> None:
     """A turned sensor and a wrong gain do not show at rest: their lines are not tested."""
     turned = 'kind = "polarity"\nchannel = "mass_acc_m_s2"\nat_s = 0.0'
     gain = 'kind = "gain"\nchannel = "force_r1_n"\nat_s = 0.0\nsize = 0.1'
-    rig = planted(turned, gain)
-    found = examined(Watched(rig), rig)
-    assert found.has_passed
-    untested = {one.channel for one in found.lines if one.verdict == "not tested"}
+    rig = plant_faults(turned, gain)
+    result = examine(Watched(rig), rig)
+    assert result.has_passed
+    untested = {line.channel for line in result.lines if line.verdict == "not tested"}
     assert {"mass_acc_m_s2", "force_r1_n"} <= untested
 
 
 def test_a_machine_that_falls_silent_is_a_line_and_it_is_released() -> None:
-    rig = planted('kind = "stall"\nat_s = 1.0')
+    rig = plant_faults('kind = "stall"\nat_s = 1.0')
     backend = Watched(rig)
-    found = examined(backend, rig)
-    assert [name for name, _ in failing(found)] == ["machine answers"]
-    assert "simulated table" in found.lines[-1].do
+    result = examine(backend, rig)
+    assert [name for name, _ in failing(result)] == ["machine answers"]
+    assert "simulated table" in result.lines[-1].do
     assert backend.calls[-1] == "close"
 
 
@@ -148,7 +150,7 @@ def test_a_machine_that_hands_over_late_is_said() -> None:
             self.clock.wait_until(self.scheduled_time_s(self._next - 1) + 0.15)
             return volts
 
-    assert failing(examined(Slow())) == [("samples on time", "")]
+    assert failing(examine(Slow())) == [("samples on time", "")]
 
 
 class Struck(Watched):
@@ -164,7 +166,7 @@ class Struck(Watched):
     def ask(self, what: str) -> None:
         self.asked.append(what)
         self._asked = self._next
-        self._now = next((one for key, one in self._swings.items() if key in what), {})
+        self._now = next((swing for key, swing in self._swings.items() if key in what), {})
 
     def declines(self) -> bool:
         return self.tired
@@ -187,45 +189,49 @@ HANDS = {
 }
 
 
-def struck(rig: RigConfig = RIG, **hands: dict[str, float]) -> tuple[Struck, WiringCheckResult]:
-    backend = Struck(rig, HANDS | {key.replace("_", " "): one for key, one in hands.items()})
-    return backend, examined(backend, rig, backend)
+def run_tap_tests(
+    rig: RigConfig = RIG, **hands: dict[str, float]
+) -> tuple[Struck, WiringCheckResult]:
+    backend = Struck(
+        rig, HANDS | {key.replace("_", " "): response for key, response in hands.items()}
+    )
+    return backend, examine(backend, rig, backend)
 
 
 def test_a_person_who_taps_as_asked_proves_every_polarity() -> None:
-    backend, found = struck()
-    assert [one.split(",")[0] for one in backend.asked] == [
+    backend, result = run_tap_tests()
+    assert [asked.split(",")[0] for asked in backend.asked] == [
         "tap the table to the right", "tap the mass to the right",
         "press the load cells of the right bumper", "press the load cells of the left bumper",
     ]  # fmt: skip
-    polarity = {one.channel: one.verdict for one in found.lines if one.name == "polarity"}
+    polarity = {line.channel: line.verdict for line in result.lines if line.name == "polarity"}
     assert polarity.pop("table_disp_m") == "not tested"  # the servo held it
     assert set(polarity.values()) == {"pass"}
     assert len(polarity) == 7
-    assert found.has_passed
+    assert result.has_passed
     assert not np.concatenate(backend.queued).any()
     assert backend.moved_m == 0.0
 
 
 def test_a_planted_polarity_is_found_by_the_tap() -> None:
-    rig = planted('kind = "polarity"\nchannel = "mass_acc_m_s2"\nat_s = 0.0')
+    rig = plant_faults('kind = "polarity"\nchannel = "mass_acc_m_s2"\nat_s = 0.0')
     assert rig.is_simulated
     hands = {"mass_acc_m_s2": -0.3, "mass_disp_m": 0.5}  # the fault turns what the sensor gives
-    _, found = struck(rig, tap_the_mass=hands)
-    assert failing(found) == [("polarity", "mass_acc_m_s2")]
+    _, result = run_tap_tests(rig, tap_the_mass=hands)
+    assert failing(result) == [("polarity", "mass_acc_m_s2")]
 
 
 def test_who_does_nothing_or_declines_leaves_lines_that_are_not_tested() -> None:
-    backend, found = struck(RIG, right_bumper={})
-    untested = {one.channel for one in found.lines if one.name == "polarity"} - {
-        one.channel for one in found.lines if one.name == "polarity" and one.verdict == "pass"
+    backend, result = run_tap_tests(RIG, right_bumper={})
+    untested = {line.channel for line in result.lines if line.name == "polarity"} - {
+        line.channel for line in result.lines if line.name == "polarity" and line.verdict == "pass"
     }
     assert untested == {"table_disp_m", "force_r1_n", "force_r2_n"}
-    assert found.has_passed
+    assert result.has_passed
     backend = Struck(RIG, {})
     backend.tired = True
-    found = examined(backend, RIG, backend)
-    assert {one.verdict for one in found.lines if one.name == "polarity"} == {"not tested"}
+    result = examine(backend, RIG, backend)
+    assert {line.verdict for line in result.lines if line.name == "polarity"} == {"not tested"}
     assert backend.clock.now() < 20.0  # nobody waits for who has said no
 
 
@@ -239,7 +245,7 @@ class Hasty(Struck):
     def read(self, samples: int) -> Float2D:
         volts = super().read(samples)
         t = (np.arange(self._next - samples, self._next) - self._asked) / RATE
-        asked = [one for one in self.asked if "right bumper" in one]
+        asked = [asked for asked in self.asked if "right bumper" in asked]
         if asked and asked[-1] == self.asked[-1] and len(asked) <= self.times:
             volts[self.channels.index("force_r1_n")] += 1.0 * ((t > 0.2) & (t < 0.9))
         return volts
@@ -248,13 +254,15 @@ class Hasty(Struck):
 @pytest.mark.parametrize(("times", "verdict"), [(1, "pass"), (9, "not tested")])
 def test_who_presses_too_early_is_asked_again(times: int, verdict: str) -> None:
     backend = Hasty(RIG, times)
-    found = examined(backend, RIG, backend)
-    assert failing(found) == []
-    right = [one for one in backend.asked if "right bumper" in one]
+    result = examine(backend, RIG, backend)
+    assert failing(result) == []
+    right = [asked for asked in backend.asked if "right bumper" in asked]
     assert len(right) == min(times + 1, 3)
     assert "once more" in right[1]
-    lines = [one for one in found.lines if one.channel == "force_r1_n" and one.name == "polarity"]
-    assert [one.verdict for one in lines] == [verdict]
+    lines = [
+        line for line in result.lines if line.channel == "force_r1_n" and line.name == "polarity"
+    ]
+    assert [line.verdict for line in lines] == [verdict]
 
 
 class Holding(Struck):
@@ -264,7 +272,8 @@ class Holding(Struck):
         volts = super().read(samples)
         t = (np.arange(self._next - samples, self._next) - self._asked) / RATE
         right, left = (
-            [one for one in self.asked if f"{side} bumper" in one] for side in ("right", "left")
+            [asked for asked in self.asked if f"{side} bumper" in asked]
+            for side in ("right", "left")
         )
         if right and not left:
             volts[self.channels.index("force_r1_n")] += 1.0 * (t > 0.6)
@@ -275,14 +284,16 @@ class Holding(Struck):
 
 def test_a_press_that_is_held_until_the_next_is_asked_for_swaps_nothing() -> None:
     backend = Holding(RIG, HANDS)
-    found = examined(backend, RIG, backend)
-    assert failing(found) == []
-    assert len([one for one in backend.asked if "left bumper" in one]) == 2
-    lines = [one for one in found.lines if one.channel == "force_l1_n" and one.name == "polarity"]
-    assert [one.verdict for one in lines] == ["pass"]
+    result = examine(backend, RIG, backend)
+    assert failing(result) == []
+    assert len([asked for asked in backend.asked if "left bumper" in asked]) == 2
+    lines = [
+        line for line in result.lines if line.channel == "force_l1_n" and line.name == "polarity"
+    ]
+    assert [line.verdict for line in lines] == ["pass"]
 
 
-def shunted(size: float) -> WiringCheckResult:
+def run_shunt_check(size: float) -> WiringCheckResult:
     head = 'channel = "force_r1_n"\nunit = "kN"\n'
     assert TEXT.count(head) == 1
     text = TEXT.replace(head, head + "shunt = 2.0\nshunt_tolerance = 0.05\n")
@@ -297,14 +308,16 @@ def shunted(size: float) -> WiringCheckResult:
             return volts
 
     backend = Switched(rig, HANDS)
-    return examined(backend, rig, backend)
+    return examine(backend, rig, backend)
 
 
 def test_a_shunt_proves_the_gain() -> None:
-    assert failing(shunted(2.02)) == []
-    assert [one.verdict for one in shunted(2.02).lines if one.name == "shunt"] == ["pass"]
-    assert failing(shunted(2.2)) == [("shunt", "force_r1_n")]
-    assert failing(shunted(-2.0)) == [("shunt", "force_r1_n")]
+    assert failing(run_shunt_check(2.02)) == []
+    assert [line.verdict for line in run_shunt_check(2.02).lines if line.name == "shunt"] == [
+        "pass"
+    ]
+    assert failing(run_shunt_check(2.2)) == [("shunt", "force_r1_n")]
+    assert failing(run_shunt_check(-2.0)) == [("shunt", "force_r1_n")]
 
 
 Invoke = Callable[..., tuple[int, str]]
@@ -342,11 +355,11 @@ def test_the_command_says_it_in_a_table_and_ends_with_2_where_a_line_fails(
 
 def test_as_json_every_line_stands_there(invoke: Invoke) -> None:
     code, text = invoke("--table", "simulated", "--json")
-    found = json.loads(text)
-    assert (code, found["passed"], found["backend"]) == (0, True, "simulated")
-    assert {one["channel"] for one in found["lines"]} == {*RIG.channels, ""}
-    assert {one["verdict"] for one in found["lines"]} == {"pass", "not tested"}
-    (acc,) = (one for one in found["inputs"] if one["channel"] == "table_acc_m_s2")
+    report = json.loads(text)
+    assert (code, report["passed"], report["backend"]) == (0, True, "simulated")
+    assert {line["channel"] for line in report["lines"]} == {*RIG.channels, ""}
+    assert {line["verdict"] for line in report["lines"]} == {"pass", "not tested"}
+    (acc,) = (sensor for sensor in report["inputs"] if sensor["channel"] == "table_acc_m_s2")
     assert acc["noise_rms"] == pytest.approx(0.0005, rel=0.1)
     assert acc["mean"] == pytest.approx(0.001, abs=1e-4)
 
@@ -354,9 +367,9 @@ def test_as_json_every_line_stands_there(invoke: Invoke) -> None:
 def test_what_is_asked_for_must_fit(invoke: Invoke) -> None:
     quick = str(PROFILES_DIR / "tests" / "quickstart.toml")
     for words in ((), ("--json",), (quick, "--json"), (quick, "--unattended")):
-        with pytest.raises(InputError, match="PROFILE"):
+        with raises_input_error(where="check", allowed="PROFILE"):
             invoke(*words)
-    with pytest.raises(InputError, match="did you mean 'simulated'"):
+    with raises_input_error(where="--table simulatd", remedy="'simulated'"):
         invoke("--table", "simulatd")
     assert "ready: nothing exceeds" in invoke(quick)[1]  # the pre-flight is what it was
 
@@ -366,15 +379,15 @@ def test_a_loss_is_no_traceback() -> None:
         def tare(self, samples: int) -> Float2D:
             raise MachineLost("the cable is out; put it in")
 
-    found = examined(Lost())
-    assert failing(found) == [("machine answers", "")]
-    assert found.lines[0].do == "the cable is out; put it in"
+    result = examine(Lost())
+    assert failing(result) == [("machine answers", "")]
+    assert result.lines[0].do == "the cable is out; put it in"
 
 
 def free_port(kind: int) -> int:
-    with socket.socket(socket.AF_INET, kind) as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 @pytest.mark.slow
@@ -397,7 +410,9 @@ def test_on_a_table_of_its_own_every_line_passes_and_its_black_box_saw_no_motion
         result = subprocess.run(words, capture_output=True, text=True, check=False)
         table.terminate()
     assert result.returncode == 0, result.stdout + result.stderr
-    passed = {one["name"] for one in json.loads(result.stdout)["lines"] if one["verdict"] == "pass"}
+    passed = {
+        line["name"] for line in json.loads(result.stdout)["lines"] if line["verdict"] == "pass"
+    }
     assert {"noise", "command at 0 V", "samples on time"} <= passed
     assert ({"heartbeat comes back", "heartbeat stops", "all is well"} <= passed) == (
         name == "ni_simulated"

@@ -1,4 +1,7 @@
-"""The command line as its user meets it: what it refuses, how it says so, and what it leaves."""
+"""The command line as its user meets it: what it refuses, how it says so, and what it leaves.
+
+Each kind of outcome is seen once from a process of its own; the rest call `main` in this one.
+"""
 
 import json
 import os
@@ -11,6 +14,7 @@ from mcap.writer import Writer
 from typer.core import TyperGroup
 from typer.main import get_command
 
+from tests.command_line import call_main
 from twin.cli import main
 from twin.cli.main import app
 
@@ -40,7 +44,7 @@ def shaketwin(*words: object, cwd: Path | None = None) -> subprocess.CompletedPr
     )
 
 
-def refused(result: subprocess.CompletedProcess[str], *words: str) -> None:
+def require_refusal(result: subprocess.CompletedProcess[str], *words: str) -> None:
     """Exit code 2, one message that holds the words, no traceback."""
     assert result.returncode == 2, result.stdout + result.stderr
     assert "Traceback" not in result.stderr
@@ -56,7 +60,7 @@ def profile(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of an unpaced run."""
     folder = tmp_path_factory.mktemp("recorded")
     (folder / "short.toml").write_text(SHORT)
@@ -86,31 +90,31 @@ def test_a_bad_profile_is_refused_before_anything_starts(
     old: str, new: str, words: list[str], profile: Path, tmp_path: Path
 ) -> None:
     profile.write_text(SHORT.replace(old, new, 1))
-    refused(shaketwin("run", profile, "--out", tmp_path / "out"), "short.toml", *words)
+    require_refusal(call_main("run", profile, "--out", tmp_path / "out"), "short.toml", *words)
     assert not (tmp_path / "out").exists()
 
 
 def test_every_fault_of_a_profile_is_said_at_once(profile: Path) -> None:
     profile.write_text(SHORT.replace("550.0", "-1").replace("cycles = 4", "cyclse = 4"))
-    refused(shaketwin("check", profile), "mass_kg", "cyclse", "sweep.cycles: missing")
+    require_refusal(shaketwin("check", profile), "mass_kg", "cyclse", "sweep.cycles: missing")
 
 
 def test_a_folder_with_content_is_refused_and_kept(profile: Path, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "run.mcap").write_bytes(b"precious")
     for command in (["run"], ["run", "--speed", "max"], ["simulate"]):
-        result = shaketwin(command[0], profile, *command[1:], "--out", tmp_path / "out")
-        refused(result, "exists and has content")
+        result = call_main(command[0], profile, *command[1:], "--out", tmp_path / "out")
+        require_refusal(result, "exists and has content")
     assert (tmp_path / "out" / "run.mcap").read_bytes() == b"precious"
 
 
 def test_a_folder_that_cannot_be_written_is_refused(profile: Path) -> None:
     place = Path("/proc/shaketwin") if os.getuid() == 0 else Path("/shaketwin")
-    refused(shaketwin("run", profile, "--out", place), str(place), "cannot write here")
+    require_refusal(call_main("run", profile, "--out", place), str(place), "cannot write here")
 
 
 @pytest.mark.parametrize("command", ["replay", "prc", "view"])
-def test_a_log_that_is_none_is_refused(command: str, recorded: Path, tmp_path: Path) -> None:
+def test_a_log_that_is_none_is_refused(command: str, run_folder: Path, tmp_path: Path) -> None:
     text, foreign, cut = tmp_path / "a.mcap", tmp_path / "b.mcap", tmp_path / "c.mcap"
     text.write_text("time_s,u\n0,1\n")
     with foreign.open("wb") as stream:
@@ -119,39 +123,41 @@ def test_a_log_that_is_none_is_refused(command: str, recorded: Path, tmp_path: P
         channel = writer.register_channel("/camera", "json", writer.register_schema("x", "", b""))
         writer.add_message(channel, 0, b"{}", 0)
         writer.finish()
-    whole = (recorded / "run.mcap").read_bytes()
+    whole = (run_folder / "run.mcap").read_bytes()
     cut.write_bytes(whole[:40])
-    there = set(tmp_path.iterdir())
-    refused(shaketwin(command, text, cwd=tmp_path), "not an MCAP file")
-    refused(shaketwin(command, foreign, cwd=tmp_path), "not a shaketwin log", "/camera")
-    refused(shaketwin(command, cut, cwd=tmp_path), str(cut))
-    refused(shaketwin(command, tmp_path / "none.mcap", cwd=tmp_path), "none.mcap", "No such file")
-    assert set(tmp_path.iterdir()) == there
+    files = set(tmp_path.iterdir())
+    require_refusal(call_main(command, text, cwd=tmp_path), "not an MCAP file")
+    require_refusal(call_main(command, foreign, cwd=tmp_path), "not a shaketwin log", "/camera")
+    require_refusal(call_main(command, cut, cwd=tmp_path), str(cut))
+    require_refusal(
+        shaketwin(command, tmp_path / "none.mcap", cwd=tmp_path), "none.mcap", "No such file"
+    )
+    assert set(tmp_path.iterdir()) == files
 
 
-def test_a_truncated_log_still_shows_its_curve(recorded: Path, tmp_path: Path) -> None:
-    whole = (recorded / "run.mcap").read_bytes()
+def test_a_truncated_log_still_shows_its_curve(run_folder: Path, tmp_path: Path) -> None:
+    whole = (run_folder / "run.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: int(0.9 * len(whole))])
-    result = shaketwin("prc", tmp_path / "cut.mcap", "--json")
+    result = call_main("prc", tmp_path / "cut.mcap", "--json")
     assert result.returncode == 0, result.stderr
     steps = json.loads(result.stdout)["steps"]
-    full = json.loads((recorded / "summary.json").read_text())["steps"]
+    full = json.loads((run_folder / "summary.json").read_text())["steps"]
     assert 0 < len(steps) < len(full)
     assert steps == full[: len(steps)]
 
 
-def test_prc_says_the_numbers_of_the_summary(recorded: Path) -> None:
-    result = shaketwin("prc", recorded, "--json")
+def test_prc_says_the_numbers_of_the_summary(run_folder: Path) -> None:
+    result = shaketwin("prc", run_folder, "--json")
     assert result.returncode == 0, result.stderr
-    found = json.loads(result.stdout)
-    assert found["steps"] == json.loads((recorded / "summary.json").read_text())["steps"]
-    table = shaketwin("prc", recorded).stdout
+    printed = json.loads(result.stdout)
+    assert printed["steps"] == json.loads((run_folder / "summary.json").read_text())["steps"]
+    table = call_main("prc", run_folder).stdout
     assert "3.400" in table
-    assert f"{found['steps'][0]['measured']['eta_d']:.3f}" in table
+    assert f"{printed['steps'][0]['measured']['eta_d']:.3f}" in table
 
 
-def test_prc_fits_a_narrow_terminal_and_a_file_is_not_cut(recorded: Path) -> None:
-    command = [SHAKETWIN, "prc", str(recorded)]
+def test_prc_fits_a_narrow_terminal_and_a_file_is_not_cut(run_folder: Path) -> None:
+    command = [SHAKETWIN, "prc", str(run_folder)]
     bare = {key: value for key, value in os.environ.items() if key != "COLUMNS"}
     narrow, file = (
         subprocess.run(command, capture_output=True, text=True, check=True, env=env).stdout
@@ -168,7 +174,7 @@ def test_help_is_quick() -> None:
     slow = "numpy numba scipy pydantic matplotlib mcap zenoh rerun"
     code = (
         "import sys; from twin.cli.main import app; "
-        f"print([one for one in {slow.split()} if one in sys.modules])"
+        f"print([name for name in {slow.split()} if name in sys.modules])"
     )
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
@@ -176,15 +182,27 @@ def test_help_is_quick() -> None:
     assert result.stdout.strip() == "[]"
 
 
+def test_only_a_report_imports_what_draws_and_scipy_signal_is_for_discovery() -> None:
+    code = (
+        "import sys; slow = {'matplotlib', 'scipy.signal'}; "
+        "import twin.cli.report; print(sorted(slow & set(sys.modules))); "
+        "import twin.reports.report; print(sorted(slow & set(sys.modules)))"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.split("\n") == ["[]", "['matplotlib']", ""]
+
+
 def test_export_and_replay_say_steps_in_the_same_words() -> None:
     group = get_command(app)
     assert isinstance(group, TyperGroup)
-    found = []
+    options = []
     for name in ("export", "replay"):
-        (option,) = (one for one in group.commands[name].params if one.name == "steps")
-        found.append((option.metavar, getattr(option, "help", None)))
-    assert found[0] == found[1]
-    assert found[0][0] == "FIRST:LAST"
+        (option,) = (param for param in group.commands[name].params if param.name == "steps")
+        options.append((option.metavar, getattr(option, "help", None)))
+    assert options[0] == options[1]
+    assert options[0][0] == "FIRST:LAST"
 
 
 @pytest.mark.parametrize(("command", "kept"), [("run", True), ("campaign", True), ("prc", False)])
@@ -198,18 +216,19 @@ def test_only_what_records_says_that_the_recording_is_kept(
     monkeypatch.setattr(sys, "argv", ["shaketwin", command, "x"])
     with pytest.raises(SystemExit, match="2"):
         main.main()
-    told = capsys.readouterr().err
-    assert "No space left on device" in told
-    assert ("the recording is kept" in told) == kept
+    message = capsys.readouterr().err
+    assert "No space left on device" in message
+    assert ("the recording is kept" in message) == kept
 
 
+@pytest.mark.usefixtures("draft")
 def test_replay_with_another_model_differs_and_says_by_how_much(
-    recorded: Path, tmp_path: Path
+    run_folder: Path, tmp_path: Path
 ) -> None:
     text = (ROOT / "profiles" / "models" / "snm.toml").read_text()
     (tmp_path / "stiff.toml").write_text(text.replace("36000.0", "39600.0"))
     out = tmp_path / "out"
-    result = shaketwin("replay", recorded, "--model", tmp_path / "stiff.toml", "--out", out)
+    result = call_main("replay", run_folder, "--model", tmp_path / "stiff.toml", "--out", out)
     assert result.returncode == 0, result.stderr
     summary = json.loads((out / "summary.json").read_text())
     assert not summary["replay"]["identical"]
@@ -219,12 +238,13 @@ def test_replay_with_another_model_differs_and_says_by_how_much(
 
 
 @pytest.mark.parametrize("speed", ["0", "-1", "fast", "nan"])
-def test_a_replay_speed_that_is_none_is_refused(speed: str, recorded: Path) -> None:
-    refused(shaketwin("replay", recorded, "--speed", speed), "--speed", "allowed: max")
+def test_a_replay_speed_that_is_none_is_refused(speed: str, run_folder: Path) -> None:
+    require_refusal(call_main("replay", run_folder, "--speed", speed), "--speed", "allowed: max")
 
 
+@pytest.mark.usefixtures("draft")
 def test_simulate_measures_nothing(profile: Path, tmp_path: Path) -> None:
-    result = shaketwin("simulate", profile, "--out", tmp_path / "out")
+    result = call_main("simulate", profile, "--out", tmp_path / "out")
     assert result.returncode == 0, result.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert [step["measured"] for step in summary["steps"]] == [None] * 4
@@ -233,7 +253,7 @@ def test_simulate_measures_nothing(profile: Path, tmp_path: Path) -> None:
 
 
 def test_check_moves_nothing_and_draws_the_drive(profile: Path, tmp_path: Path) -> None:
-    result = shaketwin("check", profile, "--out", tmp_path / "drive", cwd=tmp_path)
+    result = call_main("check", profile, "--out", tmp_path / "drive", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "ready: " in result.stdout
     assert (tmp_path / "drive" / "drive.png").stat().st_size > 10_000
@@ -241,4 +261,4 @@ def test_check_moves_nothing_and_draws_the_drive(profile: Path, tmp_path: Path) 
 
 
 def test_no_monitor_no_view_where_nothing_runs() -> None:
-    refused(shaketwin("view", "--connect", "tcp/127.0.0.1:1"), "127.0.0.1:1")
+    require_refusal(call_main("view", "--connect", "tcp/127.0.0.1:1"), "127.0.0.1:1")

@@ -22,6 +22,7 @@ from table_io.backends.opendaq import discovery as daq_found
 from table_io.backends.opendaq.discovery import discover_devices as discover_opendaq_devices
 from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
+from tests.input_errors import raises_input_error
 from twin.cli import devices as command
 from twin.cli.main import app
 
@@ -54,16 +55,16 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
 
 
 def cards(text: str) -> dict[str, dict[str, object]]:
-    return {one["card"]: one for one in json.loads(text)["cards"]}
+    return {entry["card"]: entry for entry in json.loads(text)["cards"]}
 
 
 def test_every_shipped_card_stands_there_and_whether_it_answers(run: Run) -> None:
     code, text = run("--json")
-    found = cards(text)
+    by_card = cards(text)
     assert code == 0
-    assert set(found) == {"simulated", "machine"}
-    assert found["simulated"]["answers"] is True
-    assert found["machine"]["where"] == "tcp/127.0.0.1:7450"
+    assert set(by_card) == {"simulated", "machine"}
+    assert by_card["simulated"]["answers"] is True
+    assert by_card["machine"]["where"] == "tcp/127.0.0.1:7450"
 
 
 def test_cards_of_the_working_directory_too_good_and_bad(run: Run, tmp_path: Path) -> None:
@@ -76,12 +77,12 @@ def test_cards_of_the_working_directory_too_good_and_bad(run: Run, tmp_path: Pat
         listener.bind(str(here))
         listener.listen()
         code, text = run("--json")
-    found = cards(text)
+    by_card = cards(text)
     assert code == 0
-    assert found[str(tmp_path / "mine.toml")]["answers"] is True
-    assert found[str(tmp_path / "broken.toml")]["answers"] is False
-    assert "did you mean 'span_mm'" in str(found[str(tmp_path / "broken.toml")]["why"])
-    assert not any("test.toml" in name or "latin.toml" in name for name in found)
+    assert by_card[str(tmp_path / "mine.toml")]["answers"] is True
+    assert by_card[str(tmp_path / "broken.toml")]["answers"] is False
+    assert "did you mean 'span_mm'" in str(by_card[str(tmp_path / "broken.toml")]["why"])
+    assert not any("test.toml" in name or "latin.toml" in name for name in by_card)
     assert "start it first" in str(cards(run("--json")[1])[str(tmp_path / "mine.toml")]["why"])
 
 
@@ -90,7 +91,7 @@ def test_devices_stand_in_a_table_with_what_they_have(run: Run) -> None:
     assert "daq.nd://lab" in text
     assert "2 AI -10 to 10 V up to 100000 Hz" in text
     devices = json.loads(run("--json")[1])["devices"]
-    (laser,) = (one for one in devices if one["kind"] == "opendaq")
+    (laser,) = (device for device in devices if device["kind"] == "opendaq")
     assert laser["ports"][0]["names"] == ["Sig/AI0", "Sig/AI1"]
 
 
@@ -113,16 +114,16 @@ def test_who_hangs_is_not_waited_for_and_who_breaks_is_a_sentence() -> None:
     def broken() -> None:
         raise OSError("the driver is gone")
 
-    def refused() -> None:
+    def refuse() -> None:
         raise InputError("start it first")
 
-    asked = {"good": lambda: 1, "hung": ever.wait, "broken": broken, "refused": refused}
-    heard = command.ask_all(asked, 0.2)
-    assert heard["good"] == 1
-    assert isinstance(heard["hung"], InputError)
-    assert "no answer within 0.2 s" in str(heard["hung"])
-    assert str(heard["refused"]) == "start it first"
-    assert str(heard["broken"]) == "OSError: the driver is gone"
+    asked = {"good": lambda: 1, "hung": ever.wait, "broken": broken, "refused": refuse}
+    answers = command.ask_all(asked, 0.2)
+    assert answers["good"] == 1
+    assert isinstance(answers["hung"], InputError)
+    assert "no answer within 0.2 s" in str(answers["hung"])
+    assert str(answers["refused"]) == "start it first"
+    assert str(answers["broken"]) == "OSError: the driver is gone"
     ever.set()
 
 
@@ -156,19 +157,19 @@ class Lab(rpc.NiDAQmxServicer):  # type: ignore[misc]  # untyped: its package is
 
 @pytest.fixture
 def server() -> Iterator[str]:
-    one = grpc.server(futures.ThreadPoolExecutor(2))
-    port = one.add_insecure_port("127.0.0.1:0")
-    rpc.add_NiDAQmxServicer_to_server(Lab(), one)
-    one.start()
+    rpc_server = grpc.server(futures.ThreadPoolExecutor(2))
+    port = rpc_server.add_insecure_port("127.0.0.1:0")
+    rpc.add_NiDAQmxServicer_to_server(Lab(), rpc_server)
+    rpc_server.start()
     yield f"127.0.0.1:{port}"
-    one.stop(None)
+    rpc_server.stop(None)
 
 
 def test_a_device_server_is_asked_by_the_vendors_own_client(server: str) -> None:
     (device,) = ni_found.discover_devices(server)
     assert (device.name, device.product, device.serial) == ("Dev1", "PCIe-6363", "1A2B")
     assert device.where == server
-    ports = {one.kind: one for one in device.ports}
+    ports = {port.kind: port for port in device.ports}
     assert set(ports) == {"AI", "AO"}
     assert ports["AI"].names == ("Dev1/ai0", "Dev1/ai1")
     assert ports["AI"].ranges_v == ((-10.0, 10.0),)
@@ -176,7 +177,7 @@ def test_a_device_server_is_asked_by_the_vendors_own_client(server: str) -> None
 
 
 def test_no_device_server_there_and_no_driver_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(InputError, match=r"no gRPC Device Server answers at 127\.0\.0\.1:9"):
+    with raises_input_error(where="127.0.0.1:9"):
         ni_found.discover_devices("127.0.0.1:9")
 
     def none() -> object:

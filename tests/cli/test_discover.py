@@ -14,6 +14,7 @@ import pytest
 from table_io.block import Float1D
 from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
+from tests.input_errors import raises_input_error
 from twin.cli import discover
 from twin.cli.discover import discover_command
 from twin.cli.identify import identify_command
@@ -60,14 +61,14 @@ class Made:
     profile: Path
 
 
-def made(folder: Path, truth: str = "", gap: str = "4.0") -> Made:
+def record_run(folder: Path, truth: str = "", gap: str = "4.0") -> Made:
     folder.mkdir()
     rig, text = folder / "rig.toml", (PROFILES_DIR / "rigs" / "simulated.toml").read_text()
     if truth:
         sealed = folder / "truth.toml"
         sealed.write_text(truth)
-        told = hashlib.sha256(truth.encode()).hexdigest()
-        text += f'truth = "{sealed}"\ntruth_sha256 = "{told}"\n'
+        digest = hashlib.sha256(truth.encode()).hexdigest()
+        text += f'truth = "{sealed}"\ntruth_sha256 = "{digest}"\n'
     rig.write_text(text)
     profile, log = folder / "p.toml", folder / f"{folder.name}.mcap"
     profile.write_text(PROFILE.format(rig=rig, gap=gap))
@@ -77,30 +78,34 @@ def made(folder: Path, truth: str = "", gap: str = "4.0") -> Made:
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    return made(tmp_path_factory.mktemp("bad") / "plain")
+    return record_run(tmp_path_factory.mktemp("bad") / "plain")
 
 
-def changed(one: Made, folder: Path, change: Callable[[str, Float1D], Float1D]) -> Path:
+def change_log(source: Made, folder: Path, change: Callable[[str, Float1D], Float1D]) -> Path:
     """The log of a table with other values in it."""
-    (piece,) = read_recording(one.log).contiguous_blocks("meas")
+    (piece,) = read_recording(source.log).contiguous_blocks("meas")
     columns = [change(name, piece.channel(name)) for name in piece.channels]
     table, log = folder / "table.csv", folder / "changed.mcap"
     rows = np.array([piece.time_s, *columns]).T
     head = ",".join(["time_s", *piece.channels])
     np.savetxt(table, rows, fmt="%.9g", delimiter=",", header=head, comments="")
-    import_samples(table, log, one.profile, None, None)
+    import_samples(table, log, source.profile, None, None)
     return log
 
 
-def told(logs: list[Path], out: Path, model: str = "snm") -> tuple[dict[str, Any], Discovery]:
+def discover_from(
+    logs: list[Path], out: Path, model: str = "snm"
+) -> tuple[dict[str, Any], Discovery]:
     """verdict.json and what it was made from; nothing is drawn."""
-    seen: list[Discovery] = []
+    discoveries: list[Discovery] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            discover, "write_discovery_page", lambda folder, found, *_: seen.append(found)
+            discover,
+            "write_discovery_page",
+            lambda folder, discovery, *_: discoveries.append(discovery),
         )
         assert discover_command(logs, model, out, NOTHING_NAMED) == 0
-    return json.loads((out / "verdict.json").read_text()), seen[0]
+    return json.loads((out / "verdict.json").read_text()), discoveries[0]
 
 
 @pytest.mark.parametrize("learn", [discover_command, identify_command])
@@ -110,109 +115,110 @@ def test_a_log_counts_once_whatever_its_name(
     again = tmp_path / "again.mcap"
     shutil.copy(plain.log, again)
     out = tmp_path / ("out.toml" if learn is identify_command else "out")
-    with pytest.raises(InputError, match=r"again\.mcap: the same log as"):
+    with raises_input_error(where=again, problem=plain.log):
         learn([plain.log, again], "snm", out)
     assert not out.exists()
 
 
 def test_what_is_in_the_way_is_said_before_the_long_work(tmp_path: Path) -> None:
     (tmp_path / "there").write_text("mine")
-    with pytest.raises(InputError, match="has content"):
+    with raises_input_error(key="--out", value=str(tmp_path)):
         discover_command([tmp_path / "no.mcap"], "snm", tmp_path)
-    assert [one.name for one in tmp_path.iterdir()] == ["there"]
+    assert [path.name for path in tmp_path.iterdir()] == ["there"]
 
 
 def test_half_a_force_is_not_believed(plain: Made, tmp_path: Path) -> None:
     def dead(name: str, values: Float1D) -> Float1D:
         return 0.0 * values if name == "force_r1_n" else values
 
-    (log,), notes = load_logs([changed(plain, tmp_path, dead)])
-    assert not {one for one in log.signals.channels if one.startswith("force_")}
-    assert [one for one in notes if "force_r1_n is dead" in one and "all load cells" in one]
+    (log,), notes = load_logs([change_log(plain, tmp_path, dead)])
+    assert not {name for name in log.signals.channels if name.startswith("force_")}
+    assert [text for text in notes if "force_r1_n is dead" in text and "all load cells" in text]
     (log,), notes = load_logs([plain.log])
     assert {"force_r1_n", "force_l2_n"} <= {*log.signals.channels}
     assert not notes
 
 
 def test_a_load_cell_of_the_wrong_sign_is_refused(plain: Made, tmp_path: Path) -> None:
-    def turned(name: str, values: Float1D) -> Float1D:
+    def flip_sign(name: str, values: Float1D) -> Float1D:
         return -values if name == "force_l2_n" else values
 
     with pytest.raises(InputError) as error:
-        load_logs([changed(plain, tmp_path, turned)])
+        load_logs([change_log(plain, tmp_path, flip_sign)])
     assert error.value.key == "force_l2_n"
 
 
 def test_lost_samples_are_counted(plain: Made, tmp_path: Path) -> None:
-    def holed(name: str, values: Float1D) -> Float1D:
+    def cut_holes(name: str, values: Float1D) -> Float1D:
         values = values.copy()
         values[3000:3070] = np.nan if name == "mass_acc_m_s2" else values[3000:3070]
         return values
 
-    _, notes = load_logs([changed(plain, tmp_path, holed)])
-    assert any("70 samples of mass_acc_m_s2 are lost" in one for one in notes)
+    _, notes = load_logs([change_log(plain, tmp_path, cut_holes)])
+    assert any("70 samples of mass_acc_m_s2 are lost" in text for text in notes)
 
 
 def test_bumpers_that_the_profile_does_not_know(tmp_path: Path) -> None:
     truth = "[base]\ngap_right_m = 0.002\ngap_left_m = 0.002\n"
-    _, notes = load_logs([made(tmp_path / "touching", truth, "inf").log])
-    assert sum("no right bumper" in one for one in notes) == 2
-    assert sum("no left bumper" in one for one in notes) == 2
+    _, notes = load_logs([record_run(tmp_path / "touching", truth, "inf").log])
+    assert sum("no right bumper" in text for text in notes) == 2
+    assert sum("no left bumper" in text for text in notes) == 2
 
 
 def test_time_that_runs_backwards_is_no_model_and_no_crash(plain: Made, tmp_path: Path) -> None:
-    log = changed(plain, tmp_path, lambda _, values: values[::-1])
-    found, discovery = told([log], tmp_path / "out")
+    log = change_log(plain, tmp_path, lambda _, values: values[::-1])
+    verdict, discovery = discover_from([log], tmp_path / "out")
     sheet, steps = discovery.prepared.problem.log_residuals[0], load_logs([log])[0][0].steps
     assert steps
     assert run_log_free(sheet, steps, discovery.selection.null) == []  # no resonance to scale by
-    assert found["verdict"] == "unexplained"
-    assert any("damping = 0 " in one and "bound" in one for one in found["notes"])
+    assert verdict["verdict"] == "unexplained"
+    assert any("damping = 0 " in text and "bound" in text for text in verdict["notes"])
 
 
 def test_agreement_with_other_parameters_is_not_agreement(tmp_path: Path) -> None:
-    stiff = made(tmp_path / "stiff", "[base]\ndamper_stiffness_n_m = 72000.0\n")
-    found, _ = told([stiff.log], tmp_path / "out")
-    assert found["verdict"] == "none"
-    assert found["why"].endswith(REFITTED_SUFFIX)
-    assert "agrees only with other parameters" in format_verdict(found)
+    stiff = record_run(tmp_path / "stiff", "[base]\ndamper_stiffness_n_m = 72000.0\n")
+    verdict, _ = discover_from([stiff.log], tmp_path / "out")
+    assert verdict["verdict"] == "none"
+    assert verdict["why"].endswith(REFITTED_SUFFIX)
+    assert "agrees only with other parameters" in format_verdict(verdict)
 
 
 def test_an_effect_of_the_model_that_is_not_there_is_said(plain: Made, tmp_path: Path) -> None:
     text = (PROFILES_DIR / "models" / "snm.toml").read_text()
     model = tmp_path / "more.toml"
     model.write_text(f'{text}[[effects]]\nid = "bumper_hardening"\nparameters = {{ k2 = 4e7 }}\n')
-    found, _ = told([plain.log], tmp_path / "out", str(model))
-    assert found["verdict"] == "none"
-    assert abs(found["base"]["bumper_hardening.k2"]["value"]) < 4e6
-    assert any("bumper_hardening" in one and "vanishes" in one for one in found["notes"])
-    assert not any("gap" in one for one in found["notes"])
+    verdict, _ = discover_from([plain.log], tmp_path / "out", str(model))
+    assert verdict["verdict"] == "none"
+    assert abs(verdict["base"]["bumper_hardening.k2"]["value"]) < 4e6
+    assert any("bumper_hardening" in text and "vanishes" in text for text in verdict["notes"])
+    assert not any("gap" in text for text in verdict["notes"])
 
 
 def test_enough_before_anything_leaves_nothing(
     plain: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(*_: object, **__: object) -> Discovery:
+    def interrupt(*_: object, **__: object) -> Discovery:
         raise Cancelled
 
-    monkeypatch.setattr(discover, "discover_effects", interrupted)
+    monkeypatch.setattr(discover, "discover_effects", interrupt)
     assert discover_command([plain.log], "snm", tmp_path / "out") == EXIT_INTERRUPTED
     assert not (tmp_path / "out").exists()
 
 
 def test_motion_alone_says_nothing_of_forces(plain: Made, tmp_path: Path) -> None:
-    def lost(name: str, values: Float1D) -> Float1D:
+    def lose_all_but_displacements(name: str, values: Float1D) -> Float1D:
         return values if name.endswith("disp_m") else values * np.nan
 
     with pytest.raises(InputError) as error:
-        load_logs([changed(plain, tmp_path, lost)])
+        load_logs([change_log(plain, tmp_path, lose_all_but_displacements)])
     assert "mass_acc_m_s2" in error.value.allowed
 
 
 def test_a_load_cell_that_bears_nothing_is_no_candidate(tmp_path: Path) -> None:
-    (log,), _ = load_logs([made(tmp_path / "flight", gap="inf").log])
+    (log,), _ = load_logs([record_run(tmp_path / "flight", gap="inf").log])
     names = {
-        one.name for one in prepare_problem([log], read_model_template("snm")[0]).problem.library
+        library.name
+        for library in prepare_problem([log], read_model_template("snm")[0]).problem.library
     }
     assert "sensor_gain.mass_acc_m_s2" in names
     assert "sensor_offset.force_r1_n" in names

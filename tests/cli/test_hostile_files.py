@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from table_io.errors import InputError
-from tests.studies.hostile_files import Trials, called, watch
+from tests.input_errors import raises_input_error
+from tests.studies.hostile_files import Trials, call_command, watch
 from twin.run.run_config import from_texts
 
 COMMANDS = {"verify", "prc", "replay", "import"}
@@ -20,40 +20,40 @@ def trials(tmp_path_factory: pytest.TempPathFactory) -> Trials:
 def test_a_hostile_file_is_refused_or_read(
     number: int, trials: Trials, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    said = trials.run(number)
-    assert {one.split()[0] for one in said} == COMMANDS
+    outcomes = trials.run(number)
+    assert {outcome.split()[0] for outcome in outcomes} == COMMANDS
     assert "CRASH" not in capsys.readouterr().out
-    assert not any(one.endswith("crashed") for one in said)
+    assert not any(outcome.endswith("crashed") for outcome in outcomes)
 
 
 def test_a_crash_would_be_seen(trials: Trials, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("twin.cli.verify.examine_logs", lambda paths, _: paths[7])
-    code, error = called(("verify", trials.folder / "whole.mcap"), report=False)
+    code, error = call_command(("verify", trials.folder / "whole.mcap"), report=False)
     assert code == "crashed"
     assert "IndexError" in error
 
 
 def test_a_whole_file_is_none_of_these(trials: Trials, tmp_path: Path) -> None:
     log = trials.folder / "whole.mcap"
-    assert called(("prc", log, "--json"), report=False)[0] == "0"
+    assert call_command(("prc", log, "--json"), report=False)[0] == "0"
     (tmp_path / "a.csv").write_bytes(trials.table)
-    assert called(("import", tmp_path / "a.csv", "-o", tmp_path / "a.mcap"), False)[0] == "0"
+    assert call_command(("import", tmp_path / "a.csv", "-o", tmp_path / "a.mcap"), False)[0] == "0"
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("old", "new", "fields"),
     [
-        ("frequency_hz = 20.0", "frequency_hz = 1e-300", "look for a wrong power of ten"),
-        ("span_mm = 60.0", "span_mm = 1e308", "look for a wrong power of ten"),
-        ("span_mm = 60.0", "span_mm = " + "[" * 5000, "nested too deeply"),
+        ("frequency_hz = 20.0", "frequency_hz = 1e-300", {"remedy": "power of ten"}),
+        ("span_mm = 60.0", "span_mm = 1e308", {"remedy": "power of ten"}),
+        ("span_mm = 60.0", "span_mm = " + "[" * 5000, {"remedy": "nesting"}),
     ],
 )
 def test_a_recorded_text_from_which_nothing_follows_is_refused(
-    old: str, new: str, words: str, trials: Trials
+    old: str, new: str, fields: dict[str, str], trials: Trials
 ) -> None:
     start = trials.start
     assert old in start.rig_toml
-    with pytest.raises(InputError, match=words):
+    with raises_input_error(**fields):
         from_texts(
             "n", start.profile_toml, start.rig_toml.replace(old, new), start.model_toml, "a.mcap"
         )
@@ -61,6 +61,6 @@ def test_a_recorded_text_from_which_nothing_follows_is_refused(
 
 @pytest.mark.slow
 def test_ten_thousand_hostile_files() -> None:
-    said, wrong = watch(0, 10_000)
+    counts, wrong = watch(0, 10_000)
     assert not wrong
-    assert sum(said.values()) >= 40_000
+    assert sum(counts.values()) >= 40_000

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from table_io.errors import InputError
+from tests.input_errors import raises_input_error
 from tests.recording.test_mcap_log import run, write
 from twin.cli import repair
 from twin.cli.repair import write_repaired
@@ -66,13 +66,13 @@ def test_one_that_reads_back_as_another_is_not_left(
         return Verification(again.recording, again.messages[1:], again.report)
 
     monkeypatch.setattr(repair, "examine_logs", forgetful)
-    with pytest.raises(InputError, match="differs from what was read"):
+    with raises_input_error(where=new, remedy=str(old)):
         write_repaired(verified, [old], new)
     assert not new.exists()
 
 
 def test_what_was_there_stays(old: Path) -> None:
     before = old.read_bytes()
-    with pytest.raises(InputError, match="exists already"):
+    with raises_input_error(where=old):
         write_repaired(examine_logs([old]), [old], old)
     assert old.read_bytes() == before

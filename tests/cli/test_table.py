@@ -17,6 +17,7 @@ from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.sim.machine.flight_recorder import read_flight_record
+from tests.input_errors import raises_input_error
 from twin.cli.run import run_test
 from twin.cli.table import serve_table
 
@@ -33,25 +34,30 @@ def card(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("rig", "listen", "scale", "part"),
+    ("rig", "listen", "scale", "fields"),
     [
-        ("machine", "tcp/0.0.0.0:7450", 1.0, "other computers"),
-        ("machine", "unix/none/there", 1.0, "--listen unix/none/there"),
-        ("machine", None, 0.5, "--time-scale 0.5: .*allowed: 1 to 20"),
-        ("simulated", None, 1.0, "backend = 'simulated': .*allowed: .*machine.*--listen"),
-        ("machin", None, 1.0, "did you mean 'machine'"),
+        ("machine", "tcp/0.0.0.0:7450", 1.0, {"key": "endpoint", "value": "tcp/0.0.0.0:7450"}),
+        ("machine", "unix/none/there", 1.0, {"where": "--listen unix/none/there"}),
+        ("machine", None, 0.5, {"where": "--time-scale 0.5", "allowed": "1 to 20"}),
+        (
+            "simulated",
+            None,
+            1.0,
+            {"value": "simulated", "allowed": "machine", "remedy": "--listen"},
+        ),
+        ("machin", None, 1.0, {"remedy": "'machine'"}),
     ],
 )
 def test_what_is_wrong_is_said_before_anything_listens(
-    rig: str, listen: str | None, scale: float, part: str
+    rig: str, listen: str | None, scale: float, fields: dict[str, str]
 ) -> None:
-    with pytest.raises(InputError, match=part):
+    with raises_input_error(**fields):
         serve_table(rig, listen, None, scale, io.StringIO())
 
 
 def test_a_run_without_its_table_says_how_to_start_it_and_leaves_nothing(tmp_path: Path) -> None:
     profile, rig = PROFILES_DIR / "tests" / "quickstart.toml", str(card(tmp_path))
-    with pytest.raises(InputError, match="start it first, in another terminal: shaketwin table"):
+    with raises_input_error(remedy="shaketwin table --rig"):
         run_test(profile, tmp_path / "out", False, None, rig, False, "tcp/127.0.0.1:7447")
     with pytest.raises(InputError) as raised:
         run_test(profile, tmp_path / "out", True, None, rig, False, "tcp/127.0.0.1:7447")

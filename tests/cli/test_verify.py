@@ -1,6 +1,8 @@
 """`verify` and `--repair`: what is whole, what is lost and where, and what is left as a new log."""
 
+import errno
 import json
+import os
 import random
 from contextlib import closing, suppress
 from dataclasses import replace
@@ -19,7 +21,8 @@ from table_io.clock import ManualClock
 from table_io.errors import InputError
 from table_io.records import RunStart, RunStop, SampleGap
 from tests.cli.test_cli import SHORT
-from tests.exchange.mutants import damaged, spans, whole
+from tests.exchange.mutants import damage, spans, whole
+from tests.input_errors import raises_input_error
 from twin.cli.main import app
 from twin.cli.verify import examine_logs
 from twin.recording.mcap_log import LogWriter, write_items
@@ -44,7 +47,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     )
     with closing(source):
         items = list(islice(add_twin_items(source, bundle.prepare_twin()), 170))
-    items = [one for one in items if one.index < 1000]
+    items = [item for item in items if item.index < 1000]
     items.append(RunStop(1000, "stopped", "it was enough", ("idle", "at rest")))
     assert isinstance(items[0], RunStart)
     return read_recording(whole(folder / "run.mcap", items, items[0]))
@@ -65,13 +68,13 @@ def verify(*words: object) -> tuple[int, dict[str, Any]]:
     return result.exit_code, json.loads(result.stdout)
 
 
-def said(*words: object) -> str:
+def read_output(*words: object) -> str:
     """What it says to people."""
     return CliRunner().invoke(app, ["verify", *map(str, words)]).stdout
 
 
 def chunk(path: Path, number: int) -> tuple[int, int]:
-    places = [one[1:] for one in spans(path.read_bytes()) if one[0] == CHUNK]
+    places = [span[1:] for span in spans(path.read_bytes()) if span[0] == CHUNK]
     assert len(places) > 3
     return places[number]
 
@@ -83,36 +86,38 @@ def flip(path: Path, at: int) -> None:
 
 
 def test_a_whole_log_is_whole(log: Path, recording: Recording) -> None:
-    code, found = verify(log)
-    assert (code, found["sound"]) == (0, True)
-    assert found["damage"] == found["gaps"] == found["altered"] == []
-    assert (found["content"], found["schema"]) == ("same", 3)
-    assert found["samples"]["acquired"] == 1000
-    assert found["topics"]["/rig/meas"] == {"messages": 50, "missing": 0}
-    assert found["replay"] == {"possible": True, "identical": True, "because": []}
-    assert found["run"] == recording.run
-    assert said(log).splitlines()[-2:] == ["can be replayed, to the bit", "whole"]
+    code, report = verify(log)
+    assert (code, report["sound"]) == (0, True)
+    assert report["damage"] == report["gaps"] == report["altered"] == []
+    assert (report["content"], report["schema"]) == ("same", 3)
+    assert report["samples"]["acquired"] == 1000
+    assert report["topics"]["/rig/meas"] == {"messages": 50, "missing": 0}
+    assert report["replay"] == {"possible": True, "identical": True, "because": []}
+    assert report["run"] == recording.run
+    assert read_output(log).splitlines()[-2:] == ["can be replayed, to the bit", "whole"]
 
 
 def test_a_flipped_bit_costs_a_chunk_and_is_found_there(log: Path) -> None:
     first, end = chunk(log, 2)
     flip(log, (first + end) // 2)
-    code, found = verify(log)
+    code, report = verify(log)
     assert code == 4
-    assert [(one["byte"], one["bytes"]) for one in found["damage"][:1]] == [(first, end - first)]
-    (gap,) = found["gaps"]
-    missing = found["topics"]["/rig/meas"]["missing"]
-    assert gap["count"] == 20 * missing == found["samples"]["missing"] > 0
-    assert found["content"] == "differs"
-    assert found["replay"]["possible"]
-    assert not found["replay"]["identical"]
-    text = said(log)
+    assert [(damage["byte"], damage["bytes"]) for damage in report["damage"][:1]] == [
+        (first, end - first)
+    ]
+    (gap,) = report["gaps"]
+    missing = report["topics"]["/rig/meas"]["missing"]
+    assert gap["count"] == 20 * missing == report["samples"]["missing"] > 0
+    assert report["content"] == "differs"
+    assert report["replay"]["possible"]
+    assert not report["replay"]["identical"]
+    text = read_output(log)
     assert f"bytes {first} to {end}" in text
     assert f"samples {gap['first']} to {gap['first'] + gap['count'] - 1} " in text
     assert "damaged; `--repair NEW`" in text
 
 
-def repaired(log: Path) -> Path:
+def repair_log(log: Path) -> Path:
     """The new file; the old one is as it was."""
     before = log.read_bytes()
     new = log.with_name("new.mcap")
@@ -127,37 +132,42 @@ def test_a_repaired_log_holds_all_that_was_left_and_says_what_was_not(
     for number in (1, 3):
         first, end = chunk(log, number)
         flip(log, (first + end) // 2)
-    left, found = recover_log(log).messages, verify(log)[1]
-    new = repaired(log)
+    left, report = recover_log(log).messages, verify(log)[1]
+    new = repair_log(log)
     again = recover_log(new)
     assert again.is_intact
-    old = {(one.topic, one.payload, one.log_time, one.publish_time) for one in left}
-    have = {(one.topic, one.payload, one.log_time, one.publish_time) for one in again.messages}
+    old = {
+        (message.topic, message.payload, message.log_time, message.publish_time) for message in left
+    }
+    have = {
+        (message.topic, message.payload, message.log_time, message.publish_time)
+        for message in again.messages
+    }
     assert old <= have
     assert sorted(topic for topic, *_ in have - old) == ["/rig/gap"] * 2 + ["/run/event"]
-    lost = [(gap["first"], gap["count"]) for gap in found["gaps"]]
+    lost = [(gap["first"], gap["count"]) for gap in report["gaps"]]
     gaps = read_recording(new).records(SampleGap)
     assert [(gap.index, gap.count, gap.channel, gap.reason) for gap in gaps] == [
-        (*one, "", "lost") for one in lost
+        (*gap, "", "lost") for gap in lost
     ]
     assert again.metadata["repaired"]["from_1"] == "run.mcap"
-    assert again.metadata["repaired"]["lost_samples"] == str(found["samples"]["missing"])
-    code, now = verify(new)
-    assert (code, now["damage"], now["content"]) == (4, [], "same")
-    assert now["gaps"] == [
+    assert again.metadata["repaired"]["lost_samples"] == str(report["samples"]["missing"])
+    code, report = verify(new)
+    assert (code, report["damage"], report["content"]) == (4, [], "same")
+    assert report["gaps"] == [
         {"first": first, "count": count, "channel": "", "reason": "lost"} for first, count in lost
     ]
-    assert not now["replay"]["identical"]
-    assert "the file is whole, the recording has gaps" in said(new)
+    assert not report["replay"]["identical"]
+    assert "the file is whole, the recording has gaps" in read_output(new)
     assert read_recording(new).start == recording.start
 
 
 def test_a_killed_recording_is_made_whole(log: Path, recording: Recording) -> None:
     log.write_bytes(log.read_bytes()[: chunk(log, -1)[1]])
-    code, found = verify(log)
-    assert (code, found["content"], found["gaps"]) == (4, "unknown", [])
-    assert [one["reason"][:27] for one in found["damage"]] == ["the file was never finished"]
-    new = read_recording(repaired(log))
+    code, report = verify(log)
+    assert (code, report["content"], report["gaps"]) == (4, "unknown", [])
+    assert [damage["reason"][:27] for damage in report["damage"]] == ["the file was never finished"]
+    new = read_recording(repair_log(log))
     assert new.is_intact
     assert new.missing_samples == 0
     for stream in ("meas", "pred"):
@@ -167,36 +177,39 @@ def test_a_killed_recording_is_made_whole(log: Path, recording: Recording) -> No
 
 def test_repair_never_writes_over_anything(log: Path) -> None:
     before = log.read_bytes()
-    with pytest.raises(InputError, match="exists already; nothing recorded is ever overwritten"):
+    with raises_input_error(where=log):
         verify(log, "--repair", log)
     assert log.read_bytes() == before
 
 
 def test_what_is_no_log_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("time_s\n1\n")
-    with pytest.raises(InputError, match="not an MCAP file"):
+    with raises_input_error(where=tmp_path / "a.csv", remedy="run.mcap"):
         verify(tmp_path / "a.csv")
-    with pytest.raises(InputError, match="No such file"):
+    missing = os.strerror(errno.ENOENT)
+    with raises_input_error(where=tmp_path / "b.mcap", problem=missing):
         verify(tmp_path / "b.mcap")
-    with pytest.raises(InputError, match="No such file"):
+    with raises_input_error(where=tmp_path, problem="no recording"):
         verify(tmp_path)
 
 
 def test_a_gap_of_the_test_is_no_damage(recording: Recording, tmp_path: Path) -> None:
     items = [
-        one for one in recording.items if not (isinstance(one, Block) and 400 <= one.index < 440)
+        item
+        for item in recording.items
+        if not (isinstance(item, Block) and 400 <= item.index < 440)
     ]
     gap = SampleGap(400, 40, "", "lost")
     write_items(
         tmp_path / "a.mcap", [*items, gap, SampleGap(7, 1, "force_r1_n", "late")], recording.start
     )
-    code, found = verify(tmp_path / "a.mcap")
-    assert (code, found["damage"]) == (4, [])
-    assert [(one["first"], one["count"], one["channel"]) for one in found["gaps"]] == [
+    code, report = verify(tmp_path / "a.mcap")
+    assert (code, report["damage"]) == (4, [])
+    assert [(gap["first"], gap["count"], gap["channel"]) for gap in report["gaps"]] == [
         (7, 1, "force_r1_n"),
         (400, 40, ""),
     ]
-    assert found["replay"]["because"] == ["40 samples are missing"]
+    assert report["replay"]["because"] == ["40 samples are missing"]
 
 
 def test_altered_texts_and_messages_are_seen(log: Path, recording: Recording) -> None:
@@ -204,42 +217,42 @@ def test_altered_texts_and_messages_are_seen(log: Path, recording: Recording) ->
     writer.write_run_description(
         replace(recording.start, model_toml=recording.start.model_toml + "#")
     )
-    for one in recording.items:
-        writer.write(topic_for(one), encode_item(one, recording.run), one.index)
+    for item in recording.items:
+        writer.write(topic_for(item), encode_item(item, recording.run), item.index)
     writer._content.add("/run/event", 0, b"")  # which is not there
     writer.close()
-    code, found = verify(log.with_name("b.mcap"))
-    assert (code, found["content"]) == (4, "differs")
-    assert [one["reason"] for one in found["damage"]] == [
+    code, report = verify(log.with_name("b.mcap"))
+    assert (code, report["content"]) == (4, "differs")
+    assert [damage["reason"] for damage in report["damage"]] == [
         "the messages are not those that were written"
     ]
     content = log.read_bytes()
     at = next(first for opcode, first, _ in spans(content) if opcode == ATTACHMENT)
     flip(log, at + 80)
-    code, found = verify(log)
-    assert (code, found["altered"]) == (4, ["profile.toml"])
+    code, report = verify(log)
+    assert (code, report["altered"]) == (4, ["profile.toml"])
 
 
 def test_a_text_that_is_gone_is_seen(recording: Recording, tmp_path: Path) -> None:
     writer = LogWriter(tmp_path / "a.mcap", recording.start.rate_hz)
     writer.write_metadata("attachments", {"profile.toml": "0" * 64})
-    for one in recording.items:
-        writer.write(topic_for(one), encode_item(one, recording.run), one.index)
+    for item in recording.items:
+        writer.write(topic_for(item), encode_item(item, recording.run), item.index)
     writer.close()
-    code, found = verify(tmp_path / "a.mcap")
-    assert (code, found["altered"]) == (4, ["profile.toml"])
-    assert found["damage"] == found["gaps"] == []
+    code, report = verify(tmp_path / "a.mcap")
+    assert (code, report["altered"]) == (4, ["profile.toml"])
+    assert report["damage"] == report["gaps"] == []
 
 
 def test_other_versions_are_named(recording: Recording, tmp_path: Path) -> None:
     versions = {**recording.start.versions, "numpy": "1.0.0"}
     start = replace(recording.start, versions=versions)
     write_items(tmp_path / "a.mcap", [start, *recording.items[1:]], start)
-    code, found = verify(tmp_path / "a.mcap")
-    installed = found["versions"]["numpy"]["installed"]
+    code, report = verify(tmp_path / "a.mcap")
+    installed = report["versions"]["numpy"]["installed"]
     assert code == 0
-    assert found["versions"]["numpy"] == {"recorded": "1.0.0", "installed": np.__version__}
-    assert found["replay"]["because"] == [f"versions differ: numpy 1.0.0 -> {installed}"]
+    assert report["versions"]["numpy"] == {"recorded": "1.0.0", "installed": np.__version__}
+    assert report["replay"]["because"] == [f"versions differ: numpy 1.0.0 -> {installed}"]
 
 
 def test_a_model_that_cannot_be_built_cannot_be_replayed(
@@ -247,9 +260,9 @@ def test_a_model_that_cannot_be_built_cannot_be_replayed(
 ) -> None:
     start = replace(recording.start, model_toml="[base]\n")
     write_items(tmp_path / "a.mcap", [start, *recording.items[1:]], start)
-    code, found = verify(tmp_path / "a.mcap")
-    assert (code, found["replay"]["possible"]) == (0, False)
-    assert "base.stiffness_n_m" in found["replay"]["because"][0]
+    code, report = verify(tmp_path / "a.mcap")
+    assert (code, report["replay"]["possible"]) == (0, False)
+    assert "base.stiffness_n_m" in report["replay"]["because"][0]
 
 
 def test_the_parts_of_a_recording_are_read_as_one(recording: Recording, tmp_path: Path) -> None:
@@ -258,10 +271,12 @@ def test_the_parts_of_a_recording_are_read_as_one(recording: Recording, tmp_path
     items, start = list(recording.items), recording.start
     write_items(folder / PARTS_FOLDER / "part-001.mcap", items[:200], start)
     write_items(folder / PARTS_FOLDER / "part-002.mcap", [start, *items[180:]], start)
-    code, found = verify(folder)
+    code, report = verify(folder)
     assert code == 4
-    assert [one["reason"] for one in found["damage"]] == ["2 parts that were not put together"]
-    assert (found["gaps"], found["content"], found["samples"]["missing"]) == ([], "same", 0)
+    assert [damage["reason"] for damage in report["damage"]] == [
+        "2 parts that were not put together"
+    ]
+    assert (report["gaps"], report["content"], report["samples"]["missing"]) == ([], "same", 0)
     new = tmp_path / "new.mcap"
     assert verify(folder, "--repair", new)[0] == 4
     assert verify(new)[0] == 0
@@ -279,7 +294,9 @@ def test_the_parts_of_a_recording_are_read_as_one(recording: Recording, tmp_path
 def test_logs_of_different_runs_are_no_parts_of_one(recording: Recording, tmp_path: Path) -> None:
     other = replace(recording.start, run="another")
     write_items(tmp_path / "b.mcap", [other, *recording.items[1:]], other)
-    with pytest.raises(InputError, match=r"of different runs \(another, r\)"):
+    with raises_input_error(
+        where=f"{recording.path} and {tmp_path / 'b.mcap'}", problem="(another, r)"
+    ):
         verify(recording.path, tmp_path / "b.mcap")
 
 
@@ -288,7 +305,7 @@ def test_what_is_left_after_any_accident_can_be_repaired(log: Path) -> None:
     made = 0
     for seed in range(12):
         bad, new = log.with_name(f"{seed}.mcap"), log.with_name(f"{seed}.new.mcap")
-        bad.write_bytes(damaged(content, random.Random(seed)))
+        bad.write_bytes(damage(content, random.Random(seed)))
         with suppress(InputError):
             verify(bad, "--repair", new)
             made += 1

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from table_io.errors import InputError
 from table_io.records import RunStop, SampleGap
-from tests.recording.example_run import SIZE, START, block, run, write
+from tests.recording.example_run import BLOCK_SAMPLES, START, block, run, write
 from twin.cli.main import app
 from twin.cli.verify import find_missing_end
 from twin.exchange.export import export_log
@@ -26,7 +26,7 @@ def verify(*words: object) -> tuple[int, dict[str, Any]]:
     return result.exit_code, json.loads(result.stdout)
 
 
-def said(*words: object) -> list[str]:
+def read_output_lines(*words: object) -> list[str]:
     """The lines that it says to people."""
     return CliRunner().invoke(app, ["verify", *map(str, words)]).stdout.splitlines()
 
@@ -41,44 +41,50 @@ def cut(tmp_path: Path) -> Path:
 
 
 def test_half_a_test_is_not_whole_even_if_its_file_is(cut: Path) -> None:
-    code, found = verify(cut)
+    code, report = verify(cut)
     end = read_recording(cut).contiguous_blocks("meas")[-1].end
     lost = {"first": end, "count": PLANNED - end, "channel": "", "reason": "no end was recorded"}
     assert 0 < end < PLANNED
-    assert (code, found["gaps"].count(lost)) == (4, 1)
+    assert (code, report["gaps"].count(lost)) == (4, 1)
     new = cut.with_name("new.mcap")
     assert verify(cut, "--repair", new)[0] == 4
-    code, found = verify(new)
-    assert (code, found["sound"], found["damage"]) == (4, False, [])
-    assert found["gaps"].count(lost) == 1
+    code, report = verify(new)
+    assert (code, report["sound"], report["damage"]) == (4, False, [])
+    assert report["gaps"].count(lost) == 1
     assert read_recording(new).is_intact  # the file; the test is not
     assert not [
-        one for one in read_recording(new).records(SampleGap) if not one.channel
+        gap for gap in read_recording(new).records(SampleGap) if not gap.channel
     ]  # nobody knows what was lost
-    lines = said(new)
+    lines = read_output_lines(new)
     assert lines[-1] == "the file is whole, the recording has gaps"
-    assert any(f"samples {end} to {PLANNED - 1} " in one and "no end" in one for one in lines)
+    assert any(f"samples {end} to {PLANNED - 1} " in line and "no end" in line for line in lines)
 
 
 def test_a_repaired_log_says_of_what(cut: Path) -> None:
     new = cut.with_name("new.mcap")
-    assert any("`--repair NEW`" in one for one in said(cut))
-    lines = said(cut, "--repair", new)
+    assert any("`--repair NEW`" in line for line in read_output_lines(cut))
+    lines = read_output_lines(cut, "--repair", new)
     assert new.exists()
     assert "damaged" in lines
-    assert not any("--repair NEW" in one for one in lines)  # it was given
-    assert any(one.startswith("repaired: from run.mcap: the file was never") for one in said(new))
+    assert not any("--repair NEW" in line for line in lines)  # it was given
+    assert any(
+        line.startswith("repaired: from run.mcap: the file was never")
+        for line in read_output_lines(new)
+    )
     assert verify(new)[1]["repaired"]["from_1"] == "run.mcap"
     assert verify(cut)[1]["repaired"] == {}
 
 
 def test_no_end_is_a_gap_even_of_no_samples(tmp_path: Path) -> None:
-    items = [one for one in run() if not isinstance(one, RunStop)]
+    items = [item for item in run() if not isinstance(item, RunStop)]
     write(tmp_path / "run.mcap", [*items, block(PLANNED)])  # more than was planned
-    assert find_missing_end(read_recording(tmp_path / "run.mcap")) == [(PLANNED + SIZE, 0)]
-    code, found = verify(tmp_path)
-    assert (code, found["gaps"][0]["count"]) == (4, 0)
-    assert any(f"from sample {PLANNED + SIZE} (at " in one for one in said(tmp_path))
+    assert find_missing_end(read_recording(tmp_path / "run.mcap")) == [(PLANNED + BLOCK_SAMPLES, 0)]
+    code, report = verify(tmp_path)
+    assert (code, report["gaps"][0]["count"]) == (4, 0)
+    assert any(
+        f"from sample {PLANNED + BLOCK_SAMPLES} (at " in line
+        for line in read_output_lines(tmp_path)
+    )
 
 
 def test_parts_alone_are_no_log_yet(tmp_path: Path) -> None:
@@ -95,10 +101,10 @@ def test_parts_alone_are_no_log_yet(tmp_path: Path) -> None:
         with pytest.raises(InputError) as caught:
             reader(folder)
         assert str(caught.value) == words
-    code, found = verify(folder)
-    assert (code, found["sound"], found["apart"]) == (4, False, [words])
-    assert found["samples"]["acquired"] == PLANNED
-    assert said(folder)[-1] == words
+    code, report = verify(folder)
+    assert (code, report["sound"], report["apart"]) == (4, False, [words])
+    assert report["samples"]["acquired"] == PLANNED
+    assert read_output_lines(folder)[-1] == words
     (folder / PARTS_FOLDER / "part-001.mcap").rename(folder / "run.mcap")
     assert "apart" in verify(folder)[1]
     assert verify(folder)[1]["apart"] == []

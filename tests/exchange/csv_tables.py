@@ -12,7 +12,7 @@ def write_csv(recording: Recording, path: Path, names: tuple[str, ...] = ()) -> 
     pieces = recording.contiguous_blocks("meas")
     names = names or pieces[0].channels
     rows = np.concatenate(
-        [np.array([one.time_s, *(one.channel(name) for name in names)]).T for one in pieces]
+        [np.array([piece.time_s, *(piece.channel(name) for name in names)]).T for piece in pieces]
     )
     with path.open("w") as file:
         file.write(",".join(["time_s", *names]) + "\n")

@@ -15,12 +15,12 @@ from twin.recording.reader import Recording
 from twin.transport.codec import Item
 
 LOST = (40, 60)  # samples that no block has
-SILENT = 300  # samples at the start of which the twin says nothing
+SILENT_SAMPLES = 300  # samples at the start of which the twin says nothing
 
 
 def items() -> list[Item]:
     """A run with a hole, lost samples, a negative zero, odd bits, and a twin that begins late."""
-    found: list[Item] = [Event(0, "state", "running"), SampleGap(40, 20, "", "lost")]
+    kept: list[Item] = [Event(0, "state", "running"), SampleGap(40, 20, "", "lost")]
     for item in blocks():
         if isinstance(item, Block):
             values = item.values.copy()
@@ -30,15 +30,15 @@ def items() -> list[Item]:
             copy = replace(item, values=values)
             ends = (0, *LOST, copy.end) if item.index == 0 else (copy.index, copy.end)
             for first, last in zip(ends[::2], ends[1::2], strict=True):
-                if item.stream == "meas" or first >= SILENT:
-                    found.append(copy.cut(first, last))
+                if item.stream == "meas" or first >= SILENT_SAMPLES:
+                    kept.append(copy.cut(first, last))
         else:
-            found.append(item)
+            kept.append(item)
     ratios = NormalizedResponse(0.1, 0.2, 0.3, 0.4, 0.5, float("nan"), (1,), (1,), 0.0, 0.0)
-    return [*found, PrcPoint(1500, 0, "forward", 1.0, ratios, None, 0.49, 0.49, 0.01)]
+    return [*kept, PrcPoint(1500, 0, "forward", 1.0, ratios, None, 0.49, 0.49, 0.01)]
 
 
-def exported(folder: Path, kinds: tuple[str, ...]) -> tuple[Path, Path]:
+def export_formats(folder: Path, kinds: tuple[str, ...]) -> tuple[Path, Path]:
     """(the log, it in these formats as out.csv and so on)."""
     path, base = folder / "run.mcap", folder / "out"
     profile = (PROFILES_DIR / "tests" / "g4_ss3.toml").read_text()
@@ -56,7 +56,7 @@ LABEL_FIELDS = ("step", "label", "cycle")
 def measured(recording: Recording) -> tuple[np.ndarray, ...]:
     """(index, values, step, label, cycle) of every measured sample."""
     pieces = recording.contiguous_blocks("meas")
-    index = np.concatenate([np.arange(one.index, one.end) for one in pieces])
-    values = np.concatenate([one.values for one in pieces], axis=1)
-    labels = [np.concatenate([getattr(one, k) for one in pieces]) for k in LABEL_FIELDS]
+    index = np.concatenate([np.arange(piece.index, piece.end) for piece in pieces])
+    values = np.concatenate([piece.values for piece in pieces], axis=1)
+    labels = [np.concatenate([getattr(piece, k) for piece in pieces]) for k in LABEL_FIELDS]
     return index, values, *labels

@@ -20,8 +20,8 @@ from twin.recording.mcap_log import LogWriter
 from twin.recording.mcap_records import CHUNK, MAGIC, RECORD_HEADER
 from twin.transport.codec import Item, encode_item, topic_for
 
-SAMPLES = 3000  # of the log that is damaged: enough for chunks, few enough for thousands
-FLUSH = 20  # messages
+LOG_SAMPLES = 3000  # of the log that is damaged: enough for chunks, few enough for thousands
+FLUSH_MESSAGES = 20  # messages
 NUMBERS = (0.0, -0.0, 1e-320, -1e308, 1e308, float("nan"), float("inf"), float("-inf"), 0.1)
 WHOLES = (0, 1, 2, 63, 64, 127, 128, 2**31 - 1, 2**31, 2**53, 2**63 - 1)
 TEXTS = (
@@ -42,16 +42,16 @@ Log = list[tuple[str, bytes, int]]  # topic, payload, sample index
 def whole(path: Path, items: list[Item], start: RunStart) -> Path:
     """A log of many small chunks."""
     messages = [(topic_for(item), encode_item(item, start.run), item.index) for item in items]
-    return written(path, messages, start)
+    return write_messages(path, messages, start)
 
 
-def written(path: Path, messages: Log, start: RunStart) -> Path:
+def write_messages(path: Path, messages: Log, start: RunStart) -> Path:
     """A log with these messages, whatever they are, and every checksum right."""
     writer = LogWriter(path, 2000.0)
     writer.write_run_description(start)
     for number, (name, payload, index) in enumerate(messages, 1):
         writer.write(name, payload, index)
-        if number % FLUSH == 0:
+        if number % FLUSH_MESSAGES == 0:
             writer.flush()
     writer.close()
     return path
@@ -59,15 +59,15 @@ def written(path: Path, messages: Log, start: RunStart) -> Path:
 
 def spans(content: bytes) -> list[tuple[int, int, int]]:
     """(opcode, first byte, the byte after it) of each record of a whole file."""
-    found, at = [], len(MAGIC)
+    records, at = [], len(MAGIC)
     while at + RECORD_HEADER.size <= len(content) - len(MAGIC):
         opcode, length = RECORD_HEADER.unpack_from(content, at)
-        found.append((opcode, at, at + RECORD_HEADER.size + length))
+        records.append((opcode, at, at + RECORD_HEADER.size + length))
         at += RECORD_HEADER.size + length
-    return found
+    return records
 
 
-def damaged(content: bytes, chance: random.Random) -> bytes:
+def damage(content: bytes, chance: random.Random) -> bytes:
     """The bytes of a file after an accident or two."""
     for _ in range(chance.choice((1, 1, 1, 2, 5))):
         content = chance.choice(ACCIDENTS)(content, chance)
@@ -109,21 +109,23 @@ def _cut(content: bytes, chance: random.Random) -> bytes:
 
 def _reorder(content: bytes, chance: random.Random) -> bytes:
     """Records swapped, twice there, or gone."""
-    found = [content[first:end] for _, first, end in spans(content)] if content[:8] == MAGIC else []
-    if len(found) < 3 or len(found) > 10_000:
+    records = (
+        [content[first:end] for _, first, end in spans(content)] if content[:8] == MAGIC else []
+    )
+    if len(records) < 3 or len(records) > 10_000:
         return content
     for _ in range(chance.choice((1, 1, 3, 50))):
-        a, b = chance.randrange(len(found)), chance.randrange(len(found))
+        a, b = chance.randrange(len(records)), chance.randrange(len(records))
         kind = chance.randrange(4)
         if kind == 0:
-            found[a], found[b] = found[b], found[a]
+            records[a], records[b] = records[b], records[a]
         elif kind == 1:
-            found.insert(a, found[b])
-        elif kind == 2 and len(found) > 2:
-            del found[a]
+            records.insert(a, records[b])
+        elif kind == 2 and len(records) > 2:
+            del records[a]
         elif kind == 3:
-            chance.shuffle(found)
-    return MAGIC + b"".join(found) + chance.choice((MAGIC, b""))
+            chance.shuffle(records)
+    return MAGIC + b"".join(records) + chance.choice((MAGIC, b""))
 
 
 def _reframe(content: bytes, chance: random.Random) -> bytes:
@@ -161,7 +163,7 @@ def lied(messages: Log, items: list[Item], run: str, chance: random.Random) -> L
         name, payload, index = messages[at]
         kind = chance.randrange(6)
         if kind == 0:
-            messages[at] = name, damaged(payload, chance), index
+            messages[at] = name, damage(payload, chance), index
         elif kind == 1:
             messages[at] = chance.choice(messages)[0], payload, index
         elif kind == 2:
@@ -178,10 +180,10 @@ def strange(item: Any, chance: random.Random) -> Any:
     """A record with one field that it cannot have; a block with samples, labels or places so."""
     if isinstance(item, Block):
         return _strange_block(item, chance)
-    one = chance.choice(fields(item))
-    hint = get_type_hints(type(item))[one.name]
-    value = getattr(item, one.name)
-    return replace(item, **{one.name: _strange(value, hint, chance)})
+    field = chance.choice(fields(item))
+    hint = get_type_hints(type(item))[field.name]
+    value = getattr(item, field.name)
+    return replace(item, **{field.name: _strange(value, hint, chance)})
 
 
 def _strange(value: Any, hint: Any, chance: random.Random) -> Any:
@@ -280,7 +282,7 @@ def _chunk(packed: bytes, size: int) -> bytes:
     return RECORD_HEADER.pack(CHUNK, len(content)) + content
 
 
-def scrawled(table: bytes, chance: random.Random) -> bytes:
+def scrawl(table: bytes, chance: random.Random) -> bytes:
     """A table as a tired hand leaves it."""
     lines = table.split(b"\n")
     words = (b"inf", b"1e999", b"-", b"1,5", b'"', b"0x10", b"\xff\xfe", b"9" * 99)
@@ -300,4 +302,4 @@ def scrawled(table: bytes, chance: random.Random) -> bytes:
         if chance.random() < 0.1:
             del lines[chance.randrange(1, len(lines))]
     torn = chance.random() < 0.1
-    return damaged(b"\n".join(lines), chance) if torn else b"\n".join(lines)
+    return damage(b"\n".join(lines), chance) if torn else b"\n".join(lines)

@@ -14,7 +14,7 @@ from twin.exchange.sampling import find_holes
 TIME = np.arange(400) / 200.0
 
 
-def taken(folder: Path, card: str | None = None, **columns: Float1D) -> ImportedSamples:
+def import_columns(folder: Path, card: str | None = None, **columns: Float1D) -> ImportedSamples:
     """The samples of a table of these columns with a map of this text."""
     path = folder / "map.toml"
     if card is not None:
@@ -26,9 +26,11 @@ def taken(folder: Path, card: str | None = None, **columns: Float1D) -> Imported
     return read_samples(table, read_column_map(path if card is not None else None))
 
 
-def refused(folder: Path, words: list[str], card: str | None = None, **columns: Float1D) -> None:
+def require_refused(
+    folder: Path, words: list[str], card: str | None = None, **columns: Float1D
+) -> None:
     with pytest.raises(InputError) as caught:
-        taken(folder, card, **columns)
+        import_columns(folder, card, **columns)
     for word in words:
         assert word in str(caught.value)
 
@@ -44,18 +46,18 @@ def test_a_map_converts_as_it_says_and_leaves_the_rest_out(tmp_path: Path) -> No
     rel_disp_m = { column = "V2", unit = "mm", gain = -2.0, offset = 0.5 }
     table_acc_m_s2 = { column = "V1", unit = "g" }
     """
-    found = taken(tmp_path, card, t=1e3 * TIME, V1=wave(), V2=wave(3), V3=wave(4))
-    assert found.rate_hz == 200.0
-    assert list(found.channels) == ["table_acc_m_s2", "rel_disp_m"]
-    np.testing.assert_allclose(found.channels["table_acc_m_s2"], 9.80665 * wave())
-    np.testing.assert_allclose(found.channels["rel_disp_m"], -2e-3 * wave(3) + 0.5)
-    assert "left out: V3" in found.notes
+    samples = import_columns(tmp_path, card, t=1e3 * TIME, V1=wave(), V2=wave(3), V3=wave(4))
+    assert samples.rate_hz == 200.0
+    assert list(samples.channels) == ["table_acc_m_s2", "rel_disp_m"]
+    np.testing.assert_allclose(samples.channels["table_acc_m_s2"], 9.80665 * wave())
+    np.testing.assert_allclose(samples.channels["rel_disp_m"], -2e-3 * wave(3) + 0.5)
+    assert "left out: V3" in samples.notes
 
 
 def test_a_rate_stands_in_for_time(tmp_path: Path) -> None:
-    found = taken(tmp_path, "rate_hz = 610.35", rel_disp_m=wave())
-    assert found.rate_hz == 610.35
-    assert found.index.tolist() == list(range(400))
+    samples = import_columns(tmp_path, "rate_hz = 610.35", rel_disp_m=wave())
+    assert samples.rate_hz == 610.35
+    assert samples.index.tolist() == list(range(400))
 
 
 @pytest.mark.parametrize(
@@ -78,12 +80,12 @@ def test_a_rate_stands_in_for_time(tmp_path: Path) -> None:
     ],
 )
 def test_maps_that_cannot_be(tmp_path: Path, card: str, words: list[str]) -> None:
-    refused(tmp_path, words, card, t=TIME, b=wave())
+    require_refused(tmp_path, words, card, t=TIME, b=wave())
 
 
 def test_an_unknown_column_without_a_map_is_refused_with_the_nearest_name(tmp_path: Path) -> None:
     words = ["'table_acc'", "did you mean 'table_acc_m_s2'?", "--columns"]
-    refused(tmp_path, words, time_s=TIME, table_acc=wave())
+    require_refused(tmp_path, words, time_s=TIME, table_acc=wave())
 
 
 @pytest.mark.parametrize(
@@ -99,43 +101,45 @@ def test_time_that_does_not_rise_names_its_row(
 ) -> None:
     time = TIME.copy()
     time[place] = value
-    refused(tmp_path, ["table.csv", "time_s", *words], time_s=time, rel_disp_m=wave())
+    require_refused(tmp_path, ["table.csv", "time_s", *words], time_s=time, rel_disp_m=wave())
 
 
 def test_time_that_is_nowhere_uniform_is_refused(tmp_path: Path) -> None:
     for time in (TIME**1.5, np.sort(np.random.default_rng(0).uniform(0, 2, 400))):
-        refused(tmp_path, ["resample"], time_s=time, rel_disp_m=wave())
+        require_refused(tmp_path, ["resample"], time_s=time, rel_disp_m=wave())
 
 
 @pytest.mark.parametrize("rate", [200.0, 610.35, 2000.0, 1e4 / 3])
 def test_rounded_and_jittering_time_is_taken_as_uniform(tmp_path: Path, rate: float) -> None:
     jitter = np.random.default_rng(0).uniform(-0.2, 0.2, 5000)
     time = 3.0 + (np.arange(5000) + jitter) / rate
-    found = taken(tmp_path, time_s=np.round(time, 5), rel_disp_m=np.ones(5000))
-    assert found.index.tolist() == list(range(5000))
-    assert found.rate_hz == pytest.approx(rate, rel=2e-5)
-    assert any("jitters" in text for text in found.notes)
-    assert any("begins at" in text for text in found.notes)
+    samples = import_columns(tmp_path, time_s=np.round(time, 5), rel_disp_m=np.ones(5000))
+    assert samples.index.tolist() == list(range(5000))
+    assert samples.rate_hz == pytest.approx(rate, rel=2e-5)
+    assert any("jitters" in text for text in samples.notes)
+    assert any("begins at" in text for text in samples.notes)
 
 
 def test_holes_keep_their_length(tmp_path: Path) -> None:
     keep = np.r_[0:100, 103:250, 390:400]
-    found = taken(tmp_path, time_s=np.round(TIME, 3)[keep], rel_disp_m=wave()[keep])
-    assert found.index.tolist() == keep.tolist()
-    assert find_holes(found.index) == [(100, 3), (250, 140)]
+    samples = import_columns(tmp_path, time_s=np.round(TIME, 3)[keep], rel_disp_m=wave()[keep])
+    assert samples.index.tolist() == keep.tolist()
+    assert find_holes(samples.index) == [(100, 3), (250, 140)]
 
 
 @pytest.mark.parametrize("wrong", [1000.0, 9.80665])
 def test_a_unit_that_looks_wrong_is_pointed_out(tmp_path: Path, wrong: float) -> None:
     x, a = 1e-3 * wave(), -1e-3 * (4 * np.pi) ** 2 * wave()
-    fine = taken(tmp_path, time_s=TIME, table_disp_m=x, table_acc_m_s2=a)
+    fine = import_columns(tmp_path, time_s=TIME, table_disp_m=x, table_acc_m_s2=a)
     assert not [text for text in fine.notes if "warning" in text]
-    odd = taken(tmp_path, time_s=TIME, table_disp_m=x, table_acc_m_s2=a / wrong)
+    odd = import_columns(tmp_path, time_s=TIME, table_disp_m=x, table_acc_m_s2=a / wrong)
     assert [text for text in odd.notes if "warning:" in text and "table_disp_m" in text]
     np.testing.assert_array_equal(odd.channels["table_acc_m_s2"], a / wrong)
 
 
 def test_what_is_missing_or_lost_is_said(tmp_path: Path) -> None:
-    found = taken(tmp_path, time_s=TIME, rel_disp_m=wave(), force_r1_n=np.full(400, np.nan))
-    assert "force_r1_n: all samples lost" in found.notes
-    assert any(text.startswith("not in the file: drive_disp_m") for text in found.notes)
+    samples = import_columns(
+        tmp_path, time_s=TIME, rel_disp_m=wave(), force_r1_n=np.full(400, np.nan)
+    )
+    assert "force_r1_n: all samples lost" in samples.notes
+    assert any(text.startswith("not in the file: drive_disp_m") for text in samples.notes)

@@ -12,7 +12,7 @@ from scipy.io import loadmat, wavfile
 from table_io.acquisition.external_control import plan_open_loop_drive
 from table_io.block import Float1D
 from table_io.config.base import find_config
-from table_io.errors import InputError
+from tests.input_errors import raises_input_error
 from twin.cli.table import ExternalController, serve_table
 from twin.exchange.drive_file import WRITERS, DriveFile, export_drive, read_drive, write_drive
 from twin.run.run_config import read_run_config
@@ -49,13 +49,13 @@ def plan(profile: Path) -> Float1D:
     return values
 
 
-def written(profile: Path, folder: Path, name: str) -> Path:
+def export_file(profile: Path, folder: Path, name: str) -> Path:
     export_drive(profile, None, folder / name, "")
     return folder / name
 
 
 def test_csv_says_unit_rate_and_hash(profile: Path, plan: Float1D, tmp_path: Path) -> None:
-    path = written(profile, tmp_path, "drive.csv")
+    path = export_file(profile, tmp_path, "drive.csv")
     head = path.read_text().splitlines()[:5]
     digest = hashlib.sha256(plan.astype("<f8").tobytes()).hexdigest()
     assert f"# sha256 {digest}" in head
@@ -68,13 +68,13 @@ def test_csv_says_unit_rate_and_hash(profile: Path, plan: Float1D, tmp_path: Pat
 
 
 def test_txt_is_two_columns_and_nothing_else(profile: Path, plan: Float1D, tmp_path: Path) -> None:
-    rows = np.loadtxt(written(profile, tmp_path, "drive.txt"))
+    rows = np.loadtxt(export_file(profile, tmp_path, "drive.txt"))
     assert rows.shape == (plan.size, 2)
     assert np.abs(rows[:, 1] * 1e-3 - plan).max() < 1e-12
 
 
 def test_uff_is_read_by_pyuff(profile: Path, plan: Float1D, tmp_path: Path) -> None:
-    path = written(profile, tmp_path, "drive.uff")
+    path = export_file(profile, tmp_path, "drive.uff")
     held = pyuff.UFF(str(path)).read_sets(0)
     assert held["type"] == 58
     assert held["func_type"] == 1
@@ -87,14 +87,14 @@ def test_uff_is_read_by_pyuff(profile: Path, plan: Float1D, tmp_path: Path) -> N
 
 
 def test_mat_is_read_by_scipy(profile: Path, plan: Float1D, tmp_path: Path) -> None:
-    held = loadmat(written(profile, tmp_path, "drive.mat"))
+    held = loadmat(export_file(profile, tmp_path, "drive.mat"))
     assert np.array_equal(held["displacement_mm"][:, 0], plan * 1e3)
     assert float(held["rate_hz"][0, 0]) == 2000.0
 
 
 def test_wav_is_read_by_scipy(profile: Path, plan: Float1D, tmp_path: Path) -> None:
     """Full scale is the span of the card, 60 mm."""
-    rate, values = wavfile.read(written(profile, tmp_path, "drive.wav"))
+    rate, values = wavfile.read(export_file(profile, tmp_path, "drive.wav"))
     assert rate == 2000
     assert values.dtype == np.int32
     assert np.abs(values / (2**31 - 1) * 0.06 - plan).max() < 0.06 / 2**31
@@ -102,10 +102,11 @@ def test_wav_is_read_by_scipy(profile: Path, plan: Float1D, tmp_path: Path) -> N
 
 def test_rpc_is_laid_out_as_specified(profile: Path, plan: Float1D, tmp_path: Path) -> None:
     """Records of 128 bytes, four a block of 512; the first three at fixed places; then frames."""
-    raw = written(profile, tmp_path, "drive.rpc").read_bytes()
+    raw = export_file(profile, tmp_path, "drive.rpc").read_bytes()
     records = [raw[k : k + 128] for k in range(0, 512 * 40, 128)]
     words = {
-        one[:32].rstrip(b"\0").decode(): one[32:].rstrip(b"\0").decode() for one in records[:27]
+        record[:32].rstrip(b"\0").decode(): record[32:].rstrip(b"\0").decode()
+        for record in records[:27]
     }
     assert list(words)[:3] == ["FORMAT", "NUM_HEADER_BLOCKS", "NUM_PARAMS"]
     blocks, frames = int(words["NUM_HEADER_BLOCKS"]), int(words["FRAMES"])
@@ -120,10 +121,10 @@ def test_rpc_is_laid_out_as_specified(profile: Path, plan: Float1D, tmp_path: Pa
 
 def test_rpc_is_read_by_another_reader(profile: Path, plan: Float1D, tmp_path: Path) -> None:
     reader = pytest.importorskip("rpc_reader.rpc_reader", reason="needs pip install rpc_reader")
-    one = reader.ReadRPC(written(profile, tmp_path, "drive.rpc"))
-    one.import_rpc_data_from_file()
-    assert one.get_channels()[0]["Units"] == "mm"
-    read = one.get_data()[: plan.size, 0] * 1e-3
+    rpc = reader.ReadRPC(export_file(profile, tmp_path, "drive.rpc"))
+    rpc.import_rpc_data_from_file()
+    assert rpc.get_channels()[0]["Units"] == "mm"
+    read = rpc.get_data()[: plan.size, 0] * 1e-3
     assert np.abs(read - plan).max() < 0.51 * plan.max() / 32752
 
 
@@ -131,27 +132,27 @@ def test_rpc_is_read_by_another_reader(profile: Path, plan: Float1D, tmp_path: P
 def test_the_simulated_controller_reads_it(
     name: str, profile: Path, plan: Float1D, tmp_path: Path
 ) -> None:
-    values, rate = read_drive(written(profile, tmp_path, name))
+    values, rate = read_drive(export_file(profile, tmp_path, name))
     assert rate == 2000.0
     assert np.abs(values - plan).max() < 1e-12
 
 
 def test_bad_input_is_told(profile: Path, tmp_path: Path) -> None:
-    path = written(profile, tmp_path, "drive.csv")
-    with pytest.raises(InputError, match="exists already"):
+    path = export_file(profile, tmp_path, "drive.csv")
+    with raises_input_error(where=f"-o {path}"):
         export_drive(profile, None, path, "")
-    with pytest.raises(InputError, match=r"--format '\.doc'.*allowed: csv, txt"):
+    with raises_input_error(where="--format '.doc'", allowed="csv, txt"):
         export_drive(profile, None, tmp_path / "drive.doc", "")
-    with pytest.raises(InputError, match="decides while it runs"):
+    with raises_input_error(key="[track]"):
         export_drive(find_config("track", "tests"), None, tmp_path / "track.csv", "")
     (tmp_path / "empty.csv").write_text("nothing\n")
-    with pytest.raises(InputError, match="no drive file"):
+    with raises_input_error(where=f"--play {tmp_path / 'empty.csv'}", remedy="shaketwin drive"):
         read_drive(tmp_path / "empty.csv")
 
 
 def test_a_rate_that_wav_cannot_say_leaves_no_file(tmp_path: Path) -> None:
     file = DriveFile("x", np.zeros(10), 1000.5, 60.0)
-    with pytest.raises(InputError, match="not whole"):
+    with raises_input_error(where="--format wav", problem="1000.5 Hz"):
         write_drive(tmp_path / "x.wav", "wav", file)
     assert not (tmp_path / "x.wav").exists()
 
@@ -174,20 +175,20 @@ def test_what_cannot_be_written_leaves_no_file(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setitem(WRITERS, "csv", full)
-    with pytest.raises(InputError, match="No space left"):
+    with raises_input_error(where=f"-o {tmp_path / 'x.csv'}", problem="No space left on device"):
         write_drive(tmp_path / "x.csv", "csv", DriveFile("x", np.zeros(10), 1000.0, 60.0))
     assert not list(tmp_path.iterdir())
 
 
 def test_a_file_with_what_is_no_number_is_not_played(tmp_path: Path) -> None:
     (tmp_path / "nan.txt").write_text("0 0\n0.0005 nan\n0.001 1\n")
-    with pytest.raises(InputError, match="no numbers"):
+    with raises_input_error(where=f"--play {tmp_path / 'nan.txt'}"):
         read_drive(tmp_path / "nan.txt")
 
 
 @pytest.mark.parametrize("after", [0.0, -1.0, 0.4, float("nan")])
 def test_a_controller_cannot_play_at_once(after: float) -> None:
-    with pytest.raises(InputError, match=r"--after .*0\.5 s and more"):
+    with raises_input_error(where=f"--after {after:g}", allowed="0.5 s"):
         serve_table(
             "follow_simulated",
             None,

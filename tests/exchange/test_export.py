@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
 from table_io.records import RunStop, StepAdded
-from tests.exchange.exported import LABEL_FIELDS, LOST, exported, measured
+from tests.exchange.exported import LABEL_FIELDS, LOST, export_formats, measured
+from tests.input_errors import raises_input_error
 from tests.reports.recordings import MEASURED, RATE, STEPS, blocks, start_record
 from twin.cli.main import app
 from twin.exchange.columns import read_column_map, read_samples
@@ -29,7 +30,7 @@ FORMATS = ("csv", "parquet", "mat")
 
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    return exported(tmp_path_factory.mktemp("export"), (*FORMATS, "rrd"))
+    return export_formats(tmp_path_factory.mktemp("export"), (*FORMATS, "rrd"))
 
 
 @pytest.fixture(scope="module")
@@ -47,14 +48,14 @@ def out(both: tuple[Path, Path]) -> Path:
 def test_samples_and_labels_come_back_to_the_bit(log: Path, out: Path, kind: str) -> None:
     index, values, *labels = measured(read_recording(log))
     table = read_table(out.with_suffix(f".{kind}"))
-    found = read_samples(table, None)
-    assert found.rate_hz == RATE
-    assert found.index.tolist() == index.tolist()
-    assert not set(range(*LOST)) & set(found.index.tolist())
-    assert set(found.channels) == set(MEASURED)
+    samples = read_samples(table, None)
+    assert samples.rate_hz == RATE
+    assert samples.index.tolist() == index.tolist()
+    assert not set(range(*LOST)) & set(samples.index.tolist())
+    assert set(samples.channels) == set(MEASURED)
     for name, row in zip(MEASURED, values, strict=True):
-        assert found.channels[name].tobytes() == row.tobytes(), name
-    back = read_labels(table, found)
+        assert samples.channels[name].tobytes() == row.tobytes(), name
+    back = read_labels(table, samples)
     assert back.steps == STEPS
     for name, true in zip(LABEL_FIELDS, labels, strict=True):
         assert getattr(back, name)[index].tolist() == true.tolist()
@@ -64,12 +65,12 @@ def test_samples_and_labels_come_back_to_the_bit(log: Path, out: Path, kind: str
 def test_the_twin_goes_out_beside_the_measurement(log: Path, out: Path, kind: str) -> None:
     table = read_table(out.with_suffix(f".{kind}"))
     index = measured(read_recording(log))[0]
-    (told,) = read_recording(log).contiguous_blocks("pred")
+    (predicted,) = read_recording(log).contiguous_blocks("pred")
     for name in ("free/rel_disp_m", "window/force_l2_n"):
         column = table.read_column(TWIN_PREFIX + name.replace("/", "_"))
-        assert np.isnan(column[index < told.index]).all()
-        spoken = told.channel(name)[index[index >= told.index] - told.index]
-        assert column[index >= told.index].tobytes() == spoken.tobytes()
+        assert np.isnan(column[index < predicted.index]).all()
+        spoken = predicted.channel(name)[index[index >= predicted.index] - predicted.index]
+        assert column[index >= predicted.index].tobytes() == spoken.tobytes()
 
 
 @pytest.mark.parametrize("kind", ["parquet", "mat"])
@@ -104,24 +105,24 @@ def test_other_libraries_read_the_files(out: Path) -> None:
 
 def rows_by_entity(rrd: Path) -> dict[str, int]:
     """How often each entity changes, by Rerun's own reader."""
-    found: dict[str, int] = {}
+    rows: dict[str, int] = {}
     for chunk in RrdReader(rrd).stream():
         if not chunk.is_static:
             name = str(chunk.entity_path)
-            found[name] = found.get(name, 0) + chunk.num_rows
-    return found
+            rows[name] = rows.get(name, 0) + chunk.num_rows
+    return rows
 
 
 def test_rerun_reads_its_file(log: Path, out: Path, tmp_path: Path) -> None:
     """Whether it was fed batch by batch, or in one, as a log out of its order has to be."""
-    found = rows_by_entity(out.with_suffix(".rrd"))
-    assert sum(rows >= measured(read_recording(log))[0].size for rows in found.values()) >= 3
+    rows = rows_by_entity(out.with_suffix(".rrd"))
+    assert sum(count >= measured(read_recording(log))[0].size for count in rows.values()) >= 3
     start = read_recording(log).start
     write_items(tmp_path / "run.mcap", [*read_recording(log).items], start)
     assert iter_batches(tmp_path / "run.mcap", 9) is not None
     assert iter_batches(log, 9) is None
     assert export_log(tmp_path, ["rrd"], None, (), None) == 0
-    assert rows_by_entity(tmp_path / "run.rrd") == found
+    assert rows_by_entity(tmp_path / "run.rrd") == rows
 
 
 def test_a_choice_of_channels_and_steps(log: Path, tmp_path: Path) -> None:
@@ -129,9 +130,9 @@ def test_a_choice_of_channels_and_steps(log: Path, tmp_path: Path) -> None:
     table = read_table(tmp_path / "a.csv")
     assert set(table.columns) == {"time_s", "mass_disp_m", *LABEL_UNITS}
     assert set(table.read_column("step")) == {2, 3}
-    found = read_samples(table, None)
-    back = read_labels(table, found)
-    assert [one.frequency_hz for one in back.steps] == [2.0, 2.5]
+    samples = read_samples(table, None)
+    back = read_labels(table, samples)
+    assert [step.frequency_hz for step in back.steps] == [2.0, 2.5]
     assert any("numbered from 0" in text for text in back.messages)
 
 
@@ -167,12 +168,12 @@ def test_nothing_is_overwritten_and_no_half_file_left(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "x.csv").write_text("mine")
-    with pytest.raises(InputError, match="exists already"):
+    with raises_input_error(where=tmp_path / "x.csv"):
         export_log(log, ["csv"], tmp_path / "x", (), None)
     assert (tmp_path / "x.csv").read_text() == "mine"
-    with pytest.raises(InputError, match="no such log"):
+    with raises_input_error(where=tmp_path / "none.mcap"):
         export_log(tmp_path / "none.mcap", ["csv"], None, (), None)
-    with pytest.raises(InputError, match="not an MCAP file"):
+    with raises_input_error(where=tmp_path / "x.csv", remedy="run.mcap"):
         export_log(tmp_path / "x.csv", ["mat"], None, (), None)
 
     def full(*_: Any) -> None:
@@ -189,7 +190,7 @@ def test_a_library_that_is_missing_is_said_before_anything_is_written(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     monkeypatch.delitem(sys.modules, "twin.exchange.formats.parquet", raising=False)
-    with pytest.raises(InputError, match=r"--parquet: pyarrow is not installed; pip install"):
+    with raises_input_error(where="--parquet", problem="pyarrow", remedy="pip install"):
         export_log(log, ["csv", "parquet"], tmp_path / "new" / "x", (), None)
     assert not list(tmp_path.iterdir())
 
@@ -198,16 +199,16 @@ def test_what_a_call_wrote_goes_with_what_it_could_not_write(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """And nothing else does: not a file that came to stand there meanwhile."""
-    there = tmp_path / "x.foxglove.layout.json"
+    existing = tmp_path / "x.foxglove.layout.json"
 
     def slow(*_: Any) -> None:
-        there.write_text("mine")
+        existing.write_text("mine")
 
     monkeypatch.setattr("twin.exchange.foxglove.write_foxglove", slow)
-    with pytest.raises(InputError, match=r"layout.json: exists already"):
+    with raises_input_error(where=existing):
         export_log(log, ["csv", "foxglove"], tmp_path / "x", ("mass_disp_m",), None)
-    assert [*tmp_path.iterdir()] == [there]
-    assert there.read_text() == "mine"
+    assert [*tmp_path.iterdir()] == [existing]
+    assert existing.read_text() == "mine"
 
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
@@ -215,7 +216,7 @@ def test_what_a_call_wrote_goes_with_what_it_could_not_write(
     monkeypatch.setattr("twin.exchange.formats.mat.savemat", full)
     with pytest.raises(OSError, match="No space"):
         export_log(log, ["csv", "mat"], tmp_path / "a" / "b" / "y", ("mass_disp_m",), None)
-    assert [*tmp_path.iterdir()] == [there]
+    assert [*tmp_path.iterdir()] == [existing]
     assert "rows of" not in capsys.readouterr().out
 
 
@@ -236,7 +237,7 @@ def test_labels_that_contradict_themselves_name_the_row(out: Path, tmp_path: Pat
     lines = out.with_suffix(".csv").read_text().splitlines()
     names = lines[0].split(",")
 
-    def refused(row: int, column: str, cell: str, *words: str) -> None:
+    def require_refused(row: int, column: str, cell: str, *words: str) -> None:
         cells = lines[row - 1].split(",")
         cells[names.index(column)] = cell
         path = tmp_path / "wrong.csv"
@@ -247,28 +248,28 @@ def test_labels_that_contradict_themselves_name_the_row(out: Path, tmp_path: Pat
         for word in (f"row {row}", *words):
             assert word in str(caught.value)
 
-    refused(9, "label", "7", "label is 7", "0 to 5")
-    refused(9, "cycle", "0.5", "cycle is 0.5", "whole numbers")
-    refused(9, "step", "nan", "step is nan")
-    refused(9, "frequency_hz", "3.0", "frequency_hz is 3", "step 0")
-    refused(2, "direction", "0", "step 0 lacks direction")
+    require_refused(9, "label", "7", "label is 7", "0 to 5")
+    require_refused(9, "cycle", "0.5", "cycle is 0.5", "whole numbers")
+    require_refused(9, "step", "nan", "step is nan")
+    require_refused(9, "frequency_hz", "3.0", "frequency_hz is 3", "step 0")
+    require_refused(2, "direction", "0", "step 0 lacks direction")
 
 
 def test_a_name_with_an_ending_is_the_name_of_all(log: Path, tmp_path: Path) -> None:
     assert export_log(log, ["csv", "mat"], tmp_path / "new" / "a.csv", ("mass_disp_m",), None) == 0
-    assert sorted(one.name for one in (tmp_path / "new").iterdir()) == ["a.csv", "a.mat"]
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["a.csv", "a.mat"]
 
 
 def test_the_commands(log: Path, tmp_path: Path) -> None:
     run = CliRunner()
     new = tmp_path / "a.csv"
     asked = ["export", str(log), "--csv", "--steps", "1:2", "--channel", "mass_disp_m"]
-    told = run.invoke(app, [*asked, "-o", str(new)])
-    assert told.exit_code == 0, told.output
-    assert "rows of 8 columns" in told.output
+    result = run.invoke(app, [*asked, "-o", str(new)])
+    assert result.exit_code == 0, result.output
+    assert "rows of 8 columns" in result.output
     assert isinstance(run.invoke(app, [*asked[:-3], "x"]).exception, InputError)
-    told = run.invoke(app, ["import", str(new), "--list"])
-    assert "mass_disp_m: " in told.output
+    result = run.invoke(app, ["import", str(new), "--list"])
+    assert "mass_disp_m: " in result.output
     assert isinstance(run.invoke(app, ["import", str(new)]).exception, InputError)
     both = run.invoke(app, ["import", str(new), "--list", "-o", str(tmp_path / "b.mcap")])
     assert "omit -o or --list" in str(both.exception)

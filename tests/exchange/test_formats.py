@@ -1,5 +1,8 @@
 """Other people's formats: the same recording out of each, and what none of them may do to us."""
 
+import errno
+import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +13,7 @@ from scipy.io import savemat
 
 from table_io.block import Float1D
 from table_io.errors import InputError
+from tests.input_errors import raises_input_error
 from twin.exchange.columns import ColumnMap, ImportedSamples, read_samples
 from twin.exchange.formats import SampleTable, read_table
 
@@ -66,8 +70,8 @@ def hdf5(path: Path) -> None:
 
 def tdms(path: Path) -> None:
     def channel(name: str, values: Float1D, unit: str) -> Any:
-        said = {"wf_increment": 1 / RATE, "wf_start_offset": 0.0, "unit_string": unit}
-        return nptdms.ChannelObject("test", name, values, properties=said)
+        properties = {"wf_increment": 1 / RATE, "wf_start_offset": 0.0, "unit_string": unit}
+        return nptdms.ChannelObject("test", name, values, properties=properties)
 
     with nptdms.TdmsWriter(str(path)) as file:
         file.write_segment([channel("u", DISP[:99], "mm"), channel("F", FORCE[:99], "N")])
@@ -116,48 +120,46 @@ FORMATS: dict[str, tuple[str, Callable[[Path], None], dict[str, Any]]] = {
 }
 
 
-def made(folder: Path, kind: str) -> SampleTable:
+def make_table(folder: Path, kind: str) -> SampleTable:
     name, write, card = FORMATS[kind]
     write(folder / name)
     return read_table(folder / name, card.get("group", ""))
 
 
-def taken(table: SampleTable, kind: str, **changed: Any) -> ImportedSamples:
+def import_table(table: SampleTable, kind: str, **changed: Any) -> ImportedSamples:
     return read_samples(table, ColumnMap.model_validate({**FORMATS[kind][2], **changed}))
 
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_a_component_test_is_the_same_out_of_every_format(tmp_path: Path, kind: str) -> None:
-    found = taken(made(tmp_path, kind), kind)
-    assert (found.rate_hz, found.index.tolist()) == (RATE, list(range(N)))
+    samples = import_table(make_table(tmp_path, kind), kind)
+    assert (samples.rate_hz, samples.index.tolist()) == (RATE, list(range(N)))
     force = np.nan_to_num(FORCE) if kind.startswith("uff") else FORCE  # UFF knows no lost sample
     if kind == "uff text":  # twelve digits are all that it has
-        np.testing.assert_allclose(found.channels["rel_disp_m"], 1e-3 * DISP, rtol=1e-11)
-        np.testing.assert_allclose(found.channels["damper_force_n"], force, rtol=1e-11)
+        np.testing.assert_allclose(samples.channels["rel_disp_m"], 1e-3 * DISP, rtol=1e-11)
+        np.testing.assert_allclose(samples.channels["damper_force_n"], force, rtol=1e-11)
     else:
-        assert found.channels["rel_disp_m"].tobytes() == (1e-3 * DISP).tobytes()
-        assert np.isnan(found.channels["damper_force_n"]).tolist() == np.isnan(force).tolist()
+        assert samples.channels["rel_disp_m"].tobytes() == (1e-3 * DISP).tobytes()
+        assert np.isnan(samples.channels["damper_force_n"]).tolist() == np.isnan(force).tolist()
         good = np.isfinite(force)
-        assert found.channels["damper_force_n"][good].tobytes() == force[good].tobytes()
+        assert samples.channels["damper_force_n"][good].tobytes() == force[good].tobytes()
 
 
 @pytest.mark.parametrize("kind", ["hdf5", "tdms", "uff binary"])
 def test_a_unit_of_the_file_that_is_not_the_maps_is_refused(tmp_path: Path, kind: str) -> None:
-    table = made(tmp_path, kind)
+    table = make_table(tmp_path, kind)
     time = {"time_s": TIMED["time_s"]} if kind == "hdf5" else {}
 
-    def mapped(**column: Any) -> ImportedSamples:
-        return taken(table, kind, columns={**time, "rel_disp_m": {"column": "u", **column}})
+    def import_with_column(**column: Any) -> ImportedSamples:
+        return import_table(table, kind, columns={**time, "rel_disp_m": {"column": "u", **column}})
 
-    with pytest.raises(
-        InputError, match=r"'u' is in 'mm' by the file, rel_disp_m in 'um' by the ma"
-    ):
-        mapped(unit="um")
-    with pytest.raises(InputError, match=r"'mm' by the file, rel_disp_m in 'm' by its name"):
-        mapped()
-    with pytest.raises(InputError, match="'mm' by the file, rel_disp_m in 'V' by the map"):
-        mapped(file_unit="V", gain=2.0)
-    by_hand = mapped(file_unit="mm", gain=-2.0, offset=1.0).channels["rel_disp_m"]
+    with raises_input_error(where=table.path, problem="'um'", remedy="file_unit = 'mm'"):
+        import_with_column(unit="um")
+    with raises_input_error(where=table.path, problem="'m' by its name", remedy="file_unit = 'mm'"):
+        import_with_column()
+    with raises_input_error(where=table.path, problem="'V'", remedy="file_unit = 'mm'"):
+        import_with_column(file_unit="V", gain=2.0)
+    by_hand = import_with_column(file_unit="mm", gain=-2.0, offset=1.0).channels["rel_disp_m"]
     np.testing.assert_array_equal(by_hand, -2.0 * DISP + 1.0)
 
 
@@ -166,26 +168,26 @@ def test_a_unit_is_known_in_other_spellings(tmp_path: Path, unit: str) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["mass_acc_m_s2"] = DISP
         file["mass_acc_m_s2"].attrs["units"] = unit
-    found = read_samples(read_table(tmp_path / "a.h5"), ColumnMap(rate_hz=RATE))
-    assert found.channels["mass_acc_m_s2"].tobytes() == DISP.tobytes()
+    samples = read_samples(read_table(tmp_path / "a.h5"), ColumnMap(rate_hz=RATE))
+    assert samples.channels["mass_acc_m_s2"].tobytes() == DISP.tobytes()
 
 
 def test_a_rate_that_is_not_the_files_is_refused(tmp_path: Path) -> None:
-    table = made(tmp_path, "tdms")
-    assert taken(table, "tdms", rate_hz=200.0).rate_hz == 200.0
-    with pytest.raises(InputError, match=r"rate_hz = 250\.0: the file states 200 Hz"):
-        taken(table, "tdms", rate_hz=250.0)
+    table = make_table(tmp_path, "tdms")
+    assert import_table(table, "tdms", rate_hz=200.0).rate_hz == 200.0
+    with raises_input_error(key="rate_hz", value=250.0, problem="200 Hz"):
+        import_table(table, "tdms", rate_hz=250.0)
 
 
 def test_uff_with_times_of_its_own(tmp_path: Path) -> None:
     uff(tmp_path / "a.uff", 1, even=0)
     table = read_table(tmp_path / "a.uff")
     assert table.columns["u"].clock == "u/time"
-    assert taken(table, "uff binary").rate_hz == RATE
+    assert import_table(table, "uff binary").rate_hz == RATE
     grouped = pyuff.UFF(str(tmp_path / "b.uff"))
-    for one in pyuff.UFF(str(tmp_path / "a.uff")).read_sets():
-        grouped.write_sets({**one, "id1": f"rig/{one['id1']}"}, "add")
-    assert taken(read_table(tmp_path / "b.uff", "rig"), "uff binary").rate_hz == RATE
+    for set in pyuff.UFF(str(tmp_path / "a.uff")).read_sets():
+        grouped.write_sets({**set, "id1": f"rig/{set['id1']}"}, "add")
+    assert import_table(read_table(tmp_path / "b.uff", "rig"), "uff binary").rate_hz == RATE
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet", "npz", "uff", "h5", "tdms"])
@@ -201,8 +203,10 @@ def test_a_slash_in_a_unit_is_no_group(tmp_path: Path, kind: str) -> None:
         np.savez(path, **columns)
     elif kind == "uff":
         uff(tmp_path / "b.uff", 1)
-        for one, name in zip(pyuff.UFF(str(tmp_path / "b.uff")).read_sets(), names, strict=True):
-            pyuff.UFF(str(path)).write_sets({**one, "id1": name}, "add")
+        for data_set, name in zip(
+            pyuff.UFF(str(tmp_path / "b.uff")).read_sets(), names, strict=True
+        ):
+            pyuff.UFF(str(path)).write_sets({**data_set, "id1": name}, "add")
     elif kind == "h5":  # no name of a dataset has a slash, that of a field may
         with h5py.File(path, "w") as file:
             file["run/table"] = np.zeros(N, [(name, float) for name in names])
@@ -229,34 +233,36 @@ def test_what_is_no_column_is_listed_with_its_reason(tmp_path: Path) -> None:
     table = read_table(tmp_path / name)
     assert {"test/t", "test/u", "test/F"} <= set(table.columns)
     assert table.skipped["test/who"] == "text"
-    with pytest.raises(InputError, match="no group 'tset'; allowed: test"):
+    with raises_input_error(where=tmp_path / name, problem="'tset'", allowed="test"):
         read_table(tmp_path / name, "tset")
-    lines = "\n".join(made(tmp_path, "tdms").contents)
+    lines = "\n".join(make_table(tmp_path, "tdms").contents)
     assert "u: 400 rows, in 'mm', 200 Hz" in lines
-    made(tmp_path, "mat v7.3")
+    make_table(tmp_path, "mat v7.3")
     assert read_table(tmp_path / FORMATS["mat v7.3"][0]).skipped == {"who": "text"}
-    assert list(made(tmp_path, "hdf5").columns) == ["F", "t", "u"]  # no link is followed
-    assert "o: not a column: objects" in made(tmp_path, "npz").contents
+    assert list(make_table(tmp_path, "hdf5").columns) == ["F", "t", "u"]  # no link is followed
+    assert "o: not a column: objects" in make_table(tmp_path, "npz").contents
 
 
 def test_columns_of_two_recordings_are_not_mixed(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["one/u"], file["two/F"] = DISP, FORCE[:-1]
     mapped = {"rel_disp_m": {"column": "one/u"}, "damper_force_n": {"column": "two/F"}}
-    with pytest.raises(InputError, match=r"different length .one/u: 400, two/F: 399"):
+    with raises_input_error(where=tmp_path / "a.h5", problem="one/u: 400, two/F: 399"):
         read_samples(read_table(tmp_path / "a.h5"), ColumnMap.model_validate({"columns": mapped}))
 
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_a_file_that_was_cut_off(tmp_path: Path, kind: str) -> None:
-    made(tmp_path, kind)
+    make_table(tmp_path, kind)
     path = tmp_path / FORMATS[kind][0]
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 3])
-    with pytest.raises(InputError, match=path.name):
-        taken(read_table(path, FORMATS[kind][2].get("group", "")), kind)
+    with pytest.raises(InputError, match=re.escape(path.name)):
+        import_table(read_table(path, FORMATS[kind][2].get("group", "")), kind)
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
     for kind in FORMATS:
-        with pytest.raises(InputError, match="No such file"):
+        with raises_input_error(
+            where=tmp_path / FORMATS[kind][0], problem=os.strerror(errno.ENOENT)
+        ):
             read_table(tmp_path / FORMATS[kind][0])

@@ -14,6 +14,7 @@ from scipy.io import savemat
 
 from table_io.errors import InputError
 from tests.exchange.test_formats import uff
+from tests.input_errors import raises_input_error
 from twin.exchange import formats
 from twin.exchange.columns import ColumnMap, read_samples
 from twin.exchange.formats import read_table, sandbox
@@ -109,8 +110,8 @@ def test_a_library_that_is_not_there_is_named(
         raise ModuleNotFoundError("No module named 'h5py'", name="h5py")
 
     monkeypatch.setattr(formats, "import_module", absent)
-    with pytest.raises(
-        InputError, match=r"h5py is not installed; pip install shaketwin\[formats\]"
+    with raises_input_error(
+        where=tmp_path / "a.h5", problem="h5py", remedy="pip install shaketwin[formats]"
     ):
         read_table(tmp_path / "a.h5")
 
@@ -132,9 +133,8 @@ def spin() -> None:
     ("work", "words"), [(crash, "crashed"), (swell, "too large"), (spin, "hung"), (os.abort, "cra")]
 )
 def test_a_reader_that_dies_does_not_take_us_along(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, work: Callable[[], Any], words: str
+    tmp_path: Path, work: Callable[[], Any], words: str
 ) -> None:
-    monkeypatch.setattr(sandbox, "MAX_CPU_S", 1)
     (tmp_path / "x").touch()
-    with pytest.raises(InputError, match=words):
-        sandbox.run_isolated(tmp_path / "x", work)
+    with raises_input_error(where=tmp_path / "x", problem=words):
+        sandbox.run_isolated(tmp_path / "x", work, max_cpu_s=1)

@@ -10,7 +10,8 @@ from table_io.block import Block, Label
 from table_io.errors import InputError
 from table_io.records import Comparison, Event, PrcPoint, SampleGap
 from tests.exchange.csv_tables import write_csv
-from tests.run.test_unpaced import QUICK, played
+from tests.input_errors import raises_input_error
+from tests.run.test_unpaced import QUICK, play_run
 from twin.cli.replay import ReplayRequest, replay_logs
 from twin.cli.report import print_recording_prc
 from twin.exchange.export import export_log
@@ -33,13 +34,13 @@ rel_disp_m = { column = "V2" }
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Recording]:
     """A folder with quick.toml and table.csv of an unpaced run, and the run itself."""
     folder = tmp_path_factory.mktemp("ours")
-    recording = read_recording(played(folder, SHORT)[1])
+    recording = read_recording(play_run(folder, SHORT)[1])
     write_csv(recording, folder / "table.csv")
     return folder, recording
 
 
 @pytest.fixture(scope="module")
-def imported(run: tuple[Path, Recording]) -> Recording:
+def imported_log(run: tuple[Path, Recording]) -> Recording:
     folder, _ = run
     log = folder / "imported" / "run.mcap"
     assert import_samples(folder / "table.csv", log, folder / "quick.toml", None, None) == 0
@@ -55,35 +56,37 @@ def steps(recording: Recording) -> list[dict[str, Any]]:
     return summarise(recording, read_recorded_config(recording).parameters)["steps"]
 
 
-def said(recording: Recording) -> str:
+def read_warnings(recording: Recording) -> str:
     return "\n".join(event.text for event in recording.records(Event))
 
 
-def test_the_samples_are_those_of_the_run(run: tuple[Path, Recording], imported: Recording) -> None:
-    ours, theirs = whole(run[1]), whole(imported)
+def test_the_samples_are_those_of_the_run(
+    run: tuple[Path, Recording], imported_log: Recording
+) -> None:
+    ours, theirs = whole(run[1]), whole(imported_log)
     assert (theirs.rate_hz, theirs.channels) == (ours.rate_hz, ours.channels)
     np.testing.assert_allclose(theirs.values, ours.values, rtol=1e-8)
 
 
 def test_steps_and_measured_cycles_are_found_where_they_were_driven(
-    run: tuple[Path, Recording], imported: Recording
+    run: tuple[Path, Recording], imported_log: Recording
 ) -> None:
-    ours, theirs = whole(run[1]), whole(imported)
-    assert imported.start.steps == run[1].start.steps
-    for step in imported.start.steps:
-        true, found = (
-            np.flatnonzero((one.step == step.index) & (one.label == Label.MEASURE))
-            for one in (ours, theirs)
+    ours, theirs = whole(run[1]), whole(imported_log)
+    assert imported_log.start.steps == run[1].start.steps
+    for step in imported_log.start.steps:
+        true, detected = (
+            np.flatnonzero((log.step == step.index) & (log.label == Label.MEASURE))
+            for log in (ours, theirs)
         )
         length = ours.rate_hz / step.frequency_hz
-        assert abs(true[0] - found[0]) < 0.02 * length
-        assert abs(true[-1] - found[-1]) < 0.02 * length
+        assert abs(true[0] - detected[0]) < 0.02 * length
+        assert abs(true[-1] - detected[-1]) < 0.02 * length
         held = (ours.step == step.index) & (ours.cycle >= 0) & (theirs.cycle >= 0)
         assert (ours.cycle == theirs.cycle)[held].mean() > 0.98
 
 
-def test_the_prc_is_that_of_the_run(run: tuple[Path, Recording], imported: Recording) -> None:
-    for ours, theirs in zip(steps(run[1]), steps(imported), strict=True):
+def test_the_prc_is_that_of_the_run(run: tuple[Path, Recording], imported_log: Recording) -> None:
+    for ours, theirs in zip(steps(run[1]), steps(imported_log), strict=True):
         assert ours["frequency_hz"] == theirs["frequency_hz"]
         assert ours["direction"] == theirs["direction"]
         # At the jump the motion is no steady one, and a sample earlier is another motion.
@@ -94,13 +97,13 @@ def test_the_prc_is_that_of_the_run(run: tuple[Path, Recording], imported: Recor
 
 
 def test_prc_and_replay_take_it_as_one_of_ours(
-    imported: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str], draft: None
+    imported_log: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str], draft: None
 ) -> None:
-    print_recording_prc(imported.path, True)
+    print_recording_prc(imported_log.path, True)
     assert '"frequency_hz": 3.6' in capsys.readouterr().out
-    assert replay_logs(ReplayRequest([imported.path], [], tmp_path / "again")) == 0
+    assert replay_logs(ReplayRequest([imported_log.path], [], tmp_path / "again")) == 0
     assert len(read_recording(tmp_path / "again" / "run.mcap").records(PrcPoint)) == len(
-        imported.start.steps
+        imported_log.start.steps
     )
     assert (tmp_path / "again" / "report.html").stat().st_size > 10_000
 
@@ -113,13 +116,13 @@ def test_a_sweep_that_is_another_changes_no_step(
     log = tmp_path / "other.mcap"
     import_samples(run[0] / "table.csv", log, profile, None, None)
     recording = read_recording(log)
-    driven = [(one.direction, one.frequency_hz) for one in run[1].start.steps]
-    found = [(one.direction, one.frequency_hz) for one in recording.start.steps]
-    assert [way for way, _ in found] == [way for way, _ in driven]
-    np.testing.assert_allclose([hz for _, hz in found], [hz for _, hz in driven], rtol=2e-3)
+    driven = [(step.direction, step.frequency_hz) for step in run[1].start.steps]
+    detected = [(step.direction, step.frequency_hz) for step in recording.start.steps]
+    assert [way for way, _ in detected] == [way for way, _ in driven]
+    np.testing.assert_allclose([hz for _, hz in detected], [hz for _, hz in driven], rtol=2e-3)
     assert replay_logs(ReplayRequest([log], [], tmp_path / "again")) == 0
     again = read_recording(tmp_path / "again" / "run.mcap").records(PrcPoint)
-    assert [one.frequency_hz for one in again] == [hz for _, hz in found]
+    assert [step.frequency_hz for step in again] == [hz for _, hz in detected]
 
 
 def rows(run: tuple[Path, Recording]) -> list[str]:
@@ -135,7 +138,7 @@ def test_a_hole_is_a_gap_between_two_blocks(run: tuple[Path, Recording], tmp_pat
     assert import_samples(tmp_path / "holed.csv", log, run[0] / "quick.toml", None, None) == 4
     recording = read_recording(log)
     assert recording.records(SampleGap) == (SampleGap(2000, 50, "", "lost"),)
-    assert [(one.index, one.end) for one in recording.contiguous_blocks("meas")] == [
+    assert [(block.index, block.end) for block in recording.contiguous_blocks("meas")] == [
         (0, 2000),
         (2050, 6000),
     ]
@@ -160,7 +163,7 @@ def test_lost_cells_and_lost_sensors_stay_lost(run: tuple[Path, Recording], tmp_
         SampleGap(0, 6000, "force_r1_n", "lost"),
         SampleGap(100, 1, "mass_acc_m_s2", "lost"),
     }
-    assert "force_r1_n: all samples lost" in said(recording)
+    assert "force_r1_n: all samples lost" in read_warnings(recording)
 
 
 def test_the_profile_holds_at_another_rate(run: tuple[Path, Recording], tmp_path: Path) -> None:
@@ -169,10 +172,10 @@ def test_the_profile_holds_at_another_rate(run: tuple[Path, Recording], tmp_path
     profile = tmp_path / "half.toml"
     profile.write_text(SHORT + "[acquisition]\nblock_samples = 10 # ten\nrate_hz = 2000.0\n")
     import_samples(tmp_path / "half.csv", tmp_path / "half.mcap", profile, None, None)
-    found = read_recorded_config(read_recording(tmp_path / "half.mcap")).profile
-    assert found.acquisition.rate_hz == 1000.0
-    assert found.acquisition.block_samples == 10
-    assert found.specimen.gap_mm == 4.0
+    recorded = read_recorded_config(read_recording(tmp_path / "half.mcap")).profile
+    assert recorded.acquisition.rate_hz == 1000.0
+    assert recorded.acquisition.block_samples == 10
+    assert recorded.specimen.gap_mm == 4.0
     (tmp_path / "slow.csv").write_text("\n".join([lines[0], *lines[1::10]]))
     with pytest.raises(InputError, match=r"200 Hz of .*slow.csv(.|\n)*at least 440"):
         import_samples(tmp_path / "slow.csv", tmp_path / "slow.mcap", profile, None, None)
@@ -187,11 +190,11 @@ def test_our_own_export_is_the_same_run_again(
     assert whole(again).is_identical(whole(run[1]))
     for name in ("steps", "profile_toml", "rig_toml", "model_toml"):
         assert getattr(again.start, name) == getattr(run[1].start, name)
-    (ours,), (theirs,) = (one.contiguous_blocks("pred") for one in (run[1], again))
+    (ours,), (theirs,) = (recording.contiguous_blocks("pred") for recording in (run[1], again))
     assert theirs.is_identical(ours)
     assert again.records(PrcPoint) == run[1].records(PrcPoint)
-    assert "no --profile" not in said(again)
-    assert "steps, labels and cycles are taken from the file" in said(again)
+    assert "no --profile" not in read_warnings(again)
+    assert "steps, labels and cycles are taken from the file" in read_warnings(again)
 
 
 def test_a_table_without_a_profile_says_so_and_has_its_curve(
@@ -204,10 +207,10 @@ def test_a_table_without_a_profile_says_so_and_has_its_curve(
     assert len(bare.records(PrcPoint)) == len(run[1].start.steps)
     sweep = read_recorded_config(bare).profile.sweep
     assert (sweep.cycles, sweep.measured_cycles) == (6, 2)
-    (warning,) = (one for one in bare.records(Event) if one.kind == "warning")
+    (warning,) = (event for event in bare.records(Event) if event.kind == "warning")
     assert warning.text.startswith("no --profile: unit mass, no bumpers, a 1 Hz placeholder model")
     assert warning.text in capsys.readouterr().out
-    assert "no --profile" not in said(run[1])
+    assert "no --profile" not in read_warnings(run[1])
 
 
 def test_labels_of_a_table_stand_before_what_its_motion_tells(
@@ -217,15 +220,15 @@ def test_labels_of_a_table_stand_before_what_its_motion_tells(
     assert export_log(run[1].path, ["csv"], tmp_path / "out", ("table_acc_m_s2",), (1, 2)) == 0
     import_samples(tmp_path / "out.csv", tmp_path / "a.mcap", run[0] / "quick.toml", None, None)
     steps = read_recording(tmp_path / "a.mcap").start.steps
-    assert [one.frequency_hz for one in steps] == [
-        one.frequency_hz for one in run[1].start.steps[1:3]
+    assert [step.frequency_hz for step in steps] == [
+        step.frequency_hz for step in run[1].start.steps[1:3]
     ]
     lines = (tmp_path / "out.csv").read_text().splitlines()
     kept = [k for k, name in enumerate(lines[0].split(",")) if name != "cycle"]
     rows = [",".join(line.split(",")[k] for k in kept) for line in lines]
     (tmp_path / "less.csv").write_text("\n".join(rows))
     import_samples(tmp_path / "less.csv", tmp_path / "b.mcap", run[0] / "quick.toml", None, None)
-    assert "left out: step, label, direction" in said(read_recording(tmp_path / "b.mcap"))
+    assert "left out: step, label, direction" in read_warnings(read_recording(tmp_path / "b.mcap"))
 
 
 def test_a_shaking_table_of_others(tmp_path: Path) -> None:
@@ -234,7 +237,7 @@ def test_a_shaking_table_of_others(tmp_path: Path) -> None:
         '[columns]\ntime_s = { column = "timepos:1" }\n'
         'table_disp_m = { column = "timepos:2", gain = 0.01 }\n'
     )
-    file = there("shaking_table/SineA5F2.npz")
+    file = open_dataset("shaking_table/SineA5F2.npz")
     assert import_samples(file, tmp_path / "a.mcap", None, None, card) == 0
     recording = read_recording(tmp_path / "a.mcap")
     assert (whole(recording).rate_hz, len(whole(recording))) == (200.0, 4001)
@@ -243,7 +246,7 @@ def test_a_shaking_table_of_others(tmp_path: Path) -> None:
 
 
 def test_what_a_file_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    print_contents(there("bncs/CNP100.csv"), None)
+    print_contents(open_dataset("bncs/CNP100.csv"), None)
     assert "rel_disp_m: " in capsys.readouterr().out
 
 
@@ -257,15 +260,15 @@ def test_a_component_test_without_a_table_is_a_log_that_is_not_replayed(tmp_path
     recording = read_recording(log)
     assert recording.start.channels == ("damper_force_n", "rel_disp_m")
     assert not recording.records(Comparison)
-    assert "no --profile" in said(recording)
+    assert "no --profile" in read_warnings(recording)
     assert recording.start.steps[0].frequency_hz == pytest.approx(1.0, rel=1e-3)
-    with pytest.raises(InputError, match="no table_acc_m_s2"):
+    with raises_input_error(where=log, key="table_acc_m_s2"):
         replay_logs(ReplayRequest([log], [], tmp_path / "out"))
-    with pytest.raises(InputError, match="exists already"):
+    with raises_input_error(where=log):
         import_samples(file, log, None, None, None)
 
 
-def there(name: str) -> Path:
+def open_dataset(name: str) -> Path:
     path = DATA / name
     if not path.is_file():
         pytest.skip("the measured data of others are not here")
@@ -274,21 +277,21 @@ def there(name: str) -> Path:
 
 def test_a_building_under_an_earthquake(tmp_path: Path, draft: None) -> None:
     log = tmp_path / "b" / "run.mcap"
-    assert import_samples(there("bncs/CNP100.csv"), log, None, None, None) == 0
+    assert import_samples(open_dataset("bncs/CNP100.csv"), log, None, None, None) == 0
     recording = read_recording(log)
     block = whole(recording)
     assert block.rate_hz == 200.0
     assert block.channel("rel_disp_m")[0] == -9.43853e-05
     assert set(block.step) == {-1}
     assert set(block.label) == {Label.REST, Label.SETTLE}
-    assert "no stepped sine" in said(recording)
+    assert "no stepped sine" in read_warnings(recording)
     assert replay_logs(ReplayRequest([log], [], tmp_path / "again")) == 0
 
 
 def test_the_silverbox_by_a_map(tmp_path: Path) -> None:
     (tmp_path / "map.toml").write_text(SILVERBOX)
     file, log = tmp_path / "s.csv", tmp_path / "s.mcap"
-    lines = there("silverbox/SNLS80mV.csv").read_text().splitlines(keepends=True)
+    lines = open_dataset("silverbox/SNLS80mV.csv").read_text().splitlines(keepends=True)
     file.write_text("".join(lines[:20_001]))
     assert import_samples(file, log, None, None, tmp_path / "map.toml") == 0
     block = whole(read_recording(log))

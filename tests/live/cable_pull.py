@@ -46,7 +46,7 @@ def main() -> None:
             time.sleep(0.002)
 
         words = [ENDPOINT, str(lab / "people" / "far"), str(BLOCKS)]
-        listener = line.there(sys.executable, "-c", LISTENER, *words, stdout=-1)
+        listener = line.start_far(sys.executable, "-c", LISTENER, *words, stdout=-1)
         hub.publish(MEAS_TOPIC, (0).to_bytes(4, "big"))
         assert listener.stdout is not None
         while not hub.subscriber_progress.positions and listener.poll() is None:

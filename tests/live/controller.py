@@ -22,7 +22,7 @@ from table_io.records import Event, RunStop
 from twin.live.scheduling import request_realtime
 
 
-def asked() -> str:
+def read_command() -> str:
     """The line that waits on standard input, or nothing."""
     ready, _, _ = select.select([sys.stdin], [], [], 0.0)
     return os.read(sys.stdin.fileno(), 64).decode().strip() if ready else ""
@@ -37,7 +37,7 @@ def main() -> None:
     assert isinstance(backend, MachineBackend)
 
     def commands() -> OperatorCommand | None:
-        word = asked()
+        word = read_command()
         if word == "garbage":
             backend._require_connection().sendall(b"GET / HTTP/1.1\r\nHost: table\r\n\r\n")
         elif word == "drop":

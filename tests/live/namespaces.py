@@ -26,7 +26,7 @@ def refusal() -> str:
     return done.stderr.strip()
 
 
-def enclosed(module: str, *arguments: str) -> "subprocess.Popen[str]":
+def start_isolated(module: str, *arguments: str) -> "subprocess.Popen[str]":
     """A module of the tests as the program of a host of its own."""
     return subprocess.Popen(
         ["unshare", "-Urn", sys.executable, "-m", module, *arguments],
@@ -44,7 +44,7 @@ class Cable:
 
     other: int
 
-    def there(self, *command: str, **how: object) -> "subprocess.Popen[str]":
+    def start_far(self, *command: str, **how: object) -> "subprocess.Popen[str]":
         """A program on the other host."""
         enter = ["nsenter", "-t", str(self.other), "-n", *command]
         return subprocess.Popen(enter, text=True, **how)  # type: ignore[call-overload]

@@ -15,7 +15,7 @@ from tests.live.test_live import (
     assert_at_rest,
     assert_whole,
     finish,
-    replayed,
+    replay_run,
     running,
     start,
 )
@@ -26,11 +26,11 @@ pytestmark = pytest.mark.slow
 def recorder(process: subprocess.Popen[str]) -> int:
     """Process id of the run's recorder."""
     ours = ["pgrep", "-P", str(process.pid), "-f", "processes recorder"]
-    found = subprocess.run(ours, capture_output=True, text=True, check=True)
-    return int(found.stdout.split()[0])
+    completed = subprocess.run(ours, capture_output=True, text=True, check=True)
+    return int(completed.stdout.split()[0])
 
 
-def limited(process: subprocess.Popen[str], folder: Path, more: int) -> None:
+def limit_recording(process: subprocess.Popen[str], folder: Path, more: int) -> None:
     """Let the recording grow by so many bytes and no further; -1 lifts it."""
     part = folder / "out" / ".parts" / "part-001.mcap"
     size = part.stat().st_size + more if more >= 0 else resource.RLIM_INFINITY
@@ -41,13 +41,13 @@ def limited(process: subprocess.Popen[str], folder: Path, more: int) -> None:
 def test_a_full_disk_brings_the_table_to_rest_and_leaves_what_was_written(tmp_path: Path) -> None:
     process = start(tmp_path)
     running(process)
-    limited(process, tmp_path, 300_000)
-    code, said, recording, summary = finish(process, tmp_path)
-    assert code == 3, said
-    assert "cannot write the recording (File too large: " in said
-    assert "stop: cannot write the recording" in said  # the rig heard it and decayed to rest
-    assert "the recorder failed: the end of the recording could not be written" in said
-    assert "Traceback" not in said
+    limit_recording(process, tmp_path, 300_000)
+    code, output, recording, summary = finish(process, tmp_path)
+    assert code == 3, output
+    assert "cannot write the recording (File too large: " in output
+    assert "stop: cannot write the recording" in output  # the rig heard it and decayed to rest
+    assert "the recorder failed: the end of the recording could not be written" in output
+    assert "Traceback" not in output
     assert summary["verdict"] == "halted"
     assert len(summary["steps"]) == 1
     assert [block.index for block in recording.contiguous_blocks("meas")] == [0]
@@ -56,16 +56,16 @@ def test_a_full_disk_brings_the_table_to_rest_and_leaves_what_was_written(tmp_pa
 def test_a_disk_that_has_room_again_loses_nothing_but_the_table_rests(tmp_path: Path) -> None:
     process = start(tmp_path)
     running(process)
-    limited(process, tmp_path, 50_000)
+    limit_recording(process, tmp_path, 50_000)
     time.sleep(1.5)
-    limited(process, tmp_path, -1)
-    code, said, recording, summary = finish(process, tmp_path)
-    assert code == 3, said
+    limit_recording(process, tmp_path, -1)
+    code, output, recording, summary = finish(process, tmp_path)
+    assert code == 3, output
     assert_whole(recording)
     assert_at_rest(recording)
     assert summary["verdict"] == "stopped"
-    assert [one.kind for one in recording.records(Event)].count("disk") == 2
-    assert "identical to the bit" in replayed(tmp_path).stdout
+    assert [event.kind for event in recording.records(Event)].count("disk") == 2
+    assert "identical to the bit" in replay_run(tmp_path).stdout
 
 
 def test_a_recorder_that_stalls_and_one_that_hangs_leave_no_gap(tmp_path: Path) -> None:
@@ -81,9 +81,9 @@ def test_a_recorder_that_stalls_and_one_that_hangs_leave_no_gap(tmp_path: Path) 
     time.sleep(3.0)
     assert recorder(process) == stalled, "three seconds are no reason to end it"
     os.kill(stalled, signal.SIGSTOP)
-    code, said, recording, _ = finish(process, tmp_path)
-    assert code == 0, said
-    assert "the recorder has been silent for 10 s; ending it" in said
-    assert "recorder died (SIGKILL); restarting it, the table goes on" in said
+    code, output, recording, _ = finish(process, tmp_path)
+    assert code == 0, output
+    assert "the recorder has been silent for 10 s; ending it" in output
+    assert "recorder died (SIGKILL); restarting it, the table goes on" in output
     assert_whole(recording)
-    assert replayed(tmp_path).returncode == 0
+    assert replay_run(tmp_path).returncode == 0

@@ -12,11 +12,11 @@ from table_io.backends.opendaq.config import OpenDaqWiring
 from table_io.backends.opendaq.source import check_reachable
 from table_io.config.base import find_config, load_config
 from table_io.config.rig import RigConfig
-from table_io.errors import InputError
 from table_io.records import RunStart, Timing
 from table_io.sim.opendaq import OpenDaqServer
-from twin.live.twin_process import _TwinProcess
-from twin.reports.summary import _timing
+from tests.input_errors import raises_input_error
+from twin.live.twin_process import TwinProcess
+from twin.reports.summary import summarise_timing
 from twin.run.disk import bytes_per_s, planned_bytes
 from twin.run.run_config import compile_rig_kernels, read_run_config
 
@@ -53,7 +53,7 @@ def test_the_time_that_is_waited_for_the_controller_needs_room() -> None:
 @pytest.mark.parametrize("follows", [False, True])
 def test_no_latency_is_told_of_blocks_that_were_held_back(follows: bool) -> None:
     absent: Any = None
-    twin = _TwinProcess("r", absent, absent, absent, absent, "", external_clock=follows)
+    twin = TwinProcess("r", absent, absent, absent, absent, "", external_clock=follows)
     start = RunStart(
         0, "r", "n", "table", "", "", "", 2000.0, 20, (), (), 0, {}, {}, platform.node(), "", 5.0
     )
@@ -62,8 +62,8 @@ def test_no_latency_is_told_of_blocks_that_were_held_back(follows: bool) -> None
 
 
 def test_a_stopwatch_that_saw_nothing_says_no_latency() -> None:
-    found = _timing((Timing(0, "twin", 0.0, 0.0, 0.0, 0, 0, 0.1, "normal"),))
-    assert found["latency_ms"] == {"p50": None, "p99": None, "max": None}
+    timing = summarise_timing((Timing(0, "twin", 0.0, 0.0, 0.0, 0, 0, 0.1, "normal"),))
+    assert timing["latency_ms"] == {"p50": None, "p99": None, "max": None}
 
 
 def test_an_address_that_is_no_name_is_told() -> None:
@@ -72,7 +72,7 @@ def test_an_address_that_is_no_name_is_told() -> None:
     wiring = rig.get_section(OpenDaqWiring)
     assert wiring is not None
     wiring = wiring.model_copy(update={"device": "daq.nd://a..b"})
-    with pytest.raises(InputError, match=r"no openDAQ device answers at daq\.nd://a\.\.b"):
+    with raises_input_error(where="daq.nd://a..b"):
         check_reachable(rig.model_copy(update={"opendaq": wiring}))
 
 

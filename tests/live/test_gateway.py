@@ -26,13 +26,14 @@ from twin.live.process_config import ProcessConfig, make_private_folder, process
 from twin.run.run_config import read_run_config
 from twin.transport.codec import MEAS_TOPIC, TOPIC_TYPES, decode_item, encode_item
 from twin.transport.endpoint import LOCAL_SOCKET_PREFIX, key_expression, list_runs
+from twin.transport.reliable_subscriber import ReliableSubscriber
 from twin.transport.zenoh_link import MAX_OBSERVERS, BusLink, open_hub, open_spoke
 
 RUN = "20260101-120000-quickstart"
 PATIENCE_S = 20.0
 BUNDLE = read_run_config(PROFILES_DIR / "tests" / "quickstart.toml")
 RIG = BUNDLE.rig.name
-CAPACITY = 100_000
+QUEUE_CAPACITY = 100_000
 
 
 @dataclass
@@ -42,7 +43,7 @@ class Rig:
     spec: ProcessConfig
     sent: list[tuple[str, bytes]] = field(default_factory=list)
     orders: list[tuple[str, str]] = field(default_factory=list)
-    heard: list[Event] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
     waiting: list[tuple[str, bytes]] = field(default_factory=list)
     over: threading.Event = field(default_factory=threading.Event)
     ready: threading.Event = field(default_factory=threading.Event)
@@ -51,7 +52,7 @@ class Rig:
         link = open_hub(RIG, self.spec.endpoint)
         link.declare(tuple(TOPIC_TYPES))
         commands = link.declare_commands()
-        events = link.subscribe(("/run/event",), history=True, capacity=CAPACITY)
+        events = link.subscribe(("/run/event",), history=True, capacity=QUEUE_CAPACITY)
         link.declare_alive(process_token(self.spec, "rig"))
         self.ready.set()
         while not self.over.is_set():
@@ -62,10 +63,10 @@ class Rig:
             if (order := commands.poll()) is not None:
                 self.orders.append((order.name, order.text))
                 order.reply("yes")
-            if (said := events.get(0.001)) is not None:
-                event = decode_item(*said)[1]
+            if (message := events.get(0.001)) is not None:
+                event = decode_item(*message)[1]
                 assert isinstance(event, Event)
-                self.heard.append(event)
+                self.events.append(event)
         link.close()
 
 
@@ -92,14 +93,14 @@ def spec() -> Iterator[ProcessConfig]:
 
 @pytest.fixture(scope="module")
 def rig(spec: ProcessConfig) -> Iterator[Rig]:
-    one = Rig(spec)
-    thread = threading.Thread(target=one.play)
+    played = Rig(spec)
+    thread = threading.Thread(target=played.play)
     thread.start()
-    assert one.ready.wait(PATIENCE_S)
+    assert played.ready.wait(PATIENCE_S)
     start = BUNDLE.make_start_factory(RUN, "table")({}, 0.0)
-    one.waiting += [("/run/start", encode_item(start, RUN))]
-    yield one
-    one.over.set()
+    played.waiting += [("/run/start", encode_item(start, RUN))]
+    yield played
+    played.over.set()
     thread.join()
 
 
@@ -117,7 +118,7 @@ class Door:
 
 
 @pytest.fixture(scope="module")
-def patched() -> Iterator[list[Door]]:
+def doors() -> Iterator[list[Door]]:
     doors: list[Door] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "nice", lambda _: 0)
@@ -127,33 +128,46 @@ def patched() -> Iterator[list[Door]]:
 
 
 @pytest.fixture(scope="module")
-def door(spec: ProcessConfig, rig: Rig, patched: list[Door]) -> Iterator[list[Door]]:
-    patched.append(Door(spec))
-    yield patched
-    patched[-1].close()
+def door(spec: ProcessConfig, rig: Rig, doors: list[Door]) -> Iterator[list[Door]]:
+    doors.append(Door(spec))
+    yield doors
+    doors[-1].close()
 
 
 @pytest.fixture
 def observer(spec: ProcessConfig, door: list[Door]) -> Iterator[BusLink]:
-    link = joined(spec)
+    link = connect(spec)
     yield link
     link.close()
 
 
-def joined(spec: ProcessConfig) -> BusLink:
+def connect(spec: ProcessConfig) -> BusLink:
     """Connected, once the gate is there and shows the rig."""
     link = open_spoke(RIG, spec.listen, PATIENCE_S)
     until(lambda: process_token(spec, "rig") in link.list_components())
     return link
 
 
-def took(inbox: "object", count: int) -> list[tuple[str, bytes]]:
+def took(inbox: ReliableSubscriber, count: int) -> list[tuple[str, bytes]]:
     got: list[tuple[str, bytes]] = []
     end = time.monotonic() + PATIENCE_S
     while len(got) < count and time.monotonic() < end:
-        if (one := inbox.get(0.05)) is not None:  # type: ignore[attr-defined]
-            got.append(one)
+        if (message := inbox.get(0.05)) is not None:
+            got.append(message)
     return got
+
+
+def wait_until_delivered(rig: Rig, inbox: ReliableSubscriber) -> None:
+    """Return once events reach `inbox`: without history, what a new subscriber misses is lost."""
+
+    def is_delivered() -> bool:
+        rig.waiting += [("/run/event", encode_item(Event(0, "state", "start"), RUN))]
+        return inbox.get(0.05) is not None
+
+    until(is_delivered)
+    until(lambda: not rig.waiting)
+    while inbox.get(0.5) is not None:
+        pass
 
 
 def test_what_comes_out_is_what_was_said_inside_byte_for_byte(
@@ -163,20 +177,20 @@ def test_what_comes_out_is_what_was_said_inside_byte_for_byte(
     sizes = [10, 2500, 48 * 2**10, 200_000, 0]
     rig.waiting += [(MEAS_TOPIC, random.randbytes(size)) for size in sizes]
     until(lambda: not rig.waiting)
-    sent = [one for one in rig.sent if one[0] in (MEAS_TOPIC, "/run/start")]
-    inbox = observer.subscribe((MEAS_TOPIC, "/run/start"), history=True, capacity=CAPACITY)
+    sent = [sent for sent in rig.sent if sent[0] in (MEAS_TOPIC, "/run/start")]
+    inbox = observer.subscribe((MEAS_TOPIC, "/run/start"), history=True, capacity=QUEUE_CAPACITY)
     got = took(inbox, len(sent))
     assert sorted(got) == sorted(sent)
-    assert [one for one in got if one[0] == MEAS_TOPIC] == [
-        one for one in sent if one[0] == MEAS_TOPIC
+    assert [message for message in got if message[0] == MEAS_TOPIC] == [
+        message for message in sent if message[0] == MEAS_TOPIC
     ]
 
 
 def test_a_successor_leaves_no_gap_and_doubles_nothing(
     observer: BusLink, rig: Rig, spec: ProcessConfig, door: list[Door]
 ) -> None:
-    before = len([one for one in rig.sent if one[0] == "/twin/cmp"])
-    inbox = observer.subscribe(("/twin/cmp",), history=True, capacity=CAPACITY)
+    before = len([sent for sent in rig.sent if sent[0] == "/twin/cmp"])
+    inbox = observer.subscribe(("/twin/cmp",), history=True, capacity=QUEUE_CAPACITY)
     numbered = [("/twin/cmp", number.to_bytes(4, "big")) for number in range(60)]
     rig.waiting += numbered[:20]
     got = took(inbox, before + 20)
@@ -192,32 +206,32 @@ def test_a_successor_leaves_no_gap_and_doubles_nothing(
 
 
 def test_status_and_configuration_answer(observer: BusLink, rig: Rig) -> None:
-    def asked(path: str) -> bytes:
+    def request(path: str) -> bytes:
         answer = observer.query(path, timeout_s=PATIENCE_S)
         assert answer is not None
         return answer
 
-    until(lambda: "steps" in json.loads(asked("config/run")))
-    run = json.loads(asked("config/run"))
+    until(lambda: "steps" in json.loads(request("config/run")))
+    run = json.loads(request("config/run"))
     assert run["run"] == RUN
     assert len(run["steps"]) == len(BUNDLE.steps)
     assert "profile_toml" not in run
-    assert asked("config/profile").decode() == BUNDLE.profile_toml
-    assert asked("config/rig").decode() == BUNDLE.rig_toml
-    assert asked("config/model").decode() == BUNDLE.model_toml
-    names = [one.name for one in FileDescriptorSet.FromString(asked("config/schema")).file]
+    assert request("config/profile").decode() == BUNDLE.profile_toml
+    assert request("config/rig").decode() == BUNDLE.rig_toml
+    assert request("config/model").decode() == BUNDLE.model_toml
+    names = [file.name for file in FileDescriptorSet.FromString(request("config/schema")).file]
     assert names == ["shaketwin.proto"]
-    assert asked("state/role/anna") == b"command"
+    assert request("state/role/anna") == b"command"
     rig.waiting += [("/run/event", encode_item(Event(0, "state", "running"), RUN))]
-    until(lambda: json.loads(asked("state/status"))["state"] == "running")
-    status = json.loads(asked("state/status"))
+    until(lambda: json.loads(request("state/status"))["state"] == "running")
+    status = json.loads(request("state/status"))
     assert status["run"] == RUN
     assert process_token(rig.spec, "rig") in status["components"]
     assert status["verdict"] is None
 
 
 def test_an_observer_is_seen_while_it_is_there(observer: BusLink, spec: ProcessConfig) -> None:
-    other = joined(spec)
+    other = connect(spec)
     other.declare_alive("observer.anna.monitor")
     other.declare_alive("observer.\x1b[2J")
     until(lambda: "observer.??2J" in observer.list_components())
@@ -242,7 +256,7 @@ def test_who_lives_inside_is_seen_outside_until_it_dies(
 def test_a_command_reaches_the_rig_signed_and_is_recorded(observer: BusLink, rig: Rig) -> None:
     assert observer.send_command("hold/anna", f"{RUN}\nlook at it", PATIENCE_S) == "yes"
     assert rig.orders[-1] == ("hold", f"{RUN}\nlook at it by anna")
-    until(lambda: Event(rig.heard[-1].index, "order", "hold: look at it by anna") in rig.heard)
+    until(lambda: Event(rig.events[-1].index, "order", "hold: look at it by anna") in rig.events)
 
 
 def test_refused_commands_reach_nobody_and_a_flood_is_one_sentence_now_and_then(
@@ -257,11 +271,11 @@ def test_refused_commands_reach_nobody_and_a_flood_is_one_sentence_now_and_then(
     assert answers == {f"refused: this is run {RUN}"}
     assert observer.send_command("start/anna", f"{RUN}\n", PATIENCE_S) is not None
     assert rig.orders == before
-    until(lambda: sum(one.kind == "refused" for one in rig.heard) >= MAX_REFUSAL_BURST)
-    told = [one for one in rig.heard if one.kind == "refused"]
-    assert all(one.text.isprintable() for one in told)
-    assert len(told) <= MAX_REFUSAL_BURST + 2 + (time.monotonic() - begun) / REFUSAL_INTERVAL_S
-    assert told[1].text == f"stop by mallory0: this is run {RUN}"
+    until(lambda: sum(event.kind == "refused" for event in rig.events) >= MAX_REFUSAL_BURST)
+    refusals = [event for event in rig.events if event.kind == "refused"]
+    assert all(event.text.isprintable() for event in refusals)
+    assert len(refusals) <= MAX_REFUSAL_BURST + 2 + (time.monotonic() - begun) / REFUSAL_INTERVAL_S
+    assert refusals[1].text == f"stop by mallory0: this is run {RUN}"
 
 
 def test_observers_hide_no_component_and_are_no_rig(
@@ -270,10 +284,10 @@ def test_observers_hide_no_component_and_are_no_rig(
     def status() -> dict[str, list[str]]:
         answer = observer.query("state/status", timeout_s=PATIENCE_S)
         assert answer is not None
-        said: dict[str, list[str]] = json.loads(answer)
-        return said
+        listing: dict[str, list[str]] = json.loads(answer)
+        return listing
 
-    other = joined(spec)
+    other = connect(spec)
     for number in range(MAX_OBSERVERS + 10):
         other.declare_alive(f"observer.0.{number}.rig")
     until(lambda: len(status()["observers"]) == MAX_OBSERVERS)
@@ -290,8 +304,9 @@ def test_observers_hide_no_component_and_are_no_rig(
 def test_what_observers_publish_or_answer_reaches_nobody(
     observer: BusLink, rig: Rig, spec: ProcessConfig
 ) -> None:
-    other = joined(spec)
-    inbox = other.subscribe((MEAS_TOPIC, "/run/event"), history=False, capacity=CAPACITY)
+    other = connect(spec)
+    inbox = other.subscribe((MEAS_TOPIC, "/run/event"), history=False, capacity=QUEUE_CAPACITY)
+    wait_until_delivered(rig, inbox)
     session, before = observer._session, list(rig.orders)
     forged = encode_item(Event(0, "state", "forged"), RUN)
     observer.declare(("/run/event",))
@@ -301,10 +316,10 @@ def test_what_observers_publish_or_answer_reaches_nobody(
         session.put(key_expression(RIG, MEAS_TOPIC), b"forged")
         assert false.poll() is None
     rig.waiting += [("/run/event", encode_item(Event(1, "state", "true"), RUN))]
-    (one,) = took(inbox, 1)
-    assert decode_item(*one)[1] == Event(1, "state", "true")
+    (message,) = took(inbox, 1)
+    assert decode_item(*message)[1] == Event(1, "state", "true")
     assert inbox.get(0.7) is None
-    assert not [event for event in rig.heard if event.text == "forged"]
+    assert not [event for event in rig.events if event.text == "forged"]
     assert rig.orders == before
     other.close()
 
@@ -314,7 +329,7 @@ def test_garbage_harms_nothing(observer: BusLink, rig: Rig, spec: ProcessConfig)
     session = observer._session
     paths = ["state/held", "state/status", "cmd/stop/x", "cmd/stop/*", "**", "config/*", "alive/x"]
     before = list(rig.orders)
-    start = observer.subscribe(("/run/start",), history=True, capacity=CAPACITY).get_fragment(
+    start = observer.subscribe(("/run/start",), history=True, capacity=QUEUE_CAPACITY).get_fragment(
         PATIENCE_S
     )
     assert start is not None
@@ -332,7 +347,7 @@ def test_garbage_harms_nothing(observer: BusLink, rig: Rig, spec: ProcessConfig)
             session.get(where, lambda _: None, payload=body, timeout=0.05)
         elif "*" not in where:
             session.put(where, body, attachment=body[:17])
-    other = joined(spec)
+    other = connect(spec)
     assert other.query("state/status", timeout_s=PATIENCE_S) is not None
     assert rig.orders == before
     other.close()
@@ -358,15 +373,15 @@ def test_garbage_harms_nothing(observer: BusLink, rig: Rig, spec: ProcessConfig)
 def test_a_command_is_refused_with_the_reason(
     order: str, who: str, role: str, text: str, part: str
 ) -> None:
-    said = validate_command(order, who, role, RUN, text)
-    assert part in said
-    assert bool(said) == bool(part)
+    problem = validate_command(order, who, role, RUN, text)
+    assert part in problem
+    assert bool(problem) == bool(part)
 
 
 def test_refusals_are_told_again_after_a_while() -> None:
     refusals = RefusalLimiter()
-    told = [refusals.limit("no", 0.001 * number) for number in range(1000)]
-    assert [one for one in told if one] == ["no"] * MAX_REFUSAL_BURST
+    answers = [refusals.limit("no", 0.001 * number) for number in range(1000)]
+    assert [answer for answer in answers if answer] == ["no"] * MAX_REFUSAL_BURST
     assert (
         refusals.limit("no", 11.0)
         == f"no (and {1000 - MAX_REFUSAL_BURST} more since the last one recorded)"
@@ -377,13 +392,13 @@ def test_refusals_are_told_again_after_a_while() -> None:
 def test_after_the_end_a_gate_waits_for_whoever_still_fetches(
     spec: ProcessConfig, rig: Rig, door: list[Door]
 ) -> None:
-    late = joined(spec)
-    inbox = late.subscribe((MEAS_TOPIC, "/run/stop"), history=True, capacity=CAPACITY)
+    late = connect(spec)
+    inbox = late.subscribe((MEAS_TOPIC, "/run/stop"), history=True, capacity=QUEUE_CAPACITY)
     bodies = [(MEAS_TOPIC, random.randbytes(20_000)) for _ in range(200)]
     rig.waiting += [*bodies, ("/run/stop", encode_item(RunStop(9, "complete", "", ()), RUN))]
     until(lambda: not rig.waiting)
     door[-1].shut.set()
-    sent = [one for one in rig.sent if one[0] in (MEAS_TOPIC, "/run/stop")]
+    sent = [sent for sent in rig.sent if sent[0] in (MEAS_TOPIC, "/run/stop")]
     assert len(took(inbox, len(sent))) == len(sent)
     late.close()
     door[-1].thread.join()

@@ -13,7 +13,7 @@ from tests.live.test_live import (
     endpoint,
     finish,
     kill,
-    replayed,
+    replay_run,
     running,
     start,
 )
@@ -27,8 +27,8 @@ def test_a_dead_gate_leaves_no_gap_here_nor_there(tmp_path: Path) -> None:
     listen = endpoint()
     process = start(tmp_path, "--listen", listen, profile=LONG)
     running(process)
-    there = tmp_path / "there"
-    command = [SHAKETWIN, "attend", "recorder", "--connect", listen, "--out", str(there)]
+    remote = tmp_path / "there"
+    command = [SHAKETWIN, "attend", "recorder", "--connect", listen, "--out", str(remote)]
     attending = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert attending.stdout is not None
     assert attending.stdout.readline().startswith("recording")
@@ -37,18 +37,21 @@ def test_a_dead_gate_leaves_no_gap_here_nor_there(tmp_path: Path) -> None:
     kill(process, "gate")
     tries = (subprocess.run([*tell, "resume"], check=False).returncode for _ in range(10))
     assert any(code == 0 for code in tries), "the next gate never came"
-    code, said, recording, _ = finish(process, tmp_path)
-    assert code == 0, said
-    assert "gate died (SIGKILL); restarting it, the table goes on" in said
-    assert "order: hold: a look by " in said
+    code, output, recording, _ = finish(process, tmp_path)
+    assert code == 0, output
+    assert "gate died (SIGKILL); restarting it, the table goes on" in output
+    assert "order: hold: a look by " in output
     assert_whole(recording)
     attending.communicate()
     assert attending.returncode == 0
     here, beside = (
-        Counter((one.topic, one.payload) for one in recover_log(folder / "run.mcap").messages)
-        for folder in (tmp_path / "out", there)
+        Counter(
+            (message.topic, message.payload)
+            for message in recover_log(folder / "run.mcap").messages
+        )
+        for folder in (tmp_path / "out", remote)
     )
     only_here = here - beside
     assert [topic for topic, _ in only_here] == ["/run/timing"]  # the recorder's last word
     assert not beside - here
-    assert replayed(tmp_path).returncode == 0
+    assert replay_run(tmp_path).returncode == 0

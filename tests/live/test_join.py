@@ -11,8 +11,8 @@ import pytest
 
 from table_io.block import Block
 from table_io.config.base import PROFILES_DIR
-from table_io.errors import InputError
 from table_io.records import Event, RunStop, Timing
+from tests.input_errors import raises_input_error
 from tests.live.test_live import endpoint
 from twin.live import join
 from twin.live.join import join_as_recorder
@@ -84,7 +84,7 @@ def test_everything_is_recorded_also_what_came_before_its_start(
     assert join_as_recorder(where, RIG, tmp_path / "copy", None) == 0
     log = tmp_path / "copy" / "run.mcap"
     sent = sorted((topic_for(item), encode_item(item, RUN)) for item in items)
-    assert sorted((one.topic, one.payload) for one in recover_log(log).messages) == sent
+    assert sorted((message.topic, message.payload) for message in recover_log(log).messages) == sent
 
 
 class Played:
@@ -105,9 +105,9 @@ def test_what_comes_before_the_start_is_written_after_it(
     monkeypatch.setattr(join, "MAX_SILENCE_S", 0.0)
     start = BUNDLE.make_start_factory(RUN, "table")({}, 0.0)
     inbox = Played(Event(0, "state", "armed"), block(0), start, block(1))
-    join._record_run(RUN, inbox, tmp_path, lambda: None)  # type: ignore[arg-type]
+    join.record_run(RUN, inbox, tmp_path, lambda: None)  # type: ignore[arg-type]
     part = recover_log(tmp_path / ".parts" / "part-001.mcap")
-    assert sorted(one.topic for one in part.messages) == [
+    assert sorted(message.topic for message in part.messages) == [
         "/rig/meas", "/rig/meas", "/run/event", "/run/start",
     ]  # fmt: skip
 
@@ -127,9 +127,9 @@ def test_ctrl_c_ends_the_recording(
 ) -> None:
     start = BUNDLE.make_start_factory(RUN, "table")({}, 0.0)
     where = gate(start, *map(block, range(10)))
-    record = join._record_run
+    record = join.record_run
 
-    def interrupted(
+    def interrupt_record(
         run: str, inbox: ReliableSubscriber, folder: Path, asked: Callable[[], str | None]
     ) -> bool:
         """As it is, but Ctrl-C comes as soon as the test's beginning has."""
@@ -141,7 +141,7 @@ def test_ctrl_c_ends_the_recording(
 
         return record(run, inbox, folder, asked_then)
 
-    monkeypatch.setattr(join, "_record_run", interrupted)
+    monkeypatch.setattr(join, "record_run", interrupt_record)
     code = join_as_recorder(where, RIG, tmp_path / "copy", None)
     assert code == EXIT_INTERRUPTED
     assert (tmp_path / "copy" / "run.mcap").exists()
@@ -153,6 +153,6 @@ def test_no_folder_is_named_by_a_peer_that_sends_no_run(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     where = gate(run=run)
-    with pytest.raises(InputError, match=rf"'{RIG}'.*--rig"):
+    with raises_input_error(key="endpoint", value=where, problem=RIG, remedy="--rig"):
         join_as_recorder(where, RIG, None, None)
     assert not list(tmp_path.iterdir())

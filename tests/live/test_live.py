@@ -8,11 +8,14 @@ import socket
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from table_io.records import Fault
+from tests.command_line import call_main
 from twin.recording.reader import Recording, read_recording
 from twin.run.diagnostics import LEVEL_VARIABLE
 
@@ -32,6 +35,8 @@ directions = ["forward"]
 """
 QUICK = f"{PROFILE}[loop_check]\nenabled = false\n"  # the processes are the same, 15 s sooner
 
+pytestmark = pytest.mark.usefixtures("draft")  # of what is drawn in this process
+
 
 def endpoint() -> str:
     """A loopback endpoint that nobody uses now."""
@@ -50,13 +55,20 @@ def start(folder: Path, *options: str, profile: str = QUICK) -> subprocess.Popen
     )
 
 
+def read_until(process: subprocess.Popen[str], beginning: str) -> str:
+    """Return what a run says up to the first line that begins as the pattern."""
+    assert process.stdout is not None
+    output = ""
+    for line in process.stdout:
+        output += line
+        if re.match(rf"\s*{beginning}", line):
+            return output
+    raise AssertionError(f"no line begins {beginning}: {output}")
+
+
 def running(process: subprocess.Popen[str]) -> None:
     """Return once the first step has been played."""
-    assert process.stdout is not None
-    for line in process.stdout:
-        if re.match(r"\s*1/\d+ ", line):
-            return
-    raise AssertionError("the run ended before its first step")
+    read_until(process, r"1/\d+ ")
 
 
 def kill(process: subprocess.Popen[str], component: str) -> None:
@@ -71,11 +83,11 @@ def kill(process: subprocess.Popen[str], component: str) -> None:
 
 
 def finish(process: subprocess.Popen[str], folder: Path) -> tuple[int, str, Recording, dict]:
-    """(exit code, what was said, recording, summary) of a run."""
-    said, _ = process.communicate()
+    """(exit code, output, recording, summary) of a run."""
+    output, _ = process.communicate()
     out = folder / "out"
     summary = json.loads((out / "summary.json").read_text())
-    return process.returncode, said, read_recording(out / "run.mcap"), summary
+    return process.returncode, output, read_recording(out / "run.mcap"), summary
 
 
 def assert_whole(recording: Recording) -> None:
@@ -85,19 +97,46 @@ def assert_whole(recording: Recording) -> None:
     assert [block.index for block in recording.contiguous_blocks("meas")] == [0]
 
 
-def replayed(folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [SHAKETWIN, "replay", str(folder / "out"), "--out", str(folder / "again")],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+def replay_run(folder: Path) -> subprocess.CompletedProcess[str]:
+    return call_main("replay", folder / "out", "--out", folder / "again")
 
 
-def test_a_live_run_is_whole_and_its_replay_identical(tmp_path: Path) -> None:
-    process = start(tmp_path, profile=PROFILE)
-    code, said, recording, summary = finish(process, tmp_path)
-    assert code == 0, said
+@dataclass(frozen=True)
+class WholeRun:
+    """A live run from loop check to report, and what others were told beside it."""
+
+    folder: Path
+    code: int
+    output: str
+    recording: Recording
+    summary: dict[str, Any]
+    second: subprocess.CompletedProcess[str]  # a run at the same endpoint
+    early: subprocess.CompletedProcess[str]  # a report of the run before its end
+
+
+@pytest.fixture(scope="module")
+def whole_run(tmp_path_factory: pytest.TempPathFactory) -> WholeRun:
+    """A run of the short test that logs the lives of its processes; to look at only."""
+    folder, listen = tmp_path_factory.mktemp("whole"), endpoint()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(LEVEL_VARIABLE, "info")
+        process = start(folder, "--listen", listen, profile=PROFILE)
+    begin = read_until(process, "state: checking")
+    (folder / "second").mkdir()
+    second = start(folder / "second", "--listen", listen)
+    refusal, _ = second.communicate()
+    early = call_main("report", folder / "out")
+    assert process.poll() is None, "the run was over before the others were refused"
+    code, output, recording, summary = finish(process, folder)
+    return WholeRun(
+        folder, code, begin + output, recording, summary,
+        subprocess.CompletedProcess(second.args, second.returncode, refusal), early,
+    )  # fmt: skip
+
+
+def test_a_live_run_is_whole_and_its_replay_identical(whole_run: WholeRun) -> None:
+    recording, summary = whole_run.recording, whole_run.summary
+    assert whole_run.code == 0, whole_run.output
     assert_whole(recording)
     assert summary["verdict"] == "complete"
     assert all(line["passed"] for line in summary["checks"])
@@ -106,10 +145,16 @@ def test_a_live_run_is_whole_and_its_replay_identical(tmp_path: Path) -> None:
     for step in summary["steps"]:
         assert step["twin"]["eta_d"] == pytest.approx(step["measured"]["eta_d"], rel=0.02)
     assert summary["timing"]["latency_ms"]["p50"] > 0
-    assert (tmp_path / "out" / "report.html").stat().st_size > 100_000
-    again = replayed(tmp_path)
+    out, new = whole_run.folder / "out", whole_run.folder / "again"
+    assert (out / "report.html").stat().st_size > 100_000
+    again = subprocess.run(
+        [SHAKETWIN, "replay", str(out), "--out", str(new)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert again.returncode == 0, again.stdout + again.stderr
-    replay = json.loads((tmp_path / "again" / "summary.json").read_text())["replay"]
+    replay = json.loads((new / "summary.json").read_text())["replay"]
     assert replay["identical"]
     assert replay["comparisons"] == replay["compared"] > 300
 
@@ -118,52 +163,44 @@ def test_a_dead_twin_is_a_fault_that_replay_respects(tmp_path: Path) -> None:
     process = start(tmp_path)
     running(process)
     kill(process, "twin")
-    code, said, recording, summary = finish(process, tmp_path)
-    assert code == 0, said
-    assert "twin died (SIGKILL); restarting it" in said
+    code, output, recording, summary = finish(process, tmp_path)
+    assert code == 0, output
+    assert "twin died (SIGKILL); restarting it" in output
     assert_whole(recording)
     (fault,) = recording.records(Fault)
     assert fault.component == "twin"
     assert 0 < fault.from_index < fault.to_index <= summary["run"]["samples"]
-    compared = [one.index for one in recording.blocks("pred")]
+    compared = [block.index for block in recording.blocks("pred")]
     assert not [index for index in compared if fault.from_index <= index < fault.to_index]
     assert fault.to_index in compared
     # what was measured while the twin was dead is in the summary all the same
     assert len(summary["steps"]) == 3
-    again = replayed(tmp_path)
+    again = replay_run(tmp_path)
     assert again.returncode == 0, again.stdout + again.stderr
     assert "identical to the bit" in again.stdout
 
 
-def test_a_dead_recorder_leaves_no_gap(tmp_path: Path) -> None:
-    process = start(tmp_path)
-    running(process)
-    kill(process, "recorder")
-    code, said, recording, summary = finish(process, tmp_path)
-    assert code == 0, said
-    assert "recorder died (SIGKILL); restarting it" in said
-    assert_whole(recording)
-    assert len(summary["steps"]) == 3
-    assert replayed(tmp_path).returncode == 0
-
-
-def test_a_dead_viewer_changes_nothing(tmp_path: Path) -> None:
+def test_a_dead_recorder_leaves_no_gap_and_a_dead_viewer_changes_nothing(tmp_path: Path) -> None:
     process = start(tmp_path, "--view")
     running(process)
+    kill(process, "recorder")
     kill(process, "viewer")
-    code, said, recording, _ = finish(process, tmp_path)
-    assert code == 0, said
-    assert "viewer died (SIGKILL); restarting it" in said
+    code, output, recording, summary = finish(process, tmp_path)
+    assert code == 0, output
+    assert "recorder died (SIGKILL); restarting it" in output
+    assert "viewer died (SIGKILL); restarting it" in output
     assert_whole(recording)
+    assert len(summary["steps"]) == 3
     assert (tmp_path / "out" / "view.rrd").stat().st_size > 10_000
+    assert replay_run(tmp_path).returncode == 0
 
 
 def test_a_dead_twin_stops_the_table_where_so_configured(tmp_path: Path) -> None:
     process = start(tmp_path, profile=QUICK + '[on_death]\ntwin = "stop"\n')
     running(process)
     kill(process, "twin")
-    code, said, recording, summary = finish(process, tmp_path)
-    assert summary["verdict"] == "stopped", said
+    code, output, recording, summary = finish(process, tmp_path)
+    assert summary["verdict"] == "stopped", output
     assert_whole(recording)
     assert code == 3
     assert summary["reason"].startswith("twin died")
@@ -183,8 +220,8 @@ def test_ctrl_c_decays_to_rest_and_closes_the_recording(tmp_path: Path) -> None:
     process = start(tmp_path)
     running(process)
     process.send_signal(signal.SIGINT)
-    code, said, recording, summary = finish(process, tmp_path)
-    assert code == 130, said
+    code, output, recording, summary = finish(process, tmp_path)
+    assert code == 130, output
     assert summary["verdict"] == "stopped"
     assert_whole(recording)
     assert_at_rest(recording)
@@ -203,9 +240,7 @@ def test_a_dead_supervisor_leaves_a_table_at_rest_and_a_readable_recording(
         time.sleep(0.2)
     assert not pids(tmp_path), "processes outlive their run"
     assert list(parts.glob("part-*.mcap"))
-    done = subprocess.run(
-        [SHAKETWIN, "report", str(tmp_path / "out")], capture_output=True, text=True, check=False
-    )
+    done = call_main("report", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     recording = read_recording(tmp_path / "out" / "run.mcap")
     assert_whole(recording)
@@ -214,10 +249,10 @@ def test_a_dead_supervisor_leaves_a_table_at_rest_and_a_readable_recording(
 
 def pids(folder: Path) -> list[str]:
     """Processes of the run in this folder."""
-    found = subprocess.run(
+    listing = subprocess.run(
         ["pgrep", "-f", str(folder / "out")], capture_output=True, text=True, check=False
     )
-    return found.stdout.split()
+    return listing.stdout.split()
 
 
 def test_a_port_in_use_is_bad_input_and_nothing_is_started(tmp_path: Path) -> None:
@@ -226,48 +261,34 @@ def test_a_port_in_use_is_bad_input_and_nothing_is_started(tmp_path: Path) -> No
         taken.listen()
         listen = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
         process = start(tmp_path, "--listen", listen)
-        said, _ = process.communicate()
+        output, _ = process.communicate()
     assert process.returncode == 2
-    assert "in use" in said
-    assert "Traceback" not in said
+    assert "in use" in output
+    assert "Traceback" not in output
     assert not (tmp_path / "out").exists()
 
 
-def test_a_second_run_at_the_same_endpoint_is_refused_and_harms_nothing(tmp_path: Path) -> None:
-    listen = endpoint()
-    long = QUICK.replace("cycles = 5", "cycles = 12", 1)  # outlives the start of the second
-    first = start(tmp_path, "--listen", listen, profile=long)
-    running(first)
-    (tmp_path / "second").mkdir()
-    second = start(tmp_path / "second", "--listen", listen)
-    said, _ = second.communicate()
-    assert second.returncode == 2, said
-    assert "in use" in said
-    assert not (tmp_path / "second" / "out").exists()
-    # nor does a report written too early take the recording away from under the run
-    early = subprocess.run(
-        [SHAKETWIN, "report", str(tmp_path / "out")], capture_output=True, text=True, check=False
-    )
-    assert early.returncode == 2
-    assert str(tmp_path / "out") in early.stderr
-    code, said, recording, summary = finish(first, tmp_path)
-    assert code == 0, said
-    assert_whole(recording)
-    assert len(summary["steps"]) == 3
-    assert replayed(tmp_path).returncode == 0
-
-
-def test_the_log_tells_the_starts_and_ends_of_the_processes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_second_run_at_the_same_endpoint_is_refused_and_harms_nothing(
+    whole_run: WholeRun,
 ) -> None:
-    monkeypatch.setenv(LEVEL_VARIABLE, "info")
-    code, said, *_ = finish(start(tmp_path), tmp_path)
-    assert code == 0, said
-    lines = re.findall(r"^\d{4}-\S+ \S+ (shaketwin run|\w+) INFO (.*)$", said, re.M)
+    assert whole_run.second.returncode == 2, whole_run.second.stdout
+    assert "in use" in whole_run.second.stdout
+    assert not (whole_run.folder / "second" / "out").exists()
+    # nor does a report written too early take the recording away from under the run
+    assert whole_run.early.returncode == 2
+    assert str(whole_run.folder / "out") in whole_run.early.stderr
+    assert whole_run.code == 0, whole_run.output
+    assert_whole(whole_run.recording)
+    assert len(whole_run.summary["steps"]) == 3
+
+
+def test_the_log_tells_the_starts_and_ends_of_the_processes(whole_run: WholeRun) -> None:
+    assert whole_run.code == 0, whole_run.output
+    lines = re.findall(r"^\d{4}-\S+ \S+ (shaketwin run|\w+) INFO (.*)$", whole_run.output, re.M)
     processes = ("rig", "gate", "twin", "recorder")
     starts = re.compile(r"(\w+) started, process \d+")
-    found = [starts.fullmatch(text) for process, text in lines if process == "shaketwin run"]
-    assert [match[1] for match in found if match] == list(processes)
+    matches = [starts.fullmatch(text) for process, text in lines if process == "shaketwin run"]
+    assert [match[1] for match in matches if match] == list(processes)
     ended = {process for process, text in lines if re.fullmatch(r"process \d+ ends", text)}
     assert ended == set(processes)
     assert ("rig", "command start, accepted") in lines
@@ -279,24 +300,21 @@ def test_an_interrupt_before_the_start_moves_nothing(tmp_path: Path) -> None:
     process.stdout.readline()  # what will be run; its processes are being started now
     time.sleep(0.3)
     process.send_signal(signal.SIGINT)
-    said, _ = process.communicate()
-    assert process.returncode == 130, said
-    assert "nothing moved" in said
+    output, _ = process.communicate()
+    assert process.returncode == 130, output
+    assert "nothing moved" in output
     assert not (tmp_path / "out").exists()
 
 
 def test_a_twin_dead_at_the_very_end_is_a_fault_too(tmp_path: Path) -> None:
-    process = start(tmp_path)
-    assert process.stdout is not None
-    for line in process.stdout:
-        if re.match(r"\s*3/3 ", line):
-            break
+    process = start(tmp_path, profile=QUICK.replace("stop_hz = 4.0", "stop_hz = 3.6"))
+    read_until(process, "1/1 ")
     kill(process, "twin")
-    code, said, recording, summary = finish(process, tmp_path)
-    assert code == 0, said
+    code, output, recording, summary = finish(process, tmp_path)
+    assert code == 0, output
     (fault,) = recording.records(Fault)
     assert fault.to_index <= summary["run"]["samples"]
-    again = replayed(tmp_path)
+    again = replay_run(tmp_path)
     assert again.returncode == 0, again.stdout + again.stderr
 
 
@@ -304,10 +322,10 @@ def test_a_dead_rig_halts_the_run_and_keeps_what_was_recorded(tmp_path: Path) ->
     process = start(tmp_path)
     running(process)
     kill(process, "rig")
-    code, said, recording, summary = finish(process, tmp_path)
-    assert code == 3, said
-    assert "the rig process died (SIGKILL)" in said
-    assert "Traceback" not in said
+    code, output, recording, summary = finish(process, tmp_path)
+    assert code == 3, output
+    assert "the rig process died (SIGKILL)" in output
+    assert "Traceback" not in output
     assert summary["verdict"] == "halted"
     assert len(summary["steps"]) >= 1
     pieces = recording.contiguous_blocks("meas")
@@ -316,7 +334,7 @@ def test_a_dead_rig_halts_the_run_and_keeps_what_was_recorded(tmp_path: Path) ->
 
 
 def test_the_bus_never_listens_to_the_network(tmp_path: Path) -> None:
-    process = start(tmp_path, "--listen", "tcp/0.0.0.0:7447")
-    said, _ = process.communicate()
-    assert process.returncode == 2
-    assert "would go over the network" in said
+    (tmp_path / "short.toml").write_text(QUICK)
+    result = call_main("run", tmp_path / "short.toml", "--listen", "tcp/0.0.0.0:7447", cwd=tmp_path)
+    assert result.returncode == 2
+    assert "would go over the network" in result.stderr

@@ -5,17 +5,17 @@ import json
 import pytest
 
 from tests.live.cable_pull import BLOCKS
-from tests.live.namespaces import enclosed, refusal
+from tests.live.namespaces import refusal, start_isolated
 
 WHY = refusal()
 
 
 @pytest.mark.skipif(bool(WHY), reason=f"no network namespaces here: {WHY}")
 def test_a_cable_pulled_for_two_seconds_leaves_no_gap() -> None:
-    process = enclosed("tests.live.cable_pull")
+    process = start_isolated("tests.live.cable_pull")
     try:
-        said, _ = process.communicate()
+        output, _ = process.communicate()
     finally:
         process.kill()
-    assert process.returncode == 0, said
-    assert json.loads(said.splitlines()[-1]) == {"got": list(range(BLOCKS)), "missed": 0}
+    assert process.returncode == 0, output
+    assert json.loads(output.splitlines()[-1]) == {"got": list(range(BLOCKS)), "missed": 0}

@@ -13,13 +13,13 @@ import pytest
 
 from table_io.block import Block
 from table_io.clock import ManualClock
-from table_io.errors import InputError
 from table_io.records import Event, RunStop, Timing
+from tests.input_errors import raises_input_error
 from tests.reports.recordings import blocks, start_record
 from twin.live import recorder as module
 from twin.live.latency import LatencyHistogram
 from twin.live.process_config import ProcessConfig
-from twin.live.recorder import _Recorder
+from twin.live.recorder import Recorder
 from twin.recording.mcap_log import LogWriter, iter_messages
 from twin.recording.merge import verify_log
 from twin.recording.reader import read_recording
@@ -38,7 +38,7 @@ class Bus:
     coming: deque[tuple[str, bytes]]
     clock: ManualClock
     each_turn: Callable[[int], None] = lambda _: None
-    said: list[Any] = field(default_factory=list)
+    published: list[Any] = field(default_factory=list)
     orders: list[str] = field(default_factory=list)
     answers: deque[str | None] = field(default_factory=deque)
     turns: int = 0
@@ -52,7 +52,7 @@ class Bus:
         return self.coming.popleft() if self.coming else None
 
     def publish(self, name: str, payload: bytes) -> None:
-        self.said.append((name, payload))
+        self.published.append((name, payload))
         self.coming.appendleft((name, payload))
 
     def send_command(self, name: str, text: str, timeout_s: float) -> str | None:
@@ -71,7 +71,7 @@ def limit(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], None]]:
 
 def items() -> list[Any]:
     """A whole run: start, 200 blocks with what the twin says, stop, the twin's last word."""
-    some = next(one for one in blocks() if isinstance(one, Block) and one.stream == "meas")
+    some = next(block for block in blocks() if isinstance(block, Block) and block.stream == "meas")
     size = len(some)
     run: list[Any] = [START]
     for number in range(200):
@@ -81,44 +81,44 @@ def items() -> list[Any]:
     return [*run, RunStop(end, "complete", "", ()), Timing(end, "twin", 0, 0, 0, 0, 0, 0, "")]
 
 
-def at_work(folder: Path, room_s: float = 1e3) -> tuple[_Recorder, Bus]:
+def at_work(folder: Path, room_s: float = 1e3) -> tuple[Recorder, Bus]:
     """A recorder that is about to record the run."""
     clock = ManualClock()
-    bus = Bus(deque((topic_for(one), encode_item(one, START.run)) for one in items()), clock)
+    bus = Bus(deque((topic_for(item), encode_item(item, START.run)) for item in items()), clock)
     link: Any = bus
     reserve = DiskReserve(folder / "reserve", 1000)
     writer = LogWriter(folder / "part.mcap", START.rate_hz)
     watch = LatencyHistogram("recorder", clock, BLOCK_S)
-    return _Recorder(
+    return Recorder(
         SPEC, link, link, writer, watch, DiskForecast(room_s), reserve, START.rate_hz, clock
     ), bus
 
 
-def told(bus: Bus, kind: str) -> list[str]:
+def read_event_texts(bus: Bus, kind: str) -> list[str]:
     """The texts of the events that the recorder published."""
-    found = [one for one in read_items(bus) if isinstance(one, Event) and one.kind == kind]
-    return [one.text for one in found]
+    events = [item for item in read_items(bus) if isinstance(item, Event) and item.kind == kind]
+    return [event.text for event in events]
 
 
 def read_items(bus: Bus) -> list[Any]:
     from twin.transport.codec import decode_item
 
-    return [decode_item(*one)[1] for one in bus.said]
+    return [decode_item(*message)[1] for message in bus.published]
 
 
-def recorded(folder: Path) -> list[Any]:
+def list_recorded(folder: Path) -> list[Any]:
     """Kind and index of everything in the part but what the recorder said itself."""
     own = ("disk", "recorder")
     return sorted(
-        (type(one).__name__, one.index)
-        for one in read_recording(folder / "part.mcap").items
-        if not (isinstance(one, Event) and one.kind in own)
-        and not (isinstance(one, Timing) and one.component == "recorder")
+        (type(item).__name__, item.index)
+        for item in read_recording(folder / "part.mcap").items
+        if not (isinstance(item, Event) and item.kind in own)
+        and not (isinstance(item, Timing) and item.component == "recorder")
     )
 
 
-def expected() -> list[Any]:
-    return sorted((type(one).__name__, one.index) for one in items())
+def list_expected() -> list[Any]:
+    return sorted((type(item).__name__, item.index) for item in items())
 
 
 def test_all_that_came_is_in_the_file_a_quarter_second_later(
@@ -137,10 +137,10 @@ def test_all_that_came_is_in_the_file_a_quarter_second_later(
     assert len(lags) > 20
     assert max(lags) * BLOCK_S / 3 <= 0.25
     assert verify_log(tmp_path / "part.mcap")
-    assert recorded(tmp_path) == expected()
-    timings = [one for one in read_items(bus) if isinstance(one, Timing)]
+    assert list_recorded(tmp_path) == list_expected()
+    timings = [item for item in read_items(bus) if isinstance(item, Timing)]
     assert len(timings) >= 200 * BLOCK_S - 2  # one a second
-    assert {one.component for one in timings} == {"recorder"}
+    assert {timing.component for timing in timings} == {"recorder"}
     assert not bus.orders
     assert not (tmp_path / "reserve").exists()
 
@@ -162,14 +162,14 @@ def test_a_full_disk_stops_the_table_once_and_loses_nothing_if_there_is_room_aga
     bus.each_turn = disk
     recorder.run()
     recorder.finish()
-    first, again, *_ = told(bus, "disk")
+    first, again, *_ = read_event_texts(bus, "disk")
     assert first.startswith("cannot write the recording (File too large: ")
     assert "part.mcap): the table is stopped; what was written stays readable" in first
     assert again == "the disk takes the recording again; what waited is written"
     why = f"stop {START.run}\ncannot write the recording (File too large: {tmp_path}/part.mcap)"
     assert bus.orders == [f"{why} 0.5"] * 2
     assert verify_log(tmp_path / "part.mcap")
-    assert recorded(tmp_path) == expected()
+    assert list_recorded(tmp_path) == list_expected()
 
 
 def test_a_disk_that_stays_full_leaves_what_was_written_readable(
@@ -178,9 +178,7 @@ def test_a_disk_that_stays_full_leaves_what_was_written_readable(
     recorder, bus = at_work(tmp_path)
     bus.each_turn = lambda turn: limit(60_000) if turn == 5 else None
     recorder.run()
-    with pytest.raises(
-        InputError, match=r"the end of the recording could not be written: File too"
-    ):
+    with raises_input_error(problem=os.strerror(errno.EFBIG)):
         recorder.finish()
     assert bus.orders
     part = read_recording(tmp_path / "part.mcap")
@@ -196,7 +194,9 @@ def test_a_disk_that_fills_up_is_told_in_time(
     recorder, bus = at_work(tmp_path, room_s=1e6)
     recorder.run()
     recorder.finish()
-    assert [text for text in told(bus, "disk") if "1 MB left on the disk: room for" in text]
+    assert [
+        text for text in read_event_texts(bus, "disk") if "1 MB left on the disk: room for" in text
+    ]
     assert not bus.orders
 
 
@@ -207,14 +207,16 @@ def test_a_disk_that_does_not_sync_stops_the_table(
         raise OSError(errno.EIO, "Input/output error")
 
     monkeypatch.setattr(os, "fsync", dying)
-    monkeypatch.setattr(module, "SYNC_INTERVAL_S", 1.0)
     recorder, bus = at_work(tmp_path)
+    recorder.sync_interval_s = 1.0
     recorder.run()
     recorder.finish()
-    assert told(bus, "disk")[0].startswith("cannot write the recording (Input/output error: ")
+    assert read_event_texts(bus, "disk")[0].startswith(
+        "cannot write the recording (Input/output error: "
+    )
     assert len(bus.orders) == 1
     assert verify_log(tmp_path / "part.mcap")
-    assert recorded(tmp_path) == expected()
+    assert list_recorded(tmp_path) == list_expected()
 
 
 def test_what_another_run_says_is_not_recorded(
@@ -226,12 +228,14 @@ def test_what_another_run_says_is_not_recorded(
     bus.missed = 4
     recorder.run()
     recorder.finish()
-    assert recorded(tmp_path) == expected()
-    assert not [one for one in iter_messages(tmp_path / "part.mcap") if b"stray" in one.payload]
+    assert list_recorded(tmp_path) == list_expected()
+    assert not [
+        message for message in iter_messages(tmp_path / "part.mcap") if b"stray" in message.payload
+    ]
     (lost,) = [
-        one
-        for one in read_recording(tmp_path / "part.mcap").records(Event)
-        if one.kind == "recorder"
+        event
+        for event in read_recording(tmp_path / "part.mcap").records(Event)
+        if event.kind == "recorder"
     ]
     assert lost.text == "recorder: 4 messages missed, 0 dropped"
 
@@ -243,11 +247,11 @@ def test_of_samples_that_no_log_can_hold_nothing_is_recorded(
     bus.coming.insert(9, ("/run/event", encode_item(Event(2**50, "stray", ""), START.run)))
     recorder.run()
     recorder.finish()
-    assert recorded(tmp_path) == expected()
+    assert list_recorded(tmp_path) == list_expected()
     (left,) = [
-        one
-        for one in read_recording(tmp_path / "part.mcap").records(Event)
-        if one.kind == "recorder"
+        event
+        for event in read_recording(tmp_path / "part.mcap").records(Event)
+        if event.kind == "recorder"
     ]
     assert left.text == "recorder: 1 messages left out, of impossible samples"
 
@@ -264,12 +268,12 @@ def test_a_sync_that_failed_is_not_believed_to_be_mended(
         if len(calls) == 1:
             raise OSError(errno.EIO, "Input/output error", "part.mcap")
 
-    monkeypatch.setattr(module, "SYNC_INTERVAL_S", 0.2)
+    recorder.sync_interval_s = 0.2
     monkeypatch.setattr(LogWriter, "sync", sync)
     monkeypatch.setattr(module, "is_orphaned", lambda: False)
     recorder.run()
     recorder.finish()
     assert len(calls) > 3
-    assert len(told(bus, "disk")) == 1
-    assert "Input/output error" in told(bus, "disk")[0]
+    assert len(read_event_texts(bus, "disk")) == 1
+    assert "Input/output error" in read_event_texts(bus, "disk")[0]
     assert len(bus.orders) == 1

@@ -16,13 +16,13 @@ from table_io.block import Block
 from table_io.records import Comparison, Event, Fault, Params, RunStop, Timing
 from tests.live.test_gateway import (
     BUNDLE,
-    CAPACITY,
     PATIENCE_S,
+    QUEUE_CAPACITY,
     RIG,
     RUN,
     Door,
     Rig,
-    joined,
+    connect,
     took,
     until,
 )
@@ -52,10 +52,10 @@ from twin.transport.zenoh_link import BusLink, open_spoke
 KINDS = frozenset(("drift", "no jump"))
 RATE_HZ = BUNDLE.drive.rate_hz
 SIZE = BUNDLE.profile.acquisition.block_samples
-END = 5000
+END_SAMPLE = 5000
 PARAMS = Params(0, {"stiffness": 1.0}, "x")
 TIMING = Timing(0, "twin", 0, 0, 0, 0, 0, 0, "")
-COMPARED = Comparison(END + MAX_LEAD_SAMPLES - 1, 2, (), (), (), ())
+COMPARED = Comparison(END_SAMPLE + MAX_LEAD_SAMPLES - 1, 2, (), (), (), ())
 
 spec = spec_of_a_run
 
@@ -71,8 +71,8 @@ def measured(number: int) -> Block:
     ("item", "taken"),
     [
         (PARAMS, True),
-        (replace(PARAMS, index=END + MAX_LEAD_SAMPLES), True),
-        (replace(PARAMS, index=END + MAX_LEAD_SAMPLES + 1), False),
+        (replace(PARAMS, index=END_SAMPLE + MAX_LEAD_SAMPLES), True),
+        (replace(PARAMS, index=END_SAMPLE + MAX_LEAD_SAMPLES + 1), False),
         (replace(PARAMS, index=2**50), False),
         (COMPARED, False),
         (replace(COMPARED, count=1), True),
@@ -90,23 +90,23 @@ def measured(number: int) -> Block:
 )
 def test_of_a_twin_outside_only_what_a_twin_says_is_taken(item: Item, taken: bool) -> None:
     name = topic_for(item)
-    assert is_valid_offer(name, encode_item(item, RUN), RUN, END, KINDS) == taken
-    assert not is_valid_offer(name, encode_item(item, "another"), RUN, END, KINDS)
-    assert not is_valid_offer(name, b"garbage", RUN, END, KINDS)
+    assert is_valid_offer(name, encode_item(item, RUN), RUN, END_SAMPLE, KINDS) == taken
+    assert not is_valid_offer(name, encode_item(item, "another"), RUN, END_SAMPLE, KINDS)
+    assert not is_valid_offer(name, b"garbage", RUN, END_SAMPLE, KINDS)
 
 
 class Lying:
     """An inbox in which these pieces lie."""
 
-    def __init__(self, *there: Fragment) -> None:
-        self.there = list(there)
+    def __init__(self, *fragments: Fragment) -> None:
+        self.fragments = list(fragments)
 
     def get_fragment(self, _: float) -> Fragment | None:
-        return self.there.pop(0) if self.there else None
+        return self.fragments.pop(0) if self.fragments else None
 
 
-def offers(*there: Fragment) -> OfferFilter:
-    inbox: Any = Lying(*there)
+def offers(*fragments: Fragment) -> OfferFilter:
+    inbox: Any = Lying(*fragments)
     return OfferFilter(inbox, RUN, KINDS)
 
 
@@ -122,29 +122,29 @@ def test_nobody_outside_speaks_under_a_name_of_the_run() -> None:
     mine, theirs = parts("aa"), parts("bb")
     some = offers(*theirs, *mine, *theirs)
     some.run_publishers.add("bb")
-    assert [some.take(END) for _ in range(4)] == [[], mine, [], None]
+    assert [some.take(END_SAMPLE) for _ in range(4)] == [[], mine, [], None]
 
 
 def test_who_was_let_in_is_let_in_further() -> None:
     first, second = parts("aa"), parts("aa", number=1)
     some = offers(*first, *second)
-    assert some.take(END) == first
+    assert some.take(END_SAMPLE) == first
     some.run_publishers.add("aa")
-    assert some.take(END) == second
+    assert some.take(END_SAMPLE) == second
 
 
 def test_a_payload_in_pieces_is_let_in_whole_or_not_at_all() -> None:
     whole = parts("aa", "x" * 2 * FRAGMENT_BYTES)
     after = parts("aa", "y" * FRAGMENT_BYTES, number=7)
     some = offers(*whole, whole[0], whole[2], *whole[1:], *after)
-    assert [some.take(END) for _ in range(9)] == [[], [], whole, [], [], [], [], [], after]
+    assert [some.take(END_SAMPLE) for _ in range(9)] == [[], [], whole, [], [], [], [], [], after]
 
 
 def test_beginnings_without_an_end_are_forgotten() -> None:
     long = parts("aa", "x" * MAX_PAYLOAD_FRAGMENTS * FRAGMENT_BYTES)
     begun = [parts(f"{n:04x}", "x" * FRAGMENT_BYTES)[0] for n in range(2 * MAX_PARTIAL_PAYLOADS)]
     some = offers(*long, *begun)
-    while some.take(END) is not None:
+    while some.take(END_SAMPLE) is not None:
         assert len(some._partial_payloads) <= MAX_PARTIAL_PAYLOADS
     assert "aa" not in some._twin_publishers
 
@@ -152,21 +152,21 @@ def test_beginnings_without_an_end_are_forgotten() -> None:
 @pytest.fixture(scope="module")
 def rig(spec: ProcessConfig) -> Iterator[Rig]:
     """A rig, and a gate that takes offers; the first blocks are played."""
-    one = Rig(replace(spec, remote_twin=True))
-    thread = threading.Thread(target=one.play)
+    played = Rig(replace(spec, remote_twin=True))
+    thread = threading.Thread(target=played.play)
     thread.start()
-    assert one.ready.wait(PATIENCE_S)
+    assert played.ready.wait(PATIENCE_S)
     start = BUNDLE.make_start_factory(RUN, "table")({}, 0.0)
-    one.waiting += [(topic_for(item), encode_item(item, RUN)) for item in (start, measured(0))]
+    played.waiting += [(topic_for(item), encode_item(item, RUN)) for item in (start, measured(0))]
     with pytest.MonkeyPatch.context() as patch:
         doors: list[Door] = []
         patch.setattr(os, "nice", lambda _: 0)
         patch.setattr(gates, "is_orphaned", lambda: bool(doors) and doors[-1].shut.is_set())
         patch.setattr(gates, "MAX_QUIET_S", 0.2)
-        doors.append(Door(one.spec))
-        yield one
+        doors.append(Door(played.spec))
+        yield played
         doors[-1].close()
-    one.over.set()
+    played.over.set()
     thread.join()
 
 
@@ -192,28 +192,30 @@ def serving(*links: BusLink) -> Iterator[None]:
 
 
 def test_a_twin_outside_is_heard_inside_and_by_everybody_once(rig: Rig) -> None:
-    twin, listener = joined(rig.spec), joined(rig.spec)
+    twin, listener = connect(rig.spec), connect(rig.spec)
     inside = open_spoke(RIG, rig.spec.endpoint, PATIENCE_S)
     topics = ("/twin/params", "/run/timing", "/run/event")
     inboxes = [
-        link.subscribe(topics, history=True, capacity=CAPACITY) for link in (inside, listener)
+        link.subscribe(topics, history=True, capacity=QUEUE_CAPACITY) for link in (inside, listener)
     ]
     twin.declare(topics, offered=True)
-    said: list[Item] = [replace(PARAMS, index=n, reason="x" * 60_000) for n in range(5)]
-    said += [TIMING, Event(0, "drift", "of the stiffness")]
+    latest: list[Item] = [replace(PARAMS, index=n, reason="x" * 60_000) for n in range(5)]
+    latest += [TIMING, Event(0, "drift", "of the stiffness")]
     twin.publish("/twin/params", b"garbage")
     far: list[Item] = [
         replace(PARAMS, index=2**50),
         replace(TIMING, component="rig"),
         Event(0, "order", ""),
     ]
-    for item in (*far, *said):
+    for item in (*far, *latest):
         twin.publish(topic_for(item), encode_item(item, RUN))
     with serving(twin):
-        heard = [took(inbox, len(said)) for inbox in inboxes]
+        received = [took(inbox, len(latest)) for inbox in inboxes]
         rest = [inbox.get(0.3) for inbox in inboxes]
-    for one in heard:
-        assert sorted(one) == sorted((topic_for(item), encode_item(item, RUN)) for item in said)
+    for messages in received:
+        assert sorted(messages) == sorted(
+            (topic_for(item), encode_item(item, RUN)) for item in latest
+        )
     assert rest == [None, None]
     inside.close()
     listener.close()
@@ -226,10 +228,10 @@ def test_under_the_rigs_name_nobody_silences_it(rig: Rig) -> None:
         for where in (rig.spec.endpoint, rig.spec.listen, rig.spec.listen)
     )
     name = "/run/timing"
-    supervisor = inside.subscribe((name,), history=True, capacity=CAPACITY)
+    supervisor = inside.subscribe((name,), history=True, capacity=QUEUE_CAPACITY)
     stamps: list[bytes] = []
     observer._session.declare_subscriber(
-        key_expression(RIG, name), lambda one: stamps.append(one.attachment.to_bytes())
+        key_expression(RIG, name), lambda sample: stamps.append(sample.attachment.to_bytes())
     )
     own = [encode_item(replace(TIMING, component="rig", index=n), RUN) for n in range(4)]
     while not stamps:
@@ -245,26 +247,26 @@ def test_under_the_rigs_name_nobody_silences_it(rig: Rig) -> None:
         for where in (key_expression(RIG, name), key_expression(RIG, name, offered=True)):
             put(where, encode_item(TIMING, RUN), attachment=FRAGMENT_HEADER.pack(source, 10**9, 3))
         time.sleep(0.7)  # in which the gate asks what is on offer
-        rig.waiting += [(name, one) for one in own[1:]]
+        rig.waiting += [(name, payload) for payload in own[1:]]
         until(lambda: not rig.waiting)
-        heard = [one[1] for one in iter(lambda: supervisor.get(0.2), None)]
-    assert [one for one in heard if one in own[1:]] == own[1:]
+        payloads = [message[1] for message in iter(lambda: supervisor.get(0.2), None)]
+    assert [payload for payload in payloads if payload in own[1:]] == own[1:]
     assert supervisor.missed == 0
     for link in (inside, observer):
         link.close()
 
 
 def test_a_twin_answers_nobody_but_the_gate(rig: Rig) -> None:
-    victim, twin = joined(rig.spec), joined(rig.spec)
-    inbox = victim.subscribe((MEAS_TOPIC,), history=True, capacity=CAPACITY)
-    there = len([one for one in rig.sent if one[0] == MEAS_TOPIC])
-    assert len(took(inbox, there)) == there
+    victim, twin = connect(rig.spec), connect(rig.spec)
+    inbox = victim.subscribe((MEAS_TOPIC,), history=True, capacity=QUEUE_CAPACITY)
+    sent_count = len([message for message in rig.sent if message[0] == MEAS_TOPIC])
+    assert len(took(inbox, sent_count)) == sent_count
     ((_, source), _), *_ = inbox._positions.items()
     for offering in (True, False):
-        liar = joined(rig.spec) if not offering else twin
+        liar = connect(rig.spec) if not offering else twin
         liar.declare(("/twin/params",), offered=offering)
         shelf = HistoryCache()
-        shelf.add(there, 3, b"forged")
+        shelf.add(sent_count, 3, b"forged")
         liar._caches[MEAS_TOPIC, source] = shelf
         with serving(liar):
             assert inbox.get(0.7) is None
@@ -279,22 +281,22 @@ def test_a_twin_that_comes_after_another_says_what_is_missing(
     monkeypatch.setattr(twin_process, "request_realtime", lambda _: "")
     inside = open_spoke(RIG, rig.spec.endpoint, PATIENCE_S)
     topics = (CMP_TOPIC, "/run/fault", "/twin/params")
-    inbox = inside.subscribe(topics, history=True, capacity=CAPACITY)
+    inbox = inside.subscribe(topics, history=True, capacity=QUEUE_CAPACITY)
     inside.declare((CMP_TOPIC,))
     inside.publish(CMP_TOPIC, encode_item(Comparison(0, 3 * SIZE, (), (), (), ()), RUN))
-    observer = joined(rig.spec)
+    observer = connect(rig.spec)
     until(lambda: b'"compared": %d' % (3 * SIZE) in (observer.query("state/status") or b""))
     codes: list[int] = []
     thread = threading.Thread(
         target=lambda: codes.append(join_as_twin(rig.spec.listen, RIG, None)), daemon=True
     )
     thread.start()
-    heard: list[Item] = []
+    items: list[Item] = []
     for number in itertools.count(1):
         rig.waiting.append((MEAS_TOPIC, encode_item(measured(number), RUN)))
-        if (one := inbox.get(0.01)) is not None:
-            heard.append(decode_item(*one)[1])
-        faults = [item for item in heard if isinstance(item, Fault)]
+        if (message := inbox.get(0.01)) is not None:
+            items.append(decode_item(*message)[1])
+        faults = [item for item in items if isinstance(item, Fault)]
         if faults or number == 2000:
             break
     rig.waiting.append(
@@ -303,8 +305,8 @@ def test_a_twin_that_comes_after_another_says_what_is_missing(
     rig.waiting.append((MEAS_TOPIC, encode_item(measured(number + 1), RUN)))
     thread.join(PATIENCE_S)
     assert codes == [0]
-    (said,) = faults
-    assert (said.component, said.from_index, said.to_index) == ("twin", 3 * SIZE, said.index)
-    assert said.index % SIZE == 0
+    (fault,) = faults
+    assert (fault.component, fault.from_index, fault.to_index) == ("twin", 3 * SIZE, fault.index)
+    assert fault.index % SIZE == 0
     observer.close()
     inside.close()

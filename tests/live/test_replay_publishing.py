@@ -1,5 +1,7 @@
 """A replay on the bus: whoever listens gets the bytes of the log, all of them, slow or not."""
 
+import errno
+import os
 import socket
 import threading
 import time
@@ -10,6 +12,7 @@ import pytest
 
 from table_io.errors import InputError
 from table_io.records import RunStart, RunStop
+from tests.input_errors import raises_input_error
 from twin.cli.replay import ReplayRequest, replay_logs
 from twin.live import replay_publishing
 from twin.recording.recovery import recover_log
@@ -35,7 +38,7 @@ class Listener(threading.Thread):
     def __init__(self, endpoint: str, stall_s: float) -> None:
         super().__init__(daemon=True)
         self.endpoint, self.stall_s = endpoint, stall_s
-        self.heard: list[tuple[str, bytes]] = []
+        self.received: list[tuple[str, bytes]] = []
         self.missed = 0
         self.alive: set[str] = set()
 
@@ -52,19 +55,19 @@ class Listener(threading.Thread):
         while quiet < 5 and time.monotonic() < until:
             arrived = inbox.get(0.1)
             if arrived is None:
-                ended = any(topic == "/run/stop" for topic, _ in self.heard)
+                ended = any(topic == "/run/stop" for topic, _ in self.received)
                 quiet += ended
                 continue
             quiet = 0
-            self.heard.append(arrived)
-            if len(self.heard) == 200:
+            self.received.append(arrived)
+            if len(self.received) == 200:
                 self.alive = link.list_components()
                 time.sleep(self.stall_s)
         self.missed = inbox.missed + inbox.dropped
         link.close()
 
 
-def published(
+def publish_replay(
     log_file: Path, endpoint: str, out: Path, stall_s: float, speed: str = "max"
 ) -> Listener:
     listener = Listener(endpoint, stall_s)
@@ -80,17 +83,19 @@ def test_what_is_heard_is_what_is_recorded(
     log_file: Path, endpoint: str, tmp_path: Path, speed: str
 ) -> None:
     """Both streams, byte for byte, in the order of the test; rig and twin are alive."""
-    listener = published(log_file, endpoint, tmp_path / "out", 0.0, speed)
+    listener = publish_replay(log_file, endpoint, tmp_path / "out", 0.0, speed)
     made = recover_log(tmp_path / "out" / "run.mcap").messages
     assert listener.missed == 0
-    assert Counter(listener.heard) == Counter((one.topic, one.payload) for one in made)
+    assert Counter(listener.received) == Counter((item.topic, item.payload) for item in made)
     for topic in ("/rig/meas", "/twin/pred", "/twin/cmp"):
-        indices = [decode_item(*one)[1].index for one in listener.heard if one[0] == topic]
+        indices = [
+            decode_item(*message)[1].index for message in listener.received if message[0] == topic
+        ]
         assert len(indices) > 300
         assert indices == sorted(indices)
-    items = [decode_item(*one)[1] for one in listener.heard]
-    start = next(one for one in items if isinstance(one, RunStart))
-    assert any(isinstance(one, RunStop) for one in items)
+    items = [decode_item(*message)[1] for message in listener.received]
+    start = next(item for item in items if isinstance(item, RunStart))
+    assert any(isinstance(item, RunStop) for item in items)
     assert listener.alive == {f"{start.run}.rig", f"{start.run}.twin"}
 
 
@@ -102,19 +107,21 @@ def test_who_is_slow_is_waited_for(
     one that does not wait would."""
     monkeypatch.setattr(history_cache, "MAX_CACHED_FRAGMENTS", 100)
     monkeypatch.setattr(replay_publishing, "MAX_LEAD_FRAGMENTS", 80 if waits else 10**9)
-    listener = published(log_file, endpoint, tmp_path / "out", 1.0)
+    listener = publish_replay(log_file, endpoint, tmp_path / "out", 1.0)
     if not waits:
         assert listener.missed > 0
         return
     made = recover_log(tmp_path / "out" / "run.mcap").messages
     assert listener.missed == 0
-    assert Counter(listener.heard) == Counter((one.topic, one.payload) for one in made)
+    assert Counter(listener.received) == Counter((item.topic, item.payload) for item in made)
 
 
 def test_a_bus_that_is_taken_is_refused(log_file: Path, endpoint: str, tmp_path: Path) -> None:
     hub = open_hub("simulated", endpoint)
     try:
-        with pytest.raises(InputError, match="cannot listen there"):
+        with raises_input_error(
+            key="endpoint", value=endpoint, problem=os.strerror(errno.EADDRINUSE)
+        ):
             replay_logs(ReplayRequest([log_file], [], tmp_path / "out", publish=endpoint))
     finally:
         hub.close()

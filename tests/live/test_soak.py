@@ -30,7 +30,7 @@ SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
 CONTROLLER = str(Path(__file__).with_name("controller.py"))
 CARD = (PROFILES_DIR / "rigs" / "machine.toml").read_text()
 A = 0.05 * GRAVITY_M_S2
-PEAK = 1.06  # of the level: a decay multiplies a blend that may itself be at 1.05
+PEAK_RATIO = 1.06  # of the level: a decay multiplies a blend that may itself be at 1.05
 UPDATE = 10 ** (2.0 / 20)  # most that an amplitude update changes, maybe one not yet reported
 STILL_M = 2e-4  # that a table at rest still moves, with a mass that swings on it
 TEST = """
@@ -93,7 +93,7 @@ class Outcome:
 
     case: Case
     done_s: float  # on the machine's clock
-    said: str
+    output: str
 
 
 @dataclass
@@ -139,8 +139,8 @@ class Group:
             assert first.startswith("started"), f"{first}{rig.stdout.read()} ({rig.wait()})"
             time.sleep(case.after_s / self.pace)
             done_s = self._do(case, rig)
-            said, _ = rig.communicate()
-        return Outcome(case, done_s, said)
+            output, _ = rig.communicate()
+        return Outcome(case, done_s, output)
 
     def _do(self, case: Case, rig: subprocess.Popen[str]) -> float:
         """Do it; the time on the machine's clock at which it was certainly done."""
@@ -185,13 +185,15 @@ def longest_s(card: RigConfig, test: Profile) -> float:
 
 def proven(group: Group, life: RecordedSession, outcome: Outcome) -> float:
     """Seconds of the machine from the deed to rest; AssertionError where the law is broken."""
-    where = f"{group.folder.name} {outcome.case} {life.notes}\n{outcome.said}"
+    where = f"{group.folder.name} {outcome.case} {life.notes}\n{outcome.output}"
     card = parse_toml(CARD, RigConfig, "card")
     test = load_config(group.folder / "test.toml", Profile, "test profile")[0]
     command = life.command_m
     assert life.missing == 0, where
-    corrections = [float(one) for one in re.findall(r"correction=([0-9.e+-]+)", outcome.said)]
-    most = PEAK * A * (max([1.0, *corrections]) * UPDATE if group.check else 1.0)
+    corrections = [
+        float(number) for number in re.findall(r"correction=([0-9.e+-]+)", outcome.output)
+    ]
+    most = PEAK_RATIO * A * (max([1.0, *corrections]) * UPDATE if group.check else 1.0)
     jumps = np.diff(np.concatenate([np.zeros(2), command, np.zeros(2)]), 2)
     assert np.abs(jumps).max() * life.rate_hz**2 <= most, where
     if "replayed" not in group.fault:
@@ -208,11 +210,11 @@ def proven(group: Group, life: RecordedSession, outcome: Outcome) -> float:
 
 def check_told(life: RecordedSession, outcome: Outcome) -> None:
     """The machine knows how it lost its controller, or that it was given back."""
-    why, where = life.notes[-2][1], f"{outcome.case} {life.notes}\n{outcome.said}"
-    if outcome.case.deed in ORDERS or re.search(r"^over", outcome.said, re.MULTILINE):
+    why, where = life.notes[-2][1], f"{outcome.case} {life.notes}\n{outcome.output}"
+    if outcome.case.deed in ORDERS or re.search(r"^over", outcome.output, re.MULTILINE):
         assert "released" in why or "lost" in why, where
     else:
-        assert any(one in why for one in LOSSES[outcome.case.deed]), where
+        assert any(loss in why for loss in LOSSES[outcome.case.deed]), where
 
 
 def test_a_rig_that_dies_leaves_a_table_that_comes_to_rest(tmp_path: Path) -> None:
@@ -226,7 +228,7 @@ def test_a_rig_that_dies_leaves_a_table_that_comes_to_rest(tmp_path: Path) -> No
         proven(group, life, outcome)
         check_told(life, outcome)
         assert np.abs(life.command_m).max() > 1e-4  # it did move
-    assert re.search(r"over \d+ halted", group.outcomes[2].said)  # it was told when it came back
+    assert re.search(r"over \d+ halted", group.outcomes[2].output)  # it was told when it came back
 
 
 def cases_of(seed: int, count: int, most_s: float) -> list[Case]:
@@ -267,7 +269,7 @@ def test_two_hundred_random_deaths(tmp_path: Path) -> None:
             except AssertionError as error:
                 broken.append(str(error))
     ends = Counter(end(outcome) for group in groups for outcome in group.outcomes)
-    every = np.concatenate([np.array(one) for one in seconds.values()])
+    every = np.concatenate([np.array(values) for values in seconds.values()])
     print(f"\n{every.size} deaths, {samples} samples, {len(broken)} that broke the law")
     moved = every[every > 0.0]
     print(f"{moved.size} tables in motion: median {np.median(moved):.2f} s to rest, worst", end=" ")
@@ -281,7 +283,7 @@ def test_two_hundred_random_deaths(tmp_path: Path) -> None:
 
 def end(outcome: Outcome) -> str:
     """How a rig ended: its verdict, an error, or without a word."""
-    over = re.search(r"^over \d+ (\w+)", outcome.said, re.MULTILINE)
-    last = outcome.said.strip().rpartition("\n")[2]
+    over = re.search(r"^over \d+ (\w+)", outcome.output, re.MULTILINE)
+    last = outcome.output.strip().rpartition("\n")[2]
     error = re.match(r"(?:[\w.]+\.)?(\w+(?:Error|Lost|Interrupt))\b", last)
     return over[1] if over else error[1] if error else "nothing"

@@ -54,20 +54,22 @@ class Played:
         )  # fmt: skip
 
 
-def attended(played: Played, asked: Callable[[], str | None], **children: Any) -> Supervisor:
+def run_supervisor(played: Played, asked: Callable[[], str | None], **children: Any) -> Supervisor:
     """A supervisor that has attended a run to its end, with these children beside the usual."""
     spec: Any = SimpleNamespace(run=RUN)
     bus: Any = played
-    one = Supervisor(spec, OnDeathConfig(), played.clock, lambda _: None, asked, lambda _: None)
+    supervisor = Supervisor(
+        spec, OnDeathConfig(), played.clock, lambda _: None, asked, lambda _: None
+    )
     usual = {name: played.child(name) for name in ("rig", "recorder", "gate", "twin")}
-    one.children = usual | children
-    one._supervise(bus, bus)
-    return one
+    supervisor.children = usual | children
+    supervisor._supervise(bus, bus)
+    return supervisor
 
 
 def test_a_stop_is_repeated_until_the_rig_has_it() -> None:
     played = Played(("rig", "recorder", "gate"), [None, None, "refused: no"])
-    attended(played, lambda: "interrupted")
+    run_supervisor(played, lambda: "interrupted")
     assert played.orders == [("stop", "interrupted")] * 4
     assert played.kills == []
 
@@ -75,14 +77,14 @@ def test_a_stop_is_repeated_until_the_rig_has_it() -> None:
 def test_without_a_recorder_the_table_stops_though_the_first_order_is_lost() -> None:
     played = Played(("rig", "gate"), [None])
     dead = played.child("recorder", died=True, restarts=MAX_RESTARTS)
-    one = attended(played, lambda: None, recorder=dead)
-    assert "recorder" not in one.children
+    supervisor = run_supervisor(played, lambda: None, recorder=dead)
+    assert "recorder" not in supervisor.children
     assert played.orders == [("stop", "recorder died (exit 1)")] * 2
 
 
 def test_a_second_recorder_that_hangs_stops_the_table_though_the_order_is_lost() -> None:
     played = Played(("rig", "gate"), [None], 2.5 * MAX_COMPONENT_SILENCE_S)
-    attended(played, lambda: None)
+    run_supervisor(played, lambda: None)
     assert played.kills == ["recorder"] * 2
     assert played.orders == [("stop", "the recorder hangs")] * 2
 
@@ -92,6 +94,6 @@ def test_a_gate_that_hangs_is_ended_and_the_table_goes_on(
     spoken: tuple[str, ...], kills: int
 ) -> None:
     played = Played(spoken, [], 2.5 * MAX_COMPONENT_SILENCE_S)
-    attended(played, lambda: None)
+    run_supervisor(played, lambda: None)
     assert played.kills.count("gate") == kills
     assert bool(played.orders) == ("recorder" not in spoken)

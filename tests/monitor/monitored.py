@@ -57,7 +57,7 @@ def block(index: int, count: int = 20, step: int = 3, label: Label = Label.MEASU
     values[1], values[2] = -LEVEL / w**2 * np.sin(w * at), LEVEL * np.sin(w * at)
     values[5] = 4000.0
     cycle = -1 if label in (Label.REST, Label.BLEND) else 1
-    whole = [np.full(count, one) for one in (step, int(label), cycle)]
+    whole = [np.full(count, label_value) for label_value in (step, int(label), cycle)]
     return Block("meas", index, RATE, SENSORS, values, *whole)
 
 
@@ -66,15 +66,15 @@ def quantities(eta: float) -> NormalizedResponse:
 
 
 def point(step: int) -> PrcPoint:
-    one = STEPS[step]
+    planned = STEPS[step]
     eta = 0.1 + 0.02 * step
     return PrcPoint(
-        2000 * (step + 1), step, one.direction, one.frequency_hz, quantities(eta),
+        2000 * (step + 1), step, planned.direction, planned.frequency_hz, quantities(eta),
         quantities(1.2 * eta), LEVEL, LEVEL, 0.01,
     )  # fmt: skip
 
 
-def compared(index: int, count: int = 20) -> Comparison:
+def make_comparison(index: int, count: int = 20) -> Comparison:
     """rms 1e-3, error of the restarted twin 1e-4, of the free one 2e-4, in every channel."""
     n = len(COMPARED_CHANNELS)
     return Comparison(index, count, COMPARED_CHANNELS, (1e-6 * count,) * n, (4e-8 * count,) * n,
@@ -111,4 +111,4 @@ def records() -> list[Item]:
 
 def stream(first: int = 6000, end: int = 8000) -> list[Item]:
     """Measured blocks and comparisons of samples first .. end - 1."""
-    return [make(at) for at in range(first, end, 20) for make in (block, compared)]
+    return [make(at) for at in range(first, end, 20) for make in (block, make_comparison)]

@@ -1,5 +1,6 @@
 """The monitor on a bus: who joins late, a rig that goes and comes, a terminal, a file, nobody."""
 
+import errno
 import fcntl
 import io
 import os
@@ -19,8 +20,8 @@ import pytest
 from rich.console import Console
 from rich.text import Text
 
-from table_io.errors import InputError
 from table_io.records import RunStop
+from tests.input_errors import raises_input_error
 from tests.live.test_live import endpoint
 from tests.monitor.monitored import RUN, block, point, records, start, stream
 from twin.monitor import app
@@ -31,7 +32,7 @@ from twin.transport.codec import TOPIC_TYPES, Item, encode_item, topic_for
 from twin.transport.zenoh_link import BusLink, open_hub, open_spoke
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
-ROUNDS = 200  # of 0.05 s: long enough for anything here
+MAX_ROUNDS = 200  # of 0.05 s: long enough for anything here
 
 
 def publish(hub: BusLink, items: Sequence[Item], run: str = RUN) -> None:
@@ -85,7 +86,7 @@ def watching_at(place: str) -> Iterator[MonitorClient]:
 
 def until(watch: MonitorClient, hub: BusLink, what: Callable[[LiveRunState], object]) -> None:
     """Listen until something is true of the board."""
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         hub.serve()
         watch.listen(0.05)
         if what(watch.run_state):
@@ -106,7 +107,7 @@ def test_who_joins_late_gets_what_was_and_then_what_comes() -> None:
             publish(hub, [block(8000)])
             until(watch, hub, lambda b: b.recent.end == 8020)
             # 50 s of old samples are nobody's wish
-            assert [one.index for one in watch.run_state.recent.blocks] == [8000]
+            assert [block.index for block in watch.run_state.recent.blocks] == [8000]
             assert watch.ignored == 0
 
 
@@ -196,8 +197,8 @@ def test_an_order_goes_out_only_after_a_yes_of_who_may(
     watch, sheet = Still(commands), Sheet(keys)
     run_event_loop(watch, sheet, order)  # type: ignore[arg-type]
     assert given == orders
-    assert [one.text for one in watch.run_state.events.values()] == [
-        f"told to {one}" for one in orders
+    assert [event.text for event in watch.run_state.events.values()] == [
+        f"told to {order}" for order in orders
     ]
     assert any("y = yes" in line for line in sheet.shown) == (commands and keys != "yq")
 
@@ -228,9 +229,11 @@ def test_once_and_picture(
         assert "watched" in capsys.readouterr().out
         run_monitor(place, "simulated", False, False, picture, None)
         assert "<svg" in picture.read_text()
-        with pytest.raises(InputError, match="exists already"):
+        with raises_input_error(where=picture):
             run_monitor(place, "simulated", False, False, picture, None)
-        with pytest.raises(InputError, match="cannot write"):
+        with raises_input_error(
+            where=tmp_path / "no" / "now.svg", problem=os.strerror(errno.ENOENT)
+        ):
             run_monitor(place, "simulated", False, False, tmp_path / "no" / "now.svg", None)
 
 
@@ -238,11 +241,11 @@ def test_nobody_there_and_nothing_said_are_told(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(app, "ANSWER_TIMEOUT_S", 0.3)
     monkeypatch.setattr(app, "START_TIMEOUT_S", 0.3)
     place = endpoint()
-    with pytest.raises(InputError, match="no rig answers there"):
+    with raises_input_error(key="endpoint", value=place, problem="0.3 s"):
         run_monitor(place, "simulated", False, True, None, None)
-    with pytest.raises(InputError, match="not understood"):
+    with raises_input_error(key="endpoint", value="nonsense"):
         run_monitor("nonsense", "simulated", True, True, None, None)
-    with hub_at(place), pytest.raises(InputError, match="no test at the endpoint"):
+    with hub_at(place), raises_input_error(problem="0.3 s", remedy="shaketwin run"):
         run_monitor(place, "simulated", False, True, None, None)
 
 
@@ -256,34 +259,34 @@ def test_without_a_terminal_it_is_a_line_a_step_until_the_end() -> None:
         ) as process:  # fmt: skip
             while process.poll() is None:
                 hub.serve()
-            said = process.stdout.read() if process.stdout else ""
-    assert process.returncode == 0, said
-    assert [line.split()[0] for line in said.splitlines() if "forward" in line] == [
+            output = process.stdout.read() if process.stdout else ""
+    assert process.returncode == 0, output
+    assert [line.split()[0] for line in output.splitlines() if "forward" in line] == [
         "1/10", "2/10", "3/10",
     ]  # fmt: skip
-    assert "complete: all driven" in said
+    assert "complete: all driven" in output
 
 
 def test_on_a_terminal_it_draws_and_gives_it_back(tmp_path: Path) -> None:
     place = endpoint()
-    here, there = pty.openpty()
-    fcntl.ioctl(there, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
-    before = termios.tcgetattr(there)
+    here, terminal = pty.openpty()
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    before = termios.tcgetattr(terminal)
     with running(place):
         process = subprocess.Popen(
             [SHAKETWIN, "monitor", "--connect", place],
-            stdin=there, stdout=there, stderr=there,
+            stdin=terminal, stdout=terminal, stderr=terminal,
             env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "", "LINES": ""},
         )  # fmt: skip
         shown = read_until(here, rb"Warnings and events.*abort")
         assert b"\x1b[?1049h" in shown
-        assert termios.tcgetattr(there)[3] != before[3]
+        assert termios.tcgetattr(terminal)[3] != before[3]
         os.write(here, b"q")
         shown = read_until(here, rb"\x1b\[\?1049l")
         assert process.wait(20) == 0
-    assert termios.tcgetattr(there) == before
+    assert termios.tcgetattr(terminal) == before
     os.close(here)
-    os.close(there)
+    os.close(terminal)
 
 
 def read_until(terminal: int, what: bytes) -> bytes:

@@ -43,30 +43,32 @@ ABOUT = SessionStatus(
 
 
 @pytest.fixture(scope="module")
-def watched() -> LiveRunState:
+def watched_state() -> LiveRunState:
     return board([*records(), *stream()])
 
 
-def text(found: LiveRunState, width: int, height: int, about: SessionStatus = ABOUT) -> str:
-    return "\n".join(line.plain for line in draw_screen(found, about, width, height))
+def text(state: LiveRunState, width: int, height: int, about: SessionStatus = ABOUT) -> str:
+    return "\n".join(line.plain for line in draw_screen(state, about, width, height))
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_it_fills_the_terminal_and_no_more(watched: LiveRunState, size: tuple[int, int]) -> None:
-    for found in (watched, LiveRunState(), board([start()])):
-        lines = draw_screen(found, ABOUT, *size)
+def test_it_fills_the_terminal_and_no_more(
+    watched_state: LiveRunState, size: tuple[int, int]
+) -> None:
+    for state in (watched_state, LiveRunState(), board([start()])):
+        lines = draw_screen(state, ABOUT, *size)
         assert len(lines) == size[1]
         assert all(line.cell_len <= size[0] for line in lines)
         assert not any("…" in line.plain or "\n" in line.plain for line in lines)
 
 
 @pytest.mark.parametrize("width", [39, 40, 59, 65])
-def test_no_panel_is_wider_than_its_column(watched: LiveRunState, width: int) -> None:
+def test_no_panel_is_wider_than_its_column(watched_state: LiveRunState, width: int) -> None:
     """The screen would cut what is."""
-    for panel in {one.title: one
+    for panel in {cell.title: cell
                   for set_ in (NARROW_LAYOUT, SHORT_LAYOUT, DEFAULT_LAYOUT, LARGE_LAYOUT)
-                  for column in set_ for one in column}.values():  # fmt: skip
-        lines = panel.draw(watched, width, 20)
+                  for column in set_ for cell in column}.values():  # fmt: skip
+        lines = panel.draw(watched_state, width, 20)
         assert len(lines) <= 20
         assert Text.from_markup(panel.title + panel.legend).cell_len < width
         assert all(line.cell_len <= width for line in lines), panel.title
@@ -77,8 +79,8 @@ def test_too_small_a_terminal_is_told_what_is_needed() -> None:
     assert len(draw_screen(LiveRunState(), ABOUT, 5, 3)) == 3
 
 
-def test_at_120_columns_everything_is_there(watched: LiveRunState) -> None:
-    shown = text(watched, 120, 40)
+def test_at_120_columns_everything_is_there(watched_state: LiveRunState) -> None:
+    shown = text(watched_state, 120, 40)
     for part in (
         "watched  Simulated uni-axial shaking table", "● running, measuring  0:00:08",
         "step  4/10   3.500 Hz ↑ forward    cycle 2/5", "13 %  0:00:52 left",
@@ -96,8 +98,8 @@ def test_at_120_columns_everything_is_there(watched: LiveRunState) -> None:
     assert re.search(r"stiffness  36.10±0.050 kN/m  -5.0±0.2 %", shown)
 
 
-def test_at_80_columns_the_essential_is_there(watched: LiveRunState) -> None:
-    shown = text(watched, 80, 24)
+def test_at_80_columns_the_essential_is_there(watched_state: LiveRunState) -> None:
+    shown = text(watched_state, 80, 24)
     for part in (
         "step  4/10", "0.0500 g", "u rel", "force R1", "PRC η_d", "η_a", "divergence:",
         "p99  rig 2.0  twin 2.0 ms  0 missed", "connected", "q quit",
@@ -105,77 +107,79 @@ def test_at_80_columns_the_essential_is_there(watched: LiveRunState) -> None:
         assert part in shown, part
 
 
-def test_where_not_all_have_room_the_nearest_to_a_limit_are_shown(watched: LiveRunState) -> None:
-    rows = [line.plain.split("  ")[0].strip() for line in panels.draw_limits(watched, 39, 3)]
+def test_where_not_all_have_room_the_nearest_to_a_limit_are_shown(
+    watched_state: LiveRunState,
+) -> None:
+    rows = [line.plain.split("  ")[0].strip() for line in panels.draw_limits(watched_state, 39, 3)]
     assert [row[:9] for row in rows] == ["table acc", "mass disp", "force R1"]
-    shown = text(watched, 80, 24).splitlines()
+    shown = text(watched_state, 80, 24).splitlines()
     begin = next(k for k, line in enumerate(shown) if line.startswith("Margins"))
     assert [line[:9].strip() for line in shown[begin + 1 : begin + 4]] == [row[:9] for row in rows]
     assert shown[begin + 4].startswith("Identified")
 
 
-def test_a_panel_without_room_is_left_out(watched: LiveRunState) -> None:
-    low, high = text(watched, 60, 12), text(watched, 60, 24)
+def test_a_panel_without_room_is_left_out(watched_state: LiveRunState) -> None:
+    low, high = text(watched_state, 60, 12), text(watched_state, 60, 24)
     assert "Level ─" in low
     assert "PRC" not in low
     assert "PRC" in high
     assert "Measured | twin" not in high
-    assert "Error of the last cycle by phase" in text(watched, 200, 60)
+    assert "Error of the last cycle by phase" in text(watched_state, 200, 60)
 
 
-def test_beyond_its_band_is_marked(watched: LiveRunState) -> None:
-    rows = {line.plain.split("  ")[0]: line for line in panels.draw_twin(watched, 59, 9)}
+def test_beyond_its_band_is_marked(watched_state: LiveRunState) -> None:
+    rows = {line.plain.split("  ")[0]: line for line in panels.draw_twin(watched_state, 59, 9)}
     assert rows["u rel"].plain.rstrip().endswith("◀")
     assert "0.100  0.050 mm" in rows["u rel"].plain
     assert "200 %" in rows["u rel"].plain
     assert "◀" not in rows["mass disp"].plain
-    agreement = watched.get_latest(Agreement)
+    agreement = watched_state.get_latest(Agreement)
     assert agreement is not None
     nothing = replace(agreement, band=(float("nan"),) * len(agreement.band))
     silent = board([*records(), *stream(), replace(nothing, index=7999)])
     assert not any("◀" in line.plain for line in panels.draw_twin(silent, 59, 9))
 
 
-def test_the_error_is_told_by_phase_where_there_is_room(watched: LiveRunState) -> None:
-    assert "flight   right    left" in text(watched, 200, 60)
-    assert re.search(r"u rel +0\.080   0\.150   0\.160 mm", text(watched, 200, 60))
+def test_the_error_is_told_by_phase_where_there_is_room(watched_state: LiveRunState) -> None:
+    assert "flight   right    left" in text(watched_state, 200, 60)
+    assert re.search(r"u rel +0\.080   0\.150   0\.160 mm", text(watched_state, 200, 60))
     assert not panels.draw_phases(board([start()]), 60, 9)[0].plain.startswith(" ")
 
 
 def test_without_agreement_the_error_is_that_of_the_last_second() -> None:
-    found = board([start(), *stream()])
+    state = board([start(), *stream()])
     assert any("1.000  0.100      – mm      10 %   0.200" in line.plain
-               for line in panels.draw_twin(found, 59, 9))  # fmt: skip
+               for line in panels.draw_twin(state, 59, 9))  # fmt: skip
 
 
-def test_what_has_drifted_comes_first(watched: LiveRunState) -> None:
-    first, *others = (line.plain.rstrip() for line in panels.draw_specimen(watched, 39, 6))
+def test_what_has_drifted_comes_first(watched_state: LiveRunState) -> None:
+    first, *others = (line.plain.rstrip() for line in panels.draw_specimen(watched_state, 39, 6))
     assert first.startswith("stiffness")
     assert others[0].startswith("jump")
     assert len(others) == 5
     assert "bumper R   510.0±0.930 kN/m" in others
     assert "gap L      1.990±0.003 mm    +0.1±0.2 %" in others
-    estimate = watched.get_latest(Estimate)
+    estimate = watched_state.get_latest(Estimate)
     assert estimate is not None
     steady = board([start(), replace(estimate, drift=(100.0, 0.0, 0.0, 0.0, 0.0))])
     assert panels.draw_specimen(steady, 39, 1)[0].plain.startswith("no jump forecast")
 
 
 def test_the_newest_comes_first_and_long_sentences_go_on_below() -> None:
-    found = board([start(), Event(1000, "warning", "first " * 20), Event(2000, "state", "holding")])
-    lines = [line.plain for line in panels.draw_events(found, 39, 10)]
+    state = board([start(), Event(1000, "warning", "first " * 20), Event(2000, "state", "holding")])
+    lines = [line.plain for line in panels.draw_events(state, 39, 10)]
     assert lines[0] == "0:00:02 state: holding"
     assert lines[1].startswith("0:00:01 warning: first")
     assert lines[2].startswith("        first")
     assert " ".join(lines[1:]).count("first") == 20
 
 
-def test_the_end_a_trip_and_silence_are_told(watched: LiveRunState) -> None:
+def test_the_end_a_trip_and_silence_are_told(watched_state: LiveRunState) -> None:
     trip = Trip(500, 520, "stroke", "table_disp_m", 0.07, 0.06, "the table moved too far")
     halted = board([start(), trip, RunStop(520, "aborted", "the table moved too far")])
     assert "ended: aborted" in text(halted, 80, 24)
     assert "protection (stroke): the table" in text(halted, 80, 24)
-    assert "0:01:05" in text(watched, 80, 24, replace(ABOUT, silent_s=65.0))
+    assert "0:01:05" in text(watched_state, 80, 24, replace(ABOUT, silent_s=65.0))
     assert "0:01:05" not in text(halted, 80, 24, replace(ABOUT, silent_s=65.0))
     late = board([start(), *stream(64_000, 65_000)])
     assert "100 %  0:00:05 over" in text(late, 80, 24)  # longer than planned
@@ -183,20 +187,26 @@ def test_the_end_a_trip_and_silence_are_told(watched: LiveRunState) -> None:
     assert "until resumed" in text(held, 80, 24)
 
 
-def test_orders_are_offered_to_whom_they_are_allowed_and_confirmed(watched: LiveRunState) -> None:
-    assert "abort" not in text(watched, 80, 24, replace(ABOUT, may_command=False))
-    assert "q quit" in text(watched, 80, 24, replace(ABOUT, may_command=False))
+def test_orders_are_offered_to_whom_they_are_allowed_and_confirmed(
+    watched_state: LiveRunState,
+) -> None:
+    assert "abort" not in text(watched_state, 80, 24, replace(ABOUT, may_command=False))
+    assert "q quit" in text(watched_state, 80, 24, replace(ABOUT, may_command=False))
     assert "stop the test?  y = yes" in text(
-        watched, 80, 24, replace(ABOUT, pending_command="stop")
+        watched_state, 80, 24, replace(ABOUT, pending_command="stop")
     )
 
 
 def test_numbers_have_at_most_six_characters() -> None:
     values = (0.0, 0.0123, -0.5, 9.9999, 12.345, -123.4, 1234.5, 98765.4, 1e9)
-    assert all(len(format_number(one)) <= 6 for one in values)
-    assert [format_number(one) for one in (0.0123, 12.345, 1234.5)] == ["0.012", "12.35", "1234"]
+    assert all(len(format_number(value)) <= 6 for value in values)
+    assert [format_number(number) for number in (0.0123, 12.345, 1234.5)] == [
+        "0.012",
+        "12.35",
+        "1234",
+    ]
     assert format_number(None) == format_number(float("nan")) == format_percent(float("inf")) == "–"
-    assert [format_percent(one) for one in (0.001, 0.5, 1.2)] == ["0.1 %", "50 %", "120 %"]
+    assert [format_percent(share) for share in (0.001, 0.5, 1.2)] == ["0.1 %", "50 %", "120 %"]
 
 
 def dots(lines: list[Text]) -> set[tuple[int, int]]:
@@ -239,7 +249,7 @@ def test_marks_have_room_between_them() -> None:
     assert re.fullmatch(rf"[^○]*(○[^○]{{{MIN_MARK_SPACING - 1}}})+○?[^○]*", row)
 
 
-def test_the_curve_grows_with_the_points(watched: LiveRunState) -> None:
+def test_the_curve_grows_with_the_points(watched_state: LiveRunState) -> None:
     """Both directions, measured over twin; a point more is a dot more at its frequency."""
     before = curves.draw_prc(board([start(), point(0)]), 60, 16)
     after = curves.draw_prc(board([start(), point(0), point(9)]), 60, 16)
@@ -253,27 +263,27 @@ def test_the_curve_grows_with_the_points(watched: LiveRunState) -> None:
 
 
 def test_the_end_of_an_axis_is_round() -> None:
-    assert [nice_ceil(one) for one in (0.9, 0.21, 3.2, 1000.0)] == pytest.approx(
+    assert [nice_ceil(number) for number in (0.9, 0.21, 3.2, 1000.0)] == pytest.approx(
         [1.0, 0.3, 4.0, 1000.0]
     )
 
 
 def test_a_text_from_elsewhere_does_not_command_the_terminal() -> None:
     wild = Event(10, "order", "stop: \x1b[2J\x1b]0;mine\x07 by\tana\n\u202e")
-    found = board([replace(start(), name="a\x1b[31m"), wild])
+    state = board([replace(start(), name="a\x1b[31m"), wild])
     about = replace(ABOUT, components=frozenset({"observer.a\x1b[5m.monitor-1"}))
     for size in SIZES:
-        assert all(line.plain.isprintable() for line in draw_screen(found, about, *size))
+        assert all(line.plain.isprintable() for line in draw_screen(state, about, *size))
 
 
 def test_damaged_bytes_never_break_it() -> None:
     """Whatever can be decoded can be drawn."""
     chance = random.Random(7)
     sound = [*records(), *stream(7800), RunStop(8000, "complete", "all driven")]
-    payloads = [(topic_for(one), encode_item(one, RUN)) for one in sound]
-    found, taken = LiveRunState(), 0
+    payloads = [(topic_for(item), encode_item(item, RUN)) for item in sound]
+    state, taken = LiveRunState(), 0
     for turn in range(4000):
-        found = found if turn % 400 else LiveRunState()
+        state = state if turn % 400 else LiveRunState()
         where, payload = chance.choice(payloads)
         damaged = bytearray(payload)
         for _ in range(chance.randrange(4)):
@@ -282,8 +292,8 @@ def test_damaged_bytes_never_break_it() -> None:
             run, item = decode_item(where, bytes(damaged))
         except WireError:
             continue
-        found, taken = update_run_state(found, run, item), taken + 1
+        state, taken = update_run_state(state, run, item), taken + 1
         if turn % 40 == 0:
             for size in ((80, 24), (200, 60)):
-                assert len(draw_screen(found, ABOUT, *size)) == size[1]
+                assert len(draw_screen(state, ABOUT, *size)) == size[1]
     assert taken > 1000

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.recording.example_run import RATE, START, payloads, run, write
+from tests.recording.example_run import RATE_HZ, START, payloads, run, write
 from twin.recording.append_only_file import AppendOnlyFile
 from twin.recording.mcap_log import LogWriter, iter_messages
 from twin.recording.merge import verify_log
@@ -39,9 +39,9 @@ def test_what_does_not_fit_waits_and_is_written_once(tmp_path: Path, limit: Limi
         expected += piece
         with contextlib.suppress(OSError):
             file.drain()
-        there = (tmp_path / "a").read_bytes()
-        assert expected.startswith(there)
-        assert (file.tell(), file.pending_bytes) == (len(expected), len(expected) - len(there))
+        content = (tmp_path / "a").read_bytes()
+        assert expected.startswith(content)
+        assert (file.tell(), file.pending_bytes) == (len(expected), len(expected) - len(content))
     file.write(b"more")
     limit(0)
     with pytest.raises(OSError, match=r"File too large: '.*/a'"):
@@ -57,7 +57,7 @@ def test_what_does_not_fit_waits_and_is_written_once(tmp_path: Path, limit: Limi
 def test_a_log_goes_on_where_the_disk_was_full(tmp_path: Path, limit: Limit, room: int) -> None:
     write(tmp_path / "whole.mcap", run(), flush_every=3)
     assert room < (tmp_path / "whole.mcap").stat().st_size
-    writer, failed = LogWriter(tmp_path / "a.mcap", RATE), 0
+    writer, failed = LogWriter(tmp_path / "a.mcap", RATE_HZ), 0
     writer.write_run_description(START)
     limit(room)
     for number, item in enumerate(run(), 1):
@@ -71,9 +71,9 @@ def test_a_log_goes_on_where_the_disk_was_full(tmp_path: Path, limit: Limit, roo
     with pytest.raises(OSError, match="File too large"):
         writer.close()
     # meanwhile: every chunk that fitted can be read, in order
-    found = [one.payload for one in iter_messages(tmp_path / "a.mcap")]
-    assert found == payloads(run())[: len(found)]
-    assert bool(found) is (room > 5000)
+    recovered = [message.payload for message in iter_messages(tmp_path / "a.mcap")]
+    assert recovered == payloads(run())[: len(recovered)]
+    assert bool(recovered) is (room > 5000)
     limit(-1)
     writer.close()
     assert verify_log(tmp_path / "a.mcap")
@@ -90,7 +90,7 @@ def test_a_dying_disk_is_named_by_the_file(
     def dead(*_: object) -> int:
         raise OSError(errno.EIO, "Input/output error")
 
-    writer = LogWriter(tmp_path / "a.mcap", RATE)
+    writer = LogWriter(tmp_path / "a.mcap", RATE_HZ)
     writer.write_run_description(START)
     with monkeypatch.context() as patch:
         patch.setattr(os, call, dead)

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from table_io.errors import InputError
 from table_io.records import PrcPoint
+from tests.input_errors import raises_input_error
 from tests.recording.example_run import START, run
 from twin.log import open_log
 from twin.recording import mcap_log
@@ -49,10 +49,10 @@ WRITTEN = {  # version: (sha256 of the content, messages, measured eta_d of each
 
 def content(path: Path) -> dict[str, str]:
     """The hash and the counts of what a log holds."""
-    found = ContentHash()
-    for one in iter_messages(path):
-        found.add(one.topic, one.log_time, one.payload)
-    return found.to_metadata()
+    content_hash = ContentHash()
+    for message in iter_messages(path):
+        content_hash.add(message.topic, message.log_time, message.payload)
+    return content_hash.to_metadata()
 
 
 def test_every_version_has_its_golden_file() -> None:
@@ -64,16 +64,16 @@ def test_every_version_has_its_golden_file() -> None:
 def test_a_log_of_any_version_is_read_to_the_bit(version: int) -> None:
     path = GOLDEN / f"v{version}.mcap"
     digest, messages, eta_d = WRITTEN[version]
-    found, recording = recover_log(path), read_recording(path)
-    assert found.is_intact
-    assert read_schema_version(path, found.metadata) == version
+    recovered, recording = recover_log(path), read_recording(path)
+    assert recovered.is_intact
+    assert read_schema_version(path, recovered.metadata) == version
     assert (content(path)["sha256"], len(recording.items)) == (digest, messages)
-    points = [one.measured.eta_d for one in recording.records(PrcPoint) if one.measured]
+    points = [point.measured.eta_d for point in recording.records(PrcPoint) if point.measured]
     assert tuple(points) == eta_d
     assert recording.is_intact
     assert recording.missing_samples == 0
     assert [step.frequency_hz for step in recording.start.steps] == pytest.approx([3.8, 3.9, 4.0])
-    assert find_altered_attachments(found.metadata, found.attachments) == []
+    assert find_altered_attachments(recovered.metadata, recovered.attachments) == []
 
 
 @pytest.mark.parametrize("version", WRITTEN)
@@ -90,22 +90,22 @@ def test_merging_brings_a_log_to_the_newest_version(version: int, tmp_path: Path
     merge([part], out)
     assert read_schema_version(out, recover_log(out).metadata) == SCHEMA_VERSION
     assert verify_log(out)
-    assert [one.index for one in read_recording(out).items] == [
-        one.index for one in read_recording(part).items
+    assert [item.index for item in read_recording(out).items] == [
+        item.index for item in read_recording(part).items
     ]
-    assert sorted(one.payload for one in iter_messages(out)) == sorted(
-        one.payload for one in iter_messages(part)
+    assert sorted(message.payload for message in iter_messages(out)) == sorted(
+        message.payload for message in iter_messages(part)
     )
 
 
-def merged(path: Path) -> None:
+def merge_alone(path: Path) -> None:
     merge([path], path.with_name("out.mcap"))
 
 
 def merged_of_a_killed_recorder(path: Path) -> None:
     content = path.read_bytes()
     path.write_bytes(content[: len(content) // 2])
-    merged(path)
+    merge_alone(path)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def merged_of_a_killed_recorder(path: Path) -> None:
         read_log_table,
         lambda path: iter_batches(path, 9),
         open_log,
-        merged,
+        merge_alone,
         merged_of_a_killed_recorder,
     ],
     ids=["read", "gather", "batches", "open_log", "merge", "merge_killed"],
@@ -126,12 +126,14 @@ def test_a_newer_version_is_refused_by_its_number(
     with monkeypatch.context() as newer:
         newer.setattr(mcap_log, "SCHEMA_VERSION", SCHEMA_VERSION + 1)
         write_items(tmp_path / "new.mcap", run(), START)
-    with pytest.raises(InputError, match=r"new.mcap: written in schema version 4; allowed: 1 to 3"):
+    with raises_input_error(
+        where=tmp_path / "new.mcap", problem=SCHEMA_VERSION + 1, allowed=f"1 to {SCHEMA_VERSION}"
+    ):
         reader(tmp_path / "new.mcap")
     assert not (tmp_path / "out.mcap").exists()
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "two", "9" * 5000, "1.0", ""])
 def test_a_version_that_is_none_is_refused(text: str) -> None:
-    with pytest.raises(InputError, match="written in schema version"):
+    with raises_input_error(where="a.mcap", problem=text, allowed=f"1 to {SCHEMA_VERSION}"):
         read_schema_version(Path("a.mcap"), {"run": {"schema": text}})

@@ -22,8 +22,8 @@ MESSAGES = [("/rig/meas", 0, b"one"), ("/rig/meas", 10, b"two"), ("/run/event", 
 
 def record(messages: list[tuple[str, int, bytes]]) -> dict[str, str]:
     content = ContentHash()
-    for one in messages:
-        content.add(*one)
+    for message in messages:
+        content.add(*message)
     return content.to_metadata()
 
 
@@ -35,7 +35,7 @@ def test_the_hash_is_the_one_of_the_page() -> None:
 
 
 def test_the_hash_depends_on_order_time_topic_and_bytes() -> None:
-    changed = [list(one) for one in permutations(MESSAGES)]
+    changed = [list(permutation) for permutation in permutations(MESSAGES)]
     changed += [
         [("/rig/meas", 1, b"one"), *MESSAGES[1:]],
         [("/rig/gap", 0, b"one"), *MESSAGES[1:]],
@@ -44,7 +44,7 @@ def test_the_hash_depends_on_order_time_topic_and_bytes() -> None:
         [*MESSAGES, MESSAGES[0]],
         [("/rig/meas", 0, b"one/rig/meas 10 3\ntwo"), MESSAGES[2]],  # nothing runs together
     ]
-    assert len({record(one)["sha256"] for one in changed}) == len(changed)
+    assert len({record(messages)["sha256"] for messages in changed}) == len(changed)
 
 
 @pytest.mark.parametrize("name", sorted(build_attachments(START)))
@@ -54,7 +54,7 @@ def test_an_attachment_that_is_not_what_was_written_is_named(name: str) -> None:
     assert find_altered_attachments(metadata, texts) == []
     assert find_altered_attachments(metadata, texts | {name: texts[name] + b" "}) == [name]
     assert find_altered_attachments(
-        metadata, {one: data for one, data in texts.items() if one != name}
+        metadata, {name_: data for name_, data in texts.items() if name_ != name}
     ) == [name]
     assert find_altered_attachments({}, texts) == []  # version 1 recorded none
 
@@ -63,19 +63,19 @@ def test_the_calibration_names_each_channel() -> None:
     card = (PROFILES_DIR / "rigs" / "simulated.toml").read_text()
     lost = {"table_disp_m": 1e-4, "mass_disp_m": float("nan")}
     channels = ("drive_disp_m", "table_disp_m", "mass_disp_m")
-    found = json.loads(
+    calibration = json.loads(
         build_calibration_json(replace(START, rig_toml=card, channels=channels, tare=lost))
     )
-    assert list(found) == list(channels)
-    assert found["table_disp_m"] == {
+    assert list(calibration) == list(channels)
+    assert calibration["table_disp_m"] == {
         "unit": "mm", "range": 75.0, "volts_per_unit": pytest.approx(10 / 75), "bits": 24,
         "tare_si": 1e-4,
     }  # fmt: skip
-    assert found["mass_disp_m"]["tare_si"] is None
-    assert "tare_si" not in found["drive_disp_m"]
+    assert calibration["mass_disp_m"]["tare_si"] is None
+    assert "tare_si" not in calibration["drive_disp_m"]
 
 
 @pytest.mark.parametrize("card", ["", "r = 1", "sensors = 3", "sensors = [1, 2]", "not toml ["])
 def test_a_recording_without_a_machine_card_has_its_tare(card: str) -> None:
-    found = json.loads(build_calibration_json(replace(START, rig_toml=card)))
-    assert found == {"drive_disp_m": {}, "table_disp_m": {"tare_si": 1e-4}}
+    calibration = json.loads(build_calibration_json(replace(START, rig_toml=card)))
+    assert calibration == {"drive_disp_m": {}, "table_disp_m": {"tare_si": 1e-4}}

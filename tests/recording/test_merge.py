@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from table_io.errors import InputError
 from table_io.records import Event
-from tests.recording.example_run import RATE, START, payloads, run, write
+from tests.input_errors import raises_input_error
+from tests.recording.example_run import RATE_HZ, START, payloads, run, write
 from twin.recording.log_metadata import build_attachments
 from twin.recording.mcap_log import LogWriter, iter_messages
 from twin.recording.merge import merge, verify_log
@@ -49,7 +49,7 @@ def test_parts_in_any_order_make_the_original_to_the_bit(tmp_path: Path) -> None
         assert merged.is_intact
         assert payloads(merged.items) == expected
         assert [
-            one.payload for one in recover_log(out).messages
+            message.payload for message in recover_log(out).messages
         ] == expected  # in the file itself too
         assert merged.missing_samples == 0
     assert [part.read_bytes() for part in parts] == before
@@ -58,14 +58,18 @@ def test_parts_in_any_order_make_the_original_to_the_bit(tmp_path: Path) -> None
 def test_merging_keeps_texts_and_times(tmp_path: Path, log: Path) -> None:
     merge([log, log], tmp_path / "out.mcap")
     with (tmp_path / "out.mcap").open("rb") as stream:
-        names = [one.name for one in make_reader(stream).iter_attachments()]
+        names = [attachment.name for attachment in make_reader(stream).iter_attachments()]
     assert sorted(names) == sorted(build_attachments(START))
     # the wall clock of the recorder too, of whoever heard a message
     was = sorted(
-        (one.log_time, one.topic, one.payload, one.publish_time) for one in iter_messages(log)
+        (message.log_time, message.topic, message.payload, message.publish_time)
+        for message in iter_messages(log)
     )
     merged = iter_messages(tmp_path / "out.mcap")
-    assert was == sorted((one.log_time, one.topic, one.payload, one.publish_time) for one in merged)
+    assert was == sorted(
+        (message.log_time, message.topic, message.payload, message.publish_time)
+        for message in merged
+    )
 
 
 def test_a_start_that_was_lost_is_taken_from_its_copy(tmp_path: Path) -> None:
@@ -79,7 +83,7 @@ def test_parts_without_a_start_are_kept_and_not_merged(
 ) -> None:
     monkeypatch.setattr(LogWriter, "write_run_description", lambda *_: None)
     write(tmp_path / "part.mcap", run()[5:])
-    with pytest.raises(InputError, match=r"part.mcap: holds no start record; the parts are kept"):
+    with raises_input_error(where=tmp_path / "part.mcap", remedy="shaketwin verify"):
         merge([tmp_path / "part.mcap"], tmp_path / "out.mcap")
     assert not (tmp_path / "out.mcap").exists()
 
@@ -92,7 +96,7 @@ def test_what_is_sorted_in_pieces_is_the_same(tmp_path: Path, log: Path, run_byt
     write(tmp_path / "b.mcap", [items[0], *shuffled[40:]])
     parts = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
     assert merge(parts, tmp_path / "out.mcap", run_bytes) == len(items)
-    assert [one.payload for one in iter_messages(tmp_path / "out.mcap")] == payloads(
+    assert [message.payload for message in iter_messages(tmp_path / "out.mcap")] == payloads(
         read_recording(log).items
     )
     assert verify_log(tmp_path / "out.mcap")
@@ -101,7 +105,7 @@ def test_what_is_sorted_in_pieces_is_the_same(tmp_path: Path, log: Path, run_byt
 
 def test_memory_is_bounded_however_long_the_parts_are(tmp_path: Path) -> None:
     text = random.Random(1).randbytes(15_000).hex()
-    writer = LogWriter(tmp_path / "a.mcap", RATE)
+    writer = LogWriter(tmp_path / "a.mcap", RATE_HZ)
     writer.write_run_description(START)
     writer.write("/run/start", encode_item(START, START.run), 0)
     for index in range(400):
@@ -138,7 +142,7 @@ def test_a_log_is_verified_by_its_hash(tmp_path: Path, log: Path) -> None:
         cut.write_bytes(content[:size])
         assert not verify_log(cut)
     # of whole files with sound checksums: a hash that is another's, and none (version 1)
-    digest = next(one for one in (b"sha256",) if one in content)
+    digest = next(name for name in (b"sha256",) if name in content)
     at = content.rindex(digest) + len(digest) + 4
     cut.write_bytes(content[:at] + b"0" * 64 + content[at + 64 :])
     assert not verify_log(cut)

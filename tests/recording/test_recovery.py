@@ -15,9 +15,9 @@ import pytest
 from mcap.writer import CompressionType, Writer
 
 from table_io.block import Block
-from table_io.errors import InputError
 from table_io.records import Comparison, Fault, FrequencyResponse, RunStop, Step, StepAdded
-from tests.exchange.mutants import BOMBS, bomb, spans, written
+from tests.exchange.mutants import BOMBS, bomb, spans, write_messages
+from tests.input_errors import raises_input_error
 from tests.recording.test_mcap_log import START, payloads, run, write
 from twin.recording.mcap_records import CHUNK, MAGIC, MAX_RECORD_BYTES, RECORD_HEADER
 from twin.recording.merge import merge
@@ -25,7 +25,7 @@ from twin.recording.reader import read_recording
 from twin.recording.recovery import recover_log, work_limit
 from twin.transport.codec import Item, encode_item, topic_for
 
-EVERY = 7  # messages in a chunk
+CHUNK_MESSAGES = 7  # messages in a chunk
 COST = 2**24  # that a small file may cost here
 
 
@@ -33,7 +33,7 @@ COST = 2**24  # that a small file may cost here
 def content(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """A whole log of many chunks."""
     path = tmp_path_factory.mktemp("log") / "run.mcap"
-    write(path, run(), flush_every=EVERY)
+    write(path, run(), flush_every=CHUNK_MESSAGES)
     return path.read_bytes()
 
 
@@ -41,36 +41,36 @@ def chunks(content: bytes) -> list[tuple[int, int]]:
     return [(first, end) for opcode, first, end in spans(content) if opcode == CHUNK]
 
 
-def kept(path: Path, content: bytes) -> list[bytes]:
+def recover_payloads(path: Path, content: bytes) -> list[bytes]:
     """Payloads of what is found in a file, in file order."""
     path.write_bytes(content)
-    return [one.payload for one in recover_log(path).messages]
+    return [message.payload for message in recover_log(path).messages]
 
 
 def without(number: int) -> list[bytes]:
     """The payloads of the whole log but for those of one chunk."""
     all_of_them = payloads(run())
-    return all_of_them[: number * EVERY] + all_of_them[(number + 1) * EVERY :]
+    return all_of_them[: number * CHUNK_MESSAGES] + all_of_them[(number + 1) * CHUNK_MESSAGES :]
 
 
-def flipped(content: bytes, first: int, end: int) -> bytes:
+def flip_bit(content: bytes, first: int, end: int) -> bytes:
     at = (first + end) // 2 + 20
     return content[:at] + bytes([content[at] ^ 16]) + content[at + 1 :]
 
 
-def zeroed(content: bytes, first: int, end: int) -> bytes:
+def zero_out(content: bytes, first: int, end: int) -> bytes:
     return content[: first + 60] + bytes(end - first - 60) + content[end:]
 
 
-def gnawed(content: bytes, first: int, end: int) -> bytes:
+def cut_out(content: bytes, first: int, end: int) -> bytes:
     return content[: first + 70] + content[end - 30 :]
 
 
-def stuffed(content: bytes, first: int, end: int) -> bytes:
+def stuff_garbage(content: bytes, first: int, end: int) -> bytes:
     return content[: first + 70] + b"\x06garbage\x00\x00" * 50 + content[first + 70 :]
 
 
-def stretched(content: bytes, first: int, end: int) -> bytes:
+def stretch_length(content: bytes, first: int, end: int) -> bytes:
     return content[: first + 1] + struct.pack("<Q", end - first + 40) + content[first + 9 :]
 
 
@@ -78,7 +78,7 @@ def endless(content: bytes, first: int, end: int) -> bytes:
     return content[: first + 1] + struct.pack("<Q", 2**63) + content[first + 9 :]
 
 
-def renamed(content: bytes, first: int, end: int) -> bytes:
+def change_opcode(content: bytes, first: int, end: int) -> bytes:
     return content[:first] + b"\x07" + content[first + 1 :]
 
 
@@ -90,34 +90,37 @@ Accident = Callable[[bytes, int, int], bytes]
 
 
 @pytest.mark.parametrize(
-    "accident", [flipped, zeroed, gnawed, stuffed, stretched, endless, renamed, missing]
+    "accident",
+    [flip_bit, zero_out, cut_out, stuff_garbage, stretch_length, endless, change_opcode, missing],
 )
 def test_an_accident_costs_one_chunk(accident: Accident, content: bytes, tmp_path: Path) -> None:
     places = chunks(content)
     assert len(places) > 10
     for number in (0, len(places) // 2, len(places) - 1):
         bad = accident(content, *places[number])
-        assert kept(tmp_path / "bad.mcap", bad) == without(number)
+        assert recover_payloads(tmp_path / "bad.mcap", bad) == without(number)
         recording = read_recording(tmp_path / "bad.mcap")
         assert not recording.is_intact
         assert recording.damage
         assert recording.start == START  # of the first chunk too: it stands there twice
-        lost = payloads(run())[number * EVERY : (number + 1) * EVERY]
+        lost = payloads(run())[number * CHUNK_MESSAGES : (number + 1) * CHUNK_MESSAGES]
         assert not set(payloads(recording.items)) & (set(lost) - {payloads([START])[0]})
 
 
 def test_the_damage_is_told_by_its_place(content: bytes, tmp_path: Path) -> None:
     first, end = chunks(content)[3]
-    (tmp_path / "bad.mcap").write_bytes(flipped(content, first, end))
+    (tmp_path / "bad.mcap").write_bytes(flip_bit(content, first, end))
     damage = recover_log(tmp_path / "bad.mcap").damage
-    assert [(one.offset, one.size) for one in damage] == [(first, end - first)]
+    assert [(damaged.offset, damaged.size) for damaged in damage] == [(first, end - first)]
 
 
 def test_several_accidents_cost_several_chunks(content: bytes, tmp_path: Path) -> None:
     places = chunks(content)
-    bad = endless(flipped(content, *places[2]), *places[6])
-    expected = [one for one in payloads(run()) if one in without(2) and one in without(6)]
-    assert kept(tmp_path / "bad.mcap", bad) == expected
+    bad = endless(flip_bit(content, *places[2]), *places[6])
+    expected = [
+        payload for payload in payloads(run()) if payload in without(2) and payload in without(6)
+    ]
+    assert recover_payloads(tmp_path / "bad.mcap", bad) == expected
 
 
 def test_a_killed_recorder_without_its_first_chunk_has_not_written_for_nothing(
@@ -125,7 +128,7 @@ def test_a_killed_recorder_without_its_first_chunk_has_not_written_for_nothing(
 ) -> None:
     places = chunks(content)
     path = tmp_path / "bad.mcap"
-    path.write_bytes(flipped(content, *places[0])[: places[-1][1]])
+    path.write_bytes(flip_bit(content, *places[0])[: places[-1][1]])
     recording = read_recording(path)
     assert sorted(payloads(recording.items)) == sorted([*without(0), encode_item(START, START.run)])
 
@@ -144,13 +147,13 @@ def test_a_bad_sector_costs_the_chunk_on_it(
 
     (tmp_path / "a.mcap").write_bytes(content)
     monkeypatch.setattr(Path, "open", lambda *_: Dying(content))
-    found = recover_log(tmp_path / "a.mcap")
-    assert [one.payload for one in found.messages] == without(4)
-    assert [(one.offset, one.size) for one in found.damage] == [(first, end - first)]
+    recovered = recover_log(tmp_path / "a.mcap")
+    assert [message.payload for message in recovered.messages] == without(4)
+    assert [(damage.offset, damage.size) for damage in recovered.damage] == [(first, end - first)]
 
 
 def test_merging_gives_up_nothing_that_stands_after_damage(content: bytes, tmp_path: Path) -> None:
-    (tmp_path / "part.mcap").write_bytes(flipped(content, *chunks(content)[3]))
+    (tmp_path / "part.mcap").write_bytes(flip_bit(content, *chunks(content)[3]))
     merge([tmp_path / "part.mcap"], tmp_path / "out.mcap")
     assert sorted(payloads(read_recording(tmp_path / "out.mcap").items)) == sorted(without(3))
 
@@ -159,16 +162,16 @@ def test_merging_gives_up_nothing_that_stands_after_damage(content: bytes, tmp_p
 def test_order_and_copies_of_chunks_change_nothing_but_are_seen(
     seed: int, content: bytes, tmp_path: Path
 ) -> None:
-    chance, found = random.Random(seed), spans(content)
-    body = [content[first:end] for opcode, first, end in found if opcode == CHUNK]
-    rest = [content[first:end] for opcode, first, end in found if opcode not in (CHUNK, 7)]
+    chance, records = random.Random(seed), spans(content)
+    body = [content[first:end] for opcode, first, end in records if opcode == CHUNK]
+    rest = [content[first:end] for opcode, first, end in records if opcode not in (CHUNK, 7)]
     mixed = [*body, *chance.sample(body, 3)]
     chance.shuffle(mixed)
     path = tmp_path / "mixed.mcap"
     path.write_bytes(MAGIC + rest[0] + b"".join(mixed) + b"".join(rest[1:]) + MAGIC)
     recording = read_recording(path)
     assert sorted(payloads(recording.items)) == sorted(payloads(run()))
-    assert [item.index for item in recording.items] == sorted(one.index for one in run())
+    assert [item.index for item in recording.items] == sorted(item.index for item in run())
     assert not recording.is_intact
     assert recording.missing_samples == 0
 
@@ -176,9 +179,9 @@ def test_order_and_copies_of_chunks_change_nothing_but_are_seen(
 def test_a_lost_beginning_costs_what_stood_there(content: bytes, tmp_path: Path) -> None:
     (_, _), (first, _) = chunks(content)[:2]
     for lost in (MAGIC[1:5], content[:20], content[: first + 30]):
-        found = kept(tmp_path / "bad.mcap", bytes(len(lost)) + content[len(lost) :])
+        recovered = recover_payloads(tmp_path / "bad.mcap", bytes(len(lost)) + content[len(lost) :])
         expected = payloads(run())
-        assert found in (expected, expected[2 * EVERY :], expected[EVERY:])
+        assert recovered in (expected, expected[2 * CHUNK_MESSAGES :], expected[CHUNK_MESSAGES:])
 
 
 @pytest.mark.parametrize("packing", list(CompressionType))
@@ -190,8 +193,8 @@ def test_every_packing_of_the_format_is_read(packing: CompressionType, tmp_path:
     writer.add_message(channel, 0, encode_item(START, START.run), 7, 3)
     writer.finish()
     (tmp_path / "a.mcap").write_bytes(stream.getvalue())
-    (one,) = recover_log(tmp_path / "a.mcap").messages
-    assert (one.topic, one.sequence, one.publish_time) == ("/run/start", 3, 7)
+    (message,) = recover_log(tmp_path / "a.mcap").messages
+    assert (message.topic, message.sequence, message.publish_time) == ("/run/start", 3, 7)
     assert read_recording(tmp_path / "a.mcap").start == START
 
 
@@ -202,14 +205,14 @@ def test_no_bomb_goes_off(kind: int, tmp_path: Path, monkeypatch: pytest.MonkeyP
     path.write_bytes(bomb(kind))
     tracemalloc.start()
     try:
-        found = recover_log(path)
+        recovered = recover_log(path)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert found.damage
-    assert not found.is_intact
+    assert recovered.damage
+    assert not recovered.is_intact
     assert peak < 3 * MAX_RECORD_BYTES + 2 * COST
-    with pytest.raises(InputError, match=r"holds no start record|not a shaketwin log"):
+    with raises_input_error(where=path):
         read_recording(path)
 
 
@@ -234,12 +237,12 @@ def test_what_does_not_fit_into_memory_is_refused_and_is_no_damage(
     path.write_bytes(content)
     monkeypatch.setattr("twin.recording.recovery.memory_limit_bytes", lambda: small)
     assert recover_log(path, frozenset(("/rig/gap",))).is_intact
-    with pytest.raises(InputError, match="needs more memory"):
+    with raises_input_error(where=path, remedy="memory"):
         recover_log(path)
     path.write_bytes(bomb(2))  # of messages without a payload
     tracemalloc.start()
     try:
-        with pytest.raises(InputError, match="needs more memory"):
+        with raises_input_error(where=path, remedy="memory"):
             recover_log(path)
         held = tracemalloc.get_traced_memory()[1]
     finally:
@@ -248,7 +251,7 @@ def test_what_does_not_fit_into_memory_is_refused_and_is_no_damage(
 
 
 def blocks_of(items: list[Item]) -> list[Block]:
-    return [one for one in items if isinstance(one, Block) and one.stream == "meas"]
+    return [item for item in items if isinstance(item, Block) and item.stream == "meas"]
 
 
 RUN = run()
@@ -271,19 +274,21 @@ LIES: dict[str, Item] = {
 @pytest.mark.parametrize("words", LIES)
 def test_what_cannot_be_is_left_out_and_told(words: str, tmp_path: Path) -> None:
     lie = LIES[words]
-    items = [one for one in RUN if one is not ONE or not isinstance(lie, Block)]
-    told = [(topic_for(one), encode_item(one, START.run), one.index) for one in [*items, lie]]
-    recording = read_recording(written(tmp_path / "lie.mcap", told, START))
+    items = [item for item in RUN if item is not ONE or not isinstance(lie, Block)]
+    messages = [
+        (topic_for(item), encode_item(item, START.run), item.index) for item in [*items, lie]
+    ]
+    recording = read_recording(write_messages(tmp_path / "lie.mcap", messages, START))
     left = [
-        one
-        for one in items
+        item
+        for item in items
         if not (
-            isinstance(lie, Block) and encode_item(one, START.run) == encode_item(ONE, START.run)
+            isinstance(lie, Block) and encode_item(item, START.run) == encode_item(ONE, START.run)
         )
     ]
     assert sorted(payloads(recording.items)) == sorted(payloads(left))
     assert not recording.is_intact
-    assert any(words in one.reason for one in recording.damage), recording.damage
+    assert any(words in damage.reason for damage in recording.damage), recording.damage
 
 
 @pytest.mark.parametrize(
@@ -304,31 +309,31 @@ def test_a_start_that_cannot_be_is_refused(
 ) -> None:
     start = replace(START, **changed)
     path = tmp_path / "run.mcap"
-    written(
+    write_messages(
         path, [("/run/start", encode_item(start, start.run), 0)], replace(start, rate_hz=2000.0)
     )
-    stripped = [one for one in spans(path.read_bytes()) if one[0] != 9]  # without its copy
+    stripped = [span for span in spans(path.read_bytes()) if span[0] != 9]  # without its copy
     raw = path.read_bytes()
     path.write_bytes(MAGIC + b"".join(raw[first:end] for _, first, end in stripped) + MAGIC)
-    with pytest.raises(InputError, match=words):
+    with raises_input_error(where=path, problem=words):
         read_recording(path)
 
 
 def test_messages_of_another_run_are_left_out(tmp_path: Path) -> None:
     stop = RunStop(600, "complete", "x", ())
-    told = [(topic_for(one), encode_item(one, START.run), one.index) for one in run()]
-    path = written(
-        tmp_path / "a.mcap", [*told, ("/run/stop", encode_item(stop, "other"), 600)], START
+    messages = [(topic_for(item), encode_item(item, START.run), item.index) for item in run()]
+    path = write_messages(
+        tmp_path / "a.mcap", [*messages, ("/run/stop", encode_item(stop, "other"), 600)], START
     )
     recording = read_recording(path)
     assert payloads([recording.stop] if recording.stop else []) == payloads(run()[-1:])
-    assert [one.reason for one in recording.damage] == ["/run/stop: of another run"]
+    assert [damage.reason for damage in recording.damage] == ["/run/stop: of another run"]
 
 
 def test_only_the_topics_asked_for_are_read(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_bytes(content)
     recording = read_recording(tmp_path / "a.mcap", ["/rig/gap"])
-    wanted = [one for one in run() if topic_for(one) in ("/rig/gap", "/run/start")]
+    wanted = [item for item in run() if topic_for(item) in ("/rig/gap", "/run/start")]
     assert sorted(payloads(recording.items)) == sorted(payloads(wanted))
     assert recording.is_intact
 
@@ -337,6 +342,8 @@ def test_a_wrong_checksum_of_the_whole_is_told(content: bytes, tmp_path: Path) -
     first, end = next((first, end) for opcode, first, end in spans(content) if opcode == 15)
     assert end - first == RECORD_HEADER.size + 4
     wrong = struct.pack("<I", zlib.crc32(b"another"))
-    assert kept(tmp_path / "a.mcap", content[: end - 4] + wrong + content[end:]) == payloads(run())
-    (one,) = recover_log(tmp_path / "a.mcap").damage
-    assert "the data differ" in one.reason
+    assert recover_payloads(
+        tmp_path / "a.mcap", content[: end - 4] + wrong + content[end:]
+    ) == payloads(run())
+    (damage,) = recover_log(tmp_path / "a.mcap").damage
+    assert "the data differ" in damage.reason

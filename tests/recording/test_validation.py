@@ -8,7 +8,7 @@ import pytest
 
 from table_io.block import Block
 from table_io.records import Event, Record
-from tests.recording.example_run import RATE, START, block, run
+from tests.recording.example_run import RATE_HZ, START, block, run
 from twin.exchange.export import export_log
 from twin.log import open_log
 from twin.recording.mcap_log import LogWriter
@@ -22,12 +22,12 @@ def foreign(path: Path) -> Path:
     """A log in order, and in it a block and an event that another run has at the same samples."""
     other = replace(block(200), values=block(200).values + 1.0)
     strange: list[Item] = [other, Event(200, "jump", "of another run")]
-    writer = LogWriter(path, RATE)
+    writer = LogWriter(path, RATE_HZ)
     writer.write_run_description(START)
     for item in run():
         if item.index == 200 and strange:  # before the true samples
-            for one in strange:
-                writer.write(topic_for(one), encode_item(one, "another"), one.index)
+            for odd in strange:
+                writer.write(topic_for(odd), encode_item(odd, "another"), odd.index)
             strange = []
         writer.write(topic_for(item), encode_item(item, START.run), item.index)
     writer.close()
@@ -50,7 +50,7 @@ def test_a_recording_leaves_out_what_is_of_another_run(log: Path, true: Block) -
     (meas,) = recording.contiguous_blocks("meas")
     assert meas.values.tobytes() == true.values.tobytes()
     assert not recording.is_intact
-    assert [one.reason for one in recording.damage] == [
+    assert [damage.reason for damage in recording.damage] == [
         "/rig/meas: of another run", "/run/event: of another run",
     ]  # fmt: skip
 
@@ -62,7 +62,9 @@ def test_rows_leave_it_out_and_are_not_whole(log: Path, true: Block) -> None:
             rows.read_columns(slice(0, 600), name)[name].tobytes() == true.values[number].tobytes()
         )
     assert not rows.is_intact
-    assert not any(isinstance(one, Event) and "another" in one.text for one in rows.records)
+    assert not any(
+        isinstance(record, Event) and "another" in record.text for record in rows.records
+    )
 
 
 def test_an_export_says_so(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -73,10 +75,11 @@ def test_an_export_says_so(log: Path, tmp_path: Path, capsys: pytest.CaptureFixt
 def test_batches_leave_it_out(log: Path) -> None:
     fed = iter_batches(log, 20)
     assert fed is not None
-    items = [one for batch in fed for one in batch]
+    items = [item for batch in fed for item in batch]
     assert encode_item(items[0], START.run) == encode_item(START, START.run)
     mine, theirs = (
-        sorted(encode_item(one, "") for one in some) for some in (items, read_recording(log).items)
+        sorted(encode_item(item, "") for item in some)
+        for some in (items, read_recording(log).items)
     )
     assert mine == theirs
 
@@ -86,7 +89,7 @@ def test_the_door_is_whole_where_every_topic_is(log: Path, true: Block, tmp_path
     door = open_log(log)
     assert door["drive_disp_m"].tobytes() == true.values[0].tobytes()
     assert door.whole is read_recording(log).is_intact is False
-    writer = LogWriter(tmp_path / "run.mcap", RATE)
+    writer = LogWriter(tmp_path / "run.mcap", RATE_HZ)
     writer.write_run_description(START)
     for item in run():
         writer.write(topic_for(item), encode_item(item, START.run), item.index)
@@ -108,12 +111,12 @@ def test_the_door_is_whole_where_every_topic_is(log: Path, true: Block, tmp_path
     ids=["rate", "channels", "label", "start", "late"],
 )
 def test_one_filter_by_the_rules_of_the_reader(odd: Block | Record) -> None:
-    said: list[str] = []
+    reasons: list[str] = []
     bad, good = encode_item(odd, START.run), encode_item(block(20), START.run)
-    assert list(iter_valid_items(topic_for(odd), [bad], START, said)) == []
-    assert bool(said) is (odd is not START)
-    assert len(list(iter_valid_items("/rig/meas", [b"\xff", good], START, said))) == 1
-    assert "not a Block" in said[-1]
+    assert list(iter_valid_items(topic_for(odd), [bad], START, reasons)) == []
+    assert bool(reasons) is (odd is not START)
+    assert len(list(iter_valid_items("/rig/meas", [b"\xff", good], START, reasons))) == 1
+    assert "not a Block" in reasons[-1]
 
 
 def test_what_a_file_holds_is_not_what_is_read(log: Path) -> None:

@@ -9,4 +9,7 @@ from twin.transport.codec import encode_item
 def recorded_in(recording: Recording) -> RecordedRun:
     """Its comparisons as the bytes that stand in its log; so what was changed in memory is too."""
     compared = recording.records(Comparison)
-    return RecordedRun(recording, {one.index: encode_item(one, recording.run) for one in compared})
+    return RecordedRun(
+        recording,
+        {comparison.index: encode_item(comparison, recording.run) for comparison in compared},
+    )

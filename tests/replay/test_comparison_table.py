@@ -1,15 +1,17 @@
 """Several recordings and models in one go: one table, as JSON, as CSV and on the terminal."""
 
 import csv
+import errno
 import json
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from table_io.errors import InputError
 from table_io.records import Comparison
+from tests.input_errors import raises_input_error
 from twin.cli.replay import ReplayRequest, replay_logs
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import read_recording
@@ -54,8 +56,8 @@ def test_every_log_with_every_model_has_a_row_and_a_folder(table: Path) -> None:
     assert [row["identical"] for row in rows] == [True, False, True, False]
     for row in rows:
         own = table / f"{row['log']}-{Path(row['model']).stem}"
-        found = json.loads((own / "summary.json").read_text())
-        assert row["nrmse rel_disp_m"] == found["comparison"]["rel_disp_m"]["nrmse"]
+        summary = json.loads((own / "summary.json").read_text())
+        assert row["nrmse rel_disp_m"] == summary["comparison"]["rel_disp_m"]["nrmse"]
         assert (own / "run.mcap").is_file()
     # the stiffer model is worse in everything that there is
     for right, wrong in (rows[:2], rows[2:]):
@@ -103,33 +105,38 @@ def test_one_that_is_not_identical_is_told_by_the_exit_code(
 
 
 @pytest.mark.parametrize(
-    "logs_of, models, steps, said",
+    "logs_of, models, steps, fields",
     [
-        (["g4"], ["recorded", "nosuch"], None, "nosuch"),
-        (["g4", "nosuch"], ["recorded"], None, "nosuch"),
-        (["g4"], ["recorded", "stiff.toml", "stiff.toml"], None, "give each model once"),
-        (["g4"], ["stiff.toml", "g4/stiff.toml"], None, "two of one name under other names"),
-        (["g4", "ginf"], ["recorded"], "6:9", "no such steps"),
-        (["g4", "still"], ["recorded"], None, "no table_acc_m_s2"),
+        (["g4"], ["recorded", "nosuch"], None, {"where": "--model nosuch"}),
+        (["g4", "nosuch"], ["recorded"], None, {"problem": os.strerror(errno.ENOENT)}),
+        (["g4"], ["recorded", "stiff.toml", "stiff.toml"], None, {"problem": "g4-stiff"}),
+        (["g4"], ["stiff.toml", "g4/stiff.toml"], None, {"problem": "g4-stiff"}),
+        (["g4", "ginf"], ["recorded"], "6:9", {"where": "--steps 6:9", "allowed": "0 to 5"}),
+        (["g4", "still"], ["recorded"], None, {"key": "table_acc_m_s2"}),
     ],
 )
 def test_what_cannot_be_is_said_before_the_first_replay(
     logs: list[Path], tmp_path: Path, logs_of: list[str], models: list[str], steps: str | None,
-    said: str,
+    fields: dict[str, str],
 ) -> None:  # fmt: skip
     """Nothing is made, so that the corrected command is not refused."""
     home, out = logs[0].parent, tmp_path / "out"
-    given = [str(home / one) if one.endswith(".toml") else one for one in models]
-    with pytest.raises(InputError, match=said):
-        replay_logs(ReplayRequest([home / one for one in logs_of], given, out, steps=steps))
+    given = [str(home / model) if model.endswith(".toml") else model for model in models]
+    with raises_input_error(**fields):
+        replay_logs(ReplayRequest([home / item for item in logs_of], given, out, steps=steps))
     assert not out.exists()
 
 
 @pytest.mark.parametrize(
-    "more", [{"view": True}, {"publish": "tcp/127.0.0.1:7563"}, {"speed": "2"}]
+    "more, where",
+    [
+        ({"view": True}, "--view"),
+        ({"publish": "tcp/127.0.0.1:7563"}, "--publish"),
+        ({"speed": "2"}, "--speed 2"),
+    ],
 )
 def test_what_shows_one_replay_is_refused_for_many(
-    logs: list[Path], tmp_path: Path, more: dict[str, str]
+    logs: list[Path], tmp_path: Path, more: dict[str, str], where: str
 ) -> None:
-    with pytest.raises(InputError, match=r"one log|omit it"):
+    with raises_input_error(where=where):
         replay_logs(ReplayRequest(logs, [], tmp_path / "out", **more))  # type: ignore[arg-type]

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from table_io.block import Block
-from table_io.errors import InputError
 from table_io.records import (
     Agreement,
     Comparison,
@@ -21,6 +20,7 @@ from table_io.records import (
     RunStart,
     RunStop,
 )
+from tests.input_errors import raises_input_error
 from tests.replay.in_memory import recorded_in
 from twin.cli.replay import ReplayRequest, replay_logs
 from twin.compare import pipeline, twins
@@ -45,13 +45,13 @@ def again(
     return identity, read_recording(path)
 
 
-def told(recording: Recording, *kinds: type) -> list[bytes]:
+def encode_records(recording: Recording, *kinds: type) -> list[bytes]:
     """All records of these kinds, as bytes without the run's name."""
-    return [encode_item(one, "") for one in recording.items if isinstance(one, kinds)]
+    return [encode_item(item, "") for item in recording.items if isinstance(item, kinds)]
 
 
 def with_values(items: tuple[Item, ...], old: Item, new: Item) -> list[Item]:
-    return [new if one is old else one for one in items]
+    return [new if item is old else item for item in items]
 
 
 # How it is cut and read
@@ -74,9 +74,10 @@ def test_however_it_is_cut_the_result_is_the_same(
         Params,
         RunStop,
     ):
-        assert told(made, kind) == told(recording, kind) != [], kind
+        assert encode_records(made, kind) == encode_records(recording, kind) != [], kind
     warnings = [
-        [one for one in log.records(Event) if one.kind in EVENT_KINDS] for log in (made, recording)
+        [event for event in log.records(Event) if event.kind in EVENT_KINDS]
+        for log in (made, recording)
     ]
     assert warnings[0] == warnings[1] != []
     for stream in ("meas", "pred"):
@@ -110,21 +111,23 @@ def test_steps_are_equal_to_the_recorded_ones_for_both_twins(
     identity, made = again(recorded_in(recording), bundle, tmp_path / "run.mcap", span)
     assert identity.is_identical
     whole = [
-        one for one in recording.records(Comparison)
-        if span.first <= one.index and one.index + one.count <= span.last
+        comparison for comparison in recording.records(Comparison)
+        if span.first <= comparison.index and comparison.index + comparison.count <= span.last
     ]  # fmt: skip
     assert len(whole) == identity.compared > 100
-    assert told(made, Comparison) == [encode_item(one, "") for one in whole]
-    assert [one.step for one in made.records(PrcPoint)] == [2, 3]
-    assert told(made, PrcPoint) == [
-        encode_item(one, "") for one in recording.records(PrcPoint)[2:4]
+    assert encode_records(made, Comparison) == [encode_item(comparison, "") for comparison in whole]
+    assert [point.step for point in made.records(PrcPoint)] == [2, 3]
+    assert encode_records(made, PrcPoint) == [
+        encode_item(point, "") for point in recording.records(PrcPoint)[2:4]
     ]
     kinds: tuple[type[Agreement | Estimate], ...] = (Agreement, Estimate)
     for kind in kinds:
-        inside = [one for one in recording.records(kind) if one.step in (2, 3)]
-        assert told(made, kind) == [encode_item(one, "") for one in inside], kind
-    assert [(one.step, one.cycle) for one in made.records(CycleExtremes)] == [
-        (one.step, one.cycle) for one in recording.records(CycleExtremes) if one.step in (2, 3)
+        inside = [record for record in recording.records(kind) if record.step in (2, 3)]
+        assert encode_records(made, kind) == [encode_item(record, "") for record in inside], kind
+    assert [(cycle.step, cycle.cycle) for cycle in made.records(CycleExtremes)] == [
+        (cycle.step, cycle.cycle)
+        for cycle in recording.records(CycleExtremes)
+        if cycle.step in (2, 3)
     ]
     for stream in ("meas", "pred"):
         (shown,) = made.contiguous_blocks(stream)
@@ -142,17 +145,17 @@ def test_the_last_step_ends_with_the_run(
     span = SampleRange.of_steps(recording, last, last)
     identity, made = again(recorded_in(recording), bundle, tmp_path / "run.mcap", span)
     assert identity.is_identical
-    assert told(made, PrcPoint) == [encode_item(recording.records(PrcPoint)[-1], "")]
+    assert encode_records(made, PrcPoint) == [encode_item(recording.records(PrcPoint)[-1], "")]
 
 
 def test_steps_that_are_not_there_are_refused(recording: Recording) -> None:
-    with pytest.raises(InputError, match=r"--steps 6:9: no such steps .* 0 to 5"):
+    with raises_input_error(where="--steps 6:9", allowed="0 to 5"):
         SampleRange.of_steps(recording, 6, 9)
 
 
 @pytest.mark.parametrize("text", ["5:3", "a:b", "", "1:2:3", "-1:2"])
 def test_a_range_that_is_none_is_refused(text: str) -> None:
-    with pytest.raises(InputError, match="allowed: FIRST:LAST"):
+    with raises_input_error(where=f"--steps {text}", allowed="FIRST:LAST"):
         parse_step_range(text)
     assert parse_step_range("4") == (4, 4)
     assert parse_step_range("3:12") == (3, 12)
@@ -161,7 +164,7 @@ def test_a_range_that_is_none_is_refused(text: str) -> None:
 # Parameters that changed during the run
 
 
-def changed(recording: Recording, bundle: RunConfig, index: int, path: Path) -> Recording:
+def change_parameters(recording: Recording, bundle: RunConfig, index: int, path: Path) -> Recording:
     """The recording as it would be had stiffness and gap changed at sample `index`.
 
     Made with the pipeline alone, fed in blocks of 20 up to the change and from there on.
@@ -171,17 +174,19 @@ def changed(recording: Recording, bundle: RunConfig, index: int, path: Path) -> 
     params = Params(index, {**values, "stiffness": 1.02 * values["stiffness"]}, "identified")
     (whole,) = recording.contiguous_blocks("meas")
     state, begun = pipeline.start_pipeline(setup)
-    said: list[Item] = [*begun, params]
+    events: list[Item] = [*begun, params]
     for first, last in ((0, index), (index, whole.end)):
         for at in range(first, last, 20):
             state, made = pipeline.step(setup, state, whole.cut(at, min(at + 20, last)))
-            said.extend(made)
+            events.extend(made)
         setup = pipeline.adopt_params(setup, params)
     kept = [
-        one for one in recording.items
-        if (isinstance(one, Block) and one.stream == "meas") or isinstance(one, (RunStart, RunStop))
-    ]  # fmt: skip
-    write_items(path, [*kept, *said], recording.start)
+        item
+        for item in recording.items
+        if (isinstance(item, Block) and item.stream == "meas")
+        or isinstance(item, (RunStart, RunStop))
+    ]
+    write_items(path, [*kept, *events], recording.start)
     return read_recording(path)
 
 
@@ -189,13 +194,14 @@ def changed(recording: Recording, bundle: RunConfig, index: int, path: Path) -> 
 def test_parameters_that_changed_are_changed_again(
     recording: Recording, bundle: RunConfig, tmp_path: Path, index: int
 ) -> None:
-    other = changed(recording, bundle, index, tmp_path / "changed.mcap")
+    other = change_parameters(recording, bundle, index, tmp_path / "changed.mcap")
     identity, made = again(recorded_in(other), bundle, tmp_path / "run.mcap")
     assert identity.is_identical
-    assert told(made, Params, PrcPoint) == told(other, Params, PrcPoint)
+    assert encode_records(made, Params, PrcPoint) == encode_records(other, Params, PrcPoint)
     # without the change the twin goes another way from there on
     ignored = replace(other, items=tuple(
-        one for one in other.items if not (isinstance(one, Params) and one.reason == "identified")
+        item for item in other.items
+        if not (isinstance(item, Params) and item.reason == "identified")
     ))  # fmt: skip
     identity, _ = again(recorded_in(ignored), bundle, tmp_path / "ignored.mcap")
     assert identity.first_difference is not None
@@ -206,24 +212,24 @@ def test_steps_after_a_change_say_what_holds(
     recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
     """The parameters that changed before the first sample stand at it."""
-    other = changed(recording, bundle, 2013, tmp_path / "changed.mcap")
+    other = change_parameters(recording, bundle, 2013, tmp_path / "changed.mcap")
     span = SampleRange.of_steps(other, 4, 4)
     assert span.first > 2013
     identity, made = again(recorded_in(other), bundle, tmp_path / "run.mcap", span)
     assert identity.is_identical
-    assert [one.index for one in made.records(Params)] == [span.first, span.first]
+    assert [params.index for params in made.records(Params)] == [span.first, span.first]
     assert made.records(Params)[-1].reason == "identified"
 
 
 def test_a_change_within_a_gap_holds_after_it(
     recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
-    other = changed(recording, bundle, 2013, tmp_path / "changed.mcap")
+    other = change_parameters(recording, bundle, 2013, tmp_path / "changed.mcap")
     holed = replace(other, items=tuple(
-        one for one in other.items if not isinstance(one, Block) or not 2000 <= one.index < 2100
+        item for item in other.items if not isinstance(item, Block) or not 2000 <= item.index < 2100
     ))  # fmt: skip
     _, made = again(recorded_in(holed), bundle, tmp_path / "run.mcap")
-    assert [one.reason for one in made.records(Params)] == ["start", "identified"]
+    assert [params.reason for params in made.records(Params)] == ["start", "identified"]
     assert made.records(Params)[-1].index == 2013
 
 
@@ -243,7 +249,7 @@ def test_a_damaged_comparison_is_one_that_differs(
 # What differs, and how much
 
 
-def planted(log_file: Path, folder: Path, **versions: str) -> Path:
+def plant_versions(log_file: Path, folder: Path, **versions: str) -> Path:
     """The log as if it had been recorded with other versions."""
     recording = read_recording(log_file)
     start = replace(recording.start, versions={**recording.start.versions, **versions})
@@ -253,7 +259,7 @@ def planted(log_file: Path, folder: Path, **versions: str) -> Path:
 
 
 @pytest.fixture
-def found(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+def report(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """What the command has to say of a replay; no report is drawn."""
     kept: dict[str, Any] = {}
 
@@ -266,23 +272,23 @@ def found(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 
 def test_another_version_alone_makes_no_difference(
-    log_file: Path, tmp_path: Path, found: dict[str, Any]
+    log_file: Path, tmp_path: Path, report: dict[str, Any]
 ) -> None:
-    path = planted(log_file, tmp_path, numpy="0.1")
+    path = plant_versions(log_file, tmp_path, numpy="0.1")
     assert replay_logs(ReplayRequest([path], [], tmp_path / "out")) == 0
-    assert found["identical"] is True
-    assert set(found["versions_differing"]) == {"numpy"}
+    assert report["identical"] is True
+    assert set(report["versions_differing"]) == {"numpy"}
 
 
 def test_another_kernel_is_told_with_versions_and_size(
     log_file: Path,
     tmp_path: Path,
-    found: dict[str, Any],
+    report: dict[str, Any],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """A constant of the restart changed by a millionth, as a new library might."""
-    path = planted(log_file, tmp_path, numpy="0.1", kernels="0123456789ab")
+    path = plant_versions(log_file, tmp_path, numpy="0.1", kernels="0123456789ab")
     exact = twins.estimate_motion
 
     def other(*given: object) -> tuple[float, float]:
@@ -291,20 +297,20 @@ def test_another_kernel_is_told_with_versions_and_size(
 
     monkeypatch.setattr(twins, "estimate_motion", other)
     code = replay_logs(ReplayRequest([path], [], tmp_path / "out"))
-    said = " ".join(capsys.readouterr().out.split())
+    output = " ".join(capsys.readouterr().out.split())
     assert code == EXIT_NOT_IDENTICAL
-    assert "numpy 0.1 -> " in said
-    assert "kernels 0123456789ab -> " in said
-    assert "scipy" not in said
-    assert found["differing"] > 100
-    sizes = found["relative_difference"]
+    assert "numpy 0.1 -> " in output
+    assert "kernels 0123456789ab -> " in output
+    assert "scipy" not in output
+    assert report["differing"] > 100
+    sizes = report["relative_difference"]
     # the difference fades within a window, so it is a part of the millionth
     assert 1e-8 < sizes["window/rel_disp_m"] < 1e-6
-    assert f"{max(v for k, v in sizes.items() if k.startswith('window')):.2g}" in said
+    assert f"{max(v for k, v in sizes.items() if k.startswith('window')):.2g}" in output
 
 
 def test_the_size_is_the_rms_of_the_difference_over_the_signal(
-    recording: Recording, bundle: RunConfig, log_file: Path, tmp_path: Path, found: dict[str, Any]
+    recording: Recording, bundle: RunConfig, log_file: Path, tmp_path: Path, report: dict[str, Any]
 ) -> None:
     stiff = tmp_path / "stiff.toml"
     stiff.write_text(bundle.model_toml.replace("36000.0", "37800.0"))
@@ -313,7 +319,7 @@ def test_the_size_is_the_rms_of_the_difference_over_the_signal(
         recording.contiguous_blocks("pred"),
         read_recording(tmp_path / "out" / "run.mcap").contiguous_blocks("pred"),
     )
-    sizes = found["relative_difference"]
+    sizes = report["relative_difference"]
     for name in ("free/rel_disp_m", "window/force_r1_n"):
         a, b = old.channel(name), new.channel(name)
         known = np.isfinite(a) & np.isfinite(b)

@@ -28,13 +28,13 @@ def again(
 
 
 def notes(recording: Recording, kind: str) -> list[str]:
-    return [one.text for one in recording.records(Event) if one.kind == kind]
+    return [event.text for event in recording.records(Event) if event.kind == kind]
 
 
 def without_comparisons(recording: Recording, path: Path, *, ended: bool) -> Path:
     items: list[Item] = [
-        one for one in recording.items
-        if not isinstance(one, Comparison) and (ended or one is not recording.stop)
+        item for item in recording.items
+        if not isinstance(item, Comparison) and (ended or item is not recording.stop)
     ]  # fmt: skip
     write_items(path, items, recording.start)
     return path
@@ -47,7 +47,7 @@ def some_steps(recording: Recording, bundle: RunConfig, tmp_path: Path) -> Recor
 
 
 @pytest.fixture
-def found(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+def report(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """What the command has to say of a replay; no report is drawn."""
     kept: dict[str, Any] = {}
 
@@ -83,9 +83,9 @@ def test_some_steps_are_a_sound_recording(some_steps: Recording, recording: Reco
     first = some_steps.start.index
     assert notes(some_steps, "cut") == [f"from {recording.run} at sample {first}"]
     assert verify_logs([some_steps.path], False, None) == 0
-    found = examine_logs([some_steps.path]).report
-    assert (found["gaps"], found["damage"], found["sound"]) == ([], [], True)
-    assert found["replay"] == {
+    report = examine_logs([some_steps.path]).report
+    assert (report["gaps"], report["damage"], report["sound"]) == ([], [], True)
+    assert report["replay"] == {
         "possible": True,
         "identical": False,
         "because": [f"its beginning is in {recording.run}"],
@@ -95,7 +95,7 @@ def test_some_steps_are_a_sound_recording(some_steps: Recording, recording: Reco
 def test_a_gap_before_the_first_of_some_steps_is_one(some_steps: Recording, tmp_path: Path) -> None:
     first = some_steps.start.index
     write_items(tmp_path / "a.mcap", [
-        one for one in some_steps.items if one.index != first or one is some_steps.start
+        item for item in some_steps.items if item.index != first or item is some_steps.start
     ], some_steps.start)  # fmt: skip
     (gap,) = examine_logs([tmp_path / "a.mcap"]).report["gaps"]
     assert gap["first"] == first
@@ -105,15 +105,15 @@ def test_some_steps_replayed_are_not_said_to_differ(
     some_steps: Recording,
     recording: Recording,
     tmp_path: Path,
-    found: dict[str, Any],
+    report: dict[str, Any],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Alone and among many: the twin comes to them from before their first sample."""
     assert replay_logs(ReplayRequest([some_steps.path], [], tmp_path / "one")) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert found["differing"] > 0
-    assert (found["identical"], found["beginning"]) == (None, recording.run)
-    assert f"its beginning is in {recording.run}; " in said
+    output = " ".join(capsys.readouterr().out.split())
+    assert report["differing"] > 0
+    assert (report["identical"], report["beginning"]) == (None, recording.run)
+    assert f"its beginning is in {recording.run}; " in output
     made = read_recording(tmp_path / "one" / "run.mcap")
     assert notes(made, "cut") == notes(some_steps, "cut")  # as true of this one
     logs = [some_steps.path, recording.path]
@@ -126,7 +126,7 @@ def test_some_steps_replayed_are_not_said_to_differ(
 def test_where_none_was_recorded_nothing_differs(
     recording: Recording,
     tmp_path: Path,
-    found: dict[str, Any],
+    report: dict[str, Any],
     capsys: pytest.CaptureFixture[str],
     ended: bool,
 ) -> None:
@@ -135,19 +135,19 @@ def test_where_none_was_recorded_nothing_differs(
     assert replay_logs(ReplayRequest([log], [], tmp_path / "one")) == 0
     made = len(read_recording(tmp_path / "one" / "run.mcap").records(Comparison))
     assert made > 300
-    said = " ".join(capsys.readouterr().out.split())
-    assert f"no comparisons were recorded; {made} are made" in said
-    assert found["identical"] is None
+    output = " ".join(capsys.readouterr().out.split())
+    assert f"no comparisons were recorded; {made} are made" in output
+    assert report["identical"] is None
 
 
 def test_one_that_differs_is_told_alone_and_among_many(
-    recording: Recording, tmp_path: Path, found: dict[str, Any]
+    recording: Recording, tmp_path: Path, report: dict[str, Any]
 ) -> None:
     """A recording that ended and lacks a comparison that the replay makes."""
     lost = recording.records(Comparison)[300]
     log = tmp_path / "a.mcap"
-    write_items(log, [one for one in recording.items if one is not lost], recording.start)
+    write_items(log, [item for item in recording.items if item is not lost], recording.start)
     assert replay_logs(ReplayRequest([log], [], tmp_path / "one")) == EXIT_NOT_IDENTICAL
-    assert (found["identical"], found["unrecorded"]) == (False, 1)
+    assert (report["identical"], report["unrecorded"]) == (False, 1)
     asked = ReplayRequest([log, recording.path], [], tmp_path / "many")
     assert replay_logs(asked) == EXIT_NOT_IDENTICAL

@@ -31,15 +31,15 @@ def again(
 
 
 def comparisons(recording: Recording) -> list[bytes]:
-    return [encode_item(one, "") for one in recording.records(Comparison)]
+    return [encode_item(comparison, "") for comparison in recording.records(Comparison)]
 
 
 def records(recording: Recording) -> list[bytes]:
     """Every record but the start and what it is a replay of, which differ from run to run."""
     return [
-        encode_item(one, "") for one in recording.items
-        if not isinstance(one, (Block, RunStart))
-        and not (isinstance(one, Event) and one.kind == "replay")
+        encode_item(item, "") for item in recording.items
+        if not isinstance(item, (Block, RunStart))
+        and not (isinstance(item, Event) and item.kind == "replay")
     ]  # fmt: skip
 
 
@@ -140,22 +140,23 @@ def recorded_with_faults(
     Made with nothing but the pipeline: fed up to the death, started afresh at the end of it.
     """
     kept: list[Item] = [
-        one
-        for one in recording.items
-        if (isinstance(one, Block) and one.stream == "meas") or isinstance(one, (RunStart, RunStop))
+        item
+        for item in recording.items
+        if (isinstance(item, Block) and item.stream == "meas")
+        or isinstance(item, (RunStart, RunStop))
     ]
     setup = bundle.prepare_twin()
     whole = recording.contiguous_blocks("meas")[0]
-    said: list[Record | Block] = []
+    items: list[Record | Block] = []
     lives = [0, *(edge for span in spans for edge in span), whole.end]
     for first, last in list(pairwise(lives))[::2]:
         state, begun = pipeline.start_pipeline(setup, first)
-        said.extend(begun)
+        items.extend(begun)
         for at in range(first, last, 20):
             state, made = pipeline.step(setup, state, whole.cut(at, min(at + 20, last)))
-            said.extend(made)
-    said.extend(Fault(b, "twin", a, b, "the process died and was restarted") for a, b in spans)
-    write_items(path, [*kept, *said], recording.start)
+            items.extend(made)
+    items.extend(Fault(b, "twin", a, b, "the process died and was restarted") for a, b in spans)
+    write_items(path, [*kept, *items], recording.start)
     return read_recording(path)
 
 
@@ -179,10 +180,10 @@ def test_replay_is_dead_where_the_twin_was(
     assert comparisons(made) == comparisons(died)
     assert records(made) == records(died)
     for a, b in spans:
-        assert not any(one.index < b and one.end > a for one in made.blocks("pred"))
+        assert not any(block.index < b and block.end > a for block in made.blocks("pred"))
     # after the fresh start it differs from a twin that never died, so the fault mattered
     never, _ = again(replace(died, items=tuple(
-        one for one in died.items if not isinstance(one, Fault)
+        item for item in died.items if not isinstance(item, Fault)
     )), bundle, tmp_path)  # fmt: skip
     assert not never.is_identical
     identity, _ = again(made, bundle, tmp_path)
@@ -203,10 +204,10 @@ def test_missing_samples_are_replayed_as_they_were(
     recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
     kept: list[Item] = [
-        one
-        for one in recording.items
-        if isinstance(one, (RunStart, RunStop))
-        or (isinstance(one, Block) and one.stream == "meas" and not 2500 <= one.index < 2600)
+        item
+        for item in recording.items
+        if isinstance(item, (RunStart, RunStop))
+        or (isinstance(item, Block) and item.stream == "meas" and not 2500 <= item.index < 2600)
     ]
     write_items(tmp_path / "holed.mcap", kept, recording.start)
     _, first = again(read_recording(tmp_path / "holed.mcap"), bundle, tmp_path)
@@ -223,31 +224,31 @@ def test_what_the_rig_said_is_kept_and_hints_are_said_anew(
     write_items(tmp_path / "run.mcap", [*recording.items, note], recording.start)
     _, made = again(read_recording(tmp_path / "run.mcap"), bundle, tmp_path)
     assert note in made.records(Event)
-    hints = [one for one in recording.records(Event) if one.kind == "jump"]
+    hints = [event for event in recording.records(Event) if event.kind == "jump"]
     assert hints
-    assert [one for one in made.records(Event) if one.kind == "jump"] == hints
+    assert [event for event in made.records(Event) if event.kind == "jump"] == hints
 
 
 # The model alone
 
 
 @pytest.fixture(scope="module")
-def simulated(bundle: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> Recording:
+def simulated_run(bundle: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> Recording:
     path = tmp_path_factory.mktemp("simulate") / "run.mcap"
     simulate_ideal(bundle, "model", path, lambda _: None)
     return read_recording(path)
 
 
-def test_a_simulation_has_measured_nothing(simulated: Recording, bundle: RunConfig) -> None:
-    assert simulated.start.source == "model"
-    summary = summarise(simulated, bundle.parameters)
+def test_a_simulation_has_measured_nothing(simulated_run: Recording, bundle: RunConfig) -> None:
+    assert simulated_run.start.source == "model"
+    summary = summarise(simulated_run, bundle.parameters)
     assert len(summary["steps"]) == 6
     for step in summary["steps"]:
         assert step["measured"] is None
         assert step["twin"]["eta_d"] > 0
         assert step["table_acc_fundamental_m_s2"] == pytest.approx(0.05 * 9.80665, rel=1e-3)
         assert step["thd"] < 1e-3
-    assert all(one.measured is None for one in simulated.records(PrcPoint))
+    assert all(point.measured is None for point in simulated_run.records(PrcPoint))
     assert all(
         values == {"nrmse": None, "free_nrmse": None} for values in summary["comparison"].values()
     )
@@ -255,10 +256,13 @@ def test_a_simulation_has_measured_nothing(simulated: Recording, bundle: RunConf
     assert summary["run"]["branches_from"] == "twin"
 
 
-def test_a_simulated_point_is_that_of_physics_md(simulated: Recording) -> None:
+def test_a_simulated_point_is_that_of_physics_md(simulated_run: Recording) -> None:
     """Impacting at 3.4 Hz with neither servo nor noise, as far as the drift leaves it."""
-    found = {(one.direction, one.frequency_hz): one.twin for one in simulated.records(PrcPoint)}
-    values = found["forward", 3.4]
+    twins = {
+        (point.direction, point.frequency_hz): point.twin
+        for point in simulated_run.records(PrcPoint)
+    }
+    values = twins["forward", 3.4]
     assert values is not None
     assert abs(values.drift) < 0.05
     assert 30.537 * values.eta_d == pytest.approx(5.123, rel=1e-3 + abs(values.drift))
@@ -287,21 +291,23 @@ def test_a_simulated_curve_of_free_flight_is_the_closed_form(
     assert summary["jumps"] == summary["hysteresis"] == []
 
 
-def test_a_simulation_predicts_from_its_first_sample(simulated: Recording) -> None:
-    (predicted,) = simulated.contiguous_blocks("pred")
+def test_a_simulation_predicts_from_its_first_sample(simulated_run: Recording) -> None:
+    (predicted,) = simulated_run.contiguous_blocks("pred")
     assert np.isfinite(predicted.channel("free/rel_disp_m")).all()
     assert np.isnan(predicted.channel("window/rel_disp_m")).all()
 
 
 def test_the_replay_of_a_simulation_is_identical(
-    simulated: Recording, bundle: RunConfig, tmp_path: Path
+    simulated_run: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
-    identity, made = again(simulated, bundle_of(simulated), tmp_path)
+    identity, made = again(simulated_run, bundle_of(simulated_run), tmp_path)
     assert identity.is_identical
     assert identity.recorded > 300
-    assert made.records(PrcPoint) == simulated.records(PrcPoint) or all(
+    assert made.records(PrcPoint) == simulated_run.records(PrcPoint) or all(
         encode_item(a, "") == encode_item(b, "")
-        for a, b in zip(made.records(PrcPoint), simulated.records(PrcPoint), strict=True)
+        for a, b in zip(made.records(PrcPoint), simulated_run.records(PrcPoint), strict=True)
     )
-    assert made.contiguous_blocks("pred")[0].is_identical(simulated.contiguous_blocks("pred")[0])
-    assert all(math.isnan(one.free_error_ss[0]) for one in made.records(Comparison))
+    assert made.contiguous_blocks("pred")[0].is_identical(
+        simulated_run.contiguous_blocks("pred")[0]
+    )
+    assert all(math.isnan(comparison.free_error_ss[0]) for comparison in made.records(Comparison))

@@ -30,11 +30,15 @@ class Drawn:
     html: str
 
 
-def make(folder: Path, items: list[Item] | None = None, told: Any = None, gap: str = "4.0") -> Path:
+def make(
+    folder: Path, items: list[Item] | None = None, run_summary: Any = None, gap: str = "4.0"
+) -> Path:
     """The folder, with run.mcap and summary.json written into it."""
     start = start_record(gap)
     write_items(folder / "run.mcap", [start, *(blocks() if items is None else items)], start)
-    (folder / "summary.json").write_text(json.dumps(summary() if told is None else told))
+    (folder / "summary.json").write_text(
+        json.dumps(summary() if run_summary is None else run_summary)
+    )
     return folder
 
 
@@ -45,7 +49,7 @@ def run_folder(tmp_path: Path) -> Maker:
 
 
 @pytest.fixture(scope="session")
-def drawn(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
+def drawn_report(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
     """Drawn once, in full quality; to look at, not to write into."""
     folder = make(tmp_path_factory.mktemp("drawn"))
     run = build_report_data(read_recording(folder / "run.mcap"), summary())

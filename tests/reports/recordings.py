@@ -74,7 +74,7 @@ def blocks(channels: tuple[str, ...] = MEASURED) -> list[Item]:
         values = np.array([twin[name.split("/")[1]] for name in TWIN_CHANNELS])
         items.append(Block("pred", index, RATE, TWIN_CHANNELS, values, *labels))
         ss = tuple(float((rig[name] ** 2).sum()) for name in COMPARED_CHANNELS)
-        free, window = (tuple(part**2 * one for one in ss) for part in (0.1, 0.05))
+        free, window = (tuple(part**2 * error for error in ss) for part in (0.1, 0.05))
         items.append(Comparison(index, n, COMPARED_CHANNELS, ss, free, window))
         index += n
     return [*items, RunStop(index, "complete", "all steps driven")]
@@ -112,5 +112,5 @@ def summary(who: tuple[str, ...] = ("measured", "twin")) -> dict[str, Any]:
 
 def one_step(channels: tuple[str, ...] = MEASURED) -> tuple[list[Item], dict[str, Any]]:
     """(items, summary) of a run that was stopped after its first step."""
-    told = {**summary(), "verdict": "stopped", "hysteresis": [], "jumps": [], "timing": {}}
-    return blocks(channels)[:3], {**told, "steps": told["steps"][:1]}
+    values = {**summary(), "verdict": "stopped", "hysteresis": [], "jumps": [], "timing": {}}
+    return blocks(channels)[:3], {**values, "steps": values["steps"][:1]}

@@ -13,6 +13,7 @@ from matplotlib.image import imread
 from table_io.config.base import PROFILES_DIR, parse_toml
 from twin.cli.discover import write_results
 from twin.identification.discover import Discovery, PreparedLog, discover_effects
+from twin.identification.parameters import GapKey
 from twin.model.config import ModelConfig
 from twin.model.inverse_dynamics import forces_along
 from twin.reports.discovery.figure_data import (
@@ -29,7 +30,7 @@ from twin.reports.plot_style import RC_PARAMS
 from twin.run.run_config import read_model_template, read_run_config
 from twin.run.unpaced import play_unpaced
 
-K2 = 4.0e7  # N/m2
+HARDENING_N_M2 = 4.0e7  # N/m2
 SHORT = """
 title = "G4, a few steps"
 rig = "{rig}"
@@ -61,12 +62,12 @@ FIGURES = {
 
 
 @dataclass(frozen=True, eq=False)
-class Left:
+class DiscoveryOutput:
     """A discovery and what was left of it in a folder."""
 
-    found: Discovery
+    discovery: Discovery
     logs: Sequence[PreparedLog]
-    told: Json
+    verdict_json: Json
     folder: Path
 
     @property
@@ -74,10 +75,10 @@ class Left:
         return (self.folder / "report.html").read_text(encoding="utf-8")
 
 
-def recorded(folder: Path) -> Path:
+def record_run(folder: Path) -> Path:
     """The log of a short unpaced run, of a rig whose bumpers harden."""
     truth, card = folder / "truth.toml", folder / "rig.toml"
-    text = f'[[effects]]\nid = "bumper_hardening"\nparameters = {{ k2 = {K2} }}\n'
+    text = f'[[effects]]\nid = "bumper_hardening"\nparameters = {{ k2 = {HARDENING_N_M2} }}\n'
     truth.write_text(text)
     sealed = hashlib.sha256(text.encode()).hexdigest()
     rig = (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")
@@ -88,132 +89,142 @@ def recorded(folder: Path) -> Path:
     return log
 
 
-def left(folder: Path, logs: Sequence[PreparedLog], found: Discovery) -> Left:
+def write_output(
+    folder: Path, logs: Sequence[PreparedLog], discovery: Discovery
+) -> DiscoveryOutput:
     folder.mkdir()
-    told = verdict_to_json(found, 1.5, ["<b>said</b>"])
-    write_results(folder, found, read_model_template("snm")[1], logs, told)
-    return Left(found, logs, told, folder)
+    verdict = verdict_to_json(discovery, 1.5, ["<b>said</b>"])
+    write_results(folder, discovery, read_model_template("snm")[1], logs, verdict)
+    return DiscoveryOutput(discovery, logs, verdict, folder)
 
 
 @pytest.fixture(scope="module")
-def every(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Left]]:
+def every(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, DiscoveryOutput]]:
     """A discovery of each verdict, all of one recording, with coarse pictures.
 
     None: with the model that the one before found. Unexplained: the truth is left out of the
     library. Ambiguous: another set is said to be as good, and the recording has no steps.
     """
     root, model = tmp_path_factory.mktemp("pages"), read_model_template("snm")[0]
-    logs, _ = load_logs([recorded(root)])
+    logs, _ = load_logs([record_run(root)])
     known = discover_effects(logs, model, without=AWAY)
-    rival = next(one for one in known.selection.tried if one.names != known.verdict.best.names)
+    rival = next(
+        tried for tried in known.selection.tried if tried.names != known.verdict.best.names
+    )
     unsure = replace(
         known, verdict=replace(known.verdict, outcome="ambiguous", alternatives=(rival,))
     )
     stepless = [replace(log, steps=()) for log in logs]
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(RC_PARAMS, "savefig.dpi", 40)
-        out = {"named": left(root / "named", logs, known)}
-        out["ambiguous"] = left(root / "ambiguous", stepless, unsure)
+        out = {"named": write_output(root / "named", logs, known)}
+        out["ambiguous"] = write_output(root / "ambiguous", stepless, unsure)
         whole = read_model_template(str(root / "named" / "model.toml"))[0]
-        out["none"] = left(root / "none", logs, discover_effects(logs, whole, without=AWAY))
-        out["unexplained"] = left(
+        out["none"] = write_output(root / "none", logs, discover_effects(logs, whole, without=AWAY))
+        out["unexplained"] = write_output(
             root / "unexplained", logs, discover_effects(logs, model, without=WITHOUT)
         )
         yield out
 
 
 @pytest.fixture(params=VERDICTS)
-def one(request: pytest.FixtureRequest, every: dict[str, Left]) -> Left:
+def output(request: pytest.FixtureRequest, every: dict[str, DiscoveryOutput]) -> DiscoveryOutput:
     return every[request.param]
 
 
-def test_each_verdict_is_the_one_meant(every: dict[str, Left]) -> None:
-    assert {word: left.told["verdict"] for word, left in every.items()} == {w: w for w in VERDICTS}
+def test_each_verdict_is_the_one_meant(every: dict[str, DiscoveryOutput]) -> None:
+    assert {word: left.verdict_json["verdict"] for word, left in every.items()} == {
+        w: w for w in VERDICTS
+    }
 
 
-def test_the_page_needs_nothing_else(one: Left, tmp_path: Path) -> None:
-    page = one.page
+def test_the_page_needs_nothing_else(output: DiscoveryOutput, tmp_path: Path) -> None:
+    page = output.page
     assert not re.search(r"(src|href)=[\"'](?!data:)|url\(|@import|<script", page)
-    assert page.count("data:image/png;base64,") == len(list((one.folder / "figures").iterdir()))
+    assert page.count("data:image/png;base64,") == len(list((output.folder / "figures").iterdir()))
     assert "&lt;b&gt;said&lt;/b&gt;" in page
     assert "<b>said" not in page
     assert not re.search(r"\bnan\b|\bNone\b</|\{\{|Undefined", page)
 
 
-def test_the_page_says_the_verdict_the_gap_and_what_to_do(one: Left) -> None:
-    page, gap = one.page, one.told["gap"]
-    assert f'<p class="verdict {one.told["verdict"]}">' in page
-    assert one.told["why"] in page.replace("&#39;", "'")
-    assert one.told["next_run"][1:] in page
+def test_the_page_says_the_verdict_the_gap_and_what_to_do(output: DiscoveryOutput) -> None:
+    page, gap = output.page, output.verdict_json["gap"]
+    assert f'<p class="verdict {output.verdict_json["verdict"]}">' in page
+    assert output.verdict_json["why"] in page.replace("&#39;", "'")
+    assert output.verdict_json["next_run"][1:] in page
     for value in (gap["held_out_before"], gap["held_out_after"], gap["noise_floor"]):
         assert f"{value:.3g}" in page
-    for effect in one.told["effects"]:
+    for effect in output.verdict_json["effects"]:
         assert effect["id"] in page
         for name, value in effect["parameters"].items():
             numbers = [value[key] for key in ("value", "low", "high")]
             cells = "".join(
-                f"<td>{format_rounded(one, count_digits(*numbers))}</td>" for one in numbers
+                f"<td>{format_rounded(number, count_digits(*numbers))}</td>" for number in numbers
             )
             assert f'<td class="text">{name}</td>{cells}' in page
 
 
-def test_the_first_sentence(every: dict[str, Left]) -> None:
+def test_the_first_sentence(every: dict[str, DiscoveryOutput]) -> None:
     heads = {word: re.search("<h1>(.*)</h1>", left.page)[1] for word, left in every.items()}  # type: ignore[index]
     assert "agree to within the noise" in heads["none"]
     assert heads["named"] == "The model lacks bumper_hardening."
     assert "do not determine which" in heads["ambiguous"]
-    for names in every["ambiguous"].told["ambiguous"]:
+    for names in every["ambiguous"].verdict_json["ambiguous"]:
         assert " with ".join(names) in heads["ambiguous"]
     assert "no effect of the library explains" in heads["unexplained"]
 
 
 def test_a_sensor_that_errs_is_not_laid_to_the_model() -> None:
     effect = {"id": "sensor_gain", "channel": "mass_acc_m_s2"}
-    told = {"verdict": "named", "effects": [effect], "ambiguous": []}
-    sentence = format_verdict(told)
+    verdict = {"verdict": "named", "effects": [effect], "ambiguous": []}
+    sentence = format_verdict(verdict)
     assert "sensor_gain of mass_acc_m_s2" in sentence
     assert "model lacks" not in sentence
 
 
-def test_what_fell_away_is_said_with_its_reason(every: dict[str, Left]) -> None:
+def test_what_fell_away_is_said_with_its_reason(every: dict[str, DiscoveryOutput]) -> None:
     page = every["unexplained"].page
     assert "Effects that were not tested" in page
     assert page.count("left out of the library") == len(WITHOUT)
 
 
-def test_every_figure_is_there_and_not_empty(one: Left) -> None:
-    files = {path.stem: path for path in (one.folder / "figures").glob("*.png")}
-    stepped = any(log.steps for log in one.logs)
+def test_every_figure_is_there_and_not_empty(output: DiscoveryOutput) -> None:
+    files = {path.stem: path for path in (output.folder / "figures").glob("*.png")}
+    stepped = any(log.steps for log in output.logs)
     assert files.keys() == (FIGURES if stepped else FIGURES - {"map_0", "prc", "impacts"})
-    assert ("No map over frequency" in one.page) != stepped
+    assert ("No map over frequency" in output.page) != stepped
     for name, path in files.items():
         pixels = imread(path)[..., :3]
         assert (pixels.min(axis=2) < 0.9).mean() > 0.01, name
 
 
-def test_a_term_without_a_name_is_drawn_and_never_in_the_model(every: dict[str, Left]) -> None:
-    one = every["unexplained"]
-    shown = DiscoveryView(one.found, one.logs)
-    assert one.found.verdict.generic is not None
+def test_a_term_without_a_name_is_drawn_and_never_in_the_model(
+    every: dict[str, DiscoveryOutput],
+) -> None:
+    output = every["unexplained"]
+    shown = DiscoveryView(output.discovery, output.logs)
+    assert output.discovery.verdict.generic is not None
     assert shown.law_name.startswith("general.bumper")
-    assert "generic term, bumper" in one.page
-    assert "general" not in (one.folder / "model.toml").read_text()
+    assert "generic term, bumper" in output.page
+    assert "general" not in (output.folder / "model.toml").read_text()
 
 
-def test_the_law_drawn_is_the_force_that_is_missing(every: dict[str, Left]) -> None:
-    shown = DiscoveryView(every["named"].found, every["named"].logs)
+def test_the_law_drawn_is_the_force_that_is_missing(every: dict[str, DiscoveryOutput]) -> None:
+    shown = DiscoveryView(every["named"].discovery, every["named"].logs)
     assert shown.law is not None
     assert shown.law_forces is not None
     sheet, guess = shown.log_residuals[0], shown.law.fit.parameters
     wanted, law, after = (entries_to_samples(sheet, 1, part, guess) for part in shown.law_forces)
-    there = np.isfinite(law)
-    depth = sheet.motion().u[there] - sheet.motion().gaps_m[0] - guess.values["gap0"]
-    assert law[there] == pytest.approx(K2 * depth**2, rel=0.1, abs=5.0)
+    touching = np.isfinite(law)
+    depth = sheet.motion().u[touching] - sheet.motion().gaps_m[0] - guess.values[GapKey(0)]
+    assert law[touching] == pytest.approx(HARDENING_N_M2 * depth**2, rel=0.1, abs=5.0)
     assert np.nanstd(after) < 0.1 * np.nanstd(wanted)
     assert np.nanmax(np.abs(entries_to_samples(sheet, 0, shown.law_forces[1], guess))) < 1e-6
 
 
-def test_the_model_that_is_left_says_how_well_its_numbers_are_known(every: dict[str, Left]) -> None:
+def test_the_model_that_is_left_says_how_well_its_numbers_are_known(
+    every: dict[str, DiscoveryOutput],
+) -> None:
     card = parse_toml((every["named"].folder / "model.toml").read_text(), ModelConfig, "model.toml")
     low, high = card.intervals["bumper_hardening.k2"]
     value = float(card.effects[0].parameters["k2"])
@@ -236,11 +247,11 @@ def test_logs_that_are_called_alike_are_told_apart(tmp_path: Path) -> None:
     assert name_logs([]) == []
 
 
-def test_measured_less_what_is_left_is_the_models_force(every: dict[str, Left]) -> None:
-    one = every["named"]
+def test_measured_less_what_is_left_is_the_models_force(every: dict[str, DiscoveryOutput]) -> None:
+    output = every["named"]
     sheet, guess = (
-        DiscoveryView(one.found, one.logs).log_residuals[0],
-        one.found.verdict.best.fit.parameters,
+        DiscoveryView(output.discovery, output.logs).log_residuals[0],
+        output.discovery.verdict.best.fit.parameters,
     )
     m = sheet.motion()
     model_at_log = guess.model_for_log(0, m)
@@ -253,13 +264,13 @@ def test_measured_less_what_is_left_is_the_models_force(every: dict[str, Left]) 
         assert (measured[row] - away)[used] == pytest.approx(model[used], abs=5.0)  # of a tare
 
 
-def test_the_twin_comes_nearer_when_it_runs_free(every: dict[str, Left]) -> None:
-    one = every["named"]
-    shown = DiscoveryView(one.found, one.logs)
+def test_the_twin_comes_nearer_when_it_runs_free(every: dict[str, DiscoveryOutput]) -> None:
+    output = every["named"]
+    shown = DiscoveryView(output.discovery, output.logs)
     errors = []
     for explained in shown.before_after:
         points = run_log_free(shown.log_residuals[0], shown.sweep_steps(0), explained)
-        assert len(points) == len(one.logs[0].steps)
+        assert len(points) == len(output.logs[0].steps)
         forward = [
             (p.measured, p.twin)
             for p in points
@@ -270,54 +281,55 @@ def test_the_twin_comes_nearer_when_it_runs_free(every: dict[str, Left]) -> None
     assert errors[1] < 0.25 * errors[0]
 
 
-def test_the_table_of_the_curves_says_how_much_nearer(every: dict[str, Left]) -> None:
-    one = every["named"]
-    shown = DiscoveryView(one.found, one.logs)
+def test_the_table_of_the_curves_says_how_much_nearer(every: dict[str, DiscoveryOutput]) -> None:
+    output = every["named"]
+    shown = DiscoveryView(output.discovery, output.logs)
     runs = run_logs_free(shown)
     (row,) = compute_misfits(shown, runs)
     measured = max(p.measured.eta_d for p in runs[0][0] if p.measured is not None)
     assert row["measured"]["eta_d"] == measured
     assert row["after"]["error"] < 0.25 * row["before"]["error"]
-    assert f"<b>{100 * row['after']['error']:.2f} %</b>" in one.page
+    assert f"<b>{100 * row['after']['error']:.2f} %</b>" in output.page
     same = replace(
-        one.found.selection, null=one.found.verdict.best
+        output.discovery.selection, null=output.discovery.verdict.best
     )  # nothing before but what is after
     (row,) = compute_misfits(
-        again := DiscoveryView(replace(one.found, selection=same), one.logs), run_logs_free(again)
+        again := DiscoveryView(replace(output.discovery, selection=same), output.logs),
+        run_logs_free(again),
     )
     assert row["before"] == row["after"]
 
 
 @pytest.mark.parametrize(
-    ("value", "half", "said"),
+    ("value", "half", "texts"),
     [(12345.678, 0.05, ("12\u2009345.678", "12\u2009345.628", "12\u2009345.728")),
      (510000.0, 300.0, ("510\u2009000", "509\u2009700", "510\u2009300")),
      (1500.4, 0.45, ("1500.40", "1499.95", "1500.85")), (0.4, 0.2, ("0.4000", "0.2000", "0.6000")),
      (3.0, 0.0, ("3.000", "3.000", "3.000"))],
 )  # fmt: skip
 def test_an_interval_can_be_told_from_its_value(
-    value: float, half: float, said: tuple[str, ...]
+    value: float, half: float, texts: tuple[str, ...]
 ) -> None:
     numbers = (value, value - half, value + half)
-    assert tuple(format_rounded(one, count_digits(*numbers)) for one in numbers) == said
+    assert tuple(format_rounded(number, count_digits(*numbers)) for number in numbers) == texts
 
 
 def test_the_gates_pass_where_no_sensor_errs_and_fail_where_one_does(
-    every: dict[str, Left],
+    every: dict[str, DiscoveryOutput],
 ) -> None:
-    one = every["none"]
-    shown = DiscoveryView(one.found, one.logs)
+    output = every["none"]
+    shown = DiscoveryView(output.discovery, output.logs)
     assert {gate.passed for gate in check_instruments(shown)} == {True}
-    assert ">FAIL<" not in one.page
+    assert ">FAIL<" not in output.page
     sheet = shown.log_residuals[0]
-    null = one.found.selection.null
+    null = output.discovery.selection.null
     mass = sheet.entry_row == sheet.rows.index("mass")
     at_rest = sheet.entry_row == len(sheet.rows)
     wrong = np.where(mass, 2.0, np.where(at_rest, 9.0, null.held_out[0]))
     broken = replace(
-        one.found.selection, null=replace(null, fit=replace(null.fit, held_out=(wrong,)))
+        output.discovery.selection, null=replace(null, fit=replace(null.fit, held_out=(wrong,)))
     )
-    broken_view = DiscoveryView(replace(one.found, selection=broken), one.logs)
+    broken_view = DiscoveryView(replace(output.discovery, selection=broken), output.logs)
     failed = [gate.label for gate in check_instruments(broken_view) if not gate.passed]
     assert failed[0].startswith("mass: ")
     assert len(failed) == 1 + len(sheet.rest_channels)

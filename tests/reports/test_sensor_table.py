@@ -64,7 +64,7 @@ def start(rig_toml: str = CARD, started_at: str = "2026-03-11T10:00:00+00:00") -
 
 
 def test_a_row_says_what_the_card_says_and_the_tare_in_its_unit() -> None:
-    rows = {one.channel: one for one in build_sensor_rows(start(CARD + RECORD))}
+    rows = {row.channel: row for row in build_sensor_rows(start(CARD + RECORD))}
     assert list(rows) == list(parse_toml(CARD, RigConfig, "card").channels)
     acc = rows["table_acc_m_s2"]
     assert (acc.instrument, acc.serial, acc.certificate) == ("PCB 3713B", "LW 12", "K-77")
@@ -80,9 +80,9 @@ def test_a_row_says_what_the_card_says_and_the_tare_in_its_unit() -> None:
 
 def test_overdue_is_judged_on_the_day_of_the_run() -> None:
     before = {
-        one.channel: one for one in build_sensor_rows(start(started_at="2021-03-11T23:00:00"))
+        row.channel: row for row in build_sensor_rows(start(started_at="2021-03-11T23:00:00"))
     }
-    after = {one.channel: one for one in build_sensor_rows(start(started_at="2021-03-12T00:10:00"))}
+    after = {row.channel: row for row in build_sensor_rows(start(started_at="2021-03-12T00:10:00"))}
     assert not before["table_acc_m_s2"].overdue
     assert after["table_acc_m_s2"].overdue
 
@@ -90,14 +90,14 @@ def test_overdue_is_judged_on_the_day_of_the_run() -> None:
 @pytest.mark.parametrize("text", ["", "not = = toml", "sensors = 3", '[[sensors]]\nchannel = "x"'])
 def test_without_a_card_the_tare_is_still_shown(text: str) -> None:
     rows = build_sensor_rows(start(text, started_at=""))
-    assert [(one.channel, one.tare, one.unit) for one in rows] == [
+    assert [(row.channel, row.tare, row.unit) for row in rows] == [
         ("table_acc_m_s2", 0.0980665, "m/s2"),
         ("force_l2_n", 5.0, "N"),
     ]
 
 
 def test_a_run_warns_records_and_reports_what_is_overdue(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, draft: None
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "card.toml").write_text(CARD)
@@ -105,22 +105,22 @@ def test_a_run_warns_records_and_reports_what_is_overdue(
     words = ["run", "short.toml", "--table", "card.toml", "--speed", "max", "--out", "out"]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 0, result.stdout
-    told = "table_acc_m_s2 (serial LW 12): its calibration was due on 2021-03-11"
-    assert f"warning: {told}" in result.stdout
+    reminder = "table_acc_m_s2 (serial LW 12): its calibration was due on 2021-03-11"
+    assert f"warning: {reminder}" in result.stdout
     (event,) = (
-        one
-        for one in read_recording(Path("out/run.mcap")).records(Event)
-        if one.kind == "calibration"
+        event
+        for event in read_recording(Path("out/run.mcap")).records(Event)
+        if event.kind == "calibration"
     )
-    assert told in event.text
+    assert reminder in event.text
     assert event.index == 0
     page = Path("out/report.html").read_text(encoding="utf-8")
     assert "<h3>Sensors</h3>" in page
     assert "<b>2021-03-11, overdue</b>" in page
     assert "&lt;the institute&gt;" in page
-    assert told in page
-    found = CliRunner().invoke(app, ["verify", "out"]).stdout
-    assert "serial LW 12" in found
-    assert "OVERDUE when the run began" in found
+    assert reminder in page
+    output = CliRunner().invoke(app, ["verify", "out"]).stdout
+    assert "serial LW 12" in output
+    assert "OVERDUE when the run began" in output
     sensors = json.loads(CliRunner().invoke(app, ["verify", "out", "--json"]).stdout)["sensors"]
-    assert [one["overdue"] for one in sensors if one["serial"]] == [True]
+    assert [sensor["overdue"] for sensor in sensors if sensor["serial"]] == [True]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from table_io.block import Block
 from table_io.records import (
@@ -79,7 +80,7 @@ def strict(text: str) -> Any:
 
 
 def without(recording: Recording, *kinds: type) -> list[Item]:
-    return [one for one in recording.items if not isinstance(one, kinds)]
+    return [item for item in recording.items if not isinstance(item, kinds)]
 
 
 def point(
@@ -143,11 +144,11 @@ def test_steps_are_the_recorded_points(
     recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
     summary = summary_of(list(recording.items), recording, bundle, tmp_path)
-    for step, one in zip(summary["steps"], recording.records(PrcPoint), strict=True):
-        assert one.measured is not None
-        assert one.twin is not None
-        assert step["measured"] == json.loads(json.dumps(asdict(one.measured)))
-        assert step["twin"] == json.loads(json.dumps(asdict(one.twin)))
+    for step, point_record in zip(summary["steps"], recording.records(PrcPoint), strict=True):
+        assert point_record.measured is not None
+        assert point_record.twin is not None
+        assert step["measured"] == json.loads(json.dumps(asdict(point_record.measured)))
+        assert step["twin"] == json.loads(json.dumps(asdict(point_record.twin)))
 
 
 def test_without_processes_there_is_no_latency(
@@ -175,7 +176,7 @@ def test_the_last_timing_of_each_component_counts(
 
 def test_nrmse_is_that_of_the_samples(recording: Recording, bundle: RunConfig) -> None:
     """Directly from the recorded samples, over those that both have."""
-    found = summarise(recording, bundle.parameters)["comparison"]
+    comparison = summarise(recording, bundle.parameters)["comparison"]
     measured, predicted = (
         recording.contiguous_blocks("meas")[0],
         recording.contiguous_blocks("pred")[0],
@@ -188,7 +189,7 @@ def test_nrmse_is_that_of_the_samples(recording: Recording, bundle: RunConfig) -
         for track, key in (("window", "nrmse"), ("free", "free_nrmse")):
             error = x - predicted.channel(f"{track}/{name}")[cells]
             want = math.sqrt((error**2).sum() / (x**2).sum())
-            assert found[name][key] == pytest.approx(want, rel=1e-9)
+            assert comparison[name][key] == pytest.approx(want, rel=1e-9)
 
 
 def test_a_lost_channel_is_null_and_the_others_stay(
@@ -196,28 +197,28 @@ def test_a_lost_channel_is_null_and_the_others_stay(
 ) -> None:
     place = COMPARED_CHANNELS.index("force_r1_n")
     items: list[Item] = []
-    for one in recording.items:
-        if isinstance(one, Comparison):
-            sums = list(one.measured_ss)
+    for item in recording.items:
+        if isinstance(item, Comparison):
+            sums = list(item.measured_ss)
             sums[place] = math.nan
-            items.append(replace(one, measured_ss=tuple(sums)))
+            items.append(replace(item, measured_ss=tuple(sums)))
         else:
-            items.append(one)
-    found = summary_of(items, recording, bundle, tmp_path)["comparison"]
+            items.append(item)
+    comparison = summary_of(items, recording, bundle, tmp_path)["comparison"]
     whole = summarise(recording, bundle.parameters)["comparison"]
-    assert found["force_r1_n"] == {"nrmse": None, "free_nrmse": None}
-    assert found["force_r2_n"] == whole["force_r2_n"]
+    assert comparison["force_r1_n"] == {"nrmse": None, "free_nrmse": None}
+    assert comparison["force_r2_n"] == whole["force_r2_n"]
 
 
 def test_load_cells_without_bumpers_have_nothing_to_compare(
     recording: Recording, bundle: RunConfig
 ) -> None:
     parameters = replace(bundle.parameters, gap_r=math.inf)
-    found = summarise(recording, parameters)["comparison"]
+    comparison = summarise(recording, parameters)["comparison"]
     for name in CELLS[:2]:
-        assert found[name] == {"nrmse": None, "free_nrmse": None}
+        assert comparison[name] == {"nrmse": None, "free_nrmse": None}
     for name in (*CELLS[2:], "rel_disp_m"):
-        assert found[name]["nrmse"] > 0
+        assert comparison[name]["nrmse"] > 0
 
 
 # Jumps and hysteresis
@@ -252,14 +253,14 @@ def test_a_dead_twin_leaves_what_was_measured(
     recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
     """Dead over the second step: its measured part is made from the samples, its twin is null."""
-    cycles = {one.step: one for one in recording.records(CycleExtremes)}
+    cycles = {cycle.step: cycle for cycle in recording.records(CycleExtremes)}
     dead = (cycles[0].index + 250, cycles[1].index + 100)
     fault = Fault(dead[1], "twin", *dead, "the process died and was restarted")
     kept = [
-        one
-        for one in recording.items
-        if not (isinstance(one, (PrcPoint, CycleExtremes)) and one.step == 1)
-        and not (isinstance(one, Comparison) and dead[0] <= one.index < dead[1])
+        item
+        for item in recording.items
+        if not (isinstance(item, (PrcPoint, CycleExtremes)) and item.step == 1)
+        and not (isinstance(item, Comparison) and dead[0] <= item.index < dead[1])
     ]
     summary = summary_of([*kept, fault], recording, bundle, tmp_path)
     assert [step["index"] for step in summary["steps"]] == [0, 1, 2, 3]
@@ -286,7 +287,7 @@ def test_a_stopped_run_without_a_point(bundle: RunConfig, tmp_path: Path) -> Non
 def test_a_recording_without_an_end_says_so(
     recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
-    kept = [one for one in without(recording, RunStop) if one.index < 3000]
+    kept = [item for item in without(recording, RunStop) if item.index < 3000]
     summary = summary_of(kept, recording, bundle, tmp_path)
     assert summary["verdict"] == "halted"
     assert summary["reason"] == "the recording ends without a stop record"
@@ -313,9 +314,9 @@ def test_gaps_and_lost_samples_are_counted(
     ]
     assert summary_of([*recording.items, *gaps], recording, bundle, tmp_path)["gaps"] == 2
     kept = [
-        one
-        for one in recording.items
-        if not (isinstance(one, Block) and one.stream == "meas" and 1500 <= one.index < 1600)
+        item
+        for item in recording.items
+        if not (isinstance(item, Block) and item.stream == "meas" and 1500 <= item.index < 1600)
     ]
     (tmp_path / "holed").mkdir()
     summary = summary_of(kept, recording, bundle, tmp_path / "holed")
@@ -334,8 +335,8 @@ def test_points_of_a_lost_sensor_are_null_not_zero(
     recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
     values = NormalizedResponse(0.1, math.nan, 0.02, 0.0, math.nan, 0.0, (), (), 0.0, 0.0)
-    one = replace(point(0, "forward", 3.4, 0.1, None), measured=values, thd=math.nan)
-    items = [*without(recording, PrcPoint, Event), one]
+    lone_point = replace(point(0, "forward", 3.4, 0.1, None), measured=values, thd=math.nan)
+    items = [*without(recording, PrcPoint, Event), lone_point]
     (step,) = summary_of(items, recording, bundle, tmp_path)["steps"]
     assert step["measured"]["eta_a"] is None
     assert step["measured"]["r_r"] is None
@@ -350,3 +351,17 @@ def test_a_lost_start_record_is_taken_from_its_copy(recording: Recording, tmp_pa
     assert again.start == recording.start
     (damage,) = again.damage
     assert "/run/start: lost" in damage.reason
+
+
+def test_a_key_that_the_contract_does_not_know_is_not_written(
+    recording: Recording, bundle: RunConfig, tmp_path: Path
+) -> None:
+    summary = summarise(recording, bundle.parameters)
+    write_summary(summary, tmp_path / "summary.json")
+    assert (tmp_path / "summary.json").read_text() == dump_strict_json(summary) + "\n"
+    step = {**summary["steps"][0], "mood": "good"}
+    without_gaps = {key: value for key, value in summary.items() if key != "gaps"}
+    for wrong in ({**summary, "steps": [step]}, {**summary, "mood": "good"}, without_gaps):
+        with pytest.raises(ValidationError):
+            write_summary(wrong, tmp_path / "other.json")
+    assert not (tmp_path / "other.json").exists()

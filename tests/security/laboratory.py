@@ -44,14 +44,14 @@ def own(lab: Path, name: str) -> Path:
 def aged(lab: Path, folder: Path, name: str, days: float, hosts: tuple[str, ...] = ()) -> Path:
     """Keys issued so many days ago."""
     authority = CertificateKeyPair((lab / "ca.pem").read_bytes(), (lab / "ca.key.pem").read_bytes())
-    return kept(
+    return write_keys(
         folder,
         lab,
         issue_certificate(authority, name, hosts, local_datetime() - timedelta(days=days)),
     )
 
 
-def kept(folder: Path, lab: Path, pair: CertificateKeyPair) -> Path:
+def write_keys(folder: Path, lab: Path, pair: CertificateKeyPair) -> Path:
     """A folder of keys with this pair, and the authority of a laboratory."""
     folder.mkdir()
     shutil.copy(lab / "ca.pem", folder)
@@ -85,9 +85,11 @@ def put(by: Any, key: str, body: bytes = b"") -> None:
     by.delete(f"{ROOT}/{key}", congestion_control=block)
 
 
-def noted(where: list[str]) -> Any:
+def note_keys(where: list[str]) -> Any:
     """What writes down the keys of samples or queries before anything later is heard."""
-    return zenoh.handlers.Callback(lambda one: where.append(str(one.key_expr)), indirect=False)
+    return zenoh.handlers.Callback(
+        lambda sample: where.append(str(sample.key_expr)), indirect=False
+    )
 
 
 def answers(of: Any, key: str) -> list[bytes]:
@@ -100,7 +102,7 @@ def answers(of: Any, key: str) -> list[bytes]:
 def alive(of: Any) -> set[str]:
     """The tokens that a session sees."""
     replies = of.liveliness().get(f"{ROOT}/alive/*", timeout=10.0)
-    return {str(one.ok.key_expr).rsplit("/", 1)[1] for one in replies if one.ok is not None}
+    return {str(reply.ok.key_expr).rsplit("/", 1)[1] for reply in replies if reply.ok is not None}
 
 
 @contextmanager

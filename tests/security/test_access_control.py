@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from table_io.errors import InputError
+from tests.input_errors import raises_input_error
 from tests.security.laboratory import (
     COMPONENTS,
     PEOPLE,
@@ -18,7 +18,7 @@ from tests.security.laboratory import (
     door,
     free_port,
     laboratory,
-    noted,
+    note_keys,
     own,
     put,
 )
@@ -68,53 +68,53 @@ def person(hub: BusLink, lab: Path, endpoint: str, closing: ExitStack) -> Any:
     return come
 
 
-def settled(session: Any) -> None:
+def settle(session: Any) -> None:
     """Whatever the session sent before has been seen by the hub, and the other way round."""
     assert answers(session, "state/role/none")
 
 
-def heard(session: Any, *keys: str) -> list[str]:
+def collect_keys(session: Any, *keys: str) -> list[str]:
     """The keys of what a session gets for these subscriptions, growing."""
     got: list[str] = []
-    for one in keys:
-        where = f"{ROOT}/{one}"
-        session.declare_subscriber(where, noted(got))
-    settled(session)
+    for key in keys:
+        where = f"{ROOT}/{key}"
+        session.declare_subscriber(where, note_keys(got))
+    settle(session)
     return got
 
 
 @pytest.mark.parametrize("who", KNOWN)
 def test_everybody_known_hears_every_topic(hub: BusLink, person: Any, who: str) -> None:
     session = person(who)
-    got = heard(
+    got = collect_keys(
         session, *(key_expression(RIG, topic).removeprefix(f"{ROOT}/") for topic in TOPIC_TYPES)
     )
     for topic in TOPIC_TYPES:
         put(hub._session, key_expression(RIG, topic).removeprefix(f"{ROOT}/"))
-    settled(session)
+    settle(session)
     assert sorted(got) == sorted(key_expression(RIG, topic) for topic in TOPIC_TYPES)
 
 
 @pytest.mark.parametrize("who", [*KNOWN, "gone"])
 def test_nobody_hears_commands_or_what_is_wider(hub: BusLink, person: Any, who: str) -> None:
     session = person(who)
-    got = heard(session, "**", "*/rig/meas", "cmd/**", "state/**", "../**")
+    got = collect_keys(session, "**", "*/rig/meas", "cmd/**", "state/**", "../**")
     for where in ("stream/rig/meas", "event/run/start", "cmd/stop/anna", "state/held"):
         put(hub._session, where)
-    settled(session)
+    settle(session)
     assert got == []
 
 
 def test_who_is_not_in_the_list_hears_nothing(hub: BusLink, person: Any) -> None:
     asked: list[str] = []
-    rig = hub._session.declare_queryable(f"{ROOT}/**", noted(asked))
+    rig = hub._session.declare_queryable(f"{ROOT}/**", note_keys(asked))
     session = person("gone")
-    got = heard(session, "stream/rig/meas", "event/run/start")
+    got = collect_keys(session, "stream/rig/meas", "event/run/start")
     put(hub._session, "stream/rig/meas")
-    settled(session)
+    settle(session)
     assert (got, alive(session)) == ([], set())
-    for one in ("state/status", "state/role/gone", "state/role/*", "config/run", "cmd/stop/gone"):
-        assert answers(session, one) == []
+    for path in ("state/status", "state/role/gone", "state/role/*", "config/run", "cmd/stop/gone"):
+        assert answers(session, path) == []
     rig.undeclare()
     assert set(asked) == {f"{ROOT}/state/role/none"}
 
@@ -131,8 +131,8 @@ def test_a_twin_elsewhere_is_heard_without_loss(
     got = []
     for _ in range(200):
         twin.serve()
-        if (one := inbox.get(0.05)) is not None:
-            got.append(one[1])
+        if (message := inbox.get(0.05)) is not None:
+            got.append(message[1])
             if len(got) == 2:
                 break
             twin.publish("/twin/point", b"after")
@@ -144,11 +144,11 @@ def test_only_a_twin_publishes_and_only_what_a_twin_computes(
     hub: BusLink, person: Any, who: str
 ) -> None:
     got: list[str] = []
-    listener = hub._session.declare_subscriber("**", noted(got))
+    listener = hub._session.declare_subscriber("**", note_keys(got))
     session = person(who)
     for where in (*NOT_THEIRS, "stream/twin/pred", "event/twin/point", "offer/twin/pred"):
         put(session, where)
-    settled(session)
+    settle(session)
     listener.undeclare()
     assert got == ([f"{ROOT}/offer/twin/pred"] if who == "tina" else [])
 
@@ -179,19 +179,19 @@ def test_nobody_answers_or_listens_in_the_rigs_place(hub: BusLink, person: Any, 
     asked: list[str] = []
     false_rig = person(who)
     for where in ("cmd/**", "cmd/stop/anna", "state/**", "state/status", "config/**", "state/held"):
-        false_rig.declare_queryable(f"{ROOT}/{where}", noted(asked))
-    false_rig.declare_queryable(f"{ROOT}/state/offers", noted(asked))
-    heard(false_rig, "cmd/**", "cmd/stop/anna")
+        false_rig.declare_queryable(f"{ROOT}/{where}", note_keys(asked))
+    false_rig.declare_queryable(f"{ROOT}/state/offers", note_keys(asked))
+    collect_keys(false_rig, "cmd/**", "cmd/stop/anna")
     honest = person("anna")
     assert answers(honest, "cmd/stop/anna") == [b"refused: this is run run"]
     assert answers(honest, "state/status") == [b"state/status"]
     assert answers(honest, "config/run") == [b"config/run"]
     assert answers(honest, "state/held") == []
     assert answers(honest, "state/offers") == []
-    settled(false_rig)
+    settle(false_rig)
     assert asked == []
     answers(hub._session, "state/offers")
-    settled(false_rig)
+    settle(false_rig)
     assert set(asked) == ({f"{ROOT}/state/offers"} if who == "tina" else set())
 
 
@@ -211,7 +211,7 @@ def test_nobody_is_there_under_anothers_name(hub: BusLink, person: Any, who: str
         session.liveliness().declare_token(f"{ROOT}/alive/{name}")
         for name in (*false, *others, f"observer.{who}x.1", f"observer.{who}.1")
     ]
-    settled(session)
+    settle(session)
     theirs = {f"observer.{who}.1"} if who in KNOWN else set()
     assert alive(hub._session) == {*COMPONENTS} | theirs
     assert alive(person("bob")) == {*COMPONENTS} | theirs
@@ -226,11 +226,9 @@ def test_our_own_end_says_who_is_not_in_the_list(lab: Path) -> None:
 
 
 def said_to_whom(lab: Path, endpoint: str) -> None:
-    with pytest.raises(
-        InputError, match="certificate is good, but gone is not in the rig's access"
-    ):
+    with raises_input_error(key="endpoint", value=endpoint, problem="gone"):
         open_spoke(RIG, endpoint, 5.0, read_credentials(own(lab, "gone")))
-    with pytest.raises(InputError, match=r"'other'.*--rig"):
+    with raises_input_error(key="endpoint", value=endpoint, problem="'other'"):
         open_spoke("other", endpoint, 5.0, read_credentials(own(lab, "anna")))
     link = open_spoke(RIG, endpoint, 5.0, read_credentials(own(lab, "anna")))
     assert link.query("state/status") == b"state/status"
@@ -243,7 +241,7 @@ def test_a_run_with_a_twin_of_its_own_takes_no_other(lab: Path, closing: ExitSta
     session = raw_person(lab, "tina", endpoint)
     closing.callback(session.close)
     got: list[str] = []
-    link._session.declare_subscriber("**", noted(got))
+    link._session.declare_subscriber("**", note_keys(got))
     put(session, "offer/twin/pred")
     assert answers(session, "state/role/tina") == [b"twin"]
     assert got == []
@@ -257,25 +255,25 @@ def test_on_this_machine_everybody_asks_and_nobody_publishes(
     also: Settings = build_open_access(RIG, remote_twin=twin)
     link = closing.enter_context(door(endpoint, extra_settings=also))
     session, false_rig, honest = (raw_session(endpoint, {}) for _ in range(3))
-    for one in (session, false_rig, honest):
-        closing.callback(one.close)
+    for peer in (session, false_rig, honest):
+        closing.callback(peer.close)
     published: list[str] = []
-    link._session.declare_subscriber("**", noted(published))
-    got, too_wide = heard(session, "stream/rig/meas"), heard(honest, "**", "cmd/**")
+    link._session.declare_subscriber("**", note_keys(published))
+    got, too_wide = collect_keys(session, "stream/rig/meas"), collect_keys(honest, "**", "cmd/**")
     asked: list[str] = []
-    false_rig.declare_queryable(f"{ROOT}/cmd/**", noted(asked))
+    false_rig.declare_queryable(f"{ROOT}/cmd/**", note_keys(asked))
     kept = [
         false_rig.liveliness().declare_token(f"{ROOT}/alive/{name}")
         for name in ("run.twin", "observer.me.1")
     ]
     for where in (*NOT_THEIRS, "stream/twin/pred", "offer/twin/pred"):
         put(false_rig, where)
-    settled(false_rig)
+    settle(false_rig)
     assert published == ([f"{ROOT}/offer/twin/pred"] if twin else [])
     put(link._session, "stream/rig/meas")
     put(link._session, "cmd/stop/me")
     assert answers(honest, "cmd/stop/me") == [b"cmd/stop/me"]
-    settled(session)
+    settle(session)
     assert (got, too_wide, asked) == ([f"{ROOT}/stream/rig/meas"], [], [])
     assert alive(session) == {*COMPONENTS, "observer.me.1"}
     assert kept

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from table_io.errors import InputError
+from tests.input_errors import raises_input_error
 from tests.security.laboratory import (
     COMPONENTS,
     RIG,
@@ -96,8 +96,10 @@ def test_behind_a_router_nobody_publishes_in_the_rigs_name(
 ) -> None:
     anna, bob = behind("anna"), behind("bob")
     got: list[bytes] = []
-    anna.declare_subscriber(f"{ROOT}/stream/rig/meas", lambda one: got.append(bytes(one.payload)))
-    bob.declare_queryable(f"{ROOT}/state/**", lambda one: one.reply(one.key_expr, b"false"))
+    anna.declare_subscriber(
+        f"{ROOT}/stream/rig/meas", lambda sample: got.append(bytes(sample.payload))
+    )
+    bob.declare_queryable(f"{ROOT}/state/**", lambda query: query.reply(query.key_expr, b"false"))
     for _ in range(TRIES):  # until the subscription has reached the rig
         between[0]._session.put(f"{ROOT}/stream/rig/meas", b"true")
         bob.put(f"{ROOT}/stream/rig/meas", b"false")
@@ -115,14 +117,16 @@ def test_our_own_end_comes_in_by_a_router(
     link = open_spoke(RIG, between[1], 5.0, read_credentials(own(lab, "anna")))
     assert link.query("state/status") == b"state/status"
     link.close()
-    with pytest.raises(InputError, match="gone is not in the rig's access list"):
+    with raises_input_error(key="endpoint", value=between[1], problem="gone"):
         open_spoke(RIG, between[1], 5.0, read_credentials(own(lab, "gone")))
 
 
 def test_a_router_has_that_role_and_listens_with_keys(lab: Path) -> None:
-    with pytest.raises(InputError, match=r"anna is not a router; .*relay"):
+    with raises_input_error(
+        where=lab / "access.toml", key="NAME", value="anna", problem="router", remedy="relay"
+    ):
         print_router_settings(lab, "anna", "tls/0.0.0.0:7447", RIG)
-    with pytest.raises(InputError, match="tcp/ shows no certificate"):
+    with raises_input_error(key="endpoint", value="tcp/0.0.0.0:7447", remedy="tls/"):
         print_router_settings(lab, "relay", "tcp/0.0.0.0:7447", RIG)
 
 

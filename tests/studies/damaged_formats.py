@@ -21,7 +21,7 @@ from tests.exchange.test_formats import FORMATS
 from twin.exchange.columns import ColumnMap, read_samples
 from twin.exchange.formats import read_table
 
-HEAD = 4000  # bytes in which half of the changes lie: there stands what a file says of itself
+HEAD_BYTES = 4000  # bytes in which half of the changes lie: there stands what a file says of itself
 ODD = (0, 0x7F, 0x80, 0xFF)
 HUGE = (b"\xff" * 8, bytes(8), (2**62).to_bytes(8, "little"), (2**31 - 1).to_bytes(4, "big") * 2)
 
@@ -30,7 +30,7 @@ def mutant(data: bytes, seed: str) -> bytes:
     """The file with one kind of damage; the same for the same seed."""
     rng = random.Random(seed)
     out = bytearray(data)
-    zone = len(out) if rng.random() < 0.5 else min(HEAD, len(out))
+    zone = len(out) if rng.random() < 0.5 else min(HEAD_BYTES, len(out))
     at, size = rng.randrange(zone), rng.randrange(1, 300)
     kind = rng.choice(("bytes", "bytes", "bytes", "cut", "huge", "less", "more", "moved"))
     if kind == "bytes":
@@ -72,19 +72,19 @@ def main() -> int:
             path.unlink(missing_ok=True)
             write(path)
             data = path.read_bytes()
-            found: Counter[str] = Counter()
+            counts: Counter[str] = Counter()
             slowest = 0.0
             for number in range(count):
                 path.write_bytes(mutant(data, f"{kind} {number}"))
                 begun = process_time()
                 came = outcome(path, card)
                 slowest = max(slowest, process_time() - begun)
-                found[came] += 1
+                counts[came] += 1
                 if came.startswith("Traceback"):
                     wrong += 1
                     print(f"{kind}, mutant {number}: {came}")
-            told = ", ".join(f"{times} {what.splitlines()[0]}" for what, times in found.items())
-            print(f"{kind:10} {told}; slowest {slowest:.2f} s of CPU", flush=True)
+            summary = ", ".join(f"{times} {what.splitlines()[0]}" for what, times in counts.items())
+            print(f"{kind:10} {summary}; slowest {slowest:.2f} s of CPU", flush=True)
     for who, which in (("we", resource.RUSAGE_SELF), ("readers", resource.RUSAGE_CHILDREN)):
         print(f"{who}: {resource.getrusage(which).ru_maxrss / 1024:.0f} MB at the most")
     return int(wrong > 0)

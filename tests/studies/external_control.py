@@ -25,7 +25,7 @@ from table_io.excitation.drive import Drive
 from table_io.sim.controller import DrivePlayback
 from tests.table_io.excitation.sine_segments import sine_segments
 
-RATE = 2000.0
+RATE_HZ = 2000.0
 LSB = 2 * 0.06 / 2**24
 LATER = (5.0, 10.0, 20.0, 40.0)  # s after the motion began
 CASES = (
@@ -44,49 +44,49 @@ def drive_of(name: str, check: bool) -> Drive:
     return plan_open_loop_drive(Profile.model_validate(raw), rig)
 
 
-def followed(
+def follow_drive(
     drive: Drive, ppm: float, begins: float, rng: np.random.Generator
 ) -> tuple[float, list[float]]:
     """(s from the motion's begin until it is found, error in samples at each of LATER)."""
     first = sine_segments(drive)[0]
     sigma = 0.01 * first.level1 / (2 * math.pi * first.f1) ** 2
     motion = begins + first.start
-    count = int(motion + (LATER[-1] + 0.5) * RATE)
-    played = DrivePlayback(drive.command(0, count), RATE, RATE, begins, ppm)
-    now, found_s, errors = DriveFollower(drive, RATE, sigma, LSB), math.nan, list[float]()
+    count = int(motion + (LATER[-1] + 0.5) * RATE_HZ)
+    played = DrivePlayback(drive.command(0, count), RATE_HZ, RATE_HZ, begins, ppm)
+    follower, found_s, errors = DriveFollower(drive, RATE_HZ, sigma, LSB), math.nan, list[float]()
     for at in range(0, count, 500):
         command = played.command(at, 500) + sigma * rng.standard_normal(500)
-        now = advance_follower(now, np.rint(command / LSB) * LSB)
-        if now.fit is None:
+        follower = advance_follower(follower, np.rint(command / LSB) * LSB)
+        if follower.fit is None:
             continue
-        since = (now.processed_end - motion) / RATE
+        since = (follower.processed_end - motion) / RATE_HZ
         error = (
-            float(now.fit.drive_index(np.array([now.processed_end]))[0])
-            - (now.processed_end - begins) * played.values_per_sample
+            float(follower.fit.drive_index(np.array([follower.processed_end]))[0])
+            - (follower.processed_end - begins) * played.values_per_sample
         )
         if not errors:
             found_s, errors = since, [abs(error)]
         elif len(errors) <= len(LATER) and since >= LATER[len(errors) - 1]:
             errors.append(abs(error))
-    assert now.state == "playing", now.reason
+    assert follower.state == "playing", follower.reason
     return found_s, errors
 
 
 def alignment(lives: int) -> None:
     """The largest error of all lives, in samples."""
-    later = ", ".join(f"at {one:g} s" for one in LATER)
+    later = ", ".join(f"at {later:g} s" for later in LATER)
     print(f"drive, lives: found after s at most; error when found p50, max; max {later}")
     for name, check, hz in CASES:
         drive, rng = drive_of(name, check), np.random.default_rng(11)
         all_of = [
-            followed(drive, rng.uniform(-100, 100), rng.uniform(3000, 9000), rng)
+            follow_drive(drive, rng.uniform(-100, 100), rng.uniform(3000, 9000), rng)
             for _ in range(lives)
         ]
-        errors = np.array([one for _, one in all_of])
+        errors = np.array([error for _, error in all_of])
         print(
             f"{name} from {hz} Hz, {'with' if check else 'without'} loop check, {lives}: "
-            f"{max(one for one, _ in all_of):.2f}; {np.median(errors[:, 0]):.3f}, "
-            + ", ".join(f"{one:.3f}" for one in errors.max(axis=0)),
+            f"{max(duration for duration, _ in all_of):.2f}; {np.median(errors[:, 0]):.3f}, "
+            + ", ".join(f"{error:.3f}" for error in errors.max(axis=0)),
             flush=True,
         )
 
@@ -94,17 +94,17 @@ def alignment(lives: int) -> None:
 def labels(ppm: float = 50.0) -> None:
     drive, begins = drive_of("g4_ss3", True), 7000.37
     for noise in (0.0, 0.01):
-        told, true = _told(drive, ppm, begins, noise)
+        estimated, true = _estimate_indices(drive, ppm, begins, noise)
         moving = true >= sine_segments(drive)[0].start
-        off = np.abs(told - true)[moving]
-        low = int(min(told.min(), true.min())) - 1
-        rows = drive.labels(low, int(max(told.max(), true.max())) + 4 - low)
-        wrong = np.zeros(told.size, dtype=bool)
+        off = np.abs(estimated - true)[moving]
+        low = int(min(estimated.min(), true.min())) - 1
+        rows = drive.labels(low, int(max(estimated.max(), true.max())) + 4 - low)
+        wrong = np.zeros(estimated.size, dtype=bool)
         for row in rows:
-            wrong |= row[told - low] != row[np.rint(true).astype(int) - low]
+            wrong |= row[estimated - low] != row[np.rint(true).astype(int) - low]
         edges = sum(int(np.count_nonzero(np.diff(row))) for row in rows)
         print(
-            f"labels over {true.size / RATE:.0f} s at {ppm:g} ppm, noise {100 * noise:g} %: "
+            f"labels over {true.size / RATE_HZ:.0f} s at {ppm:g} ppm, noise {100 * noise:g} %: "
             f"place off by {off.max():.2f} samples at most (0.5 is the nearest one), p99 "
             f"{np.percentile(off, 99):.2f}; {int(wrong[moving].sum())} of {moving.sum()} samples "
             f"have another label, at {edges} edges",
@@ -112,20 +112,26 @@ def labels(ppm: float = 50.0) -> None:
         )
 
 
-def _told(drive: Drive, ppm: float, begins: float, noise: float) -> tuple[np.ndarray, np.ndarray]:
+def _estimate_indices(
+    drive: Drive, ppm: float, begins: float, noise: float
+) -> tuple[np.ndarray, np.ndarray]:
     """(places told, true places) of every sample."""
     file, rng = drive.command(0, drive.rest_start + 1000), np.random.default_rng(3)
     first = sine_segments(drive)[0]
     sigma = noise * first.level1 / (2 * math.pi * first.f1) ** 2
-    played = DrivePlayback(file, RATE, RATE, begins, ppm)
-    now, count, told = DriveFollower(drive, RATE, sigma, LSB), played.end // 500 * 500, []
+    played = DrivePlayback(file, RATE_HZ, RATE_HZ, begins, ppm)
+    follower, count, estimates = (
+        DriveFollower(drive, RATE_HZ, sigma, LSB),
+        played.end // 500 * 500,
+        [],
+    )
     for at in range(0, count, 500):
         command = played.command(at, 500) + sigma * rng.standard_normal(500)
-        now = advance_follower(now, np.rint(command / LSB) * LSB)
-        now, places = take_drive_indices(now, now.located_end - now.taken_end)
-        told.append(places)
-    assert now.state == "playing", now.reason
-    return np.concatenate(told)[:count], (np.arange(count) - begins) * played.values_per_sample
+        follower = advance_follower(follower, np.rint(command / LSB) * LSB)
+        follower, places = take_drive_indices(follower, follower.located_end - follower.taken_end)
+        estimates.append(places)
+    assert follower.state == "playing", follower.reason
+    return np.concatenate(estimates)[:count], (np.arange(count) - begins) * played.values_per_sample
 
 
 def live() -> None:

@@ -34,7 +34,7 @@ ALLOWED = {0, 2, 3, 4, 5}
 MEMORY = 2 * 2**30  # bytes a process may have
 HANGS_S = 60.0  # of computing for one mutant
 SILENT_S = 600.0  # of the clock, which others may slow
-REPORTED = 50  # one in so many replays makes its report too
+REPORT_INTERVAL = 50  # one in so many replays makes its report too
 PROFILE = """
 title = "Short"
 [specimen]
@@ -65,9 +65,9 @@ class Trials:
         recording = read_recording(run)
         end = recording.stop.index if recording.stop else 0
         # The loop check and the sweep are long: their beginnings, a step and the end are enough.
-        kept = [one for one in recording.items if one.index < 500 or one.index > end - 600]
+        kept = [item for item in recording.items if item.index < 500 or item.index > end - 600]
         self.items, self.start = kept, recording.start
-        self.messages = [(topic_for(one), encode_item(one, "run"), one.index) for one in kept]
+        self.messages = [(topic_for(item), encode_item(item, "run"), item.index) for item in kept]
         self.whole = mutants.whole(folder / "whole.mcap", kept, recording.start).read_bytes()
         write_csv(recording, folder / "table.csv")
         lines = (folder / "table.csv").read_bytes().split(b"\n")
@@ -78,19 +78,19 @@ class Trials:
         """(its ending, its bytes)."""
         chance, kind = random.Random(number), number % 10
         if kind < 4:
-            return ".mcap", mutants.damaged(self.whole, chance)
+            return ".mcap", mutants.damage(self.whole, chance)
         if kind < 8:
             path = self.folder / f"{number}.lie.mcap"
             messages = mutants.lied(self.messages, self.items, "run", chance)
-            content = mutants.written(path, messages, self.start).read_bytes()
+            content = mutants.write_messages(path, messages, self.start).read_bytes()
             path.unlink()
             return ".mcap", content
         if kind == 8 and number % 100 == 8:
             return ".mcap", mutants.bomb(number // 100)
         if number % 40 == 19 and self.foreign:
             ending, content = chance.choice(self.foreign)
-            return ending, mutants.damaged(content, chance)
-        return ".csv", mutants.scrawled(self.table, chance)
+            return ending, mutants.damage(content, chance)
+        return ".csv", mutants.scrawl(self.table, chance)
 
     def run(self, number: int) -> Counter[str]:
         """What each command said: its name and exit code, or how it failed."""
@@ -99,7 +99,7 @@ class Trials:
         place.mkdir()
         file = place / f"a{ending}"
         file.write_bytes(content)
-        said: Counter[str] = Counter()
+        outcomes: Counter[str] = Counter()
         calls: list[tuple[object, ...]] = [
             ("verify", file, "--repair", place / "repaired.mcap"),
             ("verify", file, "--json"),
@@ -108,12 +108,12 @@ class Trials:
             ("import", file, "-o", place / "taken.mcap"),
         ]
         for words in calls if number % 20 == 0 else [calls[0], *calls[2:]]:
-            code, error = called(words, report=number % REPORTED == 0)
-            said[f"{words[0]} {code}"] += 1
+            code, error = call_command(words, report=number % REPORT_INTERVAL == 0)
+            outcomes[f"{words[0]} {code}"] += 1
             if error:
                 print(f"CRASH {number} {words[0]}\n{error}", flush=True)
         shutil.rmtree(place)
-        return said
+        return outcomes
 
 
 def _formats() -> list[tuple[str, Callable[[Path], bytes]]]:
@@ -123,14 +123,14 @@ def _formats() -> list[tuple[str, Callable[[Path], bytes]]]:
     except (ModuleNotFoundError, pytest.skip.Exception):
         return []  # without their libraries
 
-    def made(write: Callable[[Path], None], path: Path) -> bytes:
+    def write_and_read(write: Callable[[Path], None], path: Path) -> bytes:
         write(path)
         return path.read_bytes()
 
-    return [(name, partial(made, write)) for name, write, _ in FORMATS.values()]
+    return [(name, partial(write_and_read, write)) for name, write, _ in FORMATS.values()]
 
 
-def called(words: tuple[object, ...], report: bool) -> tuple[str, str]:
+def call_command(words: tuple[object, ...], report: bool) -> tuple[str, str]:
     """(exit code, traceback where there was one) of the command line."""
     from twin.cli import main
     from twin.reports import report as reports
@@ -170,7 +170,7 @@ def work(first: int, last: int) -> None:
 
 def watch(first: int, last: int) -> tuple[Counter[str], list[str]]:
     """(how often each command ended how, what should not have happened)."""
-    said: Counter[str] = Counter()
+    outcomes: Counter[str] = Counter()
     wrong = []
     while first < last:
         command = [
@@ -189,7 +189,7 @@ def watch(first: int, last: int) -> tuple[Counter[str], list[str]]:
                 if first % 100 == 0:
                     print(f"{first} ...", flush=True)
             elif word == "SAID":
-                said[rest.partition(" ")[2]] += int(rest.partition(" ")[0])
+                outcomes[rest.partition(" ")[2]] += int(rest.partition(" ")[0])
             elif word == "MEMORY":
                 print(f"largest memory {rest} MB")
             else:
@@ -208,7 +208,7 @@ def watch(first: int, last: int) -> tuple[Counter[str], list[str]]:
         else:
             break
         child.wait()
-    return said, wrong
+    return outcomes, wrong
 
 
 def _lines(child: subprocess.Popen[bytes]) -> Iterator[str]:
@@ -229,9 +229,9 @@ if __name__ == "__main__":
         work(int(sys.argv[2]), int(sys.argv[3]))
     else:
         begin = int(sys.argv[2]) if len(sys.argv) > 2 else 0
-        told, faults = watch(begin, begin + int(sys.argv[1]))
-        for name, times in sorted(told.items()):
+        outcomes, faults = watch(begin, begin + int(sys.argv[1]))
+        for name, times in sorted(outcomes.items()):
             print(f"{name:>16} {times}")
-        print(f"{sum(one.startswith(('CRASH', 'DIED')) for one in faults)} crashes,",
-              f"{sum(one.startswith('HUNG') for one in faults)} hangs")  # fmt: skip
+        print(f"{sum(text.startswith(('CRASH', 'DIED')) for text in faults)} crashes,",
+              f"{sum(text.startswith('HUNG') for text in faults)} hangs")  # fmt: skip
         raise SystemExit(1 if faults else 0)

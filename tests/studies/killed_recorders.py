@@ -39,13 +39,13 @@ from twin.run.run_config import RunConfig, read_run_config
 from twin.transport import history_cache
 from twin.transport.codec import MEAS_TOPIC, Item, encode_item, topic_for
 
-SECONDS = 60.0
-HELD = 2500  # blocks
+RUN_S = 60.0
+HELD_BLOCKS = 2500  # blocks
 BLOCK_S, SIZE = 0.01, 20
 MEAN_LIFE_S = 2.5
 STALL_S = 3.0
 TIMED_S = 0.005  # within which a death has to be known to be timed
-STALLED = 0.15  # of the recorders, once
+STALLED_SHARE = 0.15  # of the recorders, once
 NEVER = float("inf")
 Pipe = tuple[int, int]  # its end tells the children that the study is gone
 
@@ -70,23 +70,23 @@ class Chain:
         """Fork a recorder and decide when it dies."""
         part = self.folder / f"part-{len(self.parts) + 1:03d}.mcap"
         self.parts.append(part)
-        self.pid = forked(lambda: run_recorder(self.spec, str(part)), pipe, self.folder / "log")
+        self.pid = fork_child(lambda: run_recorder(self.spec, str(part)), pipe, self.folder / "log")
         self.born = self.awake = time.time()
         self.die = self.born + chance.expovariate(1 / MEAN_LIFE_S)
-        if chance.random() < STALLED:
+        if chance.random() < STALLED_SHARE:
             self.stop = chance.uniform(self.born, self.die)
             self.die += STALL_S
 
-    def turn(self, now: float, chance: random.Random, pipe: Pipe) -> None:
+    def turn(self, now_s: float, chance: random.Random, pipe: Pipe) -> None:
         """Let it stall, go on or die, where it is time."""
-        if now > self.stop:
+        if now_s > self.stop:
             os.kill(self.pid, signal.SIGSTOP)
             self.stalls += 1
-            self.stop, self.resume = NEVER, now + STALL_S
-        if now > self.resume:
+            self.stop, self.resume = NEVER, now_s + STALL_S
+        if now_s > self.resume:
             os.kill(self.pid, signal.SIGCONT)
-            self.resume, self.awake = NEVER, now
-        if now > self.die:
+            self.resume, self.awake = NEVER, now_s
+        if now_s > self.die:
             before = time.time()
             os.kill(self.pid, signal.SIGKILL)
             died = time.time()  # or some time before, where this process had to wait meanwhile
@@ -97,7 +97,7 @@ class Chain:
             self.begin(chance, pipe)
 
 
-def forked(work, pipe: Pipe, log: Path) -> int:
+def fork_child(work, pipe: Pipe, log: Path) -> int:
     """Id of a child that does `work`; nothing is imported anew, so that a thousand are cheap."""
     pid = os.fork()
     if pid:
@@ -121,7 +121,7 @@ def run_items(bundle: RunConfig, run: str) -> list[list[tuple[str, bytes]]]:
     start = bundle.make_start_factory(run, "table")({}, 0.0)
     chance = np.random.default_rng(1)
     turns: list[list[Item]] = [[start]]
-    for number in range(round(SECONDS / BLOCK_S)):
+    for number in range(round(RUN_S / BLOCK_S)):
         index = number * SIZE
         labels = [np.zeros(SIZE, np.int64)] * 3
         rate = start.rate_hz
@@ -137,7 +137,7 @@ def publish(turns: list[list[tuple[str, bytes]]], endpoint: str, rig: str, times
     """The rig: a block each 10 ms, then whatever is still asked for."""
     from twin.transport.zenoh_link import open_hub
 
-    history_cache.MAX_CACHED_FRAGMENTS = HELD
+    history_cache.MAX_CACHED_FRAGMENTS = HELD_BLOCKS
     link = open_hub(rig, endpoint)
     link.declare(tuple({name for turn in turns for name, _ in turn}))
     begin = time.monotonic() + 2.0
@@ -155,7 +155,7 @@ def publish(turns: list[list[tuple[str, bytes]]], endpoint: str, rig: str, times
         time.sleep(0.0005)
 
 
-def judged(chain: Chain, times: np.ndarray) -> dict[str, list[float]]:
+def judge_parts(chain: Chain, times: np.ndarray) -> dict[str, list[float]]:
     """Of each killed part: s from its last message to the death, and whether it has holes.
 
     The bus brings a message each few ms, so this is what a recorder had taken in and not flushed.
@@ -164,13 +164,13 @@ def judged(chain: Chain, times: np.ndarray) -> dict[str, list[float]]:
     """
     lost, empty, holes, unreadable = [], 0, 0, 0
     for part, born, awake, died in chain.killed:
-        found = list(iter_messages(part)) if part.exists() else []
-        if not found:  # it died before anything had come
+        messages = list(iter_messages(part)) if part.exists() else []
+        if not messages:  # it died before anything had come
             empty += 1
             continue
         if not math.isnan(died):
-            lost.append(died - max(awake, found[-1].publish_time / 1e9))
-        blocks = [one.log_time for one in found if one.topic == MEAS_TOPIC]
+            lost.append(died - max(awake, messages[-1].publish_time / 1e9))
+        blocks = [message.log_time for message in messages if message.topic == MEAS_TOPIC]
         numbers = [round(at / 1e9 / BLOCK_S) for at in blocks]
         own = [number for number in numbers if times[number + 1] > born]
         holes += own != list(range(own[0], own[-1] + 1)) if own else 0
@@ -198,16 +198,18 @@ def one_run(number: int, chains: int, bundle: RunConfig, folder: Path) -> dict[s
     turns = run_items(bundle, spec.run)
     pipe = os.pipe()
     times = folder / "times.npy"
-    rig = forked(lambda: publish(turns, endpoint, bundle.rig.name, times), pipe, folder / "rig.log")
+    rig = fork_child(
+        lambda: publish(turns, endpoint, bundle.rig.name, times), pipe, folder / "rig.log"
+    )
     time.sleep(0.5)
     lines = [Chain(folder / f"chain-{k}", spec) for k in range(chains)]
     for chain in lines:
         chain.folder.mkdir()
         chain.begin(chance, pipe)
-    end = time.time() + SECONDS + 1.5
-    while (now := time.time()) < end:
+    end = time.time() + RUN_S + 1.5
+    while (now_s := time.time()) < end:
         for chain in lines:
-            chain.turn(now, chance, pipe)
+            chain.turn(now_s, chance, pipe)
         time.sleep(0.002)
     for chain in lines:
         os.kill(chain.pid, signal.SIGCONT)
@@ -216,20 +218,23 @@ def one_run(number: int, chains: int, bundle: RunConfig, folder: Path) -> dict[s
     os.waitpid(rig, 0)
     os.close(pipe[0])
     os.close(pipe[1])
-    return told(lines, np.load(times), len(turns) - 2)
+    return summarise_run(lines, np.load(times), len(turns) - 2)
 
 
-def told(lines: list[Chain], times: np.ndarray, blocks: int) -> dict[str, object]:
+def summarise_run(lines: list[Chain], times: np.ndarray, blocks: int) -> dict[str, object]:
     """The line of a run for the file."""
-    judgements = [judged(chain, times) for chain in lines]
+    judgements = [judge_parts(chain, times) for chain in lines]
     after = []
     for chain in lines:
         whole = chain.folder / "whole.mcap"
         merge([part for part in chain.parts if part.exists()], whole)
-        found = {one.log_time for one in iter_messages(whole) if one.topic == MEAS_TOPIC}
-        after.append(blocks - len(found) if verify_log(whole) else blocks)
+        stamps = {
+            message.log_time for message in iter_messages(whole) if message.topic == MEAS_TOPIC
+        }
+        after.append(blocks - len(stamps) if verify_log(whole) else blocks)
     line: dict[str, object] = {
-        key: [value for one in judgements for value in one[key]] for key in judgements[0]
+        key: [value for judgement in judgements for value in judgement[key]]
+        for key in judgements[0]
     }
     kills = sum(len(chain.killed) for chain in lines)
     return line | {
@@ -265,7 +270,7 @@ def main() -> None:
     asked = parser.parse_args()
     bundle = read_run_config(PROFILES_DIR / "tests" / "quickstart.toml")
     before = asked.out.read_text().splitlines() if asked.out.exists() else []
-    lines = [json.loads(one) for one in before]
+    lines = [json.loads(line) for line in before]
     while sum(line["kills"] for line in lines) < asked.kills:
         with tempfile.TemporaryDirectory() as folder:
             lines.append(one_run(len(lines), asked.chains, bundle, Path(folder)))

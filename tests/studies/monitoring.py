@@ -24,11 +24,11 @@ from twin.run.run_config import RunConfig, from_texts
 from twin.run.unpaced import add_twin_items
 
 ALL = ("ginf", "g30", "g16", "g10", "g4_ss1", "g4_ss2", "g4_ss3", "g0", "gm1", "gm2", "gm10")
-LOST = 0.05
+LOST_SHARE = 0.05
 TRUTH = '[[effects]]\nid = "stiffness_drift"\nparameters = {{ rate = {:.9f} }}\n'
 
 
-def said(name: str, truth: str, folder: Path) -> Iterator[tuple[RunConfig, Record | Block]]:
+def iter_session(name: str, truth: str, folder: Path) -> Iterator[tuple[RunConfig, Record | Block]]:
     """Every item of a session with that truth."""
     files = (f"tests/{name}.toml", "rigs/simulated.toml", "models/snm.toml")
     profile, rig, model = ((PROFILES_DIR / file).read_text() for file in files)
@@ -51,7 +51,7 @@ def row(name: str, truth: str) -> tuple[str, float]:
     events: list[Event] = []
     begins, end, rate = -1, 0, 1.0
     with TemporaryDirectory() as folder:
-        for bundle, item in said(name, truth, Path(folder)):
+        for bundle, item in iter_session(name, truth, Path(folder)):
             rate = bundle.drive.rate_hz
             if isinstance(item, Block) and item.stream == "meas":
                 if begins < 0 and (item.step >= 0).any():
@@ -59,15 +59,15 @@ def row(name: str, truth: str) -> tuple[str, float]:
                 end = item.end
             elif isinstance(item, Event) and item.kind in EVENT_KINDS:
                 events.append(item)
-    jumps = [one for one in events if one.kind in ("jump", "no jump")]
-    as_expected = sum("where the model expects it" in one.text for one in jumps)
-    others = [one for one in events if one.kind not in ("jump", "no jump", "drift")]
-    drift = next((one for one in events if one.kind == "drift"), None)
-    seen = "-" if drift is None else f"{(drift.index - begins) / rate:.0f} s: {drift.text}"
-    kinds = ", ".join(sorted({one.kind for one in others})) or "-"
+    jumps = [event for event in events if event.kind in ("jump", "no jump")]
+    as_expected = sum("where the model expects it" in jump.text for jump in jumps)
+    others = [event for event in events if event.kind not in ("jump", "no jump", "drift")]
+    drift = next((event for event in events if event.kind == "drift"), None)
+    drift_text = "-" if drift is None else f"{(drift.index - begins) / rate:.0f} s: {drift.text}"
+    kinds = ", ".join(sorted({other.kind for other in others})) or "-"
     lasts = (end - begins) / rate
     clean = "5 % lost" if truth else "clean"
-    return f"| {name} | {clean} | {as_expected} of {len(jumps)} | {seen} | {kinds} |", lasts
+    return f"| {name} | {clean} | {as_expected} of {len(jumps)} | {drift_text} | {kinds} |", lasts
 
 
 def main(names: Sequence[str]) -> None:
@@ -75,7 +75,7 @@ def main(names: Sequence[str]) -> None:
     for name in names or ALL:
         line, lasts = row(name, "")
         print(line, flush=True)
-        print(row(name, TRUTH.format(-LOST / lasts))[0], flush=True)
+        print(row(name, TRUTH.format(-LOST_SHARE / lasts))[0], flush=True)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests.live.namespaces import HERE, THERE, Cable, cable, enclosed
+from tests.live.namespaces import HERE, THERE, Cable, cable, start_isolated
 from twin.recording.reader import read_recording
 from twin.recording.recovery import recover_log
 
@@ -58,7 +58,7 @@ def nothing(_: Cable) -> None:
     """The cable stays."""
 
 
-def pulled(line: Cable) -> None:
+def pull_cable(line: Cable) -> None:
     """The cable is pulled for 2 s."""
     line.pull()
     time.sleep(2.0)
@@ -72,7 +72,7 @@ def long_pulled(line: Cable) -> None:
     line.plug()
 
 
-def slowed(line: Cable) -> None:
+def slow_cable(line: Cable) -> None:
     """Half of what is published fits through, for 6 s."""
     line.slow("2mbit")
     time.sleep(6.0)
@@ -81,9 +81,9 @@ def slowed(line: Cable) -> None:
 
 CASES: dict[str, Callable[[Cable], None]] = {
     "nothing": nothing,
-    "pulled": pulled,
+    "pulled": pull_cable,
     "long_pulled": long_pulled,
-    "slowed": slowed,
+    "slowed": slow_cable,
     "restarted": nothing,  # to the cable: the router between is killed, the next comes 2 s later
 }
 
@@ -104,7 +104,7 @@ def router(line: Cable, lab: Path) -> "subprocess.Popen[str]":
     """A router on the other host, once it listens."""
     listen = f"tls/{THERE}:{ROUTER_PORT}"
     command = [sys.executable, "-c", ROUTER, listen, str(lab / "people" / "relay")]
-    process = line.there(*command, stdout=subprocess.PIPE)
+    process = line.start_far(*command, stdout=subprocess.PIPE)
     assert process.stdout is not None
     process.stdout.readline()
     return process
@@ -122,13 +122,13 @@ def play(case: str, line: Cable, folder: Path) -> dict[str, object]:
         between = router(line, lab)
         reached = f"tls/{THERE}:{ROUTER_PORT}"
         command += ["--router", reached]
-    with (folder / "run.txt").open("w") as said:
-        run = subprocess.Popen(command, stdout=said, stderr=said)
+    with (folder / "run.txt").open("w") as output:
+        run = subprocess.Popen(command, stdout=output, stderr=output)
     wait_for(folder / "run.txt", "state: running", run)
     attend = [SHAKETWIN, "attend", "recorder", "--connect", reached, "--out", str(folder / "there")]
     attend += ["--keys", str(lab / "people" / "rec")]
-    with (folder / "attend.txt").open("w") as said:
-        far = line.there(*attend, stdout=said, stderr=said)
+    with (folder / "attend.txt").open("w") as output:
+        far = line.start_far(*attend, stdout=output, stderr=output)
     wait_for(folder / "attend.txt", "recording", far)
     time.sleep(BEFORE_S)
     if between is not None:
@@ -157,13 +157,15 @@ def wait_for(path: Path, words: str, process: "subprocess.Popen[Any]") -> None:
 def figures(folder: Path) -> dict[str, object]:
     """What the recordings here and there hold."""
     logs = [folder / place / "run.mcap" for place in ("here", "there")]
-    here, there = (Counter((m.topic, m.payload) for m in recover_log(log).messages) for log in logs)
+    here, remote = (
+        Counter((m.topic, m.payload) for m in recover_log(log).messages) for log in logs
+    )
     timing = json.loads((folder / "here" / "summary.json").read_text())["timing"]
     rig = timing["components"]["rig"]
     return {
         "missing": [read_recording(log).missing_samples for log in logs],
-        "only here": sum((here - there).values()),
-        "only there": sum((there - here).values()),
+        "only here": sum((here - remote).values()),
+        "only there": sum((remote - here).values()),
         "rig_ms": (rig["p50_ms"], rig["p99_ms"], rig["max_ms"]),
         "twin_ms": timing["latency_ms"]["p99"],
         "missed": timing["missed_deadlines"],
@@ -178,10 +180,10 @@ def main() -> None:
     asked = parser.parse_args()
     if not asked.enclosed:
         only = ["--only", asked.only] if asked.only else []
-        process = enclosed("tests.studies.namespaces", "--enclosed", *only)
+        process = start_isolated("tests.studies.namespaces", "--enclosed", *only)
         assert process.stdout is not None
-        for said in process.stdout:
-            print(said, end="", flush=True)
+        for stdout in process.stdout:
+            print(stdout, end="", flush=True)
         raise SystemExit(process.wait())
     with cable() as line:
         for case in [asked.only] if asked.only else CASES:

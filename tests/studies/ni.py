@@ -43,7 +43,7 @@ NOTHING = RunStart(0, "", "", "table", "", "", "", 2e3, 20, (), (), 0, {}, {}, "
 
 
 @contextmanager
-def served(
+def serve_table(
     folder: Path, pace: float = 1.0
 ) -> Iterator[tuple[Path, RigConfig, subprocess.Popen[str]]]:
     """(card, rig, process) of a server on a free port; its black box is folder/box."""
@@ -73,20 +73,20 @@ class Watched(NiBackend):
 
     def __init__(self, rig: RigConfig, clock: Clock, channel: Any = None) -> None:
         super().__init__(rig, SPECIMEN, 2000.0, clock, channel)
-        self.told = CommandBuffer()
+        self.commands = CommandBuffer()
         self.samples = self.wrong = 0
         self._step_v = 2 * rig.output.span_v / 2**rig.output.bits
 
     def queue(self, index: int, volts: Float1D) -> None:
         super().queue(index, volts)
-        self.told.replace_from(index, volts)
+        self.commands.replace_from(index, volts)
 
     def read(self, samples: int) -> Float2D:
         volts = super().read(samples)
-        told = self.told.values(self.samples, self.samples + samples)
-        self.wrong += int((np.abs(volts[0] - told) > self._step_v).sum())
+        expected = self.commands.values(self.samples, self.samples + samples)
+        self.wrong += int((np.abs(volts[0] - expected) > self._step_v).sum())
         self.samples += samples
-        self.told.discard_before(self.samples - 3)
+        self.commands.discard_before(self.samples - 3)
         return volts
 
 
@@ -98,21 +98,24 @@ def soak(minutes: float, pace: float) -> None:
         profile = parse_toml(text.replace("cycles = 5", f"cycles = {cycles}", 1), Profile, "soak")
         if plan_sweep(profile).planned_end >= minutes * 60.0 * 2000.0:
             break
-    with tempfile.TemporaryDirectory() as folder, served(Path(folder), pace) as (_, rig, _process):
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        serve_table(Path(folder), pace) as (_, rig, _process),
+    ):
         clock, late = RealClock(pace), LatenessLog()
         backend = Watched(rig, clock)
         steps = profile.sweep.steps
         ends: dict[int, list[Float2D]] = {0: [], steps[-1].index: []}
         gaps, stop = 0, None
-        for one in run_session(
+        for session in run_session(
             SessionSetup(profile, rig), backend, clock, lambda tare, at: NOTHING, lambda: None, late
         ):
-            gaps += isinstance(one, SampleGap)
-            stop = one if isinstance(one, RunStop) else stop
-            if isinstance(one, Block):
+            gaps += isinstance(session, SampleGap)
+            stop = session if isinstance(session, RunStop) else stop
+            if isinstance(session, Block):
                 for index, blocks in ends.items():
-                    if (one.step == index).all():
-                        blocks.append(one.values[:2])
+                    if (session.step == index).all():
+                        blocks.append(session.values[:2])
         lags = [
             lag(np.concatenate(blocks, axis=1), steps[index].frequency_hz, 2000.0)
             if blocks
@@ -159,7 +162,7 @@ def hours(count: float) -> None:
 
 def decisions(count: int) -> None:
     """From a decision to the first changed sample of the output, as it is acquired back."""
-    with tempfile.TemporaryDirectory() as folder, served(Path(folder)) as (_, rig, _process):
+    with tempfile.TemporaryDirectory() as folder, serve_table(Path(folder)) as (_, rig, _process):
         clock, chance = RealClock(), np.random.default_rng(1)
         backend = Watched(rig, clock)
         backend.open()
@@ -203,9 +206,9 @@ def swing(first: int, count: int) -> Float1D:
     return 0.5 * np.sin(2 * np.pi * 0.5 * at / 2000.0)
 
 
-def killed(whom: str) -> None:
+def kill_mid_run(whom: str) -> None:
     """A run whose server or rig is killed in motion."""
-    with tempfile.TemporaryDirectory() as name, served(Path(name)) as (card, _, server):
+    with tempfile.TemporaryDirectory() as name, serve_table(Path(name)) as (card, _, server):
         folder = Path(name)
         command: list[str | Path] = [
             SHAKETWIN,
@@ -228,13 +231,13 @@ def killed(whom: str) -> None:
             if whom == "server":
                 server.kill()
                 print(f"server killed: run ends with code {run.wait(60)}")
-                told = subprocess.run(
+                completed = subprocess.run(
                     [SHAKETWIN, "verify", folder / "out" / "run.mcap"],
                     capture_output=True, text=True, check=False,
                 )  # fmt: skip
                 summary = json.loads((folder / "out" / "summary.json").read_text())
                 print({key: summary[key] for key in ("verdict", "reason", "gaps")})
-                print(f"verify: code {told.returncode}: {told.stdout.split()[-1]}")
+                print(f"verify: code {completed.returncode}: {completed.stdout.split()[-1]}")
             else:
                 theirs = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
                 for number in (run.pid, *map(int, theirs)):
@@ -267,6 +270,6 @@ if __name__ == "__main__":
         case ["decisions", count]:
             decisions(int(count))
         case ["server" | "rig" as whom]:
-            killed(whom)
+            kill_mid_run(whom)
         case _:
             print(__doc__)

@@ -33,8 +33,8 @@ from twin.transport.zenoh_link import BusLink, open_spoke
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
 RIG = "simulated"
-OBSERVERS = 10
-FUZZ = 10_000
+OBSERVER_COUNT = 10
+FUZZ_MESSAGES = 10_000
 PHASES = ("quiet", "stalled", "flood", "garbage", "fuzz", "quiet again")
 PROFILE = """
 title = "Observed"
@@ -107,8 +107,8 @@ def fuzz(link: BusLink, seconds: float) -> None:
     chance = random.Random(3)
     parts = ["state", "cmd", "config", "stream", "event", "alive", "held", "stop", "*", "**", "é"]
     begin = time.monotonic()
-    for number in range(FUZZ):
-        time.sleep(max(0.0, begin + number * seconds / FUZZ - time.monotonic()))
+    for number in range(FUZZ_MESSAGES):
+        time.sleep(max(0.0, begin + number * seconds / FUZZ_MESSAGES - time.monotonic()))
         where = "/".join(["shaketwin", RIG, *chance.choices(parts, k=chance.randint(1, 4))])
         body = chance.randbytes(chance.choice((0, 1, 20, 500, 5000, 70_000)))
         try:
@@ -142,13 +142,13 @@ def be(asked: argparse.Namespace) -> None:
         listen(link, asked.seconds, asked.out, asked.child != "probe")
 
 
-def begun(folder: Path, endpoint: str, seconds: float) -> "subprocess.Popen[bytes]":
+def begin_run(folder: Path, endpoint: str, seconds: float) -> "subprocess.Popen[bytes]":
     """The run, once the table moves."""
     cycles = round((seconds + 60) * 3.8 / 3)
     (folder / "test.toml").write_text(PROFILE.format(cycles=cycles))
     command = [SHAKETWIN, "run", str(folder / "test.toml"), "--out", str(folder / "out")]
-    with (folder / "said.txt").open("w") as said:
-        run = subprocess.Popen([*command, "--listen", endpoint], stdout=said, stderr=said)
+    with (folder / "said.txt").open("w") as output:
+        run = subprocess.Popen([*command, "--listen", endpoint], stdout=output, stderr=output)
     while "state: running" not in (folder / "said.txt").read_text():
         if run.poll() is not None:
             raise SystemExit((folder / "said.txt").read_text())
@@ -163,17 +163,17 @@ def study(minutes: float, folder: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
-    run = begun(folder, endpoint, whole)
+    run = begin_run(folder, endpoint, whole)
     inside = ProcessConfig.read(folder / "out" / ".parts" / "spec.json").endpoint
     probe = child("probe", inside, whole, folder / "probe.npz")
     names = ("observer", "stalled")
     honest = [
         child(names[number == 0], endpoint, whole, folder / f"{names[number == 0]}{number}.npz")
-        for number in range(OBSERVERS + 1)
+        for number in range(OBSERVER_COUNT + 1)
     ]
     hostile = {name: child(name, endpoint, length - 1, folder / "x") for name in HOSTILE}
     link = open_spoke(RIG, endpoint, 30.0)
-    everybody = OBSERVERS + 2 + len(HOSTILE)
+    everybody = OBSERVER_COUNT + 2 + len(HOSTILE)
     while sum(name.startswith("observer.") for name in link.list_components()) < everybody:
         time.sleep(0.1)
     link.close()
@@ -194,8 +194,8 @@ def study(minutes: float, folder: Path) -> None:
             hostile[phase].kill()
             hostile[phase].wait()
         spans.append((phase, begin, time.monotonic()))
-    for one in (probe, *honest):
-        one.wait()
+    for peer in (probe, *honest):
+        peer.wait()
     run.send_signal(signal.SIGINT)
     run.wait()
     report(folder, spans)
@@ -213,24 +213,24 @@ def report(folder: Path, spans: list[tuple[str, float, float]]) -> None:
     for phase, begin, end in spans:
         those = late[(at_rig[:, 1] > begin) & (at_rig[:, 1] < end)]
         print(f"{phase:12} {those.size:7d} {words(those):>38}")
-    timings = {one.component: one for one in recording.records(Timing)}
-    for name, one in timings.items():
-        figures = f"p50 {one.p50_ms:.2f} p99 {one.p99_ms:.2f} max {one.max_ms:.2f}"
-        print(f"{name:9} by itself {figures} ms, {one.cpu_share:.0%} of a core")
+    timings = {timing.component: timing for timing in recording.records(Timing)}
+    for name, timing in timings.items():
+        figures = f"p50 {timing.p50_ms:.2f} p99 {timing.p99_ms:.2f} max {timing.max_ms:.2f}"
+        print(f"{name:9} by itself {figures} ms, {timing.cpu_share:.0%} of a core")
     put = dict(at_rig[:, :2].tolist())
     hops: dict[str, list[np.ndarray[Any, Any]]] = {"rig -> gate": [], "gate -> observer": []}
     gaps = blocks = 0
     for path in sorted(folder.glob("observer*.npz")):
-        found = np.load(path)
-        rows = found["rows"]
-        gaps, blocks = gaps + int(found["gaps"]), blocks + int(found["blocks"])
+        arrays = np.load(path)
+        rows = arrays["rows"]
+        gaps, blocks = gaps + int(arrays["gaps"]), blocks + int(arrays["blocks"])
         known = np.array([put.get(index, np.nan) for index in rows[:, 0]])
         hops["rig -> gate"].append((rows[:, 1] - known) * 1e3)
         hops["gate -> observer"].append((rows[:, 2] - rows[:, 1]) * 1e3)
     for hop, parts in hops.items():
         values = np.concatenate(parts)
         print(f"{hop:17} {words(values[np.isfinite(values)])} ms")
-    print(f"{OBSERVERS} observers: {blocks} blocks, {gaps} gaps")
+    print(f"{OBSERVER_COUNT} observers: {blocks} blocks, {gaps} gaps")
 
 
 def words(values: np.ndarray[Any, Any]) -> str:

@@ -85,11 +85,11 @@ def main(out: Path, what: list[str]) -> int:
     table = out / "study.csv"
     done = list(csv.DictReader(table.open())) if table.exists() else []
     live, logs = "--live" in what, "--logs" in what
-    names = [one for one in what if not one.startswith("--")]
+    names = [argument for argument in what if not argument.startswith("--")]
     how = "live" if live else "as recorded" if logs else "unpaced"
     every = [PROFILES_DIR / "tests" / f"{name}.toml" for name in PAPER]
-    sources = [Path(one) for one in names] if logs else [
-        one for one in every if not names or one.stem in names
+    sources = [Path(name) for name in names] if logs else [
+        path for path in every if not names or path.stem in names
     ]  # fmt: skip
     for source in sources:
         name = resolve_log_path(source).parent.name if logs else source.stem

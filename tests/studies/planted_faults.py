@@ -85,11 +85,11 @@ def session(profile: Profile, rig: RigConfig) -> Iterator[tuple[Block | Record, 
     clock, rate = ManualClock(), profile.acquisition.rate_hz
     backend = SimulatedBackend(rig, profile.specimen, rate, clock)
     nothing = RunStart(0, "", "", "table", "", "", "", rate, 20, (), (), 0, {}, {}, "", "", 0.0)
-    said = run_session(
+    stream = run_session(
         SessionSetup(profile, rig), backend, clock, lambda tare, at: nothing, lambda: None
     )
-    for one in said:
-        yield one, clock.now() - backend.scheduled_time_s(0)
+    for item in stream:
+        yield item, clock.now() - backend.scheduled_time_s(0)
 
 
 def times(profile: Profile, count: int, seed: int) -> list[tuple[float, float]]:
@@ -98,14 +98,14 @@ def times(profile: Profile, count: int, seed: int) -> list[tuple[float, float]]:
     Not in its first 15 %, where what is usual is learnt, and not in its last 30 %.
     """
     step: list[np.ndarray] = []
-    for one, _ in session(profile, machine()):
-        if isinstance(one, Block):
-            step.append(one.step)
+    for item, _ in session(profile, machine()):
+        if isinstance(item, Block):
+            step.append(item.step)
     steps = np.concatenate(step)
     moving = np.flatnonzero(steps >= 0)
     moving = moving[int(0.15 * moving.size) : int(0.7 * moving.size)]
     at = np.random.default_rng(seed).choice(moving, count, replace=False)
-    hz = [one.frequency_hz for one in profile.sweep.steps]
+    hz = [step.frequency_hz for step in profile.sweep.steps]
     rate = profile.acquisition.rate_hz
     return [(float(i / rate), hz[steps[i]]) for i in sorted(at.tolist())]
 
@@ -121,30 +121,30 @@ def faults() -> Iterator[dict[str, Any]]:
                 yield {"kind": kind, "channel": channel, **extra}
 
 
-def tried(profile: Profile, fault: dict[str, Any], at_s: float, hz: float) -> Outcome:
+def try_fault(profile: Profile, fault: dict[str, Any], at_s: float, hz: float) -> Outcome:
     """One fault planted in one session."""
-    found, by, early, ended = float("nan"), "", 0, ""
-    for one, now_s in session(profile, machine(({"at_s": at_s, **fault},))):
-        if isinstance(one, RunStop):
-            ended = one.verdict
-        elif isinstance(one, (Trip, SampleGap)) or (isinstance(one, Event) and one.kind in TOLD):
+    delay_s, by, early, ended = float("nan"), "", 0, ""
+    for item, now_s in session(profile, machine(({"at_s": at_s, **fault},))):
+        if isinstance(item, RunStop):
+            ended = item.verdict
+        elif isinstance(item, (Trip, SampleGap)) or (isinstance(item, Event) and item.kind in TOLD):
             if now_s < at_s:
                 early += 1
             elif not by:
-                found, by = now_s - at_s, named(one)
+                delay_s, by = now_s - at_s, name_finding(item)
     size = fault.get("size", fault.get("for_s", float("nan")))
     return Outcome(
-        fault["kind"], fault.get("channel", ""), size, found, found * hz, by, ended, early
+        fault["kind"], fault.get("channel", ""), size, delay_s, delay_s * hz, by, ended, early
     )
 
 
-def named(one: Trip | SampleGap | Event) -> str:
+def name_finding(event: Trip | SampleGap | Event) -> str:
     """What found it, in a word or two."""
-    if isinstance(one, Trip):
-        return one.kind
-    if isinstance(one, SampleGap):
-        return f"gap ({one.reason})"
-    return one.kind
+    if isinstance(event, Trip):
+        return event.kind
+    if isinstance(event, SampleGap):
+        return f"gap ({event.reason})"
+    return event.kind
 
 
 def study(profiles: tuple[str, ...], count: int, seed: int = 1) -> list[Outcome]:
@@ -156,7 +156,7 @@ def study(profiles: tuple[str, ...], count: int, seed: int = 1) -> list[Outcome]
         order = np.random.default_rng(seed).permutation(len(moments)).tolist()
         for k, fault in enumerate(faults()):
             for at_s, hz in (moments[order[count * k + j]] for j in range(count)):
-                out.append(tried(profile, fault, at_s, hz))
+                out.append(try_fault(profile, fault, at_s, hz))
                 print(name, f"{at_s:.3f} s", out[-1], file=sys.stderr, flush=True)
     return out
 
@@ -168,18 +168,22 @@ def table(outcomes: list[Outcome]) -> str:
         "|---|---|---|---|---|---|---|---|",
     ]
     for kind in FAULT_KINDS:
-        mine = [one for one in outcomes if one.kind == kind]
-        hit = [one for one in mine if one.by]
+        mine = [outcome for outcome in outcomes if outcome.kind == kind]
+        hit = [outcome for outcome in mine if outcome.by]
         if not hit:
             rows.append(f"| {kind} | {len(mine)} | 0 | | | | | |")
             continue
-        ms, cycles = [1e3 * one.seconds for one in hit], [one.cycles for one in hit]
-        by = " ".join(sorted({one.by for one in hit}, key=[one.by for one in hit].count)[::-1])
-        ends = sorted({one.ended for one in hit})
-        said = ", ".join(f"{[one.ended for one in hit].count(end)} {end}" for end in ends)
+        ms, cycles = [1e3 * outcome.seconds for outcome in hit], [outcome.cycles for outcome in hit]
+        by = " ".join(
+            sorted({outcome.by for outcome in hit}, key=[outcome.by for outcome in hit].count)[::-1]
+        )
+        ends = sorted({outcome.ended for outcome in hit})
+        endings = ", ".join(
+            f"{[outcome.ended for outcome in hit].count(end)} {end}" for end in ends
+        )
         rows.append(
             f"| {kind} | {len(mine)} | {len(hit)} | {median(ms):.0f} ms | {max(ms):.0f} ms | "
-            f"{median(cycles):.2f} / {max(cycles):.2f} | {by} | {said} |"
+            f"{median(cycles):.2f} / {max(cycles):.2f} | {by} | {endings} |"
         )
     return "\n".join(rows)
 
@@ -201,15 +205,15 @@ def smallest(name: str) -> str:
         unit = CHANNEL_BY_NAME[channel].unit
         cells = []
         for kind, ladder in LADDERS.items():
-            said = "not found"
+            entry = "not found"
             for step in ladder:
                 size = step if kind == "gain" else step * LARGEST[unit]
                 fault = {"kind": kind, "channel": channel, "size": size}
-                if tried(profile, fault, at_s, hz).by:
+                if try_fault(profile, fault, at_s, hz).by:
                     human = {"m": "mm", "m/s2": "g", "N": "kN"}[unit]
-                    said = f"{100 * size:g} %" if kind == "gain" else f"{size:g} {human}"
+                    entry = f"{100 * size:g} %" if kind == "gain" else f"{size:g} {human}"
                     break
-            cells.append(said)
+            cells.append(entry)
         rows.append(f"| {channel} | {' | '.join(cells)} |")
         print(rows[-1], file=sys.stderr, flush=True)
     return "\n".join(rows)
@@ -224,10 +228,10 @@ def false_findings() -> str:
     for seed, name in enumerate(SWEEPS, 11):
         profile = load_config(PROFILES_DIR / "tests" / f"{name}.toml", Profile, "test profile")[0]
         trips, events, end = 0, 0, 0
-        for one, _ in session(profile, machine(seed=seed)):
-            trips += isinstance(one, Trip)
-            events += isinstance(one, Event) and one.kind in TOLD
-            end = one.index
+        for item, _ in session(profile, machine(seed=seed)):
+            trips += isinstance(item, Trip)
+            events += isinstance(item, Event) and item.kind in TOLD
+            end = item.index
         minutes = end / profile.acquisition.rate_hz / 60
         rows.append(f"| {name} | {seed} | {minutes:.1f} | {trips} | {events} |")
         print(rows[-1], file=sys.stderr, flush=True)
@@ -242,9 +246,9 @@ def main(what: str) -> None:
     else:
         outcomes = study(tuple(sys.argv[2:]) or ("slow", "middle", "fast"), 2)
         print(table(outcomes))
-        missed = [one for one in outcomes if not one.by]
+        missed = [outcome for outcome in outcomes if not outcome.by]
         print(f"\n{len(outcomes)} planted, {len(outcomes) - len(missed)} found; ", end="")
-        print(f"{sum(one.early for one in outcomes)} findings before a fault was planted")
+        print(f"{sum(outcome.early for outcome in outcomes)} findings before a fault was planted")
         print(*missed, sep="\n")
 
 

@@ -32,9 +32,9 @@ def main() -> None:
             except InputError as error:
                 row(what, str(error), doors)
         for who in ("bob", "rec", "tina", "anna"):
-            said = io.StringIO()
+            stream = io.StringIO()
             try:
-                with contextlib.redirect_stdout(said):
+                with contextlib.redirect_stdout(stream):
                     send_command("stop", "", doors.keyed, RIG, doors.keys(who))
                 row(f"`tell stop` by {who}", "obeyed", doors)
             except InputError as error:
@@ -57,8 +57,8 @@ def main() -> None:
                 row("TLS, no certificate", str(error.reason), doors)
 
 
-def row(what: str, said: str, doors: Doors) -> None:
-    print(f"| {what} | {said.replace(str(doors.folder), '...')} |", flush=True)
+def row(what: str, text: str, doors: Doors) -> None:
+    print(f"| {what} | {text.replace(str(doors.folder), '...')} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -34,14 +34,14 @@ from table_io.sim.machine.flight_recorder import read_flight_record
 from tests.table_io.backends.udp_bench import (
     SPECIMEN,
     card,
-    compiled,
+    compile_target,
     free_port,
     python_target,
-    relayed,
+    relay_packets,
 )
 from twin.live.scheduling import request_realtime
 
-RATE = 2000.0
+RATE_HZ = 2000.0
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
 DECISIONS, KILLS = 400, 10
 STILL_M = 2e-4
@@ -72,19 +72,19 @@ def latency(folder: Path) -> None:
                     address = stack.enter_context(python_target(folder, ""))
                 else:
                     address = ("127.0.0.1", free_port())
-                    program = compiled(folder)
+                    program = compile_target(folder)
                     command = [str(program), address[0], str(address[1])]
                     process = stack.enter_context(subprocess.Popen(command, stdout=-3))
                     stack.callback(process.terminate)
                 if share:
-                    address = stack.enter_context(relayed(address, 1, share)).address
+                    address = stack.enter_context(relay_packets(address, 1, share)).address
                 _decide(address, f"{side:6s} {100 * share:g} % of each evil")
 
 
 def _decide(address: tuple[str, int], title: str) -> None:
     clock, chance = RealClock(), random.Random(1)
     request_realtime(50)  # as the rig is in a run
-    backend = UdpBackend(parse_toml(card(address, ""), RigConfig, "card"), SPECIMEN, RATE, clock)
+    backend = UdpBackend(parse_toml(card(address, ""), RigConfig, "card"), SPECIMEN, RATE_HZ, clock)
     for _ in range(100):  # a target that was just started
         try:
             backend.open()
@@ -98,7 +98,12 @@ def _decide(address: tuple[str, int], title: str) -> None:
         backend.read(20 * chance.randint(1, 4))
         decided = clock.now()
         while True:
-            at = backend._newest_sample() + 1 + backend.replace_after + math.ceil(DECISION_S * RATE)
+            at = (
+                backend._newest_sample()
+                + 1
+                + backend.replace_after
+                + math.ceil(DECISION_S * RATE_HZ)
+            )
             asked = clock.now()
             try:
                 backend.queue(at, np.zeros(8000))
@@ -109,7 +114,7 @@ def _decide(address: tuple[str, int], title: str) -> None:
         changed.append(backend.scheduled_time_s(at) - decided)
     missed = backend._state.missed
     backend.close()
-    ms = [1e3 * np.percentile(one, (50, 99, 100)) for one in (changed, handed)]
+    ms = [1e3 * np.percentile(delays, (50, 99, 100)) for delays in (changed, handed)]
     print(
         f"latency {title}: decision to first changed sample p50 {ms[0][0]:.1f} p99 {ms[0][1]:.1f} "
         f"max {ms[0][2]:.1f} ms; 8000 samples handed over in p50 {ms[1][0]:.1f} p99 "
@@ -123,7 +128,7 @@ def drive(path: str, test: str) -> None:
     """A rig to be killed: says so once it has started."""
     rig = load_config(Path(path), RigConfig, "machine card")[0]
     profile = load_config(Path(test), Profile, "test profile")[0]
-    backend = UdpBackend(rig, profile.specimen, RATE, RealClock())
+    backend = UdpBackend(rig, profile.specimen, RATE_HZ, RealClock())
 
     def describe(_: dict[str, float], epoch_s: float) -> Event:
         print("started", flush=True)
@@ -157,11 +162,11 @@ def kills(folder: Path) -> None:
         time.sleep(8.0)
     rests, peaks = [], []
     for at, life in zip(killed, read_flight_record(folder / "box"), strict=True):
-        count = round((at - life.epoch_s) * RATE)
+        count = round((at - life.epoch_s) * RATE_HZ)
         drive, table = life.command_m, life.row("table_disp")
-        rests.append((np.flatnonzero(np.abs(drive) > 1e-6)[-1] - count) / RATE)
-        table_s = (np.flatnonzero(np.abs(table) > STILL_M)[-1] - count) / RATE
-        peaks.append(np.abs(np.diff(drive, 2)).max() * RATE**2 / 9.80665)
+        rests.append((np.flatnonzero(np.abs(drive) > 1e-6)[-1] - count) / RATE_HZ)
+        table_s = (np.flatnonzero(np.abs(table) > STILL_M)[-1] - count) / RATE_HZ
+        peaks.append(np.abs(np.diff(drive, 2)).max() * RATE_HZ**2 / 9.80665)
         assert drive[-1] == 0.0, "the command rests at its mean"
         print(
             f"kills: command at rest {rests[-1]:.2f} s after, table within 0.2 mm {table_s:.2f} s"
@@ -206,11 +211,11 @@ def _run(folder: Path, title: str, meanwhile: Callable[[], None]) -> None:
     ]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         meanwhile()
-        said = process.communicate()[0]
+        output = process.communicate()[0]
     summary = json.loads((out / "summary.json").read_text())
     verify = [SHAKETWIN, "verify", str(out / "run.mcap")]
     verified = subprocess.run(verify, stdout=subprocess.PIPE, text=True, check=False)
-    print(f"{title}: exit {process.returncode}; {said.strip().splitlines()[-1]}")
+    print(f"{title}: exit {process.returncode}; {output.strip().splitlines()[-1]}")
     print(f"{title}: {summary['verdict']}, {summary.get('reason')}; gaps {summary['gaps']}")
     print(f"{title}: {json.dumps(summary['timing'])}")
     print(
@@ -222,7 +227,7 @@ def main() -> None:
     if sys.argv[1:2] == ["drive"]:
         drive(*sys.argv[2:])
         return
-    studies = {one.__name__: one for one in (latency, kills, quickstart, target)}
+    studies = {study.__name__: study for study in (latency, kills, quickstart, target)}
     for name in sys.argv[1:] or studies:
         with tempfile.TemporaryDirectory() as folder:
             studies[name](Path(folder))

@@ -18,7 +18,7 @@ from twin.transport.endpoint import PUBLIC_HUB_SETTINGS, key_expression, merge_s
 from twin.transport.zenoh_link import open_hub
 
 PAGE = (Path(codec.__file__).parent / "BUS.md").read_text()
-ENOUGH = 4000  # turns of the hub, 5 ms each
+MAX_TURNS = 4000  # turns of the hub, 5 ms each
 
 
 @pytest.mark.parametrize("topic", codec.TOPIC_TYPES)
@@ -45,9 +45,9 @@ def test_the_example_runs_as_it_stands() -> None:
     assert listener.stdout is not None
     steps = np.zeros(20, dtype=np.int64)
     os.set_blocking(listener.stdout.fileno(), False)
-    said = ""
+    output = ""
     try:
-        for number in range(ENOUGH):
+        for number in range(MAX_TURNS):
             values = np.full((1, 20), float(number))
             block = Block(
                 "meas", 20 * number, 2000.0, ("mass_disp_m",), values, steps, steps, steps
@@ -56,16 +56,16 @@ def test_the_example_runs_as_it_stands() -> None:
             if (question := questions.poll()) is not None:
                 question.reply(codec.message_schema(Block)[1])
             if select.select([listener.stdout], [], [], 0.005)[0]:
-                said += os.read(listener.stdout.fileno(), 65536).decode()
-            if said.count("\n") > 3:
+                output += os.read(listener.stdout.fileno(), 65536).decode()
+            if output.count("\n") > 3:
                 break
     finally:
         listener.kill()
         listener.wait()
         listener.stdout.close()
         link.close()
-    lines = said.splitlines()[:3]
-    assert len(lines) == 3, said
+    lines = output.splitlines()[:3]
+    assert len(lines) == 3, output
     for line in lines:
         match = re.fullmatch(r"([\d.]+) \{'(\w+)': ([\d.]+)\}", line)
         assert match is not None, line

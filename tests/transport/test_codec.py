@@ -45,7 +45,9 @@ def anything_like(hint: Any) -> st.SearchStrategy[Any]:
         return st.dictionaries(*(anything_like(arg) for arg in get_args(hint)), max_size=4)
     if isinstance(hint, type) and is_dataclass(hint):
         hints = get_type_hints(hint)
-        return st.builds(hint, **{one.name: anything_like(hints[one.name]) for one in fields(hint)})
+        return st.builds(
+            hint, **{field.name: anything_like(hints[field.name]) for field in fields(hint)}
+        )
     return {
         NoneType: st.none(),
         int: st.integers(0, codec.MAX_SAMPLE_INDEX),
@@ -79,15 +81,15 @@ def bits(value: Any) -> Any:
     if isinstance(value, float):
         return struct.pack("<d", value)
     if isinstance(value, tuple):
-        return tuple(bits(one) for one in value)
+        return tuple(bits(element) for element in value)
     if isinstance(value, dict):
-        return {key: bits(one) for key, one in value.items()}
+        return {key: bits(element) for key, element in value.items()}
     if is_dataclass(value):
-        return type(value), tuple(bits(getattr(value, one.name)) for one in fields(value))
+        return type(value), tuple(bits(getattr(value, field.name)) for field in fields(value))
     return value
 
 
-def returned(item: Item) -> Item:
+def return_through_bytes(item: Item) -> Item:
     """The item after a way through bytes."""
     name, back = decode_item(topic_for(item), encode_item(item, "run-7"))
     assert name == (item.run if isinstance(item, RunStart) else "run-7")
@@ -99,7 +101,7 @@ def test_every_record_comes_back_to_the_bit(kind: type) -> None:
     @given(anything_like(kind))
     @settings(max_examples=40, deadline=None)
     def law(record: Record) -> None:
-        back = returned(record)
+        back = return_through_bytes(record)
         assert bits(back) == bits(record)
         assert encode_item(back, "run-7") == encode_item(record, "run-7")
 
@@ -109,7 +111,7 @@ def test_every_record_comes_back_to_the_bit(kind: type) -> None:
 @given(any_block())
 @settings(max_examples=80, deadline=None)
 def test_every_block_comes_back_to_the_bit(block: Block) -> None:
-    back = returned(block)
+    back = return_through_bytes(block)
     assert isinstance(back, Block)
     assert back.is_identical(block)
     assert back.values.shape == block.values.shape
@@ -120,11 +122,11 @@ def test_what_is_missing_is_not_what_is_empty() -> None:
     none = CycleExtremes(20, 1, 0, 3, 100, None, None)
     zeros = Extremes(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, (), ())
     empty = CycleExtremes(20, 1, 0, 3, 100, zeros, None)
-    assert returned(none) == none
-    assert returned(empty) == empty
+    assert return_through_bytes(none) == none
+    assert return_through_bytes(empty) == empty
     assert encode_item(none, "") != encode_item(empty, "")
     point = PrcPoint(20, 1, "forward", 2.0, None, None, -0.0, float("nan"), 0.0)
-    assert bits(returned(point)) == bits(point)
+    assert bits(return_through_bytes(point)) == bits(point)
 
 
 def test_the_order_in_a_dictionary_changes_no_byte() -> None:
@@ -155,18 +157,20 @@ def cards() -> list[type]:
     return [kind for kind in codec.MESSAGE_NAMES if kind is not Block]
 
 
-def wanted(hint: Any) -> tuple[str, str]:
+def describe_hint(hint: Any) -> tuple[str, str]:
     """(kind, "one" | "optional" | "many" | "map") that a proto field must have for a type hint."""
     if get_origin(hint) is UnionType:
-        return wanted(next(arg for arg in get_args(hint) if arg is not NoneType))[0], "optional"
+        return describe_hint(next(arg for arg in get_args(hint) if arg is not NoneType))[
+            0
+        ], "optional"
     if get_origin(hint) is tuple:
-        return wanted(get_args(hint)[0])[0], "many"
+        return describe_hint(get_args(hint)[0])[0], "many"
     if get_origin(hint) is dict:
-        return " to ".join(wanted(arg)[0] for arg in get_args(hint)), "map"
+        return " to ".join(describe_hint(arg)[0] for arg in get_args(hint)), "map"
     return codec.MESSAGE_NAMES.get(hint, hint.__name__), "one"
 
 
-def found(field: FieldDescriptor) -> tuple[str, str]:
+def describe_field(field: FieldDescriptor) -> tuple[str, str]:
     """The same of a proto field."""
     kinds = {
         FieldDescriptor.CPPTYPE_INT64: "int",
@@ -176,21 +180,22 @@ def found(field: FieldDescriptor) -> tuple[str, str]:
         FieldDescriptor.CPPTYPE_STRING: "str",
     }
     if field.message_type is None:
-        return kinds[field.cpp_type], "many" if field.is_repeated else "one"
+        optional = "optional" if field.containing_oneof is not None else "one"
+        return kinds[field.cpp_type], "many" if field.is_repeated else optional
     if field.message_type.GetOptions().map_entry:
         parts = field.message_type.fields_by_name
-        return f"{found(parts['key'])[0]} to {found(parts['value'])[0]}", "map"
+        return f"{describe_field(parts['key'])[0]} to {describe_field(parts['value'])[0]}", "map"
     return field.message_type.name, "many" if field.is_repeated else "optional"
 
 
 @pytest.mark.parametrize("kind", cards(), ids=lambda kind: kind.__name__)
 def test_the_schema_has_the_fields_of_the_record_and_no_other(kind: type) -> None:
     hints = get_type_hints(kind)
-    record = {one.name: wanted(hints[one.name]) for one in fields(kind)}
+    record = {field.name: describe_hint(hints[field.name]) for field in fields(kind)}
     if kind in RECORD_TYPES:
         record["run"] = ("str", "one")  # the wire adds the run to what does not name it itself
     message = pb.DESCRIPTOR.message_types_by_name[codec.MESSAGE_NAMES[kind]]
-    assert {field.name: found(field) for field in message.fields} == record
+    assert {field.name: describe_field(field) for field in message.fields} == record
 
 
 def test_the_schema_has_the_fields_of_a_block_and_no_other() -> None:

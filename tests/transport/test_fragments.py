@@ -52,7 +52,7 @@ def test_a_payload_in_pieces_is_whole_with_the_last_one(size: int) -> None:
     payload = random.Random(size).randbytes(size)
     parcel = PayloadAssembly()
     *before, last = split_payload(TOPIC, SOURCE, 7, payload)
-    assert [parcel.add(one) for one in before] == [None] * len(before)
+    assert [parcel.add(fragment) for fragment in before] == [None] * len(before)
     assert parcel.add(last) == payload
     assert last.sequence == 7 + len(before)
     assert len(last.header) == 17
@@ -70,11 +70,11 @@ def test_an_answer_holds_no_more_than_fits_beside_what_tells_its_sizes() -> None
     shelf = HistoryCache()
     for number in range(3000):
         shelf.add(number, 3, b"x")
-    said, chunk = build_history_reply({(TOPIC, SOURCE): shelf}, {TOPIC: {SOURCE: 100}}, True)
-    ((topic, source, first, end, sizes),) = said
+    header, chunk = build_history_reply({(TOPIC, SOURCE): shelf}, {TOPIC: {SOURCE: 100}}, True)
+    ((topic, source, first, end, sizes),) = header
     assert (topic, source, first, end) == (TOPIC, SOURCE, 100, 3000)
     assert len(sizes) == len(chunk) == MAX_REPLY_FRAGMENTS
-    assert len(json.dumps(said)) + FRAGMENT_BYTES < 2**16
+    assert len(json.dumps(header)) + FRAGMENT_BYTES < 2**16
 
 
 def test_only_so_many_askers_are_kept_in_mind() -> None:
@@ -181,8 +181,8 @@ def test_who_lies_about_how_far_it_has_come_lacks_no_more_than_is_held(lie: floa
 def test_an_answer_about_another_topic_is_nobodys() -> None:
     link = Asked()
     inbox = ReliableSubscriber(link, (TOPIC,), True, 10)
-    said = [["/run/stop", SOURCE, 0, 1, [[3, 3]]], [TOPIC, SOURCE, 0, 1, [[3, 2]]]]
-    inbox.handle_sample("", Bytes(json.dumps(said).encode()), Bytes(b"abcde"))
+    header = [["/run/stop", SOURCE, 0, 1, [[3, 3]]], [TOPIC, SOURCE, 0, 1, [[3, 2]]]]
+    inbox.handle_sample("", Bytes(json.dumps(header).encode()), Bytes(b"abcde"))
     assert inbox.get(0.0) == (TOPIC, b"de")
     assert inbox.get(0.0) is None
 
@@ -216,8 +216,8 @@ def test_of_what_is_offered_ever_new_publishers_cost_nothing() -> None:
         piece = Fragment(TOPIC, f"{number:016x}", 0, 1, b"begun")
         inbox.handle_sample(TOPIC, Bytes(piece.header), Bytes(piece.body))
         assert inbox.get(0.0) is None
-    said = [[TOPIC, f"{number:016x}", 0, 1, [[1, 1]]] for number in range(500, 900)]
-    inbox.handle_sample("", Bytes(json.dumps(said).encode()), Bytes(bytes(400)))
+    header = [[TOPIC, f"{number:016x}", 0, 1, [[1, 1]]] for number in range(500, 900)]
+    inbox.handle_sample("", Bytes(json.dumps(header).encode()), Bytes(bytes(400)))
     assert inbox.get(0.0) is None
     assert len(inbox._assemblies) <= MAX_OFFERING_PUBLISHERS + 1
     inbox._queried_at = float("-inf")

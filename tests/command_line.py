@@ -1,0 +1,25 @@
+"""The command line called in the process of a test, which does not import everything anew."""
+
+import subprocess
+import sys
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from pathlib import Path
+
+import pytest
+
+from twin.cli import main
+
+
+def call_main(*words: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run `shaketwin` with these words in this process; an exception fails the test."""
+    argv, out, err = ["shaketwin", *map(str, words)], StringIO(), StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
+        patch.setattr(sys, "argv", argv)
+        patch.setattr(main, "configure_logging", lambda _: None)  # it would outlive the test
+        if cwd is not None:
+            patch.chdir(cwd)
+        with pytest.raises(SystemExit) as ended:
+            main.main()
+    assert isinstance(ended.value.code, int)
+    return subprocess.CompletedProcess(argv, ended.value.code, out.getvalue(), err.getvalue())
