@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.identification.played import SNM
+from twin.identification.motion import RecordScale
 from twin.identification.parameters import (
     BUMPER_STIFFNESS,
     DAMPING,
@@ -28,6 +29,9 @@ from twin.identification.parameters import (
 from twin.model.effects import find_effect
 from twin.model.model import SensorModel
 
+SCALE = RecordScale(
+    0.02, 0.2, 3.0, 1e-3, 1650.0, 5e-3, 2e-3, 25.0, {"table_acc_m_s2": 0.5}
+)  # a rig of 550 kg
 SIDES = (BaseKey("bumper_stiffness_r"), BaseKey("bumper_stiffness_l"))
 FIT_ONLY: dict[ParameterKey, float] = {
     SLIP_SPEED: 1e-3, TermKey("damper u^5", "force"): 3.0, TareKey(1, "u"): 1e-5,
@@ -94,8 +98,8 @@ def test_a_vector_sets_the_free_parameters_alone_tied_ones_together() -> None:
 
 
 def test_a_removed_effect_leaves_neither_values_nor_free_parameters() -> None:
-    friction = list_effect_parameters(find_effect("coulomb_friction"))
-    base = list_base_parameters(SNM, [False], False, {})
+    friction = list_effect_parameters(find_effect("coulomb_friction"), SCALE)
+    base = list_base_parameters([False], None, {}, SCALE)
     start = ParameterSet.from_model(SNM, 1).with_free(base)
     added = start.with_values({friction[0].key: 30.0}).with_free((*base, *friction))
     removed = added.without(friction)
@@ -104,7 +108,7 @@ def test_a_removed_effect_leaves_neither_values_nor_free_parameters() -> None:
 
 
 def test_bumpers_gaps_and_tares_are_free_where_the_logs_determine_them() -> None:
-    free = list_base_parameters(SNM, [False, True], True, {TareKey(0, "acc"): 1e-3})
+    free = list_base_parameters([False, True], 1.0, {TareKey(0, "acc"): 1e-3}, SCALE)
     by_key = {parameter.key: parameter for parameter in free}
     assert {STIFFNESS, DAMPING, BUMPER_STIFFNESS, GapKey(1), INPUT_GAIN} <= by_key.keys()
     assert GapKey(0) not in by_key

@@ -4,7 +4,6 @@ Forces depend (nearly) linearly on the amplitude of a candidate, but not on its 
 Each candidate therefore has a ladder of trial shapes; the fit interpolates between them.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,6 +11,7 @@ import numpy as np
 
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from twin.identification.generic_terms import list_term_parameters, list_terms
+from twin.identification.motion import RecordScale
 from twin.identification.parameters import (
     GENERIC_PREFIX,
     SLIP_SPEED,
@@ -19,13 +19,17 @@ from twin.identification.parameters import (
     ParameterKey,
     ParameterSet,
     list_effect_parameters,
+    measure_size,
 )
 from twin.identification.residuals import LogResiduals
 from twin.model.effects import EFFECTS, load_plugins
-from twin.model.effects.effect import Effect
+from twin.model.effects.effect import Effect, EffectParameter
 
 LADDER_LENGTH = 9
-SLIP_SPEEDS_M_S = (1e-5, 3e-4, 1e-3, 3e-3)  # trial values; friction near zero velocity varies
+# of the largest velocity: trial values; friction near zero velocity varies
+SLIP_SHARES = (5e-5, 1.5e-3, 5e-3, 1.5e-2)
+LADDER_SHARES_M = (0.01, 2.0)  # ends of the ladder of a length, of the largest displacement
+MAX_LADDER_PERIODS = 6.0  # of the main motion: end of the ladder of a relaxation time
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +48,10 @@ class Candidate:
     channel: str = ""
 
     @classmethod
-    def from_effect(
-        cls, effect: Effect, channel: str, shapes: tuple[tuple[float, ...], ...]
-    ) -> "Candidate":
+    def from_effect(cls, effect: Effect, channel: str, scale: RecordScale) -> "Candidate":
         """Return the candidate of a library effect; `channel` is that of a sensor effect."""
-        free = list_effect_parameters(effect, channel)
+        free = list_effect_parameters(effect, scale, channel)
+        shapes = _list_shapes(effect, free, scale)
         index = next(
             i for i, parameter in enumerate(effect.parameters) if parameter.vanishing is not None
         )
@@ -56,15 +59,11 @@ class Candidate:
         name = f"{effect.id}.{channel}" if channel else effect.id
         amplitude = free[index]
         if effect.id == "coulomb_friction":
+            speeds = [share * scale.v for share in SLIP_SHARES]
             slip = FreeParameter(
-                SLIP_SPEED,
-                SLIP_SPEEDS_M_S[0],
-                3.0 * SLIP_SPEEDS_M_S[-1],
-                SLIP_SPEEDS_M_S[0],
-                "m/s",
-                logarithmic=True,
+                SLIP_SPEED, speeds[0], 3.0 * speeds[-1], speeds[0], "m/s", logarithmic=True
             )
-            free, shapes = (*free, slip), tuple((speed,) for speed in SLIP_SPEEDS_M_S)
+            free, shapes = (*free, slip), tuple((speed,) for speed in speeds)
         return cls(name, free, amplitude, vanishing, shapes, effect, channel)
 
     def add_to(
@@ -77,11 +76,12 @@ class Candidate:
         return parameters.with_values(values).with_free((*parameters.free, *self.free))
 
 
-def list_generic_candidates(has_contact: bool) -> tuple[Candidate, ...]:
+def list_generic_candidates(log_residuals: Sequence[LogResiduals]) -> tuple[Candidate, ...]:
     """Return the generic terms as candidates."""
-    candidates = []
-    for name, ladder in list_terms(has_contact):
-        free = list_term_parameters(name, ladder)
+    candidates, scale = [], log_residuals[0].scale
+    has_contact = any((residuals.contact_state > 0).any() for residuals in log_residuals)
+    for name, ladder in list_terms(has_contact, scale):
+        free = list_term_parameters(name, ladder, scale)
         shapes = tuple((width,) for width in ladder) or ((),)
         candidates.append(Candidate(f"{GENERIC_PREFIX}.{name}", free, free[0], 0.0, shapes))
     return tuple(candidates)
@@ -102,7 +102,7 @@ def list_candidates(
             excluded[effect.id] = reason
             continue
         for channel in sorted(_checkable_channels(channels)) if effect.acts == "sensor" else ("",):
-            candidate = Candidate.from_effect(effect, channel, _shape_ladder(effect, log_residuals))
+            candidate = Candidate.from_effect(effect, channel, log_residuals[0].scale)
             already_free = {free.key for free in candidate.free} & fitted.values.keys()
             if (
                 not already_free
@@ -153,28 +153,32 @@ def _is_unloaded(candidate: Candidate, log_residuals: Sequence[LogResiduals]) ->
     )
 
 
-def _shape_ladder(
-    effect: Effect, log_residuals: Sequence[LogResiduals]
+def _list_shapes(
+    effect: Effect, free: Sequence[FreeParameter], scale: RecordScale
 ) -> tuple[tuple[float, ...], ...]:
-    """Return trial shapes: a ladder for a single parameter by its unit, typical values for more."""
-    amplitude = next(
-        parameter for parameter in effect.parameters if parameter.vanishing is not None
-    )
-    shapes = [parameter for parameter in effect.parameters if parameter is not amplitude]
-    if len(shapes) != 1:
-        return (tuple(parameter.typical for parameter in shapes),)
-    (shape,) = shapes
-    if shape.unit == "m":
-        largest = max(
-            float(np.abs(residuals.motion().u[residuals.row_mask[0]]).max())
-            for residuals in log_residuals
-        )
-        low, high = 0.01 * largest, 2.0 * largest
-    elif shape.unit == "s":
-        duration = max(float(np.ptp(residuals.motion().time_s)) for residuals in log_residuals)
-        low, high = 0.5 / log_residuals[0].motion().rate_hz, min(0.1 * duration, 3.0)
+    """Return trial shapes: a ladder for a single parameter, the middle of its ladder for more."""
+    ladders = [
+        _shape_ladder(parameter, own, effect, scale)
+        for parameter, own in zip(effect.parameters, free, strict=True)
+        if not own.vanishing and own.logarithmic
+    ]
+    if len(ladders) == 1:
+        return tuple((rung,) for rung in ladders[0])
+    return (tuple(ladder[len(ladder) // 2] for ladder in ladders),)
+
+
+def _shape_ladder(
+    parameter: EffectParameter, free: FreeParameter, effect: Effect, scale: RecordScale
+) -> list[float]:
+    """Return the trial values of a shape parameter, within its bounds, SI."""
+    if parameter.unit == "m":
+        low, high = (share * scale.u for share in LADDER_SHARES_M)
+    elif parameter.unit == "s":
+        longest = MAX_LADDER_PERIODS * 2 * np.pi * scale.time_s
+        low, high = 0.5 * scale.sample_s, min(0.1 * scale.duration_s, longest)
     else:
-        low, high = 0.1 * shape.typical, 10.0 * shape.typical
-    low, high = max(low, shape.low), min(high, shape.high)
-    ladder = np.exp(np.linspace(math.log(low), math.log(high), LADDER_LENGTH))
-    return tuple((min(max(float(rung), shape.low), shape.high),) for rung in ladder)
+        size = measure_size(parameter, effect, "", scale) or parameter.typical
+        low, high = 0.1 * size, 10.0 * size
+    low, high = max(low, free.low), min(high, free.high)
+    rungs = np.geomspace(low, max(high, low), LADDER_LENGTH)
+    return [min(max(float(rung), free.low), free.high) for rung in rungs]

@@ -18,7 +18,7 @@ import numpy as np
 from table_io.block import Block, Float1D, Int1D
 from table_io.channels import contact_forces
 from twin.identification.parameters import ParameterSet
-from twin.identification.residuals import CONTACT_NOISE_FACTOR, LogResiduals
+from twin.identification.residuals import LogResiduals
 
 DEBOUNCE_S = 0.005  # no contact for this time before an onset, and mostly contact after it
 SIDE_NAMES = ("right", "left")
@@ -72,12 +72,11 @@ def estimate_contact_gaps(
     position = m.u - parameters.tare_error(residuals.log_number, "u")
     for side, law in enumerate(laws):
         sign = 1.0 if side == 0 else -1.0
-        rms = (m.noise.right, m.noise.left)[side]
         for edge, kind in ((1, "onset"), (-1, "release")):
             times, level = [], 0.0
             for block in blocks:
                 force = sign * contact_forces(block)[side]
-                level = _contact_threshold(force, block, residuals, rms)
+                level = _contact_threshold(force, block, residuals, side)
                 times.append(
                     (_find_crossings(force > level, block.rate_hz, edge) + block.index - 0.5)
                     / block.rate_hz
@@ -88,7 +87,7 @@ def estimate_contact_gaps(
             if crossing_s.size < MIN_CROSSINGS:
                 continue
             u, v = (sign * np.interp(crossing_s, m.time_s, row) for row in (position, m.v))
-            depth = (max(residuals.contact_n, CONTACT_NOISE_FACTOR * rms) - law[1] * v) / law[0]
+            depth = (residuals.contact_thresholds_n[side] - law[1] * v) / law[0]
             if edge > 0:
                 depth = np.maximum(depth, 0.0)
             estimates.append(
@@ -97,12 +96,12 @@ def estimate_contact_gaps(
     return tuple(estimates)
 
 
-def _contact_threshold(force: Float1D, block: Block, residuals: LogResiduals, rms: float) -> float:
+def _contact_threshold(force: Float1D, block: Block, residuals: LogResiduals, side: int) -> float:
     """Return the contact threshold of a side in N, as in `LogResiduals.contact_state`.
 
     The reading of the load cells at rest is added to it.
     """
-    threshold = max(residuals.contact_n, CONTACT_NOISE_FACTOR * rms)
+    threshold = residuals.contact_thresholds_n[side]
     rest = block.label == 0
     if min(residuals.signals.gaps_m) > 0 and rest.any():
         threshold += float(np.nanmedian(force[rest]))

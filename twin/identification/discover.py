@@ -63,7 +63,7 @@ MAX_PARAMETER_RATIO = 1.5  # ratio to the model's parameter beyond which the spe
 
 @dataclass(frozen=True, eq=False)
 class PreparedLog:
-    """Log prepared for identification: signals, contact threshold in N, steps."""
+    """Log prepared for identification: signals, least contact threshold in N (or 0), steps."""
 
     signals: LogSignals
     contact_n: float
@@ -208,29 +208,30 @@ def initialize_parameters(log_residuals: Sequence[LogResiduals], model: Model) -
         for residuals in log_residuals
     )
     parameters = ParameterSet.from_model(model, len(log_residuals))
-    if fit_input:
-        parameters = parameters.with_values(
-            {INPUT_GAIN: _input_gain(log_residuals[0], model), INPUT_OFFSET: 0.0}
-        )
+    input_gain = _input_gain(log_residuals[0]) if fit_input else None
+    if input_gain is not None:
+        parameters = parameters.with_values({INPUT_GAIN: input_gain, INPUT_OFFSET: 0.0})
     tare_sigmas = {
         TareKey(log, quantity): residuals.signals.rest_value(quantity)[1]
         for log, residuals in enumerate(log_residuals)
         for quantity in residuals.signals.zero_channels
     }
+    scale = log_residuals[0].scale
     free = (
-        *list_base_parameters(model, has_contact, fit_input, tare_sigmas),
-        *list_model_effect_parameters(model),
+        *list_base_parameters(has_contact, input_gain, tare_sigmas, scale),
+        *list_model_effect_parameters(model, scale),
     )
     return parameters.with_values(dict.fromkeys(tare_sigmas, 0.0)).with_free(free)
 
 
-def _input_gain(residuals: LogResiduals, model: Model) -> float:
-    """Estimate the input gain: measured table acceleration over that required by the model."""
-    m, p = residuals.motion(), model.parameters
-    needed = m.acc - m.table_acc + (p.stiffness * m.u + p.damping * m.v) / p.mass
-    table_acc = m.table_acc
-    slope = float(np.nanmean(needed * table_acc) / max(float(np.nanmean(table_acc**2)), 1e-300))
-    return 1.0 / abs(slope) if slope else 1.0
+def _input_gain(residuals: LogResiduals) -> float:
+    """Estimate the gain of the table's acceleration: u'' = -k u - c u' - table_acc / gain."""
+    m = residuals.motion()
+    columns = np.array([m.u, m.v, m.table_acc])[:, m.moving]
+    size = np.abs(columns).max(axis=1, keepdims=True)
+    relative_acc = (m.acc - m.table_acc)[m.moving]
+    slope = np.linalg.lstsq((columns / size).T, relative_acc, rcond=None)[0][2] / size[2, 0]
+    return 1.0 / abs(float(slope)) if slope else 1.0
 
 
 def _check_enough_data(residuals: LogResiduals) -> None:

@@ -7,19 +7,20 @@ model. Each is `force` times a shape of size 1 at the largest measured u, v or d
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from scipy.signal import lfilter
 
 from table_io.block import Float1D, Float2D
-from twin.identification.motion import MeasuredMotion
+from twin.identification.motion import MeasuredMotion, RecordScale
 from twin.identification.parameters import SLIP_SPEED, FreeParameter, ParameterKey, TermKey
 
 BasisFunction = Callable[[Float1D, Float1D, float], Float1D]
 TERM_WIDTHS = (0.03, 0.06, 0.12, 0.25, 0.5)
-RESONANCES_HZ = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0, 22.0, 32.0)  # Hz
+# Trial resonances, of the main frequency of the motion: a quarter of an octave apart, as a narrow
+# resonance is found only near a trial.
+RESONANCES = tuple(float(ratio) for ratio in 2.0 ** (np.arange(-8, 17) / 4.0))
 RESONATOR_DAMPING = 0.03
 
 # Functions of u / U and v / V in the damper, and of d / D and d' / V in a bumper.
@@ -53,28 +54,25 @@ BUMPER_TERMS: dict[str, BasisFunction] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class TermScale:
-    """Largest displacement in m, velocity in m/s and depth in m over all logs."""
+def list_terms(has_contact: bool, scale: RecordScale) -> tuple[tuple[str, tuple[float, ...]], ...]:
+    """Return (name, trial widths) of each term; no widths for a term without a width.
 
-    u: float
-    v: float
-    d: float
-
-
-def list_terms(has_contact: bool) -> tuple[tuple[str, tuple[float, ...]], ...]:
-    """Return (name, trial widths) of each term; no widths for a term without a width."""
+    The width of the resonator is its frequency in Hz.
+    """
+    main_hz = 1.0 / (2 * np.pi * scale.time_s)
     damper_terms: list[tuple[str, tuple[float, ...]]] = [
         (f"damper {name}", ()) for name in DAMPER_TERMS
     ]
     damper_terms += [(f"damper {name}", TERM_WIDTHS) for name in DAMPER_WIDTH_TERMS]
-    damper_terms += [("damper resonator", RESONANCES_HZ)]
+    damper_terms += [("damper resonator", tuple(ratio * main_hz for ratio in RESONANCES))]
     return (*damper_terms, *((f"bumper {name}", ()) for name in BUMPER_TERMS if has_contact))
 
 
-def list_term_parameters(name: str, ladder: tuple[float, ...]) -> tuple[FreeParameter, ...]:
+def list_term_parameters(
+    name: str, ladder: tuple[float, ...], scale: RecordScale
+) -> tuple[FreeParameter, ...]:
     """Return the free parameters of a term: amplitude in N, and width if it has one."""
-    force = FreeParameter(TermKey(name, "force"), -np.inf, np.inf, 1.0, "N", vanishing=0.0)
+    force = FreeParameter(TermKey(name, "force"), -np.inf, np.inf, scale.force, "N", vanishing=0.0)
     if not ladder:
         return (force,)
     width = FreeParameter(
@@ -88,7 +86,7 @@ def compute_generic_forces(
     m: MeasuredMotion,
     gaps_m: tuple[float, float],
     touched: npt.NDArray[np.int8],
-    scale: TermScale,
+    scale: RecordScale,
 ) -> Float2D:
     """Return the forces that the generic terms add to D, F_R >= 0, -F_L >= 0, (3, sample) in N."""
     out = np.zeros((3, m.u.size))
@@ -111,7 +109,7 @@ def compute_generic_forces(
             out[0] += force * sign_factor * column(m.u / scale.u, m.v / scale.v, width)
         else:
             for side, (side_sign, gap) in enumerate(zip((1.0, -1.0), gaps_m, strict=True)):
-                d = np.clip((side_sign * m.u - gap) / scale.d, 0.0, None)
+                d = np.clip((side_sign * m.u - gap) / scale.depth, 0.0, None)
                 push = BUMPER_TERMS[shape](d, side_sign * m.v / scale.v, width)
                 out[1 + side] += force * np.where(touched[side] > 0, push, 0.0)
     return out

@@ -238,7 +238,8 @@ def _estimate_asymmetry(
     gaps = [key for key in joint.values if isinstance(key, NuisanceKey) and key.kind == "gap"]
     kept = [parameter for parameter in joint.free if parameter.key not in gaps]
     zeros: dict[ParameterKey, float] = dict.fromkeys((GAP_OFFSET, *gaps), 0.0)
-    free = (*kept, *list_effect_parameters(find_effect("gap_offset")))
+    scale = log_residuals[0].scale
+    free = (*kept, *list_effect_parameters(find_effect("gap_offset"), scale))
     start = joint.parameters.with_values(zeros).with_free(free)
     fit = fit_parameters(log_residuals, start)
     corrected = float(np.mean([residuals.gap_correction for residuals in log_residuals]))
@@ -258,7 +259,7 @@ def _compare_windows(
         window_nrmse(
             blocks,
             parameters.model_for_log(residuals.log_number, residuals.motion()),
-            residuals.contact_n,
+            max(residuals.contact_thresholds_n),
         )
         for parameters in parameter_sets
     )

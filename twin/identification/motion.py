@@ -9,6 +9,8 @@ so noise is neither differentiated nor integrated without bound, and there is no
 residual is white with variance 1 for any force law; a deviation indicates a sensor error.
 """
 
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,3 +81,45 @@ class MeasuredMotion:
         """Samples with the drive in motion and all channels valid, (sample,)."""
         moving: Bool2D = self.good & (self.label != Label.REST)
         return moving
+
+
+@dataclass(frozen=True, slots=True)
+class RecordScale:
+    """Largest values of the measured motion of all logs, SI.
+
+    Bounds and trial values of a fit are multiples of them, never absolute numbers, so that a
+    result does not depend on the size of the specimen.
+    """
+
+    u: float  # relative displacement
+    v: float  # its rate
+    acc: float  # total acceleration of the mass
+    depth: float  # compression of a bumper; u without bumpers
+    force: float  # of the damper if it was measured, else of inertia
+    table_disp: float
+    sample_s: float  # time between samples
+    duration_s: float  # of the longest log
+    readings: Mapping[str, float]  # by channel
+
+    @property
+    def time_s(self) -> float:
+        """Displacement over velocity in s: one radian of the main motion."""
+        return self.u / self.v
+
+
+def measure_scale(motions: Sequence[MeasuredMotion], readings: Mapping[str, float]) -> RecordScale:
+    """Return the scale of the motions of all logs; `readings` are the largest by channel, SI."""
+
+    def largest(rows: Sequence[Float1D]) -> float:
+        moving = [np.nan_to_num(row[m.moving]) for row, m in zip(rows, motions, strict=True)]
+        return float(max(np.abs(row).max(initial=0.0) for row in moving)) or 1.0
+
+    u = largest([m.u for m in motions])
+    gaps = [gap for m in motions for gap in m.gaps_m if math.isfinite(gap)]
+    forces = [-m.mass_kg * m.acc if m.damper is None else m.damper for m in motions]
+    return RecordScale(
+        u, largest([m.v for m in motions]), largest([m.acc for m in motions]),
+        max(u - min(gaps), 1e-2 * u) if gaps else u, largest(forces),
+        largest([m.table_disp for m in motions]), min(1.0 / m.rate_hz for m in motions),
+        max(float(np.ptp(m.time_s)) for m in motions), readings,
+    )  # fmt: skip

@@ -5,15 +5,16 @@ Each parameter has a key: `BaseKey`, `EffectKey`, `TermKey`, `SlipKey`, `GapKey`
 """
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from table_io.block import Float1D
-from twin.identification.motion import MeasuredMotion
+from twin.identification.motion import MeasuredMotion, RecordScale
 from twin.model.effects import find_effect
-from twin.model.effects.effect import Effect
+from twin.model.effects.effect import Effect, EffectParameter
 from twin.model.model import EffectInstance, Model, SensorModel
 from twin.model.parameters import Parameters
 
@@ -21,7 +22,13 @@ GENERIC_PREFIX = "general"  # of the names of generic terms
 # of the names of the corrections per log
 GAP_PREFIX, TARE_PREFIX, NUISANCE_PREFIX = "gap", "zero", "nuisance"
 MAX_TARE_SIGMA = 4.0  # bound on a tare error in standard deviations; more is a sensor offset
-MIN_START_SHARE = 1e-6  # of the start value: lower bound of parameters that must not vanish
+# Bounds of a fit, as multiples of what the record can contain (see `measure_size`):
+MIN_SHARE = 1e-6  # lower bound of base parameters that must not vanish
+MAX_RATIO = 10.0  # of amplitudes
+SHAPE_RATIOS = {"m": (5e-4, 5.0)}  # of shapes, by unit
+OTHER_SHAPE_RATIOS = (1e-3, 1e3)
+SMALL_LENGTH_SHARE = 0.1  # of the largest displacement: size of an error of a gap
+MAX_INPUT_GAIN_RATIO = 1e3  # of the gain of the input to its estimate
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,9 +179,9 @@ class ParameterSet:
                     effects.setdefault(effect, {})[name] = value
         return Model(
             Parameters.from_dict(base),
+            # not `create`: a fit has bounds of its own, from the record
             tuple(
-                EffectInstance.create(find_effect(effect), values)
-                for effect, values in effects.items()
+                EffectInstance(find_effect(effect), values) for effect, values in effects.items()
             ),
         )
 
@@ -252,24 +259,27 @@ BASE_PARAMETERS: tuple[tuple[BaseKey, str, tuple[BaseKey, ...]], ...] = (
 
 
 def list_base_parameters(
-    model: Model,
     has_contact: Sequence[bool],
-    fit_input: bool,
+    input_gain: float | None,
     tare_sigmas: Mapping[TareKey, float],
+    scale: RecordScale,
 ) -> tuple[FreeParameter, ...]:
     """Return the free parameters of the SNM; bumpers and gaps only for logs with contact.
 
-    `tare_sigmas`: standard deviations of the tares, SI.
-    `fit_input`: also fit gain and offset of the input, where no other channel can check them.
+    `tare_sigmas`: standard deviations of the tares, SI. `input_gain`: an estimate of the gain of
+    the input, which is fitted with its offset where no other channel can check it; else None.
     """
-    base, free = model.base.as_dict(), []
+    free = []
+    sizes = {
+        STIFFNESS: scale.force / scale.u, DAMPING: scale.force / scale.v,
+        BUMPER_STIFFNESS: scale.force / scale.depth, BUMPER_DAMPING: scale.force / scale.v,
+    }  # fmt: skip
     for key, unit, tied in BASE_PARAMETERS if any(has_contact) else BASE_PARAMETERS[:2]:
-        scale = base[(tied or (key,))[0].name] or 1.0
         # some effects need a bumper dashpot: without it the bumper face does not relax
-        low = 0.0 if key == DAMPING else MIN_START_SHARE * scale
-        free.append(FreeParameter(key, low, math.inf, scale, unit, tied=tied))
+        low = 0.0 if key == DAMPING else MIN_SHARE * sizes[key]
+        free.append(FreeParameter(key, low, math.inf, sizes[key], unit, tied=tied))
     free += [
-        FreeParameter(GapKey(log), -0.05, 0.05, 1e-3, "m")
+        FreeParameter(GapKey(log), -scale.u, scale.u, SMALL_LENGTH_SHARE * scale.u, "m")
         for log, touches in enumerate(has_contact)
         if touches
     ]
@@ -278,32 +288,101 @@ def list_base_parameters(
         free.append(
             FreeParameter(tare, -MAX_TARE_SIGMA * sigma, MAX_TARE_SIGMA * sigma, sigma, unit)
         )
-    if fit_input:
-        free.append(FreeParameter(INPUT_GAIN, 1e-12, 1e12, 1.0, "", logarithmic=True))
-        free.append(FreeParameter(INPUT_OFFSET, -1e9, 1e9, 1.0, "m/s2"))
+    if input_gain is not None:
+        low, high = input_gain / MAX_INPUT_GAIN_RATIO, input_gain * MAX_INPUT_GAIN_RATIO
+        free.append(FreeParameter(INPUT_GAIN, low, high, input_gain, "", logarithmic=True))
+        reading = scale.readings[INPUT_OFFSET.channel]
+        largest = MAX_RATIO * reading
+        free.append(FreeParameter(INPUT_OFFSET, -largest, largest, reading, "m/s2"))
     return tuple(free)
 
 
-def list_effect_parameters(effect: Effect, channel: str = "") -> tuple[FreeParameter, ...]:
-    """Return the free parameters of an effect, on a channel if it acts on a sensor."""
-    return tuple(
-        FreeParameter(
-            EffectKey(effect.id, parameter.name, channel),
-            parameter.low,
-            parameter.high,
-            abs(parameter.typical - (parameter.vanishing or 0.0)) or 1.0,
-            parameter.unit,
-            logarithmic=parameter.vanishing is None,
-            vanishing=parameter.vanishing,
-        )
-        for parameter in effect.parameters
-    )
+def measure_size(
+    parameter: EffectParameter, effect: Effect, channel: str, scale: RecordScale
+) -> float | None:
+    """Return the size of a parameter at which its effect is as large as the record itself, SI.
+
+    It follows from the unit, with the largest force, displacement (depth in a bumper) and time of
+    the record. None without one: a pure number or a time does not scale with the specimen.
+    """
+    if effect.acts == "sensor":
+        return scale.readings.get(channel) if parameter.name == "offset" else None
+    if effect.input_acceleration is not None:
+        values = {other.name: other.typical for other in effect.parameters}
+        largest = abs(float(effect.input_acceleration(scale.table_disp, values)))
+        return abs(parameter.typical) * scale.acc / largest if largest else None
+    if parameter.unit == "m" and parameter.vanishing is not None:
+        return SMALL_LENGTH_SHARE * scale.u
+    if parameter.unit == "m/s" and parameter.vanishing is not None:  # a drift over the test
+        return SMALL_LENGTH_SHARE * scale.u / scale.duration_s
+    length = scale.depth if effect.is_in_bumpers else scale.u
+    return _size_of_unit(parameter.unit, scale.force, length, length / scale.v)
 
 
-def list_model_effect_parameters(model: Model) -> tuple[FreeParameter, ...]:
+def _size_of_unit(unit: str, force: float, length: float, time: float) -> float | None:
+    """Return the product of these sizes in a unit such as "N s2/m2"; None for s and pure numbers.
+
+    None too for a unit that is written otherwise.
+    """
+    sizes = {"N": force, "m": length, "s": time, "kg": force * time**2 / length, "rad": 1.0}
+    if unit in ("", "s"):
+        return None
+    size = 1.0
+    numerator, _, denominator = unit.partition("/")
+    for factors, sign in ((numerator, 1), (denominator, -1)):
+        for factor in factors.split():
+            matched = re.fullmatch(r"([A-Za-z]+)(\d*)", factor)
+            if matched is None or matched[1] not in sizes:
+                return None
+            size *= sizes[matched[1]] ** (sign * int(matched[2] or 1))
+    return size
+
+
+def list_effect_parameters(
+    effect: Effect, scale: RecordScale, channel: str = ""
+) -> tuple[FreeParameter, ...]:
+    """Return the free parameters of an effect, on a channel if it acts on a sensor.
+
+    Their bounds come from the record, the library's guard only model files; pure numbers and
+    delays, which do not scale with the specimen, keep those of the library.
+    """
+    free = []
+    for parameter in effect.parameters:
+        low, high = _find_bounds(parameter, effect, channel, scale)
+        vanishing = parameter.vanishing
+        size = measure_size(parameter, effect, channel, scale)
+        typical = abs(parameter.typical - (vanishing or 0.0)) or 1.0
+        free.append(
+            FreeParameter(
+                EffectKey(effect.id, parameter.name, channel), low, high, size or typical,
+                parameter.unit, logarithmic=vanishing is None, vanishing=vanishing,
+            )
+        )  # fmt: skip
+    return tuple(free)
+
+
+def _find_bounds(
+    parameter: EffectParameter, effect: Effect, channel: str, scale: RecordScale
+) -> tuple[float, float]:
+    """Return the bounds of a parameter in a fit, SI."""
+    size, vanishing = measure_size(parameter, effect, channel, scale), parameter.vanishing
+    if vanishing is None and parameter.unit == "s":
+        return 0.02 * scale.sample_s, scale.duration_s
+    if not size:
+        return parameter.low, parameter.high
+    if vanishing is None:
+        low, high = SHAPE_RATIOS.get(parameter.unit, OTHER_SHAPE_RATIOS)
+        return low * size, high * size
+    # a sign that the library forbids, because it would feed energy in, stays forbidden
+    low = vanishing if parameter.low >= vanishing else vanishing - MAX_RATIO * size
+    high = vanishing if parameter.high <= vanishing else vanishing + MAX_RATIO * size
+    return low, high
+
+
+def list_model_effect_parameters(model: Model, scale: RecordScale) -> tuple[FreeParameter, ...]:
     """Return the free parameters of every effect of a model."""
     return tuple(
         free
         for instance in model.effects
-        for free in list_effect_parameters(instance.effect, instance.channel)
+        for free in list_effect_parameters(instance.effect, scale, instance.channel)
     )

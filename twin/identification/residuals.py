@@ -22,14 +22,20 @@ import numpy as np
 import numpy.typing as npt
 
 from table_io.block import Bool2D, Float1D, Float2D, Int1D
-from twin.identification.generic_terms import TermScale, compute_generic_forces
-from twin.identification.motion import ConsistencyResidual, MeasuredMotion
+from twin.identification.generic_terms import compute_generic_forces
+from twin.identification.motion import (
+    ConsistencyResidual,
+    MeasuredMotion,
+    RecordScale,
+    measure_scale,
+)
 from twin.identification.parameters import SLIP_SPEED, NuisanceKey, ParameterSet, TermKey
 from twin.identification.signals import LogSignals, derives_acc
 from twin.model.inverse_dynamics import forces_along
 from twin.model.model import Model, SensorModel
 
 CONTACT_NOISE_FACTOR = 8.0  # times the rms noise of a load cell: above it there is contact
+MIN_CONTACT_SHARE = 0.02  # of the rms inertia force: below it a load cell shows no contact
 CONTACT_MARGIN_S = 0.012  # around contact and release, where the low pass smears the force step
 BLOCK_S = 1.0  # block length where there are no forcing cycles
 FORCE_ROWS = ("damper", "right", "left")
@@ -78,14 +84,15 @@ class LogResiduals:
     """Regression problem of one log: residual rows, sample selection, blocks and noise.
 
     `log_number` is the index of the log; `reference` supplies the stiffness and damping that
-    convert noise of the motion into noise of the forces.
+    convert noise of the motion into noise of the forces. `contact_n` is a least contact threshold
+    in N, which may be 0: see `contact_thresholds_n`.
     """
 
     log_number: int
     signals: LogSignals
     contact_n: float
     reference: Model
-    scale: TermScale
+    scale: RecordScale
     weight: float = 1.0  # noise multiplier; above 1 where model error, not noise, limits the fit
     thinning: int = 1  # keep one in `thinning` of the cycles of a step and of the other blocks
     nuisances: NuisanceTerms | None = None
@@ -113,13 +120,23 @@ class LogResiduals:
             known = -1 if any(math.isfinite(gap) for gap in m.gaps_m) else 0
             return np.full((2, m.u.size), known, dtype=np.int8)
         sides = []
-        for push, rms, gap in (
-            (m.right, m.noise.right, m.gaps_m[0]),
-            (m.left, m.noise.left, m.gaps_m[1]),
+        for push, threshold, gap in zip(
+            (m.right, m.left), self.contact_thresholds_n, m.gaps_m, strict=True
         ):
             idle = float(np.median(push[~m.moving])) if gap > 0 and (~m.moving).any() else 0.0
-            sides.append(push - idle > max(self.contact_n, CONTACT_NOISE_FACTOR * rms))
+            sides.append(push - idle > threshold)
         return np.array(sides, dtype=np.int8)
+
+    @cached_property
+    def contact_thresholds_n(self) -> tuple[float, float]:
+        """Force of the right and of the left cells in N above which there is contact."""
+        m = self.motion()
+        inertia_n = m.mass_kg * float(np.sqrt(np.nan_to_num(m.acc[m.moving] ** 2).mean()))
+        least = max(self.contact_n, MIN_CONTACT_SHARE * inertia_n)
+        right, left = (
+            max(least, CONTACT_NOISE_FACTOR * rms) for rms in (m.noise.right, m.noise.left)
+        )
+        return right, left
 
     @cached_property
     def row_mask(self) -> Bool2D:
@@ -414,11 +431,11 @@ def build_log_residuals(
 ) -> tuple[LogResiduals, ...]:
     """Build the residuals of several logs, each (signals, contact threshold in N), on one scale."""
     motions = [signals.fuse_motion() for signals, _ in logs]
-    u = max(float(np.abs(m.u[m.moving]).max(initial=0.0)) for m in motions) or 1.0
-    v = max(float(np.abs(m.v[m.moving]).max(initial=0.0)) for m in motions) or 1.0
-    gaps = [gap for m in motions for gap in m.gaps_m if math.isfinite(gap)]
-    depth = max(u - min(gaps), 1e-2 * u) if gaps else u
-    scale = TermScale(u, v, depth)
+    readings: dict[str, float] = {}
+    for signals, _ in logs:
+        for channel in signals.channels:
+            readings[channel] = max(readings.get(channel, 0.0), signals.largest_reading(channel))
+    scale = measure_scale(motions, readings)
     thinning = math.ceil(sum(int(m.moving.sum()) for m in motions) / MAX_SAMPLES) or 1
     weighted = zip(logs, weights or [1.0] * len(logs), strict=True)
     return tuple(

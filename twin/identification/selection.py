@@ -233,9 +233,7 @@ def _fit_generic_terms(
 ) -> tuple[FittedSet, ...]:
     """Fit generic terms alone, in addition to the best effects, and in place of each of them."""
     best = state.best
-    library = list_generic_candidates(
-        any((residuals.contact_state > 0).any() for residuals in problem.log_residuals)
-    )
+    library = list_generic_candidates(problem.log_residuals)
 
     def report_best(progress: SelectionProgress) -> None:
         # a generic term is never reported as the best set

@@ -87,6 +87,11 @@ class LogSignals:
         values = self.grid.to_time_domain(self.spectra[channel])[self.label != Label.REST]
         return float(values.std()) if values.size else 0.0
 
+    def largest_reading(self, channel: str) -> float:
+        """Return the largest absolute reading of a channel while the drive moves, SI."""
+        values = self.grid.to_time_domain(self.spectra[channel])[self.label != Label.REST]
+        return float(np.abs(values).max(initial=0.0))
+
     @property
     def relative_spectrum(self) -> Spectrum:
         """Spectrum of the displacement of the mass relative to the table, from the lasers alone."""

@@ -32,9 +32,9 @@ BOUC_WEN = Effect(
     id="bouc_wen",
     term="Fy z, rate-independent hysteresis with memory",
     parameters=(
-        EffectParameter("force", "N", 0.0, 1e4, 0.0, 150.0, "Fy, reached far from a reversal."),
+        EffectParameter("force", "N", 0.0, 1e9, 0.0, 150.0, "Fy, reached far from a reversal."),
         EffectParameter(
-            "yield_displacement", "m", 1e-5, 0.1, None, 3e-3, "uy: Fy / uy is the initial slope."
+            "yield_displacement", "m", 1e-9, 10.0, None, 3e-3, "uy: Fy / uy is the initial slope."
         ),
     ),
     acts="force",

@@ -17,7 +17,7 @@ BUMPER_HARDENING = Effect(
     id="bumper_hardening",
     term="k2 u_j |u_j| in each bumper",
     parameters=(
-        EffectParameter("k2", "N/m2", 0.0, 1e10, 0.0, 1e8, "Coefficient of depth squared."),
+        EffectParameter("k2", "N/m2", 0.0, 1e15, 0.0, 1e8, "Coefficient of depth squared."),
     ),
     acts="force",
     place="bumpers",

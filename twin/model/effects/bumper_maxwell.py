@@ -13,7 +13,7 @@ BUMPER_MAXWELL = Effect(
     id="bumper_maxwell",
     term="b_j in each bumper, b_j' = kb u_j' - b_j / tau",
     parameters=(
-        EffectParameter("kb", "N/m", 0.0, 1e7, 0.0, 2e5, "Stiffness that relaxes."),
+        EffectParameter("kb", "N/m", 0.0, 1e12, 0.0, 2e5, "Stiffness that relaxes."),
         EffectParameter("tau", "s", 1e-4, 100.0, None, 0.05, "Relaxation time."),
     ),
     acts="linear",

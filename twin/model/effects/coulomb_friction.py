@@ -19,7 +19,7 @@ def force(direction: float, fc: float) -> float:
 COULOMB_FRICTION = Effect(
     id="coulomb_friction",
     term="Fc sign(u')",
-    parameters=(EffectParameter("fc", "N", 0.0, 5e3, 0.0, 50.0, "Friction force during slip."),),
+    parameters=(EffectParameter("fc", "N", 0.0, 1e9, 0.0, 50.0, "Friction force during slip."),),
     acts="force",
     residual=(
         "Loss per cycle in proportion to amplitude, so equivalent damping falls as 1/amplitude; "

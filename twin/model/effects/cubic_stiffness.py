@@ -18,7 +18,7 @@ CUBIC_STIFFNESS = Effect(
     id="cubic_stiffness",
     term="k3 u^3 in the damper",
     parameters=(
-        EffectParameter("k3", "N/m3", -3e7, 1e10, 0.0, 1e7, "Cubic coefficient of the damper."),
+        EffectParameter("k3", "N/m3", -1e15, 1e15, 0.0, 1e7, "Cubic coefficient of the damper."),
     ),
     acts="force",
     residual=(

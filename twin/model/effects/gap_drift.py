@@ -13,7 +13,7 @@ GAP_DRIFT = Effect(
     term="both gaps grow by rate x time",
     parameters=(
         EffectParameter(
-            "rate", "m/s", -1e-4, 1e-4, 0.0, 5e-6, "Opening speed of the gap of each side."
+            "rate", "m/s", -1.0, 1.0, 0.0, 5e-6, "Opening speed of the gap of each side."
         ),
     ),
     acts="linear",

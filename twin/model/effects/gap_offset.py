@@ -25,9 +25,7 @@ GAP_OFFSET = Effect(
     id="gap_offset",
     term="contact at u = G/2 + offset on the right, at u = -(G/2 - offset) on the left",
     parameters=(
-        EffectParameter(
-            "offset", "m", -0.015, 0.015, 0.0, 3e-4, "Right gap minus half the total gap."
-        ),
+        EffectParameter("offset", "m", -1.0, 1.0, 0.0, 3e-4, "Right gap minus half the total gap."),
     ),
     acts="parameters",
     place="bumpers",

@@ -20,7 +20,7 @@ HUNT_CROSSLEY = Effect(
     id="hunt_crossley",
     term="ch |u_j| u_j' in each bumper",
     parameters=(
-        EffectParameter("ch", "N s/m2", 0.0, 1e9, 0.0, 5e5, "Damping per depth of compression."),
+        EffectParameter("ch", "N s/m2", 0.0, 1e14, 0.0, 5e5, "Damping per depth of compression."),
     ),
     acts="force",
     place="bumpers",

@@ -12,7 +12,7 @@ MAXWELL_DAMPER = Effect(
     id="maxwell_damper",
     term="k1 spring in series with a dashpot, parallel to K and C",
     parameters=(
-        EffectParameter("k1", "N/m", 0.0, 1e6, 0.0, 8e3, "Stiffness that relaxes."),
+        EffectParameter("k1", "N/m", 0.0, 1e12, 0.0, 8e3, "Stiffness that relaxes."),
         EffectParameter("tau", "s", 1e-4, 100.0, None, 0.05, "Relaxation time."),
     ),
     acts="linear",

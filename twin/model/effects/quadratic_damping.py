@@ -17,7 +17,7 @@ QUADRATIC_DAMPING = Effect(
     id="quadratic_damping",
     term="c2 u' |u'| in the damper",
     parameters=(
-        EffectParameter("c2", "N s2/m2", 0.0, 1e6, 0.0, 2e3, "Coefficient of speed squared."),
+        EffectParameter("c2", "N s2/m2", 0.0, 1e12, 0.0, 2e3, "Coefficient of speed squared."),
     ),
     acts="force",
     residual=(

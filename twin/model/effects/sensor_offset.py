@@ -11,7 +11,7 @@ SENSOR_OFFSET = Effect(
     term="reading = value + offset, of one channel",
     parameters=(
         EffectParameter(
-            "offset", "unit of the channel", -1e4, 1e4, 0.0, 1e-3, "Reading at a value of zero."
+            "offset", "unit of the channel", -1e9, 1e9, 0.0, 1e-3, "Reading at a value of zero."
         ),
     ),
     acts="sensor",

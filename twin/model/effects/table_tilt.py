@@ -22,7 +22,7 @@ TABLE_TILT = Effect(
     id="table_tilt",
     term="-M g tilt x on the right side, x the table displacement",
     parameters=(
-        EffectParameter("tilt", "rad/m", -10.0, 10.0, 0.0, 0.1, "Rotation per table displacement."),
+        EffectParameter("tilt", "rad/m", -1e3, 1e3, 0.0, 0.1, "Rotation per table displacement."),
     ),
     acts="input",
     place="input",

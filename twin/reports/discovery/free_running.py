@@ -103,12 +103,13 @@ def run_log_free(
     )  # fmt: skip
     model = parameters.model_for_log(residuals.log_number, m)
     window = round(WINDOW_S * m.rate_hz)
-    twin = TwinSetup(model, m.rate_hz, window, window, residuals.contact_n)
+    contact_n = max(residuals.contact_thresholds_n)
+    twin = TwinSetup(model, m.rate_hz, window, window, contact_n)
     u_star, a_star, _ = free_flight_resonance(
         replace(residuals.reference.parameters, mass=m.mass_kg), level
     )
     gaps = model.parameters.gap_r, model.parameters.gap_l
-    scale = PrcScale(model.parameters, m.rate_hz, residuals.contact_n, u_star, a_star, gaps)
+    scale = PrcScale(model.parameters, m.rate_hz, contact_n, u_star, a_star, gaps)
     driven_steps = tuple(replace(sweep_step, acceleration_m_s2=level) for sweep_step in steps)
     setup = PipelineSetup(twin, scale, driven_steps, max(cycles))
     state, _ = start_pipeline(setup, first)

@@ -78,7 +78,9 @@ def load_recording(recording: Recording, name: str) -> LoadedLog:
             where=location,
             allowed="logs with mass_acc_m_s2 or table_acc_m_s2 (inertia force), or damper_force_n",
         )
-    log = PreparedLog(signals, profile.comparison.contact_n, start.steps)
+    is_stated = "contact_n" in profile.comparison.model_fields_set
+    contact_n = profile.comparison.contact_n if is_stated else 0.0  # else from the record
+    log = PreparedLog(signals, contact_n, start.steps)
     return LoadedLog(log, blocks, tuple(_list_notes(recording, name, profile, blocks, dead)))
 
 
