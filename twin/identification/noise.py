@@ -38,19 +38,21 @@ def estimate_noise_density(values: Float1D, rest: Bool2D, frequency: Float1D) ->
     """Return the noise density of a channel at frequencies in cycles per sample, (frequency,).
 
     White noise of rms s has the density s. The quiet segments in motion show the noise above the
-    frequencies of the motion, also where an anti-alias filter has lowered it; below, it continues
-    as white. The record at rest, which is short, shows whether it really does: it may be louder
-    towards low frequency (1/f), and where the motion hides the noise, it gives its level.
+    frequencies of the motion; below, it continues as white. The record at rest, which is short,
+    shows whether it really does: it may be louder towards low frequency (1/f), or lowered by an
+    anti-alias filter, and where the motion hides the noise, it gives its level. Without rest a
+    filter cannot be told from the end of the band of the motion, and none is assumed.
     """
     finite, quiet = values[np.isfinite(values)], values[rest & np.isfinite(values)]
     motion = _estimate_quiet_bands(finite)
-    passed = _count_passed_bands(motion)
+    at_rest = _estimate_rest_bands(quiet) if quiet.size >= MIN_REST_SAMPLES else None
+    passed = motion.power.size
+    if at_rest is not None:
+        passed = _count_passed_bands(motion, _find_roll_off(at_rest))
     power, corner = motion.power.copy(), 0.0
-    power[:passed] = _find_white_level(motion.power[:passed])
-    if quiet.size >= MIN_REST_SAMPLES:
-        level, corner = _compare_with_rest(
-            _estimate_rest_bands(quiet), power[0], motion.frequency[passed - 1]
-        )
+    power[:passed] = _find_white_level(motion.power[:passed], motion.sigma[:passed])
+    if at_rest is not None:
+        level, corner = _compare_with_rest(at_rest, power[0], motion.frequency[passed - 1])
         power[:passed] = level
     power[passed:] = np.minimum(power[passed:], power[0])
     shape = np.interp(
@@ -127,17 +129,25 @@ def _average_bands(hz: Float1D, power: Float1D, spread: float) -> NoiseBands:
     return NoiseBands(frequency, np.maximum(mean, 1e-300), sigma)
 
 
-def _count_passed_bands(bands: NoiseBands) -> int:
-    """Return the number of bands below the roll-off of an anti-alias filter: all without one."""
-    power, octave = bands.power, BANDS_PER_OCTAVE
+def _find_roll_off(at_rest: NoiseBands) -> float:
+    """Return the frequency above which an anti-alias filter lowers the noise; 0.5 without one."""
+    power, octave = at_rest.power, BANDS_PER_OCTAVE
     falls = power[:-octave] > MIN_FILTER_FALL * power[octave:]
-    rolling_off = np.flatnonzero(falls & (bands.frequency[:-octave] > MIN_FILTER_CYCLES))
-    return int(rolling_off[0]) if rolling_off.size else power.size
+    rolling_off = np.flatnonzero(falls & (at_rest.frequency[:-octave] > MIN_FILTER_CYCLES))
+    return float(at_rest.frequency[rolling_off[0]]) if rolling_off.size else 0.5
 
 
-def _find_white_level(power: Float1D) -> float:
-    """Return the lowest mean power of three adjacent bands: the motion only adds to it."""
-    return float(np.convolve(power, np.ones(3) / 3.0, "valid").min(initial=np.inf))
+def _count_passed_bands(bands: NoiseBands, roll_off: float) -> int:
+    """Return the number of bands below the roll-off of a filter, at least three."""
+    return max(int(np.searchsorted(bands.frequency, roll_off)), 3)
+
+
+def _find_white_level(power: Float1D, sigma: Float1D) -> float:
+    """Return the lowest power of the wide bands: the motion only adds to it.
+
+    The least of the narrow bands is low by chance.
+    """
+    return float(power[sigma <= 2.0 * sigma.min()].min())
 
 
 def _compare_with_rest(rest: NoiseBands, white: float, highest: float) -> tuple[float, float]:

@@ -139,7 +139,11 @@ class LogSignals:
         return replace(self, noise=noise)
 
     def fuse_motion(self, sensors: Sequence[SensorModel] = ()) -> MeasuredMotion:
-        """Return the motion, assuming that these sensors read gain x value(t - lag) + offset."""
+        """Return the motion, assuming that these sensors read gain x value(t - lag) + offset.
+
+        The noise is that of the readings as they are: scaled by an assumed gain, it would let the
+        misfit shrink by its own denominator.
+        """
         spectra = dict(self.spectra)
         for sensor in sensors:
             if sensor.channel in spectra:
@@ -147,11 +151,7 @@ class LogSignals:
                 spectra[sensor.channel] = (
                     shifted * np.exp(1j * self.omega * sensor.lag) / sensor.gain
                 )
-        noise = dict(self.noise)
-        for sensor in sensors:
-            if sensor.channel in noise:
-                noise[sensor.channel] = noise[sensor.channel] / abs(sensor.gain)
-        return _SensorFusion(self, spectra, noise).fuse()
+        return _SensorFusion(self, spectra, self.noise).fuse()
 
 
 def derives_acc(channels: Container[str]) -> bool:
