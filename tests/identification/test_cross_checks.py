@@ -6,6 +6,7 @@ import numpy as np
 
 from twin.identification.cross_checks import SubsetEstimate, list_disagreements
 from twin.identification.least_squares import FitResult
+from twin.identification.motion import RecordScale
 from twin.identification.parameters import FreeParameter, GapKey, ParameterKey, ParameterSet
 
 KEYS: list[ParameterKey] = [GapKey(log) for log in range(12)]
@@ -21,5 +22,6 @@ def test_disagreements_come_in_the_order_of_the_parameters() -> None:
         SubsetEstimate(source, dict.fromkeys(keys, (value, 1e-5)), 1000, True)
         for source, value, keys in (("early", 0.0, KEYS), ("late", 1e-3, [*KEYS[::-1]][:-1]))
     ]
-    names = [text.split(":")[0] for text in list_disagreements(joint, apart)]
+    scale = RecordScale(0.02, 0.2, 3.0, 1e-3, 1650.0, 5e-3, 2e-3, 25.0, {})
+    names = [text.split(":")[0] for text in list_disagreements(joint, apart, scale)]
     assert names == [str(key) for key in KEYS[1:]]

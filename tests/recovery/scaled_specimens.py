@@ -6,6 +6,7 @@ the noise.
 """
 
 import math
+from collections.abc import Container
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -26,12 +27,18 @@ CHANNELS = (*MOTION, *RIGHT_CELLS, *LEFT_CELLS)
 
 @dataclass(frozen=True)
 class Hidden:
-    """A law that the start model lacks: its name and coefficients; `gap` without bumpers is inf."""
+    """A law that the start model lacks: its name and coefficients; a gap without bumper is inf."""
 
     name: str = ""
     a: float = 0.0
     b: float = 1.0
     gap: float = math.inf
+    has_left_bumper: bool = True
+
+    @property
+    def gaps_m(self) -> tuple[float, float]:
+        """Right and left gap."""
+        return self.gap, self.gap if self.has_left_bumper else math.inf
 
 
 @cache
@@ -47,7 +54,7 @@ def simulate(hidden: Hidden) -> Float2D:
     table_acc *= 0.6 / table_acc.std()
     h, u, v_half, relative_acc, z, right, left = float(time[1]), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     out = np.empty((len(CHANNELS), time.size // PARTS))
-    name, a, b = hidden.name, hidden.a, hidden.b
+    name, a, b, (gap_r, gap_l) = hidden.name, hidden.a, hidden.b, hidden.gaps_m
     for k, acc in enumerate(table_acc.tolist()):
         v = v_half + 0.5 * h * relative_acc  # leapfrog: the velocity is known half a step before
         force = K * u + C * v
@@ -60,8 +67,8 @@ def simulate(hidden: Hidden) -> Float2D:
         elif name == "bouc_wen":
             force += a * z
         bumpers = []
-        for sign, face in ((1.0, right), (-1.0, left)):
-            depth = sign * u - hidden.gap
+        for sign, face, gap in ((1.0, right, gap_r), (-1.0, left, gap_l)):
+            depth = sign * u - gap
             push = 0.0
             if depth >= face:
                 push = K_J * depth + C_J * sign * v
@@ -76,15 +83,24 @@ def simulate(hidden: Hidden) -> Float2D:
         v_half += h * relative_acc
         u += h * v_half
         z += h * (v_half - 0.5 * (abs(v_half) * z * abs(z) + v_half * z * z)) / b
-        right = u - hidden.gap if push_r > 0 else right * math.exp(-h * K_J / C_J)
-        left = -u - hidden.gap if push_l > 0 else left * math.exp(-h * K_J / C_J)
+        right = u - gap_r if push_r > 0 else right * math.exp(-h * K_J / C_J)
+        left = -u - gap_l if push_l > 0 else left * math.exp(-h * K_J / C_J)
     return out
 
 
 def record(
-    hidden: Hidden, force: float = 1.0, length: float = 1.0, noise: float = 0.003, seed: int = 3
-) -> PreparedLog:
+    hidden: Hidden, force: float = 1.0, length: float = 1.0, noise: float = 0.003, seed: int = 3,
+    without: Container[str] = (),
+) -> PreparedLog:  # fmt: skip
     """Return the noisy recording, with mass and forces, or all lengths, multiplied by a factor."""
+    return prepare(record_block(hidden, force, length, noise, seed, without), hidden, force, length)
+
+
+def record_block(
+    hidden: Hidden, force: float = 1.0, length: float = 1.0, noise: float = 0.003, seed: int = 3,
+    without: Container[str] = (),
+) -> Block:  # fmt: skip
+    """Return the measured block of `record`, without some channels."""
     true = simulate(hidden)
     channels = CHANNELS if math.isfinite(hidden.gap) else MOTION
     true = true[: len(channels)]
@@ -94,9 +110,15 @@ def record(
     values[len(MOTION) :] *= force * length
     label = np.full(values.shape[1], int(Label.SETTLE), dtype=np.int64)
     outside = np.full(values.shape[1], -1, dtype=np.int64)
-    block = Block("meas", 0, RATE_HZ, channels, values, outside, label, outside.copy())
-    gaps = (length * hidden.gap, length * hidden.gap)
-    return PreparedLog(build_signals((block,), hidden.name, force * MASS, gaps), 0.0)
+    kept = [k for k, name in enumerate(channels) if name not in without]
+    names = tuple(channels[k] for k in kept)
+    return Block("meas", 0, RATE_HZ, names, values[kept], outside, label, outside.copy())
+
+
+def prepare(block: Block, hidden: Hidden, force: float = 1.0, length: float = 1.0) -> PreparedLog:
+    """Return the log of a block, with the mass and the gaps of the specimen."""
+    right, left = (length * gap for gap in hidden.gaps_m)
+    return PreparedLog(build_signals((block,), "short", force * MASS, (right, left)), 0.0)
 
 
 def start_model(force: float = 1.0) -> Model:

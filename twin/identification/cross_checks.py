@@ -10,6 +10,7 @@ from table_io.block import Bool2D
 from table_io.records import Step
 from twin.identification.contact_onsets import ContactGaps
 from twin.identification.least_squares import FitResult, compute_slopes, fit_parameters
+from twin.identification.motion import RecordScale
 from twin.identification.parameters import (
     BUMPER_DAMPING,
     BUMPER_STIFFNESS,
@@ -25,10 +26,11 @@ from twin.identification.residuals import LogResiduals
 from twin.model.effects import find_effect
 
 MIN_SUBSET_BLOCKS = 6  # with fewer blocks the standard error of a subset is unreliable
+MIN_DETERMINING_BLOCKS = 4.0  # with fewer, a warning
 # standard deviations at which two estimates disagree; high because about thirty are compared
 MIN_DISAGREEMENT_SIGMA = 4.0
-# smallest disagreement reported: relative, and for a gap in m
-MIN_DISAGREEMENT_SHARE, MIN_DISAGREEMENT_M = 0.01, 2e-5
+# smallest disagreement reported: relative, and for a gap of the largest displacement
+MIN_DISAGREEMENT_SHARE, MIN_DISAGREEMENT_OF_U = 0.01, 1e-3
 OPPOSED_SUBSETS = (
     ("small motion", "large motion"), ("forward", "backward"), ("early", "late"),
     ("contact right", "contact left"),
@@ -175,6 +177,12 @@ def list_fit_warnings(
     """Yield warnings on convergence, bounds and parameters that the logs do not determine."""
     if not joint.converged:
         yield "the fit has not converged: do not use its values"
+    for key, count in joint.block_counts.items():
+        if count < MIN_DETERMINING_BLOCKS and not is_correction(key):
+            yield (
+                f"{key}: determined by {max(round(count), 1)} contacts or cycles alone; its "
+                "interval is wide for that and assumes that others would be alike"
+            )
     for key in joint.at_bound:
         yield f"{key}: at its bound, {joint.values[key]:.4g}; its interval is not valid"
     if BUMPER_STIFFNESS not in joint.values:
@@ -187,10 +195,12 @@ def list_fit_warnings(
         yield f"{key}: not determined by the logs; kept as in the start model"
 
 
-def list_asymmetry_warnings(asymmetry: tuple[float, float] | None) -> Iterator[str]:
+def list_asymmetry_warnings(
+    asymmetry: tuple[float, float] | None, scale: RecordScale
+) -> Iterator[str]:
     """Yield a warning if the gaps differ from the stated ones in opposite directions."""
     if asymmetry and abs(asymmetry[0]) > max(
-        MIN_DISAGREEMENT_M, MIN_DISAGREEMENT_SIGMA * asymmetry[1]
+        MIN_DISAGREEMENT_OF_U * scale.u, MIN_DISAGREEMENT_SIGMA * asymmetry[1]
     ):
         offset, sd = asymmetry
         yield (
@@ -200,7 +210,9 @@ def list_asymmetry_warnings(asymmetry: tuple[float, float] | None) -> Iterator[s
         )
 
 
-def list_disagreements(joint: FitResult, parts: Sequence[SubsetEstimate]) -> Iterator[str]:
+def list_disagreements(
+    joint: FitResult, parts: Sequence[SubsetEstimate], scale: RecordScale
+) -> Iterator[str]:
     """Yield a warning where opposed subsets, or free flight and the joint fit, disagree."""
     by_name = {part.source: part.values for part in parts}
     joint_values = {key: (value, joint.std_errors[key]) for key, value in joint.values.items()}
@@ -210,7 +222,8 @@ def list_disagreements(joint: FitResult, parts: Sequence[SubsetEstimate]) -> Ite
     for a, b, first, second in pairs:
         for key in [key for key in first if key in second]:
             (x, sx), (y, sy) = first[key], second[key]
-            if _disagree(x - y, math.hypot(sx, sy), y, units[key]):
+            notable = _notable_difference(y, units[key], scale)
+            if abs(x - y) > max(MIN_DISAGREEMENT_SIGMA * math.hypot(sx, sy), notable):
                 yield (
                     f"{key}: {x:.5g} {units[key]} in {a}, {y:.5g} in {b}, "
                     f"{abs(x - y) / math.hypot(sx, sy):.0f} standard deviations apart: the "
@@ -218,9 +231,9 @@ def list_disagreements(joint: FitResult, parts: Sequence[SubsetEstimate]) -> Ite
                 )
 
 
-def _disagree(difference: float, sd: float, value: float, unit: str) -> bool:
-    notable = MIN_DISAGREEMENT_M if unit == "m" else MIN_DISAGREEMENT_SHARE * abs(value)
-    return abs(difference) > max(MIN_DISAGREEMENT_SIGMA * sd, notable)
+def _notable_difference(value: float, unit: str, scale: RecordScale) -> float:
+    """Return the smallest difference from a value that is reported, however certain it is."""
+    return MIN_DISAGREEMENT_OF_U * scale.u if unit == "m" else MIN_DISAGREEMENT_SHARE * abs(value)
 
 
 def list_onset_warnings(
@@ -229,8 +242,9 @@ def list_onset_warnings(
     """Yield a warning where the gap from contact onsets or releases differs from the fitted gap."""
     for gaps in contact_gaps:
         gap = fitted_gap(log_residuals[gaps.log], joint, gaps.side)
+        notable = _notable_difference(gap, "m", log_residuals[gaps.log].scale)
         sd = math.hypot(gaps.std_error, joint.std_errors.get(GapKey(gaps.log), 0.0))
-        if _disagree(gaps.value - gap, sd, gap, "m"):
+        if abs(gaps.value - gap) > max(MIN_DISAGREEMENT_SIGMA * sd, notable):
             yield (
                 f"{log_residuals[gaps.log].signals.name}: {gaps.side} {gaps.kind}s lie at "
                 f"{1e3 * gaps.value:.3f} mm, the fitted gap at {1e3 * gap:.3f} mm: the bumper law "

@@ -119,10 +119,11 @@ def identify_parameters(
         for residuals, log_blocks in zip(log_residuals, blocks, strict=True)
     )
     warnings = (
-        *list_fit_warnings(log_residuals, joint, fixed), *list_asymmetry_warnings(asymmetry),
-        *list_disagreements(joint, parts),
+        *list_fit_warnings(log_residuals, joint, fixed),
+        *list_asymmetry_warnings(asymmetry, log_residuals[0].scale),
+        *list_disagreements(joint, parts, log_residuals[0].scale),
         *list_onset_warnings(log_residuals, joint, contact_gaps),
-    )  # fmt: skip
+    )
     return IdentificationResult(
         problem,
         start,
@@ -251,18 +252,27 @@ def _compare_windows(
 ) -> tuple[float, float] | None:
     """Return the nrmse of u of two parameter sets over windows restarted from the measured state.
 
-    In chaotic motion a free run diverges after a few cycles. None without table acceleration.
+    In chaotic motion a free run diverges after a few cycles. None without table acceleration, and
+    where the rate is too low for a model. Bumpers that were not touched are left out: they may be
+    those of a default.
     """
     if not blocks or "table_acc_m_s2" not in residuals.signals.channels:
         return None
-    before, after = (
-        window_nrmse(
-            blocks,
-            parameters.model_for_log(residuals.log_number, residuals.motion()),
-            max(residuals.contact_thresholds_n),
-        )
-        for parameters in parameter_sets
-    )
+    m, contact = residuals.motion(), residuals.contact_state
+    right, left = m.gaps_m
+    # without load cells, contact is where the gaps are exceeded
+    touches = bool((np.where(contact < 0, [m.u > right, -m.u > left], contact) > 0).any())
+    models = []
+    for parameters in parameter_sets:
+        model = parameters.model_for_log(residuals.log_number, m)
+        if not touches:
+            effects = tuple(i for i in model.effects if not i.effect.is_in_bumpers)
+            model = Model(replace(model.base, gap_r=math.inf, gap_l=math.inf), effects)
+        if model.min_rate_hz > blocks[0].rate_hz:
+            return None
+        models.append(model)
+    contact_n = max(residuals.contact_thresholds_n)
+    before, after = (window_nrmse(blocks, model, contact_n) for model in models)
     return before, after
 
 

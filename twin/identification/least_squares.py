@@ -2,9 +2,10 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.special import stdtrit
 
 from table_io.block import Bool2D, Float1D, Float2D, Int1D
 from twin.identification.parameters import (
@@ -20,6 +21,8 @@ MAX_ITERATIONS = 40
 MIN_COST_GAIN = 1e-6  # relative cost decrease below which the iteration stops
 SLOPE_STEP = 1e-4  # finite-difference step, relative to the scale of a parameter
 HELD_OUT_DAMPINGS = (1e-9, 1e-6, 1e-4, 1e-2, 1.0, 1e2, 1e4)  # tried for the step of a fold's refit
+MIN_SCATTER_BLOCKS = 10.0  # with fewer, their scatter alone may be too small by chance
+COLOUR_FACTOR = 1.5  # of the error within a contact: noise of the fused motion is not white there
 # of a parameter's curvature: with less in the training folds, they do not determine it
 MIN_CURVATURE_SHARE = 1e-3
 
@@ -45,6 +48,8 @@ class FitResult:
     converged: bool
     at_bound: tuple[ParameterKey, ...]
     held_out: tuple[Float1D, ...] = ()  # per log, cross-validation residual, (entry,)
+    # blocks (cycles, contacts) that determine each parameter; inf where readings at rest do
+    block_counts: Mapping[ParameterKey, float] = field(default_factory=dict)
 
     @property
     def free(self) -> tuple[FreeParameter, ...]:
@@ -193,6 +198,7 @@ class _LevenbergMarquardt:
         gradients = jacobian * self.select_training(current)
         first, count = 0, 0
         scatter, rest_scatter = np.zeros_like(inverse), np.zeros_like(inverse)
+        information = []  # of each block, (free, block)
         for residuals, mask in zip(self.log_residuals, self.train, strict=True):
             blocks = residuals.entry_contact_block[mask]
             entries = slice(first, first + blocks.size)
@@ -202,6 +208,9 @@ class _LevenbergMarquardt:
             )
             # a rest row has a single entry: its variance is taken from the noise
             rest_slopes = jacobian[:, entries][:, at_rest] / residuals.weight
+            information.append(
+                [np.bincount(blocks[~at_rest], row[entries][~at_rest] ** 2) for row in jacobian]
+            )
             scatter += block_gradients @ block_gradients.T
             rest_scatter += rest_slopes @ rest_slopes.T
             first += blocks.size
@@ -210,6 +219,9 @@ class _LevenbergMarquardt:
         scatter *= count / max(count - len(self.free), 1)
         covariance = inverse @ (scatter + rest_scatter) @ inverse
         sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        block_counts = _count_effective_blocks(information, np.diag(hessian))
+        white_sd = np.sqrt(np.maximum(np.diag(inverse), 0.0) * max(cost / max(self.count, 1), 1.0))
+        sd = _widen_for_few_blocks(sd, white_sd, block_counts)
         divisor = np.where(sd > 0, sd, 1.0)
         values, std_errors, at_bound = {}, {}, []
         for i, free in enumerate(self.free):
@@ -223,6 +235,7 @@ class _LevenbergMarquardt:
             parameters, values, std_errors, correlation, cost / max(self.count, 1),
             converged,
             tuple(at_bound), self._compute_held_out(x, current, jacobian),
+            {free.key: float(n) for free, n in zip(self.free, block_counts, strict=True)},
         )  # fmt: skip
 
     def _compute_held_out(
@@ -272,6 +285,35 @@ class _LevenbergMarquardt:
             if float(trial_r @ trial_r) <= cost:
                 return trial
         return current  # no step improves the training folds
+
+
+def _count_effective_blocks(information: Sequence[list[Float1D]], total: Float1D) -> Float1D:
+    """Return how many equally informative blocks would determine each parameter as well, (free,).
+
+    `information` has the sums of squared slopes by block of each log; `total` (free,) includes
+    readings at rest and priors, with most of which a parameter needs no blocks: inf.
+    """
+    counts = np.full(total.size, math.inf)
+    for i in range(total.size):
+        blocks = np.concatenate([log_blocks[i] for log_blocks in information])
+        if blocks.sum() > 0.5 * total[i]:
+            counts[i] = blocks.sum() ** 2 / (blocks @ blocks)
+    return counts
+
+
+def _widen_for_few_blocks(sd: Float1D, white_sd: Float1D, block_counts: Float1D) -> Float1D:
+    """Return standard deviations, (free,), of which 1.96 are the 95 % interval.
+
+    The scatter between few blocks has few degrees of freedom (Student's t), and that between as
+    few as the parameters vanishes, however uncertain they are. The interval is then at least that
+    of noise alone, from `white_sd` (free,).
+    """
+    widened = sd.copy()
+    for i in np.flatnonzero((sd > 0) & np.isfinite(block_counts)):
+        widened[i] *= stdtrit(max(block_counts[i] - 1.0, 1.0), 0.975) / 1.96
+        if block_counts[i] < MIN_SCATTER_BLOCKS:
+            widened[i] = max(widened[i], COLOUR_FACTOR * white_sd[i])
+    return widened
 
 
 def _curvature_scale(hessian: Float2D) -> Float1D:

@@ -401,7 +401,11 @@ class LogResiduals:
         The mean square of pure noise is at most 1: only its negative half enters, scaled by
         sqrt(2). The undershoot of the low pass after a release is not counted as tension.
         """
-        sides = (m.right, "right", m.noise.right), (m.left, "left", m.noise.left)
+        # a side without cells has no noise and no samples in these rows
+        sides = (
+            (m.right, "right", m.noise.right or 1.0),
+            (m.left, "left", m.noise.left or 1.0),
+        )
         return np.array([
             np.minimum(
                 push - parameters.tare_error(self.log_number, name)

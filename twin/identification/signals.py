@@ -24,6 +24,8 @@ from twin.model.model import SensorModel
 
 LOST_MARGIN_S = 0.3  # excluded around lost samples: the fusion spreads the interpolation error
 OPEN_END_S = 0.5  # excluded at an end of the record that is not at rest
+# Of the power of a drive with a single frequency: within this width, of the frequency, about it.
+MIN_SINGLE_LINE_SHARE, SINGLE_LINE_WIDTH = 0.95, 0.05
 BODY_SENSORS = (
     ("mass", "mass_disp_m", "mass_acc_m_s2"),
     ("table", "table_disp_m", "table_acc_m_s2"),
@@ -174,6 +176,12 @@ class _SensorFusion:
         position, noise_u, noise_v, consistency = self._relative_displacement()
         right, noise_right = self._side_force(RIGHT_CELLS)
         left, noise_left = self._side_force(LEFT_CELLS)
+        # a side without a bumper needs no cells: its force is zero
+        nothing = np.zeros(signals.time_s.size)
+        if np.isfinite(noise_right) and np.isnan(noise_left):
+            left, noise_left = nothing, 0.0
+        elif np.isfinite(noise_left) and np.isnan(noise_right):
+            right, noise_right = nothing, 0.0
         acc = self._time_series("mass_acc_m_s2")
         if derives_acc(self.spectra):
             acc = self.grid.to_time_domain(
@@ -307,6 +315,10 @@ def build_signals(
         for key in USED_CHANNELS
         if key in block.channels and is_channel_alive(block.channel(key))
     }
+    if find_unmeasured_side(columns, gaps_m):
+        columns = {
+            key: values for key, values in columns.items() if key not in (*RIGHT_CELLS, *LEFT_CELLS)
+        }
     if "rel_disp_m" not in columns and not {"mass_disp_m", "table_disp_m"} <= columns.keys():
         raise InputError(
             "the displacement of the mass relative to the table was not measured",
@@ -338,6 +350,36 @@ def build_signals(
         block.cycle[:: grid.decimation],
         usable[:: grid.decimation],
     )  # fmt: skip
+
+
+def has_single_frequency(signals: LogSignals) -> bool:
+    """Return True if the drive has one frequency: most of its power lies about its main line.
+
+    The drive is the motion of the table where it was measured, else that of the mass.
+    """
+    table = ("table_acc_m_s2", "table_disp_m")
+    channel = next((name for name in table if name in signals.channels), "rel_disp_m")
+    values = signals.grid.to_time_domain(signals.spectra[channel])[signals.label != Label.REST]
+    window = np.hanning(values.size)
+    power = np.abs(np.fft.rfft((values - values.mean()) * window)) ** 2
+    if not power.sum() > 0:
+        return False
+    line = np.arange(power.size)
+    main = int(power[1:].argmax()) + 1
+    about_main = np.abs(line - main) <= max(SINGLE_LINE_WIDTH * main, 3.0)
+    return float(power[about_main].sum() / power.sum()) > MIN_SINGLE_LINE_SHARE
+
+
+def find_unmeasured_side(channels: Container[str], gaps_m: tuple[float, float]) -> str:
+    """Return "right" or "left" if only the other side's bumper force was measured, else "".
+
+    Half of the bumper forces is worse than none: the balance of the mass gives their sum. A side
+    without a bumper needs no cells.
+    """
+    sides = {"right": (RIGHT_CELLS, gaps_m[0]), "left": (LEFT_CELLS, gaps_m[1])}
+    measured = {side for side, (cells, _) in sides.items() if any(c in channels for c in cells)}
+    missing = [side for side, (_, gap) in sides.items() if gap < np.inf and side not in measured]
+    return missing[0] if measured and missing else ""
 
 
 def is_channel_alive(values: Float1D) -> bool:

@@ -14,7 +14,13 @@ from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.errors import InputError
 from twin.identification.discover import PreparedLog
-from twin.identification.signals import build_signals, is_channel_alive
+from twin.identification.signals import (
+    LogSignals,
+    build_signals,
+    find_unmeasured_side,
+    has_single_frequency,
+    is_channel_alive,
+)
 from twin.recording.reader import Recording
 from twin.recording.run_paths import resolve_log_path
 from twin.run.recordings import open_recording
@@ -81,7 +87,7 @@ def load_recording(recording: Recording, name: str) -> LoadedLog:
     is_stated = "contact_n" in profile.comparison.model_fields_set
     contact_n = profile.comparison.contact_n if is_stated else 0.0  # else from the record
     log = PreparedLog(signals, contact_n, start.steps)
-    return LoadedLog(log, blocks, tuple(_list_notes(recording, name, profile, blocks, dead)))
+    return LoadedLog(log, blocks, tuple(_list_notes(recording, profile, signals, blocks, dead)))
 
 
 def _find_dead_channels(blocks: Sequence[Block]) -> frozenset[str]:
@@ -118,14 +124,25 @@ def name_logs(paths: Sequence[Path]) -> list[str]:
 
 
 def _list_notes(
-    recording: Recording, name: str, profile: Profile, blocks: Sequence[Block], dead: frozenset[str]
+    recording: Recording,
+    profile: Profile,
+    signals: LogSignals,
+    blocks: Sequence[Block],
+    dead: frozenset[str],
 ) -> Iterator[str]:
     """Yield notes on the recording that matter for the verdict."""
+    name = signals.name
     if recording.missing_samples:
         yield f"{name}: {recording.missing_samples} samples are missing; they are not used"
-    if len({step.frequency_hz for step in recording.start.steps}) == 1:
+    if has_single_frequency(signals):
         alike = "damping, lag, relaxation and hysteresis cannot be distinguished"
         yield f"{name}: only one frequency; {alike}"
+    live = {channel for block in blocks[:1] for channel in block.channels} - dead
+    if side := find_unmeasured_side(live, profile.specimen.gaps_m):
+        yield (
+            f"{name}: no load cell measures the {side} bumper, so all load cells are ignored; the "
+            "balance of the mass gives the sum of both"
+        )
     yield from _check_loads(recording, name, profile, blocks, dead)
     for channel in blocks[0].channels if blocks else ():
         if channel not in CHANNEL_BY_NAME:
