@@ -5,6 +5,9 @@ enters the residual of a log linearly: r + sum of z x column. What it explains i
 effect of the specimen. Kinds, by channel or side:
 
     gain, lag            of a channel: reading = (1 + gain) x value(t - lag)
+    roll_off             of a channel: its gain rises with the square of the frequency, by a bracket
+                         that resonates, or falls, by a filter
+    low_cut              of an accelerometer: corner of its high pass of the first order
     offset               of a channel, after its tare; constant, and slow with time (offset1, ...)
     chebyshev2 to 7      of a laser, in position: terms of its linearity error, 0 at position 0
     share, share_slope   of the force of a side between its two cells: constant, and with position
@@ -27,6 +30,7 @@ from twin.identification.residuals import LogResiduals, Nuisance, NuisanceTerms
 from twin.identification.signals import SENSOR_PAIRS, LogSignals
 from twin.identification.spectra import Spectrum
 
+ACCELEROMETERS = ("mass_acc_m_s2", "table_acc_m_s2")
 LASERS = ("rel_disp_m", "mass_disp_m", "table_disp_m")
 SIDES = {"right": RIGHT_CELLS, "left": LEFT_CELLS}
 LINEARITY_DEGREES = range(2, 8)
@@ -34,6 +38,8 @@ SLOW_TERMS = 2  # cosines over the length of the record, besides the constant of
 # Typical sizes (one standard deviation).
 TYPICAL_GAIN = 0.005  # calibration and temperature
 TYPICAL_LAG_S = 5e-4  # multiplexed channels, different anti-alias filters
+TYPICAL_ROLL_OFF_S2 = 0.01 / (2.0 * math.pi * 100.0) ** 2  # 1 % at 100 Hz
+TYPICAL_LOW_CUT = 2.0 * math.pi * 0.16  # rad/s, of an IEPE accelerometer: 5 % at 0.5 Hz
 TYPICAL_OFFSET = 0.005  # of the rms of the channel: drift since the tare
 TYPICAL_LINEARITY = 0.002  # of the largest excursion, each term of the error of a laser
 TYPICAL_SHARE, TYPICAL_SHARE_SLOPE = 0.05, 0.02  # of the force; at the largest excursion
@@ -66,6 +72,12 @@ def list_nuisances(signals: LogSignals) -> tuple[Nuisance, ...]:
     scaled = [channel for channel in checkable if channel not in paired] + [*pairs]
     nuisances = [Nuisance("gain", place, TYPICAL_GAIN) for place in scaled]
     nuisances += [Nuisance("lag", channel, TYPICAL_LAG_S) for channel in checkable]
+    nuisances += [Nuisance("roll_off", channel, TYPICAL_ROLL_OFF_S2) for channel in checkable]
+    nuisances += [
+        Nuisance("low_cut", channel, TYPICAL_LOW_CUT)
+        for channel in channels
+        if channel in ACCELEROMETERS
+    ]
     for channel in channels:
         size = TYPICAL_OFFSET * signals.channel_rms(channel)
         nuisances += [
@@ -107,6 +119,12 @@ def correct_signals(signals: LogSignals, nuisance: Nuisance, z: float) -> LogSig
             corrected = spectrum / (1.0 + amount)
         case "lag":
             corrected = spectrum * np.exp(1j * signals.omega * amount)
+        case "roll_off":
+            corrected = spectrum / (1.0 + amount * signals.omega**2)
+        case "low_cut":
+            # without the constant, which a high pass takes away for good
+            slow = amount / np.maximum(signals.omega, signals.omega[1])
+            corrected = spectrum * (1.0 - 1j * slow)
         case "cross":
             corrected = spectrum - amount * signals.spectra["table_acc_m_s2"]
         case kind if kind.startswith("chebyshev"):
