@@ -17,11 +17,10 @@ from twin.identification.discover import (
     fit_known_effects,
     prepare_problem,
 )
-from twin.identification.parameters import DAMPING, EffectKey, TareKey
+from twin.identification.parameters import EffectKey, TareKey
 from twin.identification.screening import assign_folds, build_normal_equations, rank_candidates
 from twin.identification.selection import Cancelled, SelectionProgress
 from twin.identification.verdict import closed_fraction, judge_selection
-from twin.model.model import Model
 
 
 @cache
@@ -154,21 +153,6 @@ def test_where_several_sets_do_as_well_what_they_share_is_named() -> None:
         judge_selection(bench, replace(named, best=apart[0], tried=tuple(apart)), 1.0).outcome
         == "ambiguous"
     )
-
-
-def test_a_model_that_was_fitted_is_no_second_opinion() -> None:
-    """Its damping has taken up the loss of the hysteresis that it lacks, on other recordings."""
-    prepared = log(format_truth("bouc_wen", force=120.0, yield_displacement=4e-4))
-    taken_up = 1.4 * prepare_problem([prepared], SNM).first_fit.values[DAMPING]
-    assert taken_up > 2.0 * SNM.parameters.damping
-    start = Model(replace(SNM.base, damping=taken_up))
-    doubted, believed = (
-        discover_effects([prepared], start),
-        discover_effects([prepared], start, fitted=True),
-    )
-    assert doubted.verdict.outcome == "unexplained"
-    assert "only if the damping" in doubted.verdict.reason
-    assert (believed.verdict.outcome, believed.verdict.best.names) == ("named", ("bouc_wen",))
 
 
 def test_several_logs_count_together() -> None:

@@ -19,7 +19,7 @@ from twin.identification.signals import build_signals
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 
-RATE_HZ, SECONDS, PARTS = 200.0, 24.0, 8
+RATE_HZ, REST_S, SECONDS, PARTS = 200.0, 3.0, 24.0, 8
 MASS, K, C, K_J, C_J, GAP = 550.0, 36e3, 1.1e3, 120e3, 900.0, 6e-3
 MOTION = ("rel_disp_m", "mass_acc_m_s2", "table_acc_m_s2")
 CHANNELS = (*MOTION, *RIGHT_CELLS, *LEFT_CELLS)
@@ -43,7 +43,7 @@ class Hidden:
 
 @cache
 def simulate(hidden: Hidden) -> Float2D:
-    """Return the true (channel, sample) in SI of 24 s of a band-limited motion of the table."""
+    """Return the true (channel, sample) in SI: a rest, then a band-limited motion of the table."""
     random = np.random.default_rng(7)
     time = np.arange(round(SECONDS * RATE_HZ * PARTS)) / (RATE_HZ * PARTS)
     hz = np.arange(0.5, 4.0, 1.0 / SECONDS)
@@ -51,7 +51,7 @@ def simulate(hidden: Hidden) -> Float2D:
     table_acc = np.zeros(time.size)
     for f, phase in zip(hz, phases, strict=True):
         table_acc += np.cos(2 * np.pi * f * time + phase)
-    table_acc *= 0.6 / table_acc.std()
+    table_acc *= 0.6 / table_acc.std() * np.sin(0.5 * np.pi * np.minimum(time, 1.0)) ** 2
     h, u, v_half, relative_acc, z, right, left = float(time[1]), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     out = np.empty((len(CHANNELS), time.size // PARTS))
     name, a, b, (gap_r, gap_l) = hidden.name, hidden.a, hidden.b, hidden.gaps_m
@@ -63,7 +63,7 @@ def simulate(hidden: Hidden) -> Float2D:
         elif name == "quadratic_damping":
             force += a * v * abs(v)
         elif name == "coulomb_friction":
-            force += a * math.tanh(v / 1e-4)
+            force += a * math.tanh(v / 2e-3)
         elif name == "bouc_wen":
             force += a * z
         bumpers = []
@@ -85,7 +85,7 @@ def simulate(hidden: Hidden) -> Float2D:
         z += h * (v_half - 0.5 * (abs(v_half) * z * abs(z) + v_half * z * z)) / b
         right = u - gap_r if push_r > 0 else right * math.exp(-h * K_J / C_J)
         left = -u - gap_l if push_l > 0 else left * math.exp(-h * K_J / C_J)
-    return out
+    return np.concatenate([np.zeros((len(CHANNELS), round(REST_S * RATE_HZ))), out], axis=1)
 
 
 def record(
@@ -105,10 +105,13 @@ def record_block(
     channels = CHANNELS if math.isfinite(hidden.gap) else MOTION
     true = true[: len(channels)]
     draw = np.random.default_rng(seed).standard_normal(true.shape)
-    values = true + noise * true.std(axis=1, keepdims=True) * draw
+    rms = true.std(axis=1, keepdims=True)
+    rms[len(MOTION) :] = np.maximum(rms[len(MOTION) :], 10.0)  # idle load cells are noisy too
+    values = true + noise * rms * draw
     values[: len(MOTION)] *= length
     values[len(MOTION) :] *= force * length
     label = np.full(values.shape[1], int(Label.SETTLE), dtype=np.int64)
+    label[: round(REST_S * RATE_HZ)] = int(Label.REST)
     outside = np.full(values.shape[1], -1, dtype=np.int64)
     kept = [k for k, name in enumerate(channels) if name not in without]
     names = tuple(channels[k] for k in kept)

@@ -85,18 +85,19 @@ def test_intervals_from_few_contacts_are_honest() -> None:
     hits = []
     for seed in range(8):
         fit = (result := identify(FEW_CONTACTS, seed)).fit
-        for key in (BUMPER_STIFFNESS, BUMPER_DAMPING):
-            hits.append(abs(fit.values[key] - TRUTH[key]) < 1.96 * fit.std_errors[key])
-            assert fit.std_errors[key] < 0.1 * TRUTH[key]
+        hits.append(
+            abs(fit.values[BUMPER_STIFFNESS] - K_J) < 1.96 * fit.std_errors[BUMPER_STIFFNESS]
+        )
+        assert 1e-3 < fit.std_errors[BUMPER_STIFFNESS] / K_J < 0.1
         assert fit.block_counts[BUMPER_STIFFNESS] < 4.0
         assert any(text.startswith("bumper_stiffness: determined by") for text in result.warnings)
-    assert sum(hits) >= 14
+    assert sum(hits) >= 7
 
 
 def with_drive(values: np.ndarray) -> PreparedLog:
     block = record_block(Hidden())
     rows = block.values.copy()
-    rows[block.channels.index("table_acc_m_s2")] = values
+    rows[block.channels.index("table_acc_m_s2")] = np.where(block.label > 0, values, 0.0)
     return prepare(replace(block, values=rows), Hidden())
 
 

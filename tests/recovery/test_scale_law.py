@@ -76,9 +76,11 @@ def test_a_start_of_another_size_leaves_the_verdict(force: float) -> None:
     discovery = discover_effects([record(HIDDEN["bouc_wen"], force)], start_model())
     assert discovery.verdict.best.names == ("bouc_wen",)
     expected = discover("bouc_wen", 1.0, 1.0).verdict.best.fit.values
-    for key, value in discovery.verdict.best.fit.values.items():
-        ratio = 1.0 if key == EffectKey("bouc_wen", "yield_displacement") else force
-        assert value == pytest.approx(ratio * expected[key], rel=1e-3)
+    values = discovery.verdict.best.fit.values
+    for key in (STIFFNESS, DAMPING, EffectKey("bouc_wen", "force")):
+        assert values[key] == pytest.approx(force * expected[key], rel=1e-3)
+    shape = EffectKey("bouc_wen", "yield_displacement")
+    assert values[shape] == pytest.approx(expected[shape], rel=1e-3)
 
 
 def test_the_model_of_a_large_specimen_can_be_loaded() -> None:

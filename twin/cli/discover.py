@@ -63,16 +63,15 @@ def discover_command(
             logs, notes = load_logs(paths)
             held_out_logs = load_logs(held_out)[0] if held_out else ()
             with open_mapper(logs) as mapper:
-                discovery = discover_effects(
-                    logs, start, report, without, mapper, fitted=bool(config.fitted_on)
-                )
+                discovery = discover_effects(logs, start, report, without, mapper)
     except (InputError, Cancelled) as error:
         folder.rmdir()  # leave no empty folder after a failure
         if isinstance(error, InputError):
             raise
         print_line("interrupted before any result; nothing is written")
         return EXIT_INTERRUPTED
-    verdict = verdict_to_json(discovery, clock.now() - start_s, notes, held_out_logs)
+    seconds = clock.now() - start_s
+    verdict = verdict_to_json(discovery, seconds, notes, held_out_logs, start)
     write_results(folder, discovery, config, logs, verdict)
     print_verdict(verdict)
     print_line(f"{folder}")
@@ -175,7 +174,8 @@ def print_verdict(verdict: Json) -> None:
     for log in verdict["held_out_logs"]:
         print_line(
             f"  {log['log']}, held out entirely: NRMSE of the damper force "
-            f"{log['nrmse_before']:.3g} -> {log['nrmse_after']:.3g}"
+            f"{log['nrmse_before']:.3g} -> {log['nrmse_after']:.3g} (model as given "
+            f"{log['nrmse_given']:.3g}, noise {log['noise_floor']:.2g})"
         )
     for note in verdict["notes"]:
         print_line(f"  note: {note}")

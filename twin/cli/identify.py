@@ -120,7 +120,7 @@ def identification_to_json(result: IdentificationResult, notes: Sequence[str]) -
         },
         "gap_offset": interval_to_json(*result.asymmetry, "m") if result.asymmetry else None,
         "correlations": [{"of": [a, b], "value": value} for a, b, value in result.correlated_pairs],
-        "rms_over_noise": math.sqrt(fit.cost),
+        "rms_over_noise": result.rms_over_noise,
         "converged": fit.converged,
         "at_bound": [*map(str, fit.at_bound)],
         "not_determined": [*map(str, result.undetermined)],
@@ -146,8 +146,13 @@ def identification_to_json(result: IdentificationResult, notes: Sequence[str]) -
             for gaps in result.contact_gaps
         ],
         "windows": [
-            {"log": name, "window_s": WINDOW_S, "nrmse_start": pair[0], "nrmse_identified": pair[1]}
-            for name, pair in zip(names, result.window_errors, strict=True)
+            {
+                "log": name, "window_s": WINDOW_S, "nrmse_start": pair[0],
+                "nrmse_identified": pair[1], "noise_floor": floor,
+            }
+            for name, pair, floor in zip(
+                names, result.window_errors, result.window_floors, strict=True
+            )
             if pair
         ],
         "warnings": [*result.warnings],
@@ -211,7 +216,8 @@ def print_identification(report: Json) -> None:
         print_line(
             f"{note['log']}: error of u over windows of {note['window_s']:g} s, "
             f"{100 * note['nrmse_start']:.3g} % of its rms with the start model, "
-            f"{100 * note['nrmse_identified']:.3g} % as identified"
+            f"{100 * note['nrmse_identified']:.3g} % as identified, noise "
+            f"{100 * note['noise_floor']:.2g} %"
         )
     print_line(f"rms residual over the sensor noise: {report['rms_over_noise']:.3f}")
     for note in report["warnings"]:

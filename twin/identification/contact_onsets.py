@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from table_io.block import Block, Float1D, Int1D
-from table_io.channels import contact_forces
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS, contact_forces
 from twin.identification.parameters import ParameterSet
 from twin.identification.residuals import LogResiduals
 
@@ -70,7 +70,10 @@ def estimate_contact_gaps(
         return ()
     estimates = []
     position = m.u - parameters.tare_error(residuals.log_number, "u")
+    channels = residuals.signals.channels
     for side, law in enumerate(laws):
+        if not any(cell in channels for cell in (RIGHT_CELLS, LEFT_CELLS)[side]):
+            continue  # a side without a bumper
         sign = 1.0 if side == 0 else -1.0
         for edge, kind in ((1, "onset"), (-1, "release")):
             times, level = [], 0.0

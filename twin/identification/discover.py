@@ -31,7 +31,6 @@ from twin.identification.parameters import (
     GapKey,
     ParameterSet,
     TareKey,
-    is_sensor_error,
     list_base_parameters,
     list_model_effect_parameters,
 )
@@ -193,7 +192,9 @@ def _start_nuisances(
 
 def explain_with_nuisances(prepared: PreparedProblem) -> PreparedProblem:
     """Return the problem with nuisances if they, but not ideal sensors, explain the logs."""
-    if prepared.first_fit.cost <= MAX_EXPLAINED_COST:
+    is_weighted = max(residuals.weight for residuals in prepared.problem.log_residuals) > 1.0
+    # a model that misses by many times the noise is not explained by errors of a laboratory
+    if is_weighted or prepared.first_fit.cost <= MAX_EXPLAINED_COST:
         return prepared
     imperfect = add_nuisances(prepared)
     return imperfect if imperfect.first_fit.cost <= MAX_EXPLAINED_COST else prepared
@@ -278,20 +279,18 @@ def discover_effects(
     report: ProgressCallback = lambda progress: None,
     without: Sequence[str] = (),
     mapper: MapFunction = map,
-    fitted: bool = False,
 ) -> Discovery:
     """Find the effects that the model lacks by stepwise selection, and judge them (`verdict`).
 
-    `mapper` may be a parallel map. `fitted`: the parameters of the model were fitted to recordings
-    and may have absorbed missing effects; then they are not used to check the new ones.
+    `mapper` may be a parallel map.
     """
     report(SelectionProgress("the model alone"))
     prepared = prepare_problem(logs, model, without, mapper)
-    discovery = _select_and_judge(prepared, logs, model, report, fitted)
+    discovery = _select_and_judge(prepared, logs, model, report)
     if not discovery.selection.complete or _is_explained(discovery.verdict, MAX_IDEAL_ERRORS):
         return discovery
     imperfect = add_nuisances(prepared)
-    with_nuisances = _select_and_judge(imperfect, logs, model, report, fitted)
+    with_nuisances = _select_and_judge(imperfect, logs, model, report)
     if not with_nuisances.selection.complete:
         return replace(discovery, selection=replace(discovery.selection, complete=False))
     is_ended_early = count_sensor_errors(discovery.selection.best) > MAX_IDEAL_ERRORS
@@ -312,7 +311,6 @@ def _select_and_judge(
     logs: Sequence[PreparedLog],
     model: Model,
     report: ProgressCallback,
-    fitted: bool,
 ) -> Discovery:
     """Return the selection from a prepared problem, judged; see `discover_effects`."""
     problem = prepared.problem
@@ -324,8 +322,7 @@ def _select_and_judge(
         noise_floor * estimate_repeatability_floor(problem.log_residuals, selection.best.held_out),
         selection.best.cost,
     )
-    start = {} if fitted else ParameterSet.from_model(model, 0).values
-    verdict = judge_selection(problem, selection, floor, start, noise_floor)
+    verdict = judge_selection(problem, selection, floor, noise_floor)
     # implausible base parameters are reported only if they remain so with the effects added
     pulls = find_pulling_bumpers(problem.log_residuals, verdict.best.held_out)
     notes = (*prepared.notes, *find_implausible_parameters(model, verdict.best.fit), *pulls)
@@ -359,19 +356,3 @@ def fit_known_effects(
 def _small_amplitude(candidate: Candidate) -> float:
     free = candidate.amplitude
     return min(max(candidate.vanishing + 1e-3 * free.scale, free.low), free.high)
-
-
-def held_out_log_nrmse(log: PreparedLog, fitted: FittedSet) -> float:
-    """Return the NRMSE of the damper force on a held-out log, with the gaps stated there."""
-    fitted_parameters = fitted.fit.parameters
-    model = fitted_parameters.to_model()
-    parameters = ParameterSet.from_model(model, 1).with_values(
-        {key: value for key, value in fitted_parameters.values.items() if is_sensor_error(key)}
-    )
-    (residuals,) = build_log_residuals([(log.signals, log.contact_n)], model)
-    motion = residuals.motion(parameters.assumed_sensors())
-    mass = parameters.model_for_log(0, motion).parameters.mass
-    damper = residuals.entry_row == 0
-    error = residuals.evaluate(parameters)[damper] * residuals.force_noise(motion, mass)[0]
-    force = residuals.measured_forces(motion, mass)[0][residuals.entry_sample[damper]]
-    return float(error.std() / force.std())

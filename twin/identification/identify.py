@@ -60,7 +60,8 @@ MIN_REPORTED_CORRELATION = 0.7
 class IdentificationResult:
     """Result of an identification.
 
-    `window_errors` are (nrmse of u before, after) of each log, or None.
+    `window_errors` are (nrmse of u before, after) of each log, or None, and `window_floors` what
+    the noise of u alone would leave in them.
     """
 
     problem: SelectionProblem
@@ -72,8 +73,19 @@ class IdentificationResult:
     asymmetry: tuple[float, float] | None
     contact_gaps: tuple[ContactGaps, ...]
     window_errors: tuple[tuple[float, float] | None, ...]
+    window_floors: tuple[float, ...]
     warnings: tuple[str, ...]
     notes: tuple[str, ...]
+
+    @property
+    def rms_over_noise(self) -> float:
+        """Rms of the residual in motion over the noise of the sensors, whatever the weights."""
+        squares, count = 0.0, 0
+        for residuals in self.problem.log_residuals:
+            r = residuals.evaluate(self.fit.parameters) * residuals.weight
+            r = r[residuals.entry_row < len(residuals.rows)]
+            squares, count = squares + float(r @ r), count + r.size
+        return math.sqrt(squares / max(count, 1))
 
     @property
     def correlated_pairs(self) -> tuple[tuple[str, str, float], ...]:
@@ -133,6 +145,7 @@ def identify_parameters(
         asymmetry,
         contact_gaps,
         windows,
+        tuple(_window_noise(residuals.signals) for residuals in log_residuals),
         warnings,
         (*prepared.notes, *find_implausible_parameters(model, joint)),
     )
@@ -274,6 +287,16 @@ def _compare_windows(
     contact_n = max(residuals.contact_thresholds_n)
     before, after = (window_nrmse(blocks, model, contact_n) for model in models)
     return before, after
+
+
+def _window_noise(signals: LogSignals) -> float:
+    """Return the rms noise of the measured u over the rms of u: a floor of `window_nrmse`."""
+    pair = ("mass_disp_m", "table_disp_m")
+    channels = pair if {*pair} <= {*signals.channels} else ("rel_disp_m",)
+    # rms of one sample: white noise of rms s has the density s at every frequency
+    noise = math.hypot(*(float(np.sqrt(np.mean(signals.noise[c] ** 2))) for c in channels))
+    u = signals.grid.to_time_domain(signals.relative_spectrum)[signals.label != Label.REST]
+    return noise / max(float(np.sqrt(np.mean(u**2))), 1e-300)
 
 
 def window_nrmse(blocks: Sequence[Block], model: Model, contact_n: float) -> float:

@@ -290,8 +290,8 @@ class LogResiduals:
         """Whitening filter of the damper row, (frequency,); None with an accelerometer."""
         if not derives_acc(self.signals.channels) or self.motion().damper is not None:
             return None
-        p = self.reference.parameters
-        return self.signals.whitening(p.stiffness / p.mass, p.damping / p.mass)
+        p, mass = self.reference.parameters, self.signals.mass_kg
+        return self.signals.whitening(p.stiffness / mass, p.damping / mass)
 
     @cached_property
     def sample_block(self) -> Int1D:
@@ -340,8 +340,11 @@ class LogResiduals:
             slope[slope.size - count + number] = 1.0
         return slope
 
-    def evaluate_rows(self, parameters: ParameterSet, m: MeasuredMotion) -> Float1D:
-        """Return the residual over its noise on a given motion, (entry,), without the rest row."""
+    def force_errors(self, parameters: ParameterSet, m: MeasuredMotion) -> Float2D:
+        """Return measured minus modelled damper force, F_R and -F_L on a motion in N, (3, sample).
+
+        Without load cells the damper force is the sum of all forces.
+        """
         model = parameters.model_for_log(self.log_number, m)
         u = m.u - parameters.tare_error(self.log_number, "u")
         d, right, left = forces_along(model, u, m.v, m.time_s, self.contact_state)
@@ -362,8 +365,12 @@ class LogResiduals:
                 parameters.values, m, (p.gap_r, p.gap_l), self.contact_state, self.scale
             )
             expected += generic
-        mass = model.parameters.mass
-        rows = self.measured_forces(m, mass, parameters) - expected
+        return self.measured_forces(m, model.parameters.mass, parameters) - expected
+
+    def evaluate_rows(self, parameters: ParameterSet, m: MeasuredMotion) -> Float1D:
+        """Return the residual over its noise on a given motion, (entry,), without the rest row."""
+        rows = self.force_errors(parameters, m)
+        mass = parameters.model_for_log(self.log_number, m).parameters.mass
         # the noise is that of the nominal mass: a misfit must not shrink by its own denominator
         rows /= self.force_noise(m, mass * self.signals.mass_kg / m.mass_kg)[:, None]
         if self.whitening is not None:

@@ -127,6 +127,15 @@ class LogSignals:
         gain: Float1D = self.low_pass / np.hypot(s_u, self.noise["table_acc_m_s2"])
         return gain / self.grid.white_noise_rms(self.low_pass)
 
+    def balance_noise(self, stiffness: float, damping: float) -> float:
+        """Return the rms noise in m/s2 of the force balance without accelerometer, per kg.
+
+        The parameters are those of `whitening`: this is the noise that it makes white.
+        """
+        gain = self.whitening(stiffness, damping) * self.grid.white_noise_rms(self.low_pass)
+        density = np.divide(self.low_pass, gain, out=np.zeros_like(gain), where=gain > 0)
+        return self.grid.white_noise_rms(density * self.low_pass)
+
     def calibrate_noise(self) -> "LogSignals":
         """Return the signals with the noise of laser and accelerometer as loud as they disagree.
 

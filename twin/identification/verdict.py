@@ -8,7 +8,7 @@ The gap's excess is the mean square of the cross-validation residual over the no
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from twin.identification.parameters import (
@@ -30,10 +30,6 @@ MIN_GENERIC_GAIN_SHARE = 0.012
 # of the gap's excess: the same where it replaces one of several effects
 MIN_REPLACEMENT_GAIN_SHARE = 0.001
 MIN_VISIBLE_EXCESS = 0.05  # of the floor: excess below which there is no gap
-# ratio to both start and null beyond which a base parameter was absorbed by the selected effects
-MAX_BASE_RATIO = 1.6
-# ratio of start and null below which the start is no independent check
-MAX_SAME_BASE_RATIO = 1.2
 NEVER_AT_BOUND = (STIFFNESS, DAMPING, BUMPER_STIFFNESS)  # positive in a real specimen
 MIN_NAMED_GAP_SHARE = 0.5  # of the gap's excess that the named effects must close
 
@@ -56,13 +52,12 @@ def judge_selection(
     problem: SelectionProblem,
     selection: SelectionResult,
     floor: float,
-    start: Mapping[ParameterKey, float] | None = None,
     noise: float = 1.0,
 ) -> DiscoveryVerdict:
     """Judge the outcome of a selection; `floor` is a mean square over the noise.
 
-    `start` are the base parameters of the given model, an independent check of the fitted ones.
-    `noise` is the mean square of sensor noise alone: below it no effect is named.
+    `noise` is the mean square of sensor noise alone: below it no effect is named. The parameters
+    of the given model do not count: it may be rough, and every one of them is fitted.
     """
     null, best = selection.null, selection.best
     gap = max(null.cost - floor, 1e-9)
@@ -84,18 +79,16 @@ def judge_selection(
         fitted for fitted in as_good if _tares_at_bound(fitted) < _tares_at_bound(best)
     ]:
         alternative = min(unstrained, key=lambda fitted: fitted.cost)
-        return judge_selection(problem, replace(selection, best=alternative), floor, start, noise)
+        return judge_selection(problem, replace(selection, best=alternative), floor, noise)
     alternatives = tuple({frozenset(fitted.names): fitted for fitted in reversed(as_good)}.values())
     has_remainder = remaining > MAX_REMAINDER_SHARE * gap and remaining > MIN_VISIBLE_EXCESS * floor
     confidence = _confidence(selection, rivals, remaining / gap)
-    if doubt := _find_doubt(
-        selection, None if is_additional else generic, start or {}, has_remainder, gap
-    ):
+    if doubt := _find_doubt(selection, None if is_additional else generic, has_remainder, gap):
         return DiscoveryVerdict(
             "unexplained", best, min(confidence, 0.3), (), generic, floor, True, doubt
         )
     if alternatives and (
-        core := _judge_common_core(problem, selection, alternatives, floor, start, noise)
+        core := _judge_common_core(problem, selection, alternatives, floor, noise)
     ):
         return core
     if alternatives:
@@ -124,7 +117,6 @@ def _judge_common_core(
     selection: SelectionResult,
     alternatives: Sequence[FittedSet],
     floor: float,
-    start: Mapping[ParameterKey, float] | None,
     noise: float,
 ) -> DiscoveryVerdict | None:
     """Return the verdict on the effects common to all equally good sets, if it is "named"."""
@@ -141,7 +133,7 @@ def _judge_common_core(
         if len(fitted.effects) == 1 or common < set(fitted.names)
     ]
     of_core = replace(selection, best=core, generic_sets=tuple(generic_sets))
-    verdict = judge_selection(problem, of_core, floor, start, noise)
+    verdict = judge_selection(problem, of_core, floor, noise)
     if verdict.outcome != "named":
         return None
     alternatives_text = " or ".join(
@@ -157,7 +149,6 @@ def _judge_common_core(
 def _find_doubt(
     selection: SelectionResult,
     generic: FittedSet | None,
-    start: Mapping[ParameterKey, float],
     has_remainder: bool,
     gap: float,
 ) -> str:
@@ -166,8 +157,6 @@ def _find_doubt(
     names = " + ".join(best.names)
     if generic is not None:
         return f"{generic.names[-1]} explains what {names} cannot"
-    if absorbed := _describe_absorbed_base(selection, start):
-        return f"{names} would close the gap only if {absorbed}"
     if has_remainder and (selection.null.cost - best.cost) < MIN_NAMED_GAP_SHARE * gap:
         return "the best effects close less than half of the gap"
     at_bound = [
@@ -232,24 +221,6 @@ def _needs_named_effects(selection: SelectionResult, generic: FittedSet, gap: fl
         return False
     costs = [fitted.cost for fitted in selection.generic_sets if len(fitted.effects) == 1]
     return min(costs, default=math.inf) - generic.cost > MAX_REMAINDER_SHARE * gap
-
-
-def _describe_absorbed_base(selection: SelectionResult, start: Mapping[ParameterKey, float]) -> str:
-    """Describe the base parameter absorbed by the selected effects; empty if there is none."""
-    for key in (STIFFNESS, DAMPING):
-        given = start.get(key, 0.0)
-        null, best = (
-            fitted.fit.values.get(key, 0.0) for fitted in (selection.null, selection.best)
-        )
-        if min(given, null) <= 0 or _ratio(given, null) < MAX_SAME_BASE_RATIO:
-            continue
-        if best <= 0 or min(_ratio(best, given), _ratio(best, null)) > MAX_BASE_RATIO:
-            return f"the {key} were {best:.4g} instead of {given:.4g} as in the model"
-    return ""
-
-
-def _ratio(a: float, b: float) -> float:
-    return max(a / b, b / a)
 
 
 def _find_rivals(

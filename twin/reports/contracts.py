@@ -432,8 +432,10 @@ class HeldOutLog(Contract):
     """Errors of the damper force on a log that was held out entirely."""
 
     log: str = Field(description="name of the log")
-    nrmse_before: Ratio = Field(description="of the model")
+    nrmse_given: Ratio = Field(None, description="of the model as given, not fitted")
+    nrmse_before: Ratio = Field(description="of the model, refitted to the other logs")
     nrmse_after: Ratio = Field(description="with the effects added")
+    noise_floor: Ratio = Field(None, description="what the noise of the sensors alone would leave")
 
 
 class Verdict(Contract):

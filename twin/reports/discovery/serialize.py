@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from twin.identification.candidates import Candidate
-from twin.identification.discover import Discovery, PreparedLog, held_out_log_nrmse
+from twin.identification.discover import Discovery, PreparedLog
+from twin.identification.held_out import compute_force_error
 from twin.identification.least_squares import FitResult
 from twin.identification.parameters import (
     SLIP_SPEED,
@@ -13,6 +14,7 @@ from twin.identification.parameters import (
     EffectKey,
     FreeParameter,
     GapKey,
+    ParameterSet,
     SlipKey,
     TareKey,
     TermKey,
@@ -21,7 +23,7 @@ from twin.identification.parameters import (
 )
 from twin.identification.selection import FittedSet
 from twin.identification.verdict import closed_fraction, suggest_next_run
-from twin.model.model import SENSOR_CHANNELS
+from twin.model.model import SENSOR_CHANNELS, Model
 
 Json = dict[str, Any]
 MIN_GAP_ERROR_M = 1e-6  # smaller gap corrections are not reported
@@ -39,11 +41,16 @@ def verdict_to_json(
     seconds: float = 0.0,
     notes: Sequence[str] = (),
     held_out_logs: Sequence[PreparedLog] = (),
+    given: Model | None = None,
 ) -> Json:
-    """Return the content of verdict.json, see `twin.reports.contracts.Verdict`."""
+    """Return the content of verdict.json, see `twin.reports.contracts.Verdict`.
+
+    `given` is the model as given, before any fit, for comparison on the held-out logs.
+    """
     verdict, selection = discovery.verdict, discovery.selection
     best, null = verdict.best, selection.null
     where = discovery.localization
+    factor = noise_factor(discovery)
     names, alternatives = best.names, [fitted.names for fitted in verdict.alternatives]
     return {
         "verdict": verdict.outcome,
@@ -53,7 +60,7 @@ def verdict_to_json(
         ],
         "ambiguous": [[*names], *([*ids] for ids in alternatives)] if alternatives else [],
         "candidates": candidates_to_json(
-            selection.null, (*selection.tried, *selection.generic_sets)
+            selection.null, (*selection.tried, *selection.generic_sets), factor
         ),
         "where": {
             "frequency_hz": list(where.frequency_hz) if where.frequency_hz else None,
@@ -64,16 +71,16 @@ def verdict_to_json(
         },
         "gap": {
             "metric": METRIC,
-            "before": math.sqrt(null.fit.cost),
-            "after": math.sqrt(best.fit.cost),
-            "noise_floor": math.sqrt(verdict.floor),
-            "held_out_before": math.sqrt(null.cost),
-            "held_out_after": math.sqrt(best.cost),
+            "before": factor * math.sqrt(null.fit.cost),
+            "after": factor * math.sqrt(best.fit.cost),
+            "noise_floor": factor * math.sqrt(verdict.floor),
+            "held_out_before": factor * math.sqrt(null.cost),
+            "held_out_after": factor * math.sqrt(best.cost),
             "closed_fraction": closed_fraction(null.cost, best.cost, verdict.floor),
         },
         "remainder": {
             "unexplained": verdict.has_remainder,
-            "evidence": generic_term_to_json(verdict.generic),
+            "evidence": generic_term_to_json(verdict.generic, factor),
         },
         "base": base_to_json(best),
         "fell_away": dict(discovery.prepared.excluded),
@@ -85,15 +92,33 @@ def verdict_to_json(
         ],
         "next_run": suggest_next_run(verdict.outcome, names, alternatives),
         "seconds": seconds,
-        "held_out_logs": [
-            {
-                "log": log.signals.name,
-                "nrmse_before": held_out_log_nrmse(log, null),
-                "nrmse_after": held_out_log_nrmse(log, best),
-            }
-            for log in held_out_logs
-        ],
+        "held_out_logs": [_held_out_to_json(log, discovery, given) for log in held_out_logs],
     }
+
+
+def _held_out_to_json(log: PreparedLog, discovery: Discovery, given: Model | None) -> Json:
+    """Return the errors of the damper force on a held-out log of every model, and the noise."""
+    null, best = discovery.selection.null.fit, discovery.verdict.best.fit
+    after = compute_force_error(log, best.parameters)
+    as_given = given and compute_force_error(log, ParameterSet.from_model(given, 1))
+    return {
+        "log": log.signals.name,
+        "nrmse_given": as_given.nrmse if as_given else None,
+        "nrmse_before": compute_force_error(log, null.parameters).nrmse,
+        "nrmse_after": after.nrmse,
+        "noise_floor": after.noise_floor,
+    }
+
+
+def noise_factor(discovery: Discovery) -> float:
+    """Return the factor from weighted residuals to multiples of the sensor noise.
+
+    Where model error rules, residuals are divided by it in place of the noise, log by log.
+    """
+    log_residuals = discovery.prepared.problem.log_residuals
+    counts = [residuals.entry_row.size for residuals in log_residuals]
+    squares = [residuals.weight**2 for residuals in log_residuals]
+    return math.sqrt(sum(n * w for n, w in zip(counts, squares, strict=True)) / sum(counts))
 
 
 def effect_to_json(candidate: Candidate, fit: FitResult, confidence: float) -> Json:
@@ -168,8 +193,10 @@ def _format_reason(discovery: Discovery) -> str:
     return f"{discovery.verdict.reason}{REFITTED_SUFFIX if has_notes else ''}"
 
 
-def candidates_to_json(null: FittedSet, tried: Sequence[FittedSet]) -> list[Json]:
-    """Return every refitted set with its cross-validation error, best first."""
+def candidates_to_json(
+    null: FittedSet, tried: Sequence[FittedSet], factor: float = 1.0
+) -> list[Json]:
+    """Return every refitted set with its cross-validation error, times a factor, best first."""
     best: dict[frozenset[str], FittedSet] = {}
     for fitted in (null, *tried):
         key = frozenset(fitted.names)
@@ -178,7 +205,7 @@ def candidates_to_json(null: FittedSet, tried: Sequence[FittedSet]) -> list[Json
     return [
         {
             "id": " + ".join(fitted.names) or "nothing added",
-            "held_out_error": math.sqrt(fitted.cost),
+            "held_out_error": factor * math.sqrt(fitted.cost),
             "converged": fitted.fit.converged,
             **({"at_bound": [*map(str, fitted.fit.at_bound)]} if fitted.fit.at_bound else {}),
         }
@@ -186,7 +213,7 @@ def candidates_to_json(null: FittedSet, tried: Sequence[FittedSet]) -> list[Json
     ]
 
 
-def generic_term_to_json(general: FittedSet | None) -> Json | None:
+def generic_term_to_json(general: FittedSet | None, factor: float = 1.0) -> Json | None:
     """Return the generic term that fits better than every library effect; None without one."""
     if general is None:
         return None
@@ -194,7 +221,7 @@ def generic_term_to_json(general: FittedSet | None) -> Json | None:
     return {
         "term": term.name.split(".", 1)[1],
         "meaning": "u, v, d relative to their largest measured values, w likewise (resonator: Hz)",
-        "held_out_error": math.sqrt(general.cost),
+        "held_out_error": factor * math.sqrt(general.cost),
         "parameters": {
             free.key.name: parameter_to_json(general.fit, free)
             for free in term.free
