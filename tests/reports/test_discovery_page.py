@@ -191,7 +191,8 @@ def test_what_fell_away_is_said_with_its_reason(every: dict[str, DiscoveryOutput
 def test_every_figure_is_there_and_not_empty(output: DiscoveryOutput) -> None:
     files = {path.stem: path for path in (output.folder / "figures").glob("*.png")}
     stepped = any(log.steps for log in output.logs)
-    assert files.keys() == (FIGURES if stepped else FIGURES - {"map_0", "prc", "impacts"})
+    laws = {"laws"} if output.discovery.verdict.outcome != "none" else set()
+    assert files.keys() == laws | (FIGURES if stepped else FIGURES - {"map_0", "prc", "impacts"})
     assert ("No map over frequency" in output.page) != stepped
     for name, path in files.items():
         pixels = imread(path)[..., :3]
@@ -204,7 +205,8 @@ def test_a_term_without_a_name_is_drawn_and_never_in_the_model(
     output = every["unexplained"]
     shown = DiscoveryView(output.discovery, output.logs)
     assert output.discovery.verdict.generic is not None
-    assert shown.law_name.startswith("general.bumper")
+    assert shown.law_name.startswith("generic term bumper")
+    assert [forces.is_generic for forces in shown.forces_of_each][-1]
     assert "generic term, bumper" in output.page
     assert "general" not in (output.folder / "model.toml").read_text()
 
@@ -214,12 +216,14 @@ def test_the_law_drawn_is_the_force_that_is_missing(every: dict[str, DiscoveryOu
     assert shown.law is not None
     assert shown.law_forces is not None
     sheet, guess = shown.log_residuals[0], shown.law.fit.parameters
-    wanted, law, after = (entries_to_samples(sheet, 1, part, guess) for part in shown.law_forces)
+    forces = shown.law_forces
+    wanted, law, after = forces.required[1], forces.law[1], forces.remaining[1]
     touching = np.isfinite(law)
     depth = sheet.motion().u[touching] - sheet.motion().gaps_m[0] - guess.values[GapKey(0)]
     assert law[touching] == pytest.approx(HARDENING_N_M2 * depth**2, rel=0.1, abs=5.0)
     assert np.nanstd(after) < 0.1 * np.nanstd(wanted)
-    assert np.nanmax(np.abs(entries_to_samples(sheet, 0, shown.law_forces[1], guess))) < 1e-6
+    assert np.nanmax(np.abs(forces.law[0])) < 1e-6
+    assert [own.label for own in shown.forces_of_each] == ["bumper_hardening"]
 
 
 def test_the_model_that_is_left_says_how_well_its_numbers_are_known(

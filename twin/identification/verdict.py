@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from twin.identification.parameters import (
     BUMPER_STIFFNESS,
     DAMPING,
+    GENERIC_PREFIX,
     STIFFNESS,
     ParameterKey,
     TareKey,
@@ -105,7 +106,7 @@ def judge_selection(
             f"{percent:.2g} % of the gap remains, as an inexact form of the force law may leave"
         )
     if generic is not None:
-        reason = f"part of the gap remains unexplained; it resembles {generic.names[-1]}"
+        reason = f"part of the gap remains unexplained; it resembles {_format_generic(generic)}"
         confidence, has_remainder = 0.8 * confidence, True
     elif has_remainder:
         reason = "part of the gap remains unexplained"
@@ -156,7 +157,7 @@ def _find_doubt(
     best = selection.best
     names = " + ".join(best.names)
     if generic is not None:
-        return f"{generic.names[-1]} explains what {names} cannot"
+        return f"{_format_generic(generic)} explains what {names} cannot"
     if has_remainder and (selection.null.cost - best.cost) < MIN_NAMED_GAP_SHARE * gap:
         return "the best effects close less than half of the gap"
     at_bound = [
@@ -176,7 +177,9 @@ def _judge_unnamed(
 ) -> DiscoveryVerdict:
     null = selection.null
     if generic is not None and problem.is_worthwhile(null, generic):
-        reason = f"no effect of the library, but {generic.names[-1]} explains part of the gap"
+        reason = (
+            f"no effect of the library, but {_format_generic(generic)} explains part of the gap"
+        )
         return DiscoveryVerdict("unexplained", null, 0.9, (), generic, floor, True, reason)
     if null.cost > (1 + 2 * MIN_VISIBLE_EXCESS) * floor:
         reason = "the residual exceeds the noise, and no effect of the library explains it"
@@ -188,6 +191,10 @@ def _judge_unnamed(
         )
         return DiscoveryVerdict("unexplained", null, 0.8, (), None, floor, True, reason)
     return DiscoveryVerdict("none", null, 0.95, (), None, floor, False, "the residual is noise")
+
+
+def _format_generic(fitted: FittedSet) -> str:
+    return f"the generic term {fitted.names[-1].removeprefix(f'{GENERIC_PREFIX}.')}"
 
 
 def _find_better_generic(

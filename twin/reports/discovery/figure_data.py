@@ -11,12 +11,13 @@ from functools import cached_property
 
 import numpy as np
 
-from table_io.block import Float1D, Int1D, Label
+from table_io.block import Float1D, Float2D, Int1D, Label
 from table_io.records import Step
+from twin.identification.candidates import Candidate
 from twin.identification.discover import Discovery, PreparedLog
 from twin.identification.localization import PHASES, classify_phases, is_stepped_sine
 from twin.identification.motion import MeasuredMotion
-from twin.identification.parameters import ParameterSet
+from twin.identification.parameters import GENERIC_PREFIX, ParameterSet
 from twin.identification.residuals import FORCE_ROWS, LogResiduals
 from twin.identification.selection import FittedSet
 
@@ -27,6 +28,7 @@ CLOSE_UP_S = 3.0  # length of a close-up without steps
 MAX_PERIOD_CHANGE = 0.3
 # excess over the noise, and its standard errors, at which a sensor check fails
 MIN_GATE_EXCESS, MIN_GATE_SIGMA = 0.1, 4.0
+MAX_DRAWN_FREQUENCY = 8.0  # of the main frequency: of a force without an accelerometer
 Pair = tuple[FittedSet, FittedSet]
 
 
@@ -37,6 +39,24 @@ class CloseUp:
     title: str
     direction: str
     samples: Int1D
+
+
+@dataclass(frozen=True, eq=False)
+class TermForces:
+    """Forces of one or several terms on a log in N, (3, sample) each, as in `FORCE_ROWS`.
+
+    `required` is measured minus model without the terms, `law` what they add. NaN where unused.
+    """
+
+    label: str
+    is_generic: bool
+    required: Float2D
+    law: Float2D
+
+    @property
+    def remaining(self) -> Float2D:
+        """Measured minus model with the terms."""
+        return self.required - self.law
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,16 +88,26 @@ class DiscoveryView:
 
     @property
     def law(self) -> FittedSet | None:
-        """Set with the effects found, or with the generic term; None if nothing was found."""
+        """Set whose force is drawn: that of the effects named, else that with the generic term.
+
+        None if nothing was found.
+        """
         v = self.discovery.verdict
-        return v.generic or (v.best if v.best.effects else None)
+        if v.generic is not None and (v.outcome == "unexplained" or not v.best.effects):
+            return v.generic
+        return v.best if v.best.effects else None
 
     @property
     def law_name(self) -> str:
-        """Names of the effects whose force is drawn."""
-        v = self.discovery.verdict
-        names = v.generic.names[-1:] if v.generic else v.best.names
-        return " + ".join(names)
+        """Names of the terms whose force is drawn; a generic one is called so."""
+        return " + ".join(format_term(term) for term in self._drawn_terms)
+
+    @property
+    def _drawn_terms(self) -> tuple[Candidate, ...]:
+        if self.law is None:
+            return ()
+        is_generic = self.law is self.discovery.verdict.generic
+        return self.law.effects[-1:] if is_generic else self.law.effects
 
     def title_suffix(self, number: int) -> str:
         """Return " · log name" to append to a title; empty with a single log."""
@@ -98,20 +128,53 @@ class DiscoveryView:
         return int(np.argmax(squares))
 
     @cached_property
-    def law_forces(self) -> tuple[Float1D, Float1D, Float1D] | None:
-        """Forces (required of the law, of the law, residual) of the worst log, (entry,) over noise.
-
-        The required force is measured minus model, with the law removed from the model.
-        """
+    def law_forces(self) -> TermForces | None:
+        """Forces of all terms that are drawn together; None if nothing was found."""
         if self.law is None:
             return None
-        residuals, parameters = self.log_residuals[self.worst_log], self.law.fit.parameters
-        without_law = parameters
-        for effect in self.law.effects:
-            if self.discovery.verdict.generic is None or effect is self.law.effects[-1]:
-                without_law = without_law.without(effect.free)
-        wanted, remaining = residuals.evaluate(without_law), residuals.evaluate(parameters)
-        return wanted, wanted - remaining, remaining
+        residuals = self.log_residuals[self.worst_log]
+        return compute_term_forces(residuals, self.law.fit.parameters, self._drawn_terms)
+
+    @cached_property
+    def forces_of_each(self) -> tuple[TermForces, ...]:
+        """Forces of each effect found, then of the generic term; sensor errors have none."""
+        v, residuals = self.discovery.verdict, self.log_residuals[self.worst_log]
+        pairs = [(v.best, term) for term in v.best.effects if not term.channel]
+        pairs += [(v.generic, v.generic.effects[-1])] if v.generic else []
+        return tuple(
+            compute_term_forces(residuals, fitted.fit.parameters, [term]) for fitted, term in pairs
+        )
+
+
+def format_term(term: Candidate) -> str:
+    """Return the name of an effect for a reader; a term outside the library is called generic."""
+    if term.effect is not None:
+        return term.name
+    return f"generic term {term.name.removeprefix(f'{GENERIC_PREFIX}.')} (no effect of the library)"
+
+
+def compute_term_forces(
+    residuals: LogResiduals, parameters: ParameterSet, terms: Sequence[Candidate]
+) -> TermForces:
+    """Return the force that terms of a fitted set add, and what the measurement requires of it."""
+    without = parameters
+    for term in terms:
+        without = without.without(term.free)
+    required, remaining = (
+        residuals.force_errors(own, residuals.motion(own.assumed_sensors()))
+        for own in (without, parameters)
+    )
+    if residuals.whitening is not None:
+        # the force of inertia is then a second derivative, whose noise would hide any law
+        omega = residuals.signals.omega * residuals.scale.time_s
+        gain = 1.0 / (1.0 + (omega / MAX_DRAWN_FREQUENCY) ** 8)
+        for force in (required[0], remaining[0]):
+            force[:] = residuals.signals.grid.apply_gain(force, gain)
+    unused = ~residuals.row_mask[: len(FORCE_ROWS)]
+    required[unused], remaining[unused] = np.nan, np.nan
+    label = " + ".join(format_term(term) for term in terms)
+    is_generic = any(term.effect is None for term in terms)
+    return TermForces(label, is_generic, required, required - remaining)
 
 
 def entries_to_samples(

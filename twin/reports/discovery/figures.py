@@ -21,9 +21,13 @@ from twin.identification.parameters import GENERIC_PREFIX, TARE_PREFIX
 from twin.identification.residuals import FORCE_ROWS, LogResiduals
 from twin.identification.selection import MIN_GAP_SHARE
 from twin.reports.discovery.figure_data import DiscoveryView, is_periodic, list_phases
-from twin.reports.discovery.force_figures import draw_force_histories, draw_residual_forces
+from twin.reports.discovery.force_figures import (
+    GENERIC_COLOUR,
+    draw_force_histories,
+    draw_residual_forces,
+)
 from twin.reports.discovery.free_running import FreeRuns
-from twin.reports.discovery.serialize import Json
+from twin.reports.discovery.serialize import Json, noise_factor
 from twin.reports.discovery.twin_figures import draw_free_running
 from twin.reports.plot_style import (
     DIRECTION_COLOURS,
@@ -44,12 +48,7 @@ MIN_CELL_SIGMA = 3.0  # standard errors above which a cell is marked
 PHASE_LABELS = {
     "flight": "flight", "contact_right": "right", "contact_left": "left", "contact_both": "both",
 }  # fmt: skip
-BEFORE_COLOUR, AFTER_COLOUR, BEST_COLOUR, GENERIC_COLOUR = (
-    "#8b929c",
-    "#1a7f37",
-    "#1a7f37",
-    "#d98a1f",
-)
+BEFORE_COLOUR, AFTER_COLOUR, BEST_COLOUR = "#8b929c", "#1a7f37", "#1a7f37"
 
 
 def draw_discovery_figures(
@@ -279,7 +278,8 @@ def _draw_time(view: DiscoveryView) -> CaptionedFigures:
                 ax.yaxis.set_major_formatter("{x:g}")
                 ax.yaxis.set_minor_formatter("")
         for ax, name in zip(axes, rows, strict=True):
-            floor, (low, high) = view.discovery.verdict.floor, ax.get_ylim()
+            floor = noise_factor(view.discovery) ** 2 * view.discovery.verdict.floor
+            low, high = ax.get_ylim()
             ax.axhline(floor, color=TWIN_COLOUR, ls="--", lw=0.9)
             ax.set_ylim(min(low, 0.08 * floor), max(high, 12 * floor))
             ax.set_ylabel(name)
@@ -310,4 +310,5 @@ def _block_means(
         np.bincount(blocks, weights=residuals.signals.time_s[residuals.entry_sample[in_rows]])
         / count
     )
-    return t, np.bincount(blocks, weights=held_out[in_rows] ** 2) / count
+    squares = (residuals.weight * held_out[in_rows]) ** 2
+    return t, np.bincount(blocks, weights=squares) / count

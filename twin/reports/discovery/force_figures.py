@@ -1,21 +1,24 @@
-"""Force close-ups: residual-force loops over u, u' and depth, and force histories.
+"""Forces: the law of each effect, residual-force loops over u, u' and depth, and histories.
 
 Measured data have the color of the direction, the fitted law or the model is black.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from table_io.block import Float1D
-from twin.identification.parameters import GENERIC_PREFIX, ParameterSet
 from twin.identification.residuals import LogResiduals
 from twin.reports.discovery.figure_data import (
     CloseUp,
     DiscoveryView,
+    TermForces,
+    compute_term_forces,
     entries_to_samples,
     is_force,
     measured_forces,
@@ -32,10 +35,15 @@ from twin.reports.plot_style import (
 )
 
 SIDES = ("right", "left")  # of residual rows 1 and 2
+FORCE_NAMES = ("damper", "right bumper", "left bumper")
+GENERIC_COLOUR = "#d98a1f"
+MAX_POINTS = 6000  # of a cloud
+MIN_CYCLE_SAMPLES = 25.0  # of the main motion, for a line through the samples
 
 
 def draw_residual_forces(view: DiscoveryView) -> CaptionedFigures:
-    """Draw residual damper force over u and u', bumper forces over depth, before and after."""
+    """Draw the law of each effect, then residual damper and bumper forces, before and after."""
+    yield from _draw_laws(view)
     residuals, steps = view.log_residuals[view.worst_log], view.sweep_steps(view.worst_log)
     damper = _draw_damper(view, residuals, select_close_ups(residuals, steps, 0))
     sides = [row for row in (1, 2) if (residuals.entry_row == row).any()]
@@ -45,29 +53,72 @@ def draw_residual_forces(view: DiscoveryView) -> CaptionedFigures:
         for close_up in select_close_ups(residuals, steps, row)
     }
     bumpers = _draw_bumpers(view, residuals, sides, list(close_ups.values())[:4])
-    law_squares = np.nan_to_num(_force_entries(view)[1]) ** 2
-    bumpers_dominate = (
-        law_squares[residuals.entry_row == 0].sum()
-        < law_squares[np.isin(residuals.entry_row, sides)].sum()
-    )
-    for drawn in (bumpers, damper) if bumpers_dominate else (damper, bumpers):
+    squares = np.nansum(_forces(view).law ** 2, axis=1)
+    for drawn in (bumpers, damper) if squares[0] < squares[1:].sum() else (damper, bumpers):
         yield from drawn
 
 
-def _force_entries(view: DiscoveryView) -> tuple[Float1D, Float1D, Float1D]:
-    """Return (measured minus model without the effects found, their force, residual), (entry,).
-
-    If nothing was found, the first is the residual of the base model and the force is NaN.
-    """
+def _forces(view: DiscoveryView) -> TermForces:
+    """Return the forces to draw; if nothing was found, the residual of the base model alone."""
     if view.law_forces is not None:
         return view.law_forces
-    before, after = (fitted.held_out[view.worst_log] for fitted in view.before_after)
-    return before, np.full_like(before, np.nan), after
+    residuals, null = view.log_residuals[view.worst_log], view.before_after[0]
+    forces = compute_term_forces(residuals, null.fit.parameters, ())
+    return replace(forces, law=np.zeros_like(forces.law))
 
 
-def _entry_parameters(view: DiscoveryView) -> ParameterSet:
-    """Return the parameter set that belongs to the entries of `_force_entries`."""
-    return (view.law or view.before_after[0]).fit.parameters
+def _draw_laws(view: DiscoveryView) -> CaptionedFigures:
+    """Draw the force of each effect over displacement and rate: required by the data, and fitted.
+
+    Over depth where it acts in a bumper.
+    """
+    drawn = [forces for forces in view.forces_of_each if np.nansum(forces.law**2) > 0]
+    if not drawn:
+        return
+    m = view.log_residuals[view.worst_log].motion()
+    figure = Figure(figsize=(FIGURE_WIDTH_IN, 2.9 * len(drawn) + 0.5))
+    axes = figure.subplots(len(drawn), 2, sharey="row", squeeze=False)
+    for row_axes, forces in zip(axes, drawn, strict=True):
+        row = int(np.argmax(np.nansum(forces.law**2, axis=1)))
+        used = np.flatnonzero(np.isfinite(forces.required[row]))
+        used = used[:: max(used.size // MAX_POINTS, 1)]
+        sign = -1.0 if row == 2 else 1.0
+        depth = sign * m.u - (m.gaps_m[row - 1] if row else 0.0)
+        names = ("depth in mm", "rate of depth in mm/s") if row else ("$u$ in mm", "$u'$ in mm/s")
+        colour = GENERIC_COLOUR if forces.is_generic else DIRECTION_COLOURS["forward"]
+        for ax, x, name in zip(row_axes, (depth, sign * m.v), names, strict=True):
+            _draw_loop(ax, (1e3 * x[used], forces.required[row, used]), colour)
+            ax.xaxis.set_major_locator(MaxNLocator(6))
+            ax.plot(1e3 * x[used], forces.law[row, used], ".", color=TWIN_COLOUR, ms=1.1, mew=0)
+            ax.set_xlabel(name)
+        remaining = forces.remaining[row]
+        sizes = [float(np.nanstd(force)) for force in (forces.required[row], remaining)]
+        row_axes[0].set_title(f"{forces.label}: {FORCE_NAMES[row]}")
+        row_axes[1].set_title(
+            f"rms {sizes[0]:.3g} N required, {sizes[1]:.3g} N remain", loc="right",
+            color=GUIDE_COLOUR,
+        )  # fmt: skip
+        row_axes[0].set_ylabel("force in N")
+    kinds = {
+        False: ("required of the effect", DIRECTION_COLOURS["forward"]),
+        True: ("required of the generic term, no effect of the library", GENERIC_COLOUR),
+    }
+    handles = [
+        Line2D([], [], color=colour, marker=".", ls="", ms=7, label=text)
+        for generic, (text, colour) in kinds.items()
+        if any(forces.is_generic == generic for forces in drawn)
+    ]
+    handles.append(
+        Line2D([], [], color=TWIN_COLOUR, marker=".", ls="", ms=4, label="the law as fitted")
+    )
+    figure.legend(handles=handles, loc="outside upper center", ncols=3)
+    caption = (
+        "What measurement requires of each law, measured force minus that of the model without it, "
+        "and the law itself, over the whole log with the largest residual. A generic term stands "
+        "for what is not in the library and never enters a model."
+    )
+    title = f"Force of what was found, measured and fitted{view.title_suffix(view.worst_log)}"
+    yield CaptionedFigure("laws", title, caption, figure)
 
 
 def _format_caption(view: DiscoveryView) -> str:
@@ -85,10 +136,9 @@ def _draw_damper(
     if not close_ups:
         return
     m, no_law = residuals.motion(), np.full(residuals.signals.time_s.size, np.nan)
-    wanted, law, remaining = (
-        entries_to_samples(residuals, 0, values, _entry_parameters(view))
-        for values in _force_entries(view)
-    )
+    forces = _forces(view)
+    wanted, law, remaining = forces.required[0], forces.law[0], forces.remaining[0]
+    law = no_law if view.law is None else law
     u, v = ("$u$ in mm", 1e3 * m.u), ("$u'$ in mm/s", 1e3 * m.v)
     columns = [
         (*u, wanted, law),
@@ -96,6 +146,11 @@ def _draw_damper(
         (*v, wanted, law),
         (*v, remaining, no_law),
     ]
+    cycle = 2 * np.pi * residuals.scale.time_s / residuals.scale.sample_s
+    # lines between few samples of a cycle would draw a polygon
+    law_style: dict[str, Any] = (
+        {"lw": 0.8} if cycle > MIN_CYCLE_SAMPLES else {"ls": "", "marker": ".", "ms": 1.4, "mew": 0}
+    )
     figure = Figure(figsize=(FIGURE_WIDTH_IN, 2.2 * len(close_ups) + 0.6))
     axes = figure.subplots(len(close_ups), 4, sharey="row", squeeze=False)
     for row_axes, close_up in zip(axes, close_ups, strict=True):
@@ -105,9 +160,10 @@ def _draw_damper(
                 (x[close_up.samples], y[close_up.samples]),
                 DIRECTION_COLOURS[close_up.direction],
             )
-            ax.plot(x[close_up.samples], drawn[close_up.samples], color=TWIN_COLOUR, lw=0.8)
+            ax.plot(x[close_up.samples], drawn[close_up.samples], color=TWIN_COLOUR, **law_style)
+            ax.xaxis.set_major_locator(MaxNLocator(4))
         row_axes[0].set_title(close_up.title)
-        row_axes[0].set_ylabel(_force_label(residuals, "damper"))
+        row_axes[0].set_ylabel("force in N")
     for ax, text in zip(axes[0], ("before", "after", "before", "after"), strict=True):
         ax.set_title(text, loc="right", color=GUIDE_COLOUR)
     for ax, (label, *_) in zip(axes[-1], columns, strict=True):
@@ -122,7 +178,7 @@ def _draw_bumpers(
 ) -> CaptionedFigures:
     if not close_ups:
         return
-    m, entries, parameters = residuals.motion(), _force_entries(view), _entry_parameters(view)
+    m, forces = residuals.motion(), _forces(view)
     figure = Figure(figsize=(FIGURE_WIDTH_IN, 2.2 * (2 if len(close_ups) > 2 else 1) + 0.6))
     axes = figure.subplots(-(-len(close_ups) // 2), 4, sharey="row", squeeze=False)
     pairs = axes.reshape(-1, 2)
@@ -132,14 +188,15 @@ def _draw_bumpers(
         for row in sides:
             depth = 1e3 * ((m.u, -m.u)[row - 1] - m.gaps_m[row - 1])
             wanted, law, remaining = (
-                entries_to_samples(residuals, row, values, parameters)[close_up.samples]
-                for values in entries
+                values[row, close_up.samples]
+                for values in (forces.required, forces.law, forces.remaining)
             )
             colour = SIDE_COLOURS[SIDES[row - 1]]
             x = depth[close_up.samples]
             for ax, y in zip(pair, (wanted, remaining), strict=True):
                 _draw_loop(ax, (x, y), colour)
-            pair[0].plot(x, law, color=TWIN_COLOUR, lw=0.8, ls="-" if row == 1 else "--")
+            if view.law is not None:
+                pair[0].plot(x, law, color=TWIN_COLOUR, lw=0.8, ls="-" if row == 1 else "--")
         pair[0].set_title(close_up.title)
         pair[0].set_ylabel("force in N")
         for ax, text in zip(pair, ("before", "after"), strict=True):
@@ -156,20 +213,12 @@ def _draw_loop(ax: Axes, curve: tuple[Float1D, Float1D], colour: str) -> None:
     ax.plot(*curve, ".", color=colour, ms=3.2, alpha=0.6, mew=0)
 
 
-def _force_label(residuals: LogResiduals, row: str) -> str:
-    return "force in N" if is_force(residuals, 0) else f"{row} force over its noise"
-
-
 def _add_legend(figure: Figure, view: DiscoveryView, dots: list[tuple[str, str]]) -> None:
     handles = [
         Line2D([], [], color=colour, marker=".", ls="", ms=7, label=text) for text, colour in dots
     ]
     if view.law is not None:
-        handles.append(
-            Line2D(
-                [], [], color=TWIN_COLOUR, label=view.law_name.removeprefix(f"{GENERIC_PREFIX}.")
-            )
-        )
+        handles.append(Line2D([], [], color=TWIN_COLOUR, label=view.law_name))
     figure.legend(handles=handles, loc="outside upper center", ncols=4)
 
 
@@ -185,7 +234,6 @@ def draw_force_histories(view: DiscoveryView) -> CaptionedFigures:
     t = m.time_s[k] - m.time_s[k[0]]
     figure = Figure(figsize=(FIGURE_WIDTH_IN, 1.8 * len(rows) + 0.6))
     axes = figure.subplots(len(rows), 2, sharex=True, sharey="row", squeeze=False)
-    names = ("damper", "right bumper", "left bumper")
     for column, (fitted, title) in enumerate(
         zip(view.before_after, ("before", "after"), strict=True)
     ):
@@ -197,7 +245,7 @@ def draw_force_histories(view: DiscoveryView) -> CaptionedFigures:
             ax.plot(t, measured[row][k], color=DIRECTION_COLOURS[close_up.direction], lw=2.2)
             model: dict[str, Any] = {"color": TWIN_COLOUR, "lw": 0.9}
             ax.plot(t, (measured[row] - error)[k], **model)
-            ax.set_ylabel(f"{names[row]} in N" if column == 0 else "")
+            ax.set_ylabel(f"{FORCE_NAMES[row]} in N" if column == 0 else "")
         axes[0, column].set_title(f"{title}, {close_up.title}")
         axes[-1, column].set_xlabel("time in s")
     handles = [
