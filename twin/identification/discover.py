@@ -152,8 +152,12 @@ def add_nuisances(prepared: PreparedProblem) -> PreparedProblem:
     problem, mapper, first = prepared.problem, prepared.problem.mapper, prepared.parameters
     moving = sum(int(residuals.motion().moving.sum()) for residuals in problem.log_residuals)
     thinning = max(math.ceil(moving / MAX_NUISANCE_SAMPLES), problem.log_residuals[0].thinning)
+    # Only the ratio of the weights counts: the best log has the noise that its priors stand against.
+    least = min(residuals.weight for residuals in problem.log_residuals)
     log_residuals = tuple(
-        linearize_nuisances(replace(residuals, thinning=thinning), first)
+        linearize_nuisances(
+            replace(residuals, thinning=thinning, weight=residuals.weight / least), first
+        )
         for residuals in problem.log_residuals
     )
     fit = fit_parameters(

@@ -1,5 +1,6 @@
 """Noise density of a channel, from the record at rest and from the spectrum in motion."""
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -17,9 +18,12 @@ MIN_DEVIATION_SIGMA = 3.0  # standard deviations: a smaller deviation from white
 # The same for 1/f noise, which the few lowest lines show: their power is far from normal.
 MIN_CORNER_SIGMA = 6.0
 MIN_WHITE_CYCLES = 0.02  # cycles per sample: above it noise at rest shows the white level
+PASSED_SHARE = 0.5  # of the frequency where a filter rolls off: below it, it passes all
+HIGHEST_CYCLES = 0.5  # per sample
 MIN_NOISE_SHARE = 1e-4  # of a channel's rms: lower limit of the noise
-# An anti-alias filter lowers the density by this factor within an octave, above this frequency.
-MIN_FILTER_FALL, MIN_FILTER_CYCLES = 30.0, 0.08  # -, cycles per sample
+# An anti-alias filter lowers the power by this factor within an octave, above this frequency; the
+# resolution of a converter may stop the fall.
+MIN_FILTER_FALL, MIN_FILTER_CYCLES = 4.0, 0.08  # -, cycles per sample
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +68,18 @@ def estimate_noise_density(values: Float1D, rest: Bool2D, frequency: Float1D) ->
     return np.maximum(density, max(least, 1e-300))
 
 
+def find_filter_corner(values: Float1D, rest: Bool2D) -> float:
+    """Return the frequency in cycles per sample where an anti-alias filter begins to roll off.
+
+    The record at rest shows it; inf without a filter, or with a short rest.
+    """
+    quiet = values[rest & np.isfinite(values)]
+    if quiet.size < MIN_REST_SAMPLES:
+        return math.inf
+    corner = _find_roll_off(_estimate_rest_bands(quiet))
+    return corner if corner < HIGHEST_CYCLES else math.inf
+
+
 def compare_with_white(values: Float1D, gain: Float1D) -> Float1D:
     """Return the power of a series over that of white noise of rms 1 after a gain, (frequency,).
 
@@ -77,7 +93,7 @@ def compare_with_white(values: Float1D, gain: Float1D) -> Float1D:
     passed = expected > 0.1
     segments = 0.5 * max(2 * values.size // samples - 1, 1)
     bands = _average_bands(
-        hz[passed], 0.5 * power[passed] / expected[passed], 1.0 / np.sqrt(segments)
+        hz[passed], 0.5 * power[passed] / expected[passed], 1.0 / np.sqrt(segments), True
     )
     louder = bands.power > 1.0 + MIN_DEVIATION_SIGMA * bands.sigma
     ratio = np.where(louder, bands.power, 1.0)
@@ -115,7 +131,9 @@ def _estimate_rest_bands(values: Float1D) -> NoiseBands:
     return _average_bands(hz, 0.5 * power, 1.0 / np.sqrt(segments))
 
 
-def _average_bands(hz: Float1D, power: Float1D, spread: float) -> NoiseBands:
+def _average_bands(
+    hz: Float1D, power: Float1D, spread: float, with_lines: bool = False
+) -> NoiseBands:
     """Return the mean of each band without spectral lines; `spread` is the deviation of a bin."""
     lowest, highest = 1.5 * (hz[1] - hz[0]), hz[-1]
     count = max(round(BANDS_PER_OCTAVE * np.log2(highest / lowest)), 2)
@@ -123,23 +141,24 @@ def _average_bands(hz: Float1D, power: Float1D, spread: float) -> NoiseBands:
     bands = []
     for first, last in pairwise(edges):
         band = power[first:last]
-        line_free = band[band <= 4.0 * np.median(band)]
+        line_free = band if with_lines else band[band <= 4.0 * np.median(band)]
         bands.append((hz[first:last].mean(), line_free.mean(), spread / np.sqrt(line_free.size)))
     frequency, mean, sigma = (np.array(column) for column in zip(*bands, strict=True))
     return NoiseBands(frequency, np.maximum(mean, 1e-300), sigma)
 
 
 def _find_roll_off(at_rest: NoiseBands) -> float:
-    """Return the frequency above which an anti-alias filter lowers the noise; 0.5 without one."""
+    """Return the frequency above which an anti-alias filter lowers the noise, or the highest."""
     power, octave = at_rest.power, BANDS_PER_OCTAVE
     falls = power[:-octave] > MIN_FILTER_FALL * power[octave:]
     rolling_off = np.flatnonzero(falls & (at_rest.frequency[:-octave] > MIN_FILTER_CYCLES))
-    return float(at_rest.frequency[rolling_off[0]]) if rolling_off.size else 0.5
+    return float(at_rest.frequency[rolling_off[0]]) if rolling_off.size else HIGHEST_CYCLES
 
 
 def _count_passed_bands(bands: NoiseBands, roll_off: float) -> int:
-    """Return the number of bands below the roll-off of a filter, at least three."""
-    return max(int(np.searchsorted(bands.frequency, roll_off)), 3)
+    """Return the number of bands that a filter passes whole, at least three."""
+    highest = roll_off if roll_off == HIGHEST_CYCLES else PASSED_SHARE * roll_off
+    return max(int(np.searchsorted(bands.frequency, highest)), 3)
 
 
 def _find_white_level(power: Float1D, sigma: Float1D) -> float:

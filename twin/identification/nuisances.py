@@ -5,8 +5,6 @@ enters the residual of a log linearly: r + sum of z x column. What it explains i
 effect of the specimen. Kinds, by channel or side:
 
     gain, lag            of a channel: reading = (1 + gain) x value(t - lag)
-    roll_off             of a channel: its gain rises with the square of the frequency, by a bracket
-                         that resonates, or falls, by a filter
     low_cut              of an accelerometer: corner of its high pass of the first order
     offset               of a channel, after its tare; constant, and slow with time (offset1, ...)
     chebyshev2 to 7      of a laser, in position: terms of its linearity error, 0 at position 0
@@ -38,10 +36,14 @@ SLOW_TERMS = 2  # cosines over the length of the record, besides the constant of
 # Typical sizes (one standard deviation).
 TYPICAL_GAIN = 0.005  # calibration and temperature
 TYPICAL_LAG_S = 5e-4  # multiplexed channels, different anti-alias filters
-TYPICAL_ROLL_OFF_S2 = 0.01 / (2.0 * math.pi * 100.0) ** 2  # 1 % at 100 Hz
 TYPICAL_LOW_CUT = 2.0 * math.pi * 0.16  # rad/s, of an IEPE accelerometer: 5 % at 0.5 Hz
 TYPICAL_OFFSET = 0.005  # of the rms of the channel: drift since the tare
 TYPICAL_LINEARITY = 0.002  # of the largest excursion, each term of the error of a laser
+# Of the largest excursion: speckle and roughness under the light spot of a laser, which the rest
+# does not show, and at low frequency no accelerometer.
+TYPICAL_SURFACE = 1e-4
+TYPICAL_CORNER_HZ = 1.0  # below it 1/f noise exceeds white noise, which is seen at WHITE_CYCLES
+WHITE_CYCLES = 0.05  # per sample
 TYPICAL_SHARE, TYPICAL_SHARE_SLOPE = 0.05, 0.02  # of the force; at the largest excursion
 TYPICAL_PLATE = 0.005  # of the specimen's mass
 TYPICAL_CROSS = 0.01  # cross-axis sensitivity and pitch
@@ -72,7 +74,6 @@ def list_nuisances(signals: LogSignals) -> tuple[Nuisance, ...]:
     scaled = [channel for channel in checkable if channel not in paired] + [*pairs]
     nuisances = [Nuisance("gain", place, TYPICAL_GAIN) for place in scaled]
     nuisances += [Nuisance("lag", channel, TYPICAL_LAG_S) for channel in checkable]
-    nuisances += [Nuisance("roll_off", channel, TYPICAL_ROLL_OFF_S2) for channel in checkable]
     nuisances += [
         Nuisance("low_cut", channel, TYPICAL_LOW_CUT)
         for channel in channels
@@ -119,8 +120,6 @@ def correct_signals(signals: LogSignals, nuisance: Nuisance, z: float) -> LogSig
             corrected = spectrum / (1.0 + amount)
         case "lag":
             corrected = spectrum * np.exp(1j * signals.omega * amount)
-        case "roll_off":
-            corrected = spectrum / (1.0 + amount * signals.omega**2)
         case "low_cut":
             # without the constant, which a high pass takes away for good
             slow = amount / np.maximum(signals.omega, signals.omega[1])
@@ -174,7 +173,7 @@ def linearize_nuisances(
     With `calibrate` the noise of the corrected sensors is taken from their disagreement.
     """
     terms = residuals.nuisances
-    signals = raw = residuals.signals if terms is None else terms.raw
+    signals = raw = _add_typical_noise(residuals.signals) if terms is None else terms.raw
     nuisances = list_nuisances(raw)
     centre = dict.fromkeys(nuisances, 0.0)
     if terms is not None:
@@ -213,6 +212,19 @@ def linearize_nuisances(
         np.array([centre[nuisance] for nuisance, _ in kept]),
     )  # fmt: skip
     return replace(bare, nuisances=terms)
+
+
+def _add_typical_noise(signals: LogSignals) -> LogSignals:
+    """Return the signals with the noise that a short rest does not show: 1/f, and of surfaces."""
+    u = signals.grid.to_time_domain(signals.relative_spectrum)
+    hz = signals.omega / (2.0 * np.pi)
+    slow = np.sqrt(1.0 + TYPICAL_CORNER_HZ / np.maximum(hz, 0.5 * hz[1]))
+    middle = WHITE_CYCLES * signals.grid.rate_hz
+    noise = {
+        channel: np.maximum(density, np.interp(middle, hz, density) * slow)
+        for channel, density in signals.noise.items()
+    }
+    return replace(signals, noise=noise, surface_noise_m=TYPICAL_SURFACE * float(np.abs(u).max()))
 
 
 def _compute_noise_shares(

@@ -37,6 +37,8 @@ from twin.model.model import Model, SensorModel
 CONTACT_NOISE_FACTOR = 8.0  # times the rms noise of a load cell: above it there is contact
 MIN_CONTACT_SHARE = 0.02  # of the rms inertia force: below it a load cell shows no contact
 CONTACT_MARGIN_S = 0.012  # around contact and release, where the low pass smears the force step
+# The same after an anti-alias filter: periods of its corner until its response to a step has died.
+FILTER_SETTLING_CYCLES = 3.0
 BLOCK_S = 1.0  # block length where there are no forcing cycles
 FORCE_ROWS = ("damper", "right", "left")
 TARED_CHANNELS = ("acc", "right", "left")
@@ -144,7 +146,8 @@ class LogResiduals:
         m = self.motion()
         used = np.zeros((len(self.rows), m.u.size), dtype=bool)
         used[0] = m.moving & np.isfinite(self.measured_forces(m, m.mass_kg)[0])
-        margin = max(round(CONTACT_MARGIN_S * m.rate_hz), 1)
+        margin_s = max(CONTACT_MARGIN_S, FILTER_SETTLING_CYCLES / self.signals.filter_hz)
+        margin = max(round(margin_s * m.rate_hz), 1)
         window = np.ones(2 * margin + 1)
         if m.has_load_cells and m.damper is None:
             for row in range(2):

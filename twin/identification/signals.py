@@ -3,6 +3,7 @@
 Gain, lag and offset of a sensor are simple operations on its spectrum, so a fit can vary them.
 """
 
+import math
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,7 +14,11 @@ from table_io.block import Block, Bool2D, Float1D, Int1D, Label, join_blocks
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.errors import InputError
 from twin.identification.motion import ConsistencyResidual, MeasuredMotion, MotionNoise
-from twin.identification.noise import compare_with_white, estimate_noise_density
+from twin.identification.noise import (
+    compare_with_white,
+    estimate_noise_density,
+    find_filter_corner,
+)
 from twin.identification.spectra import (
     FrequencyGrid,
     Spectrum,
@@ -59,6 +64,8 @@ class LogSignals:
     label: Int1D
     cycle: Int1D
     good: Bool2D
+    filter_hz: float = math.inf  # corner of the slowest anti-alias filter
+    surface_noise_m: float = 0.0  # rms error of each laser in motion, besides its noise
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -223,7 +230,7 @@ class _SensorFusion:
             consistency = tuple(pair[2] for pair in pairs if pair[2] is not None)
             return (
                 pairs[0][0] - pairs[1][0],
-                self._displacement_noise(noise_density),
+                self._displacement_noise(noise_density, laser_count=2),
                 self._velocity_noise(noise_density),
                 consistency,
             )
@@ -240,7 +247,7 @@ class _SensorFusion:
         )
         return (
             spectrum,
-            self._displacement_noise(noise_density),
+            self._displacement_noise(noise_density, laser_count=1),
             self._velocity_noise(noise_density),
             (residual,) if residual else (),
         )
@@ -284,8 +291,10 @@ class _SensorFusion:
                 residuals.append(ConsistencyResidual(side, difference / noise))
         return tuple(residuals)
 
-    def _displacement_noise(self, noise_density: Float1D) -> float:
-        return self.grid.white_noise_rms(noise_density * self.low_pass)
+    def _displacement_noise(self, noise_density: Float1D, laser_count: int) -> float:
+        """Return the rms noise of u; the surface noise is too slow for the low pass."""
+        surface = math.sqrt(laser_count) * self.signals.surface_noise_m
+        return math.hypot(self.grid.white_noise_rms(noise_density * self.low_pass), surface)
 
     def _velocity_noise(self, noise_density: Float1D) -> float:
         return self.grid.white_noise_rms(self.omega * noise_density * self.low_pass)
@@ -358,6 +367,7 @@ def build_signals(
         block.step[:: grid.decimation], block.label[:: grid.decimation],
         block.cycle[:: grid.decimation],
         usable[:: grid.decimation],
+        min(find_filter_corner(values, at_rest) for values in columns.values()) * block.rate_hz,
     )  # fmt: skip
 
 
