@@ -152,7 +152,8 @@ def add_nuisances(prepared: PreparedProblem) -> PreparedProblem:
     problem, mapper, first = prepared.problem, prepared.problem.mapper, prepared.parameters
     moving = sum(int(residuals.motion().moving.sum()) for residuals in problem.log_residuals)
     thinning = max(math.ceil(moving / MAX_NUISANCE_SAMPLES), problem.log_residuals[0].thinning)
-    # Only the ratio of the weights counts: the best log has the noise that its priors stand against.
+    # Only the ratio of the weights counts: the best log has the noise that its priors stand
+    # against.
     least = min(residuals.weight for residuals in problem.log_residuals)
     log_residuals = tuple(
         linearize_nuisances(
@@ -196,9 +197,9 @@ def _start_nuisances(
 
 def explain_with_nuisances(prepared: PreparedProblem) -> PreparedProblem:
     """Return the problem with nuisances if they, but not ideal sensors, explain the logs."""
-    is_weighted = max(residuals.weight for residuals in prepared.problem.log_residuals) > 1.0
-    # a model that misses by many times the noise is not explained by errors of a laboratory
-    if is_weighted or prepared.first_fit.cost <= MAX_EXPLAINED_COST:
+    # where model error limits the fit, the residual is divided by it: this is over the noise
+    least = min(residuals.weight for residuals in prepared.problem.log_residuals)
+    if least**2 * prepared.first_fit.cost <= MAX_EXPLAINED_COST:
         return prepared
     imperfect = add_nuisances(prepared)
     return imperfect if imperfect.first_fit.cost <= MAX_EXPLAINED_COST else prepared

@@ -208,8 +208,9 @@ class _LevenbergMarquardt:
             )
             # a rest row has a single entry: its variance is taken from the noise
             rest_slopes = jacobian[:, entries][:, at_rest] / residuals.weight
+            moving_slopes = [row[entries][~at_rest] ** 2 for row in jacobian]
             information.append(
-                [np.bincount(blocks[~at_rest], row[entries][~at_rest] ** 2) for row in jacobian]
+                [np.bincount(blocks[~at_rest], row).astype(np.float64) for row in moving_slopes]
             )
             scatter += block_gradients @ block_gradients.T
             rest_scatter += rest_slopes @ rest_slopes.T
