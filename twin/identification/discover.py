@@ -321,13 +321,13 @@ def _select_and_judge(
     problem = prepared.problem
     selection = stepwise_selection(problem, prepared.parameters, report)
     steps = [log.steps for log in logs]
-    noise_floor = min(residuals.weight for residuals in problem.log_residuals) ** -2
     # a residual below the noise means that the noise was overestimated
     floor = min(
-        noise_floor * estimate_repeatability_floor(problem.log_residuals, selection.best.held_out),
+        problem.noise
+        * estimate_repeatability_floor(problem.log_residuals, selection.best.held_out),
         selection.best.cost,
     )
-    verdict = judge_selection(problem, selection, floor, noise_floor)
+    verdict = judge_selection(problem, selection, floor)
     # implausible base parameters are reported only if they remain so with the effects added
     pulls = find_pulling_bumpers(problem.log_residuals, verdict.best.held_out)
     notes = (*prepared.notes, *find_implausible_parameters(model, verdict.best.fit), *pulls)

@@ -46,7 +46,7 @@ PULL_ROWS = ("right pull", "left pull")
 # of the largest contact force: undershoot of the low pass after a release
 MAX_UNDERSHOOT_SHARE = 0.005
 MAX_CACHED_MOTIONS = 3  # for assumed sensor models other than the nominal one
-MAX_SAMPLES = 500_000  # moving samples of all logs together; limits memory
+MAX_SAMPLES = 200_000  # moving samples of all logs together; limits memory
 
 
 @dataclass(frozen=True, slots=True)

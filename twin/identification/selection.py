@@ -29,6 +29,7 @@ MAX_EFFECTS = 3
 MAX_REFITS, MAX_GENERIC_REFITS = 5, 2  # candidates refitted in a round
 MIN_REFITS, MAX_COST_RATIO = 2, 1.5  # beyond the first two, skip costs above this ratio to the best
 MIN_PROMISED_GAIN = 0.003  # of the residual squares: candidates that promise less are not refitted
+MIN_VISIBLE_EXCESS = 0.05  # of the floor: excess below which there is no gap
 MIN_GAP_SHARE = 0.02  # of the initial gap that a second or third effect must close
 MIN_GAIN_SIGMA = 4.0  # standard errors by which a gain must exceed zero
 MIN_GAIN_SHARE = 0.03  # of the residual squares, overall or in one row, that an effect must remove
@@ -108,6 +109,15 @@ class SelectionProblem:
             if effect.effect is not None and effect.effect.id in self.amplitude_limits
         )
 
+    @property
+    def noise(self) -> float:
+        """Mean square of sensor noise alone: below it no effect is named."""
+        return min(residuals.weight for residuals in self.log_residuals) ** -2
+
+    def is_noise(self, null: FittedSet, best: FittedSet) -> bool:
+        """Return True if the base alone leaves less than noise, and the best set hardly less."""
+        return null.cost < self.noise and null.cost < (1 + 2 * MIN_VISIBLE_EXCESS) * best.cost
+
     @cached_property
     def folds(self) -> tuple[Int1D, ...]:
         """Cross-validation fold of each entry, (entry,) per log."""
@@ -177,6 +187,8 @@ def stepwise_selection(
             previous, state = state.best, _forward_step(problem, state, report)
             if state.best is previous:  # its exchanges were tried when it was accepted
                 break
+            if problem.is_noise(state.null, state.best):  # a second effect would fit noise, too
+                return replace(state, best=state.null)
             state = _exchange_step(problem, state, report)
             if count_sensor_errors(state.best) > problem.max_sensor_errors:
                 return state

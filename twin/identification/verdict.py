@@ -19,7 +19,12 @@ from twin.identification.parameters import (
     ParameterKey,
     TareKey,
 )
-from twin.identification.selection import FittedSet, SelectionProblem, SelectionResult
+from twin.identification.selection import (
+    MIN_VISIBLE_EXCESS,
+    FittedSet,
+    SelectionProblem,
+    SelectionResult,
+)
 
 # standard errors by which a rival set must be worse to be excluded
 MIN_SEPARATION_SIGMA = 3.5
@@ -30,7 +35,6 @@ MAX_REMAINDER_SHARE = 0.06  # of the gap's excess: a larger remainder is reporte
 MIN_GENERIC_GAIN_SHARE = 0.012
 # of the gap's excess: the same where it replaces one of several effects
 MIN_REPLACEMENT_GAIN_SHARE = 0.001
-MIN_VISIBLE_EXCESS = 0.05  # of the floor: excess below which there is no gap
 NEVER_AT_BOUND = (STIFFNESS, DAMPING, BUMPER_STIFFNESS)  # positive in a real specimen
 MIN_NAMED_GAP_SHARE = 0.5  # of the gap's excess that the named effects must close
 
@@ -53,18 +57,17 @@ def judge_selection(
     problem: SelectionProblem,
     selection: SelectionResult,
     floor: float,
-    noise: float = 1.0,
 ) -> DiscoveryVerdict:
     """Judge the outcome of a selection; `floor` is a mean square over the noise.
 
-    `noise` is the mean square of sensor noise alone: below it no effect is named. The parameters
-    of the given model do not count: it may be rough, and every one of them is fitted.
+    The parameters of the given model do not count: it may be rough, and every one of them is
+    fitted.
     """
     null, best = selection.null, selection.best
     gap = max(null.cost - floor, 1e-9)
     generic = _find_better_generic(problem, selection, floor)
     is_additional = generic is not None and _needs_named_effects(selection, generic, gap)
-    if null.cost < noise and null.cost < (1 + 2 * MIN_VISIBLE_EXCESS) * best.cost:
+    if problem.is_noise(null, best):
         reason = "the residual of the model is below the noise of the sensors"
         return DiscoveryVerdict("none", null, 0.9, (), None, floor, False, reason)
     if not best.effects:
@@ -80,7 +83,7 @@ def judge_selection(
         fitted for fitted in as_good if _tares_at_bound(fitted) < _tares_at_bound(best)
     ]:
         alternative = min(unstrained, key=lambda fitted: fitted.cost)
-        return judge_selection(problem, replace(selection, best=alternative), floor, noise)
+        return judge_selection(problem, replace(selection, best=alternative), floor)
     alternatives = tuple({frozenset(fitted.names): fitted for fitted in reversed(as_good)}.values())
     has_remainder = remaining > MAX_REMAINDER_SHARE * gap and remaining > MIN_VISIBLE_EXCESS * floor
     confidence = _confidence(selection, rivals, remaining / gap)
@@ -88,9 +91,7 @@ def judge_selection(
         return DiscoveryVerdict(
             "unexplained", best, min(confidence, 0.3), (), generic, floor, True, doubt
         )
-    if alternatives and (
-        core := _judge_common_core(problem, selection, alternatives, floor, noise)
-    ):
+    if alternatives and (core := _judge_common_core(problem, selection, alternatives, floor)):
         return core
     if alternatives:
         names = "; ".join(" + ".join(fitted.names) for fitted in alternatives)
@@ -118,7 +119,6 @@ def _judge_common_core(
     selection: SelectionResult,
     alternatives: Sequence[FittedSet],
     floor: float,
-    noise: float,
 ) -> DiscoveryVerdict | None:
     """Return the verdict on the effects common to all equally good sets, if it is "named"."""
     sets = [set(fitted.names) for fitted in (selection.best, *alternatives)]
@@ -134,7 +134,7 @@ def _judge_common_core(
         if len(fitted.effects) == 1 or common < set(fitted.names)
     ]
     of_core = replace(selection, best=core, generic_sets=tuple(generic_sets))
-    verdict = judge_selection(problem, of_core, floor, noise)
+    verdict = judge_selection(problem, of_core, floor)
     if verdict.outcome != "named":
         return None
     alternatives_text = " or ".join(
