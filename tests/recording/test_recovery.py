@@ -18,8 +18,16 @@ from table_io.block import Block
 from table_io.records import Comparison, Fault, FrequencyResponse, RunStop, Step, StepAdded
 from tests.exchange.mutants import BOMBS, bomb, spans, write_messages
 from tests.input_errors import raises_input_error
-from tests.recording.test_mcap_log import START, payloads, run, write
-from twin.recording.mcap_records import CHUNK, MAGIC, MAX_RECORD_BYTES, RECORD_HEADER
+from tests.recording.example_run import RATE_HZ, START, payloads, run, write
+from twin.recording.mcap_log import LogWriter
+from twin.recording.mcap_records import (
+    CHUNK,
+    MAGIC,
+    MAX_RECORD_BYTES,
+    MESSAGE_INDEX,
+    RECORD_HEADER,
+    find_record_candidates,
+)
 from twin.recording.merge import merge
 from twin.recording.reader import read_recording
 from twin.recording.recovery import recover_log, work_limit
@@ -105,6 +113,72 @@ def test_an_accident_costs_one_chunk(accident: Accident, content: bytes, tmp_pat
         assert recording.start == START  # of the first chunk too: it stands there twice
         lost = payloads(run())[number * CHUNK_MESSAGES : (number + 1) * CHUNK_MESSAGES]
         assert not set(payloads(recording.items)) & (set(lost) - {payloads([START])[0]})
+
+
+@pytest.mark.parametrize("further_records", [0, 1])
+def test_no_coincidence_of_lengths_costs_the_next_chunk(
+    further_records: int, tmp_path: Path
+) -> None:
+    """What is lost of a chunk is as long as what follows: its declared end is a record's again."""
+    items, path = run(), tmp_path / "bad.mcap"
+    long_chunk = 9 * CHUNK_MESSAGES
+    writer = LogWriter(path, RATE_HZ)
+    writer.write_run_description(START)
+    for number, item in enumerate(items, 1):
+        writer.write(topic_for(item), encode_item(item, START.run), item.index)
+        if number in (long_chunk, long_chunk + CHUNK_MESSAGES):
+            writer.flush()
+    writer.close()
+    whole = path.read_bytes()
+    records = spans(whole)
+    (first, end), following = chunks(whole)[:2]
+    boundary = records[records.index((CHUNK, *following)) + further_records][2]
+    cut = boundary - end
+    assert 0 < cut < end - first - 100
+    bad = whole[: first + 70] + whole[first + 70 + cut :]
+    assert recover_payloads(path, bad) == payloads(items)[long_chunk:]
+    (damage,) = recover_log(path).damage
+    assert (damage.offset, damage.size) == (first, following[0] - cut - first)
+
+
+def test_messages_in_a_damaged_chunk_are_not_those_of_the_file(tmp_path: Path) -> None:
+    """Without compression they look like records; the chunk after them is found all the same."""
+    stream = BytesIO()
+    writer = Writer(stream, compression=CompressionType.NONE)
+    writer.start()
+    channel = writer.register_channel("/run/start", "protobuf", 0)
+    for sequence in range(6):
+        writer.add_message(channel, 0, encode_item(START, START.run), 0, sequence)
+        if sequence in (2, 4):
+            writer.flush()
+    writer.finish()
+    whole = stream.getvalue()
+    first, end = chunks(whole)[0]
+    path = tmp_path / "bad.mcap"
+    path.write_bytes(whole[: end - 1] + bytes([whole[end - 1] ^ 1]) + whole[end:])
+    assert [message.sequence for message in recover_log(path).messages] == [3, 4, 5]
+    assert [(damage.offset, damage.size) for damage in recover_log(path).damage] == [
+        (first, end - first)
+    ]
+
+
+def test_many_damaged_places_cost_no_more_than_the_file_is_long(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is searched for the next record grows with its distance, not with the rest of it."""
+    searched: list[int] = []
+
+    def count(window: bytes) -> list[int]:
+        searched.append(len(window))
+        return find_record_candidates(window)
+
+    monkeypatch.setattr("twin.recording.recovery.find_record_candidates", count)
+    index = RECORD_HEADER.pack(MESSAGE_INDEX, 6) + struct.pack("<HI", 1, 0)
+    damaged = 3000
+    path = tmp_path / "bad.mcap"
+    path.write_bytes(MAGIC + RECORD_HEADER.pack(1, 8) + bytes(8) + (bytes(9) + 2 * index) * damaged)
+    assert len(recover_log(path).damage) == damaged
+    assert sum(searched) < 2048 * damaged
 
 
 def test_the_damage_is_told_by_its_place(content: bytes, tmp_path: Path) -> None:

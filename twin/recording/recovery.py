@@ -1,7 +1,8 @@
 """Recovery of all readable messages from a damaged MCAP file, with bounded memory.
 
-Invalid records are skipped. Reading resumes after a damaged chunk at the end that it declares, and
-after other damage at the next valid record. Work and memory are limited from the start.
+Invalid records are skipped. Reading resumes after a damaged chunk at the next valid chunk, at the
+latest at the end that it declares, and after other damage at the next valid record. Work and memory
+are limited from the start.
 """
 
 import os
@@ -40,7 +41,9 @@ from twin.recording.mcap_records import (
 )
 
 UNFINISHED_REASON = "the file was never finished: its recorder was killed, or still writes"
-SEARCH_WINDOW_BYTES = 2**20  # searched at once for the next record
+# Searched at once for the next record: little at first, since it may be near after each of many
+# damaged places, then twice as much each time.
+MIN_SEARCH_WINDOW_BYTES, MAX_SEARCH_WINDOW_BYTES = 2**10, 2**20
 UNNAMED_TOPIC_PREFIX = "?"  # placeholder topic of messages whose channel record is lost
 # Limits for untrusted files (decompression bombs). Work is in bytes read again or decompressed and
 # proportional to the file size, so that long recordings are accepted: a valid recording of constant
@@ -281,23 +284,32 @@ class _Scanner:
         return decompress_chunk(content)
 
     def _find_next_record(self, offset: int) -> int:
-        """Return the offset of the next valid record after `offset`, or the size of the file."""
+        """Return the offset at which reading resumes after damage at `offset`, or the file size.
+
+        The messages in a damaged chunk may look like records of the file, but chunks never nest: a
+        valid one within the declared range follows the damaged one, of which bytes were lost.
+        """
         try:
             opcode, length = self._read_header(offset)
             end = offset + RECORD_HEADER.size + length
             if opcode == CHUNK and (end == self.size or self._read_header(end)[0]):
-                return end
+                return self._search_record(offset + 1, end, frozenset((CHUNK,)))
         except InvalidRecordError:
             pass
-        offset += 1
-        while offset < self.size and self.remaining_work >= 0:
-            for candidate in find_record_candidates(
-                self._read_at(offset, SEARCH_WINDOW_BYTES + RECORD_HEADER.size)
-            ):
-                if self._is_valid_record(offset + candidate):
+        return self._search_record(offset + 1, self.size, frozenset(MIN_RECORD_LENGTHS))
+
+    def _search_record(self, offset: int, end: int, opcodes: frozenset[int]) -> int:
+        """Return the offset of the first valid record in `offset` to `end`, or `end`."""
+        window_bytes = MIN_SEARCH_WINDOW_BYTES
+        while offset < end and self.remaining_work >= 0:
+            count = min(window_bytes, end - offset)
+            window = self._read_at(offset, count + RECORD_HEADER.size - 1)
+            for candidate in find_record_candidates(window):
+                if window[candidate] in opcodes and self._is_valid_record(offset + candidate):
                     return offset + candidate
-            offset += SEARCH_WINDOW_BYTES + 1
-        return self.size
+            offset += count
+            window_bytes = min(2 * window_bytes, MAX_SEARCH_WINDOW_BYTES)
+        return end
 
     def _is_valid_record(self, offset: int) -> bool:
         """Check for a valid record at `offset`, followed by another one or the end of the file."""
