@@ -1,6 +1,7 @@
 """From the exported file to the report: the programs as a person runs them, through openDAQ."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -10,8 +11,10 @@ import pytest
 
 from table_io.config.base import find_config
 from table_io.errors import InputError
+from table_io.records import Event
 from tests.table_io.backends.separate_processes import own_network
 from twin.cli.table import ExternalController, serve_table
+from twin.recording.reader import read_recording
 
 pytest.importorskip("opendaq")
 PROGRAM = Path(sys.executable).parent / "shaketwin"
@@ -58,8 +61,11 @@ def test_a_drive_is_exported_played_followed_recorded_and_replayed(tmp_path: Pat
             finally:
                 device.kill()
     assert ran.returncode == 0, ran.stdout + ran.stderr
-    assert "play the drive file on the controller NOW" in ran.stdout
-    assert "-60" in ran.stdout.split("runs ")[-1].split(" ppm")[0]
+    events = read_recording(tmp_path / "run" / "run.mcap").records(Event)
+    assert [event.index for event in events if event.kind == "follow"] == [0]  # asked to play it
+    alignment = [event.text for event in events if event.kind == "aligned"][-1]  # of the whole run
+    clock_ppm = re.findall(r"(\S+) ppm", alignment)
+    assert [float(ppm) for ppm in clock_ppm] == [pytest.approx(-60.0, abs=0.5)]
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["verdict"] == "complete"
     assert summary["gaps"] == 0
