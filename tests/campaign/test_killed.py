@@ -56,10 +56,6 @@ TESTS = {
     "g4": {"gap": "4.0", "start": 2.6, "stop": 4.4, "step": 0.6, "cycles": 6,
            "directions": ["forward", "backward"]},
 }  # fmt: skip
-COARSE = """
-from twin.reports import plot_style
-plot_style.RC_PARAMS.update({"savefig.dpi": 30, "figure.constrained_layout.use": False})
-"""  # in every process of it: pictures are not what is tried here
 RELATIVE_TOLERANCE = (
     0.025  # of a curve: the level is only held within 2 %, and noise goes on elsewhere
 )
@@ -87,7 +83,7 @@ class Both:
 
 
 @pytest.fixture(scope="module")
-def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
+def both(tmp_path_factory: pytest.TempPathFactory, draft_path: str) -> Both:
     folder = tmp_path_factory.mktemp("campaigns")
     for name, values in TESTS.items():
         (folder / f"{name}.toml").write_text(TEST.format(name=name, **values))
@@ -105,8 +101,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
         )
     share = random.uniform(0.2, 0.95)
     size = (whole / "02-g4" / "run.mcap").stat().st_size
-    (folder / "sitecustomize.py").write_text(COARSE)
-    environment = {**os.environ, "PYTHONPATH": str(folder)}
+    environment = {**os.environ, "PYTHONPATH": draft_path}  # pictures are not what is tried here
     command = [SHAKETWIN, "campaign", str(folder / "c.toml"), "--speed", "max"]
     command += ["--out", str(killed)]
     _kill(command, environment, killed / "02-g4" / "run.mcap", share * size)

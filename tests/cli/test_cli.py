@@ -33,6 +33,8 @@ cycles = 4
 measured_cycles = 2
 """
 
+pytestmark = pytest.mark.usefixtures("drafts")
+
 
 def shaketwin(*words: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
@@ -221,7 +223,6 @@ def test_only_what_records_says_that_the_recording_is_kept(
     assert ("the recording is kept" in message) == kept
 
 
-@pytest.mark.usefixtures("draft")
 def test_replay_with_another_model_differs_and_says_by_how_much(
     run_folder: Path, tmp_path: Path
 ) -> None:
@@ -242,7 +243,6 @@ def test_a_replay_speed_that_is_none_is_refused(speed: str, run_folder: Path) ->
     require_refusal(call_main("replay", run_folder, "--speed", speed), "--speed", "allowed: max")
 
 
-@pytest.mark.usefixtures("draft")
 def test_simulate_measures_nothing(profile: Path, tmp_path: Path) -> None:
     result = call_main("simulate", profile, "--out", tmp_path / "out")
     assert result.returncode == 0, result.stderr

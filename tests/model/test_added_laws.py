@@ -192,6 +192,7 @@ def test_a_law_that_cannot_work_is_told_why(effect, problem):
     assert problem in find_law_problem(effect)
 
 
+@pytest.mark.usefixtures("drafts")
 def test_commands_take_it(package, tmp_path):
     """`simulate` with both kinds of law, in a process that finds the installed package."""
     snm_file = (PROFILES_DIR / "models" / "snm.toml").read_text()

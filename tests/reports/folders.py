@@ -1,7 +1,8 @@
 """Folders of runs for the report, as the recorder and the summary leave them."""
 
 import json
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,25 @@ from twin.transport.codec import Item
 Maker = Callable[..., Path]
 COARSE = {"savefig.dpi": 30, "figure.constrained_layout.use": False, "axes.grid": False}
 BARE = dict.fromkeys(("xtick.bottom", "ytick.left", "xtick.labelbottom", "ytick.labelleft"), False)
+# Makes pictures coarse in a process that draws; one that does not draw imports nothing for it.
+DRAFT_SITE = f"""
+import importlib.util, sys
+
+class DraftFinder:
+    def find_spec(self, name, path=None, target=None):
+        if name != "twin.reports.plot_style":
+            return None
+        sys.meta_path.remove(self)
+        spec = importlib.util.find_spec(name)
+        execute = spec.loader.exec_module
+        def execute_as_draft(module):
+            execute(module)
+            module.RC_PARAMS.update({COARSE | BARE})
+        spec.loader.exec_module = execute_as_draft
+        return spec
+
+sys.meta_path.insert(0, DraftFinder())
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +75,23 @@ def drawn_report(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
     run = build_report_data(read_recording(folder / "run.mcap"), summary())
     pictures = figures.draw_run_figures(run, folder / "figures")
     return Drawn(folder, pictures, render_report(run, pictures))
+
+
+@pytest.fixture(scope="session")
+def draft_path(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """PYTHONPATH with which a process draws as `draft` does."""
+    folder = tmp_path_factory.mktemp("draft")
+    (folder / "sitecustomize.py").write_text(DRAFT_SITE)
+    return os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH"))))
+
+
+@pytest.fixture(scope="module")
+def drafts(draft_path: str) -> Iterator[None]:
+    """As `draft`, in all of a module and in the processes that it starts."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plot_style, "RC_PARAMS", {**plot_style.RC_PARAMS, **COARSE, **BARE})
+        patch.setenv("PYTHONPATH", draft_path)
+        yield
 
 
 @pytest.fixture

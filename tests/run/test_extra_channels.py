@@ -46,6 +46,8 @@ rate_hz = 1000.0
 sensor = "warn"
 """
 
+pytestmark = pytest.mark.usefixtures("drafts")
+
 
 def shaketwin(*arguments: str | Path, code: int = 0) -> str:
     """The output of the command, which ends with this code."""
@@ -102,7 +104,7 @@ def test_the_summary_compares_what_the_model_predicts(summary: dict[str, Any]) -
         assert comparison[SECOND_ACC][key] == pytest.approx(expected, rel=0.1)
 
 
-def test_a_replay_is_identical_to_the_bit(run: Path, lab: Path, draft: None) -> None:
+def test_a_replay_is_identical_to_the_bit(run: Path, lab: Path) -> None:
     shaketwin("replay", run, "--speed", "max", "--out", lab / "replay")
     replayed = json.loads((lab / "replay" / "summary.json").read_text())
     recorded = json.loads((run / "summary.json").read_text())
@@ -212,7 +214,7 @@ def test_the_monitor_lists_them(run: Path) -> None:
     [("rail", SECOND_ACC, "clipped"), ("nan", TEMPERATURE, "lost")],
 )
 def test_a_fault_of_one_is_in_the_recording_and_its_summary(
-    tmp_path: Path, kind: str, channel: str, gap: str, draft: None
+    tmp_path: Path, kind: str, channel: str, gap: str
 ) -> None:
     fault = f'\n[[simulated.faults]]\nkind = "{kind}"\nat_s = 12.0\nchannel = "{channel}"\n'
     text = LAB_TEXT.replace("\n[[channels]]", f"{fault}\n[[channels]]", 1)

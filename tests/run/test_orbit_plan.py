@@ -13,7 +13,7 @@ from twin.dynamics.period_map import make_period_map
 from twin.model.model import Model
 from twin.run.feedback_gains import FeedbackTiming, OpenLoop, closed_loop_multipliers
 from twin.run.orbit_plan import find_unstable_stretch, make_orbit_plan
-from twin.run.run_config import read_run_config
+from twin.run.run_config import RunConfig, read_run_config
 
 RANGE_HZ = (2.75, 4.1)
 FEEDBACK_TIMING = FeedbackTiming(latency_s=0.046, jitter_s=0.005, block_s=0.01)
@@ -23,6 +23,12 @@ UNSTABLE_POINTS = 24
 @pytest.fixture(scope="module")
 def plan():
     return make_orbit_plan(Model(snm()), RANGE_HZ, AG, UNSTABLE_POINTS, FEEDBACK_TIMING)
+
+
+@pytest.fixture(scope="module")
+def planned_config() -> RunConfig:
+    """The shipped profile of the unstable branch, for whose rig a plan is made as it is read."""
+    return read_run_config(PROFILES_DIR / "tests" / "g4_unstable.toml")
 
 
 @pytest.fixture(scope="module")
@@ -101,8 +107,8 @@ def test_too_large_a_latency_is_refused_with_the_largest_allowed():
     assert 100 < allowed_ms < 160
 
 
-def test_a_profile_without_a_plan_gets_one_for_its_rig():
-    config = read_run_config(PROFILES_DIR / "tests" / "g4_unstable.toml")
+def test_a_profile_without_a_plan_gets_one_for_its_rig(planned_config):
+    config = planned_config
     continuation = parse_toml(config.profile_toml, Profile, "").continuation
     assert continuation is not None
     plan = continuation.orbit_plan
@@ -112,8 +118,8 @@ def test_a_profile_without_a_plan_gets_one_for_its_rig():
     assert max(point.multiplier_size for point in plan.points) > 6.5
 
 
-def test_limits_and_duration_count_the_feedback_and_its_updates():
-    config = read_run_config(PROFILES_DIR / "tests" / "g4_unstable.toml")
+def test_limits_and_duration_count_the_feedback_and_its_updates(planned_config):
+    config = planned_config
     continuation = config.profile.continuation
     assert continuation is not None
     for demand, orbit in zip(config.margins[-len(config.steps) :], config.steps, strict=True):
@@ -132,7 +138,13 @@ def test_a_table_under_external_control_is_refused():
         read_run_config(PROFILES_DIR / "tests" / "g4_unstable.toml", "follow_simulated")
 
 
-def test_a_profile_that_is_no_table_cannot_take_a_plan(tmp_path):
+def test_a_profile_that_is_no_table_cannot_take_a_plan(tmp_path, monkeypatch):
+    """Refused at once: to make a plan takes seconds."""
+
+    def make_no_plan(*_) -> None:
+        raise AssertionError("a plan was made")
+
+    monkeypatch.setattr("twin.run.orbit_plan.make_orbit_plan", make_no_plan)
     path = tmp_path / "inline.toml"
     path.write_text(
         'title = "Inline"\n'

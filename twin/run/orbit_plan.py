@@ -288,6 +288,7 @@ def attach_orbit_plan(text: str, profile: Profile, rig: RigConfig, model: Model,
     config = profile.continuation
     assert config is not None
     timing = find_timing(profile, rig)
+    _attach_file(text, "", where)  # refuses before the plan is computed
     plan = make_orbit_plan(
         model,
         (config.start_hz, config.stop_hz),
@@ -295,10 +296,15 @@ def attach_orbit_plan(text: str, profile: Profile, rig: RigConfig, model: Model,
         config.points,
         timing,
     )
+    return _attach_file(text, plan.to_json(), where)
+
+
+def _attach_file(text: str, content: str, where: str) -> str:
+    """Return the text of a profile with the content of its orbit plan; InputError if impossible."""
     named = re.sub(
         r"^[ \t]*\[excitation\].*$", rf'\g<0>\nfile = "{PLAN_FILE}"', text, count=1, flags=re.M
     )
-    attached = f"{named}\n[excitation.files]\n\"{PLAN_FILE}\" = '''\n{plan.to_json()}'''\n"
+    attached = f"{named}\n[excitation.files]\n\"{PLAN_FILE}\" = '''\n{content}'''\n"
     try:
         if tomllib.loads(attached)["excitation"]["file"] == PLAN_FILE:
             return attached
