@@ -11,6 +11,7 @@ import pytest
 from matplotlib.image import imread
 
 from table_io.config.base import PROFILES_DIR, parse_toml
+from tests.reports.folders import COARSE
 from twin.cli.discover import write_results
 from twin.identification.discover import Discovery, PreparedLog, discover_effects
 from twin.identification.parameters import GapKey
@@ -100,7 +101,7 @@ def write_output(
 
 @pytest.fixture(scope="module")
 def every(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, DiscoveryOutput]]:
-    """A discovery of each verdict, all of one recording, with coarse pictures.
+    """A discovery of each verdict, all of one recording; one page laid out as a user gets it.
 
     None: with the model that the one before found. Unexplained: the truth is left out of the
     library. Ambiguous: another set is said to be as good, and the recording has no steps.
@@ -118,6 +119,8 @@ def every(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Discov
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(RC_PARAMS, "savefig.dpi", 40)
         out = {"named": write_output(root / "named", logs, known)}
+        for name, value in COARSE.items():
+            patch.setitem(RC_PARAMS, name, value)
         out["ambiguous"] = write_output(root / "ambiguous", stepless, unsure)
         whole = read_model_template(str(root / "named" / "model.toml"))[0]
         out["none"] = write_output(root / "none", logs, discover_effects(logs, whole, without=AWAY))
