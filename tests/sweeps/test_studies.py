@@ -276,7 +276,10 @@ def test_a_batch_that_cannot_be_is_refused_before_it_begins(profile: Path) -> No
     require_refused(profile, [undamped], ["inf"], {"where": case, "key": "damping", "value": 0})
 
 
-def test_ctrl_c_keeps_the_sweeps_that_are_done(tmp_path: Path) -> None:
+def test_ctrl_c_keeps_the_sweeps_that_are_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, draft_path: str
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", draft_path)
     profile = tmp_path / "long.toml"
     profile.write_text(TEST.replace("cycles = 5", "cycles = 60", 1))
     hard = model(tmp_path, "hard", HARDENING)
