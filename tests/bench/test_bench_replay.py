@@ -27,7 +27,7 @@ MOST_READINGS_OF_A_CHANNEL = 1.0
 @pytest.fixture(scope="module")
 def bundle(request: pytest.FixtureRequest, bundle: RunConfig) -> RunConfig:
     """A whole test to measure with; where nothing is measured, the short one of other tests."""
-    if request.config.getoption("benchmark_disable"):
+    if not request.config.getoption("benchmark_enable"):
         return bundle
     return read_run_config(find_config("quickstart", "tests"))
 
