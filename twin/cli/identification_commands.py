@@ -89,6 +89,13 @@ def discovery_command(
         int | None, typer.Option("--workers", help="Processes; default: all cores.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the study in --out.")] = False,
+    laboratory: Annotated[
+        str,
+        typer.Option(
+            "--laboratory",
+            help="Imperfections of instruments and set-up: none, typical, or one bad at a time.",
+        ),
+    ] = "none",
     controls: Annotated[
         bool,
         typer.Option(
@@ -100,4 +107,4 @@ def discovery_command(
     """Score discovery on blind cases with sealed ground truth."""
     from twin.validation.study.command import run_discovery_study as command
 
-    raise typer.Exit(command(out, seeds, cells or [], workers, resume, controls))
+    raise typer.Exit(command(out, seeds, cells or [], workers, resume, controls, laboratory))

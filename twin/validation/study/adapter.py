@@ -5,10 +5,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from twin.identification.cross_checks import fitted_gap
 from twin.identification.discover import PreparedLog, discover_effects, fit_known_effects
+from twin.identification.identify import identify_parameters
+from twin.identification.parameters import GapKey
 from twin.model.model import Model
-from twin.reports.discovery.loading import load_logs
-from twin.reports.discovery.serialize import verdict_to_json
+from twin.reports.discovery.loading import load_logs, load_recordings
+from twin.reports.discovery.serialize import interval_to_json, parameter_to_json, verdict_to_json
 from twin.run.run_config import read_model_template
 
 
@@ -16,6 +19,27 @@ def run_discovery(case_dir: Path) -> dict[str, Any]:
     """Run discovery on the recording of a case; return the verdict as in verdict.json."""
     logs, notes, model = load_case(case_dir)
     return verdict_to_json(discover_effects(logs, model), notes=notes)
+
+
+def run_identification(case_dir: Path) -> dict[str, Any]:
+    """Run identification on the recording of a case; return parameters and gaps with intervals.
+
+    The gap of a side has no interval, as in the output of `identify`.
+    """
+    (loaded,) = load_recordings([case_dir / "log.mcap"])
+    model = read_model_template(str(case_dir / "model.toml"))[0]
+    result = identify_parameters([loaded.log], [loaded.blocks], model)
+    fit, (residuals,) = result.fit, result.problem.log_residuals
+    sides = {side: fitted_gap(residuals, fit, side) for side in ("right", "left")}
+    sd = 2.0 * fit.std_errors.get(GapKey(0), math.inf)
+    return {
+        "verdict": "identified",
+        "parameters": {free.name: parameter_to_json(fit, free) for free in fit.free}
+        | {"gap": interval_to_json(sum(sides.values()), sd, "m")}
+        | {f"gap_{side}": {"value": value, "unit": "m"} for side, value in sides.items()},
+        "rms_over_noise": math.sqrt(fit.cost),
+        "warnings": [*result.warnings],
+    }
 
 
 def fit_true_structure(case_dir: Path, effects: Sequence[str]) -> float | None:

@@ -10,7 +10,7 @@ from typing import Any, TextIO
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from table_io.clock import RealClock
-from table_io.errors import InputError
+from table_io.errors import InputError, suggest
 from twin.reports.finalize import EXIT_INTERRUPTED
 from twin.run.folders import make_output_folder
 from twin.run.terminal import catch_interrupts, console, print_line
@@ -25,7 +25,12 @@ from twin.validation.study.report import (
     verdict_label,
     write_study_pages,
 )
-from twin.validation.study.strata import draw_case, list_case_numbers
+from twin.validation.study.strata import (
+    LABORATORY_LEVELS,
+    LaboratoryLevel,
+    draw_case,
+    list_case_numbers,
+)
 from twin.validation.study.worker_pool import Work, map_in_processes
 
 Json = dict[str, Any]
@@ -40,6 +45,7 @@ def run_discovery_study(
     workers: int | None,
     resume: bool,
     controls: bool = False,
+    laboratory: str = "none",
 ) -> int:
     """Evaluate the requested cases that have no result, then the controls; return the exit code."""
     if workers is not None and workers < 1:
@@ -50,7 +56,7 @@ def run_discovery_study(
             allowed="1 or more",
             remedy="omit --workers to use all cores",
         )
-    numbers = _parse_cases(seeds, patterns)
+    numbers = _parse_cases(seeds, patterns, _parse_laboratory(laboratory))
     folder = _open_folder(out, resume)
     if describe_missing():
         print_line(describe_missing())
@@ -129,14 +135,27 @@ def _format_row(row: Json) -> str:
     return f"{row['cell']}: {verdict_label(row)}{confidence}: {mark}{seconds}"
 
 
-def _parse_cases(seeds: int, patterns: Sequence[str]) -> list[int]:
+def _parse_laboratory(text: str) -> LaboratoryLevel:
+    for level in LABORATORY_LEVELS:
+        if text == level:
+            return level
+    raise InputError(
+        "unknown laboratory",
+        key="--laboratory",
+        value=text,
+        allowed=", ".join(LABORATORY_LEVELS),
+        remedy=suggest(text, LABORATORY_LEVELS),
+    )
+
+
+def _parse_cases(seeds: int, patterns: Sequence[str], laboratory: LaboratoryLevel) -> list[int]:
     """Return case numbers from cell patterns and numbers, separated by commas."""
     words = [word for pattern in patterns for word in pattern.split(",") if word]
     own = [int(word) for word in words if word.isdecimal()]
     for number in own:
         draw_case(number)
     cells = [word for word in words if not word.isdecimal()]
-    return own + (list_case_numbers(seeds, cells) if cells or not own else [])
+    return own + (list_case_numbers(seeds, cells, laboratory) if cells or not own else [])
 
 
 def _open_folder(out: Path | None, resume: bool) -> Path:

@@ -8,9 +8,14 @@ from typing import Any
 
 from table_io.clock import cpu_seconds
 from twin.reports.summary import dump_strict_json
-from twin.validation.study.adapter import fit_true_structure, run_discovery
+from twin.validation.study.adapter import (
+    fit_true_structure,
+    run_discovery,
+    run_identification,
+)
 from twin.validation.study.baselines import find_baselines
 from twin.validation.study.generation import CasePaths, generate_case
+from twin.validation.study.laboratory_scores import score_identification, score_laboratory
 from twin.validation.study.scoring import score_verdict
 from twin.validation.study.strata import draw_case
 
@@ -39,9 +44,18 @@ def evaluate_case(root: Path, number: int, method: Method = run_discovery) -> Js
             "label": case.label,
             "made_in": made_s - start_s,
         }
-    verdict, failure = _run_method(method, paths.case_dir)
+    is_identified = about["kind"] == "identify"
+    verdict, failure = _run_method(
+        run_identification if is_identified else method, paths.case_dir
+    )
     evaluated_s = cpu_seconds()
     paths.verdict.write_text(dump_strict_json(verdict), encoding="utf-8")
+    timing = {
+        "label": case.label, "seconds": evaluated_s - made_s, "made_in": made_s - start_s,
+        **({"failed": failure} if failure else {}),
+    }  # fmt: skip
+    if "laboratory" in about:
+        return _score_in_laboratory(verdict, about) | timing
     truth = [effect["name"] for effect in about["effects"]]
     oracle = None if about["kind"] == "unknown" else _fit_oracle(paths, truth)
     row = _score_verdict(verdict, about, oracle)
@@ -53,12 +67,21 @@ def evaluate_case(root: Path, number: int, method: Method = run_discovery) -> Js
         | ({"failed": baseline_failure} if baseline_failure else {})
         for name, (baseline_verdict, baseline_failure) in runs.items()
     }
-    row |= {"label": case.label, "seconds": evaluated_s - made_s, "made_in": made_s - start_s}
-    return (
-        row
-        | ({"failed": failure} if failure else {})
-        | ({"rivals": baselines} if baselines else {})
-    )
+    return row | timing | ({"rivals": baselines} if baselines else {})
+
+
+def _score_in_laboratory(verdict: Json, about: Json) -> Json:
+    """Return the row of a case in a laboratory; baselines and oracle know no laboratory."""
+    if about["kind"] == "identify":
+        keys = ("number", "cell", "kind", "noise", "size", "reached", "ended", "sized")
+        laboratory = about["laboratory"]
+        return {key: about[key] for key in keys} | {
+            "laboratory": laboratory["level"], "imperfection": laboratory["imperfection"],
+            "truth": [], "named": [], "said": verdict["verdict"], "confidence": None,
+            **score_identification(verdict, about),
+        }  # fmt: skip
+    row = _score_verdict(verdict, about)
+    return row | score_laboratory(row, verdict, about)
 
 
 def _score_verdict(verdict: Json, about: Json, oracle: float | None = None) -> Json:

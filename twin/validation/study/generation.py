@@ -12,18 +12,21 @@ import json
 import math
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from table_io.acquisition.session import run_session
-from table_io.backends import open_backend
+from table_io.acquisition.session import TARE_S, RunDescriber, run_session
+from table_io.backends import Backend, open_backend
+from table_io.block import Block
 from table_io.clock import ManualClock
-from table_io.records import RunStop
+from table_io.config.calibration import compute_tare, volts_to_si
+from table_io.records import Record, RunStop
+from table_io.sim.imperfections import SIDES, Imperfection, resolve_sides
 from twin.recording.mcap_log import write_items
-from twin.run.run_config import from_texts
+from twin.run.run_config import RunConfig, from_texts
 from twin.validation.study.amplitude_search import (
     BaselineResidual,
     apply_sensor_effect,
@@ -31,15 +34,18 @@ from twin.validation.study.amplitude_search import (
     find_share,
     scale_parameters,
 )
+from twin.validation.study.laboratory_truth import list_affected_channels, list_true_errors
 from twin.validation.study.rig_setup import (
     MODEL_TOML,
     NOMINAL_RIG,
     PROFILE,
     PROFILE_TOML,
+    SIGNAL_CHANNELS,
     StudySignals,
     compute_noise_rms,
     format_toml,
     make_rig_toml,
+    simulate_readings,
     simulate_signals,
 )
 from twin.validation.study.strata import Case, PlantedEffect
@@ -93,7 +99,10 @@ def generate_case(case: Case, root: Path) -> CasePaths:
         folder.mkdir(parents=True)
     shares, residual = find_shares(case)
     truth_path = paths.sealed_dir / "truth.toml"
-    text = f"# {case.salt}\n" + format_toml(make_truth(case, case.planted, shares))
+    truth = make_truth(case, case.planted, shares)
+    if case.imperfections:
+        truth["imperfections"] = [*map(_describe_imperfection, case.imperfections)]
+    text = f"# {case.salt}\n" + format_toml(truth)
     truth_path.write_text(text, encoding="utf-8")
     outcome = f"not played: the effect reaches size {residual.size:.3g}"
     if case.cell.accepts(residual.size):
@@ -111,13 +120,54 @@ def generate_case(case: Case, root: Path) -> CasePaths:
         "ended": outcome,
         "sized": outcome == "complete",
         "region": residual.region if case.planted else None,
+        "base": _describe_base(truth["base"], case.imperfections),
         "effects": [
             _describe_effect(planted, share)
             for planted, share in zip(case.planted, shares, strict=True)
         ],
     }
+    if case.imperfections:
+        about["laboratory"] = _describe_laboratory(case, truth_path, _sha256(text))
     paths.about.write_text(json.dumps(about, indent=1), encoding="utf-8")
     return paths
+
+
+def _describe_base(
+    base: dict[str, float], imperfections: Sequence[Imperfection]
+) -> dict[str, float]:
+    """Return the true base parameters for scoring: gaps with the errors of their readings."""
+    readings = resolve_sides(imperfections, "gap_reading")
+    gaps = {
+        f"gap_{side}_m": base[f"gap_{side}_m"] + readings.get(side, {}).get("offset", 0.0)
+        for side in SIDES
+    }
+    return base | gaps | {"stated_gap_m": 0.5 * sum(PROFILE.specimen.gaps_m)}
+
+
+def _describe_imperfection(imperfection: Imperfection) -> dict[str, Any]:
+    """Return an entry of [[imperfections]]; infinite parameters are at their vanishing value."""
+    place = {
+        key: value
+        for key, value in (("channel", imperfection.channel), ("side", imperfection.side))
+        if value is not None
+    }
+    return {
+        "id": imperfection.id, "form": imperfection.form, **place,
+        "parameters": _round_values(imperfection.parameters),
+    }  # fmt: skip
+
+
+def _describe_laboratory(case: Case, truth_path: Path, sha256: str) -> dict[str, Any]:
+    """Return the laboratory of a case for scoring, with the errors that a verdict may name."""
+    rig = make_rig_toml(0.0, case.noise_seed, str(truth_path), sha256)
+    signals, readings = simulate_readings(rig)
+    return {
+        "level": case.cell.laboratory,
+        "imperfection": case.cell.imperfection,
+        "imperfections": [*map(_describe_imperfection, case.imperfections)],
+        "channels": list_affected_channels(case.imperfections, SIGNAL_CHANNELS),
+        "errors": list_true_errors(case.imperfections, signals, readings),
+    }
 
 
 def _describe_effect(planted: PlantedEffect, share: float) -> dict[str, Any]:
@@ -199,12 +249,38 @@ def _record_case(case: Case, paths: CasePaths, truth_path: Path, sha256: str) ->
     clock = ManualClock()
     backend = open_backend(bundle.rig, bundle.profile, clock)
     make_start = bundle.make_start_factory(case.label, "table")
-    start, *rest = run_session(bundle.session_setup, backend, clock, make_start, lambda: None)
+    if case.imperfections:
+        start, *rest = play_unprotected(bundle, backend, make_start)
+    else:
+        start, *rest = run_session(bundle.session_setup, backend, clock, make_start, lambda: None)
     assert not isinstance(start, RunStop)
     write_items(paths.log, [start, *rest], start)  # type: ignore[arg-type]
     stop = rest[-1]
     assert isinstance(stop, RunStop)
     return stop
+
+
+def play_unprotected(
+    bundle: RunConfig, backend: Backend, describe: RunDescriber
+) -> Iterator[Block | Record]:
+    """Yield RunStart, the blocks of the whole drive and RunStop, as a session without protection.
+
+    In an imperfect laboratory the protection would end the test of what discovery is to judge.
+    """
+    rig, acquisition, drive = bundle.rig, bundle.profile.acquisition, bundle.drive
+    backend.open()
+    tare = compute_tare(backend.tare(int(TARE_S * acquisition.rate_hz)), rig.sensors)
+    end = drive.rest_start + round(acquisition.rest_s * acquisition.rate_hz)
+    backend.queue(0, drive.command(0, end) * rig.output.volts_per_m)
+    backend.start()
+    yield describe(tare, backend.scheduled_time_s(0))
+    for first in range(0, end, acquisition.block_samples):
+        count = min(acquisition.block_samples, end - first)
+        values = volts_to_si(backend.read(count), rig.sensors, tare)
+        labels = drive.labels(first, count)
+        yield Block("meas", first, acquisition.rate_hz, rig.channels, values, *labels)
+    backend.close()
+    yield RunStop(end, "complete", "the whole drive was played")
 
 
 def _round_values(values: dict[str, float]) -> dict[str, float]:

@@ -105,6 +105,14 @@ def compute_noise_rms(noise: float) -> dict[str, float]:
 
 def simulate_signals(rig_text: str) -> StudySignals:
     """Simulate the study's test on the machine of a rig config, without session and sensors."""
+    return simulate_readings(rig_text)[0]
+
+
+def simulate_readings(rig_text: str) -> tuple[StudySignals, dict[str, Float1D]]:
+    """Simulate the study's test; return the true signals and the readings of their channels.
+
+    Readings (sample,) are in SI, of the sensors of the rig config before the tare.
+    """
     rig, rate = parse_toml(rig_text, RigConfig, "the study's machine"), PROFILE.acquisition.rate_hz
     drive = plan_sweep(PROFILE)
     count = drive.planned_end + round(SETTLING_S * rate)
@@ -114,7 +122,7 @@ def simulate_signals(rig_text: str) -> StudySignals:
     backend.open()
     backend.queue(0, drive.command(0, count) * rig.output.volts_per_m)
     backend.start()
-    backend.take(count)
+    volts = backend.take(count)
     table_disp, table_acc, mass_disp, mass_acc, force_right, force_left = recorded[0]
     step, label, _ = drive.labels(0, count)
     cells = dict.fromkeys(RIGHT_CELLS, 0.5 * force_right) | dict.fromkeys(
@@ -124,7 +132,12 @@ def simulate_signals(rig_text: str) -> StudySignals:
         dict(zip(SIGNAL_CHANNELS, (table_disp, table_acc, mass_disp, mass_acc), strict=False))
         | cells
     )
-    return StudySignals(channels, force_right, force_left, step, np.asarray(label) != Label.REST)
+    readings = {
+        name: volts[rig.channels.index(name)] / rig.sensors[rig.channels.index(name)].volts_per_si
+        for name in channels
+    }
+    moving = np.asarray(label) != Label.REST
+    return StudySignals(channels, force_right, force_left, step, moving), readings
 
 
 def _si_per_unit(channel: str) -> float:

@@ -2,27 +2,35 @@
 
 A case number is 1000 x the index of its cell + the index in the cell. The case is drawn from its
 number alone, so that it can be repeated independently of the others. New cells are appended.
+
+Cells with a laboratory repeat those of the ideal rig with instruments as every laboratory has them
+("typical"), and without an effect with one of them in need of repair ("bad").
 """
 
 import fnmatch
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
+from typing import Literal
 
 import numpy as np
 
 from table_io.errors import InputError
 from table_io.sim.ground_truth import EFFECT_DEFINITIONS, EffectDefinition
 from table_io.sim.hidden_entry import HiddenParameter
+from table_io.sim.imperfections import IMPERFECTION_IDS, Imperfection, draw_laboratory
 
 NUMBERS_PER_CELL = 1000  # case numbers reserved per cell
 RESIDUAL_SIZES = (1.5, 3.0, 10.0)  # residual of the base model over the noise floor
 SIZE_TOLERANCE = (0.75, 1.34)  # accepted ratio of reached to requested size
 NOISE_LEVELS = (0.002, 0.01, 0.05)  # relative to each channel's rms in the nominal test
 BASE_SCATTER = 0.05  # relative, of stiffness, damping, bumpers and gap in every case
+LABORATORY_SIZES, LABORATORY_NOISE = RESIDUAL_SIZES[1:], NOISE_LEVELS[:2]
 CASE_MULTIPLE = 5  # times as many cases in cells without an effect and of pairs
 STUDY_SEED = 20160  # of the random draws
+LaboratoryLevel = Literal["none", "typical", "bad"]
+LABORATORY_LEVELS: tuple[LaboratoryLevel, ...] = ("none", "typical", "bad")
 
 SENSOR_CHANNELS = {
     "sensor_gain": ("mass_acc_m_s2", "mass_disp_m", "table_acc_m_s2", "force_r1_n"),
@@ -76,32 +84,42 @@ class PlantableEffect:
 class Cell:
     """Cell of similar cases: `kind` is single, sensor, none, pair or unknown (not in the library).
 
-    `effects` are the planted ones; of pairs those from which each case draws two.
+    `effects` are the planted ones; of pairs those from which each case draws two. The kind identify
+    plants none, and identifies parameters in place of effects. `imperfection` is the only one of
+    the laboratory; empty for all of them.
     """
 
     kind: str
     size: float
     noise: float
     effects: tuple[PlantableEffect, ...] = ()
+    laboratory: LaboratoryLevel = "none"
+    imperfection: str = ""
 
     @property
     def name(self) -> str:
-        """Name, for example single/coulomb_friction/3/1%."""
+        """Name, for example single/coulomb_friction/3/1% or typical/none/hum/1%."""
+        level = "" if self.laboratory == "none" else self.laboratory
+        return "/".join(part for part in (level, self.stratum) if part)
+
+    @property
+    def stratum(self) -> str:
+        """Name without the laboratory."""
         effect_name = self.effects[0].name if self.kind in ("single", "sensor", "unknown") else ""
         size = f"{self.size:g}" if self.size else ""
-        return "/".join(
-            part for part in (self.kind, effect_name, size, f"{100 * self.noise:g}%") if part
-        )
+        parts = (self.kind, effect_name, self.imperfection, size, f"{100 * self.noise:g}%")
+        return "/".join(part for part in parts if part)
 
     def accepts(self, reached: float) -> bool:
         """Return whether a case of this size belongs to the cell; pairs may have any size."""
-        if self.kind in ("none", "pair"):
+        if not self.size or self.kind == "pair":
             return True
         return SIZE_TOLERANCE[0] <= reached / self.size <= SIZE_TOLERANCE[1]
 
     def case_count(self, seeds: int) -> int:
         """Return the number of cases of the cell for `seeds`."""
-        return seeds * (CASE_MULTIPLE if self.kind in ("none", "pair") else 1)
+        is_large = self.kind in ("none", "pair", "identify") and not self.imperfection
+        return seeds * (CASE_MULTIPLE if is_large else 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +142,7 @@ class Case:
     planted: tuple[PlantedEffect, ...]
     noise_seed: int
     salt: str  # in the sealed file, so that the truth cannot be found from its hash
+    imperfections: tuple[Imperfection, ...] = field(default=(), hash=False)
 
 
 def _make_cells() -> tuple[Cell, ...]:
@@ -157,7 +176,26 @@ def _make_cells() -> tuple[Cell, ...]:
         for size in RESIDUAL_SIZES[1:]
         for noise in NOISE_LEVELS
     ]
-    return tuple(cells)
+    return (*cells, *_make_laboratory_cells(cells))
+
+
+def _make_laboratory_cells(ideal: Sequence[Cell]) -> list[Cell]:
+    """Return the cells with a laboratory: those of the ideal rig that its targets are about."""
+    clean = [cell for cell in ideal if cell.kind == "none" and cell.noise in LABORATORY_NOISE]
+    hidden = [
+        cell
+        for cell in ideal
+        if cell.size in LABORATORY_SIZES and cell.noise in LABORATORY_NOISE
+    ]
+    alone = [
+        replace(cell, laboratory=level, imperfection=imperfection)
+        for level in LABORATORY_LEVELS[1:]
+        for imperfection in IMPERFECTION_IDS
+        for cell in clean
+    ]
+    together = [replace(cell, laboratory="typical") for cell in (*clean, *hidden)]
+    identified = [replace(cell, kind="identify", laboratory="typical") for cell in clean]
+    return [*alone, *together, *identified]
 
 
 CELLS = _make_cells()
@@ -183,7 +221,10 @@ def draw_case(number: int) -> Case:
     planted = tuple(_draw_effect(effect, generator) for effect in effects)
     noise_seed, salt = int(generator.integers(2**31)), generator.bytes(16).hex()
     label = hashlib.blake2s(f"{STUDY_SEED} {number}".encode(), digest_size=5).hexdigest()
-    return Case(number, cell, label, base, planted, noise_seed, salt)
+    imperfections: Sequence[Imperfection] = ()
+    if cell.laboratory != "none":
+        imperfections = draw_laboratory(cell.laboratory, generator, cell.imperfection or None)
+    return Case(number, cell, label, base, planted, noise_seed, salt, tuple(imperfections))
 
 
 def _draw_effect(effect: PlantableEffect, generator: np.random.Generator) -> PlantedEffect:
@@ -198,12 +239,15 @@ def _draw_effect(effect: PlantableEffect, generator: np.random.Generator) -> Pla
     return PlantedEffect(effect, sign, shapes)
 
 
-def list_case_numbers(seeds: int, patterns: Sequence[str] = ()) -> list[int]:
-    """Return the numbers of `seeds` cases per cell, for the cells that match (default: all).
+def list_case_numbers(
+    seeds: int, patterns: Sequence[str] = (), laboratory: LaboratoryLevel = "none"
+) -> list[int]:
+    """Return the numbers of `seeds` cases per cell of a laboratory that matches (default: all).
 
     The first case of every cell comes first, so that an interrupted study covers all cells.
-    InputError if a pattern matches no cell.
+    InputError if a pattern matches no cell; patterns are of names without the laboratory.
     """
+    strata = {k: cell.stratum for k, cell in enumerate(CELLS) if cell.laboratory == laboratory}
     max_seeds = NUMBERS_PER_CELL // CASE_MULTIPLE
     if not 1 <= seeds <= max_seeds:
         raise InputError(
@@ -212,11 +256,12 @@ def list_case_numbers(seeds: int, patterns: Sequence[str] = ()) -> list[int]:
             value=seeds,
             allowed=f"1 to {max_seeds}",
         )
-    chosen = set(range(len(CELLS))) if not patterns else set()
+    chosen = set() if patterns else {*strata}
     for pattern in patterns:
-        matches = {k for k, cell in enumerate(CELLS) if fnmatch.fnmatchcase(cell.name, pattern)}
+        matches = {k for k, name in strata.items() if fnmatch.fnmatchcase(name, pattern)}
         if not matches:
-            examples = ", ".join(CELLS[k].name for k in (0, 3, 4, len(CELLS) - 1))
+            names = [*strata.values()]
+            examples = ", ".join(names[k] for k in (0, 3, 4, len(names) - 1))
             raise InputError(
                 "no cell matches",
                 key="--cells",
