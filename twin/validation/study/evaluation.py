@@ -45,9 +45,7 @@ def evaluate_case(root: Path, number: int, method: Method = run_discovery) -> Js
             "made_in": made_s - start_s,
         }
     is_identified = about["kind"] == "identify"
-    verdict, failure = _run_method(
-        run_identification if is_identified else method, paths.case_dir
-    )
+    verdict, failure = _run_method(run_identification if is_identified else method, paths.case_dir)
     evaluated_s = cpu_seconds()
     paths.verdict.write_text(dump_strict_json(verdict), encoding="utf-8")
     timing = {

@@ -12,7 +12,7 @@ import json
 import math
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -34,7 +34,11 @@ from twin.validation.study.amplitude_search import (
     find_share,
     scale_parameters,
 )
-from twin.validation.study.laboratory_truth import list_affected_channels, list_true_errors
+from twin.validation.study.laboratory_truth import (
+    compute_setup_errors,
+    list_affected_channels,
+    list_true_errors,
+)
 from twin.validation.study.rig_setup import (
     MODEL_TOML,
     NOMINAL_RIG,
@@ -122,7 +126,7 @@ def generate_case(case: Case, root: Path) -> CasePaths:
         "region": residual.region if case.planted else None,
         "base": _describe_base(truth["base"], case.imperfections),
         "effects": [
-            _describe_effect(planted, share)
+            _describe_effect(planted, share, compute_setup_errors(case.imperfections))
             for planted, share in zip(case.planted, shares, strict=True)
         ],
     }
@@ -170,12 +174,21 @@ def _describe_laboratory(case: Case, truth_path: Path, sha256: str) -> dict[str,
     }
 
 
-def _describe_effect(planted: PlantedEffect, share: float) -> dict[str, Any]:
-    """Return the description of a planted effect for scoring."""
+def _describe_effect(
+    planted: PlantedEffect, share: float, set_up: Mapping[str, Mapping[str, float]]
+) -> dict[str, Any]:
+    """Return the description of a planted effect for scoring.
+
+    An error of the set-up by the laboratory adds to a planted one; ratios multiply.
+    """
+    parameters = scale_parameters(planted, share)
+    for name, error in set_up.get(planted.effect.name, {}).items():
+        total = parameters[name] * error if name == "ratio" else parameters[name] + error
+        parameters[name] = total
     return {
         "name": planted.effect.name,
         "form": planted.effect.definition.form,
-        "parameters": _round_values(scale_parameters(planted, share)),
+        "parameters": _round_values(parameters),
         "vanishing": {
             parameter.name: parameter.vanishing for parameter in planted.effect.amplitudes
         },

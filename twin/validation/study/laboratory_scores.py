@@ -16,7 +16,7 @@ naming it (`unexplained`) is no finding.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from twin.identification.parameters import GAP_PREFIX
@@ -46,13 +46,10 @@ def score_laboratory(row: Json, verdict: Json, about: Json) -> Json:
     classes = [finding["class"] for finding in findings]
     named_classes = classes if is_named else []
     affected = {
-        name
-        for name in row["named"]
-        if is_named and _channel(name) in laboratory["channels"]
+        name for name in row["named"] if is_named and _channel(name) in laboratory["channels"]
     }
     scores: Json = {
-        "healthy": row["said"] == "none"
-        or (is_named and all(c == "instrument" for c in classes)),
+        "healthy": row["said"] == "none" or (is_named and all(c == "instrument" for c in classes)),
         "instrument": "instrument" in named_classes,
         "on_channel": bool(affected) or "instrument" in named_classes,
         "physics": "physics" in named_classes,
@@ -153,7 +150,7 @@ def score_identification(identified: Json, about: Json) -> Json:
     """Return the row of an identification: error and coverage of each parameter."""
     true = about["base"]
     gaps = {side: true[key] for side, key in GAP_KEYS.items()}
-    estimates = identified["parameters"]
+    estimates = identified.get("parameters", {})  # none where it failed
     rows = [
         _score_estimate(name, estimates[name], true[key], true[key])
         for name, key in BASE_KEYS.items()
@@ -168,8 +165,3 @@ def score_identification(identified: Json, about: Json) -> Json:
         "rms_over_noise": identified.get("rms_over_noise"),
         "warnings": len(identified.get("warnings", ())),
     }
-
-
-def describe_failures(rows: Sequence[Json]) -> list[Json]:
-    """Return the rows of the laboratory that miss what their kind demands."""
-    return [row for row in rows if row.get("laboratory") and not row["right"]]

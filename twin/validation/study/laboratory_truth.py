@@ -51,9 +51,7 @@ def measure_channel_errors(
     for name, (gain, delay, offset) in fits.items():
         others = np.median([fits[other][1] for other in fits if other != name])
         behind = np.mean([fits[other][1] for other in lasers if other != name])
-        errors[name] = ChannelError(
-            gain, (float(delay - others), float(delay - behind)), offset
-        )
+        errors[name] = ChannelError(gain, (float(delay - others), float(delay - behind)), offset)
     return errors
 
 
@@ -93,7 +91,9 @@ def list_true_errors(
     return true
 
 
-def list_affected_channels(imperfections: Sequence[Imperfection], channels: Sequence[str]) -> list[str]:
+def list_affected_channels(
+    imperfections: Sequence[Imperfection], channels: Sequence[str]
+) -> list[str]:
     """Return the channels on which an imperfection of a laboratory acts."""
     affected = set()
     for entry in imperfections:

@@ -55,6 +55,21 @@ class StudyMetric:
     target: str
     value: str
     is_reached: bool | None  # None: no target, or no cases
+    rate: Rate | None = None
+
+    def to_json(self) -> Json:
+        """Return the metric with the count and the Wilson interval of its rate."""
+        row: Json = {
+            "metric": self.name, "target": self.target, "value": self.value,
+            "reached": self.is_reached,
+        }  # fmt: skip
+        if self.rate is not None:
+            low, high = self.rate.interval
+            row |= {
+                "hits": self.rate.hits, "count": self.rate.count,
+                "share": self.rate.share if self.rate.count else None, "low": low, "high": high,
+            }  # fmt: skip
+        return row
 
 
 def compute_rate(rows: Iterable[Json], key: str) -> Rate:
@@ -95,21 +110,22 @@ def _count_hits(rows: Sequence[Json]) -> Rate:
 
 
 def compute_metrics(rows: Sequence[Json]) -> list[StudyMetric]:
-    """Return every metric of the study, in the order of its page."""
-    usable_rows = select_usable(rows)
-    single = [*_select_kind(usable_rows, "single"), *_select_kind(usable_rows, "sensor")]
+    """Return every metric of the study on the ideal rig, in the order of its page."""
+    usable_rows = [row for row in select_usable(rows) if not row.get("laboratory")]
+    single = [*select_kind(usable_rows, "single"), *select_kind(usable_rows, "sensor")]
     return [
         *_make_naming_metrics(single),
         *_make_rejection_metrics(usable_rows),
-        *_make_pair_metrics(_select_kind(usable_rows, "pair")),
+        *_make_pair_metrics(select_kind(usable_rows, "pair")),
         _make_calibration_metric(compute_calibration(usable_rows)),
         *_make_fit_metrics(usable_rows, single),
         *_make_parameter_metrics([row for row in single if abs(row["noise"] - 0.01) < 1e-9]),
-        _make_median_metric("CPU time per case in s", usable_rows, "seconds", 10.0),
+        make_median_metric("CPU time per case in s", usable_rows, "seconds", 10.0),
     ]
 
 
-def _select_kind(rows: Sequence[Json], kind: str) -> list[Json]:
+def select_kind(rows: Sequence[Json], kind: str) -> list[Json]:
+    """Return the rows of a kind of cell."""
     return [row for row in rows if row["kind"] == kind]
 
 
@@ -125,29 +141,29 @@ def _make_naming_metrics(single: Sequence[Json]) -> list[StudyMetric]:
     small = [row for row in low_noise if row["size"] < MIN_NAMEABLE_SIZE]
     top_1, set_of_two, alone = (compute_rate(large, key) for key in ("top1", "two", "exact"))
     return [
-        _make_min_metric("top-1, size >= 3, noise <= 1 %", top_1, 0.95),
-        _make_min_metric("set of two, size >= 3, noise <= 1 %", set_of_two, 0.98),
-        _make_min_metric("named alone, size >= 3, noise <= 1 %", alone, None),
-        _make_min_metric("top-1, noise 5 %", compute_rate(high_noise, "top1"), 0.75),
-        _make_min_metric("top-1, size 1.5, noise <= 1 %", compute_rate(small, "top1"), None),
+        make_min_metric("top-1, size >= 3, noise <= 1 %", top_1, 0.95),
+        make_min_metric("set of two, size >= 3, noise <= 1 %", set_of_two, 0.98),
+        make_min_metric("named alone, size >= 3, noise <= 1 %", alone, None),
+        make_min_metric("top-1, noise 5 %", compute_rate(high_noise, "top1"), 0.75),
+        make_min_metric("top-1, size 1.5, noise <= 1 %", compute_rate(small, "top1"), None),
     ]
 
 
 def _make_rejection_metrics(usable_rows: Sequence[Json]) -> list[StudyMetric]:
     """Return false alarms, and verdicts and regions of effects that the library lacks."""
     nothing, unknown, one_effect = (
-        _select_kind(usable_rows, kind) for kind in ("none", "unknown", "single")
+        select_kind(usable_rows, kind) for kind in ("none", "unknown", "single")
     )
     unexplained, wrong_name, region = (
         compute_rate(unknown, key) for key in ("unexplained", "wrong_name", "region")
     )
     false_alarm = compute_rate(nothing, "false_alarm")
     return [
-        _make_max_metric("nothing hidden: false alarm", false_alarm, 0.02),
-        _make_min_metric("not in the library: unexplained", unexplained, 0.90),
-        _make_max_metric("not in the library: wrong name", wrong_name, 0.05),
-        _make_min_metric("not in the library: region correct", region, 0.85),
-        _make_min_metric("one effect: region correct", compute_rate(one_effect, "region"), None),
+        make_max_metric("nothing hidden: false alarm", false_alarm, 0.02),
+        make_min_metric("not in the library: unexplained", unexplained, 0.90),
+        make_max_metric("not in the library: wrong name", wrong_name, 0.05),
+        make_min_metric("not in the library: region correct", region, 0.85),
+        make_min_metric("one effect: region correct", compute_rate(one_effect, "region"), None),
     ]
 
 
@@ -156,10 +172,10 @@ def _make_pair_metrics(pairs: Sequence[Json]) -> list[StudyMetric]:
     distinct = [row for row in pairs if (row.get("mark") or 0.0) >= MIN_DISTINCT_MARK]
     both, at_least_one = compute_rate(distinct, "both"), compute_rate(distinct, "one")
     return [
-        _make_min_metric("two effects: both", compute_rate(pairs, "both"), 0.80),
-        _make_min_metric("two effects: at least one", compute_rate(pairs, "one"), 0.97),
-        _make_min_metric("two effects, both identifiable: both", both, None),
-        _make_min_metric("two effects, both identifiable: at least one", at_least_one, None),
+        make_min_metric("two effects: both", compute_rate(pairs, "both"), 0.80),
+        make_min_metric("two effects: at least one", compute_rate(pairs, "one"), 0.97),
+        make_min_metric("two effects, both identifiable: both", both, None),
+        make_min_metric("two effects, both identifiable: at least one", at_least_one, None),
     ]
 
 
@@ -170,26 +186,29 @@ def _make_fit_metrics(usable_rows: Sequence[Json], single: Sequence[Json]) -> li
     near_oracle = _count_within(named_right, "after_oracle", 1.05)
     closed = _count_within(large_right, "closed", 0.95, above=True)
     return [
-        _make_median_metric(
+        make_median_metric(
             "held-out after / floor, named correctly", named_right, "after_floor", 1.10
         ),
-        _make_min_metric("held-out after <= 1.05 oracle, named correctly", near_oracle, 0.90),
-        _make_min_metric("gap closed >= 0.95, size >= 3", closed, None),
+        make_min_metric("held-out after <= 1.05 oracle, named correctly", near_oracle, 0.90),
+        make_min_metric("gap closed >= 0.95, size >= 3", closed, None),
     ]
 
 
-def _make_min_metric(name: str, hit_rate: Rate, target: float | None) -> StudyMetric:
+def make_min_metric(name: str, hit_rate: Rate, target: float | None) -> StudyMetric:
+    """Return the metric of a rate that should be at least the target."""
     target_text = f">= {100 * target:.0f} %" if target is not None else ""
     is_reached = hit_rate.share >= target if target is not None and hit_rate.count else None
-    return StudyMetric(name, target_text, str(hit_rate), is_reached)
+    return StudyMetric(name, target_text, str(hit_rate), is_reached, hit_rate)
 
 
-def _make_max_metric(name: str, hit_rate: Rate, target: float) -> StudyMetric:
+def make_max_metric(name: str, hit_rate: Rate, target: float) -> StudyMetric:
+    """Return the metric of a rate that should be at most the target."""
     is_reached = hit_rate.share <= target if hit_rate.count else None
-    return StudyMetric(name, f"<= {100 * target:.0f} %", str(hit_rate), is_reached)
+    return StudyMetric(name, f"<= {100 * target:.0f} %", str(hit_rate), is_reached, hit_rate)
 
 
-def _make_median_metric(name: str, rows: Sequence[Json], key: str, target: float) -> StudyMetric:
+def make_median_metric(name: str, rows: Sequence[Json], key: str, target: float) -> StudyMetric:
+    """Return the metric of a quantity whose median should be at most the target."""
     values = _collect_values(rows, key)
     if not values:
         return StudyMetric(name, f"median <= {target:g}", "-", None)
@@ -223,22 +242,30 @@ def _make_parameter_metrics(rows: Sequence[Json]) -> list[StudyMetric]:
     ]
 
 
+def make_coverage_metric(name: str, covered: Rate, low: float, high: float | None) -> StudyMetric:
+    """Return the metric of intervals that should hold the truth in a share from low to high."""
+    target = f"{100 * low:.0f} to {100 * high:.0f} %" if high else f">= {100 * low:.0f} %"
+    is_covered = low <= covered.share <= (high or 1.0) if covered.count else None
+    return StudyMetric(name, target, str(covered), is_covered, covered)
+
+
 def _make_recovery_metrics(
     forms: str, estimates: Sequence[Json]
 ) -> tuple[StudyMetric, StudyMetric]:
     close = Rate(sum(estimate["error"] <= 0.05 for estimate in estimates), len(estimates))
     covered = compute_rate(estimates, "covered")
-    is_covered = 0.90 <= covered.share <= 0.98 if covered.count else None
     errors = [estimate["error"] for estimate in estimates]
     middle = f"; median error {100 * float(np.median(errors)):.2g} %" if errors else ""
     all_close = close.share == 1.0 if close.count else None
     return (
         StudyMetric(
-            f"parameters within 5 %, noise 1 %, {forms}", "all", f"{close}{middle}", all_close
+            f"parameters within 5 %, noise 1 %, {forms}",
+            "all",
+            f"{close}{middle}",
+            all_close,
+            close,
         ),
-        StudyMetric(
-            f"interval coverage, noise 1 %, {forms}", "90 to 98 %", str(covered), is_covered
-        ),
+        make_coverage_metric(f"interval coverage, noise 1 %, {forms}", covered, 0.90, 0.98),
     )
 
 

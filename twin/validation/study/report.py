@@ -1,4 +1,4 @@
-"""Report of a study: table.md with metrics, tables and worst misses, and confusion.png."""
+"""Report of a study: table.md with metrics and tables, metrics.json, and confusion.png."""
 
 import json
 from collections import Counter
@@ -8,7 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from twin.reports.summary import dump_strict_json
 from twin.validation.study.comparison_tables import format_baseline_table, format_control_table
+from twin.validation.study.laboratory_report import (
+    compute_laboratory_metrics,
+    format_laboratory_tables,
+)
 from twin.validation.study.rates import (
     Rate,
     StudyMetric,
@@ -22,7 +27,7 @@ from twin.validation.study.scoring import select_worst_misses
 
 Json = dict[str, Any]
 RESULTS_FILE, CONTROLS_FILE = "results.jsonl", "controls.jsonl"
-TABLE_FILE, CONFUSION_FILE = "table.md", "confusion.png"
+TABLE_FILE, METRICS_FILE, CONFUSION_FILE = "table.md", "metrics.json", "confusion.png"
 OTHER_VERDICTS = ("none", "ambiguous", "unexplained", "failed")
 NO_EFFECT = "(nothing)"
 TABLE_SPECS = (
@@ -50,14 +55,26 @@ def read_rows(path: Path) -> list[Json]:
 def write_study_pages(folder: Path) -> Path:
     """Write table.md and confusion.png from the results in a folder; return the table's path."""
     rows = read_rows(folder / RESULTS_FILE)
-    usable_rows = select_usable(rows)
+    every_usable_row = select_usable(rows)
+    usable_rows = [row for row in every_usable_row if not row.get("laboratory")]
+    in_laboratory = [row for row in every_usable_row if row.get("laboratory")]
     if any(row["kind"] != "pair" for row in usable_rows):
         from twin.validation.study.confusion_matrix import draw_confusion_matrix
 
         draw_confusion_matrix(*compute_confusion(usable_rows), folder / CONFUSION_FILE)
     path = folder / TABLE_FILE
+    metrics = [
+        *(compute_metrics(rows) if usable_rows or not in_laboratory else []),
+        *(compute_laboratory_metrics(rows) if in_laboratory else []),
+    ]
+    (folder / METRICS_FILE).write_text(
+        dump_strict_json({"metrics": [metric.to_json() for metric in metrics]}), encoding="utf-8"
+    )
     lines = [
-        *_format_page(rows, usable_rows),
+        *_format_head(rows, len(every_usable_row)),
+        *_format_metrics(metrics),
+        *format_laboratory_tables(in_laboratory),
+        *_format_tables(usable_rows),
         *format_baseline_table(usable_rows),
         *format_control_table(read_rows(folder / CONTROLS_FILE), usable_rows),
     ]
@@ -89,7 +106,7 @@ def _truth_label(row: Json) -> str:
     return str(row["truth"][0]) if row["truth"] else NO_EFFECT
 
 
-def _format_page(rows: Sequence[Json], usable_rows: Sequence[Json]) -> Iterator[str]:
+def _format_head(rows: Sequence[Json], usable_count: int) -> Iterator[str]:
     latest_rows = select_latest(rows)
     failed = sum(bool(row.get("failed")) for row in latest_rows)
     excluded = Counter(str(row.get("ended", "not made")).split(":")[0] for row in latest_rows
@@ -97,12 +114,17 @@ def _format_page(rows: Sequence[Json], usable_rows: Sequence[Json]) -> Iterator[
     reasons = ", ".join(f"{word} {count}" for word, count in excluded.most_common()) or "none"
     yield "# Blind study of discovery\n"
     yield (
-        f"{len(latest_rows)} cases, {len(usable_rows)} evaluated; {failed} without a verdict, "
+        f"{len(latest_rows)} cases, {usable_count} evaluated; {failed} without a verdict, "
         f"which count as misses. Excluded: {reasons} (not played: within its bounds the effect "
         "does not reach the size of its cell; aborted: stopped by protection). Rates with "
         "counts and 95 % Wilson intervals.\n"
     )
-    yield from _format_metrics(compute_metrics(rows))
+
+
+def _format_tables(usable_rows: Sequence[Json]) -> Iterator[str]:
+    """Yield the tables of the cases on the ideal rig."""
+    if not usable_rows:
+        return
     for title, kinds, key in TABLE_SPECS:
         yield from _format_table(title, [row for row in usable_rows if row["kind"] in kinds], key)
     yield from _format_calibration(usable_rows)

@@ -183,9 +183,7 @@ def _make_laboratory_cells(ideal: Sequence[Cell]) -> list[Cell]:
     """Return the cells with a laboratory: those of the ideal rig that its targets are about."""
     clean = [cell for cell in ideal if cell.kind == "none" and cell.noise in LABORATORY_NOISE]
     hidden = [
-        cell
-        for cell in ideal
-        if cell.size in LABORATORY_SIZES and cell.noise in LABORATORY_NOISE
+        cell for cell in ideal if cell.size in LABORATORY_SIZES and cell.noise in LABORATORY_NOISE
     ]
     alone = [
         replace(cell, laboratory=level, imperfection=imperfection)
