@@ -1,7 +1,6 @@
 """The study in imperfect laboratories: its cases, true errors of instruments, and scores."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +8,12 @@ import numpy as np
 import pytest
 
 from table_io.acquisition.session import run_session
-from table_io.backends import open_backend
+from table_io.backends import Backend, open_backend
 from table_io.block import Block
 from table_io.clock import ManualClock
 from table_io.config.base import parse_toml
 from table_io.errors import InputError
-from table_io.records import RunStop
+from table_io.records import RunStart, RunStop
 from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.ground_truth import GroundTruth, HiddenEffect
 from table_io.sim.ground_truth_applied import build_hidden_plant
@@ -35,7 +34,7 @@ from twin.validation.study.laboratory_scores import (
 from twin.validation.study.laboratory_truth import (
     compute_setup_errors,
     list_affected_channels,
-    measure_channel_errors,
+    measure_reading_errors,
 )
 from twin.validation.study.report import METRICS_FILE, RESULTS_FILE, write_study_pages
 from twin.validation.study.rig_setup import (
@@ -73,7 +72,7 @@ def case_in(cell: str, place: int = 0) -> Case:
     return draw_case(NUMBERS_PER_CELL * [c.name for c in CELLS].index(cell) + place)
 
 
-def in_laboratory(kind: str = "none", *effects: Json, level: str = "typical", **more: Any) -> Json:
+def make_about(kind: str = "none", *effects: Json, level: str = "typical", **more: Any) -> Json:
     laboratory = {
         "level": level, "imperfection": more.pop("imperfection", ""), "errors": ERRORS,
         "channels": ["force_r1_n", "force_r2_n"],
@@ -81,7 +80,7 @@ def in_laboratory(kind: str = "none", *effects: Json, level: str = "typical", **
     return about(kind, *effects, laboratory=laboratory, base=BASE, **more)
 
 
-def named(name: str, key: str, value: float, half: float = 0.0) -> Json:
+def make_named_verdict(name: str, key: str, value: float, half: float = 0.0) -> Json:
     """A verdict that names one effect with one parameter."""
     effect = {
         "id": name, "confidence": 0.9,
@@ -90,9 +89,9 @@ def named(name: str, key: str, value: float, half: float = 0.0) -> Json:
     return verdict("named") | {"effects": [effect], "why": "the residual is noise"}
 
 
-def score(told: Json, case: Json) -> Json:
-    row = score_verdict(told, case)
-    return row | score_laboratory(row, told, case)
+def score_case(outcome: Json, case: Json) -> Json:
+    row = score_verdict(outcome, case)
+    return row | score_laboratory(row, outcome, case)
 
 
 def test_every_imperfection_has_its_cells_and_the_ideal_ones_are_as_before() -> None:
@@ -147,7 +146,7 @@ def test_the_errors_of_channels_are_measured() -> None:
         readings[name] = np.concatenate([np.zeros(lag), value[:-lag]]) + 0.3
     readings["force_r1_n"] = 1.1 * readings["force_r1_n"]
     readings["force_l2_n"] = readings["force_l2_n"] + 0.2 * signals.moving
-    errors = measure_channel_errors(signals, readings)
+    errors = measure_reading_errors(signals, readings)
     assert errors["force_r1_n"].gain == pytest.approx(1.1, abs=1e-3)
     assert errors["force_l2_n"].gain == pytest.approx(1.0, abs=1e-3)
     assert errors["mass_acc_m_s2"].lags == pytest.approx((3e-3, 3e-3), rel=0.02)
@@ -181,16 +180,16 @@ def test_errors_of_the_set_up_are_those_of_the_plant() -> None:
 
 
 def test_the_channels_on_which_an_imperfection_acts() -> None:
-    def affected(*entries: Imperfection) -> list[str]:
+    def list_channels(*entries: Imperfection) -> list[str]:
         return list_affected_channels(entries, SIGNAL_CHANNELS)
 
     sharing = Imperfection(id="load_sharing", side="left", parameters={"share": 0.6})
-    assert affected(sharing) == ["force_l1_n", "force_l2_n"]
+    assert list_channels(sharing) == ["force_l1_n", "force_l2_n"]
     hum = Imperfection(id="hum", channel="mass_disp_m", parameters={"rms": 1e-5})
-    assert affected(hum, sharing) == ["mass_disp_m", "force_l1_n", "force_l2_n"]
+    assert list_channels(hum, sharing) == ["mass_disp_m", "force_l1_n", "force_l2_n"]
     skew = Imperfection(id="channel_skew", parameters={"skew": 2e-5})
-    assert affected(skew) == list(SIGNAL_CHANNELS[:-1])
-    assert affected(Imperfection(id="mass_reading", parameters={"ratio": 1.01})) == []
+    assert list_channels(skew) == list(SIGNAL_CHANNELS[:-1])
+    assert list_channels(Imperfection(id="mass_reading", parameters={"ratio": 1.01})) == []
 
 
 @pytest.mark.parametrize(
@@ -214,9 +213,9 @@ def test_the_channels_on_which_an_imperfection_acts() -> None:
 def test_what_a_verdict_names_has_a_class(
     name: str, key: str, value: float, half: float, expected: str
 ) -> None:
-    effect = named(name, key, value, half)["effects"][0]
-    assert classify_finding(name, effect, in_laboratory()) == expected
-    row = score(named(name, key, value, half), in_laboratory())
+    effect = make_named_verdict(name, key, value, half)["effects"][0]
+    assert classify_finding(name, effect, make_about()) == expected
+    row = score_case(make_named_verdict(name, key, value, half), make_about())
     assert [finding["class"] for finding in row["findings"]] == [expected]
     assert row["healthy"] == row["right"] == (expected == "instrument")
     assert row["physics"] == (expected == "physics")
@@ -224,40 +223,40 @@ def test_what_a_verdict_names_has_a_class(
 
 
 def test_clean_recordings() -> None:
-    healthy = score(verdict("none"), in_laboratory())
+    healthy = score_case(verdict("none"), make_about())
     assert (healthy["healthy"], healthy["right"]) == (True, True)
     for word in ("unexplained", "ambiguous", "failed"):
-        row = score(verdict(word, "cubic_stiffness"), in_laboratory())
+        row = score_case(verdict(word, "cubic_stiffness"), make_about())
         assert (row["healthy"], row["physics"], row["wrong_name"]) == (False, False, False), word
 
 
 def test_a_bad_instrument_is_named_on_its_channel() -> None:
-    bad = in_laboratory(level="bad", imperfection="load_sharing")
-    exact = score(named("sensor_gain.force_r1_n", "gain", 1.21), bad)
+    bad = make_about(level="bad", imperfection="load_sharing")
+    exact = score_case(make_named_verdict("sensor_gain.force_r1_n", "gain", 1.21), bad)
     assert (exact["on_channel"], exact["instrument"], exact["right"]) == (True, True, True)
-    kind = score(named("sensor_lag.force_r2_n", "lag", 1e-3), bad)
+    kind = score_case(make_named_verdict("sensor_lag.force_r2_n", "lag", 1e-3), bad)
     assert (kind["on_channel"], kind["instrument"], kind["right"]) == (True, False, True)
-    elsewhere = score(named("sensor_gain.mass_disp_m", "gain", 1.1), bad)
+    elsewhere = score_case(make_named_verdict("sensor_gain.mass_disp_m", "gain", 1.1), bad)
     assert (elsewhere["on_channel"], elsewhere["right"]) == (False, False)
-    assert not score(verdict("none"), bad)["right"]
-    assert score(named("cubic_stiffness", "k3", 1e7), bad)["physics"]
+    assert not score_case(verdict("none"), bad)["right"]
+    assert score_case(make_named_verdict("cubic_stiffness", "k3", 1e7), bad)["physics"]
 
 
 def test_an_effect_is_named_and_nothing_false() -> None:
-    gain = named("sensor_gain.force_r1_n", "gain", 1.2)["effects"]
+    gain = make_named_verdict("sensor_gain.force_r1_n", "gain", 1.2)["effects"]
     right = verdict("named", TRUE["name"])
     with_gain = right | {"effects": [*gain, *right["effects"]]}
-    for told, expected in ((right, True), (with_gain, True)):
-        row = score(told, in_laboratory("single", TRUE))
+    for outcome, expected in ((right, True), (with_gain, True)):
+        row = score_case(outcome, make_about("single", TRUE))
         assert (row["hit"], row["wrong_name"], row["right"]) == (expected, False, expected)
-    extra = score(verdict("named", TRUE["name"], "gap_drift"), in_laboratory("single", TRUE))
+    extra = score_case(verdict("named", TRUE["name"], "gap_drift"), make_about("single", TRUE))
     assert (extra["hit"], extra["wrong_name"], extra["right"]) == (True, True, False)
-    pair = in_laboratory("pair", TRUE, OTHER)
-    assert score(verdict("named", TRUE["name"], OTHER["name"]), pair)["right"]
-    assert not score(right, pair)["right"]
-    unknown = in_laboratory("unknown", {**TRUE, "name": "adhesion"})
-    assert score(verdict("unexplained"), unknown)["right"]
-    assert score(verdict("named", "hunt_crossley"), unknown)["wrong_name"]
+    pair = make_about("pair", TRUE, OTHER)
+    assert score_case(verdict("named", TRUE["name"], OTHER["name"]), pair)["right"]
+    assert not score_case(right, pair)["right"]
+    unknown = make_about("unknown", {**TRUE, "name": "adhesion"})
+    assert score_case(verdict("unexplained"), unknown)["right"]
+    assert score_case(verdict("named", "hunt_crossley"), unknown)["wrong_name"]
 
 
 def test_base_parameters_of_a_verdict() -> None:
@@ -287,29 +286,32 @@ def test_an_identification_is_right_within_one_per_cent() -> None:
     }
     parameters["gap"] = {"value": 4.11e-3, "low": 4.0e-3, "high": 4.105e-3}
     parameters["gap_right"] = {"value": 2.21e-3}
-    row = score_identification({"parameters": parameters}, in_laboratory("identify"))
+    row = score_identification({"parameters": parameters}, make_about("identify"))
     assert row["right"]
     assert [e["covered"] for e in row["estimates"]] == [True, True, True, None]
     parameters["gap_left"] = {"value": 1.93e-3}
-    assert not score_identification({"parameters": parameters}, in_laboratory("identify"))["right"]
-    assert not score_identification({"verdict": "failed"}, in_laboratory("identify"))["right"]
+    assert not score_identification({"parameters": parameters}, make_about("identify"))["right"]
+    assert not score_identification({"verdict": "failed"}, make_about("identify"))["right"]
 
 
 def test_metrics_count_each_kind_once(tmp_path: Path) -> None:
-    bad = in_laboratory(level="bad", imperfection="load_sharing")
+    bad = make_about(level="bad", imperfection="load_sharing")
     cases = [
-        (verdict("none"), in_laboratory()),
-        (verdict("none"), in_laboratory(imperfection="hum")),
-        (named("cubic_stiffness", "k3", 1e7), in_laboratory()),
-        (named("sensor_gain.force_r1_n", "gain", 1.2), bad),
+        (verdict("none"), make_about()),
+        (verdict("none"), make_about(imperfection="hum")),
+        (make_named_verdict("cubic_stiffness", "k3", 1e7), make_about()),
+        (make_named_verdict("sensor_gain.force_r1_n", "gain", 1.2), bad),
         (verdict("none"), bad),
-        (verdict("named", TRUE["name"]), in_laboratory("single", TRUE)),
-        (verdict("named", "gap_drift"), in_laboratory("single", TRUE)),
-        (verdict("none"), in_laboratory("sensor", {**TRUE, "name": "sensor_gain.mass_disp_m"})),
-        (verdict("named", TRUE["name"]), in_laboratory("pair", TRUE, OTHER)),
-        (verdict("unexplained"), in_laboratory("unknown", {**TRUE, "name": "adhesion"})),
+        (verdict("named", TRUE["name"]), make_about("single", TRUE)),
+        (verdict("named", "gap_drift"), make_about("single", TRUE)),
+        (verdict("none"), make_about("sensor", {**TRUE, "name": "sensor_gain.mass_disp_m"})),
+        (verdict("named", TRUE["name"]), make_about("pair", TRUE, OTHER)),
+        (verdict("unexplained"), make_about("unknown", {**TRUE, "name": "adhesion"})),
     ]
-    rows = [score(told, case | {"number": number}) for number, (told, case) in enumerate(cases)]
+    rows = [
+        score_case(outcome, case | {"number": number})
+        for number, (outcome, case) in enumerate(cases)
+    ]
     metrics = {metric.name: metric for metric in compute_laboratory_metrics(rows)}
 
     def counts(name: str) -> tuple[int, int]:
@@ -329,8 +331,8 @@ def test_metrics_count_each_kind_once(tmp_path: Path) -> None:
     assert counts("not in the library, in a laboratory: unexplained") == (1, 1)
     (tmp_path / RESULTS_FILE).write_text("".join(json.dumps(row) + "\n" for row in rows))
     page = write_study_pages(tmp_path).read_text()
-    told = json.loads((tmp_path / METRICS_FILE).read_text())["metrics"]
-    (entry,) = [m for m in told if m["metric"] == "one effect: named"]
+    outcome = json.loads((tmp_path / METRICS_FILE).read_text())["metrics"]
+    (entry,) = [m for m in outcome if m["metric"] == "one effect: named"]
     assert (entry["hits"], entry["count"], entry["reached"]) == (1, 2, False)
     assert (entry["low"], entry["high"]) == pytest.approx((0.0945, 0.9055), abs=1e-4)
     assert "top-1, size" not in page, "the ideal study has no case here"
@@ -339,25 +341,23 @@ def test_metrics_count_each_kind_once(tmp_path: Path) -> None:
 
 def test_a_recording_without_protection_is_that_of_a_session() -> None:
     config = from_texts("x", PROFILE_TOML, make_rig_toml(0.01, 5), MODEL_TOML, "x")
-    drive = config.drive
-    outputs = []
-    for play in (True, False):
-        clock = ManualClock()
-        backend = open_backend(config.rig, config.profile, clock)
-        describe = config.make_start_factory("x", "table")
-        outputs.append([
-            *(play_unprotected(config, backend, describe) if play
-              else run_session(config.session_setup, backend, clock, describe, lambda: None))
-        ])  # fmt: skip
-    assert drive.planned_end > 0
-    ours, theirs = ([item for item in items if isinstance(item, Block)] for items in outputs)
-    assert len(ours) == len(theirs)
-    assert all(a.is_identical(b) for a, b in zip(ours, theirs, strict=True))
-    assert outputs[0][0] == replace(
-        outputs[1][0], started_at=outputs[0][0].started_at, epoch_s=outputs[0][0].epoch_s
-    )
-    assert isinstance(outputs[0][-1], RunStop)
-    assert (outputs[0][-1].index, outputs[0][-1].verdict) == (outputs[1][-1].index, "complete")
+    describe = config.make_start_factory("x", "table")
+
+    def open_table() -> Backend:
+        return open_backend(config.rig, config.profile, ManualClock())
+
+    ours = [*play_unprotected(config, open_table(), describe)]
+    session = run_session(config.session_setup, open_table(), ManualClock(), describe, lambda: None)
+    theirs = [*session]
+    pairs = [[item for item in items if isinstance(item, Block)] for items in (ours, theirs)]
+    assert all(a.is_identical(b) for a, b in zip(*pairs, strict=True))
+    assert sum(map(len, pairs[0])) > config.drive.planned_end
+    assert isinstance(ours[0], RunStart)
+    assert isinstance(theirs[0], RunStart)
+    assert (ours[0].tare, ours[0].rig_toml) == (theirs[0].tare, theirs[0].rig_toml)
+    assert isinstance(ours[-1], RunStop)
+    assert isinstance(theirs[-1], RunStop)
+    assert (ours[-1].index, ours[-1].verdict) == (theirs[-1].index, "complete")
 
 
 def test_a_case_in_a_laboratory(tmp_path: Path) -> None:

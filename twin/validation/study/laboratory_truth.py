@@ -6,7 +6,7 @@ once more without noise, and each channel is compared with the true value of its
 
     reading = gain x value - lag x rate of value + offset,      least squares while the table moves,
 
-offset after the tare. A lag common to all channels is not observable: see `lag` of `ChannelError`.
+offset after the tare. A lag common to all channels is not observable: see `lag` of `ReadingError`.
 Errors of the set-up are stated by the laboratory: `gap_offset` (half the right minus the left error
 of the gaps' readings), `mass_error` (stated over true mass), `table_tilt` (pitch per travel).
 """
@@ -21,7 +21,7 @@ from twin.validation.study.rig_setup import PROFILE, StudySignals
 
 
 @dataclass(frozen=True, slots=True)
-class ChannelError:
+class ReadingError:
     """Error of a channel over the moving part of a test, SI: see the module.
 
     `lags` in s: the lag behind the median of the other channels, and behind the lasers.
@@ -32,9 +32,9 @@ class ChannelError:
     offset: float
 
 
-def measure_channel_errors(
+def measure_reading_errors(
     signals: StudySignals, readings: Mapping[str, np.ndarray]
-) -> dict[str, ChannelError]:
+) -> dict[str, ReadingError]:
     """Return the error of each channel; `readings` (sample,) are noise-free, in SI."""
     moving = signals.moving
     rest = slice(0, int(np.flatnonzero(moving)[0]))
@@ -51,7 +51,7 @@ def measure_channel_errors(
     for name, (gain, delay, offset) in fits.items():
         others = np.median([fits[other][1] for other in fits if other != name])
         behind = np.mean([fits[other][1] for other in lasers if other != name])
-        errors[name] = ChannelError(gain, (float(delay - others), float(delay - behind)), offset)
+        errors[name] = ReadingError(gain, (float(delay - others), float(delay - behind)), offset)
     return errors
 
 
@@ -84,7 +84,7 @@ def list_true_errors(
         name: {key: [value] for key, value in parameters.items()}
         for name, parameters in compute_setup_errors(imperfections).items()
     }
-    for channel, error in measure_channel_errors(signals, readings).items():
+    for channel, error in measure_reading_errors(signals, readings).items():
         true[f"sensor_gain.{channel}"] = {"gain": [error.gain]}
         true[f"sensor_lag.{channel}"] = {"lag": [*error.lags]}
         true[f"sensor_offset.{channel}"] = {"offset": [error.offset]}
