@@ -35,6 +35,7 @@ from twin.validation.study.laboratory_truth import (
     compute_setup_errors,
     list_affected_channels,
     measure_reading_errors,
+    measure_visible_size,
 )
 from twin.validation.study.report import METRICS_FILE, RESULTS_FILE, write_study_pages
 from twin.validation.study.rig_setup import (
@@ -43,7 +44,9 @@ from twin.validation.study.rig_setup import (
     PROFILE_TOML,
     SIGNAL_CHANNELS,
     StudySignals,
+    compute_noise_rms,
     make_rig_toml,
+    simulate_readings,
 )
 from twin.validation.study.scoring import score_verdict
 from twin.validation.study.strata import (
@@ -75,6 +78,7 @@ def case_in(cell: str, place: int = 0) -> Case:
 def make_about(kind: str = "none", *effects: Json, level: str = "typical", **more: Any) -> Json:
     laboratory = {
         "level": level, "imperfection": more.pop("imperfection", ""), "errors": ERRORS,
+        "size": more.pop("imperfection_size", 3.0),
         "channels": ["force_r1_n", "force_r2_n"],
     }  # fmt: skip
     return about(kind, *effects, laboratory=laboratory, base=BASE, **more)
@@ -302,6 +306,7 @@ def test_metrics_count_each_kind_once(tmp_path: Path) -> None:
         (make_named_verdict("cubic_stiffness", "k3", 1e7), make_about()),
         (make_named_verdict("sensor_gain.force_r1_n", "gain", 1.2), bad),
         (verdict("none"), bad),
+        (verdict("none"), make_about(level="bad", imperfection="drift", imperfection_size=1.1)),
         (verdict("named", TRUE["name"]), make_about("single", TRUE)),
         (verdict("named", "gap_drift"), make_about("single", TRUE)),
         (verdict("none"), make_about("sensor", {**TRUE, "name": "sensor_gain.mass_disp_m"})),
@@ -322,7 +327,8 @@ def test_metrics_count_each_kind_once(tmp_path: Path) -> None:
     assert counts("typical, clean: none or true instrument") == (2, 3)
     assert counts("typical, clean, one imperfection") == (1, 1)
     assert counts("typical, clean: a physical effect named") == (1, 3)
-    assert counts("bad, clean: named as the instrument's") == (1, 2)
+    assert counts("bad, clean: named as the instrument's") == (1, 3)
+    assert counts("bad, clean, visible: named as the instrument's") == (1, 2)
     assert counts("one effect: named") == (1, 2)
     assert counts("one effect: wrong name") == (1, 2)
     assert counts("one planted error of a sensor or the set-up: named") == (0, 1)
@@ -373,6 +379,9 @@ def test_a_case_in_a_laboratory(tmp_path: Path) -> None:
     assert gain == pytest.approx(2 * right.parameters["share"], abs=0.02)
     assert errors["sensor_gain.mass_acc_m_s2"]["gain"] == pytest.approx([1.0], abs=1e-3)
     assert sealed["sized"]
+    assert sealed["laboratory"]["size"] > 10.0
+    signals, readings = simulate_readings(make_rig_toml(0.0))
+    assert measure_visible_size(signals, readings, compute_noise_rms(0.01)) < 1.1
     start = read_recording(paths.log).start
     for text in (start.rig_toml, start.profile_toml, start.model_toml, start.run):
         assert "load_sharing" not in text

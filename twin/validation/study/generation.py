@@ -38,6 +38,7 @@ from twin.validation.study.laboratory_truth import (
     compute_setup_errors,
     list_affected_channels,
     list_true_errors,
+    measure_visible_size,
 )
 from twin.validation.study.rig_setup import (
     MODEL_TOML,
@@ -165,9 +166,11 @@ def _describe_laboratory(case: Case, truth_path: Path, sha256: str) -> dict[str,
     """Return the laboratory of a case for scoring, with the errors that a verdict may name."""
     rig = make_rig_toml(0.0, case.noise_seed, str(truth_path), sha256)
     signals, readings = simulate_readings(rig)
+    noise = compute_noise_rms(case.cell.noise)
     return {
         "level": case.cell.laboratory,
         "imperfection": case.cell.imperfection,
+        "size": measure_visible_size(signals, readings, noise),
         "imperfections": [*map(_describe_imperfection, case.imperfections)],
         "channels": list_affected_channels(case.imperfections, SIGNAL_CHANNELS),
         "errors": list_true_errors(case.imperfections, signals, readings),

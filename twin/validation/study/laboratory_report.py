@@ -19,6 +19,8 @@ from twin.validation.study.rates import (
 Json = dict[str, Any]
 SET_UP_EFFECTS = frozenset({"gap_offset", "mass_error"})  # not of the specimen
 MAX_PARAMETER_ERROR = 0.01  # of an identified parameter
+# Residual of the refitted base model over the noise from which an imperfection can be seen.
+MIN_VISIBLE_SIZE = 1.5
 TOGETHER = "(all together)"
 
 
@@ -36,6 +38,11 @@ def compute_laboratory_metrics(rows: Sequence[Json]) -> list[StudyMetric]:
         make_min_metric(
             "bad, clean: named with kind and size", compute_rate(bad, "instrument"), None
         ),
+        make_min_metric(
+            "bad, clean, visible: named as the instrument's",
+            compute_rate([row for row in bad if is_visible(row)], "on_channel"),
+            0.90,
+        ),
         make_max_metric("bad, clean: a physical effect named", compute_rate(bad, "physics"), 0.02),
         make_min_metric("one effect: named", compute_rate(specimen, "hit"), 0.95),
         make_max_metric("one effect: wrong name", compute_rate(specimen, "wrong_name"), 0.02),
@@ -48,6 +55,11 @@ def compute_laboratory_metrics(rows: Sequence[Json]) -> list[StudyMetric]:
         *_make_identification_metrics(select_kind(typical, "identify")),
         make_median_metric("laboratory: CPU time per case in s", usable_rows, "seconds", 60.0),
     ]
+
+
+def is_visible(row: Json) -> bool:
+    """Return whether the imperfections leave more than noise in the residual of the base model."""
+    return bool((row.get("imperfection_size") or 0.0) >= MIN_VISIBLE_SIZE)
 
 
 def _split_single(typical: Sequence[Json]) -> tuple[list[Json], list[Json]]:

@@ -59,6 +59,7 @@ def score_laboratory(row: Json, verdict: Json, about: Json) -> Json:
     return {
         "laboratory": laboratory["level"],
         "imperfection": laboratory["imperfection"],
+        "imperfection_size": laboratory["size"],
         "findings": findings,
         **scores,
         "right": _is_right(row, laboratory["level"], scores),

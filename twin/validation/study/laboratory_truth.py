@@ -11,12 +11,16 @@ Errors of the set-up are stated by the laboratory: `gap_offset` (half the right 
 of the gaps' readings), `mass_error` (stated over true mass), `table_tilt` (pitch per travel).
 """
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from table_io.block import Float1D
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.sim.imperfections import Imperfection, resolve_sides
+from twin.validation.study.amplitude_search import evaluate_residual
 from twin.validation.study.rig_setup import PROFILE, StudySignals
 
 
@@ -33,7 +37,7 @@ class ReadingError:
 
 
 def measure_reading_errors(
-    signals: StudySignals, readings: Mapping[str, np.ndarray]
+    signals: StudySignals, readings: Mapping[str, Float1D]
 ) -> dict[str, ReadingError]:
     """Return the error of each channel; `readings` (sample,) are noise-free, in SI."""
     moving = signals.moving
@@ -55,6 +59,28 @@ def measure_reading_errors(
     return errors
 
 
+def measure_visible_size(
+    signals: StudySignals, readings: Mapping[str, Float1D], noise: Mapping[str, float]
+) -> float:
+    """Return the size of the laboratory, as that of an effect, from noise-free readings in SI.
+
+    It is that of the residual of the refitted base model, or of the difference of the two cells of
+    a side while they bear a load, if that is larger. `noise` is the rms per channel.
+    """
+    rest = slice(0, int(np.flatnonzero(signals.moving)[0]))
+    tared = {name: values - values[rest].mean() for name, values in readings.items()}
+    errors = {name: tared[name] - value for name, value in signals.channels.items()}
+    right, left = (sum(errors[cell] for cell in cells) for cells in (RIGHT_CELLS, LEFT_CELLS))
+    shown = replace(signals, channels=tared, right=signals.right + right, left=signals.left - left)
+    differences = [evaluate_residual(shown, signals, noise).rms]
+    for (first, second), force in ((RIGHT_CELLS, signals.right), (LEFT_CELLS, signals.left)):
+        if (loaded := signals.moving & (force != 0.0)).any():
+            difference = (tared[first] - tared[second])[loaded]
+            sigma = np.hypot(noise[first], noise[second])
+            differences.append(float(np.sqrt(np.mean(difference**2)) / sigma))
+    return math.hypot(1.0, max(differences))
+
+
 def compute_setup_errors(imperfections: Sequence[Imperfection]) -> dict[str, dict[str, float]]:
     """Return the parameters of the errors of the set-up, by effect of the library."""
     gaps = resolve_sides(imperfections, "gap_reading")
@@ -74,7 +100,7 @@ def compute_setup_errors(imperfections: Sequence[Imperfection]) -> dict[str, dic
 def list_true_errors(
     imperfections: Sequence[Imperfection],
     signals: StudySignals,
-    readings: Mapping[str, np.ndarray],
+    readings: Mapping[str, Float1D],
 ) -> dict[str, dict[str, list[float]]]:
     """Return the true parameters of each instrument error, by its name in a verdict.
 
