@@ -7,6 +7,7 @@ import pytest
 
 from table_io.block import Float1D
 from table_io.errors import InputError
+from tests.input_errors import raises_input_error
 from twin.exchange.columns import ImportedSamples, read_column_map, read_samples
 from twin.exchange.formats import SampleTable, make_column
 from twin.exchange.sampling import find_holes
@@ -127,14 +128,101 @@ def test_holes_keep_their_length(tmp_path: Path) -> None:
     assert find_holes(samples.index) == [(100, 3), (250, 140)]
 
 
-@pytest.mark.parametrize("wrong", [1000.0, 9.80665])
-def test_a_unit_that_looks_wrong_is_pointed_out(tmp_path: Path, wrong: float) -> None:
+BOTH = """[columns]
+table_disp_m = {{ column = "table_disp_m"{disp} }}
+table_acc_m_s2 = {{ column = "table_acc_m_s2"{acc} }}
+"""
+
+
+@pytest.mark.parametrize("wrong", [1000.0, 9.80665, 1000.0 * 9.80665, 39.37])
+def test_units_that_contradict_each_other_are_refused_unless_stated(
+    tmp_path: Path, wrong: float
+) -> None:
     x, a = 1e-3 * wave(), -1e-3 * (4 * np.pi) ** 2 * wave()
     fine = import_columns(tmp_path, time_s=TIME, table_disp_m=x, table_acc_m_s2=a)
     assert not [text for text in fine.notes if "warning" in text]
-    odd = import_columns(tmp_path, time_s=TIME, table_disp_m=x, table_acc_m_s2=a / wrong)
-    assert [text for text in odd.notes if "warning:" in text and "table_disp_m" in text]
-    np.testing.assert_array_equal(odd.channels["table_acc_m_s2"], a / wrong)
+    odd = {"time_s": TIME, "table_disp_m": x, "table_acc_m_s2": a / wrong}
+    with raises_input_error(where=tmp_path / "table.csv", key="table_disp_m", allowed="mm"):
+        import_columns(tmp_path, **odd)
+    with raises_input_error(key="table_disp_m", problem="table_acc_m_s2"):
+        import_columns(tmp_path, BOTH.format(disp=', unit = "m"', acc=""), **odd)
+    stated = import_columns(
+        tmp_path, BOTH.format(disp=', unit = "m"', acc=', unit = "m/s2"'), **odd
+    )
+    assert [text for text in stated.notes if "warning:" in text and "table_disp_m" in text]
+    np.testing.assert_array_equal(stated.channels["table_acc_m_s2"], a / wrong)
+
+
+def test_a_displacement_of_35_m_is_refused_and_a_quiet_table_warned_of(tmp_path: Path) -> None:
+    with raises_input_error(key="rel_disp_m", problem="70"):
+        import_columns(tmp_path, time_s=TIME, rel_disp_m=35.0 * wave())
+    quiet = import_columns(tmp_path, time_s=TIME, table_acc_m_s2=0.0141 * wave())
+    assert [text for text in quiet.notes if "warning:" in text and "table_acc_m_s2" in text]
+
+
+def test_units_of_laboratories(tmp_path: Path) -> None:
+    card = """[columns]
+    rel_disp_m = { column = "x", unit = "in" }
+    damper_force_n = { column = "F", unit = "kip" }
+    mass_disp_m = { column = "y", unit = "cm" }
+    """
+    samples = import_columns(tmp_path, card, time_s=TIME, x=wave(), y=wave(), F=wave())
+    for name, factor in (
+        ("rel_disp_m", 0.0254),
+        ("damper_force_n", 4448.2216152605),
+        ("mass_disp_m", 0.01),
+    ):
+        np.testing.assert_allclose(samples.channels[name], factor * wave(), rtol=1e-12)
+
+
+def test_a_slice_is_taken_in_the_times_of_the_file(tmp_path: Path) -> None:
+    card = "from_s = 10.5\nto_s = 11.0\n"
+    samples = import_columns(tmp_path, card, time_s=10.0 + TIME, rel_disp_m=TIME)
+    assert samples.channels["rel_disp_m"][[0, -1]] == pytest.approx([0.5, 1.0])
+    assert samples.index.tolist() == list(range(101))
+    by_rate = import_columns(tmp_path, "from_s = 0.5\nrate_hz = 200.0", rel_disp_m=TIME)
+    assert by_rate.channels["rel_disp_m"][0] == pytest.approx(0.5)
+    with raises_input_error(key="--from, --to", allowed="0 to"):
+        import_columns(tmp_path, "from_s = 9.0", time_s=TIME, rel_disp_m=wave())
+
+
+@pytest.mark.parametrize(("kind", "slope"), [("mean", 1.0), ("line", 0.0)])
+def test_a_trend_is_removed(tmp_path: Path, kind: str, slope: float) -> None:
+    values = 0.3 + 0.1 * TIME
+    values[5] = np.nan
+    samples = import_columns(tmp_path, f'detrend = "{kind}"', time_s=TIME, rel_disp_m=values)
+    channel = samples.channels["rel_disp_m"]
+    assert np.nanmean(channel) == pytest.approx(0.0, abs=1e-12)
+    assert np.nanmax(channel) - np.nanmin(channel) == pytest.approx(
+        slope * 0.1 * TIME[-1], abs=1e-9
+    )
+
+
+def test_accelerations_are_integrated_in_the_stated_band(tmp_path: Path) -> None:
+    """Outside the band nothing is left, of the accelerations neither."""
+    rng, hz = np.random.default_rng(0), 2.0
+    time = np.arange(4000) / 200.0
+    u = 3e-3 * np.sin(2 * np.pi * hz * time) * np.hanning(time.size)
+    acc = np.gradient(np.gradient(u, time), time)
+    table = 0.2 * np.sin(2 * np.pi * 5.0 * time) * np.hanning(time.size)
+    drift = 0.05 * np.sin(2 * np.pi * 0.07 * time)
+    samples = import_columns(
+        tmp_path, "integrate_hz = [0.5, 20.0]", time_s=time,
+        mass_acc_m_s2=acc + table + drift + 1e-3 * rng.normal(size=time.size), table_acc_m_s2=table,
+    )  # fmt: skip
+    error = samples.channels["rel_disp_m"] - u
+    assert error.std() < 0.06 * u.std()
+    left = samples.channels["mass_acc_m_s2"] - acc - table
+    assert left.std() < 0.05 * drift.std()
+    assert any("0.5 to 20 Hz" in note for note in samples.notes)
+
+
+@pytest.mark.parametrize(
+    ("band", "allowed"), [("[0.5, 200.0]", "100 Hz"), ("[0.1, 20.0]", "1 to"), ("[9.0, 2.0]", "LOW")]
+)
+def test_bands_that_cannot_be(tmp_path: Path, band: str, allowed: str) -> None:
+    with raises_input_error(allowed=allowed):
+        import_columns(tmp_path, f"integrate_hz = {band}", time_s=TIME, mass_acc_m_s2=wave())
 
 
 def test_what_is_missing_or_lost_is_said(tmp_path: Path) -> None:

@@ -208,7 +208,7 @@ def test_a_table_without_a_profile_says_so_and_has_its_curve(
     sweep = read_recorded_config(bare).profile.sweep
     assert (sweep.cycles, sweep.measured_cycles) == (6, 2)
     (warning,) = (event for event in bare.records(Event) if event.kind == "warning")
-    assert warning.text.startswith("no --profile: unit mass, no bumpers, a 1 Hz placeholder model")
+    assert warning.text.startswith("no --profile: unit mass, no bumpers, a placeholder model")
     assert warning.text in capsys.readouterr().out
     assert "no --profile" not in read_warnings(run[1])
 

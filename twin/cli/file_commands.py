@@ -43,11 +43,18 @@ def verify_command(
 
 @files_app.command("import", rich_help_panel=FILES_PANEL)
 def import_command(
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="CSV, Parquet, MAT, UFF 58, TDMS, HDF5 or npz.")
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...",
+            help="Text, xlsx, Parquet, MAT, UFF 58, TDMS, HDF5 or npz; several runs alike.",
+        ),
     ],
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="LOG", help="New log, a .mcap file.")
+        Path | None,
+        typer.Option(
+            "-o", "--out", metavar="LOG", help="New log, a .mcap file; of several files a folder."
+        ),
     ] = None,
     profile: Annotated[
         Path | None, typer.Option("--profile", help="Test profile with specimen, gaps and sweep.")
@@ -63,31 +70,71 @@ def import_command(
             help="Column map (channel, unit, gain of each column), a .toml file.",
         ),
     ] = None,
+    accept: Annotated[
+        bool, typer.Option("--accept", help="Take the map that is proposed without -o.")
+    ] = False,
+    save_map: Annotated[
+        Path | None,
+        typer.Option("--save-map", metavar="MAP", help="Write the proposed map to this new file."),
+    ] = None,
+    mass: Annotated[
+        float | None, typer.Option("--mass", metavar="KG", help="Moving mass, without a profile.")
+    ] = None,
+    rate: Annotated[
+        float | None,
+        typer.Option("--rate", metavar="HZ", help="Sampling rate of a file without times."),
+    ] = None,
+    from_s: Annotated[
+        float | None, typer.Option("--from", metavar="S", help="Import from this time of the file.")
+    ] = None,
+    to_s: Annotated[
+        float | None, typer.Option("--to", metavar="S", help="Import up to this time of the file.")
+    ] = None,
+    detrend: Annotated[
+        str | None,
+        typer.Option("--detrend", metavar="mean|line", help="Remove it from every channel."),
+    ] = None,
+    no_rest: Annotated[
+        bool, typer.Option("--no-rest", help="Take no still part as rest at zero.")
+    ] = False,
+    integrate: Annotated[
+        str | None,
+        typer.Option(
+            "--integrate",
+            metavar="LOW:HIGH",
+            help="Integrate the relative displacement from accelerations, in this band in Hz.",
+        ),
+    ] = None,
     contents: Annotated[
         bool, typer.Option("--list", help="Only list the contents of the file.")
     ] = False,
 ) -> None:
-    """Import a table of samples as a log; steps come from its labels or its motion."""
-    from twin.exchange import import_table
+    """Import tables of samples as logs; without -o, propose which column is which channel."""
+    from table_io.errors import InputError
+    from twin.cli import import_files
 
     if contents:
         if out is not None:
-            from table_io.errors import InputError
-
             raise InputError(
-                f"--list writes no log, it only prints the contents of {file}",
+                f"--list writes no log, it only prints the contents of {files[0]}",
                 where=f"-o {out}",
                 remedy="omit -o or --list",
             )
-        import_table.print_contents(file, columns)
-        return
-    if out is None:
-        from table_io.errors import InputError
+        from twin.exchange.import_table import print_contents
 
-        raise InputError(
-            "the name of the new log is missing", where=file, remedy="add it, such as -o run.mcap"
-        )
-    raise typer.Exit(import_table.import_samples(file, out, profile, rig, columns))
+        for file in files:
+            print_contents(file, columns)
+        return
+    stated = {
+        "mass_kg": mass, "rate_hz": rate, "from_s": from_s, "to_s": to_s, "detrend": detrend,
+        "rest": False if no_rest else None,
+        "integrate_hz": import_files.parse_band(integrate) if integrate is not None else None,
+    }  # fmt: skip
+    request = import_files.ImportRequest(
+        files, out, profile, rig, columns, accept, save_map,
+        {key: value for key, value in stated.items() if value is not None},
+    )  # fmt: skip
+    raise typer.Exit(import_files.import_command(request))
 
 
 @files_app.command("export", rich_help_panel=FILES_PANEL)

@@ -1,11 +1,13 @@
 """Column mapping of an imported table: to channels in SI and sample indices.
 
-Units are declared, never inferred; a unit that looks wrong causes a warning only.
+Units are declared, never inferred. Numbers that are absurd in a unit which nobody stated are
+refused; in a stated unit they cause a warning.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
@@ -14,26 +16,13 @@ from table_io.block import Float1D, Int1D
 from table_io.channels import CHANNEL_BY_NAME, Channel
 from table_io.config.base import ConfigModel, Finite, Positive, load_config
 from table_io.errors import InputError, suggest
-from table_io.units import GRAVITY_M_S2, UNITS
+from table_io.units import UNITS
 from twin.exchange.formats import MAX_LISTED_COLUMNS, SampleTable, check_size
+from twin.exchange.formats.layout import TIME_UNITS, normalize_unit
+from twin.exchange.integration import integrate_accelerations
+from twin.exchange.plausibility import list_implausible
 from twin.exchange.sampling import fit_uniform_rate, resolve_stated_rate
 from twin.recording.tabular import LABEL_UNITS, TIME_COLUMN, TWIN_PREFIX
-
-UNIT_SPELLINGS = {
-    "meter": "m", "meters": "m", "metre": "m", "metres": "m",
-    "millimeter": "mm", "millimetre": "mm",
-    "m/s/s": "m/s2", "ms-2": "m/s2", "m*s-2": "m/s2", "gn": "g", "newton": "N", "newtons": "N",
-    "n": "N", "kn": "kN", "°c": "degC", "degc": "degC", "celsius": "degC",
-    "sec": "s", "second": "s", "seconds": "s", "hz": "Hz",
-}  # fmt: skip
-TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
-SUSPECT_FACTORS = {1e3: "1000", 1e-3: "1/1000", GRAVITY_M_S2: "g", 1 / GRAVITY_M_S2: "1/g"}
-RELATIVE_ACC = "mass_acc_m_s2 - table_acc_m_s2"
-DERIVATIVE_PAIRS = (
-    ("table_disp_m", "table_acc_m_s2"),
-    ("mass_disp_m", "mass_acc_m_s2"),
-    ("rel_disp_m", RELATIVE_ACC),
-)
 
 
 class ColumnSource(ConfigModel):
@@ -76,6 +65,14 @@ class ColumnMap(ConfigModel):
 
     group: str = Field("", description="Group, structure or folder inside the file.")
     rate_hz: Positive | None = Field(None, description="Sampling rate of a file without times.")
+    mass_kg: Positive | None = Field(None, description="Moving mass; a component test has none.")
+    from_s: Finite | None = Field(None, description="First time of the file that is imported.")
+    to_s: Finite | None = Field(None, description="Last time of the file that is imported.")
+    rest: bool = Field(True, description="Still beginnings and ends are at rest, at zero.")
+    detrend: Literal["", "mean", "line"] = Field("", description="Remove it from each channel.")
+    integrate_hz: tuple[Positive, Positive] | None = Field(
+        None, description="Band in which rel_disp_m is integrated from the accelerations."
+    )
     columns: dict[str, ColumnSource] = Field(default_factory=dict)
 
     @field_validator("columns")
@@ -86,6 +83,13 @@ class ColumnMap(ConfigModel):
         if TIME_COLUMN in columns and info.data.get("rate_hz") is not None:
             raise ValueError(f"{TIME_COLUMN} and rate_hz both state the sampling times; keep one")
         return columns
+
+    @field_validator("integrate_hz")
+    @classmethod
+    def _check_band(cls, band: tuple[float, float] | None) -> tuple[float, float] | None:
+        if band is not None and not band[0] < band[1]:
+            raise InputError("not a band", value=list(band), allowed="[LOW, HIGH] with LOW < HIGH")
+        return band
 
 
 @dataclass(frozen=True)
@@ -150,12 +154,21 @@ class ImportedSamples:
 
 
 def read_samples(
-    table: SampleTable, column_map: ColumnMap | None, known: ImportColumns = CANONICAL_COLUMNS
+    table: SampleTable,
+    column_map: ColumnMap | None,
+    known: ImportColumns = CANONICAL_COLUMNS,
+    *,
+    leave_out: bool | None = None,
 ) -> ImportedSamples:
-    """Convert a table to samples; raise InputError for unknown columns or nonuniform time."""
+    """Convert a table to samples; raise InputError for unknown columns or nonuniform time.
+
+    `leave_out`: unknown columns are left out, else refused; by default as far as there is a map.
+    """
     if column_map is not None:
         known.check_map(column_map)
-    sources, notes = _select_columns(table, column_map, known)
+    if leave_out is None:
+        leave_out = column_map is not None
+    sources, notes = _select_columns(table, column_map, known, leave_out)
     for name, column in sources.items():
         _check_unit(table, name, column, known.recorded_unit(name))
     _check_lengths(table, sources)
@@ -164,6 +177,11 @@ def read_samples(
         for name, column in sources.items()
     }
     time = values.pop(TIME_COLUMN, _read_file_time(table, sources, column_map))
+    if column_map is not None and (column_map.from_s, column_map.to_s) != (None, None):
+        rows, note = _select_rows(table, sources, column_map, time)
+        values = {name: column[rows] for name, column in values.items()}
+        time = None if time is None else time[rows]
+        notes.append(note)
     order = [name for name in known.channels if name in values]
     channels = {name: values[name] for name in order}
     if time is not None:
@@ -174,15 +192,15 @@ def read_samples(
         rate, rate_notes = resolve_stated_rate(
             table, infos, column_map.rate_hz if column_map is not None else None
         )
-        index = np.arange(infos[0].size)
+        index = np.arange(next(iter(channels.values())).size)
         notes += rate_notes
     missing = [name for name in known.channels if name not in channels]
     notes.append(f"not in the file: {', '.join(missing)}")
     notes += [f"{name}: all samples lost" for name in order if np.isnan(channels[name]).all()]
+    notes += _check_plausibility(table, sources, channels, known, rate)
     labels = {name: values[name] for name in LABEL_UNITS if name in values}
-    return ImportedSamples(
-        rate, index, channels, (*table.notes, *notes, *_find_suspect_units(channels, rate)), labels
-    )
+    samples = ImportedSamples(rate, index, channels, (*table.notes, *notes), labels)
+    return condition_samples(samples, column_map) if column_map is not None else samples
 
 
 def _read_file_time(
@@ -207,7 +225,7 @@ def _read_file_time(
 
 
 def _select_columns(
-    table: SampleTable, column_map: ColumnMap | None, known: ImportColumns
+    table: SampleTable, column_map: ColumnMap | None, known: ImportColumns, leave_out: bool
 ) -> tuple[dict[str, ColumnSource], list[str]]:
     """Select the source of each channel, by the map and by name; return (sources, notes)."""
     mapped = dict(column_map.columns) if column_map is not None else {}
@@ -225,12 +243,13 @@ def _select_columns(
             name != TIME_COLUMN or column_map is None or column_map.rate_hz is None
         ):
             mapped[name] = ColumnSource(column=name)
-        elif column_map is None:
+        elif not leave_out:
             raise InputError(
                 f"column {name!r} is unknown; {suggest(name, known.names)}",
                 where=table.path,
-                remedy="rename it, map the columns with --columns MAP (others are left out), or "
-                "declare it by [[channels]] in a rig file and give that by --rig",
+                remedy="`import FILE` without -o proposes a map; or map the columns with --columns "
+                "MAP (others are left out), or declare it by [[channels]] in a rig file and give "
+                "that by --rig",
             )
         else:
             left_out.append(name)
@@ -281,7 +300,7 @@ def _check_unit(table: SampleTable, name: str, column: ColumnSource, recorded_un
     if not file_unit or (column.file_unit is not None and column.file_unit == file_unit):
         return
     stated = column.file_unit or column.unit or recorded_unit
-    if _normalize_unit(file_unit) == stated:
+    if normalize_unit(file_unit) == stated:
         return
     declared_by = "the map" if column.file_unit or column.unit else "its name"
     raise InputError(
@@ -291,14 +310,6 @@ def _check_unit(table: SampleTable, name: str, column: ColumnSource, recorded_un
         remedy=f"state unit = ... in a --columns file, or file_unit = {file_unit!r} if a gain "
         "converts it",
     )
-
-
-def _normalize_unit(unit: str) -> str:
-    """Return the unit in canonical spelling if it is known."""
-    text = unit.strip().replace("²", "2").replace("µ", "u").replace("μ", "u")
-    for character in ("^", "**", " ", "(", ")", "[", "]"):
-        text = text.replace(character, "")
-    return UNIT_SPELLINGS.get(text.lower(), text)
 
 
 def _check_lengths(table: SampleTable, sources: dict[str, ColumnSource]) -> None:
@@ -314,35 +325,88 @@ def _check_lengths(table: SampleTable, sources: dict[str, ColumnSource]) -> None
     check_size(table, [*sizes])
 
 
-def _find_suspect_units(channels: dict[str, Float1D], rate_hz: float) -> list[str]:
-    """Return warnings where a second derivative differs from an acceleration by 1000 or g.
-
-    The rms ratio omega^2 |X| / |A| is taken over the spectral lines where |X A| is at least 0.1 of
-    its maximum.
-    """
-    finite = {name: values for name, values in channels.items() if np.isfinite(values).any()}
-    if {"mass_acc_m_s2", "table_acc_m_s2"} <= finite.keys():
-        finite[RELATIVE_ACC] = finite["mass_acc_m_s2"] - finite["table_acc_m_s2"]
-    warnings = []
-    for disp, acc in DERIVATIVE_PAIRS:
-        if not {disp, acc} <= finite.keys():
-            continue
-        x, a = (np.nan_to_num(finite[name] - np.nanmean(finite[name])) for name in (disp, acc))
-        window = np.hanning(x.size)
-        spectrum_x, spectrum_a = np.fft.rfft(x * window), np.fft.rfft(a * window)
-        omega_squared = (2 * np.pi * rate_hz * np.fft.rfftfreq(x.size)) ** 2
-        is_loud = np.abs(spectrum_x * spectrum_a) >= 0.1 * np.abs(spectrum_x * spectrum_a).max()
-        total = float(np.sum(np.abs(spectrum_a[is_loud]) ** 2))
-        ratio = float(
-            np.sqrt(np.sum(np.abs(omega_squared * spectrum_x)[is_loud] ** 2) / max(total, 1e-300))
+def _select_rows(
+    table: SampleTable,
+    sources: dict[str, ColumnSource],
+    column_map: ColumnMap,
+    time: Float1D | None,
+) -> tuple[slice, str]:
+    """Return (rows from `from_s` to `to_s`, note); raise InputError if none is between them."""
+    if time is None:
+        infos = [table.columns[column.column] for column in sources.values()]
+        rate_hz, _ = resolve_stated_rate(table, infos, column_map.rate_hz)
+        time = infos[0].start_s + np.arange(infos[0].size) / rate_hz
+    first_s = -np.inf if column_map.from_s is None else column_map.from_s
+    last_s = np.inf if column_map.to_s is None else column_map.to_s
+    inside = np.flatnonzero((time >= first_s) & (time <= last_s))
+    if not inside.size:
+        raise InputError(
+            f"no sample from {first_s:g} to {last_s:g} s",
+            where=table.path,
+            key="--from, --to",
+            allowed=f"{time[0]:g} to {time[-1]:g} s",
         )
-        for factor, name in SUSPECT_FACTORS.items():
-            if abs(np.log(ratio / factor)) < 0.25:
-                warnings.append(
-                    f"warning: the second derivative of {disp} is {name} times {acc}; if a unit is "
-                    "wrong, state units with --columns"
-                )
+    rows = slice(int(inside[0]), int(inside[-1]) + 1)
+    return rows, f"only {time[rows.start]:.6g} to {time[rows.stop - 1]:.6g} s of the file"
+
+
+def _check_plausibility(
+    table: SampleTable,
+    sources: dict[str, ColumnSource],
+    channels: dict[str, Float1D],
+    known: ImportColumns,
+    rate_hz: float,
+) -> list[str]:
+    """Return warnings of absurd numbers in stated units; InputError where no unit is stated."""
+    units = {name: known.recorded_unit(name) for name in channels}
+    warnings = []
+    for implausible in list_implausible(channels, units, rate_hz):
+        unstated = [
+            sources[name].column
+            for name in implausible.channels
+            if not (
+                sources[name].unit
+                or sources[name].gain != 1.0
+                or table.columns[sources[name].column].unit
+            )
+        ]
+        if unstated and not implausible.is_possible:
+            raise InputError(
+                f"{implausible.problem}; the unit of {', '.join(unstated)} is nowhere stated",
+                where=table.path,
+                key=implausible.channels[0],
+                allowed=", ".join(known.unit_factors(implausible.channels[0])),
+                remedy="state unit = ... in a --columns file, also if the numbers are right",
+            )
+        warnings.append(f"warning: {implausible.problem}; check the units in the map")
     return warnings
+
+
+def condition_samples(samples: ImportedSamples, column_map: ColumnMap) -> ImportedSamples:
+    """Return the samples detrended, and integrated, as the map demands, with notes."""
+    channels, notes = dict(samples.channels), [*samples.notes]
+    if column_map.detrend:
+        degree = 0 if column_map.detrend == "mean" else 1
+        channels = {
+            name: _remove_trend(values, samples.index, degree) for name, values in channels.items()
+        }
+        notes.append(f"{column_map.detrend} removed from every channel")
+    if column_map.integrate_hz is not None:
+        channels, note = integrate_accelerations(
+            channels, samples.index, samples.rate_hz, column_map.integrate_hz
+        )
+        notes.append(note)
+    return replace(samples, channels=channels, notes=tuple(notes))
+
+
+def _remove_trend(values: Float1D, index: Int1D, degree: int) -> Float1D:
+    """Return the channel less its mean or its straight line, (row,)."""
+    is_finite = np.isfinite(values)
+    if is_finite.sum() <= degree:
+        return values
+    line = np.polynomial.Polynomial.fit(index[is_finite], values[is_finite], degree)
+    detrended: Float1D = values - line(index)
+    return detrended
 
 
 def read_column_map(path: Path | None) -> ColumnMap | None:

@@ -1,23 +1,32 @@
 """`shaketwin import`: conversion of a table of samples to a log."""
 
 import json
+import math
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from table_io.block import Block, Float1D, Float2D
+from table_io.block import Block, Float1D, Float2D, Label
 from table_io.config.base import find_config, load_config, parse_toml
 from table_io.config.channel import read_channels
 from table_io.config.profile import Profile, load_profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.records import Event, RunStart, RunStop, SampleGap
-from twin.exchange.columns import ImportColumns, ImportedSamples, read_column_map, read_samples
+from twin.exchange.columns import (
+    ColumnMap,
+    ImportColumns,
+    ImportedSamples,
+    read_column_map,
+    read_samples,
+)
 from twin.exchange.formats import TOML_TEXTS, SampleTable, read_table
 from twin.exchange.labels import read_labels, typical_cycles
+from twin.exchange.proposal import propose_map
 from twin.exchange.sampling import find_holes
 from twin.identification.step_detection import DetectedSteps, find_steps
 from twin.reports.finalize import EXIT_GAPS
@@ -29,7 +38,7 @@ from twin.run.warm_up import compile_kernels
 from twin.transport.codec import Item
 
 NO_PROFILE = (
-    "warning: no --profile: unit mass, no bumpers, a 1 Hz placeholder model; PRC and twin are "
+    "warning: no --profile: {mass}, no bumpers, a placeholder model; PRC and twin are "
     "meaningless, give --profile"
 )
 MOTION_CHANNELS = (
@@ -38,14 +47,16 @@ MOTION_CHANNELS = (
     "table_acc_m_s2",
     "rel_disp_m",
 )  # steps are detected in the first one present
+NO_REST = "nothing is taken as rest: no channel has a zero, noise is taken from the motion"
+MAX_REST_SHARE = 0.1  # of the range of the motion, by which a channel may be off zero at rest
 MAX_GAPS = 1000  # per channel: beyond, lost samples are only counted
 MAX_SAMPLES_PER_ROW = 10  # beyond, the rows are not one recording
 PLAIN_PROFILE = """\
 title = {title}
-notes = "No profile was given: a unit mass without bumpers, so a force is one per unit mass."
+notes = {notes}
 rig = {rig}
 [specimen]
-mass_kg = 1.0
+mass_kg = {mass_kg!r}
 gap_mm = inf
 [acquisition]
 rate_hz = {rate_hz!r}
@@ -56,14 +67,17 @@ step_hz = {hz!r}
 cycles = {cycles}
 measured_cycles = {measured}
 """
+UNIT_MASS_NOTE = "No mass was given: a unit mass without bumpers, so a force is one per unit mass."
 PLAIN_MODEL = """\
-title = "Placeholder: 1 Hz, 5 % damping; the specimen is unknown, give --model"
+title = "Placeholder: {hz:.3g} Hz, 5 % damping; the specimen is unknown, give --model"
 [base]
-stiffness_n_m = 39.47841760435743
-damping_n_s_m = 0.6283185307179586
+stiffness_n_m = {stiffness!r}
+damping_n_s_m = {damping!r}
 bumper_stiffness_n_m = 1.0
 bumper_damping_n_s_m = 0.0
 """
+MAX_PLACEHOLDER_HZ, PLACEHOLDER_DAMPING = 1.0, 0.05
+SAMPLES_PER_CYCLE = 128  # of the placeholder; a power of two, so that no rate is rounded below 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +102,31 @@ class _SampleGrid:
         yield first, self.size
 
 
+@dataclass(frozen=True)
+class ImportOptions:
+    """Options of an import that a column map may also state; those given here win.
+
+    `accept`: take the proposed map.
+    """
+
+    accept: bool = False
+    settings: Mapping[str, Any] = field(default_factory=dict)  # keys of ColumnMap
+
+    def apply(self, column_map: ColumnMap | None) -> ColumnMap | None:
+        """Return the map with these settings; None if there is nothing to state."""
+        if not self.settings:
+            return column_map
+        stated = column_map.model_dump(exclude_unset=True) if column_map is not None else {}
+        return ColumnMap.model_validate(stated | dict(self.settings))
+
+
 def import_samples(
-    file: Path, out: Path, profile: Path | None, rig: str | None, columns: Path | None
+    file: Path,
+    out: Path,
+    profile: Path | None,
+    rig: str | None,
+    columns: Path | None,
+    options: ImportOptions = ImportOptions(),
 ) -> int:
     """Convert the table in `file` to a new log at `out`; return the exit code."""
     if out.exists():
@@ -100,10 +137,25 @@ def import_samples(
     if profile is not None:
         load_profile(profile)  # report errors before reading a long table
     table = read_table(file, column_map.group if column_map is not None else "")
-    rig_toml = _read_rig_toml(table, profile, rig)
-    samples_read = read_samples(table, column_map, ImportColumns(read_channels(rig_toml)))
+    rig_toml = read_rig_toml(table, profile, rig)
+    known = ImportColumns(read_channels(rig_toml))
+    if options.accept:
+        proposal = propose_map(table, known, options.settings)
+        if proposal.questions:
+            raise InputError(
+                "the proposed map is open: " + "; ".join(proposal.questions),
+                where=file,
+                remedy="save it by --save-map MAP, answer there, and import with --columns MAP",
+            )
+        column_map = proposal.to_map()
+    is_mapped = columns is not None or options.accept
+    column_map = options.apply(column_map)
+    samples_read = read_samples(table, column_map, known, leave_out=is_mapped)
     file_labels = read_labels(table, samples_read) if samples_read.labels else None
-    config = _build_run_config(table, profile, rig_toml, samples_read.rate_hz, file_labels)
+    mass_kg = column_map.mass_kg if column_map is not None else None
+    config = _build_run_config(
+        table, profile, rig_toml, samples_read.rate_hz, file_labels, mass_kg
+    )
     grid = _to_grid(file, samples_read)
     if file_labels is not None:
         labels = file_labels
@@ -116,11 +168,19 @@ def import_samples(
             is_acc=is_acc,
             on_grid=profile is not None,
         )
+    if column_map is not None and not column_map.rest:
+        moving = np.where(labels.label == Label.REST, int(Label.SETTLE), labels.label)
+        labels = replace(labels, label=moving, messages=(*labels.messages, NO_REST))
     is_history = not labels.steps and bool((labels.step >= 0).any())
     steps = () if is_history else labels.steps or config.steps
     config = replace(config, drive=replace(config.drive, steps=steps))
-    missing_profile = (NO_PROFILE,) if profile is None and not _has_config_texts(table) else ()
-    notes = (*missing_profile, *samples_read.notes, *labels.messages, _describe_steps(labels))
+    mass_text = "unit mass" if mass_kg is None else f"{mass_kg:g} kg"
+    is_plain = profile is None and not _has_config_texts(table)
+    missing_profile = (NO_PROFILE.format(mass=mass_text),) if is_plain else ()
+    notes = (
+        *missing_profile, *samples_read.notes, *labels.messages, _describe_steps(labels),
+        *_find_shifted_rest(grid, labels),
+    )  # fmt: skip
     gaps = 0
     with RunProgress(console, len(steps), grid.size) as progress:
 
@@ -145,6 +205,24 @@ def import_samples(
     return EXIT_GAPS if gaps else 0
 
 
+def _find_shifted_rest(grid: _SampleGrid, labels: DetectedSteps) -> Iterator[str]:
+    """Yield a warning per displacement or force whose still beginning is far from its zero."""
+    moving = np.flatnonzero(labels.label != Label.REST)
+    if not moving.size or not moving[0]:
+        return
+    for name, values in zip(grid.channels, grid.values, strict=True):
+        rest, motion = values[: moving[0]], values[moving[0] : moving[-1] + 1]
+        if not (np.isfinite(rest).any() and np.isfinite(motion).any()):
+            continue
+        offset = float(np.nanmean(rest))
+        if abs(offset) > MAX_REST_SHARE * float(np.nanmax(motion) - np.nanmin(motion)):
+            yield (
+                f"warning: {name} reads {offset:.4g} while it is still: rest is taken as its zero; "
+                "if it is none, as after the mean was removed or under a preload, import with "
+                "--no-rest"
+            )
+
+
 def print_contents(file: Path, columns: Path | None) -> None:
     """Print the contents of a file, one line per column."""
     column_map = read_column_map(columns)
@@ -157,7 +235,7 @@ def _has_config_texts(table: SampleTable) -> bool:
     return len(table.texts) == len(TOML_TEXTS)
 
 
-def _read_rig_toml(table: SampleTable, profile: Path | None, rig: str | None) -> str:
+def read_rig_toml(table: SampleTable, profile: Path | None, rig: str | None) -> str:
     """Read the text of the rig file: the one given, else of the table, else of the profile."""
     if rig is None and profile is None and _has_config_texts(table):
         return table.texts["rig_toml"]
@@ -175,6 +253,7 @@ def _build_run_config(
     rig_toml: str,
     rate_hz: float,
     labels: DetectedSteps | None,
+    mass_kg: float | None = None,
 ) -> RunConfig:
     """Build the run config of the log, with the sampling rate of the file."""
     file = table.path
@@ -185,23 +264,48 @@ def _build_run_config(
             profile_toml = _set_rate(profile_toml, rate_hz)
         return from_texts(file.stem, profile_toml, rig_toml, model_toml, f"config in {file}")
     if profile is None:
-        hz = min(1.0, rate_hz / 100)  # placeholder that passes profile validation
-        cycles, measured = typical_cycles(labels) if labels is not None else (3, 3)
-        text = PLAIN_PROFILE.format(
-            title=json.dumps(f"Imported: {file.name}"),
-            rig=json.dumps(parse_toml(rig_toml, RigConfig, "rig file").name),
-            rate_hz=rate_hz,
-            hz=hz,
-            cycles=cycles,
-            measured=measured,
+        return _build_placeholder(table, rig_toml, rate_hz, labels, mass_kg)
+    if mass_kg is not None:
+        raise InputError(
+            "the profile states the mass", key="mass_kg", value=mass_kg, remedy="leave one out"
         )
-        return from_texts(file.stem, text, rig_toml, PLAIN_MODEL, f"{file} without a profile")
     test_profile, text = load_profile(profile)
     model_toml = read_model(test_profile.model, profile)[1]
     source = f"{profile}, at the {rate_hz:g} Hz of {file}"
     if test_profile.acquisition.rate_hz != rate_hz:
         text = _set_rate(text, rate_hz)
     return from_texts(profile.stem, text, rig_toml, model_toml, source)
+
+
+def _build_placeholder(
+    table: SampleTable,
+    rig_toml: str,
+    rate_hz: float,
+    labels: DetectedSteps | None,
+    mass_kg: float | None,
+) -> RunConfig:
+    """Build the run config of a log whose specimen is unknown, but for its mass if it is given."""
+    hz = min(MAX_PLACEHOLDER_HZ, rate_hz / SAMPLES_PER_CYCLE)
+    mass = 1.0 if mass_kg is None else mass_kg
+    omega = 2.0 * math.pi * hz
+    cycles, measured = typical_cycles(labels) if labels is not None else (3, 3)
+    profile_toml = PLAIN_PROFILE.format(
+        title=json.dumps(f"Imported: {table.path.name}"),
+        notes=json.dumps(UNIT_MASS_NOTE if mass_kg is None else "Without bumpers."),
+        rig=json.dumps(parse_toml(rig_toml, RigConfig, "rig file").name),
+        mass_kg=mass,
+        rate_hz=rate_hz,
+        hz=hz,
+        cycles=cycles,
+        measured=measured,
+    )
+    model_toml = PLAIN_MODEL.format(
+        hz=hz,
+        stiffness=mass * omega**2,
+        damping=2.0 * PLACEHOLDER_DAMPING * mass * omega,
+    )
+    source = f"{table.path} without a profile"
+    return from_texts(table.path.stem, profile_toml, rig_toml, model_toml, source)
 
 
 def _set_rate(profile_toml: str, rate_hz: float) -> str:

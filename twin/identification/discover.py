@@ -115,8 +115,7 @@ def prepare_problem(
         raise InputError("no log is given", remedy="give at least one recording")
     pairs = [(log.signals, log.contact_n) for log in logs]
     log_residuals = build_log_residuals(pairs, model)
-    for residuals in log_residuals:
-        _check_enough_data(residuals)
+    _check_enough_data(log_residuals)
     parameters = initialize_parameters(log_residuals, model)
     first = fit_parameters(log_residuals, parameters, mapper=mapper)
     log_residuals = build_log_residuals(pairs, first.parameters.to_model())
@@ -240,15 +239,22 @@ def _input_gain(residuals: LogResiduals) -> float:
     return 1.0 / abs(float(slope)) if slope else 1.0
 
 
-def _check_enough_data(residuals: LogResiduals) -> None:
-    entries, blocks = residuals.entry_row.size, np.unique(residuals.entry_block).size
-    if entries < MIN_ENTRIES or blocks < MIN_BLOCKS:
-        raise InputError(
-            f"too few usable samples: {entries} in {blocks} cycles",
-            where=residuals.signals.name,
-            allowed=f"at least {MIN_ENTRIES} in {MIN_BLOCKS} cycles",
-            remedy="record a longer test",
-        )
+def _check_enough_data(log_residuals: Sequence[LogResiduals]) -> None:
+    """Raise InputError if all logs together hold too few samples or cycles, or one holds none."""
+    counts = [
+        (residuals.entry_row.size, np.unique(residuals.entry_block).size)
+        for residuals in log_residuals
+    ]
+    entries, blocks = (sum(count) for count in zip(*counts, strict=True))
+    for residuals, (own_entries, _) in zip(log_residuals, counts, strict=True):
+        if not own_entries or entries < MIN_ENTRIES or blocks < MIN_BLOCKS:
+            raise InputError(
+                f"too few usable samples: {own_entries if not own_entries else entries} in "
+                f"{blocks} cycles",
+                where=residuals.signals.name if len(counts) == 1 or not own_entries else "",
+                allowed=f"at least {MIN_ENTRIES} in {MIN_BLOCKS} cycles, in all logs together",
+                remedy="record a longer test, or give several recordings of the specimen",
+            )
 
 
 def find_implausible_parameters(model: Model, fit: FitResult) -> list[str]:

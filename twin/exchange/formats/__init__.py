@@ -22,6 +22,7 @@ FORMATS = {
     ".tdms": "tdms",
     ".h5": "hdf5", ".hdf5": "hdf5", ".hdf": "hdf5",
     ".npz": "npz",
+    ".xlsx": "xlsx", ".xlsm": "xlsx",
 }  # fmt: skip
 TOML_TEXTS = (
     "profile_toml",
@@ -74,6 +75,7 @@ class SampleTable:
     first_row: int = 1  # row number in the file of the first sample
     skipped: dict[str, str] = field(default_factory=dict)
     texts: dict[str, str] = field(default_factory=dict)  # of TOML_TEXTS
+    facts: dict[str, float] = field(default_factory=dict)  # stated: rate_hz, mass_kg
 
     def read_column(self, name: str) -> Float1D:
         """Read the values of a column, (row,), float64; NaN where a sample is lost."""

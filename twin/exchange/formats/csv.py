@@ -1,12 +1,15 @@
 """CSV reader and writer for text tables of numbers.
 
-The delimiter (comma, semicolon or tab) is that of the header. An empty cell or "NaN" is a lost
-sample. Any other cell that is not a finite number is an InputError with file, row and column.
+The delimiter is a comma, a semicolon, a tab or blanks; the samples may be preceded by remarks, a
+row of names and a row of units (`layout`). An empty cell or "NaN" is a lost sample. Any other cell
+that is not a finite number is an InputError with file, row and column.
 """
 
 import csv
+import re
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from itertools import chain, islice
 from pathlib import Path
 from typing import TextIO
 
@@ -15,9 +18,11 @@ import numpy as np
 from table_io.channels import CHANNEL_BY_NAME
 from table_io.errors import InputError
 from twin.exchange.formats import FORMATS, SampleTable, make_column
+from twin.exchange.formats.layout import MAX_HEAD_ROWS, TableLayout, find_layout
 from twin.recording.tabular import TIME_COLUMN, LogTable
 
-DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs"}
+BLANKS = " "  # one or more of them, or tabs
+DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", BLANKS: "blanks"}
 MAX_LINE_CHARS = 1_000_000
 SNIFF_BYTES = 4096
 
@@ -53,14 +58,18 @@ def write_csv(rows: LogTable, file: TextIO) -> None:
 
 def _parse_table(file: TextIO, path: Path) -> SampleTable:
     lines = _iter_lines(file, path)
-    header = next(lines)
-    delimiter = max(DELIMITERS, key=header.count)
-    names = _parse_header(header, delimiter, path)
-    reader = csv.reader(lines, delimiter=delimiter)
-    width, values = len(names), array("d")
-    row, blank_row = 1, 0
+    head = list(islice(lines, MAX_HEAD_ROWS))
+    delimiter, layout = _find_layout(head)
+    if layout is None:  # reports what is wrong with the row after a first row of names
+        names = _parse_header(head[0], delimiter, path)
+        layout = TableLayout((*names,), ("",) * len(names), 1, len(names))
+    else:
+        names = _check_names(layout, head, delimiter, path)
+    first_row, width, values = layout.first_row + 1, layout.width, array("d")
+    row, blank_row = first_row - 1, 0
+    separate = _separate(chain(head[layout.first_row :], lines), delimiter)
     try:
-        for row, cells in enumerate(reader, start=2):
+        for row, cells in enumerate(separate, start=first_row):
             if not cells:
                 blank_row = blank_row or row
                 continue
@@ -72,6 +81,8 @@ def _parse_table(file: TextIO, path: Path) -> SampleTable:
                 cells.pop()
             if len(cells) != width:
                 raise _width_error(path, row, len(cells), names)
+            if layout.has_decimal_commas:
+                cells = [_use_decimal_point(cell, row, path) for cell in cells]
             try:
                 values.extend([float(cell) for cell in cells])
             except ValueError:
@@ -90,18 +101,82 @@ def _parse_table(file: TextIO, path: Path) -> SampleTable:
     table = np.frombuffer(values).reshape(-1, width)
     for name, column in zip(names, table.T, strict=True):
         if np.isinf(column).any():
-            row_with_inf = int(np.flatnonzero(np.isinf(column))[0]) + 2
+            row_with_inf = int(np.flatnonzero(np.isinf(column))[0]) + first_row
             raise InputError(
                 "infinite",
                 where=f"{path}: row {row_with_inf}, column {name!r}",
                 remedy="leave lost samples empty",
             )
     notes = () if delimiter == "," else (f"cells are separated by {DELIMITERS[delimiter]}",)
+    notes += ("numbers have decimal commas",) if layout.has_decimal_commas else ()
     columns = {
-        name: make_column(np.ascontiguousarray(column))
-        for name, column in zip(names, table.T, strict=True)
+        name: make_column(np.ascontiguousarray(column), unit)
+        for name, column, unit in zip(names, table.T, layout.units, strict=True)
     }
-    return SampleTable(path, columns, notes, first_row=2)
+    return SampleTable(path, columns, notes, first_row=first_row, facts=layout.facts)
+
+
+def _find_layout(head: list[str]) -> tuple[str, TableLayout | None]:
+    """Find (delimiter, layout) of the first lines: the delimiter that names most columns."""
+    layouts = {}
+    for delimiter in DELIMITERS:
+        try:
+            rows = _separate_words(head) if delimiter == BLANKS else _separate(head, delimiter)
+            layouts[delimiter] = find_layout([*rows])
+        except csv.Error:
+            layouts[delimiter] = None
+    fits = {
+        delimiter: layout
+        for delimiter, layout in layouts.items()
+        # "1,2" is two cells, unless other delimiters separate several numbers like it
+        if layout is not None and not (layout.has_decimal_commas and layout.width == 1)
+    }
+    if not fits:
+        return max((",", ";", "\t"), key=head[0].count), None
+    best = max(fits, key=lambda delimiter: (bool(fits[delimiter].names), fits[delimiter].width))
+    return best, fits[best]
+
+
+def _separate(lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
+    """Yield the cells of each line; none for an empty line."""
+    if delimiter == BLANKS:
+        return (line.split() for line in lines)
+    return csv.reader(lines, delimiter=delimiter)
+
+
+def _separate_words(lines: Iterable[str]) -> Iterator[list[str]]:
+    """Yield the cells of lines of a table separated by blanks; names may contain single ones."""
+    for line in lines:
+        cells = line.split()
+        if any(_is_number(cell.replace(",", ".", 1)) for cell in cells):
+            yield cells
+        else:
+            spaced = re.split(r"\s{2,}|\t", line.strip())
+            yield spaced if len(spaced) > 1 else cells
+
+
+def _check_names(layout: TableLayout, head: list[str], delimiter: str, path: Path) -> list[str]:
+    """Return the names of the columns; raise InputError for those that cannot be."""
+    if not layout.names:
+        above = next(
+            (line for line in reversed(head[: layout.first_row]) if line.strip()), ""
+        )
+        cells = next(_separate([above], delimiter), [])
+        if delimiter != BLANKS and len(cells) > 1 and not above.lstrip().startswith("#"):
+            raise _width_error(path, layout.first_row + 1, layout.width, cells)
+        return [f"column {number}" for number in range(1, layout.width + 1)]
+    names = [*layout.names]
+    row = f"row {layout.first_row}"
+    if "" in names:
+        raise InputError(f"column {names.index('') + 1} has no name", where=f"{path}: {row}")
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise InputError(
+            f"{row} names {', '.join(repeated)} more than once",
+            where=path,
+            remedy="keep one of each",
+        )
+    return names
 
 
 def _iter_lines(file: TextIO, path: Path) -> Iterator[str]:
@@ -117,25 +192,16 @@ def _iter_lines(file: TextIO, path: Path) -> Iterator[str]:
 
 
 def _parse_header(line: str, delimiter: str, path: Path) -> list[str]:
-    """Parse the column names; a trailing delimiter is ignored."""
-    names = [name.strip() for name in next(csv.reader([line], delimiter=delimiter), [])]
+    """Parse the first line as column names; a trailing delimiter is ignored."""
+    names = [name.strip() for name in next(_separate([line], delimiter), [])]
     if names and not names[-1]:
         names.pop()
-    if not names or all(_is_number(name) for name in names):
+    if not names:
         raise InputError(
             "row 1 names no columns",
             where=path,
             allowed=", ".join((TIME_COLUMN, *CHANNEL_BY_NAME)),
             remedy="put column names there, or other names and map them with --columns MAP",
-        )
-    if "" in names:
-        raise InputError(f"column {names.index('') + 1} has no name", where=f"{path}: row 1")
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
-        raise InputError(
-            f"row 1 names {', '.join(repeated)} more than once",
-            where=path,
-            remedy="keep one of each",
         )
     return names
 
@@ -166,6 +232,16 @@ def _parse_number(cell: str, location: str) -> float:
         where=location,
         remedy="leave a lost sample empty; state units in the --columns file",
     )
+
+
+def _use_decimal_point(cell: str, row: int, path: Path) -> str:
+    if "." in cell:
+        raise InputError(
+            f"{cell.strip()!r} has a decimal point, other numbers have decimal commas",
+            where=f"{path}: row {row}",
+            remedy="export the table with one kind of decimal separator",
+        )
+    return cell.replace(",", ".", 1)
 
 
 def _width_error(path: Path, row: int, count: int, names: list[str]) -> InputError:

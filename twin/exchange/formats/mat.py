@@ -19,6 +19,7 @@ from twin.exchange.formats import (
     add_array,
     extract_column,
 )
+from twin.exchange.formats.layout import add_fact, find_fact
 from twin.recording.tabular import LogTable
 
 HEADER_BYTES = 128
@@ -43,6 +44,8 @@ def scan_columns(path: Path) -> SampleTable:
             continue
         code = "i" if kind in INTEGER_CLASSES else NUMPY_KINDS.get(kind, "V")
         add_array(table, name, shape, code, (name,))
+        if (fact := find_fact(name)) and code in "fi" and set(shape) == {1}:
+            add_fact(table.facts, fact, float(_load_variable(path, name).item()))
         if name in TOML_TEXTS and kind == "char":
             table.texts[name] = "".join(_load_variable(path, name).reshape(-1))
     return table

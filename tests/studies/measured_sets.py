@@ -1,0 +1,578 @@
+"""Discovery on the measured sets of other laboratories: verdicts and held-out errors, a table.
+
+    git clone https://github.com/labcontrol-data/mr-damper FOLDER/mr-damper
+    git clone https://github.com/ARTS-Laboratory/Dataset-Friction-Damper-with-Backlash \\
+        FOLDER/Dataset-Friction-Damper-with-Backlash
+    git clone https://github.com/jaorozco1/physics-informed-lstm-base-isolation \\
+        FOLDER/physics-informed-lstm-base-isolation
+    git clone https://github.com/biaslab/nsi-silverbox FOLDER/nsi-silverbox
+    python -m tests.studies.measured_sets FOLDER [--only CASE]... [--out DIR]
+
+Each case is imported and discovered by the commands that a user would give. What they find is then
+judged by a plain computation of its own, which shares no code with the product: the force laws of
+the model file are evaluated with their own integrators on the held-out motion (component tests), or
+the model is simulated (Silverbox). NRMSE = rms of (measured - modelled force) about its mean, over
+the rms of the measured force about its mean, while it moves. A set that is not in FOLDER is listed
+as absent. About a minute a case.
+"""
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numba as nb
+import numpy as np
+from scipy.io import loadmat
+from scipy.signal import resample_poly
+
+from table_io.block import Float1D
+
+SHAKETWIN = (sys.executable, "-c", "from twin.cli.main import main; main()")
+INCH_M, KIP_N = 0.0254, 4448.2216152605
+MR_RUNS = tuple(f"ensaio{number}.1" for number in range(1, 10))  # one current, falling amplitude
+MR_MAP = """
+rate_hz = 100.0
+[columns]
+rel_disp_m = { column = "x_F:1", unit = "mm" }
+damper_force_n = { column = "x_F:3", unit = "N" }
+"""
+TABLE_MAP = """
+[columns]
+time_s = { column = "time" }
+rel_disp_m = { column = "displacement", unit = "mm" }
+damper_force_n = { column = "force", unit = "N" }
+"""
+SILVERBOX_MAP = """
+rate_hz = 610.3515625
+[columns]
+table_acc_m_s2 = { column = "V1", gain = -1.0 }
+rel_disp_m = { column = "V2" }
+"""
+SILVERBOX_HZ = 1e7 / 2**14
+ARROW, MULTISINE = slice(1000, 40500), slice(41000, 67000)  # rows: extrapolating test, training
+# share of each floor of the five-storey building, from its base up, in the total mass
+FLOOR_SHARES = (0.09328893, 0.1695185, 0.16294455, 0.11053888, 0.1059777, 0.35773146)
+BNCS_HZ = 200.0
+SUBSTEPS = 20  # of a sample, where a law with memory is integrated
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredRun:
+    """Motion u in m and force in N of a component test, (sample,), for the judgement."""
+
+    name: str
+    rate_hz: float
+    u: Float1D
+    force: Float1D
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedCase:
+    """Files to import with one column map, the held-out runs, and how the model is judged."""
+
+    files: tuple[Path, ...]
+    column_map: str  # none: the proposed map is accepted
+    held_out: tuple[MeasuredRun, ...] = ()
+    judge: Callable[[dict[str, Any], dict[str, Any]], float] | None = None
+    options: tuple[str, ...] = ()  # of the import
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A measured set, what is known of it, and the largest held-out error.
+
+    The verdict is right if it names one of `right_effects` and, of the specimen, only these and
+    `tolerated_effects`; `expects_remainder`: a part that no library effect explains must be
+    reported.
+    """
+
+    name: str
+    source: str
+    prepare: Callable[[Path, Path], PreparedCase]
+    goal: float
+    right_effects: frozenset[str]
+    tolerated_effects: frozenset[str] = frozenset()
+    expects_remainder: bool = False
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class CaseResult:
+    """Outcome of a case; `error` and `linear_error` are NRMSE, or mV."""
+
+    name: str
+    outcome: str
+    effects: tuple[str, ...]
+    confidence: float
+    judgement: str
+    linear_error: float
+    error: float
+    seconds: float
+    details: tuple[str, ...] = field(default=())
+
+
+# Preparation: the sets as files that a user would have
+
+
+def read_mr_run(folder: Path, name: str) -> tuple[Float1D, Float1D]:
+    """Return (displacement in mm, force in N) of a run, (sample,)."""
+    table = loadmat(folder / "data" / f"{name}.mat")["x_F"]
+    return table[:, 0].astype(float), table[:, 2].astype(float)
+
+
+def prepare_mr_damper(folder: Path, scratch: Path, variant: str) -> PreparedCase:
+    """Magnetorheological damper under sines at one current: odd runs train, even runs judge."""
+    training, held_out = MR_RUNS[::2], MR_RUNS[1::2]
+    runs = []
+    for name in held_out:
+        displacement, force = read_mr_run(folder, name)
+        runs.append(MeasuredRun(name, 100.0, 1e-3 * displacement, force))
+    if variant == "raw":
+        files = tuple(folder / "data" / f"{name}.mat" for name in training)
+        return PreparedCase(files, MR_MAP, tuple(runs))
+    files = []
+    for name in training:
+        displacement, force = read_mr_run(folder, name)
+        first = 0
+        if variant == "rest cut":
+            first = int(np.argmax(np.abs(displacement - displacement[0]) > 1.0))
+        else:
+            displacement, force = displacement - displacement.mean(), force - force.mean()
+        time_s = np.arange(displacement.size) / 100.0
+        columns = {"time": time_s, "displacement": displacement, "force": force}
+        files.append(
+            write_table(
+                scratch / f"{name}.csv", {key: x[first:] for key, x in columns.items()}
+            )
+        )
+    return PreparedCase(tuple(files), TABLE_MAP, tuple(runs))
+
+
+def read_friction_run(path: Path) -> dict[str, Float1D]:
+    """Return time, displacement and friction force, (sample,) each, named with their units."""
+    rows = np.array(json.loads(path.read_text())["data"])
+    return {
+        "time (s)": rows[:, 0], "displacement (in)": rows[:, 1], "friction force (kip)": rows[:, 2],
+    }  # fmt: skip
+
+
+def prepare_friction_damper(folder: Path, scratch: Path) -> PreparedCase:
+    """Band-brake damper with backlash: trained on sines, judged on earthquakes."""
+    data = folder / "data" / "dataset-2"
+    sines = [
+        data / "characterization datasets" / f"{hz}Hz36lbtension{amplitude}amplitude.json"
+        for hz in ("0.25", "0.5", "1")
+        for amplitude in ("0.5", "1", "1.5")
+    ]
+    files = tuple(
+        write_table(scratch / f"{path.stem.replace('.', '_')}.csv", read_friction_run(path))
+        for path in sines
+    )
+    held_out = []
+    for name in ("ImperialValleyDBE", "ImperialValleyMCE", "KocaeliDBE", "KocaeliMCE"):
+        run = read_friction_run(data / "earthquake profiles" / f"{name}.json")
+        held_out.append(
+            MeasuredRun(
+                name,
+                1024.0,
+                INCH_M * run["displacement (in)"],
+                KIP_N * run["friction force (kip)"],
+            )
+        )
+    return PreparedCase(files, "", tuple(held_out))
+
+
+def read_bearing_run(folder: Path, name: str) -> dict[str, Float1D]:
+    """Return the channels of a run of the base-isolated building, per unit of its mass."""
+    data = folder / "data" / f"BI-BNCS_{name}"
+
+    def read(column: str) -> Float1D:
+        return np.loadtxt(data / f"{column}.txt").ravel()
+
+    floors = [read(f"a{number}") for number in range(1, 7)]
+    size = min(floors[0].size, read("d1").size)
+    columns = {
+        "time_s": np.arange(size) / BNCS_HZ,
+        "rel_disp_m": read("d1"),
+        "damper_force_n": -sum(
+            share * floor for share, floor in zip(FLOOR_SHARES, floors, strict=True)
+        ),
+        "table_acc_m_s2": read("u"),
+        "mass_acc_m_s2": floors[0],
+    }
+    return {name: values[:size] for name, values in columns.items()}
+
+
+def prepare_bearings(folder: Path, scratch: Path) -> PreparedCase:
+    """Building on high-damping rubber bearings: one motion at 50 and 140 % trains, four judge."""
+    files = tuple(
+        write_table(scratch / f"{name}.csv", read_bearing_run(folder, name))
+        for name in ("ICA50", "ICA140")
+    )
+    held_out = []
+    for name in ("CNP100", "ICA100", "LAC100", "SP100"):
+        run = read_bearing_run(folder, name)
+        held_out.append(MeasuredRun(name, BNCS_HZ, run["rel_disp_m"], run["damper_force_n"]))
+    return PreparedCase(files, "", tuple(held_out))
+
+
+def prepare_silverbox(folder: Path, scratch: Path) -> PreparedCase:
+    """Electronic oscillator with cubic spring: trained on multisines, simulated on the arrow."""
+    volts = np.genfromtxt(
+        folder / "data" / "Silverbox" / "SNLS80mV.csv", delimiter=",", skip_header=1
+    )[:, :2]
+    part = volts[MULTISINE]
+    file = write_table(scratch / "multisine.csv", {"V1": part[:, 0], "V2": part[:, 1]})
+
+    def judge(verdict: dict[str, Any], model: dict[str, Any]) -> float:
+        return simulate_arrow(volts, model)
+
+    return PreparedCase((file,), SILVERBOX_MAP, judge=judge)
+
+
+def write_table(path: Path, columns: dict[str, Float1D]) -> Path:
+    """Write columns as a CSV file; return its path."""
+    header = ",".join(columns)
+    np.savetxt(path, np.array([*columns.values()]).T, delimiter=",", header=header, comments="")
+    return path
+
+
+# Judgement: plain evaluation of a model file
+
+
+@nb.njit
+def integrate_hysteresis(v: Float1D, dt: float, yield_displacement: float) -> Float1D:
+    """Return Bouc-Wen's z, (sample,), by Heun steps: uy z' = v - (|v| z |z| + v z^2) / 2."""
+    z, out = 0.0, np.empty(v.size)
+    for sample in range(v.size):
+        out[sample] = z
+        if sample == v.size - 1:
+            break
+        for step in range(SUBSTEPS):
+            first = v[sample] + (v[sample + 1] - v[sample]) * step / SUBSTEPS
+            second = v[sample] + (v[sample + 1] - v[sample]) * (step + 1) / SUBSTEPS
+            h = dt / SUBSTEPS / yield_displacement
+            rate = first - 0.5 * (abs(first) * z * abs(z) + first * z * z)
+            end = min(max(z + h * rate, -1.0), 1.0)
+            after = second - 0.5 * (abs(second) * end * abs(end) + second * end * end)
+            z = min(max(z + 0.5 * h * (rate + after), -1.0), 1.0)
+    return out
+
+
+@nb.njit
+def integrate_relaxation(v: Float1D, dt: float, stiffness: float, tau: float) -> Float1D:
+    """Return the force of a Maxwell branch, (sample,): f' = k1 v - f / tau, v piecewise linear."""
+    force, out = 0.0, np.empty(v.size)
+    decay = math.exp(-dt / tau)
+    for sample in range(v.size):
+        out[sample] = force
+        if sample < v.size - 1:
+            mean = 0.5 * (v[sample] + v[sample + 1])
+            force = force * decay + stiffness * tau * (1.0 - decay) * mean
+    return out
+
+
+def evaluate_force(
+    u: Float1D, rate_hz: float, model: dict[str, Any], slip_speed: float
+) -> Float1D:
+    """Return the force of the damper of a model file on this motion, (sample,), in N."""
+    v = np.gradient(u) * rate_hz
+    force = model["base"]["stiffness_n_m"] * u + model["base"]["damping_n_s_m"] * v
+    for effect in model.get("effects", ()):
+        p = effect["parameters"]
+        match effect["id"]:
+            case "cubic_stiffness":
+                force = force + p["k3"] * u**3
+            case "quadratic_damping":
+                force = force + p["c2"] * v * np.abs(v)
+            case "coulomb_friction":
+                force = force + p["fc"] * np.tanh(v / slip_speed)
+            case "bouc_wen":
+                z = integrate_hysteresis(v, 1.0 / rate_hz, p["yield_displacement"])
+                force = force + p["force"] * z
+            case "maxwell_damper":
+                force = force + integrate_relaxation(v, 1.0 / rate_hz, p["k1"], p["tau"])
+            case name:
+                print(f"    {name} is not judged: it adds no force to this component")
+    return force
+
+
+def compute_nrmse(run: MeasuredRun, model: dict[str, Any], slip_speed: float) -> float:
+    """Return the NRMSE of the force of a held-out run while it moves, each about its mean."""
+    force = evaluate_force(run.u, run.rate_hz, model, slip_speed)
+    moving = find_motion(run.u)
+    error = (run.force - force)[moving]
+    return float(error.std() / run.force[moving].std())
+
+
+def find_motion(u: Float1D) -> slice:
+    """Return the samples from the first to the last that is off its end by 2 % of the range."""
+    reach = 0.02 * np.ptp(u)
+    off_start, off_end = np.abs(u - u[0]) > reach, np.abs(u - u[-1]) > reach
+    return slice(int(np.argmax(off_start)), u.size - int(np.argmax(off_end[::-1])))
+
+
+def fit_linear_force(runs: Sequence[MeasuredRun]) -> dict[str, Any]:
+    """Return a model of spring and dashpot, by linear regression on the runs, as a model file."""
+    rows, forces = [], []
+    for run in runs:
+        moving = find_motion(run.u)
+        columns = np.array([run.u, np.gradient(run.u) * run.rate_hz])[:, moving]
+        rows.append(columns.T - columns.mean(axis=1))
+        forces.append(run.force[moving] - run.force[moving].mean())
+    stiffness, damping = np.linalg.lstsq(np.vstack(rows), np.hstack(forces), rcond=None)[0]
+    return {"base": {"stiffness_n_m": stiffness, "damping_n_s_m": damping}}
+
+
+@nb.njit
+def simulate_oscillator(
+    push: Float1D, dt: float, stiffness: float, damping: float, cubic: float
+) -> Float1D:
+    """Return u of u'' + c u' + k u + k3 u^3 = push, (sample,): Runge-Kutta, two samples a step."""
+    u, v, out = 0.0, 0.0, np.empty(push.size // 2)
+    for step in range(out.size - 1):
+        out[step] = u
+        a, b, c = push[2 * step], push[2 * step + 1], push[2 * step + 2]
+        v1, w1 = v, a - damping * v - stiffness * u - cubic * u**3
+        u2, v2 = u + 0.5 * dt * v1, v + 0.5 * dt * w1
+        w2 = b - damping * v2 - stiffness * u2 - cubic * u2**3
+        u3, v3 = u + 0.5 * dt * v2, v + 0.5 * dt * w2
+        w3 = b - damping * v3 - stiffness * u3 - cubic * u3**3
+        u4, v4 = u + dt * v3, v + dt * w3
+        w4 = c - damping * v4 - stiffness * u4 - cubic * u4**3
+        u += dt / 6.0 * (v1 + 2.0 * v2 + 2.0 * v3 + v4)
+        v += dt / 6.0 * (w1 + 2.0 * w2 + 2.0 * w3 + w4)
+    out[-1] = u
+    return out
+
+
+def simulate_arrow(volts: Float1D, model: dict[str, Any]) -> float:
+    """Return the rms error of the simulated output in mV on the part that extrapolates.
+
+    The model file gives stiffness, damping and cubic term; the gain and the offset of the input,
+    which no model file holds, are those that fit the simulated training part best.
+    """
+    effects = {effect["id"]: effect["parameters"] for effect in model.get("effects", ())}
+    cubic = effects.get("cubic_stiffness", {}).get("k3", 0.0)
+    base, parts = model["base"], 16
+
+    def simulate(rows: slice, gain: float, offset: float) -> Float1D:
+        push = resample_poly(gain * volts[rows, 0] + offset, parts, 1)
+        u = simulate_oscillator(
+            push, 2.0 / SILVERBOX_HZ / parts, base["stiffness_n_m"], base["damping_n_s_m"], cubic
+        )
+        return u[:: parts // 2]
+
+    gain, offset = base["stiffness_n_m"], 0.0  # the static gain of the box is about one
+    rows, settled = MULTISINE, slice(2000, None)
+    for _ in range(4):  # Gauss-Newton with finite differences
+        u = simulate(rows, gain, offset)
+        by_gain = (simulate(rows, 1.001 * gain, offset) - u) / (1e-3 * gain)
+        by_offset = (simulate(rows, gain, offset + 1e-4 * gain) - u) / (1e-4 * gain)
+        columns = np.array([by_gain, by_offset, np.ones(u.size)]).T[settled]
+        step = np.linalg.lstsq(columns, (volts[rows, 1] - u)[settled], rcond=None)[0]
+        gain, offset = gain + float(step[0]), offset + float(step[1])
+    u = simulate(slice(0, ARROW.stop), gain, offset)
+    return float(1e3 * (volts[: ARROW.stop, 1] - u)[ARROW].std())
+
+
+# The cases
+
+
+def make_mr_case(variant: str) -> Case:
+    def prepare(folder: Path, scratch: Path) -> PreparedCase:
+        return prepare_mr_damper(folder, scratch, variant)
+
+    return Case(
+        f"MR damper, {variant}",
+        "mr-damper",
+        prepare,
+        0.12,
+        frozenset({"bouc_wen", "coulomb_friction"}),
+        frozenset({"quadratic_damping", "maxwell_damper"}),
+    )
+
+
+CASES = (
+    make_mr_case("raw"),
+    make_mr_case("mean removed"),
+    make_mr_case("rest cut"),
+    Case(
+        "friction damper",
+        "Dataset-Friction-Damper-with-Backlash",
+        prepare_friction_damper,
+        0.48,
+        frozenset({"coulomb_friction", "bouc_wen"}),
+        expects_remainder=True,
+    ),
+    Case(
+        "BNCS",
+        "physics-informed-lstm-base-isolation",
+        prepare_bearings,
+        0.255,
+        frozenset({"bouc_wen"}),
+        expects_remainder=True,
+    ),
+    Case(
+        "Silverbox", "nsi-silverbox", prepare_silverbox, 0.7, frozenset({"cubic_stiffness"}),
+        unit=" mV",
+    ),
+)  # fmt: skip
+INSTRUMENT_EFFECTS = frozenset({"sensor_offset", "sensor_gain", "sensor_lag"})
+
+
+def run_shaketwin(*arguments: str | Path) -> str:
+    """Run a command of the product; return its output, raise RuntimeError if it fails."""
+    done = subprocess.run(
+        [*SHAKETWIN, *map(str, arguments)], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise RuntimeError(f"shaketwin {arguments[0]}: {(done.stderr or done.stdout).strip()}")
+    return done.stdout
+
+
+def run_case(case: Case, folder: Path, out: Path) -> CaseResult:
+    """Import and discover a case, and judge what was found."""
+    out.mkdir(parents=True)
+    prepared = case.prepare(folder, out)
+    (out / "map.toml").write_text(prepared.column_map)
+    logs = []
+    for file in prepared.files:
+        log = out / f"{file.stem}.mcap"
+        options = ["--columns", out / "map.toml"] if prepared.column_map else ["--accept"]
+        options += prepared.options
+        run_shaketwin("import", file, "-o", log, *options)
+        logs.append(log)
+    start_s = time.monotonic()
+    text = run_shaketwin("discover", *logs, "--out", out / "discovery")
+    seconds = time.monotonic() - start_s
+    (out / "discover.txt").write_text(text)
+    verdict = json.loads((out / "discovery" / "verdict.json").read_text())
+    model = tomllib.loads((out / "discovery" / "model.toml").read_text())
+    if prepared.judge is not None:
+        bare = {"base": {key: model["base"][key] for key in model["base"]}}
+        return summarize(
+            case, verdict, prepared.judge(verdict, bare), prepared.judge(verdict, model), seconds
+        )
+    slip_speed = next(
+        (effect["slip_speed"]["value"] for effect in verdict["effects"] if "slip_speed" in effect),
+        1e-3,
+    )
+    linear = fit_linear_force(read_training_runs(prepared))
+    errors = {run.name: compute_nrmse(run, model, slip_speed) for run in prepared.held_out}
+    linear_errors = [compute_nrmse(run, linear, slip_speed) for run in prepared.held_out]
+    return summarize(
+        case,
+        verdict,
+        float(np.mean(linear_errors)),
+        float(np.mean([*errors.values()])),
+        seconds,
+        tuple(f"{name} {error:.3f}" for name, error in errors.items()),
+    )
+
+
+def read_training_runs(prepared: PreparedCase) -> list[MeasuredRun]:
+    """Return the training runs of a component test, read again from the files."""
+    runs = []
+    for file in prepared.files:
+        if file.suffix == ".mat":
+            table = loadmat(file)["x_F"].astype(float)
+            runs.append(MeasuredRun(file.stem, 100.0, 1e-3 * table[:, 0], table[:, 2]))
+            continue
+        table = np.genfromtxt(file, delimiter=",", names=True)
+        time_s, u, force = (table[name] for name in table.dtype.names[:3])
+        scales = {"displacement": (1e-3, 1.0)}.get(table.dtype.names[1], (1.0, 1.0))
+        if "friction_force_kip" in table.dtype.names:
+            scales = (INCH_M, KIP_N)
+        runs.append(
+            MeasuredRun(
+                file.stem, 1.0 / float(np.mean(np.diff(time_s))), scales[0] * u, scales[1] * force
+            )
+        )
+    return runs
+
+
+def summarize(
+    case: Case,
+    verdict: dict[str, Any],
+    linear_error: float,
+    error: float,
+    seconds: float,
+    details: tuple[str, ...] = (),
+) -> CaseResult:
+    """Judge a verdict: right, refused (honest), or wrong, with the reason."""
+    names = tuple(
+        ".".join(filter(None, (effect["id"], effect.get("channel", ""))))
+        for effect in verdict["effects"]
+    )
+    specimen = {effect["id"] for effect in verdict["effects"]} - INSTRUMENT_EFFECTS
+    sets = [set(name.split(".")[0] for name in ids) for ids in verdict["ambiguous"]]
+    if verdict["verdict"] == "unexplained":
+        judgement = "refused"
+    elif verdict["verdict"] == "ambiguous" and any(case.right_effects & ids for ids in sets):
+        judgement = "refused (right among the candidates)"
+    elif not specimen & case.right_effects:
+        judgement = "WRONG: the known effect is not named"
+    elif specimen - case.right_effects - case.tolerated_effects:
+        judgement = "WRONG: an effect that is not there"
+    elif case.expects_remainder and not verdict["remainder"]["unexplained"]:
+        judgement = "right, but the remainder is not reported"
+    else:
+        judgement = "right"
+    confidence = min((effect["confidence"] for effect in verdict["effects"]), default=math.nan)
+    return CaseResult(
+        case.name, verdict["verdict"], names, confidence, judgement, linear_error, error, seconds,
+        details,
+    )  # fmt: skip
+
+
+def format_row(case: Case, result: CaseResult) -> str:
+    """Format a result as a row of the table."""
+    met = "met" if result.error <= case.goal else "MISSED"
+    effects = " + ".join(result.effects) or "-"
+    return (
+        f"| {case.name} | {result.outcome}: {effects} ({result.confidence:.2f}) | "
+        f"{result.judgement} | {result.linear_error:.3g}{case.unit} | "
+        f"{result.error:.3g}{case.unit} | {case.goal:g}{case.unit}: {met} | "
+        f"{result.seconds:.0f} s |"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--only", action="append", default=[], help="Cases that contain this.")
+    parser.add_argument("--out", type=Path, help="New folder that keeps logs and results.")
+    arguments = parser.parse_args()
+    print("| set | verdict (confidence) | judged | linear | model | goal | discover |")
+    print("|---|---|---|---|---|---|---|", flush=True)
+    with TemporaryDirectory() as temporary:
+        for case in CASES:
+            if arguments.only and not any(part in case.name for part in arguments.only):
+                continue
+            folder = arguments.folder / case.source
+            if not folder.is_dir():
+                print(f"| {case.name} | absent: {folder} | | | | | |", flush=True)
+                continue
+            out = (arguments.out or Path(temporary)) / case.name.replace(" ", "_").replace(",", "")
+            try:
+                result = run_case(case, folder, out)
+            except (RuntimeError, OSError) as error:
+                print(f"| {case.name} | FAILED: {error} | | | | | |", flush=True)
+                continue
+            print(format_row(case, result), flush=True)
+            if result.details:
+                print(f"  held out: {', '.join(result.details)}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
