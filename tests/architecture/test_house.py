@@ -21,6 +21,7 @@ OWNERS = {  # packages that may import a foreign library
     "nidaqmx": ("table_io/backends/ni", "table_io/sim/ni"),
     "nptdms": ("twin/exchange/formats",),
     "opendaq": ("table_io/backends/opendaq", "table_io/sim"),
+    "openpyxl": ("twin/exchange/formats",),
     "pyarrow": ("twin/exchange/formats",),
     "pysindy": ("twin/validation/study",),
     "pyuff": ("twin/exchange/formats",),

@@ -143,7 +143,7 @@ def test_units_that_contradict_each_other_are_refused_unless_stated(
     assert not [text for text in fine.notes if "warning" in text]
     odd = {"time_s": TIME, "table_disp_m": x, "table_acc_m_s2": a / wrong}
     with raises_input_error(where=tmp_path / "table.csv", key="table_disp_m", allowed="mm"):
-        import_columns(tmp_path, **odd)
+        import_columns(tmp_path, None, **odd)
     with raises_input_error(key="table_disp_m", problem="table_acc_m_s2"):
         import_columns(tmp_path, BOTH.format(disp=', unit = "m"', acc=""), **odd)
     stated = import_columns(
@@ -218,7 +218,8 @@ def test_accelerations_are_integrated_in_the_stated_band(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("band", "allowed"), [("[0.5, 200.0]", "100 Hz"), ("[0.1, 20.0]", "1 to"), ("[9.0, 2.0]", "LOW")]
+    ("band", "allowed"),
+    [("[0.5, 200.0]", "100 Hz"), ("[0.1, 20.0]", "1 to"), ("[9.0, 2.0]", "LOW")],
 )
 def test_bands_that_cannot_be(tmp_path: Path, band: str, allowed: str) -> None:
     with raises_input_error(allowed=allowed):

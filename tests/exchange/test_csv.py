@@ -95,7 +95,12 @@ def test_hostile_tables(tmp_path: Path, content: str | bytes, words: list[str]) 
         ("  t   u\n  0  1.5\n 0.1 -2e-3\n 0.2   3\n", ["t", "u"], ["", ""], 2),
         ("# t u\n0 1.5\n0.1 -2e-3\n0.2 3\n", ["t", "u"], ["", ""], 2),
         ("t (s) disp (mm)\n0 1.5\n0.1 -2e-3\n0.2 3\n", ["t (s)", "disp (mm)"], ["s", "mm"], 2),
-        ("Time  Disp table [mm]\n0 1.5\n0.1 -2e-3\n0.2 3\n", ["Time", "Disp table [mm]"], ["", "mm"], 2),
+        (
+            "Time  Disp table [mm]\n0 1.5\n0.1 -2e-3\n0.2 3\n",
+            ["Time", "Disp table [mm]"],
+            ["", "mm"],
+            2,
+        ),
         ("t,u\ns,in\n0,1.5\n0.1,-2e-3\n0.2,3\n", ["t", "u"], ["s", "in"], 3),
         ("t;u\n[s];[kN]\n0;1,5\n0,1;-0,002\n0,2;3\n", ["t", "u"], ["s", "kN"], 3),
         ("Test 7, 3 May\nrun,2\n\nt\tu\n0\t1.5\n0.1\t-2e-3\n0.2\t3\n", ["t", "u"], ["", ""], 5),

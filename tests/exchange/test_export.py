@@ -270,7 +270,11 @@ def test_the_commands(log: Path, tmp_path: Path) -> None:
     assert isinstance(run.invoke(app, [*asked[:-3], "x"]).exception, InputError)
     result = run.invoke(app, ["import", str(new), "--list"])
     assert "mass_disp_m: " in result.output
-    assert isinstance(run.invoke(app, ["import", str(new)]).exception, InputError)
+    proposed = run.invoke(app, ["import", str(new)])
+    assert proposed.exit_code == 0
+    assert "--accept" in proposed.output
+    unnamed = run.invoke(app, ["import", str(new), "--columns", str(tmp_path / "map.toml")])
+    assert isinstance(unnamed.exception, InputError)
     both = run.invoke(app, ["import", str(new), "--list", "-o", str(tmp_path / "b.mcap")])
     assert "omit -o or --list" in str(both.exception)
     assert run.invoke(app, ["import", str(new), "-o", str(tmp_path / "a.mcap")]).exit_code == 4

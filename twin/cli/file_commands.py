@@ -128,7 +128,7 @@ def import_command(
     stated = {
         "mass_kg": mass, "rate_hz": rate, "from_s": from_s, "to_s": to_s, "detrend": detrend,
         "rest": False if no_rest else None,
-        "integrate_hz": import_files.parse_band(integrate) if integrate is not None else None,
+        "integrate_hz": import_files.parse_band(integrate),
     }  # fmt: skip
     request = import_files.ImportRequest(
         files, out, profile, rig, columns, accept, save_map,

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from rich.markup import escape
 from rich.table import Table
 
 from table_io.config.channel import read_channels
@@ -106,7 +107,8 @@ def print_proposal(file: Path, proposal: MapProposal) -> None:
     for title in ("channel", "column", "unit", "because"):
         table.add_column(title, no_wrap=True)
     for item in proposal.columns:
-        table.add_row(item.channel, item.column, item.unit or "-", item.reason)
+        cells = (item.channel, item.column, item.unit or "-", item.reason)
+        table.add_row(*map(escape, cells))
     print_table(console, table)
     if proposal.rate_hz is not None:
         print_line(f"sampling rate: {proposal.rate_hz:.9g} Hz")
@@ -154,8 +156,10 @@ def format_settings(settings: Mapping[str, Any]) -> list[str]:
     return words + (["--no-rest"] if settings.get("rest") is False else [])
 
 
-def parse_band(text: str) -> tuple[float, float]:
-    """Parse LOW:HIGH in Hz."""
+def parse_band(text: str | None) -> tuple[float, float] | None:
+    """Parse LOW:HIGH in Hz; None without the option."""
+    if text is None:
+        return None
     try:
         low, high = (float(part) for part in text.split(":"))
     except ValueError:

@@ -19,7 +19,11 @@ from table_io.errors import InputError, suggest
 from table_io.units import UNITS
 from twin.exchange.formats import MAX_LISTED_COLUMNS, SampleTable, check_size
 from twin.exchange.formats.layout import TIME_UNITS, normalize_unit
-from twin.exchange.integration import integrate_accelerations
+from twin.exchange.integration import (
+    EXTERNAL_FORCE,
+    convert_external_force,
+    integrate_accelerations,
+)
 from twin.exchange.plausibility import list_implausible
 from twin.exchange.sampling import fit_uniform_rate, resolve_stated_rate
 from twin.recording.tabular import LABEL_UNITS, TIME_COLUMN, TWIN_PREFIX
@@ -94,17 +98,17 @@ class ColumnMap(ConfigModel):
 
 @dataclass(frozen=True)
 class ImportColumns:
-    """Columns that an import knows: the channels of the rig, the time and the labels."""
+    """Columns that an import knows: channels of the rig, time, labels and an external force."""
 
     channels: Mapping[str, Channel]
 
     @property
     def names(self) -> tuple[str, ...]:
-        return (TIME_COLUMN, *self.channels, *LABEL_UNITS)
+        return (TIME_COLUMN, *self.channels, EXTERNAL_FORCE, *LABEL_UNITS)
 
     def recorded_unit(self, name: str) -> str:
         """Return the unit in which a column is recorded, "" without one."""
-        units = {TIME_COLUMN: "s", **LABEL_UNITS}
+        units = {TIME_COLUMN: "s", EXTERNAL_FORCE: "N", **LABEL_UNITS}
         return self.channels[name].unit if name in self.channels else units[name]
 
     def unit_factors(self, name: str) -> dict[str, float]:
@@ -182,8 +186,15 @@ def read_samples(
         values = {name: column[rows] for name, column in values.items()}
         time = None if time is None else time[rows]
         notes.append(note)
+    force = values.pop(EXTERNAL_FORCE, None)
     order = [name for name in known.channels if name in values]
     channels = {name: values[name] for name in order}
+    if force is not None:
+        mass_kg = column_map.mass_kg if column_map is not None else None
+        channels |= convert_external_force(channels, force, mass_kg)
+        order = [name for name in known.channels if name in channels]
+        channels = {name: channels[name] for name in order}
+        notes.append(f"{EXTERNAL_FORCE} on the mass is recorded as a table acceleration, -F / M")
     if time is not None:
         rate, index, rate_notes = fit_uniform_rate(time, table)
         notes += rate_notes
@@ -360,6 +371,7 @@ def _check_plausibility(
     """Return warnings of absurd numbers in stated units; InputError where no unit is stated."""
     units = {name: known.recorded_unit(name) for name in channels}
     warnings = []
+    channels = {name: values for name, values in channels.items() if name in sources}
     for implausible in list_implausible(channels, units, rate_hz):
         unstated = [
             sources[name].column

@@ -140,34 +140,15 @@ def import_samples(
     rig_toml = read_rig_toml(table, profile, rig)
     known = ImportColumns(read_channels(rig_toml))
     if options.accept:
-        proposal = propose_map(table, known, options.settings)
-        if proposal.questions:
-            raise InputError(
-                "the proposed map is open: " + "; ".join(proposal.questions),
-                where=file,
-                remedy="save it by --save-map MAP, answer there, and import with --columns MAP",
-            )
-        column_map = proposal.to_map()
+        column_map = _accept_proposal(table, known, options, profile)
     is_mapped = columns is not None or options.accept
     column_map = options.apply(column_map)
     samples_read = read_samples(table, column_map, known, leave_out=is_mapped)
     file_labels = read_labels(table, samples_read) if samples_read.labels else None
     mass_kg = column_map.mass_kg if column_map is not None else None
-    config = _build_run_config(
-        table, profile, rig_toml, samples_read.rate_hz, file_labels, mass_kg
-    )
+    config = _build_run_config(table, profile, rig_toml, samples_read.rate_hz, file_labels, mass_kg)
     grid = _to_grid(file, samples_read)
-    if file_labels is not None:
-        labels = file_labels
-    else:
-        signal, is_acc = _motion_signal(grid)
-        labels = find_steps(
-            signal,
-            samples_read.rate_hz,
-            config.profile.sweep,
-            is_acc=is_acc,
-            on_grid=profile is not None,
-        )
+    labels = file_labels or _detect_labels(grid, config, on_grid=profile is not None)
     if column_map is not None and not column_map.rest:
         moving = np.where(labels.label == Label.REST, int(Label.SETTLE), labels.label)
         labels = replace(labels, label=moving, messages=(*labels.messages, NO_REST))
@@ -203,6 +184,28 @@ def import_samples(
         record_items(items, out, run, samples_read.rate_hz, on_item)
     print_line(f"{grid.size} samples of {len(grid.channels)} channels, {gaps} gaps -> {out}")
     return EXIT_GAPS if gaps else 0
+
+
+def _accept_proposal(
+    table: SampleTable, known: ImportColumns, options: ImportOptions, profile: Path | None
+) -> ColumnMap:
+    """Return the proposed map; raise InputError if it is open. A profile states its own mass."""
+    proposal = propose_map(table, known, options.settings)
+    if proposal.questions:
+        raise InputError(
+            "the proposed map is open: " + "; ".join(proposal.questions),
+            where=table.path,
+            remedy="save it by --save-map MAP, answer there, and import with --columns MAP",
+        )
+    column_map = proposal.to_map()
+    return column_map if profile is None else column_map.model_copy(update={"mass_kg": None})
+
+
+def _detect_labels(grid: _SampleGrid, config: RunConfig, on_grid: bool) -> DetectedSteps:
+    """Detect the steps of the sweep in the motion of the table."""
+    signal, is_acc = _motion_signal(grid)
+    rate_hz = config.profile.acquisition.rate_hz
+    return find_steps(signal, rate_hz, config.profile.sweep, is_acc=is_acc, on_grid=on_grid)
 
 
 def _find_shifted_rest(grid: _SampleGrid, labels: DetectedSteps) -> Iterator[str]:

@@ -78,7 +78,7 @@ def list_implausible(
     problems = []
     finite = {name: values for name, values in channels.items() if np.isfinite(values).any()}
     for name, values in finite.items():
-        low, high = PLAUSIBLE_RANGES.get(units.get(name, ""), (0.0, np.inf))
+        _, high = PLAUSIBLE_RANGES.get(units.get(name, ""), (0.0, np.inf))
         reach = float(np.nanmax(values) - np.nanmin(values))
         if reach > high:
             text = f"{name} has a range of {reach:.4g} {units[name]}, more than {high:g}"

@@ -17,7 +17,7 @@ from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.units import UNITS
 from twin.exchange.columns import CANONICAL_COLUMNS, ColumnMap, ColumnSource, ImportColumns
 from twin.exchange.formats import SampleTable
-from twin.exchange.formats.layout import TIME_UNITS, is_unit, normalize_unit
+from twin.exchange.formats.layout import TIME_UNITS, find_unit, is_unit, normalize_unit
 from twin.exchange.plausibility import CHECKED_PAIRS, find_plausible_units, match_unit_pairs
 from twin.recording.tabular import LABEL_UNITS, TIME_COLUMN
 
@@ -140,7 +140,7 @@ def propose_map(
     chosen: dict[str, str] = {name: name for name in names if name in known.channels}
     time_column = _find_time(table, names, quantities)
     sorted_names = [name for name in names if name not in chosen and name != time_column]
-    for quantity in CHANNELS_OF:
+    for quantity, possible in CHANNELS_OF.items():
         group = [name for name in sorted_names if quantities[name] == quantity]
         bodies = {name: _find_body(name) for name in group}
         for name, body in bodies.items():
@@ -148,7 +148,7 @@ def propose_map(
             if channel:
                 chosen[channel] = name
             else:
-                free = tuple(c for c in CHANNELS_OF[quantity] if c not in chosen)
+                free = tuple(other for other in possible if other not in chosen)
                 alternatives[name] = free
                 questions.append(
                     f"column {name!r} is a {quantity} of an unknown body: {' or '.join(free)}?"
@@ -194,7 +194,7 @@ def _split_words(name: str) -> list[str]:
 
 def _stated_unit(table: SampleTable, name: str) -> str:
     """Return the unit that the file or the end of the name states, "" without one."""
-    unit = normalize_unit(table.columns[name].unit)
+    unit = normalize_unit(table.columns[name].unit) or find_unit(name)
     if unit:
         return unit
     words = re.split(r"[^a-zA-Z0-9/²]+", name.strip(" )]"))
@@ -311,9 +311,7 @@ def _propose_unit(
     )  # fmt: skip
 
 
-def _unit_by_partner(
-    table: SampleTable, channel: str, name: str, chosen: dict[str, str]
-) -> str:
+def _unit_by_partner(table: SampleTable, channel: str, name: str, chosen: dict[str, str]) -> str:
     """Return the unit of a displacement or acceleration by its partner with a stated unit."""
     rate_hz = table.facts.get("rate_hz") or 1.0
     for disp, acc in CHECKED_PAIRS:
@@ -341,9 +339,7 @@ def _centred(values: Float1D) -> Float1D:
     return values - np.nanmean(values)
 
 
-def _list_missing(
-    chosen: set[str], has_mass: bool, settings: Mapping[str, Any]
-) -> Iterator[str]:
+def _list_missing(chosen: set[str], has_mass: bool, settings: Mapping[str, Any]) -> Iterator[str]:
     """Yield what an analysis would need in addition."""
     displacement = (
         "rel_disp_m" in chosen
@@ -352,7 +348,7 @@ def _list_missing(
     )
     accelerations = {"mass_acc_m_s2", "table_acc_m_s2"} <= chosen
     if not displacement and accelerations:
-        yield "a relative displacement: integrate it, --integrate LOW:HIGH (Hz)"
+        yield "a relative displacement: --integrate LOW:HIGH (Hz) derives it"
     elif not displacement:
         yield "a relative displacement (rel_disp_m, or mass_disp_m and table_disp_m)"
     if not chosen & {"damper_force_n", "mass_acc_m_s2", "table_acc_m_s2"}:
@@ -363,5 +359,3 @@ def _list_missing(
         yield "the mass: state --mass KG, else forces are per unit mass"
     if not chosen & {*RIGHT_CELLS, *LEFT_CELLS} and "damper_force_n" not in chosen:
         yield "load cells: bumper forces are then known by the inertia of the mass only"
-
-

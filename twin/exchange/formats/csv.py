@@ -65,11 +65,39 @@ def _parse_table(file: TextIO, path: Path) -> SampleTable:
         layout = TableLayout((*names,), ("",) * len(names), 1, len(names))
     else:
         names = _check_names(layout, head, delimiter, path)
-    first_row, width, values = layout.first_row + 1, layout.width, array("d")
-    row, blank_row = first_row - 1, 0
-    separate = _separate(chain(head[layout.first_row :], lines), delimiter)
+    first_row = layout.first_row + 1
+    rows = _separate(chain(head[layout.first_row :], lines), delimiter)
+    values = _read_values(rows, names, layout, path)
+    if not values:
+        raise InputError(
+            "a header and no samples below it", where=path, remedy="export the data too"
+        )
+    table = np.frombuffer(values).reshape(-1, layout.width)
+    for name, column in zip(names, table.T, strict=True):
+        if np.isinf(column).any():
+            row_with_inf = int(np.flatnonzero(np.isinf(column))[0]) + first_row
+            raise InputError(
+                "infinite",
+                where=f"{path}: row {row_with_inf}, column {name!r}",
+                remedy="leave lost samples empty",
+            )
+    notes = [] if delimiter == "," else [f"cells are separated by {DELIMITERS[delimiter]}"]
+    notes += ["numbers have decimal commas"] if layout.has_decimal_commas else []
+    columns = {
+        name: make_column(np.ascontiguousarray(column), unit)
+        for name, column, unit in zip(names, table.T, layout.units, strict=True)
+    }
+    return SampleTable(path, columns, (*notes,), first_row=first_row, facts=layout.facts)
+
+
+def _read_values(
+    rows: Iterator[list[str]], names: list[str], layout: TableLayout, path: Path
+) -> "array[float]":
+    """Read the numbers of all rows, one row after the other; InputError for any other cell."""
+    width, values = layout.width, array("d")
+    row, blank_row = layout.first_row, 0
     try:
-        for row, cells in enumerate(separate, start=first_row):
+        for row, cells in enumerate(rows, start=layout.first_row + 1):
             if not cells:
                 blank_row = blank_row or row
                 continue
@@ -81,39 +109,19 @@ def _parse_table(file: TextIO, path: Path) -> SampleTable:
                 cells.pop()
             if len(cells) != width:
                 raise _width_error(path, row, len(cells), names)
-            if layout.has_decimal_commas:
-                cells = [_use_decimal_point(cell, row, path) for cell in cells]
+            texts = _use_decimal_points(cells, row, path) if layout.has_decimal_commas else cells
             try:
-                values.extend([float(cell) for cell in cells])
+                values.extend([float(text) for text in texts])
             except ValueError:
                 values.extend(
-                    _parse_number(cell, f"{path}: row {row}, column {name!r}")
-                    for cell, name in zip(cells, names, strict=True)
+                    _parse_number(text, f"{path}: row {row}, column {name!r}")
+                    for text, name in zip(texts, names, strict=True)
                 )
     except csv.Error as error:
         raise InputError(
             str(error), where=f"{path}: row {row + 1}", remedy="look for an unclosed quote"
         ) from None
-    if not values:
-        raise InputError(
-            "a header and no samples below it", where=path, remedy="export the data too"
-        )
-    table = np.frombuffer(values).reshape(-1, width)
-    for name, column in zip(names, table.T, strict=True):
-        if np.isinf(column).any():
-            row_with_inf = int(np.flatnonzero(np.isinf(column))[0]) + first_row
-            raise InputError(
-                "infinite",
-                where=f"{path}: row {row_with_inf}, column {name!r}",
-                remedy="leave lost samples empty",
-            )
-    notes = () if delimiter == "," else (f"cells are separated by {DELIMITERS[delimiter]}",)
-    notes += ("numbers have decimal commas",) if layout.has_decimal_commas else ()
-    columns = {
-        name: make_column(np.ascontiguousarray(column), unit)
-        for name, column, unit in zip(names, table.T, layout.units, strict=True)
-    }
-    return SampleTable(path, columns, notes, first_row=first_row, facts=layout.facts)
+    return values
 
 
 def _find_layout(head: list[str]) -> tuple[str, TableLayout | None]:
@@ -158,9 +166,7 @@ def _separate_words(lines: Iterable[str]) -> Iterator[list[str]]:
 def _check_names(layout: TableLayout, head: list[str], delimiter: str, path: Path) -> list[str]:
     """Return the names of the columns; raise InputError for those that cannot be."""
     if not layout.names:
-        above = next(
-            (line for line in reversed(head[: layout.first_row]) if line.strip()), ""
-        )
+        above = next((line for line in reversed(head[: layout.first_row]) if line.strip()), "")
         cells = next(_separate([above], delimiter), [])
         if delimiter != BLANKS and len(cells) > 1 and not above.lstrip().startswith("#"):
             raise _width_error(path, layout.first_row + 1, layout.width, cells)
@@ -234,14 +240,16 @@ def _parse_number(cell: str, location: str) -> float:
     )
 
 
-def _use_decimal_point(cell: str, row: int, path: Path) -> str:
-    if "." in cell:
-        raise InputError(
-            f"{cell.strip()!r} has a decimal point, other numbers have decimal commas",
-            where=f"{path}: row {row}",
-            remedy="export the table with one kind of decimal separator",
-        )
-    return cell.replace(",", ".", 1)
+def _use_decimal_points(cells: list[str], row: int, path: Path) -> list[str]:
+    """Return the cells of a row with points for commas; InputError for one that has a point."""
+    for cell in cells:
+        if "." in cell:
+            raise InputError(
+                f"{cell.strip()!r} has a decimal point, other numbers have decimal commas",
+                where=f"{path}: row {row}",
+                remedy="export the table with one kind of decimal separator",
+            )
+    return [cell.replace(",", ".", 1) for cell in cells]
 
 
 def _width_error(path: Path, row: int, count: int, names: list[str]) -> InputError:

@@ -6,7 +6,7 @@ the line above it holds the names, or the units below the names; all above that 
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from table_io.units import UNITS
@@ -28,9 +28,13 @@ UNIT_SPELLINGS = {
 }  # fmt: skip
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
 MASS_UNITS_KG = {"kg": 1.0, "t": 1e3, "ton": 1e3, "tons": 1e3, "tonnes": 1e3, "lb": 0.45359237}
-RATE_NAMES = r"(?:sampling|sample|scan|acquisition)[ _]*(?:rate|frequency|freq)|rate_hz|fs|f_s"
-INTERVAL_NAMES = r"(?:sampling|sample|time)[ _]*(?:interval|period|step|increment)|dt|ts|delta_?t"
-MASS_NAMES = r"(?:total|moving|specimen|test|payload)?[ _]*mass(?:_kg)?|m_kg"
+FACT_NAMES = {
+    "rate_hz": (r"(?:sampling|sample|scan|acquisition)[ _]*(?:rate|frequency|freq)|rate_hz|fs|f_s"),
+    "interval_s": (
+        r"(?:sampling|sample|time)[ _]*(?:interval|period|step|increment)|dt|ts|delta_?t"
+    ),
+    "mass_kg": r"(?:total|moving|specimen|test|payload)?[ _]*mass(?:_kg)?|m_kg",
+}
 NUMBER = r"[-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?"
 
 
@@ -66,16 +70,15 @@ def find_layout(rows: Sequence[Sequence[str]]) -> TableLayout | None:
     else:
         return None
     above = [k for k in range(index) if any(map(str.strip, rows[k]))]
-    names, units = (), ("",) * width
+    names: tuple[str, ...] = ()
+    units = ("",) * width
     if above and (header := _fit_names(rows[above[-1]], width)):
         names, above = header, above[:-1]
         if all(not name or is_unit(name) for name in names) and any(names):
             units = tuple(normalize_unit(name) for name in names)
             names = _fit_names(rows[above[-1]], width) if above else ()
             above = above[:-1] if names else above
-    units = tuple(
-        unit or find_unit(name) for unit, name in zip(units, names or units, strict=True)
-    )
+    units = tuple(unit or find_unit(name) for unit, name in zip(units, names or units, strict=True))
     facts = read_facts(" ".join(rows[k]).strip() for k in above)
     return TableLayout(names, units, index, width, commas, facts)
 
@@ -152,15 +155,16 @@ def find_unit(name: str) -> str:
     return normalize_unit(match[1]) if match and is_unit(match[1]) else ""
 
 
-def read_facts(lines: object) -> dict[str, float]:
+def read_facts(lines: Iterable[str]) -> dict[str, float]:
     """Return the facts of a test that lines of text state: `rate_hz`, `mass_kg`."""
     facts: dict[str, float] = {}
-    for line in lines if not isinstance(lines, str) else [lines]:  # type: ignore[attr-defined]
-        for names, key in ((RATE_NAMES, "rate_hz"), (INTERVAL_NAMES, "interval_s"),
-                           (MASS_NAMES, "mass_kg")):  # fmt: skip
-            pattern = rf"(?i)(?<![\w])(?:{names})\s*(?:[(\[]([^)\]]*)[)\]])?\s*[:=,;\s]\s*({NUMBER})\s*([a-zA-Z]*)"
+    for line in lines:
+        for key, names in FACT_NAMES.items():
+            brackets = r"(?:[(\[]([^)\]]*)[)\]])?"
+            pattern = rf"(?i)(?<!\w)(?:{names})\s*{brackets}\s*[:=,;\s]\s*({NUMBER})\s*([a-z]*)"
             if match := re.search(pattern, line):
-                add_fact(facts, key, float(match[2].replace(",", ".")), match[1] or match[3])
+                value = float(match[2].replace(",", "."))
+                add_fact(facts, key, value, match[1] or match[3])
     return facts
 
 
@@ -178,8 +182,7 @@ def add_fact(facts: dict[str, float], key: str, value: float, unit: str = "") ->
 
 def find_fact(name: str) -> str:
     """Return the fact that a variable of this name holds: `rate_hz`, `interval_s`, `mass_kg`."""
-    for names, key in ((RATE_NAMES, "rate_hz"), (INTERVAL_NAMES, "interval_s"),
-                       (MASS_NAMES, "mass_kg")):  # fmt: skip
+    for key, names in FACT_NAMES.items():
         if re.fullmatch(rf"(?i)(?:{names})", name.rpartition("/")[2]):
             return key
     return ""
