@@ -56,7 +56,7 @@ ARROW, MULTISINE = slice(1000, 40500), slice(41000, 67000)  # rows: extrapolatin
 # share of each floor of the five-storey building, from its base up, in the total mass
 FLOOR_SHARES = (0.09328893, 0.1695185, 0.16294455, 0.11053888, 0.1059777, 0.35773146)
 BNCS_HZ = 200.0
-SUBSTEPS = 20  # of a sample, where a law with memory is integrated
+SUBSTEPS_PER_SAMPLE = 20  # of a sample, where a law with memory is integrated
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,10 +240,10 @@ def integrate_hysteresis(v: Float1D, dt: float, yield_displacement: float) -> Fl
         out[sample] = z
         if sample == v.size - 1:
             break
-        for step in range(SUBSTEPS):
-            first = v[sample] + (v[sample + 1] - v[sample]) * step / SUBSTEPS
-            second = v[sample] + (v[sample + 1] - v[sample]) * (step + 1) / SUBSTEPS
-            h = dt / SUBSTEPS / yield_displacement
+        for step in range(SUBSTEPS_PER_SAMPLE):
+            first = v[sample] + (v[sample + 1] - v[sample]) * step / SUBSTEPS_PER_SAMPLE
+            second = v[sample] + (v[sample + 1] - v[sample]) * (step + 1) / SUBSTEPS_PER_SAMPLE
+            h = dt / SUBSTEPS_PER_SAMPLE / yield_displacement
             rate = first - 0.5 * (abs(first) * z * abs(z) + first * z * z)
             end = min(max(z + h * rate, -1.0), 1.0)
             after = second - 0.5 * (abs(second) * end * abs(end) + second * end * end)

@@ -134,7 +134,7 @@ def import_command(
         files, out, profile, rig, columns, accept, save_map,
         {key: value for key, value in stated.items() if value is not None},
     )  # fmt: skip
-    raise typer.Exit(import_files.import_command(request))
+    raise typer.Exit(import_files.run_import(request))
 
 
 @files_app.command("export", rich_help_panel=FILES_PANEL)

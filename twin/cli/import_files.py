@@ -33,7 +33,7 @@ class ImportRequest:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
 
-def import_command(request: ImportRequest) -> int:
+def run_import(request: ImportRequest) -> int:
     """Import the files, or propose a map if no log is named; return the exit code."""
     if request.out is None and request.columns is None:
         propose_import(request)

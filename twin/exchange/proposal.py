@@ -19,7 +19,7 @@ from twin.exchange.columns import CANONICAL_COLUMNS, ColumnMap, ColumnSource, Im
 from twin.exchange.formats import SampleTable
 from twin.exchange.formats.layout import TIME_UNITS, find_unit, is_unit, normalize_unit
 from twin.exchange.plausibility import CHECKED_PAIRS, find_plausible_units, match_unit_pairs
-from twin.recording.tabular import LABEL_UNITS, TIME_COLUMN
+from twin.recording.tabular import LABEL_UNITS, TIME_COLUMN, TWIN_PREFIX
 
 QUANTITY_WORDS = {
     "time": {"t", "time", "timestamp", "elapsed", "zeit", "tempo"},
@@ -133,7 +133,11 @@ def propose_map(
     """
     stated = {key: float((settings or {})[key]) for key in FACT_KEYS if key in (settings or {})}
     table = replace(table, facts=table.facts | stated)
-    names = _longest_columns(table)
+    names = [
+        name
+        for name in _longest_columns(table)
+        if name not in LABEL_UNITS and not name.startswith(TWIN_PREFIX)
+    ]
     quantities = {name: _find_quantity(table, name) for name in names}
     questions: list[str] = []
     alternatives: dict[str, tuple[str, ...]] = {}
@@ -150,9 +154,8 @@ def propose_map(
             else:
                 free = tuple(other for other in possible if other not in chosen)
                 alternatives[name] = free
-                questions.append(
-                    f"column {name!r} is a {quantity} of an unknown body: {' or '.join(free)}?"
-                )
+                candidates = " or ".join(free) or "no channel is left"
+                questions.append(f"column {name!r}: {quantity} of which body? {candidates}")
     columns = [
         ProposedColumn(TIME_COLUMN, time_column, *_propose_time_unit(table, time_column))
     ] if time_column else []  # fmt: skip
@@ -173,7 +176,7 @@ def propose_map(
         tuple(_list_missing({*chosen}, "mass_kg" in table.facts, settings or {}))
         if chosen
         else (),
-        tuple(name for name in table.columns if name not in open_names and name not in LABEL_UNITS),
+        tuple(name for name in names if name not in open_names),
         alternatives,
     )  # fmt: skip
 
@@ -297,7 +300,7 @@ def _propose_unit(
         return "", "", (
             f"column {name!r}: its unit is not stated; state one of {', '.join(allowed)}"
         )  # fmt: skip
-    values = _centred(table.read_column(name))
+    values = _remove_mean(table.read_column(name))
     plausible = find_plausible_units(known.recorded_unit(channel), values, allowed)
     pair = _unit_by_partner(table, channel, name, chosen)
     if pair:
@@ -325,8 +328,8 @@ def _unit_by_partner(table: SampleTable, channel: str, name: str, chosen: dict[s
         if not unit:
             continue
         pairs = match_unit_pairs(
-            _centred(table.read_column(chosen[disp])),
-            _centred(table.read_column(chosen[acc])),
+            _remove_mean(table.read_column(chosen[disp])),
+            _remove_mean(table.read_column(chosen[acc])),
             rate_hz,
         )
         fitting = {d if channel == disp else a for d, a in pairs if unit in (d, a)}
@@ -335,7 +338,7 @@ def _unit_by_partner(table: SampleTable, channel: str, name: str, chosen: dict[s
     return ""
 
 
-def _centred(values: Float1D) -> Float1D:
+def _remove_mean(values: Float1D) -> Float1D:
     return values - np.nanmean(values)
 
 
