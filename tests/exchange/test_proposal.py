@@ -215,3 +215,12 @@ def test_a_workbook_is_read_as_it_was_exported(tmp_path: Path) -> None:
     file.write_bytes(file.read_bytes()[:2000])
     with raises_input_error(where=file):
         import_samples(file, tmp_path / "c.mcap", None, None, None, ImportOptions(accept=True))
+
+
+def test_a_motion_without_steps_gets_none_of_the_placeholder(tmp_path: Path) -> None:
+    noise = np.cumsum(np.random.default_rng(0).normal(size=TIME.size)) * 1e-2
+    file, log = tmp_path / "noise.csv", tmp_path / "noise.mcap"
+    table = np.array([TIME, noise, 36 * noise])
+    np.savetxt(file, table.T, delimiter=",", header="t (s),stroke (mm),load (N)", comments="")
+    import_samples(file, log, None, None, None, ImportOptions(accept=True))
+    assert read_recording(log).start.steps == ()

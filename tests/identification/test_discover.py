@@ -9,7 +9,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from table_io.block import Int1D, Label
 from tests.identification.played import SNM, format_truth, log
+from tests.input_errors import raises_input_error
 from twin.identification.discover import (
     Discovery,
     PreparedLog,
@@ -162,6 +164,26 @@ def test_several_logs_count_together() -> None:
     assert both.best.names == alone.best.names == ("bumper_hardening",)
     key = EffectKey("bumper_hardening", "k2")
     assert both.best.fit.std_errors[key] < alone.best.fit.std_errors[key]
+
+
+def test_short_logs_are_enough_together() -> None:
+    """None of them has nine cycles or 1,000 samples of its own."""
+    whole = log("")
+    moving = np.flatnonzero(whole.signals.label != Label.REST)
+    pieces = [shorten(whole, piece) for piece in np.array_split(moving, 24)[4:20:2]]
+    with raises_input_error(where=pieces[0].signals.name, allowed="9 cycles"):
+        prepare_problem(pieces[:1], SNM)
+    with raises_input_error(allowed="in all logs together"):
+        prepare_problem(pieces[:2], SNM)
+    prepared = prepare_problem(pieces, SNM)
+    assert prepared.first_fit.converged
+
+
+def shorten(whole: PreparedLog, samples: Int1D) -> PreparedLog:
+    """The log with only these samples usable."""
+    good = np.zeros_like(whole.signals.good)
+    good[samples] = whole.signals.good[samples]
+    return replace(whole, signals=replace(whole.signals, good=good))
 
 
 def test_where_too_much_is_recorded_the_last_cycles_say_the_same(

@@ -153,10 +153,11 @@ def import_samples(
         moving = np.where(labels.label == Label.REST, int(Label.SETTLE), labels.label)
         labels = replace(labels, label=moving, messages=(*labels.messages, NO_REST))
     is_history = not labels.steps and bool((labels.step >= 0).any())
-    steps = () if is_history else labels.steps or config.steps
+    is_plain = profile is None and not _has_config_texts(table)
+    # the steps of a placeholder's sweep were never played
+    steps = labels.steps or (() if is_history or is_plain else config.steps)
     config = replace(config, drive=replace(config.drive, steps=steps))
     mass_text = "unit mass" if mass_kg is None else f"{mass_kg:g} kg"
-    is_plain = profile is None and not _has_config_texts(table)
     missing_profile = (NO_PROFILE.format(mass=mass_text),) if is_plain else ()
     notes = (
         *missing_profile, *samples_read.notes, *labels.messages, _describe_steps(labels),
