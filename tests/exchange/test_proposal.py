@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from table_io.block import Float1D
+from table_io.block import Float1D, Label
 from table_io.errors import InputError
 from tests.input_errors import raises_input_error
 from twin.cli.main import app
@@ -168,11 +168,19 @@ def test_options_of_an_import_are_those_of_a_map(tmp_path: Path) -> None:
 def test_a_still_beginning_off_zero_is_warned_of(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options = ImportOptions(accept=True)
-    for offset, warned in ((0.0, False), (5.0, True)):
-        file = write_component(tmp_path / f"{offset}.txt", offset=offset)
-        import_samples(file, tmp_path / f"{offset}.mcap", None, None, None, options)
-        assert ("--no-rest" in capsys.readouterr().out) is warned
+    """A component that is held off its zero is not at rest, unless the user says so."""
+    for offset, settings, is_rest, warned in (
+        (0.0, {}, True, False), (5.0, {}, False, True), (5.0, {"rest": True}, True, False),
+    ):  # fmt: skip
+        name = f"{offset}{len(settings)}"
+        file, log = (
+            write_component(tmp_path / f"{name}.txt", offset=offset),
+            tmp_path / f"{name}.mcap",
+        )
+        import_samples(file, log, None, None, None, ImportOptions(True, settings))
+        (block,) = read_recording(log).contiguous_blocks("meas")
+        assert bool(block.label[0] == Label.REST) is is_rest
+        assert ("warning: rel_disp_m" in capsys.readouterr().out) is warned
 
 
 def test_several_runs_become_the_logs_of_a_folder(tmp_path: Path) -> None:

@@ -140,8 +140,7 @@ def prepare_mr_damper(folder: Path, scratch: Path, variant: str) -> PreparedCase
             "force (N)": run.force - run.force.mean(),
         }
         tables.append(write_table(scratch / f"{run.name}.csv", columns))
-    options = ("--no-rest",) if variant == "mean removed, no rest" else ()
-    return PreparedCase(tuple(tables), "", training, held_out, options=options)
+    return PreparedCase(tuple(tables), "", training, held_out)
 
 
 def prepare_friction_damper(folder: Path, scratch: Path, training: str) -> PreparedCase:
@@ -420,7 +419,6 @@ def make_friction_case(training: str) -> Case:
 CASES = (
     make_mr_case("raw"),
     make_mr_case("mean removed"),
-    make_mr_case("mean removed, no rest"),
     make_mr_case("rest cut"),
     make_friction_case("sines"),
     make_friction_case("earthquakes"),

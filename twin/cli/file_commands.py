@@ -94,9 +94,10 @@ def import_command(
         str | None,
         typer.Option("--detrend", metavar="mean|line", help="Remove it from every channel."),
     ] = None,
-    no_rest: Annotated[
-        bool, typer.Option("--no-rest", help="Take no still part as rest at zero.")
-    ] = False,
+    rest: Annotated[
+        bool | None,
+        typer.Option("--rest/--no-rest", help="Take still parts as rest at zero, or nothing."),
+    ] = None,
     integrate: Annotated[
         str | None,
         typer.Option(
@@ -127,7 +128,7 @@ def import_command(
         return
     stated = {
         "mass_kg": mass, "rate_hz": rate, "from_s": from_s, "to_s": to_s, "detrend": detrend,
-        "rest": False if no_rest else None,
+        "rest": rest,
         "integrate_hz": import_files.parse_band(integrate),
     }  # fmt: skip
     request = import_files.ImportRequest(

@@ -153,7 +153,9 @@ def format_settings(settings: Mapping[str, Any]) -> list[str]:
     if "integrate_hz" in settings:
         low, high = settings["integrate_hz"]
         words += ["--integrate", f"{low:g}:{high:g}"]
-    return words + (["--no-rest"] if settings.get("rest") is False else [])
+    if "rest" in settings:
+        words.append("--rest" if settings["rest"] else "--no-rest")
+    return words
 
 
 def parse_band(text: str | None) -> tuple[float, float] | None:

@@ -72,7 +72,11 @@ class ColumnMap(ConfigModel):
     mass_kg: Positive | None = Field(None, description="Moving mass; a component test has none.")
     from_s: Finite | None = Field(None, description="First time of the file that is imported.")
     to_s: Finite | None = Field(None, description="Last time of the file that is imported.")
-    rest: bool = Field(True, description="Still beginnings and ends are at rest, at zero.")
+    rest: bool | None = Field(
+        None,
+        description="Still parts are at rest, at zero; by default, but for a component test that "
+        "stands still off its zero.",
+    )
     detrend: Literal["", "mean", "line"] = Field("", description="Remove it from each channel.")
     integrate_hz: tuple[Positive, Positive] | None = Field(
         None, description="Band in which rel_disp_m is integrated from the accelerations."

@@ -149,9 +149,8 @@ def import_samples(
     config = _build_run_config(table, profile, rig_toml, samples_read.rate_hz, file_labels, mass_kg)
     grid = _to_grid(file, samples_read)
     labels = file_labels or _detect_labels(grid, config, on_grid=profile is not None)
-    if column_map is not None and not column_map.rest:
-        moving = np.where(labels.label == Label.REST, int(Label.SETTLE), labels.label)
-        labels = replace(labels, label=moving, messages=(*labels.messages, NO_REST))
+    is_rest = column_map.rest if column_map is not None else None
+    labels = _judge_rest(grid, labels, is_rest, is_component=profile is None)
     is_history = not labels.steps and bool((labels.step >= 0).any())
     is_plain = profile is None and not _has_config_texts(table)
     # the steps of a placeholder's sweep were never played
@@ -159,10 +158,7 @@ def import_samples(
     config = replace(config, drive=replace(config.drive, steps=steps))
     mass_text = "unit mass" if mass_kg is None else f"{mass_kg:g} kg"
     missing_profile = (NO_PROFILE.format(mass=mass_text),) if is_plain else ()
-    notes = (
-        *missing_profile, *samples_read.notes, *labels.messages, _describe_steps(labels),
-        *_find_shifted_rest(grid, labels),
-    )  # fmt: skip
+    notes = (*missing_profile, *samples_read.notes, *labels.messages, _describe_steps(labels))
     gaps = 0
     with RunProgress(console, len(steps), grid.size) as progress:
 
@@ -209,22 +205,53 @@ def _detect_labels(grid: _SampleGrid, config: RunConfig, on_grid: bool) -> Detec
     return find_steps(signal, rate_hz, config.profile.sweep, is_acc=is_acc, on_grid=on_grid)
 
 
-def _find_shifted_rest(grid: _SampleGrid, labels: DetectedSteps) -> Iterator[str]:
-    """Yield a warning per displacement or force whose still beginning is far from its zero."""
+def _judge_rest(
+    grid: _SampleGrid, labels: DetectedSteps, is_rest: bool | None, is_component: bool
+) -> DetectedSteps:
+    """Return the labels without rest if it is no zero, by `is_rest` or by the readings there.
+
+    A mass on its spring comes to rest at zero. An actuator holds a component anywhere, so its still
+    part is no zero if its displacement is far from it.
+    """
+    offsets = _measure_rest_offsets(grid, labels) if is_rest is None else {}
+    is_held = is_component and {"damper_force_n", "rel_disp_m"} <= {*grid.channels}
+    if is_rest is None:
+        is_rest = not (is_held and "rel_disp_m" in offsets)
+        advice = (
+            "if it is none, as after the mean was removed, import with --no-rest"
+            if is_rest
+            else "a component may be held anywhere; if this is its zero, import with --rest"
+        )
+        taken = "rest is taken as its zero" if is_rest else "nothing is taken as rest"
+        labels = replace(
+            labels,
+            messages=(
+                *labels.messages,
+                *(
+                    f"warning: {name} reads {offset:.4g} while it is still: {taken}; {advice}"
+                    for name, offset in offsets.items()
+                ),
+            ),
+        )
+    if is_rest:
+        return labels
+    moving = np.where(labels.label == Label.REST, int(Label.SETTLE), labels.label)
+    return replace(labels, label=moving, messages=(*labels.messages, NO_REST))
+
+
+def _measure_rest_offsets(grid: _SampleGrid, labels: DetectedSteps) -> dict[str, float]:
+    """Return the mean of each channel that is far from zero in the still beginning, in SI."""
     moving = np.flatnonzero(labels.label != Label.REST)
+    offsets: dict[str, float] = {}
     if not moving.size or not moving[0]:
-        return
+        return offsets
     for name, values in zip(grid.channels, grid.values, strict=True):
         rest, motion = values[: moving[0]], values[moving[0] : moving[-1] + 1]
-        if not (np.isfinite(rest).any() and np.isfinite(motion).any()):
-            continue
-        offset = float(np.nanmean(rest))
-        if abs(offset) > MAX_REST_SHARE * float(np.nanmax(motion) - np.nanmin(motion)):
-            yield (
-                f"warning: {name} reads {offset:.4g} while it is still: rest is taken as its zero; "
-                "if it is none, as after the mean was removed or under a preload, import with "
-                "--no-rest"
-            )
+        if np.isfinite(rest).any() and np.isfinite(motion).any():
+            offset = float(np.nanmean(rest))
+            if abs(offset) > MAX_REST_SHARE * float(np.nanmax(motion) - np.nanmin(motion)):
+                offsets[name] = offset
+    return offsets
 
 
 def print_contents(file: Path, columns: Path | None) -> None:
