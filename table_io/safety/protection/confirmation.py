@@ -16,6 +16,7 @@ from table_io.block import Float1D, Float2D
 from table_io.control.frf import evaluate_transfer
 from table_io.records import FrequencyResponse
 from table_io.safety.protection import cycle_checks, load_cells
+from table_io.safety.protection.consistency import highpass_displacement
 from table_io.safety.protection.cycle import DriveCycle, ProtectionContext, Suspicion
 from table_io.safety.protection.cycle_checks import PairBaseline, SwingAverage
 from table_io.safety.protection.load_cells import ForceShare
@@ -34,7 +35,8 @@ class SampleSpan:
     """Samples between two marks: values (channel, sample), command and phase (sample,).
 
     `level` and `label` are those of the last sample. `key` identifies the motion (0 rest, -1 loop
-    check). `is_half_cycle` is True if the span is half a cycle long.
+    check). `is_half_cycle` is True if the span is half a cycle long. `filtered` holds the
+    displacement of each sensor pair behind the low cut of its accelerometer, (sample,).
     """
 
     values: Float2D
@@ -44,6 +46,7 @@ class SampleSpan:
     label: int
     key: int
     is_half_cycle: bool
+    filtered: Mapping[str, Float1D] = field(default_factory=lambda: MappingProxyType({}))
 
 
 def _empty_mapping() -> Mapping[Any, Any]:
@@ -84,7 +87,7 @@ def check_cycle(
     """Run the cycle checks after one more span: return (state, newly confirmed suspicions)."""
     if span.key <= 0:
         return replace(state, spans=(), streaks=_empty_mapping()), ()
-    kept = [span]
+    kept = [_filter_displacements(context, state, span)]
     for earlier in reversed(state.spans):
         if _count_cycles(kept) > MIN_CYCLE_COUNT:
             break
@@ -92,7 +95,7 @@ def check_cycle(
     state = replace(state, spans=tuple(kept))
     if _count_cycles(kept) < MIN_CYCLE_COUNT:
         return state, ()
-    state, suspicions = _check_any_motion(state, _join_spans(context, kept))
+    state, suspicions = _check_any_motion(state, _join_spans(context, kept), kept)
     last = kept[-2:]
     steady = span.key >= FIRST_HOLD_KEY and all(
         part.is_half_cycle and part.key == span.key for part in last
@@ -107,19 +110,45 @@ def check_cycle(
     return replace(state, streaks=MappingProxyType(streaks)), tuple(confirmed)
 
 
+def _filter_displacements(
+    context: ProtectionContext, state: CycleCheckState, span: SampleSpan
+) -> SampleSpan:
+    """Return the span with its filtered displacements, continued from the span before."""
+    filtered = {}
+    for names, acceleration in cycle_checks.SENSOR_PAIRS:
+        if not {*names, acceleration} <= {*context.rig.channels}:
+            continue
+        x = cycle_checks.sum_channels(context.rig, span.values, names)
+        last = None
+        if state.spans:
+            before = cycle_checks.sum_channels(context.rig, state.spans[-1].values[:, -1:], names)
+            last = float(before[0]), float(state.spans[-1].filtered[names[0]][-1])
+        baseline = state.pair_baselines.get(names[0], PairBaseline())
+        filtered[names[0]] = highpass_displacement(
+            x, baseline.errors.low_cut, context.rate_hz, last
+        )
+    return replace(span, filtered=filtered)
+
+
 def _check_any_motion(
-    state: CycleCheckState, cycle: DriveCycle
+    state: CycleCheckState, cycle: DriveCycle, spans: list[SampleSpan]
 ) -> tuple[CycleCheckState, list[Suspicion]]:
     """Run the checks that apply to any motion: consistency of sensors and load cells."""
     suspicions: list[Suspicion] = []
     baselines = dict(state.pair_baselines)
-    for names, acceleration, pair in cycle_checks.compare_sensor_pairs(cycle):
-        baseline = baselines.get(names[0])
+    for names, acceleration in cycle_checks.SENSOR_PAIRS:
+        if not cycle.has(*names, acceleration):
+            continue
+        baseline = baselines.get(names[0], PairBaseline())
+        filtered = np.concatenate([span.filtered[names[0]] for span in spans])
+        pair = cycle_checks.compare_sensor_pair(
+            cycle, names, acceleration, filtered, baseline.errors.low_cut
+        )
         mismatches = list(
             cycle_checks.check_sensor_pair(cycle, names, acceleration, pair, baseline)
         )
         if not mismatches:
-            baselines[names[0]] = (baseline or PairBaseline(pair)).update(pair)
+            baselines[names[0]] = baseline.update(pair)
         suspicions += mismatches
     cell_suspicions, shares = load_cells.check_cell_pairs(cycle, state.force_shares)
     return replace(

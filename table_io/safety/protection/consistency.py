@@ -5,14 +5,20 @@ No force law is used: the comparison holds for any motion, including chaotic one
 Weak form: integral phi'' x dt = integral phi a dt, for phi that vanishes with its slope at both
 ends of a window. phi = sin^4(pi t / T) exp(-i k (w t + theta)) at the drive's frequency (k = 1, 2)
 differentiates no noise and cancels offsets of x; with k = 0 an offset of a remains.
+
+A sound accelerometer may have a low cut, and filters may delay one sensor more than the other:
+    a = gain hp(x'') delayed,  hp = s / (s + w_c),  hp(x'') = x'' - w_c x' + w_c^2 hp(x)
+so   <phi, a> = gain <phi'', x> + gain w_c (<phi', x> + w_c <phi, hp(x)>) + delay <phi', a>
+for any motion, with hp(x) a recursion over all samples since rest (`highpass_displacement`).
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+from scipy import signal
 
 from table_io.block import Float1D, Float2D
 
@@ -22,6 +28,16 @@ MIN_AMPLITUDE_SNR, MIN_AMPLITUDE_RATIO = (
     20.0,
     0.3,
 )  # amplitude over its standard error, and over the motion, from which a ratio is evaluated
+# Low cut and delay of sound sensors. IEPE accelerometers are down by 3 dB at 0.16 to 0.5 Hz; twice
+# that is no longer a sensor for tests from 0.5 Hz on. A low-pass of fourth order at 100 Hz delays
+# by 4.2 ms.
+MAX_LOW_CUT_RAD_S = 2 * math.pi * 1.0
+MAX_DELAY_S = 0.005
+# Standard deviations expected before anything is measured: gain, gain x low cut, delay. At one
+# frequency low cut and delay are told apart by them only.
+PRIOR_SD = (0.2, 2 * math.pi * 0.3, 0.001)
+FIT_ERROR_RATIO = 0.01  # of the motion: errors of sensors that are none of the three
+AVERAGING_CHECKS = 20  # ten cycles: longer than a transient
 Complex1D = npt.NDArray[np.complex128]
 
 
@@ -30,13 +46,32 @@ class WeakFormPair:
     """Acceleration amplitudes from a displacement and from an acceleration in one window, m/s2.
 
     All at 0, 1 and 2 times the drive's frequency, (3,). `constant` is the response to a constant of
-    1 m/s2, `sigma` the standard error of the difference of the amplitudes.
+    1 m/s2, `sigma` the standard error of the difference of the amplitudes. `low_cut_term` (m/s) and
+    `delay_term` (m/s3) are the changes of the acceleration per rad/s of low cut and s of delay.
     """
 
     displacement: Complex1D
     acceleration: Complex1D
     constant: Complex1D
     sigma: Float1D
+    low_cut_term: Complex1D
+    delay_term: Complex1D
+
+    def remove_errors(self, errors: "PairErrors") -> "WeakFormPair":
+        """Return the pair as sensors without these errors would show it."""
+        return replace(
+            self,
+            displacement=errors.gain * (self.displacement + errors.low_cut * self.low_cut_term),
+            acceleration=self.acceleration - errors.delay_s * self.delay_term,
+        )
+
+    def normal_equations(self) -> tuple[Float2D, Float1D]:
+        """Return (matrix (3, 3), right side (3,)) of gain, gain x low cut and delay."""
+        columns = np.array([self.displacement, self.low_cut_term, self.delay_term])[:, 1:]
+        weight = 1.0 / np.hypot(FIT_ERROR_RATIO * self.size, self.sigma[1:])
+        rows = np.concatenate([columns.real * weight, columns.imag * weight], axis=1)
+        values = self.acceleration[1:]
+        return rows @ rows.T, rows @ np.concatenate([values.real * weight, values.imag * weight])
 
     @cached_property
     def size(self) -> float:
@@ -72,15 +107,15 @@ class WeakFormPair:
         return self._beyond_noise(difference - self.offset * self.constant)
 
     @property
-    def ratio(self) -> complex:
-        """Ratio of acceleration to displacement at the drive's frequency; NaN if uncertain."""
+    def is_clear(self) -> bool:
+        """True if the motion at the drive's frequency is large enough to compare the sensors."""
         threshold = max(MIN_AMPLITUDE_SNR * float(self.sigma[1]), MIN_AMPLITUDE_RATIO * self.size)
-        is_clear = abs(self.displacement[1]) > threshold
-        return complex(self.acceleration[1] / self.displacement[1]) if is_clear else complex("nan")
+        return bool(abs(self.displacement[1]) > threshold)
 
-    def ratio_mismatch(self, ratio: complex) -> float:
-        """Return the difference from `ratio` at the drive's frequency, beyond noise, m/s2."""
-        difference = abs(ratio * self.displacement[1] - self.acceleration[1])
+    @property
+    def fundamental_mismatch(self) -> float:
+        """Difference at the drive's frequency in excess of six standard errors, m/s2."""
+        difference = abs(self.displacement[1] - self.acceleration[1])
         return float(max(difference - NOISE_SIGMAS * self.sigma[1], 0.0))
 
     def _beyond_noise(self, difference: Complex1D) -> float:
@@ -91,11 +126,90 @@ class WeakFormPair:
         return float(np.sum(np.abs(self.constant) ** 2))
 
 
+@dataclass(frozen=True, slots=True)
+class PairErrors:
+    """Errors of an accelerometer relative to a displacement: gain, low cut in rad/s, delay in s."""
+
+    gain: float = 1.0
+    low_cut: float = 0.0
+    delay_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairErrorEstimate:
+    """Running estimate of the errors of a sensor pair over about AVERAGING_CHECKS checks.
+
+    `matrix` (3, 3) and `rhs` (3,) are sums of normal equations in which old checks fade.
+    """
+
+    errors: PairErrors = PairErrors()
+    matrix: Float2D = field(default_factory=lambda: np.zeros((3, 3)))
+    rhs: Float1D = field(default_factory=lambda: np.zeros(3))
+    check_count: int = 0
+
+    def update(self, pair: WeakFormPair) -> "PairErrorEstimate":
+        """Return the estimate with one more comparison."""
+        kept = 1.0 - 1.0 / AVERAGING_CHECKS
+        matrix, rhs = pair.normal_equations()
+        matrix, rhs = kept * self.matrix + matrix, kept * self.rhs + rhs
+        return PairErrorEstimate(_solve_errors(matrix, rhs), matrix, rhs, self.check_count + 1)
+
+
+def fit_phase_errors(pair: WeakFormPair) -> PairErrors:
+    """Fit the low cut and delay of sound sensors that explain a comparison best, at gain 1."""
+    return _solve_errors(*pair.normal_equations(), fixed_gain=True)
+
+
+def _solve_errors(matrix: Float2D, rhs: Float1D, fixed_gain: bool = False) -> PairErrors:
+    """Solve normal equations within the bounds of sound sensors, near their expected values.
+
+    A gain beyond +-1 keeps the low cut as product; it is no sound sensor anyway.
+    """
+    prior = np.array(PRIOR_SD) ** -2.0
+    matrix, rhs = matrix + np.diag(prior), rhs + prior * np.array([1.0, 0.0, 0.0])
+    low = np.array([-math.inf, 0.0, -MAX_DELAY_S])
+    high = np.array([math.inf, MAX_LOW_CUT_RAD_S, MAX_DELAY_S])
+    x, is_free = np.array([1.0, 0.0, 0.0]), np.array([not fixed_gain, True, True])
+    while is_free.any():
+        x[is_free] = np.linalg.solve(
+            matrix[np.ix_(is_free, is_free)], (rhs - matrix[:, ~is_free] @ x[~is_free])[is_free]
+        )
+        beyond = is_free & ((x < low) | (x > high))
+        if not beyond.any():
+            break
+        x = np.clip(x, low, high)
+        is_free &= ~beyond
+    gain, scaled_low_cut, delay_s = x.tolist()
+    return PairErrors(gain, scaled_low_cut / max(gain, 1.0 - PRIOR_SD[0]), delay_s)
+
+
+def highpass_displacement(
+    x: Float1D, low_cut: float, rate_hz: float, last: tuple[float, float] | None
+) -> Float1D:
+    """Return a displacement in m, (sample,), behind a first-order high-pass of `low_cut` rad/s.
+
+    `last`: (displacement, output) at the sample before; None: at rest. Lost samples (NaN) repeat
+    the one before.
+    """
+    before, output = last or (math.nan, 0.0)
+    joined = np.concatenate([[before], x])
+    finite = np.flatnonzero(np.isfinite(joined))
+    if not finite.size:
+        return np.full(x.size, output)
+    latest = np.searchsorted(finite, np.arange(joined.size), side="right") - 1
+    steps = np.diff(joined[finite[np.maximum(latest, 0)]])
+    half = 0.5 * low_cut / rate_hz  # trapezoidal rule
+    pole = (1.0 - half) / (1.0 + half)
+    filtered, _ = signal.lfilter([1.0 / (1.0 + half)], [1.0, -pole], steps, zi=[pole * output])
+    return np.asarray(filtered, dtype=np.float64)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class WeakFormWindow:
-    """Test functions phi and phi'' of one window, orders 0, 1 and 2, complex (order, sample)."""
+    """Test functions phi, phi' and phi'' of one window, orders 0 to 2, complex (order, sample)."""
 
     phi: npt.NDArray[np.complex128]
+    phi_d: npt.NDArray[np.complex128]
     phi_dd: npt.NDArray[np.complex128]
 
 
@@ -114,25 +228,40 @@ def make_window(samples: int, cycles: float, middle: float, rate_hz: float) -> W
     tone = np.exp(-2j * np.pi * (middle + cycles * (t - 0.5)))
     total = float(bell.sum())
     phi = np.empty((len(WINDOW_ORDERS), samples), dtype=np.complex128)
-    phi_dd = np.empty_like(phi)
+    phi_d, phi_dd = np.empty_like(phi), np.empty_like(phi)
     wave = np.ones_like(tone)
     for k in WINDOW_ORDERS:
         scale = (2.0 if k else 1.0) / total
         phi[k] = scale * bell * wave
+        phi_d[k] = scale * (slope - 1j * k * omega * bell) * wave
         phi_dd[k] = scale * (curvature - 2j * k * omega * slope - (k * omega) ** 2 * bell) * wave
         wave = wave * tone
-    return WeakFormWindow(phi, phi_dd)
+    return WeakFormWindow(phi, phi_d, phi_dd)
 
 
 def compare_motion(
-    window: WeakFormWindow, x: Float1D, a: Float1D, noise: tuple[float, float]
+    window: WeakFormWindow,
+    x: Float1D,
+    a: Float1D,
+    noise: tuple[float, float],
+    filtered: tuple[Float1D, float],
 ) -> WeakFormPair:
-    """Compare displacement x in m with acceleration a in m/s2, (sample,); `noise`: rms of each."""
+    """Compare displacement x in m with acceleration a in m/s2, (sample,); `noise`: rms of each.
+
+    `filtered`: displacement behind a high-pass, (sample,), and its corner in rad/s.
+    """
     errors = np.hypot(
         noise[0] * np.linalg.norm(window.phi_dd, axis=1),
         noise[1] * np.linalg.norm(window.phi, axis=1),
     )
-    return WeakFormPair(window.phi_dd @ x, window.phi @ a, window.phi.sum(axis=1), errors)
+    return WeakFormPair(
+        window.phi_dd @ x,
+        window.phi @ a,
+        window.phi.sum(axis=1),
+        errors,
+        window.phi_d @ x + filtered[1] * (window.phi @ filtered[0]),
+        window.phi_d @ a,
+    )
 
 
 @dataclass(frozen=True, slots=True)

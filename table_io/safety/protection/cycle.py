@@ -10,7 +10,11 @@ from table_io.block import Float1D, Float2D
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.order_tracking import HarmonicFit, track_channels
-from table_io.safety.protection.consistency import remove_spikes
+from table_io.safety.protection.consistency import (
+    WeakFormWindow,
+    make_window,
+    remove_spikes,
+)
 
 # Checks are half a cycle apart, so the first and the last of three share no sample.
 CONFIRMATION_CHECKS = 3
@@ -87,6 +91,12 @@ class DriveCycle:
         rows = [*(self.clean_channel(name) for name in names), self.command]
         tracked = track_channels(np.array(rows), self.phase, TRACKED_HARMONICS)
         return dict(zip((*names, "command"), tracked, strict=True))
+
+    @cached_property
+    def window(self) -> WeakFormWindow:
+        """Test functions over the cycle."""
+        middle = 0.5 * float(self.phase[0] + self.phase[-1])
+        return make_window(self.phase.size, self.cycle_count, middle, self.context.rate_hz)
 
     def has(self, *names: str) -> bool:
         """Return True if the rig has these channels and no sample of them is lost."""

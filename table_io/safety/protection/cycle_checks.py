@@ -5,25 +5,32 @@ Each function yields suspicions; one that persists over several checks becomes a
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from table_io.block import Label
+from table_io.block import Float1D, Float2D, Label
+from table_io.config.rig import RigConfig
 from table_io.control.order_tracking import track_harmonics
-from table_io.safety.protection.consistency import WeakFormPair, compare_motion, make_window
+from table_io.safety.protection.consistency import (
+    AVERAGING_CHECKS,
+    PairErrorEstimate,
+    PairErrors,
+    WeakFormPair,
+    compare_motion,
+    fit_phase_errors,
+)
 from table_io.safety.protection.cycle import TRACKED_HARMONICS, DriveCycle, Suspicion, suspect_drift
 
 MAX_MISMATCH_RATIO = 0.12  # of the motion; slightly more than the limit of the loop check
-MAX_MISMATCH_CHANGE = 0.05  # of the motion; change from the mean ratio of the last ten cycles
-MIN_BASELINE_CHECKS = 6  # checks from which that mean ratio is used
+MAX_MISMATCH_CHANGE = 0.05  # of the motion; change from the errors of the last ten cycles
+MIN_BASELINE_CHECKS = 6  # checks from which those errors are known
 OFFSET_RANGE_RATIO = 1e-3  # of a sensor's range
 MAX_OFFSET_RESIDUAL_RATIO = 0.3  # remaining share of a mismatch that an offset explains
 OFFSET_AMPLITUDE_RATIO = 0.02  # of the table's motion
 MAX_READ_BACK_ERROR = 0.02  # of the command
 MAX_GAIN_CHANGE = 0.2  # of the identified response
 MAX_LAG_CHANGE_RATIO, MAX_LAG_CHANGE_S = 0.5, 0.003  # of the identified lag, and absolute minimum
-AVERAGING_CHECKS = 20  # ten cycles: longer than a transient
 MAX_SWING_ASYMMETRY = 0.35  # of the swing of the mass: twice that of the chaotic case G4
 SENSOR_PAIRS = (
     (("table_disp_m",), "table_acc_m_s2"),
@@ -32,42 +39,47 @@ SENSOR_PAIRS = (
 )
 
 
-def compare_sensor_pairs(cycle: DriveCycle) -> Iterator[tuple[tuple[str, ...], str, WeakFormPair]]:
-    """Yield (displacement channels, acceleration channel, comparison) of each measured pair."""
-    pairs = [pair for pair in SENSOR_PAIRS if cycle.has(*pair[0], pair[1])]
-    if not pairs:
-        return
-    count = cycle.phase.size
-    middle = 0.5 * float(cycle.phase[0] + cycle.phase[-1])
-    weight = make_window(count, cycle.cycle_count, middle, cycle.context.rate_hz)
-    for names, acceleration in pairs:
-        x = np.sum([cycle.clean_channel(name) for name in names], axis=0)
-        noise = cycle.sigma(*names), cycle.sigma(acceleration)
-        yield (
-            names,
-            acceleration,
-            compare_motion(weight, x, cycle.clean_channel(acceleration), noise),
-        )
-
-
 @dataclass(frozen=True, slots=True)
 class PairBaseline:
-    """Baseline of a sensor pair: last consistent comparison, and ratio averaged over checks."""
+    """Baseline of a sensor pair: last consistent comparison, and its errors."""
 
-    last: WeakFormPair
-    ratio: complex = complex("nan")
-    check_count: int = 0
+    last: WeakFormPair | None = None
+    estimate: PairErrorEstimate = field(default_factory=PairErrorEstimate)
+
+    @property
+    def errors(self) -> PairErrors:
+        return self.estimate.errors
+
+    @property
+    def is_known(self) -> bool:
+        """True if the errors of the pair are known."""
+        return self.estimate.check_count >= MIN_BASELINE_CHECKS
 
     def update(self, pair: WeakFormPair) -> "PairBaseline":
         """Return the baseline updated with one more consistent comparison."""
-        if not math.isfinite(abs(pair.ratio)):
-            return PairBaseline(pair, self.ratio, self.check_count)
-        if not self.check_count:
-            return PairBaseline(pair, pair.ratio, 1)
-        weight = 1.0 / min(self.check_count + 1, AVERAGING_CHECKS)
-        return PairBaseline(
-            pair, self.ratio + weight * (pair.ratio - self.ratio), self.check_count + 1
-        )
+        return PairBaseline(pair, self.estimate.update(pair) if pair.is_clear else self.estimate)
+
+
+def sum_channels(rig: RigConfig, values: Float2D, names: tuple[str, ...]) -> Float1D:
+    """Return the sum of channels, (sample,), from values (channel, sample)."""
+    return np.asarray(sum(values[rig.channels.index(name)] for name in names))
+
+
+def compare_sensor_pair(
+    cycle: DriveCycle,
+    names: tuple[str, ...],
+    acceleration: str,
+    filtered: Float1D,
+    low_cut: float,
+) -> WeakFormPair:
+    """Compare displacement channels with an acceleration channel.
+
+    `filtered` is the sum of the displacements behind a high-pass of `low_cut` rad/s, (sample,).
+    """
+    x = np.sum([cycle.clean_channel(name) for name in names], axis=0)
+    noise = cycle.sigma(*names), cycle.sigma(acceleration)
+    values = cycle.clean_channel(acceleration)
+    return compare_motion(cycle.window, x, values, noise, (filtered, low_cut))
 
 
 def check_sensor_pair(
@@ -75,44 +87,43 @@ def check_sensor_pair(
     names: tuple[str, ...],
     acceleration: str,
     pair: WeakFormPair,
-    baseline: PairBaseline | None,
+    baseline: PairBaseline,
 ) -> Iterator[Suspicion]:
     """Yield a suspicion if a displacement and an acceleration are inconsistent, or became so.
 
-    The sensor that changed more since the last consistent check is suspected; if the motion itself
-    changes from cycle to cycle, it may be the other one.
+    Low cut and delay of sound sensors are no inconsistency. The sensor that changed more since the
+    last consistent check is suspected; if the motion itself changes from cycle to cycle, it may be
+    the other one.
     """
-    share, limit, problem = (
-        pair.mismatch / pair.size if pair.size else 0.0,
-        MAX_MISMATCH_RATIO,
-        "does not fit",
-    )
-    if (
-        share <= MAX_MISMATCH_RATIO
-        and baseline is not None
-        and baseline.check_count >= MIN_BASELINE_CHECKS
-    ):
+    fitted = pair.remove_errors(fit_phase_errors(pair))
+    share = fitted.mismatch / fitted.size if fitted.size else 0.0
+    limit, problem = MAX_MISMATCH_RATIO, "does not fit"
+    if share <= MAX_MISMATCH_RATIO and baseline.is_known:
+        fitted = pair.remove_errors(baseline.errors)
         share, limit, problem = (
-            pair.ratio_mismatch(baseline.ratio) / pair.size,
+            fitted.fundamental_mismatch / fitted.size,
             MAX_MISMATCH_CHANGE,
             "no longer fits",
         )
     max_offset = OFFSET_RANGE_RATIO * cycle.context.range_si(acceleration) + 6.0 * pair.sigma_offset
     if share <= limit:
         # A gain error within its limit may cause an apparent offset of this size.
-        if abs(pair.offset) > max_offset + MAX_MISMATCH_RATIO * pair.average:
+        if abs(fitted.offset) > max_offset + MAX_MISMATCH_RATIO * fitted.average:
             yield suspect_drift(
-                acceleration, pair.offset, max_offset + MAX_MISMATCH_RATIO * pair.average, "m/s2"
+                acceleration,
+                fitted.offset,
+                max_offset + MAX_MISMATCH_RATIO * fitted.average,
+                "m/s2",
             )
         return
     if (
-        abs(pair.offset) > max_offset
-        and pair.mismatch_without_offset < MAX_OFFSET_RESIDUAL_RATIO * pair.mismatch
+        abs(fitted.offset) > max_offset
+        and fitted.mismatch_without_offset < MAX_OFFSET_RESIDUAL_RATIO * fitted.mismatch
     ):
-        yield suspect_drift(acceleration, pair.offset, max_offset, "m/s2")
+        yield suspect_drift(acceleration, fitted.offset, max_offset, "m/s2")
         return
     suspected, other = names[0], acceleration
-    if baseline is not None:
+    if baseline.last is not None:
         displacement_change = abs(pair.displacement[1] - baseline.last.displacement[1])
         if abs(pair.acceleration[1] - baseline.last.acceleration[1]) > displacement_change:
             suspected, other = acceleration, names[0]

@@ -130,8 +130,11 @@ def compute_thresholds(
     measured = [rig.channel_by_name[name] for name in names]
     on_table = [(channel.quantity, channel.body) == TABLE_ACCELERATION for channel in measured]
     spike_limit[on_table] += rig.output.lsb_m / HALF_MIN_LAG_S**2
-    steps = lsb.copy()
-    steps[[drive, table]] = np.maximum(lsb[[drive, table]], rig.output.lsb_m)
+    # A converter resolves less than its bits where a reading at rest alternates between few values.
+    steps = np.maximum(lsb, math.sqrt(12.0) * sigma)
+    steps[[drive, table]] = np.maximum(steps[[drive, table]], rig.output.lsb_m)
+    # Where noise proves a sensor alive, slow motion may show as many equal samples as rest.
+    must_move = np.isin(names, needed) & ~informative
     return Thresholds(
         rate_hz,
         math.ceil(HISTORY_S * rate_hz),
@@ -150,7 +153,7 @@ def compute_thresholds(
         full_scale,
         spike_limit,
         np.where(informative, np.maximum(MIN_STUCK_S * rate_hz, STUCK_RUN_FACTOR * runs), math.inf),
-        np.where(np.isin(names, needed), MIN_MOTION_LSB * steps, math.inf),
+        np.where(must_move, MIN_MOTION_LSB * steps, math.inf),
         MIN_STUCK_S * rate_hz,
         informative & (runs <= MIN_REPEAT_SAMPLES),
         MAX_LOST_S * rate_hz,
