@@ -6,7 +6,7 @@ forces are in N per m/s2.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,10 +17,22 @@ from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.order_tracking import track_channels, track_harmonics
 from table_io.excitation.drive import Drive, Segment
+from table_io.safety.protection.consistency import (
+    PairErrors,
+    WeakFormPair,
+    compare_motion,
+    highpass_displacement,
+    make_window,
+    solve_errors,
+)
 
 Complex1D = npt.NDArray[np.complex128]
 TRACKED_ORDERS = 5  # fitted together; higher orders are orthogonal over whole cycles
 REST_WINDOW_S = 1.0  # at the end of the rest after the motion, when residual motion has decayed
+MAX_RATIO_ERROR = 0.02  # standard error above which sensors are not compared at a frequency
+MAX_MISMATCH_RATIO = 0.1  # of two sensors of one body
+LOW_CUT_ITERATIONS = 4  # the equations are linear but for the square of the low cut
+MIN_LOW_CUT_RAD_S = 2 * math.pi * 0.02  # below it turns the phase by 2 degrees at 0.5 Hz
 
 
 @dataclass(frozen=True)
@@ -100,9 +112,76 @@ class LoopCheckData:
         """Return the phase of the drive over a window, in cycles, (sample,)."""
         return self.drive.phase(window.index, len(window))
 
+    def compare_sensors(
+        self, displacements: tuple[str, ...], acceleration: str
+    ) -> tuple[float, PairErrors]:
+        """Compare the second derivative of a sum of displacements with an acceleration.
+
+        Return (|ratio - 1|, errors): the largest over the held motions with low enough noise,
+        without the low cut and delay that explain all of them best; NaN if there is none.
+        """
+        block, rate_hz = self.block, self.block.rate_hz
+        x = np.sum([block.channel(name) for name in displacements], axis=0)
+        a = block.channel(acceleration)
+        noise = math.hypot(*map(self.noise, displacements)), self.noise(acceleration)
+        errors, pairs = PairErrors(), list[WeakFormPair]()
+        for _ in range(LOW_CUT_ITERATIONS):
+            filtered = highpass_displacement(x, errors.low_cut, rate_hz, None)
+            pairs = []
+            for hold in self.holds:
+                window = self.window(hold)
+                span = slice(window.index - block.index, window.end - block.index)
+                if not np.isfinite(x[span] + a[span]).all():
+                    continue
+                phase, cycles = self.phase(window), len(window) * hold.f0 / rate_hz
+                middle = 0.5 * float(phase[0] + phase[-1])
+                test_functions = make_window(len(window), cycles, middle, rate_hz)
+                high_passed = filtered[span], errors.low_cut
+                pair = compare_motion(test_functions, x[span], a[span], noise, high_passed)
+                if pair.sigma[1] <= MAX_RATIO_ERROR * pair.size:
+                    pairs.append(pair)
+            if not pairs:
+                return math.nan, PairErrors()
+            equations = [pair.normal_equations() for pair in pairs]
+            errors = solve_errors(
+                np.sum([matrix for matrix, _ in equations], axis=0),
+                np.sum([rhs for _, rhs in equations], axis=0),
+            )
+        phase_errors = replace(errors, gain=1.0)
+        corrected = [pair.remove_errors(phase_errors) for pair in pairs]
+        mismatch = max(abs(pair.displacement[1] / pair.acceleration[1] - 1.0) for pair in corrected)
+        return float(mismatch), errors
+
+    @cached_property
+    def table_low_cut(self) -> float:
+        """Low cut of the table's accelerometer in rad/s; 0 if it has none or is not comparable."""
+        return self._measure_low_cut(("table_disp_m",), "table_acc_m_s2")
+
+    @cached_property
+    def mass_low_cut(self) -> float:
+        """Low cut of the mass's accelerometer in rad/s; 0 if it has none or is not comparable."""
+        mass = ("mass_disp_m",) if self.has("mass_disp_m") else ("rel_disp_m", "table_disp_m")
+        return self._measure_low_cut(mass, "mass_acc_m_s2")
+
+    def _measure_low_cut(self, displacements: tuple[str, ...], acceleration: str) -> float:
+        if not self.has(*displacements, acceleration):
+            return 0.0
+        mismatch, errors = self.compare_sensors(displacements, acceleration)
+        is_proven = mismatch <= MAX_MISMATCH_RATIO and errors.low_cut >= MIN_LOW_CUT_RAD_S
+        return errors.low_cut if is_proven else 0.0
+
     def tones(self, name: str) -> Complex1D:
-        """Return the tone of a channel at each held motion, (hold,); NaN where it is lost."""
-        units = np.array([self._tone_scale(name, hold) for hold in self.holds])
+        """Return the tone of a channel at each held motion, (hold,); NaN where it is lost.
+
+        Accelerations are those in front of the low cut of their sensor.
+        """
+        units = np.array([self._tone_scale(name, hold) for hold in self.holds], dtype=complex)
+        low_cut = {
+            "table_acc_m_s2": lambda: self.table_low_cut,
+            "mass_acc_m_s2": lambda: self.mass_low_cut,
+        }.get(name, float)()
+        if low_cut:
+            units *= 1.0 + low_cut / (2j * math.pi * self.frequencies_hz)
         return self._fundamentals[self.block.channels.index(name)] * units
 
     @cached_property
@@ -162,40 +241,3 @@ class LoopCheckData:
 def _finite_std(values: Float1D) -> float:
     finite = values[np.isfinite(values)]
     return float(finite.std()) if finite.size else math.nan
-
-
-def derivative_mismatch(
-    displacement: tuple[Float1D, float],
-    acceleration: tuple[Float1D, float],
-    phase: Float1D,
-    omega: float,
-    rate_hz: float,
-) -> tuple[float, float]:
-    """Compare a displacement with an acceleration: return (|ratio - 1|, its standard error).
-
-    The ratio is the second derivative of the displacement over the acceleration. Both are given as
-    (samples, noise rms), SI, over one window at the constant angular frequency `omega`. Weak form:
-    integral phi'' x dt = integral phi a dt with phi = sin^4 times the drive's tone, which vanishes
-    with three derivatives at both ends: exact for any motion, independent of offsets, and without
-    differentiating noise.
-    """
-    x, a = displacement[0], acceleration[0]
-    length_s = x.size / rate_hz
-    angle = np.pi * (np.arange(x.size) + 0.5) / x.size
-    sin2, cos2 = np.sin(angle) ** 2, np.cos(angle) ** 2
-    window = sin2**2
-    slope = 4 * math.pi / length_s * sin2 * np.sin(angle) * np.cos(angle)
-    curvature = (math.pi / length_s) ** 2 * (12 * sin2 * cos2 - 4 * sin2**2)
-    tone = np.exp(-2j * np.pi * phase)
-    phi = window * tone
-    phi_dd = (curvature - 2j * omega * slope - omega**2 * window) * tone
-    displacement_integral, acceleration_integral = complex(phi_dd @ x), complex(phi @ a)
-    scatter = math.hypot(
-        displacement[1] * float(np.linalg.norm(phi_dd)),
-        acceleration[1] * float(np.linalg.norm(phi)),
-    )
-    if acceleration_integral == 0:
-        return math.nan, math.inf
-    return abs(displacement_integral / acceleration_integral - 1.0), scatter / max(
-        abs(acceleration_integral), abs(displacement_integral)
-    )

@@ -167,7 +167,8 @@ def _check_steady_motion(
         *cycle_checks.check_table_mean(cycle),
         *cycle_checks.check_mass_mean(cycle, swing),
     ]
-    transfers = cycle_checks.measure_transfer(cycle)
+    table_errors = state.pair_baselines.get("table_disp_m", PairBaseline()).errors
+    transfers = cycle_checks.measure_transfer(cycle, table_errors.low_cut)
     frequency_hz = round(cycle.omega / (2 * math.pi), 3)
     reference = state.visited_responses.get(frequency_hz)
     if state.response is not None:

@@ -152,15 +152,15 @@ class PairErrorEstimate:
         kept = 1.0 - 1.0 / AVERAGING_CHECKS
         matrix, rhs = pair.normal_equations()
         matrix, rhs = kept * self.matrix + matrix, kept * self.rhs + rhs
-        return PairErrorEstimate(_solve_errors(matrix, rhs), matrix, rhs, self.check_count + 1)
+        return PairErrorEstimate(solve_errors(matrix, rhs), matrix, rhs, self.check_count + 1)
 
 
 def fit_phase_errors(pair: WeakFormPair) -> PairErrors:
     """Fit the low cut and delay of sound sensors that explain a comparison best, at gain 1."""
-    return _solve_errors(*pair.normal_equations(), fixed_gain=True)
+    return solve_errors(*pair.normal_equations(), fixed_gain=True)
 
 
-def _solve_errors(matrix: Float2D, rhs: Float1D, fixed_gain: bool = False) -> PairErrors:
+def solve_errors(matrix: Float2D, rhs: Float1D, fixed_gain: bool = False) -> PairErrors:
     """Solve normal equations within the bounds of sound sensors, near their expected values.
 
     A gain beyond +-1 keeps the low cut as product; it is no sound sensor anyway.

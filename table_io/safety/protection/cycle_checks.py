@@ -222,14 +222,16 @@ def check_command_gain(cycle: DriveCycle) -> Iterator[Suspicion]:
         yield Suspicion("command", "drive_disp_m", gain, 1 + math.copysign(limit, gain - 1), text)
 
 
-def measure_transfer(cycle: DriveCycle) -> tuple[complex, complex]:
+def measure_transfer(cycle: DriveCycle, low_cut: float) -> tuple[complex, complex]:
     """Return (table displacement, table acceleration) over the command, complex; NaN if lost.
 
-    The acceleration is converted to displacement (-1/w^2).
+    The acceleration is converted to displacement (-1/w^2), in front of the low cut of its sensor in
+    rad/s.
     """
     command = complex(cycle.tones["command"].amplitudes[0])
     transfers = []
-    for name, scale in (("table_disp_m", 1.0), ("table_acc_m_s2", -(cycle.omega**-2))):
+    from_acceleration = -(cycle.omega**-2) * (1.0 - 1j * low_cut / cycle.omega)
+    for name, scale in (("table_disp_m", 1.0), ("table_acc_m_s2", from_acceleration)):
         measurable = cycle.has(name) and command != 0
         tone = scale * complex(cycle.tones[name].amplitudes[0])
         transfers.append(tone / command if measurable else complex("nan"))

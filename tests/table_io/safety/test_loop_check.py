@@ -31,7 +31,7 @@ from table_io.safety.loop_check import (
     find_remedy,
     plan_targets,
 )
-from table_io.safety.loop_check.data import derivative_mismatch
+from table_io.safety.protection.consistency import WeakFormPair, compare_motion, make_window
 from tests.table_io.excitation.sine_segments import sine_segments
 
 RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
@@ -470,15 +470,18 @@ def test_the_weak_form_needs_neither_a_steady_motion_nor_a_tare() -> None:
         offset = 5.0 if order == 0 else 0.0
         return 1e-3 * np.imag(growing + 2 * other) + offset
 
-    error, scatter = derivative_mismatch(
-        (evaluate_motion(0), 0.0), (evaluate_motion(2), 1e-3), f * t, 2 * math.pi * f, rate
-    )
-    assert error < 4e-4
-    assert 0 < scatter < 0.01
-    error, _ = derivative_mismatch(
-        (1.1 * evaluate_motion(0), 0.0), (evaluate_motion(2), 0.0), f * t, 2 * math.pi * f, rate
-    )
-    assert error == pytest.approx(0.1, abs=1e-3)
+    def compare(gain: float, noise: float) -> tuple[complex, WeakFormPair]:
+        window = make_window(t.size, t.size * f / rate, f * float(t[-1]) / 2, rate)
+        filtered = np.zeros_like(t), 0.0
+        pair = compare_motion(
+            window, gain * evaluate_motion(0), evaluate_motion(2), (0.0, noise), filtered
+        )
+        return complex(pair.displacement[1] / pair.acceleration[1]), pair
+
+    ratio, pair = compare(1.0, 1e-3)
+    assert abs(ratio - 1.0) < 4e-4
+    assert 0 < pair.sigma[1] < 0.01 * pair.size
+    assert abs(compare(1.1, 0.0)[0]) == pytest.approx(1.1, abs=1e-3)
 
 
 @pytest.mark.parametrize(("share", "lines"), [(0.004, 0), (0.02, 1)])
