@@ -17,14 +17,8 @@ from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.order_tracking import track_channels, track_harmonics
 from table_io.excitation.drive import Drive, Segment
-from table_io.safety.protection.consistency import (
-    PairErrors,
-    WeakFormPair,
-    compare_motion,
-    highpass_displacement,
-    make_window,
-    solve_errors,
-)
+from table_io.safety.protection.consistency import WeakFormPair, compare_motion, make_window
+from table_io.sensor_errors import PairErrors, highpass, solve_errors
 
 Complex1D = npt.NDArray[np.complex128]
 TRACKED_ORDERS = 5  # fitted together; higher orders are orthogonal over whole cycles
@@ -126,7 +120,7 @@ class LoopCheckData:
         noise = math.hypot(*map(self.noise, displacements)), self.noise(acceleration)
         errors, pairs = PairErrors(), list[WeakFormPair]()
         for _ in range(LOW_CUT_ITERATIONS):
-            filtered = highpass_displacement(x, errors.low_cut, rate_hz, None)
+            filtered = highpass(x, errors.low_cut, rate_hz)
             pairs = []
             for hold in self.holds:
                 window = self.window(hold)

@@ -16,10 +16,10 @@ from table_io.block import Float1D, Float2D
 from table_io.control.frf import evaluate_transfer
 from table_io.records import FrequencyResponse
 from table_io.safety.protection import cycle_checks, load_cells
-from table_io.safety.protection.consistency import highpass_displacement
 from table_io.safety.protection.cycle import DriveCycle, ProtectionContext, Suspicion
 from table_io.safety.protection.cycle_checks import PairBaseline, SwingAverage
 from table_io.safety.protection.load_cells import ForceShare
+from table_io.sensor_errors import highpass
 
 FIRST_HOLD_KEY = 2  # keys from here on are motions of constant frequency and level
 MIN_CYCLE_COUNT = 1.0 - 1e-3  # cycles that count as a whole one
@@ -124,9 +124,7 @@ def _filter_displacements(
             before = cycle_checks.sum_channels(context.rig, state.spans[-1].values[:, -1:], names)
             last = float(before[0]), float(state.spans[-1].filtered[names[0]][-1])
         baseline = state.pair_baselines.get(names[0], PairBaseline())
-        filtered[names[0]] = highpass_displacement(
-            x, baseline.errors.low_cut, context.rate_hz, last
-        )
+        filtered[names[0]] = highpass(x, baseline.errors.low_cut, context.rate_hz, last)
     return replace(span, filtered=filtered)
 
 

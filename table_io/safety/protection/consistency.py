@@ -9,18 +9,18 @@ differentiates no noise and cancels offsets of x; with k = 0 an offset of a rema
 A sound accelerometer may have a low cut, and filters may delay one sensor more than the other:
     a = gain hp(x'') delayed,  hp = s / (s + w_c),  hp(x'') = x'' - w_c x' + w_c^2 hp(x)
 so   <phi, a> = gain <phi'', x> + gain w_c (<phi', x> + w_c <phi, hp(x)>) + delay <phi', a>
-for any motion, with hp(x) a recursion over all samples since rest (`highpass_displacement`).
+for any motion, with hp(x) a recursion over all samples since rest (`sensor_errors.highpass`).
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy import signal
 
 from table_io.block import Float1D, Float2D
+from table_io.sensor_errors import FIT_ERROR_RATIO, PairErrors, solve_errors
 
 WINDOW_ORDERS = (0, 1, 2)
 NOISE_SIGMAS = 6.0
@@ -28,16 +28,6 @@ MIN_AMPLITUDE_SNR, MIN_AMPLITUDE_RATIO = (
     20.0,
     0.3,
 )  # amplitude over its standard error, and over the motion, from which a ratio is evaluated
-# Low cut and delay of sound sensors. IEPE accelerometers are down by 3 dB at 0.16 to 0.5 Hz; twice
-# that is no longer a sensor for tests from 0.5 Hz on. A low-pass of fourth order at 100 Hz delays
-# by 4.2 ms.
-MAX_LOW_CUT_RAD_S = 2 * math.pi * 1.0
-MAX_DELAY_S = 0.005
-# Standard deviations expected before anything is measured: gain, gain x low cut, delay. At one
-# frequency low cut and delay are told apart by them only.
-PRIOR_SD = (0.2, 2 * math.pi * 0.3, 0.001)
-FIT_ERROR_RATIO = 0.01  # of the motion: errors of sensors that are none of the three
-AVERAGING_CHECKS = 20  # ten cycles: longer than a transient
 Complex1D = npt.NDArray[np.complex128]
 
 
@@ -126,82 +116,9 @@ class WeakFormPair:
         return float(np.sum(np.abs(self.constant) ** 2))
 
 
-@dataclass(frozen=True, slots=True)
-class PairErrors:
-    """Errors of an accelerometer relative to a displacement: gain, low cut in rad/s, delay in s."""
-
-    gain: float = 1.0
-    low_cut: float = 0.0
-    delay_s: float = 0.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PairErrorEstimate:
-    """Running estimate of the errors of a sensor pair over about AVERAGING_CHECKS checks.
-
-    `matrix` (3, 3) and `rhs` (3,) are sums of normal equations in which old checks fade.
-    """
-
-    errors: PairErrors = PairErrors()
-    matrix: Float2D = field(default_factory=lambda: np.zeros((3, 3)))
-    rhs: Float1D = field(default_factory=lambda: np.zeros(3))
-    check_count: int = 0
-
-    def update(self, pair: WeakFormPair) -> "PairErrorEstimate":
-        """Return the estimate with one more comparison."""
-        kept = 1.0 - 1.0 / AVERAGING_CHECKS
-        matrix, rhs = pair.normal_equations()
-        matrix, rhs = kept * self.matrix + matrix, kept * self.rhs + rhs
-        return PairErrorEstimate(solve_errors(matrix, rhs), matrix, rhs, self.check_count + 1)
-
-
 def fit_phase_errors(pair: WeakFormPair) -> PairErrors:
     """Fit the low cut and delay of sound sensors that explain a comparison best, at gain 1."""
     return solve_errors(*pair.normal_equations(), fixed_gain=True)
-
-
-def solve_errors(matrix: Float2D, rhs: Float1D, fixed_gain: bool = False) -> PairErrors:
-    """Solve normal equations within the bounds of sound sensors, near their expected values.
-
-    A gain beyond +-1 keeps the low cut as product; it is no sound sensor anyway.
-    """
-    prior = np.array(PRIOR_SD) ** -2.0
-    matrix, rhs = matrix + np.diag(prior), rhs + prior * np.array([1.0, 0.0, 0.0])
-    low = np.array([-math.inf, 0.0, -MAX_DELAY_S])
-    high = np.array([math.inf, MAX_LOW_CUT_RAD_S, MAX_DELAY_S])
-    x, is_free = np.array([1.0, 0.0, 0.0]), np.array([not fixed_gain, True, True])
-    while is_free.any():
-        x[is_free] = np.linalg.solve(
-            matrix[np.ix_(is_free, is_free)], (rhs - matrix[:, ~is_free] @ x[~is_free])[is_free]
-        )
-        beyond = is_free & ((x < low) | (x > high))
-        if not beyond.any():
-            break
-        x = np.clip(x, low, high)
-        is_free &= ~beyond
-    gain, scaled_low_cut, delay_s = x.tolist()
-    return PairErrors(gain, scaled_low_cut / max(gain, 1.0 - PRIOR_SD[0]), delay_s)
-
-
-def highpass_displacement(
-    x: Float1D, low_cut: float, rate_hz: float, last: tuple[float, float] | None
-) -> Float1D:
-    """Return a displacement in m, (sample,), behind a first-order high-pass of `low_cut` rad/s.
-
-    `last`: (displacement, output) at the sample before; None: at rest. Lost samples (NaN) repeat
-    the one before.
-    """
-    before, output = last or (math.nan, 0.0)
-    joined = np.concatenate([[before], x])
-    finite = np.flatnonzero(np.isfinite(joined))
-    if not finite.size:
-        return np.full(x.size, output)
-    latest = np.searchsorted(finite, np.arange(joined.size), side="right") - 1
-    steps = np.diff(joined[finite[np.maximum(latest, 0)]])
-    half = 0.5 * low_cut / rate_hz  # trapezoidal rule
-    pole = (1.0 - half) / (1.0 + half)
-    filtered, _ = signal.lfilter([1.0 / (1.0 + half)], [1.0, -pole], steps, zi=[pole * output])
-    return np.asarray(filtered, dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

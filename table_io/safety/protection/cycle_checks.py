@@ -13,14 +13,12 @@ from table_io.block import Float1D, Float2D, Label
 from table_io.config.rig import RigConfig
 from table_io.control.order_tracking import track_harmonics
 from table_io.safety.protection.consistency import (
-    AVERAGING_CHECKS,
-    PairErrorEstimate,
-    PairErrors,
     WeakFormPair,
     compare_motion,
     fit_phase_errors,
 )
 from table_io.safety.protection.cycle import TRACKED_HARMONICS, DriveCycle, Suspicion, suspect_drift
+from table_io.sensor_errors import AVERAGING_CHECKS, PairErrorEstimate, PairErrors
 
 MAX_MISMATCH_RATIO = 0.12  # of the motion; slightly more than the limit of the loop check
 MAX_MISMATCH_CHANGE = 0.05  # of the motion; change from the errors of the last ten cycles
@@ -57,7 +55,9 @@ class PairBaseline:
 
     def update(self, pair: WeakFormPair) -> "PairBaseline":
         """Return the baseline updated with one more consistent comparison."""
-        return PairBaseline(pair, self.estimate.update(pair) if pair.is_clear else self.estimate)
+        return PairBaseline(
+            pair, self.estimate.update(pair.normal_equations()) if pair.is_clear else self.estimate
+        )
 
 
 def sum_channels(rig: RigConfig, values: Float2D, names: tuple[str, ...]) -> Float1D:
