@@ -13,7 +13,7 @@ import numpy as np
 from table_io.block import Block, Float1D, Label, join_blocks
 from table_io.channels import Channel, contact_forces, relative_displacement
 from table_io.config.profile import Profile
-from table_io.records import CycleExtremes, Params, Record, Step, StepAdded
+from table_io.records import Comparison, CycleExtremes, Params, Record, Step, StepAdded
 from twin.compare import monitoring
 from twin.compare.cycles import (
     UNKNOWN_CONTACT,
@@ -29,12 +29,13 @@ from twin.compare.extra_channels import select_predicted
 from twin.compare.monitoring import MonitoringState
 from twin.compare.monitoring.cycle import CycleData, MonitoringSetup
 from twin.compare.monitoring.jumps import JumpPrediction, predict_jumps
+from twin.compare.monitoring.low_cut import LowCutRemoval
 from twin.compare.sensors import remove_sensor_errors
 from twin.compare.twins import TwinSetup, TwinStates, advance_twins, start_twins
 from twin.model.model import Model
 from twin.model.parameters import free_flight_resonance
 
-BlockPair = tuple[Block, Block]  # the same samples measured and predicted
+CycleBlocks = tuple[Block, ...]  # the same samples measured, predicted, and without low cuts
 MAX_MISSING_SAMPLES = 3  # samples that a whole held cycle may lack
 
 
@@ -69,14 +70,14 @@ class PipelineSetup:
 class PipelineState:
     """State before sample `twins.index`; `cycle_blocks` are pieces of the unfinished held cycle.
 
-    Pieces are (measured, predicted); the first one includes the lead samples of the cycle.
+    The first piece includes the lead samples of the cycle.
     """
 
     twins: TwinStates
     cycle_key: tuple[int, int] | None = None  # (step, cycle) of the last sample; None = unknown
-    recent: BlockPair | None = None  # the last samples, as many as a cycle's lead
+    recent: CycleBlocks | None = None  # the last samples, as many as a cycle's lead
     cycle_start: int = 0  # sample at which the held cycle began
-    cycle_blocks: tuple[BlockPair, ...] = ()
+    cycle_blocks: tuple[CycleBlocks, ...] = ()
     cycles: tuple[CycleExtremes, ...] = ()  # of the current step
     base_acc: tuple[Float1D, ...] = ()  # of its measured cycles
     onsets: tuple[OnsetDepths, ...] = ()  # of its held cycles, measured
@@ -85,6 +86,7 @@ class PipelineState:
         UNKNOWN_CONTACT,
     )  # measured, twin
     monitoring: MonitoringState = field(default_factory=MonitoringState)
+    low_cuts: LowCutRemoval = field(default_factory=LowCutRemoval)
 
 
 def prepare_pipeline(
@@ -157,51 +159,67 @@ def step(
     Records: Comparison, CycleExtremes, PrcPoint and those of the monitoring.
     """
     if block.index != state.twins.index:
-        state = PipelineState(start_twins(setup.twin, block.index), monitoring=state.monitoring)
-    twins, predicted, comparisons = advance_twins(setup.twin, state.twins, block)
-    items: list[Block | Record] = [predicted, *comparisons]
-    state = replace(state, twins=twins)
-    available = _join_pairs(state.recent, (block, predicted))
+        twins = start_twins(setup.twin, block.index)
+        state = PipelineState(twins, monitoring=state.monitoring, low_cuts=state.low_cuts)
+    pieces: list[Block] = []
+    compared: list[Comparison] = []
+    records: list[Block | Record] = []
     changes = np.flatnonzero(np.diff(block.step) | np.diff(block.cycle)) + 1
     edges = [0, *changes.tolist(), len(block)]
     for first, last in pairwise(edges):
+        piece = block.cut(block.index + first, block.index + last)
         cycle_key = (int(block.step[first]), int(block.cycle[first]))
         if cycle_key != state.cycle_key:
-            state, records = _finish_cycle(setup, state, cycle_key)
-            items.extend(records)
-        start, end = block.index + first, block.index + last
-        if not state.monitoring.noise.is_known:
-            state = replace(
-                state, monitoring=monitoring.update_noise(state.monitoring, block.cut(start, end))
-            )
-        if cycle_key[1] >= 0 and state.cycle_blocks:
-            state = replace(
-                state, cycle_blocks=(*state.cycle_blocks, _cut_pair(available, start, end))
-            )
-        elif cycle_key[1] >= 0 and _is_cycle_start(state, cycle_key):
-            state = replace(
-                state,
-                cycle_start=start,
-                cycle_blocks=(_cut_pair(available, start - setup.scale.lead_samples, end),),
-            )
-        state = replace(state, cycle_key=cycle_key)
-    return replace(
-        state, recent=_cut_pair(available, block.end - setup.scale.lead_samples, block.end)
-    ), items
+            state, items = _finish_cycle(setup, state, cycle_key)
+            records.extend(items)
+        state, predicted, comparisons = _advance_piece(setup, state, piece, cycle_key)
+        pieces.append(predicted)
+        compared.extend(comparisons)
+    return state, [join_blocks(pieces), *compared, *records]
 
 
-def _join_pairs(before: BlockPair | None, new: BlockPair) -> BlockPair:
+def _advance_piece(
+    setup: PipelineSetup, state: PipelineState, piece: Block, cycle_key: tuple[int, int]
+) -> tuple[PipelineState, Block, list[Comparison]]:
+    """Advance the twins over samples of one cycle: return (state, predicted, Comparisons)."""
+    low_cuts, corrected = state.low_cuts.apply(piece)
+    twins, predicted, comparisons = advance_twins(setup.twin, state.twins, corrected)
+    blocks = (piece, predicted, corrected)
+    available = blocks if state.recent is None else _join_pieces([state.recent, blocks])
+    start, end, lead = piece.index, piece.end, setup.scale.lead_samples
+    monitoring_state = state.monitoring
+    if not monitoring_state.noise.is_known:
+        monitoring_state = monitoring.update_noise(monitoring_state, piece)
+    cycle_start, cycle_blocks = state.cycle_start, state.cycle_blocks
+    if cycle_key[1] >= 0 and cycle_blocks:
+        cycle_blocks = (*cycle_blocks, blocks)
+    elif cycle_key[1] >= 0 and _is_cycle_start(state, cycle_key):
+        cycle_start, cycle_blocks = start, (_cut_piece(available, start - lead, end),)
     return (
-        new
-        if before is None
-        else (join_blocks([before[0], new[0]]), join_blocks([before[1], new[1]]))
+        replace(
+            state,
+            twins=twins,
+            low_cuts=low_cuts,
+            monitoring=monitoring_state,
+            cycle_start=cycle_start,
+            cycle_blocks=cycle_blocks,
+            cycle_key=cycle_key,
+            recent=_cut_piece(available, end - lead, end),
+        ),
+        predicted,
+        comparisons,
     )
 
 
-def _cut_pair(piece: BlockPair, first: int, end: int) -> BlockPair:
+def _join_pieces(pieces: Iterable[CycleBlocks]) -> CycleBlocks:
+    """Return consecutive pieces joined."""
+    return tuple(join_blocks(list(blocks)) for blocks in zip(*pieces, strict=True))
+
+
+def _cut_piece(piece: CycleBlocks, first: int, end: int) -> CycleBlocks:
     """Return the samples first .. end - 1 of a piece, as far as it has them."""
     first = max(first, piece[0].index)
-    return piece[0].cut(first, end), piece[1].cut(first, end)
+    return tuple(block.cut(first, end) for block in piece)
 
 
 def _is_cycle_start(state: PipelineState, cycle_key: tuple[int, int]) -> bool:
@@ -256,7 +274,7 @@ def _evaluate_cycle(
         or end - first < setup.twin.rate_hz / planned_step.frequency_hz - MAX_MISSING_SAMPLES
     ):
         return state, []
-    measured, predicted = (join_blocks(blocks) for blocks in zip(*cycle_blocks, strict=True))
+    measured, predicted, no_low_cuts = _join_pieces(cycle_blocks)
     measured_motion, twin_motion = _cycle_motions(measured, predicted)
     lead = first - measured.index
     measured_extremes, measured_contact = cycle_extremes(
@@ -270,9 +288,16 @@ def _evaluate_cycle(
     base_acc = state.base_acc
     if label == Label.MEASURE:
         base_acc = (*base_acc, measured.channel("table_acc_m_s2")[lead:])
-    cycle_block = measured.cut(first, end)
-    corrected = remove_sensor_errors(setup.twin.model.sensors, cycle_block)
-    cycle_data = CycleData(planned_step, number, cycle_block, corrected, predicted.cut(first, end))
+    recorded, cycle_block = measured.cut(first, end), no_low_cuts.cut(first, end)
+    sensors = setup.twin.model.sensors
+    cycle_data = CycleData(
+        planned_step,
+        number,
+        cycle_block,
+        remove_sensor_errors(sensors, cycle_block),
+        predicted.cut(first, end),
+        remove_sensor_errors(sensors, recorded),
+    )
     monitoring_state, events = monitoring.monitor_cycle(
         setup.monitoring_setup, state.monitoring, cycle_data
     )
@@ -286,6 +311,7 @@ def _evaluate_cycle(
         ),
         contact=(measured_contact, twin_contact),
         monitoring=monitoring_state,
+        low_cuts=state.low_cuts.settle(recorded, monitoring_state.consistency.low_cuts),
     ), [cycle, *events]
 
 

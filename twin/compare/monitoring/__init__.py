@@ -48,18 +48,22 @@ def monitor_cycle(
     setup: MonitoringSetup, state: MonitoringState, cycle: CycleData
 ) -> tuple[MonitoringState, list[Record]]:
     """Update the state with a held cycle; return it with the new records."""
-    agreement_state, agreement_records = check_agreement(setup, state.agreement, state.noise, cycle)
     consistency, consistency_events = check_consistency(
         setup, state.consistency, state.noise, cycle
     )
-    drift, estimates = update_estimate(
-        setup,
-        state.drift,
-        state.noise,
-        cycle,
-        trusted=not agreement_state.ever_reported,
-        doubt=consistency.any,
+    agreement_state, agreement_records = check_agreement(
+        setup, state.agreement, state.noise, cycle, is_input_right=consistency.is_settled
     )
+    drift, estimates = state.drift, list[Record]()
+    if consistency.is_settled:
+        drift, estimates = update_estimate(
+            setup,
+            state.drift,
+            state.noise,
+            cycle,
+            trusted=not agreement_state.ever_reported,
+            doubt=consistency.any,
+        )
     attractor, attractor_events = detect_attractor_change(state.attractor, cycle)
     after = replace(
         state, agreement=agreement_state, drift=drift, attractor=attractor, consistency=consistency

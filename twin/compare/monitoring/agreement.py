@@ -36,9 +36,16 @@ class AgreementState:
 
 
 def check_agreement(
-    setup: MonitoringSetup, state: AgreementState, noise: ChannelNoise, cycle: CycleData
+    setup: MonitoringSetup,
+    state: AgreementState,
+    noise: ChannelNoise,
+    cycle: CycleData,
+    is_input_right: bool = True,
 ) -> tuple[AgreementState, list[Record]]:
-    """Return the Agreement of a cycle, and an Event if channels have left their bands."""
+    """Return the Agreement of a cycle, and an Event if channels have left their bands.
+
+    The twin is not judged by a cycle in which its input was wrong.
+    """
     measured = compared_values(cycle.measured)
     errors = [
         (values - cycle.predicted.channel(f"window/{name}")) ** 2
@@ -60,7 +67,7 @@ def check_agreement(
         e / b if b > 0 and not np.isnan(e) else 0.0
         for e, b in zip(record.error, record.band, strict=True)
     ]
-    if np.isnan(record.error).all():  # nothing was measured
+    if not is_input_right or np.isnan(record.error).all():
         return state, [record]
     if state.cycles == ALREADY_REPORTED:
         return AgreementState(ALREADY_REPORTED if max(shares) > MAX_AGREEING_SHARE else 0, True), [

@@ -30,13 +30,18 @@ class MonitoringSetup:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CycleData:
-    """A whole held cycle of a step; `corrected` is measured without the model's sensor errors."""
+    """A whole held cycle of a step.
+
+    `measured` is without the low cuts of accelerometers, `corrected` also without the model's
+    sensor errors. `recorded` is as recorded, but without the latter.
+    """
 
     step: Step
     number: int
     measured: Block
     corrected: Block
     predicted: Block
+    recorded: Block | None = None  # None: there are no low cuts
 
     @property
     def end(self) -> int:
