@@ -56,12 +56,17 @@ class WeakFormPair:
         )
 
     def normal_equations(self) -> tuple[Float2D, Float1D]:
-        """Return (matrix (3, 3), right side (3,)) of gain, gain x low cut and delay."""
-        columns = np.array([self.displacement, self.low_cut_term, self.delay_term])[:, 1:]
-        weight = 1.0 / np.hypot(FIT_ERROR_RATIO * self.size, self.sigma[1:])
-        rows = np.concatenate([columns.real * weight, columns.imag * weight], axis=1)
-        values = self.acceleration[1:]
-        return rows @ rows.T, rows @ np.concatenate([values.real * weight, values.imag * weight])
+        """Return (matrix (3, 3), right side (3,)) of gain, gain x low cut and delay.
+
+        An offset of the acceleration is eliminated, so that its drift is not taken for them.
+        """
+        terms = self.displacement, self.low_cut_term, self.delay_term, self.acceleration
+        weight = 1.0 / np.hypot(FIT_ERROR_RATIO * self.size, self.sigma)
+        constant, *rows = (_stack_parts(weight * term) for term in (self.constant, *terms))
+        constant /= np.linalg.norm(constant)
+        columns = np.array([row - (row @ constant) * constant for row in rows])
+        products = columns @ columns.T
+        return products[:3, :3], products[:3, 3]
 
     @cached_property
     def size(self) -> float:
@@ -114,6 +119,11 @@ class WeakFormPair:
     @property
     def _weight(self) -> float:
         return float(np.sum(np.abs(self.constant) ** 2))
+
+
+def _stack_parts(amplitudes: Complex1D) -> Float1D:
+    """Return real and imaginary parts of amplitudes, (6,)."""
+    return np.concatenate([amplitudes.real, amplitudes.imag])
 
 
 def fit_phase_errors(pair: WeakFormPair) -> PairErrors:
