@@ -47,7 +47,7 @@ class WeakFormPair:
     low_cut_term: Complex1D
     delay_term: Complex1D
 
-    def remove_errors(self, errors: "PairErrors") -> "WeakFormPair":
+    def remove_errors(self, errors: PairErrors) -> "WeakFormPair":
         """Return the pair as sensors without these errors would show it."""
         return replace(
             self,
@@ -60,13 +60,30 @@ class WeakFormPair:
 
         An offset of the acceleration is eliminated, so that its drift is not taken for them.
         """
-        terms = self.displacement, self.low_cut_term, self.delay_term, self.acceleration
-        weight = 1.0 / np.hypot(FIT_ERROR_RATIO * self.size, self.sigma)
-        constant, *rows = (_stack_parts(weight * term) for term in (self.constant, *terms))
-        constant /= np.linalg.norm(constant)
+        constant, *rows = self._weighted_parts(slice(None))
+        constant = constant / np.linalg.norm(constant)
         columns = np.array([row - (row @ constant) * constant for row in rows])
         products = columns @ columns.T
         return products[:3, :3], products[:3, 3]
+
+    def fit_phase_errors(self) -> PairErrors:
+        """Fit the low cut and delay of sound sensors that reduce the mismatch most, at gain 1."""
+        columns = np.array(self._weighted_parts(slice(1, None))[1:])
+        products = columns @ columns.T
+        return solve_errors(products[:3, :3], products[:3, 3], fixed_gain=True)
+
+    def _weighted_parts(self, orders: slice) -> list[Float1D]:
+        """Return real and imaginary parts over their error of constant, three terms and values."""
+        weight = 1.0 / np.hypot(FIT_ERROR_RATIO * self.size, self.sigma)
+        amplitudes = (
+            self.constant,
+            self.displacement,
+            self.low_cut_term,
+            self.delay_term,
+            self.acceleration,
+        )
+        weighted = [(weight * each)[orders] for each in amplitudes]
+        return [np.concatenate([each.real, each.imag]) for each in weighted]
 
     @cached_property
     def size(self) -> float:
@@ -119,16 +136,6 @@ class WeakFormPair:
     @property
     def _weight(self) -> float:
         return float(np.sum(np.abs(self.constant) ** 2))
-
-
-def _stack_parts(amplitudes: Complex1D) -> Float1D:
-    """Return real and imaginary parts of amplitudes, (6,)."""
-    return np.concatenate([amplitudes.real, amplitudes.imag])
-
-
-def fit_phase_errors(pair: WeakFormPair) -> PairErrors:
-    """Fit the low cut and delay of sound sensors that explain a comparison best, at gain 1."""
-    return solve_errors(*pair.normal_equations(), fixed_gain=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

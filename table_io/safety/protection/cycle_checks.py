@@ -5,7 +5,7 @@ Each function yields suspicions; one that persists over several checks becomes a
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from table_io.control.order_tracking import track_harmonics
 from table_io.safety.protection.consistency import (
     WeakFormPair,
     compare_motion,
-    fit_phase_errors,
 )
 from table_io.safety.protection.cycle import TRACKED_HARMONICS, DriveCycle, Suspicion, suspect_drift
 from table_io.sensor_errors import AVERAGING_CHECKS, PairErrorEstimate, PairErrors
@@ -95,7 +94,8 @@ def check_sensor_pair(
     last consistent check is suspected; if the motion itself changes from cycle to cycle, it may be
     the other one.
     """
-    fitted = pair.remove_errors(fit_phase_errors(pair))
+    known = replace(baseline.errors, gain=1.0) if baseline.is_known else pair.fit_phase_errors()
+    fitted = pair.remove_errors(known)
     share = fitted.mismatch / fitted.size if fitted.size else 0.0
     limit, problem = MAX_MISMATCH_RATIO, "does not fit"
     if share <= MAX_MISMATCH_RATIO and baseline.is_known:

@@ -4,7 +4,8 @@ With test functions phi (`cycle.weight_functions`), by parts, SI:
     damper   -<phi, M a> = K <phi, u> - C <phi', u> + q_R <phi, F_R> + q_L <phi, F_L>
     bumper    <phi, F_j> + C_j <phi', u_j> = K_j <phi, u_j> - K_j G_j <phi, 1>   over each contact
 (u_j = u right, -u left; forces as the load cells read them; q_j = 1 within the load cells' error).
-Forces of the model's effects are taken from its own restarted motion.
+Forces of the model's effects are taken from its own restarted motion. The last column of the damper
+is a nuisance: plates in front of the load cells, which move with the table, add -m_p A to them.
 """
 
 import numpy as np
@@ -32,7 +33,7 @@ def force_equations(
 ) -> list[Equations | None]:
     """Return the equations of each of `LAW_NAMES`; None if the cycle gives none.
 
-    Parameters: (K, C, q_R, q_L), (K_R, K_R G_R), (K_L, K_L G_L).
+    Parameters: (K, C, q_R, q_L, m_p), (K_R, K_R G_R), (K_L, K_L G_L).
     """
     return [_damper_equations(setup, noise, cycle), *_bumper_equations(setup, noise, cycle)]
 
@@ -40,7 +41,7 @@ def force_equations(
 def _damper_equations(
     setup: MonitoringSetup, noise: ChannelNoise, cycle: CycleData
 ) -> Equations | None:
-    """Return noise-scaled equations of K, C, q_R and q_L; None if the cycle gives none."""
+    """Return noise-scaled equations of K, C, q_R, q_L and m_p; None if the cycle gives none."""
     p = setup.model.parameters
     u, a = relative_displacement(cycle.corrected), cycle.channel_values("mass_acc_m_s2")
     sides = [
@@ -54,7 +55,8 @@ def _damper_equations(
     phi, slope, _ = weight_functions(u.size, setup.rate_hz)
     values = -weighted_sums(phi, p.mass * a + _effect_forces(setup, cycle, "damper"))
     by_force = [weighted_sums(phi, side_force) for side_force in sides]
-    rows = np.stack([weighted_sums(phi, u), -weighted_sums(slope, u), *by_force], axis=1)
+    by_plates = weighted_sums(phi, np.nan_to_num(cycle.channel_values("table_acc_m_s2")))
+    rows = np.stack([weighted_sums(phi, u), -weighted_sums(slope, u), *by_force, by_plates], axis=1)
     acc_rms = _finite_or(noise.channel_rms("mass_acc_m_s2"), 1e-3 * float(a.std())) * p.mass
     cell_rms = _finite_or(noise.channel_rms(RIGHT_CELLS[0]), 0.0)
     white_sd = np.sqrt((phi**2).sum(axis=1)) * np.hypot(acc_rms, 2 * cell_rms)

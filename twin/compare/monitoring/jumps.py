@@ -25,6 +25,9 @@ MIN_CHANGE_RATIO = 0.5  # of the model's change, for the same jump
 MAX_STEP_HZ, CYCLES_PER_STEP, AVERAGED_CYCLES = 0.02, 20, 5
 MAX_CYCLES = 4000  # of an integrated model, at 0.3 ms each
 BRANCH_EXIT_POINTS = 3  # points on which a motion leaves its branch
+# Of the frequency of a jump: gaps are known to 0.05 mm each, which moves the jumps of a gap of 4 mm
+# by half a per cent, and masses and lasers add to it.
+JUMP_TOLERANCE = 0.01
 MAX_STEPS_LATE = 1  # steps that a jump may be late before it is missed
 STEPS_NEAR_JUMP = 3  # steps around a jump in which the model's own response is no reference
 
@@ -165,8 +168,12 @@ def track_jumps(tracking: JumpTracking, point: PrcPoint) -> tuple[JumpTracking, 
     late = tuple(
         jump for jump in tracking.upcoming if jump.after.index + MAX_STEPS_LATE <= point.step
     )
+    # A jump that the end of a direction cut off may come after the turn.
+    turned = tuple(jump for jump in late if jump.after.direction != point.direction)
     tracking = replace(
-        tracking, upcoming=tuple(jump for jump in tracking.upcoming if jump not in late)
+        tracking,
+        upcoming=tuple(jump for jump in tracking.upcoming if jump not in late),
+        overdue=(*tracking.overdue, *turned),
     )
     return tracking, [*items, forecast_jump(tracking, point)]
 
@@ -190,7 +197,11 @@ def _match_jumps(
     messages: list[tuple[str, str]] = []
     upcoming_same = [jump for jump in tracking.upcoming if jump.after.direction == point.direction]
     overdue = [jump for jump in tracking.overdue if jump.after.direction == point.direction]
-    due = [jump for jump in upcoming_same if jump.after.index <= point.step]
+    turned = [jump for jump in tracking.overdue if jump.after.direction != point.direction]
+    due = [
+        jump for jump in upcoming_same
+        if jump.after.index <= point.step or _is_at_step(jump, point)
+    ]  # fmt: skip
     sudden_change = describe_sudden_change(last, point)
     arrived = [
         jump
@@ -201,6 +212,8 @@ def _match_jumps(
         where = "where the model expects it"
         if jump.after.index <= last.step:
             where = f"one step after where the model expects it ({jump.at_hz:.3f} Hz)"
+        elif jump.after.index > point.step:
+            where = f"one step before where the model expects it ({jump.at_hz:.3f} Hz)"
         messages.append(("jump", f"{_describe_jump(jump)} came {where}"))
     for jump in due:
         if jump not in arrived and jump.after.index + MAX_STEPS_LATE <= point.step:
@@ -213,14 +226,25 @@ def _match_jumps(
     if hint is not None and point.step != tracking.last_jump_step + 1:
         early = [jump for jump in upcoming_same if jump not in due]
         matched = next((jump for jump in (*overdue, *early) if _is_same_jump(jump, change)), None)
-        messages.append(("unexpected jump", f"{hint}; {_describe_distance(matched, point)}"))
-        arrived = [] if matched is None else [matched]
+        after_turn = next((jump for jump in turned if _is_same_jump(jump, change)), None)
+        if after_turn is not None:
+            place = f"after the turn, where the model expects it before ({after_turn.at_hz:.3f} Hz)"
+            messages.append(("jump", f"{_describe_jump(after_turn)} came {place}"))
+            turned.remove(after_turn)
+        else:
+            messages.append(("unexpected jump", f"{hint}; {_describe_distance(matched, point)}"))
+            arrived = [] if matched is None else [matched]
     if arrived or hint is not None:
         tracking = replace(tracking, last_jump_step=point.step)
     upcoming = tuple(jump for jump in tracking.upcoming if jump not in arrived)
-    return replace(
-        tracking, upcoming=upcoming, overdue=tuple(jump for jump in overdue if jump not in arrived)
-    ), messages
+    overdue = [jump for jump in overdue if jump not in arrived]
+    return replace(tracking, upcoming=upcoming, overdue=(*overdue, *turned)), messages
+
+
+def _is_at_step(jump: ExpectedJump, point: PrcPoint) -> bool:
+    """Return whether a jump expected just after a step may come with it."""
+    distance_hz = abs(jump.at_hz - point.frequency_hz)
+    return jump.before.index == point.step and distance_hz <= JUMP_TOLERANCE * jump.at_hz
 
 
 def _is_same_jump(jump: ExpectedJump, change: float) -> bool:

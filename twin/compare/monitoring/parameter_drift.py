@@ -5,11 +5,15 @@ The equations of each held cycle are summed in chunks of a few cycles, and the c
     drift   least squares over all, stiffness or gap with a linear trend in time and another in the
             logarithm of the amplitude, so that a nonlinear law is not taken for a drift
 with standard deviations from the scatter among the chunks where it exceeds the noise.
+
+A drift is reported if it is also significant for instruments as they are: plates in front of the
+load cells, lasers whose linearity error depends on the amplitude, and few chunks (Student's t).
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import ndtr, stdtrit
 
 from table_io.block import Float1D, Float2D
 from table_io.channels import relative_displacement
@@ -33,6 +37,9 @@ PARAMETER_NAMES = (
     ("bumper_stiffness_r", "gap_r"),
     ("bumper_stiffness_l", "gap_l"),
 )
+PARAMETER_COUNTS = (4, 2, 2)  # of each law; further columns are nuisances
+PLATE_MASS_SD_KG = 5.0
+LASER_SLOPE_SD, LASER_ERROR_SD_M = 0.01, 1e-4  # of u, per e-fold of the amplitude
 TREND_COLUMNS = (0, 1, 1)  # index of the linear parameter of each law that may drift
 
 
@@ -166,25 +173,41 @@ def _report_drift(
     )
     names: list[str] = []
     columns: list[tuple[float, float, float, float]] = []
+    changes: list[tuple[float, float, float]] = []
+    instruments = (
+        LASER_SLOPE_SD * p.stiffness,
+        LASER_ERROR_SD_M * p.bumper_stiffness_r,
+        LASER_ERROR_SD_M * p.bumper_stiffness_l,
+    )
     for law, (law_names, law_chunks) in enumerate(zip(PARAMETER_NAMES, state.chunks, strict=True)):
-        estimates = _law_estimates(law_chunks, law, law_curvature * force_scale[law])
+        full_chunks = [chunk for chunk in law_chunks if chunk.count >= MIN_CHUNK_CYCLES]
+        curvature = law_curvature * force_scale[law]
+        estimates = _law_estimates(full_chunks, law, curvature)
         names += law_names if estimates else ()
         columns += estimates
+        if estimates:
+            law_changes = [(float("nan"),) * 3] * 2
+            max_curvature = max(curvature, instruments[law])
+            law_changes[TREND_COLUMNS[law]] = _measure_drift(full_chunks, law, max_curvature, True)
+            changes += law_changes
     if not names:
         return state, []
     values, sd, drift, drift_sd = (tuple(column) for column in zip(*columns, strict=True))
     record = Estimate(cycle.end, cycle.step.index, tuple(names), values, sd, drift, drift_sd)
     items: list[Record] = [record]
     drifting = set(state.drifting)
-    for name, value, change, spread in zip(names, values, drift, drift_sd, strict=True):
+    for name, value, estimate, judged in zip(names, values, columns, changes, strict=True):
         min_change = MIN_DRIFT_FRACTION * (
             state.max_depth_m if name.startswith("gap") else abs(value)
         )
-        is_significant = abs(change) > MIN_DRIFT_SIGMA * spread and abs(change) > min_change
+        is_significant = all(
+            abs(change) > sigmas * spread and abs(change) > min_change
+            for change, spread, sigmas in ((*estimate[2:], MIN_DRIFT_SIGMA), judged)
+        )
         if is_significant and name not in drifting:
-            items.append(Event(cycle.end, "drift", _sentence(name, value, change, spread)))
+            items.append(Event(cycle.end, "drift", _sentence(name, value, *judged[:2])))
             drifting.add(name)
-        elif abs(change) < 0.5 * MIN_DRIFT_SIGMA * spread:
+        elif abs(judged[0]) < 0.5 * judged[2] * judged[1]:
             drifting.discard(name)
     return replace(state, drifting=frozenset(drifting)), items
 
@@ -203,17 +226,19 @@ def _sentence(name: str, value: float, change: float, spread: float) -> str:
 
 
 def _law_estimates(
-    chunks: tuple[Chunk, ...], law: int, law_curvature: float
+    full_chunks: list[Chunk], law: int, law_curvature: float
 ) -> list[tuple[float, float, float, float]]:
     """Return (value, sd, drift, sd of the drift) of both parameters of a law; empty at first.
 
     `law_curvature`: allowed dependence of the drifting one on the logarithm of the amplitude.
     """
-    full_chunks = [chunk for chunk in chunks if chunk.count >= MIN_CHUNK_CYCLES]
     if len(full_chunks) < 2:
         return []
     since_s = min(full_chunks[-1].time_s - RECENT_S, full_chunks[-2].time_s)
-    recent = _solve_chunks([chunk for chunk in full_chunks if chunk.time_s >= since_s], None, 0.0)
+    count = PARAMETER_COUNTS[law]
+    recent = _solve_chunks(
+        [chunk for chunk in full_chunks if chunk.time_s >= since_s], count, None, 0.0
+    )
     if recent is None:
         return []
     (first, second), covariance = recent[0][:2], recent[1][:2, :2]
@@ -225,35 +250,49 @@ def _law_estimates(
         second = second / first
     sd = np.sqrt(np.diag(jacobian @ covariance @ jacobian.T))
     drift = [(float("nan"), float("nan"))] * 2
-    trend = (
-        _solve_chunks(full_chunks, TREND_COLUMNS[law], law_curvature)
-        if len(full_chunks) >= MIN_DRIFT_CHUNKS
-        else None
-    )
-    if trend is not None and trend[0][0] > 0:
-        span = full_chunks[-1].time_s - full_chunks[0].time_s
-        x, spread = trend
-        scale = span / x[0] if law else span
-        drift[TREND_COLUMNS[law]] = float(scale * x[-1]), float(scale * np.sqrt(spread[-1, -1]))
+    drift[TREND_COLUMNS[law]] = _measure_drift(full_chunks, law, law_curvature)[:2]
     return [(float(first), float(sd[0]), *drift[0]), (float(second), float(sd[1]), *drift[1])]
 
 
+def _measure_drift(
+    full_chunks: list[Chunk], law: int, law_curvature: float, with_nuisances: bool = False
+) -> tuple[float, float, float]:
+    """Return (drift, its sd, sds that make it significant) of a law's drifting parameter.
+
+    NaN while there are too few chunks.
+    """
+    nan = float("nan")
+    if len(full_chunks) < MIN_DRIFT_CHUNKS:
+        return nan, nan, nan
+    count = full_chunks[0].rhs.size if with_nuisances else PARAMETER_COUNTS[law]
+    trend = _solve_chunks(full_chunks, count, TREND_COLUMNS[law], law_curvature)
+    if trend is None or trend[0][0] <= 0:
+        return nan, nan, nan
+    span = full_chunks[-1].time_s - full_chunks[0].time_s
+    x, spread = trend
+    scale = span / x[0] if law else span
+    dof = len(full_chunks) - x.size
+    sigmas = float(stdtrit(dof, ndtr(MIN_DRIFT_SIGMA))) if dof > 0 else float("inf")
+    return float(scale * x[-1]), float(scale * np.sqrt(spread[-1, -1])), sigmas
+
+
 def _solve_chunks(
-    chunks: list[Chunk], trend: int | None, law_curvature: float
+    chunks: list[Chunk], count: int, trend: int | None, law_curvature: float
 ) -> tuple[Float1D, Float2D] | None:
     """Return (parameters, covariance) by least squares over the chunks; None if singular.
 
-    With a trend of one of them, two more follow: per e-fold of the amplitude, and per s. The
-    covariance is that of the noise, larger where the chunks scatter more.
+    `count`: columns of the equations that are used. With a trend of one of them, two more follow:
+    per e-fold of the amplitude, and per s. The covariance is that of the noise, larger where the
+    chunks scatter more.
     """
-    matrices = np.array([chunk.matrix for chunk in chunks])
-    right_sides = np.array([chunk.rhs for chunk in chunks])
+    matrices = np.array([chunk.matrix[:count, :count] for chunk in chunks])
+    right_sides = np.array([chunk.rhs[:count] for chunk in chunks])
     regressors = np.array([(chunk.log_amplitude, chunk.time_s) for chunk in chunks])
-    count = right_sides.shape[1]
     expansion = np.tile(np.eye(count, count if trend is None else count + 2), (len(chunks), 1, 1))
     prior = np.zeros(expansion.shape[2])
     prior[2:count] = LOAD_CELL_GAIN_SD**-2  # load-cell gains are 1 within this
     rhs = prior.copy()
+    prior[4:count], rhs[4:count] = PLATE_MASS_SD_KG**-2, 0.0
     if trend is not None:
         expansion[:, trend, count:] = regressors - regressors[0]
         prior[count] = law_curvature**-2
