@@ -4,8 +4,9 @@ With test functions phi (`cycle.weight_functions`), by parts, SI:
     damper   -<phi, M a> = K <phi, u> - C <phi', u> + q_R <phi, F_R> + q_L <phi, F_L>
     bumper    <phi, F_j> + C_j <phi', u_j> = K_j <phi, u_j> - K_j G_j <phi, 1>   over each contact
 (u_j = u right, -u left; forces as the load cells read them; q_j = 1 within the load cells' error).
-Forces of the model's effects are taken from its own restarted motion. The last column of the damper
-is a nuisance: plates in front of the load cells, which move with the table, add -m_p A to them.
+Forces of the model's effects are taken from its own restarted motion. The last columns are
+nuisances: plates in front of the load cells, which move with the table, add -m_p A to them, and
+lasers whose slopes differ by e add e y to u, with the table's displacement y.
 """
 
 import numpy as np
@@ -33,7 +34,7 @@ def force_equations(
 ) -> list[Equations | None]:
     """Return the equations of each of `LAW_NAMES`; None if the cycle gives none.
 
-    Parameters: (K, C, q_R, q_L, m_p), (K_R, K_R G_R), (K_L, K_L G_L).
+    Parameters: (K, C, q_R, q_L, m_p, K e), (K_R, K_R G_R, K_R e), (K_L, K_L G_L, K_L e).
     """
     return [_damper_equations(setup, noise, cycle), *_bumper_equations(setup, noise, cycle)]
 
@@ -41,7 +42,7 @@ def force_equations(
 def _damper_equations(
     setup: MonitoringSetup, noise: ChannelNoise, cycle: CycleData
 ) -> Equations | None:
-    """Return noise-scaled equations of K, C, q_R, q_L and m_p; None if the cycle gives none."""
+    """Return noise-scaled equations of K, C, q_R, q_L and nuisances; None if there are none."""
     p = setup.model.parameters
     u, a = relative_displacement(cycle.corrected), cycle.channel_values("mass_acc_m_s2")
     sides = [
@@ -56,7 +57,9 @@ def _damper_equations(
     values = -weighted_sums(phi, p.mass * a + _effect_forces(setup, cycle, "damper"))
     by_force = [weighted_sums(phi, side_force) for side_force in sides]
     by_plates = weighted_sums(phi, np.nan_to_num(cycle.channel_values("table_acc_m_s2")))
-    rows = np.stack([weighted_sums(phi, u), -weighted_sums(slope, u), *by_force, by_plates], axis=1)
+    by_table = weighted_sums(phi, np.nan_to_num(cycle.channel_values("table_disp_m")))
+    by_motion = [weighted_sums(phi, u), -weighted_sums(slope, u)]
+    rows = np.stack([*by_motion, *by_force, by_plates, by_table], axis=1)
     acc_rms = _finite_or(noise.channel_rms("mass_acc_m_s2"), 1e-3 * float(a.std())) * p.mass
     cell_rms = _finite_or(noise.channel_rms(RIGHT_CELLS[0]), 0.0)
     white_sd = np.sqrt((phi**2).sum(axis=1)) * np.hypot(acc_rms, 2 * cell_rms)
@@ -77,6 +80,7 @@ def _bumper_equations(
     """Return noise-scaled equations of K_j and K_j G_j over all contacts, right and left."""
     p = setup.model.parameters
     u = relative_displacement(cycle.corrected)
+    y = np.nan_to_num(cycle.channel_values("table_disp_m"))
     gap_opening = setup.model.gap_opening_m(cycle.end / setup.rate_hz)
     equations: list[Equations | None] = []
     forces = contact_forces(cycle.corrected)
@@ -96,7 +100,12 @@ def _bumper_equations(
         )
         contacts = [
             _contact_equations(
-                side * u[i:j] - gap_opening, push[i:j] - effect_force[i:j], c, setup.rate_hz, rms
+                side * u[i:j] - gap_opening,
+                push[i:j] - effect_force[i:j],
+                side * y[i:j],
+                c,
+                setup.rate_hz,
+                rms,
             )
             for i, j in edges.reshape(-1, 2).tolist()
             if j - i >= MIN_CONTACT_SAMPLES
@@ -107,12 +116,14 @@ def _bumper_equations(
 
 
 def _contact_equations(
-    depth: Float1D, push: Float1D, damping: float, rate_hz: float, rms: float
+    depth: Float1D, push: Float1D, table: Float1D, damping: float, rate_hz: float, rms: float
 ) -> tuple[Float2D, Float1D]:
     """Return noise-scaled equations of one contact."""
     phi, slope, _ = (functions[:2] for functions in weight_functions(depth.size, rate_hz))
     values = weighted_sums(phi, push) + damping * weighted_sums(slope, depth)
-    rows = np.stack([weighted_sums(phi, depth), -phi.sum(axis=1)], axis=1)
+    rows = np.stack(
+        [weighted_sums(phi, depth), -phi.sum(axis=1), weighted_sums(phi, table)], axis=1
+    )
     sd = np.hypot(
         np.sqrt((phi**2).sum(axis=1)) * rms, LOAD_CELL_ERROR * weighted_sums(np.abs(phi), push)
     )

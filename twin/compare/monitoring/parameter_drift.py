@@ -39,7 +39,8 @@ PARAMETER_NAMES = (
 )
 PARAMETER_COUNTS = (4, 2, 2)  # of each law; further columns are nuisances
 PLATE_MASS_SD_KG = 5.0
-LASER_SLOPE_SD, LASER_ERROR_SD_M = 0.01, 1e-4  # of u, per e-fold of the amplitude
+LASER_SLOPE_SD = 0.01  # difference of two lasers; also of u per e-fold of the amplitude
+LASER_ERROR_SD_M = 1e-4  # of a gap per e-fold of the amplitude
 TREND_COLUMNS = (0, 1, 1)  # index of the linear parameter of each law that may drift
 
 
@@ -179,6 +180,11 @@ def _report_drift(
         LASER_ERROR_SD_M * p.bumper_stiffness_r,
         LASER_ERROR_SD_M * p.bumper_stiffness_l,
     )
+    nuisance_sds = (
+        (PLATE_MASS_SD_KG, LASER_SLOPE_SD * p.stiffness),
+        (LASER_SLOPE_SD * p.bumper_stiffness_r,),
+        (LASER_SLOPE_SD * p.bumper_stiffness_l,),
+    )
     for law, (law_names, law_chunks) in enumerate(zip(PARAMETER_NAMES, state.chunks, strict=True)):
         full_chunks = [chunk for chunk in law_chunks if chunk.count >= MIN_CHUNK_CYCLES]
         curvature = law_curvature * force_scale[law]
@@ -188,7 +194,9 @@ def _report_drift(
         if estimates:
             law_changes = [(float("nan"),) * 3] * 2
             max_curvature = max(curvature, instruments[law])
-            law_changes[TREND_COLUMNS[law]] = _measure_drift(full_chunks, law, max_curvature, True)
+            law_changes[TREND_COLUMNS[law]] = _measure_drift(
+                full_chunks, law, max_curvature, nuisance_sds[law]
+            )
             changes += law_changes
     if not names:
         return state, []
@@ -237,7 +245,7 @@ def _law_estimates(
     since_s = min(full_chunks[-1].time_s - RECENT_S, full_chunks[-2].time_s)
     count = PARAMETER_COUNTS[law]
     recent = _solve_chunks(
-        [chunk for chunk in full_chunks if chunk.time_s >= since_s], count, None, 0.0
+        [chunk for chunk in full_chunks if chunk.time_s >= since_s], count, (), None, 0.0
     )
     if recent is None:
         return []
@@ -255,17 +263,19 @@ def _law_estimates(
 
 
 def _measure_drift(
-    full_chunks: list[Chunk], law: int, law_curvature: float, with_nuisances: bool = False
+    full_chunks: list[Chunk], law: int, law_curvature: float, nuisance_sds: tuple[float, ...] = ()
 ) -> tuple[float, float, float]:
     """Return (drift, its sd, sds that make it significant) of a law's drifting parameter.
 
-    NaN while there are too few chunks.
+    `nuisance_sds`: expected sizes of the nuisances that are fitted too. NaN while there are too few
+    chunks.
     """
     nan = float("nan")
     if len(full_chunks) < MIN_DRIFT_CHUNKS:
         return nan, nan, nan
-    count = full_chunks[0].rhs.size if with_nuisances else PARAMETER_COUNTS[law]
-    trend = _solve_chunks(full_chunks, count, TREND_COLUMNS[law], law_curvature)
+    trend = _solve_chunks(
+        full_chunks, PARAMETER_COUNTS[law], nuisance_sds, TREND_COLUMNS[law], law_curvature
+    )
     if trend is None or trend[0][0] <= 0:
         return nan, nan, nan
     span = full_chunks[-1].time_s - full_chunks[0].time_s
@@ -277,22 +287,28 @@ def _measure_drift(
 
 
 def _solve_chunks(
-    chunks: list[Chunk], count: int, trend: int | None, law_curvature: float
+    chunks: list[Chunk],
+    parameter_count: int,
+    nuisance_sds: tuple[float, ...],
+    trend: int | None,
+    law_curvature: float,
 ) -> tuple[Float1D, Float2D] | None:
     """Return (parameters, covariance) by least squares over the chunks; None if singular.
 
-    `count`: columns of the equations that are used. With a trend of one of them, two more follow:
+    Columns of the equations after the parameters are nuisances of these sizes; those after them are
+    not used. With a trend of one of them, two more follow:
     per e-fold of the amplitude, and per s. The covariance is that of the noise, larger where the
     chunks scatter more.
     """
+    count = parameter_count + len(nuisance_sds)
     matrices = np.array([chunk.matrix[:count, :count] for chunk in chunks])
     right_sides = np.array([chunk.rhs[:count] for chunk in chunks])
     regressors = np.array([(chunk.log_amplitude, chunk.time_s) for chunk in chunks])
     expansion = np.tile(np.eye(count, count if trend is None else count + 2), (len(chunks), 1, 1))
     prior = np.zeros(expansion.shape[2])
-    prior[2:count] = LOAD_CELL_GAIN_SD**-2  # load-cell gains are 1 within this
+    prior[2:parameter_count] = LOAD_CELL_GAIN_SD**-2  # load-cell gains are 1 within this
     rhs = prior.copy()
-    prior[4:count], rhs[4:count] = PLATE_MASS_SD_KG**-2, 0.0
+    prior[parameter_count:count] = np.array(nuisance_sds) ** -2.0
     if trend is not None:
         expansion[:, trend, count:] = regressors - regressors[0]
         prior[count] = law_curvature**-2
