@@ -76,7 +76,10 @@ def discover_and_hold_out(hidden: Hidden) -> tuple[Discovery, Json, Block]:
 @pytest.mark.parametrize("hidden", [FRICTION, CUBIC], ids=lambda hidden: hidden.name)
 def test_the_force_errors_of_a_held_out_log(hidden: Hidden) -> None:
     discovery, figures, apart = discover_and_hold_out(hidden)
-    given = {STIFFNESS: start_model().base.stiffness, DAMPING: start_model().base.damping}
+    given: dict[ParameterKey, float] = {
+        STIFFNESS: start_model().base.stiffness,
+        DAMPING: start_model().base.damping,
+    }
     null = dict(discovery.selection.null.fit.values)
     best = dict(discovery.verdict.best.fit.values)
     for key, values in (("given", given), ("before", null), ("after", best)):

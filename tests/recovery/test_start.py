@@ -42,7 +42,7 @@ def random_start(seed: int) -> Model:
 
 
 @cache
-def expected(name: str) -> Discovery:
+def discover_from_near(name: str) -> Discovery:
     return discover_effects([recording(name)], start_model())
 
 
@@ -51,7 +51,9 @@ def expected(name: str) -> Discovery:
 def test_a_rough_start_leaves_the_verdict(name: str, seed: int) -> None:
     verdict = discover_effects([recording(name)], random_start(seed)).verdict
     assert (verdict.outcome, verdict.best.names) == ("named", (name,)), verdict.reason
-    assert verdict.confidence == pytest.approx(expected(name).verdict.confidence, abs=0.01)
-    for key, value in expected(name).verdict.best.fit.values.items():
-        sd = expected(name).verdict.best.fit.std_errors[key]
+    assert verdict.confidence == pytest.approx(
+        discover_from_near(name).verdict.confidence, abs=0.01
+    )
+    for key, value in discover_from_near(name).verdict.best.fit.values.items():
+        sd = discover_from_near(name).verdict.best.fit.std_errors[key]
         assert verdict.best.fit.values[key] == pytest.approx(value, rel=1e-3, abs=0.1 * sd), key

@@ -80,7 +80,7 @@ def list_generic_candidates(log_residuals: Sequence[LogResiduals]) -> tuple[Cand
     """Return the generic terms as candidates."""
     candidates, scale = [], log_residuals[0].scale
     has_contact = any((residuals.contact_state > 0).any() for residuals in log_residuals)
-    for name, ladder in list_terms(has_contact, scale):
+    for name, ladder in list_terms(has_contact):
         free = list_term_parameters(name, ladder, scale)
         shapes = tuple((width,) for width in ladder) or ((),)
         candidates.append(Candidate(f"{GENERIC_PREFIX}.{name}", free, free[0], 0.0, shapes))

@@ -18,9 +18,7 @@ from twin.identification.parameters import SLIP_SPEED, FreeParameter, ParameterK
 
 BasisFunction = Callable[[Float1D, Float1D, float], Float1D]
 TERM_WIDTHS = (0.03, 0.06, 0.12, 0.25, 0.5)
-# Trial resonances, of the main frequency of the motion: a quarter of an octave apart, as a narrow
-# resonance is found only near a trial.
-RESONANCES = tuple(float(ratio) for ratio in 2.0 ** (np.arange(-8, 17) / 4.0))
+RESONANCES_HZ = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0, 22.0, 32.0)  # Hz
 RESONATOR_DAMPING = 0.03
 
 # Functions of u / U and v / V in the damper, and of d / D and d' / V in a bumper.
@@ -54,17 +52,13 @@ BUMPER_TERMS: dict[str, BasisFunction] = {
 }
 
 
-def list_terms(has_contact: bool, scale: RecordScale) -> tuple[tuple[str, tuple[float, ...]], ...]:
-    """Return (name, trial widths) of each term; no widths for a term without a width.
-
-    The width of the resonator is its frequency in Hz.
-    """
-    main_hz = 1.0 / (2 * np.pi * scale.time_s)
+def list_terms(has_contact: bool) -> tuple[tuple[str, tuple[float, ...]], ...]:
+    """Return (name, trial widths) of each term; no widths for a term without a width."""
     damper_terms: list[tuple[str, tuple[float, ...]]] = [
         (f"damper {name}", ()) for name in DAMPER_TERMS
     ]
     damper_terms += [(f"damper {name}", TERM_WIDTHS) for name in DAMPER_WIDTH_TERMS]
-    damper_terms += [("damper resonator", tuple(ratio * main_hz for ratio in RESONANCES))]
+    damper_terms += [("damper resonator", RESONANCES_HZ)]
     return (*damper_terms, *((f"bumper {name}", ()) for name in BUMPER_TERMS if has_contact))
 
 

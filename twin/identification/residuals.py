@@ -377,7 +377,8 @@ class LogResiduals:
         # the noise is that of the nominal mass: a misfit must not shrink by its own denominator
         rows /= self.force_noise(m, mass * self.signals.mass_kg / m.mass_kg)[:, None]
         if self.whitening is not None:
-            rows[0] = self.signals.grid.apply_gain(rows[0], self.whitening)
+            # the second derivative at an open end is no force, and the filter would spread it
+            rows[0] = self.signals.grid.apply_gain(np.where(m.good, rows[0], 0.0), self.whitening)
         all_rows = [
             *rows,
             *(

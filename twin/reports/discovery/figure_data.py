@@ -169,7 +169,8 @@ def compute_term_forces(
         omega = residuals.signals.omega * residuals.scale.time_s
         gain = 1.0 / (1.0 + (omega / MAX_DRAWN_FREQUENCY) ** 8)
         for force in (required[0], remaining[0]):
-            force[:] = residuals.signals.grid.apply_gain(force, gain)
+            usable = np.where(residuals.signals.good, force, 0.0)  # not at an open end
+            force[:] = residuals.signals.grid.apply_gain(usable, gain)
     unused = ~residuals.row_mask[: len(FORCE_ROWS)]
     required[unused], remaining[unused] = np.nan, np.nan
     label = " + ".join(format_term(term) for term in terms)
