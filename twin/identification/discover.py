@@ -45,7 +45,7 @@ from twin.identification.selection import (
     count_sensor_errors,
     stepwise_selection,
 )
-from twin.identification.signals import LogSignals, derives_acc
+from twin.identification.signals import CELL_PAIRS, SENSOR_PAIRS, LogSignals, derives_acc
 from twin.identification.verdict import DiscoveryVerdict, judge_selection
 from twin.model.model import Model
 
@@ -301,11 +301,41 @@ def discover_effects(
     if not discovery.selection.complete or _is_explained(discovery.verdict, MAX_IDEAL_ERRORS):
         return discovery
     imperfect = add_nuisances(prepared)
+    if not _can_explain(imperfect, discovery):
+        return discovery
     with_nuisances = _select_and_judge(imperfect, logs, model, report)
     if not with_nuisances.selection.complete:
         return replace(discovery, selection=replace(discovery.selection, complete=False))
     is_ended_early = count_sensor_errors(discovery.selection.best) > MAX_IDEAL_ERRORS
     return with_nuisances if is_ended_early or _is_explained(with_nuisances.verdict) else discovery
+
+
+def _can_explain(imperfect: PreparedProblem, ideal: Discovery) -> bool:
+    """Return True if nuisances can be what the best set with ideal instruments leaves.
+
+    Either instruments disagree, which no force law makes them do, or nuisances close the gap of
+    the base or of the best set.
+    """
+    best, problem, start = ideal.verdict.best, imperfect.problem, imperfect.parameters
+    for residuals, held_out in zip(
+        ideal.prepared.problem.log_residuals, best.held_out, strict=True
+    ):
+        for row, name in enumerate(residuals.rows):
+            entries = held_out[residuals.entry_row == row] * residuals.weight
+            if (
+                name in (*SENSOR_PAIRS, *CELL_PAIRS)
+                and entries.size
+                and _rms(entries) ** 2 > MAX_EXPLAINED_COST
+            ):
+                return True
+    if imperfect.first_fit.cost <= MAX_EXPLAINED_COST or not best.effects:
+        return imperfect.first_fit.cost <= MAX_EXPLAINED_COST
+    added = [free for effect in best.effects for free in effect.free]
+    values = {free.key: best.fit.parameters.values[free.key] for free in added}
+    start = start.with_values(values).with_free((*start.free, *added))
+    return fit_parameters(problem.log_residuals, start, mapper=problem.mapper).cost <= (
+        MAX_EXPLAINED_COST
+    )
 
 
 def _is_explained(verdict: DiscoveryVerdict, max_sensor_errors: int = MAX_EFFECTS) -> bool:

@@ -39,6 +39,10 @@ SENSOR_PAIRS: Mapping[str, tuple[str, ...]] = {
     **{body: (laser, accelerometer) for body, laser, accelerometer in BODY_SENSORS},
     "mass against table": ("rel_disp_m", "mass_acc_m_s2", "table_acc_m_s2"),
 }
+CELL_PAIRS: Mapping[str, tuple[str, ...]] = {
+    "right cells": RIGHT_CELLS,
+    "left cells": LEFT_CELLS,
+}
 USED_CHANNELS = (
     "rel_disp_m", "mass_disp_m", "table_disp_m", "mass_acc_m_s2", "table_acc_m_s2",
     *RIGHT_CELLS, *LEFT_CELLS, "damper_force_n",
@@ -284,7 +288,7 @@ class _SensorFusion:
     def _load_cell_residuals(self) -> tuple[ConsistencyResidual, ...]:
         """Return the difference of the two load cells of each side over their noise."""
         residuals = []
-        for side, (first, second) in (("right cells", RIGHT_CELLS), ("left cells", LEFT_CELLS)):
+        for side, (first, second) in CELL_PAIRS.items():
             if {first, second} <= self.spectra.keys():
                 difference = self._time_series(first) - self._time_series(second)
                 noise = np.hypot(self._filtered_rms(first), self._filtered_rms(second))

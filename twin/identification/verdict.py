@@ -176,7 +176,8 @@ def _judge_unnamed(
     problem: SelectionProblem, selection: SelectionResult, floor: float, generic: FittedSet | None
 ) -> DiscoveryVerdict:
     null = selection.null
-    if generic is not None and problem.is_worthwhile(null, generic):
+    is_visible = null.cost > (1 + MIN_VISIBLE_EXCESS) * floor
+    if generic is not None and is_visible and problem.is_worthwhile(null, generic):
         reason = (
             f"no effect of the library, but {_format_generic(generic)} explains part of the gap"
         )
