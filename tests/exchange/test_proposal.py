@@ -146,7 +146,7 @@ def write_component(path: Path, rate_hz: float = 200.0, offset: float = 0.0) -> 
     return path
 
 
-@pytest.mark.parametrize("rate_hz", [10.0, 12.62103863193593, 33.3, 5000.0])
+@pytest.mark.parametrize("rate_hz", [10.0, 13.1, 26.2, 5000.0])
 def test_any_rate_is_imported_without_a_profile(tmp_path: Path, rate_hz: float) -> None:
     file, log = write_component(tmp_path / "slow.txt", rate_hz), tmp_path / "slow.mcap"
     assert import_samples(file, log, None, None, None, ImportOptions(accept=True)) == 0
