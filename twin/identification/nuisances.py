@@ -67,7 +67,16 @@ def list_nuisances(signals: LogSignals) -> tuple[Nuisance, ...]:
     # No measurement contradicts the scale of all displacements together, nor their common lag; that
     # of all forces is the mass, or a force sensor of the damper.
     references = ("rel_disp_m", "mass_disp_m", "damper_force_n")
-    checkable = [channel for channel in channels if channel not in references]
+    # Alone, an accelerometer that lags looks like damping: another sensor must see the same motion.
+    paired_sensors = {
+        channel for pair in SENSOR_PAIRS.values() if {*pair} <= {*channels} for channel in pair
+    }
+    checkable = [
+        channel
+        for channel in channels
+        if channel not in references
+        and (channel not in ACCELEROMETERS or channel in paired_sensors)
+    ]
     pairs = {side: cells for side, cells in SIDES.items() if {*cells} <= {*channels}}
     paired = {cell for cells in pairs.values() for cell in cells}
     # The gains of two cells are that of their sum, and their shares.
@@ -76,7 +85,7 @@ def list_nuisances(signals: LogSignals) -> tuple[Nuisance, ...]:
     nuisances += [Nuisance("lag", channel, TYPICAL_LAG_S) for channel in checkable]
     nuisances += [
         Nuisance("low_cut", channel, TYPICAL_LOW_CUT)
-        for channel in channels
+        for channel in checkable
         if channel in ACCELEROMETERS
     ]
     for channel in channels:

@@ -31,6 +31,7 @@ LOST_MARGIN_S = 0.3  # excluded around lost samples: the fusion spreads the inte
 OPEN_END_S = 0.5  # excluded at an end of the record that is not at rest
 # Of the power of a drive with a single frequency: within this width, of the frequency, about it.
 MIN_SINGLE_LINE_SHARE, SINGLE_LINE_WIDTH = 0.95, 0.05
+MAX_NOISE_RATIO = 4.0  # noise in motion over that at rest: sensors that disagree more are faulty
 BODY_SENSORS = (
     ("mass", "mass_disp_m", "mass_acc_m_s2"),
     ("table", "table_disp_m", "table_acc_m_s2"),
@@ -157,6 +158,7 @@ class LogSignals:
         for residual in self.fuse_motion().consistency_residuals:
             channels = SENSOR_PAIRS.get(residual.body, ())
             ratio = np.sqrt(compare_with_white(residual.values, self.low_pass))
+            ratio = np.minimum(ratio, MAX_NOISE_RATIO)
             noise |= {name: noise[name] * ratio for name in channels if name in noise}
         return replace(self, noise=noise)
 
