@@ -27,10 +27,10 @@ BODY_SENSORS = (
 )
 CELL_PAIRS = (("right", *RIGHT_CELLS), ("left", *LEFT_CELLS))
 MAX_ACC_MISMATCH = 0.008  # of the acceleration: error of mounting and calibration
-# The linearity error of a laser, 0.1 % of full scale, ripples about seven times over the range, so
-# small motions are measured with a slope that is off by 0.7 %; an uneven surface adds a fixed
-# profile of some um over position. Neither shows at rest.
-MAX_LASER_SLOPE_ERROR, MAX_LASER_PROFILE_M = 0.007, 4.5e-6
+# The linearity error of a laser, up to 0.2 % of full scale, ripples about seven times over the
+# range, so small motions are measured with a slope that is off by 1.4 %; an uneven surface adds a
+# fixed profile of some um over position. Neither shows at rest.
+MAX_LASER_SLOPE_ERROR, MAX_LASER_PROFILE_M = 0.014, 4.5e-6
 MIN_LOW_CUT_RAD_S = 2 * np.pi * 0.02  # below it turns the phase by 2 degrees at 0.5 Hz
 MAX_LEFT_PHASE_RAD = 0.01  # of a low cut that is not removed: below it the twin's input is right
 MAX_SHARE_DIFFERENCE = 0.1  # of a side's force: by which its two cells may differ
