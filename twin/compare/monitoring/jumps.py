@@ -165,6 +165,9 @@ def track_jumps(tracking: JumpTracking, point: PrcPoint) -> tuple[JumpTracking, 
         change = math.log(_amplitude(point) / _amplitude(last))
         tracking, messages = _match_jumps(tracking, last, point, change)
         items = [Event(point.index, kind, text) for kind, text in messages]
+    elif last is not None and tracking.last_jump_step == last.step:
+        # At the turn the motion goes on at the same frequency.
+        tracking = replace(tracking, last_jump_step=point.step)
     late = tuple(
         jump for jump in tracking.upcoming if jump.after.index + MAX_STEPS_LATE <= point.step
     )
@@ -226,7 +229,7 @@ def _match_jumps(
     if hint is not None and point.step != tracking.last_jump_step + 1:
         early = [jump for jump in upcoming_same if jump not in due]
         matched = next((jump for jump in (*overdue, *early) if _is_same_jump(jump, change)), None)
-        after_turn = next((jump for jump in turned if _is_same_jump(jump, change)), None)
+        after_turn = next((jump for jump in turned if change * jump.change > 0), None)
         if after_turn is not None:
             place = f"after the turn, where the model expects it before ({after_turn.at_hz:.3f} Hz)"
             messages.append(("jump", f"{_describe_jump(after_turn)} came {place}"))
