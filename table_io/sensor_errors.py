@@ -13,7 +13,6 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import signal
 
 from table_io.block import Float1D, Float2D
 
@@ -104,5 +103,20 @@ def highpass(
     steps = np.diff(joined[finite[np.maximum(latest, 0)]])
     half = 0.5 * low_cut / rate_hz  # trapezoidal rule
     pole = (1.0 - half) / (1.0 + half)
-    filtered, _ = signal.lfilter([1.0 / (1.0 + half)], [1.0, -pole], steps, zi=[pole * output])
-    return np.asarray(filtered, dtype=np.float64)
+    return filter_first_order(steps, (1.0 / (1.0 + half), 0.0), pole, pole * output)[0]
+
+
+def filter_first_order(
+    x: Float1D, gains: tuple[float, float], pole: float, state: float
+) -> tuple[Float1D, float]:
+    """Return y_i = b0 x_i + z_i with z_(i+1) = b1 x_i + pole y_i, (sample,), and the last z.
+
+    The numbers are those of `scipy.signal.lfilter`, whose import takes longer than the start of a
+    command.
+    """
+    b0, b1 = gains
+    y = np.empty(x.size)
+    for i, value in enumerate(x.tolist()):
+        y[i] = b0 * value + state
+        state = b1 * value + pole * float(y[i])
+    return y, state

@@ -72,7 +72,7 @@ def test_two_effects_are_both_named() -> None:
 @pytest.mark.parametrize(
     "truth",
     [
-        format_truth("cubic_damping", c3=3e4),
+        pytest.param(format_truth("cubic_damping", c3=3e4), marks=pytest.mark.slow),
         format_truth("bumper_cubic", kc=2e9),
         format_truth("appendage", mass=5.0, frequency=6.0),
     ],

@@ -155,7 +155,7 @@ def test_a_card_with_sensors():
         ('id = "coulomb_friction"\nparameters = { fc = inf }',
          {"key": "fc", "value": math.inf, "allowed": "finite"}),
         ('id = "coulomb_friction"\nparameters = { fc = -1.0 }',
-         {"key": "fc", "value": -1.0, "allowed": "0 to 5000 N"}),
+         {"key": "fc", "value": -1.0, "allowed": "0 to 1e+09 N"}),
         ('id = "bouc_wen"\nparameters = { force = 1.0 }', {"key": "yield_displacement"}),
     ],
 )  # fmt: skip

@@ -4,10 +4,16 @@ import math
 
 import numpy as np
 import pytest
+from scipy import signal
 
 from table_io.block import Float1D
 from table_io.safety.protection.consistency import WeakFormPair, compare_motion, make_window
-from table_io.sensor_errors import MAX_LOW_CUT_RAD_S, PairErrorEstimate, highpass
+from table_io.sensor_errors import (
+    MAX_LOW_CUT_RAD_S,
+    PairErrorEstimate,
+    filter_first_order,
+    highpass,
+)
 
 RATE_HZ, CYCLE_HZ = 1000.0, 0.8
 
@@ -78,3 +84,12 @@ def test_the_division_into_calls_changes_no_bit() -> None:
     second = highpass(x[1234:], 1.0, RATE_HZ, (float(x[1233]), float(first[-1])))
     assert np.isfinite(whole).all()
     assert np.array_equal(whole, np.concatenate([first, second]))
+
+
+@pytest.mark.parametrize("b1", [0.0, 0.3])
+def test_the_filter_is_that_of_scipy_to_the_bit(b1: float) -> None:
+    x = np.random.default_rng(1).standard_normal(500)
+    y, state = filter_first_order(x, (0.3, b1), 0.98, 0.7)
+    expected, expected_state = signal.lfilter([0.3, b1], [1.0, -0.98], x, zi=[0.7])
+    np.testing.assert_array_equal(y, expected)
+    assert state == expected_state[0]

@@ -275,7 +275,12 @@ def without_sensor(text: str, channel: str, times: int = 1) -> str:
             {"remedy": "did you mean 'mass_acc_m_s2'? or declare it in a [[channels]] table"},
         ),
         ('"force_l2_n"', '"force_l1_n"', "sensors", {"remedy": "one sensor per channel"}),
-        ('"table_acc_m_s2"', '"rel_disp_m"', "sensors.2.unit", {"allowed": "m, mm, um, cm, in, ft"}),
+        (
+            '"table_acc_m_s2"',
+            '"rel_disp_m"',
+            "sensors.2.unit",
+            {"allowed": "m, mm, um, cm, in, ft"},
+        ),
         (
             "volts_per_unit = 5.0",
             "volts_per_unit = 0.0",

@@ -13,10 +13,9 @@ are unchanged to the bit.
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy import signal
 
 from table_io.block import Block, Float1D
-from table_io.sensor_errors import highpass
+from table_io.sensor_errors import filter_first_order, highpass
 
 CROSSOVER_RAD_S = 2 * np.pi * 0.5  # lambda
 SETTLING_TIMES = 6.0  # of the slowest filter, after which a repeated cycle is periodic
@@ -43,14 +42,14 @@ class LowCutFilter:
         known = np.nan_to_num(a)
         half = 0.5 * CROSSOVER_RAD_S / rate_hz  # trapezoidal rule
         gain, pole = 0.5 / rate_hz / (1.0 + half), (1.0 - half) / (1.0 + half)
-        fast, state = signal.lfilter([gain, gain], [1.0, -pole], known, zi=[self.fast])
+        fast, state = filter_first_order(known, (gain, gain), pole, self.fast)
         finite = x[np.isfinite(x)]
         last_x = float(finite[-1]) if finite.size else (self.displacement or (np.nan, 0.0))[0]
         after = replace(
             self,
             displacement=(last_x, float(y[-1])),
             slow=(float(y[-1]), float(slow[-1])),
-            fast=float(state[0]),
+            fast=state,
         )
         return after, a + self.low_cut * (fast + CROSSOVER_RAD_S * slow)
 
