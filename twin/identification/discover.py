@@ -151,12 +151,11 @@ def add_nuisances(prepared: PreparedProblem) -> PreparedProblem:
     problem, mapper, first = prepared.problem, prepared.problem.mapper, prepared.parameters
     moving = sum(int(residuals.motion().moving.sum()) for residuals in problem.log_residuals)
     thinning = max(math.ceil(moving / MAX_NUISANCE_SAMPLES), problem.log_residuals[0].thinning)
-    # Only the ratio of the weights counts: the best log has the noise that its priors stand
-    # against.
-    least = min(residuals.weight for residuals in problem.log_residuals)
+    # Only the ratio of the weights counts: the priors stand against the noise of the best log.
     log_residuals = tuple(
         linearize_nuisances(
-            replace(residuals, thinning=thinning, weight=residuals.weight / least), first
+            replace(residuals, thinning=thinning, weight=residuals.weight / problem.least_weight),
+            first,
         )
         for residuals in problem.log_residuals
     )
@@ -197,8 +196,7 @@ def _start_nuisances(
 def explain_with_nuisances(prepared: PreparedProblem) -> PreparedProblem:
     """Return the problem with nuisances if they, but not ideal sensors, explain the logs."""
     # where model error limits the fit, the residual is divided by it: this is over the noise
-    least = min(residuals.weight for residuals in prepared.problem.log_residuals)
-    if least**2 * prepared.first_fit.cost <= MAX_EXPLAINED_COST:
+    if prepared.problem.least_weight**2 * prepared.first_fit.cost <= MAX_EXPLAINED_COST:
         return prepared
     imperfect = add_nuisances(prepared)
     return imperfect if imperfect.first_fit.cost <= MAX_EXPLAINED_COST else prepared
@@ -246,15 +244,16 @@ def _check_enough_data(log_residuals: Sequence[LogResiduals]) -> None:
         for residuals in log_residuals
     ]
     entries, blocks = (sum(count) for count in zip(*counts, strict=True))
-    for residuals, (own_entries, _) in zip(log_residuals, counts, strict=True):
-        if not own_entries or entries < MIN_ENTRIES or blocks < MIN_BLOCKS:
-            raise InputError(
-                f"too few usable samples: {own_entries if not own_entries else entries} in "
-                f"{blocks} cycles",
-                where=residuals.signals.name if len(counts) == 1 or not own_entries else "",
-                allowed=f"at least {MIN_ENTRIES} in {MIN_BLOCKS} cycles, in all logs together",
-                remedy="record a longer test, or give several recordings of the specimen",
-            )
+    names = [residuals.signals.name for residuals in log_residuals]
+    empty = [name for name, (own_entries, _) in zip(names, counts, strict=True) if not own_entries]
+    if empty or entries < MIN_ENTRIES or blocks < MIN_BLOCKS:
+        where = empty or (names if len(names) == 1 else [""])
+        raise InputError(
+            f"too few usable samples: {0 if empty else entries} in {blocks} cycles",
+            where=where[0],
+            allowed=f"at least {MIN_ENTRIES} in {MIN_BLOCKS} cycles, in all logs together",
+            remedy="record a longer test, or give several recordings of the specimen",
+        )
 
 
 def find_implausible_parameters(model: Model, fit: FitResult) -> list[str]:
@@ -317,25 +316,26 @@ def _can_explain(imperfect: PreparedProblem, ideal: Discovery) -> bool:
     the base or of the best set.
     """
     best, problem, start = ideal.verdict.best, imperfect.problem, imperfect.parameters
-    for residuals, held_out in zip(
-        ideal.prepared.problem.log_residuals, best.held_out, strict=True
-    ):
-        for row, name in enumerate(residuals.rows):
-            entries = held_out[residuals.entry_row == row] * residuals.weight
-            if (
-                name in (*SENSOR_PAIRS, *CELL_PAIRS)
-                and entries.size
-                and _rms(entries) ** 2 > MAX_EXPLAINED_COST
-            ):
-                return True
-    if imperfect.first_fit.cost <= MAX_EXPLAINED_COST or not best.effects:
-        return imperfect.first_fit.cost <= MAX_EXPLAINED_COST
-    added = [free for effect in best.effects for free in effect.free]
-    values = {free.key: best.fit.parameters.values[free.key] for free in added}
-    start = start.with_values(values).with_free((*start.free, *added))
-    return fit_parameters(problem.log_residuals, start, mapper=problem.mapper).cost <= (
-        MAX_EXPLAINED_COST
-    )
+    logs = zip(ideal.prepared.problem.log_residuals, best.held_out, strict=True)
+    if any(_sensors_disagree(residuals, held_out) for residuals, held_out in logs):
+        return True
+    fit = imperfect.first_fit
+    if fit.cost > MAX_EXPLAINED_COST and best.effects:
+        added = [free for effect in best.effects for free in effect.free]
+        values = {free.key: best.fit.parameters.values[free.key] for free in added}
+        start = start.with_values(values).with_free((*start.free, *added))
+        fit = fit_parameters(problem.log_residuals, start, mapper=problem.mapper)
+    return fit.cost <= MAX_EXPLAINED_COST
+
+
+def _sensors_disagree(residuals: LogResiduals, held_out: Float1D) -> bool:
+    """Return True if sensors of one body or side differ beyond their noise."""
+    entries = [
+        held_out[residuals.entry_row == row] * residuals.weight
+        for row, name in enumerate(residuals.rows)
+        if name in SENSOR_PAIRS or name in CELL_PAIRS
+    ]
+    return any(_rms(values) ** 2 > MAX_EXPLAINED_COST for values in entries)
 
 
 def _is_explained(verdict: DiscoveryVerdict, max_sensor_errors: int = MAX_EFFECTS) -> bool:

@@ -19,7 +19,6 @@ MIN_DEVIATION_SIGMA = 3.0  # standard deviations: a smaller deviation from white
 MIN_CORNER_SIGMA = 6.0
 MIN_WHITE_CYCLES = 0.02  # cycles per sample: above it noise at rest shows the white level
 PASSED_SHARE = 0.5  # of the frequency where a filter rolls off: below it, it passes all
-HIGHEST_CYCLES = 0.5  # per sample
 MIN_NOISE_SHARE = 1e-4  # of a channel's rms: lower limit of the noise
 # An anti-alias filter lowers the power by this factor within an octave, above this frequency; the
 # resolution of a converter may stop the fall.
@@ -76,8 +75,7 @@ def find_filter_corner(values: Float1D, rest: Bool2D) -> float:
     quiet = values[rest & np.isfinite(values)]
     if quiet.size < MIN_REST_SAMPLES:
         return math.inf
-    corner = _find_roll_off(_estimate_rest_bands(quiet))
-    return corner if corner < HIGHEST_CYCLES else math.inf
+    return _find_roll_off(_estimate_rest_bands(quiet))
 
 
 def compare_with_white(values: Float1D, gain: Float1D) -> Float1D:
@@ -148,17 +146,16 @@ def _average_bands(
 
 
 def _find_roll_off(at_rest: NoiseBands) -> float:
-    """Return the frequency above which an anti-alias filter lowers the noise, or the highest."""
+    """Return the frequency above which an anti-alias filter lowers the noise; inf without one."""
     power, octave = at_rest.power, BANDS_PER_OCTAVE
     falls = power[:-octave] > MIN_FILTER_FALL * power[octave:]
     rolling_off = np.flatnonzero(falls & (at_rest.frequency[:-octave] > MIN_FILTER_CYCLES))
-    return float(at_rest.frequency[rolling_off[0]]) if rolling_off.size else HIGHEST_CYCLES
+    return float(at_rest.frequency[rolling_off[0]]) if rolling_off.size else math.inf
 
 
 def _count_passed_bands(bands: NoiseBands, roll_off: float) -> int:
     """Return the number of bands that a filter passes whole, at least three."""
-    highest = roll_off if roll_off == HIGHEST_CYCLES else PASSED_SHARE * roll_off
-    return max(int(np.searchsorted(bands.frequency, highest)), 3)
+    return max(int(np.searchsorted(bands.frequency, PASSED_SHARE * roll_off)), 3)
 
 
 def _find_white_level(power: Float1D, sigma: Float1D) -> float:

@@ -11,7 +11,7 @@ effect of the specimen. Kinds, by channel or side:
     share, share_slope   of the force of a side between its two cells: constant, and with position
     plate                mass in front of the cells of a side, which the table accelerates
     cross                part of the acceleration of the table in the accelerometer of the mass
-    gap, mass            readings of the set-up: right gap against left gap, and mass
+    gap                  reading of the set-up: right gap against left gap
 """
 
 import math

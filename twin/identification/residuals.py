@@ -348,7 +348,10 @@ class LogResiduals:
 
         Without load cells the damper force is the sum of all forces.
         """
-        model = parameters.model_for_log(self.log_number, m)
+        return self._force_errors(parameters.model_for_log(self.log_number, m), parameters, m)
+
+    def _force_errors(self, model: Model, parameters: ParameterSet, m: MeasuredMotion) -> Float2D:
+        """Return `force_errors` of the model of this log."""
         u = m.u - parameters.tare_error(self.log_number, "u")
         d, right, left = forces_along(model, u, m.v, m.time_s, self.contact_state)
         if SLIP_SPEED in parameters.values:
@@ -372,10 +375,11 @@ class LogResiduals:
 
     def evaluate_rows(self, parameters: ParameterSet, m: MeasuredMotion) -> Float1D:
         """Return the residual over its noise on a given motion, (entry,), without the rest row."""
-        rows = self.force_errors(parameters, m)
-        mass = parameters.model_for_log(self.log_number, m).parameters.mass
+        model = parameters.model_for_log(self.log_number, m)
+        rows = self._force_errors(model, parameters, m)
         # the noise is that of the nominal mass: a misfit must not shrink by its own denominator
-        rows /= self.force_noise(m, mass * self.signals.mass_kg / m.mass_kg)[:, None]
+        nominal_mass = model.parameters.mass * self.signals.mass_kg / m.mass_kg
+        rows /= self.force_noise(m, nominal_mass)[:, None]
         if self.whitening is not None:
             # the second derivative at an open end is no force, and the filter would spread it
             rows[0] = self.signals.grid.apply_gain(np.where(m.good, rows[0], 0.0), self.whitening)

@@ -110,9 +110,14 @@ class SelectionProblem:
         )
 
     @property
+    def least_weight(self) -> float:
+        """Weight of the log whose residual is closest to its noise."""
+        return min(residuals.weight for residuals in self.log_residuals)
+
+    @property
     def noise(self) -> float:
         """Mean square of sensor noise alone: below it no effect is named."""
-        return min(residuals.weight for residuals in self.log_residuals) ** -2
+        return self.least_weight**-2
 
     def is_noise(self, null: FittedSet, best: FittedSet) -> bool:
         """Return True if the base alone leaves less than noise, and the best set hardly less."""

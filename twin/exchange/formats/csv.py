@@ -18,7 +18,7 @@ import numpy as np
 from table_io.channels import CHANNEL_BY_NAME
 from table_io.errors import InputError
 from twin.exchange.formats import FORMATS, SampleTable, make_column
-from twin.exchange.formats.layout import MAX_HEAD_ROWS, TableLayout, find_layout
+from twin.exchange.formats.layout import MAX_HEAD_ROWS, TableLayout, find_layout, is_number
 from twin.recording.tabular import TIME_COLUMN, LogTable
 
 BLANKS = " "  # one or more of them, or tabs
@@ -156,7 +156,7 @@ def _separate_words(lines: Iterable[str]) -> Iterator[list[str]]:
     """Yield the cells of lines of a table separated by blanks; names may contain single ones."""
     for line in lines:
         cells = line.split()
-        if any(_is_number(cell.replace(",", ".", 1)) for cell in cells):
+        if any(is_number(cell.replace(",", ".", 1)) for cell in cells):
             yield cells
         else:
             spaced = re.split(r"\s{2,}|\t", line.strip())
@@ -212,22 +212,14 @@ def _parse_header(line: str, delimiter: str, path: Path) -> list[str]:
     return names
 
 
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
 def _parse_number(cell: str, location: str) -> float:
     """Parse a cell as a number; an empty cell is NaN."""
     text = cell.strip()
     if not text:
         return float("nan")
-    if _is_number(text):
+    if is_number(text):
         return float(text)
-    if _is_number(text.replace(",", ".", 1)):
+    if is_number(text.replace(",", ".", 1)):
         raise InputError(
             f"{text!r} has a decimal comma",
             where=location,

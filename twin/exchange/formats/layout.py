@@ -103,7 +103,7 @@ def _fit_names(row: Sequence[str], width: int) -> tuple[str, ...]:
             else:
                 joined.append(cell)
         cells = joined
-    if len(cells) != width or all(_is_number(cell) for cell in cells):
+    if len(cells) != width or all(is_number(cell) for cell in cells):
         return ()
     return tuple(cells)
 
@@ -116,11 +116,12 @@ def _strip_end(row: Sequence[str]) -> Sequence[str]:
 def _is_row_of_numbers(row: Sequence[str], commas: bool) -> bool:
     cells = [cell.strip() for cell in row]
     return any(cells) and all(
-        not cell or _is_number(cell.replace(",", ".") if commas else cell) for cell in cells
+        not cell or is_number(cell.replace(",", ".") if commas else cell) for cell in cells
     )
 
 
-def _is_number(cell: str) -> bool:
+def is_number(cell: str) -> bool:
+    """Return True if a cell of a table is a number, with a decimal point if any."""
     try:
         float(cell)
     except ValueError:
@@ -131,7 +132,7 @@ def _is_number(cell: str) -> bool:
 def _has_decimal_commas(rows: Sequence[Sequence[str]]) -> bool:
     """Return True if numbers have decimal commas, and none a decimal point."""
     cells = [cell.strip() for row in rows for cell in row]
-    if any("." in cell and _is_number(cell) for cell in cells):
+    if any("." in cell and is_number(cell) for cell in cells):
         return False
     return any(re.fullmatch(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?", cell) for cell in cells)
 
