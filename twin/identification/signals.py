@@ -13,6 +13,7 @@ import numpy as np
 from table_io.block import Block, Bool2D, Float1D, Int1D, Label, join_blocks
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.errors import InputError
+from twin.identification.hum import remove_hum
 from twin.identification.motion import ConsistencyResidual, MeasuredMotion, MotionNoise
 from twin.identification.noise import (
     compare_with_white,
@@ -23,7 +24,6 @@ from twin.identification.spectra import (
     FrequencyGrid,
     Spectrum,
     exclude_margins,
-    find_mains_notches,
 )
 from twin.model.model import SensorModel
 
@@ -360,14 +360,13 @@ def build_signals(
         usable[-margin:] = False
     size = -(-len(block) // grid.decimation)
     spectra = {key: grid.to_spectrum(values) for key, values in columns.items()}
-    low_pass = grid.low_pass * find_mains_notches(grid, spectra.values())
     frequency = grid.omega / (2 * np.pi * block.rate_hz)
     noise = {
         key: estimate_noise_density(values, at_rest, frequency) for key, values in columns.items()
     }
     return LogSignals(
-        name, mass_kg, gaps_m, grid, grid.omega, low_pass,
-        grid.to_spectrum(np.ones(len(block))), spectra, noise,
+        name, mass_kg, gaps_m, grid, grid.omega, grid.low_pass,
+        grid.to_spectrum(np.ones(len(block))), remove_hum(spectra, grid, at_rest), noise,
         _measure_rest(columns, at_rest, noise),
         (block.index + grid.decimation * np.arange(size)) / block.rate_hz,
         block.step[:: grid.decimation], block.label[:: grid.decimation],

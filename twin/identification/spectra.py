@@ -1,6 +1,5 @@
 """Spectra of whole records: low-pass filtering and decimation."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,10 +11,6 @@ from table_io.block import Bool2D, Float1D
 TARGET_RATE_HZ = 500.0  # 50 samples of a contact of 0.1 s; noise above the band is removed
 ROLL_OFF_START = 0.8  # of the new Nyquist frequency: start of the low-pass roll-off
 PAD_S = 2.0
-MAINS_HZ, MAINS_TOLERANCE = (50.0, 60.0), 0.002  # relative deviation of the mains frequency
-NOTCH_SURROUNDINGS_HZ = 3.0
-MIN_LINE_RATIO = 20.0  # power of a line over the mean around it; noise alone hardly reaches it
-MIN_NOTCH_HZ, NOTCH_LINES = 0.15, 10.0  # half width of a notch: least, and in lines of the record
 Spectrum = npt.NDArray[np.complex128]
 
 
@@ -90,26 +85,6 @@ class FrequencyGrid:
     def white_noise_rms(self, gain: Float1D) -> float:
         """Return the rms of white noise of rms 1 (original rate) after a gain, (frequency,)."""
         return float(np.sqrt(np.sum(gain**2) / (self.padded_size / 2 + 1)))
-
-
-def find_mains_notches(grid: FrequencyGrid, spectra: Iterable[Spectrum]) -> Float1D:
-    """Return a gain, (frequency,): 0 around mains hum that stands out in any spectrum, else 1.
-
-    All channels get the same notches, so that a balance of their forces stays one.
-    """
-    hz = grid.omega / (2 * np.pi)
-    notches, duration_s = np.ones(hz.size), grid.size / grid.rate_hz
-    half_width = max(MIN_NOTCH_HZ, NOTCH_LINES / duration_s)
-    powers = [np.abs(spectrum) ** 2 for spectrum in spectra]
-    for mains in MAINS_HZ:
-        for line in np.arange(mains, hz[-1] - NOTCH_SURROUNDINGS_HZ, mains):
-            inside = np.abs(hz - line) < MAINS_TOLERANCE * line + 0.5 * half_width
-            around = (np.abs(hz - line) < NOTCH_SURROUNDINGS_HZ) & ~inside
-            for power in powers:
-                peak = np.flatnonzero(inside)[int(np.argmax(power[inside]))]
-                if power[peak] > MIN_LINE_RATIO * power[around].mean():
-                    notches[np.abs(hz - hz[peak]) < half_width] = 0.0
-    return notches
 
 
 def bridge_gaps(values: Float1D) -> Float1D:
