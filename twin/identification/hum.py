@@ -5,24 +5,34 @@ apart is time: hum is there at rest and lasts for the whole record, a harmonic b
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
-from scipy.fft import fft, ifft, ifftshift, rfft, rfftfreq
+from scipy.fft import ifft, ifftshift, rfft, rfftfreq
 from scipy.ndimage import binary_dilation
 
-from table_io.block import Bool2D, Float1D
+from table_io.block import Bool2D, Float1D, Float2D
 from twin.identification.spectra import FrequencyGrid, Spectrum
 
 MAINS_HZ, MAINS_TOLERANCE = (50.0, 60.0), 0.002  # relative deviation of the mains frequency
-MIN_REST_S = 2.0  # from here on the rest alone shows whether there is hum
+MIN_REST_S = 0.5  # from here on the rest alone shows whether there is hum
 PART_COUNT = 4  # of a record without rest: hum is in every part
-SURROUNDINGS_HZ = 3.0
+SURROUNDINGS_HZ = 5.0
 MIN_LINE_RATIO = 20.0  # power of a line over the mean around it; noise alone hardly reaches it
 LINE_WIDTH_HZ = 0.15  # standard deviation of the Gaussian filter that follows a line over time
+SETTLING_S = 1.0 / (2.0 * math.pi * LINE_WIDTH_HZ)  # standard deviation of its response
 FILTER_WIDTHS = 4.0  # half width of that filter, in standard deviations
 MAX_EXCESS = 3.0  # times the amplitude at rest: above it there is a harmonic of the drive
 ZERO_PADDING = 8  # of a transform that measures the frequency of a line
+
+
+class _Line(NamedTuple):
+    """Line of hum in a record: frequency, and by channel its amplitude, and if it stands out."""
+
+    frequency_hz: float
+    amplitudes: Float1D
+    stands_out: Bool2D
 
 
 def remove_hum(
@@ -34,80 +44,104 @@ def remove_hum(
     samples before the motion, (sample,) at the original rate.
     """
     rate_hz = grid.rate_hz / grid.decimation
-    records = [grid.to_time_domain(spectrum) for spectrum in spectra.values()]
-    rest = at_rest[:: grid.decimation]
-    parts = [[values[rest] for values in records]]
-    if rest.sum() < MIN_REST_S * rate_hz:
-        parts = [
-            list(part)
-            for part in zip(
-                *(np.array_split(values, PART_COUNT) for values in records), strict=True
-            )
-        ]
+    records = np.array([grid.to_time_domain(spectrum) for spectrum in spectra.values()])
+    rest = records[:, at_rest[:: grid.decimation]]
+    has_rest = rest.shape[1] >= MIN_REST_S * rate_hz
     cleaned = dict(spectra)
-    for mains in MAINS_HZ:
-        for nominal in np.arange(mains, rate_hz / 2 - SURROUNDINGS_HZ, mains):
-            found = [_find_line(part, rate_hz, nominal) for part in parts]
-            if all(line_hz for line_hz, _ in found):
-                amplitudes = np.median([amplitude for _, amplitude in found], axis=0)
-                line_hz = float(np.median([line_hz for line_hz, _ in found]))
-                cleaned = _remove_line(cleaned, grid, line_hz, amplitudes)
+    for nominal in _list_lines(rate_hz):
+        parts = [
+            _measure_line(part, rate_hz, nominal)
+            for part in np.array_split(records, PART_COUNT, axis=1)
+        ]
+        amplitudes = np.median([line.amplitudes for line in parts], axis=0)
+        seen = lasting = np.logical_and.reduce([line.stands_out for line in parts])
+        line_hz = float(np.median([line.frequency_hz for line in parts]))
+        if has_rest:
+            resting = _measure_line(rest, rate_hz, nominal)
+            # one that is too weak to stand out at rest must not be weaker there than in motion
+            weak = lasting & (amplitudes <= MAX_EXCESS * resting.amplitudes)
+            seen = resting.stands_out | weak
+            amplitudes = np.where(resting.stands_out, resting.amplitudes, amplitudes)
+            line_hz = line_hz if (seen & lasting).any() else resting.frequency_hz
+        if seen.any():
+            limits = np.where(seen, MAX_EXCESS * amplitudes, np.inf)
+            cleaned = _remove_line(cleaned, grid, line_hz, limits)
     return cleaned
 
 
-def _find_line(records: Sequence[Float1D], rate_hz: float, nominal: float) -> tuple[float, Float1D]:
-    """Return the frequency of a line, 0 if none stands out, and its amplitudes, (channel,).
+def measure_hum(values: Float1D, rate_hz: float) -> float:
+    """Return the rms of mains hum in a record at rest, (sample,); 0 if none stands out."""
+    if values.size < MIN_REST_S * rate_hz:
+        return 0.0
+    lines = [_measure_line(values[None], rate_hz, nominal) for nominal in _list_lines(rate_hz)]
+    return math.sqrt(
+        0.5 * sum(float(line.amplitudes[0]) ** 2 for line in lines if line.stands_out[0])
+    )
 
-    The amplitude is infinite in a channel in which the line does not stand out.
-    """
-    size = records[0].size
+
+def _list_lines(rate_hz: float) -> list[float]:
+    """Return the frequencies of the mains and their harmonics below half a sampling rate."""
+    return [
+        float(line)
+        for mains in MAINS_HZ
+        for line in np.arange(mains, rate_hz / 2 - SURROUNDINGS_HZ, mains)
+    ]
+
+
+def _measure_line(records: Float2D, rate_hz: float, nominal: float) -> _Line:
+    """Return the highest line of records, (channel, sample), next to a nominal frequency."""
+    size = records.shape[1]
     window = np.hanning(size)
     hz = rfftfreq(ZERO_PADDING * size, 1.0 / rate_hz)
-    tolerance = MAINS_TOLERANCE * nominal + rate_hz / size
     near = np.abs(hz - nominal) < SURROUNDINGS_HZ + 2 * rate_hz / size
-    inside = np.abs(hz - nominal)[near] < tolerance
-    # the main lobe of the window about a line anywhere inside
-    around = np.abs(hz - nominal)[near] > tolerance + 2 * rate_hz / size
-    amplitudes, best_ratio, line_hz = np.full(len(records), np.inf), MIN_LINE_RATIO, 0.0
-    for channel, values in enumerate(records):
-        spectrum = rfft((values - values.mean()) * window, ZERO_PADDING * size)[near]
-        power = np.abs(spectrum) ** 2
-        peak = int(np.argmax(np.where(inside, power, 0.0)))
-        ratio = power[peak] / max(float(power[around].mean()), np.finfo(float).tiny)
-        if ratio > MIN_LINE_RATIO:
-            amplitudes[channel] = 2.0 * np.sqrt(power[peak]) / window.sum()
-        if ratio > best_ratio:
-            best_ratio, line_hz = ratio, float(hz[near][peak])
-    return line_hz, amplitudes
+    distance = np.abs(hz[near] - nominal)
+    tolerance = MAINS_TOLERANCE * nominal + rate_hz / size
+    around = distance > tolerance + 2 * rate_hz / size  # beyond the main lobe of the window
+    tared = records - records.mean(axis=1, keepdims=True)
+    power = np.abs(rfft(tared * window, ZERO_PADDING * size)[:, near]) ** 2
+    inside = np.where(distance < tolerance, power, 0.0)
+    level = np.maximum(power[:, around].mean(axis=1), np.finfo(float).tiny)
+    ratio = inside.max(axis=1) / level
+    return _Line(
+        float(hz[near][inside[ratio.argmax()].argmax()]),
+        2.0 * np.sqrt(inside.max(axis=1)) / window.sum(),
+        ratio > MIN_LINE_RATIO,
+    )
 
 
 def _remove_line(
-    spectra: Mapping[str, Spectrum], grid: FrequencyGrid, line_hz: float, amplitudes: Float1D
+    spectra: Mapping[str, Spectrum], grid: FrequencyGrid, line_hz: float, limits: Float1D
 ) -> dict[str, Spectrum]:
-    """Return the spectra less one line of hum, of known amplitudes, (channel,), at rest.
+    """Return the spectra less one line of hum.
 
-    The line is followed over time; where a channel is far louder than at rest, or the record ends,
-    hum is interpolated from before and after.
+    The line is followed over time. Where its amplitude exceeds the limit of a channel, (channel,),
+    or the record ends, hum is interpolated from before and after.
     """
     line_spacing = grid.rate_hz / grid.padded_size
     centre, reach = round(line_hz / line_spacing), int(FILTER_WIDTHS * LINE_WIDTH_HZ / line_spacing)
     # from the line upwards, then from below up to it: the order of a transform of the envelope
     offset = ifftshift(np.arange(-reach, reach + 1))
     gain = np.exp(-0.5 * (offset * line_spacing / LINE_WIDTH_HZ) ** 2)
-    lines, count = centre + offset, offset.size
-    envelope = ifft([spectrum[lines] * gain for spectrum in spectra.values()], axis=1)
-    amplitude = 2.0 * np.abs(envelope) * count / grid.padded_size
-    step_s = 1.0 / (count * line_spacing)
-    time_s = np.arange(count) * step_s
-    settling_s = 1.0 / (2 * np.pi * LINE_WIDTH_HZ)
-    is_loud = (amplitude > MAX_EXCESS * amplitudes[:, None]).any(axis=0)
-    spread = math.ceil(FILTER_WIDTHS * settling_s / step_s)
+    scale = 2.0 * offset.size / grid.padded_size
+    envelopes = scale * ifft([x[centre + offset] * gain for x in spectra.values()], axis=1)
+    step_s = 1.0 / (offset.size * line_spacing)
+    time_s = np.arange(offset.size) * step_s
+    is_loud = (np.abs(envelopes) > limits[:, None]).any(axis=0)
+    spread = math.ceil(FILTER_WIDTHS * SETTLING_S / step_s)
     known = ~binary_dilation(is_loud, iterations=spread) if is_loud.any() else ~is_loud
-    known &= (time_s > settling_s) & (time_s < grid.size / grid.rate_hz - settling_s)
-    cleaned = dict(spectra)
-    if known.any():
-        for name, values in zip(spectra, envelope, strict=True):
-            cleaned[name] = spectra[name].copy()
-            hum = np.interp(time_s, time_s[known], values[known], period=count * step_s)
-            cleaned[name][lines] -= fft(hum)
+    end_s = 2.0 * SETTLING_S
+    known &= (time_s > end_s) & (time_s < grid.size / grid.rate_hz - end_s)
+    if known.sum() < 2:
+        return dict(spectra)
+    # the envelope turns slowly: its frequency is between two lines of the spectrum
+    pairs = known[1:] & known[:-1]
+    turn = np.sum((envelopes[:, 1:] * envelopes[:, :-1].conj())[:, pairs])
+    exact_hz = centre * line_spacing + float(np.angle(turn)) / (2 * np.pi * step_s)
+    turning = np.exp(-2j * np.pi * (exact_hz - centre * line_spacing) * time_s)
+    sample_s = np.arange(-(-grid.size // grid.decimation)) * grid.decimation / grid.rate_hz
+    carrier = np.exp(2j * np.pi * exact_hz * sample_s)
+    cleaned = {}
+    for (name, spectrum), envelope in zip(spectra.items(), envelopes * turning, strict=True):
+        hum = np.interp(sample_s, time_s[known], envelope[known]) * carrier
+        cleaned[name] = spectrum - grid.from_time_domain(hum.real)
     return cleaned

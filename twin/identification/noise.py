@@ -8,6 +8,7 @@ import numpy as np
 from scipy.signal import spectrogram, welch
 
 from table_io.block import Bool2D, Float1D
+from twin.identification.hum import measure_hum
 
 MIN_REST_SAMPLES = 100
 SEGMENT_SAMPLES = 256  # of a spectrum; 50 % overlap
@@ -23,6 +24,7 @@ MIN_NOISE_SHARE = 1e-4  # of a channel's rms: lower limit of the noise
 # An anti-alias filter lowers the power by this factor within an octave, above this frequency; the
 # resolution of a converter may stop the fall.
 MIN_FILTER_FALL, MIN_FILTER_CYCLES = 4.0, 0.08  # -, cycles per sample
+FILTER_CORNERS = 100  # tried between that frequency and the highest
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +37,23 @@ class NoiseBands:
     frequency: Float1D
     power: Float1D
     sigma: Float1D
+
+
+@dataclass(frozen=True, slots=True)
+class RestNoise:
+    """Noise of a channel at rest, SI and Hz.
+
+    White noise of this rms, mains hum, the frequency below which 1/f noise exceeds white noise (0
+    without), the smallest step of the readings (0 if noise exceeds it), and the frequencies where
+    an anti-alias filter begins to act, and where it halves the power (inf without a filter).
+    """
+
+    rms: float
+    hum_rms: float
+    corner_hz: float
+    resolution: float
+    roll_off_hz: float
+    filter_hz: float
 
 
 def estimate_noise_density(values: Float1D, rest: Bool2D, frequency: Float1D) -> Float1D:
@@ -67,15 +86,24 @@ def estimate_noise_density(values: Float1D, rest: Bool2D, frequency: Float1D) ->
     return np.maximum(density, max(least, 1e-300))
 
 
-def find_filter_corner(values: Float1D, rest: Bool2D) -> float:
-    """Return the frequency in cycles per sample where an anti-alias filter begins to roll off.
-
-    The record at rest shows it; inf without a filter, or with a short rest.
-    """
+def measure_rest_noise(values: Float1D, rest: Bool2D, rate_hz: float) -> RestNoise | None:
+    """Return the noise of a channel at rest; None if the rest is too short."""
     quiet = values[rest & np.isfinite(values)]
-    if quiet.size < MIN_REST_SAMPLES:
-        return math.inf
-    return _find_roll_off(_estimate_rest_bands(quiet))
+    if quiet.size < MIN_REST_SAMPLES or not np.ptp(quiet) > 0:
+        return None
+    bands = _estimate_rest_bands(quiet)
+    roll_off = _find_roll_off(bands)
+    passed = _count_passed_bands(bands, roll_off)
+    fast = np.flatnonzero(bands.frequency[:passed] > MIN_WHITE_CYCLES)
+    if not fast.size:
+        fast = np.array([passed - 1])
+    white = float(np.average(bands.power[fast], weights=bands.sigma[fast] ** -2.0))
+    corner = _compare_with_rest(bands, white, bands.frequency[passed - 1])[1]
+    half_power = _fit_half_power(bands, white) if math.isfinite(roll_off) else math.inf
+    return RestNoise(
+        math.sqrt(white), measure_hum(quiet, rate_hz), corner * rate_hz, _find_resolution(values),
+        roll_off * rate_hz, half_power * rate_hz,
+    )  # fmt: skip
 
 
 def compare_with_white(values: Float1D, gain: Float1D) -> Float1D:
@@ -151,6 +179,22 @@ def _find_roll_off(at_rest: NoiseBands) -> float:
     falls = power[:-octave] > MIN_FILTER_FALL * power[octave:]
     rolling_off = np.flatnonzero(falls & (at_rest.frequency[:-octave] > MIN_FILTER_CYCLES))
     return float(at_rest.frequency[rolling_off[0]]) if rolling_off.size else math.inf
+
+
+def _fit_half_power(at_rest: NoiseBands, white: float) -> float:
+    """Return the half-power frequency of a filter of fourth order on noise of a white level.
+
+    Far below the white level the resolution of the converter shows, not the filter.
+    """
+    fast = at_rest.frequency > MIN_WHITE_CYCLES
+    corners = np.geomspace(MIN_FILTER_CYCLES, 0.5, FILTER_CORNERS)[:, None]
+    expected = 1.0 / (1.0 + (at_rest.frequency[fast] / corners) ** 8)
+    floor = 1.0 / MIN_FILTER_FALL**2
+    difference = np.log(
+        np.maximum(expected, floor) / np.maximum(at_rest.power[fast] / white, floor)
+    )
+    misfit = ((difference / at_rest.sigma[fast]) ** 2).sum(axis=1)
+    return float(corners[int(misfit.argmin()), 0])
 
 
 def _count_passed_bands(bands: NoiseBands, roll_off: float) -> int:

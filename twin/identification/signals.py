@@ -5,7 +5,7 @@ Gain, lag and offset of a sensor are simple operations on its spectrum, so a fit
 
 import math
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,10 @@ from table_io.errors import InputError
 from twin.identification.hum import remove_hum
 from twin.identification.motion import ConsistencyResidual, MeasuredMotion, MotionNoise
 from twin.identification.noise import (
+    RestNoise,
     compare_with_white,
     estimate_noise_density,
-    find_filter_corner,
+    measure_rest_noise,
 )
 from twin.identification.spectra import (
     FrequencyGrid,
@@ -69,12 +70,17 @@ class LogSignals:
     label: Int1D
     cycle: Int1D
     good: Bool2D
-    filter_hz: float = math.inf  # corner of the slowest anti-alias filter
+    rest_noise: Mapping[str, RestNoise] = field(default_factory=dict)  # where there is a rest
     surface_noise_m: float = 0.0  # rms error of each laser in motion, besides its noise
 
     @property
     def channels(self) -> tuple[str, ...]:
         return tuple(self.spectra)
+
+    @property
+    def filter_hz(self) -> float:
+        """Frequency where the slowest anti-alias filter begins to act; inf without one."""
+        return min((noise.roll_off_hz for noise in self.rest_noise.values()), default=math.inf)
 
     @property
     def zero_channels(self) -> dict[str, tuple[tuple[str, float], ...]]:
@@ -364,6 +370,10 @@ def build_signals(
     noise = {
         key: estimate_noise_density(values, at_rest, frequency) for key, values in columns.items()
     }
+    measured = {
+        key: measure_rest_noise(values, at_rest, block.rate_hz) for key, values in columns.items()
+    }
+    rest_noise = {key: value for key, value in measured.items() if value is not None}
     return LogSignals(
         name, mass_kg, gaps_m, grid, grid.omega, grid.low_pass,
         grid.to_spectrum(np.ones(len(block))), remove_hum(spectra, grid, at_rest), noise,
@@ -372,7 +382,7 @@ def build_signals(
         block.step[:: grid.decimation], block.label[:: grid.decimation],
         block.cycle[:: grid.decimation],
         usable[:: grid.decimation],
-        min(find_filter_corner(values, at_rest) for values in columns.values()) * block.rate_hz,
+        rest_noise,
     )  # fmt: skip
 
 

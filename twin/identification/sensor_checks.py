@@ -1,0 +1,232 @@
+"""Checks of the instruments, apart from any force law: healthy, or to be mended.
+
+Noise is judged on the record at rest. A laser and an accelerometer on one body are compared with
+each other, as are the two load cells of a side with their sum. What errors explain the recordings
+together with the model is added from the fit: lags of all channels, and gaps read wrongly.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from table_io.block import Float1D, Label
+from table_io.channels import CHANNEL_BY_NAME
+from twin.identification.discover import MAX_EXPLAINED_COST
+from twin.identification.least_squares import FitResult
+from twin.identification.parameters import GapKey, NuisanceKey
+from twin.identification.residuals import LogResiduals
+from twin.identification.signals import CELL_PAIRS, SENSOR_PAIRS, LogSignals
+from twin.identification.spectra import Spectrum
+
+INTERVAL_SIGMA = 1.96  # standard deviations either side: 95 %
+STRONG_RATIO = 25.0  # power of a spectral line over its noise: weaker ones are not compared
+# Limits of healthy instruments; see `table_io.sim.imperfections` for sizes in laboratories.
+MAX_HUM_RATIO = 3.0  # rms over that of the noise
+MAX_CORNER_HZ = 40.0  # below it 1/f noise exceeds white noise; 1 Hz is usual
+MAX_RESOLUTION_SHARE = 0.01  # of the rms of the channel in motion
+MIN_FILTER_HZ = 140.0  # an impact on a stiff bumper has harmonics up to there
+MAX_GAIN_ERROR = 0.01  # two calibrations of class 0.5 %
+MAX_LAG_S = 3e-4  # multiplexed converters and unequal filters stay below it
+MAX_LOW_CUT_HZ = 0.3  # 5 % at 0.9 Hz
+MAX_REMAINDER_SHARE, MIN_REMAINDER_RATIO = 0.02, 3.0  # of the motion; over the noise
+MAX_SHARE_ERROR = 0.05  # of the force, off an equal division between the cells of a side
+MAX_PLATE_SHARE = 0.01  # of the mass of the specimen, in front of the cells of a side
+MAX_GAP_ERROR_M = 1.5e-4  # a feeler gauge reads to 0.05 mm
+
+
+@dataclass(frozen=True, slots=True)
+class SensorCheck:
+    """One checked quantity of a log: value with its 95 % interval, and the limit of its size.
+
+    kind         value
+    noise        rms at rest, in the unit of the channel; no limit
+    hum          rms of mains hum at rest over that noise
+    one_over_f   frequency below which 1/f noise exceeds white noise, Hz
+    resolution   smallest step of the readings over the rms in motion
+    filter       half-power frequency of an anti-alias filter, Hz; the limit is the least
+    gain, lag, low_cut, remainder   accelerometer against laser: gain less 1, lag in s, corner in
+                 Hz, and what none of them explains, over the motion
+    share        force of the first cell of a side over that of both, less 1/2
+    plate        mass in front of the cells of a side over that of the specimen
+    gap          true gap of a side less the stated one, m
+    """
+
+    log: str
+    kind: str
+    channels: tuple[str, ...]
+    value: float
+    low: float
+    high: float
+    limit: float | None
+    unit: str = ""
+
+    @property
+    def is_healthy(self) -> bool:
+        """Return False if the whole interval is beyond the limit."""
+        if self.limit is None:
+            return True
+        if self.kind == "filter":
+            return self.high >= self.limit
+        return min(abs(self.low), abs(self.high)) <= self.limit or self.low < 0 < self.high
+
+
+def check_sensors(log_residuals: Sequence[LogResiduals], fit: FitResult) -> tuple[SensorCheck, ...]:
+    """Return all checks of the instruments of logs, with the parameters of a fit to them."""
+    checks: list[SensorCheck] = []
+    for residuals in log_residuals:
+        signals = residuals.signals if residuals.nuisances is None else residuals.nuisances.raw
+        checks += _check_noise(signals)
+        checks += _check_pairs(signals)
+        checks += _check_cells(signals)
+        if fit.cost * residuals.weight**2 <= MAX_EXPLAINED_COST:
+            checks += _check_fitted(residuals, fit)
+    return tuple(checks)
+
+
+def _check_noise(signals: LogSignals) -> Iterator[SensorCheck]:
+    for channel, noise in signals.rest_noise.items():
+        rms, motion = noise.rms, signals.channel_rms(channel)
+
+        # noise makes up for a coarse step
+        step = noise.resolution if noise.resolution > 2.0 * rms else 0.0
+        rows: list[tuple[str, float, float | None, str]] = [
+            ("noise", rms, None, CHANNEL_BY_NAME[channel].unit),
+            ("hum", noise.hum_rms / rms, MAX_HUM_RATIO, ""),
+            ("one_over_f", noise.corner_hz, MAX_CORNER_HZ, "Hz"),
+            ("resolution", step / motion if motion else 0.0, MAX_RESOLUTION_SHARE, ""),
+            ("filter", noise.filter_hz, MIN_FILTER_HZ, "Hz"),
+        ]
+        for kind, value, limit, unit in rows:
+            if math.isfinite(value):
+                yield SensorCheck(signals.name, kind, (channel,), value, value, value, limit, unit)
+
+
+def _check_pairs(signals: LogSignals) -> Iterator[SensorCheck]:
+    for channels in SENSOR_PAIRS.values():
+        if {*channels} <= {*signals.channels}:
+            position, acc = channels[0], channels[1]
+            spectrum, variance = signals.spectra[acc], signals.noise[acc] ** 2
+            if len(channels) > 2:  # relative displacement: the table's acceleration is taken off
+                spectrum = spectrum - signals.spectra[channels[2]]
+                variance = variance + signals.noise[channels[2]] ** 2
+            variance = variance + (signals.omega**2 * signals.noise[position]) ** 2
+            yield from _compare_pair(
+                signals, channels, signals.spectra[position], spectrum, variance
+            )
+
+
+def _compare_pair(
+    signals: LogSignals, channels: tuple[str, ...], position: Spectrum, acc: Spectrum,
+    variance: Float1D,
+) -> Iterator[SensorCheck]:  # fmt: skip
+    """Yield gain, lag and low cut of an accelerometer against a displacement, by least squares.
+
+    The spectra and the variance of the noise density of their balance are (frequency,).
+    """
+    sigma = np.sqrt(variance * signals.grid.size)
+    strong = (np.abs(acc) ** 2 > STRONG_RATIO * sigma**2) & (signals.omega > 0)
+    strong &= signals.low_pass > 0.5
+    if strong.sum() < 10:
+        return
+    omega = signals.omega[strong]
+    expected, measured = (
+        values[strong] / sigma[strong] for values in (-(signals.omega**2) * position, acc)
+    )
+
+    def residual(errors: Float1D) -> Float1D:
+        gain, lag, low_cut = errors[0], 1e-3 * errors[1], errors[2]
+        modelled = gain * expected * np.exp(-1j * omega * lag) / (1.0 - 1j * low_cut / omega)
+        difference = measured - modelled
+        return np.concatenate([difference.real, difference.imag])
+
+    fit = least_squares(residual, (1.0, 0.0, 0.01), bounds=([-2, -20, 0], [5, 20, 20]))
+    chi_square = max(float(fit.fun @ fit.fun) / (2 * omega.size - 3), 1.0)
+    sd = np.sqrt(np.diag(np.linalg.pinv(fit.jac.T @ fit.jac)) * chi_square)
+    gain, lag, low_cut = fit.x
+    rows = (
+        ("gain", gain - 1.0, sd[0], MAX_GAIN_ERROR, ""),
+        ("lag", 1e-3 * lag, 1e-3 * sd[1], MAX_LAG_S, "s"),
+        ("low_cut", low_cut / (2 * np.pi), sd[2] / (2 * np.pi), MAX_LOW_CUT_HZ, "Hz"),
+    )
+    for kind, value, deviation, limit, unit in rows:
+        yield _check_estimate(signals, kind, channels, value, deviation, limit, unit)
+    ratio = math.sqrt(chi_square)
+    share = float(np.linalg.norm(fit.fun) / np.linalg.norm(measured))
+    yield SensorCheck(
+        signals.name, "remainder", channels, share, share, share,
+        MAX_REMAINDER_SHARE if ratio > MIN_REMAINDER_RATIO else None,
+    )  # fmt: skip
+
+
+def _check_cells(signals: LogSignals) -> Iterator[SensorCheck]:
+    moving = signals.good & (signals.label != Label.REST)
+    for side, cells in CELL_PAIRS.items():
+        if not {*cells} <= {*signals.channels} or not moving.any():
+            continue
+        first, second = (
+            signals.grid.to_time_domain(signals.spectra[cell])[moving] for cell in cells
+        )
+        force = first + second
+        noise = math.hypot(*(signals.grid.white_noise_rms(signals.noise[cell]) for cell in cells))
+        loaded = np.abs(force) > STRONG_RATIO * noise
+        if loaded.sum() > 100:
+            share, sd = _fit_ratio(first[loaded] - second[loaded], force[loaded])
+            yield _check_estimate(signals, "share", cells, 0.5 * share, 0.5 * sd, MAX_SHARE_ERROR)
+        if "table_acc_m_s2" not in signals.channels:
+            continue
+        table = signals.grid.to_time_domain(signals.spectra["table_acc_m_s2"])[moving]
+        idle = np.abs(force) < max(0.2 * STRONG_RATIO * noise, 0.02 * float(np.abs(force).max()))
+        if idle.sum() > 100:
+            sign = -1.0 if side == "right cells" else 1.0
+            mass, sd = _fit_ratio(sign * force[idle], table[idle])
+            yield _check_estimate(
+                signals, "plate", cells, mass / signals.mass_kg, sd / signals.mass_kg,
+                MAX_PLATE_SHARE,
+            )  # fmt: skip
+
+
+def _fit_ratio(values: Float1D, reference: Float1D) -> tuple[float, float]:
+    """Return the ratio of two signals by least squares, and its standard deviation by blocks."""
+    parts = [
+        (float(v @ r), float(r @ r))
+        for v, r in zip(np.array_split(values, 10), np.array_split(reference, 10), strict=True)
+    ]
+    products, powers = np.array(parts).T
+    ratio = products.sum() / powers.sum()
+    left_out = (products.sum() - products) / np.maximum(powers.sum() - powers, 1e-300)
+    return float(ratio), float(np.sqrt(0.9 * np.sum((left_out - ratio) ** 2)))
+
+
+def _check_fitted(residuals: LogResiduals, fit: FitResult) -> Iterator[SensorCheck]:
+    """Yield the lags and the gaps of the fit."""
+    signals, terms, number = residuals.signals, residuals.nuisances, residuals.log_number
+    unequal = unequal_sd = 0.0
+    known = zip(terms.nuisances, terms.centre, strict=True) if terms else ()
+    for nuisance, centre in known:
+        key = NuisanceKey(number, nuisance.kind, nuisance.place)
+        value = nuisance.size * (centre + fit.values.get(key, 0.0))
+        sd = nuisance.size * fit.std_errors.get(key, 0.0)
+        if nuisance.kind == "gap":
+            unequal, unequal_sd = value, sd
+        elif nuisance.kind == "lag":
+            yield _check_estimate(signals, "lag", (nuisance.place,), value, sd, MAX_LAG_S, "s")
+    common, sd = fit.values.get(GapKey(number), 0.0), fit.std_errors.get(GapKey(number), 0.0)
+    for side, sign, gap in zip(("right", "left"), (1.0, -1.0), signals.gaps_m, strict=True):
+        if math.isfinite(gap) and (sd or unequal_sd):
+            yield _check_estimate(
+                signals, "gap", (side,), common + sign * unequal, math.hypot(sd, unequal_sd),
+                MAX_GAP_ERROR_M, "m",
+            )  # fmt: skip
+
+
+def _check_estimate(
+    signals: LogSignals, kind: str, channels: tuple[str, ...], value: float, sd: float,
+    limit: float, unit: str = "",
+) -> SensorCheck:  # fmt: skip
+    half = INTERVAL_SIGMA * float(sd)
+    return SensorCheck(
+        signals.name, kind, channels, float(value), value - half, value + half, limit, unit
+    )
