@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from table_io.block import Float1D
+from table_io.block import Bool2D, Float1D
 from twin.identification.hum import remove_hum
 from twin.identification.spectra import FrequencyGrid
 
 RATE_HZ, DURATION_S, REST_S = 1000.0, 60.0, 4.0
-TIME_S = np.arange(int(RATE_HZ * DURATION_S)) / RATE_HZ
+TIME_S: Float1D = np.arange(int(RATE_HZ * DURATION_S)) / RATE_HZ
 MOVING = TIME_S >= REST_S
 IN_STEP = (TIME_S >= 30.0) & (TIME_S < 38.0)
 INSIDE = (TIME_S > 2.0) & (TIME_S < DURATION_S - 2.0)
@@ -16,9 +16,14 @@ INSIDE = (TIME_S > 2.0) & (TIME_S < DURATION_S - 2.0)
 
 def make_hum(frequency_hz: float, rms: float) -> Float1D:
     """Return hum whose frequency wanders by 5 mHz, as that of a public grid does."""
-    phase = 2 * np.pi * (frequency_hz * TIME_S + 0.05 * np.sin(2 * np.pi * TIME_S / 60.0))
-    hum: Float1D = np.sqrt(2) * rms * np.sin(phase + 0.7)
+    turns = frequency_hz * TIME_S + 0.05 * np.sin(2 * np.pi * TIME_S / 60.0)
+    hum: Float1D = rms * np.sqrt(2.0) * np.sin(2 * np.pi * turns + 0.7)
     return hum
+
+
+def make_harmonic() -> Float1D:
+    """Return the fifteenth harmonic of a step at 4 Hz."""
+    return np.where(IN_STEP, 5.0 * np.sin(2 * np.pi * 60.0 * TIME_S), 0.0)
 
 
 def clean(*records: Float1D, has_rest: bool = True) -> list[Float1D]:
@@ -29,7 +34,7 @@ def clean(*records: Float1D, has_rest: bool = True) -> list[Float1D]:
     return [grid.to_time_domain(spectrum) for spectrum in cleaned.values()]
 
 
-def rms_of(values: Float1D, where: np.ndarray) -> float:
+def rms_of(values: Float1D, where: Bool2D) -> float:
     """Return the rms of values at half the rate where a mask at the full rate is True."""
     return float(np.sqrt(np.mean(values[where[::2]] ** 2)))
 
@@ -38,8 +43,10 @@ def rms_of(values: Float1D, where: np.ndarray) -> float:
 def motion() -> Float1D:
     """Response to a drive at 3.1 Hz with harmonics, and noise of rms 0.1."""
     noise = 0.1 * np.random.default_rng(5).standard_normal(TIME_S.size)
-    harmonics = sum(np.sin(2 * np.pi * 3.1 * n * TIME_S) * 10.0 / n**2 for n in range(1, 60))
-    return noise + MOVING * harmonics
+    order = np.arange(1, 60)
+    harmonics = np.sin(2 * np.pi * 3.1 * np.outer(TIME_S, order)) @ (10.0 / order**2)
+    motion: Float1D = noise + MOVING * harmonics
+    return motion
 
 
 @pytest.mark.parametrize("has_rest", [True, False])
@@ -55,7 +62,7 @@ def test_hum_is_removed_from_every_channel_that_has_it(
 
 
 def test_a_harmonic_of_the_drive_at_the_mains_frequency_stays(motion: Float1D) -> None:
-    harmonic = IN_STEP * 5.0 * np.sin(2 * np.pi * 60.0 * TIME_S)
+    harmonic = make_harmonic()
     expected = clean(motion)[0] + clean(harmonic)[0]
     assert rms_of(clean(motion + harmonic)[0] - expected, INSIDE) < 1e-6
 
@@ -63,7 +70,7 @@ def test_a_harmonic_of_the_drive_at_the_mains_frequency_stays(motion: Float1D) -
 def test_hum_is_interpolated_over_a_step_with_a_harmonic_at_its_frequency(
     motion: Float1D,
 ) -> None:
-    harmonic, hum = IN_STEP * 5.0 * np.sin(2 * np.pi * 60.0 * TIME_S), make_hum(60.0, 0.3)
+    harmonic, hum = make_harmonic(), make_hum(60.0, 0.3)
     expected = clean(motion)[0] + clean(harmonic)[0]
     departure = clean(motion + harmonic + hum)[0] - expected
     assert rms_of(departure, INSIDE) < 0.3 * rms_of(hum[::2], INSIDE)

@@ -5,7 +5,11 @@ import pytest
 from scipy.signal import butter, lfilter
 
 from table_io.block import Bool2D, Float1D
-from twin.identification.noise import compare_with_white, estimate_noise_density
+from twin.identification.noise import (
+    compare_with_white,
+    estimate_noise_density,
+    measure_rest_noise,
+)
 
 SAMPLES, REST_SAMPLES = 60_000, 2_000
 WHITE_RMS = 0.02
@@ -67,3 +71,25 @@ def test_only_a_louder_series_differs_from_white_noise() -> None:
     ratio = compare_with_white(white + _pink(corner=0.01) / WHITE_RMS, np.ones(1000))
     assert ratio[2] == pytest.approx(1.0 + 0.01 / 0.001, rel=0.5)  # at 0.001 cycles per sample
     assert ratio[500] == pytest.approx(1.0, abs=0.25)
+
+
+@pytest.mark.parametrize("corner_hz", [0.0, 60.0])
+def test_the_rest_shows_level_hum_and_slow_noise(corner_hz: float) -> None:
+    hum = 6.0 * WHITE_RMS * np.sqrt(2.0) * np.sin(2 * np.pi * 0.05003 * np.arange(SAMPLES))
+    noise = measure_rest_noise(
+        _motion() + _white() + _pink(corner_hz / 1e3) + hum, _rest(), rate_hz=1e3
+    )
+    assert noise is not None
+    assert noise.rms == pytest.approx(WHITE_RMS, rel=0.4)  # slow noise is loud up to the corner
+    assert noise.hum_rms == pytest.approx(6.0 * WHITE_RMS, rel=0.1)
+    assert corner_hz / 4.0 <= noise.corner_hz <= 2.0 * corner_hz  # few lines tell, within 2 s
+    assert np.isinf(noise.filter_hz)
+
+
+@pytest.mark.parametrize("corner", [0.09, 0.2])
+def test_the_rest_shows_an_anti_alias_filter(corner: float) -> None:
+    b, a = butter(4, 2.0 * corner)
+    noise = measure_rest_noise(lfilter(b, a, _motion() + _white()), _rest(), rate_hz=1e3)
+    assert noise is not None
+    assert noise.filter_hz == pytest.approx(1e3 * corner, rel=0.1)
+    assert noise.corner_hz == 0.0

@@ -24,6 +24,7 @@ from twin.model.effects import find_effect
 from twin.reports.contracts import Verdict
 from twin.reports.discovery.loading import load_logs
 from twin.reports.discovery.page import write_discovery_page
+from twin.reports.discovery.sensor_section import describe_sensors
 from twin.reports.discovery.serialize import Json, model_to_toml, verdict_to_json
 from twin.reports.finalize import EXIT_INTERRUPTED
 from twin.reports.summary import dump_contract
@@ -171,6 +172,8 @@ def print_verdict(verdict: Json) -> None:
             print_line(
                 f"  {effect['id']} {name} = {value['value']:.5g} +- {half:.2g} {value['unit']}"
             )
+    for line in describe_sensors(verdict["sensors"]):
+        print_line(f"  {line}")
     for log in verdict["held_out_logs"]:
         print_line(
             f"  {log['log']}, held out entirely: NRMSE of the damper force "

@@ -69,14 +69,16 @@ def remove_hum(
     return cleaned
 
 
-def measure_hum(values: Float1D, rate_hz: float) -> float:
-    """Return the rms of mains hum in a record at rest, (sample,); 0 if none stands out."""
+def separate_hum(values: Float1D, rate_hz: float) -> tuple[Float1D, float]:
+    """Return a record at rest, (sample,), without the hum that stands out, and the rms of it."""
     if values.size < MIN_REST_S * rate_hz:
-        return 0.0
+        return values, 0.0
     lines = [_measure_line(values[None], rate_hz, nominal) for nominal in _list_lines(rate_hz)]
-    return math.sqrt(
-        0.5 * sum(float(line.amplitudes[0]) ** 2 for line in lines if line.stands_out[0])
-    )
+    seen = np.array([line.frequency_hz for line in lines if line.stands_out[0]])
+    phase = 2.0 * np.pi * np.outer(np.arange(values.size) / rate_hz, seen)
+    waves = np.hstack([np.cos(phase), np.sin(phase)])
+    hum: Float1D = waves @ np.linalg.lstsq(waves, values - values.mean())[0]
+    return values - hum, float(np.sqrt(np.mean(hum**2)))
 
 
 def _list_lines(rate_hz: float) -> list[float]:

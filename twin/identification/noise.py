@@ -1,14 +1,14 @@
 """Noise density of a channel, from the record at rest and from the spectrum in motion."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from itertools import pairwise
 
 import numpy as np
 from scipy.signal import spectrogram, welch
 
 from table_io.block import Bool2D, Float1D
-from twin.identification.hum import measure_hum
+from twin.identification.hum import separate_hum
 
 MIN_REST_SAMPLES = 100
 SEGMENT_SAMPLES = 256  # of a spectrum; 50 % overlap
@@ -24,6 +24,8 @@ MIN_NOISE_SHARE = 1e-4  # of a channel's rms: lower limit of the noise
 # An anti-alias filter lowers the power by this factor within an octave, above this frequency; the
 # resolution of a converter may stop the fall.
 MIN_FILTER_FALL, MIN_FILTER_CYCLES = 4.0, 0.08  # -, cycles per sample
+MIN_WHITE_SHARE = 0.1  # of the noise at rest that seems white
+WHITE_FITS = 3  # of white and 1/f noise, each weighted by the one before
 FILTER_CORNERS = 100  # tried between that frequency and the highest
 
 
@@ -89,21 +91,23 @@ def estimate_noise_density(values: Float1D, rest: Bool2D, frequency: Float1D) ->
 def measure_rest_noise(values: Float1D, rest: Bool2D, rate_hz: float) -> RestNoise | None:
     """Return the noise of a channel at rest; None if the rest is too short."""
     quiet = values[rest & np.isfinite(values)]
-    if quiet.size < MIN_REST_SAMPLES or not np.ptp(quiet) > 0:
+    if quiet.size < MIN_REST_SAMPLES:
         return None
+    resolution = _find_resolution(values)
+    if not np.ptp(quiet) > resolution:
+        return RestNoise(resolution / math.sqrt(12.0), 0.0, 0.0, resolution, math.inf, math.inf)
+    quiet, hum_rms = separate_hum(quiet, rate_hz)
     bands = _estimate_rest_bands(quiet)
     roll_off = _find_roll_off(bands)
-    passed = _count_passed_bands(bands, roll_off)
-    fast = np.flatnonzero(bands.frequency[:passed] > MIN_WHITE_CYCLES)
-    if not fast.size:
-        fast = np.array([passed - 1])
-    white = float(np.average(bands.power[fast], weights=bands.sigma[fast] ** -2.0))
-    corner = _compare_with_rest(bands, white, bands.frequency[passed - 1])[1]
+    # the resolution of a converter may hide the roll-off of a filter, which then looks like 1/f
+    unfiltered = int(np.searchsorted(bands.frequency, MIN_FILTER_CYCLES))
+    passed = min(_count_passed_bands(bands, roll_off), unfiltered)
+    white, corner = _fit_white_and_slow(bands, max(passed, 3))
     half_power = _fit_half_power(bands, white) if math.isfinite(roll_off) else math.inf
+    rms = max(math.sqrt(white), resolution / math.sqrt(12.0))
     return RestNoise(
-        math.sqrt(white), measure_hum(quiet, rate_hz), corner * rate_hz, _find_resolution(values),
-        roll_off * rate_hz, half_power * rate_hz,
-    )  # fmt: skip
+        rms, hum_rms, corner * rate_hz, resolution, roll_off * rate_hz, half_power * rate_hz
+    )
 
 
 def compare_with_white(values: Float1D, gain: Float1D) -> Float1D:
@@ -179,6 +183,29 @@ def _find_roll_off(at_rest: NoiseBands) -> float:
     falls = power[:-octave] > MIN_FILTER_FALL * power[octave:]
     rolling_off = np.flatnonzero(falls & (at_rest.frequency[:-octave] > MIN_FILTER_CYCLES))
     return float(at_rest.frequency[rolling_off[0]]) if rolling_off.size else math.inf
+
+
+def _fit_white_and_slow(at_rest: NoiseBands, passed: int) -> tuple[float, float]:
+    """Return level and corner, cycles per sample, of the power level x (1 + corner / f).
+
+    `passed` bands are below the roll-off of a filter. Without a significant corner it is 0.
+    """
+    frequency, power, sigma = (values[:passed] for values in astuple(at_rest))
+    weight = sigma**-2.0 * (frequency > MIN_WHITE_CYCLES)
+    level = float(np.average(power, weights=weight if weight.any() else None))
+    columns = np.stack([np.ones_like(frequency), 1.0 / frequency])
+    expected = np.full_like(power, level)
+    for _ in range(WHITE_FITS):
+        scaled = columns / (sigma * expected)
+        normal = np.linalg.pinv(scaled @ scaled.T)
+        white, slow = normal @ (scaled @ (power / (sigma * expected)))
+        expected = np.maximum(np.array([white, slow]) @ columns, MIN_WHITE_SHARE * level)
+    white = max(white, MIN_WHITE_SHARE * level)
+    information = float((columns[1] ** 2 / sigma**2).sum())
+    is_clear = slow > MIN_DEVIATION_SIGMA * math.sqrt(normal[1, 1])
+    if is_clear and slow / white > MIN_CORNER_SIGMA * information**-0.5:
+        return float(white), float(slow / white)
+    return level, 0.0
 
 
 def _fit_half_power(at_rest: NoiseBands, white: float) -> float:

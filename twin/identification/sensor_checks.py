@@ -24,7 +24,7 @@ from twin.identification.spectra import Spectrum
 INTERVAL_SIGMA = 1.96  # standard deviations either side: 95 %
 STRONG_RATIO = 25.0  # power of a spectral line over its noise: weaker ones are not compared
 # Limits of healthy instruments; see `table_io.sim.imperfections` for sizes in laboratories.
-MAX_HUM_RATIO = 3.0  # rms over that of the noise
+MAX_HUM_RATIO = 5.0  # rms over that of the noise
 MAX_CORNER_HZ = 40.0  # below it 1/f noise exceeds white noise; 1 Hz is usual
 MAX_RESOLUTION_SHARE = 0.01  # of the rms of the channel in motion
 MIN_FILTER_HZ = 140.0  # an impact on a stiff bumper has harmonics up to there
@@ -88,7 +88,7 @@ def check_sensors(log_residuals: Sequence[LogResiduals], fit: FitResult) -> tupl
 
 def _check_noise(signals: LogSignals) -> Iterator[SensorCheck]:
     for channel, noise in signals.rest_noise.items():
-        rms, motion = noise.rms, signals.channel_rms(channel)
+        rms, motion = max(noise.rms, np.finfo(float).tiny), signals.channel_rms(channel)
 
         # noise makes up for a coarse step
         step = noise.resolution if noise.resolution > 2.0 * rms else 0.0
@@ -226,7 +226,5 @@ def _check_estimate(
     signals: LogSignals, kind: str, channels: tuple[str, ...], value: float, sd: float,
     limit: float, unit: str = "",
 ) -> SensorCheck:  # fmt: skip
-    half = INTERVAL_SIGMA * float(sd)
-    return SensorCheck(
-        signals.name, kind, channels, float(value), value - half, value + half, limit, unit
-    )
+    value, half = float(value), INTERVAL_SIGMA * float(sd)
+    return SensorCheck(signals.name, kind, channels, value, value - half, value + half, limit, unit)

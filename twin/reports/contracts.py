@@ -438,6 +438,27 @@ class HeldOutLog(Contract):
     noise_floor: Ratio = Field(None, description="what the noise of the sensors alone would leave")
 
 
+class SensorCheckResult(Contract):
+    """Checked quantity of an instrument, see `twin.identification.sensor_checks`."""
+
+    log: str = Field(description="name of the log")
+    kind: str = Field(description="checked quantity")
+    channels: list[str] = Field(description="its channels, or the side of a gap")
+    value: Number = Field(description="estimate, in `unit`")
+    low: Number = Field(description="lower end of its 95 % interval, in `unit`")
+    high: Number = Field(description="upper end of its 95 % interval, in `unit`")
+    unit: str = Field(description="unit of the numbers; empty for a ratio")
+    limit: Number | None = Field(description="size that is allowed; null if there is no limit")
+    healthy: bool = Field(description="whether the interval reaches the allowed sizes")
+
+
+class Sensors(Contract):
+    """Verdict on the instruments, apart from the physics of the specimen."""
+
+    state: Literal["healthy", "to be mended"] = Field(description="of all instruments together")
+    checks: list[SensorCheckResult] = Field(description="what was checked")
+
+
 class Verdict(Contract):
     """verdict.json of a discovery."""
 
@@ -451,6 +472,7 @@ class Verdict(Contract):
     where: Location = Field(description="where model and measurement disagree")
     gap: Gap = Field(description="gap before and after")
     remainder: Remainder = Field(description="part of the gap that remains")
+    sensors: Sensors | None = Field(None, description="on the instruments; absent in old files")
     base: dict[str, Interval] = Field(description="refitted parameters of the given model")
     fell_away: dict[str, str] = Field(description="reason of each effect that was not tested")
     notes: list[str] = Field(description="notes to the user")

@@ -15,6 +15,12 @@ from twin.identification.screening import MIN_STEP_UNITS
 from twin.reports.discovery.figure_data import DiscoveryView, check_instruments
 from twin.reports.discovery.figures import draw_discovery_figures
 from twin.reports.discovery.free_running import compute_misfits, run_logs_free
+from twin.reports.discovery.sensor_section import (
+    CHANNEL_KINDS,
+    KIND_LABELS,
+    tabulate_channels,
+    tabulate_comparisons,
+)
 from twin.reports.discovery.serialize import REFITTED_SUFFIX, Json
 from twin.reports.page import embed_images, format_significant, render_page
 
@@ -49,6 +55,9 @@ def write_discovery_page(
         sections=SECTIONS,
         complete=discovery.selection.complete,
         gates=check_instruments(view),
+        sensor_rows=tabulate_channels(verdict["sensors"]),
+        channel_columns=("channel", *(KIND_LABELS[kind] for kind in CHANNEL_KINDS)),
+        comparison_rows=tabulate_comparisons(verdict["sensors"]),
         misfits=compute_misfits(view, runs),
         images={
             section: embed_images(section_pictures)

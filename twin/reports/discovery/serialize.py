@@ -22,6 +22,7 @@ from twin.identification.parameters import (
     is_sensor_error,
 )
 from twin.identification.selection import FittedSet
+from twin.identification.sensor_checks import SensorCheck, check_sensors
 from twin.identification.verdict import closed_fraction, suggest_next_run
 from twin.model.model import SENSOR_CHANNELS, Model
 
@@ -82,6 +83,7 @@ def verdict_to_json(
             "unexplained": verdict.has_remainder,
             "evidence": generic_term_to_json(verdict.generic, factor),
         },
+        "sensors": sensors_to_json(check_discovery_sensors(discovery)),
         "base": base_to_json(best),
         "fell_away": dict(discovery.prepared.excluded),
         "notes": [
@@ -108,6 +110,43 @@ def _held_out_to_json(log: PreparedLog, discovery: Discovery, given: Model | Non
         "nrmse_after": after.nrmse,
         "noise_floor": after.noise_floor,
     }
+
+
+def check_discovery_sensors(discovery: Discovery) -> tuple[SensorCheck, ...]:
+    """Return the checks of the instruments, and the sensor errors that the verdict names."""
+    best, verdict = discovery.verdict.best, discovery.verdict
+    log_residuals = discovery.prepared.problem.log_residuals
+    checks = check_sensors(log_residuals, best.fit)
+    if verdict.outcome != "named":
+        return checks
+    logs = ", ".join(residuals.signals.name for residuals in log_residuals)
+    named = []
+    for effect in best.effects:
+        free = effect.amplitude
+        if effect.channel and isinstance(free.key, EffectKey):
+            size = best.fit.values[free.key] - effect.vanishing
+            half = INTERVAL_SIGMA * best.fit.std_errors[free.key]
+            named.append(
+                SensorCheck(
+                    logs, free.key.name, (effect.channel,), size, size - half, size + half, 0.0,
+                    free.unit,
+                )
+            )  # fmt: skip
+    return (*checks, *named)
+
+
+def sensors_to_json(checks: Sequence[SensorCheck]) -> Json:
+    """Return the verdict on the instruments."""
+    rows = [
+        {
+            "log": check.log, "kind": check.kind, "channels": [*check.channels],
+            "value": check.value, "low": check.low, "high": check.high, "unit": check.unit,
+            "limit": check.limit, "healthy": check.is_healthy,
+        }
+        for check in checks
+    ]  # fmt: skip
+    is_healthy = all(check.is_healthy for check in checks)
+    return {"state": "healthy" if is_healthy else "to be mended", "checks": rows}
 
 
 def noise_factor(discovery: Discovery) -> float:

@@ -1,0 +1,127 @@
+"""Faults of instruments are found where they are, with their size; usual laboratories are healthy.
+
+The faults are put on recorded readings here, independently of the simulated laboratory.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from table_io.block import Block, Float1D, Label, join_blocks
+from table_io.sim.imperfections import draw_laboratory
+from tests.identification.played import SNM, blocks
+from twin.identification.discover import PreparedLog, prepare_problem
+from twin.identification.sensor_checks import SensorCheck, check_sensors
+from twin.identification.signals import build_signals
+
+RATE_HZ, MASS_KG = 1000.0, 550.0
+MASS, TABLE = ("mass_disp_m", "mass_acc_m_s2"), ("table_disp_m", "table_acc_m_s2")
+RIGHT = ("force_r1_n", "force_r2_n")
+Distortion = Callable[[Float1D, Block], Float1D]
+
+
+def check(block: Block) -> tuple[SensorCheck, ...]:
+    """Return the checks of a recording."""
+    log = PreparedLog(build_signals((block,), "log", MASS_KG, (0.002, 0.002)), 0.0)
+    prepared = prepare_problem([log], SNM)
+    return check_sensors(prepared.problem.log_residuals, prepared.first_fit)
+
+
+@cache
+def recorded() -> Block:
+    return join_blocks(blocks())
+
+
+def distort(channel: str, distortion: Distortion) -> Block:
+    """Return the recording with other readings of a channel."""
+    block = recorded()
+    values = block.values.copy()
+    values[block.channels.index(channel)] = distortion(block.channel(channel), block)
+    return replace(block, values=values)
+
+
+def find_faults(block: Block) -> dict[tuple[str, tuple[str, ...]], SensorCheck]:
+    """Return the checks that are not healthy, by kind and channels."""
+    return {(c.kind, c.channels): c for c in check(block) if not c.is_healthy}
+
+
+def noise_of(values: Float1D, block: Block) -> float:
+    at_rest = np.cumsum(block.label != Label.REST) == 0
+    return float(values[at_rest].std())
+
+
+def add_hum(values: Float1D, block: Block) -> Float1D:
+    time_s = np.arange(values.size) / RATE_HZ
+    hum: Float1D = 8.0 * np.sqrt(2.0) * np.sin(2 * np.pi * 49.98 * time_s + 1.0)
+    return values + noise_of(values, block) * hum
+
+
+def filter_low(values: Float1D, block: Block) -> Float1D:
+    b, a = signal.butter(4, 90.0, fs=RATE_HZ)
+    filtered: Float1D = signal.lfilter(b, a, values)
+    return filtered
+
+
+def filter_high(values: Float1D, block: Block) -> Float1D:
+    b, a = signal.butter(1, 0.5, "highpass", fs=RATE_HZ)
+    filtered: Float1D = signal.lfilter(b, a, values)
+    return filtered
+
+
+def delay(values: Float1D, block: Block) -> Float1D:
+    places = np.arange(values.size)
+    return np.interp(places - 0.7, places, values)
+
+
+FAULTS: dict[str, tuple[str, Distortion, str, tuple[str, ...], float]] = {
+    "hum": ("force_l2_n", add_hum, "hum", ("force_l2_n",), 8.0),
+    "filter": ("mass_acc_m_s2", filter_low, "filter", ("mass_acc_m_s2",), 90.0),
+    "low cut": ("table_acc_m_s2", filter_high, "low_cut", TABLE, 0.5),
+    "lag": ("mass_acc_m_s2", delay, "lag", MASS, 7e-4),
+    "gain": ("mass_acc_m_s2", lambda x, _: 1.03 * x, "gain", MASS, 0.03),
+    "resolution": (
+        "mass_acc_m_s2", lambda x, _: 0.2 * np.round(x / 0.2), "resolution", ("mass_acc_m_s2",),
+        0.0,
+    ),
+    "cell": ("force_r1_n", lambda x, _: 1.4 * x, "share", RIGHT, 0.2 / 2.4),
+    "plate": (
+        "force_r1_n", lambda x, block: x - 9.0 * block.channel("table_acc_m_s2"), "plate", RIGHT,
+        9.0 / MASS_KG,
+    ),
+}  # fmt: skip
+
+
+def test_ideal_instruments_are_healthy() -> None:
+    checks = check(recorded())
+    assert all(c.is_healthy for c in checks)
+    assert {c.kind for c in checks} >= {"noise", "hum", "gain", "lag", "low_cut", "share", "plate"}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_is_found_on_its_channel_with_its_size(name: str) -> None:
+    channel, distortion, kind, channels, size = FAULTS[name]
+    faults = find_faults(distort(channel, distortion))
+    found = faults[kind, channels]
+    if size:
+        assert found.value == pytest.approx(size, rel=0.2)
+    places = {place for _, check in faults.items() for place in check.channels}
+    assert places <= {*MASS, *channels} if channel.startswith("mass") else places <= {*channels}
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_usual_laboratory_is_healthy(seed: int) -> None:
+    laboratory = draw_laboratory("typical", np.random.default_rng(seed))
+    truth = ""
+    for entry in laboratory:
+        place = f'channel = "{entry.channel}"\n' if entry.channel else ""
+        place += f'side = "{entry.side}"\n' if entry.side else ""
+        numbers = ", ".join(
+            f"{key} = {value!r}" for key, value in entry.parameters.items() if np.isfinite(value)
+        )
+        truth += f'[[imperfections]]\nid = "{entry.id}"\nform = "{entry.form}"\n{place}'
+        truth += f"parameters = {{ {numbers} }}\n"
+    assert find_faults(join_blocks(blocks(truth))) == {}
