@@ -124,8 +124,9 @@ def test_what_nuisances_cannot_explain_is_left_to_ideal_instruments() -> None:
     "kind_and_place",
     [
         ("gain", "right"), ("gain", "table_acc_m_s2"), ("lag", "mass_acc_m_s2"),
-        ("offset1", "mass_disp_m"), ("chebyshev3", "table_disp_m"), ("share", "left"),
-        ("plate", "right"), ("cross", "mass_acc_m_s2"), ("gap", ""),
+        ("resonance", "mass_acc_m_s2"), ("offset1", "mass_disp_m"),
+        ("chebyshev3", "table_disp_m"), ("share", "left"), ("plate", "right"),
+        ("cross", "mass_acc_m_s2"), ("gap", ""),
     ],
 )  # fmt: skip
 def test_a_column_is_the_effect_of_its_nuisance(kind_and_place: tuple[str, str]) -> None:
@@ -146,7 +147,7 @@ def test_a_column_is_the_effect_of_its_nuisance(kind_and_place: tuple[str, str])
 
 def test_a_prior_holds_every_nuisance() -> None:
     """Its entries are the values, and its bounds those of a typical error."""
-    prepared = add_nuisances(prepare_problem([log()], SNM))
+    prepared = add_nuisances(prepare_problem([log()], SNM), 1.0)
     residuals = prepared.problem.log_residuals[0]
     values = nuisance_values(prepared)
     entries = residuals.evaluate(prepared.parameters)[-len(values) :]

@@ -246,6 +246,22 @@ def test_a_bad_instrument_is_named_on_its_channel() -> None:
     assert score_case(make_named_verdict("cubic_stiffness", "k3", 1e7), bad)["physics"]
 
 
+def test_instruments_called_to_be_mended_count_where_they_are_bad_only() -> None:
+    def mend(kind: str, *channels: str) -> dict[str, object]:
+        check = {"kind": kind, "channels": channels, "healthy": False}
+        return {**verdict("none"), "sensors": {"state": "to be mended", "checks": [check]}}
+
+    typical = score_case(mend("share", "force_r1_n", "force_r2_n"), make_about())
+    assert (typical["healthy"], typical["right"]) == (False, False)
+    bad = make_about(level="bad", imperfection="load_sharing")
+    for faults, found in (
+        (mend("share", "force_r1_n", "force_r2_n"), True),
+        (mend("gain", "table_disp_m", "table_acc_m_s2"), False),
+    ):
+        row = score_case(faults, bad)
+        assert (row["on_channel"], row["right"], row["physics"]) == (found, found, False)
+
+
 def test_an_effect_is_named_and_nothing_false() -> None:
     gain = make_named_verdict("sensor_gain.force_r1_n", "gain", 1.2)["effects"]
     right = verdict("named", TRUE["name"])

@@ -52,9 +52,11 @@ from twin.model.model import Model
 MIN_ENTRIES, MIN_BLOCKS = 1000, 9
 MAX_IDEAL_ERRORS = 1  # of sensors: several at once are the small ones that every laboratory has
 MAX_NUISANCE_SAMPLES = 60_000  # moving samples of all logs; limits time and memory
-LINEARIZATION_COUNT = (
-    2  # about the nuisances found before: their products matter in a bad laboratory
-)
+# About the nuisances found before: their products matter in a bad laboratory.
+LINEARIZATION_COUNT = 2
+# Share of the residual with ideal instruments (rms) that the nuisances, which are only so many
+# forms of errors, may leave where they explain it.
+INSTRUMENT_MISFIT = 0.01
 MAX_EXPLAINED_COST = 1.1  # mean square over the noise
 MODEL_LIMITED_RMS = 50.0  # residual rms over the noise above which model error limits the fit
 MAX_PARAMETER_RATIO = 1.5  # ratio to the model's parameter beyond which the specimen is another one
@@ -142,11 +144,12 @@ def prepare_problem(
     )
 
 
-def add_nuisances(prepared: PreparedProblem) -> PreparedProblem:
+def add_nuisances(prepared: PreparedProblem, ideal_cost: float) -> PreparedProblem:
     """Return the problem with linear terms for the nuisances of instruments and set-up.
 
-    Lasers and accelerometers are compared first, on the rows that no force law enters: that gives
-    their noise in motion, and the nuisances about which the terms are linear.
+    `ideal_cost` is the mean square over the noise that remains with ideal instruments. Lasers and
+    accelerometers are compared first, on the rows that no force law enters: that gives their noise
+    in motion, and the nuisances about which the terms are linear.
     """
     problem, mapper, first = prepared.problem, prepared.problem.mapper, prepared.parameters
     moving = sum(int(residuals.motion().moving.sum()) for residuals in problem.log_residuals)
@@ -178,6 +181,7 @@ def add_nuisances(prepared: PreparedProblem) -> PreparedProblem:
             problem,
             log_residuals=log_residuals,
             max_sensor_errors=MAX_EFFECTS,
+            instrument_misfit=INSTRUMENT_MISFIT**2 * ideal_cost,
             amplitude_limits=TYPICAL_LIMITS,
         ),
         first_fit=fit,
@@ -196,10 +200,12 @@ def _start_nuisances(
 def explain_with_nuisances(prepared: PreparedProblem) -> PreparedProblem:
     """Return the problem with nuisances if they, but not ideal sensors, explain the logs."""
     # where model error limits the fit, the residual is divided by it: this is over the noise
-    if prepared.problem.least_weight**2 * prepared.first_fit.cost <= MAX_EXPLAINED_COST:
+    cost = prepared.problem.least_weight**2 * prepared.first_fit.cost
+    if cost <= MAX_EXPLAINED_COST:
         return prepared
-    imperfect = add_nuisances(prepared)
-    return imperfect if imperfect.first_fit.cost <= MAX_EXPLAINED_COST else prepared
+    imperfect = add_nuisances(prepared, cost)
+    is_explained = imperfect.first_fit.cost <= MAX_EXPLAINED_COST * imperfect.problem.noise
+    return imperfect if is_explained else prepared
 
 
 def initialize_parameters(log_residuals: Sequence[LogResiduals], model: Model) -> ParameterSet:
@@ -299,7 +305,8 @@ def discover_effects(
     discovery = _select_and_judge(prepared, logs, model, report)
     if not discovery.selection.complete or _is_explained(discovery.verdict, MAX_IDEAL_ERRORS):
         return discovery
-    imperfect = add_nuisances(prepared)
+    ideal_cost = prepared.problem.least_weight**2 * discovery.verdict.best.cost
+    imperfect = add_nuisances(prepared, ideal_cost)
     if not _can_explain(imperfect, discovery):
         return discovery
     with_nuisances = _select_and_judge(imperfect, logs, model, report)
@@ -319,13 +326,13 @@ def _can_explain(imperfect: PreparedProblem, ideal: Discovery) -> bool:
     logs = zip(ideal.prepared.problem.log_residuals, best.held_out, strict=True)
     if any(_sensors_disagree(residuals, held_out) for residuals, held_out in logs):
         return True
-    fit = imperfect.first_fit
-    if fit.cost > MAX_EXPLAINED_COST and best.effects:
+    fit, max_cost = imperfect.first_fit, MAX_EXPLAINED_COST * problem.noise
+    if fit.cost > max_cost and best.effects:
         added = [free for effect in best.effects for free in effect.free]
         values = {free.key: best.fit.parameters.values[free.key] for free in added}
         start = start.with_values(values).with_free((*start.free, *added))
         fit = fit_parameters(problem.log_residuals, start, mapper=problem.mapper)
-    return fit.cost <= MAX_EXPLAINED_COST
+    return fit.cost <= max_cost
 
 
 def _sensors_disagree(residuals: LogResiduals, held_out: Float1D) -> bool:

@@ -6,6 +6,7 @@ effect of the specimen. Kinds, by channel or side:
 
     gain, lag            of a channel: reading = (1 + gain) x value(t - lag)
     low_cut              of an accelerometer: corner of its high pass of the first order
+    resonance            of an accelerometer on its bracket: the inverse square of its frequency
     offset               of a channel, after its tare; constant, and slow with time (offset1, ...)
     chebyshev2 to 7      of a laser, in position: terms of its linearity error, 0 at position 0
     share, share_slope   of the force of a side between its two cells: constant, and with position
@@ -36,7 +37,8 @@ SLOW_TERMS = 2  # cosines over the length of the record, besides the constant of
 # Typical sizes (one standard deviation).
 TYPICAL_GAIN = 0.005  # calibration and temperature
 TYPICAL_LAG_S = 5e-4  # multiplexed channels, different anti-alias filters
-TYPICAL_LOW_CUT = 2.0 * math.pi * 0.16  # rad/s, of an IEPE accelerometer: 5 % at 0.5 Hz
+TYPICAL_LOW_CUT = 2.0 * math.pi * 0.25  # rad/s, of an IEPE accelerometer: 5 % at 0.8 Hz
+TYPICAL_RESONANCE = (2.0 * math.pi * 400.0) ** -2.0  # s2/rad2, of a bracket of sheet metal
 TYPICAL_OFFSET = 0.005  # of the rms of the channel: drift since the tare
 TYPICAL_LINEARITY = 0.002  # of the largest excursion, each term of the error of a laser
 # Of the largest excursion: speckle and roughness under the light spot of a laser, which the rest
@@ -84,7 +86,8 @@ def list_nuisances(signals: LogSignals) -> tuple[Nuisance, ...]:
     nuisances = [Nuisance("gain", place, TYPICAL_GAIN) for place in scaled]
     nuisances += [Nuisance("lag", channel, TYPICAL_LAG_S) for channel in checkable]
     nuisances += [
-        Nuisance("low_cut", channel, TYPICAL_LOW_CUT)
+        Nuisance(kind, channel, size)
+        for kind, size in (("low_cut", TYPICAL_LOW_CUT), ("resonance", TYPICAL_RESONANCE))
         for channel in checkable
         if channel in ACCELEROMETERS
     ]
@@ -133,6 +136,8 @@ def correct_signals(signals: LogSignals, nuisance: Nuisance, z: float) -> LogSig
             # without the constant, which a high pass takes away for good
             slow = amount / np.maximum(signals.omega, signals.omega[1])
             corrected = spectrum * (1.0 - 1j * slow)
+        case "resonance":
+            corrected = spectrum * (1.0 - amount * signals.omega**2)
         case "cross":
             corrected = spectrum - amount * signals.spectra["table_acc_m_s2"]
         case kind if kind.startswith("chebyshev"):

@@ -92,6 +92,8 @@ class SelectionProblem:
     mapper: MapFunction = map
     # Ideal instruments are no explanation with more errors of sensors: they end the selection.
     max_sensor_errors: int = MAX_EFFECTS
+    # Mean square over the noise of what instruments leave that err in other ways than assumed.
+    instrument_misfit: float = 0.0
     # Smallest deviation of the amplitude from its vanishing value, by effect.
     amplitude_limits: Mapping[str, float] = field(default_factory=dict)
 
@@ -116,12 +118,13 @@ class SelectionProblem:
 
     @property
     def noise(self) -> float:
-        """Mean square of sensor noise alone: below it no effect is named."""
-        return self.least_weight**-2
+        """Mean square of what instruments alone leave: below it no effect is named."""
+        return (1.0 + self.instrument_misfit) * self.least_weight**-2
 
     def is_noise(self, null: FittedSet, best: FittedSet) -> bool:
-        """Return True if the base alone leaves less than noise, and the best set hardly less."""
-        return null.cost < self.noise and null.cost < (1 + 2 * MIN_VISIBLE_EXCESS) * best.cost
+        """Return True if the base alone leaves hardly more than noise, and the best set as much."""
+        is_low = null.cost < (1 + MIN_VISIBLE_EXCESS) * self.noise
+        return is_low and null.cost < (1 + 2 * MIN_VISIBLE_EXCESS) * best.cost
 
     @cached_property
     def folds(self) -> tuple[Int1D, ...]:

@@ -32,6 +32,7 @@ MAX_GAIN_ERROR = 0.01  # two calibrations of class 0.5 %
 MAX_LAG_S = 3e-4  # multiplexed converters and unequal filters stay below it
 MAX_LOW_CUT_HZ = 0.3  # 5 % at 0.9 Hz
 MAX_REMAINDER_SHARE, MIN_REMAINDER_RATIO = 0.02, 3.0  # of the motion; over the noise
+MIN_RESONANCE_HZ = 400.0  # of an accelerometer on its bracket
 MAX_SHARE_ERROR = 0.05  # of the force, off an equal division between the cells of a side
 MAX_PLATE_SHARE = 0.01  # of the mass of the specimen, in front of the cells of a side
 MAX_GAP_ERROR_M = 1.5e-4  # a feeler gauge reads to 0.05 mm
@@ -47,6 +48,7 @@ class SensorCheck:
     one_over_f   frequency below which 1/f noise exceeds white noise, Hz
     resolution   smallest step of the readings over the rms in motion
     filter       half-power frequency of an anti-alias filter, Hz; the limit is the least
+    resonance    frequency of an accelerometer on its bracket, Hz; the limit is the least
     gain, lag, low_cut, remainder   accelerometer against laser: gain less 1, lag in s, corner in
                  Hz, and what none of them explains, over the motion
     share        force of the first cell of a side over that of both, less 1/2
@@ -68,7 +70,7 @@ class SensorCheck:
         """Return False if the whole interval is beyond the limit."""
         if self.limit is None:
             return True
-        if self.kind == "filter":
+        if self.kind in ("filter", "resonance"):
             return self.high >= self.limit
         return min(abs(self.low), abs(self.high)) <= self.limit or self.low < 0 < self.high
 
@@ -213,6 +215,15 @@ def _check_fitted(residuals: LogResiduals, fit: FitResult) -> Iterator[SensorChe
             unequal, unequal_sd = value, sd
         elif nuisance.kind == "lag":
             yield _check_estimate(signals, "lag", (nuisance.place,), value, sd, MAX_LAG_S, "s")
+        elif nuisance.kind == "resonance" and value > INTERVAL_SIGMA * sd:
+            frequency, low, high = (
+                (value + deviation) ** -0.5 / (2.0 * math.pi)
+                for deviation in (0.0, INTERVAL_SIGMA * sd, -INTERVAL_SIGMA * sd)
+            )
+            yield SensorCheck(
+                signals.name, "resonance", (nuisance.place,), frequency, low, high,
+                MIN_RESONANCE_HZ, "Hz",
+            )  # fmt: skip
     common, sd = fit.values.get(GapKey(number), 0.0), fit.std_errors.get(GapKey(number), 0.0)
     for side, sign, gap in zip(("right", "left"), (1.0, -1.0), signals.gaps_m, strict=True):
         if math.isfinite(gap) and (sd or unequal_sd):

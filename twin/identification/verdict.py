@@ -274,8 +274,10 @@ def _confidence(
     completeness = 0.4 + 0.6 / (
         1.0 + math.exp((math.sqrt(max(remaining_share, 0.0)) - 0.27) / 0.04)
     )
-    # an instrument as bad as one can be says nothing about the law of the specimen
-    is_at_bound = any(not isinstance(key, NuisanceKey) for key in best.fit.at_bound)
+    # an instrument as bad as one can be, or its tare beside its drift, says nothing about the law
+    has_nuisances = any(isinstance(key, NuisanceKey) for key in best.fit.values)
+    harmless = (NuisanceKey, TareKey) if has_nuisances else ()
+    is_at_bound = any(not isinstance(key, harmless) for key in best.fit.at_bound)
     validity = 1.0 if best.fit.converged and not is_at_bound else 0.6
     return 0.98 * separation * completeness * validity
 

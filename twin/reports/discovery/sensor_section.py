@@ -15,6 +15,7 @@ KIND_LABELS = {
     "gain": "gain error",
     "lag": "lag",
     "low_cut": "low cut",
+    "resonance": "resonance of the mounting",
     "remainder": "disagreement left",
     "share": "share of the first cell less half",
     "plate": "mass in front of the cells",
@@ -44,7 +45,7 @@ def describe_sensors(sensors: Json) -> list[str]:
     lines = [f"sensors: {sensors['state']}"]
     for check in faults:
         allowed = (
-            f", allowed {'from' if check['kind'] == 'filter' else 'up to'} "
+            f", allowed {'from' if check['kind'] in ('filter', 'resonance') else 'up to'} "
             f"{_format_size(check, check['limit'])}"
             if check["limit"]
             else ""

@@ -12,11 +12,12 @@ Everything that a verdict names is one of
     physics       an effect of the specimen that is not there
 
 A verdict is healthy if it is `none`, or names true instrument findings only. What it lists without
-naming it (`unexplained`) is no finding.
+naming it (`unexplained`) is no finding. In a typical laboratory, whose instruments are sound, it
+must not call them to be mended either; in a bad one that is a finding on the channels it states.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from twin.identification.parameters import GAP_PREFIX
@@ -48,10 +49,16 @@ def score_laboratory(row: Json, verdict: Json, about: Json) -> Json:
     affected = {
         name for name in row["named"] if is_named and _channel(name) in laboratory["channels"]
     }
+    faults = [
+        check for check in verdict.get("sensors", {}).get("checks", ()) if not check["healthy"]
+    ]
+    is_sound = row["said"] == "none" or (is_named and all(c == "instrument" for c in classes))
+    found = "instrument" in named_classes or _is_on_channel(faults, laboratory)
     scores: Json = {
-        "healthy": row["said"] == "none" or (is_named and all(c == "instrument" for c in classes)),
+        "healthy": is_sound and not (faults and laboratory["level"] == "typical"),
         "instrument": "instrument" in named_classes,
-        "on_channel": bool(affected) or "instrument" in named_classes,
+        "on_channel": bool(affected) or found,
+        "sensor_faults": [f"{check['kind']}.{','.join(check['channels'])}" for check in faults],
         "physics": "physics" in named_classes,
         "wrong_name": bool({"physics", "false"} & {*named_classes}),
         "hit": is_named and {*row["truth"]} <= {*row["named"]},
@@ -67,6 +74,15 @@ def score_laboratory(row: Json, verdict: Json, about: Json) -> Json:
         "before": gap.get("held_out_before"), "after": gap.get("held_out_after"),
         "why": verdict.get("why", verdict.get("reason", "")),
     }  # fmt: skip
+
+
+def _is_on_channel(faults: Sequence[Json], laboratory: Json) -> bool:
+    """Return whether the instruments called to be mended are those that err."""
+    wrong_gaps = "gap_offset" in laboratory["errors"]
+    return any(
+        {*check["channels"]} & {*laboratory["channels"]} or (check["kind"] == "gap" and wrong_gaps)
+        for check in faults
+    )
 
 
 def _is_right(row: Json, level: str, scores: Json) -> bool:
