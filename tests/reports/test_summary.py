@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from table_io.block import Block
+from table_io.block import Block, Label
 from table_io.records import (
     Comparison,
     CycleExtremes,
@@ -192,6 +192,14 @@ def test_nrmse_is_that_of_the_samples(recording: Recording, bundle: RunConfig) -
             size = u[cells] if name == "mass_disp_m" else x
             want = math.sqrt((error**2).sum() / (size**2).sum())
             assert comparison[name][key] == pytest.approx(want, rel=1e-9)
+        # white noise of the card would leave this of a perfect model
+        at_rest = np.cumsum(measured.label != Label.REST) == 0
+        lasers = np.array([measured.channel(n)[at_rest] for n in ("mass_disp_m", "table_disp_m")])
+        noise = measured.channel(name)[at_rest].std() if "acc" in name or "force" in name else (
+            math.hypot(*lasers.std(axis=1))
+        )  # fmt: skip
+        floor = noise * math.sqrt(x.size / (size**2).sum())
+        assert comparison[name]["noise_floor"] == pytest.approx(floor, rel=0.2)
 
 
 def test_a_lost_channel_is_null_and_the_others_stay(
@@ -208,7 +216,7 @@ def test_a_lost_channel_is_null_and_the_others_stay(
             items.append(item)
     comparison = summary_of(items, recording, bundle, tmp_path)["comparison"]
     whole = summarise(recording, bundle.parameters)["comparison"]
-    assert comparison["force_r1_n"] == {"nrmse": None, "free_nrmse": None}
+    assert comparison["force_r1_n"] == dict.fromkeys(("nrmse", "free_nrmse", "noise_floor"))
     assert comparison["force_r2_n"] == whole["force_r2_n"]
 
 
@@ -218,7 +226,7 @@ def test_load_cells_without_bumpers_have_nothing_to_compare(
     parameters = replace(bundle.parameters, gap_r=math.inf)
     comparison = summarise(recording, parameters)["comparison"]
     for name in CELLS[:2]:
-        assert comparison[name] == {"nrmse": None, "free_nrmse": None}
+        assert comparison[name] == dict.fromkeys(("nrmse", "free_nrmse", "noise_floor"))
     for name in (*CELLS[2:], "rel_disp_m"):
         assert comparison[name]["nrmse"] > 0
 

@@ -166,6 +166,7 @@ def describe_replay(
             tuple(item for item in recorded_items if isinstance(item, Comparison)),
             config.parameters,
             config.rig.channel_by_name,
+            summaries.find_channel_noise(recording),
         ),
     }
 

@@ -209,7 +209,7 @@ def _check_fitted(residuals: LogResiduals, fit: FitResult) -> Iterator[SensorChe
     known = zip(terms.nuisances, terms.centre, strict=True) if terms else ()
     for nuisance, centre in known:
         key = NuisanceKey(number, nuisance.kind, nuisance.place)
-        value = nuisance.size * (centre + fit.values.get(key, 0.0))
+        value = float(nuisance.size * (centre + fit.values.get(key, 0.0)))
         sd = nuisance.size * fit.std_errors.get(key, 0.0)
         if nuisance.kind == "gap":
             unequal, unequal_sd = value, sd

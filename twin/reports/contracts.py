@@ -200,6 +200,7 @@ class ChannelError(Contract):
 
     nrmse: Ratio = Field(description="of the twin restarted from the measured state")
     free_nrmse: Ratio = Field(description="of the free-running twin")
+    noise_floor: Ratio = Field(None, description="what the noise of the sensors alone would leave")
 
 
 class WindowResult(Contract):

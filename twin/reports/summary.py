@@ -34,6 +34,7 @@ from twin.compare import COMPARED_CHANNELS
 from twin.compare.curves import detect_hysteresis
 from twin.compare.extra_channels import select_predicted
 from twin.compare.monitoring import EVENT_KINDS as MONITOR_KINDS
+from twin.compare.monitoring.cycle import ChannelNoise
 from twin.model.model import Model
 from twin.model.parameters import Parameters, free_flight_resonance
 from twin.recording.reader import Recording
@@ -99,7 +100,10 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         "twin_hysteresis": [asdict(interval) for interval in twin_intervals],
         "timing": summarise_timing(recording.records(Timing)),
         "comparison": channel_nrmse(
-            recording.records(Comparison), parameters, read_channels(start.rig_toml)
+            recording.records(Comparison),
+            parameters,
+            read_channels(start.rig_toml),
+            find_channel_noise(recording),
         ),
         "estimates": _estimates_entry(recording.records(Estimate)),
         "warnings": [
@@ -127,10 +131,10 @@ def _windows_entry(recording: Recording, parameters: Parameters, profile: Profil
     if recording.start.steps:
         return {}
 
-    channels = read_channels(recording.start.rig_toml)
+    channels, noise = read_channels(recording.start.rig_toml), find_channel_noise(recording)
 
     def compare(comparisons: tuple[Comparison, ...]) -> Json:
-        return channel_nrmse(comparisons, parameters, channels)
+        return channel_nrmse(comparisons, parameters, channels, noise)
 
     return {"windows": summarise_windows(recording, profile.comparison.contact_n, compare)}
 
@@ -259,16 +263,30 @@ def summarise_timing(records: tuple[Timing, ...]) -> Json:
     }
 
 
+def find_channel_noise(recording: Recording) -> ChannelNoise:
+    """Return the noise of the channels of a recording, from its first samples at rest."""
+    noise = ChannelNoise()
+    for block in recording.blocks("meas"):
+        if noise.is_known:
+            break
+        noise = noise.add_block(block)
+    return noise
+
+
 def channel_nrmse(
-    comparisons: tuple[Comparison, ...], parameters: Parameters, channels: Mapping[str, Channel]
+    comparisons: tuple[Comparison, ...],
+    parameters: Parameters,
+    channels: Mapping[str, Channel],
+    noise: ChannelNoise,
 ) -> Json:
     """Return the NRMSE by channel: `nrmse` of the restarted twin, `free_nrmse` of the free one.
 
     NRMSE = sqrt(sum of squared errors / sum of squared measurements); that of `mass_disp_m` is over
     the displacement relative to the table, because the motion of the table is measured and no
     prediction. The restarted twin shows the model error; the free one also the divergence between
-    solutions. None for the force on an absent bumper, which is noise only. `channels` is the
-    registry of the rig.
+    solutions. `noise_floor` is what the noise of the sensors alone would leave, as it is at rest.
+    None for the force on an absent bumper, which is noise only. `channels` is the registry of the
+    rig.
     """
     gaps = {"right_bumper": parameters.gap_r, "left_bumper": parameters.gap_l}
     absent = {
@@ -286,6 +304,7 @@ def channel_nrmse(
         for name in ("measured_ss", "free_error_ss", "window_error_ss")
     )
     measured[:, names.index("mass_disp_m")] = measured[:, names.index("rel_disp_m")]
+    counts = np.array([comparison.count for comparison in comparisons])
     entries: Json = {}
     for column, name in enumerate(names):
         values = {}
@@ -297,8 +316,29 @@ def channel_nrmse(
                 if total > 0 and name not in absent
                 else None
             )
+        is_known = np.isfinite(measured[:, column])
+        total = measured[is_known, column].sum()
+        rms = _compared_noise(noise, name)
+        values["noise_floor"] = (
+            rms * math.sqrt(counts[is_known].sum() / total)
+            if total > 0 and math.isfinite(rms) and name not in absent
+            else None
+        )
         entries[name] = values
     return entries
+
+
+def _compared_noise(noise: ChannelNoise, name: str) -> float:
+    """Return the noise rms in the error of a compared channel; NaN if it is unknown.
+
+    The error of both displacements of the mass is that of its motion relative to the table.
+    """
+    rms = noise.channel_rms(name)
+    if name == "mass_disp_m" or math.isnan(rms):
+        lasers = ("mass_disp_m", "table_disp_m")
+        if name in ("rel_disp_m", "mass_disp_m"):
+            return math.hypot(*(noise.channel_rms(laser) for laser in lasers))
+    return rms
 
 
 def format_summary(summary: Json) -> str:
