@@ -24,6 +24,7 @@ from twin.identification.nuisances import (
     linearize_nuisances,
     list_nuisance_parameters,
     sensor_mask,
+    widen_intervals,
 )
 from twin.identification.parameters import (
     INPUT_GAIN,
@@ -310,6 +311,11 @@ def discover_effects(
     if not _can_explain(imperfect, discovery):
         return discovery
     with_nuisances = _select_and_judge(imperfect, logs, model, report)
+    best = with_nuisances.verdict.best
+    ideal = _fit_with_effects(prepared, best)
+    widened = widen_intervals(best.fit, ideal, prepared.problem.log_residuals)
+    verdict = replace(with_nuisances.verdict, best=replace(best, fit=widened))
+    with_nuisances = replace(with_nuisances, verdict=verdict)
     if not with_nuisances.selection.complete:
         return replace(discovery, selection=replace(discovery.selection, complete=False))
     is_ended_early = count_sensor_errors(discovery.selection.best) > MAX_IDEAL_ERRORS
@@ -322,17 +328,25 @@ def _can_explain(imperfect: PreparedProblem, ideal: Discovery) -> bool:
     Either instruments disagree, which no force law makes them do, or nuisances close the gap of
     the base or of the best set.
     """
-    best, problem, start = ideal.verdict.best, imperfect.problem, imperfect.parameters
+    best = ideal.verdict.best
     logs = zip(ideal.prepared.problem.log_residuals, best.held_out, strict=True)
     if any(_sensors_disagree(residuals, held_out) for residuals, held_out in logs):
         return True
-    fit, max_cost = imperfect.first_fit, MAX_EXPLAINED_COST * problem.noise
-    if fit.cost > max_cost and best.effects:
-        added = [free for effect in best.effects for free in effect.free]
-        values = {free.key: best.fit.parameters.values[free.key] for free in added}
-        start = start.with_values(values).with_free((*start.free, *added))
-        fit = fit_parameters(problem.log_residuals, start, mapper=problem.mapper)
-    return fit.cost <= max_cost
+    max_cost = MAX_EXPLAINED_COST * imperfect.problem.noise
+    return (
+        imperfect.first_fit.cost <= max_cost or _fit_with_effects(imperfect, best).cost <= max_cost
+    )
+
+
+def _fit_with_effects(prepared: PreparedProblem, fitted: FittedSet) -> FitResult:
+    """Return the fit of a prepared problem with the effects of a set that was fitted to another."""
+    problem, start = prepared.problem, prepared.parameters
+    added = [free for effect in fitted.effects for free in effect.free]
+    if not added:
+        return prepared.first_fit
+    values = {free.key: fitted.fit.parameters.values[free.key] for free in added}
+    start = start.with_values(values).with_free((*start.free, *added))
+    return fit_parameters(problem.log_residuals, start, mapper=problem.mapper)
 
 
 def _sensors_disagree(residuals: LogResiduals, held_out: Float1D) -> bool:

@@ -34,6 +34,7 @@ from twin.identification.discover import (
     prepare_problem,
 )
 from twin.identification.least_squares import FitResult, compute_slopes, fit_parameters
+from twin.identification.nuisances import widen_intervals
 from twin.identification.parameters import (
     DAMPING,
     STIFFNESS,
@@ -108,11 +109,14 @@ def identify_parameters(
 
     Raise InputError if a log holds too few usable samples.
     """
-    prepared = explain_with_nuisances(prepare_problem(logs, model))
+    ideal = prepare_problem(logs, model)
+    prepared = explain_with_nuisances(ideal)
     problem = prepared.problem
     log_residuals = problem.log_residuals
     joint, fixed = _fit_determined(log_residuals, prepared.parameters)
     joint = correct_bias(log_residuals, joint)
+    if prepared is not ideal:
+        joint = widen_intervals(joint, ideal.first_fit, log_residuals)
     p = joint.parameters.to_model().base
     laws = (
         (p.bumper_stiffness_r, p.bumper_damping_r),

@@ -24,7 +24,16 @@ from numpy.polynomial import Chebyshev
 
 from table_io.block import Bool2D, Float1D
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
-from twin.identification.parameters import FreeParameter, ParameterSet
+from twin.identification.least_squares import FitResult
+from twin.identification.parameters import (
+    BUMPER_DAMPING,
+    BUMPER_STIFFNESS,
+    FreeParameter,
+    GapKey,
+    ParameterSet,
+    is_correction,
+    size_of_unit,
+)
 from twin.identification.residuals import LogResiduals, Nuisance, NuisanceTerms
 from twin.identification.signals import SENSOR_PAIRS, LogSignals
 from twin.identification.spectra import Spectrum
@@ -50,6 +59,8 @@ TYPICAL_SHARE, TYPICAL_SHARE_SLOPE = 0.05, 0.02  # of the force; at the largest 
 TYPICAL_PLATE = 0.005  # of the specimen's mass
 TYPICAL_CROSS = 0.01  # cross-axis sensitivity and pitch
 TYPICAL_GAP_M, TYPICAL_MASS = 1e-4, 0.005  # of the readings of the set-up
+# Share of the change of a parameter due to the nuisances that their assumed forms leave open.
+OPEN_SHARE = 0.005
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 MAX_SIZE = 4.0  # typical sizes; a larger error is a fault, and an effect of its own
 # Smaller than these, effects that are errors of instruments or set-up are those of any laboratory.
@@ -280,3 +291,38 @@ def list_nuisance_parameters(log_residuals: Sequence[LogResiduals]) -> tuple[Fre
         if residuals.nuisances is not None
         for key, centre in zip(residuals.nuisances.keys, residuals.nuisances.centre, strict=True)
     )
+
+
+def widen_intervals(
+    fit: FitResult, ideal: FitResult, log_residuals: Sequence[LogResiduals]
+) -> FitResult:
+    """Return a fit with nuisances whose standard deviations hold what these leave open.
+
+    No sensor contradicts the scale of all displacements: a parameter is as uncertain as it depends
+    on it, which its unit tells, as forces are masses times accelerations. A bumper meets a part of
+    the range of the lasers, with its own slope within their linearity. And the change since the
+    fit `ideal`, without nuisances, depends on their assumed forms.
+    """
+    std_errors = dict(fit.std_errors)
+    for free in fit.free:
+        key = free.key
+        if is_correction(key):
+            continue
+        value = fit.values[key]
+        size = abs(value)
+        if isinstance(key, GapKey):
+            size += max(filter(math.isfinite, log_residuals[key.log].signals.gaps_m), default=0.0)
+        is_bumper = key in (BUMPER_STIFFNESS, BUMPER_DAMPING)
+        std_errors[key] = math.hypot(
+            std_errors[key],
+            TYPICAL_GAIN * _length_exponent(free.unit) * size,
+            TYPICAL_LINEARITY * size if is_bumper else 0.0,
+            OPEN_SHARE * (value - ideal.values[key]) if key in ideal.values else 0.0,
+        )
+    return replace(fit, std_errors=std_errors)
+
+
+def _length_exponent(unit: str) -> float:
+    """Return the power with which a quantity in this unit grows with the scale of lengths."""
+    ratio = size_of_unit(unit, force=math.e, length=math.e, time=1.0)
+    return math.log(ratio) if ratio else 0.0

@@ -316,10 +316,10 @@ def measure_size(
     if parameter.unit == "m/s" and parameter.vanishing is not None:  # a drift over the test
         return SMALL_LENGTH_SHARE * scale.u / scale.duration_s
     length = scale.depth if effect.is_in_bumpers else scale.u
-    return _size_of_unit(parameter.unit, scale.force, length, length / scale.v)
+    return size_of_unit(parameter.unit, scale.force, length, length / scale.v)
 
 
-def _size_of_unit(unit: str, force: float, length: float, time: float) -> float | None:
+def size_of_unit(unit: str, force: float, length: float, time: float) -> float | None:
     """Return the product of these sizes in a unit such as "N s2/m2"; None for s and pure numbers.
 
     None too for a unit that is written otherwise.
