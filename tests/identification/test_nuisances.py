@@ -11,7 +11,6 @@ import pytest
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from tests.identification.played import SNM, TRUE, format_truth, log
 from twin.identification.discover import (
-    MAX_EXPLAINED_COST,
     PreparedLog,
     PreparedProblem,
     add_nuisances,
@@ -30,6 +29,7 @@ from twin.identification.nuisances import (
 )
 from twin.identification.parameters import DAMPING, STIFFNESS, NuisanceKey
 from twin.identification.residuals import Nuisance
+from twin.identification.selection import MAX_EXPLAINED_COST
 from twin.identification.signals import LogSignals
 
 CELL_SHARE = 0.52  # of the right force in its first cell, and of the left one in its second

@@ -38,6 +38,7 @@ from twin.identification.parameters import (
 from twin.identification.residuals import LogResiduals, build_log_residuals
 from twin.identification.selection import (
     MAX_EFFECTS,
+    MAX_EXPLAINED_COST,
     FittedSet,
     ProgressCallback,
     SelectionProblem,
@@ -46,6 +47,7 @@ from twin.identification.selection import (
     count_sensor_errors,
     stepwise_selection,
 )
+from twin.identification.sensor_checks import compare_sensors
 from twin.identification.signals import CELL_PAIRS, SENSOR_PAIRS, LogSignals, derives_acc
 from twin.identification.verdict import DiscoveryVerdict, judge_selection
 from twin.model.model import Model
@@ -58,7 +60,6 @@ LINEARIZATION_COUNT = 2
 # Share of the residual with ideal instruments (rms) that the nuisances, which are only so many
 # forms of errors, may leave where they explain it.
 INSTRUMENT_MISFIT = 0.01
-MAX_EXPLAINED_COST = 1.1  # mean square over the noise
 MODEL_LIMITED_RMS = 50.0  # residual rms over the noise above which model error limits the fit
 MAX_PARAMETER_RATIO = 1.5  # ratio to the model's parameter beyond which the specimen is another one
 
@@ -145,12 +146,15 @@ def prepare_problem(
     )
 
 
-def add_nuisances(prepared: PreparedProblem, ideal_cost: float) -> PreparedProblem:
+def add_nuisances(
+    prepared: PreparedProblem, ideal_cost: float, effects: Sequence[Candidate] = ()
+) -> PreparedProblem:
     """Return the problem with linear terms for the nuisances of instruments and set-up.
 
     `ideal_cost` is the mean square over the noise that remains with ideal instruments. Lasers and
     accelerometers are compared first, on the rows that no force law enters: that gives their noise
-    in motion, and the nuisances about which the terms are linear.
+    in motion, and the nuisances about which the terms are linear. Then the forces have their say,
+    with these `effects` in the model: without one that is there, nuisances would stand in for it.
     """
     problem, mapper, first = prepared.problem, prepared.problem.mapper, prepared.parameters
     moving = sum(int(residuals.motion().moving.sum()) for residuals in problem.log_residuals)
@@ -175,18 +179,41 @@ def add_nuisances(prepared: PreparedProblem, ideal_cost: float) -> PreparedProbl
             for residuals in log_residuals
         )
         start = _start_nuisances(log_residuals, fit.parameters.with_free(first.free))
+        for effect in effects:
+            start = effect.add_to(start, effect.shapes[0], _small_amplitude(effect))
+        fit = fit_parameters(log_residuals, start, mapper=mapper)
+    if effects:
+        added = [free for effect in effects for free in effect.free]
+        start = _start_nuisances(log_residuals, fit.parameters.without(added))
         fit = fit_parameters(log_residuals, start, mapper=mapper)
     return replace(
         prepared,
         problem=replace(
             problem,
             log_residuals=log_residuals,
+            library=_drop_sound_sensors(problem),
             max_sensor_errors=MAX_EFFECTS,
             instrument_misfit=INSTRUMENT_MISFIT**2 * ideal_cost,
             amplitude_limits=TYPICAL_LIMITS,
         ),
         first_fit=fit,
     )
+
+
+def _drop_sound_sensors(problem: SelectionProblem) -> tuple[Candidate, ...]:
+    """Return the candidates without faults of sensors that agree with another on the same body."""
+    sound = set.intersection(
+        *(
+            {
+                f"sensor_{check.kind}.{channel}"
+                for check in compare_sensors(residuals.signals)
+                if check.kind in ("gain", "lag") and check.is_healthy
+                for channel in check.channels
+            }
+            for residuals in problem.log_residuals
+        )
+    )
+    return tuple(candidate for candidate in problem.library if candidate.name not in sound)
 
 
 def _start_nuisances(
@@ -311,6 +338,9 @@ def discover_effects(
     if not _can_explain(imperfect, discovery):
         return discovery
     with_nuisances = _select_and_judge(imperfect, logs, model, report)
+    if effects := with_nuisances.verdict.best.effects:
+        imperfect = add_nuisances(prepared, ideal_cost, effects)
+        with_nuisances = _select_and_judge(imperfect, logs, model, report)
     best = with_nuisances.verdict.best
     ideal = _fit_with_effects(prepared, best)
     widened = widen_intervals(best.fit, ideal, prepared.problem.log_residuals)

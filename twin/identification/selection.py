@@ -26,6 +26,7 @@ from twin.identification.screening import (
 )
 
 MAX_EFFECTS = 3
+MAX_EXPLAINED_COST = 1.1  # mean square over the noise: with less, nothing is left to explain
 MAX_REFITS, MAX_GENERIC_REFITS = 5, 2  # candidates refitted in a round
 MIN_REFITS, MAX_COST_RATIO = 2, 1.5  # beyond the first two, skip costs above this ratio to the best
 MIN_PROMISED_GAIN = 0.003  # of the residual squares: candidates that promise less are not refitted
@@ -108,8 +109,15 @@ class SelectionProblem:
             abs(fitted.fit.values[effect.amplitude.key] - effect.vanishing)
             > self.amplitude_limits[effect.effect.id]
             for effect in fitted.effects
-            if effect.effect is not None and effect.effect.id in self.amplitude_limits
+            if effect.effect is not None and self.is_limited(effect)
         )
+
+    def is_limited(self, candidate: Candidate) -> bool:
+        """Return True for a fault of an instrument or of the set-up whose amplitude has a limit.
+
+        Where the residual is noise such a fault has nothing to explain.
+        """
+        return candidate.effect is not None and candidate.effect.id in self.amplitude_limits
 
     @property
     def least_weight(self) -> float:
@@ -302,7 +310,9 @@ def _refit_candidates(
         library = [
             candidate
             for candidate in problem.library
-            if candidate.name not in kept_names and candidate is not dropped
+            if candidate.name not in kept_names
+            and candidate is not dropped
+            and not (current.cost < problem.noise and problem.is_limited(candidate))
         ]
     if not library:
         return []

@@ -14,10 +14,10 @@ from scipy.optimize import least_squares
 
 from table_io.block import Float1D, Label
 from table_io.channels import CHANNEL_BY_NAME
-from twin.identification.discover import MAX_EXPLAINED_COST
 from twin.identification.least_squares import FitResult
 from twin.identification.parameters import GapKey, NuisanceKey
 from twin.identification.residuals import LogResiduals
+from twin.identification.selection import MAX_EXPLAINED_COST
 from twin.identification.signals import CELL_PAIRS, SENSOR_PAIRS, LogSignals
 from twin.identification.spectra import Spectrum
 
@@ -30,7 +30,7 @@ MAX_RESOLUTION_SHARE = 0.01  # of the rms of the channel in motion
 MIN_FILTER_HZ = 140.0  # an impact on a stiff bumper has harmonics up to there
 MAX_GAIN_ERROR = 0.01  # two calibrations of class 0.5 %
 MAX_LAG_S = 3e-4  # multiplexed converters and unequal filters stay below it
-MAX_LOW_CUT_HZ = 0.3  # 5 % at 0.9 Hz
+MAX_LOW_CUT_HZ = 0.32  # 5 % at 1 Hz
 MAX_REMAINDER_SHARE, MIN_REMAINDER_RATIO = 0.02, 3.0  # of the motion; over the noise
 MIN_RESONANCE_HZ = 400.0  # of an accelerometer on its bracket
 MAX_SHARE_ERROR = 0.05  # of the force, off an equal division between the cells of a side
@@ -81,7 +81,7 @@ def check_sensors(log_residuals: Sequence[LogResiduals], fit: FitResult) -> tupl
     for residuals in log_residuals:
         signals = residuals.signals if residuals.nuisances is None else residuals.nuisances.raw
         checks += _check_noise(signals)
-        checks += _check_pairs(signals)
+        checks += compare_sensors(signals)
         checks += _check_cells(signals)
         if fit.cost * residuals.weight**2 <= MAX_EXPLAINED_COST:
             checks += _check_fitted(residuals, fit)
@@ -106,7 +106,8 @@ def _check_noise(signals: LogSignals) -> Iterator[SensorCheck]:
                 yield SensorCheck(signals.name, kind, (channel,), value, value, value, limit, unit)
 
 
-def _check_pairs(signals: LogSignals) -> Iterator[SensorCheck]:
+def compare_sensors(signals: LogSignals) -> Iterator[SensorCheck]:
+    """Yield the checks of each accelerometer against the laser on the same body."""
     for channels in SENSOR_PAIRS.values():
         if {*channels} <= {*signals.channels}:
             position, acc = channels[0], channels[1]
