@@ -58,8 +58,8 @@ MAX_NUISANCE_SAMPLES = 60_000  # moving samples of all logs; limits time and mem
 # About the nuisances found before: their products matter in a bad laboratory.
 LINEARIZATION_COUNT = 2
 # Share of the residual with ideal instruments (rms) that the nuisances, which are only so many
-# forms of errors, may leave where they explain it.
-INSTRUMENT_MISFIT = 0.01
+# forms of errors, may leave where they explain it; and the most, as mean square over the noise.
+INSTRUMENT_MISFIT, MAX_INSTRUMENT_MISFIT = 0.01, 3.0
 MODEL_LIMITED_RMS = 50.0  # residual rms over the noise above which model error limits the fit
 MAX_PARAMETER_RATIO = 1.5  # ratio to the model's parameter beyond which the specimen is another one
 
@@ -193,7 +193,7 @@ def add_nuisances(
             log_residuals=log_residuals,
             library=_drop_sound_sensors(problem),
             max_sensor_errors=MAX_EFFECTS,
-            instrument_misfit=INSTRUMENT_MISFIT**2 * ideal_cost,
+            instrument_misfit=min(INSTRUMENT_MISFIT**2 * ideal_cost, MAX_INSTRUMENT_MISFIT),
             amplitude_limits=TYPICAL_LIMITS,
         ),
         first_fit=fit,
