@@ -13,13 +13,16 @@ from twin.identification.cross_checks import fitted_gap
 from twin.identification.identify import WINDOW_S, IdentificationResult, identify_parameters
 from twin.identification.least_squares import FitResult
 from twin.identification.parameters import FreeParameter, GapKey, TareKey, get_log
+from twin.identification.sensor_checks import check_sensors
 from twin.reports.discovery.loading import load_recordings
+from twin.reports.discovery.sensor_section import describe_sensors
 from twin.reports.discovery.serialize import (
     INTERVAL_SIGMA,
     Json,
     interval_to_json,
     model_to_toml,
     parameter_to_json,
+    sensors_to_json,
 )
 from twin.reports.summary import dump_strict_json
 from twin.run.folders import make_output_folder, make_run_folder
@@ -155,6 +158,7 @@ def identification_to_json(result: IdentificationResult, notes: Sequence[str]) -
             )
             if pair
         ],
+        "sensors": sensors_to_json(check_sensors(log_residuals, fit)),
         "warnings": [*result.warnings],
         "notes": [*notes],
     }  # fmt: skip
@@ -220,6 +224,8 @@ def print_identification(report: Json) -> None:
             f"{100 * note['noise_floor']:.2g} %"
         )
     print_line(f"rms residual over the sensor noise: {report['rms_over_noise']:.3f}")
+    for line in describe_sensors(report["sensors"]):
+        print_line(line)
     for note in report["warnings"]:
         print_line(f"warning: {note}")
     for note in report["notes"]:

@@ -4,19 +4,21 @@ A harmonic of the drive may coincide with a line of the mains for some steps. Wh
 apart is time: hum is there at rest and lasts for the whole record, a harmonic belongs to its steps.
 """
 
+import itertools
 import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from scipy.fft import ifft, ifftshift, rfft, rfftfreq
+from scipy.fft import ifft, ifftshift, next_fast_len, rfft, rfftfreq
 from scipy.ndimage import binary_dilation
 
 from table_io.block import Bool2D, Float1D, Float2D
 from twin.identification.spectra import FrequencyGrid, Spectrum
 
 MAINS_HZ, MAINS_TOLERANCE = (50.0, 60.0), 0.002  # relative deviation of the mains frequency
-MIN_REST_S = 0.5  # from here on the rest alone shows whether there is hum
+MIN_REST_S = 0.5  # a shorter rest is not used
+CLEAR_REST_S = 2.0  # from here on the rest alone shows whether there is hum
 PART_COUNT = 4  # of a record without rest: hum is in every part
 SURROUNDINGS_HZ = 5.0
 MIN_LINE_RATIO = 20.0  # power of a line over the mean around it; noise alone hardly reaches it
@@ -24,7 +26,7 @@ LINE_WIDTH_HZ = 0.15  # standard deviation of the Gaussian filter that follows a
 SETTLING_S = 1.0 / (2.0 * math.pi * LINE_WIDTH_HZ)  # standard deviation of its response
 FILTER_WIDTHS = 4.0  # half width of that filter, in standard deviations
 MAX_EXCESS = 3.0  # times the amplitude at rest: above it there is a harmonic of the drive
-ZERO_PADDING = 8  # of a transform that measures the frequency of a line
+FREQUENCY_STEP_HZ = 0.1  # at most, between the values of a transform that measures a line
 
 
 class _Line(NamedTuple):
@@ -46,23 +48,21 @@ def remove_hum(
     rate_hz = grid.rate_hz / grid.decimation
     records = np.array([grid.to_time_domain(spectrum) for spectrum in spectra.values()])
     rest = records[:, at_rest[:: grid.decimation]]
+    parts = [_measure_lines(part, rate_hz) for part in np.array_split(records, PART_COUNT, axis=1)]
     has_rest = rest.shape[1] >= MIN_REST_S * rate_hz
+    lines_at_rest = _measure_lines(rest, rate_hz) if has_rest else itertools.repeat(None)
     cleaned = dict(spectra)
-    for nominal in _list_lines(rate_hz):
-        parts = [
-            _measure_line(part, rate_hz, nominal)
-            for part in np.array_split(records, PART_COUNT, axis=1)
-        ]
-        amplitudes = np.median([line.amplitudes for line in parts], axis=0)
-        seen = lasting = np.logical_and.reduce([line.stands_out for line in parts])
-        line_hz = float(np.median([line.frequency_hz for line in parts]))
-        if has_rest:
-            resting = _measure_line(rest, rate_hz, nominal)
-            # one that is too weak to stand out at rest must not be weaker there than in motion
-            weak = lasting & (amplitudes <= MAX_EXCESS * resting.amplitudes)
-            seen = resting.stands_out | weak
-            amplitudes = np.where(resting.stands_out, resting.amplitudes, amplitudes)
-            line_hz = line_hz if (seen & lasting).any() else resting.frequency_hz
+    for resting, *in_parts in zip(lines_at_rest, *parts, strict=False):
+        amplitudes = np.median([line.amplitudes for line in in_parts], axis=0)
+        seen = lasting = np.logical_and.reduce([line.stands_out for line in in_parts])
+        line_hz = float(np.median([line.frequency_hz for line in in_parts]))
+        if resting is not None:
+            # one that does not stand out at rest must not be weaker there than in motion
+            seen = lasting & (amplitudes <= MAX_EXCESS * resting.amplitudes)
+            if rest.shape[1] >= CLEAR_REST_S * rate_hz:
+                seen |= resting.stands_out
+                amplitudes = np.where(resting.stands_out, resting.amplitudes, amplitudes)
+                line_hz = line_hz if (seen & lasting).any() else resting.frequency_hz
         if seen.any():
             limits = np.where(seen, MAX_EXCESS * amplitudes, np.inf)
             cleaned = _remove_line(cleaned, grid, line_hz, limits)
@@ -73,7 +73,7 @@ def separate_hum(values: Float1D, rate_hz: float) -> tuple[Float1D, float]:
     """Return a record at rest, (sample,), without the hum that stands out, and the rms of it."""
     if values.size < MIN_REST_S * rate_hz:
         return values, 0.0
-    lines = [_measure_line(values[None], rate_hz, nominal) for nominal in _list_lines(rate_hz)]
+    lines = _measure_lines(values[None], rate_hz)
     seen = np.array([line.frequency_hz for line in lines if line.stands_out[0]])
     phase = 2.0 * np.pi * np.outer(np.arange(values.size) / rate_hz, seen)
     waves = np.hstack([np.cos(phase), np.sin(phase)])
@@ -81,34 +81,31 @@ def separate_hum(values: Float1D, rate_hz: float) -> tuple[Float1D, float]:
     return values - hum, float(np.sqrt(np.mean(hum**2)))
 
 
-def _list_lines(rate_hz: float) -> list[float]:
-    """Return the frequencies of the mains and their harmonics below half a sampling rate."""
-    return [
-        float(line)
-        for mains in MAINS_HZ
-        for line in np.arange(mains, rate_hz / 2 - SURROUNDINGS_HZ, mains)
-    ]
-
-
-def _measure_line(records: Float2D, rate_hz: float, nominal: float) -> _Line:
-    """Return the highest line of records, (channel, sample), next to a nominal frequency."""
+def _measure_lines(records: Float2D, rate_hz: float) -> list[_Line]:
+    """Return the highest line next to each harmonic of the mains, in records (channel, sample)."""
     size = records.shape[1]
     window = np.hanning(size)
-    hz = rfftfreq(ZERO_PADDING * size, 1.0 / rate_hz)
-    near = np.abs(hz - nominal) < SURROUNDINGS_HZ + 2 * rate_hz / size
-    distance = np.abs(hz[near] - nominal)
-    tolerance = MAINS_TOLERANCE * nominal + rate_hz / size
-    around = distance > tolerance + 2 * rate_hz / size  # beyond the main lobe of the window
+    padded = next_fast_len(max(size, round(1.0 / FREQUENCY_STEP_HZ * rate_hz)), real=True)
+    hz = rfftfreq(padded, 1.0 / rate_hz)
     tared = records - records.mean(axis=1, keepdims=True)
-    power = np.abs(rfft(tared * window, ZERO_PADDING * size)[:, near]) ** 2
-    inside = np.where(distance < tolerance, power, 0.0)
-    level = np.maximum(power[:, around].mean(axis=1), np.finfo(float).tiny)
-    ratio = inside.max(axis=1) / level
-    return _Line(
-        float(hz[near][inside[ratio.argmax()].argmax()]),
-        2.0 * np.sqrt(inside.max(axis=1)) / window.sum(),
-        ratio > MIN_LINE_RATIO,
-    )
+    spectra = [rfft(record * window, padded) for record in tared]
+    lines = []
+    for mains in MAINS_HZ:
+        for nominal in np.arange(mains, rate_hz / 2 - SURROUNDINGS_HZ, mains):
+            first, last = np.searchsorted(
+                hz, nominal + (SURROUNDINGS_HZ + 2 * rate_hz / size) * np.array([-1.0, 1.0])
+            )
+            distance = np.abs(hz[first:last] - nominal)
+            tolerance = MAINS_TOLERANCE * nominal + rate_hz / size
+            around = distance > tolerance + 2 * rate_hz / size  # beyond the main lobe
+            power = np.array([np.abs(spectrum[first:last]) ** 2 for spectrum in spectra])
+            inside = np.where(distance < tolerance, power, 0.0)
+            level = np.maximum(power[:, around].mean(axis=1), np.finfo(float).tiny)
+            ratio = inside.max(axis=1) / level
+            frequency_hz = float(hz[first + inside[ratio.argmax()].argmax()])
+            amplitudes = 2.0 * np.sqrt(inside.max(axis=1)) / window.sum()
+            lines.append(_Line(frequency_hz, amplitudes, ratio > MIN_LINE_RATIO))
+    return lines
 
 
 def _remove_line(

@@ -24,6 +24,7 @@ MIN_NOISE_SHARE = 1e-4  # of a channel's rms: lower limit of the noise
 # An anti-alias filter lowers the power by this factor within an octave, above this frequency; the
 # resolution of a converter may stop the fall.
 MIN_FILTER_FALL, MIN_FILTER_CYCLES = 4.0, 0.08  # -, cycles per sample
+MIN_CORNER_REST_S = 0.9  # a shorter rest does not show 1/f noise
 MIN_WHITE_SHARE = 0.1  # of the noise at rest that seems white
 WHITE_FITS = 3  # of white and 1/f noise, each weighted by the one before
 FILTER_CORNERS = 100  # tried between that frequency and the highest
@@ -103,6 +104,7 @@ def measure_rest_noise(values: Float1D, rest: Bool2D, rate_hz: float) -> RestNoi
     unfiltered = int(np.searchsorted(bands.frequency, MIN_FILTER_CYCLES))
     passed = min(_count_passed_bands(bands, roll_off), unfiltered)
     white, corner = _fit_white_and_slow(bands, max(passed, 3))
+    corner = corner if quiet.size >= MIN_CORNER_REST_S * rate_hz else 0.0
     half_power = _fit_half_power(bands, white) if math.isfinite(roll_off) else math.inf
     rms = max(math.sqrt(white), resolution / math.sqrt(12.0))
     return RestNoise(
