@@ -81,8 +81,13 @@ def compute_generic_forces(
     gaps_m: tuple[float, float],
     touched: npt.NDArray[np.int8],
     scale: RecordScale,
+    resonator_force: Callable[[float], Float1D],
 ) -> Float2D:
-    """Return the forces that the generic terms add to D, F_R >= 0, -F_L >= 0, (3, sample) in N."""
+    """Return the forces that the generic terms add to D, F_R >= 0, -F_L >= 0, (3, sample) in N.
+
+    `resonator_force` returns that of a resonator of a frequency in Hz: it depends on the history of
+    the motion, which `m` may hold in part.
+    """
     out = np.zeros((3, m.u.size))
     for key, force in values.items():
         if not (isinstance(key, TermKey) and key.name == "force"):
@@ -96,7 +101,7 @@ def compute_generic_forces(
             else 1.0
         )
         if shape == "resonator":
-            out[0] += force * _resonator_force(m, width)
+            out[0] += force * resonator_force(width)
         elif location == "damper":
             column = DAMPER_TERMS.get(shape) or DAMPER_WIDTH_TERMS[shape]
             sign_factor = friction_sign if "sign(v)" in shape else 1.0
@@ -109,7 +114,7 @@ def compute_generic_forces(
     return out
 
 
-def _resonator_force(m: MeasuredMotion, hz: float) -> Float1D:
+def compute_resonator_force(m: MeasuredMotion, hz: float) -> Float1D:
     """Return the force of an attached resonator over its largest value, (sample,).
 
     q'' + 2 z w q' + w^2 q = -a, with a the acceleration of the mass; the force is that of the

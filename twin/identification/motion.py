@@ -11,7 +11,8 @@ residual is white with variance 1 for any force law; a deviation indicates a sen
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -71,7 +72,7 @@ class MeasuredMotion:
     consistency_residuals: tuple[ConsistencyResidual, ...] = ()
     damper: Float1D | None = None
 
-    @property
+    @cached_property
     def has_load_cells(self) -> bool:
         """True if bumper forces were measured."""
         return bool(np.isfinite(self.right).any())
@@ -81,6 +82,17 @@ class MeasuredMotion:
         """Samples with the drive in motion and all channels valid, (sample,)."""
         moving: Bool2D = self.good & (self.label != Label.REST)
         return moving
+
+    def select(self, samples: Int1D) -> "MeasuredMotion":
+        """Return the motion at these samples alone, without its consistency residuals."""
+        return replace(
+            self, time_s=self.time_s[samples], u=self.u[samples], v=self.v[samples],
+            acc=self.acc[samples], table_acc=self.table_acc[samples],
+            table_disp=self.table_disp[samples], right=self.right[samples],
+            left=self.left[samples], step=self.step[samples], label=self.label[samples],
+            cycle=self.cycle[samples], good=self.good[samples], consistency_residuals=(),
+            damper=None if self.damper is None else self.damper[samples],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from table_io.block import Bool2D, Float1D, Float2D, Int1D
-from twin.identification.generic_terms import compute_generic_forces
+from twin.identification.generic_terms import compute_generic_forces, compute_resonator_force
 from twin.identification.motion import (
     ConsistencyResidual,
     MeasuredMotion,
@@ -31,7 +31,7 @@ from twin.identification.motion import (
 )
 from twin.identification.parameters import SLIP_SPEED, NuisanceKey, ParameterSet, TermKey
 from twin.identification.signals import LogSignals, derives_acc
-from twin.model.inverse_dynamics import forces_along
+from twin.model.inverse_dynamics import depends_on_history, forces_along
 from twin.model.model import Model, SensorModel
 
 CONTACT_NOISE_FACTOR = 8.0  # times the rms noise of a load cell: above it there is contact
@@ -79,6 +79,26 @@ class NuisanceTerms:
     def values(self, parameters: ParameterSet) -> Float1D:
         """Return the values of the nuisances in a parameter set, (nuisance,)."""
         return np.array([parameters.values.get(key, 0.0) for key in self.keys])
+
+
+@dataclass(frozen=True, eq=False)
+class SampledMotion:
+    """Motion at the samples where forces are needed, and whole: some depend on its history.
+
+    `contact` (2, sample) is the contact state at these samples, and `consistency` are the
+    consistency residuals, each at the samples of its own row.
+    """
+
+    whole: MeasuredMotion
+    samples: Int1D | slice
+    m: MeasuredMotion
+    contact: npt.NDArray[np.int8]
+    consistency: tuple[ConsistencyResidual, ...] = ()
+
+    @cached_property
+    def largest_pushes(self) -> tuple[float, float]:
+        """Largest measured force of the right and of the left side of the whole motion in N."""
+        return float(np.nanmax(self.whole.right)), float(np.nanmax(self.whole.left))
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,6 +231,46 @@ class LogResiduals:
         return (*FORCE_ROWS, *(consistency.body for consistency in m.consistency_residuals), *pulls)
 
     @cached_property
+    def _row_samples(self) -> tuple[Int1D, ...]:
+        """Samples of each row."""
+        return tuple(np.flatnonzero(row) for row in self.row_mask)
+
+    @cached_property
+    def _used_samples(self) -> Int1D:
+        """Samples of any row, (used,); all samples where the rows are whitened over time."""
+        if self.whitening is not None:
+            return np.arange(self.row_mask.shape[1])
+        return np.flatnonzero(self.row_mask.any(axis=0))
+
+    @cached_property
+    def _row_places(self) -> tuple[Int1D, ...]:
+        """Places of the samples of each row among the used ones."""
+        return tuple(np.flatnonzero(row[self._used_samples]) for row in self.row_mask)
+
+    @cached_property
+    def _sampled_motions(self) -> list[SampledMotion]:
+        """Cache of `_sample_motion`: of the motions in the cache of motions, and the last one."""
+        return []
+
+    def _sample_motion(self, m: MeasuredMotion) -> SampledMotion:
+        """Return what the residual needs of a motion; the most recent ones are cached."""
+        sampled = next((known for known in self._sampled_motions if known.whole is m), None)
+        if sampled is None:
+            samples, residuals = self._used_samples, m.consistency_residuals
+            rows = self._row_samples[len(FORCE_ROWS) :][: len(residuals)]
+            consistency = tuple(
+                replace(residual, values=residual.values[row])
+                for residual, row in zip(residuals, rows, strict=True)
+            )
+            sampled = SampledMotion(
+                m, samples, m.select(samples), self.contact_state[:, samples], consistency
+            )
+            cached = [motion for _, motion in self.motion_cache]
+            kept = [s for s in self._sampled_motions if any(s.whole is motion for motion in cached)]
+            self._sampled_motions[:] = [*kept, sampled]
+        return sampled
+
+    @cached_property
     def entry_row(self) -> Int1D:
         """Row of each residual entry, (entry,)."""
         rows = np.repeat(np.arange(len(self.rows)), self.row_mask.sum(axis=1))
@@ -225,8 +285,8 @@ class LogResiduals:
     @cached_property
     def entry_sample(self) -> Int1D:
         """Sample of each residual entry, (entry,)."""
-        samples = [np.flatnonzero(row) for row in self.row_mask]
-        return np.concatenate([*samples, np.zeros(self._rest_entry_count, dtype=np.int64)])
+        at_rest = np.zeros(self._rest_entry_count, dtype=np.int64)
+        return np.concatenate([*self._row_samples, at_rest])
 
     @cached_property
     def entry_block(self) -> Int1D:
@@ -253,18 +313,23 @@ class LogResiduals:
         self, m: MeasuredMotion, mass_kg: float, parameters: ParameterSet | None = None
     ) -> Float2D:
         """Return (3, sample) in N: damper force from the force balance of the mass, F_R, -F_L."""
+        return np.array(self._measured_forces(m, mass_kg, parameters))
+
+    def _measured_forces(
+        self, m: MeasuredMotion, mass_kg: float, parameters: ParameterSet | None
+    ) -> tuple[Float1D, Float1D, Float1D]:
         zero_error = {
             channel: parameters.tare_error(self.log_number, channel) if parameters else 0.0
             for channel in TARED_CHANNELS
         }
         if m.damper is not None:
             nothing = np.full(m.u.size, np.nan)
-            return np.array([m.damper, nothing, nothing])
+            return m.damper, nothing, nothing
         inertia, right, left = (
             -mass_kg * (m.acc - zero_error["acc"]), m.right - zero_error["right"],
             m.left - zero_error["left"]
         )  # fmt: skip
-        return np.array([inertia - right + left if m.has_load_cells else inertia, right, left])
+        return (inertia - right + left if m.has_load_cells else inertia), right, left
 
     def force_noise(self, m: MeasuredMotion, mass_kg: float) -> Float1D:
         """Return the rms sensor noise of the force rows in N, (3,).
@@ -310,15 +375,18 @@ class LogResiduals:
     def evaluate(self, parameters: ParameterSet) -> Float1D:
         """Return the residual over its noise, (entry,): measured minus model, row after row."""
         m = self.motion(parameters.assumed_sensors())
-        rows, rest = self.evaluate_rows(parameters, m), self._rest_entries(parameters)
+        rows, rest = self._list_rows(parameters, m), self._rest_entries(parameters)
         if self.nuisances is None:
-            return np.concatenate([rows, rest]) / self.weight
-        values = self.nuisances.values(parameters)
-        rows += values.astype(np.float32) @ self.nuisances.columns
+            entries = np.concatenate([*rows, rest])
+            entries /= self.weight
+            return entries
+        values, columns = self.nuisances.values(parameters), self.nuisances.columns
+        priors = self.nuisances.centre + values
+        entries = np.concatenate([*rows, rest, priors])
+        entries[: columns.shape[1]] += values.astype(np.float32) @ columns
         # the priors keep their weight where model error limits the fit
-        return np.concatenate(
-            [rows / self.weight, rest / self.weight, self.nuisances.centre + values]
-        )
+        entries[: entries.size - priors.size] /= self.weight
+        return entries
 
     @property
     def gap_correction(self) -> float:
@@ -348,12 +416,16 @@ class LogResiduals:
 
         Without load cells the damper force is the sum of all forces.
         """
-        return self._force_errors(parameters.model_for_log(self.log_number, m), parameters, m)
+        model = parameters.model_for_log(self.log_number, m)
+        whole = SampledMotion(m, slice(None), m, self.contact_state)
+        return np.array(self._force_errors(model, parameters, whole))
 
-    def _force_errors(self, model: Model, parameters: ParameterSet, m: MeasuredMotion) -> Float2D:
-        """Return `force_errors` of the model of this log."""
-        u = m.u - parameters.tare_error(self.log_number, "u")
-        d, right, left = forces_along(model, u, m.v, m.time_s, self.contact_state)
+    def _force_errors(
+        self, model: Model, parameters: ParameterSet, sampled: SampledMotion
+    ) -> tuple[Float1D, Float1D, Float1D]:
+        """Return `force_errors` of the model of this log, (used,) each."""
+        m = sampled.m
+        d, right, left = self._model_forces(model, parameters, sampled)
         if SLIP_SPEED in parameters.values:
             fc = model.effect_parameter("coulomb_friction", "fc") or 0.0
             d = d + fc * (
@@ -364,36 +436,54 @@ class LogResiduals:
         added = model.added_acceleration(m.table_disp)
         if added is not None:
             d = d + model.parameters.mass * added
-        expected = np.array([d, right, -left])
+        left = -left
         if any(isinstance(key, TermKey) for key in parameters.values):
             p = model.parameters
             generic = compute_generic_forces(
-                parameters.values, m, (p.gap_r, p.gap_l), self.contact_state, self.scale
-            )
-            expected += generic
-        return self.measured_forces(m, model.parameters.mass, parameters) - expected
+                parameters.values, m, (p.gap_r, p.gap_l), sampled.contact, self.scale,
+                lambda hz: compute_resonator_force(sampled.whole, hz)[sampled.samples],
+            )  # fmt: skip
+            d, right, left = d + generic[0], right + generic[1], left + generic[2]
+        measured = self._measured_forces(m, model.parameters.mass, parameters)
+        return measured[0] - d, measured[1] - right, measured[2] - left
+
+    def _model_forces(
+        self, model: Model, parameters: ParameterSet, sampled: SampledMotion
+    ) -> Float2D:
+        """Return D, F_R >= 0 and F_L <= 0 of a model in N, (3, used)."""
+        zero_error = parameters.tare_error(self.log_number, "u")
+        if self._knows_contact and not depends_on_history(model):
+            m = sampled.m
+            return forces_along(model, m.u - zero_error, m.v, m.time_s, sampled.contact)
+        m = sampled.whole
+        forces = forces_along(model, m.u - zero_error, m.v, m.time_s, self.contact_state)
+        return forces[:, sampled.samples]
+
+    @cached_property
+    def _knows_contact(self) -> bool:
+        return bool((self.contact_state >= 0).all())
 
     def evaluate_rows(self, parameters: ParameterSet, m: MeasuredMotion) -> Float1D:
         """Return the residual over its noise on a given motion, (entry,), without the rest row."""
-        model = parameters.model_for_log(self.log_number, m)
-        rows = self._force_errors(model, parameters, m)
+        return np.concatenate(self._list_rows(parameters, m))
+
+    def _list_rows(self, parameters: ParameterSet, m: MeasuredMotion) -> list[Float1D]:
+        """Return the rows of `evaluate_rows`, each at its own samples."""
+        model, sampled = parameters.model_for_log(self.log_number, m), self._sample_motion(m)
+        forces = self._force_errors(model, parameters, sampled)
         # the noise is that of the nominal mass: a misfit must not shrink by its own denominator
         nominal_mass = model.parameters.mass * self.signals.mass_kg / m.mass_kg
-        rows /= self.force_noise(m, nominal_mass)[:, None]
+        noise = self.force_noise(m, nominal_mass)
+        places = self._row_places[: len(FORCE_ROWS)]
+        rows = [f[place] / rms for f, place, rms in zip(forces, places, noise, strict=True)]
         if self.whitening is not None:
             # the second derivative at an open end is no force, and the filter would spread it
-            rows[0] = self.signals.grid.apply_gain(np.where(m.good, rows[0], 0.0), self.whitening)
-        all_rows = [
-            *rows,
-            *(
-                self._correct_consistency(consistency, parameters)
-                for consistency in m.consistency_residuals
-            ),
-        ]
+            damper = np.where(m.good, forces[0] / noise[0], 0.0)
+            rows[0] = self.signals.grid.apply_gain(damper, self.whitening)[places[0]]
+        rows += [self._correct_consistency(c, parameters) for c in sampled.consistency]
         if m.has_load_cells and m.damper is None:
-            all_rows += [*self._pull_rows(m, parameters)]
-        samples = [row[used] for row, used in zip(all_rows, self.row_mask, strict=True)]
-        return np.concatenate(samples)
+            rows += self._pull_rows(sampled, parameters)
+        return rows
 
     def _correct_consistency(
         self, consistency: ConsistencyResidual, parameters: ParameterSet
@@ -410,24 +500,27 @@ class LogResiduals:
             else consistency.values
         )
 
-    def _pull_rows(self, m: MeasuredMotion, parameters: ParameterSet) -> Float2D:
-        """Return the tension of each side over the noise of its cells, (2, sample); 0 for pushes.
+    def _pull_rows(self, sampled: SampledMotion, parameters: ParameterSet) -> list[Float1D]:
+        """Return the tension of each side over the noise of its cells, in its row; 0 for pushes.
 
         The mean square of pure noise is at most 1: only its negative half enters, scaled by
         sqrt(2). The undershoot of the low pass after a release is not counted as tension.
         """
+        m = sampled.m
         # a side without cells has no noise and no samples in these rows
         sides = (
             (m.right, "right", m.noise.right or 1.0),
             (m.left, "left", m.noise.left or 1.0),
         )
-        return np.array([
+        return [
             np.minimum(
-                push - parameters.tare_error(self.log_number, name)
-                + MAX_UNDERSHOOT_SHARE * np.nanmax(push), 0.0)
+                push[place] - parameters.tare_error(self.log_number, name)
+                + MAX_UNDERSHOOT_SHARE * largest, 0.0)
             * math.sqrt(2.0) / rms
-            for push, name, rms in sides
-        ])  # fmt: skip
+            for (push, name, rms), place, largest in zip(
+                sides, self._row_places[-len(PULL_ROWS) :], sampled.largest_pushes, strict=True
+            )
+        ]  # fmt: skip
 
     def _rest_entries(self, parameters: ParameterSet) -> Float1D:
         """Return the rest row, (entry,): readings at rest less offsets, tare errors, over noise."""

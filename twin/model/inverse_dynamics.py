@@ -280,8 +280,19 @@ def forces_along(
     coefficients, laws = kernel_coefficients(model)
     fastest_rate = _fastest_law_rate(model)
     out = np.empty((3, u.size))
-    _force_kernel(u, v, time_s, contact.astype(np.float64), coefficients, laws, fastest_rate, out)
+    touched = contact.astype(np.float64, order="C")
+    _force_kernel(u, v, time_s, touched, coefficients, laws, fastest_rate, out)
     return out
+
+
+def depends_on_history(model: Model) -> bool:
+    """Return True if a force depends on the motion before it, where contact was measured.
+
+    Where it was not, every force does: a face that is touched stays touched while it pushes.
+    """
+    p, _ = kernel_coefficients(model)
+    has_states = any(effect.states for effect, _ in model.added_laws)
+    return has_states or max(p.fy, p.k1, p.kb) > 0.0
 
 
 def _fastest_law_rate(model: Model) -> float:
