@@ -216,7 +216,7 @@ def linearize_nuisances(
 
     def slope(nuisance: Nuisance) -> Float1D:
         corrected = correct_signals(signals, nuisance, SLOPE_STEP)
-        rows = bare.evaluate_rows(parameters, corrected.fuse_motion())
+        rows = bare.evaluate_rows(parameters, signals.fuse_corrected(corrected))
         # A gain scales the noise too, so that a large one would seem to reduce the misfit: the
         # share of the noise in the slope is taken out.
         slope: Float1D = (rows - before) / SLOPE_STEP
@@ -265,7 +265,7 @@ def _compute_noise_shares(
         noisy = _with_spectra(
             signals, {channel: signals.spectra[channel] + density * np.exp(1j * phase)}
         )
-        noise = residuals.evaluate_rows(parameters, noisy.fuse_motion()) - before
+        noise = residuals.evaluate_rows(parameters, signals.fuse_corrected(noisy)) - before
         counts = np.maximum(np.bincount(rows), 1)
         shares[channel] = np.bincount(rows, weights=noise**2) / counts
     total = np.maximum(np.sum([*shares.values()], axis=0), 1e-300)

@@ -6,7 +6,7 @@ Gain, lag and offset of a sensor are simple operations on its spectrum, so a fit
 import math
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import cached_property
 
 import numpy as np
 
@@ -174,14 +174,15 @@ class LogSignals:
         The noise is that of the readings as they are: scaled by an assumed gain, it would let the
         misfit shrink by its own denominator.
         """
-        spectra = dict(self.spectra)
-        for sensor in sensors:
-            if sensor.channel in spectra:
-                shifted = spectra[sensor.channel] - sensor.offset * self.unit_spectrum
-                spectra[sensor.channel] = (
-                    shifted * np.exp(1j * self.omega * sensor.lag) / sensor.gain
-                )
-        return _SensorFusion(self, spectra, self.noise).fuse()
+        return self._fusion.fuse(self.spectra, sensors)
+
+    def fuse_corrected(self, corrected: "LogSignals") -> MeasuredMotion:
+        """Return the motion of corrected signals: with the noise of these, and most spectra."""
+        return replace(self._fusion.fuse(corrected.spectra), gaps_m=corrected.gaps_m)
+
+    @cached_property
+    def _fusion(self) -> "_SensorFusion":
+        return _SensorFusion(self)
 
 
 def derives_acc(channels: Container[str]) -> bool:
@@ -189,134 +190,162 @@ def derives_acc(channels: Container[str]) -> bool:
     return "mass_acc_m_s2" not in channels and "table_acc_m_s2" in channels
 
 
+@dataclass(frozen=True, slots=True)
+class _ChannelWeights:
+    """Share of a displacement or acceleration in the fusion, gains by frequency, (frequency,)."""
+
+    u: Float1D
+    body: str = ""  # of its sensor-consistency residual
+    consistency: Float1D | None = None
+
+
 class _SensorFusion:
-    """Minimum-variance fusion of displacement and acceleration spectra into one motion."""
+    """Minimum-variance fusion of displacement and acceleration spectra into one motion.
 
-    def __init__(
-        self, signals: LogSignals, spectra: Mapping[str, Spectrum], noise: Mapping[str, Float1D]
-    ) -> None:
-        self.signals, self.spectra, self.noise = signals, spectra, noise
+    It is linear: every channel adds its own series, (sample,), to those of the motion. The series
+    of the channels as read are computed once; gain and offset of a sensor only scale and shift.
+    """
+
+    def __init__(self, signals: LogSignals) -> None:
+        self.signals, self.noise = signals, signals.noise
         self.grid, self.omega, self.low_pass = signals.grid, signals.omega, signals.low_pass
-        self.missing = np.full(signals.time_s.size, np.nan)
-
-    def fuse(self) -> MeasuredMotion:
-        signals = self.signals
-        position, noise_u, noise_v, consistency = self._relative_displacement()
-        right, noise_right = self._side_force(RIGHT_CELLS)
-        left, noise_left = self._side_force(LEFT_CELLS)
-        # a side without a bumper needs no cells: its force is zero
-        nothing = np.zeros(signals.time_s.size)
-        if np.isfinite(noise_right) and np.isnan(noise_left):
-            left, noise_left = nothing, 0.0
-        elif np.isfinite(noise_left) and np.isnan(noise_right):
-            right, noise_right = nothing, 0.0
-        acc = self._time_series("mass_acc_m_s2")
-        if derives_acc(self.spectra):
-            acc = self.grid.to_time_domain(
-                (self.spectra["table_acc_m_s2"] - self.omega**2 * position) * self.low_pass
-            )
-        noise = MotionNoise(
-            noise_u, noise_v, self._filtered_rms("mass_acc_m_s2"), noise_right, noise_left,
-            self._filtered_rms("damper_force_n"),
+        self.kept_share = self.grid.white_noise_rms(self.low_pass)
+        self.weights: dict[str, _ChannelWeights] = {}
+        self.sensitivity: dict[str, float] = {}  # of the consistency residuals
+        if {"mass_disp_m", "table_disp_m"} <= signals.spectra.keys():
+            densities = [
+                self._weigh(body, sign, laser, {accelerometer: 1.0})
+                for (body, laser, accelerometer), sign in zip(BODY_SENSORS, (1, -1), strict=True)
+            ]
+        else:
+            accelerometers = {"mass_acc_m_s2": 1.0, "table_acc_m_s2": -1.0}
+            densities = [self._weigh("mass against table", 1, "rel_disp_m", accelerometers)]
+        density = np.hypot.reduce(densities) * self.low_pass
+        # the surface noise is too slow for the low pass
+        surface = math.sqrt(len(densities)) * signals.surface_noise_m
+        rms = self._filtered_rms
+        self.motion_noise = MotionNoise(
+            math.hypot(self.grid.white_noise_rms(density), surface),
+            self.grid.white_noise_rms(self.omega * density),
+            rms("mass_acc_m_s2"), self._side_noise(RIGHT_CELLS), self._side_noise(LEFT_CELLS),
+            rms("damper_force_n"),
         )  # fmt: skip
-        consistency += self._load_cell_residuals()
-        damper = self._time_series("damper_force_n") if "damper_force_n" in self.spectra else None
+        self.cell_noise = {side: self._side_noise(cells) for side, cells in CELL_PAIRS.items()}
+        self.series: dict[str, dict[str, Float1D]] = {}
+        self.unit_series: dict[str, dict[str, Float1D]] = {}  # of readings of 1 SI
+
+    def _weigh(
+        self, body: str, sign: int, laser: str, accelerometers: Mapping[str, float]
+    ) -> Float1D:
+        """Set the weights of the sensors of a body; return the density of its fused noise.
+
+        With a `sign` for each accelerometer: mass less table, where the laser reads their distance.
+        """
+        s_x = self.noise[laser]
+        if not accelerometers.keys() <= self.signals.spectra.keys():
+            self.weights[laser] = _ChannelWeights(sign * self.low_pass)
+            return s_x
+        s_a, w2 = np.hypot.reduce([self.noise[name] for name in accelerometers]), self.omega**2
+        variance = s_a**2 + w2**2 * s_x**2
+        residual = self.low_pass / np.sqrt(variance) / self.kept_share
+        self.weights[laser] = _ChannelWeights(
+            sign * s_a**2 / variance * self.low_pass, body, w2 * residual
+        )
+        for name, own_sign in accelerometers.items():
+            self.weights[name] = _ChannelWeights(
+                -sign * own_sign * w2 * s_x**2 / variance * self.low_pass, body, own_sign * residual
+            )
+        self.sensitivity[body] = 1.0 / (float(np.sqrt(variance[0])) * self.kept_share)
+        density: Float1D = s_a * s_x / np.sqrt(variance)
+        return density
+
+    def fuse(
+        self, spectra: Mapping[str, Spectrum], sensors: Sequence[SensorModel] = ()
+    ) -> MeasuredMotion:
+        """Return the motion of the spectra of all channels, for assumed sensors."""
+        signals, assumed = self.signals, {sensor.channel: sensor for sensor in sensors}
+        shares = {
+            channel: self._read(channel, spectrum, assumed.get(channel))
+            for channel, spectrum in spectra.items()
+        }
+        missing = np.full(signals.time_s.size, np.nan)
+
+        def add(name: str, channels: Sequence[str] = USED_CHANNELS) -> Float1D:
+            """Return the sum of one series of the channels that have it; NaN without any."""
+            parts = [shares[c][name] for c in channels if c in shares and name in shares[c]]
+            total = parts[0] if parts else missing
+            if len(parts) > 1:
+                total = parts[0] + parts[1]
+                for part in parts[2:]:
+                    total += part
+            return total
+
+        right, left = add("read", RIGHT_CELLS), add("read", LEFT_CELLS)
+        noise = self.motion_noise
+        # a side without a bumper needs no cells: its force is zero
+        if np.isfinite(noise.right) and np.isnan(noise.left):
+            left, noise = np.zeros(missing.size), replace(noise, left=0.0)
+        elif np.isfinite(noise.left) and np.isnan(noise.right):
+            right, noise = np.zeros(missing.size), replace(noise, right=0.0)
+        consistency = [
+            ConsistencyResidual(body, add(body), sensitivity)
+            for body, sensitivity in self.sensitivity.items()
+        ]
+        for side, (first, second) in CELL_PAIRS.items():
+            if {first, second} <= spectra.keys():
+                difference = shares[first]["read"] - shares[second]["read"]
+                difference /= self.cell_noise[side]
+                consistency.append(ConsistencyResidual(side, difference))
+        acc = add("read", ["mass_acc_m_s2"])
+        if derives_acc(spectra):
+            acc = add("relative acc") + add("read", ["table_acc_m_s2"])
         return MeasuredMotion(
             signals.name, self.grid.rate_hz / self.grid.decimation, signals.mass_kg,
-            signals.gaps_m, signals.time_s,
-            self.grid.to_time_domain(position * self.low_pass),
-            self.grid.to_time_domain(1j * self.omega * position * self.low_pass),
-            acc, self._time_series("table_acc_m_s2"), self._time_series("table_disp_m"),
-            right, left,
-            signals.step, signals.label, signals.cycle, signals.good, noise, consistency, damper,
+            signals.gaps_m, signals.time_s, add("u"), add("v"), acc,
+            add("read", ["table_acc_m_s2"]), add("read", ["table_disp_m"]), right, left,
+            signals.step, signals.label, signals.cycle, signals.good, noise, tuple(consistency),
+            add("read", ["damper_force_n"]) if "damper_force_n" in spectra else None,
         )  # fmt: skip
 
-    def _relative_displacement(
-        self,
-    ) -> tuple[Spectrum, float, float, tuple[ConsistencyResidual, ...]]:
-        """Return (spectrum of u, rms noise of u, rms noise of v, consistency residuals)."""
-        spectra = self.spectra
-        if {"mass_disp_m", "table_disp_m"} <= spectra.keys():
-            pairs = [self._fuse_body(*body) for body in BODY_SENSORS]
-            noise_density = np.hypot(pairs[0][1], pairs[1][1])
-            consistency = tuple(pair[2] for pair in pairs if pair[2] is not None)
-            return (
-                pairs[0][0] - pairs[1][0],
-                self._displacement_noise(noise_density, laser_count=2),
-                self._velocity_noise(noise_density),
-                consistency,
-            )
-        acc, noise = None, np.zeros(self.omega.size)
-        if {"mass_acc_m_s2", "table_acc_m_s2"} <= spectra.keys():
-            acc = spectra["mass_acc_m_s2"] - spectra["table_acc_m_s2"]
-            noise = np.hypot(self.noise["mass_acc_m_s2"], self.noise["table_acc_m_s2"])
-        spectrum, noise_density, residual = self._fuse(
-            "mass against table",
-            spectra["rel_disp_m"],
-            self.noise["rel_disp_m"],
-            acc,
-            noise,
-        )
-        return (
-            spectrum,
-            self._displacement_noise(noise_density, laser_count=1),
-            self._velocity_noise(noise_density),
-            (residual,) if residual else (),
-        )
+    def _read(
+        self, channel: str, spectrum: Spectrum, sensor: SensorModel | None
+    ) -> dict[str, Float1D]:
+        """Return the series of a channel, of which the sensor reads gain x value(t - lag) + offset.
 
-    def _fuse_body(
-        self, body: str, laser: str, accelerometer: str
-    ) -> tuple[Spectrum, Float1D, Any]:
-        acc = self.spectra.get(accelerometer)
-        return self._fuse(
-            body,
-            self.spectra[laser],
-            self.noise[laser],
-            acc,
-            self.noise.get(accelerometer, np.zeros(self.omega.size)),
-        )
+        Those of the channels as read are cached.
+        """
+        if sensor is not None and sensor.lag:
+            tared = spectrum - sensor.offset * self.signals.unit_spectrum
+            series = self._filter(channel, tared * np.exp(1j * self.omega * sensor.lag))
+        elif spectrum is not self.signals.spectra[channel]:
+            series = self._filter(channel, spectrum)
+        else:
+            if channel not in self.series:
+                self.series[channel] = self._filter(channel, spectrum)
+            series = self.series[channel]
+        if sensor is not None and sensor.offset and not sensor.lag:
+            if channel not in self.unit_series:
+                self.unit_series[channel] = self._filter(channel, self.signals.unit_spectrum)
+            unit = self.unit_series[channel]
+            series = {name: values - sensor.offset * unit[name] for name, values in series.items()}
+        if sensor is not None and sensor.gain != 1.0:
+            series = {name: values / sensor.gain for name, values in series.items()}
+        return series
 
-    def _fuse(
-        self, body: str, position: Spectrum, s_x: Float1D, acc: Spectrum | None, s_a: Float1D
-    ) -> tuple[Spectrum, Float1D, ConsistencyResidual | None]:
-        """Return (fused spectrum, density of its noise, consistency residual)."""
-        if acc is None:
-            return position, s_x, None
-        w2 = self.omega**2
-        variance = s_a**2 + w2**2 * s_x**2
-        fused = (s_a**2 * position - w2 * s_x**2 * acc) / variance
-        difference = self.grid.to_time_domain(
-            (acc + w2 * position) / np.sqrt(variance) * self.low_pass
-        )
-        kept_share = self.grid.white_noise_rms(self.low_pass)
-        sensitivity = 1.0 / (float(np.sqrt(variance[0])) * kept_share)
-        consistency = ConsistencyResidual(body, difference / kept_share, sensitivity)
-        return fused, s_a * s_x / np.sqrt(variance), consistency
-
-    def _load_cell_residuals(self) -> tuple[ConsistencyResidual, ...]:
-        """Return the difference of the two load cells of each side over their noise."""
-        residuals = []
-        for side, (first, second) in CELL_PAIRS.items():
-            if {first, second} <= self.spectra.keys():
-                difference = self._time_series(first) - self._time_series(second)
-                noise = np.hypot(self._filtered_rms(first), self._filtered_rms(second))
-                residuals.append(ConsistencyResidual(side, difference / noise))
-        return tuple(residuals)
-
-    def _displacement_noise(self, noise_density: Float1D, laser_count: int) -> float:
-        """Return the rms noise of u; the surface noise is too slow for the low pass."""
-        surface = math.sqrt(laser_count) * self.signals.surface_noise_m
-        return math.hypot(self.grid.white_noise_rms(noise_density * self.low_pass), surface)
-
-    def _velocity_noise(self, noise_density: Float1D) -> float:
-        return self.grid.white_noise_rms(self.omega * noise_density * self.low_pass)
-
-    def _time_series(self, name: str) -> Float1D:
-        return (
-            self.grid.to_time_domain(self.spectra[name] * self.low_pass)
-            if name in self.spectra
-            else self.missing
-        )
+    def _filter(self, channel: str, spectrum: Spectrum) -> dict[str, Float1D]:
+        """Return the series of a channel: its share in u, v, ..., and the readings themselves."""
+        series, weights = {}, self.weights.get(channel)
+        if weights is not None:
+            position = spectrum * weights.u
+            series["u"] = self.grid.to_time_domain(position)
+            series["v"] = self.grid.to_time_domain(1j * self.omega * position)
+            if derives_acc(self.signals.spectra):
+                series["relative acc"] = self.grid.to_time_domain(-(self.omega**2) * position)
+            if weights.consistency is not None:
+                series[weights.body] = self.grid.to_time_domain(spectrum * weights.consistency)
+        if channel not in ("rel_disp_m", "mass_disp_m"):
+            series["read"] = self.grid.to_time_domain(spectrum * self.low_pass)
+        return series
 
     def _filtered_rms(self, name: str) -> float:
         """Return the rms noise of a channel after the low pass, SI; NaN without the channel."""
@@ -324,15 +353,10 @@ class _SensorFusion:
             return float("nan")
         return self.grid.white_noise_rms(self.noise[name] * self.low_pass)
 
-    def _side_force(self, cells: tuple[str, ...]) -> tuple[Float1D, float]:
-        """Return (force of the cells of a side, (sample,) in N, its rms noise)."""
-        present = [name for name in cells if name in self.spectra]
-        if not present:
-            return self.missing, float("nan")
-        total = np.sum([self.spectra[name] for name in present], axis=0)
-        return self.grid.to_time_domain(total * self.low_pass), float(
-            np.hypot.reduce([*map(self._filtered_rms, present)])
-        )
+    def _side_noise(self, cells: tuple[str, ...]) -> float:
+        """Return the rms noise of the force of a side in N; NaN without load cells."""
+        present = [self._filtered_rms(name) for name in cells if name in self.signals.spectra]
+        return float(np.hypot.reduce(present)) if present else float("nan")
 
 
 def build_signals(
