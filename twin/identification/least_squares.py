@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol, TypeVar
 
 import numpy as np
 from scipy.special import stdtrit
@@ -26,14 +27,16 @@ COLOUR_FACTOR = 1.5  # of the error within a contact: noise of the fused motion 
 # of a parameter's curvature: with less in the training folds, they do not determine it
 MIN_CURVATURE_SHARE = 1e-3
 
-# Same interface as `map`; a caller may supply a parallel one.
-MapFunction = Callable[
-    [
-        Callable[[tuple[ParameterSet, FreeParameter]], list[Float1D]],
-        Iterable[tuple[ParameterSet, FreeParameter]],
-    ],
-    Iterable[list[Float1D]],
-]
+Argument = TypeVar("Argument")
+Result = TypeVar("Result")
+
+
+class MapFunction(Protocol):
+    """Same interface as `map`; a caller may supply a parallel one."""
+
+    def __call__(
+        self, function: Callable[[Argument], Result], values: Iterable[Argument], /
+    ) -> Iterable[Result]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,22 +93,41 @@ def compute_slopes(
         step = -step
     moved = parameters.with_values(dict.fromkeys(free.keys, free.to_external(x + step)))
     log_number = get_log(free.key)
-    return [
-        (residuals.evaluate(moved) - old) / step
-        if log_number in (None, residuals.log_number)
-        else np.zeros(old.size)  # a parameter of another log
-        for residuals, old in zip(log_residuals, before, strict=True)
-    ]
+    slopes = []
+    for residuals, old in zip(log_residuals, before, strict=True):
+        if log_number in (None, residuals.log_number):
+            slope = residuals.evaluate(moved)
+            slope -= old
+            slope /= step
+        else:
+            slope = np.zeros(old.size)  # a parameter of another log
+        slopes.append(slope)
+    return slopes
 
 
-def compute_columns(
+def compute_jacobian(
     log_residuals: Sequence[LogResiduals],
-    requests: Sequence[tuple[ParameterSet, FreeParameter]],
+    parameters: ParameterSet,
     before: Sequence[Float1D],
+    train: Sequence[Bool2D] | None = None,
     mapper: MapFunction = map,
-) -> list[list[Float1D]]:
-    """Return the Jacobian columns of several parameters, each at its own parameter set."""
-    return [*mapper(lambda pair: compute_slopes(log_residuals, *pair, before), requests)]
+) -> Float2D:
+    """Return the slopes of the free parameters, (free, entry), on the training entries alone."""
+    columns = mapper(
+        lambda free: compute_slopes(log_residuals, parameters, free, before), parameters.free
+    )
+    count = sum(old.size for old in before) if train is None else sum(m.sum() for m in train)
+    jacobian = np.empty((len(parameters.free), count))
+    for row, slopes in zip(jacobian, columns, strict=True):
+        row[:] = select_entries(slopes, train)
+    return jacobian
+
+
+def select_entries(entries: Sequence[Float1D], train: Sequence[Bool2D] | None) -> Float1D:
+    """Return the training entries of all logs, (entry,); all entries without `train`."""
+    if train is not None:
+        entries = [values[mask] for values, mask in zip(entries, train, strict=True)]
+    return entries[0] if len(entries) == 1 else np.concatenate(entries)
 
 
 class _LevenbergMarquardt:
@@ -121,10 +143,11 @@ class _LevenbergMarquardt:
     ) -> None:
         self.log_residuals, self.start, self.free = log_residuals, start, start.free
         self.folds, self.mapper = folds, mapper
-        self.train = train or [
-            np.ones(residuals.entry_row.size, dtype=bool) for residuals in log_residuals
-        ]
-        self.count = sum(int(mask.sum()) for mask in self.train)
+        self.train = train
+        self.count = sum(
+            residuals.entry_row.size if train is None else int(train[log].sum())
+            for log, residuals in enumerate(log_residuals)
+        )
         low = [-math.inf if f.low == -math.inf else f.to_internal(f.low) for f in self.free]
         self.low = np.array(low)
         self.high = np.array(
@@ -136,13 +159,11 @@ class _LevenbergMarquardt:
         return [residuals.evaluate(parameters) for residuals in self.log_residuals]
 
     def select_training(self, entries: Sequence[Float1D]) -> Float1D:
-        return np.concatenate([row[mask] for row, mask in zip(entries, self.train, strict=True)])
+        return select_entries(entries, self.train)
 
-    def compute_jacobian(self, parameters: ParameterSet, current: list[Float1D]) -> Float2D:
-        columns = compute_columns(
-            self.log_residuals, [(parameters, free) for free in self.free], current, self.mapper
-        )
-        return np.array([*map(self.select_training, columns)]).reshape(len(self.free), self.count)
+    def compute_jacobian(self, x: Float1D, current: list[Float1D]) -> Float2D:
+        parameters = self.start.with_vector(x)
+        return compute_jacobian(self.log_residuals, parameters, current, self.train, self.mapper)
 
     def take_step(self, x: Float1D, hessian: Float2D, gradient: Float1D, damping: float) -> Float1D:
         """Return x after a damped Gauss-Newton step; a parameter that would leave a bound stays."""
@@ -157,8 +178,8 @@ class _LevenbergMarquardt:
         current = self.evaluate(x)
         r = self.select_training(current)
         cost, damping, converged = float(r @ r), 1e-4, not self.free
+        jacobian = self.compute_jacobian(x, current)
         for _ in range(0 if converged else MAX_ITERATIONS):
-            jacobian = self.compute_jacobian(self.start.with_vector(x), current)
             hessian, gradient = jacobian @ jacobian.T, jacobian @ r
             gain = 0.0
             for _ in range(8):
@@ -174,17 +195,18 @@ class _LevenbergMarquardt:
                     damping = max(damping / 10, 1e-9)
                     break
                 damping *= 10
-            if gain < MIN_COST_GAIN:
+            if gain < MIN_COST_GAIN:  # the slopes are those of the result, too
                 converged = True
                 break
-        return self._build_result(x, current, cost, converged)
+            del jacobian  # it is large
+            jacobian = self.compute_jacobian(x, current)
+        return self._build_result(x, current, jacobian, cost, converged)
 
     def _build_result(
-        self, x: Float1D, current: list[Float1D], cost: float, converged: bool
+        self, x: Float1D, current: list[Float1D], jacobian: Float2D, cost: float, converged: bool
     ) -> FitResult:
         """Return the fit with standard errors from a sandwich estimator clustered by block."""
         parameters = self.start.with_vector(x)
-        jacobian = self.compute_jacobian(parameters, current)
         hessian = jacobian @ jacobian.T
         scale = _curvature_scale(hessian)
         # parameters at a bound are fixed there
@@ -195,27 +217,32 @@ class _LevenbergMarquardt:
             (hessian / np.outer(scale, scale))[inner_block], hermitian=True
         )
         inverse /= np.outer(scale, scale)
-        gradients = jacobian * self.select_training(current)
+        r = self.select_training(current)
         first, count = 0, 0
         scatter, rest_scatter = np.zeros_like(inverse), np.zeros_like(inverse)
         information = []  # of each block, (free, block)
-        for residuals, mask in zip(self.log_residuals, self.train, strict=True):
-            blocks = residuals.entry_contact_block[mask]
-            entries = slice(first, first + blocks.size)
-            at_rest = (residuals.entry_row == len(residuals.rows))[mask]
+        for log, residuals in enumerate(self.log_residuals):
+            blocks, at_rest = (
+                residuals.entry_contact_block,
+                residuals.entry_row == len(residuals.rows),
+            )
+            if self.train is not None:
+                blocks, at_rest = blocks[self.train[log]], at_rest[self.train[log]]
+            last = first + blocks.size
+            moving = slice(first, last - np.count_nonzero(at_rest))  # the rest row is the last one
+            blocks = blocks[~at_rest]
             block_gradients = np.array(
-                [np.bincount(blocks[~at_rest], weights=row[entries][~at_rest]) for row in gradients]
+                [np.bincount(blocks, weights=row[moving] * r[moving]) for row in jacobian]
             )
             # a rest row has a single entry: its variance is taken from the noise
-            rest_slopes = jacobian[:, entries][:, at_rest] / residuals.weight
-            moving_slopes = [row[entries][~at_rest] ** 2 for row in jacobian]
+            rest_slopes = jacobian[:, moving.stop : last] / residuals.weight
             information.append(
-                [np.bincount(blocks[~at_rest], row).astype(np.float64) for row in moving_slopes]
+                [np.bincount(blocks, row[moving] ** 2).astype(np.float64) for row in jacobian]
             )
             scatter += block_gradients @ block_gradients.T
             rest_scatter += rest_slopes @ rest_slopes.T
-            first += blocks.size
-            count += np.unique(blocks[~at_rest]).size
+            first = last
+            count += np.unique(blocks).size
         # small-sample correction: each fitted parameter costs one degree of freedom
         scatter *= count / max(count - len(self.free), 1)
         covariance = inverse @ (scatter + rest_scatter) @ inverse

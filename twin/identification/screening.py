@@ -10,13 +10,19 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+import numpy.typing as npt
 
 from table_io.block import Float1D, Float2D, Int1D
 from twin.identification.candidates import Candidate
-from twin.identification.least_squares import MapFunction, compute_columns, solve_damped
-from twin.identification.parameters import ParameterSet
+from twin.identification.least_squares import (
+    MapFunction,
+    compute_slopes,
+    solve_damped,
+)
+from twin.identification.parameters import FreeParameter, ParameterSet
 from twin.identification.residuals import LogResiduals
 
+Float32Array = npt.NDArray[np.float32]
 FOLD_COUNT, NEVER_HELD_OUT = 3, -1
 MIN_STEP_UNITS = 6  # with fewer steps, blocks are held out instead
 
@@ -103,6 +109,34 @@ def assign_folds(residuals: LogResiduals) -> Int1D:
     return np.where(at_rest, NEVER_HELD_OUT, assign_units(residuals) % FOLD_COUNT)
 
 
+@dataclass(frozen=True, eq=False)
+class UnitOrder:
+    """Order of the entries of all logs by unit: `edges` (unit + 1,) of the units, their folds."""
+
+    orders: tuple[Int1D, ...]  # of the entries of each log
+    edges: Int1D
+    fold: Int1D
+
+    @classmethod
+    def from_logs(cls, log_residuals: Sequence[LogResiduals]) -> "UnitOrder":
+        orders, sizes, folds = [], [], []
+        for residuals in log_residuals:
+            unit = assign_units(residuals)
+            orders.append(np.argsort(unit, kind="stable"))
+            sizes.append(np.bincount(unit))
+            fold = np.arange(sizes[-1].size) % FOLD_COUNT
+            if (residuals.entry_row == len(residuals.rows)).any():
+                fold[-1] = NEVER_HELD_OUT  # the unit of the rest row
+            folds.append(fold)
+        edges = np.cumsum([0, *np.concatenate(sizes)])
+        return cls(tuple(orders), edges, np.concatenate(folds))
+
+    def sort(self, entries: Sequence[Float1D]) -> Float32Array:
+        """Return the entries of all logs, (entry,) each, in this order."""
+        parts = [values[order] for values, order in zip(entries, self.orders, strict=True)]
+        return np.concatenate(parts, dtype=np.float32, casting="same_kind")
+
+
 def build_normal_equations(
     log_residuals: Sequence[LogResiduals],
     parameters: ParameterSet,
@@ -116,39 +150,50 @@ def build_normal_equations(
         if parameter.low < parameters.values[parameter.keys[0]] < parameter.high
     ]
     before = [residuals.evaluate(parameters) for residuals in log_residuals]
-    requests = [(parameters, parameter) for parameter in free]
-    variants = []
+    variants: list[Variant] = []
+    requests: list[tuple[ParameterSet, FreeParameter]] = []
     for candidate in library:
         amplitude, vanishing = candidate.amplitude, candidate.vanishing
         sign = int(amplitude.low >= vanishing) - int(amplitude.high <= vanishing)
         for shape in candidate.shapes:
-            variants.append(Variant(candidate, shape, len(requests), sign))
+            variants.append(Variant(candidate, shape, len(free) + len(requests), sign))
             requests.append((candidate.add_to(parameters, shape), amplitude))
-    columns = compute_columns(log_residuals, requests, before, mapper)
-    base_count = len(free)
-    hessians, gradients, squares, folds = [], [], [], []
-    for k, residuals in enumerate(log_residuals):
-        unit = assign_units(residuals)
-        order = np.argsort(unit, kind="stable")
-        edges = np.searchsorted(unit[order], np.arange(unit.max() + 2))
-        rows = np.array([column[k] for column in columns], dtype=np.float32)[:, order]
-        residual = before[k][order].astype(np.float32)
-        has_rest = bool((residuals.entry_row == len(residuals.rows)).any())
-        for u, (first, last) in enumerate(pairwise(edges)):
-            part, r = rows[:, first:last], residual[first:last]
-            hessian = np.diag(np.einsum("pn,pn->p", part, part, dtype=np.float64))
-            hessian[:base_count] = part[:base_count] @ part.T
-            hessian[:, :base_count] = hessian[:base_count].T
-            hessians.append(hessian)
-            gradients.append((part @ r).astype(np.float64))
-            squares.append(float(r @ r))
-            folds.append(NEVER_HELD_OUT if has_rest and last == unit.size else u % FOLD_COUNT)
-    products = np.array(hessians)
-    scale = np.sqrt(np.maximum(np.einsum("upp->p", products), 1e-300))
+    order = UnitOrder.from_logs(log_residuals)
+    residual = order.sort(before)
+
+    def sort_slopes(request: tuple[ParameterSet, FreeParameter]) -> Float32Array:
+        return order.sort(compute_slopes(log_residuals, *request, before))
+
+    base = np.empty((len(free), residual.size), dtype=np.float32)
+    base_requests = [(parameters, parameter) for parameter in free]
+    for row, slopes in zip(base, mapper(sort_slopes, base_requests), strict=True):
+        row[:] = slopes
+
+    def sum_products(slopes: Float32Array) -> tuple[Float2D, Float1D, Float1D]:
+        """Return slopes x (slopes of the base, (unit, base); themselves; residual, (unit,))."""
+        parts = [slice(*edges) for edges in pairwise(order.edges)]
+        return (
+            np.array([base[:, part] @ slopes[part] for part in parts]),
+            np.array([np.sum(slopes[part] ** 2, dtype=np.float64) for part in parts]),
+            np.array([slopes[part] @ residual[part] for part in parts]),
+        )
+
+    # candidates one at a time: all their slopes together would need much memory
+    candidate_sums = mapper(lambda request: sum_products(sort_slopes(request)), requests)
+    base_count, count = len(free), len(free) + len(requests)
+    hessian, gradient = (
+        np.zeros((order.fold.size, count, count)),
+        np.empty((order.fold.size, count)),
+    )
+    for k, sums in enumerate((*map(sum_products, base), *candidate_sums)):
+        hessian[:, :base_count, k] = hessian[:, k, :base_count] = sums[0]
+        hessian[:, k, k], gradient[:, k] = sums[1:]
+    scale = np.sqrt(np.maximum(np.einsum("upp->p", hessian), 1e-300))
+    hessian /= np.outer(scale, scale)
+    squares = np.array([float(residual[i:k] @ residual[i:k]) for i, k in pairwise(order.edges)])
     return NormalEquations(
-        products / np.outer(scale, scale), np.array(gradients) / scale, np.array(squares),
-        np.array(folds), base_count, tuple(variants), scale,
-    )  # fmt: skip
+        hessian, gradient / scale, squares, order.fold, base_count, tuple(variants), scale
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
