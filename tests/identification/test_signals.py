@@ -1,5 +1,7 @@
 """Motion from lasers and accelerometers, and what their disagreement says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -79,6 +81,27 @@ def test_a_lag_is_taken_back() -> None:
     error = (mended.acc - sound.acc)[sound.moving]
     was = (late.fuse_motion().acc - sound.acc)[sound.moving]
     assert error.std() < 0.1 * was.std()
+
+
+@pytest.mark.parametrize("channel", ["mass_acc_m_s2", "table_disp_m", "force_r1_n"])
+@pytest.mark.parametrize("lag", [0.0, 2e-3])
+def test_an_assumed_sensor_gives_the_motion_of_its_corrected_readings(
+    channel: str, lag: float
+) -> None:
+    signals, gain, offset = log().signals, 1.02, 1e-3
+    sensor = SensorModel(channel, gain=gain, lag=lag, offset=offset)
+    tared = signals.spectra[channel] - offset * signals.unit_spectrum
+    spectrum = tared * np.exp(1j * signals.omega * lag) / gain
+    corrected = replace(signals, spectra={**signals.spectra, channel: spectrum})
+    expected = corrected.fuse_motion()
+    for motion in (signals.fuse_motion((sensor,)), signals.fuse_corrected(corrected)):
+        for name in ("u", "v", "acc", "table_acc", "table_disp", "right", "left"):
+            values, size = getattr(motion, name), float(np.abs(getattr(expected, name)).max())
+            np.testing.assert_allclose(values, getattr(expected, name), rtol=0, atol=1e-9 * size)
+        pairs = zip(motion.consistency_residuals, expected.consistency_residuals, strict=True)
+        for own, other in pairs:
+            assert own.body == other.body
+            np.testing.assert_allclose(own.values, other.values, rtol=0, atol=1e-6)
 
 
 def test_without_displacement_there_is_nothing_to_learn() -> None:

@@ -164,6 +164,7 @@ def add_nuisances(
         linearize_nuisances(
             replace(residuals, thinning=thinning, weight=residuals.weight / problem.least_weight),
             first,
+            mapper=mapper,
         )
         for residuals in problem.log_residuals
     )
@@ -175,7 +176,7 @@ def add_nuisances(
     )
     for _ in range(LINEARIZATION_COUNT):
         log_residuals = tuple(
-            linearize_nuisances(residuals, fit.parameters, calibrate=True)
+            linearize_nuisances(residuals, fit.parameters, calibrate=True, mapper=mapper)
             for residuals in log_residuals
         )
         start = _start_nuisances(log_residuals, fit.parameters.with_free(first.free))

@@ -105,22 +105,23 @@ def compute_slopes(
     return slopes
 
 
-def compute_jacobian(
+def fill_jacobian(
     log_residuals: Sequence[LogResiduals],
     parameters: ParameterSet,
     before: Sequence[Float1D],
-    train: Sequence[Bool2D] | None = None,
-    mapper: MapFunction = map,
-) -> Float2D:
-    """Return the slopes of the free parameters, (free, entry), on the training entries alone."""
+    train: Sequence[Bool2D] | None,
+    mapper: MapFunction,
+    jacobian: Float2D,
+) -> None:
+    """Fill `jacobian`, (free, entry), with the slopes of the free parameters.
+
+    It has the training entries alone, and is filled again in each iteration: it is large.
+    """
     columns = mapper(
         lambda free: compute_slopes(log_residuals, parameters, free, before), parameters.free
     )
-    count = sum(old.size for old in before) if train is None else sum(m.sum() for m in train)
-    jacobian = np.empty((len(parameters.free), count))
     for row, slopes in zip(jacobian, columns, strict=True):
         row[:] = select_entries(slopes, train)
-    return jacobian
 
 
 def select_entries(entries: Sequence[Float1D], train: Sequence[Bool2D] | None) -> Float1D:
@@ -161,9 +162,9 @@ class _LevenbergMarquardt:
     def select_training(self, entries: Sequence[Float1D]) -> Float1D:
         return select_entries(entries, self.train)
 
-    def compute_jacobian(self, x: Float1D, current: list[Float1D]) -> Float2D:
+    def fill_jacobian(self, jacobian: Float2D, x: Float1D, current: list[Float1D]) -> None:
         parameters = self.start.with_vector(x)
-        return compute_jacobian(self.log_residuals, parameters, current, self.train, self.mapper)
+        fill_jacobian(self.log_residuals, parameters, current, self.train, self.mapper, jacobian)
 
     def take_step(self, x: Float1D, hessian: Float2D, gradient: Float1D, damping: float) -> Float1D:
         """Return x after a damped Gauss-Newton step; a parameter that would leave a bound stays."""
@@ -178,7 +179,8 @@ class _LevenbergMarquardt:
         current = self.evaluate(x)
         r = self.select_training(current)
         cost, damping, converged = float(r @ r), 1e-4, not self.free
-        jacobian = self.compute_jacobian(x, current)
+        jacobian = np.empty((x.size, r.size))
+        self.fill_jacobian(jacobian, x, current)
         for _ in range(0 if converged else MAX_ITERATIONS):
             hessian, gradient = jacobian @ jacobian.T, jacobian @ r
             gain = 0.0
@@ -198,8 +200,7 @@ class _LevenbergMarquardt:
             if gain < MIN_COST_GAIN:  # the slopes are those of the result, too
                 converged = True
                 break
-            del jacobian  # it is large
-            jacobian = self.compute_jacobian(x, current)
+            self.fill_jacobian(jacobian, x, current)
         return self._build_result(x, current, jacobian, cost, converged)
 
     def _build_result(
@@ -275,8 +276,11 @@ class _LevenbergMarquardt:
         fold = np.concatenate(self.folds)
         held_out = [values.copy() for values in current]
         hessian = jacobian @ jacobian.T
-        for k in np.unique(fold[fold >= 0]):
-            refitted = self._refit_without(x, current, jacobian, hessian, fold != k)
+        numbers = np.unique(fold[fold >= 0])
+        fits = self.mapper(
+            lambda k: self._refit_without(x, current, jacobian, hessian, fold != k), numbers
+        )
+        for k, refitted in zip(numbers, fits, strict=True):
             for target, source, log_fold in zip(held_out, refitted, self.folds, strict=True):
                 target[log_fold == k] = source[log_fold == k]
         return tuple(held_out)

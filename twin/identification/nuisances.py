@@ -16,15 +16,16 @@ effect of the specimen. Kinds, by channel or side:
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 from numpy.polynomial import Chebyshev
 
 from table_io.block import Bool2D, Float1D
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
-from twin.identification.least_squares import FitResult
+from twin.identification.least_squares import FitResult, MapFunction
 from twin.identification.parameters import (
     BUMPER_DAMPING,
     BUMPER_STIFFNESS,
@@ -190,7 +191,7 @@ def linearize_nuisances(
     residuals: LogResiduals,
     parameters: ParameterSet,
     calibrate: bool = False,
-    mapper: Callable[..., Iterable[Float1D]] = map,
+    mapper: MapFunction = map,
 ) -> LogResiduals:
     """Return the residuals of a log with its nuisances as linear terms.
 
@@ -198,7 +199,8 @@ def linearize_nuisances(
     With `calibrate` the noise of the corrected sensors is taken from their disagreement.
     """
     terms = residuals.nuisances
-    signals = raw = _add_typical_noise(residuals.signals) if terms is None else terms.raw
+    raw = _add_typical_noise(residuals.signals) if terms is None else terms.raw
+    signals = replace(raw)  # a copy, so that the series of its fusion are not kept with the terms
     nuisances = list_nuisances(raw)
     centre = dict.fromkeys(nuisances, 0.0)
     if terms is not None:
@@ -212,9 +214,9 @@ def linearize_nuisances(
         known_contact=residuals.contact_state,
     )  # fmt: skip
     before = bare.evaluate_rows(parameters, bare.motion())
-    noise_shares = _compute_noise_shares(bare, parameters, before)
+    noise_shares = _compute_noise_shares(bare, parameters, before, mapper)
 
-    def slope(nuisance: Nuisance) -> Float1D:
+    def slope(nuisance: Nuisance) -> npt.NDArray[np.float32]:
         corrected = correct_signals(signals, nuisance, SLOPE_STEP)
         rows = bare.evaluate_rows(parameters, signals.fuse_corrected(corrected))
         # A gain scales the noise too, so that a large one would seem to reduce the misfit: the
@@ -223,12 +225,11 @@ def linearize_nuisances(
         if nuisance.kind == "gain":
             scaled = SIDES.get(nuisance.place, (nuisance.place,))
             slope += nuisance.size * sum(noise_shares[channel] for channel in scaled) * before
-        return slope
+        return slope.astype(np.float32)
 
-    columns = [*mapper(slope, nuisances)]
     kept = [
         (nuisance, column)
-        for nuisance, column in zip(nuisances, columns, strict=True)
+        for nuisance, column in zip(nuisances, mapper(slope, nuisances), strict=True)
         if column @ column > MIN_COLUMN_NORM**2 or centre[nuisance]
     ]
     table = np.array([column for _, column in kept], dtype=np.float32).reshape(-1, before.size)
@@ -253,21 +254,26 @@ def _add_typical_noise(signals: LogSignals) -> LogSignals:
 
 
 def _compute_noise_shares(
-    residuals: LogResiduals, parameters: ParameterSet, before: Float1D
+    residuals: LogResiduals, parameters: ParameterSet, before: Float1D, mapper: MapFunction
 ) -> dict[str, Float1D]:
     """Return the share of each channel in the noise of the row of each entry, (entry,)."""
     signals = residuals.signals
     phase = np.cumsum(np.arange(signals.omega.size) * GOLDEN_ANGLE)  # as good as random
     rows = residuals.entry_row[: before.size]
-    shares = {}
-    for channel in signals.channels:
+    counts = np.maximum(np.bincount(rows), 1)
+
+    def mean_square(channel: str) -> Float1D:
+        """Return the mean square of the noise of a channel in each row, (row,)."""
         density = signals.noise[channel] * math.sqrt(signals.grid.size)
         noisy = _with_spectra(
             signals, {channel: signals.spectra[channel] + density * np.exp(1j * phase)}
         )
         noise = residuals.evaluate_rows(parameters, signals.fuse_corrected(noisy)) - before
-        counts = np.maximum(np.bincount(rows), 1)
-        shares[channel] = np.bincount(rows, weights=noise**2) / counts
+        share: Float1D = np.bincount(rows, weights=noise**2) / counts
+        return share
+
+    channels = signals.channels
+    shares = dict(zip(channels, mapper(mean_square, channels), strict=True))
     total = np.maximum(np.sum([*shares.values()], axis=0), 1e-300)
     return {channel: (share / total)[rows] for channel, share in shares.items()}
 
