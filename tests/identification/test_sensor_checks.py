@@ -32,13 +32,13 @@ def check(block: Block) -> tuple[SensorCheck, ...]:
 
 
 @cache
-def recorded() -> Block:
+def record() -> Block:
     return join_blocks(blocks())
 
 
 def distort(channel: str, distortion: Distortion) -> Block:
     """Return the recording with other readings of a channel."""
-    block = recorded()
+    block = record()
     values = block.values.copy()
     values[block.channels.index(channel)] = distortion(block.channel(channel), block)
     return replace(block, values=values)
@@ -96,7 +96,7 @@ FAULTS: dict[str, tuple[str, Distortion, str, tuple[str, ...], float]] = {
 
 
 def test_ideal_instruments_are_healthy() -> None:
-    checks = check(recorded())
+    checks = check(record())
     assert all(c.is_healthy for c in checks)
     assert {c.kind for c in checks} >= {"noise", "hum", "gain", "lag", "low_cut", "share", "plate"}
 
@@ -105,10 +105,10 @@ def test_ideal_instruments_are_healthy() -> None:
 def test_a_fault_is_found_on_its_channel_with_its_size(name: str) -> None:
     channel, distortion, kind, channels, size = FAULTS[name]
     faults = find_faults(distort(channel, distortion))
-    found = faults[kind, channels]
+    fault = faults[kind, channels]
     if size:
-        assert found.value == pytest.approx(size, rel=0.2)
-    places = {place for _, check in faults.items() for place in check.channels}
+        assert fault.value == pytest.approx(size, rel=0.2)
+    places = {place for check in faults.values() for place in check.channels}
     assert places <= {*MASS, *channels} if channel.startswith("mass") else places <= {*channels}
 
 

@@ -254,12 +254,12 @@ def test_instruments_called_to_be_mended_count_where_they_are_bad_only() -> None
     typical = score_case(mend("share", "force_r1_n", "force_r2_n"), make_about())
     assert (typical["healthy"], typical["right"]) == (False, False)
     bad = make_about(level="bad", imperfection="load_sharing")
-    for faults, found in (
+    for faults, is_found in (
         (mend("share", "force_r1_n", "force_r2_n"), True),
         (mend("gain", "table_disp_m", "table_acc_m_s2"), False),
     ):
         row = score_case(faults, bad)
-        assert (row["on_channel"], row["right"], row["physics"]) == (found, found, False)
+        assert (row["on_channel"], row["right"], row["physics"]) == (is_found, is_found, False)
 
 
 def test_an_effect_is_named_and_nothing_false() -> None:

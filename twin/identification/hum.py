@@ -54,17 +54,17 @@ def remove_hum(
     cleaned = dict(spectra)
     for resting, *in_parts in zip(lines_at_rest, *parts, strict=False):
         amplitudes = np.median([line.amplitudes for line in in_parts], axis=0)
-        seen = lasting = np.logical_and.reduce([line.stands_out for line in in_parts])
+        is_hum = lasting = np.logical_and.reduce([line.stands_out for line in in_parts])
         line_hz = float(np.median([line.frequency_hz for line in in_parts]))
         if resting is not None:
             # one that does not stand out at rest must not be weaker there than in motion
-            seen = lasting & (amplitudes <= MAX_EXCESS * resting.amplitudes)
+            is_hum = lasting & (amplitudes <= MAX_EXCESS * resting.amplitudes)
             if rest.shape[1] >= CLEAR_REST_S * rate_hz:
-                seen |= resting.stands_out
+                is_hum |= resting.stands_out
                 amplitudes = np.where(resting.stands_out, resting.amplitudes, amplitudes)
-                line_hz = line_hz if (seen & lasting).any() else resting.frequency_hz
-        if seen.any():
-            limits = np.where(seen, MAX_EXCESS * amplitudes, np.inf)
+                line_hz = line_hz if (is_hum & lasting).any() else resting.frequency_hz
+        if is_hum.any():
+            limits = np.where(is_hum, MAX_EXCESS * amplitudes, np.inf)
             cleaned = _remove_line(cleaned, grid, line_hz, limits)
     return cleaned
 
@@ -74,8 +74,8 @@ def separate_hum(values: Float1D, rate_hz: float) -> tuple[Float1D, float]:
     if values.size < MIN_REST_S * rate_hz:
         return values, 0.0
     lines = _measure_lines(values[None], rate_hz)
-    seen = np.array([line.frequency_hz for line in lines if line.stands_out[0]])
-    phase = 2.0 * np.pi * np.outer(np.arange(values.size) / rate_hz, seen)
+    frequencies_hz = np.array([line.frequency_hz for line in lines if line.stands_out[0]])
+    phase = 2.0 * np.pi * np.outer(np.arange(values.size) / rate_hz, frequencies_hz)
     waves = np.hstack([np.cos(phase), np.sin(phase)])
     hum: Float1D = waves @ np.linalg.lstsq(waves, values - values.mean())[0]
     return values - hum, float(np.sqrt(np.mean(hum**2)))

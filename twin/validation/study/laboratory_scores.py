@@ -53,11 +53,11 @@ def score_laboratory(row: Json, verdict: Json, about: Json) -> Json:
         check for check in verdict.get("sensors", {}).get("checks", ()) if not check["healthy"]
     ]
     is_sound = row["said"] == "none" or (is_named and all(c == "instrument" for c in classes))
-    found = "instrument" in named_classes or _is_on_channel(faults, laboratory)
+    is_on_channel = "instrument" in named_classes or _is_on_channel(faults, laboratory)
     scores: Json = {
         "healthy": is_sound and not (faults and laboratory["level"] == "typical"),
         "instrument": "instrument" in named_classes,
-        "on_channel": bool(affected) or found,
+        "on_channel": bool(affected) or is_on_channel,
         "sensor_faults": [f"{check['kind']}.{','.join(check['channels'])}" for check in faults],
         "physics": "physics" in named_classes,
         "wrong_name": bool({"physics", "false"} & {*named_classes}),
