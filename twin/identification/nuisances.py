@@ -48,6 +48,7 @@ SLOW_TERMS = 2  # cosines over the length of the record, besides the constant of
 TYPICAL_GAIN = 0.005  # calibration and temperature
 TYPICAL_LAG_S = 5e-4  # multiplexed channels, different anti-alias filters
 TYPICAL_LOW_CUT = 2.0 * math.pi * 0.25  # rad/s, of an IEPE accelerometer: 5 % at 0.8 Hz
+RESTORED_FROM_HZ = 0.1  # what a low cut took away
 TYPICAL_RESONANCE = (2.0 * math.pi * 400.0) ** -2.0  # s2/rad2, of a bracket of sheet metal
 TYPICAL_OFFSET = 0.005  # of the rms of the channel: drift since the tare
 TYPICAL_LINEARITY = 0.002  # of the largest excursion, each term of the error of a laser
@@ -145,9 +146,10 @@ def correct_signals(signals: LogSignals, nuisance: Nuisance, z: float) -> LogSig
         case "lag":
             corrected = spectrum * np.exp(1j * signals.omega * amount)
         case "low_cut":
-            # without the constant, which a high pass takes away for good
-            slow = amount / np.maximum(signals.omega, signals.omega[1])
-            corrected = spectrum * (1.0 - 1j * slow)
+            # not where the mass hardly accelerates: slow noise would grow without limit there
+            omega = np.maximum(signals.omega, signals.omega[1])
+            is_fast = 1.0 / (1.0 + (2.0 * np.pi * RESTORED_FROM_HZ / omega) ** 8)
+            corrected = spectrum * (1.0 - 1j * is_fast * amount / omega)
         case "resonance":
             corrected = spectrum * (1.0 - amount * signals.omega**2)
         case "cross":

@@ -216,7 +216,12 @@ def _check_fitted(residuals: LogResiduals, fit: FitResult) -> Iterator[SensorChe
             unequal, unequal_sd = value, sd
         elif nuisance.kind == "lag":
             yield _check_estimate(signals, "lag", (nuisance.place,), value, sd, MAX_LAG_S, "s")
-        elif nuisance.kind == "resonance" and value > INTERVAL_SIGMA * sd:
+        elif (
+            # beside an anti-alias filter the difference of two filters looks like a resonance
+            nuisance.kind == "resonance"
+            and math.isinf(signals.filter_hz)
+            and value > INTERVAL_SIGMA * sd
+        ):
             frequency, low, high = (
                 (value + deviation) ** -0.5 / (2.0 * math.pi)
                 for deviation in (0.0, INTERVAL_SIGMA * sd, -INTERVAL_SIGMA * sd)
