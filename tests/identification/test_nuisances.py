@@ -163,3 +163,21 @@ def test_what_nothing_contradicts_is_no_nuisance() -> None:
     places = {nuisance.place for nuisance in nuisances if nuisance.kind == "gain"}
     assert places == {"table_disp_m", "mass_acc_m_s2", "table_acc_m_s2", "right", "left"}
     assert all(isinstance(nuisance, Nuisance) and nuisance.size > 0 for nuisance in nuisances)
+
+
+def test_a_low_cut_is_restored_where_the_mass_accelerates_and_no_slow_noise_grows() -> None:
+    """A low cut of 0.4 Hz takes a third of a motion at 0.8 Hz; below 0.1 Hz there is only noise."""
+    signals = log().signals
+    cut = 2.0 * math.pi * 0.4
+    through = 1j * signals.omega / (1j * signals.omega + cut)
+    read = signals.spectra["mass_acc_m_s2"] * through
+    distorted = replace(signals, spectra={**signals.spectra, "mass_acc_m_s2": read})
+    restored = correct_signals(distorted, Nuisance("low_cut", "mass_acc_m_s2", cut), 1.0)
+    gain = np.abs(restored.spectra["mass_acc_m_s2"][1:] / read[1:])
+    hz = signals.omega[1:] / (2.0 * math.pi)
+    fast, slow = hz > 0.3, hz < 0.05
+    true = signals.spectra["mass_acc_m_s2"][1:][fast]
+    error = restored.spectra["mass_acc_m_s2"][1:][fast] - true
+    assert np.linalg.norm(error) < 1e-3 * np.linalg.norm(true)
+    assert gain[slow].max() < 1.1
+    assert gain.max() < 5.0
