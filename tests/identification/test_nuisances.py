@@ -131,7 +131,7 @@ def test_what_nuisances_cannot_explain_is_left_to_ideal_instruments() -> None:
 )  # fmt: skip
 def test_a_column_is_the_effect_of_its_nuisance(kind_and_place: tuple[str, str]) -> None:
     """Signals corrected by one typical size change the residual by the column."""
-    problem = prepare_problem([log()], SNM)
+    problem = prepare_problem([log(noise=0.2)], SNM)
     parameters = problem.parameters
     residuals = linearize_nuisances(problem.problem.log_residuals[0], parameters)
     terms = residuals.nuisances

@@ -51,6 +51,7 @@ TYPICAL_LOW_CUT = 2.0 * math.pi * 0.25  # rad/s, of an IEPE accelerometer: 5 % a
 RESTORED_FROM_HZ = 0.1  # what a low cut took away
 TYPICAL_RESONANCE = (2.0 * math.pi * 400.0) ** -2.0  # s2/rad2, of a bracket of sheet metal
 TYPICAL_OFFSET = 0.005  # of the rms of the channel: drift since the tare
+TYPICAL_LASER_OFFSET = 0.001
 TYPICAL_LINEARITY = 0.002  # of the largest excursion, each term of the error of a laser
 # Of the largest excursion: speckle and roughness under the light spot of a laser, which the rest
 # does not show, and at low frequency no accelerometer.
@@ -105,7 +106,8 @@ def list_nuisances(signals: LogSignals) -> tuple[Nuisance, ...]:
         if channel in ACCELEROMETERS
     ]
     for channel in channels:
-        size = TYPICAL_OFFSET * signals.channel_rms(channel)
+        share = TYPICAL_LASER_OFFSET if channel in LASERS else TYPICAL_OFFSET
+        size = share * signals.channel_rms(channel)
         nuisances += [
             Nuisance("offset" + (str(term) if term else ""), channel, size)
             for term in range(SLOW_TERMS + 1)
@@ -221,12 +223,13 @@ def linearize_nuisances(
     def slope(nuisance: Nuisance) -> npt.NDArray[np.float32]:
         corrected = correct_signals(signals, nuisance, SLOPE_STEP)
         rows = bare.evaluate_rows(parameters, signals.fuse_corrected(corrected))
-        # A gain scales the noise too, so that a large one would seem to reduce the misfit: the
-        # share of the noise in the slope is taken out.
+        # A gain or a resonance scales the noise too, so that a large one would seem to reduce the
+        # misfit: the share of the noise in the slope is taken out.
         slope: Float1D = (rows - before) / SLOPE_STEP
-        if nuisance.kind == "gain":
+        if nuisance.kind in ("gain", "resonance"):
             scaled = SIDES.get(nuisance.place, (nuisance.place,))
-            slope += nuisance.size * sum(noise_shares[channel] for channel in scaled) * before
+            shares = sum(noise_shares[nuisance.kind, channel] for channel in scaled)
+            slope += nuisance.size * shares * before
         return slope.astype(np.float32)
 
     kept = [
@@ -257,27 +260,40 @@ def _add_typical_noise(signals: LogSignals) -> LogSignals:
 
 def _compute_noise_shares(
     residuals: LogResiduals, parameters: ParameterSet, before: Float1D, mapper: MapFunction
-) -> dict[str, Float1D]:
-    """Return the share of each channel in the noise of the row of each entry, (entry,)."""
+) -> dict[tuple[str, str], Float1D]:
+    """Return how gains and resonances scale the noise of the row of each entry, (entry,).
+
+    By kind and channel: the share of its noise in that of the row, for a resonance weighted with
+    the square of the angular frequency.
+    """
     signals = residuals.signals
-    phase = np.cumsum(np.arange(signals.omega.size) * GOLDEN_ANGLE)  # as good as random
+    phase = np.exp(1j * np.cumsum(np.arange(signals.omega.size) * GOLDEN_ANGLE))  # as if random
     rows = residuals.entry_row[: before.size]
     counts = np.maximum(np.bincount(rows), 1)
 
-    def mean_square(channel: str) -> Float1D:
-        """Return the mean square of the noise of a channel in each row, (row,)."""
-        density = signals.noise[channel] * math.sqrt(signals.grid.size)
-        noisy = _with_spectra(
-            signals, {channel: signals.spectra[channel] + density * np.exp(1j * phase)}
-        )
-        noise = residuals.evaluate_rows(parameters, signals.fuse_corrected(noisy)) - before
-        share: Float1D = np.bincount(rows, weights=noise**2) / counts
-        return share
+    def evaluate_noise(channel: str, gain: Float1D) -> Float1D:
+        density = gain * signals.noise[channel] * math.sqrt(signals.grid.size)
+        noisy = _with_spectra(signals, {channel: signals.spectra[channel] + density * phase})
+        return residuals.evaluate_rows(parameters, signals.fuse_corrected(noisy)) - before
 
-    channels = signals.channels
-    shares = dict(zip(channels, mapper(mean_square, channels), strict=True))
-    total = np.maximum(np.sum([*shares.values()], axis=0), 1e-300)
-    return {channel: (share / total)[rows] for channel, share in shares.items()}
+    def mean_products(channel: str) -> dict[str, Float1D]:
+        """Return the mean products of the noise of a channel with itself, scaled, (row,) each."""
+        noise = evaluate_noise(channel, np.ones_like(signals.omega))
+        scaled = {"gain": noise}
+        if channel in ACCELEROMETERS:
+            scaled["resonance"] = evaluate_noise(channel, signals.omega**2)
+        return {
+            kind: np.bincount(rows, weights=noise * values) / counts
+            for kind, values in scaled.items()
+        }
+
+    products = dict(zip(signals.channels, mapper(mean_products, signals.channels), strict=True))
+    total = np.maximum(np.sum([of["gain"] for of in products.values()], axis=0), 1e-300)
+    return {
+        (kind, channel): (product / total)[rows]
+        for channel, of_channel in products.items()
+        for kind, product in of_channel.items()
+    }
 
 
 def sensor_mask(residuals: LogResiduals) -> Bool2D:
