@@ -23,6 +23,7 @@ KIND_LABELS = {
     "offset": "offset",
 }
 CHANNEL_KINDS = ("noise", "hum", "one_over_f", "resolution", "filter")  # of a channel at rest
+LEAST_SHOWN = 1e-12  # SI: a smaller value is that of a bound
 # Units in which quantities are read: factor and name, by kind or by unit in SI.
 SHOWN_UNITS = {
     "s": (1e6, "\u00b5s"), "m": (1e6, "\u00b5m"), "gain": (100.0, "%"),
@@ -101,4 +102,5 @@ def _format_size(check: Json, value: float) -> str:
     if check["kind"] == "noise":
         channel = CHANNEL_BY_NAME[check["channels"][0]]
         factor, name = (1e6, "\u00b5m") if channel.unit == "m" else (1.0, channel.unit)
-    return f"{format_significant(factor * value)} {name}".strip()
+    shown = factor * value if abs(value) > LEAST_SHOWN else 0.0
+    return f"{format_significant(shown)} {name}".strip()
