@@ -11,13 +11,12 @@ from table_io.clock import RealClock
 from table_io.errors import InputError
 from twin.identification.cross_checks import fitted_gap
 from twin.identification.identify import WINDOW_S, IdentificationResult, identify_parameters
-from twin.identification.least_squares import FitResult
+from twin.identification.least_squares import INTERVAL_SIGMA, FitResult
 from twin.identification.parameters import FreeParameter, GapKey, TareKey, get_log
 from twin.identification.sensor_checks import check_sensors
 from twin.reports.discovery.loading import load_recordings
 from twin.reports.discovery.sensor_section import describe_sensors
 from twin.reports.discovery.serialize import (
-    INTERVAL_SIGMA,
     Json,
     interval_to_json,
     model_to_toml,

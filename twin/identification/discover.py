@@ -339,7 +339,8 @@ def discover_effects(
     if not _can_explain(imperfect, discovery):
         return discovery
     with_nuisances = _select_and_judge(imperfect, logs, model, report)
-    if effects := with_nuisances.verdict.best.effects:
+    effects = with_nuisances.verdict.best.effects
+    if effects and with_nuisances.selection.complete:
         imperfect = add_nuisances(prepared, ideal_cost, effects)
         with_nuisances = _select_and_judge(imperfect, logs, model, report)
     best = with_nuisances.verdict.best

@@ -14,14 +14,13 @@ from scipy.optimize import least_squares
 
 from table_io.block import Float1D, Label
 from table_io.channels import CHANNEL_BY_NAME
-from twin.identification.least_squares import FitResult
+from twin.identification.least_squares import INTERVAL_SIGMA, FitResult
 from twin.identification.parameters import GapKey, NuisanceKey
 from twin.identification.residuals import LogResiduals
 from twin.identification.selection import MAX_EXPLAINED_COST
 from twin.identification.signals import CELL_PAIRS, SENSOR_PAIRS, LogSignals
 from twin.identification.spectra import Spectrum
 
-INTERVAL_SIGMA = 1.96  # standard deviations either side: 95 %
 STRONG_RATIO = 25.0  # power of a spectral line over its noise: weaker ones are not compared
 # Limits of healthy instruments; see `table_io.sim.imperfections` for sizes in laboratories.
 MAX_HUM_RATIO = 5.0  # rms over that of the noise

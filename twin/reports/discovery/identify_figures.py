@@ -9,9 +9,9 @@ from matplotlib.figure import Figure
 
 from twin.identification.cross_checks import fitted_gap
 from twin.identification.identify import IdentificationResult
+from twin.identification.least_squares import INTERVAL_SIGMA
 from twin.identification.parameters import is_correction
 from twin.identification.residuals import LogResiduals
-from twin.reports.discovery.serialize import INTERVAL_SIGMA
 from twin.reports.plot_style import (
     DIRECTION_COLOURS,
     FIGURE_WIDTH_IN,

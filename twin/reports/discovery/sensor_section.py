@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-from table_io.channels import CHANNEL_BY_NAME
 from twin.reports.discovery.serialize import Json
 from twin.reports.page import format_significant
 
@@ -99,8 +98,5 @@ def tabulate_comparisons(sensors: Json) -> list[CheckRow]:
 def _format_size(check: Json, value: float) -> str:
     unit = check["unit"]
     factor, name = SHOWN_UNITS.get(check["kind"], SHOWN_UNITS.get(unit, (1.0, unit)))
-    if check["kind"] == "noise":
-        channel = CHANNEL_BY_NAME[check["channels"][0]]
-        factor, name = (1e6, "\u00b5m") if channel.unit == "m" else (1.0, channel.unit)
     shown = factor * value if abs(value) > LEAST_SHOWN else 0.0
     return f"{format_significant(shown)} {name}".strip()

@@ -7,7 +7,7 @@ from typing import Any
 from twin.identification.candidates import Candidate
 from twin.identification.discover import Discovery, PreparedLog
 from twin.identification.held_out import compute_force_error
-from twin.identification.least_squares import FitResult
+from twin.identification.least_squares import INTERVAL_SIGMA, FitResult
 from twin.identification.parameters import (
     SLIP_SPEED,
     BaseKey,
@@ -34,7 +34,6 @@ METRIC = (
 )
 STOPPED_NOTE = "stopped early: not every effect was tested, so other effects may fit better"
 REFITTED_SUFFIX = ", but with other parameters than the model has: see the notes"
-INTERVAL_SIGMA = 1.96  # standard deviations either side: 95 %
 
 
 def verdict_to_json(
