@@ -1,1 +1,9 @@
 """The rig: drives the shaking table and acquires the sensors. It never imports `twin`."""
+
+import os
+
+from platformdirs import user_cache_path
+
+# Compiled kernels go to the user's cache folder, not into the package or the working folder; numba
+# reads this when it is imported, and child processes inherit it.
+os.environ.setdefault("NUMBA_CACHE_DIR", str(user_cache_path("shaketwin") / "kernels"))

@@ -46,12 +46,21 @@ def endpoint() -> str:
 
 
 def start(folder: Path, *options: str, profile: str = QUICK) -> subprocess.Popen[str]:
-    """A live run of the short test that writes to folder/out."""
+    """A live run of the short test that writes to folder/out.
+
+    Its working folder holds a package `twin`, which no process of the run may import.
+    """
+    (folder / "twin").mkdir()
+    (folder / "twin" / "__init__.py").write_text("raise SystemExit('from the working folder')\n")
     path = folder / "short.toml"
     path.write_text(profile)
     command = [SHAKETWIN, "run", str(path), "--out", str(folder / "out"), "--listen", endpoint()]
     return subprocess.Popen(
-        [*command, *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        [*command, *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        cwd=folder,
     )
 
 

@@ -157,7 +157,7 @@ class WorkerPool:
 
     def _start_worker(self) -> RunWorker:
         process = subprocess.Popen(
-            [sys.executable, "-m", "twin.campaign.worker"],
+            [sys.executable, "-P", "-m", "twin.campaign.worker"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             pass_fds=(self._lock,),

@@ -345,9 +345,12 @@ class _RigDiedError(Exception):
 
 
 def start_process(component: str, parts_folder: Path, argument: str) -> ChildProcess:
-    """Start a process in its own session, so that Ctrl-C does not reach it."""
+    """Start a process in its own session, so that Ctrl-C does not reach it.
+
+    It imports nothing from the user's working folder (-P), which may hold a folder `twin`.
+    """
     log_path = parts_folder / f"{component}.log"
-    command = [sys.executable, "-m", "twin.live.processes", component]
+    command = [sys.executable, "-P", "-m", "twin.live.processes", component]
     command += [str(parts_folder / "spec.json"), argument]
     with log_path.open("ab") as out:
         process = subprocess.Popen(

@@ -311,7 +311,7 @@ def item_types() -> Iterable[type]:
 def regenerate_protobuf() -> None:
     """Regenerate shaketwin_pb2.py and .pyi from the .proto (needs the extra "proto")."""
     folder = Path(__file__).parent
-    command = [sys.executable, "-m", "grpc_tools.protoc", f"-I{folder}"]
+    command = [sys.executable, "-P", "-m", "grpc_tools.protoc", f"-I{folder}"]
     command += [f"--python_out={folder}", f"--pyi_out={folder}", str(folder / "shaketwin.proto")]
     subprocess.run(command, check=True)
 
