@@ -8,6 +8,7 @@ from table_io.config.backend import BackendConfig
 from table_io.config.base import ConfigModel, Finite, NonNegative, Positive
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError, suggest
+from table_io.sim.ground_truth import GroundTruth
 
 
 class FaultKind(NamedTuple):
@@ -87,7 +88,13 @@ class SimulatedTableConfig(BackendConfig):
     bumper_stiffness_n_m: Positive
     bumper_damping_n_s_m: Positive
     faults: tuple[InjectedFault, ...] = ()
-    truth: str | None = Field(None, description="Path of a sealed file, see `sim/ground_truth.py`.")
+    hidden: GroundTruth | None = Field(
+        None,
+        description="What the model does not know: true parameters (base), effects, imperfections.",
+    )
+    truth: str | None = Field(
+        None, description="The same in a sealed file: its path; relative to the working folder."
+    )
     truth_sha256: str | None = Field(None, pattern=r"^[0-9a-fA-F]{64}$", validate_default=True)
 
     @field_validator("truth_sha256")
@@ -95,6 +102,8 @@ class SimulatedTableConfig(BackendConfig):
     def _check_truth_pair(cls, sha256: str | None, info: ValidationInfo) -> str | None:
         if "truth" in info.data and (info.data["truth"] is None) != (sha256 is None):
             raise InputError("truth and truth_sha256 go together", remedy="give both or neither")
+        if sha256 is not None and info.data.get("hidden") is not None:
+            raise InputError("[simulated.hidden] and truth are given", allowed="one of them")
         return sha256
 
     def list_faults(self, rig: RigConfig) -> list[str]:

@@ -1,4 +1,8 @@
-"""Ground truth of the simulated table: hidden parameters and effects, in a file of its own.
+"""Ground truth of the simulated table: hidden parameters and effects.
+
+In the rig file, for everybody to read: tables `[simulated.hidden.base]`,
+`[[simulated.hidden.effects]]`, `[[simulated.hidden.imperfections]]`; or sealed, in a file of its
+own, whose path and hash the rig file states:
 
     [base]                      # in SI, overrides rig file and specimen
     damper_stiffness_n_m = 36900.0
@@ -14,7 +18,7 @@
     id = "channel_skew"
     parameters = { skew = 20e-6 }
 
-The rig file states the path and hash of this file; only the simulated backend reads it.
+Only the simulated backend reads it, never the twin.
 `DEFINITION_BY_ID` lists the effects that can be hidden. Signs and meanings are those of the effects
 of the same name in the model library; the functional forms differ (`hidden_plant.py`), so that no
 model can reproduce the truth exactly.
@@ -178,7 +182,7 @@ EntryT = TypeVar("EntryT", HiddenEffect, Imperfection)
 
 
 class GroundTruth(ConfigModel):
-    """Ground-truth file: overridden parameters, hidden effects and imperfections of the rig."""
+    """Ground truth of a rig: overridden parameters, hidden effects and imperfections of the rig."""
 
     base: BaseOverrides = BaseOverrides()
     effects: tuple[HiddenEffect, ...] = ()

@@ -51,9 +51,9 @@ def build_plant(table: SimulatedTableConfig, specimen: Specimen, rate_hz: float)
 
 
 def load_ground_truth(table: SimulatedTableConfig) -> GroundTruth | None:
-    """Load the ground truth of a simulated table; None without one; InputError if unreadable."""
+    """Return the ground truth of a simulated table; None without one; InputError if unreadable."""
     if table.truth is None:
-        return None
+        return table.hidden
     try:
         raw = Path(table.truth).read_bytes()
     except OSError as error:

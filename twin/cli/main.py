@@ -98,6 +98,28 @@ def run_command(
     raise typer.Exit(code)
 
 
+@app.command("demo", rich_help_panel=DRIVE_PANEL)
+def demo_command(
+    out: OutOption = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", help="Seed of the hidden effect; default: random.")
+    ] = None,
+    keep: Annotated[
+        Path | None,
+        typer.Option(
+            "--keep", metavar="FOLDER", help="Leave a rig file with the effect here, to edit."
+        ),
+    ] = None,
+    show_page: Annotated[
+        bool, typer.Option("--open/--no-open", help="Open the page in a browser at the end.")
+    ] = True,
+) -> None:
+    """Demonstrate it in two minutes: an effect hidden at random, found, added, and unsealed."""
+    from twin.cli.demo import run_demo as command
+
+    raise typer.Exit(command(out, seed, keep, show_page))
+
+
 @app.command("campaign", rich_help_panel=DRIVE_PANEL)
 def campaign_command(
     file: Annotated[

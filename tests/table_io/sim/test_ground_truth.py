@@ -159,6 +159,21 @@ def test_a_truth_without_its_hash_is_refused(key: str) -> None:
     assert fault.key == "simulated.truth_sha256"
 
 
+def test_the_key_hidden_of_the_rig_file_hides_without_a_seal(tmp_path: Path) -> None:
+    text = PHYSICS.replace("[base]", "[simulated.hidden.base]")
+    text = text.replace("[[effects]]", "[[simulated.hidden.effects]]")
+    rig = parse_toml(CARD_TOML + text, RigConfig, "card")
+    hidden = SimulatedBackend(rig, SPECIMEN, RATE_HZ, ManualClock())
+    hidden.open()
+    volts = acquire_run(hidden, [1000])
+    assert (volts == acquire_run(machine(tmp_path, PHYSICS), [1000])).all()
+    assert (volts != acquire_run(machine(tmp_path, None), [1000])).any()
+    sealed = f'truth = "a.toml"\ntruth_sha256 = "{"0" * 64}"\n'
+    with pytest.raises(InputError) as error:
+        parse_toml(CARD_TOML + sealed + text, RigConfig, "card")
+    assert [fault.key for fault in error.value.faults] == ["simulated.truth_sha256"]
+
+
 def test_a_truth_with_nothing_in_it_is_no_truth(tmp_path: Path) -> None:
     plain, empty = machine(tmp_path, None, noise_rms=0.0), machine(tmp_path, "", noise_rms=0.0)
     step = [[2 * abs(s.range * s.volts_per_unit) / 2**s.bits] for s in CARD.sensors]
