@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Iterable, Sequence
+from importlib.util import find_spec
 from typing import Any
 
 MIN_SIMILARITY = 0.5  # of a known name that is suggested, 1 for the same
@@ -72,3 +73,14 @@ def suggest(name: str, known: Iterable[str]) -> str:
     hidden_count = len(known_names[MAX_LISTED_NAMES:])
     suffix = f" and {hidden_count} more" if hidden_count else ""
     return f"known: {', '.join(known_names[:MAX_LISTED_NAMES]) or 'none'}{suffix}"
+
+
+def format_pip_line(extra: str) -> str:
+    """Return the remedy for a package that is not installed, which an extra of ours brings."""
+    return f'pip install "shaketwin[{extra}]"'
+
+
+def require_package(package: str, extra: str, where: str) -> None:
+    """Raise InputError with the pip line unless `package` can be imported; imports nothing."""
+    if find_spec(package) is None:
+        raise InputError(f"{package} is not installed", where=where, remedy=format_pip_line(extra))

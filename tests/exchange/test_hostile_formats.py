@@ -110,9 +110,7 @@ def test_a_library_that_is_not_there_is_named(
         raise ModuleNotFoundError("No module named 'h5py'", name="h5py")
 
     monkeypatch.setattr(formats, "import_module", absent)
-    with raises_input_error(
-        where=tmp_path / "a.h5", problem="h5py", remedy="pip install shaketwin[formats]"
-    ):
+    with raises_input_error(where=tmp_path / "a.h5", problem="h5py", remedy='"shaketwin[formats]"'):
         read_table(tmp_path / "a.h5")
 
 

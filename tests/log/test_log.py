@@ -231,7 +231,7 @@ def test_the_dataset_has_every_channel_with_its_unit(log: Log, recording: Record
 
 def test_without_xarray_it_says_what_to_install(log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "xarray", None)
-    with raises_input_error(remedy="pip install 'shaketwin[notebook]'"):
+    with raises_input_error(remedy='"shaketwin[notebook]"'):
         log.to_xarray()
 
 

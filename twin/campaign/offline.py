@@ -23,6 +23,7 @@ from twin.campaign.messages import (
 from twin.campaign.state import ActiveCampaign
 from twin.live.process_config import ProcessConfig
 from twin.reports.finalize import EXIT_ABORTED, EXIT_INTERRUPTED
+from twin.run.system import count_cores
 from twin.run.terminal import catch_interrupts, console, print_line
 
 MAX_WORKERS = 2  # each holds a whole recording in memory while it writes the report
@@ -111,7 +112,7 @@ class WorkerPool:
     @property
     def free(self) -> bool:
         """Whether another run can be submitted."""
-        limit = min(MAX_WORKERS, len(os.sched_getaffinity(0)))
+        limit = min(MAX_WORKERS, count_cores())
         return sum(bool(worker.run) for worker in self._workers) < limit
 
     @property

@@ -1,7 +1,6 @@
 """State of a campaign: campaign.json, replaced atomically at every change, and its recordings."""
 
 import difflib
-import fcntl
 import hashlib
 import json
 import os
@@ -31,6 +30,7 @@ from twin.run.merge_parts import LOCK_FILE as PARTS_LOCK_FILE
 from twin.run.merge_parts import merge_run_parts
 from twin.run.recordings import read_recorded_config
 from twin.run.run_config import RunConfig, make_run_id
+from twin.run.system import lock_file
 
 CAMPAIGN_FILE, CONFIG_FOLDER, LOCK_FILE = "campaign.toml", "cards", ".lock"
 CALIBRATION_RECORDS = re.compile(r"^\[\[calibrations\]\].*\n?(?:(?!\[).+\n?|\n)*", re.MULTILINE)
@@ -124,7 +124,7 @@ def hold_lock(path: Path) -> Iterator[int]:
     with path.open("a") as lock:
         while True:
             try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                lock_file(lock, exclusive=True)
                 break
             except BlockingIOError:
                 if clock.now() > until:

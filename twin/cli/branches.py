@@ -1,6 +1,5 @@
 """`branches`: follow the periodic motions of a model, stable and unstable, over a parameter."""
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from twin.reports.branches.map_page import format_map_headline, write_map_report
 from twin.reports.branches.page import list_bifurcations, write_branch_report
 from twin.run.folders import make_output_folder
 from twin.run.run_config import RunConfig, make_run_id, read_run_config
+from twin.run.system import count_cores
 from twin.run.terminal import announce_if_slow, console, print_line
 from twin.run.warm_up import COMPILING_MESSAGE
 from twin.studies.batch import make_gap_variants
@@ -79,7 +79,7 @@ def show_branches(request: BranchRequest) -> int:
     attractors = None
     if request.attractors or request.basins_hz is not None:
         point = OperatingPoint(model, frequency_hz, level)
-        cores = len(os.sched_getaffinity(0))
+        cores = count_cores()
         with announce_if_slow(ATTRACTOR_MESSAGE), ThreadPoolExecutor(cores) as pool:
             attractors = study_attractors(point, request.over, limits, request.basins_hz, pool.map)
         bands = tuple((band.low, band.high) for band in attractors.bands)

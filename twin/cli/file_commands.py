@@ -8,6 +8,16 @@ import typer
 FILES_PANEL = "Recording files"
 files_app = typer.Typer()
 
+
+def require_view_extra(wanted: bool) -> bool:
+    """Return the value of an option that needs Rerun; InputError if that is not installed."""
+    if wanted:
+        from twin.viewer.address import require_rerun
+
+        require_rerun("a Rerun view")
+    return wanted
+
+
 StepsOption = Annotated[
     str | None,
     typer.Option(
@@ -150,7 +160,12 @@ def export_command(
         bool,
         typer.Option("--foxglove", help="Foxglove: MCAP with a message per sample, and a layout."),
     ] = False,
-    rrd: Annotated[bool, typer.Option("--rrd", help="Rerun, with the project's layout.")] = False,
+    rrd: Annotated[
+        bool,
+        typer.Option(
+            "--rrd", callback=require_view_extra, help="Rerun, with the project's layout."
+        ),
+    ] = False,
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", help="New file without ending; default: next to LOG."),

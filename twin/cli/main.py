@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from twin.cli.credential_commands import KeysOption, keys_app, read_keys_option
-from twin.cli.file_commands import StepsOption, files_app
+from twin.cli.file_commands import StepsOption, files_app, require_view_extra
 from twin.cli.hardware_commands import hardware_app
 from twin.cli.identification_commands import identification_app
 from twin.cli.live_commands import live_app
@@ -48,6 +48,9 @@ OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for th
 ModelOption = Annotated[
     str | None, typer.Option("--model", help="Model: a .toml file or the name of a shipped one.")
 ]
+SaveViewOption = Annotated[
+    bool, typer.Option("--view", callback=require_view_extra, help="Also write view.rrd.")
+]
 ListenOption = Annotated[
     str, typer.Option("--listen", help="Endpoint at which observers reach the test.")
 ]
@@ -74,7 +77,10 @@ def run_command(
         str | None, typer.Option("--table", help="Rig file or name, instead of the profile's.")
     ] = None,
     view: Annotated[
-        bool, typer.Option("--view", help="Serve a Rerun view and write view.rrd.")
+        bool,
+        typer.Option(
+            "--view", callback=require_view_extra, help="Serve a Rerun view and write view.rrd."
+        ),
     ] = False,
     listen: ListenOption = DEFAULT_ENDPOINT,
     keys: KeysOption = None,
@@ -236,7 +242,9 @@ def simulate_command(
         int | None, typer.Option("--workers", help="Cores for many models or gaps; default: all.")
     ] = None,
     out: OutOption = None,
-    view: Annotated[bool, typer.Option("--view", help="Also write view.rrd.")] = False,
+    view: Annotated[
+        bool, typer.Option("--view", callback=require_view_extra, help="Also write view.rrd.")
+    ] = False,
 ) -> None:
     """Run the model alone on the ideal drive; or compare many models and gaps."""
     from twin.cli.simulate import simulate_profile as command
@@ -325,7 +333,9 @@ def replay_command(
     ] = False,
     listen: ListenOption = DEFAULT_ENDPOINT,
     keys: KeysOption = None,
-    view: Annotated[bool, typer.Option("--view", help="Also write view.rrd.")] = False,
+    view: Annotated[
+        bool, typer.Option("--view", callback=require_view_extra, help="Also write view.rrd.")
+    ] = False,
 ) -> None:
     """Replay recordings; with the recorded model the comparisons are bit-identical.
 
@@ -394,6 +404,7 @@ def view_command(
     keys: KeysOption = None,
 ) -> None:
     """Open Rerun with the project's layout, on a recording or a running test."""
+    require_view_extra(True)
     from twin.cli.view import show_view as command
 
     command(log, save, picture, connect, rig, read_keys_option(keys))

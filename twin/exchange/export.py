@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
-from table_io.errors import InputError
+from table_io.errors import InputError, format_pip_line
 from table_io.records import RunStart
 from twin.recording.run_paths import resolve_log_path
 from twin.recording.tabular import LogTable, iter_batches, read_log_table
@@ -142,7 +142,7 @@ def _load_writer(file_format: str) -> Callable[[LogTable, Any], None]:
         raise InputError(
             f"{error.name} is not installed",
             where=f"--{file_format}",
-            remedy="pip install shaketwin[formats]",
+            remedy=format_pip_line("formats"),
         ) from None
     return write_parquet
 

@@ -1,6 +1,5 @@
 """`shaketwin join`: record, or run the twin for, a test that runs on another computer."""
 
-import fcntl
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ from twin.recording.run_paths import PARTS_FOLDER
 from twin.reports.finalize import EXIT_GAPS, EXIT_INTERRUPTED
 from twin.run.folders import RUNS_FOLDER, make_output_folder
 from twin.run.merge_parts import LOCK_FILE, merge_run_parts
+from twin.run.system import lock_file
 from twin.run.terminal import catch_interrupts, print_line
 from twin.security.credentials import Credentials, user_name
 from twin.transport.codec import TOPIC_TYPES, WireError, decode_item, encode_item, topic_for
@@ -109,7 +109,7 @@ def record_run(
     parts_folder = folder / PARTS_FOLDER
     parts_folder.mkdir()
     with (parts_folder / LOCK_FILE).open("a") as lock:
-        fcntl.flock(lock, fcntl.LOCK_SH)
+        lock_file(lock)
         recorder = _JoinedRecorder(run, parts_folder / "part-001.mcap", RealClock())
         recorder.record_until_complete(inbox, poll_interrupt)
         if recorder.writer is None:

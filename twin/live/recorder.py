@@ -1,7 +1,6 @@
 """Recorder of a live run: writes all bus traffic to a part file and handles disk errors."""
 
 import contextlib
-import fcntl
 import logging
 import os
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -24,6 +23,7 @@ from twin.live.process_config import (
 from twin.recording.mcap_log import LogTimeError, LogWriter
 from twin.run.disk import RESERVE_S, DiskForecast, DiskReserve, bytes_per_s, free_bytes
 from twin.run.merge_parts import LOCK_FILE
+from twin.run.system import lock_file
 from twin.transport.codec import TOPIC_TYPES, Item, WireError, decode_item, encode_item, topic_for
 from twin.transport.reliable_subscriber import ReliableSubscriber
 from twin.transport.zenoh_link import BusLink, open_spoke
@@ -240,7 +240,7 @@ def run_recorder(config: ProcessConfig, part: str) -> None:
     link.declare(("/run/timing", "/run/event"))
     inbox = link.subscribe(tuple(TOPIC_TYPES), history=True, capacity=INBOX_CAPACITY)
     lock = Path(part).with_name(LOCK_FILE).open("a")
-    fcntl.flock(lock, fcntl.LOCK_SH)  # held until exit: the parts are not merged before
+    lock_file(lock)  # held until exit: the parts are not merged before
     reserve = DiskReserve(
         Path(part).with_name("reserve"), round(RESERVE_S * bytes_per_s(run_config))
     )

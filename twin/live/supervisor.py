@@ -1,7 +1,6 @@
 """Supervisor: starts, monitors, restarts and finally ends the child processes of a live run."""
 
 import contextlib
-import fcntl
 import logging
 import os
 import shutil
@@ -19,6 +18,7 @@ from table_io.records import Comparison, Event, Fault, RunStop, Timing
 from twin.live.process_config import ProcessConfig, make_private_folder, process_token
 from twin.recording.run_paths import PARTS_FOLDER
 from twin.run.merge_parts import LOCK_FILE
+from twin.run.system import lock_file
 from twin.transport.codec import RECORD_TOPICS, Item, decode_item, encode_item, topic_for
 from twin.transport.endpoint import LOCAL_SOCKET_PREFIX, check_can_listen
 from twin.transport.reliable_subscriber import ReliableSubscriber
@@ -112,7 +112,7 @@ class Supervisor:
         self.config = replace(self.config, endpoint=f"{LOCAL_SOCKET_PREFIX}{socket_folder / 'bus'}")
         self.config.write(self.parts_folder / "spec.json")
         lock = (self.parts_folder / LOCK_FILE).open("a")
-        fcntl.flock(lock, fcntl.LOCK_SH)
+        lock_file(lock)
         began = False
         try:
             link, inbox = self._start_all()

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from table_io.block import Label
 from table_io.channels import Channel
 from table_io.config.channel import read_channels
-from table_io.errors import InputError
+from table_io.errors import InputError, format_pip_line
 from twin.compare import TWIN_CHANNELS
 from twin.recording.tabular import channel_unit
 
@@ -24,7 +24,7 @@ def build_dataset(log: "Log") -> "Dataset":
     except ImportError:
         raise InputError(
             "to_xarray needs xarray, which is not installed",
-            remedy="pip install 'shaketwin[notebook]'",
+            remedy=format_pip_line("notebook"),
         ) from None
     channels = read_channels(log.start.rig_toml)
     data = {name: ("time", log[name], _channel_attributes(name, channels)) for name in log.channels}

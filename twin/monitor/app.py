@@ -6,8 +6,6 @@ import os
 import select
 import signal
 import sys
-import termios
-import tty
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -272,6 +270,9 @@ def write_snapshot(client: MonitorClient, picture: Path | None) -> None:
 @contextmanager
 def open_display(console: Console) -> Iterator[TerminalDisplay]:
     """Open the display; the terminal settings are restored on exit."""
+    import termios  # not on Windows, where only this display is missing
+    import tty
+
     keyboard = sys.stdin.fileno()
     attributes = termios.tcgetattr(keyboard)
     try:

@@ -1,6 +1,5 @@
 """Merging of a live recording's parts; they are deleted once the log is verified."""
 
-import fcntl
 import os
 import shutil
 from pathlib import Path
@@ -9,6 +8,7 @@ from table_io.errors import InputError
 from twin.recording.merge import merge, verify_log
 from twin.recording.recovery import UNFINISHED_REASON, recover_log
 from twin.recording.run_paths import PARTS_FOLDER
+from twin.run.system import lock_file
 from twin.run.terminal import print_line
 
 LOCK_FILE = "lock"  # held shared by supervisor and recorder while they run
@@ -23,7 +23,7 @@ def merge_run_parts(folder: Path) -> Path:
     out = folder / "run.mcap"
     try:
         with (parts_folder / LOCK_FILE).open("a") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock_file(lock, exclusive=True)
             parts = sorted(parts_folder.glob("part-*.mcap"))
             if out.exists():  # an earlier call ended before it deleted the parts
                 if not verify_log(out):

@@ -3,10 +3,8 @@
 import os
 import signal
 import sys
-import webbrowser
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
@@ -28,14 +26,6 @@ console = Console(width=_console_columns())
 def print_line(text: str) -> None:
     """Print a line verbatim, without markup; only the terminal wraps it."""
     console.print(text, highlight=False, markup=False, soft_wrap=True)
-
-
-def open_in_browser(page: Path) -> bool:
-    """Open a page in the user's browser; False where there is no screen for one."""
-    has_screen = sys.platform in ("win32", "darwin") or any(
-        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
-    )
-    return has_screen and webbrowser.open(page.resolve().as_uri())
 
 
 def fits_width(on: Console, table: Table) -> bool:
@@ -83,7 +73,10 @@ def catch_interrupts(
 
 @contextmanager
 def announce_if_slow(sentence: str, after_s: float = ANNOUNCE_AFTER_S) -> Iterator[None]:
-    """Print a sentence if the body takes longer than `after_s`."""
+    """Print a sentence if the body takes longer than `after_s`; on Windows never."""
+    if not hasattr(signal, "SIGALRM"):
+        yield
+        return
     old_handler = signal.signal(signal.SIGALRM, lambda *_: print_line(sentence))
     signal.setitimer(signal.ITIMER_REAL, after_s)
     try:

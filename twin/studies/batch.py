@@ -1,6 +1,5 @@
 """Parallel stepped-sine sweeps of many models in threads; the kernels release the GIL."""
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -11,6 +10,7 @@ from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 from twin.model.stepped_sine import SteppedSineResponse
+from twin.run.system import count_cores
 
 STOP_POLL_S = 0.1  # period of polling `stop`
 
@@ -43,7 +43,7 @@ def iterate_sweeps(
     Once `stop()` is true no further sweep starts; those in progress are finished and yielded.
     """
     prepared_models = [model if isinstance(model, Model) else Model(model) for model in models]
-    with ThreadPoolExecutor(cores or len(os.sched_getaffinity(0))) as pool:
+    with ThreadPoolExecutor(cores or count_cores()) as pool:
         pending = deque(
             (index, pool.submit(simulate_sweep, model, frequencies_hz, acceleration, cycles))
             for index, model in enumerate(prepared_models)

@@ -1,7 +1,6 @@
 """`shaketwin simulate` with several models or gaps: parallel sweeps, CSV table, HTML report."""
 
 import math
-import os
 import platform
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
@@ -20,6 +19,7 @@ from twin.reports.finalize import EXIT_INTERRUPTED
 from twin.reports.summary import Json, write_json
 from twin.run.folders import make_run_folder
 from twin.run.run_config import RunConfig, read_run_config
+from twin.run.system import count_cores
 from twin.run.terminal import announce_if_slow, catch_interrupts, console, print_line
 from twin.run.versions import LIBRARIES
 from twin.run.warm_up import COMPILING_MESSAGE
@@ -51,7 +51,7 @@ def simulate_all(
     configs = read_models(model_names or [run_config.profile.model], profile)
     with announce_if_slow(COMPILING_MESSAGE):
         cases = build_cases(run_config.profile, configs, gaps, str(profile))
-    cores = min(workers or len(os.sched_getaffinity(0)), len(cases))
+    cores = min(workers or count_cores(), len(cases))
     folder, run = make_run_folder(out, f"{run_config.name}-batch")
     print_line(
         f"{run_config.profile.title}: {len(cases)} sweeps of "

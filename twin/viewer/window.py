@@ -11,7 +11,7 @@ from typing import Any
 
 from rerun.experimental import ViewerClient
 
-from table_io.errors import InputError
+from table_io.errors import InputError, format_pip_line
 
 SETTLE_CHECK_S, MAX_CHECKS, MAX_CHECKS_LIVE = (
     1.0,
@@ -29,7 +29,7 @@ def find_viewer() -> Path:
     for path in (folder / name for folder in folders for name in names):
         if path.is_file():
             return path
-    raise InputError("the Rerun viewer is not installed", remedy="run: pip install rerun-sdk")
+    raise InputError("the Rerun viewer is not installed", remedy=format_pip_line("view"))
 
 
 def open_viewer(source: Path | str) -> str:

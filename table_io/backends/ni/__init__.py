@@ -10,7 +10,7 @@ from table_io.backends.ni.config import NiWiring
 from table_io.clock import Clock
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
-from table_io.errors import InputError
+from table_io.errors import InputError, format_pip_line
 
 
 def _require_library() -> None:
@@ -22,7 +22,7 @@ def _require_library() -> None:
             "NI's client library is not installed",
             key="backend",
             value="ni",
-            remedy="pip install shaketwin[ni]",
+            remedy=format_pip_line("ni"),
         ) from None
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from typing import Any, Literal
 
 from table_io.backends.discovery import ChannelGroup, DiscoveredDevice
-from table_io.errors import InputError
+from table_io.errors import InputError, format_pip_line
 
 CONNECT_TIMEOUT_S = 2.0
 UNUSED_SESSION = "0"  # required by the client; no session of this name is created
@@ -26,7 +26,7 @@ def discover_devices(server: str | None) -> tuple[DiscoveredDevice, ...]:
         from nidaqmx.system import System
     except ImportError as error:
         raise InputError(
-            f"NI's client library is not installed ({error})", remedy="pip install shaketwin[ni]"
+            f"NI's client library is not installed ({error})", remedy=format_pip_line("ni")
         ) from None
     if server is None:
         try:

@@ -26,7 +26,7 @@ from table_io.backends.opendaq.timestamps import (
 from table_io.block import Float2D
 from table_io.clock import Clock
 from table_io.config.rig import RigConfig
-from table_io.errors import InputError
+from table_io.errors import InputError, format_pip_line
 
 CONNECT_TIMEOUT_S = 2.0
 POLL_S = 0.001
@@ -61,7 +61,7 @@ def load_library() -> Any:
         import opendaq
     except ImportError as error:
         raise InputError(
-            f"openDAQ is not installed ({error})", remedy="pip install shaketwin[opendaq]"
+            f"openDAQ is not installed ({error})", remedy=format_pip_line("opendaq")
         ) from None
     return opendaq
 

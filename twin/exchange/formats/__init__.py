@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from table_io.block import Float1D
-from table_io.errors import InputError
+from table_io.errors import InputError, format_pip_line
 from twin.exchange.formats.sandbox import run_isolated
 
 FORMATS = {
@@ -150,7 +150,7 @@ def _load_format_module(path: Path) -> Any:
         raise InputError(
             f"{error.name} is not installed",
             where=path,
-            remedy="pip install shaketwin[formats]",
+            remedy=format_pip_line("formats"),
         ) from None
 
 

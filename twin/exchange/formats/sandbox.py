@@ -5,8 +5,8 @@ If a library crashes, hangs or exhausts memory on a damaged file, only the child
 
 import faulthandler
 import os
-import resource
 import signal
+import sys
 from collections.abc import Callable
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
@@ -27,8 +27,11 @@ T = TypeVar("T")
 def run_isolated(path: Path, work: Callable[[], T], max_cpu_s: int = MAX_CPU_S) -> T:
     """Run `work` on the file at `path` in a child process; raise InputError on any failure.
 
-    The child is killed after `max_cpu_s` of CPU time.
+    The child is killed after `max_cpu_s` of CPU time. Only Linux has the sandbox; elsewhere the
+    file is read in this process.
     """
+    if sys.platform != "linux":
+        return _raise_input_error(_capture_result(path, work))
     receiver, sender = Pipe(duplex=False)
     child = os.fork()
     if not child:
@@ -50,6 +53,11 @@ def run_isolated(path: Path, work: Callable[[], T], max_cpu_s: int = MAX_CPU_S) 
         receiver.close()
         os.kill(child, signal.SIGKILL)  # it has sent its result, or this process was interrupted
         os.waitpid(child, 0)
+    return _raise_input_error(result)
+
+
+def _raise_input_error(result: T | InputError) -> T:
+    """Return a result; raise it if it is an error."""
     if isinstance(result, InputError):
         raise result
     return result
@@ -57,6 +65,8 @@ def run_isolated(path: Path, work: Callable[[], T], max_cpu_s: int = MAX_CPU_S) 
 
 def _run_in_child(path: Path, work: Callable[[], T], sender: Connection, max_cpu_s: int) -> None:
     """Send the result of `work`, or an InputError, from the child process."""
+    import resource
+
     faulthandler.disable()  # the parent reports a crash in one message
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     used_bytes = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
@@ -73,27 +83,26 @@ def _run_in_child(path: Path, work: Callable[[], T], sender: Connection, max_cpu
         resource.setrlimit(
             resource_kind, (limit if hard_limit < 0 else min(limit, hard_limit), hard_limit)
         )
+    sender.send(_capture_result(path, work))
+
+
+def _capture_result(path: Path, work: Callable[[], T]) -> T | InputError:
+    """Return the result of `work`, or the InputError that explains why there is none."""
     try:
-        sender.send(work())
+        return work()
     except InputError as error:
-        sender.send(error)
+        return error
     except MemoryError:
-        sender.send(
-            InputError(
-                "too large for this memory", where=path, remedy="import its parts one by one"
-            )
+        return InputError(
+            "too large for this memory", where=path, remedy="import its parts one by one"
         )
     except OSError as error:
-        sender.send(
-            InputError(f"cannot read this: {error.strerror or _first_line(error)}", where=path)
-        )
+        return InputError(f"cannot read this: {error.strerror or _first_line(error)}", where=path)
     except Exception as error:  # parsers raise any exception on unexpected bytes
-        sender.send(
-            InputError(
-                f"damaged, or not of the format of its suffix: {_first_line(error)}",
-                where=path,
-                remedy="export it again",
-            )
+        return InputError(
+            f"damaged, or not of the format of its suffix: {_first_line(error)}",
+            where=path,
+            remedy="export it again",
         )
 
 

@@ -1,6 +1,5 @@
 """Paper study: every simulation that figures and table need, computed once."""
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ import numpy as np
 from table_io.block import Float1D
 from twin.reports.paper_cases import PaperCase, load_paper_cases
 from twin.reports.slow_passage import SlowSweep, run_slow_sweep
+from twin.run.system import count_cores
 from twin.validation.paper import findings, low_frequency
 from twin.validation.paper.findings import Folds, ImpactDistribution
 from twin.validation.paper.low_frequency import ChaosMeasure, SecondaryResonances
@@ -73,7 +73,7 @@ def run_paper_study(
 
         return list(pool.map(run_job, *argument_lists))
 
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+    with ThreadPoolExecutor(count_cores()) as pool:
         slow_sweeps = dict(
             zip(names, run_parallel(run_slow_sweep, list(cases.values())), strict=True)
         )

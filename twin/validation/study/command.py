@@ -1,7 +1,6 @@
 """`shaketwin study discovery`: evaluate blind cases on several processes; resumable."""
 
 import json
-import os
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -13,6 +12,7 @@ from table_io.clock import RealClock
 from table_io.errors import InputError, suggest
 from twin.reports.finalize import EXIT_INTERRUPTED
 from twin.run.folders import make_output_folder
+from twin.run.system import count_cores
 from twin.run.terminal import catch_interrupts, console, print_line
 from twin.validation.study.baselines import describe_missing
 from twin.validation.study.comparison_tables import CONTROL_TITLES
@@ -60,7 +60,7 @@ def run_discovery_study(
     folder = _open_folder(out, resume)
     if describe_missing():
         print_line(describe_missing())
-    processes = workers or len(os.sched_getaffinity(0))
+    processes = workers or count_cores()
     exit_code = run_cases(folder, numbers, processes, partial(evaluate_case, folder))
     if controls and exit_code == 0:
         print_line(f"negative controls on {CONTROL_CELLS}")

@@ -1,0 +1,42 @@
+"""What differs between operating systems: file locks, number of cores, the browser.
+
+On Windows and macOS recordings are read, replayed, reported, viewed and made by `--speed max`; a
+live run needs Linux.
+"""
+
+import os
+import sys
+import webbrowser
+from pathlib import Path
+from typing import TextIO
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    HAS_FILE_LOCKS = False
+else:
+    HAS_FILE_LOCKS = True
+
+
+def lock_file(file: TextIO, exclusive: bool = False) -> None:
+    """Lock an open file until it is closed; BlockingIOError if it cannot be locked exclusively.
+
+    Several processes may hold it shared. Does nothing on Windows, where nothing records live.
+    """
+    if HAS_FILE_LOCKS:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB if exclusive else fcntl.LOCK_SH)
+
+
+def count_cores() -> int:
+    """Return the number of cores that this process may use."""
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def open_in_browser(page: Path) -> bool:
+    """Open a page in the user's browser; False where there is no screen for one."""
+    has_screen = sys.platform in ("win32", "darwin") or any(
+        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
+    )
+    return has_screen and webbrowser.open(page.resolve().as_uri())
