@@ -46,8 +46,12 @@ class DwellConfig(ConfigModel):
     `cycles` and `seconds` count held cycles only; cycles for tuning the level come in addition.
     """
 
-    cycles: Count | None = Field(None, ge=1, le=1_000_000)
-    seconds: Positive | None = Field(None, le=86_400, validate_default=True)
+    cycles: Count | None = Field(
+        None, ge=1, le=1_000_000, description="Length in held cycles; or give `seconds`."
+    )
+    seconds: Positive | None = Field(
+        None, le=86_400, validate_default=True, description="Length in held time; or give `cycles`."
+    )
 
     @field_validator("seconds")
     @classmethod
@@ -69,14 +73,14 @@ class TrackConfig(ConfigModel):
     over the measured level is largest.
     """
 
-    by: Literal["phase", "peak"]
+    by: Literal["phase", "peak"] = Field(description="Definition of the resonance.")
     step_hz: Positive = Field(
         description="Largest change between visits, to stay on the branch; by peak: their spacing."
     )
     resolution_hz: Positive = Field(description="Converged when the next visit would move by less.")
-    lowest_hz: Positive | None = Field(None, description="None: start of the sweep.")
-    highest_hz: Positive | None = Field(None, description="None: end of the sweep.")
-    phase_deg: Number | None = Field(None, ge=20, le=160, description="None: 90.")
+    lowest_hz: Positive | None = Field(None, description="Omitted: start of the sweep.")
+    highest_hz: Positive | None = Field(None, description="Omitted: end of the sweep.")
+    phase_deg: Number | None = Field(None, ge=20, le=160, description="Omitted: 90.")
     visits: Count = Field(30, ge=3, le=10_000, description="Limit for finding it.")
     follow: Count = Field(0, ge=0, le=10_000, description="Visits after it is found.")
 
@@ -122,13 +126,15 @@ class RefineConfig(ConfigModel):
     The branch is reached again from `approach_hz`, where the branches meet, in steps of the sweep.
     """
 
-    resolution_hz: Positive
+    resolution_hz: Positive = Field(
+        description="Width of the interval to which a jump is bisected."
+    )
     cycles: Count = Field(ge=1, le=1_000_000, description="Limit on held cycles, approaches too.")
     hold_cycles: Count | None = Field(
-        None, ge=1, le=100_000, description="Held per frequency; None: as in a step."
+        None, ge=1, le=100_000, description="Held per frequency; omitted: as in a step."
     )
     approach_hz: Positive | None = Field(
-        None, description="For jumps beyond it; None: start of the sweep's direction."
+        None, description="For jumps beyond it; omitted: start of the sweep's direction."
     )
 
     def check_sweep(self, grid: SweepGrid) -> None:

@@ -62,6 +62,11 @@ class ConfigModel(BaseModel):
         return None
 
     @classmethod
+    def list_variants(cls) -> "dict[str, type[ConfigModel]]":
+        """Return the classes that read a table by what they require of it; "" if nothing."""
+        return {"": cls}
+
+    @classmethod
     def select_class(cls, table: Mapping[str, Any]) -> "type[ConfigModel]":
         """Return the class that reads a table: this one, unless the table states a kind."""
         return cls

@@ -28,28 +28,32 @@ from table_io.config.base import ConfigModel, Finite, NonNegative, Positive
 
 
 class CalibrationRecord(ConfigModel):
-    """Record of one calibration; the module describes each key."""
+    """Record of one calibration."""
 
-    channel: str
-    unit: str
-    serial: str = ""
-    at: str
-    by: str
-    method: Literal["points", "shunt"]
-    applied: tuple[Finite, ...] = Field(min_length=2)
-    applied_sd: NonNegative = 0.0
-    volts: tuple[Finite, ...]
-    volts_sd: tuple[NonNegative, ...]
-    volts_per_unit: Finite
-    volts_per_unit_sd: NonNegative
-    offset: Finite
-    offset_sd: NonNegative
-    linearity_percent: NonNegative | None = None
-    card_volts_per_unit: Finite
-    departure_percent: Finite
-    departure_sd: Finite | None = None  # None if the standard deviation is 0
-    tolerance_percent: Positive
-    passed: bool
+    channel: str = Field(description="Channel of the sensor.")
+    unit: str = Field(description="Unit of the applied values.")
+    serial: str = Field("", description="Serial number of the sensor.")
+    at: str = Field(description="Time of the calibration, ISO 8601.")
+    by: str = Field(description="Name of the operator.")
+    method: Literal["points", "shunt"] = Field(description="Applied values or a shunt.")
+    applied: tuple[Finite, ...] = Field(min_length=2, description="Applied values, in `unit`.")
+    applied_sd: NonNegative = Field(
+        0.0, description="Standard uncertainty of the applied values; 0: not stated."
+    )
+    volts: tuple[Finite, ...] = Field(description="Mean voltage at each applied value.")
+    volts_sd: tuple[NonNegative, ...] = Field(description="Standard error of each mean.")
+    volts_per_unit: Finite = Field(description="Sensitivity.")
+    volts_per_unit_sd: NonNegative = Field(description="Standard uncertainty of the sensitivity.")
+    offset: Finite = Field(description="In `unit`: volts = (value + offset) * volts_per_unit.")
+    offset_sd: NonNegative = Field(description="Standard uncertainty of the offset.")
+    linearity_percent: NonNegative | None = Field(
+        None, description="Largest residual over the span; from three points on."
+    )
+    card_volts_per_unit: Finite = Field(description="Sensitivity in the rig file at that time.")
+    departure_percent: Finite = Field(description="Departure of the sensitivity from the rig file.")
+    departure_sd: Finite | None = Field(None, description="The same in its standard uncertainty.")
+    tolerance_percent: Positive = Field(description="Allowed departure.")
+    passed: bool = Field(description="Whether the departure is allowed.")
 
 
 class CalibrationFile(ConfigModel):

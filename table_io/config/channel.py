@@ -59,15 +59,23 @@ Body = Literal["table", "mass", "damper", "right_bumper", "left_bumper", "ground
 
 
 class ChannelConfig(ConfigModel):
-    """Declared channel; the module describes each key."""
+    """Channel declared next to the canonical ones."""
 
-    quantity: str
-    unit: str
-    name: str = Field(max_length=MAX_NAME_LENGTH)
-    body: Body
-    positive: str = Field("", validate_default=True)
-    meaning: str = ""
-    simulated: dict[str, Finite] | None = Field(None, min_length=1)
+    quantity: str = Field(
+        description="What is measured: acceleration, displacement, temperature, ..."
+    )
+    unit: str = Field(description="Unit of the recording: the SI unit of the quantity.")
+    name: str = Field(
+        max_length=MAX_NAME_LENGTH, description="Name of the channel; it ends with its unit."
+    )
+    body: Body = Field(description="What it is mounted on.")
+    positive: str = Field("", validate_default=True, description="Direction of a positive value.")
+    meaning: str = Field("", description="Description for reports and exports.")
+    simulated: dict[str, Finite] | None = Field(
+        None,
+        min_length=1,
+        description="Factors of canonical channels, or `constant`, for the simulated table.",
+    )
 
     @field_validator("quantity")
     @classmethod

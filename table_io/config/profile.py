@@ -44,13 +44,15 @@ MAX_FILE_BYTES = 2 * 2**20
 class Specimen(ConfigModel):
     """Specimen on the table. `gap_mm` is the total, right plus left; negative = precompressed."""
 
-    mass_kg: Positive
+    mass_kg: Positive = Field(description="Moving mass, with everything fixed to it.")
     gap_mm: Number = Field(description="Nominal total gap; inf = no bumpers.")
     gap_right_mm: Number | None = Field(None, description="Measured gap on the right.")
     gap_left_mm: Number | None = Field(
         None, validate_default=True, description="Measured gap on the left."
     )
-    temperature_c: Finite | None = None
+    temperature_c: Finite | None = Field(
+        None, description="Of the specimen during the test; information only."
+    )
 
     @field_validator("gap_mm", "gap_right_mm", "gap_left_mm")
     @classmethod
@@ -81,8 +83,10 @@ class Specimen(ConfigModel):
 class AcquisitionConfig(ConfigModel):
     """Sampling rate, block length and recorded rest."""
 
-    rate_hz: Positive = 2000.0
-    block_samples: Count = Field(20, ge=1, le=10000)
+    rate_hz: Positive = Field(2000.0, description="Sampling rate; one of `rates_hz` of the rig.")
+    block_samples: Count = Field(
+        20, ge=1, le=10000, description="Samples in a block; the twin answers once a block."
+    )
     rest_s: Number = Field(0.5, ge=0.2, le=60, description="Recorded rest before and after.")
 
 
@@ -96,16 +100,18 @@ class ComparisonConfig(ConfigModel):
 class OnDeathConfig(ConfigModel):
     """Reaction of the test to the death of a helper process, which is restarted either way."""
 
-    twin: Literal["continue", "stop"] = "continue"
-    recorder: Literal["continue", "stop"] = "continue"
-    viewer: Literal["continue", "stop"] = "continue"
-    supervisor: Literal["continue", "stop"] = "stop"
+    twin: Literal["continue", "stop"] = Field("continue", description="Twin process.")
+    recorder: Literal["continue", "stop"] = Field("continue", description="Recorder process.")
+    viewer: Literal["continue", "stop"] = Field("continue", description="Viewer process.")
+    supervisor: Literal["continue", "stop"] = Field(
+        "stop", description="Supervisor of all of them."
+    )
 
 
 class LoopCheckConfig(ConfigModel):
     """Loop check at low level before every run, and the rest after it."""
 
-    enabled: bool = True
+    enabled: bool = Field(True, description="False skips the check.")
     level: Number = Field(0.1, gt=0, le=0.1, description="Share of the test's acceleration.")
     cycles: Count = Field(5, ge=3, le=50, description="Held cycles at each frequency.")
     frequencies_hz: tuple[Positive, ...] = Field(
@@ -117,13 +123,15 @@ class LoopCheckConfig(ConfigModel):
 class ControlConfig(ConfigModel):
     """Amplitude control: correction of the command before the measured cycles of a step."""
 
-    enabled: bool = True
+    enabled: bool = Field(True, description="False plays the nominal command without correction.")
     tolerance: Number = Field(0.02, ge=0.002, le=0.1, description="Share of the demanded level.")
     updates: Count = Field(3, ge=1, le=10, description="Largest number per step.")
     gain: Number = Field(0.8, ge=0.1, le=1.0, description="Share of an error corrected at once.")
     clamp_db: Number = Field(2.0, gt=0, le=6.0, description="Largest change per update.")
     harmonics: bool = Field(False, description="Cancel the table's harmonics 2 to 5.")
-    harmonic_updates: Count = Field(5, ge=1, le=10)
+    harmonic_updates: Count = Field(
+        5, ge=1, le=10, description="Largest number per step, with `harmonics`."
+    )
 
 
 class ProtectionConfig(ConfigModel):
@@ -139,13 +147,13 @@ class ProtectionConfig(ConfigModel):
 class SetUpConfirmation(ConfigModel):
     """Setup that the operator was asked for before a run, and the operator's confirmation."""
 
-    campaign: str
-    label: str
-    asked: str
-    answer: str
-    who: str
-    at: str  # ISO 8601
-    notes: str = ""
+    campaign: str = Field(description="Name of the campaign.")
+    label: str = Field(description="Label of the run in it.")
+    asked: str = Field(description="Set-up change that was asked for.")
+    answer: str = Field(description="Answer of the operator.")
+    who: str = Field(description="Name of the operator.")
+    at: str = Field(description="Time of the answer, ISO 8601.")
+    notes: str = Field("", description="Notes of the operator.")
 
 
 class ResumeConfig(ConfigModel):
@@ -158,11 +166,11 @@ class ResumeConfig(ConfigModel):
 class Profile(ConfigModel):
     """Test profile: everything that defines one test."""
 
-    title: str
-    citation: str = ""
-    notes: str = ""
-    rig: str = "simulated"
-    model: str = "snm"
+    title: str = Field(description="Title of the test in every report.")
+    citation: str = Field("", description="Source of the test, such as a paper.")
+    notes: str = Field("", description="Notes of the operator; they go into the recording.")
+    rig: str = Field("simulated", description="Rig file: a name or a path; `--table` replaces it.")
+    model: str = Field("snm", description="Model file: a name or a path; `--model` replaces it.")
     specimen: Specimen
     excitation: SerializeAsAny[Excitation] = Field(
         validation_alias=AliasChoices("excitation", "sweep"),

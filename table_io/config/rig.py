@@ -32,19 +32,19 @@ SectionT = TypeVar("SectionT", bound=BackendConfig)
 class MachineLimits(ConfigModel):
     """Limits of the machine, on either side of its mean position."""
 
-    stroke_mm: Positive
-    velocity_mm_s: Positive
-    acceleration_g: Positive
-    force_kn: Positive
-    frequency_hz: Positive
+    stroke_mm: Positive = Field(description="Largest displacement.")
+    velocity_mm_s: Positive = Field(description="Largest velocity.")
+    acceleration_g: Positive = Field(description="Largest acceleration.")
+    force_kn: Positive = Field(description="Largest force of the actuator.")
+    frequency_hz: Positive = Field(description="Highest frequency of a command.")
 
 
 class OutputConfig(ConfigModel):
     """Command output: +-span_v commands +-span_mm."""
 
-    span_mm: Positive
-    span_v: Positive = 10.0
-    bits: int = Field(ge=8, le=32)
+    span_mm: Positive = Field(description="Displacement at `span_v`.")
+    span_v: Positive = Field(10.0, description="Voltage of full scale.")
+    bits: int = Field(ge=8, le=32, description="Resolution of the D/A converter.")
     lead_s: Number = Field(0.5, ge=0.2, le=5.0, description="Checked command queued ahead.")
     warn_lsb: int = Field(100, ge=1, description="Warn if an amplitude has fewer LSB.")
     least_lsb: int = Field(20, ge=1, description="Refuse if an amplitude has fewer LSB.")
@@ -66,17 +66,24 @@ class OutputConfig(ConfigModel):
 class RigConfig(ConfigModel):
     """Rig file of a shaking table: its limits, output, channels, sensors, sections of backends.
 
-    A section is a table named like an installed backend and validated by its config model. Sections
-    of a backend that is not installed are kept unread, so that a recording can be read without the
-    package that drove its table; `load_rig` refuses them.
+    A section is a table named like an installed backend.
     """
 
-    model_config = ConfigDict(extra="allow", populate_by_name=True)  # the extras are sections
+    # The extras are sections, validated by the config model of their backend. Those of a backend
+    # that is not installed are kept unread, so that a recording can be read without the package
+    # that drove its table; `load_rig` refuses them.
+    model_config = ConfigDict(extra="allow", populate_by_name=True)
 
-    name: str = Field(pattern=r"^[a-z0-9_]+$")
-    title: str
-    backend: str
-    rates_hz: tuple[Positive, ...] = Field(min_length=1)
+    name: str = Field(
+        pattern=r"^[a-z0-9_]+$", description="Name of the rig on the bus: a to z, 0 to 9 and _."
+    )
+    title: str = Field(description="Name of the table in every report.")
+    backend: str = Field(
+        description="How the table is driven: an installed backend, with a table of its name here."
+    )
+    rates_hz: tuple[Positive, ...] = Field(
+        min_length=1, description="Sampling rates that the hardware supports."
+    )
     moving_mass_kg: Positive = Field(description="Table without payload, for the force margin.")
     limits: MachineLimits
     output: OutputConfig

@@ -54,22 +54,24 @@ class SensorConfig(ConfigModel):
     """Sensor of one channel: volts = (value + offset) * volts_per_unit."""
 
     channel: str = Field(description="Canonical, or declared in [[channels]] of the rig file.")
-    unit: str
+    unit: str = Field(description="Unit of `range`, `volts_per_unit` and the other values here.")
     range: Positive = Field(description="Full scale on either side, in `unit`.")
     volts_per_unit: Finite = Field(description="Sensitivity; negative if the sensor is reversed.")
-    bits: int = Field(ge=8, le=32)
+    bits: int = Field(ge=8, le=32, description="Resolution of the A/D converter.")
     noise_rms: NonNegative = Field(
         0.0, description="In `unit`, measured at rest; also the noise of the simulated table."
     )
     offset: Finite = Field(0.0, description="In `unit`, reading at 0; every run tares it.")
-    maker: str = ""
-    model: str = ""
+    maker: str = Field("", description="Maker of the instrument.")
+    model: str = Field("", description="Model of the instrument.")
     serial: str = Field("", description="Serial number.")
     calibrated: IsoDate | None = Field(None, description="Day of the last calibration.")
     due: IsoDate | None = Field(None, description="Day of the next one; or give interval_months.")
-    interval_months: Annotated[Count, Field(ge=1, le=600)] | None = None
-    certificate: str = ""
-    calibrated_by: str = ""
+    interval_months: Annotated[Count, Field(ge=1, le=600)] | None = Field(
+        None, description="Time between calibrations; or give `due`."
+    )
+    certificate: str = Field("", description="Number of the calibration certificate.")
+    calibrated_by: str = Field("", description="Who calibrated it.")
     shunt: Finite | None = Field(None, description="In `unit`, shift caused by its shunt.")
     shunt_tolerance: Positive | None = Field(
         None, validate_default=True, description="In `unit`, on either side of `shunt`."

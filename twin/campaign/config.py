@@ -31,10 +31,14 @@ class CampaignRun(ConfigModel):
     profile: str = Field(
         description="Name of a test, or path of a .toml file relative to this file."
     )
-    label: str = Field("", pattern=r"^([A-Za-z0-9][A-Za-z0-9_.-]*)?$")
+    label: str = Field(
+        "",
+        pattern=r"^([A-Za-z0-9][A-Za-z0-9_.-]*)?$",
+        description="Name of the run; empty: name of the profile.",
+    )
     prompt: str = Field("", description="Set-up change to confirm before the run; empty: none.")
-    notes: str = ""
-    repeat: Count = Field(1, ge=1, le=50)
+    notes: str = Field("", description="Notes of the operator; they go into the recording.")
+    repeat: Count = Field(1, ge=1, le=50, description="Number of repetitions.")
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -46,9 +50,9 @@ class CampaignRun(ConfigModel):
 class CampaignConfig(ConfigModel):
     """A campaign: its runs in order, and where an interrupted run continues."""
 
-    title: str
-    citation: str = ""
-    notes: str = ""
+    title: str = Field(description="Title of the campaign in every report.")
+    citation: str = Field("", description="Source of the programme.")
+    notes: str = Field("", description="Notes of the operator.")
     resume: ResumeMode = Field(
         "direction", description="Part of an interrupted run to repeat: direction, step or run."
     )

@@ -410,6 +410,18 @@ def view_command(
     command(log, save, picture, connect, rig, read_keys_option(keys))
 
 
+@app.command("guide", rich_help_panel=PLAN_PANEL)
+def guide_command(
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Write the pages to this folder; open nothing.")
+    ] = None,
+) -> None:
+    """Open the user guide in the browser; it needs no network."""
+    from twin.cli.guide import open_guide as command
+
+    command(out, app)
+
+
 app.add_typer(hardware_app)
 app.add_typer(live_app)
 app.add_typer(identification_app)

@@ -36,11 +36,13 @@ class ColumnSource(ConfigModel):
     `file_unit` must repeat the unit stated in the file.
     """
 
-    column: str
-    unit: str = ""
-    file_unit: str | None = None
-    gain: Finite = 1.0
-    offset: Finite = 0.0
+    column: str = Field(description="Name of the column in the file.")
+    unit: str = Field("", description="Unit of the column; empty: SI.")
+    file_unit: str | None = Field(
+        None, description="Unit stated in the file, where it is not `unit`."
+    )
+    gain: Finite = Field(1.0, description="Factor on the column.")
+    offset: Finite = Field(0.0, description="Added after scaling, in SI.")
 
     @field_validator("gain")
     @classmethod

@@ -16,10 +16,10 @@ from twin.model.parameters import Parameters
 class BaseModelConfig(ConfigModel):
     """Linear springs and dashpots, both bumpers alike; without bumper damping, no bumper memory."""
 
-    stiffness_n_m: Positive
-    damping_n_s_m: NonNegative
-    bumper_stiffness_n_m: Positive
-    bumper_damping_n_s_m: NonNegative
+    stiffness_n_m: Positive = Field(description="Stiffness K of the damper.")
+    damping_n_s_m: NonNegative = Field(description="Damping C of the damper.")
+    bumper_stiffness_n_m: Positive = Field(description="Stiffness of each bumper.")
+    bumper_damping_n_s_m: NonNegative = Field(description="Damping of each bumper.")
 
 
 class EffectConfig(ConfigModel):
@@ -28,7 +28,7 @@ class EffectConfig(ConfigModel):
     Sensor effects name their channel among the parameters: `channel = "mass_acc_m_s2"`.
     """
 
-    id: str
+    id: str = Field(description="Name of the effect, built in or of a plug-in.")
     parameters: dict[str, float | str] = Field(default_factory=dict)
 
     @field_validator("parameters", mode="before")
@@ -69,9 +69,9 @@ def _is_number(value: Any) -> bool:
 class ModelConfig(ConfigModel):
     """A model from models/*.toml: base parameters and the effects added to them."""
 
-    title: str
-    citation: str = ""
-    fitted_on: str = ""
+    title: str = Field(description="Title of the model in every report.")
+    citation: str = Field("", description="Source of the values.")
+    fitted_on: str = Field("", description="Recordings or tests from which the values come.")
     intervals: dict[str, tuple[Finite, Finite]] = Field(
         default={}, description="95 % intervals of fitted parameters; no calculation uses them."
     )

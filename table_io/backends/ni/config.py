@@ -20,8 +20,8 @@ class NiInput(ConfigModel):
 
     channel: str = Field(description="A sensor of the rig file.")
     physical: str = Field(pattern=r"^[^/\s]+/ai\d+$", description="Physical channel: Dev1/ai0.")
-    terminals: Literal["differential", "rse", "nrse", "pseudodifferential", "default"] = (
-        "differential"
+    terminals: Literal["differential", "rse", "nrse", "pseudodifferential", "default"] = Field(
+        "differential", description="Terminal configuration of the input."
     )
 
 

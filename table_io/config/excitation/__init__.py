@@ -53,13 +53,19 @@ class Excitation(ConfigModel):
     some also has the field `files`, which then holds their texts by name.
     """
 
-    kind: str = DEFAULT_KIND
+    kind: str = Field(DEFAULT_KIND, description="What is played; it decides the other keys.")
     FILE_KEYS: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def select_class(cls, table: Mapping[str, Any]) -> "type[Excitation]":
         """Return the class of the table's kind; ValueError lists the known kinds."""
         return find_excitation(table.get("kind", DEFAULT_KIND))
+
+    @classmethod
+    def list_variants(cls) -> dict[str, type[ConfigModel]]:
+        """Return every kind, built in or of a plug-in."""
+        kinds = dict.fromkeys([*EXCITATIONS, *list_entry_points(ENTRY_POINT_GROUP)])
+        return {f'kind = "{kind}"': find_excitation(kind) for kind in kinds}
 
     @abstractmethod
     def plan(self, rate_hz: float) -> ExcitationPlan:

@@ -29,9 +29,9 @@ class Continuation(Excitation):
 
     FILE_KEYS: ClassVar[tuple[str, ...]] = ("file",)
 
-    start_hz: Positive
-    stop_hz: Positive
-    acceleration_g: Positive = 0.05
+    start_hz: Positive = Field(description="Frequency where the branch is entered.")
+    stop_hz: Positive = Field(description="Frequency where it is left.")
+    acceleration_g: Positive = Field(0.05, description="Peak table acceleration.")
     points: Count = Field(60, ge=1, le=1000, description="Unstable orbits along the branch.")
     settle_cycles: Count = Field(10, ge=2, le=1000, description="Before each evaluation.")
     measured_cycles: Count = Field(10, ge=2, le=1000, description="Of each evaluation.")
@@ -48,7 +48,7 @@ class Continuation(Excitation):
         15.0, le=200, description="Lag of the table behind its command, which the gains allow for."
     )
     files: dict[str, str] = Field({}, description="Texts of files by name; loading attaches them.")
-    file: str | None = Field(None, description="Orbit plan; None: `run` computes it.")
+    file: str | None = Field(None, description="Orbit plan; omitted: `run` computes it.")
 
     @field_validator("stop_hz")
     @classmethod

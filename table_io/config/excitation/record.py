@@ -35,10 +35,12 @@ class RecordedHistory(History):
     FILE_KEYS: ClassVar[tuple[str, ...]] = ("file",)
 
     files: dict[str, str] = Field({}, description="Texts of files by name; loading attaches them.")
-    unit: Literal["m", "cm", "mm", "in"] | None = Field(None, description="None: of the header.")
+    unit: Literal["m", "cm", "mm", "in"] | None = Field(None, description="Omitted: of the header.")
     scale: Finite = Field(1.0, description="Factor on the displacement; negative turns it around.")
     blend_s: Number = Field(1.0, ge=0.1, le=60, description="From rest to the record, and back.")
-    file: str
+    file: str = Field(
+        description="CSV file next to the profile with `time_s` and one displacement."
+    )
 
     @field_validator("scale")
     @classmethod

@@ -23,15 +23,19 @@ from table_io.units import GRAVITY_M_S2
 class Sweep(Excitation):
     """Stepped sine sweep of constant peak table acceleration, up and down one frequency grid."""
 
-    start_hz: float = Field(ge=0.01, allow_inf_nan=False)
-    stop_hz: Positive
-    step_hz: Positive
+    start_hz: float = Field(ge=0.01, allow_inf_nan=False, description="Lowest frequency.")
+    stop_hz: Positive = Field(description="Highest frequency.")
+    step_hz: Positive = Field(description="Step of the grid; it divides the range.")
     cycles: Count = Field(ge=2, le=1000, description="Held cycles per step.")
     measured_cycles: Count = Field(
         3, ge=1, validate_default=True, description="Last held cycles, which enter the PRC point."
     )
-    acceleration_g: Positive = 0.05
-    directions: tuple[Literal["forward", "backward"], ...] = ("forward", "backward")
+    acceleration_g: Positive = Field(
+        0.05, description="Peak table acceleration, the same at every frequency."
+    )
+    directions: tuple[Literal["forward", "backward"], ...] = Field(
+        ("forward", "backward"), description="Order of the passes over the grid."
+    )
     blend_cycles: Number = Field(
         MIN_BLEND_CYCLES, ge=MIN_BLEND_CYCLES, le=20, description="Shortest blend between steps."
     )

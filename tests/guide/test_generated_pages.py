@@ -1,0 +1,101 @@
+"""Generated pages: every key, command, effect and channel, from the objects themselves."""
+
+import numpy as np
+import pytest
+import typer
+
+from table_io.config.base import ConfigModel
+from table_io.config.key_reference import describe_tables, find_unit
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from twin.cli.main import app
+from twin.guide.gallery import write_gallery
+from twin.guide.loops import compute_loops, find_loops
+from twin.guide.reference import CONFIG_FILES, write_command_reference, write_key_reference
+from twin.model.effects import EFFECTS
+from twin.model.effects.effect import Effect
+
+
+def test_every_key_of_every_file_has_a_meaning() -> None:
+    missing = [
+        f"{title} {table.name} {key.key}"
+        for title, _, model in CONFIG_FILES
+        for table in describe_tables(model)
+        for key in table.keys
+        if not key.meaning or not key.allowed
+    ]
+    assert missing == []
+
+
+def find_key(model: type[ConfigModel], table: str, key: str) -> tuple[str, str, bool, str]:
+    tables = {description.name: description.keys for description in describe_tables(model)}
+    (entry,) = (item for item in tables[table] if item.key == key)
+    return entry.unit, entry.default, entry.is_required, entry.allowed
+
+
+@pytest.mark.parametrize(
+    ("model", "table", "key", "expected"),
+    [
+        (Profile, "[specimen]", "mass_kg", ("kg", "", True, "number, above 0")),
+        (Profile, "[comparison]", "window_s", ("s", "0.25", False, "number, from 0.05 to 60")),
+        (Profile, "[on_death]", "twin", ("", '"continue"', False, '"continue" or "stop"')),
+        (Profile, '[excitation] kind = "stepped_sine"', "step_hz", ("Hz", "", True, "number, above 0")),
+        (Profile, "[track]", "phase_deg", ("degrees", "", False, "number, from 20 to 160")),
+        (RigConfig, "[[sensors]]", "bits", ("", "", True, "integer, from 8 to 32")),
+        (RigConfig, "[[ni.inputs]]", "physical", ("", "", True, r"text, pattern ^[^/\s]+/ai\d+$")),
+        (RigConfig, "[limits]", "velocity_mm_s", ("mm/s", "", True, "number, above 0")),
+    ],
+)  # fmt: skip
+def test_a_key_has_the_unit_default_and_limits_of_its_model(
+    model: type[ConfigModel], table: str, key: str, expected: tuple[str, str, bool, str]
+) -> None:
+    assert find_key(model, table, key) == expected
+
+
+def test_the_unit_of_a_key_is_its_longest_ending() -> None:
+    assert [find_unit(key) for key in ("force_n", "damping_n_s_m", "cycles", "of_m_s2")] == [
+        "N",
+        "N s/m",
+        "",
+        "m/s2",
+    ]
+
+
+def test_the_pages_list_every_key_and_command() -> None:
+    keys = write_key_reference(app)
+    for _, _, model in CONFIG_FILES:
+        for key in model.list_keys():
+            assert key in keys
+    commands = write_command_reference(app)
+    program = typer.main.get_command(app)
+    for name, command in program.commands.items():
+        if not command.hidden:
+            assert f"### shaketwin {name}" in commands
+    assert "### shaketwin keys add" in commands
+    assert "| `--remote-twin` |" in commands
+
+
+def test_the_gallery_has_every_effect_and_what_it_is_confused_with() -> None:
+    gallery = write_gallery(app)
+    for effect in EFFECTS:
+        section = gallery.partition(f"\n## {effect.id}\n")[2].partition("\n## ")[0]
+        assert effect.residual in section
+        assert section.count('<polygon class="') == 2
+        for name in effect.confused_with:
+            assert f"](#{name})" in section
+        for parameter in effect.parameters:
+            assert f"| `{parameter.name}` | {parameter.unit} |" in section
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.id)
+def test_the_shipped_loops_are_those_of_the_model(effect: Effect) -> None:
+    """Renew them with `python -m twin.guide.loops`."""
+    without, with_effect = find_loops(effect)
+    for shipped, computed in zip((without, with_effect), compute_loops(effect), strict=True):
+        assert np.allclose(shipped.u_mm, computed.u_mm, atol=2e-3)
+        assert np.allclose(shipped.force_kn, computed.force_kn, atol=2e-4)
+    change = max(
+        np.abs(with_effect.u_mm - without.u_mm).max() / np.abs(without.u_mm).max(),
+        np.abs(with_effect.force_kn - without.force_kn).max() / np.abs(without.force_kn).max(),
+    )
+    assert change > 0.02  # visible

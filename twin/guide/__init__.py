@@ -1,0 +1,1 @@
+"""User guide: Markdown pages, and pages generated from configs, commands and effects."""

@@ -1,0 +1,108 @@
+"""Reference pages as Markdown: keys of the TOML files, commands with their options, channels."""
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import typer
+
+from table_io.channels import CHANNELS
+from table_io.config.base import ConfigModel
+from table_io.config.key_reference import KeyDescription, describe_tables
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from twin.campaign.config import CampaignConfig
+from twin.exchange.columns import ColumnMap
+from twin.model.config import ModelConfig
+
+CONFIG_FILES: tuple[tuple[str, str, type[ConfigModel]], ...] = (
+    ("Test profile", "One test: specimen, excitation, acquisition, control.", Profile),
+    ("Rig file", "One table: limits, command output, sensors, wiring.", RigConfig),
+    ("Model file", "Parameters of the model and the effects added to it.", ModelConfig),
+    ("Campaign file", "A list of runs with set-up changes between them.", CampaignConfig),
+    ("Column map", "Columns of a foreign file, for `import --columns`.", ColumnMap),
+)
+
+
+def write_table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """Return a Markdown table."""
+    lines = [list(header)]
+    lines += [["---"] * len(lines[0]), *([*row] for row in rows)]
+    return "\n".join(
+        "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in row) + " |"
+        for row in lines
+    )
+
+
+def write_key_reference(_: typer.Typer) -> str:
+    """Return the page of all keys of all TOML files."""
+    parts = [
+        "# Configuration keys\n\nAll files are TOML. The ending of a key states its unit. An "
+        "unknown key is an error that names the nearest known one; one message lists all faults "
+        "of a file."
+    ]
+    for title, purpose, model in CONFIG_FILES:
+        parts.append(f"## {title}\n\n{purpose}")
+        for table in describe_tables(model):
+            parts.append(f"### `{table.name}`" if table.name else "### Top of the file")
+            parts.append(table.meaning)
+            if table.keys:
+                header = ("key", "unit", "default", "allowed", "meaning")
+                parts.append(write_table(header, map(_format_key, table.keys)))
+    return "\n\n".join(parts)
+
+
+def _format_key(key: KeyDescription) -> tuple[str, ...]:
+    default = "required" if key.is_required else f"`{key.default}`" if key.default else "–"
+    return f"`{key.key}`", key.unit, default, key.allowed, key.meaning
+
+
+def write_command_reference(app: typer.Typer) -> str:
+    """Return the page of all commands with their arguments and options."""
+    program: Any = typer.main.get_command(app)
+    panels: dict[str, list[str]] = {}
+    for name, command in program.commands.items():
+        if not command.hidden:
+            panel = str(getattr(command, "rich_help_panel", None) or "Others")
+            panels.setdefault(panel, []).extend(_describe_command(f"shaketwin {name}", command))
+    parts = [
+        "# Commands\n\n`shaketwin COMMAND --help` shows the same on the terminal. PROFILE, MODEL, "
+        "TABLE and campaign files are paths, or bare names of shipped ones."
+    ]
+    for panel, sections in panels.items():
+        parts += [f"## {panel}", *sections]
+    return "\n\n".join(parts)
+
+
+def _describe_command(name: str, command: Any) -> Iterator[str]:
+    """Yield the parts of the section of a command, or of each command of a group."""
+    inner_commands = getattr(command, "commands", {})
+    for inner_name, inner in inner_commands.items():
+        yield from _describe_command(f"{name} {inner_name}", inner)
+    if inner_commands:
+        return
+    context = command.context_class(command, info_name=name)
+    yield f"### {name}"
+    yield command.help or ""
+    yield f"```sh\n{command.get_usage(context).removeprefix('Usage: ')}\n```"
+    records = [
+        record
+        for parameter in command.get_params(context)
+        if "--help" not in parameter.opts and (record := parameter.get_help_record(context))
+    ]
+    if records:
+        yield write_table(
+            ("argument or option", "meaning"), ((f"`{key}`", text) for key, text in records)
+        )
+
+
+def write_channel_reference(_: typer.Typer) -> str:
+    """Return the page of the canonical channels."""
+    rows = (
+        (f"`{channel.name}`", channel.unit, channel.positive, channel.meaning)
+        for channel in CHANNELS
+    )
+    return (
+        "# Channels\n\nCanonical names, also the columns of exports. Right is positive, values are "
+        "SI. A rig file may declare more in `[[channels]]`.\n\n"
+        + write_table(("channel", "unit", "positive", "meaning"), rows)
+    )

@@ -1,0 +1,211 @@
+"""The guide as a folder of HTML pages that need no network, and the table of its pages."""
+
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import typer
+from markupsafe import Markup
+
+from table_io.errors import InputError
+from twin.guide.gallery import write_gallery
+from twin.guide.markdown import RenderedMarkdown, render_markdown
+from twin.guide.reference import (
+    write_channel_reference,
+    write_command_reference,
+    write_key_reference,
+)
+from twin.reports.page import render_page
+
+PACKAGES_DIR = Path(__file__).resolve().parents[2]  # holds twin and table_io
+PAGES_DIR = Path(__file__).parent / "pages"
+TEMPLATE = Path(__file__).with_name("guide.html")
+PICTURES_FOLDER = "pictures"
+
+
+@dataclass(frozen=True, slots=True)
+class GuidePage:
+    """Page of the guide: file name without suffix, title, and its Markdown.
+
+    `source` is the file of the text. A generated page has a function of the command line in its
+    place, and links name it by `slug` + ".md".
+    """
+
+    slug: str
+    title: str
+    source: "Path | Callable[[typer.Typer], str]"
+
+    @property
+    def file_name(self) -> str:
+        return f"{self.slug}.html"
+
+    @property
+    def markdown_path(self) -> Path:
+        return self.source if isinstance(self.source, Path) else PAGES_DIR / f"{self.slug}.md"
+
+    def read(self, app: typer.Typer) -> str:
+        """Return the Markdown."""
+        if isinstance(self.source, Path):
+            return self.source.read_text(encoding="utf-8")
+        return self.source(app)
+
+
+@dataclass(frozen=True, slots=True)
+class Chapter:
+    """Group of pages in the navigation."""
+
+    title: str
+    pages: tuple[GuidePage, ...]
+
+
+def _page(slug: str, title: str, source: str = "") -> GuidePage:
+    return GuidePage(slug, title, PACKAGES_DIR / source if source else PAGES_DIR / f"{slug}.md")
+
+
+CHAPTERS = (
+    Chapter(
+        "Start",
+        (
+            _page("index", "Overview"),
+            _page("install", "Install"),
+            _page("first-hour", "First hour"),
+            _page("laboratory-day", "A laboratory day"),
+            _page("while-it-runs", "While a test runs"),
+        ),
+    ),
+    Chapter(
+        "Your table and your data",
+        (
+            _page("connect", "Connect your table", "table_io/CONNECT.md"),
+            _page("ni", "NI-DAQmx", "table_io/backends/ni/NI.md"),
+            _page("udp", "UDP target", "table_io/backends/udp/PACKETS.md"),
+            _page("follow", "External controller", "table_io/acquisition/FOLLOW.md"),
+            _page("imperfections", "Imperfect laboratory", "table_io/sim/IMPERFECTIONS.md"),
+            _page("foreign-data", "Data of others", "twin/exchange/FOREIGN_DATA.md"),
+            _page("security", "Security", "twin/security/KEYS.md"),
+        ),
+    ),
+    Chapter(
+        "Understand",
+        (
+            _page("theory", "Theory"),
+            _page("conventions", "Conventions"),
+            _page("controller", "The controller"),
+            _page("discovery", "Identification and discovery"),
+            GuidePage("effects", "Effects", write_gallery),
+            _page("recording", "What a recording holds"),
+            _page("inside", "How it is built"),
+            _page("study", "How good discovery is", "twin/validation/study/README.md"),
+            _page("glossary", "Glossary"),
+        ),
+    ),
+    Chapter(
+        "Reference",
+        (
+            GuidePage("commands", "Commands", write_command_reference),
+            GuidePage("keys", "Configuration keys", write_key_reference),
+            GuidePage("channels", "Channels", write_channel_reference),
+            _page("messages", "Messages and exit codes"),
+            _page("troubleshooting", "Troubleshooting"),
+            _page("log", "Format of the log", "twin/recording/LOG.md"),
+            _page("exchange", "Import and export", "twin/exchange/EXCHANGE.md"),
+            _page("bus", "The bus", "twin/transport/BUS.md"),
+            _page("extend", "Add a test, an effect, a backend"),
+        ),
+    ),
+)
+
+
+def build_guide(folder: Path, app: typer.Typer, chapters: Sequence[Chapter] = CHAPTERS) -> Path:
+    """Write all pages to `folder`, replacing older ones; return the path of the first page.
+
+    InputError lists every link of a page that leads nowhere.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    pages = [page for chapter in chapters for page in chapter.pages]
+    links = _PageLinks(pages, folder)
+    rendered = {page: links.render(page, page.read(app)) for page in pages}
+    faults = links.find_broken(rendered)
+    if faults:
+        raise InputError("broken links", where="guide", faults=faults)
+    for page, following in zip(pages, [*pages[1:], None], strict=True):
+        html = render_page(
+            TEMPLATE,
+            page=page,
+            body=Markup(rendered[page].html),
+            headings=[heading for heading in rendered[page].headings if heading.level == 2],
+            chapters=chapters,
+            following=following,
+        )
+        (folder / page.file_name).write_text(html, encoding="utf-8")
+    return folder / pages[0].file_name
+
+
+class _PageLinks:
+    """Resolution of links between Markdown files to links between pages."""
+
+    def __init__(self, pages: Sequence[GuidePage], folder: Path) -> None:
+        self._by_path = {page.markdown_path: page for page in pages}
+        self._folder = folder
+        self._unresolved: dict[GuidePage, list[str]] = {}
+        self._anchors: list[tuple[GuidePage, GuidePage, str]] = []  # from, to, anchor
+
+    def render(self, page: GuidePage, text: str) -> RenderedMarkdown:
+        """Render the Markdown of a page."""
+        return render_markdown(
+            text,
+            lambda target: self._resolve_link(page, target),
+            lambda name: self._resolve_code(page, name),
+        )
+
+    def find_broken(self, rendered: dict[GuidePage, RenderedMarkdown]) -> list[InputError]:
+        """Return an error for each target and each anchor that does not exist."""
+        faults = [
+            InputError("no such page or file", where=page.slug, value=target)
+            for page, targets in self._unresolved.items()
+            for target in targets
+        ]
+        for source, page, anchor in self._anchors:
+            if all(heading.anchor != anchor for heading in rendered[page].headings) and (
+                f'id="{anchor}"' not in rendered[page].html
+            ):
+                faults.append(
+                    InputError(
+                        "no such heading", where=source.slug, value=f"{page.file_name}#{anchor}"
+                    )
+                )
+        return faults
+
+    def _resolve_link(self, page: GuidePage, target: str) -> str:
+        parts = urlsplit(target)
+        if parts.scheme:
+            return target
+        path = page.markdown_path
+        if parts.path:
+            path = Path(os.path.normpath(page.markdown_path.parent / parts.path))
+        linked = self._by_path.get(path)
+        if linked is None and path.is_file() and path.suffix != ".md":
+            pictures = self._folder / PICTURES_FOLDER
+            pictures.mkdir(exist_ok=True)
+            shutil.copyfile(path, pictures / path.name)
+            return f"{PICTURES_FOLDER}/{path.name}"
+        if linked is None:
+            self._unresolved.setdefault(page, []).append(target)
+            return target
+        if parts.fragment:
+            self._anchors.append((page, linked, parts.fragment))
+        name = linked.file_name if linked is not page or not parts.fragment else ""
+        return f"{name}#{parts.fragment}" if parts.fragment else name
+
+    def _resolve_code(self, page: GuidePage, name: str) -> str:
+        """Return the href of a page that a text names by the path of its file, else ""."""
+        if not name.endswith(".md"):
+            return ""
+        for path in (PACKAGES_DIR / name, page.markdown_path.parent / name):
+            linked = self._by_path.get(Path(os.path.normpath(path)))
+            if linked is not None and linked is not page:
+                return linked.file_name
+        return ""
