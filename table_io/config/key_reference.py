@@ -65,7 +65,7 @@ def describe_tables(model: type[ConfigModel], name: str = "") -> Iterator[TableD
             yield from describe_tables(variant, f"{table_name} {requirement}".strip())
 
 
-def find_unit(key: str) -> str:
+def derive_unit(key: str) -> str:
     """Return the unit in which a key states its value by its name, "" if it has none."""
     endings = [ending for ending in UNIT_ENDINGS if key.endswith(f"_{ending}")]
     return UNIT_ENDINGS[max(endings, key=len)] if endings else ""
@@ -75,7 +75,7 @@ def _describe_key(key: str, field: FieldInfo) -> KeyDescription:
     has_default = field.default is not PydanticUndefined
     return KeyDescription(
         key,
-        find_unit(key),
+        derive_unit(key),
         _format_default(field.default) if has_default else "",
         field.is_required(),
         describe_limits(field),

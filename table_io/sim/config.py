@@ -45,9 +45,13 @@ class InjectedFault(ConfigModel):
     """
 
     at_s: NonNegative = Field(description="Time from the start of the run.")
-    for_s: Positive | None = None
-    channel: str | None = None
-    size: Finite | None = None
+    for_s: Positive | None = Field(
+        None, description="Duration; omitted: to the end, where the kind allows it."
+    )
+    channel: str | None = Field(None, description="Channel of the fault, for kinds of one channel.")
+    size: Finite | None = Field(
+        None, description="Size of the fault, in the unit that its kind states."
+    )
     kind: str = Field(description="Last key: it decides which others are needed.")
 
     @field_validator("kind")
@@ -79,14 +83,16 @@ class SimulatedTableConfig(BackendConfig):
     """Simulated machine: servo, payload reaction and the true specimen on it."""
 
     servo_bandwidth_hz: Positive = Field(description="-3 dB of the closed displacement loop.")
-    servo_delay_ms: NonNegative
-    moving_mass_kg: Positive
-    payload_reaction: bool = True
-    seed: int = 0
-    damper_stiffness_n_m: Positive
-    damper_damping_n_s_m: NonNegative
-    bumper_stiffness_n_m: Positive
-    bumper_damping_n_s_m: Positive
+    servo_delay_ms: NonNegative = Field(description="Delay of the servo.")
+    moving_mass_kg: Positive = Field(description="Moving mass of the table without payload.")
+    payload_reaction: bool = Field(
+        True, description="Whether the force of the specimen moves the table."
+    )
+    seed: int = Field(0, description="Seed of the noise.")
+    damper_stiffness_n_m: Positive = Field(description="True stiffness of the damper.")
+    damper_damping_n_s_m: NonNegative = Field(description="True damping of the damper.")
+    bumper_stiffness_n_m: Positive = Field(description="True stiffness of each bumper.")
+    bumper_damping_n_s_m: Positive = Field(description="True damping of each bumper.")
     faults: tuple[InjectedFault, ...] = ()
     hidden: GroundTruth | None = Field(
         None,
@@ -95,7 +101,12 @@ class SimulatedTableConfig(BackendConfig):
     truth: str | None = Field(
         None, description="The same in a sealed file: its path; relative to the working folder."
     )
-    truth_sha256: str | None = Field(None, pattern=r"^[0-9a-fA-F]{64}$", validate_default=True)
+    truth_sha256: str | None = Field(
+        None,
+        pattern=r"^[0-9a-fA-F]{64}$",
+        validate_default=True,
+        description="SHA-256 of the sealed file.",
+    )
 
     @field_validator("truth_sha256")
     @classmethod

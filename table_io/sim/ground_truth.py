@@ -158,15 +158,19 @@ class HiddenEffect(HiddenEntry):
 
 
 class BaseOverrides(ConfigModel):
-    """True values that override rig file and specimen, SI; None: no override."""
+    """True values that override rig file and specimen, SI; omitted: no override."""
 
-    mass_kg: Positive | None = None
-    damper_stiffness_n_m: Positive | None = None
-    damper_damping_n_s_m: NonNegative | None = None
-    bumper_stiffness_n_m: Positive | None = None
-    bumper_damping_n_s_m: Positive | None = None
-    gap_right_m: Number | None = None
-    gap_left_m: Number | None = None
+    mass_kg: Positive | None = Field(None, description="True mass.")
+    damper_stiffness_n_m: Positive | None = Field(None, description="True stiffness of the damper.")
+    damper_damping_n_s_m: NonNegative | None = Field(
+        None, description="True damping of the damper."
+    )
+    bumper_stiffness_n_m: Positive | None = Field(
+        None, description="True stiffness of each bumper."
+    )
+    bumper_damping_n_s_m: Positive | None = Field(None, description="True damping of each bumper.")
+    gap_right_m: Number | None = Field(None, description="True right gap.")
+    gap_left_m: Number | None = Field(None, description="True left gap.")
 
     @field_validator("gap_right_m", "gap_left_m")
     @classmethod

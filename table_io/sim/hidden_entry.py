@@ -67,9 +67,11 @@ class HiddenEntry(ConfigModel):
     noun: ClassVar[str]
     definitions: ClassVar[Mapping[tuple[str, str], HiddenDefinition]]
 
-    id: str
+    id: str = Field(description="Name of the effect or imperfection.")
     form: str = Field("", validate_default=True, description="Empty: first form of the id.")
-    channel: str | None = None
+    channel: str | None = Field(
+        None, description="Channel on which it acts, for those of one channel."
+    )
 
     @classmethod
     def find_faults(

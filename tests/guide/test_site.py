@@ -132,6 +132,7 @@ def test_the_command_writes_the_site(tmp_path: Path, monkeypatch: pytest.MonkeyP
         return True
 
     monkeypatch.setattr("webbrowser.open", open_browser)
+    monkeypatch.setenv("DISPLAY", ":0")
     assert call_main("guide", "--out", tmp_path / "site").returncode == 0
     assert (tmp_path / "site" / "index.html").is_file()
     assert opened == []

@@ -1,6 +1,5 @@
 """`guide`: build the user guide and open it in the browser."""
 
-import webbrowser
 from pathlib import Path
 from tempfile import mkdtemp
 
@@ -8,7 +7,7 @@ import typer
 
 from table_io.errors import InputError
 from twin.guide.site import build_guide
-from twin.run.terminal import print_line
+from twin.run.terminal import open_in_browser, print_line
 
 
 def open_guide(out: Path | None, app: typer.Typer) -> None:
@@ -17,5 +16,5 @@ def open_guide(out: Path | None, app: typer.Typer) -> None:
         raise InputError("not a folder", where=f"--out {out}", remedy="give a folder")
     index = build_guide(out or Path(mkdtemp(prefix="shaketwin-guide-")), app)
     print_line(f"{index}")
-    if out is None and not webbrowser.open(index.resolve().as_uri()):
-        print_line("no browser responds; open this file in a browser")
+    if out is None and not open_in_browser(index):
+        print_line("no screen here: open this file in a browser")

@@ -15,7 +15,7 @@ from twin.guide.loops import (
     find_loops,
     shows_in_contact,
 )
-from twin.guide.reference import write_table
+from twin.guide.reference import format_table
 from twin.model import effects
 from twin.model.effects import EFFECTS, load_plugins
 from twin.model.effects.effect import Effect
@@ -32,7 +32,7 @@ ACTIONS = {
 def write_gallery(_: typer.Typer) -> str:
     """Return the page of all effects, built in and of plug-ins."""
     library = (*EFFECTS, *load_plugins())
-    overview = write_table(
+    overview = format_table(
         ("effect", "law", "place"),
         (
             (f"[`{effect.id}`](#{effect.id})", effect.term, effect.place.replace("_", " "))
@@ -65,7 +65,7 @@ def _describe_effect(effect: Effect) -> str:
     )
     if find_channel(effect):
         values += f" on {find_channel(effect)}"
-    parameters = write_table(
+    parameters = format_table(
         ("parameter", "unit", "bounds", "absent at", "meaning"),
         (
             (

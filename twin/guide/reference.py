@@ -23,7 +23,7 @@ CONFIG_FILES: tuple[tuple[str, str, type[ConfigModel]], ...] = (
 )
 
 
-def write_table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+def format_table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     """Return a Markdown table."""
     lines = [list(header)]
     lines += [["---"] * len(lines[0]), *([*row] for row in rows)]
@@ -47,7 +47,7 @@ def write_key_reference(_: typer.Typer) -> str:
             parts.append(table.meaning)
             if table.keys:
                 header = ("key", "unit", "default", "allowed", "meaning")
-                parts.append(write_table(header, map(_format_key, table.keys)))
+                parts.append(format_table(header, map(_format_key, table.keys)))
     return "\n\n".join(parts)
 
 
@@ -90,7 +90,7 @@ def _describe_command(name: str, command: Any) -> Iterator[str]:
         if "--help" not in parameter.opts and (record := parameter.get_help_record(context))
     ]
     if records:
-        yield write_table(
+        yield format_table(
             ("argument or option", "meaning"), ((f"`{key}`", text) for key, text in records)
         )
 
@@ -104,5 +104,5 @@ def write_channel_reference(_: typer.Typer) -> str:
     return (
         "# Channels\n\nCanonical names, also the columns of exports. Right is positive, values are "
         "SI. A rig file may declare more in `[[channels]]`.\n\n"
-        + write_table(("channel", "unit", "positive", "meaning"), rows)
+        + format_table(("channel", "unit", "positive", "meaning"), rows)
     )

@@ -29,7 +29,9 @@ class EffectConfig(ConfigModel):
     """
 
     id: str = Field(description="Name of the effect, built in or of a plug-in.")
-    parameters: dict[str, float | str] = Field(default_factory=dict)
+    parameters: dict[str, float | str] = Field(
+        default_factory=dict, description="A value in SI for each parameter of the effect."
+    )
 
     @field_validator("parameters", mode="before")
     @classmethod
