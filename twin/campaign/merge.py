@@ -14,6 +14,7 @@ from table_io.config.profile import Profile
 from twin.campaign.state import RunState
 from twin.compare.curves import detect_hysteresis
 from twin.reports.summary import Json, number_or_nan, prc_points
+from twin.reports.twin_verdict import judge_twin
 
 NORMALIZED_BY_U_STAR, NORMALIZED_BY_A_STAR = (
     ("eta_d", "eta_r", "eta_l"),
@@ -43,7 +44,7 @@ def merge_summaries(run: RunState, profile: Profile, summaries: Sequence[Json]) 
         marks[f"{prefix}jumps"] = [asdict(jump) for jump in jumps]
         marks[f"{prefix}hysteresis"] = [asdict(interval) for interval in intervals]
     last = summaries[-1] if summaries else {}
-    return {
+    merged = {
         **last,
         "run": (last.get("run") or {})
         | {"name": run.name, "label": run.label, "title": profile.title},
@@ -61,7 +62,9 @@ def merge_summaries(run: RunState, profile: Profile, summaries: Sequence[Json]) 
         "steps": ordered,
         **marks,
         **_summarize_quality(profile, ordered, summaries),
+        "warnings": [warning for summary in summaries for warning in summary.get("warnings", ())],
     }
+    return merged | {"twin_verdict": judge_twin(merged)}
 
 
 def _merged_verdict(run: RunState) -> str:

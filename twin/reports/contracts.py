@@ -90,6 +90,17 @@ class LevelResult(Contract):
     accepted: bool = Field(description="whether the correction was frozen for the measured cycles")
 
 
+class StepMisfit(Contract):
+    """Error of the restarted twin in a channel at a step: of the median of its held cycles."""
+
+    error: SI = Field(description="rms of measured minus twin")
+    band: SI = Field(description="tolerance, see `TwinVerdict.tolerance`")
+    misfit: Ratio = Field(description="error over the noise at rest; null if that is unknown")
+    phase: Literal["flight", "contact_right", "contact_left", ""] = Field(
+        description="phase with the largest error; empty if unknown"
+    )
+
+
 class StepKey(BaseModel):
     """Keys that a step has in every file, old ones too; it may have more."""
 
@@ -106,6 +117,9 @@ class StepEntry(StepKey, Contract):
     table_acc_peak_m_s2: Acceleration = Field(description="peak of the table acceleration")
     table_acc_fundamental_m_s2: Acceleration = Field(description="its fundamental amplitude")
     thd: Ratio = Field(description="its total harmonic distortion")
+    agreement: dict[str, StepMisfit] | None = Field(
+        None, description="of the restarted twin by channel; absent without a comparison"
+    )
 
 
 class PlannedStep(StepEntry):
@@ -129,6 +143,36 @@ class Jump(Contract):
     kind: Literal["up", "down"] = Field(
         description="change of eta_d, or of eta_a if that tells the solutions apart more clearly"
     )
+
+
+class WorstMisfit(StepMisfit):
+    """Step and channel with the largest error over band; without a step of a whole history."""
+
+    step: int | None = Field(description="number of the step")
+    direction: Direction | None = Field(description="its direction")
+    frequency_hz: Number = Field(description="its frequency", json_schema_extra={"unit": "Hz"})
+    channel: str = Field(description="channel that departs most")
+    share: Ratio = Field(description="error over band; beyond 1 it is outside the tolerance")
+    error: SI = Field(description="rms of measured minus twin; null for a whole history")
+    band: SI = Field(description="tolerance; null for a whole history")
+
+
+class TwinVerdict(Contract):
+    """Verdict on the twin, apart from that on the test; see `twin.reports.twin_verdict`."""
+
+    verdict: Literal["agrees", "departs", "not judged"] = Field(
+        description="whether the twin is within its tolerance and jumps where the rig does"
+    )
+    reason: str = Field(description="what decided it")
+    tolerance: str = Field(description="definition of the band")
+    worst: WorstMisfit | None = Field(description="null if nothing could be judged")
+    steps_outside: int = Field(description="steps with u or a outside the band")
+    steps_judged: int = Field(description="steps with a band")
+    misfit: Ratio = Field(description="of u in multiples of the noise: median over the steps")
+    missing_jumps: list[Jump] = Field(description="jumps of the twin that the rig does not show")
+    unexpected_jumps: list[Jump] = Field(description="jumps of the rig that the twin lacks")
+    warnings: int = Field(description="warnings of the condition monitoring")
+    next_command: str = Field(description="command to type next; DIR is the folder of the run")
 
 
 class HysteresisInterval(Contract):
@@ -357,6 +401,9 @@ class RunSummary(SummaryKeys, Contract):
     comparison: dict[str, ChannelError] = Field(description="errors of the twin by channel")
     estimates: dict[str, ParameterEstimate] = Field(description="by parameter")
     warnings: list[WarningEntry] = Field(description="warnings of the condition monitoring")
+    twin_verdict: TwinVerdict | None = Field(
+        None, description="on the twin, apart from `verdict` on the test; absent in old files"
+    )
     replay: ReplayResult | None = Field(None, description="absent unless it is a replay")
     sha256: str | None = Field(None, description="hash of run.mcap; only in a campaign")
 

@@ -2,11 +2,15 @@
 
 from pathlib import Path
 
+from rich.markup import escape
+
 from twin.recording.reader import read_recording
 from twin.reports import summary as summaries
+from twin.reports.twin_verdict import format_twin_verdict
 from twin.run.run_config import RunConfig
-from twin.run.terminal import print_line
+from twin.run.terminal import console, print_line
 
+VERDICT_COLOURS = {"agrees": "green", "departs": "red"}
 EXIT_ABORTED, EXIT_GAPS, EXIT_NOT_IDENTICAL, EXIT_INTERRUPTED = 3, 4, 5, 130
 
 
@@ -25,8 +29,21 @@ def finalize_run(
         from twin.viewer.view import write_rrd
 
         write_rrd(recording, folder / "view.rrd")
-    message = f"{summaries.format_summary(summary)} -> {folder / 'report.html'}"
+    message = f"test {summaries.format_summary(summary)} -> {folder / 'report.html'}"
     print_line(message)
+    print_twin_verdict(summary, folder)
     if summary["verdict"] != "complete":
         return EXIT_ABORTED
     return EXIT_GAPS if summary["gaps"] else 0
+
+
+def print_twin_verdict(summary: summaries.Json, folder: Path) -> None:
+    """Print the verdict on the twin and the next command, coloured; nothing without a twin."""
+    verdict = summary["twin_verdict"]
+    if verdict["verdict"] == "not judged":
+        return
+    colour = VERDICT_COLOURS[verdict["verdict"]]
+    first, *lines = format_twin_verdict(verdict, folder)
+    console.print(f"[bold {colour}]{escape(first)}[/]", highlight=False, soft_wrap=True)
+    for line in lines:
+        print_line(f"  {line}")

@@ -35,6 +35,7 @@ from twin.reports.report_data import (
 )
 from twin.reports.sensor_table import build_sensor_rows
 from twin.reports.summary import load_summary
+from twin.reports.twin_verdict import describe_worst, format_jump, name_command
 
 MAX_ROWS = 200
 MAX_TEXT_LENGTH = 20_000  # of a configuration as recorded
@@ -63,6 +64,7 @@ def render_report(run: ReportData, pictures: list[Picture]) -> str:
         summary=run.summary,
         start=start,
         headline=format_headline(run),
+        **_describe_twin_verdict(run),
         configs={name: parse_toml_tables(text) for name, text in texts.items()},
         images=embed_images(pictures),
         demand={step.index: step.acceleration_m_s2 for step in start.steps},
@@ -92,6 +94,19 @@ def render_report(run: ReportData, pictures: list[Picture]) -> str:
         max_rows=MAX_ROWS,
         quantity=step_quantity,
     )
+
+
+def _describe_twin_verdict(run: ReportData) -> dict[str, Any]:
+    """Return the values of the page for the verdict on the twin; None without one."""
+    verdict = run.summary.get("twin_verdict")
+    if verdict is None or verdict["verdict"] == "not judged":
+        return {"twin_verdict": None}
+    return {
+        "twin_verdict": verdict,
+        "worst": describe_worst(verdict["worst"]),
+        "next_command": name_command(verdict, run.recording.path.parent),
+        "format_jump": format_jump,
+    }
 
 
 def _shorten(text: str) -> str:

@@ -40,6 +40,7 @@ from twin.model.parameters import Parameters, free_flight_resonance
 from twin.recording.reader import Recording
 from twin.reports.contracts import Contract, RunSummary
 from twin.reports.orbits import summarise_orbits
+from twin.reports.twin_verdict import judge_twin, summarise_agreement
 from twin.reports.windows import summarise_windows
 
 Json = dict[str, Any]
@@ -58,10 +59,22 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
     jumps, intervals = detect_hysteresis(planned, source)
     twin_jumps, twin_intervals = detect_hysteresis(planned, "twin")
     levels = recording.records(Level)
+    noise = find_channel_noise(recording)
+    agreement = summarise_agreement(
+        recording,
+        parameters,
+        profile,
+        {name: _compared_noise(noise, name) for name in COMPARED_CHANNELS},
+    )
+
+    def describe_step(point: PrcPoint) -> Json:
+        entry = _step_entry(point)
+        return entry | ({"agreement": agreement[point.step]} if point.step in agreement else {})
+
     stop = recording.stop
     end = stop.index if stop else max((block.end for block in recording.blocks("meas")), default=0)
     samples = max(end - start.index, 0)
-    return {
+    summary = {
         "run": {
             "id": start.run,
             "name": start.name,
@@ -84,12 +97,12 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         "a_star_m_s2": a_star,
         "checks": [asdict(check) for check in recording.records(Check)],
         "trips": [asdict(trip) for trip in recording.records(Trip)],
-        "steps": [_step_entry(point) | _level_entry(point, levels) for point in planned],
+        "steps": [describe_step(point) | _level_entry(point, levels) for point in planned],
         **_windows_entry(recording, parameters, profile),
         **_orbits_entry(recording, profile),
         # Steps added during the test are not part of the PRC grid.
         "visits": [
-            {**_step_entry(point), "reason": reasons[point.step]}
+            {**describe_step(point), "reason": reasons[point.step]}
             for point in points
             if point.step in reasons
         ],
@@ -103,7 +116,7 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
             recording.records(Comparison),
             parameters,
             read_channels(start.rig_toml),
-            find_channel_noise(recording),
+            noise,
         ),
         "estimates": _estimates_entry(recording.records(Estimate)),
         "warnings": [
@@ -112,6 +125,7 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
             if event.kind in MONITOR_KINDS and event.kind != "jump"
         ],
     }
+    return summary | {"twin_verdict": judge_twin(summary)}
 
 
 def _find_normalisation(
@@ -366,7 +380,7 @@ def format_summary(summary: Json) -> str:
     latency = summary["timing"]["latency_ms"]["p99"]
     if latency is not None:
         parts.append(f"latency p99 {latency:.2g} ms")
-    parts.append(f"{summary['gaps']} gaps")
+    parts.append(f"{summary['gaps']} dropouts")
     if summary["faults"]:
         parts.append(f"{len(summary['faults'])} faults")
     if summary["verdict"] != "complete":

@@ -12,16 +12,18 @@ GAP_ERROR_M only, which a stiff bumper turns into force, and the two cells of a 
 force unequally, so their sum is judged.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from table_io.block import Bool2D, Float1D, Float2D
+from table_io.block import Block, Bool2D, Float1D, Float2D
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS, contact_forces, relative_displacement
 from table_io.records import Agreement, Event, Record
 from twin.compare import COMPARED_CHANNELS
 from twin.compare.monitoring.cycle import ChannelNoise, CycleData, MonitoringSetup
 from twin.compare.twins import compared_values
+from twin.model.parameters import Parameters
 
 NOISE_FACTOR = 3.0
 AMPLITUDE_TOLERANCE = 0.05  # of the amplitude
@@ -89,16 +91,8 @@ def _judge_errors(
     setup: MonitoringSetup, cycle: CycleData, record: Agreement, measured: Float2D
 ) -> list[float]:
     """Return the error of each compared channel in units of its band, with allowances."""
-    p = setup.model.parameters
-    contact_rms = [float(np.sqrt(phase.mean())) for phase in _phases(setup, cycle)[1:]]
-    forces = [
-        stiffness * GAP_ERROR_M * rms
-        for stiffness, rms in zip(
-            (p.bumper_stiffness_r, p.bumper_stiffness_l), contact_rms, strict=True
-        )
-    ]
-    allowance = dict.fromkeys(COMPARED_CHANNELS, GAP_ERROR_M * max(contact_rms))
-    allowance["mass_acc_m_s2"] = float(np.hypot(forces[0], forces[1])) / p.mass
+    right, left = (float(phase.mean()) for phase in _phases(setup, cycle)[1:])
+    allowance, forces = gap_allowances(setup.model.parameters, right, left)
     error = dict(zip(COMPARED_CHANNELS, record.error, strict=True))
     band = dict(zip(COMPARED_CHANNELS, record.band, strict=True))
     rows = dict(zip(COMPARED_CHANNELS, measured, strict=True))
@@ -115,6 +109,21 @@ def _judge_errors(
         else 0.0
         for name in COMPARED_CHANNELS
     ]
+
+
+def gap_allowances(
+    p: Parameters, right: float, left: float
+) -> tuple[dict[str, float], tuple[float, float]]:
+    """Return what `GAP_ERROR_M` contributes to the rms error of displacements and acceleration.
+
+    By channel, and of the forces (right, left) in N; `right` and `left` are the shares of the time
+    in contact.
+    """
+    force_r = p.bumper_stiffness_r * GAP_ERROR_M * math.sqrt(right)
+    force_l = p.bumper_stiffness_l * GAP_ERROR_M * math.sqrt(left)
+    allowance = dict.fromkeys(COMPARED_CHANNELS, GAP_ERROR_M * math.sqrt(max(right, left)))
+    allowance["mass_acc_m_s2"] = math.hypot(force_r, force_l) / p.mass
+    return allowance, (force_r, force_l)
 
 
 def _sentence(cycle: CycleData, record: Agreement, shares: list[float]) -> str:
@@ -144,13 +153,23 @@ def _min_band(setup: MonitoringSetup, noise: ChannelNoise, name: str) -> float:
 
 def _phases(setup: MonitoringSetup, cycle: CycleData) -> list[Bool2D]:
     """Return masks of flight, contact right and contact left: by load cells, else by gaps."""
-    u = relative_displacement(cycle.measured)
-    contacts = []
-    for side, force, gap in zip((1, -1), contact_forces(cycle.measured), setup.gaps_m, strict=True):
-        known = ~np.isnan(force)
-        contacts.append(np.where(known, side * force > setup.contact_n, side * u > gap))
-    right, left = contacts
+    right, left = detect_contact(cycle.measured, setup.contact_n, setup.gaps_m)
     return [~(right | left), right, left]
+
+
+def detect_contact(
+    block: Block, contact_n: float, gaps_m: tuple[float, float]
+) -> tuple[Bool2D, Bool2D]:
+    """Return where the mass touches the right and the left bumper, (sample,): by load cells.
+
+    By the gaps where a load cell has no value.
+    """
+    u = relative_displacement(block)
+    right, left = (
+        np.where(~np.isnan(force), side * force > contact_n, side * u > gap)
+        for side, force, gap in zip((1, -1), contact_forces(block), gaps_m, strict=True)
+    )
+    return right, left
 
 
 def _rms(squares: Float1D) -> float:

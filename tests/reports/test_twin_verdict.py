@@ -1,0 +1,162 @@
+"""Verdict on the twin: agrees on clean rigs, departs where the specimen is another one."""
+
+import hashlib
+import json
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from twin.recording.reader import read_recording
+from twin.reports.summary import Json, summarise, write_summary
+from twin.reports.twin_verdict import judge_twin
+from twin.run.run_config import read_run_config
+from twin.run.unpaced import play_unpaced
+from twin.validation.study.rig_setup import NOMINAL_RIG, format_toml
+
+TEST = """
+title = "{name}"
+rig = "{rig}"
+[specimen]
+mass_kg = 550.0
+gap_mm = {gap}
+[sweep]
+start_hz = {start}
+stop_hz = {stop}
+step_hz = {step}
+cycles = 4
+measured_cycles = 2
+[acquisition]
+rate_hz = 1000.0
+[loop_check]
+enabled = false
+[control]
+enabled = false
+"""
+FRICTION = '[[effects]]\nid = "coulomb_friction"\nparameters = { fc = 50.0 }\n'
+STIFF_BUMPERS = "[base]\nbumper_stiffness_n_m = 700e3\n"
+IMPACTS = {"gap": 4.0, "start": 2.4, "stop": 4.4, "step": 0.4}
+PRECOMPRESSED = {"gap": -2.0, "start": 4.0, "stop": 8.0, "step": 1.0}
+
+
+def run_test(folder: Path, sweep: dict[str, float], truth: str = "") -> Json:
+    """Summary of a run on a rig that hides a truth, as written."""
+    simulated = dict(NOMINAL_RIG["simulated"])
+    if truth:
+        (folder / "truth.toml").write_text(truth)
+        digest = hashlib.sha256(truth.encode()).hexdigest()
+        simulated |= {"truth": str(folder / "truth.toml"), "truth_sha256": digest}
+    (folder / "rig.toml").write_text(format_toml(NOMINAL_RIG | {"simulated": simulated}))
+    (folder / "test.toml").write_text(TEST.format(name="test", rig=folder / "rig.toml", **sweep))
+    config = read_run_config(folder / "test.toml")
+    play_unpaced(config, "test", folder / "run.mcap", lambda: None, lambda _: None)
+    recording = read_recording(folder / "run.mcap")
+    write_summary(summarise(recording, config.parameters), folder / "summary.json")
+    return dict(json.loads((folder / "summary.json").read_text()))
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> Json:
+    return run_test(tmp_path_factory.mktemp("clean"), IMPACTS)
+
+
+def test_the_twin_of_a_clean_rig_agrees_at_the_noise(clean: Json) -> None:
+    verdict = clean["twin_verdict"]
+    assert verdict["verdict"] == "agrees"
+    assert verdict["missing_jumps"] == verdict["unexpected_jumps"] == []
+    assert verdict["steps_judged"] == len(clean["steps"]) > verdict["steps_outside"] == 0
+    assert 0.8 < verdict["misfit"] < 1.5
+    assert verdict["worst"]["share"] < 0.5
+    assert verdict["next_command"] == "shaketwin view DIR"
+
+
+def test_another_clean_rig_with_precompressed_bumpers_agrees(tmp_path: Path) -> None:
+    assert run_test(tmp_path, PRECOMPRESSED)["twin_verdict"]["verdict"] == "agrees"
+
+
+@pytest.mark.parametrize(("sweep", "truth"), [(IMPACTS, FRICTION), (PRECOMPRESSED, STIFF_BUMPERS)])
+def test_the_twin_of_another_specimen_departs_while_the_test_is_complete(
+    sweep: dict[str, float], truth: str, tmp_path: Path
+) -> None:
+    summary = run_test(tmp_path, sweep, truth)
+    verdict = summary["twin_verdict"]
+    assert (summary["verdict"], verdict["verdict"]) == ("complete", "departs")
+    assert verdict["steps_outside"] > 0
+    assert verdict["worst"]["share"] > 1
+    assert verdict["worst"]["misfit"] > 10
+    assert verdict["worst"]["error"] > verdict["worst"]["band"]
+    assert verdict["next_command"] == "shaketwin discover DIR"
+
+
+def judge_changed(clean: Json, **entries: Any) -> Json:
+    return judge_twin(deepcopy(clean) | entries)
+
+
+def move_jump(jumps: list[Json], steps: int) -> list[Json]:
+    """The down-jump, so many steps of 0.4 Hz from its place."""
+    shift = 0.4 * steps
+    return [
+        jump | {"from_hz": jump["from_hz"] + shift, "to_hz": jump["to_hz"] + shift}
+        for jump in jumps
+        if jump["direction"] == "backward"
+    ]
+
+
+@pytest.mark.parametrize(("steps", "verdict"), [(0, "agrees"), (1, "agrees"), (3, "departs")])
+def test_a_jump_belongs_within_a_step_of_the_grid(clean: Json, steps: int, verdict: str) -> None:
+    jumps = move_jump(clean["jumps"], 0)
+    assert len(jumps) == 1
+    judged = judge_changed(clean, jumps=jumps, twin_jumps=move_jump(jumps, steps))
+    assert judged["verdict"] == verdict
+    is_apart = verdict == "departs"
+    assert len(judged["missing_jumps"]) == len(judged["unexpected_jumps"]) == is_apart
+
+
+def test_a_jump_that_only_the_twin_has_is_missing(clean: Json) -> None:
+    jumps = move_jump(clean["jumps"], 0)
+    judged = judge_changed(clean, jumps=[], hysteresis=[], twin_jumps=jumps)
+    assert judged["verdict"] == "departs"
+    assert judged["missing_jumps"] == jumps
+
+
+def test_one_step_outside_decides_and_is_the_worst(clean: Json) -> None:
+    steps = deepcopy(clean["steps"])
+    entry = steps[2]["agreement"]["mass_acc_m_s2"]
+    entry["error"] = 1.5 * entry["band"]
+    worst = judge_changed(clean, steps=steps)
+    assert (worst["verdict"], worst["steps_outside"]) == ("departs", 1)
+    assert worst["worst"]["step"] == steps[2]["index"]
+    assert worst["worst"]["share"] == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize(
+    ("kind", "verdict"),
+    [("disagreement", "departs"), ("unexpected jump", "agrees"), ("drift", "agrees")],
+)
+def test_warnings_that_decide(clean: Json, kind: str, verdict: str) -> None:
+    warnings = [{"at_s": 1.0, "kind": kind, "text": ""}]
+    judged = judge_changed(clean, warnings=warnings)
+    assert (judged["verdict"], judged["warnings"]) == (verdict, 1)
+
+
+def test_a_jump_warning_decides_where_one_direction_alone_was_driven(clean: Json) -> None:
+    steps = [step for step in clean["steps"] if step["direction"] == "forward"]
+    one_way = {"steps": steps, "jumps": [], "twin_jumps": []}
+    warnings = [{"at_s": 1.0, "kind": "unexpected jump", "text": ""}]
+    assert judge_changed(clean, **one_way)["verdict"] == "agrees"
+    assert judge_changed(clean, **one_way, warnings=warnings)["verdict"] == "departs"
+
+
+@pytest.mark.parametrize(("nrmse", "verdict"), [(0.03, "agrees"), (0.27, "departs")])
+def test_a_history_is_judged_by_its_nrmse(clean: Json, nrmse: float, verdict: str) -> None:
+    comparison = {"rel_disp_m": {"nrmse": nrmse, "free_nrmse": 0.5, "noise_floor": 0.003}}
+    history: Json = {"steps": [], "jumps": [], "twin_jumps": []}
+    judged = judge_changed(clean, **history, comparison=comparison)
+    assert judged["verdict"] == verdict
+    assert judged["misfit"] == pytest.approx(nrmse / 0.003)
+
+
+def test_a_model_alone_is_not_judged(clean: Json) -> None:
+    judged = judge_changed(clean, run=clean["run"] | {"source": "model"})
+    assert judged["verdict"] == "not judged"
