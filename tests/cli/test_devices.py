@@ -20,6 +20,7 @@ from table_io.backends.discovery import ChannelGroup, DiscoveredDevice
 from table_io.backends.ni import discovery as ni_found
 from table_io.backends.opendaq import discovery as daq_found
 from table_io.backends.opendaq.discovery import discover_devices as discover_opendaq_devices
+from table_io.config import base
 from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
 from tests.input_errors import raises_input_error
@@ -41,7 +42,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     rigs.mkdir(parents=True)
     for name in ("simulated", "machine"):
         (rigs / f"{name}.toml").write_text((PROFILES_DIR / "rigs" / f"{name}.toml").read_text())
-    monkeypatch.setattr(command, "PROFILES_DIR", tmp_path / "shipped")
+    monkeypatch.setattr(base, "PROFILES_DIR", tmp_path / "shipped")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(daq_found, "discover_devices", lambda addresses: (LASER,))
 
@@ -104,8 +105,8 @@ def test_a_library_that_is_missing_is_said_with_the_pip_line(
     code, text = run("--json")
     silent = json.loads(text)["not_found"]
     assert code == 0
-    assert "pip install shaketwin[ni]" in silent["NI, local driver"]
-    assert "pip install shaketwin[opendaq]" in silent["openDAQ"]
+    assert "shaketwin[ni]" in silent["NI, local driver"]
+    assert "shaketwin[opendaq]" in silent["openDAQ"]
 
 
 def test_who_hangs_is_not_waited_for_and_who_breaks_is_a_sentence() -> None:

@@ -9,10 +9,10 @@ from typing import Any, Literal
 from pydantic import Field, ValidationError, field_validator
 
 from table_io.config.base import (
-    PROFILES_DIR,
     ConfigModel,
     Count,
     find_config,
+    list_configs,
     parse_toml,
     read_text,
     resolve_config,
@@ -163,7 +163,7 @@ def _find_profile(name: str, path: Path) -> Path:
         return place
     candidate = path.parent / name
     known = [profile_path.name for profile_path in sorted(candidate.parent.glob("*.toml"))]
-    known += sorted(profile_path.stem for profile_path in (PROFILES_DIR / "tests").glob("*.toml"))
+    known += list_configs("tests", path)
     raise InputError(
         f"no such test profile in {candidate.parent}",
         where=name,

@@ -14,7 +14,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from table_io.clock import RealClock
-from table_io.config.base import find_config
+from table_io.config.base import PROFILES_DIR
 from table_io.sim.ground_truth import (
     DEFINITION_BY_ID,
     GroundTruth,
@@ -171,13 +171,13 @@ def write_rig(folder: Path, digest: str, noise_seed: int) -> None:
 
 def _read_simulated_rig(noise_seed: int) -> str:
     """Return the text of the shipped rig file, which ends in [simulated], with this seed."""
-    text = find_config("simulated", "rigs").read_text(encoding="utf-8")
+    text = (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")
     return text.replace("\nseed = 1\n", f"\nseed = {noise_seed}\n")
 
 
 def _run_twin(folder: Path, name: str, model: str | None) -> tuple[int, TwinError]:
     """Run the test into a folder of this name, as fast as possible; return (exit code, error)."""
-    test, rig = find_config(TEST, "tests"), str(folder / RIG_FILE)
+    test, rig = PROFILES_DIR / "tests" / f"{TEST}.toml", str(folder / RIG_FILE)
     code = run_test(test, folder / name, True, model, rig, False, "")
     summary = json.loads((folder / name / "summary.json").read_text(encoding="utf-8"))
     entry = summary["comparison"][CHANNEL]

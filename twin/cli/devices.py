@@ -18,15 +18,14 @@ from table_io.backends import check_reachable, get_descriptor
 from table_io.backends.discovery import DeviceSearch, DiscoveredDevice
 from table_io.clock import RealClock
 from table_io.config.backend import BACKEND_GROUP
-from table_io.config.base import PROFILES_DIR
+from table_io.config.base import list_configs
 from table_io.config.plugins import list_entry_points
 from table_io.config.rig import RigConfig
 from table_io.config.rig_file import load_rig
 from table_io.errors import InputError
-from twin.reports.summary import dump_strict_json
 from twin.run.terminal import console, print_line, print_table
 
-ANSWER_TIMEOUT_S = 6.0  # for all queries together
+ANSWER_TIMEOUT_S = 1.8  # for all queries together
 IN_PROCESS = "in the process of the run"  # address of a simulated table
 
 
@@ -55,6 +54,8 @@ def print_devices(ni: str | None, as_json: bool) -> None:
         if not (name in rig_searches and isinstance(replies[name], InputError))
     }
     if as_json:
+        from twin.reports.summary import dump_strict_json  # slow import
+
         print(dump_strict_json(_to_json(statuses, discovered)))
     else:
         _print_tables(statuses, discovered)
@@ -62,9 +63,9 @@ def print_devices(ni: str | None, as_json: bool) -> None:
 
 def _read_rigs(paths: list[Path]) -> tuple[dict[str, RigConfig], list[MachineStatus]]:
     """Read rig files; return (rigs by name, statuses of unreadable files)."""
-    rigs, unreadable = {}, []
+    rigs, unreadable, by_name = {}, [], list_configs("rigs").values()
     for path in paths:
-        name = path.stem if path.parent == PROFILES_DIR / "rigs" else str(path)
+        name = path.stem if path in by_name else str(path)
         try:
             rigs[name] = load_rig(path)[0]
         except InputError as error:
@@ -78,14 +79,14 @@ def _make_status(name: str, rig: RigConfig, reply: object) -> MachineStatus:
 
 
 def list_rig_files(folder: Path) -> list[Path]:
-    """Return the shipped rig files and those in a folder: TOML files that name a backend."""
-    paths = sorted((PROFILES_DIR / "rigs").glob("*.toml"))
+    """Return the rig files with a bare name and those in a folder: files that name a backend."""
+    paths = [*list_configs("rigs").values()]
     for path in sorted(folder.glob("*.toml")):
         try:
             text = path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError):
             continue
-        is_new = path.resolve() not in {shipped.resolve() for shipped in paths}
+        is_new = path.resolve() not in {known.resolve() for known in paths}
         if is_new and any(line.strip().startswith("backend") for line in text.splitlines()):
             paths.append(path)
     return paths

@@ -121,9 +121,12 @@ def import_command(
     ] = False,
 ) -> None:
     """Import tables of samples as logs; without -o, propose which column is which channel."""
+    from table_io.config.base import resolve_config
     from table_io.errors import InputError
     from twin.cli import import_files
 
+    if profile is not None:
+        profile = resolve_config(profile, "tests")
     if contents:
         if out is not None:
             raise InputError(

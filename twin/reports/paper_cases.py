@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from table_io.block import Float1D
-from table_io.config.base import find_config, load_config
+from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.profile import Profile
 from table_io.errors import InputError
 from table_io.records import PrcPoint, Step
@@ -160,7 +160,9 @@ def load_paper_cases(
     for gap, names in GAPS.items():
         tests = []
         for name in names:
-            profile, _ = load_config(find_config(name, "tests"), Profile, "test profile")
+            profile, _ = load_config(
+                PROFILES_DIR / "tests" / f"{name}.toml", Profile, "test profile"
+            )
             config, _ = read_model(model or profile.model)
             case_model = config.build_model(profile.specimen)
             _require_steady(case_model, model or profile.model)

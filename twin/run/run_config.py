@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from table_io.acquisition.session import SessionSetup
 from table_io.clock import local_datetime
-from table_io.config.base import find_config, load_config, parse_toml, resolve_config
+from table_io.config.base import PROFILES_DIR, find_config, load_config, parse_toml, resolve_config
 from table_io.config.profile import Profile, Specimen, load_profile
 from table_io.config.rig import RigConfig
 from table_io.config.rig_file import load_rig
@@ -206,7 +206,7 @@ def compile_rig_kernels(config: RunConfig) -> None:
     from table_io.clock import ManualClock
 
     if not config.rig.runs_at_any_speed:
-        config = read_run_config(find_config("quickstart", "tests"))
+        config = read_run_config(PROFILES_DIR / "tests" / "quickstart.toml")
     clock = ManualClock()
     session = run_session(
         config.session_setup,

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from table_io.backends.discovery import ChannelGroup, DiscoveredDevice
 from table_io.errors import InputError, format_pip_line
 
-CONNECT_TIMEOUT_S = 2.0
+CONNECT_TIMEOUT_S = 1.5
 UNUSED_SESSION = "0"  # required by the client; no session of this name is created
 CHANNEL_KINDS: tuple[tuple[Literal["AI", "AO", "DI", "DO"], str, str, str], ...] = (
     ("AI", "ai_physical_chans", "ai_voltage_rngs", "ai_max_single_chan_rate"),

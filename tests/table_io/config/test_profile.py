@@ -8,7 +8,15 @@ from typing import Any
 import pytest
 
 from table_io.channels import CHANNEL_BY_NAME
-from table_io.config.base import PROFILES_DIR, ConfigModel, find_config, load_config, parse_toml
+from table_io.config.base import (
+    PROFILES_DIR,
+    ConfigModel,
+    find_config,
+    list_configs,
+    load_config,
+    parse_toml,
+    resolve_config,
+)
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.config.sensor import SensorConfig
@@ -231,14 +239,39 @@ def test_find_knows_names_paths_and_neighbours(tmp_path: Path) -> None:
     assert find_config("simulated", "rigs", beside) == tmp_path / "rigs" / "simulated.toml"
     with pytest.raises(InputError) as raised:
         find_config("g4_s1", "tests")
-    assert raised.value.remedy == "did you mean 'g4_ss1'?"
+    assert raised.value.remedy.startswith("did you mean 'g4_ss1'?")
+    assert str(PROFILES_DIR / "tests") in raised.value.remedy
     with pytest.raises(InputError) as raised:
         find_config("bigtable", "rigs", beside)
-    assert raised.value.remedy == "did you mean 'big_table'?"
+    assert raised.value.remedy.startswith("did you mean 'big_table'?")
     with pytest.raises(InputError) as raised:
         find_config("xyz", "tests")
     assert raised.value.key == "xyz"
     assert "quickstart" in raised.value.remedy
+
+
+def test_the_folders_of_the_user_come_before_the_shipped_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    working, listed, own = (tmp_path / name for name in ("working", "listed", "own"))
+    for root, names in (
+        (working / "profiles", ("a",)),
+        (listed, ("a", "b")),
+        (own / "shaketwin", ("a", "b", "simulated")),
+    ):
+        (root / "rigs").mkdir(parents=True)
+        for name in names:
+            (root / "rigs" / f"{name}.toml").write_text(RIG_TEXT)
+    (working / "quickstart").mkdir()  # a folder of results, not the test of that name
+    monkeypatch.chdir(working)
+    monkeypatch.setenv("SHAKETWIN_PROFILES", str(listed))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(own))
+    places = [find_config(name, "rigs").parent.parent for name in ("a", "b", "simulated")]
+    assert places == [working / "profiles", listed, own / "shaketwin"]
+    assert list_configs("rigs").keys() >= {"a", "b", "simulated", "machine"}
+    shipped = PROFILES_DIR / "tests" / "quickstart.toml"
+    assert find_config("simulated", "rigs", shipped).parent.parent == own / "shaketwin"
+    assert resolve_config(Path("quickstart"), "tests") == shipped
 
 
 @pytest.mark.parametrize("channel", sorted(CHANNEL_BY_NAME))
