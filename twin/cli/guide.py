@@ -7,7 +7,8 @@ import typer
 
 from table_io.errors import InputError
 from twin.guide.site import build_guide
-from twin.run.terminal import open_in_browser, print_line
+from twin.run.system import open_in_browser
+from twin.run.terminal import print_line
 
 
 def open_guide(out: Path | None, app: typer.Typer) -> None:
