@@ -1,12 +1,10 @@
 """Loading of TOML files into validated, frozen models; one message lists all faults of a file."""
 
-import os
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
-from platformdirs import user_config_path
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
@@ -18,8 +16,6 @@ PROFILES_DIR = next(
     for folder in Path(__file__).resolve().parents[1:3]
     if (folder / "profiles").is_dir()
 )
-
-FOLDERS_VARIABLE = "SHAKETWIN_PROFILES"  # further folders, each with tests, rigs, models, campaigns
 
 # Strict: `true` or "0.05" in place of a number is a mistake, not a 1 or a 0.05.
 Number = Annotated[float, Field(strict=True)]
@@ -146,54 +142,6 @@ def read_text(path: Path, kind: str) -> str:
         raise InputError(f"no such {kind}", where=path, remedy=hint) from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read this {kind}: {error}", where=path) from None
-
-
-def list_config_folders(kind: str, profile_path: Path | None = None) -> list[Path]:
-    """List the folders that are searched for configs of a kind, such as "rigs", in their order.
-
-    Next to the profile; profiles/ in the working folder; the folders of SHAKETWIN_PROFILES; the
-    user's config folder; the shipped ones.
-    """
-    roots = [Path("profiles"), user_config_path("shaketwin"), PROFILES_DIR]
-    roots[1:1] = map(Path, filter(None, os.environ.get(FOLDERS_VARIABLE, "").split(os.pathsep)))
-    if profile_path is not None and not profile_path.resolve().is_relative_to(PROFILES_DIR):
-        roots.insert(0, profile_path.resolve().parent.parent)
-    return list(dict.fromkeys(root.resolve() / kind for root in roots))
-
-
-def list_configs(kind: str, profile_path: Path | None = None) -> dict[str, Path]:
-    """Return the paths of the configs of a kind by their bare names, sorted."""
-    folders = list_config_folders(kind, profile_path)
-    paths = [path for folder in reversed(folders) for path in folder.glob("*.toml")]
-    by_name = {path.stem: path for path in paths}  # the last one, of the first folder, stays
-    return {name: by_name[name] for name in sorted(by_name)}
-
-
-def find_config(name: str, folder: str, profile_path: Path | None = None, option: str = "") -> Path:
-    """Return the path of config `name`: a path, or a bare name found by `list_configs`.
-
-    InputError names the option that gave the name, without one the profile.
-    """
-    direct = Path(name)
-    if direct.suffix == ".toml":
-        by_profile = profile_path.parent / direct if profile_path is not None else direct
-        return by_profile if by_profile.is_file() else direct
-    configs = list_configs(folder, profile_path)
-    if name in configs:
-        return configs[name]
-    searched = ", ".join(map(str, list_config_folders(folder, profile_path)))
-    raise InputError(
-        "not found",
-        where=f"{option} {name}" if option else profile_path or "",
-        key="" if option else name,
-        allowed=f"a name in {folder} or the path of a .toml file",
-        remedy=f"{suggest(name, configs)} (searched: {searched})",
-    )
-
-
-def resolve_config(path: Path, folder: str) -> Path:
-    """Return the path of a config file given as a path, or as the bare name of one."""
-    return path if path.is_file() or len(path.parts) > 1 else find_config(str(path), folder)
 
 
 def load_config(path: Path, model: type[ConfigT], kind: str) -> tuple[ConfigT, str]:

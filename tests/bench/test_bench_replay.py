@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from table_io.config.base import find_config
+from table_io.config.folders import find_config
 from twin.log import open_log
 from twin.recording.recovery import recover_log
 from twin.replay.pipeline_replay import RecordedRun, replay_recording

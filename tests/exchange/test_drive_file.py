@@ -11,7 +11,7 @@ from scipy.io import loadmat, wavfile
 
 from table_io.acquisition.external_control import plan_open_loop_drive
 from table_io.block import Float1D
-from table_io.config.base import find_config
+from table_io.config.folders import find_config
 from tests.input_errors import raises_input_error
 from twin.cli.table import ExternalController, serve_table
 from twin.exchange.drive_file import WRITERS, DriveFile, export_drive, read_drive, write_drive

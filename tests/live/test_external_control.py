@@ -10,7 +10,8 @@ import pytest
 from table_io.backends.follow import FollowWiring
 from table_io.backends.opendaq.config import OpenDaqWiring
 from table_io.backends.opendaq.source import check_reachable
-from table_io.config.base import find_config, load_config
+from table_io.config.base import load_config
+from table_io.config.folders import find_config
 from table_io.config.rig import RigConfig
 from table_io.records import RunStart, Timing
 from table_io.sim.opendaq import OpenDaqServer

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from table_io.config.base import find_config, load_config, parse_toml
+from table_io.config.base import load_config, parse_toml
+from table_io.config.folders import find_config
 from table_io.config.profile import Specimen
 from table_io.errors import InputError
 from tests.input_errors import raises_input_error

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from table_io.config.base import find_config
+from table_io.config.folders import find_config
 from table_io.records import Event, Fault, NormalizedResponse, PrcPoint
 from tests.input_errors import raises_input_error
 from tests.reports.recordings import summary

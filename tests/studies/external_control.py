@@ -18,7 +18,8 @@ import numpy as np
 
 from table_io.acquisition.drive_follower import DriveFollower, advance_follower, take_drive_indices
 from table_io.acquisition.external_control import plan_open_loop_drive
-from table_io.config.base import find_config, load_config
+from table_io.config.base import load_config
+from table_io.config.folders import find_config
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.excitation.drive import Drive

@@ -8,15 +8,8 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationError, field_validator
 
-from table_io.config.base import (
-    ConfigModel,
-    Count,
-    find_config,
-    list_configs,
-    parse_toml,
-    read_text,
-    resolve_config,
-)
+from table_io.config.base import ConfigModel, Count, parse_toml, read_text
+from table_io.config.folders import find_config, list_configs, resolve_config
 from table_io.errors import InputError, suggest
 from table_io.safety.preflight import list_drive_warnings as coarse
 from twin.run.run_config import RunConfig, read_run_config

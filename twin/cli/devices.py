@@ -18,7 +18,7 @@ from table_io.backends import check_reachable, get_descriptor
 from table_io.backends.discovery import DeviceSearch, DiscoveredDevice
 from table_io.clock import RealClock
 from table_io.config.backend import BACKEND_GROUP
-from table_io.config.base import list_configs
+from table_io.config.folders import list_configs
 from table_io.config.plugins import list_entry_points
 from table_io.config.rig import RigConfig
 from table_io.config.rig_file import load_rig

@@ -121,7 +121,7 @@ def import_command(
     ] = False,
 ) -> None:
     """Import tables of samples as logs; without -o, propose which column is which channel."""
-    from table_io.config.base import resolve_config
+    from table_io.config.folders import resolve_config
     from table_io.errors import InputError
     from twin.cli import import_files
 

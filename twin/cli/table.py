@@ -11,7 +11,7 @@ from typing import TextIO
 
 from table_io.backends import find_descriptor
 from table_io.clock import RealClock
-from table_io.config.base import find_config
+from table_io.config.folders import find_config
 from table_io.config.profile import load_profile
 from table_io.config.rig_file import load_rig
 from table_io.errors import InputError

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from table_io.block import Block, Float1D, Float2D, Label
-from table_io.config.base import find_config, load_config, parse_toml
+from table_io.config.base import load_config, parse_toml
 from table_io.config.channel import read_channels
+from table_io.config.folders import find_config
 from table_io.config.profile import Profile, load_profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from table_io.acquisition.session import SessionSetup
 from table_io.clock import local_datetime
-from table_io.config.base import PROFILES_DIR, find_config, load_config, parse_toml, resolve_config
+from table_io.config.base import PROFILES_DIR, load_config, parse_toml
+from table_io.config.folders import find_config, resolve_config
 from table_io.config.profile import Profile, Specimen, load_profile
 from table_io.config.rig import RigConfig
 from table_io.config.rig_file import load_rig

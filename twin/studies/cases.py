@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from table_io.config.base import find_config
+from table_io.config.folders import find_config
 from table_io.config.profile import Profile, Specimen
 from table_io.errors import InputError
 from twin.model.config import ModelConfig

@@ -14,7 +14,8 @@ from table_io.acquisition.drive_follower import (
     take_drive_indices,
 )
 from table_io.block import Float1D, Int1D
-from table_io.config.base import find_config, load_config
+from table_io.config.base import load_config
+from table_io.config.folders import find_config
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.excitation.drive import Drive

@@ -12,7 +12,8 @@ from table_io.acquisition.session import OperatorCommand, SessionSetup
 from table_io.backends import MachineLost
 from table_io.block import Block, Float1D, Label, join_blocks
 from table_io.clock import ManualClock
-from table_io.config.base import find_config, load_config, parse_toml
+from table_io.config.base import load_config, parse_toml
+from table_io.config.folders import find_config
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError

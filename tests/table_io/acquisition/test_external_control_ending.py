@@ -8,7 +8,7 @@ import pytest
 
 from table_io.acquisition.external_control import plan_open_loop_drive
 from table_io.block import Float1D, Label
-from table_io.config.base import find_config
+from table_io.config.folders import find_config
 from table_io.errors import InputError
 from table_io.excitation.drive import Drive
 from tests.table_io.acquisition.external_controller import Bystander, whole

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from table_io.config.base import find_config
+from table_io.config.folders import find_config
 from table_io.errors import InputError
 from table_io.records import Event
 from tests.table_io.backends.separate_processes import own_network

@@ -8,15 +8,8 @@ from typing import Any
 import pytest
 
 from table_io.channels import CHANNEL_BY_NAME
-from table_io.config.base import (
-    PROFILES_DIR,
-    ConfigModel,
-    find_config,
-    list_configs,
-    load_config,
-    parse_toml,
-    resolve_config,
-)
+from table_io.config.base import PROFILES_DIR, ConfigModel, load_config, parse_toml
+from table_io.config.folders import find_config, list_configs, resolve_config
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.config.sensor import SensorConfig

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from table_io.config.base import PROFILES_DIR, find_config, load_config
+from table_io.config.base import PROFILES_DIR, load_config
+from table_io.config.folders import find_config
 from table_io.config.profile import Profile, load_profile
 from table_io.config.rig import RigConfig
 from table_io.excitation.trajectory import plan_excitation
