@@ -5,6 +5,7 @@ file declares further channels (`table_io/config/channel.py`); `RigConfig.channe
 both.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,15 +62,26 @@ RIGHT_CELLS = ("force_r1_n", "force_r2_n")
 LEFT_CELLS = ("force_l1_n", "force_l2_n")
 
 
+RELATIVE_DISP = "rel_disp_m"
+RELATIVE_DISP_SOURCES = ("mass_disp_m", "table_disp_m")  # their difference, unless it is measured
+
+
+def list_derived_channels(channels: Collection[str]) -> tuple[str, ...]:
+    """Return the channels that follow from these: `rel_disp_m` from both displacements, or none."""
+    is_derived = RELATIVE_DISP not in channels and {*RELATIVE_DISP_SOURCES} <= {*channels}
+    return (RELATIVE_DISP,) if is_derived else ()
+
+
 def relative_displacement(block: Block) -> Float1D:
     """Return u in m, right positive, (sample,): measured directly, else mass minus table.
 
     All NaN if the channels are missing, so that a lost sensor is not mistaken for zero.
     """
-    if "rel_disp_m" in block.channels:
-        return block.channel("rel_disp_m")
-    if {"mass_disp_m", "table_disp_m"} <= set(block.channels):
-        return block.channel("mass_disp_m") - block.channel("table_disp_m")
+    if RELATIVE_DISP in block.channels:
+        return block.channel(RELATIVE_DISP)
+    if list_derived_channels(block.channels):
+        mass_disp, table_disp = map(block.channel, RELATIVE_DISP_SOURCES)
+        return mass_disp - table_disp
     return np.full(len(block), np.nan)
 
 

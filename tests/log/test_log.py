@@ -32,7 +32,9 @@ def log(folder: Path) -> Log:
 
 def test_channels_are_those_of_the_log_to_the_bit(log: Log, recording: Recording) -> None:
     (meas,), (pred,) = recording.contiguous_blocks("meas"), recording.contiguous_blocks("pred")
-    assert log.channels == meas.channels
+    assert log.channels == (*meas.channels, "rel_disp_m")
+    u_m = meas.channel("mass_disp_m") - meas.channel("table_disp_m")
+    assert log["rel_disp_m"].tobytes() == u_m.tobytes()
     for name in meas.channels:
         assert log[name].tobytes() == meas.channel(name).tobytes()
     for track, values in (("free", log.twin), ("window", log.window)):
@@ -213,7 +215,7 @@ def test_the_dataset_has_every_channel_with_its_unit(log: Log, recording: Record
     data = log.to_xarray()
     (meas,), (pred,) = recording.contiguous_blocks("meas"), recording.contiguous_blocks("pred")
     assert set(data.data_vars) == {
-        *meas.channels, *(f"twin_{name.replace('/', '_')}" for name in pred.channels)
+        *log.channels, *(f"twin_{name.replace('/', '_')}" for name in pred.channels)
     }  # fmt: skip
     assert data.mass_acc_m_s2.values.tobytes() == meas.channel("mass_acc_m_s2").tobytes()
     name = "window/force_l2_n"

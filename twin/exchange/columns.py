@@ -13,7 +13,12 @@ import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
 
 from table_io.block import Float1D, Int1D
-from table_io.channels import CHANNEL_BY_NAME, Channel
+from table_io.channels import (
+    CHANNEL_BY_NAME,
+    RELATIVE_DISP,
+    RELATIVE_DISP_SOURCES,
+    Channel,
+)
 from table_io.config.base import ConfigModel, Finite, Positive, load_config
 from table_io.errors import InputError, suggest
 from table_io.units import UNITS
@@ -186,6 +191,9 @@ def read_samples(
         name: column.to_si(name, table.read_column(column.column), known.unit_factors(name))
         for name, column in sources.items()
     }
+    if _is_derived_disp(values):  # of an export of ours
+        del values[RELATIVE_DISP]
+        notes.append(f"left out: {RELATIVE_DISP}; it is the difference of two other channels")
     time = values.pop(TIME_COLUMN, _read_file_time(table, sources, column_map))
     if column_map is not None and (column_map.from_s, column_map.to_s) != (None, None):
         rows, note = _select_rows(table, sources, column_map, time)
@@ -218,6 +226,18 @@ def read_samples(
     labels = {name: values[name] for name in LABEL_UNITS if name in values}
     samples = ImportedSamples(rate, index, channels, (*table.notes, *notes), labels)
     return condition_samples(samples, column_map) if column_map is not None else samples
+
+
+def _is_derived_disp(values: Mapping[str, Float1D]) -> bool:
+    """Return whether `rel_disp_m` is computed from the displacements of mass and table."""
+    mass_disp, table_disp = (values.get(source) for source in RELATIVE_DISP_SOURCES)
+    derived = values.get(RELATIVE_DISP)
+    return (
+        derived is not None
+        and mass_disp is not None
+        and table_disp is not None
+        and np.array_equal(derived, mass_disp - table_disp, equal_nan=True)
+    )
 
 
 def _read_file_time(

@@ -1,6 +1,7 @@
 """Reference pages as Markdown: keys of the TOML files, commands with their options, channels."""
 
 from collections.abc import Iterable, Iterator
+from inspect import getdoc, signature
 from typing import Any
 
 import typer
@@ -10,6 +11,7 @@ from table_io.config.base import ConfigModel
 from table_io.config.key_reference import KeyDescription, describe_tables
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
+from twin import api, log
 from twin.campaign.config import CampaignConfig
 from twin.exchange.columns import ColumnMap
 from twin.model.config import ModelConfig
@@ -106,3 +108,34 @@ def write_channel_reference(_: typer.Typer) -> str:
         "SI. A rig file may declare more in `[[channels]]`.\n\n"
         + format_table(("channel", "unit", "positive", "meaning"), rows)
     )
+
+
+def write_api_reference(_: typer.Typer) -> str:
+    """Return the page of the Python interface, from its docstrings."""
+    summary, example, notes = (getdoc(api) or "").split("\n\n", 2)
+    parts = [
+        "# Python API",
+        f"{summary}",
+        f"```python\n{example.replace('>>> ', '')}\n```",
+        notes,
+    ]
+    for name in ("open_log", "run_simulated", "simulate", "replay", "identify", "discover"):
+        parts += _describe_object(name, getattr(api, name))
+    parts += ["## Log", (getdoc(log) or "").split("\n\n", 2)[2]]
+    for kind in (api.FittedModel, api.DiscoveredModel):
+        parts += [f"## {kind.__name__}", getdoc(kind) or ""]
+    return "\n\n".join(parts)
+
+
+def _describe_object(name: str, function: Any) -> Iterator[str]:
+    """Yield the parts of the section of a function."""
+    arguments = "".join(
+        f"    {argument},\n" for argument in signature(function).parameters.values()
+    )
+    result = signature(function).return_annotation
+    text = f"{name}(\n{arguments}) -> {getattr(result, '__name__', result)}"
+    for module in ("pathlib.", "collections.abc."):
+        text = text.replace(module, "")
+    yield f"## {name}"
+    yield f"```python\n{text}\n```"
+    yield getdoc(function) or ""

@@ -14,6 +14,7 @@ from table_io.errors import InputError
 from twin.guide.gallery import write_gallery
 from twin.guide.markdown import RenderedMarkdown, render_markdown
 from twin.guide.reference import (
+    write_api_reference,
     write_channel_reference,
     write_command_reference,
     write_key_reference,
@@ -105,6 +106,7 @@ CHAPTERS = (
     Chapter(
         "Reference",
         (
+            GuidePage("api", "Python API", write_api_reference),
             GuidePage("commands", "Commands", write_command_reference),
             GuidePage("keys", "Configuration keys", write_key_reference),
             GuidePage("channels", "Channels", write_channel_reference),

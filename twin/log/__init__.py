@@ -7,6 +7,7 @@
 | expression | value |
 |---|---|
 | `log["mass_disp_m"]`, `log.channels` | a measured channel; channel names (as in CSV exports) |
+| `log["rel_disp_m"]` | u; mass minus table displacement where it is not measured itself |
 | `log.twin["mass_disp_m"]` | free-running twin, driven by the table's motion alone |
 | `log.window["mass_disp_m"]` | twin restarted from the measured state every window |
 | `log.time_s`, `log.step_index`, `log.label`, `log.cycle` | time axis and labels of the drive |
@@ -31,6 +32,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from table_io.block import Block, Float1D, Float2D, Int1D
+from table_io.channels import list_derived_channels
 from table_io.config.base import parse_toml
 from table_io.config.channel import read_channels
 from table_io.config.profile import Profile
@@ -104,13 +106,13 @@ class Log:
         return (
             f"<log {self.path}: {self.profile.title or start.name}, run {start.run}, "
             f"{start.planned_samples / start.rate_hz:.0f} s planned at {start.rate_hz:g} Hz, "
-            f"{len(start.steps)} steps, {len(start.channels)} channels: "
-            f"{', '.join(start.channels)}>"
+            f"{len(start.steps)} steps, {len(self.channels)} channels: "
+            f"{', '.join(self.channels)}>"
         )
 
     @property
     def channels(self) -> tuple[str, ...]:
-        return self.start.channels
+        return (*self.start.channels, *list_derived_channels(self.start.channels))
 
     @property
     def rate_hz(self) -> float:
@@ -180,7 +182,7 @@ class Log:
     @cached_property
     def measured(self) -> ChannelMap:
         return ChannelMap(
-            "measured", self.channels, self._place_on_axis(self._blocks, self.channels)
+            "measured", self.start.channels, self._place_on_axis(self._blocks, self.start.channels)
         )
 
     @cached_property

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from table_io.block import Float1D, Float2D, Int1D, Label
+from table_io.channels import RELATIVE_DISP_SOURCES, list_derived_channels
 from table_io.records import CycleExtremes, PrcPoint, Step
 
 if TYPE_CHECKING:
@@ -17,16 +18,22 @@ UNKNOWN_LABEL = -1  # step, label and cycle of a sample that was not recorded
 
 
 class ChannelMap(Mapping[str, Float1D]):
-    """Channels of one source (measured or a twin) by name, (sample,) each."""
+    """Channels of one source (measured or a twin) by name, (sample,) each, u always among them."""
 
     def __init__(self, name: str, names: tuple[str, ...], values: Float2D) -> None:
-        self._source, self._names, self._values = name, names, values
+        self._source, self._rows, self._values = name, names, values
+        self._names = (*names, *list_derived_channels(names))
 
     def __getitem__(self, name: str) -> Float1D:
         if name not in self._names:
             available = ", ".join(self._names)
             raise KeyError(f"no channel {name!r} ({self._source}); available: {available}")
-        return self._values[self._names.index(name)]
+        if name in self._rows:
+            return self._values[self._rows.index(name)]
+        mass_disp, table_disp = (self[source] for source in RELATIVE_DISP_SOURCES)
+        values = mass_disp - table_disp
+        values.setflags(write=False)
+        return values
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
@@ -38,7 +45,7 @@ class ChannelMap(Mapping[str, Float1D]):
         return f"<{self._source}: {', '.join(self._names)}>"
 
     def cut(self, samples: slice) -> "ChannelMap":
-        return ChannelMap(self._source, self._names, self._values[:, samples])
+        return ChannelMap(self._source, self._rows, self._values[:, samples])
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -16,7 +16,7 @@ from typing import IO, Any
 import numpy as np
 
 from table_io.block import Block, Float1D, Float2D, Int1D
-from table_io.channels import Channel
+from table_io.channels import RELATIVE_DISP_SOURCES, Channel, list_derived_channels
 from table_io.config.channel import read_channels
 from table_io.errors import InputError
 from table_io.records import Event, PrcPoint, Record, RunStart, RunStop, Step, StepAdded
@@ -122,6 +122,15 @@ class LogTable:
         for k, name in enumerate(self.channels[0], start=len(SCRATCH_COLUMNS)):
             if name in (only or self.units):
                 columns[name] = self.measured[measured_rows, k]
+        for name in list_derived_channels(self.channels[0]):
+            if name in (only or self.units):
+                mass_disp, table_disp = (
+                    self.measured[
+                        measured_rows, len(SCRATCH_COLUMNS) + self.channels[0].index(source)
+                    ]
+                    for source in RELATIVE_DISP_SOURCES
+                )
+                columns[name] = mass_disp - table_disp
         for k, name in enumerate(self.channels[1], start=len(SCRATCH_COLUMNS)):
             if name in (only or self.units):
                 columns[name] = np.full(measured_rows.size, np.nan)
@@ -216,7 +225,10 @@ def _build_table(
     channels = read_channels(start.rig_toml)
     units = {
         TIME_COLUMN: "s",
-        **{name: channel_unit(name, channels) for name in meas.channels},
+        **{
+            name: channel_unit(name, channels)
+            for name in (*meas.channels, *list_derived_channels(meas.channels))
+        },
         **LABEL_UNITS,
     }
     units |= {

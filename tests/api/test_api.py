@@ -1,0 +1,79 @@
+"""The Python interface: logs, fits and verdicts as objects."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.input_errors import raises_input_error
+from twin import api
+from twin.model.config import ModelConfig
+from twin.run.run_config import RunConfig, read_model
+
+
+@pytest.fixture
+def profile(bundle: RunConfig, tmp_path: Path) -> Path:
+    path = tmp_path / "across.toml"
+    path.write_text(bundle.profile_toml)
+    return path
+
+
+def test_a_simulation_is_the_model_on_the_ideal_drive(profile: Path, tmp_path: Path) -> None:
+    log = api.simulate(profile, tmp_path / "model")
+    assert log.start.source == "model"
+    assert np.nanmax(np.abs(log.twin["rel_disp_m"])) > 1e-3
+    assert log.prc["twin_eta_d"].shape == (6,)
+    with raises_input_error(key="--out"):
+        api.simulate(profile, tmp_path / "model")
+    with raises_input_error(where="--model no_model"):
+        api.simulate(profile, tmp_path / "other", model="no_model")
+
+
+def test_a_simulated_run_has_a_table_with_noise(
+    profile: Path, log_file: Path, tmp_path: Path
+) -> None:
+    log = api.run_simulated(profile, tmp_path / "run")
+    recorded = api.open_log(log_file)
+    assert log["rel_disp_m"].tobytes() == recorded["rel_disp_m"].tobytes()
+    assert log["rel_disp_m"][: int(0.2 * log.rate_hz)].std() > 0.0
+
+
+def test_a_replay_equals_the_recording_and_takes_another_model(
+    log_file: Path, tmp_path: Path
+) -> None:
+    recorded = api.open_log(log_file)
+    again = api.replay(log_file, tmp_path / "again")
+    assert again.predicted.tobytes() == recorded.predicted.tobytes()
+    _, text = read_model("snm")
+    (tmp_path / "stiff.toml").write_text(text.replace("= 36000.0", "= 37000.0"))
+    other = api.replay(log_file.parent, tmp_path / "other", model=tmp_path / "stiff.toml")
+    assert other.model.base.stiffness == 37000.0
+    assert other["mass_disp_m"].tobytes() == recorded["mass_disp_m"].tobytes()
+    assert other.predicted.tobytes() != recorded.predicted.tobytes()
+
+
+def test_a_fit_has_intervals_and_a_model_file(log_file: Path, tmp_path: Path) -> None:
+    fitted = api.identify([log_file])
+    stiffness = fitted.parameters["stiffness"]
+    assert stiffness.unit == "N/m"
+    assert stiffness.low is not None
+    assert stiffness.high is not None
+    assert stiffness.low < 36e3 * 1.02
+    assert stiffness.high > 36e3 * 0.98
+    assert 0.5 < fitted.rms_over_noise < 2.0
+    assert any("gap" in name for name in fitted.log_parameters)
+    config, _ = read_model(str(fitted.save_model(tmp_path / "fitted.toml")))
+    assert isinstance(config, ModelConfig)
+    assert config.base.stiffness_n_m == pytest.approx(stiffness.value)
+    with raises_input_error(where=tmp_path / "fitted.toml"):
+        fitted.save_model(tmp_path / "fitted.toml")
+
+
+def test_a_discovery_has_the_verdict_and_the_model(log_file: Path, tmp_path: Path) -> None:
+    found_model = api.discover([log_file])
+    assert found_model.verdict.verdict == "none"
+    assert found_model.verdict.effects == []
+    config, _ = read_model(str(found_model.save_model(tmp_path / "found.toml")))
+    assert config.effects == ()
+    with raises_input_error(problem="effect 'no_effect'"):
+        api.discover([log_file], without=["no_effect"])
