@@ -17,8 +17,8 @@ study_app = typer.Typer(
 )
 
 
-@identification_app.command(rich_help_panel=LEARN_PANEL)
-def discover(
+@identification_app.command("discover", rich_help_panel=LEARN_PANEL)
+def discover_from_logs(
     logs: LogPaths,
     model: Annotated[
         str, typer.Option("--model", help="Test this model: a name or a .toml file.")
@@ -41,8 +41,8 @@ def discover(
     raise typer.Exit(command(logs, model, out, without or [], held_out or []))
 
 
-@identification_app.command(rich_help_panel=LEARN_PANEL)
-def identify(
+@identification_app.command("identify", rich_help_panel=LEARN_PANEL)
+def identify_from_logs(
     logs: LogPaths,
     model: Annotated[
         str, typer.Option("--model", help="Start from this model: a name or a .toml file.")
