@@ -17,8 +17,7 @@ from twin.recording.mcap_log import write_items
 from twin.recording.reader import read_recording
 from twin.reports.orbits import read_planned_branch
 from twin.reports.report import write_report
-from twin.reports.report_data import parse_toml_tables
-from twin.reports.summary import summarise, write_summary
+from twin.reports.summary import parse_toml_tables, summarise, write_summary
 from twin.viewer.plots import OrbitCurves
 
 AMPLITUDE_M = 2e-3

@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from twin.cli.run_path import LOG_HELP, parse_run_path
+
 FILES_PANEL = "Recording files"
 files_app = typer.Typer()
 
@@ -33,7 +35,9 @@ def verify_command(
     log: Annotated[
         list[Path],
         typer.Argument(
-            metavar="LOG...", help="A log, the folder of a run, or the parts of one log."
+            metavar="LOG...",
+            parser=parse_run_path,
+            help="A log, the folder of a run, the parts of one log, or `last`.",
         ),
     ],
     json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
@@ -153,7 +157,7 @@ def import_command(
 
 @files_app.command("export", rich_help_panel=FILES_PANEL)
 def export_command(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="A run.mcap or the folder of a run.")],
+    log: Annotated[Path, typer.Argument(metavar="LOG", parser=parse_run_path, help=LOG_HELP)],
     csv: Annotated[bool, typer.Option("--csv", help="CSV text without loss of precision.")] = False,
     parquet: Annotated[
         bool, typer.Option("--parquet", help="Parquet with units and profile.")

@@ -5,8 +5,13 @@ from typing import Annotated
 
 import typer
 
+from twin.cli.run_path import LOG_HELP, parse_run_path
+
 LEARN_PANEL = "Identification from recordings"
-LogPaths = Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs or folders of runs.")]
+LogPaths = Annotated[
+    list[Path],
+    typer.Argument(metavar="LOG...", parser=parse_run_path, help=f"{LOG_HELP} Repeatable."),
+]
 
 
 identification_app = typer.Typer()

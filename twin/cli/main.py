@@ -12,8 +12,9 @@ import typer
 from twin.cli.credential_commands import KeysOption, keys_app, read_keys_option
 from twin.cli.file_commands import StepsOption, files_app, require_view_extra
 from twin.cli.hardware_commands import hardware_app
-from twin.cli.identification_commands import identification_app
+from twin.cli.identification_commands import LogPaths, identification_app
 from twin.cli.live_commands import live_app
+from twin.cli.run_path import LOG_HELP, parse_run_path
 from twin.run.diagnostics import configure_logging
 
 # The matrices are small: BLAS threads cost more than they gain and delay the processes of a run.
@@ -42,7 +43,8 @@ ProfileArgument = Annotated[
     ),
 ]
 LogArgument = Annotated[
-    Path, typer.Argument(metavar="LOG", help="A run.mcap or the folder of a run.")
+    Path,
+    typer.Argument(metavar="LOG", parser=parse_run_path, help=LOG_HELP),
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
 ModelOption = Annotated[
@@ -318,7 +320,7 @@ def branches_command(
 
 @app.command("replay", rich_help_panel=LOOK_PANEL)
 def replay_command(
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs or folders of runs.")],
+    logs: LogPaths,
     model: Annotated[
         list[str] | None,
         typer.Option(
@@ -378,7 +380,12 @@ def paper_command(
 
 @app.command("report", rich_help_panel=LOOK_PANEL)
 def report_command(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run or campaign.")],
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="DIR", parser=parse_run_path, help="Folder of a run or campaign, or `last`."
+        ),
+    ],
 ) -> None:
     """Write the report of a run or campaign again: one self-contained HTML file."""
     from twin.cli.report import write_folder_report as command
@@ -389,7 +396,7 @@ def report_command(
 @app.command("view", rich_help_panel=LOOK_PANEL)
 def view_command(
     log: Annotated[
-        Path | None, typer.Argument(metavar="[LOG]", help="A run.mcap or the folder of a run.")
+        Path | None, typer.Argument(metavar="[LOG]", parser=parse_run_path, help=LOG_HELP)
     ] = None,
     save: Annotated[
         Path | None, typer.Option("--save", help="Write this .rrd file and open no viewer.")
@@ -408,6 +415,35 @@ def view_command(
     from twin.cli.view import show_view as command
 
     command(log, save, picture, connect, rig, read_keys_option(keys))
+
+
+@app.command("runs", rich_help_panel=LOOK_PANEL)
+def runs_command(
+    folder: Annotated[
+        Path, typer.Argument(metavar="[FOLDER]", help="Folder that holds runs or a folder runs.")
+    ] = Path(),
+    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    page: Annotated[
+        Path | None, typer.Option("--page", help="Also write an index page to this .html file.")
+    ] = None,
+) -> None:
+    """List the runs in a folder: date, test, gap, verdicts, misfit, warnings."""
+    from twin.cli.runs import print_runs as command
+
+    command(folder, json, page)
+
+
+@app.command("compare", rich_help_panel=LOOK_PANEL)
+def compare_command(
+    first: Annotated[Path, typer.Argument(metavar="RUN", parser=parse_run_path, help=LOG_HELP)],
+    second: Annotated[Path, typer.Argument(metavar="RUN", parser=parse_run_path, help=LOG_HELP)],
+    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    out: OutOption = None,
+) -> None:
+    """Compare two runs, or one with two models: curves, jumps, parameters, misfit."""
+    from twin.cli.compare import compare_runs as command
+
+    command(first, second, json, out)
 
 
 @app.command("guide", rich_help_panel=PLAN_PANEL)

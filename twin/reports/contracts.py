@@ -54,6 +54,10 @@ class RunInfo(Contract):
     samples: Index = Field(description="length in samples")
     duration_s: Seconds = Field(description="length in time")
     normalisation: str = Field(description="how u* and a* are found")
+    gap_m: Metres = Field(
+        None, description="nominal total gap; null without bumpers and in old files"
+    )
+    model: str | None = Field(None, description="title of the twin's model; null in old files")
     branches_from: str = Field(description="source of `jumps` and `hysteresis`: measured or twin")
 
 

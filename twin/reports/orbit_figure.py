@@ -13,7 +13,8 @@ from twin.reports.plot_style import (
     CaptionedFigure,
     CaptionedFigures,
 )
-from twin.reports.report_data import ReportData, parse_toml_tables
+from twin.reports.report_data import ReportData
+from twin.reports.summary import parse_toml_tables
 
 REFUSED_COLOUR = "#f4ac3d"
 

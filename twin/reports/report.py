@@ -30,11 +30,10 @@ from twin.reports.plot_style import Picture
 from twin.reports.report_data import (
     ReportData,
     build_report_data,
-    parse_toml_tables,
     step_quantity,
 )
 from twin.reports.sensor_table import build_sensor_rows
-from twin.reports.summary import load_summary
+from twin.reports.summary import load_summary, parse_toml_tables
 from twin.reports.twin_verdict import describe_worst, format_jump, name_command
 
 MAX_ROWS = 200

@@ -4,7 +4,6 @@ Also selects the steps that are shown in detail.
 """
 
 import math
-import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -22,7 +21,7 @@ from twin.model.config import ModelConfig
 from twin.model.model import Model
 from twin.recording.reader import Recording
 from twin.reports.players import SystemMotion
-from twin.reports.summary import Json, prc_points
+from twin.reports.summary import Json, parse_toml_tables, prc_points
 
 Curve = tuple[Float1D, Float1D]  # frequency in Hz, ascending, and quantity
 Envelope = tuple[Float1D, Float1D, Float1D]
@@ -107,14 +106,6 @@ def build_report_data(recording: Recording, summary: Json) -> ReportData:
     contact_n = ComparisonConfig.model_validate(profile.get("comparison") or {}).contact_n
     streams = {name: recording.contiguous_blocks(name) for name in ("meas", "pred")}
     return ReportData(recording, summary, streams, specimen, contact_n)
-
-
-def parse_toml_tables(text: str) -> dict[str, Any]:
-    """Parse TOML text into its tables by name; return {} if it is not valid TOML."""
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError:
-        return {}
 
 
 def step_quantity(step: dict[str, Any], source: str, name: str) -> float:

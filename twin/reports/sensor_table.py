@@ -10,7 +10,7 @@ from table_io.config.calibration_record import CalibrationRecord
 from table_io.config.channel import read_channels
 from table_io.config.sensor import SensorConfig
 from table_io.records import RunStart
-from twin.reports.report_data import parse_toml_tables
+from twin.reports.summary import parse_toml_tables
 
 
 @dataclass(frozen=True, slots=True)

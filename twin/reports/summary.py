@@ -2,6 +2,7 @@
 
 import json
 import math
+import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, fields, replace
 from pathlib import Path
@@ -86,6 +87,8 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
             "samples": samples,
             "duration_s": samples / start.rate_hz,
             "normalisation": normalisation,
+            "gap_m": sum(profile.specimen.gaps_m),  # infinite without bumpers: null in the file
+            "model": parse_toml_tables(start.model_toml).get("title"),
             "branches_from": source,
         },
         "verdict": stop.verdict if stop else "halted",
@@ -126,6 +129,14 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         ],
     }
     return summary | {"twin_verdict": judge_twin(summary)}
+
+
+def parse_toml_tables(text: str) -> dict[str, Any]:
+    """Parse TOML text into its tables by name; return {} if it is not valid TOML."""
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        return {}
 
 
 def _find_normalisation(
