@@ -20,7 +20,7 @@ from table_io.backends.discovery import ChannelGroup, DiscoveredDevice
 from table_io.backends.ni import discovery as ni_found
 from table_io.backends.opendaq import discovery as daq_found
 from table_io.backends.opendaq.discovery import discover_devices as discover_opendaq_devices
-from table_io.config import base
+from table_io.config import folders
 from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
 from tests.input_errors import raises_input_error
@@ -42,7 +42,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     rigs.mkdir(parents=True)
     for name in ("simulated", "machine"):
         (rigs / f"{name}.toml").write_text((PROFILES_DIR / "rigs" / f"{name}.toml").read_text())
-    monkeypatch.setattr(base, "PROFILES_DIR", tmp_path / "shipped")
+    monkeypatch.setattr(folders, "PROFILES_DIR", tmp_path / "shipped")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(daq_found, "discover_devices", lambda addresses: (LASER,))
 
