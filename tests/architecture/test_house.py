@@ -26,6 +26,7 @@ OWNERS = {  # packages that may import a foreign library
     "pysindy": ("twin/validation/study",),
     "pyuff": ("twin/exchange/formats",),
     "rerun": ("twin/viewer",),
+    "segno": ("twin/run",),
     "sklearn": ("twin/validation/study",),
     "time": ("table_io/clock.py",),
     "xarray": ("twin/log",),

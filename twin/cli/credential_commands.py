@@ -122,6 +122,23 @@ def router_command(
     print_router_settings(folder, name, listen, rig)
 
 
+@keys_app.command("code")
+def code_command(
+    folder: FolderArgument,
+    name: Annotated[str, typer.Argument(metavar="NAME", help="User on the access list.")],
+    page: Annotated[
+        str,
+        typer.Option(
+            "--page", metavar="URL", help="Address of the page: prints a QR code that logs in."
+        ),
+    ] = "",
+) -> None:
+    """Issue a code with which a user logs in to the web page; it replaces an earlier one."""
+    from twin.cli.credentials import issue_code
+
+    issue_code(folder, name, page)
+
+
 @keys_app.command("remove")
 def remove_command(folder: FolderArgument, name: NameArgument) -> None:
     """Revoke a user's role: the certificate is refused from then on."""

@@ -3,6 +3,7 @@
     FOLDER/ca.pem, ca.key.pem            the authority; its private key stays here
     FOLDER/certificate.pem, key.pem      the rig's
     FOLDER/access.toml                   access list: role by name
+    FOLDER/codes.toml                    hashes of the access codes of the web page
     FOLDER/people/NAME/                  ca.pem, certificate.pem, key.pem: to be handed over
     FOLDER/issued/NAME.1.pem             every certificate issued to a person
 
@@ -17,7 +18,7 @@ import secrets
 import socket
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
 from itertools import count
 from pathlib import Path
@@ -27,7 +28,7 @@ from rich.table import Table
 from table_io.clock import local_datetime
 from table_io.config.base import parse_toml
 from table_io.errors import InputError, suggest
-from twin.run.terminal import console, print_line, print_table
+from twin.run.terminal import console, print_line, print_qr_code, print_table
 from twin.security.access_control import NO_ROLE, RIG_NAME, ROLES, ROUTER_ROLE, build_router_access
 from twin.security.certificate_authority import (
     CertificateKeyPair,
@@ -46,6 +47,14 @@ from twin.security.credentials import (
     Credentials,
     check_name,
     read_people,
+)
+from twin.security.page_access import (
+    CODE_DAYS,
+    CODES_FILE,
+    CodeEntry,
+    create_code,
+    hash_code,
+    read_codes,
 )
 from twin.transport.endpoint import (
     PUBLIC_HUB_SETTINGS,
@@ -155,6 +164,34 @@ def renew_keys(folder: Path, name: str | None, hosts: Sequence[str]) -> None:
         f"{folder / PEOPLE_FOLDER / name}: new keys, to be handed over; the old ones stay valid "
         "until they expire"
     )
+
+
+def issue_code(folder: Path, name: str, page: str) -> None:
+    """Issue an access code to the web page to a person on the access list; print it once.
+
+    It replaces an earlier code of the person. With the address of the `page` a QR code logs in.
+    """
+    if name not in read_people(folder):
+        raise _unknown_name_error(folder, name, read_people(folder))
+    if page and not re.fullmatch(r"https://[^/#?\s]+/?", page):
+        raise InputError(
+            "not the address of a page",
+            key="--page",
+            value=page,
+            allowed="https://HOST:PORT, as printed by `shaketwin run --web-listen`",
+        )
+    code, last_day = create_code(), local_datetime().date() + timedelta(days=CODE_DAYS)
+    codes = read_codes(folder) | {name: CodeEntry(sha256=hash_code(code), valid_until=last_day)}
+    entries = [
+        f'[codes.{person}]\nsha256 = "{entry.sha256}"\nvalid_until = {entry.valid_until}\n'
+        for person, entry in codes.items()
+    ]
+    _write_files(folder, {CODES_FILE: "\n".join(entries).encode()})
+    print_line(f"access code of {name} until {last_day}, shown only now: {code}")
+    if page:
+        url = f"{page.rstrip('/')}/#{code}"
+        print_line(url)
+        print_qr_code(url)
 
 
 def remove_person(folder: Path, name: str) -> None:

@@ -11,6 +11,18 @@ from twin.cli.credential_commands import KeysOption, read_keys_option
 LIVE_PANEL = "Run a test"
 live_app = typer.Typer()
 
+WebOption = Annotated[
+    bool, typer.Option("--web", help="Serve a page for browsers and print its address.")
+]
+WebListenOption = Annotated[
+    str,
+    typer.Option(
+        "--web-listen",
+        metavar="HOST:PORT",
+        help="Address of the page, implies --web; beyond this computer with the rig's --keys.",
+    ),
+]
+
 
 class RunCommand(enum.StrEnum):
     """Command to a running test."""
@@ -45,11 +57,18 @@ def monitor_command(
         ),
     ] = None,
     keys: KeysOption = None,
+    web: WebOption = False,
+    web_listen: WebListenOption = "",
 ) -> None:
-    """Monitor a running test, or a published replay, on this terminal.
+    """Monitor a running test, or a published replay, on this terminal or in a browser.
 
     Keys: q quits; h, r, s, a hold, resume, stop, abort the test, each once confirmed with y.
     """
+    if web or web_listen:
+        from twin.monitor.web import serve_monitor_page
+
+        serve_monitor_page(web_listen, connect, rig, read_keys_option(keys))
+        return
     from twin.monitor.app import run_monitor as command
 
     command(connect, rig, wait, once, picture, read_keys_option(keys))
@@ -92,6 +111,7 @@ def control_command(
     keys: KeysOption = None,
 ) -> None:
     """Hold, resume, stop or abort a running test; the table always comes to rest smoothly."""
-    from twin.live.control import send_command as command
+    from twin.live.control import send_command
+    from twin.run.terminal import print_line
 
-    command(order.value, why, connect, rig, read_keys_option(keys))
+    print_line(send_command(order.value, why, connect, rig, read_keys_option(keys)))

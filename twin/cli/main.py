@@ -13,7 +13,7 @@ from twin.cli.credential_commands import KeysOption, keys_app, read_keys_option
 from twin.cli.file_commands import StepsOption, files_app, require_view_extra
 from twin.cli.hardware_commands import hardware_app
 from twin.cli.identification_commands import LogPaths, identification_app
-from twin.cli.live_commands import live_app
+from twin.cli.live_commands import WebListenOption, WebOption, live_app
 from twin.cli.run_path import LOG_HELP, parse_run_path
 from twin.run.diagnostics import configure_logging
 
@@ -95,13 +95,16 @@ def run_command(
             "--remote-twin", help="Start no twin here; another machine runs it: `join twin`."
         ),
     ] = False,
+    web: WebOption = False,
+    web_listen: WebListenOption = "",
 ) -> None:
     """Run a test: drive the table, acquire, run the twin, publish, record, report."""
     from twin.cli.run import run_test as command
 
     unpaced, credentials = speed is Speed.max, read_keys_option(keys, rig=True)
+    page = web_listen if web or web_listen else None
     code = command(
-        profile, out, unpaced, model, table, view, listen, credentials, router, remote_twin
+        profile, out, unpaced, model, table, view, listen, credentials, router, remote_twin, page
     )
     raise typer.Exit(code)
 

@@ -1,10 +1,12 @@
 """`check` and `run`: check a test before the table moves, and run it."""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from table_io.clock import RealClock, local_datetime
 from table_io.config.calibration_due import find_overdue_calibrations
+from table_io.errors import InputError
 from table_io.safety.preflight import list_drive_warnings, list_setup_warnings
 from twin.reports.finalize import EXIT_ABORTED, EXIT_INTERRUPTED, finalize_run
 from twin.run.disk import require_disk_space
@@ -41,11 +43,21 @@ def run_test(
     keys: Credentials | None = None,
     router: str = "",
     remote_twin: bool = False,
+    web: str | None = None,
 ) -> int:
-    """Run a test on the table, in real time or at full speed; return the exit code."""
+    """Run a test on the table, in real time or at full speed; return the exit code.
+
+    `web` is the address of its page, "" for the default and None for no page.
+    """
     config = read_run_config(profile, table, model)
     if unpaced:
         check_full_speed(config.rig)
+        if web is not None:
+            raise InputError(
+                "a test at full speed has no page",
+                key="--web",
+                remedy="run it in real time, or look at the recording: `shaketwin view --web LOG`",
+            )
     else:
         check_endpoint(config.rig.name, listen, has_keys=keys is not None)
         check_realtime(config, profile)
@@ -63,16 +75,25 @@ def run_test(
         f"{config.expected_s:.0f} s on {config.rig.title} "
         f"-> {folder}"
     )
-    with catch_interrupts() as poll_interrupt:
-        if unpaced:
-            _run_unpaced(config, run_id, folder, poll_interrupt)
-        else:
-            connection = (listen, keys, router, remote_twin)
-            began = _run_live(config, run_id, folder, poll_interrupt, view, *connection)
-            if not began:
-                return EXIT_INTERRUPTED
-    code = finalize_run(folder, config, view)
+    with nullcontext() if web is None else _start_page(web, listen, config.rig.name, keys):
+        with catch_interrupts() as poll_interrupt:
+            if unpaced:
+                _run_unpaced(config, run_id, folder, poll_interrupt)
+            else:
+                connection = (listen, keys, router, remote_twin)
+                began = _run_live(config, run_id, folder, poll_interrupt, view, *connection)
+                if not began:
+                    return EXIT_INTERRUPTED
+        code = finalize_run(folder, config, view)
     return EXIT_INTERRUPTED if poll_interrupt() and code == EXIT_ABORTED else code
+
+
+def _start_page(
+    web: str, listen: str, rig: str, keys: Credentials | None
+) -> AbstractContextManager[None]:
+    from twin.monitor.web import start_page_process
+
+    return start_page_process(web, listen, rig, keys)
 
 
 def _run_unpaced(

@@ -3,7 +3,6 @@
 import re
 
 from table_io.errors import InputError
-from twin.run.terminal import print_line
 from twin.security.credentials import Credentials, user_name
 from twin.transport.endpoint import list_runs, make_endpoint_error
 from twin.transport.zenoh_link import BusLink, open_spoke
@@ -28,22 +27,39 @@ def find_run(link: BusLink, connect: str, rig: str) -> str:
     return runs[0]
 
 
-def send_command(
-    command: str, reason: str, connect: str, rig: str, keys: Credentials | None = None
-) -> None:
-    """Send a command to the rig that runs at the endpoint; InputError if it is not accepted."""
+def request_command(
+    command: str,
+    reason: str,
+    connect: str,
+    rig: str,
+    keys: Credentials | None = None,
+    *,
+    run: str = "",
+    sender: str = "",
+) -> tuple[str, str]:
+    """Send a command to the rig that runs at the endpoint; return (run id, answer or "").
+
+    The answer is "yes" if the rig accepts it. Default: the run that is there, in the user's own
+    name; only a router or the rig may send in the name of another `sender`.
+    """
     link = open_spoke(rig, connect, CONNECT_TIMEOUT_S, keys)
     try:
-        run = find_run(link, connect, rig)
-        answer = link.send_command(
-            f"{command}/{user_name(keys)}", f"{run}\n{reason}", ANSWER_TIMEOUT_S
-        )
+        run = run or find_run(link, connect, rig)
+        key = f"{command}/{sender or user_name(keys)}"
+        return run, link.send_command(key, f"{run}\n{reason}", ANSWER_TIMEOUT_S) or ""
     finally:
         link.close()
+
+
+def send_command(
+    command: str, reason: str, connect: str, rig: str, keys: Credentials | None = None
+) -> str:
+    """Send a command as the user; return a confirmation, InputError if it is not accepted."""
+    run, answer = request_command(command, reason, connect, rig, keys)
     if answer != "yes":
         raise InputError(
             answer or f"the rig did not respond within {ANSWER_TIMEOUT_S:g} s",
             where=command,
             remedy="in an emergency use the machine's own emergency stop",
         )
-    print_line(f"{run}: {command} accepted")
+    return f"{run}: {command} accepted"

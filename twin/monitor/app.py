@@ -1,6 +1,5 @@
 """Monitor application: event loop with bus link, terminal and keyboard."""
 
-import contextlib
 import io
 import os
 import select
@@ -85,15 +84,17 @@ class TerminalDisplay:
 class MonitorClient:
     """Bus client that receives a run and updates its run state."""
 
-    def __init__(self, link: BusLink, user: str) -> None:
+    def __init__(
+        self, link: BusLink, user: str, live_topics: tuple[str, ...] = LIVE_TOPICS
+    ) -> None:
         self.run_state = LiveRunState()
         self.ignored = 0
+        self.role = ""  # of the user, as the gateway has it
         self._link = link
         self._user = user
-        self._role = ""
         self._components = link.watch_components()
         self._records = link.subscribe(HISTORY_TOPICS, history=True, capacity=QUEUE_CAPACITY)
-        self._blocks = link.subscribe(LIVE_TOPICS, history=False, capacity=QUEUE_CAPACITY)
+        self._blocks = link.subscribe(live_topics, history=False, capacity=QUEUE_CAPACITY)
         self._clock = RealClock()
         self._last_arrival_s = self._clock.now()
 
@@ -118,7 +119,7 @@ class MonitorClient:
                 continue
             previous, self.run_state = self.run_state, update_run_state(self.run_state, run, item)
             if previous.run != self.run_state.run:
-                self._role = (self._link.query(f"state/role/{self._user}") or b"").decode()
+                self.role = (self._link.query(f"state/role/{self._user}") or b"").decode()
             items.append(item)
         return items
 
@@ -126,7 +127,7 @@ class MonitorClient:
         """Return the session status shown on the screen in addition to the run state."""
         silent_s = self._clock.now() - self._last_arrival_s
         return SessionStatus(
-            frozenset(self._components), silent_s, self._role == "command", pending_command
+            frozenset(self._components), silent_s, self.role == "command", pending_command
         )
 
     def wait_for_run(self, wait: bool) -> None:
@@ -156,7 +157,9 @@ def run_monitor(
 ) -> None:
     """Run the monitor: interactive in a terminal, otherwise line output; or one snapshot."""
     user = user_name(credentials)
-    link = _connect(connect, rig, wait, credentials)
+    link = connect_observer(connect, rig, wait, credentials)
+    if link is None:
+        return
     link.declare_alive(f"observer.{user}.monitor-{os.getpid()}")
     try:
         client = MonitorClient(link, user)
@@ -179,11 +182,20 @@ def run_monitor(
         link.close()
 
 
-def _connect(connect: str, rig: str, wait: bool, credentials: Credentials | None) -> BusLink:
-    """Connect to the endpoint; with `wait`, retry until it answers and print the reason once."""
+def connect_observer(
+    connect: str,
+    rig: str,
+    wait: bool,
+    credentials: Credentials | None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> BusLink | None:
+    """Connect to the endpoint; with `wait`, retry until it answers and print the reason once.
+
+    None only if `should_stop()` before that.
+    """
     check_endpoint(rig, connect, credentials is not None)
     is_reported = False
-    while True:
+    while not should_stop():
         try:
             return open_spoke(rig, connect, ANSWER_TIMEOUT_S, credentials)
         except InputError as error:
@@ -192,6 +204,7 @@ def _connect(connect: str, rig: str, wait: bool, credentials: Credentials | None
             if not is_reported:
                 print_line(f"waiting: {error}")
             is_reported = True
+    return None
 
 
 def run_event_loop(client: MonitorClient, display: TerminalDisplay, send: CommandSender) -> None:
@@ -214,13 +227,10 @@ def run_event_loop(client: MonitorClient, display: TerminalDisplay, send: Comman
 
 def submit_command(command: str, connect: str, rig: str, credentials: Credentials | None) -> str:
     """Send a command as `shaketwin control` does; return its result in one sentence."""
-    output = io.StringIO()
     try:
-        with contextlib.redirect_stdout(output):
-            send_command(command, "requested from the monitor", connect, rig, credentials)
+        return send_command(command, "requested from the monitor", connect, rig, credentials)
     except InputError as error:
         return f"refused: {error}"
-    return " ".join(output.getvalue().split())
 
 
 def print_progress(client: MonitorClient) -> None:

@@ -76,7 +76,7 @@ def draw_prc(
     curves, max_value = [], 0.0
     for source in ("twin", "measured"):
         for direction, style in (("forward", FORWARD_COLOUR), ("backward", BACKWARD_COLOUR)):
-            samples = _select_values(points, source, direction, value)
+            samples = select_prc_values(points, source, direction, value)
             max_value = max([max_value, *(y for _, y in samples if math.isfinite(y))])
             twin_style = TWIN_COLOUR if direction == "forward" else DIM_STYLE
             curves.append(
@@ -111,7 +111,7 @@ def draw_orbit_curves(
     return plot_curves(curves, x_range, nice_ceil(max(amplitudes)), width, height, "Hz")
 
 
-def _select_values(
+def select_prc_values(
     points: list[PrcPoint], source: str, direction: str, value: ResponseQuantity
 ) -> list[tuple[float, float]]:
     """Return (frequency in Hz, value) of measured or twin points of a direction, by frequency."""

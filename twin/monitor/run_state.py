@@ -37,6 +37,7 @@ from table_io.records import (
     Timing,
 )
 from twin.monitor.recent import WINDOW_S, RecentSamples
+from twin.monitor.traces import TraceBuffer
 from twin.recording.validation import (
     has_invalid_labels,
     validate_block,
@@ -86,6 +87,7 @@ class LiveRunState:
     events: dict[Hashable, EventLine] = field(default_factory=dict)
     stop: RunStop | None = None
     recent: RecentSamples = field(default_factory=RecentSamples)
+    traces: TraceBuffer = field(default_factory=TraceBuffer)
     pending: deque[tuple[str, Record]] = field(default_factory=lambda: deque(maxlen=MAX_POINTS))
 
     @property
@@ -107,6 +109,18 @@ class LiveRunState:
     def step_count(self) -> int:
         """Number of steps of the test known so far."""
         return max([len(self.start.steps) if self.start else 0, *(k + 1 for k in self.added_steps)])
+
+    @property
+    def progress(self) -> float | None:
+        """Share of the planned samples that are acquired, at most 1; None without a plan."""
+        planned = self.start.planned_samples if self.start else 0
+        return min(self.index / planned, 1.0) if planned > 0 else None
+
+    @property
+    def remaining_s(self) -> float:
+        """Planned time left in s; negative if the test takes longer than planned."""
+        planned = self.start.planned_samples if self.start else 0
+        return (planned - self.index) / self.rate_hz
 
     def add_message(self, text: str) -> None:
         """Add a message of the monitor itself to the events."""
@@ -157,7 +171,10 @@ def _start_run(previous: LiveRunState, start: RunStart) -> LiveRunState:
 
 def _add_block(run_state: LiveRunState, block: Block, start: RunStart) -> LiveRunState:
     """Add a block; a block near sample 0 after later ones is a replay that starts again."""
-    if block.stream != "meas" or validate_block(block, None, start) or has_invalid_labels([block]):
+    if validate_block(block, None, start) or has_invalid_labels([block]):
+        return run_state
+    if block.stream != "meas":
+        run_state.traces.add(block)
         return run_state
     window_samples = round(WINDOW_S * block.rate_hz)
     if block.index < window_samples and run_state.block_end > block.end + window_samples:
@@ -167,6 +184,7 @@ def _add_block(run_state: LiveRunState, block: Block, start: RunStart) -> LiveRu
     run_state.index, run_state.block_end = max(run_state.index, block.end), block.end
     run_state.position = int(block.step[-1]), int(block.label[-1]), int(block.cycle[-1])
     run_state.recent.add(block, 1.0 / run_state.step.frequency_hz if run_state.step else 0.0)
+    run_state.traces.add(block)
     return run_state
 
 

@@ -203,19 +203,31 @@ def _draw_title(run_state: LiveRunState, status: SessionStatus, width: int) -> T
     return _justify(left, right, width)
 
 
-def _draw_state(run_state: LiveRunState, status: SessionStatus) -> Text:
+def describe_state(run_state: LiveRunState, status: SessionStatus) -> tuple[str, str]:
+    """Return the state of the run in words, and its style."""
     if run_state.stop is not None:
         style = GOOD_STYLE if run_state.stop.verdict == "complete" else BAD_STYLE
-        return Text(f"ended: {run_state.stop.verdict}", style)
+        return f"ended: {run_state.stop.verdict}", style
     if status.silent_s >= SILENT_S:
-        return Text(f"no data for {format_duration(status.silent_s)}", BAD_STYLE)
+        return f"no data for {format_duration(status.silent_s)}", BAD_STYLE
     if not run_state.run:
-        return Text("waiting for a run", DIM_STYLE)
-    activity = LABEL_TEXTS.get(Label(run_state.position[1]), "") if run_state.recent.blocks else ""
-    style = STATE_STYLES.get(run_state.rig_state, "")
+        return "waiting for a run", DIM_STYLE
     state = STATE_TEXTS.get(run_state.rig_state, run_state.rig_state)
-    right = Text(f"● {state or 'joined'}", style)
-    if activity and activity != run_state.rig_state:
+    return state or "joined", STATE_STYLES.get(run_state.rig_state, "")
+
+
+def describe_activity(run_state: LiveRunState) -> str:
+    """Return what the table is doing within the state, or "" if the state says it already."""
+    activity = LABEL_TEXTS.get(Label(run_state.position[1]), "") if run_state.recent.blocks else ""
+    return "" if activity == run_state.rig_state else activity
+
+
+def _draw_state(run_state: LiveRunState, status: SessionStatus) -> Text:
+    state, style = describe_state(run_state, status)
+    if run_state.stop is not None or status.silent_s >= SILENT_S or not run_state.run:
+        return Text(state, style)
+    right = Text(f"● {state}", style)
+    if activity := describe_activity(run_state):
         right.append(f", {activity}", "")
     return right.append(f"  {format_duration(run_state.index / run_state.rate_hz)}", DIM_STYLE)
 
@@ -223,15 +235,14 @@ def _draw_state(run_state: LiveRunState, status: SessionStatus) -> Text:
 def _draw_progress(run_state: LiveRunState, width: int) -> Text:
     """Draw step, progress of the test and planned remaining time."""
     left = Text(_format_step(run_state, width >= 100))
-    planned = run_state.start.planned_samples if run_state.start else 0
-    if planned <= 0:
+    share = run_state.progress
+    if share is None:
         return left
-    share = min(run_state.index / planned, 1.0)
     text = f" {100 * share:3.0f} %"
     if run_state.rig_state == "holding":
         text += "  until resumed"
     elif run_state.stop is None:
-        remaining_s = (planned - run_state.index) / run_state.rate_hz
+        remaining_s = run_state.remaining_s
         text += f"  {format_duration(abs(remaining_s))} {'left' if remaining_s >= 0 else 'over'}"
     bar_width = width - left.cell_len - len(text)
     if bar_width >= 4:

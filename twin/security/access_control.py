@@ -15,7 +15,8 @@ a denying rule could be evaded with a wider key such as `put("**")`.
 Every listed person may query cmd/<order>/<own name>, so that the gateway can refuse with a reason;
 it checks the role itself before it executes. The last part of a command's key is therefore the
 authenticated sender. A valid certificate that is not on the list may query state/role/none and
-nothing else, which shows that the rig exists and refuses.
+nothing else, which shows that the rig exists and refuses. The web page on the rig's computer
+connects with the rig's certificate and, like a router, forwards commands of those who log in there.
 """
 
 from collections.abc import Iterable, Mapping
@@ -69,8 +70,8 @@ def build_people_access(rig: str, people: Mapping[str, str]) -> dict[str, Any]:
     return _to_zenoh_settings(
         rig,
         [
-            *_people_grants(people),
-            ("routers", _names_with_role(ROUTER_ROLE, people), ANY_PERSON_RULES),
+            *_people_grants(people, [*people, RIG_NAME]),
+            ("routers", [*_names_with_role(ROUTER_ROLE, people), RIG_NAME], ANY_PERSON_RULES),
         ],
     )
 
@@ -83,7 +84,7 @@ def build_router_access(rig: str, people: Mapping[str, str]) -> dict[str, Any]:
     """
     people_behind = {name: role for name, role in people.items() if role != ROUTER_ROLE}
     return _to_zenoh_settings(
-        rig, [*_people_grants(people_behind), ("the rig", [RIG_NAME], RIG_RULES)]
+        rig, [*_people_grants(people_behind, people_behind), ("the rig", [RIG_NAME], RIG_RULES)]
     )
 
 
@@ -96,10 +97,10 @@ def build_open_access(rig: str, *, remote_twin: bool = False) -> dict[str, Any]:
     return _to_zenoh_settings(rig, [("anybody", None, rules)])
 
 
-def _people_grants(people: Mapping[str, str]) -> list[Grant]:
+def _people_grants(people: Mapping[str, str], known: Iterable[str]) -> list[Grant]:
     return [
         ("anybody", None, STRANGER_RULES),
-        ("known", list(people), KNOWN_PERSON_RULES),
+        ("known", list(known), KNOWN_PERSON_RULES),
         ("twins", _names_with_role("twin", people), TWIN_RULES),
         *((f"person {name}", [name], _own_rules(name)) for name in people),
     ]

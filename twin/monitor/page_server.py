@@ -1,0 +1,298 @@
+"""HTTP server of the web page: three static files, one stream of events, commands.
+
+A thread per client, as the standard library has it. They share `PageFeed`, which holds the newest
+sections only: a slow client skips to the newest, and is dropped once it takes nothing for
+`CLIENT_TIMEOUT_S`. Nothing is queued, and nothing of a client reaches the rig but a command.
+"""
+
+import json
+import logging
+import re
+import socket
+import ssl
+import threading
+from collections.abc import Callable, Mapping
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from table_io.acquisition.session import COMMAND_NAMES
+from table_io.clock import RealClock
+from table_io.errors import InputError
+from twin.security.page_access import PageAccess
+
+log = logging.getLogger(__name__)
+PAGE_FOLDER = Path(__file__).parent / "page"
+PAGE_FILES = {
+    "/": ("index.html", "text/html; charset=utf-8"),
+    "/page.js": ("page.js", "text/javascript; charset=utf-8"),
+    "/page.css": ("page.css", "text/css; charset=utf-8"),
+}
+MAX_CONNECTIONS, MAX_STREAMS = 64, 32
+CLIENT_TIMEOUT_S = 5.0  # for a request, and for taking what is sent
+SEND_BUFFER_BYTES = 2**16  # in the kernel, of one client
+MAX_BODY_BYTES = 1024
+POLL_S = 0.1  # within which the server ends
+HEARTBEAT_S = 2.0  # between messages to a client when nothing changes
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "connect-src 'self'; img-src 'self' data:; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+}
+
+
+class PageCommand(NamedTuple):
+    """Command of a person to the run that the page shows."""
+
+    name: str
+    run: str
+    user: str
+
+
+class CommandAnswer(NamedTuple):
+    """Answer to a command: HTTP status, and a message for the user."""
+
+    status: int
+    message: str
+
+
+CommandHandler = Callable[[PageCommand], CommandAnswer]
+
+
+class PageFeed:
+    """Newest sections of the page, and the role that the gateway gives to its user."""
+
+    def __init__(self) -> None:
+        self.role = ""
+        self._changed = threading.Condition()
+        self._sections: Mapping[str, str] = {}
+        self._version = 0
+        self._is_closed = False
+
+    def publish(self, sections: Mapping[str, str]) -> None:
+        """Replace the sections and wake the clients."""
+        with self._changed:
+            self._sections, self._version = sections, self._version + 1
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """End all streams."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify_all()
+
+    def wait_for_change(
+        self, version: int, timeout_s: float
+    ) -> tuple[int, Mapping[str, str]] | None:
+        """Return (version, sections) once newer than `version`, or after the time; None: closed."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._version != version or self._is_closed, timeout_s)
+            if self._is_closed and self._version == version:
+                return None
+            return self._version, self._sections
+
+
+class PageServer(ThreadingHTTPServer):
+    """Server of one page at (host, port) for a limited number of clients."""
+
+    daemon_threads = True
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        access: PageAccess,
+        feed: PageFeed,
+        handle_command: CommandHandler,
+    ) -> None:
+        self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        self.access, self.feed = access, feed
+        self.handle_command = handle_command
+        self.command_lock = threading.Lock()  # one command at a time
+        self.streams = threading.BoundedSemaphore(MAX_STREAMS)
+        self._connections = threading.BoundedSemaphore(MAX_CONNECTIONS)
+        super().__init__((host.strip("[]"), port), PageRequest)
+
+    def server_bind(self) -> None:
+        """Bind without the look-up of a host name, which may take seconds."""
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self.socket.bind(self.server_address)
+        self.server_address = self.socket.getsockname()
+        self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Serve a connection in a thread, or close it at once if there are too many."""
+        if not self._connections.acquire(blocking=False):
+            log.info("connection refused: %d are open", MAX_CONNECTIONS)
+            self.shutdown_request(request)
+            return
+        super().process_request(request, client_address)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Serve a connection and release its place."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._connections.release()
+
+    def finish_request(self, request: Any, client_address: Any) -> None:
+        """Serve one request, by TLS where the page has a certificate."""
+        request.settimeout(CLIENT_TIMEOUT_S)
+        request.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+        if self.access.tls is None:
+            PageRequest(request, client_address, self)
+            return
+        with self.access.tls.wrap_socket(request, server_side=True) as tls_request:
+            PageRequest(tls_request, client_address, self)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Log the error of a connection; the others go on."""
+        log.info("connection from %s ended", client_address, exc_info=True)
+
+
+class PageRequest(BaseHTTPRequestHandler):
+    """One request; the connection is closed after it."""
+
+    server: PageServer
+    server_version, sys_version = "shaketwin", ""
+
+    def do_GET(self) -> None:
+        """Send a file of the page, or the stream of events."""
+        if not self._check_host():
+            return
+        if self.path == "/events":
+            if user := self._identify():
+                self._send_events(user)
+        elif self.path in PAGE_FILES:
+            name, content_type = PAGE_FILES[self.path]
+            self._reply(200, (PAGE_FOLDER / name).read_bytes(), content_type)
+        else:
+            self._reply_message(404, "no such page")
+
+    def do_POST(self) -> None:
+        """Send a command of a person who may, asked by this page and no other."""
+        if not self._check_host():
+            return
+        origin = f"{self.server.access.scheme}://{self.headers.get('Host')}"
+        if self.path != "/command":
+            self._reply_message(404, "no such page")
+        elif self.headers.get("Origin") != origin:
+            self._reply_message(403, "refused: sent by another page")
+        elif self.headers.get_content_type() != "application/json":
+            self._reply_message(415, "refused: not JSON")
+        elif user := self._identify():
+            command = self._read_command(user)
+            if command is None:
+                self._reply_message(400, f"not a command; allowed: {', '.join(COMMAND_NAMES)}")
+                return
+            with self.server.command_lock:
+                answer = self.server.handle_command(command)
+            log.info("%s by %s: %d %s", command.name, user, *answer)
+            self._reply_message(*answer)
+
+    def _check_host(self) -> bool:
+        """Return whether the page is addressed by its own name: other names are rebound."""
+        if self.headers.get("Host", "").lower() in self.server.access.hosts:
+            return True
+        self._reply_message(421, "this page does not have that name")
+        return False
+
+    def _identify(self) -> str:
+        """Return the name of the user, or "" after a refusal."""
+        user = self.server.access.identify(self._code)
+        if not user:
+            self._reply_message(401, "log in with your access code")
+        return user
+
+    @property
+    def _code(self) -> str:
+        return self.headers.get("Authorization", "").removeprefix("Bearer ")
+
+    def _read_command(self, user: str) -> PageCommand | None:
+        """Return the command in the body, None if it is none."""
+        length = self.headers.get("Content-Length", "")
+        if not length.isascii() or not length.isdigit() or int(length) > MAX_BODY_BYTES:
+            return None
+        try:
+            body = json.loads(self.rfile.read(int(length)))
+        except (ValueError, RecursionError):
+            return None
+        name, run = (
+            (body.get("command"), body.get("run")) if isinstance(body, dict) else (None, None)
+        )
+        if name not in COMMAND_NAMES or not isinstance(run, str):
+            return None
+        return PageCommand(name, run, user) if re.fullmatch(r"\w[\w.-]{0,100}", run) else None
+
+    def _send_events(self, user: str) -> None:
+        """Send sections as they change, until the client leaves, stalls or loses its access."""
+        if not self.server.streams.acquire(blocking=False):
+            self._reply_message(503, f"{MAX_STREAMS} pages are open already")
+            return
+        try:
+            self._send_head(200, "text/event-stream; charset=utf-8")
+            self._stream_sections(user)
+        except (OSError, ssl.SSLError) as error:
+            log.info("page of %s ended: %s", user, error or type(error).__name__)
+        finally:
+            self.server.streams.release()
+
+    def _stream_sections(self, user: str) -> None:
+        access, feed, clock = self.server.access, self.server.feed, RealClock()
+        sent: Mapping[str, str] = {}
+        version, checked_s = -1, clock.now()
+        while (news := feed.wait_for_change(version, HEARTBEAT_S)) is not None:
+            version = news[0]
+            role = access.role_of(user) if access.role_of is not None else feed.role
+            sections = {**news[1], "user": json.dumps({"name": user, "role": role})}
+            changed = [name for name, text in sections.items() if sent.get(name) != text]
+            messages = [f"event: {name}\ndata: {sections[name]}\n\n" for name in changed]
+            self.wfile.write("".join(messages or [":\n\n"]).encode())
+            sent = sections
+            if clock.now() > checked_s + HEARTBEAT_S:
+                checked_s = clock.now()
+                if access.identify(self._code) != user:
+                    return
+
+    def _reply_message(self, status: int, message: str) -> None:
+        body = json.dumps({"message": message}).encode()
+        self._reply(status, body, "application/json; charset=utf-8")
+
+    def _reply(self, status: int, body: bytes, content_type: str) -> None:
+        self._send_head(status, content_type, len(body))
+        self.wfile.write(body)
+
+    def _send_head(self, status: int, content_type: str, length: int | None = None) -> None:
+        self.send_response(status)
+        for name, value in HEADERS.items():
+            self.send_header(name, value)
+        self.send_header("Content-Type", content_type)
+        if length is not None:
+            self.send_header("Content-Length", str(length))
+        self.end_headers()
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Log at the level of details; an address holds no secret, a header is not logged."""
+        log.debug(format, *args)
+
+
+def open_page_server(
+    host: str, port: int, access: PageAccess, feed: PageFeed, handle_command: CommandHandler
+) -> PageServer:
+    """Open the server and serve in a thread; raise InputError if the address is not free."""
+    try:
+        server = PageServer(host, port, access, feed, handle_command)
+    except OSError as error:
+        raise InputError(
+            f"cannot listen there ({error.strerror or error})",
+            key="--web-listen",
+            value=f"{host}:{port}",
+            remedy="give another port",
+        ) from None
+    threading.Thread(target=server.serve_forever, args=(POLL_S,), daemon=True).start()
+    return server
