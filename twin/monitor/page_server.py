@@ -176,6 +176,7 @@ class PageRequest(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         """Send a command of a person who may, asked by this page and no other."""
+        body = self._read_body()  # first: closing a connection with unread data resets it
         if not self._check_host():
             return
         origin = f"{self.server.access.scheme}://{self.headers.get('Host')}"
@@ -186,7 +187,7 @@ class PageRequest(BaseHTTPRequestHandler):
         elif self.headers.get_content_type() != "application/json":
             self._reply_message(415, "refused: not JSON")
         elif user := self._identify():
-            command = self._read_command(user)
+            command = _parse_command(body, user)
             if command is None:
                 self._reply_message(400, f"not a command; allowed: {', '.join(COMMAND_NAMES)}")
                 return
@@ -213,21 +214,13 @@ class PageRequest(BaseHTTPRequestHandler):
     def _code(self) -> str:
         return self.headers.get("Authorization", "").removeprefix("Bearer ")
 
-    def _read_command(self, user: str) -> PageCommand | None:
-        """Return the command in the body, None if it is none."""
-        length = self.headers.get("Content-Length", "")
-        if not length.isascii() or not length.isdigit() or int(length) > MAX_BODY_BYTES:
-            return None
-        try:
-            body = json.loads(self.rfile.read(int(length)))
-        except (ValueError, RecursionError):
-            return None
-        name, run = (
-            (body.get("command"), body.get("run")) if isinstance(body, dict) else (None, None)
-        )
-        if name not in COMMAND_NAMES or not isinstance(run, str):
-            return None
-        return PageCommand(name, run, user) if re.fullmatch(r"\w[\w.-]{0,100}", run) else None
+    def _read_body(self) -> bytes:
+        """Return the body, b"" if its length is not stated or not allowed."""
+        length = self.headers.get("Content-Length", "0")
+        if length.isascii() and length.isdigit() and int(length) <= MAX_BODY_BYTES:
+            return self.rfile.read(int(length))
+        self.rfile.read1(MAX_BODY_BYTES)
+        return b""
 
     def _send_events(self, user: str) -> None:
         """Send sections as they change, until the client leaves, stalls or loses its access."""
@@ -279,6 +272,18 @@ class PageRequest(BaseHTTPRequestHandler):
     def log_message(self, format: str, *args: object) -> None:
         """Log at the level of details; an address holds no secret, a header is not logged."""
         log.debug(format, *args)
+
+
+def _parse_command(body: bytes, user: str) -> PageCommand | None:
+    """Return the command in a JSON body, None if it is none."""
+    try:
+        request = json.loads(body)
+        name, run = request["command"], request["run"]
+    except (ValueError, RecursionError, TypeError, KeyError):
+        return None
+    if name not in COMMAND_NAMES or not isinstance(run, str):
+        return None
+    return PageCommand(name, run, user) if re.fullmatch(r"\w[\w.-]{0,100}", run) else None
 
 
 def open_page_server(
