@@ -1,4 +1,4 @@
-"""How every planted fault is found, and how fast: the table of the README.
+"""How every planted fault is found, and how fast: the table of the guide, The controller.
 
     python tests/studies/planted_faults.py            every fault, several channels, sizes, times
     python tests/studies/planted_faults.py smallest   the smallest gain, drift and spike found
