@@ -170,7 +170,7 @@ def test_time_that_runs_backwards_is_no_model_and_no_crash(plain: Made, tmp_path
     verdict, discovery = discover_from([log], tmp_path / "out")
     sheet, steps = discovery.prepared.problem.log_residuals[0], load_logs([log])[0][0].steps
     assert steps
-    assert run_log_free(sheet, steps, discovery.selection.null) == []  # no resonance to scale by
+    assert run_log_free(sheet, steps, discovery.selection.null) is None  # no resonance to scale by
     assert verdict["verdict"] == "unexplained"
     assert any("damping = 0 " in text and "bound" in text for text in verdict["notes"])
 

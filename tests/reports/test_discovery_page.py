@@ -13,6 +13,7 @@ from matplotlib.image import imread
 from table_io.config.base import PROFILES_DIR, parse_toml
 from tests.reports.folders import COARSE
 from twin.cli.discover import write_results
+from twin.cli.run import list_model_warnings
 from twin.identification.discover import Discovery, PreparedLog, discover_effects
 from twin.identification.parameters import GapKey
 from twin.model.config import ModelConfig
@@ -24,9 +25,11 @@ from twin.reports.discovery.figure_data import (
     measured_forces,
 )
 from twin.reports.discovery.free_running import compute_misfits, run_log_free, run_logs_free
+from twin.reports.discovery.headline import format_verdict, typeset_law
 from twin.reports.discovery.loading import load_logs, name_logs
-from twin.reports.discovery.page import count_digits, format_rounded, format_verdict
+from twin.reports.discovery.page import count_digits, format_rounded
 from twin.reports.discovery.serialize import Json, verdict_to_json
+from twin.reports.page import format_significant
 from twin.reports.plot_style import RC_PARAMS
 from twin.run.run_config import read_model_template, read_run_config
 from twin.run.unpaced import play_unpaced
@@ -58,7 +61,8 @@ AWAY = (
 WITHOUT = (*AWAY, "bumper_hardening")
 VERDICTS = ("none", "named", "ambiguous", "unexplained")
 FIGURES = {
-    "map_0", "candidates", "damper_force", "bumper_force", "histories", "prc", "impacts", "time_0",
+    "staircase", "map_0", "candidates", "damper_force", "bumper_force", "histories", "prc",
+    "impacts", "motion", "time_0",
 }  # fmt: skip
 
 
@@ -170,18 +174,21 @@ def test_the_page_says_the_verdict_the_gap_and_what_to_do(output: DiscoveryOutpu
 def test_the_first_sentence(every: dict[str, DiscoveryOutput]) -> None:
     heads = {word: re.search("<h1>(.*)</h1>", left.page)[1] for word, left in every.items()}  # type: ignore[index]
     assert "agree to within the noise" in heads["none"]
-    assert heads["named"] == "The model lacks bumper_hardening."
+    assert heads["named"] == "The model lacks bumper hardening."
     assert "do not determine which" in heads["ambiguous"]
     for names in every["ambiguous"].verdict_json["ambiguous"]:
         assert " with ".join(names) in heads["ambiguous"]
-    assert "no effect of the library explains" in heads["unexplained"]
+    evidence = every["unexplained"].verdict_json["remainder"]["evidence"]
+    assert f"A general law would fit: {evidence['term']}." in heads["unexplained"].replace(
+        "&#39;", "'"
+    )
 
 
 def test_a_sensor_that_errs_is_not_laid_to_the_model() -> None:
     effect = {"id": "sensor_gain", "channel": "mass_acc_m_s2"}
     verdict = {"verdict": "named", "effects": [effect], "ambiguous": []}
     sentence = format_verdict(verdict)
-    assert "sensor_gain of mass_acc_m_s2" in sentence
+    assert "sensor gain error of mass_acc_m_s2" in sentence
     assert "model lacks" not in sentence
 
 
@@ -195,7 +202,9 @@ def test_every_figure_is_there_and_not_empty(output: DiscoveryOutput) -> None:
     files = {path.stem: path for path in (output.folder / "figures").glob("*.png")}
     stepped = any(log.steps for log in output.logs)
     laws = {"laws"} if output.discovery.verdict.outcome != "none" else set()
-    assert files.keys() == laws | (FIGURES if stepped else FIGURES - {"map_0", "prc", "impacts"})
+    assert files.keys() == laws | (
+        FIGURES if stepped else FIGURES - {"map_0", "prc", "impacts", "motion"}
+    )
     assert ("No map over frequency" in output.page) != stepped
     for name, path in files.items():
         pixels = imread(path)[..., :3]
@@ -276,7 +285,9 @@ def test_the_twin_comes_nearer_when_it_runs_free(every: dict[str, DiscoveryOutpu
     shown = DiscoveryView(output.discovery, output.logs)
     errors = []
     for explained in shown.before_after:
-        points = run_log_free(shown.log_residuals[0], shown.sweep_steps(0), explained)
+        run = run_log_free(shown.log_residuals[0], shown.sweep_steps(0), explained)
+        assert run is not None
+        points = run.points
         assert len(points) == len(output.logs[0].steps)
         forward = [
             (p.measured, p.twin)
@@ -293,10 +304,14 @@ def test_the_table_of_the_curves_says_how_much_nearer(every: dict[str, Discovery
     shown = DiscoveryView(output.discovery, output.logs)
     runs = run_logs_free(shown)
     (row,) = compute_misfits(shown, runs)
-    measured = max(p.measured.eta_d for p in runs[0][0] if p.measured is not None)
+    measured = max(p.measured.eta_d for p in runs[0][0].points if p.measured is not None)
     assert row["measured"]["eta_d"] == measured
-    assert row["after"]["error"] < 0.25 * row["before"]["error"]
-    assert f"<b>{100 * row['after']['error']:.2f} %</b>" in output.page
+    given, refitted, final = row["models"]
+    assert final["error"] < 0.25 * refitted["error"]
+    for model in row["models"]:
+        assert f"<b>{format_significant(100 * model['error'])} %</b>" in output.page
+    assert given["error"] > final["error"]
+    assert final["jumps"] == row["measured"]["jumps"]
     same = replace(
         output.discovery.selection, null=output.discovery.verdict.best
     )  # nothing before but what is after
@@ -304,7 +319,55 @@ def test_the_table_of_the_curves_says_how_much_nearer(every: dict[str, Discovery
         again := DiscoveryView(replace(output.discovery, selection=same), output.logs),
         run_logs_free(again),
     )
-    assert row["before"] == row["after"]
+    _, refitted, final = row["models"]
+    assert refitted == final | {"label": refitted["label"]}
+
+
+def test_the_staircase_falls_from_the_model_as_given_to_the_noise(
+    every: dict[str, DiscoveryOutput],
+) -> None:
+    output = every["named"]
+    stairs, gap = output.verdict_json["staircase"], output.verdict_json["gap"]
+    sizes = [step["misfit"] for step in stairs]
+    assert len(sizes) == 4
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes == [
+        gap[key] for key in ("given", "held_out_before", "held_out_after", "noise_floor")
+    ]
+    assert "bumper_hardening" in stairs[2]["label"]
+    general = every["unexplained"].verdict_json["staircase"][-2]
+    assert "general law" in general["label"]
+    assert general["misfit"] < sizes[1]
+
+
+def test_rivals_are_excluded_by_their_standard_errors(every: dict[str, DiscoveryOutput]) -> None:
+    rivals = every["named"].verdict_json["excluded"]
+    assert rivals
+    assert all(rival["sigma"] > 3 for rival in rivals)
+    assert "bumper_hardening" not in {rival["id"] for rival in rivals}
+    assert every["none"].verdict_json["excluded"] == []
+
+
+def test_only_a_model_that_is_not_sure_is_provisional(every: dict[str, DiscoveryOutput]) -> None:
+    for word, output in every.items():
+        text = (output.folder / "model.toml").read_text()
+        model = parse_toml(text, ModelConfig, "model.toml")
+        assert bool(model.provisional) == (word in ("ambiguous", "unexplained"))
+        assert len(list_model_warnings(text)) == bool(model.provisional)
+
+
+@pytest.mark.parametrize(
+    ("term", "typeset"),
+    [
+        ("Fc sign(u')", "F<sub>c</sub> sign(u′)"),
+        ("k3 u^3 in the damper", "k<sub>3</sub> u<sup>3</sup> in the damper"),
+        ("ch |u_j| u_j'", "c<sub>h</sub> |u<sub>j</sub>| u<sub>j</sub>′"),
+        ("-M g tilt x", "−M g tilt x"),
+        ("a < b by rate", "a &lt; b by rate"),
+    ],
+)
+def test_laws_are_typeset(term: str, typeset: str) -> None:
+    assert typeset_law(term) == typeset
 
 
 @pytest.mark.parametrize(

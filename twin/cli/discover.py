@@ -22,8 +22,9 @@ from twin.identification.selection import Cancelled, ProgressCallback, Selection
 from twin.model.config import ModelConfig
 from twin.model.effects import find_effect
 from twin.reports.contracts import Verdict
+from twin.reports.discovery.headline import describe_excluded, format_verdict
 from twin.reports.discovery.loading import load_logs
-from twin.reports.discovery.page import write_discovery_page
+from twin.reports.discovery.page import format_interval, write_discovery_page
 from twin.reports.discovery.sensor_section import describe_sensors
 from twin.reports.discovery.serialize import Json, model_to_toml, verdict_to_json
 from twin.reports.finalize import EXIT_INTERRUPTED
@@ -145,7 +146,10 @@ def write_results(
     names = ", ".join(log.signals.name for log in logs)
     added = " + ".join(discovery.verdict.best.names) or "nothing added"
     title = f"{config.title}; {added}"
-    text, omitted = model_to_toml(discovery.verdict.best.fit, title, config.citation, names)
+    provisional = verdict["why"] if verdict["verdict"] in ("ambiguous", "unexplained") else ""
+    text, omitted = model_to_toml(
+        discovery.verdict.best.fit, title, config.citation, names, provisional
+    )
     verdict["notes"] += omitted
     (folder / "model.toml").write_text(text, encoding="utf-8")
     (folder / "verdict.json").write_text(dump_contract(Verdict, verdict), encoding="utf-8")
@@ -153,25 +157,25 @@ def write_results(
 
 
 def print_verdict(verdict: Json) -> None:
-    """Print the verdict, the gap, the fitted parameters and the notes."""
-    names = " + ".join(
-        ".".join(filter(None, (effect["id"], effect.get("channel"))))
-        for effect in verdict["effects"]
-    )
-    gap = verdict["gap"]
-    print_line(f"{verdict['verdict']}: {names}" if names else verdict["verdict"])
+    """Print the verdict, the misfit, the fitted parameters and the notes."""
+    print_line(f"{verdict['verdict']}: {format_verdict(verdict)}")
     print_line(f"  {verdict['why']}")
-    closed = f": {100 * gap['closed_fraction']:.0f} % closed" if verdict["effects"] else ""
-    print_line(
-        f"  gap {gap['held_out_before']:.3g} -> {gap['held_out_after']:.3g}, noise "
-        f"{gap['noise_floor']:.3g}{closed} (held out)"
+    misfit = verdict["gap"]
+    columns = " | ".join(
+        f"{label} {value:.3g}"
+        for label, value in (
+            ("as given", misfit["given"]),
+            ("refitted", misfit["held_out_before"]),
+            *([("with the effects", misfit["held_out_after"])] if verdict["effects"] else []),
+            ("noise floor", misfit["noise_floor"]),
+        )
     )
+    print_line(f"  misfit in multiples of the noise: {columns}")
     for effect in verdict["effects"]:
         for name, value in effect["parameters"].items():
-            half = 0.5 * (value["high"] - value["low"])
-            print_line(
-                f"  {effect['id']} {name} = {value['value']:.5g} +- {half:.2g} {value['unit']}"
-            )
+            print_line(f"  {effect['id']} {name} = {format_interval(value)}")
+    for rival in describe_excluded(verdict) if verdict["verdict"] == "named" else ():
+        print_line(f"  excluded: {rival['id']}, worse by {rival['sigma']:.2g} standard errors")
     for line in describe_sensors(verdict["sensors"]):
         print_line(f"  {line}")
     for log in verdict["held_out_logs"]:

@@ -5,9 +5,11 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from table_io.clock import RealClock, local_datetime
+from table_io.config.base import parse_toml
 from table_io.config.calibration_due import find_overdue_calibrations
 from table_io.errors import InputError
 from table_io.safety.preflight import list_drive_warnings, list_setup_warnings
+from twin.model.config import ModelConfig
 from twin.reports.finalize import EXIT_ABORTED, EXIT_INTERRUPTED, finalize_run
 from twin.run.disk import require_disk_space
 from twin.run.folders import RUNS_FOLDER, make_output_folder, make_run_folder
@@ -67,6 +69,7 @@ def run_test(
     messages = (
         *list_drive_warnings(config.margins, config.rig),
         *list_setup_warnings(config.profile, config.rig),
+        *list_model_warnings(config.model_toml),
     )
     for sentence in (*messages, *find_overdue_calibrations(config.rig, local_datetime().date())):
         print_line(f"warning: {sentence}")
@@ -94,6 +97,12 @@ def _start_page(
     from twin.monitor.web import start_page_process
 
     return start_page_process(web, listen, rig, keys)
+
+
+def list_model_warnings(model_toml: str) -> list[str]:
+    """Return a warning for a model that its fit marked as provisional."""
+    model = parse_toml(model_toml, ModelConfig, "model")
+    return [f"the model is provisional: {model.provisional}"] if model.provisional else []
 
 
 def _run_unpaced(

@@ -45,6 +45,7 @@ from twin.identification.selection import (
     SelectionProgress,
     SelectionResult,
     count_sensor_errors,
+    mean_square,
     stepwise_selection,
 )
 from twin.identification.sensor_checks import compare_sensors
@@ -89,9 +90,13 @@ class PreparedProblem:
 
 @dataclass(frozen=True, eq=False)
 class Discovery:
-    """Result of a discovery. The maps show cross-validation residuals before and after."""
+    """Result of a discovery. The maps show cross-validation residuals before and after.
+
+    `given` is the model as given, without any fit, with the gaps stated in the logs.
+    """
 
     prepared: PreparedProblem
+    given: FittedSet
     selection: SelectionResult
     verdict: DiscoveryVerdict
     localization: Localization
@@ -103,6 +108,14 @@ class Discovery:
     def model(self) -> Model:
         """Model with the effects found, without sensor errors."""
         return self.verdict.best.fit.parameters.to_model()
+
+
+def evaluate_given(problem: SelectionProblem, model: Model) -> FittedSet:
+    """Return the model as given as a set without free parameters, with its residuals."""
+    parameters = ParameterSet.from_model(model, len(problem.log_residuals))
+    entries = tuple(residuals.evaluate(parameters) for residuals in problem.log_residuals)
+    fit = FitResult(parameters, {}, {}, np.empty((0, 0)), mean_square(entries), True, (), entries)
+    return FittedSet((), fit)
 
 
 def prepare_problem(
@@ -423,7 +436,8 @@ def _select_and_judge(
     before = build_cells(problem.log_residuals, selection.null.held_out, floor)
     localization = localize_excess(problem.log_residuals, selection.null.held_out, before, steps)
     after = build_cells(problem.log_residuals, verdict.best.held_out, floor)
-    return Discovery(prepared, selection, verdict, localization, before, after, notes)
+    given = evaluate_given(prepared.problem, model)
+    return Discovery(prepared, given, selection, verdict, localization, before, after, notes)
 
 
 def fit_known_effects(

@@ -74,6 +74,9 @@ class ModelConfig(ConfigModel):
     title: str = Field(description="Title of the model in every report.")
     citation: str = Field("", description="Source of the values.")
     fitted_on: str = Field("", description="Recordings or tests from which the values come.")
+    provisional: str = Field(
+        "", description="Why the model is not to be trusted yet; a run with it warns."
+    )
     intervals: dict[str, tuple[Finite, Finite]] = Field(
         default={}, description="95 % intervals of fitted parameters; no calculation uses them."
     )

@@ -453,15 +453,35 @@ class Location(Contract):
 
 
 class Gap(Contract):
-    """Gap between model and measurement: rms residual over the sensor noise."""
+    """Misfit of model and measurement: rms residual over the sensor noise."""
 
     metric: str = Field(description="definition of the numbers")
+    given: Ratio = Field(
+        None, description="of the model as given, without any fit; null in old files"
+    )
     before: Ratio = Field(description="of the model, on all data")
     after: Ratio = Field(description="with the effects added, on all data")
     noise_floor: Ratio = Field(description="residual that noise alone leaves")
     held_out_before: Ratio = Field(description="of the model, cross-validation")
     held_out_after: Ratio = Field(description="with the effects added, cross-validation")
-    closed_fraction: Ratio = Field(description="share of the gap that the effects close")
+    closed_fraction: Ratio = Field(
+        description="share of the misfit above the noise that the effects remove"
+    )
+
+
+class MisfitStep(Contract):
+    """Step of the staircase from the model as given to the noise floor."""
+
+    label: str = Field(description="what was changed last")
+    misfit: Ratio = Field(description="rms residual over the noise, held out where it was fitted")
+
+
+class ExcludedSet(Contract):
+    """Effects that were fitted in place of those of the verdict, and fit worse."""
+
+    id: str = Field(description="its effects, joined by +")
+    held_out_error: Ratio = Field(description="rms cross-validation residual over the noise")
+    sigma: Ratio = Field(description="standard errors by which it is worse")
 
 
 class GenericTerm(Contract):
@@ -474,7 +494,7 @@ class GenericTerm(Contract):
 
 
 class Remainder(Contract):
-    """Part of the gap that remains."""
+    """Part of the misfit that remains."""
 
     unexplained: bool = Field(description="whether it exceeds an inexact force law")
     evidence: GenericTerm | None = Field(description="null without a better generic term")
@@ -522,8 +542,14 @@ class Verdict(Contract):
     ambiguous: list[list[str]] = Field(description="sets of effects that fit as well")
     candidates: list[CandidateResult] = Field(description="every refitted set, best first")
     where: Location = Field(description="where model and measurement disagree")
-    gap: Gap = Field(description="gap before and after")
-    remainder: Remainder = Field(description="part of the gap that remains")
+    gap: Gap = Field(description="misfit before and after")
+    staircase: list[MisfitStep] | None = Field(
+        None, description="misfit from the model as given to the noise floor; absent in old files"
+    )
+    excluded: list[ExcludedSet] | None = Field(
+        None, description="rivals of the effects, best first; absent in old files"
+    )
+    remainder: Remainder = Field(description="part of the misfit that remains")
     sensors: Sensors | None = Field(None, description="on the instruments; absent in old files")
     base: dict[str, Interval] = Field(description="refitted parameters of the given model")
     fell_away: dict[str, str] = Field(description="reason of each effect that was not tested")

@@ -3,6 +3,8 @@
 Other packages add effects through entry points of the group `shaketwin.effects`, each an `Effect`.
 """
 
+import re
+from importlib import import_module
 from itertools import chain
 
 from table_io.config.plugins import list_entry_points, load_entry, make_plugin_error
@@ -76,6 +78,14 @@ def _find_plugin_problem(effect: Effect) -> str:
             return find_law_problem(effect)
         case _:
             return f"acts = {effect.acts!r} is not available to plug-ins: parameters, input, force"
+
+
+def describe_effect(effect: Effect) -> str:
+    """Return an effect in a few words of physics: from its module, of a plug-in its term."""
+    if effect not in EFFECTS:
+        return effect.term
+    text = import_module(f"{__name__}.{effect.id}").__doc__ or effect.term
+    return re.split(r"[:,.]", text.replace("\n", " "), maxsplit=1)[0]
 
 
 def find_effect(name: str) -> Effect:

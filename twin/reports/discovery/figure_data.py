@@ -87,6 +87,11 @@ class DiscoveryView:
         return self.discovery.selection.null, self.discovery.verdict.best
 
     @property
+    def models(self) -> tuple[FittedSet, FittedSet, FittedSet]:
+        """Sets (model as given, refitted without an effect, with the effects)."""
+        return (self.discovery.given, *self.before_after)
+
+    @property
     def law(self) -> FittedSet | None:
         """Set whose force is drawn: that of the effects named, else that with the generic term.
 

@@ -4,6 +4,7 @@
 twin of `twin_figures`.
 """
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -48,6 +49,7 @@ MIN_CELL_SIGMA = 3.0  # standard errors above which a cell is marked
 PHASE_LABELS = {
     "flight": "flight", "contact_right": "right", "contact_left": "left", "contact_both": "both",
 }  # fmt: skip
+GIVEN_COLOUR = "#c9ced6"
 BEFORE_COLOUR, AFTER_COLOUR, BEST_COLOUR = "#8b929c", "#1a7f37", "#1a7f37"
 
 
@@ -58,6 +60,7 @@ def draw_discovery_figures(
     return {
         section: save_figures(figures, folder)
         for section, figures in {
+            "staircase": _draw_staircase(verdict),
             "where": _draw_maps(view), "candidates": _draw_candidates(verdict),
             "forces": draw_residual_forces(view),
             "histories": draw_force_histories(view),
@@ -65,6 +68,48 @@ def draw_discovery_figures(
             "time": _draw_time(view),
         }.items()
     }  # fmt: skip
+
+
+def _draw_staircase(verdict: Json) -> CaptionedFigures:
+    """Draw the misfit falling step by step, from the model as given to the noise floor."""
+    steps = verdict["staircase"]
+    sizes = [step["misfit"] for step in steps]
+    figure = Figure(figsize=(FIGURE_WIDTH_IN, 3.3))
+    ax = figure.subplots()
+    floor = sizes[-1]
+    bottom = 0.5 * min(sizes)
+    for number, (step, size) in enumerate(zip(steps[:-1], sizes, strict=False)):
+        is_generic = "general law" in step["label"]
+        colour = (GIVEN_COLOUR, BEFORE_COLOUR, GENERIC_COLOUR if is_generic else BEST_COLOUR)[
+            min(number, 2)
+        ]
+        ax.bar(number, size - bottom, bottom=bottom, width=0.62, color=colour)
+        ax.annotate(f"{size:.3g} ×", (number, size), (0, 3), textcoords="offset points",
+                    ha="center", weight="bold")  # fmt: skip
+        if number:
+            fall = f"÷ {sizes[number - 1] / size:.2g}" if size > 0 else ""
+            ax.plot((number - 1.31, number + 0.31), [sizes[number - 1]] * 2, color=GUIDE_COLOUR,
+                    lw=0.8, ls=":")  # fmt: skip
+            ax.annotate(fall, (number - 0.5, math.sqrt(size * sizes[number - 1])), ha="center",
+                        size=8, color=GUIDE_COLOUR)  # fmt: skip
+    ax.axhline(floor, color=TWIN_COLOUR, ls="--", lw=1)
+    ax.annotate(f"noise floor {floor:.3g} ×", (len(sizes) - 1.45, floor), (0, 3),
+                textcoords="offset points", size=8)  # fmt: skip
+    ax.set_yscale("log")
+    ax.set_ylim(bottom, 2.2 * max(sizes))
+    ax.set_xlim(-0.6, len(sizes) - 0.9)
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_minor_formatter("")
+    labels = [step["label"].replace("_", " ").replace(" + ", "\n+ ") for step in steps[:-1]]
+    ax.set_xticks(range(len(labels)), labels)
+    ax.grid(visible=False, axis="x")
+    ax.set_ylabel("misfit, multiples of the noise")
+    caption = (
+        "rms of measured minus modelled forces on the measured motion, in multiples of the sensor "
+        "noise: the model as given, its parameters refitted without an effect, then each effect "
+        "added. What is fitted is judged on held-out steps."
+    )
+    yield CaptionedFigure("staircase", "How the misfit falls", caption, figure)
 
 
 def select_logs(view: DiscoveryView) -> list[int]:
@@ -234,7 +279,7 @@ def _draw_candidates(verdict: Json) -> CaptionedFigures:
     caption = (
         "Held-out error of every fitted set of effects, by three-fold cross-validation over the "
         "steps; the base parameters are refitted with each set. A further effect is selected only "
-        f"if it closes at least {100 * MIN_GAP_SHARE:g} % of the initial gap and the gain is "
+        f"if it closes at least {100 * MIN_GAP_SHARE:g} % of the initial misfit and the gain is "
         "significant."
     )
     caption += f" {hidden_count} worse sets are not drawn." if hidden_count > 0 else ""

@@ -1,14 +1,15 @@
-"""Free runs of the model on the measured table motion, before and after, compared by PRC."""
+"""Free runs of the model on the measured table motion: as given, refitted, with the effects."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from table_io.block import Block, Label
+from table_io.block import Block, Float1D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.records import PrcPoint, Step
+from twin.compare.curves import detect_hysteresis
 from twin.compare.cycles import PrcScale
 from twin.compare.pipeline import PipelineSetup, start_pipeline, step
 from twin.compare.twins import TwinSetup
@@ -19,7 +20,19 @@ from twin.reports.discovery.figure_data import DiscoveryView
 from twin.reports.discovery.serialize import Json
 
 WINDOW_S = 0.5
-FreeRuns = tuple[list[PrcPoint], list[PrcPoint]]  # before, after
+MODELS = ("as given", "refitted", "with the effects")
+
+
+@dataclass(frozen=True, eq=False)
+class FreeRun:
+    """Free run of a model on a log: PRC points, and time in s, u measured and of the model in m."""
+
+    points: list[PrcPoint]
+    block: Block
+    u: Float1D
+
+
+FreeRuns = tuple[FreeRun, ...]  # one per model of MODELS
 
 
 def run_logs_free(view: DiscoveryView) -> dict[int, FreeRuns]:
@@ -27,28 +40,34 @@ def run_logs_free(view: DiscoveryView) -> dict[int, FreeRuns]:
     runs: dict[int, FreeRuns] = {}
     for residuals in view.log_residuals:
         steps = view.sweep_steps(residuals.log_number)
-        before, after = (run_log_free(residuals, steps, fitted) for fitted in view.before_after)
-        if before and after:
-            runs[residuals.log_number] = before, after
+        of_models = [run_log_free(residuals, steps, fitted) for fitted in view.models]
+        if all(run is not None for run in of_models):
+            runs[residuals.log_number] = tuple(run for run in of_models if run is not None)
     return runs
 
 
 def compute_misfits(view: DiscoveryView, runs: dict[int, FreeRuns]) -> list[Json]:
-    """Return per log the peak of eta_d and its frequency in Hz, measured, before and after.
+    """Return per log the peak of eta_d, its frequency in Hz and the jumps, measured and modelled.
 
-    `error` is the rms of twin minus measured eta_d over the rms of the measured curve, for both
+    `error` is the rms of model minus measured eta_d over the rms of the measured curve, for both
     directions.
     """
     return [
         {
             "log": view.log_residuals[number].signals.name,
-            "measured": _find_peak(runs[number][0], "measured"),
-            **{
-                name: _find_peak(points, "twin") | {"error": _relative_error(points)}
-                for name, points in zip(("before", "after"), runs[number], strict=True)
-            },
+            "measured": _find_peak(of_models[0].points, "measured")
+            | {"jumps": detect_hysteresis(of_models[0].points, "measured")[0]},
+            "models": [
+                _find_peak(run.points, "twin")
+                | {
+                    "label": label,
+                    "error": _relative_error(run.points),
+                    "jumps": detect_hysteresis(run.points, "twin")[0],
+                }
+                for label, run in zip(MODELS, of_models, strict=True)
+            ],
         }
-        for number in runs
+        for number, of_models in runs.items()
     ]
 
 
@@ -73,23 +92,23 @@ def _relative_error(points: Sequence[PrcPoint]) -> float:
 
 def run_log_free(
     residuals: LogResiduals, steps: Sequence[Step], fitted: FittedSet
-) -> list[PrcPoint]:
-    """Return the PRC points of a log, measured and of the model running free on the table motion.
+) -> FreeRun | None:
+    """Return the run of the model on the table motion of a log, with PRC points of both.
 
-    Empty if table or mass acceleration, or the steps, are missing. Signals are corrected for the
+    None if table or mass acceleration, or the steps, are missing. Signals are corrected for the
     sensor errors of the fit.
     """
     parameters = fitted.fit.parameters
     m = residuals.motion(parameters.assumed_sensors())
     if not steps or not np.isfinite(m.table_acc).all() or not np.isfinite(m.acc).all():
-        return []
+        return None
     measured = m.label == Label.MEASURE
     cycles = [
         np.unique(m.cycle[measured & (m.step == sweep_step.index)]).size for sweep_step in steps
     ]
     level = math.sqrt(2.0) * float(m.table_acc[measured].std()) if measured.any() else 0.0
     if level == 0.0 or max(cycles) == 0 or residuals.reference.parameters.damping == 0:
-        return []
+        return None
     columns = {"rel_disp_m": m.u, "table_disp_m": m.table_disp, "table_acc_m_s2": m.table_acc}
     columns["mass_acc_m_s2"] = m.acc
     if m.has_load_cells:
@@ -114,4 +133,6 @@ def run_log_free(
     setup = PipelineSetup(twin, scale, driven_steps, max(cycles))
     state, _ = start_pipeline(setup, first)
     _, items = step(setup, state, block)
-    return [item for item in items if isinstance(item, PrcPoint)]
+    points = [item for item in items if isinstance(item, PrcPoint)]
+    predicted = next(item for item in items if isinstance(item, Block))
+    return FreeRun(points, block, predicted.channel("free/rel_disp_m")) if points else None

@@ -1,4 +1,4 @@
-"""HTML report of a discovery: the discrepancy, the effects found, and the gap before and after.
+"""HTML report of a discovery: the discrepancy, the effects found, and the misfit of each model.
 
 The numbers are those of verdict.json; the file is self-contained.
 """
@@ -15,26 +15,27 @@ from twin.identification.screening import MIN_STEP_UNITS
 from twin.reports.discovery.figure_data import DiscoveryView, check_instruments
 from twin.reports.discovery.figures import draw_discovery_figures
 from twin.reports.discovery.free_running import compute_misfits, run_logs_free
+from twin.reports.discovery.headline import (
+    describe_excluded,
+    describe_laws,
+    format_effect,
+    format_verdict,
+)
 from twin.reports.discovery.sensor_section import (
     CHANNEL_KINDS,
     KIND_LABELS,
     tabulate_channels,
     tabulate_comparisons,
 )
-from twin.reports.discovery.serialize import REFITTED_SUFFIX, Json
+from twin.reports.discovery.serialize import Json
 from twin.reports.page import embed_images, format_significant, render_page
+from twin.reports.quantities import format_quantity
 
 MIN_DIGITS, MAX_DIGITS = 4, 8  # significant digits of a fitted value
-VERDICT_SENTENCES = {
-    "none": "Model and measurement agree to within the noise.",
-    "named": "The model lacks {names}.",
-    "ambiguous": "The model lacks an effect, but these recordings do not determine which: {names}.",
-    "unexplained": "The model lacks an effect, and no effect of the library explains the gap.",
-}
 SECTIONS = {
     "where": "Location of the discrepancy", "candidates": "Candidates", "gates": "Sensor checks",
     "forces": "Residual forces", "histories": "Before and after, on the measured motion",
-    "twin": "Before and after, free-running twin", "time": "Residual over time",
+    "twin": "The run replayed with each model", "time": "Residual over time",
 }  # fmt: skip
 
 
@@ -49,10 +50,13 @@ def write_discovery_page(
         Path(__file__).with_name("page.html"),
         verdict=verdict,
         sentence=format_verdict(verdict),
+        laws=describe_laws(verdict),
+        excluded=describe_excluded(verdict),
+        quantity=format_interval,
         held_out=describe_held_out(view),
         rows=list_parameter_rows(verdict, [log.signals.name for log in logs]),
         logs=[_log_facts(log) for log in logs],
-        sections=SECTIONS,
+        sections=order_sections(verdict),
         complete=discovery.selection.complete,
         gates=check_instruments(view),
         sensor_rows=tabulate_channels(verdict["sensors"]),
@@ -70,26 +74,16 @@ def write_discovery_page(
     return path
 
 
-def format_effect(effect: Json) -> str:
-    """Return the display name of an effect: its id, with the channel of a sensor effect."""
-    return f"{effect['id']} of {effect['channel']}" if effect.get("channel") else effect["id"]
+def order_sections(verdict: Json) -> dict[str, str]:
+    """Return the headings by section; the force that no effect explains comes first."""
+    if verdict["verdict"] != "unexplained":
+        return SECTIONS
+    return {"forces": SECTIONS["forces"]} | SECTIONS
 
 
-def format_verdict(verdict: Json) -> str:
-    """Return the verdict as one sentence."""
-    names = " and ".join(format_effect(effect) for effect in verdict["effects"])
-    if verdict["ambiguous"]:
-        names = ", or ".join(" with ".join(ids) for ids in verdict["ambiguous"])
-    if verdict["verdict"] == "named" and all(
-        effect.get("channel") for effect in verdict["effects"]
-    ):
-        return f"No effect is missing; a sensor has an error: {names}."
-    text = VERDICT_SENTENCES[verdict["verdict"]].format(names=names)
-    if verdict["verdict"] == "none" and verdict["why"].endswith(REFITTED_SUFFIX):
-        text = "No effect is missing, but the model agrees only with other parameters than it has."
-    if verdict["verdict"] == "unexplained" and names:
-        text += f" The closest is {names}, but it is not sufficient."
-    return text
+def format_interval(value: Json) -> str:
+    """Format a fitted value with half its 95 % interval and its unit."""
+    return format_quantity(value["value"], value["unit"], 0.5 * (value["high"] - value["low"]))
 
 
 def list_parameter_rows(

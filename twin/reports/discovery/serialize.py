@@ -71,6 +71,7 @@ def verdict_to_json(
         },
         "gap": {
             "metric": METRIC,
+            "given": factor * math.sqrt(discovery.given.cost),
             "before": factor * math.sqrt(null.fit.cost),
             "after": factor * math.sqrt(best.fit.cost),
             "noise_floor": factor * math.sqrt(verdict.floor),
@@ -78,6 +79,8 @@ def verdict_to_json(
             "held_out_after": factor * math.sqrt(best.cost),
             "closed_fraction": closed_fraction(null.cost, best.cost, verdict.floor),
         },
+        "staircase": staircase_to_json(discovery, factor),
+        "excluded": excluded_to_json(discovery, factor),
         "remainder": {
             "unexplained": verdict.has_remainder,
             "evidence": generic_term_to_json(verdict.generic, factor),
@@ -95,6 +98,51 @@ def verdict_to_json(
         "seconds": seconds,
         "held_out_logs": [_held_out_to_json(log, discovery, given) for log in held_out_logs],
     }
+
+
+def staircase_to_json(discovery: Discovery, factor: float) -> list[Json]:
+    """Return the misfit step by step: as given, refitted, + each effect, noise floor.
+
+    The effects are in the order in which each removes most; a set that was not fitted is left out.
+    """
+    selection, verdict = discovery.selection, discovery.verdict
+    steps = [
+        ("model as given", discovery.given.cost),
+        ("refitted, no effect", selection.null.cost),
+    ]
+    costs = {frozenset(fitted.names): fitted.cost for fitted in selection.tried}
+    costs[frozenset(verdict.best.names)] = verdict.best.cost
+    added: frozenset[str] = frozenset()
+    while added != frozenset(verdict.best.names):
+        larger = [names for names in costs if added < names <= frozenset(verdict.best.names)]
+        smallest = min(map(len, larger))
+        names = min((n for n in larger if len(n) == smallest), key=lambda n: costs[n])
+        steps.append((f"+ {' + '.join(sorted(names - added))}", costs[names]))
+        added = names
+    generic = verdict.generic
+    if generic is not None and verdict.outcome == "unexplained":
+        term = generic.names[-1].split(".", 1)[1]
+        steps.append((f"with the general law {term}", generic.cost))
+    steps.append(("noise floor", verdict.floor))
+    return [{"label": label, "misfit": factor * math.sqrt(max(c, 0.0))} for label, c in steps]
+
+
+def excluded_to_json(discovery: Discovery, factor: float) -> list[Json]:
+    """Return the sets of as many other effects as the best, best first, and how much worse."""
+    best, problem = discovery.verdict.best, discovery.prepared.problem
+    rivals: dict[frozenset[str], FittedSet] = {}
+    for fitted in sorted(discovery.selection.tried, key=lambda fitted: fitted.cost):
+        names = frozenset(fitted.names)
+        if best.effects and len(names) == len(best.effects) and names != frozenset(best.names):
+            rivals.setdefault(names, fitted)
+    return [
+        {
+            "id": " + ".join(rival.names),
+            "held_out_error": factor * math.sqrt(rival.cost),
+            "sigma": problem.compute_gain(rival, best)[2],
+        }
+        for rival in rivals.values()
+    ]
 
 
 def _held_out_to_json(log: PreparedLog, discovery: Discovery, given: Model | None) -> Json:
@@ -269,14 +317,18 @@ def generic_term_to_json(general: FittedSet | None, factor: float = 1.0) -> Json
 
 
 def model_to_toml(
-    fit: FitResult, title: str, citation: str, fitted_on: str
+    fit: FitResult, title: str, citation: str, fitted_on: str, provisional: str = ""
 ) -> tuple[str, list[str]]:
-    """Return (text of a model file, notes on what it omits); gaps belong to the test profiles."""
+    """Return (text of a model file, notes on what it omits); gaps belong to the test profiles.
+
+    `provisional` is the reason why the model is not to be trusted yet, if there is one.
+    """
     base = fit.parameters.to_model().base
     lines = [
         f"title = {_quote_toml(title)}",
         f"citation = {_quote_toml(citation)}",
         f"fitted_on = {_quote_toml(fitted_on)}",
+        *([f"provisional = {_quote_toml(provisional)}"] if provisional else []),
         "[base]",
         f"stiffness_n_m = {base.stiffness!r}",
         f"damping_n_s_m = {base.damping!r}",

@@ -1,4 +1,4 @@
-"""Figures of the free-running twin before and after: PRCs and impacts per cycle."""
+"""Figures of the free-running models: PRCs, impacts per cycle and histories of u."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from twin.reports.discovery.figure_data import DiscoveryView
-from twin.reports.discovery.free_running import FreeRuns
+from twin.reports.discovery.figure_data import DiscoveryView, select_close_ups
+from twin.reports.discovery.free_running import MODELS, FreeRuns
 from twin.reports.plot_style import (
     FIGURE_WIDTH_IN,
+    GUIDE_COLOUR,
+    TWIN_COLOUR,
     CaptionedFigure,
     CaptionedFigures,
     LineStyle,
@@ -30,7 +32,7 @@ from twin.reports.report_data import DIRECTIONS, IMPACT_KEYS, extract_prc
 def draw_free_running(
     view: DiscoveryView, runs: dict[int, FreeRuns], chosen: Sequence[int]
 ) -> CaptionedFigures:
-    """Draw PRCs and impacts of the chosen logs, before left, after right."""
+    """Draw PRCs, impacts and histories of the chosen logs, a column per model."""
     for number in chosen:
         if number in runs:
             yield from _draw_log(view, runs[number], number)
@@ -40,38 +42,80 @@ def _draw_log(view: DiscoveryView, runs: FreeRuns, number: int) -> CaptionedFigu
     name = view.title_suffix(number)
     stem = f"_{number}" if name else ""
     caption = (
-        "One point per step, from its measured cycles. The twin runs free from the first sample, "
-        "driven by the measured table acceleration, with the parameters fitted to all steps. In "
-        "chaotic bands the trajectories diverge; compare amplitudes, not samples."
+        "One point per step, from its measured cycles. The model runs free from the first sample, "
+        "driven by the measured table acceleration. In chaotic bands the trajectories diverge; "
+        "compare amplitudes, not samples. The axes are the same in every column."
     )
-    title = f"Pseudo-resonance curves, measured and twin{name}"
+    title = f"Pseudo-resonance curves, measured and modelled{name}"
     yield CaptionedFigure(f"prc{stem}", title, caption, _draw_panels(runs, FREE_PANELS))
     if any(
-        np.nan_to_num(extract_prc(runs[0], "measured", direction, side)[1]).any()
+        np.nan_to_num(extract_prc(runs[0].points, "measured", direction, side)[1]).any()
         for direction in DIRECTIONS
         for side in IMPACT_KEYS
     ):
-        caption = "Mean over the measured cycles of a step, from the load cells and from the twin."
+        caption = "Mean over the measured cycles of a step, from the load cells and from the model."
         title = f"Impacts per forcing cycle{name}"
         yield CaptionedFigure(f"impacts{stem}", title, caption, _draw_panels(runs, IMPACT_PANELS))
+    yield from _draw_motion(view, runs, number, name, stem)
+
+
+def _draw_motion(
+    view: DiscoveryView, runs: FreeRuns, number: int, name: str, stem: str
+) -> CaptionedFigures:
+    """Draw the last cycles of u at three steps, a row each, and the residual below."""
+    residuals = view.log_residuals[number]
+    close_ups = select_close_ups(residuals, view.sweep_steps(number), 0)
+    if not close_ups:
+        return
+    figure = Figure(figsize=(FIGURE_WIDTH_IN, 2.3 * len(close_ups) + 0.6))
+    axes = figure.subplots(
+        2 * len(close_ups), len(MODELS), sharex="row", sharey="row", squeeze=False,
+        height_ratios=[2, 1] * len(close_ups),
+    )  # fmt: skip
+    measured = runs[0].block.channel("rel_disp_m")
+    time_s = runs[0].block.time_s
+    for row, close_up in enumerate(close_ups):
+        shown = close_up.samples
+        t = time_s[shown] - time_s[shown[0]]
+        for column, run in enumerate(runs):
+            upper, lower = axes[2 * row : 2 * row + 2, column]
+            pale = measured_style(close_up.direction, 3.0) | {"alpha": 0.4}
+            upper.plot(t, 1e3 * measured[shown], **pale)
+            upper.plot(t, 1e3 * run.u[shown], **twin_style("forward"))
+            lower.plot(t, 1e3 * (measured - run.u)[shown], color=TWIN_COLOUR, lw=0.8)
+            lower.axhline(0, color=GUIDE_COLOUR, lw=0.5)
+            if row == 0:
+                upper.set_title(MODELS[column])
+        axes[2 * row, 0].set_ylabel(f"u in mm\n{close_up.title}")
+        axes[2 * row + 1, 0].set_ylabel("residual")
+    for ax in axes[-1]:
+        ax.set_xlabel("time in s")
+    caption = (
+        "Last cycles of three steps: measured (wide, pale) and the free-running model (thin); "
+        "below, measured minus model in mm. The model keeps its own phase and branch, so after a "
+        "jump that only one of them makes the curves part."
+    )
+    yield CaptionedFigure(f"motion{stem}", f"Displacement u{name}", caption, figure)
 
 
 def _draw_panels(runs: FreeRuns, contents: Any) -> Figure:
     figure = Figure(figsize=(FIGURE_WIDTH_IN, 2.6 * len(contents) + 0.6))
-    axes = figure.subplots(len(contents), 2, sharex=True, sharey="row", squeeze=False)
-    for column, (points, title) in enumerate(zip(runs, ("before", "after"), strict=True)):
+    axes = figure.subplots(len(contents), len(runs), sharex=True, sharey="row", squeeze=False)
+    for column, (run, title) in enumerate(zip(runs, MODELS, strict=True)):
         panels = make_prc_panels(axes[:, [column]], contents)
-        plot_prc(panels, partial(extract_prc, points, "measured"), _dotted_style)
-        plot_prc(panels, partial(extract_prc, points, "twin"), _circled_style)
+        plot_prc(panels, partial(extract_prc, run.points, "measured"), _dotted_style)
+        plot_prc(panels, partial(extract_prc, run.points, "twin"), _circled_style)
         axes[0, column].set_title(title)
-    for ax in axes[:, 1]:
+    for ax in axes[:, 1:].flat:
         ax.set_ylabel("")
     driven = [
-        direction for direction in DIRECTIONS if any(p.direction == direction for p in runs[0])
+        direction
+        for direction in DIRECTIONS
+        if any(p.direction == direction for p in runs[0].points)
     ]
     handles = [
         *direction_handles(_dotted_style, "measured ", driven),
-        *direction_handles(_circled_style, "twin ", driven),
+        *direction_handles(_circled_style, "model ", driven),
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=4)
     return figure

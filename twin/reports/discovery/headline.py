@@ -1,0 +1,86 @@
+"""Headline of a discovery in words of physics, with the typeset law of each effect."""
+
+import html
+import re
+
+from markupsafe import Markup
+
+from twin.model.effects import describe_effect, find_effect
+from twin.reports.discovery.serialize import REFITTED_SUFFIX, Json
+
+SYMBOL = r"\b([A-Z][cy]|[kc][0-9hb]|uy)\b"  # Fc, Fy, k3, ch: a letter with its index
+MAX_EXCLUDED = 3  # rivals that the headline names
+VERDICT_SENTENCES = {
+    "none": "Model and measurement agree to within the noise.",
+    "named": "The model lacks {names}.",
+    "ambiguous": "The model lacks an effect, but these recordings do not determine which: {names}.",
+    "unexplained": "The model lacks an effect that is not in the library.",
+}
+
+
+def typeset_law(term: str) -> Markup:
+    """Return the term of an effect as HTML: indices, powers, primes and minus signs."""
+    text = html.escape(term, quote=False)
+    text = re.sub(r"\b([A-Za-z])_([A-Za-z0-9]+)", r"\1<sub>\2</sub>", text)
+    text = re.sub(SYMBOL, lambda match: f"{match[1][0]}<sub>{match[1][1:]}</sub>", text)
+    text = re.sub(r"\^([0-9]+)", r"<sup>\1</sup>", text)
+    text = re.sub(r"\babs\(([^()]*)\)", r"|\1|", text)
+    text = re.sub(r"(?<![A-Za-z0-9])-(?=[A-Za-z(])", "−", text)
+    return Markup(text.replace("'", "′").replace(" x ", " × "))
+
+
+def format_effect(effect: Json) -> str:
+    """Return the display name of an effect: its id, with the channel of a sensor effect."""
+    return f"{effect['id']} of {effect['channel']}" if effect.get("channel") else effect["id"]
+
+
+def name_effect(effect: Json) -> str:
+    """Return an effect in words of physics, with the channel of a sensor effect."""
+    words = describe_effect(find_effect(effect["id"]))
+    words = words if words[1:2].isupper() else words[0].lower() + words[1:]
+    words = words if effect["id"] not in PROPER_NAMES else words[0].upper() + words[1:]
+    return f"{words} of {effect['channel']}" if effect.get("channel") else words
+
+
+PROPER_NAMES = ("bouc_wen", "coulomb_friction", "hunt_crossley")
+
+
+def format_verdict(verdict: Json) -> str:
+    """Return the verdict as one sentence in words of physics."""
+    names = " and ".join(name_effect(effect) for effect in verdict["effects"])
+    if verdict["ambiguous"]:
+        names = ", or ".join(" with ".join(ids) for ids in verdict["ambiguous"])
+    if verdict["verdict"] == "named" and all(
+        effect.get("channel") for effect in verdict["effects"]
+    ):
+        return f"No effect is missing; a sensor has an error: {names}."
+    text = VERDICT_SENTENCES[verdict["verdict"]].format(names=names)
+    if verdict["verdict"] == "none" and verdict["why"].endswith(REFITTED_SUFFIX):
+        text = "No effect is missing, but the model agrees only with other parameters than it has."
+    if verdict["verdict"] == "unexplained":
+        if term := verdict["remainder"]["evidence"]:
+            text += f" A general law would fit: {term['term']}."
+        if names:
+            text += f" The closest is {names}, but it is not sufficient."
+    return text
+
+
+def describe_laws(verdict: Json) -> list[Json]:
+    """Return the law, the trace in the residual and the numbers of each effect of the verdict."""
+    laws = []
+    for effect in verdict["effects"]:
+        definition = find_effect(effect["id"])
+        laws.append(
+            {
+                "id": format_effect(effect),
+                "law": typeset_law(definition.term),
+                "residual": definition.residual,
+                "parameters": effect["parameters"],
+            }
+        )
+    return laws
+
+
+def describe_excluded(verdict: Json) -> list[Json]:
+    """Return the rivals that are named next to the effects: those that fit best."""
+    return list((verdict.get("excluded") or [])[:MAX_EXCLUDED])
