@@ -171,11 +171,17 @@ def test_prc_fits_a_narrow_terminal_and_a_file_is_not_cut(run_folder: Path) -> N
     assert "…" not in file + narrow
 
 
-def test_help_is_quick() -> None:
+@pytest.mark.parametrize(
+    ("module", "slow"),
+    [
+        ("twin.cli.main", "numpy numba scipy pydantic matplotlib mcap zenoh rerun"),
+        ("twin.live.control", "typer numpy numba pydantic rich google.protobuf ssl"),
+    ],
+)
+def test_help_and_a_stop_order_are_quick(module: str, slow: str) -> None:
     """What is slow to import is imported by the command that needs it."""
-    slow = "numpy numba scipy pydantic matplotlib mcap zenoh rerun"
     code = (
-        "import sys; from twin.cli.main import app; "
+        f"import sys, twin.cli.entry, {module}; "
         f"print([name for name in {slow.split()} if name in sys.modules])"
     )
     result = subprocess.run(

@@ -11,8 +11,7 @@ from pathlib import Path
 from tests.live.namespaces import HERE, cable
 from twin.cli.credentials import add_person, create_keys
 from twin.security.credentials import read_credentials
-from twin.transport.codec import MEAS_TOPIC
-from twin.transport.endpoint import PUBLIC_HUB_SETTINGS
+from twin.transport.endpoint import MEAS_TOPIC, PUBLIC_HUB_SETTINGS
 from twin.transport.zenoh_link import open_hub
 
 ENDPOINT = f"tls/{HERE}:7447"

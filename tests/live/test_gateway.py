@@ -24,8 +24,8 @@ from twin.live.gateway import (
 )
 from twin.live.process_config import ProcessConfig, make_private_folder, process_token
 from twin.run.run_config import read_run_config
-from twin.transport.codec import MEAS_TOPIC, TOPIC_TYPES, decode_item, encode_item
-from twin.transport.endpoint import LOCAL_SOCKET_PREFIX, key_expression, list_runs
+from twin.transport.codec import TOPIC_TYPES, decode_item, encode_item
+from twin.transport.endpoint import LOCAL_SOCKET_PREFIX, MEAS_TOPIC, key_expression, list_runs
 from twin.transport.reliable_subscriber import ReliableSubscriber
 from twin.transport.zenoh_link import MAX_OBSERVERS, BusLink, open_hub, open_spoke
 

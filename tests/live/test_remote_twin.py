@@ -38,8 +38,8 @@ from twin.live.remote_twin import (
     OfferFilter,
     is_valid_offer,
 )
-from twin.transport.codec import CMP_TOPIC, MEAS_TOPIC, Item, decode_item, encode_item, topic_for
-from twin.transport.endpoint import key_expression
+from twin.transport.codec import Item, decode_item, encode_item, topic_for
+from twin.transport.endpoint import CMP_TOPIC, MEAS_TOPIC, key_expression
 from twin.transport.history_cache import (
     FRAGMENT_BYTES,
     FRAGMENT_HEADER,

@@ -37,7 +37,8 @@ from twin.recording.merge import merge, verify_log
 from twin.recording.recovery import recover_log
 from twin.run.run_config import RunConfig, read_run_config
 from twin.transport import history_cache
-from twin.transport.codec import MEAS_TOPIC, Item, encode_item, topic_for
+from twin.transport.codec import Item, encode_item, topic_for
+from twin.transport.endpoint import MEAS_TOPIC
 
 RUN_S = 60.0
 HELD_BLOCKS = 2500  # blocks

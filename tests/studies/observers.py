@@ -27,8 +27,8 @@ import numpy as np
 from table_io.records import Timing
 from twin.live.process_config import ProcessConfig
 from twin.recording.reader import read_recording
-from twin.transport.codec import MEAS_TOPIC, TOPIC_TYPES, decode_item
-from twin.transport.endpoint import key_expression
+from twin.transport.codec import TOPIC_TYPES, decode_item
+from twin.transport.endpoint import MEAS_TOPIC, key_expression
 from twin.transport.zenoh_link import BusLink, open_spoke
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")

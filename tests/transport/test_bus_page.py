@@ -14,7 +14,7 @@ import pytest
 from table_io.block import Block
 from twin.security.access_control import build_open_access
 from twin.transport import codec
-from twin.transport.endpoint import PUBLIC_HUB_SETTINGS, key_expression, merge_settings
+from twin.transport.endpoint import MEAS_TOPIC, PUBLIC_HUB_SETTINGS, key_expression, merge_settings
 from twin.transport.zenoh_link import open_hub
 
 PAGE = (Path(codec.__file__).parent / "BUS.md").read_text()
@@ -36,7 +36,7 @@ def test_the_example_runs_as_it_stands() -> None:
     link = open_hub(
         "shaker", endpoint, merge_settings(PUBLIC_HUB_SETTINGS, build_open_access("shaker"))
     )
-    link.declare((codec.MEAS_TOPIC,))
+    link.declare((MEAS_TOPIC,))
     questions = link.declare_requests("config/schema")
     command = [sys.executable, "-u", "-c", example, endpoint, "shaker"]
     listener = subprocess.Popen(
@@ -52,7 +52,7 @@ def test_the_example_runs_as_it_stands() -> None:
             block = Block(
                 "meas", 20 * number, 2000.0, ("mass_disp_m",), values, steps, steps, steps
             )
-            link.publish(codec.MEAS_TOPIC, codec.encode_item(block, "r"))
+            link.publish(MEAS_TOPIC, codec.encode_item(block, "r"))
             if (question := questions.poll()) is not None:
                 question.reply(codec.message_schema(Block)[1])
             if select.select([listener.stdout], [], [], 0.005)[0]:

@@ -26,7 +26,7 @@ from table_io.records import (
     RunStart,
     SampleGap,
 )
-from twin.transport import codec
+from twin.transport import codec, endpoint
 from twin.transport import shaketwin_pb2 as pb
 from twin.transport.codec import Item, WireError, decode_item, encode_item, topic_for
 
@@ -67,7 +67,7 @@ def any_block(draw: st.DrawFn) -> Block:
     whole = st.lists(st.integers(-1, codec.MAX_LABEL), min_size=samples, max_size=samples)
     labels = [np.array(draw(whole), dtype=np.int64) for _ in range(3)]
     return Block(
-        draw(st.sampled_from(sorted(codec.BLOCK_TOPICS))),
+        draw(st.sampled_from(sorted(endpoint.BLOCK_TOPICS))),
         draw(st.integers(0, codec.MAX_SAMPLE_INDEX - samples)),
         draw(st.floats(1.0, 1e6)),
         channels,
@@ -142,11 +142,11 @@ def test_the_order_in_a_dictionary_changes_no_byte() -> None:
 
 def test_every_kind_has_a_topic_of_its_own() -> None:
     assert set(codec.RECORD_TOPICS) == set(RECORD_TYPES) == set(get_args(Record))
-    topics = [*codec.BLOCK_TOPICS.values(), *codec.RECORD_TOPICS.values()]
+    topics = [*endpoint.BLOCK_TOPICS.values(), *codec.RECORD_TOPICS.values()]
     assert len(set(topics)) == len(topics)
     assert set(codec.TOPIC_TYPES) == set(topics)
     assert set(codec.item_types()) == set(codec.TOPIC_TYPES.values())
-    for stream, name in codec.BLOCK_TOPICS.items():
+    for stream, name in endpoint.BLOCK_TOPICS.items():
         empty = np.zeros(0, dtype=np.int64)
         block = Block(stream, 0, 2e3, ("a",), np.zeros((1, 0)), empty, empty, empty)
         assert topic_for(block) == name
@@ -239,7 +239,7 @@ def test_bytes_on_the_wrong_topic_are_refused() -> None:
     labels = np.zeros(2, dtype=np.int64)
     block = Block("meas", 0, 2e3, ("a",), np.ones((1, 2)), labels, labels, labels)
     with pytest.raises(WireError, match=r"/twin/pred: not a Block: .*'meas'"):
-        decode_item(codec.PRED_TOPIC, encode_item(block, "run"))
+        decode_item(endpoint.PRED_TOPIC, encode_item(block, "run"))
     with pytest.raises(WireError, match=r"/rig/nothing: unknown topic; known: /rig/meas"):
         decode_item("/rig/nothing", encode_item(SampleGap(0, 1, "", "lost"), "run"))
 
@@ -255,10 +255,10 @@ def test_a_block_with_unequal_lengths_is_refused(cut: str) -> None:
         label=[0, 0],
         cycle=[0, 0],
     )
-    assert len(decode_item(codec.MEAS_TOPIC, message.SerializeToString())[1]) == 2  # type: ignore[arg-type]
+    assert len(decode_item(endpoint.MEAS_TOPIC, message.SerializeToString())[1]) == 2  # type: ignore[arg-type]
     del (message.channels[1].values if cut == "values" else message.step)[-1:]
     with pytest.raises(WireError, match="not a Block"):
-        decode_item(codec.MEAS_TOPIC, message.SerializeToString())
+        decode_item(endpoint.MEAS_TOPIC, message.SerializeToString())
 
 
 def test_a_record_that_the_schema_does_not_know_cannot_slip_through(

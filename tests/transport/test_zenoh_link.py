@@ -18,8 +18,8 @@ import pytest
 
 from tests.input_errors import raises_input_error
 from twin.transport import history_cache, reliable_subscriber
-from twin.transport.codec import CMP_TOPIC, MEAS_TOPIC, PRED_TOPIC, TOPIC_TYPES
-from twin.transport.endpoint import key_expression
+from twin.transport.codec import TOPIC_TYPES
+from twin.transport.endpoint import CMP_TOPIC, MEAS_TOPIC, PRED_TOPIC, key_expression
 from twin.transport.history_cache import (
     FRAGMENT_BYTES,
     MAX_CACHED_FRAGMENTS,

@@ -21,7 +21,7 @@ from table_io.config.sensor import SensorConfig
 from table_io.errors import InputError, suggest
 from twin.cli.check_table import EXIT_FAILED, make_machine
 from twin.run.terminal import print_line
-from twin.security.credentials import user_name
+from twin.security.access_control import user_name
 
 MEASURING_S, PAUSE_S = 1.0, 5.0
 MAX_RANGE_SHARE = 0.999  # of the range; above it a reading counts as clipped

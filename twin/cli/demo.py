@@ -46,7 +46,7 @@ FIRST_RUN, DISCOVERY, SECOND_RUN = "1-first-run", "2-discovery", "3-second-run"
 # Effects of the library that this test shows at a typical size.
 HIDEABLE_EFFECTS = (
     "bouc_wen", "bumper_asymmetry", "bumper_hardening", "bumper_maxwell", "coulomb_friction",
-    "cubic_stiffness", "hunt_crossley", "maxwell_damper", "quadratic_damping", "table_tilt",
+    "cubic_stiffness", "hunt_crossley", "maxwell_damper", "quadratic_damping",
 )  # fmt: skip
 MIN_SIZE, MAX_SIZE = 0.8, 1.5  # of the typical one
 

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from twin.cli.credential_commands import KeysOption, read_keys_option
+from twin.cli.entry import DEFAULT_ENDPOINT
 
 LIVE_PANEL = "Run a test"
 live_app = typer.Typer()
@@ -44,7 +45,7 @@ class RemoteRole(enum.StrEnum):
 def monitor_command(
     connect: Annotated[
         str, typer.Option("--connect", help="Endpoint of the running test.")
-    ] = "tcp/127.0.0.1:7447",
+    ] = DEFAULT_ENDPOINT,
     rig: Annotated[str, typer.Option("--rig", help="Name of the running rig.")] = "simulated",
     wait: Annotated[bool, typer.Option("--wait", help="Wait for a test to begin.")] = False,
     once: Annotated[
@@ -82,7 +83,7 @@ def join_command(
     ],
     connect: Annotated[
         str, typer.Option("--connect", help="Endpoint of the running test.")
-    ] = "tcp/127.0.0.1:7447",
+    ] = DEFAULT_ENDPOINT,
     rig: Annotated[str, typer.Option("--rig", help="Name of the running rig.")] = "simulated",
     out: Annotated[Path | None, typer.Option("--out", help="New folder for the recording.")] = None,
     keys: KeysOption = None,
@@ -106,7 +107,7 @@ def control_command(
     why: Annotated[str, typer.Option("--why", help="Reason, recorded with the command.")] = "",
     connect: Annotated[
         str, typer.Option("--connect", help="Endpoint of the running test.")
-    ] = "tcp/127.0.0.1:7447",
+    ] = DEFAULT_ENDPOINT,
     rig: Annotated[str, typer.Option("--rig", help="Name of the running rig.")] = "simulated",
     keys: KeysOption = None,
 ) -> None:

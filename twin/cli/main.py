@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from twin.cli.credential_commands import KeysOption, keys_app, read_keys_option
+from twin.cli.entry import DEFAULT_ENDPOINT
 from twin.cli.file_commands import StepsOption, files_app, require_view_extra
 from twin.cli.hardware_commands import hardware_app
 from twin.cli.identification_commands import LogPaths, identification_app
@@ -56,7 +57,6 @@ SaveViewOption = Annotated[
 ListenOption = Annotated[
     str, typer.Option("--listen", help="Endpoint at which observers reach the test.")
 ]
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 
 class Speed(enum.StrEnum):
@@ -409,7 +409,7 @@ def view_command(
     ] = None,
     connect: Annotated[
         str, typer.Option("--connect", help="Endpoint of a running test, without LOG.")
-    ] = "tcp/127.0.0.1:7447",
+    ] = DEFAULT_ENDPOINT,
     rig: Annotated[str, typer.Option("--rig", help="Name of the running rig.")] = "simulated",
     keys: KeysOption = None,
 ) -> None:

@@ -24,7 +24,8 @@ from twin.run.terminal import console, print_line
 from twin.run.versions import find_version_changes, format_version_changes
 from twin.run.warm_up import compile_kernels
 from twin.security.credentials import Credentials
-from twin.transport.codec import CMP_TOPIC, Item
+from twin.transport.codec import Item
+from twin.transport.endpoint import CMP_TOPIC
 
 RECORDED = "recorded"  # model name: the model stored in the log
 

@@ -27,7 +27,8 @@ from twin.reports import summary as summaries
 from twin.reports.finalize import EXIT_GAPS, EXIT_NOT_IDENTICAL
 from twin.run.folders import make_run_folder
 from twin.run.terminal import console, print_line, print_table
-from twin.transport.codec import MEAS_TOPIC, PRED_TOPIC, TOPIC_TYPES
+from twin.transport.codec import TOPIC_TYPES
+from twin.transport.endpoint import MEAS_TOPIC, PRED_TOPIC
 
 Row = dict[str, Any]
 PRC_QUANTITIES = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l")

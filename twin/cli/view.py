@@ -9,7 +9,8 @@ from table_io.errors import InputError
 from twin.recording.reader import read_recording
 from twin.recording.run_paths import resolve_log_path
 from twin.run.terminal import print_line
-from twin.security.credentials import Credentials, user_name
+from twin.security.access_control import user_name
+from twin.security.credentials import Credentials
 from twin.transport.zenoh_link import open_spoke
 from twin.viewer.address import VIEW_ADDRESS, find_free_address, format_live_view, viewer_url
 from twin.viewer.live_view import BATCH_S, LiveView

@@ -1,11 +1,18 @@
-"""`shaketwin control`: hold, resume, stop or abort a running test from another terminal."""
+"""`shaketwin control`: hold, resume, stop or abort a running test from another terminal.
+
+Every import of this module delays a stop: it needs neither numpy nor pydantic nor rich.
+"""
 
 import re
+from typing import TYPE_CHECKING
 
 from table_io.errors import InputError
-from twin.security.credentials import Credentials, user_name
+from twin.security.access_control import user_name
 from twin.transport.endpoint import list_runs, make_endpoint_error
 from twin.transport.zenoh_link import BusLink, open_spoke
+
+if TYPE_CHECKING:
+    from twin.security.credentials import Credentials
 
 CONNECT_TIMEOUT_S = 3.0
 ANSWER_TIMEOUT_S = 2.0
@@ -32,7 +39,7 @@ def request_command(
     reason: str,
     connect: str,
     rig: str,
-    keys: Credentials | None = None,
+    keys: "Credentials | None" = None,
     *,
     run: str = "",
     sender: str = "",
@@ -52,7 +59,7 @@ def request_command(
 
 
 def send_command(
-    command: str, reason: str, connect: str, rig: str, keys: Credentials | None = None
+    command: str, reason: str, connect: str, rig: str, keys: "Credentials | None" = None
 ) -> str:
     """Send a command as the user; return a confirmation, InputError if it is not accepted."""
     run, answer = request_command(command, reason, connect, rig, keys)

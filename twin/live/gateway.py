@@ -37,8 +37,9 @@ from twin.live.remote_twin import (
 from twin.live.status import REQUEST_PATHS, RunStatus
 from twin.security.access_control import build_open_access
 from twin.security.credentials import read_credentials
-from twin.transport.codec import MEAS_TOPIC, TOPIC_TYPES, encode_item, topic_for
+from twin.transport.codec import TOPIC_TYPES, encode_item, topic_for
 from twin.transport.endpoint import (
+    MEAS_TOPIC,
     PUBLIC_HUB_SETTINGS,
     check_endpoint,
     merge_settings,

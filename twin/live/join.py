@@ -18,7 +18,8 @@ from twin.run.folders import RUNS_FOLDER, make_output_folder
 from twin.run.merge_parts import LOCK_FILE, merge_run_parts
 from twin.run.system import lock_file
 from twin.run.terminal import catch_interrupts, print_line
-from twin.security.credentials import Credentials, user_name
+from twin.security.access_control import user_name
+from twin.security.credentials import Credentials
 from twin.transport.codec import TOPIC_TYPES, WireError, decode_item, encode_item, topic_for
 from twin.transport.endpoint import make_endpoint_error
 from twin.transport.reliable_subscriber import ReliableSubscriber

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, field
 from table_io.block import Block
 from table_io.records import Comparison, Event, RunStart, RunStop, SampleGap, Step, StepAdded
 from twin.live.process_config import ProcessConfig
-from twin.transport.codec import CMP_TOPIC, MEAS_TOPIC, Item, WireError, decode_item, message_schema
-from twin.transport.endpoint import list_observers
+from twin.transport.codec import Item, WireError, decode_item, message_schema
+from twin.transport.endpoint import CMP_TOPIC, MEAS_TOPIC, list_observers
 
 STATUS_TOPICS = frozenset(("/run/start", "/run/stop", "/run/event", "/rig/gap", "/rig/decided"))
 TOML_FIELDS = ("profile_toml", "rig_toml", "model_toml")

@@ -22,7 +22,8 @@ from twin.live.process_config import (
 from twin.live.remote_twin import TWIN_TOPICS
 from twin.live.scheduling import request_realtime
 from twin.run.run_config import compile_twin_kernels
-from twin.transport.codec import MEAS_TOPIC, Item, decode_item, encode_item, topic_for
+from twin.transport.codec import Item, decode_item, encode_item, topic_for
+from twin.transport.endpoint import MEAS_TOPIC
 from twin.transport.reliable_subscriber import ReliableSubscriber
 from twin.transport.zenoh_link import BusLink, open_spoke
 

@@ -57,7 +57,8 @@ from twin.model.model import Model
 from twin.recording.reader import Recording, read_recording, read_start
 from twin.recording.run_paths import resolve_log_path
 from twin.recording.tabular import channel_unit, collect_steps
-from twin.transport.codec import MEAS_TOPIC, PRED_TOPIC, RECORD_TOPICS
+from twin.transport.codec import RECORD_TOPICS
+from twin.transport.endpoint import MEAS_TOPIC, PRED_TOPIC
 
 if TYPE_CHECKING:
     from twin.log.dataset import Dataset

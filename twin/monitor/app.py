@@ -21,9 +21,10 @@ from twin.monitor.run_state import LiveRunState, update_run_state
 from twin.monitor.screen import COMMAND_KEYS, SILENT_S, draw_screen
 from twin.run.progress import RunProgress
 from twin.run.terminal import console, print_line
-from twin.security.credentials import Credentials, user_name
-from twin.transport.codec import MEAS_TOPIC, RECORD_TOPICS, Item, WireError, decode_item
-from twin.transport.endpoint import check_endpoint
+from twin.security.access_control import user_name
+from twin.security.credentials import Credentials
+from twin.transport.codec import RECORD_TOPICS, Item, WireError, decode_item
+from twin.transport.endpoint import MEAS_TOPIC, check_endpoint
 from twin.transport.reliable_subscriber import ReliableSubscriber
 from twin.transport.zenoh_link import BusLink, open_spoke
 

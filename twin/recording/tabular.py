@@ -22,12 +22,8 @@ from table_io.errors import InputError
 from table_io.records import Event, PrcPoint, Record, RunStart, RunStop, Step, StepAdded
 from twin.recording.mcap_log import iter_messages
 from twin.recording.reader import START_TOPIC, iter_valid_items, read_start
-from twin.transport.codec import (
-    MEAS_TOPIC,
-    PRED_TOPIC,
-    TOPIC_TYPES,
-    Item,
-)
+from twin.transport.codec import TOPIC_TYPES, Item
+from twin.transport.endpoint import MEAS_TOPIC, PRED_TOPIC
 
 # Columns of every sample in addition to its channels, and their units.
 LABEL_UNITS = {

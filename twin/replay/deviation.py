@@ -9,7 +9,7 @@ from table_io.block import Block
 from twin.compare import TWIN_CHANNELS
 from twin.recording.reader import read_recording
 from twin.reports.summary import Json
-from twin.transport.codec import PRED_TOPIC
+from twin.transport.endpoint import PRED_TOPIC
 
 
 def compute_deviation(old_path: Path, new_path: Path) -> Json:

@@ -34,16 +34,8 @@ from twin.recording.recovery import recover_log
 from twin.replay.provenance import find_earlier_run, iter_start_records
 from twin.run.run_config import RunConfig
 from twin.run.unpaced import ItemHandler, record_items
-from twin.transport.codec import (
-    CMP_TOPIC,
-    PRED_TOPIC,
-    RECORD_TOPICS,
-    TOPIC_TYPES,
-    Item,
-    WireError,
-    decode_item,
-    strip_run,
-)
+from twin.transport.codec import RECORD_TOPICS, TOPIC_TYPES, Item, WireError, decode_item, strip_run
+from twin.transport.endpoint import CMP_TOPIC, PRED_TOPIC
 
 MAX_COMPARISON_SAMPLES = 10_000  # covered by one comparison
 BLOCK_DURATION_S = 1.0  # offline; results do not depend on the block size

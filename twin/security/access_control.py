@@ -19,8 +19,13 @@ nothing else, which shows that the rig exists and refuses. The web page on the r
 connects with the rig's certificate and, like a router, forwards commands of those who log in there.
 """
 
+import getpass
+import re
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from twin.security.credentials import Credentials
 
 ROUTER_ROLE = "router"
 ROLES = ("observe", "record", "twin", "command", ROUTER_ROLE)
@@ -134,3 +139,10 @@ def _to_zenoh_settings(rig: str, grants: Iterable[Grant]) -> dict[str, Any]:
     base = {"enabled": True, "default_permission": "deny"}
     lists = {"rules": zenoh_rules, "subjects": subjects, "policies": policies}
     return {"access_control": base | lists}
+
+
+def user_name(keys: "Credentials | None") -> str:
+    """Return the name in the certificate; without keys the login name on this machine."""
+    if keys is not None:
+        return keys.name
+    return re.sub(r"[^A-Za-z0-9_.-]", "_", getpass.getuser())[:64] or "unknown"

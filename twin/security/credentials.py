@@ -14,8 +14,6 @@
 A certificate is verified against the authority before it is used.
 """
 
-import getpass
-import re
 import ssl
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -239,10 +237,3 @@ def create_tls_context(folder: Path, side: int) -> ssl.SSLContext:
         ) from None
     context.verify_mode = ssl.CERT_REQUIRED
     return context
-
-
-def user_name(keys: Credentials | None) -> str:
-    """Return the name in the certificate; without keys the login name on this machine."""
-    if keys is not None:
-        return keys.name
-    return re.sub(r"[^A-Za-z0-9_.-]", "_", getpass.getuser())[:64] or "unknown"

@@ -52,14 +52,10 @@ from table_io.records import (
     Trip,
 )
 from twin.transport import shaketwin_pb2 as pb
+from twin.transport.endpoint import BLOCK_TOPICS, CMP_TOPIC
 
 Item = Block | Record
 
-# All topics of the stream.
-MEAS_TOPIC = "/rig/meas"
-PRED_TOPIC = "/twin/pred"
-CMP_TOPIC = "/twin/cmp"
-BLOCK_TOPICS = {"meas": MEAS_TOPIC, "pred": PRED_TOPIC}
 RECORD_TOPICS: dict[type, str] = {
     RunStart: "/run/start",
     RunStop: "/run/stop",

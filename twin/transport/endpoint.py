@@ -6,10 +6,13 @@ from collections.abc import Iterable
 from typing import Any
 
 from table_io.errors import InputError
-from twin.transport.codec import BLOCK_TOPICS, CMP_TOPIC
 
 Settings = dict[str, Any]
 
+MEAS_TOPIC = "/rig/meas"
+PRED_TOPIC = "/twin/pred"
+CMP_TOPIC = "/twin/cmp"
+BLOCK_TOPICS = {"meas": MEAS_TOPIC, "pred": PRED_TOPIC}
 STREAM_TOPICS = frozenset((*BLOCK_TOPICS.values(), CMP_TOPIC))  # published for every block
 LOCAL_SOCKET_PREFIX = "unixsock-stream/"  # inside a run, unreachable for other accounts
 OBSERVER_PREFIX = "observer."  # begins the liveliness names of observers

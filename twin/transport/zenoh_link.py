@@ -23,12 +23,10 @@ publisher that keeps publishing.
 
 import json
 import secrets
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import zenoh
 
-from twin.security.credentials import Credentials
-from twin.security.tls_diagnostics import diagnose_missing_role, diagnose_refusal
 from twin.transport.endpoint import (
     LOCAL_SOCKET_PREFIX,
     OBSERVER_PREFIX,
@@ -63,6 +61,9 @@ from twin.transport.requests import (
     parse_history_query,
     parse_request,
 )
+
+if TYPE_CHECKING:
+    from twin.security.credentials import Credentials
 
 # A reply inherits the congestion control of its query: the rig never waits for a stalled requester.
 DROP = zenoh.CongestionControl.DROP
@@ -268,7 +269,10 @@ class BusLink:
 
 
 def open_hub(
-    rig: str, endpoint: str, extra_settings: Settings | None = None, keys: Credentials | None = None
+    rig: str,
+    endpoint: str,
+    extra_settings: Settings | None = None,
+    keys: "Credentials | None" = None,
 ) -> BusLink:
     """Open the hub, listening at `endpoint`; raise InputError if that fails.
 
@@ -288,7 +292,7 @@ def open_hub(
 
 
 def open_spoke(
-    rig: str, endpoint: str, timeout_s: float, keys: Credentials | None = None
+    rig: str, endpoint: str, timeout_s: float, keys: "Credentials | None" = None
 ) -> BusLink:
     """Connect to the hub at `endpoint`.
 
@@ -299,6 +303,8 @@ def open_spoke(
     try:
         session = _open_session(merge_settings(config, {} if keys is None else keys.tls_settings()))
     except zenoh.ZError:
+        from twin.security.tls_diagnostics import diagnose_refusal  # slow import
+
         is_local = endpoint.startswith(LOCAL_SOCKET_PREFIX)
         refusal = None if is_local else diagnose_refusal(*split_host_port(endpoint), keys)
         no_answer = (
@@ -307,9 +313,12 @@ def open_spoke(
         )
         raise make_endpoint_error(endpoint, *(refusal or no_answer)) from None
     link = BusLink(rig, session)
-    if keys is not None and (refusal := diagnose_missing_role(link.query, keys.name, rig)):
-        link.close()
-        raise make_endpoint_error(endpoint, *refusal)
+    if keys is not None:
+        from twin.security.tls_diagnostics import diagnose_missing_role
+
+        if refusal := diagnose_missing_role(link.query, keys.name, rig):
+            link.close()
+            raise make_endpoint_error(endpoint, *refusal)
     return link
 
 

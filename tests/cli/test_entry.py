@@ -1,0 +1,43 @@
+"""Orders to a running test: what is sent without the command line, and what it parses."""
+
+import pytest
+
+from twin.cli import entry
+from twin.cli.live_commands import RunCommand
+from twin.live import control
+
+SENT = [
+    ("control stop", ("stop", "", entry.DEFAULT_ENDPOINT, "simulated")),
+    ("control hold --why tired --rig big", ("hold", "tired", entry.DEFAULT_ENDPOINT, "big")),
+    ("control abort --connect tcp/[::1]:9", ("abort", "", "tcp/[::1]:9", "simulated")),
+]
+PARSED = ["", "run stop", "control", "control --help", "control stop --why", "control sotp",
+          "control stop --keys folder", "control --why x stop"]  # fmt: skip
+
+
+@pytest.mark.parametrize(("line", "order"), SENT)
+def test_an_order_is_sent_at_once(
+    line: str, order: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    orders = []
+    monkeypatch.setattr(control, "send_command", lambda *words: orders.append(words))
+    assert entry.send_order(line.split())
+    assert orders == [order]
+
+
+@pytest.mark.parametrize("line", PARSED)
+def test_the_command_line_parses_all_else(line: str) -> None:
+    assert not entry.send_order(line.split())
+
+
+def test_the_orders_are_those_of_the_command_line() -> None:
+    assert set(entry.ORDERS) == set(RunCommand)
+
+
+def test_an_order_to_nobody_is_an_input_error(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["shaketwin", "control", "stop", "--connect", "udp/x"])
+    with pytest.raises(SystemExit, match="2"):
+        entry.main()
+    assert "udp/x" in capsys.readouterr().err
