@@ -38,7 +38,8 @@ from twin.monitor.web import (
     submit_page_command,
 )
 from twin.security import page_access
-from twin.security.credentials import read_credentials, user_name
+from twin.security.access_control import user_name
+from twin.security.credentials import read_credentials
 from twin.security.page_access import grant_page_access, hash_code, identify_person
 
 PATIENCE_S = 10.0

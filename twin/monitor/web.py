@@ -21,16 +21,15 @@ from twin.monitor.page_data import build_sections
 from twin.monitor.page_server import CommandAnswer, PageCommand, PageFeed, open_page_server
 from twin.run.diagnostics import configure_logging
 from twin.run.terminal import print_line, print_qr_code
+from twin.security.access_control import user_name
 from twin.security.credentials import (
     CERTIFICATE_FILE,
     Credentials,
     credentials_folder,
     read_credentials,
-    user_name,
 )
 from twin.security.page_access import PageAccess, grant_page_access, is_loopback_host
-from twin.transport.codec import PRED_TOPIC
-from twin.transport.endpoint import split_host_port
+from twin.transport.endpoint import PRED_TOPIC, split_host_port
 from twin.viewer.address import find_free_address
 
 PAGE_ADDRESS = "127.0.0.1:7480"

@@ -28,14 +28,8 @@ from pydantic import AfterValidator, Field
 from table_io.clock import local_datetime
 from table_io.config.base import ConfigModel, parse_toml, read_text
 from table_io.errors import InputError
-from twin.security.access_control import NO_ROLE
-from twin.security.credentials import (
-    CERTIFICATE_FILE,
-    Credentials,
-    check_name,
-    create_tls_context,
-    user_name,
-)
+from twin.security.access_control import NO_ROLE, user_name
+from twin.security.credentials import CERTIFICATE_FILE, Credentials, check_name, create_tls_context
 
 CODES_FILE = "codes.toml"
 CODE_BYTES = 15  # 120 bits, 24 characters
