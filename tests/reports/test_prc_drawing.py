@@ -11,7 +11,13 @@ from table_io.records import PrcPoint
 from tests.reports.recordings import summary
 from twin.compare.curves import PrcJump
 from twin.reports.plot_style import twin_style
-from twin.reports.prc_drawing import Panel, draw_jumps, make_prc_panels, plot_prc
+from twin.reports.prc_drawing import (
+    Panel,
+    break_at_jumps,
+    draw_jumps,
+    make_prc_panels,
+    plot_prc,
+)
 from twin.reports.report_data import extract_prc
 from twin.reports.summary import prc_points
 
@@ -71,3 +77,12 @@ def test_a_jump_at_a_frequency_that_was_not_measured_is_left_out(
     jumps = [PrcJump("forward", 2.0, 2.6, "down")]
     draw_jumps(panels, partial(extract_prc, points, "twin"), jumps)
     assert list(panels[0][0].texts) == []
+
+
+def test_a_curve_is_broken_at_the_jumps_of_its_direction(points: list[PrcPoint]) -> None:
+    curves = partial(extract_prc, points, "measured")
+    broken = break_at_jumps(curves, [PrcJump("forward", 2.0, 2.5, "down")])
+    f, eta_d = broken("forward", "eta_d")
+    assert f.tolist() == [1.0, 1.5, 2.0, 2.25, 2.5]
+    assert np.isnan(eta_d).tolist() == [False, False, False, True, False]
+    assert np.isfinite(broken("backward", "eta_d")[1]).all()

@@ -190,3 +190,11 @@ def test_a_lost_channel_never_stops_the_report(run_folder: Maker, lost: str) -> 
 )  # fmt: skip
 def test_significant_digits(value: float | None, text: str) -> None:
     assert format_significant(value) == text
+
+
+def test_the_steps_table_has_the_fundamental_with_its_error(run_folder: Maker) -> None:
+    values = summary()
+    for step in values["steps"]:
+        step["table_acc_fundamental_m_s2"] = 1.02 * 0.49  # demanded: 0.49 m/s2
+    text = words(bare(run_folder(run_summary=values)))
+    assert "0.500 0.490 2.00 0.488 2.15" in text

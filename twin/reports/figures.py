@@ -37,6 +37,7 @@ from twin.reports.plot_style import (
 from twin.reports.prc_drawing import (
     FREE_PANELS,
     PRC_PANELS,
+    break_at_jumps,
     draw_jumps,
     format_mirrored_axis,
     make_prc_panels,
@@ -92,9 +93,12 @@ def _draw_prc(run: ReportData) -> CaptionedFigures:
     prestress = compute_prestress(run)
     shade_hysteresis(panels, intervals)
     shade_precompression(panels, prestress)
-    plot_prc(panels, measured, _dotted_style)
-    plot_prc(panels, twin, twin_style)
-    jumps = [PrcJump(**jump) for jump in run.summary.get("jumps") or []]
+    jumps, twin_jumps = (
+        [PrcJump(**jump) for jump in run.summary.get(key) or []] for key in ("jumps", "twin_jumps")
+    )
+    measured_jumps = jumps if run.source == "measured" else []
+    plot_prc(panels, break_at_jumps(measured, measured_jumps), _dotted_style)
+    plot_prc(panels, break_at_jumps(twin, twin_jumps), twin_style)
     draw_jumps(panels, curves, jumps, label_in="eta_d")
     kinds = sorted({interval.kind for interval in intervals})
     patches = [Patch(color=HYSTERESIS_COLOURS[kind], label=f"{kind} hysteresis") for kind in kinds]
@@ -106,8 +110,9 @@ def _draw_prc(run: ReportData) -> CaptionedFigures:
         )
     draw_legend(run, figure, *patches, marker="o")
     caption = (
-        "One point per frequency step, averaged over its measured cycles. Arrows: jumps between "
-        "two grid frequencies. Displacement and deformation are divided by the free-flight maximum "
+        "One point per frequency step, averaged over its measured cycles; measured wide and pale, "
+        "twin thin. Curves are broken where they jump; arrows: jumps between two grid frequencies. "
+        "Displacement and deformation are divided by the free-flight maximum "
         "u*, acceleration by a*, forces by the weight."
     )
     if prestress:
@@ -131,7 +136,7 @@ def _draw_model_branches(run: ReportData) -> CaptionedFigures:
         ax.set_ylabel(label)
         for direction in DIRECTIONS:
             f, y = extract_prc(run.points, run.source, direction, name)
-            style = {**_dotted_style(direction), "ls": "", "alpha": 0.6}
+            style = {**_dotted_style(direction), "ls": ""}
             ax.plot(f, y, zorder=1.5, label=f"{run.source} {direction}", **style)
     handles = [*axes[0, 0].get_legend_handles_labels()[0], *branch_handles(branches)]
     figure.legend(handles=handles, loc="outside upper center", ncols=7)

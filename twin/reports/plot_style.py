@@ -1,6 +1,7 @@
 """Plot style of every figure: colors, line styles, figure size, and how figures are saved.
 
-Measured: red forward, blue backward. Twin: black, solid forward, dashed backward.
+Measured: wide and pale, red forward, blue backward.
+Twin: thin, black, solid forward, dashed backward.
 Import only to draw: matplotlib is slow to import.
 """
 
@@ -45,6 +46,7 @@ TRANSITION_COLOURS = {
 }  # fmt: skip
 REST_LINE_STYLE: dict[str, Any] = {"color": GUIDE_COLOUR, "ls": (0, (5, 3)), "lw": 0.8}
 UNSTABLE_STYLE: dict[str, Any] = {"color": "#777777", "ls": (0, (1, 1.4)), "lw": 1.1}
+MEASURED_ALPHA = 0.45
 LineStyle = dict[str, Any]
 DirectionStyle = Callable[[str], LineStyle]  # line style of a direction
 
@@ -90,12 +92,12 @@ def save_figures(
     return pictures
 
 
-def measured_style(direction: str, width: float = 2.2) -> LineStyle:
-    """Return a solid line in the color of the direction, visible under a coincident twin line."""
-    return {"color": DIRECTION_COLOURS[direction], "lw": width}
+def measured_style(direction: str, width: float = 3.2) -> LineStyle:
+    """Return a wide, pale line in the color of the direction: a twin line on top shows."""
+    return {"color": DIRECTION_COLOURS[direction], "lw": width, "alpha": MEASURED_ALPHA}
 
 
-def twin_style(direction: str, width: float = 0.8) -> LineStyle:
+def twin_style(direction: str, width: float = 0.9) -> LineStyle:
     """Return the line style of a twin or model: black, solid forward, dashed backward."""
     return {"color": TWIN_COLOUR, "ls": DIRECTION_DASHES[direction], "lw": width}
 

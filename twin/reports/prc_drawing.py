@@ -84,6 +84,20 @@ def plot_prc(panels: Iterable[Panel], curves: Curves, make_style: DirectionStyle
             ax.set_ylim(bottom=0)
 
 
+def break_at_jumps(curves: Curves, jumps: Sequence[PrcJump]) -> Curves:
+    """Return the curves with a NaN between the two points of each jump of their direction."""
+
+    def broken(direction: str, name: str) -> Curve:
+        f, y = curves(direction, name)
+        middles = [
+            0.5 * (jump.from_hz + jump.to_hz) for jump in jumps if jump.direction == direction
+        ]
+        places = np.searchsorted(f, middles)
+        return np.insert(f, places, middles), np.insert(y, places, np.nan)
+
+    return broken
+
+
 def shade_hysteresis(panels: Iterable[Panel], intervals: Iterable[Hysteresis]) -> None:
     """Shade hysteresis intervals, yellow right and cyan left."""
     for ax, _ in panels:

@@ -3,7 +3,7 @@
 Steps come from `report_data.select_frequencies`: at most four frequencies, both directions each.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ from twin.reports.plot_style import (
     FIGURE_WIDTH_IN,
     GUIDE_COLOUR,
     REST_LINE_STYLE,
+    TWIN_COLOUR,
     CaptionedFigure,
     CaptionedFigures,
     direction_handles,
@@ -41,6 +42,7 @@ from twin.reports.report_data import (
 
 HISTORY_CYCLES = 3
 CONTACT_ALPHAS = 0.22, 0.10  # right, left
+BAND_COLOUR = "#cfe8d5"
 
 
 def draw_legend(
@@ -70,38 +72,86 @@ def draw_histories(run: ReportData) -> CaptionedFigures:
         rows = 3 if run.has_bumpers else 2
         if not motions:
             continue
-        figure = Figure(figsize=(FIGURE_WIDTH_IN, 1.75 * rows + 0.5))
-        axes = figure.subplots(rows, len(motions), sharex=True, sharey="row", squeeze=False)
+        has_residuals = any(measured and twin for _, measured, twin in motions)
+        heights = [2.0, 0.9] * rows if has_residuals else [2.0] * rows
+        figure = Figure(figsize=(FIGURE_WIDTH_IN, 0.8 * sum(heights) + 0.6))
+        axes = figure.subplots(
+            len(heights), len(motions), sharex="col", sharey="row", squeeze=False,
+            height_ratios=heights,
+        )  # fmt: skip
+        stride = 2 if has_residuals else 1
         for column, (direction, measured, twin) in zip(axes.T, motions, strict=True):
-            column[0].set_title(f"{direction}, {hz:g} Hz")
+            histories = column[::stride]
+            histories[0].set_title(f"{direction}, {hz:g} Hz")
             column[-1].set_xlabel("time in s")
             for motion, style in (
                 (measured, measured_style(direction)),
                 (twin, twin_style(direction)),
             ):
                 if motion is not None:
-                    plot_history(column, motion.select_last(HISTORY_CYCLES), **style)
+                    plot_history(histories, motion.select_last(HISTORY_CYCLES), **style)
             contact_motion = twin if run.source == "twin" or measured is None else measured
             if contact_motion is not None:
                 shown, colour = (
                     contact_motion.select_last(HISTORY_CYCLES),
                     DIRECTION_COLOURS[direction],
                 )
-                for ax in column:
+                for ax in histories:
                     shade_contact(ax, shown, colour, CONTACT_ALPHAS, run.contact_n)
             if run.gaps_m is not None:
-                draw_rest_lines(run.gaps_m, column[0].axhline)
+                draw_rest_lines(run.gaps_m, histories[0].axhline)
+            if has_residuals and measured and twin:
+                _draw_residuals(
+                    column[1::2],
+                    measured.select_last(HISTORY_CYCLES),
+                    twin.select_last(HISTORY_CYCLES),
+                    _find_bands(run, direction, hz),
+                )
         labels = ("$u$ in mm", "$a$ in m/s²", "$F_R$, $F_L$ in kN")
-        for ax, label in zip(axes[:, 0], labels, strict=False):
+        for ax, label in zip(axes[::stride, 0], labels, strict=False):
             ax.set_ylabel(label)
-        draw_legend(run, figure, *_gap_line_handles(run))
+        for ax in axes[1::2, 0] if has_residuals else ():
+            ax.set_ylabel("residual")
+        handles: list[Line2D | Patch] = _gap_line_handles(run)
+        if has_residuals:
+            handles.append(Patch(color=BAND_COLOUR, label="tolerance"))
+        draw_legend(run, figure, *handles)
         caption = (
-            "Last measured cycles. Shaded: contact, dark for the right bumper, light for the left. "
+            "Last measured cycles; below each history, measured minus twin in the same unit, and "
+            "the tolerance of the restarted twin. Shaded: contact, dark for the right bumper, light for the left. "
             "The twin is free-running on the measured table acceleration; a chaotic motion cannot "
             "be reproduced sample by sample."
         )
         title = f"Histories at {hz:g} Hz: {reason}"
         yield CaptionedFigure(f"histories_{hz:g}hz", title, caption, figure)
+
+
+def _find_bands(run: ReportData, direction: str, hz: float) -> dict[str, float]:
+    """Return the tolerance of u in m and of a in m/s2 at a step; empty if it is unknown."""
+    for step in run.steps:
+        if step["direction"] == direction and step["frequency_hz"] == hz:
+            return {name: entry["band"] for name, entry in (step.get("agreement") or {}).items()}
+    return {}
+
+
+def _draw_residuals(
+    axes: Sequence[Axes], measured: StepMotion, twin: StepMotion, bands: dict[str, float]
+) -> None:
+    """Draw measured minus twin of u, a and the forces, each with its tolerance band."""
+    count = min(measured.time.size, twin.time.size)
+    scales = (("u", 1e3, "rel_disp_m"), ("a", 1.0, "mass_acc_m_s2"))
+    for ax, (name, scale, channel) in zip(axes, scales, strict=False):
+        difference = getattr(measured, name)[:count] - getattr(twin, name)[:count]
+        ax.plot(measured.time[:count], scale * difference, color=TWIN_COLOUR, lw=0.8)
+        if channel in bands:
+            half = scale * bands[channel]
+            ax.axhspan(-half, half, color=BAND_COLOUR, lw=0, zorder=0.4)
+    for ax in axes[2:]:
+        for name in ("force_r", "force_l"):
+            difference = getattr(measured, name)[:count] - getattr(twin, name)[:count]
+            ax.plot(measured.time[:count], difference / 1e3, color=TWIN_COLOUR, lw=0.8)
+    for ax in axes:
+        ax.axhline(0, color=GUIDE_COLOUR, lw=0.5)
 
 
 def _gap_line_handles(run: ReportData) -> list[Line2D | Patch]:
@@ -156,7 +206,9 @@ def _draw_grid(
     if not directions:
         return
     figure = Figure(figsize=(FIGURE_WIDTH_IN, 2.5 * len(directions) + 0.6))
-    axes = figure.subplots(len(directions), max(len(columns), 3), sharex="col", squeeze=False)
+    axes = figure.subplots(
+        len(directions), max(len(columns), 3), sharex="col", sharey="col", squeeze=False
+    )
     for ax in axes[:, len(columns) :].flat:
         ax.remove()
     for column, (hz, motions) in zip(axes.T, columns.items(), strict=False):

@@ -79,8 +79,7 @@ def _draw_motion(
         t = time_s[shown] - time_s[shown[0]]
         for column, run in enumerate(runs):
             upper, lower = axes[2 * row : 2 * row + 2, column]
-            pale = measured_style(close_up.direction, 3.0) | {"alpha": 0.4}
-            upper.plot(t, 1e3 * measured[shown], **pale)
+            upper.plot(t, 1e3 * measured[shown], **measured_style(close_up.direction))
             upper.plot(t, 1e3 * run.u[shown], **twin_style("forward"))
             lower.plot(t, 1e3 * (measured - run.u)[shown], color=TWIN_COLOUR, lw=0.8)
             lower.axhline(0, color=GUIDE_COLOUR, lw=0.5)
