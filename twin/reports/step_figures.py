@@ -118,7 +118,8 @@ def draw_histories(run: ReportData) -> CaptionedFigures:
         draw_legend(run, figure, *handles)
         caption = (
             "Last measured cycles; below each history, measured minus twin in the same unit, and "
-            "the tolerance of the restarted twin. Shaded: contact, dark for the right bumper, light for the left. "
+            "the tolerance of the restarted twin. Shaded: contact, dark for the right bumper, "
+            "light for the left. "
             "The twin is free-running on the measured table acceleration; a chaotic motion cannot "
             "be reproduced sample by sample."
         )
