@@ -1,6 +1,6 @@
 """The Python interface for notebooks and scripts: everything public is in this module.
 
->>> from twin.api import discover, identify, open_log, replay, run_simulated, simulate
+>>> from twin.api import discover, identify, import_data, open_log, replay, run_simulated, simulate
 >>> log = run_simulated("quickstart", "runs/first")      # a test on the simulated table
 >>> log["rel_disp_m"], log.twin["rel_disp_m"]            # u measured, u of the twin; m, (sample,)
 >>> fitted = identify([log.path])
@@ -18,7 +18,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from table_io.clock import RealClock
+from table_io.config.folders import resolve_config
 from table_io.errors import InputError
+from twin.exchange.import_table import ImportOptions, import_samples
 from twin.identification.discover import discover_effects
 from twin.identification.identify import identify_parameters
 from twin.identification.parameters import get_log
@@ -44,6 +46,7 @@ __all__ = [
     "Verdict",
     "discover",
     "identify",
+    "import_data",
     "open_log",
     "replay",
     "run_simulated",
@@ -107,6 +110,29 @@ def replay(log: PathLike, out: PathLike | None = None, model: PathLike | None = 
     span = SampleRange.all_samples(recording)
     replay_recording(recorded, config, folder / LOG_FILE, run, lambda _: None, span)
     return open_log(folder)
+
+
+def import_data(
+    file: PathLike,
+    out: PathLike,
+    columns: PathLike | None = None,
+    profile: PathLike | None = None,
+) -> Log:
+    """Import a table of samples (CSV, xlsx, Parquet, MAT, ...) to the new log `out`; return it.
+
+    `columns` is the file of a column map; without it the proposed map is taken, whose units and
+    channels are in the log's events. `profile` states specimen, gaps and steps. InputError where
+    the file leaves a question open, or `out` exists.
+    """
+    import_samples(
+        Path(file),
+        Path(out),
+        None if profile is None else resolve_config(Path(profile), "tests"),
+        None,
+        None if columns is None else Path(columns),
+        ImportOptions(accept=columns is None),
+    )
+    return open_log(out)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Generated pages: every key, command, effect and channel, from the objects themselves."""
 
+import json
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from table_io.config.rig import RigConfig
 from twin.cli.main import app
 from twin.guide.gallery import write_gallery
 from twin.guide.loops import compute_loops, find_loops
+from twin.guide.notebook import convert_notebook, list_code
 from twin.guide.reference import CONFIG_FILES, write_command_reference, write_key_reference
 from twin.model.effects import EFFECTS
 from twin.model.effects.effect import Effect
@@ -80,6 +82,26 @@ def test_the_pages_list_every_key_and_command() -> None:
             assert f"### shaketwin {name}" in commands
     assert "### shaketwin keys add" in commands
     assert "| `--remote-twin` |" in commands
+
+
+def test_a_notebook_becomes_a_page_with_its_outputs() -> None:
+    cells = [
+        {"cell_type": "markdown", "source": ["# Title\n", "\n", "Text."]},
+        {
+            "cell_type": "code",
+            "source": ["print(1)"],
+            "outputs": [
+                {"output_type": "stream", "name": "stdout", "text": ["1\n"]},
+                {"output_type": "display_data", "data": {"image/png": "AAAA\n"}},
+            ],
+        },
+    ]
+    text = json.dumps({"cells": cells})
+    page = convert_notebook(text, "a.ipynb")
+    assert page.startswith("# Title\n\nThis page is the notebook [a.ipynb](a.ipynb)")
+    assert "```python\nprint(1)\n```\n\n```text\n1\n```" in page
+    assert 'src="data:image/png;base64,AAAA"' in page
+    assert list_code(text) == ["print(1)"]
 
 
 def test_the_gallery_has_every_effect_and_what_it_is_confused_with() -> None:

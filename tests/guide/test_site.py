@@ -67,7 +67,8 @@ def list_broken(site: Path, pages: dict[str, PageParser]) -> list[str]:
         for target in [*page.targets, *page.resources]:
             parts = urlsplit(target)
             if parts.scheme:
-                broken += [f"{name}: {target}"] * (target in page.resources)
+                is_foreign = target in page.resources and parts.scheme != "data"
+                broken += [f"{name}: {target}"] * is_foreign
                 continue
             file = unquote(parts.path) or name
             linked = pages.get(file)

@@ -24,6 +24,10 @@ CONFIG_FILES: tuple[tuple[str, str, type[ConfigModel]], ...] = (
     ("Column map", "Columns of a foreign file, for `import --columns`.", ColumnMap),
 )
 
+PUBLIC_FUNCTIONS = (
+    "open_log", "run_simulated", "simulate", "replay", "import_data", "identify", "discover",
+)  # fmt: skip
+
 
 def format_table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     """Return a Markdown table."""
@@ -119,7 +123,7 @@ def write_api_reference(_: typer.Typer) -> str:
         f"```python\n{example.replace('>>> ', '')}\n```",
         notes,
     ]
-    for name in ("open_log", "run_simulated", "simulate", "replay", "identify", "discover"):
+    for name in PUBLIC_FUNCTIONS:
         parts += _describe_object(name, getattr(api, name))
     parts += ["## Log", (getdoc(log) or "").split("\n\n", 2)[2]]
     for kind in (api.FittedModel, api.DiscoveredModel):

@@ -13,6 +13,7 @@ from markupsafe import Markup
 from table_io.errors import InputError
 from twin.guide.gallery import write_gallery
 from twin.guide.markdown import RenderedMarkdown, render_markdown
+from twin.guide.notebook import convert_notebook
 from twin.guide.reference import (
     write_api_reference,
     write_channel_reference,
@@ -24,7 +25,8 @@ from twin.reports.page import render_page
 PACKAGES_DIR = Path(__file__).resolve().parents[2]  # holds twin and table_io
 PAGES_DIR = Path(__file__).parent / "pages"
 TEMPLATE = Path(__file__).with_name("guide.html")
-PICTURES_FOLDER = "pictures"
+TUTORIALS_DIR = Path(__file__).parent / "tutorials"
+FILES_FOLDER = "files"  # pictures and notebooks
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +51,10 @@ class GuidePage:
 
     def read(self, app: typer.Typer) -> str:
         """Return the Markdown."""
-        if isinstance(self.source, Path):
-            return self.source.read_text(encoding="utf-8")
-        return self.source(app)
+        if not isinstance(self.source, Path):
+            return self.source(app)
+        text = self.source.read_text(encoding="utf-8")
+        return convert_notebook(text, self.source.name) if self.source.suffix == ".ipynb" else text
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +63,10 @@ class Chapter:
 
     title: str
     pages: tuple[GuidePage, ...]
+
+
+def _tutorial(slug: str, title: str) -> GuidePage:
+    return GuidePage(slug, title, TUTORIALS_DIR / f"{slug}.ipynb")
 
 
 def _page(slug: str, title: str, source: str = "") -> GuidePage:
@@ -87,6 +94,17 @@ CHAPTERS = (
             _page("imperfections", "Imperfect laboratory", "table_io/sim/IMPERFECTIONS.md"),
             _page("foreign-data", "Data of others", "twin/exchange/FOREIGN_DATA.md"),
             _page("security", "Security", "twin/security/KEYS.md"),
+        ),
+    ),
+    Chapter(
+        "Tutorials in Python",
+        (
+            _tutorial("look-at-a-log", "Look at a log"),
+            _tutorial("fit-a-specimen", "Fit a specimen"),
+            _tutorial("find-a-hidden-effect", "Find a hidden effect"),
+            _tutorial("import-your-csv", "Import your CSV"),
+            _tutorial("write-an-effect", "Write an effect"),
+            _tutorial("write-a-backend", "Write a backend"),
         ),
     ),
     Chapter(
@@ -189,11 +207,11 @@ class _PageLinks:
         if parts.path:
             path = Path(os.path.normpath(page.markdown_path.parent / parts.path))
         linked = self._by_path.get(path)
-        if linked is None and path.is_file() and path.suffix != ".md":
-            pictures = self._folder / PICTURES_FOLDER
-            pictures.mkdir(exist_ok=True)
-            shutil.copyfile(path, pictures / path.name)
-            return f"{PICTURES_FOLDER}/{path.name}"
+        if path.is_file() and path.suffix != ".md" and (linked in (None, page)):
+            files = self._folder / FILES_FOLDER
+            files.mkdir(exist_ok=True)
+            shutil.copyfile(path, files / path.name)
+            return f"{FILES_FOLDER}/{path.name}"
         if linked is None:
             self._unresolved.setdefault(page, []).append(target)
             return target
