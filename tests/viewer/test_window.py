@@ -2,8 +2,10 @@
 
 import re
 import socket
+import urllib.request
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 import numpy as np
 import pytest
@@ -19,8 +21,9 @@ from tests.viewer.example_run import (
 )
 from twin.viewer import window
 from twin.viewer.address import find_free_address, format_live_view, parse_address, viewer_url
+from twin.viewer.style import BACKGROUND_COLOUR, LINE_STYLES, Rgb
 from twin.viewer.view import RerunView, write_rrd
-from twin.viewer.window import open_viewer, take_screenshot
+from twin.viewer.window import open_viewer, serve_web_viewer, take_screenshot
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +58,7 @@ def test_without_a_display_it_says_what_to_do(
     with raises_input_error(where=tmp_path / "none.rrd"):
         open_viewer(tmp_path / "none.rrd")
     monkeypatch.setattr(window, "find_spec", lambda _: None)
-    with raises_input_error(remedy="pip install rerun-sdk"):
+    with raises_input_error(remedy="shaketwin[view]"):
         open_viewer("rerun+http://127.0.0.1:9876/proxy")
 
 
@@ -116,3 +119,31 @@ def test_a_view_on_a_taken_port_takes_the_next() -> None:
         assert parse_address(f"{host}:{other}") == (host, int(other))
     assert "127.0.0.1:9876" in format_live_view("127.0.0.1:9877")
     assert "(" not in format_live_view("127.0.0.1:9876")
+
+
+def test_the_web_viewer_serves_on_this_computer_until_the_end(whole: Path) -> None:
+    with serve_web_viewer(whole) as url:
+        page, _, source = url.partition("?url=")
+        with urllib.request.urlopen(page) as answer:
+            assert answer.status == 200
+        host, port = urlsplit(page).netloc.split(":")
+        assert host == "127.0.0.1"
+        assert re.fullmatch(r"rerun\+http://127\.0\.0\.1:\d+/proxy", unquote(source))
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection((host, int(port)))
+
+
+@pytest.mark.parametrize(
+    "colour", sorted({line[1] for lines in LINE_STYLES.values() for line in lines})
+)
+def test_lines_are_legible_in_both_themes(colour: Rgb) -> None:
+    for background in ((255, 255, 255), BACKGROUND_COLOUR):
+        dark, light = sorted(map(luminance, (colour, background)))
+        assert (light + 0.05) / (dark + 0.05) >= 3.0
+
+
+def luminance(colour: Rgb) -> float:
+    """Relative luminance after WCAG 2."""
+    parts = [c / 255 for c in colour]
+    linear = [p / 12.92 if p <= 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]

@@ -412,12 +412,16 @@ def view_command(
     ] = DEFAULT_ENDPOINT,
     rig: Annotated[str, typer.Option("--rig", help="Name of the running rig.")] = "simulated",
     keys: KeysOption = None,
+    web: Annotated[
+        bool,
+        typer.Option("--web", help="Serve Rerun's web viewer on this computer; print its address."),
+    ] = False,
 ) -> None:
     """Open Rerun with the project's layout, on a recording or a running test."""
     require_view_extra(True)
     from twin.cli.view import show_view as command
 
-    command(log, save, picture, connect, rig, read_keys_option(keys))
+    command(log, save, picture, connect, rig, read_keys_option(keys), web)
 
 
 @app.command("runs", rich_help_panel=LOOK_PANEL)

@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+from contextlib import nullcontext, suppress
 from pathlib import Path
 
 from table_io.clock import RealClock
@@ -15,7 +16,7 @@ from twin.transport.zenoh_link import open_spoke
 from twin.viewer.address import VIEW_ADDRESS, find_free_address, format_live_view, viewer_url
 from twin.viewer.live_view import BATCH_S, LiveView
 from twin.viewer.view import write_rrd
-from twin.viewer.window import open_viewer, take_screenshot
+from twin.viewer.window import open_viewer, serve_web_viewer, take_screenshot
 
 ANSWER_TIMEOUT_S = 2.0
 CAPTURE_S = 6.0  # of a running test before its screenshot
@@ -28,9 +29,16 @@ def show_view(
     connect: str,
     rig: str,
     keys: Credentials | None = None,
+    web: bool = False,
 ) -> None:
-    """Show a recording, or a running test if `log` is None."""
-    if log is not None:
+    """Show a recording, or a running test if `log` is None; with `web` in a browser."""
+    if web and (save is not None or picture is not None):
+        raise InputError(
+            "does not go with --save and --picture", key="--web", remedy="give one of them"
+        )
+    if log is not None and web:
+        view_log_in_browser(resolve_log_path(log))
+    elif log is not None:
         view_log(resolve_log_path(log), save, picture)
     elif save is not None:
         raise InputError(
@@ -39,7 +47,7 @@ def show_view(
             remedy="give its LOG, or omit --save",
         )
     else:
-        view_live(connect, rig, picture, keys)
+        view_live(connect, rig, picture, keys, web)
 
 
 def view_log(log: Path, save: Path | None, picture: Path | None) -> None:
@@ -62,6 +70,19 @@ def view_log(log: Path, save: Path | None, picture: Path | None) -> None:
             print_line(f"{path}")
 
 
+def view_log_in_browser(log: Path) -> None:
+    """Serve a recording with the web viewer of Rerun until Ctrl-C."""
+    with tempfile.TemporaryDirectory(prefix="shaketwin-") as folder, suppress(KeyboardInterrupt):
+        rrd = Path(folder) / "view.rrd"
+        write_rrd(read_recording(log), rrd)
+        with serve_web_viewer(rrd) as url:
+            print_line(f"page: {url}")
+            print_line("Ctrl-C ends it")
+            clock = RealClock()
+            while True:
+                clock.wait_until(clock.now() + 1.0)
+
+
 def _require_parent(path: Path | None) -> None:
     """Raise InputError if the folder of a new file does not exist."""
     if path is not None and not path.absolute().parent.is_dir():
@@ -71,7 +92,11 @@ def _require_parent(path: Path | None) -> None:
 
 
 def view_live(
-    connect: str, rig: str, picture: Path | None = None, keys: Credentials | None = None
+    connect: str,
+    rig: str,
+    picture: Path | None = None,
+    keys: Credentials | None = None,
+    web: bool = False,
 ) -> None:
     """Show a running test in Rerun until its end or Ctrl-C; with `picture` only a screenshot."""
     _require_parent(picture)
@@ -86,10 +111,11 @@ def view_live(
             _take_screenshot(live, viewer_url(address), picture)
             return
         print_line(format_live_view(address))
-        print_line(open_viewer(viewer_url(address)))
-        while not live.is_over:
-            live.listen(BATCH_S)
-        print_line(live.end_reason)
+        with serve_web_viewer(viewer_url(address)) if web else nullcontext("") as url:
+            print_line(f"page: {url}" if web else open_viewer(viewer_url(address)))
+            while not live.is_over:
+                live.listen(BATCH_S)
+            print_line(live.end_reason)
     except KeyboardInterrupt:
         print_line("view closed; the test goes on")
     finally:

@@ -57,6 +57,12 @@ def format_live_view(address: str) -> str:
     return f"live view: rerun {viewer_url(address)}{note}"
 
 
+def is_free_address(address: str) -> bool:
+    """Return whether nothing listens at a "HOST:PORT" of this computer."""
+    host, _, port = address.rpartition(":")
+    return _is_free(host, int(port))
+
+
 def _is_free(host: str, port: int) -> bool:
     try:
         socket.create_server((host, port)).close()

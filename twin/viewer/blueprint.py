@@ -10,11 +10,18 @@ from table_io.records import RunStart
 from twin.viewer.plots import PLANE_WIDTH, PRC_WIDTH
 from twin.viewer.scene import HALF_MASS, Scene
 from twin.viewer.sink import RerunSink
-from twin.viewer.style import CONTACT_COLOUR, DARK_GREY, GREY, LINE_STYLES, RED, WHITE
+from twin.viewer.style import (
+    BACKGROUND_COLOUR,
+    CONTACT_COLOUR,
+    DARK_GREY,
+    LINE_STYLES,
+    RED,
+    TEAL,
+    WHITE,
+)
 
 WINDOW_S, LEGEND_S = 5.0, 1.5  # of a sliding time series: visible span, and space for the legend
 TRAIL_S = 2.0
-BACKGROUND_COLOUR = (14, 16, 20)
 # Created at import: the first such value makes pyarrow import pandas, which delays a run by 0.4 s.
 EYE_CONTROLS = rrb.EyeControls3D(position=(0.0, -2.0, 0.75), look_target=(0.0, 0.0, 0.28))
 
@@ -31,13 +38,13 @@ def log_static(sink: RerunSink, scene: Scene, mass_kg: float) -> None:
     box, strip, dot = (kind.from_fields for kind in (rr.Boxes3D, rr.LineStrips2D, rr.Points2D))
     sink.log_static("rig/bodies", box(fill_mode="solid"))
     sink.log_static("rig/frame", box(fill_mode="solid"))
-    sink.log_static("rig/twin", box(half_sizes=1.01 * HALF_MASS, colors=WHITE, radii=-1.0))
+    sink.log_static("rig/twin", box(half_sizes=1.01 * HALF_MASS, colors=TEAL, radii=-1.0))
     captions = scene.caption_texts(mass_kg)
     caption_points = rr.Points3D.from_fields(
         labels=captions, colors=WHITE, radii=0.0, show_labels=True
     )
     sink.log_static("rig/names", caption_points)
-    for source, colour, width, order in (("measured", RED, -1.8, 1), ("twin", WHITE, -0.7, 2)):
+    for source, colour, width, order in (("measured", RED, -1.8, 1), ("twin", TEAL, -0.9, 2)):
         for plane in ("phase", "loop"):
             sink.log_static(
                 f"{plane}/data/{source}", strip(colors=colour, radii=width, draw_order=order)
@@ -46,7 +53,7 @@ def log_static(sink: RerunSink, scene: Scene, mass_kg: float) -> None:
         sink.log_static(f"prc/data/{source}", line, dot(radii=2 * width, draw_order=order))
     for plot in ("prc", "phase", "loop"):
         sink.log_static(f"{plot}/grid", strip(radii=-0.5, draw_order=0))
-        sink.log_static(f"{plot}/numbers", dot(colors=GREY, radii=0.0, show_labels=True))
+        sink.log_static(f"{plot}/numbers", dot(colors=WHITE, radii=0.0, show_labels=True))
     for marks in ("prc/now", "phase/gaps", "loop/gaps"):
         sink.log_static(marks, strip(colors=CONTACT_COLOUR, radii=-0.7))
     sink.log_static("prc/ahead", strip(radii=-0.7, draw_order=3))
@@ -80,7 +87,6 @@ def _make_sliding_plot(origin: str, name: str) -> Any:
         axis_x=rrb.TimeAxis(view_range=_sliding_range(WINDOW_S + LEGEND_S, 0.15)),
         time_ranges=rrb.VisibleTimeRange("time", range=_sliding_range(WINDOW_S)),
         plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
-        background=rrb.archetypes.PlotBackground(color=BACKGROUND_COLOUR),
     )
 
 
@@ -92,7 +98,6 @@ def _make_run_plot(origin: str, name: str) -> Any:
         axis_x=rrb.TimeAxis(view_range=_elapsed_range()),
         time_ranges=rrb.VisibleTimeRange("time", range=_elapsed_range()),
         plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
-        background=rrb.archetypes.PlotBackground(color=BACKGROUND_COLOUR),
     )
 
 
@@ -129,10 +134,10 @@ def _make_left_column(scene: Scene, has_damper: bool) -> Any:
         rrb.TextDocumentView(origin=f"/{origin}", name=name) for origin, name in documents
     ]
     prc = (
-        "PRC, η_d: forward red, backward blue; free twin white, grey; branches thin; step amber, "
+        "PRC, η_d: forward red, backward blue; free twin teal, grey; branches thin; step amber, "
         "next jump violet"
     )
-    phase = _make_plane_view("phase", "Phase plane: measured red, twin white")
+    phase = _make_plane_view("phase", "Phase plane: measured red, twin teal")
     loop = _make_plane_view("loop", "Damper force over u")
     run_plots = rrb.Tabs(
         _make_run_plot("/disagreement", "Disagreement: error / band"),

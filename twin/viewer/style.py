@@ -1,16 +1,19 @@
 """Colors, names and line widths of the view."""
 
 Rgb = tuple[int, int, int]
-RED, BLUE = (255, 92, 87), (84, 160, 255)
-WHITE, GREY, DARK_GREY = (245, 245, 245), (150, 156, 168), (58, 62, 70)
+# Lines contrast at least 3 : 1 with white and with BACKGROUND_COLOUR: time series have the theme of
+# the viewer, light or dark, as background, drawn plots and the rig BACKGROUND_COLOUR.
+BACKGROUND_COLOUR = (14, 16, 20)
+RED, BLUE, TEAL = (240, 80, 75), (45, 130, 235), (0, 150, 136)
+GREY, DARK_GREY, WHITE = (125, 131, 143), (58, 62, 70), (245, 245, 245)
 STEEL_COLOUR, MASS_COLOUR, RUBBER_COLOUR, CONTACT_COLOUR = (
     (104, 110, 122),
     (66, 126, 148),
     (40, 42, 48),
-    (255, 176, 46),
+    (205, 120, 0),
 )
-IDLE_COLOUR, LIGHT_GREY = (146, 150, 160), (200, 206, 216)
-GREEN, VIOLET, PLUM = (120, 200, 110), (190, 130, 240), (104, 76, 130)
+IDLE_COLOUR = (146, 150, 160)
+GREEN, VIOLET, PLUM = (60, 150, 60), (165, 100, 225), (104, 76, 130)
 
 # Legend name, color and width of every line, in the order of the columns of an entity. Lines with
 # the same name share one legend entry.
@@ -18,23 +21,23 @@ LineStyle = tuple[str, Rgb, float]
 RESTARTED_LABEL, FREE_LABEL = "twin, restarted", "twin, free-running"
 LINE_STYLES: dict[str, tuple[LineStyle, ...]] = {
     "u/measured": (("measured", RED, 3.5),),
-    "u/twin": ((FREE_LABEL, GREY, 1.5), (RESTARTED_LABEL, WHITE, 1.3)),
+    "u/twin": ((FREE_LABEL, GREY, 1.5), (RESTARTED_LABEL, TEAL, 1.3)),
     "a/measured": (("measured", RED, 3.5), ("table, measured", BLUE, 1.5)),
-    "a/twin": ((FREE_LABEL, GREY, 1.5), (RESTARTED_LABEL, WHITE, 1.3)),
+    "a/twin": ((FREE_LABEL, GREY, 1.5), (RESTARTED_LABEL, TEAL, 1.3)),
     "force/measured": (("right, measured", RED, 3.5), ("left, measured", BLUE, 3.5)),
-    "force/twin": ((RESTARTED_LABEL, WHITE, 1.5), (RESTARTED_LABEL, WHITE, 1.5)),
+    "force/twin": ((RESTARTED_LABEL, TEAL, 1.5), (RESTARTED_LABEL, TEAL, 1.5)),
     "damper/measured": (("measured", RED, 3.5),),
-    "damper/twin": ((FREE_LABEL, GREY, 1.5), (RESTARTED_LABEL, WHITE, 1.3)),
-    "error": ((f"u, {FREE_LABEL}", GREY, 2.0), (f"u, {RESTARTED_LABEL}", WHITE, 2.0)),
+    "damper/twin": ((FREE_LABEL, GREY, 1.5), (RESTARTED_LABEL, TEAL, 1.3)),
+    "error": ((f"u, {FREE_LABEL}", GREY, 2.0), (f"u, {RESTARTED_LABEL}", TEAL, 2.0)),
     "impacts": (
         ("right, measured", RED, 3.5),
         ("left, measured", BLUE, 3.5),
-        ("right, twin free", WHITE, 1.5),
+        ("right, twin free", TEAL, 1.5),
         ("left, twin free", GREY, 1.2),
     ),
     "disagreement/band": (("band", CONTACT_COLOUR, 1.5),),
 }
-PRC_COLOURS = {"measured": (RED, BLUE), "twin": (WHITE, LIGHT_GREY)}
+PRC_COLOURS = {"measured": (RED, BLUE), "twin": (TEAL, GREY)}
 # Line of each compared channel; "": not drawn, because x differs in the same way as u.
 CHANNEL_LINES = {
     "rel_disp_m": "u",

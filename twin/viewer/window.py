@@ -3,15 +3,18 @@
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from socket import socket
 from typing import Any
+from urllib.parse import quote
 
 from rerun.experimental import ViewerClient
 
 from table_io.errors import InputError, format_pip_line
+from twin.viewer.address import find_free_address, is_free_address, viewer_url
 
 SETTLE_CHECK_S, MAX_CHECKS, MAX_CHECKS_LIVE = (
     1.0,
@@ -19,6 +22,7 @@ SETTLE_CHECK_S, MAX_CHECKS, MAX_CHECKS_LIVE = (
     3,
 )  # screenshots are compared until the picture is stable
 MAX_TRIES = 5
+WEB_VIEWER_ADDRESS, WEB_DATA_ADDRESS = "127.0.0.1:9090", "127.0.0.1:9900"
 
 
 def find_viewer() -> Path:
@@ -53,6 +57,24 @@ def _launch_viewer(program: Path, *arguments: str) -> "subprocess.Popen[bytes]":
     return subprocess.Popen(
         command, stdin=devnull, stdout=devnull, stderr=devnull, start_new_session=True
     )
+
+
+@contextmanager
+def serve_web_viewer(source: Path | str) -> Iterator[str]:
+    """Serve a file or a live URL with the web viewer, on loopback; yield the address to open."""
+    page = find_free_address(WEB_VIEWER_ADDRESS)
+    data = find_free_address(WEB_DATA_ADDRESS)
+    ports = (address.rpartition(":")[2] for address in (data, page))
+    arguments = ("--serve-web", "--port", next(ports), "--web-viewer-port", next(ports))
+    process = _launch_viewer(find_viewer(), *arguments, str(source))
+    url = source if isinstance(source, str) else viewer_url(data)
+    try:
+        while is_free_address(page):
+            _wait_or_fail(process, 0.1)
+        yield f"http://{page}?url={quote(url, safe='')}"
+    finally:
+        process.terminate()
+        process.wait(10)
 
 
 def take_screenshot(source: Path | str, png: Path, at_s: float | None = None) -> list[str]:
