@@ -1,6 +1,7 @@
 """A headless Chromium, driven through the pipe of its DevTools protocol."""
 
 import base64
+import fcntl
 import json
 import os
 import select
@@ -69,7 +70,9 @@ class Browser:
         self.call("Emulation.setEmulatedMedia", features=scheme)
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height,
                   deviceScaleFactor=1, mobile=width < 600)  # fmt: skip
-        self.call("Page.navigate", url=url)
+        error = self.call("Page.navigate", url=url).get("errorText")
+        assert not error, error
+        self.wait_for("document.readyState === 'complete'")
 
     def evaluate(self, expression: str) -> Any:
         """Return the value of an expression, awaited where it is a promise."""
@@ -95,13 +98,22 @@ class Browser:
         path.write_bytes(base64.b64decode(image))
 
 
+def _open_pipe() -> tuple[int, int]:
+    """A pipe whose ends are not 3 and 4, which become those of the browser."""
+    ends = os.pipe()
+    reading, writing = (fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 10) for end in ends)
+    for end in ends:
+        os.close(end)
+    return reading, writing
+
+
 @contextmanager
 def open_browser(profile: Path, *options: str) -> Iterator[Browser]:
     """Run Chromium with a new profile in a folder."""
     assert CHROMIUM is not None
-    (orders_read, orders), (answers, answers_write) = os.pipe(), os.pipe()
+    (orders_read, orders), (answers, answers_write) = _open_pipe(), _open_pipe()
     script = f'exec "$0" "$@" 3<&{orders_read} 4>&{answers_write}'
-    command = ["sh", "-c", script, CHROMIUM, *OPTIONS, f"--user-data-dir={profile}", *options]
+    command = ["bash", "-c", script, CHROMIUM, *OPTIONS, f"--user-data-dir={profile}", *options]
     process = subprocess.Popen(
         command, pass_fds=(orders_read, answers_write), stderr=subprocess.DEVNULL
     )

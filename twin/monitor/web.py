@@ -12,6 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
+from table_io.clock import RealClock
 from table_io.errors import InputError
 from twin.live.control import request_command
 from twin.live.gateway import GATEWAY_NICENESS
@@ -30,9 +31,10 @@ from twin.security.credentials import (
 )
 from twin.security.page_access import PageAccess, grant_page_access, is_loopback_host
 from twin.transport.endpoint import PRED_TOPIC, split_host_port
-from twin.viewer.address import find_free_address
+from twin.viewer.address import find_free_address, is_listening
 
 PAGE_ADDRESS = "127.0.0.1:7480"
+START_TIMEOUT_S = 20.0  # of the process of a page
 FINAL_FRAMES_S = 1.0  # for which the last state is shown before the server ends
 
 
@@ -160,15 +162,27 @@ def start_page_process(
     keys = credentials_folder(credentials)
     request = PageRequestConfig(address, _reach_endpoint(listen), rig, keys)
     host, port = split_host_port(f"/{address}")
-    announce_page(format_page_url(address, grant_page_access(host, port, credentials), credentials))
+    access = grant_page_access(host, port, credentials)
     command = [sys.executable, "-P", "-m", "twin.monitor.web", *request]
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True
     )
     try:
+        _wait_for_server(process, address)
+        announce_page(format_page_url(address, access, credentials))
         yield
     finally:
         process.communicate()  # closes its input
+
+
+def _wait_for_server(process: "subprocess.Popen[bytes]", address: str) -> None:
+    """Wait until the process serves its page, at most `START_TIMEOUT_S`."""
+    clock = RealClock()
+    deadline_s = clock.now() + START_TIMEOUT_S
+    while not is_listening(address):
+        if process.poll() is not None or clock.now() > deadline_s:
+            raise InputError("the page did not start", key="--web", remedy="run without it")
+        clock.wait_until(clock.now() + 0.1)
 
 
 def _reach_endpoint(listen: str) -> str:

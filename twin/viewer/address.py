@@ -57,10 +57,14 @@ def format_live_view(address: str) -> str:
     return f"live view: rerun {viewer_url(address)}{note}"
 
 
-def is_free_address(address: str) -> bool:
-    """Return whether nothing listens at a "HOST:PORT" of this computer."""
+def is_listening(address: str) -> bool:
+    """Return whether a server accepts connections at "HOST:PORT" of this computer."""
     host, _, port = address.rpartition(":")
-    return _is_free(host, int(port))
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), 1.0).close()
+    except OSError:
+        return False
+    return True
 
 
 def _is_free(host: str, port: int) -> bool:

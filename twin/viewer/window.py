@@ -14,7 +14,7 @@ from urllib.parse import quote
 from rerun.experimental import ViewerClient
 
 from table_io.errors import InputError, format_pip_line
-from twin.viewer.address import find_free_address, is_free_address, viewer_url
+from twin.viewer.address import find_free_address, is_listening, viewer_url
 
 SETTLE_CHECK_S, MAX_CHECKS, MAX_CHECKS_LIVE = (
     1.0,
@@ -69,7 +69,7 @@ def serve_web_viewer(source: Path | str) -> Iterator[str]:
     process = _launch_viewer(find_viewer(), *arguments, str(source))
     url = source if isinstance(source, str) else viewer_url(data)
     try:
-        while is_free_address(page):
+        while not is_listening(page):
             _wait_or_fail(process, 0.1)
         yield f"http://{page}?url={quote(url, safe='')}"
     finally:
