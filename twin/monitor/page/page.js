@@ -4,8 +4,8 @@
 
 const $ = (id) => document.getElementById(id);
 const state = {}; // newest section by name
-const RETRY_MS = 1000, SILENCE_MS = 6000;
-let lastMessage = 0, dirty = true, code = takeCode();
+const retryMs = 1000;
+let silenceMs = 6000, lastMessage = 0, dirty = true, code = takeCode();
 
 function takeCode() {
   const fresh = decodeURIComponent(location.hash.slice(1));
@@ -26,14 +26,14 @@ async function listen() {
       else if (response.ok) await readEvents(response.body.getReader());
       else $("answer").textContent = (await response.json()).message;
     } catch { /* the server is away: try again */ }
-    await new Promise((done) => setTimeout(done, RETRY_MS));
+    await new Promise((done) => setTimeout(done, retryMs));
   }
 }
 
 async function readEvents(reader) {
   const decoder = new TextDecoder();
   for (let text = ""; ;) {
-    const timeout = setTimeout(() => reader.cancel(), SILENCE_MS);
+    const timeout = setTimeout(() => reader.cancel(), silenceMs);
     const { value, done } = await reader.read().finally(() => clearTimeout(timeout));
     if (done) return;
     lastMessage = Date.now();
@@ -105,7 +105,7 @@ function element(tag, className, ...children) {
 }
 
 function draw() {
-  const stale = Date.now() - lastMessage > SILENCE_MS;
+  const stale = Date.now() - lastMessage > silenceMs;
   if (stale !== document.body.classList.contains("stale")) dirty = true;
   if (dirty && state.state) {
     dirty = false;

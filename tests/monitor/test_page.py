@@ -1,0 +1,95 @@
+"""The page in a real browser, fed with a test as it goes on; a live run is in `test_page_live`."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from table_io.records import Event, RunStop
+from tests.monitor.browser import CHROMIUM, Browser, open_browser
+from tests.monitor.monitored import RUN, point, records, stream
+from tests.monitor.test_page_data import watch_items
+from tests.monitor.test_page_server import Served, serving
+from twin.monitor.page_data import build_sections
+from twin.monitor.page_server import PageCommand, PageServer, open_page_server
+from twin.monitor.panels import SessionStatus
+from twin.monitor.run_state import LiveRunState, update_run_state
+from twin.security.access_control import user_name
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
+HAS_INK = """((canvas) => canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height)
+  .data.some((value) => value > 0))(document.getElementById(ID))"""
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with open_browser(tmp_path_factory.mktemp("chromium") / "profile") as browser:
+        yield browser
+
+
+def show(page: Served, state: LiveRunState) -> None:
+    page.feed.publish(build_sections(state, SessionStatus()))
+
+
+def test_the_page_shows_a_test_as_it_goes_on(browser: Browser) -> None:
+    state = watch_items(*records(), *stream())
+    with serving(answer=403) as page:
+        show(page, state)
+        browser.open(f"http://127.0.0.1:{page.port}/", width=420, dark=True)
+        browser.wait_for("$('state').textContent === 'running'")
+        assert browser.evaluate("document.documentElement.scrollWidth") == 420
+        assert browser.text("points").startswith("3 ")
+        assert "3.98" in browser.text("forecast")
+        for plot in ("level-scale", "u", "force", "prc"):
+            assert browser.evaluate(HAS_INK.replace("ID", repr(plot))), plot
+        assert browser.evaluate("[...document.querySelectorAll('#twin .bad')].length") == 1
+
+        update_run_state(state, RUN, point(3))
+        update_run_state(state, RUN, Event(8000, "divergence", "<img src=x onerror=alert(1)>"))
+        show(page, state)
+        browser.wait_for("$('points').textContent.startsWith('4 ')")
+        first = "document.querySelector('#events li')"
+        assert "<img src=x" in browser.evaluate(f"{first}.textContent")
+        assert (
+            browser.evaluate(f"{first}.className + {first}.querySelectorAll('img').length")
+            == "warn0"
+        )
+
+        assert browser.evaluate("$('commands').hidden")  # without the role
+        page.feed.role = "command"
+        show(page, state)
+        browser.wait_for("!$('commands').hidden")
+        browser.evaluate("document.querySelector('[data-command=stop]').click()")
+        assert page.commands == []
+        browser.evaluate("$('yes').click()")
+        browser.wait_for("$('answer').className === 'bad'")
+        assert page.commands == [PageCommand("stop", RUN, user_name(None))]
+
+        update_run_state(state, RUN, RunStop(9000, "stopped", "asked to stop"))
+        show(page, state)
+        browser.wait_for("$('state').textContent === 'ended: stopped' && $('commands').hidden")
+    assert [text for text in browser.console if "403" not in text] == []
+
+
+def test_the_page_finds_its_server_again(browser: Browser) -> None:
+    state = watch_items(*records())
+    with serving() as page:
+        show(page, state)
+        browser.open(f"http://127.0.0.1:{page.port}/")
+        browser.evaluate("silenceMs = 500")
+        browser.wait_for("$('state').textContent === 'running'")
+        server: PageServer = page.server
+        page.feed.close()
+        server.shutdown()
+        server.server_close()
+        browser.wait_for("$('state').textContent === 'page disconnected'")
+        page.feed = type(page.feed)()
+        update_run_state(state, RUN, point(3))
+        show(page, state)
+        page.server = open_page_server(
+            "127.0.0.1", page.port, server.access, page.feed, server.handle_command
+        )
+        browser.wait_for("$('points').textContent.startsWith('4 ')")
+        browser.wait_for("$('state').textContent === 'running'")
+        page.feed.close()
+        page.server.shutdown()
+        page.server.server_close()
