@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from twin.cli.examples import complete_names, describe_names
+
 PLAN_PANEL = "Before a test"
 hardware_app = typer.Typer()
 
@@ -13,7 +15,11 @@ hardware_app = typer.Typer()
 def check_command(
     profile: Annotated[
         Path | None,
-        typer.Argument(metavar="[PROFILE]", help="Test profile: a .toml file or a name."),
+        typer.Argument(
+            metavar="[PROFILE]",
+            help=describe_names("Test profile", "tests"),
+            autocompletion=complete_names("tests"),
+        ),
     ] = None,
     table: Annotated[
         str | None, typer.Option("--table", help="Rig file or name, instead of the profile's.")

@@ -11,10 +11,12 @@ import typer
 
 from twin.cli.credential_commands import KeysOption, keys_app, read_keys_option
 from twin.cli.entry import DEFAULT_ENDPOINT
+from twin.cli.examples import add_examples, complete_names, describe_names
 from twin.cli.file_commands import StepsOption, files_app, require_view_extra
 from twin.cli.hardware_commands import hardware_app
 from twin.cli.identification_commands import LogPaths, identification_app
 from twin.cli.live_commands import WebListenOption, WebOption, live_app
+from twin.cli.reference_commands import reference_app
 from twin.cli.run_path import LOG_HELP, parse_run_path
 from twin.run.diagnostics import configure_logging
 
@@ -24,7 +26,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 app = typer.Typer(
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
     help="Drive a shaking table through a test, with a digital twin of the specimen running "
@@ -40,7 +41,9 @@ PLAN_PANEL, DRIVE_PANEL, LOOK_PANEL = (
 ProfileArgument = Annotated[
     Path,
     typer.Argument(
-        metavar="PROFILE", help="Test profile: a .toml file or the name of a shipped one."
+        metavar="PROFILE",
+        help=describe_names("Test profile", "tests"),
+        autocompletion=complete_names("tests"),
     ),
 ]
 LogArgument = Annotated[
@@ -49,7 +52,20 @@ LogArgument = Annotated[
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
 ModelOption = Annotated[
-    str | None, typer.Option("--model", help="Model: a .toml file or the name of a shipped one.")
+    str | None,
+    typer.Option(
+        "--model",
+        help=describe_names("Model", "models"),
+        autocompletion=complete_names("models"),
+    ),
+]
+TableOption = Annotated[
+    str | None,
+    typer.Option(
+        "--table",
+        help=describe_names("Rig, instead of the profile's", "rigs"),
+        autocompletion=complete_names("rigs"),
+    ),
 ]
 SaveViewOption = Annotated[
     bool, typer.Option("--view", callback=require_view_extra, help="Also write view.rrd.")
@@ -66,6 +82,26 @@ class Speed(enum.StrEnum):
     max = "max"
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"shaketwin {version('shaketwin')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _main_callback(
+    _: Annotated[
+        bool,
+        typer.Option(
+            "--version", is_eager=True, callback=_print_version, help="Print the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """Take the options of the program itself; its help is that of `app`."""
+
+
 @app.command("run", rich_help_panel=DRIVE_PANEL)
 def run_command(
     profile: ProfileArgument,
@@ -75,9 +111,7 @@ def run_command(
         typer.Option("--speed", help="In real time, or as fast as possible (simulated tables)."),
     ] = Speed.realtime,
     model: ModelOption = None,
-    table: Annotated[
-        str | None, typer.Option("--table", help="Rig file or name, instead of the profile's.")
-    ] = None,
+    table: TableOption = None,
     view: Annotated[
         bool,
         typer.Option(
@@ -135,7 +169,7 @@ def demo_command(
 def campaign_command(
     file: Annotated[
         Path,
-        typer.Argument(metavar="FILE", help="Campaign: a .toml file or the name of a shipped one."),
+        typer.Argument(metavar="FILE", help=describe_names("Campaign", "campaigns")),
     ],
     out: OutOption = None,
     resume: Annotated[
@@ -148,9 +182,7 @@ def campaign_command(
         ),
     ] = Speed.realtime,
     model: ModelOption = None,
-    table: Annotated[
-        str | None, typer.Option("--table", help="Rig file or name, instead of the profile's.")
-    ] = None,
+    table: TableOption = None,
     yes: Annotated[
         bool, typer.Option("--yes", help="Unattended: do not prompt between runs.")
     ] = False,
@@ -216,9 +248,7 @@ def table_command(
 def drive_command(
     profile: ProfileArgument,
     out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="New file.")],
-    table: Annotated[
-        str | None, typer.Option("--table", help="Rig file or name, instead of the profile's.")
-    ] = None,
+    table: TableOption = None,
     format: Annotated[
         str,
         typer.Option(
@@ -469,7 +499,9 @@ app.add_typer(hardware_app)
 app.add_typer(live_app)
 app.add_typer(identification_app)
 app.add_typer(files_app)
+app.add_typer(reference_app)
 app.add_typer(keys_app, name="keys", rich_help_panel=PLAN_PANEL)
+add_examples(app)
 
 
 def main() -> None:

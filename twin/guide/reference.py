@@ -90,6 +90,9 @@ def _describe_command(name: str, command: Any) -> Iterator[str]:
     yield f"### {name}"
     yield command.help or ""
     yield f"```sh\n{command.get_usage(context).removeprefix('Usage: ')}\n```"
+    examples = [line for line in (command.epilog or "").splitlines() if "shaketwin " in line]
+    if examples:
+        yield "```sh\n" + "\n".join(examples) + "\n```"
     records = [
         record
         for parameter in command.get_params(context)
