@@ -37,7 +37,7 @@ KindArgument = Annotated[
 
 
 @reference_app.command("list", rich_help_panel=REFERENCE_PANEL)
-def list_command(
+def list_names_command(
     kind: Annotated[ListKind, typer.Argument(metavar="|".join(ListKind), help="What to list.")],
 ) -> None:
     """List the names that commands take: yours first, then the shipped ones."""
@@ -47,7 +47,7 @@ def list_command(
 
 
 @reference_app.command("new", rich_help_panel=REFERENCE_PANEL)
-def new_command(
+def new_file_command(
     kind: Annotated[
         FileKind, typer.Argument(metavar="test|rig|model|campaign", help="Kind of file.")
     ],
