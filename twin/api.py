@@ -231,7 +231,8 @@ def discover(
     best = discovery.verdict.best
     title = f"{config.title}; {' + '.join(best.names) or 'nothing added'}"
     names = ", ".join(log.signals.name for log in prepared)
-    text, omitted = model_to_toml(best.fit, title, config.citation, names)
+    provisional = verdict["why"] if verdict["verdict"] in ("ambiguous", "unexplained") else ""
+    text, omitted = model_to_toml(best.fit, title, config.citation, names, provisional)
     verdict["notes"] += omitted
     return DiscoveredModel(text, Verdict.model_validate_json(dump_contract(Verdict, verdict)))
 

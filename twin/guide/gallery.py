@@ -1,7 +1,9 @@
 """Gallery of the effects: law, loop without and with it, residual, what it is confused with."""
 
+import re
 from importlib import import_module
 from inspect import getdoc
+from textwrap import dedent
 from types import ModuleType
 
 import typer
@@ -19,6 +21,7 @@ from twin.guide.reference import format_table
 from twin.model import effects
 from twin.model.effects import EFFECTS, load_plugins
 from twin.model.effects.effect import Effect
+from twin.reports.discovery.headline import typeset_law
 
 ACTIONS = {
     "parameters": "changes parameters; closed form",
@@ -35,7 +38,11 @@ def write_gallery(_: typer.Typer) -> str:
     overview = format_table(
         ("effect", "law", "place"),
         (
-            (f"[`{effect.id}`](#{effect.id})", effect.term, effect.place.replace("_", " "))
+            (
+                f"[`{effect.id}`](#{effect.id})",
+                typeset_law(effect.term),
+                effect.place.replace("_", " "),
+            )
             for effect in library
         ),
     )
@@ -85,7 +92,7 @@ def _describe_effect(effect: Effect) -> str:
         [
             f"## {effect.id}",
             f"**{title}**",
-            text.strip("\n"),
+            _typeset_equations(text.strip("\n")),
             f"<figure>{draw_loops(find_loops(effect))}<figcaption>Sine of "
             f"{drive_frequency_hz(effect):g} Hz, {LEVEL_G:g} g, {condition}; {values}."
             "</figcaption></figure>",
@@ -95,6 +102,16 @@ def _describe_effect(effect: Effect) -> str:
             parameters,
             f'```toml\n[[effects]]\nid = "{effect.id}"\nparameters = {{ {channel}{toml} }}\n```',
         ]
+    )
+
+
+def _typeset_equations(text: str) -> str:
+    """Return the text with its indented blocks, the equations, as typeset HTML."""
+    return re.sub(
+        r"(?:^    .+\n?)+",
+        lambda block: f'<pre class="law">{typeset_law(dedent(block[0]).rstrip())}</pre>\n',
+        text,
+        flags=re.MULTILINE,
     )
 
 

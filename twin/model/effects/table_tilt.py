@@ -20,7 +20,7 @@ def _input_acceleration(table_disp: Any, values: Mapping[str, float]) -> Any:
 
 TABLE_TILT = Effect(
     id="table_tilt",
-    term="-M g tilt x on the right side, x the table displacement",
+    term="-M g tilt x_t on the right side, x_t the table displacement",
     parameters=(
         EffectParameter("tilt", "rad/m", -1e3, 1e3, 0.0, 0.1, "Rotation per table displacement."),
     ),
