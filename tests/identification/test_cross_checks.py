@@ -8,6 +8,8 @@ from twin.identification.cross_checks import SubsetEstimate, list_disagreements
 from twin.identification.least_squares import FitResult
 from twin.identification.motion import RecordScale
 from twin.identification.parameters import FreeParameter, GapKey, ParameterKey, ParameterSet
+from twin.reports.discovery.identify_page import format_estimate
+from twin.reports.discovery.serialize import interval_to_json
 
 KEYS: list[ParameterKey] = [GapKey(log) for log in range(12)]
 
@@ -25,3 +27,15 @@ def test_disagreements_come_in_the_order_of_the_parameters() -> None:
     scale = RecordScale(0.02, 0.2, 3.0, 1e-3, 1650.0, 5e-3, 2e-3, 25.0, {})
     names = [text.split(":")[0] for text in list_disagreements(joint, apart, scale)]
     assert names == [str(key) for key in KEYS[1:]]
+
+
+def test_too_few_cycles_give_no_interval() -> None:
+    few, many = KEYS[:2]
+    fit = FitResult(
+        ParameterSet({}), {}, {few: 5.0, many: 0.1}, np.eye(2), 1.0, True, (), (),
+        {few: 1.4, many: 12.0},
+    )  # fmt: skip
+    assert math.isinf(fit.interval_error(few))
+    assert fit.interval_error(many) == 0.1
+    estimate = interval_to_json(36e3, fit.interval_error(few), "N/m")
+    assert format_estimate(estimate) == "36.00 kN/m"

@@ -14,6 +14,7 @@ from tests.recovery.recordings import CHANNELS, TRUTH, card, make_noisy_blocks
 from twin.cli.main import app
 from twin.model.config import ModelConfig
 from twin.recording.mcap_log import write_items
+from twin.reports.quantities import format_quantity
 from twin.run.run_config import from_texts, read_model
 from twin.validation.study.rig_setup import format_toml
 
@@ -64,6 +65,17 @@ def test_the_evidence_lies_beside_it(identification: tuple[Path, str]) -> None:
     assert evidence["windows"][0]["nrmse_identified"] < 0.5 * evidence["windows"][0]["nrmse_start"]
     pictures = {path.name for path in folder.glob("*.png") if path.stat().st_size > 20_000}
     assert pictures == {"laws0.png", "correlation.png", "sources.png"}
+
+
+def test_the_page_shows_each_value_with_its_interval(identification: tuple[Path, str]) -> None:
+    folder = identification[0].with_suffix("")
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    evidence = json.loads((folder / "identify.json").read_text(encoding="utf-8"))
+    assert page.count("data:image/png;base64,") == 3
+    for estimate in evidence["parameters"].values():
+        half = 0.5 * (estimate["high"] - estimate["low"])
+        assert format_quantity(estimate["value"], estimate["unit"], half) in page
+        assert estimate["cycles"] > 3
 
 
 def test_the_terminal_says_it_all(identification: tuple[Path, str]) -> None:

@@ -39,7 +39,7 @@ SYMBOLS = {
 
 
 def identify_command(paths: Sequence[Path], model: str, out: Path | None) -> int:
-    """Identify parameters from recordings; write a model file and figures; return the exit code."""
+    """Identify parameters from recordings; write a model file and a page; return the exit code."""
     clock = RealClock()
     start_s = clock.now()
     target = _resolve_target(out)
@@ -68,13 +68,11 @@ def identify_command(paths: Sequence[Path], model: str, out: Path | None) -> int
     folder = make_output_folder(target.with_suffix(""), "")
     target.write_text(text, encoding="utf-8")
     (folder / "identify.json").write_text(dump_strict_json(report), encoding="utf-8")
-    from twin.reports.discovery.identify_figures import (
-        draw_identification_figures,  # slow to import
-    )
+    from twin.reports.discovery.identify_page import write_identification_page  # slow to import
 
-    draw_identification_figures(result, folder)
+    page = write_identification_page(folder, result, report, target.name, text)
     print_identification(report)
-    print_line(f"{target}; figures and identify.json in {folder}")
+    print_line(f"{target}; {page}")
     return 0
 
 
@@ -109,7 +107,10 @@ def identification_to_json(result: IdentificationResult, notes: Sequence[str]) -
         "method": METHOD,
         "logs": names,
         "parameters": {
-            parameter.name: parameter_to_json(fit, parameter)
+            parameter.name: interval_to_json(
+                fit.values[parameter.key], fit.interval_error(parameter.key), parameter.unit
+            )
+            | _count_cycles(fit, parameter)
             | _compare_with_start(result, parameter)
             for parameter in fit.free
             if get_log(parameter.key) is None
@@ -163,15 +164,21 @@ def identification_to_json(result: IdentificationResult, notes: Sequence[str]) -
     }  # fmt: skip
 
 
+def _count_cycles(fit: FitResult, parameter: FreeParameter) -> Json:
+    """Return the effective number of cycles or contacts that determine a parameter, if limited."""
+    count = fit.block_counts.get(parameter.key, math.inf)
+    return {"cycles": count} if math.isfinite(count) else {}
+
+
 def _compare_with_start(result: IdentificationResult, parameter: FreeParameter) -> Json:
     """Return the value of the start model and the difference from it in standard deviations."""
     start_value = result.start.values.get(parameter.keys[0])
-    value, sd = result.fit.values[parameter.key], result.fit.std_errors[parameter.key]
+    value, sd = result.fit.values[parameter.key], result.fit.interval_error(parameter.key)
     if start_value is None:
         return {}
     return {
         "start": start_value,
-        "deviations": (value - start_value) / sd if sd else None,
+        "deviations": (value - start_value) / sd if 0 < sd < math.inf else None,
     }
 
 
@@ -181,7 +188,7 @@ def _gap_json(result: IdentificationResult, log: int) -> Json:
     sides = {side: fitted_gap(residuals, result.fit, side) for side in ("right", "left")}
     gap: Json = {"stated": sum(residuals.signals.gaps_m), "unit": "m", **sides}
     if key in result.fit.std_errors:
-        gap |= interval_to_json(sum(sides.values()), 2 * result.fit.std_errors[key], "m")
+        gap |= interval_to_json(sum(sides.values()), 2 * result.fit.interval_error(key), "m")
     return gap
 
 
@@ -199,15 +206,14 @@ def print_identification(report: Json) -> None:
         )  # fmt: skip
     for log, note in report["gaps"].items():
         if "low" in note:
-            gap_deviations = (
-                INTERVAL_SIGMA * 2 * (note["value"] - note["stated"]) / (note["high"] - note["low"])
-            )
+            width = note["high"] - note["low"]
+            gap_deviations = INTERVAL_SIGMA * 2 * (note["value"] - note["stated"]) / width
             table.add_row(
                 f"gap of {log}",
                 *_format_interval(note, 1e3),
                 "mm",
                 f"{1e3 * note['stated']:g}",
-                f"{gap_deviations:+.1f}",
+                f"{gap_deviations:+.1f}" if width < math.inf else "",
             )
     print_table(console, table)
     _print_subsets(report)
@@ -264,7 +270,12 @@ def _print_subsets(report: Json) -> None:
 
 
 def _format_interval(estimate: Json, scale: float = 1.0) -> tuple[str, str]:
-    """Return (value, half interval) as text, with the digits that the interval justifies."""
-    half = 0.5 * scale * (estimate["high"] - estimate["low"])
-    places = max(0, 1 - math.floor(math.log10(half))) if 0 < half < math.inf else 3
-    return f"{scale * estimate['value']:.{places}f}", f"{half:.{places}f}"
+    """Return (value, half interval) as text, with the digits that the interval justifies.
+
+    Without an interval, as of too few cycles, the value has four digits.
+    """
+    value, half = scale * estimate["value"], 0.5 * scale * (estimate["high"] - estimate["low"])
+    if not 0 < half < math.inf:
+        return f"{value:.4g}", "-"
+    places = max(0, 1 - math.floor(math.log10(half)))
+    return f"{value:.{places}f}", f"{half:.{places}f}"

@@ -39,7 +39,10 @@ OPPOSED_SUBSETS = (
 
 @dataclass(frozen=True, eq=False)
 class SubsetEstimate:
-    """Estimate from a subset of the samples; `values` hold (value, standard deviation) in SI."""
+    """Estimate from a subset of the samples; `values` hold (value, standard deviation) in SI.
+
+    The standard deviation is infinite where too few cycles determine the value.
+    """
 
     source: str
     values: Mapping[ParameterKey, tuple[float, float]]
@@ -164,7 +167,7 @@ def _estimate_subset(
         return SubsetEstimate(source, {}, entries, True)
     fit = fit_parameters(log_residuals, start.with_free(observable), train)
     determined = {
-        key: (value, fit.std_errors[key])
+        key: (value, fit.interval_error(key))
         for key, value in fit.values.items()
         if fit.std_errors[key] > 0
     }

@@ -19,6 +19,7 @@ from twin.identification.parameters import (
 from twin.identification.residuals import LogResiduals
 
 MAX_ITERATIONS = 40
+MIN_INTERVAL_BLOCKS = 3.0  # effective blocks (cycles, contacts) below which there is no interval
 INTERVAL_SIGMA = 1.96  # standard deviations either side: 95 %
 MIN_COST_GAIN = 1e-6  # relative cost decrease below which the iteration stops
 SLOPE_STEP = 1e-4  # finite-difference step, relative to the scale of a parameter
@@ -59,6 +60,14 @@ class FitResult:
     def free(self) -> tuple[FreeParameter, ...]:
         """The fitted parameters, in the order of the correlation."""
         return self.parameters.free
+
+    def interval_error(self, key: ParameterKey) -> float:
+        """Return the standard error of a parameter; inf if too few blocks determine it.
+
+        The scatter between so few cycles says nothing about their mean.
+        """
+        is_known = self.block_counts.get(key, math.inf) >= MIN_INTERVAL_BLOCKS
+        return self.std_errors[key] if is_known else math.inf
 
 
 def fit_parameters(

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -16,23 +15,42 @@ from twin.reports.plot_style import (
     DIRECTION_COLOURS,
     FIGURE_WIDTH_IN,
     GUIDE_COLOUR,
-    RC_PARAMS,
     SIDE_COLOURS,
     TWIN_COLOUR,
+    CaptionedFigure,
+    CaptionedFigures,
+    Picture,
+    save_figures,
 )
 
 MAX_POINTS = 6000  # of a scatter plot
 CLOUD_STYLE = {"ls": "", "marker": ".", "ms": 1.6, "mew": 0, "alpha": 0.6, "rasterized": True}
 
 
-def draw_identification_figures(result: IdentificationResult, folder: Path) -> None:
-    """Write laws<log>.png, correlation.png and sources.png to the folder."""
-    with mpl.rc_context(RC_PARAMS):
-        for residuals in result.problem.log_residuals:
-            _draw_laws(result, residuals).savefig(folder / f"laws{residuals.log_number}.png")
-        _draw_correlation(result).savefig(folder / "correlation.png")
-        if result.subsets:
-            _draw_subsets(result).savefig(folder / "sources.png")
+def draw_identification_figures(result: IdentificationResult, folder: Path) -> list[Picture]:
+    """Write laws<log>.png, correlation.png and sources.png to the folder; return them in order."""
+    return save_figures(_draw_figures(result), folder)
+
+
+def _draw_figures(result: IdentificationResult) -> CaptionedFigures:
+    for residuals in result.problem.log_residuals:
+        caption = (
+            "Measured forces over the measured motion, less what the other terms explain, and the "
+            "identified laws. Below right: gap of each side from single contacts."
+        )
+        title = f"Force laws, {residuals.signals.name}"
+        name = f"laws{residuals.log_number}"
+        yield CaptionedFigure(name, title, caption, _draw_laws(result, residuals))
+    if result.subsets:
+        caption = (
+            "Each parameter from one subset of the samples, with its 95 % interval; the grey band "
+            "is the interval of the joint fit. A point without a bar has too few cycles for one."
+        )
+        title = "Estimates from subsets of the samples"
+        yield CaptionedFigure("sources", title, caption, _draw_subsets(result))
+    caption = "Near ±1, only a combination of the two parameters is determined."
+    yield CaptionedFigure("correlation", "Correlation of the estimates", caption,
+                          _draw_correlation(result))  # fmt: skip
 
 
 def _draw_laws(result: IdentificationResult, residuals: LogResiduals) -> Figure:
@@ -132,7 +150,7 @@ def _draw_correlation(result: IdentificationResult) -> Figure:
     kept = [k for k, parameter in enumerate(result.fit.free) if not is_correction(parameter.key)]
     names = [result.fit.free[k].name for k in kept]
     matrix = result.fit.correlation[np.ix_(kept, kept)]
-    figure = Figure(figsize=(0.55 * len(kept) + 3.2, 0.55 * len(kept) + 2.2))
+    figure = Figure(figsize=(FIGURE_WIDTH_IN, 0.5 * len(kept) + 1.2))
     ax = figure.subplots()
     ax.imshow(matrix, cmap="RdBu_r", vmin=-1, vmax=1)
     ax.grid(False)
@@ -141,7 +159,6 @@ def _draw_correlation(result: IdentificationResult) -> Figure:
     for (i, k), value in np.ndenumerate(matrix):
         ax.text(k, i, f"{value:+.2f}", ha="center", va="center", fontsize=7,
                 color="white" if abs(value) > 0.6 else TWIN_COLOUR)  # fmt: skip
-    ax.set_title("correlation of the estimates")
     return figure
 
 
@@ -170,7 +187,7 @@ def _draw_subsets(result: IdentificationResult) -> Figure:
                 ax.errorbar(
                     scale * x,
                     row,
-                    xerr=scale * INTERVAL_SIGMA * sx,
+                    xerr=scale * INTERVAL_SIGMA * sx if np.isfinite(sx) else None,
                     fmt="o",
                     color=TWIN_COLOUR,
                     ms=3,
