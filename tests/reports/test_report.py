@@ -1,5 +1,6 @@
 """The report of a run: what it shows is what was recorded, whatever is missing."""
 
+import csv
 import json
 import math
 import re
@@ -11,9 +12,11 @@ import pytest
 from table_io.block import Block
 from table_io.errors import InputError
 from table_io.records import Comparison, Event, Fault, RunStop, SampleGap, Timing
+from tests.command_line import call_main
 from tests.input_errors import raises_input_error
 from tests.reports.folders import Drawn, Maker
 from tests.reports.recordings import MEASURED, blocks, one_step, start_record, summary
+from twin.campaign import STATE_FILE
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import read_recording
 from twin.reports.page import format_significant
@@ -198,3 +201,26 @@ def test_the_steps_table_has_the_fundamental_with_its_error(run_folder: Maker) -
         step["table_acc_fundamental_m_s2"] = 1.02 * 0.49  # demanded: 0.49 m/s2
     text = words(bare(run_folder(run_summary=values)))
     assert "0.500 0.490 2.00 0.488 2.15" in text
+
+
+def test_a_report_as_pdf_and_its_figures_in_all_formats(run_folder: Maker) -> None:
+    folder = run_folder(*one_step())
+    result = call_main("report", folder, "--format", "pdf", "--figures")
+    assert result.returncode == 0
+    assert (folder / "report.pdf").read_bytes().startswith(b"%PDF")
+    pictures = {path.stem for path in (folder / "figures").glob("*.png")}
+    for suffix in ("svg", "pdf", "csv"):
+        assert {path.stem for path in (folder / "figures").glob(f"*.{suffix}")} == pictures
+    with (folder / "figures" / "prc.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    first = [float(row["y"]) for row in rows if row["panel"] == "1" and row["x"] == "1.0"]
+    assert first == pytest.approx([0.1234, 1.1 * 0.1234])  # measured, twin
+
+
+def test_only_the_report_of_a_run_is_a_pdf(run_folder: Maker) -> None:
+    folder = run_folder()
+    (folder / STATE_FILE).write_text("{}")
+    result = call_main("report", folder, "--format", "pdf")
+    assert result.returncode == 2
+    assert "--format pdf" in result.stderr
+    assert not (folder / "report.pdf").exists()

@@ -75,6 +75,13 @@ ListenOption = Annotated[
 ]
 
 
+class ReportFormat(enum.StrEnum):
+    """File format of a report."""
+
+    html = "html"
+    pdf = "pdf"
+
+
 class Speed(enum.StrEnum):
     """Pace of a run."""
 
@@ -419,11 +426,17 @@ def report_command(
             metavar="DIR", parser=parse_run_path, help="Folder of a run or campaign, or `last`."
         ),
     ],
+    output: Annotated[
+        ReportFormat, typer.Option("--format", help="Of a run, pdf writes report.pdf too.")
+    ] = ReportFormat.html,
+    figures: Annotated[
+        bool, typer.Option("--figures", help="Also write each figure as SVG, PDF and CSV.")
+    ] = False,
 ) -> None:
     """Write the report of a run or campaign again: one self-contained HTML file."""
     from twin.cli.report import write_folder_report as command
 
-    command(folder)
+    command(folder, output is ReportFormat.pdf, figures)
 
 
 @app.command("view", rich_help_panel=LOOK_PANEL)

@@ -9,6 +9,8 @@ from twin.run.recordings import open_recording, read_recorded_config
 from twin.run.terminal import console, print_line
 from twin.studies import TABLE_FILE
 
+FIGURE_FORMATS = ("svg", "pdf", "csv")  # next to PNG
+
 
 def print_recording_prc(log: Path, as_json: bool) -> None:
     """Print the PRC of a recording, or of every run of a campaign, as a table or JSON."""
@@ -43,19 +45,22 @@ def print_recording_prc(log: Path, as_json: bool) -> None:
         print_prc(console, summary)
 
 
-def write_folder_report(folder: Path) -> None:
+def write_folder_report(folder: Path, as_pdf: bool = False, all_formats: bool = False) -> None:
     """Rewrite report.html in the folder of a run, campaign or batch.
 
-    A run or campaign is reported from its recordings, a batch from its table.
+    A run or campaign is reported from its recordings, a batch from its table. Of a run also
+    report.pdf, and each figure in all formats, where asked for.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give the folder of a run or a batch")
     from twin.recording.run_paths import PARTS_FOLDER
-    from twin.reports.report import write_report
+    from twin.reports.report import load_report_data, write_report
     from twin.run.merge_parts import merge_run_parts
 
     if (folder / PARTS_FOLDER).is_dir():
         merge_run_parts(folder)
+    if as_pdf or all_formats:
+        _require_run(folder, "--format pdf" if as_pdf else "--figures")
     if (folder / STATE_FILE).is_file():
         from twin.campaign.report import write_campaign_report
 
@@ -70,4 +75,21 @@ def write_folder_report(folder: Path) -> None:
     if not (folder / "summary.json").exists():
         summary = summaries.summarise(recording, read_recorded_config(recording).parameters)
         summaries.write_summary(summary, folder / "summary.json")
-    print_line(f"{write_report(folder, recording)}")
+    print_line(f"{write_report(folder, recording, FIGURE_FORMATS if all_formats else ())}")
+    if as_pdf:
+        from twin.reports.pdf_report import write_pdf_report
+
+        path = folder / "report.pdf"
+        write_pdf_report(load_report_data(folder, recording), path)
+        print_line(f"{path}")
+
+
+def _require_run(folder: Path, option: str) -> None:
+    """Raise InputError if the folder is that of a campaign or batch."""
+    if (folder / STATE_FILE).is_file() or (folder / TABLE_FILE).is_file():
+        raise InputError(
+            "the report of a campaign or batch is a page only",
+            where=option,
+            allowed="the folder of a run",
+            remedy="give the folder of one of its runs",
+        )

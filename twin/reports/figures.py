@@ -1,5 +1,6 @@
 """Figures of a run, arranged and colored as in Stefani, De Angelis, Andreaus, Figs. 2 to 12."""
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -60,11 +61,21 @@ from twin.reports.window_figure import draw_window_histories
 MARKER_SIZES = {"forward": 4.6, "backward": 2.6}  # both show where they coincide
 
 
-def draw_run_figures(run: ReportData, folder: Path) -> list[Picture]:
-    """Draw all figures for which the run has data into PNG files; return them in report order."""
-    for stale in folder.glob("histories_*hz.png"):
+def draw_run_figures(
+    run: ReportData, folder: Path, more_formats: Sequence[str] = ()
+) -> list[Picture]:
+    """Draw all figures for which the run has data into PNG files; return them in report order.
+
+    `more_formats`: see `save_figures`.
+    """
+    for stale in folder.glob("histories_*hz.*"):
         stale.unlink()
-    draws = (
+    return save_figures(draw_figures(run), folder, more_formats=more_formats)
+
+
+def draw_figures(run: ReportData) -> CaptionedFigures:
+    """Yield all figures for which the run has data, in report order."""
+    for draw in (
         draw_orbits,
         _draw_prc,
         _draw_model_branches,
@@ -75,8 +86,8 @@ def draw_run_figures(run: ReportData, folder: Path) -> list[Picture]:
         _draw_errors,
         _draw_overview,
         _draw_level,
-    )
-    return save_figures((figure for draw in draws for figure in draw(run)), folder)
+    ):
+        yield from draw(run)
 
 
 def _draw_prc(run: ReportData) -> CaptionedFigures:

@@ -5,12 +5,14 @@ Twin: thin, black, solid forward, dashed backward.
 Import only to draw: matplotlib is slow to import.
 """
 
+import csv
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -75,9 +77,14 @@ class Picture:
 
 
 def save_figures(
-    figures: Iterable[CaptionedFigure], folder: Path, dark: bool = False
+    figures: Iterable[CaptionedFigure],
+    folder: Path,
+    dark: bool = False,
+    more_formats: Sequence[str] = (),
 ) -> list[Picture]:
     """Save figures as PNG files in `folder`; return them in order.
+
+    `more_formats`: also as svg, pdf, or csv, the data of the drawn lines.
 
     The figures are drawn while they are iterated over: `figures` must be a generator, so that
     the style applies. `dark`: on a dark ground; only for figures whose colors allow it.
@@ -88,8 +95,29 @@ def save_figures(
         for drawing in figures:
             path = folder / f"{drawing.name}.png"
             drawing.figure.savefig(path)
+            for suffix in more_formats:
+                other = path.with_suffix(f".{suffix}")
+                if suffix == "csv":
+                    write_line_data(drawing.figure, other)
+                else:
+                    drawing.figure.savefig(other)
             pictures.append(Picture(path, drawing.title, drawing.caption))
     return pictures
+
+
+def write_line_data(figure: Figure, path: Path) -> None:
+    """Write the points of every drawn line of a figure as CSV: panel, axes, line, x, y."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(("panel", "x_label", "y_label", "line", "style", "x", "y"))
+        for panel, ax in enumerate(figure.axes, 1):
+            for number, line in enumerate(ax.lines, 1):
+                label = str(line.get_label())
+                name = f"line {number}" if label.startswith("_") else label
+                style = f"{line.get_color()} {line.get_linestyle()}"
+                for x, y in np.column_stack(line.get_data(orig=False)).tolist():
+                    row = (panel, ax.get_xlabel(), ax.get_ylabel(), name, style, x, y)
+                    writer.writerow(row)
 
 
 def measured_style(direction: str, width: float = 3.2) -> LineStyle:

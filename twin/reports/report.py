@@ -3,6 +3,7 @@
 Values from the summary are shown unchanged; the page loads nothing from outside.
 """
 
+from collections.abc import Sequence
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -40,17 +41,26 @@ MAX_ROWS = 200
 MAX_TEXT_LENGTH = 20_000  # of a configuration as recorded
 
 
-def write_report(folder: Path, recording: Recording | None = None) -> Path:
+def write_report(
+    folder: Path, recording: Recording | None = None, more_formats: Sequence[str] = ()
+) -> Path:
     """Write folder/report.html and its figures from run.mcap and summary.json; return the path.
 
-    A `recording` already in memory is not read again.
+    A `recording` already in memory is not read again. `more_formats` of the figures: see
+    `save_figures`.
     """
+    run = load_report_data(folder, recording)
+    path = folder / "report.html"
+    pictures = draw_run_figures(run, folder / "figures", more_formats)
+    path.write_text(render_report(run, pictures), encoding="utf-8")
+    return path
+
+
+def load_report_data(folder: Path, recording: Recording | None = None) -> ReportData:
+    """Return the report data of a run's folder, from run.mcap and summary.json."""
     remedy = "give a folder written by run, replay or simulate"
     summary = load_summary(folder / "summary.json", SummaryKeys, remedy)
-    run = build_report_data(recording or read_recording(folder / "run.mcap"), summary)
-    path = folder / "report.html"
-    path.write_text(render_report(run, draw_run_figures(run, folder / "figures")), encoding="utf-8")
-    return path
+    return build_report_data(recording or read_recording(folder / "run.mcap"), summary)
 
 
 def render_report(run: ReportData, pictures: list[Picture]) -> str:
