@@ -55,12 +55,15 @@ def describe_tables(model: type[ConfigModel], name: str = "") -> Iterator[TableD
     yield TableDescription(name, " ".join((model.__doc__ or "").split()), keys)
     described: set[type[ConfigModel]] = set()
     for key, table in tables.items():
-        if table is None or table in described:  # a second name of the same table
+        if table is None:
             continue
-        described.add(table)
         path = f"{name.strip('[]')}.{key}".lstrip(".")
         annotation = fields[key].annotation if key in fields else None
-        for requirement, variant in table.list_variants().items():
+        # A second name of the same table is for its default kind.
+        is_alias = table in described
+        described.add(table)
+        variants = {"": table.select_class({})} if is_alias else table.list_variants()
+        for requirement, variant in variants.items():
             table_name = f"[[{path}]]" if get_origin(annotation) is tuple else f"[{path}]"
             yield from describe_tables(variant, f"{table_name} {requirement}".strip())
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
+from typer.main import get_command
 
 from tests.command_line import call_main
 from tests.input_errors import raises_input_error
@@ -100,6 +101,14 @@ def test_every_file_that_the_guide_names_exists(pages: dict[str, PageParser]) ->
     names = {code for page in pages.values() for code in page.codes if FILE_NAME.match(code)}
     assert names
     assert sorted(name for name in names if not (ROOT / name).exists()) == []
+
+
+def test_every_command_that_the_guide_names_exists(pages: dict[str, PageParser]) -> None:
+    lines = [line for page in pages.values() for code in page.codes for line in code.splitlines()]
+    names = {match[1] for line in lines if (match := re.match(r"shaketwin ([a-z]+)\b", line))}
+    commands = getattr(get_command(app), "commands")  # noqa: B009
+    assert len(names) > 20
+    assert names - commands.keys() == set()
 
 
 def test_the_build_refuses_links_that_lead_nowhere(tmp_path: Path) -> None:
