@@ -304,6 +304,9 @@ def test_the_commands(tmp_path: Path) -> None:
     run("new", folder, "--host", "rig.example", "--host", "10.0.0.9")
     run("add", folder, "anna", "--role", "observe")
     run("renew", folder, "anna")
+    assert "https://rig.example:7480/#" in run(
+        "code", folder, "anna", "--page", "https://rig.example:7480"
+    )
     run("list", folder)
     run("remove", folder, "anna")
     assert CliRunner().invoke(app, ["keys", "add", folder, "bob", "--role", "king"]).exit_code == 2
@@ -315,7 +318,7 @@ def test_the_commands_of_the_page_work(tmp_path: Path, monkeypatch: pytest.Monke
     app.add_typer(credential_commands.keys_app, name="keys")
     page = (Path(credential_commands.__file__).parents[1] / "security" / "KEYS.md").read_text()
     lines = [line for line in page.splitlines() if line.startswith("shaketwin keys")]
-    assert len(lines) == 6
+    assert len(lines) == 7
     monkeypatch.chdir(tmp_path)
     for line in lines:
         words = shlex.split(line.partition(">")[0], comments=True)

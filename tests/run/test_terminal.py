@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
+import segno
 from rich.console import Console
 from rich.table import Table
 
@@ -119,3 +120,13 @@ def test_what_a_twin_elsewhere_writes_gives_no_orders_to_the_terminal() -> None:
     lines = out.getvalue().splitlines()
     assert all(line.isprintable() for line in lines)
     assert [line[:12] for line in lines[2:]] == [f"{'':>7}  fau", f"{'':>7}  dri"]
+
+
+def test_a_qr_code_is_drawn_module_by_module() -> None:
+    text = "https://rig.lab.example:7480/#abcd-efgh"
+    lines = terminal.draw_qr_code(text)
+    halves = {"█": (0, 0), "▀": (0, 1), "▄": (1, 0), " ": (1, 1)}
+    drawn = [[halves[cell][half] for cell in line] for line in lines for half in (0, 1)]
+    modules = [[*row] for row in segno.make(text, error="l").matrix_iter(border=2)]
+    assert drawn[: len(modules)] == modules
+    assert not any(map(any, drawn[len(modules) :]))

@@ -28,15 +28,22 @@ def print_line(text: str) -> None:
     console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
-def print_qr_code(text: str) -> None:
-    """Print text as a QR code in half-block characters, light on dark as scanners expect it."""
+def draw_qr_code(text: str) -> list[str]:
+    """Return the lines of a QR code in half-block characters, light modules filled."""
     import segno
 
     rows = [[*row] for row in segno.make(text, error="l").matrix_iter(border=2)]
     rows += [[0] * len(rows[0])] * (len(rows) % 2)
-    for upper, lower in zip(rows[::2], rows[1::2], strict=True):
-        cells = ("█▀▄ "[2 * top + bottom] for top, bottom in zip(upper, lower, strict=True))
-        console.print("".join(cells), style="white on black", highlight=False, soft_wrap=True)
+    return [
+        "".join("█▀▄ "[2 * top + bottom] for top, bottom in zip(upper, lower, strict=True))
+        for upper, lower in zip(rows[::2], rows[1::2], strict=True)
+    ]
+
+
+def print_qr_code(text: str) -> None:
+    """Print text as a QR code on a terminal; nothing to a file or pipe."""
+    for line in draw_qr_code(text) if console.is_terminal else ():
+        console.print(line, style="white on black", highlight=False, soft_wrap=True)
 
 
 def fits_width(on: Console, table: Table) -> bool:

@@ -90,8 +90,9 @@ function closeQuestion() { $("confirm").hidden = true; $("commands").hidden = fa
 // Numbers and text
 
 const known = (value) => value !== null && value !== undefined;
-const digits = (value, count = 3) => (known(value) ? Number(value.toPrecision(count)).toString() : "–");
-const minus = (value) => String(value).replace("-", "−");
+const digits = (value, count = 3) => !known(value) ? "–" : value && Math.abs(value) < 1e-3 ? minus(value.toExponential(1))
+  : minus(Number(value.toPrecision(count)));
+const minus = (value) => String(value).replaceAll("-", "−");
 const signed = (value, unit) => `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(1)} ${unit}`;
 function duration(seconds) {
   const whole = Math.max(Math.floor(seconds), 0), two = (n) => String(n).padStart(2, "0");
