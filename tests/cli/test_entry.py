@@ -1,9 +1,12 @@
 """Orders to a running test: what is sent without the command line, and what it parses."""
 
+from pathlib import Path
+
 import pytest
 
 from twin.cli import entry
 from twin.cli.live_commands import RunCommand
+from twin.cli.main import announce_first_start
 from twin.live import control
 
 SENT = [
@@ -41,3 +44,20 @@ def test_an_order_to_nobody_is_an_input_error(
     with pytest.raises(SystemExit, match="2"):
         entry.main()
     assert "udp/x" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("command", "expected"), [("run", True), ("list", False)])
+def test_only_the_first_start_of_what_computes_is_announced(
+    command: str,
+    expected: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("sys.argv", ["shaketwin", command])
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
+    announce_first_start()
+    assert bool(capsys.readouterr().err) == expected
+    (tmp_path / "kernels").mkdir()
+    announce_first_start()
+    assert capsys.readouterr().err == ""

@@ -130,3 +130,19 @@ def test_a_qr_code_is_drawn_module_by_module() -> None:
     modules = [[*row] for row in segno.make(text, error="l").matrix_iter(border=2)]
     assert drawn[: len(modules)] == modules
     assert not any(map(any, drawn[len(modules) :]))
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_a_silent_phase_shows_what_it_is_at_on_a_terminal_only(
+    is_terminal: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = io.StringIO()
+    monkeypatch.setattr(
+        terminal, "console", Console(file=out, force_terminal=is_terminal, width=80)
+    )
+    with terminal.show_status("drawing") as show_part, terminal.show_status("inside"):
+        show_part("[curves]")
+        time.sleep(0.2)
+    assert ("drawing: [curves]" in out.getvalue()) == is_terminal
+    if not is_terminal:
+        assert out.getvalue() == ""

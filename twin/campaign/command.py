@@ -24,7 +24,7 @@ from twin.run.disk import require_disk_space
 from twin.run.folders import RUNS_FOLDER, make_output_folder
 from twin.run.realtime import check_full_speed, check_realtime
 from twin.run.run_config import RunConfig, make_run_id
-from twin.run.terminal import print_line
+from twin.run.terminal import print_line, show_status
 from twin.run.warm_up import compile_kernels
 from twin.security.credentials import Credentials
 
@@ -56,7 +56,8 @@ class CampaignOptions:
 def run_campaign(options: CampaignOptions) -> int:
     """Play all runs of a campaign that are not complete; return the exit code."""
     allowed = _require_any_speed if options.unpaced else check_realtime
-    plan = read_plan(options.path, options.table, options.model, allowed)
+    with show_status("checking the runs"):
+        plan = read_plan(options.path, options.table, options.model, allowed)
     compile_kernels(plan.runs[0].bundle, table=True)
     ask_operator = not (options.unpaced or options.unattended)
     if ask_operator and not sys.stdin.isatty():

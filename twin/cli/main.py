@@ -32,6 +32,10 @@ app = typer.Typer(
     "alongside; record, compare, replay, report.",
 )
 
+COMPUTING_COMMANDS = frozenset({
+    "branches", "campaign", "check", "demo", "discover", "identify", "paper", "replay", "run",
+    "simulate",
+})  # fmt: skip
 PLAN_PANEL, DRIVE_PANEL, LOOK_PANEL = (
     "Before a test",
     "Run a test",
@@ -517,11 +521,19 @@ app.add_typer(keys_app, name="keys", rich_help_panel=PLAN_PANEL)
 add_examples(app)
 
 
+def announce_first_start() -> None:
+    """Print a notice if no kernel was ever compiled here: importing them then takes a minute."""
+    folder = Path(os.environ["NUMBA_CACHE_DIR"])  # set by `table_io`
+    if set(sys.argv[1:2]) & COMPUTING_COMMANDS and not folder.exists():
+        print("first start: compiling the kernels, which takes up to a minute", file=sys.stderr)
+
+
 def main() -> None:
     """Run the command line; an input error is one message on standard error and exit code 2."""
     with contextlib.suppress(BrokenPipeError):
         try:
             configure_logging(" ".join(["shaketwin", *sys.argv[1:2]]))
+            announce_first_start()
             app()
         except ValueError as error:
             from table_io.errors import InputError

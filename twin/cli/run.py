@@ -16,7 +16,7 @@ from twin.run.folders import RUNS_FOLDER, make_output_folder, make_run_folder
 from twin.run.progress import RunProgress
 from twin.run.realtime import check_full_speed, check_realtime
 from twin.run.run_config import RunConfig, make_run_id, read_run_config
-from twin.run.terminal import catch_interrupts, console, print_line
+from twin.run.terminal import catch_interrupts, console, print_line, show_status
 from twin.run.warm_up import compile_kernels
 from twin.security.credentials import Credentials, credentials_folder
 from twin.transport.endpoint import check_endpoint
@@ -51,7 +51,8 @@ def run_test(
 
     `web` is the address of its page, "" for the default and None for no page.
     """
-    config = read_run_config(profile, table, model)
+    with show_status("checking the test"):
+        config = read_run_config(profile, table, model)
     if unpaced:
         check_full_speed(config.rig)
         if web is not None:

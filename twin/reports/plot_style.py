@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from twin.reports.report_data import DIRECTIONS
+from twin.run.terminal import show_status
 
 FIGURE_WIDTH_IN = 10.0
 RC_PARAMS: dict[Any, Any] = {
@@ -91,8 +92,10 @@ def save_figures(
     """
     folder.mkdir(parents=True, exist_ok=True)
     pictures = []
-    with mpl.rc_context(RC_PARAMS | (DARK_RC_PARAMS if dark else {})):
+    style = RC_PARAMS | (DARK_RC_PARAMS if dark else {})
+    with mpl.rc_context(style), show_status("drawing the figures") as show_part:
         for drawing in figures:
+            show_part(drawing.title)
             path = folder / f"{drawing.name}.png"
             drawing.figure.savefig(path)
             for suffix in more_formats:

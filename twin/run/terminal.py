@@ -4,9 +4,11 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from rich.console import Console
+from rich.errors import LiveError
+from rich.markup import escape
 from rich.table import Table
 
 DECAY_MESSAGE = "stopping: the table decays to rest"
@@ -87,6 +89,22 @@ def catch_interrupts(
     finally:
         for number, handler in zip(numbers, old_handlers, strict=True):
             signal.signal(number, handler)
+
+
+@contextmanager
+def show_status(text: str) -> Iterator[Callable[[str], None]]:
+    """Show a line on a terminal while something silent runs; yield a function that adds a part.
+
+    Nothing is shown under another progress bar.
+    """
+    status = console.status(text)
+    with suppress(LiveError):
+        if console.is_terminal:
+            status.start()
+    try:
+        yield lambda part: status.update(f"{text}: {escape(part)}")
+    finally:
+        status.stop()
 
 
 @contextmanager
