@@ -21,6 +21,7 @@ from twin.campaign.summary import read_campaign
 from twin.cli import report as reading
 from twin.live.process_config import ProcessConfig
 from twin.recording.reader import read_recording
+from twin.reports.prc_families import draw_all_gaps
 from twin.run.unpaced import play_unpaced
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
@@ -226,6 +227,17 @@ def test_lines_and_points_of_the_pictures_are_divided_by_the_same(both: Both) ->
             assert line.twin.r_r == own.twin.r_r
         eta = [point.measured.eta_d for point in rig.points[name] if point.measured]
         assert eta == [step["measured"]["eta_d"] for step in run["steps"]]
+
+
+def test_a_gap_without_a_measured_step_is_not_drawn(both: Both) -> None:
+    campaign = read_campaign(both.killed)
+    free, *others = campaign.runs
+    unmeasured = replace(free, summary=free.summary | {"steps": []})
+    cases, measured = prc_families(replace(campaign, runs=(unmeasured, *others)))
+    assert list(cases) == list(measured.points) == ["G4"]
+    caption = draw_all_gaps(cases, measured).caption
+    assert "G−1" not in caption
+    assert "free flight" not in caption
 
 
 def test_the_report_is_written_anew_from_the_folder_alone(

@@ -158,7 +158,7 @@ def test_a_repaired_log_holds_all_that_was_left_and_says_what_was_not(
         {"first": first, "count": count, "channel": "", "reason": "lost"} for first, count in lost
     ]
     assert not report["replay"]["identical"]
-    assert "the file is whole, the recording has gaps" in read_output(new)
+    assert "the file is whole, the recording has dropouts" in read_output(new)
     assert read_recording(new).start == recording.start
 
 

@@ -56,7 +56,7 @@ def test_half_a_test_is_not_whole_even_if_its_file_is(cut: Path) -> None:
         gap for gap in read_recording(new).records(SampleGap) if not gap.channel
     ]  # nobody knows what was lost
     lines = read_output_lines(new)
-    assert lines[-1] == "the file is whole, the recording has gaps"
+    assert lines[-1] == "the file is whole, the recording has dropouts"
     assert any(f"samples {end} to {PLANNED - 1} " in line and "no end" in line for line in lines)
 
 

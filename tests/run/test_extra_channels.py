@@ -206,7 +206,7 @@ def test_the_monitor_lists_them(run: Path) -> None:
     assert any(line.startswith("air temp") and "degC" in line for line in limits)
     twin = [line.plain for line in draw_twin(state, 80, 40)]
     assert any(line.startswith("mass acc 2") and "m/s²" in line for line in twin)
-    assert format_gaps(state).plain == "0 gaps"
+    assert format_gaps(state).plain == "0 dropouts"
 
 
 @pytest.mark.parametrize(

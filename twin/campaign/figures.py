@@ -49,7 +49,7 @@ def _draw_each(campaign: CampaignData) -> CaptionedFigures:
     for drawing in drawn:
         caption = f"{drawing.caption} {normalization[0].upper()}{normalization[1:]}."
         yield replace(drawing, name=drawing.name.removeprefix("rig_"), caption=caption)
-    if any(run.summary["steps"] for run in campaign.runs):
+    if list_swept_runs(campaign):
         yield _draw_levels(campaign)
 
 
@@ -77,8 +77,8 @@ def _is_covered_finer(hz: float, of: Sweep, sweeps: list[Sweep]) -> bool:
 
 
 def list_swept_runs(campaign: CampaignData) -> list[CampaignRunData]:
-    """List the runs of a stepped sine, which have curves over frequency."""
-    return [run for run in campaign.runs if run.profile.steps]
+    """List the runs of a stepped sine of which a step was measured: only they are drawn."""
+    return [run for run in campaign.runs if run.profile.steps and run.summary["steps"]]
 
 
 def prc_families(campaign: CampaignData) -> tuple[dict[str, PaperCase], MeasuredCampaign]:
@@ -100,7 +100,7 @@ def prc_families(campaign: CampaignData) -> tuple[dict[str, PaperCase], Measured
             for run in runs
         }  # fmt: skip
         cases[name] = CampaignGap(name, tuple(tests.values()))
-        sweeps = [run.profile.sweep for run in runs if run.summary["steps"]]
+        sweeps = [run.profile.sweep for run in runs]
         measured_campaign.points[name] = [
             point
             for run in runs
@@ -133,7 +133,7 @@ def _draw_levels(campaign: CampaignData) -> CaptionedFigure:
     handles = direction_handles(_dot_style)
     figure.legend(handles=handles, loc="outside upper center", ncols=2)
     return CaptionedFigure(
-        "level", "Level of the table at every measured step of every run",
+        "level", "Level of the table at every measured step",
         "Fundamental of the measured table acceleration over the demanded one, minus one. Green: "
         f"the tolerance of ±{band:g} %.",
         figure,

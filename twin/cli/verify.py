@@ -248,7 +248,7 @@ def print_verification(report: Json, advise: bool = True) -> None:
     for attachment in report["altered"]:
         print_line(f"altered: attachment {attachment} is not what was written")
     _print_limited("damage", [_describe_damage(damage) for damage in report["damage"]])
-    _print_limited("gap", [_describe_gap(gap, rate_hz) for gap in report["gaps"]])
+    _print_limited("dropout", [_describe_gap(gap, rate_hz) for gap in report["gaps"]])
     reasons = report["replay"]["because"]
     reason = f": {'; '.join(reasons)}" if reasons else ""
     if not report["replay"]["possible"]:
@@ -267,7 +267,7 @@ def print_verification(report: Json, advise: bool = True) -> None:
         advice = "; `--repair NEW` writes what is left as a whole file" if advise else ""
         print_line(f"damaged{advice}")
     else:
-        print_line("whole" if report["sound"] else "the file is whole, the recording has gaps")
+        print_line("whole" if report["sound"] else "the file is whole, the recording has dropouts")
 
 
 def _describe_content(report: Json) -> str:

@@ -292,11 +292,11 @@ def format_gaps(run_state: LiveRunState) -> Text:
     """Format the number of invalid samples and their channels."""
     lost_samples = sum(count for _, count in run_state.gaps.values())
     if not lost_samples:
-        return Text("0 gaps", GOOD_STYLE)
+        return Text("0 dropouts", GOOD_STYLE)
     names = ", ".join(
         sorted({describe_channel(name)[0] if name else "all" for name, _ in run_state.gaps})
     )
-    return Text(f"gaps: {lost_samples} samples, {names}", BAD_STYLE)
+    return Text(f"dropouts: {lost_samples} samples, {names}", BAD_STYLE)
 
 
 def format_latency(run_state: LiveRunState, width: int) -> Text:

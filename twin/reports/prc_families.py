@@ -1,7 +1,7 @@
 """Figures of PRC families: all gaps (Fig. 2) and from positive to negative gaps (Fig. 5)."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -106,19 +106,38 @@ def draw_all_gaps(
     figure.legend(handles=handles, loc="outside upper center", ncols=7)
     return CaptionedFigure(
         "fig02_prc" if campaign is None else "rig_fig02_prc",
-        "Pseudo-resonance curves of all gaps",
-        "Forward (red) and backward (blue) PRCs of a η_d, b η_a, c η_j and d r_j; the free flight "
-        "is green. The smaller the gap, the smaller the dots and the thinner the lines. "
+        f"Pseudo-resonance curves of {_list_names(cases)}",
+        "Forward (red) and backward (blue) PRCs of a η_d, b η_a, c η_j and d r_j"
+        + ("; the free flight is green" if FREE_FLIGHT in cases else "")
+        + ". The smaller the gap, the smaller the dots and the thinner the lines. "
         + ("Dots: measured; lines: model. " if campaign else "")
-        + "Yellow: the primary right hysteresis of G4; cyan: the left hysteresis of G−1 "
-        "(first to last grid frequency at which the directions differ"
-        + (", measured" if campaign else "")
-        + "); arrows: their jumps."
+        + _describe_highlights(highlighted, bool(campaign))
         + (" Green dashed: 1.0, the peak of G∞ continuous in frequency, by which η is divided; "
            "on the grid G∞ stays below it." if FREE_FLIGHT in cases else ""),
         figure,
         "2",
     )  # fmt: skip
+
+
+def _list_names(cases: Iterable[str]) -> str:
+    """Return the names of the gaps that are drawn."""
+    return ", ".join(map(format_minus, cases))
+
+
+def _describe_highlights(highlighted: Mapping[str, str], is_measured: bool) -> str:
+    """Return what the bands and arrows mean; empty without any."""
+    if not highlighted:
+        return ""
+    colours = {"right": "Yellow", "left": "cyan"}
+    bands = "; ".join(
+        f"{colours[kind]}: the primary {kind} hysteresis of {format_minus(name)}"
+        for name, kind in highlighted.items()
+    )
+    source = ", measured" if is_measured else ""
+    return (
+        f"{bands[0].upper()}{bands[1:]} (first to last grid frequency at which the directions "
+        f"differ{source}); arrows: jumps."
+    )
 
 
 def _mark_unit(panels: list[Panel]) -> None:
@@ -209,10 +228,10 @@ def draw_transition(
     figure.legend(handles=handles, loc="outside upper center", ncols=8)
     return CaptionedFigure(
         "fig05_prc" if campaign is None else "rig_fig05_prc",
-        "From positive to negative gaps",
-        "Forward (solid) and backward (dashed) PRCs of a η_d, b η_a, c η_j and d r_j for G4, G0, "
-        "G−1, G−2 and G−10. Dashed horizontal lines and grey areas in c and d: deformation and "
-        "force of the precompressed bumpers at rest. "
+        f"From {_list_names(list(colours)[:1])} to {_list_names(list(colours)[-1:])}",
+        "Forward (solid) and backward (dashed) PRCs of a η_d, b η_a, c η_j and d r_j for "
+        f"{_list_names(colours)}. Dashed horizontal lines and grey areas in c and d: deformation "
+        "and force of the precompressed bumpers at rest. "
         + ("Dots: measured, filled forward, open backward. " if campaign else "")
         + _compare_g2_g10(cases),
         figure,
