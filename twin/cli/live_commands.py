@@ -66,7 +66,13 @@ def monitor_command(
     Keys: q quits; h, r, s, a hold, resume, stop, abort the test, each once confirmed with y.
     """
     if web or web_listen:
+        from table_io.errors import InputError
         from twin.monitor.web import serve_monitor_page
+
+        if once or picture is not None:
+            raise InputError(
+                "does not go with --once and --picture", key="--web", remedy="give one of them"
+            )
 
         serve_monitor_page(web_listen, connect, rig, read_keys_option(keys))
         return

@@ -238,19 +238,19 @@ class PageRequest(BaseHTTPRequestHandler):
     def _stream_sections(self, user: str) -> None:
         access, feed, clock = self.server.access, self.server.feed, RealClock()
         sent: Mapping[str, str] = {}
-        version, checked_s = -1, clock.now()
+        version, checked_s, role = -1, float("-inf"), ""
         while (news := feed.wait_for_change(version, HEARTBEAT_S)) is not None:
-            version = news[0]
-            role = access.role_of(user) if access.role_of is not None else feed.role
-            sections = {**news[1], "user": json.dumps({"name": user, "role": role})}
-            changed = [name for name, text in sections.items() if sent.get(name) != text]
-            messages = [f"event: {name}\ndata: {sections[name]}\n\n" for name in changed]
-            self.wfile.write("".join(messages or [":\n\n"]).encode())
-            sent = sections
             if clock.now() > checked_s + HEARTBEAT_S:
                 checked_s = clock.now()
                 if access.identify(self._code) != user:
                     return
+                role = access.role_of(user) if access.role_of is not None else ""
+            identity = {"name": user, "role": role or feed.role}
+            version, sections = news[0], {**news[1], "user": json.dumps(identity)}
+            changed = [name for name, text in sections.items() if sent.get(name) != text]
+            messages = [f"event: {name}\ndata: {sections[name]}\n\n" for name in changed]
+            self.wfile.write("".join(messages or [":\n\n"]).encode())
+            sent = sections
 
     def _reply_message(self, status: int, message: str) -> None:
         body = json.dumps({"message": message}).encode()

@@ -1,0 +1,84 @@
+"""The page as an observer of a bus: it waits for a run, shows it, and outlives its gateway."""
+
+import http.client
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from tests.input_errors import raises_input_error
+from tests.live.test_live import endpoint
+from tests.monitor.monitored import point, records
+from tests.monitor.test_app import hub_at, publish
+from tests.monitor.test_page_server import PATIENCE_S, read_event
+from tests.security.laboratory import free_port
+from twin.cli.main import app
+from twin.cli.run import run_test
+from twin.monitor.web import PageRequestConfig, serve_page
+from twin.transport.zenoh_link import BusLink
+
+
+@contextmanager
+def page_of(place: str) -> Iterator[http.client.HTTPResponse]:
+    """The events of a page that watches this endpoint, in a thread."""
+    port, is_served, over = free_port(), threading.Event(), threading.Event()
+    request = PageRequestConfig(f"127.0.0.1:{port}", place, "simulated")
+    thread = threading.Thread(
+        target=serve_page, args=(request, lambda url: is_served.set(), over.is_set)
+    )
+    thread.start()
+    try:
+        assert is_served.wait(PATIENCE_S)
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
+        connection.request("GET", "/events")
+        with connection.getresponse() as answer:
+            yield answer
+    finally:
+        over.set()
+        thread.join()
+
+
+def wait_for(
+    events: http.client.HTTPResponse, hub: BusLink, section: str, test: Callable[[Any], bool]
+) -> None:
+    """Read events until a section is as expected, while the hub answers."""
+    over = threading.Event()
+
+    def answer() -> None:
+        while not over.wait(0.01):
+            hub.serve()
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    try:
+        while (event := read_event(events))[0] != section or not test(event[1]):
+            pass
+    finally:
+        over.set()
+        thread.join()
+
+
+def test_a_page_waits_for_a_run_and_outlives_its_gateway() -> None:
+    place = endpoint()
+    with page_of(place) as events:
+        with hub_at(place) as hub:
+            publish(hub, records())
+            wait_for(events, hub, "prc", lambda prc: prc["count"] == 3)
+        with hub_at(place) as hub:
+            publish(hub, [*records(), point(3)])
+            wait_for(events, hub, "prc", lambda prc: prc["count"] == 4)
+
+
+def test_a_page_goes_with_a_test_in_real_time_only() -> None:
+    with raises_input_error(key="--web"):
+        run_test(Path("quickstart"), None, True, None, None, False, "", web="")
+
+
+@pytest.mark.parametrize("option", ["--once", "--picture=now.svg"])
+def test_a_page_is_not_printed(option: str) -> None:
+    with raises_input_error(key="--web"):
+        CliRunner().invoke(app, ["monitor", "--web", option], catch_exceptions=False)
