@@ -50,7 +50,7 @@ def format_record(record: Record, rate_hz: float) -> tuple[str, str] | None:
             )
             return level, f"{kind}: {text}"
         case SampleGap(count=count, channel=channel, reason=reason):
-            return "WARN", f"gap: {count} samples of {channel or 'all channels'} {reason}"
+            return "WARN", f"dropout: {count} samples of {channel or 'all channels'} {reason}"
         case Fault(component=component, from_index=first, to_index=last, reason=reason):
             span = f"{first / rate_hz:.3f} s to {last / rate_hz:.3f} s"
             return "ERROR", f"{component} failed, no output from {span}: {reason}"

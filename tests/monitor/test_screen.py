@@ -89,7 +89,7 @@ def test_at_120_columns_everything_is_there(watched_state: LiveRunState) -> None
         "rig        0.410   1.960   5.200      0",
         "measured   1  2  3.000 mm  0.140  0.280", "twin       1  2  3.000 mm  0.168  0.336",
         "0:00:07 divergence: the twin has left the measurement",
-        "gap: 3 samples of force_l2_n lost", "dropouts: 3 samples, force L2",
+        "dropout: 3 samples of force_l2_n lost", "dropouts: 3 samples, force L2",
         "connected  monitor:ana×2  rig  twin", "q quit  h hold  r resume  s stop  a abort",
     ):  # fmt: skip
         assert part in shown, part

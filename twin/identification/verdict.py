@@ -105,13 +105,13 @@ def judge_selection(
     if remaining > MIN_VISIBLE_EXCESS * floor:
         percent = 100 * math.sqrt(remaining / gap)
         reason = (
-            f"{percent:.2g} % of the gap remains, as an inexact form of the force law may leave"
+            f"{percent:.2g} % of the misfit remains, as an inexact form of the force law may leave"
         )
     if generic is not None:
-        reason = f"part of the gap remains unexplained; it resembles {_format_generic(generic)}"
+        reason = f"part of the misfit remains unexplained; it resembles {_format_generic(generic)}"
         confidence, has_remainder = 0.8 * confidence, True
     elif has_remainder:
-        reason = "part of the gap remains unexplained"
+        reason = "part of the misfit remains unexplained"
     return DiscoveryVerdict("named", best, confidence, (), generic, floor, has_remainder, reason)
 
 
@@ -142,7 +142,7 @@ def _judge_common_core(
         dict.fromkeys(" + ".join(sorted(names - common)) for names in sets)
     )
     reason = (
-        f"part of the gap remains, to which {alternatives_text} may contribute: the data cannot "
+        f"part of the misfit remains, to which {alternatives_text} may contribute: the data cannot "
         "distinguish them"
     )
     return replace(verdict, has_remainder=True, reason=reason)
@@ -160,14 +160,14 @@ def _find_doubt(
     if generic is not None:
         return f"{_format_generic(generic)} explains what {names} cannot"
     if has_remainder and (selection.null.cost - best.cost) < MIN_NAMED_GAP_SHARE * gap:
-        return "the best effects close less than half of the gap"
+        return "the best effects remove less than half of the misfit"
     at_bound = [
         effect.amplitude.name
         for effect in best.effects
         if effect.amplitude.key in best.fit.at_bound
     ]
     return (
-        f"{', '.join(at_bound)} is at its bound, and part of the gap remains"
+        f"{', '.join(at_bound)} is at its bound, and part of the misfit remains"
         if has_remainder and at_bound
         else ""
     )
@@ -180,7 +180,7 @@ def _judge_unnamed(
     is_visible = null.cost > (1 + MIN_VISIBLE_EXCESS) * floor
     if generic is not None and is_visible and problem.is_worthwhile(null, generic):
         reason = (
-            f"no effect of the library, but {_format_generic(generic)} explains part of the gap"
+            f"no effect of the library, but {_format_generic(generic)} explains part of the misfit"
         )
         return DiscoveryVerdict("unexplained", null, 0.9, (), generic, floor, True, reason)
     if null.cost > (1 + 2 * MIN_VISIBLE_EXCESS) * floor:
