@@ -175,6 +175,7 @@ def test_prc_fits_a_narrow_terminal_and_a_file_is_not_cut(run_folder: Path) -> N
     ("module", "slow"),
     [
         ("twin.cli.main", "numpy numba scipy pydantic matplotlib mcap zenoh rerun"),
+        ("twin.cli.reference", "numba scipy matplotlib zenoh"),
         ("twin.live.control", "typer numpy numba pydantic rich google.protobuf ssl"),
     ],
 )

@@ -33,8 +33,8 @@ app = typer.Typer(
 )
 
 COMPUTING_COMMANDS = frozenset({
-    "branches", "campaign", "check", "demo", "discover", "identify", "paper", "replay", "run",
-    "simulate",
+    "branches", "campaign", "check", "demo", "discover", "explain", "identify", "paper",
+    "replay", "run", "schema", "simulate",
 })  # fmt: skip
 PLAN_PANEL, DRIVE_PANEL, LOOK_PANEL = (
     "Before a test",

@@ -21,11 +21,8 @@ from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError, suggest
 from twin.cli.reference_commands import FileKind, ListKind
-from twin.guide.reference import CONFIG_FILES
-from twin.model.effects import EFFECTS, describe_effect, load_plugins
 from twin.run.terminal import console, print_line, print_table
 
-MODEL_BY_KIND = dict(zip(FileKind, (model for *_, model in CONFIG_FILES), strict=True))
 TEMPLATES = {FileKind.rig: "rigs/simulated", FileKind.model: "models/snm",
              FileKind.campaign: "campaigns/paper"}  # fmt: skip
 EXAMPLE_KIND = 'kind = "stepped_sine"'  # of the excitation of a new test
@@ -37,6 +34,8 @@ def print_names(kind: ListKind) -> None:
     header: tuple[str, ...]
     rows: Iterator[tuple[str, ...]]
     if kind is ListKind.effects:
+        from twin.model.effects import EFFECTS, describe_effect, load_plugins
+
         header = ("effect", "meaning", "law", "parameters")
         rows = (
             (effect.id, describe_effect(effect), effect.term,
@@ -73,6 +72,8 @@ def _describe_folder(path: Path) -> str:
 
 def explain_key(name: str) -> None:
     """Print what a key means, in each file and table that has it; InputError if none has."""
+    from twin.guide.reference import CONFIG_FILES  # it imports the kernels
+
     entries = {
         (title, table.name, key.key): key
         for title, _, model in CONFIG_FILES
@@ -179,7 +180,9 @@ def write_schema(kind: FileKind, path: Path | None) -> None:
 
 def build_file_schema(kind: FileKind) -> dict[str, Any]:
     """Return the JSON schema of a kind of file, with the tables that plug-ins add to it."""
-    model = MODEL_BY_KIND[kind]
+    from twin.guide.reference import CONFIG_FILES
+
+    *_, model = CONFIG_FILES[list(FileKind).index(kind)]
     added: dict[str, tuple[type[ConfigModel], ...]] = {}
     if model is Profile:
         kinds = tuple(Excitation.list_variants().values())
