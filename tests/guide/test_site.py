@@ -1,6 +1,8 @@
 """The guide as its reader gets it: pages, links and anchors, pictures, no network."""
 
 import re
+import subprocess
+import sys
 from collections import Counter
 from html.parser import HTMLParser
 from pathlib import Path
@@ -13,7 +15,8 @@ from tests.command_line import call_main
 from tests.input_errors import raises_input_error
 from twin.cli.main import app
 from twin.guide.markdown import render_markdown
-from twin.guide.site import CHAPTERS, PACKAGES_DIR, Chapter, GuidePage, build_guide
+from twin.guide.reference import PACKAGES_DIR
+from twin.guide.site import CHAPTERS, Chapter, GuidePage, build_guide
 
 ROOT = Path(__file__).resolve().parents[2]
 FILE_NAME = re.compile(r"^(?:\.github|profiles|table_io|tests|twin)/[\w./-]+\.\w+$")
@@ -153,6 +156,18 @@ def test_the_command_writes_the_site(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert str(index) in result.stdout
     (tmp_path / "file").touch()
     assert call_main("guide", "--out", tmp_path / "file").returncode == 2
+
+
+def test_the_guide_imports_no_kernels() -> None:
+    """They would be compiled first, for a minute."""
+    program = (
+        "import sys, twin.guide.site, twin.cli.guide;"
+        "print([name for name in sys.modules if name.startswith('twin') and 'kernel' in name])"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == "[]"
 
 
 def test_all_pages_of_the_packages_are_in_the_guide() -> None:

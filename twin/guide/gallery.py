@@ -21,7 +21,7 @@ from twin.guide.reference import format_table
 from twin.model import effects
 from twin.model.effects import EFFECTS, load_plugins
 from twin.model.effects.effect import Effect
-from twin.reports.discovery.headline import typeset_law
+from twin.model.effects.typesetting import typeset_law
 
 ACTIONS = {
     "parameters": "changes parameters; closed form",

@@ -1,7 +1,8 @@
 """Reference pages as Markdown: keys of the TOML files, commands with their options, channels."""
 
+import ast
 from collections.abc import Iterable, Iterator
-from inspect import getdoc, signature
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -11,7 +12,6 @@ from table_io.config.base import ConfigModel
 from table_io.config.key_reference import KeyDescription, describe_tables
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
-from twin import api, log
 from twin.campaign.config import CampaignConfig
 from twin.exchange.columns import ColumnMap
 from twin.model.config import ModelConfig
@@ -24,6 +24,7 @@ CONFIG_FILES: tuple[tuple[str, str, type[ConfigModel]], ...] = (
     ("Column map", "Columns of a foreign file, for `import --columns`.", ColumnMap),
 )
 
+PACKAGES_DIR = Path(__file__).resolve().parents[2]  # holds twin and table_io
 PUBLIC_FUNCTIONS = (
     "open_log", "run_simulated", "simulate", "replay", "import_data", "identify", "discover",
 )  # fmt: skip
@@ -118,31 +119,40 @@ def write_channel_reference(_: typer.Typer) -> str:
 
 
 def write_api_reference(_: typer.Typer) -> str:
-    """Return the page of the Python interface, from its docstrings."""
-    summary, example, notes = (getdoc(api) or "").split("\n\n", 2)
+    """Return the page of the Python interface, from the docstrings of its source.
+
+    It is parsed, not imported: the import would compile kernels.
+    """
+    modules = [
+        ast.parse((PACKAGES_DIR / name).read_text(encoding="utf-8"))
+        for name in ("twin/api.py", "twin/log/__init__.py")
+    ]
+    nodes = {
+        node.name: node
+        for module in modules
+        for node in module.body
+        if isinstance(node, ast.FunctionDef | ast.ClassDef)
+    }
+    summary, example, notes = (ast.get_docstring(modules[0]) or "").split("\n\n", 2)
     parts = [
         "# Python API",
-        f"{summary}",
+        summary,
         f"```python\n{example.replace('>>> ', '')}\n```",
         notes,
     ]
     for name in PUBLIC_FUNCTIONS:
-        parts += _describe_object(name, getattr(api, name))
-    parts += ["## Log", (getdoc(log) or "").split("\n\n", 2)[2]]
-    for kind in (api.FittedModel, api.DiscoveredModel):
-        parts += [f"## {kind.__name__}", getdoc(kind) or ""]
+        parts += _describe_function(nodes[name])
+    parts += ["## Log", (ast.get_docstring(modules[1]) or "").split("\n\n", 2)[2]]
+    for name in ("FittedModel", "DiscoveredModel"):
+        parts += [f"## {name}", ast.get_docstring(nodes[name]) or ""]
     return "\n\n".join(parts)
 
 
-def _describe_object(name: str, function: Any) -> Iterator[str]:
+def _describe_function(node: Any) -> Iterator[str]:
     """Yield the parts of the section of a function."""
-    arguments = "".join(
-        f"    {argument},\n" for argument in signature(function).parameters.values()
-    )
-    result = signature(function).return_annotation
-    text = f"{name}(\n{arguments}) -> {getattr(result, '__name__', result)}"
-    for module in ("pathlib.", "collections.abc."):
-        text = text.replace(module, "")
-    yield f"## {name}"
-    yield f"```python\n{text}\n```"
-    yield getdoc(function) or ""
+    arguments = ast.unparse(node.args).replace("PathLike", "str | Path").replace("=", " = ")
+    lines = "".join(f"    {argument},\n" for argument in arguments.split(", "))
+    yield f"## {node.name}"
+    result = ast.unparse(node.returns).strip("'")
+    yield f"```python\n{node.name}(\n{lines}) -> {result}\n```"
+    yield ast.get_docstring(node) or ""

@@ -8,6 +8,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import typer
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from table_io.errors import InputError
@@ -15,16 +16,14 @@ from twin.guide.gallery import write_gallery
 from twin.guide.markdown import RenderedMarkdown, render_markdown
 from twin.guide.notebook import convert_notebook
 from twin.guide.reference import (
+    PACKAGES_DIR,
     write_api_reference,
     write_channel_reference,
     write_command_reference,
     write_key_reference,
 )
-from twin.reports.page import render_page
 
-PACKAGES_DIR = Path(__file__).resolve().parents[2]  # holds twin and table_io
 PAGES_DIR = Path(__file__).parent / "pages"
-TEMPLATE = Path(__file__).with_name("guide.html")
 TUTORIALS_DIR = Path(__file__).parent / "tutorials"
 FILES_FOLDER = "files"  # pictures and notebooks
 
@@ -151,9 +150,16 @@ def build_guide(folder: Path, app: typer.Typer, chapters: Sequence[Chapter] = CH
     faults = links.find_broken(rendered)
     if faults:
         raise InputError("broken links", where="guide", faults=faults)
+    # Of its own: the pages of reports import kernels, which are not compiled for a guide.
+    template = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    ).get_template("guide.html")
     for page, following in zip(pages, [*pages[1:], None], strict=True):
-        html = render_page(
-            TEMPLATE,
+        html = template.render(
             page=page,
             body=Markup(rendered[page].html),
             headings=[heading for heading in rendered[page].headings if heading.level == 2],

@@ -1,14 +1,9 @@
 """Headline of a discovery in words of physics, with the typeset law of each effect."""
 
-import html
-import re
-
-from markupsafe import Markup
-
 from twin.model.effects import describe_effect, find_effect
+from twin.model.effects.typesetting import typeset_law
 from twin.reports.discovery.serialize import REFITTED_SUFFIX, Json
 
-SYMBOL = r"\b([A-Z][cy]|[kc][0-9hb]|uy)\b"  # Fc, Fy, k3, ch: a letter with its index
 MAX_EXCLUDED = 3  # rivals that the headline names
 VERDICT_SENTENCES = {
     "none": "Model and measurement agree to within the noise.",
@@ -16,17 +11,6 @@ VERDICT_SENTENCES = {
     "ambiguous": "The model lacks an effect, but these recordings do not determine which: {names}.",
     "unexplained": "The model lacks an effect that is not in the library.",
 }
-
-
-def typeset_law(term: str) -> Markup:
-    """Return the term of an effect as HTML: indices, powers, primes and minus signs."""
-    text = html.escape(term, quote=False)
-    text = re.sub(r"\b([A-Za-z])_([A-Za-z0-9]+)", r"\1<sub>\2</sub>", text)
-    text = re.sub(SYMBOL, lambda match: f"{match[1][0]}<sub>{match[1][1:]}</sub>", text)
-    text = re.sub(r"\^([0-9]+)", r"<sup>\1</sup>", text)
-    text = re.sub(r"\babs\(([^()]*)\)", r"|\1|", text)
-    text = re.sub(r"(?<![A-Za-z0-9])-(?=[A-Za-z(])", "−", text)
-    return Markup(text.replace("'", "′").replace(" x ", " × "))
 
 
 def format_effect(effect: Json) -> str:
