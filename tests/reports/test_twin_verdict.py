@@ -154,6 +154,7 @@ def test_a_history_is_judged_by_its_nrmse(clean: Json, nrmse: float, verdict: st
     history: Json = {"steps": [], "jumps": [], "twin_jumps": []}
     judged = judge_changed(clean, **history, comparison=comparison)
     assert judged["verdict"] == verdict
+    assert "jump" not in judged["reason"]
     assert judged["misfit"] == pytest.approx(nrmse / 0.003)
 
 

@@ -42,6 +42,7 @@ PHASES = ("flight", "contact_right", "contact_left")
 DEPARTURE_KIND = "disagreement"  # of warnings
 JUMP_KINDS = ("no jump", "unexpected jump")  # hints, where one direction alone shows no branches
 MAX_UNREMARKABLE_MISFIT = 3.0  # times the noise: beyond it, parameters or effects can be found
+HISTORY_TOLERANCE_TEXT = f"{100 * AMPLITUDE_TOLERANCE:g} % of the rms, beyond the noise"
 TOLERANCE_TEXT = (
     f"{NOISE_FACTOR:g} x noise at rest + {100 * AMPLITUDE_TOLERANCE:g} % of the amplitude"
     f" + {1e3 * GAP_ERROR_M:g} mm of gap in contact"
@@ -145,13 +146,16 @@ def judge_twin(summary: Mapping[str, Any]) -> Json:
         verdict = "departs" if reasons else "agrees"
     misfit = _overall_misfit(summary)
     if not reasons:
-        reasons = ["within the tolerance, every jump in its place"]
+        reasons = [
+            "within the tolerance",
+            *(["every jump in its place"] if summary["steps"] else []),
+        ]
         if _is_remarkable(misfit):
             reasons.append(f"but u differs by {misfit:.2g} times the noise")
     return {
         "verdict": verdict,
-        "reason": "; ".join(reasons),
-        "tolerance": TOLERANCE_TEXT,
+        "reason": ", ".join(reasons),
+        "tolerance": TOLERANCE_TEXT if summary["steps"] else HISTORY_TOLERANCE_TEXT,
         "worst": worst,
         "steps_outside": len(outside),
         "steps_judged": _count_judged(summary),
