@@ -1,6 +1,7 @@
 """`shaketwin view`: show a recording or a running test in Rerun."""
 
 import os
+import signal
 import tempfile
 from contextlib import nullcontext, suppress
 from pathlib import Path
@@ -36,6 +37,8 @@ def show_view(
         raise InputError(
             "does not go with --save and --picture", key="--web", remedy="give one of them"
         )
+    if web:  # a SIGTERM ends the web viewer too
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     if log is not None and web:
         view_log_in_browser(resolve_log_path(log))
     elif log is not None:
