@@ -10,7 +10,7 @@
 Profiles, models and tables are names of shipped files or paths of TOML files. Values are SI, right
 is positive. A user's mistake raises `InputError`, whose fields state where, what, what is allowed
 and what to do. Nothing is overwritten: an output folder must be new or empty; without one, a new
-folder runs/<date>-<time>-<name> is made.
+folder `runs/<date>-<time>-<name>` is made.
 """
 
 from collections.abc import Mapping, Sequence

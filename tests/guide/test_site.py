@@ -114,6 +114,12 @@ def test_every_command_that_the_guide_names_exists(pages: dict[str, PageParser])
     assert names - commands.keys() == set()
 
 
+def test_no_text_is_taken_for_a_tag(pages: dict[str, PageParser]) -> None:
+    """Such as <date> outside of code, which a browser would swallow."""
+    placeholders = {"date", "time", "name", "folder", "file", "who", "log", "profile", "topic"}
+    assert [name for name, page in pages.items() if placeholders & page.tags.keys()] == []
+
+
 def test_the_build_refuses_links_that_lead_nowhere(tmp_path: Path) -> None:
     (tmp_path / "a.md").write_text("# A\n[x](b.md) [y](#nowhere) [z](#a)")
     chapters = (Chapter("Start", (GuidePage("a", "A", tmp_path / "a.md"),)),)
