@@ -49,11 +49,19 @@ class PairErrorEstimate:
     rhs: Float1D = field(default_factory=lambda: np.zeros(3))
     check_count: int = 0
 
-    def update(self, equations: tuple[Float2D, Float1D]) -> "PairErrorEstimate":
-        """Return the estimate with the normal equations of one more comparison."""
+    def update(self, equations: tuple[Float2D, Float1D], omega: float) -> "PairErrorEstimate":
+        """Return the estimate with the normal equations of one more comparison at `omega` rad/s.
+
+        They hold the low cut that was known when they were made, in hp(x). While it still moves,
+        those made before are forgotten.
+        """
         kept = 1.0 - 1.0 / AVERAGING_CHECKS
         matrix, rhs = kept * self.matrix + equations[0], kept * self.rhs + equations[1]
-        return PairErrorEstimate(solve_errors(matrix, rhs), matrix, rhs, self.check_count + 1)
+        errors = solve_errors(matrix, rhs)
+        correction = abs(errors.low_cut - self.errors.low_cut)
+        if errors.low_cut * correction > FIT_ERROR_RATIO * omega**2:
+            return PairErrorEstimate(solve_errors(*equations), *equations)
+        return PairErrorEstimate(errors, matrix, rhs, self.check_count + 1)
 
     @property
     def low_cut_sd(self) -> float:

@@ -8,6 +8,7 @@ from scipy import signal
 
 from table_io.block import Float1D
 from table_io.safety.protection.consistency import WeakFormPair, compare_motion, make_window
+from table_io.safety.protection.cycle_checks import MIN_BASELINE_CHECKS
 from table_io.sensor_errors import (
     MAX_LOW_CUT_RAD_S,
     PairErrorEstimate,
@@ -41,7 +42,7 @@ def compare_cycles(x: Float1D, a: Float1D) -> tuple[PairErrorEstimate, WeakFormP
         span = slice(start, start + samples)
         window = make_window(samples, 1.0, 0.5, RATE_HZ)
         pair = compare_motion(window, x[span], a[span], (0.0, 0.0), (filtered[span], low_cut))
-        estimate = estimate.update(pair.normal_equations())
+        estimate = estimate.update(pair.normal_equations(), 2 * math.pi * CYCLE_HZ)
     return estimate, pair
 
 
@@ -59,6 +60,27 @@ def test_errors_of_sound_sensors_are_measured(
     assert errors.delay_s == pytest.approx(delay_s, abs=2.5e-3)
     clean = pair.remove_errors(errors)
     assert clean.mismatch < 0.015 * clean.size
+
+
+def test_a_low_cut_of_half_the_frequency_is_known_once_its_estimate_has_settled() -> None:
+    """Equations made with the first, wrong low cuts do not linger in the estimate."""
+    hz, low_cut_hz = 0.5, 0.25
+    t = np.arange(round(40 * RATE_HZ)) / RATE_HZ
+    omega, low_cut = 2 * math.pi * hz, 2 * math.pi * low_cut_hz
+    response = -(omega**2) * 1j * omega / (1j * omega + low_cut)
+    x, a = 0.03 * np.sin(omega * t), 0.03 * np.imag(response * np.exp(1j * omega * t))
+    estimate, samples, checks = PairErrorEstimate(), round(RATE_HZ / hz), 0
+    window = make_window(samples, 1.0, 0.5, RATE_HZ)
+    while estimate.check_count < MIN_BASELINE_CHECKS:
+        checks += 1
+        span = slice(checks * samples, (checks + 1) * samples)
+        filtered = highpass(x[: span.stop], estimate.errors.low_cut, RATE_HZ)[span.start :]
+        known = (filtered, estimate.errors.low_cut)
+        pair = compare_motion(window, x[span], a[span], (0.0, 0.0), known)
+        estimate = estimate.update(pair.normal_equations(), omega)
+    assert checks <= 3 * MIN_BASELINE_CHECKS
+    assert estimate.errors.gain == pytest.approx(1.0, abs=0.02)
+    assert estimate.errors.low_cut == pytest.approx(low_cut, rel=0.03)
 
 
 @pytest.mark.parametrize("gain", [-1.0, 0.8, 1.25])

@@ -146,7 +146,7 @@ def _check_any_motion(
             cycle_checks.check_sensor_pair(cycle, names, acceleration, pair, baseline)
         )
         if not mismatches:
-            baselines[names[0]] = baseline.update(pair)
+            baselines[names[0]] = baseline.update(pair, cycle.omega)
         suspicions += mismatches
     cell_suspicions, shares = load_cells.check_cell_pairs(cycle, state.force_shares)
     return replace(

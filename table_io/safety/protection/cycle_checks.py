@@ -52,11 +52,11 @@ class PairBaseline:
         """True if the errors of the pair are known."""
         return self.estimate.check_count >= MIN_BASELINE_CHECKS
 
-    def update(self, pair: WeakFormPair) -> "PairBaseline":
-        """Return the baseline updated with one more consistent comparison."""
-        return PairBaseline(
-            pair, self.estimate.update(pair.normal_equations()) if pair.is_clear else self.estimate
-        )
+    def update(self, pair: WeakFormPair, omega: float) -> "PairBaseline":
+        """Return the baseline updated with one more consistent comparison at `omega` rad/s."""
+        if not pair.is_clear:
+            return replace(self, last=pair)
+        return PairBaseline(pair, self.estimate.update(pair.normal_equations(), omega))
 
 
 def sum_channels(rig: RigConfig, values: Float2D, names: tuple[str, ...]) -> Float1D:

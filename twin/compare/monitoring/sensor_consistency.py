@@ -145,7 +145,8 @@ def _check_body(
     profile_share = MAX_LASER_PROFILE_M / max(0.5 * float(np.ptp(x)), MAX_LASER_PROFILE_M)
     weight = 1.0 / np.hypot((FIT_ERROR_RATIO + profile_share) * size, sd)
     rows = weight * np.array([by_disp, by_low_cut, by_delay])
-    estimate = estimate.update((rows @ rows.T, rows @ (weight * by_acc)))
+    omega = 2 * np.pi * cycle.step.frequency_hz
+    estimate = estimate.update((rows @ rows.T, rows @ (weight * by_acc)), omega)
     errors = estimate.errors
     # A delay is told apart from a low cut, but it is not removed from the twin's input: it counts.
     expected = by_disp + errors.low_cut * by_low_cut
