@@ -216,7 +216,7 @@ def test_the_jumps_of_the_model_lie_at_the_folds_of_its_branches() -> None:
     text = PROFILE.format(gap=4.0).replace("step_hz = 0.5", "step_hz = 0.1")
     rig, model = (PROFILES_DIR / name for name in ("rigs/simulated.toml", "models/snm.toml"))
     bundle = from_texts("x", text, rig.read_text(), model.read_text(), "x")
-    jumps = predict_jumps(bundle.profile, bundle.model, bundle.steps).jumps
+    jumps = predict_jumps(bundle.profile, bundle.model, bundle.steps, 0.03).jumps
     assert [(jump.after.direction, jump.kind) for jump in jumps] == [
         ("forward", "down"), ("backward", "up"),
     ]  # fmt: skip
@@ -237,7 +237,9 @@ def point(index: int, eta: float, direction: str = "forward") -> PrcPoint:
     return PrcPoint(1000 * index, index, direction, 3.0 + 0.1 * index, own, None, n, n, n)
 
 
-def track_sweep(etas: Sequence[float | None], jump_after: int | None) -> list[Record]:
+def track_sweep(
+    etas: Sequence[float | None], jump_after: int | None, model_etas: Sequence[float] = ()
+) -> list[Record]:
     """What is said about a forward sweep; the model jumps down into step `jump_after`."""
     steps = [Step(i, "forward", 3.0 + 0.1 * i, 0.5) for i in range(len(etas))]
     jumps: tuple[ExpectedJump, ...] = ()
@@ -245,7 +247,8 @@ def track_sweep(etas: Sequence[float | None], jump_after: int | None) -> list[Re
         before, after = steps[jump_after - 1], steps[jump_after]
         at_hz = 0.5 * (before.frequency_hz + after.frequency_hz)
         jumps = (ExpectedJump(before, after, -1.5, at_hz),)
-    passing, items = JumpTracking(upcoming=jumps), list[Record]()
+    expected = {index: math.log(eta) for index, eta in enumerate(model_etas)}
+    passing, items = JumpTracking(expected, jumps), list[Record]()
     for place, eta in enumerate(etas):
         if eta is not None:
             passing, new_items = track_jumps(passing, point(place, eta))
@@ -275,6 +278,14 @@ def test_a_jump_comes_or_not(
     assert not events or words in events[-1].text
 
 
+@pytest.mark.parametrize("eta, kinds", [(1.3, []), (4.0, ["no jump"])])
+def test_no_jump_is_missed_where_the_specimen_already_moves_as_the_model_after_it(
+    eta: float, kinds: list[str]
+) -> None:
+    items = track_sweep([eta] * 6, 3, model_etas=[5, 5, 5, 1.1, 1.1, 1.1])
+    assert [event.kind for event in warnings(items)] == kinds
+
+
 @pytest.mark.parametrize(
     "model",
     [
@@ -298,7 +309,7 @@ def test_a_model_with_effects_foresees_in_a_bounded_time(
         return simulate_sweep(*given)
 
     monkeypatch.setattr(jumps, "simulate_sweep", simulate)
-    predict_jumps(bundle.profile, bundle.model, bundle.steps)
+    predict_jumps(bundle.profile, bundle.model, bundle.steps, 0.03)
     assert len(bundle.steps) * 8 > 3000
     assert cycles[0] <= jumps.MAX_CYCLES + 2 * jumps.CYCLES_PER_STEP
 

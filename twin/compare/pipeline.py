@@ -117,7 +117,7 @@ def prepare_pipeline(
     scale = PrcScale(model.parameters, rate_hz, contact_n, u_star, a_star, profile.specimen.gaps_m)
     if not steps or profile.continuation is not None:  # no numbered cycles, no curves
         return PipelineSetup(twin, scale, steps, measured_cycles=0)
-    jump_prediction = predict_jumps(profile, model, steps)
+    jump_prediction = predict_jumps(profile, model, steps, u_star)
     return PipelineSetup(twin, scale, steps, profile.sweep.measured_cycles, jump_prediction)
 
 

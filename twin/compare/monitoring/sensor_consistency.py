@@ -28,8 +28,8 @@ BODY_SENSORS = (
 CELL_PAIRS = (("right", *RIGHT_CELLS), ("left", *LEFT_CELLS))
 MAX_ACC_MISMATCH = 0.008  # of the acceleration: error of mounting and calibration
 # The linearity error of a laser, up to 0.2 % of full scale, ripples about seven times over the
-# range, so small motions are measured with a slope that is off by 1.4 %; an uneven surface adds a
-# fixed profile of some um over position. Neither shows at rest.
+# range, so small motions are measured with a slope that is off by 1.4 %; an uneven surface adds
+# some um, different in every cycle, at each harmonic. Neither shows at rest.
 MAX_LASER_SLOPE_ERROR, MAX_LASER_PROFILE_M = 0.014, 4.5e-6
 MIN_LOW_CUT_RAD_S = 2 * np.pi * 0.02  # below it turns the phase by 2 degrees at 0.5 Hz
 MAX_LEFT_PHASE_RAD = 0.01  # of a low cut that is not removed: below it the twin's input is right
@@ -154,8 +154,11 @@ def _check_body(
     share = float(np.sqrt((mismatch**2).sum())) / size
     if share <= MAX_ACC_MISMATCH:
         return "", estimate
-    max_share = MAX_ACC_MISMATCH + MAX_LASER_SLOPE_ERROR + profile_share
-    if share <= max_share or not (np.abs(mismatch) > NOISE_FACTOR * sd).any():
+    # cosine and sine of each harmonic together: independent of the phase
+    profile = MAX_LASER_PROFILE_M * np.sqrt(0.5 * a.size) * np.linalg.norm(curvature[1::2], axis=1)
+    allowed = (MAX_ACC_MISMATCH + MAX_LASER_SLOPE_ERROR) * size + profile
+    allowed = np.maximum(allowed, NOISE_FACTOR * np.hypot(sd[::2], sd[1::2]))
+    if not (np.hypot(mismatch[::2], mismatch[1::2]) > allowed).any():
         return None, estimate
     gain = float((by_acc * expected).sum() / (expected**2).sum())
     return (
