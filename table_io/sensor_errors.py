@@ -37,16 +37,20 @@ class PairErrors:
     delay_s: float = 0.0
 
 
+PRIOR_MATRIX = np.diag(np.array(PRIOR_SD) ** -2.0)
+PRIOR_RHS = PRIOR_MATRIX @ [1.0, 0.0, 0.0]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PairErrorEstimate:
     """Running estimate of the errors of a sensor pair over about AVERAGING_CHECKS comparisons.
 
-    `matrix` (3, 3) and `rhs` (3,) are sums of normal equations in which old ones fade.
+    `matrix` (3, 3) and `rhs` (3,) are sums of normal equations, with those expected before.
     """
 
     errors: PairErrors = PairErrors()
-    matrix: Float2D = field(default_factory=lambda: np.zeros((3, 3)))
-    rhs: Float1D = field(default_factory=lambda: np.zeros(3))
+    matrix: Float2D = field(default_factory=PRIOR_MATRIX.copy)
+    rhs: Float1D = field(default_factory=PRIOR_RHS.copy)
     check_count: int = 0
 
     def update(self, equations: tuple[Float2D, Float1D], omega: float) -> "PairErrorEstimate":
@@ -55,19 +59,32 @@ class PairErrorEstimate:
         They hold the low cut that was known when they were made, in hp(x). While it still moves,
         those made before are forgotten.
         """
-        kept = 1.0 - 1.0 / AVERAGING_CHECKS
-        matrix, rhs = kept * self.matrix + equations[0], kept * self.rhs + equations[1]
-        errors = solve_errors(matrix, rhs)
+        matrix = self._fade(equations[0])
+        rhs = matrix @ np.linalg.solve(self.matrix, self.rhs) + equations[1]
+        matrix += equations[0]
+        errors = _solve_bounded(matrix, rhs)
         correction = abs(errors.low_cut - self.errors.low_cut)
         if errors.low_cut * correction > FIT_ERROR_RATIO * omega**2:
-            return PairErrorEstimate(solve_errors(*equations), *equations)
+            matrix, rhs = PRIOR_MATRIX + equations[0], PRIOR_RHS + equations[1]
+            return PairErrorEstimate(_solve_bounded(matrix, rhs), matrix, rhs)
         return PairErrorEstimate(errors, matrix, rhs, self.check_count + 1)
+
+    def _fade(self, new: Float2D) -> Float2D:
+        """Return `matrix` without a share of 1 / AVERAGING_CHECKS, or what new equations replace.
+
+        So what only other frequencies or larger motions can show, as a low cut, is kept.
+        """
+        root = np.linalg.cholesky(self.matrix)
+        half = np.linalg.solve(root, new)
+        gained, vectors = np.linalg.eigh(np.linalg.solve(root, half.T))
+        kept = 1.0 - np.clip(gained, 0.0, 1.0 / AVERAGING_CHECKS)
+        turned = root @ vectors
+        return np.asarray((turned * kept) @ turned.T)
 
     @property
     def low_cut_sd(self) -> float:
         """Standard deviation of the low cut, rad/s, at gain 1."""
-        covariance = np.linalg.inv(self.matrix + np.diag(np.array(PRIOR_SD) ** -2.0))
-        return float(math.sqrt(covariance[1, 1]))
+        return float(math.sqrt(np.linalg.inv(self.matrix)[1, 1]))
 
 
 def solve_errors(matrix: Float2D, rhs: Float1D, fixed_gain: bool = False) -> PairErrors:
@@ -75,8 +92,11 @@ def solve_errors(matrix: Float2D, rhs: Float1D, fixed_gain: bool = False) -> Pai
 
     They are those of gain, gain x low cut and delay, (3, 3) and (3,).
     """
-    prior = np.array(PRIOR_SD) ** -2.0
-    matrix, rhs = matrix + np.diag(prior), rhs + prior * np.array([1.0, 0.0, 0.0])
+    return _solve_bounded(matrix + PRIOR_MATRIX, rhs + PRIOR_RHS, fixed_gain)
+
+
+def _solve_bounded(matrix: Float2D, rhs: Float1D, fixed_gain: bool = False) -> PairErrors:
+    """Solve normal equations that include the expected values within the bounds."""
     low = np.array([-math.inf, 0.0, -MAX_DELAY_S])
     high = np.array([math.inf, MAX_LOW_CUT_RAD_S, MAX_DELAY_S])
     x, is_free = np.array([1.0, 0.0, 0.0]), np.array([not fixed_gain, True, True])

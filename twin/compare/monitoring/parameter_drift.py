@@ -41,6 +41,7 @@ PARAMETER_COUNTS = (4, 2, 2)  # of each law; further columns are nuisances
 PLATE_MASS_SD_KG = 5.0
 LASER_SLOPE_SD = 0.01  # difference of two lasers; also of u per e-fold of the amplitude
 LASER_ERROR_SD_M = 1e-4  # of a gap per e-fold of the amplitude
+LASER_DRIFT_M = 3e-5  # of u, while two lasers of 100 mm range warm up by 0.015 % each
 TREND_COLUMNS = (0, 1, 1)  # index of the linear parameter of each law that may drift
 
 
@@ -205,9 +206,9 @@ def _report_drift(
     items: list[Record] = [record]
     drifting = set(state.drifting)
     for name, value, estimate, judged in zip(names, values, columns, changes, strict=True):
-        min_change = MIN_DRIFT_FRACTION * (
-            state.max_depth_m if name.startswith("gap") else abs(value)
-        )
+        min_change = MIN_DRIFT_FRACTION * abs(value)
+        if name.startswith("gap"):
+            min_change = max(MIN_DRIFT_FRACTION * state.max_depth_m, LASER_DRIFT_M)
         is_significant = all(
             abs(change) > sigmas * spread and abs(change) > min_change
             for change, spread, sigmas in ((*estimate[2:], MIN_DRIFT_SIGMA), judged)
