@@ -31,6 +31,7 @@ MAX_REFITS, MAX_GENERIC_REFITS = 5, 2  # candidates refitted in a round
 MIN_REFITS, MAX_COST_RATIO = 2, 1.5  # beyond the first two, skip costs above this ratio to the best
 MIN_PROMISED_GAIN = 0.003  # of the residual squares: candidates that promise less are not refitted
 MIN_VISIBLE_EXCESS = 0.05  # of the floor: excess below which there is no gap
+NOISE_UNCERTAINTY = 0.15  # of its mean square, which a rest of some seconds shows to 7 % in rms
 MIN_GAP_SHARE = 0.02  # of the initial gap that a second or third effect must close
 MIN_GAIN_SIGMA = 4.0  # standard errors by which a gain must exceed zero
 MIN_GAIN_SHARE = 0.03  # of the residual squares, overall or in one row, that an effect must remove
@@ -131,8 +132,8 @@ class SelectionProblem:
 
     def is_noise(self, null: FittedSet, best: FittedSet) -> bool:
         """Return True if the base alone leaves hardly more than noise, and the best set as much."""
-        is_low = null.cost < (1 + MIN_VISIBLE_EXCESS) * self.noise
-        return is_low and null.cost < (1 + 2 * MIN_VISIBLE_EXCESS) * best.cost
+        limit = 1 + NOISE_UNCERTAINTY
+        return null.cost < limit * min(self.noise, best.cost)
 
     @cached_property
     def folds(self) -> tuple[Int1D, ...]:

@@ -86,7 +86,10 @@ def judge_selection(
         alternative = min(unstrained, key=lambda fitted: fitted.cost)
         return judge_selection(problem, replace(selection, best=alternative), floor)
     alternatives = tuple({frozenset(fitted.names): fitted for fitted in reversed(as_good)}.values())
-    has_remainder = remaining > MAX_REMAINDER_SHARE * gap and remaining > MIN_VISIBLE_EXCESS * floor
+    # the form of a force law may be inexact, that of an error of a sensor is not
+    is_exact = all(name.startswith("sensor_") for name in best.names)
+    allowed = 0.0 if is_exact else MAX_REMAINDER_SHARE * gap
+    has_remainder = remaining > max(allowed, MIN_VISIBLE_EXCESS * floor)
     confidence = _confidence(selection, rivals, remaining / gap)
     if doubt := _find_doubt(selection, None if is_additional else generic, has_remainder, gap):
         return DiscoveryVerdict(

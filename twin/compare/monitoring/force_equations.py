@@ -5,8 +5,9 @@ With test functions phi (`cycle.weight_functions`), by parts, SI:
     bumper    <phi, F_j> + C_j <phi', u_j> = K_j <phi, u_j> - K_j G_j <phi, 1>   over each contact
 (u_j = u right, -u left; forces as the load cells read them; q_j = 1 within the load cells' error).
 Forces of the model's effects are taken from its own restarted motion. The last columns are
-nuisances: plates in front of the load cells, which move with the table, add -m_p A to them, and
-lasers whose slopes differ by e add e y to u, with the table's displacement y.
+nuisances: plates in front of the load cells, which move with the table, add -m_p A to them; lasers
+whose slopes differ by e add e y to u, with the table's displacement y; a low cut w and a lag t of
+the accelerometer that are left add -w x' - t a' to a, with the displacement x of the mass.
 """
 
 import numpy as np
@@ -20,10 +21,12 @@ from twin.compare.monitoring.cycle import (
     weight_functions,
     weighted_sums,
 )
+from twin.compare.monitoring.low_cut import body_displacement
 
 LAW_NAMES = ("damper", "right", "left")
 LOAD_CELL_ERROR = 0.0005  # of a contact force: error of load cells, except gain
 CLEAR_GAP_FRACTION = 0.9  # of a gap: motion within it makes no contact
+MIN_FLIGHT_SHARE = 0.1  # of a cycle
 MIN_CONTACT_SAMPLES = 8  # shorter contacts are ignored
 
 Equations = tuple[Float2D, Float1D]  # (equation, parameter) and (equation,)
@@ -34,7 +37,7 @@ def force_equations(
 ) -> list[Equations | None]:
     """Return the equations of each of `LAW_NAMES`; None if the cycle gives none.
 
-    Parameters: (K, C, q_R, q_L, m_p, K e), (K_R, K_R G_R, K_R e), (K_L, K_L G_L, K_L e).
+    Parameters: (K, C, q_R, q_L, m_p, K e, w, t), (K_R, K_R G_R, K_R e), (K_L, K_L G_L, K_L e).
     """
     return [_damper_equations(setup, noise, cycle), *_bumper_equations(setup, noise, cycle)]
 
@@ -53,13 +56,19 @@ def _damper_equations(
     ]
     if not np.isfinite(u + a + sides[0] + sides[1]).all():
         return None
+    is_flight = (sides[0] <= setup.contact_n) & (-sides[1] <= setup.contact_n)
+    if is_flight.mean() < MIN_FLIGHT_SHARE:  # the error of the load cells hides the damper
+        return None
     phi, slope, _ = weight_functions(u.size, setup.rate_hz)
     values = -weighted_sums(phi, p.mass * a + _effect_forces(setup, cycle, "damper"))
     by_force = [weighted_sums(phi, side_force) for side_force in sides]
     by_plates = weighted_sums(phi, np.nan_to_num(cycle.channel_values("table_acc_m_s2")))
     by_table = weighted_sums(phi, np.nan_to_num(cycle.channel_values("table_disp_m")))
+    x = body_displacement(cycle.corrected, "mass_acc_m_s2")
+    by_low_cut = p.mass * weighted_sums(slope, u if x is None else np.nan_to_num(x))
+    by_lag = p.mass * weighted_sums(slope, a)
     by_motion = [weighted_sums(phi, u), -weighted_sums(slope, u)]
-    rows = np.stack([*by_motion, *by_force, by_plates, by_table], axis=1)
+    rows = np.stack([*by_motion, *by_force, by_plates, by_table, by_low_cut, by_lag], axis=1)
     acc_rms = _finite_or(noise.channel_rms("mass_acc_m_s2"), 1e-3 * float(a.std())) * p.mass
     cell_rms = _finite_or(noise.channel_rms(RIGHT_CELLS[0]), 0.0)
     white_sd = np.sqrt((phi**2).sum(axis=1)) * np.hypot(acc_rms, 2 * cell_rms)

@@ -7,7 +7,10 @@ The equations of each held cycle are summed in chunks of a few cycles, and the c
 with standard deviations from the scatter among the chunks where it exceeds the noise.
 
 A drift is reported if it is also significant for instruments as they are: plates in front of the
-load cells, lasers whose linearity error depends on the amplitude, and few chunks (Student's t).
+load cells, lasers whose slope is off, an accelerometer whose phase is not quite right, which the
+damping turns into stiffness, and few chunks (Student's t). What instruments do besides depends on
+the motion, so it is another one at each step, but the same where a motion comes back: motions of
+one frequency and amplitude share an offset of the drifting parameter, of a size that is expected.
 """
 
 from dataclasses import dataclass, replace
@@ -15,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import ndtr, stdtrit
 
-from table_io.block import Float1D, Float2D
+from table_io.block import Float1D, Float2D, Int1D
 from table_io.channels import relative_displacement
 from table_io.records import Estimate, Event, Record
 from twin.compare.monitoring.cycle import ChannelNoise, CycleData, MonitoringSetup
@@ -26,7 +29,9 @@ RECENT_S = 30.0  # of the test, whose chunks give the value
 MIN_DRIFT_CHUNKS = 8  # before a drift is reported
 LOAD_CELL_GAIN_SD = 0.01  # of a contact force: constant gain error of load cells
 MIN_DRIFT_SIGMA = 4.0  # standard deviations, for a drift to be reported
-MIN_DRIFT_FRACTION = 0.003  # of a stiffness; for a gap, of the deepest deformation
+# Least drift of a stiffness, which a low cut known to 0.02 Hz does not explain, and of a gap, both
+# relative; that of a gap to the deepest deformation.
+MIN_STIFFNESS_DRIFT, MIN_GAP_DRIFT = 0.015, 0.003
 # Of a stiffness per e-fold of the amplitude: how far a law may deviate from the model's, while the
 # twin has stayed within its band, and after it has left it.
 LAW_CURVATURE, UNTRUSTED_LAW_CURVATURE = 0.003, 0.1
@@ -40,7 +45,11 @@ PARAMETER_NAMES = (
 PARAMETER_COUNTS = (4, 2, 2)  # of each law; further columns are nuisances
 PLATE_MASS_SD_KG = 5.0
 LASER_SLOPE_SD = 0.01  # difference of two lasers; also of u per e-fold of the amplitude
+LOW_CUT_SD_RAD_S, LAG_SD_S = 2 * np.pi * 0.03, 2e-4  # of an accelerometer, after its removal
+STIFFNESS_OFFSET_SD = 0.05  # of the stiffness, by what instruments do at one motion
+SAME_LOG_AMPLITUDE = 0.1  # difference up to which motions of one frequency are the same
 LASER_ERROR_SD_M = 1e-4  # of a gap per e-fold of the amplitude
+LASER_LINEARITY = 0.006  # of the displacement, two lasers with 0.15 % of their range each
 LASER_DRIFT_M = 3e-5  # of u, while two lasers of 100 mm range warm up by 0.015 % each
 TREND_COLUMNS = (0, 1, 1)  # index of the linear parameter of each law that may drift
 
@@ -55,6 +64,7 @@ class Chunk:
 
     time_s: float
     log_amplitude: float
+    frequency_hz: float
     step: int
     count: int
     duration_s: float
@@ -73,6 +83,7 @@ class DriftState:
     chunks: tuple[tuple[Chunk, ...], ...] = ((), (), ())
     drifting: frozenset[str] = frozenset()
     max_depth_m: float = 0.0  # deepest bumper deformation
+    max_travel_m: float = 0.0  # of table or mass: range of the lasers that was used
 
 
 def update_estimate(
@@ -96,7 +107,10 @@ def update_estimate(
         for law_chunks, equations in zip(state.chunks, cycle_equations, strict=True)
     )
     state = replace(
-        state, chunks=chunks, max_depth_m=max(state.max_depth_m, _max_depth(setup, cycle))
+        state,
+        chunks=chunks,
+        max_depth_m=max(state.max_depth_m, _max_depth(setup, cycle)),
+        max_travel_m=max(state.max_travel_m, _max_travel(cycle)),
     )
     grown = [
         law_chunks
@@ -120,7 +134,16 @@ def _add_cycle(
     last = chunks[-1] if chunks else None
     if last is None or last.step != cycle.step.index or last.full:
         size = rows.shape[1]
-        last = Chunk(time_s, 0.0, cycle.step.index, 0, 0.0, np.zeros((size, size)), np.zeros(size))
+        last = Chunk(
+            time_s,
+            0.0,
+            cycle.step.frequency_hz,
+            cycle.step.index,
+            0,
+            0.0,
+            np.zeros((size, size)),
+            np.zeros(size),
+        )
     else:
         chunks = chunks[:-1]
     log_amplitude = float(
@@ -129,6 +152,7 @@ def _add_cycle(
     grown = Chunk(
         last.time_s + (time_s - last.time_s) / (last.count + 1),
         last.log_amplitude + (log_amplitude - last.log_amplitude) / (last.count + 1),
+        last.frequency_hz,
         last.step,
         last.count + 1,
         last.duration_s + duration_s,
@@ -139,20 +163,27 @@ def _add_cycle(
 
 
 def _merge_pairs(chunks: tuple[Chunk, ...]) -> tuple[Chunk, ...]:
-    """Return the chunks with neighbors merged in pairs."""
-    pairs = zip(chunks[::2], chunks[1::2], strict=False)
-    return tuple(
-        Chunk(
-            0.5 * (a.time_s + b.time_s),
-            0.5 * (a.log_amplitude + b.log_amplitude),
-            b.step,
-            a.count + b.count,
-            a.duration_s + b.duration_s,
-            a.matrix + b.matrix,
-            a.rhs + b.rhs,
+    """Return the chunks with neighbors of one step merged in pairs."""
+    merged: list[Chunk] = []
+    is_pair = False
+    for chunk in chunks:
+        last = merged[-1] if merged else None
+        if last is None or is_pair or last.step != chunk.step:
+            merged.append(chunk)
+            is_pair = False
+            continue
+        merged[-1] = Chunk(
+            0.5 * (last.time_s + chunk.time_s),
+            0.5 * (last.log_amplitude + chunk.log_amplitude),
+            chunk.frequency_hz,
+            chunk.step,
+            last.count + chunk.count,
+            last.duration_s + chunk.duration_s,
+            last.matrix + chunk.matrix,
+            last.rhs + chunk.rhs,
         )
-        for a, b in pairs
-    ) + (chunks[-1:] if len(chunks) % 2 else ())
+        is_pair = True
+    return tuple(merged)
 
 
 def _max_depth(setup: MonitoringSetup, cycle: CycleData) -> float:
@@ -160,6 +191,14 @@ def _max_depth(setup: MonitoringSetup, cycle: CycleData) -> float:
     u = relative_displacement(cycle.corrected)
     extents = [float(np.nanmax(s * u)) for s in (1, -1)] if np.isfinite(u).any() else [0.0, 0.0]
     return max(0.0, *(r - g for r, g in zip(extents, setup.gaps_m, strict=True)))
+
+
+def _max_travel(cycle: CycleData) -> float:
+    """Return the largest displacement of table or mass in the cycle, in m."""
+    block = cycle.corrected
+    lasers = [name for name in ("table_disp_m", "mass_disp_m") if name in block.channels]
+    values = np.abs([block.channel(name) for name in lasers])
+    return float(np.nanmax(values, initial=0.0))
 
 
 def _report_drift(
@@ -176,13 +215,19 @@ def _report_drift(
     names: list[str] = []
     columns: list[tuple[float, float, float, float]] = []
     changes: list[tuple[float, float, float]] = []
+    laser_error_m = max(LASER_ERROR_SD_M, LASER_LINEARITY * state.max_travel_m)
     instruments = (
         LASER_SLOPE_SD * p.stiffness,
         LASER_ERROR_SD_M * p.bumper_stiffness_r,
         LASER_ERROR_SD_M * p.bumper_stiffness_l,
     )
+    offset_sds = (
+        STIFFNESS_OFFSET_SD * p.stiffness,
+        laser_error_m * p.bumper_stiffness_r,
+        laser_error_m * p.bumper_stiffness_l,
+    )
     nuisance_sds = (
-        (PLATE_MASS_SD_KG, LASER_SLOPE_SD * p.stiffness),
+        (PLATE_MASS_SD_KG, LASER_SLOPE_SD * p.stiffness, LOW_CUT_SD_RAD_S, LAG_SD_S),
         (LASER_SLOPE_SD * p.bumper_stiffness_r,),
         (LASER_SLOPE_SD * p.bumper_stiffness_l,),
     )
@@ -196,7 +241,7 @@ def _report_drift(
             law_changes = [(float("nan"),) * 3] * 2
             max_curvature = max(curvature, instruments[law])
             law_changes[TREND_COLUMNS[law]] = _measure_drift(
-                full_chunks, law, max_curvature, nuisance_sds[law]
+                full_chunks, law, max_curvature, nuisance_sds[law], offset_sds[law]
             )
             changes += law_changes
     if not names:
@@ -206,9 +251,9 @@ def _report_drift(
     items: list[Record] = [record]
     drifting = set(state.drifting)
     for name, value, estimate, judged in zip(names, values, columns, changes, strict=True):
-        min_change = MIN_DRIFT_FRACTION * abs(value)
+        min_change = MIN_STIFFNESS_DRIFT * abs(value)
         if name.startswith("gap"):
-            min_change = max(MIN_DRIFT_FRACTION * state.max_depth_m, LASER_DRIFT_M)
+            min_change = max(MIN_GAP_DRIFT * state.max_depth_m, LASER_DRIFT_M)
         is_significant = all(
             abs(change) > sigmas * spread and abs(change) > min_change
             for change, spread, sigmas in ((*estimate[2:], MIN_DRIFT_SIGMA), judged)
@@ -264,19 +309,24 @@ def _law_estimates(
 
 
 def _measure_drift(
-    full_chunks: list[Chunk], law: int, law_curvature: float, nuisance_sds: tuple[float, ...] = ()
+    full_chunks: list[Chunk],
+    law: int,
+    law_curvature: float,
+    nuisance_sds: tuple[float, ...] = (),
+    offset_sd: float = 0.0,
 ) -> tuple[float, float, float]:
     """Return (drift, its sd, sds that make it significant) of a law's drifting parameter.
 
-    `nuisance_sds`: expected sizes of the nuisances that are fitted too. NaN while there are too few
-    chunks.
+    `nuisance_sds`: expected sizes of the nuisances that are fitted too, `offset_sd` that of the
+    offsets of motions. NaN while there are too few chunks.
     """
     nan = float("nan")
     if len(full_chunks) < MIN_DRIFT_CHUNKS:
         return nan, nan, nan
     trend = _solve_chunks(
-        full_chunks, PARAMETER_COUNTS[law], nuisance_sds, TREND_COLUMNS[law], law_curvature
-    )
+        full_chunks, PARAMETER_COUNTS[law], nuisance_sds, TREND_COLUMNS[law], law_curvature,
+        offset_sd,
+    )  # fmt: skip
     if trend is None or trend[0][0] <= 0:
         return nan, nan, nan
     span = full_chunks[-1].time_s - full_chunks[0].time_s
@@ -287,19 +337,39 @@ def _measure_drift(
     return float(scale * x[-1]), float(scale * np.sqrt(spread[-1, -1])), sigmas
 
 
+def _group_motions(chunks: list[Chunk]) -> Int1D:
+    """Return the number of the motion of each chunk, (chunk,): by frequency and amplitude."""
+    motions: list[Chunk] = []
+    numbers = []
+    for chunk in chunks:
+        same = (
+            number
+            for number, motion in enumerate(motions)
+            if motion.frequency_hz == chunk.frequency_hz
+            and abs(motion.log_amplitude - chunk.log_amplitude) < SAME_LOG_AMPLITUDE
+        )
+        number = next(same, len(motions))
+        if number == len(motions):
+            motions.append(chunk)
+        numbers.append(number)
+    return np.array(numbers)
+
+
 def _solve_chunks(
     chunks: list[Chunk],
     parameter_count: int,
     nuisance_sds: tuple[float, ...],
     trend: int | None,
     law_curvature: float,
+    offset_sd: float = 0.0,
 ) -> tuple[Float1D, Float2D] | None:
     """Return (parameters, covariance) by least squares over the chunks; None if singular.
 
     Columns of the equations after the parameters are nuisances of these sizes; those after them are
     not used. With a trend of one of them, two more follow:
-    per e-fold of the amplitude, and per s. The covariance is that of the noise, larger where the
-    chunks scatter more.
+    per e-fold of the amplitude, and per s. With an `offset_sd` each motion has an offset of that
+    parameter, of that size. The covariance is that of the noise, larger where the chunks scatter
+    more.
     """
     count = parameter_count + len(nuisance_sds)
     matrices = np.array([chunk.matrix[:count, :count] for chunk in chunks])
@@ -315,6 +385,14 @@ def _solve_chunks(
         prior[count] = law_curvature**-2
     rhs += (expansion.mT @ right_sides[:, :, None]).sum(axis=0)[:, 0]
     matrix = (expansion.mT @ matrices @ expansion).sum(axis=0) + np.diag(prior)
+    motion, column = _group_motions(chunks), trend or 0
+    coupling = _sum_by(motion, (matrices[:, None, column] @ expansion)[:, 0])
+    weight = _sum_by(motion, matrices[:, column, column])
+    weight += offset_sd**-2 if offset_sd else np.inf
+    offset_rhs = _sum_by(motion, right_sides[:, column])
+    eliminated = coupling / weight[:, None]
+    matrix -= eliminated.T @ coupling
+    rhs -= eliminated.T @ offset_rhs
     size = np.sqrt(np.diag(matrix))
     if not (size > 0).all():
         return None
@@ -323,8 +401,18 @@ def _solve_chunks(
         return None
     inverse = np.linalg.inv(scaled) / np.outer(size, size)
     x: Float1D = inverse @ rhs
-    residuals = (expansion.mT @ (right_sides - (matrices @ expansion) @ x)[:, :, None])[:, :, 0]
+    offset = (offset_rhs - coupling @ x) / weight
+    left = right_sides - (matrices @ expansion) @ x - matrices[:, :, column] * offset[motion, None]
+    residuals = (expansion.mT @ left[:, :, None])[:, :, 0]
+    residuals -= eliminated[motion] * left[:, column, None]
     dof_factor = len(chunks) / max(len(chunks) - x.size, 1)
     scatter = dof_factor * inverse @ (residuals.T @ residuals) @ inverse
     inflation = np.sqrt(np.maximum(np.diag(scatter) / np.diag(inverse), 1.0))
     return x, inverse * np.outer(inflation, inflation)
+
+
+def _sum_by(motion: Int1D, values: Float2D) -> Float2D:
+    """Return the sums of values (chunk, ...) over the chunks of each motion, (motion, ...)."""
+    sums = np.zeros((int(motion.max()) + 1, *values.shape[1:]))
+    np.add.at(sums, motion, values)
+    return sums
