@@ -1,17 +1,20 @@
 """How soon the watch sees what was planted, and whether it is silent otherwise: the table.
 
-    python tests/studies/monitoring.py [PROFILE ...]
+    python -m tests.studies.monitoring [PROFILE ...] [--laboratory typical|bad] [--seed N]
 
 Plays each profile of profiles/tests (all of the paper's without arguments) on the simulated rig, at
 its own rate and as fast as it goes, clean and with 5 % of stiffness lost over the test, and prints
-what was said. Some minutes a profile.
+what was said. With `--laboratory` instruments and set-up are imperfect, drawn for each profile.
+Some minutes a profile.
 """
 
+import argparse
 import hashlib
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+import numpy as np
 
 from table_io.acquisition.session import run_session
 from table_io.backends import open_backend
@@ -19,9 +22,11 @@ from table_io.block import Block
 from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR
 from table_io.records import Event, Record
+from table_io.sim.imperfections import Level, draw_laboratory
 from twin.compare.monitoring import EVENT_KINDS
 from twin.run.run_config import RunConfig, from_texts
 from twin.run.unpaced import add_twin_items
+from twin.validation.study.rig_setup import format_toml
 
 ALL = ("ginf", "g30", "g16", "g10", "g4_ss1", "g4_ss2", "g4_ss3", "g0", "gm1", "gm2", "gm10")
 LOST_SHARE = 0.05
@@ -46,7 +51,15 @@ def iter_session(name: str, truth: str, folder: Path) -> Iterator[tuple[RunConfi
         yield bundle, item
 
 
-def row(name: str, truth: str) -> tuple[str, float]:
+def draw_imperfections(level: Level, seed: int) -> str:
+    """Text of a truth file with the imperfections of a random laboratory."""
+    entries = draw_laboratory(level, np.random.default_rng(seed))
+    return format_toml(
+        {"imperfections": [entry.model_dump(exclude_none=True) for entry in entries]}
+    )
+
+
+def row(name: str, truth: str, clean: str) -> tuple[str, float]:
     """(a line of the table, s that the test took)."""
     events: list[Event] = []
     begins, end, rate = -1, 0, 1.0
@@ -66,17 +79,22 @@ def row(name: str, truth: str) -> tuple[str, float]:
     drift_text = "-" if drift is None else f"{(drift.index - begins) / rate:.0f} s: {drift.text}"
     kinds = ", ".join(sorted({other.kind for other in others})) or "-"
     lasts = (end - begins) / rate
-    clean = "5 % lost" if truth else "clean"
     return f"| {name} | {clean} | {as_expected} of {len(jumps)} | {drift_text} | {kinds} |", lasts
 
 
-def main(names: Sequence[str]) -> None:
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("profiles", nargs="*", default=ALL)
+    parser.add_argument("--laboratory", choices=("typical", "bad"))
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
     print("| test | planted | jumps as expected | drift seen after | else |\n|---|---|---|---|---|")
-    for name in names or ALL:
-        line, lasts = row(name, "")
+    for seed, name in enumerate(options.profiles, options.seed):
+        truth = draw_imperfections(options.laboratory, seed) if options.laboratory else ""
+        line, lasts = row(name, truth, "clean")
         print(line, flush=True)
-        print(row(name, TRUTH.format(-LOST_SHARE / lasts))[0], flush=True)
+        print(row(name, truth + TRUTH.format(-LOST_SHARE / lasts), "5 % lost")[0], flush=True)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -28,7 +28,7 @@ from twin.compare.monitoring.agreement import (
     GAP_ERROR_M,
     NOISE_FACTOR,
     detect_contact,
-    gap_allowances,
+    set_up_allowances,
 )
 from twin.compare.monitoring.jumps import JUMP_TOLERANCE
 from twin.model.parameters import Parameters
@@ -38,6 +38,7 @@ from twin.reports.quantities import format_quantity
 Json = dict[str, Any]
 CHANNEL_SYMBOLS = {"rel_disp_m": ("u", "m"), "mass_acc_m_s2": ("a", "m/s2")}
 JUDGED_CHANNELS = tuple(CHANNEL_SYMBOLS)
+UNKNOWN = (0.0, 0.0, math.nan)  # shares in contact, travel
 PHASES = ("flight", "contact_right", "contact_left")
 DEPARTURE_KIND = "disagreement"  # of warnings
 JUMP_KINDS = ("no jump", "unexpected jump")  # hints, where one direction alone shows no branches
@@ -60,18 +61,24 @@ def summarise_agreement(
     by_step: dict[int, list[Agreement]] = {}
     for record in recording.records(Agreement):
         by_step.setdefault(record.step, []).append(record)
-    shares = _contact_shares(recording, profile) if by_step else {}
+    motion = _measure_motion(recording, profile) if by_step else {}
     return {
         step: _summarise_step(
-            records, gap_allowances(parameters, *shares.get(step, (0.0, 0.0)))[0], noise_rms
+            records, set_up_allowances(parameters, *motion.get(step, UNKNOWN))[0], noise_rms
         )
         for step, records in by_step.items()
     }
 
 
-def _contact_shares(recording: Recording, profile: Profile) -> dict[int, tuple[float, float]]:
-    """Return by step the shares of its held cycles in contact right and left."""
+def _measure_motion(
+    recording: Recording, profile: Profile
+) -> dict[int, tuple[float, float, float]]:
+    """Return by step the shares of held cycles in contact right and left, and the table's travel.
+
+    The travel is its largest displacement in m.
+    """
     counts: dict[int, Float1D] = {}
+    travel: dict[int, float] = {}
     for block in recording.contiguous_blocks("meas"):
         contact = detect_contact(block, profile.comparison.contact_n, profile.specimen.gaps_m)
         held = block.cycle >= 0
@@ -79,7 +86,13 @@ def _contact_shares(recording: Recording, profile: Profile) -> dict[int, tuple[f
             samples = held & (block.step == step)
             sums = np.array([samples.sum(), *(side[samples].sum() for side in contact)])
             counts[step] = counts.get(step, 0.0) + sums
-    return {step: (right / total, left / total) for step, (total, right, left) in counts.items()}
+            if "table_disp_m" in block.channels:
+                position = np.abs(block.channel("table_disp_m")[samples])
+                travel[step] = max(travel.get(step, 0.0), float(np.nanmax(position, initial=0.0)))
+    return {
+        step: (right / total, left / total, travel.get(step, math.nan))
+        for step, (total, right, left) in counts.items()
+    }
 
 
 def _summarise_step(

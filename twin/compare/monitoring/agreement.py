@@ -8,8 +8,8 @@ contact threshold. On the simulated rig with the right model the error stays bel
 band; see the tests.
 
 An Event also allows for what instruments and set-up may contribute: gaps are known to
-GAP_ERROR_M only, which a stiff bumper turns into force, and the two cells of a side may share their
-force unequally, so their sum is judged.
+GAP_ERROR_M only, which a stiff bumper turns into force, lasers have a linearity error, and the two
+cells of a side may share their force unequally, so their sum is judged.
 """
 
 import math
@@ -32,6 +32,7 @@ MIN_CYCLES_OUTSIDE = 2  # consecutive cycles beyond the band before an Event
 ALREADY_REPORTED = -1
 # Of a gap where it is touched: 0.05 mm of a feeler gauge and as much of the lasers' linearity.
 GAP_ERROR_M = 1e-4
+LASER_LINEARITY = 0.003  # of the travel of the table: 0.1 % of the range of each laser
 PHASE_NAMES = ("in flight", "in contact right", "in contact left")
 
 
@@ -92,7 +93,8 @@ def _judge_errors(
 ) -> list[float]:
     """Return the error of each compared channel in units of its band, with allowances."""
     right, left = (float(phase.mean()) for phase in _phases(setup, cycle)[1:])
-    allowance, forces = gap_allowances(setup.model.parameters, right, left)
+    travel_m = _half_range(cycle.channel_values("table_disp_m"))
+    allowance, forces = set_up_allowances(setup.model.parameters, right, left, travel_m)
     error = dict(zip(COMPARED_CHANNELS, record.error, strict=True))
     band = dict(zip(COMPARED_CHANNELS, record.band, strict=True))
     rows = dict(zip(COMPARED_CHANNELS, measured, strict=True))
@@ -111,17 +113,19 @@ def _judge_errors(
     ]
 
 
-def gap_allowances(
-    p: Parameters, right: float, left: float
+def set_up_allowances(
+    p: Parameters, right: float, left: float, travel_m: float
 ) -> tuple[dict[str, float], tuple[float, float]]:
-    """Return what `GAP_ERROR_M` contributes to the rms error of displacements and acceleration.
+    """Return what gaps and lasers contribute to the rms error of displacements and acceleration.
 
     By channel, and of the forces (right, left) in N; `right` and `left` are the shares of the time
-    in contact.
+    in contact, `travel_m` is half the range of the table's displacement, NaN if unknown.
     """
-    force_r = p.bumper_stiffness_r * GAP_ERROR_M * math.sqrt(right)
-    force_l = p.bumper_stiffness_l * GAP_ERROR_M * math.sqrt(left)
-    allowance = dict.fromkeys(COMPARED_CHANNELS, GAP_ERROR_M * math.sqrt(max(right, left)))
+    lasers = LASER_LINEARITY * travel_m if math.isfinite(travel_m) else 0.0
+    force_r = p.bumper_stiffness_r * (GAP_ERROR_M + lasers) * math.sqrt(right)
+    force_l = p.bumper_stiffness_l * (GAP_ERROR_M + lasers) * math.sqrt(left)
+    disp = GAP_ERROR_M * math.sqrt(max(right, left)) + lasers
+    allowance = dict.fromkeys(COMPARED_CHANNELS, disp)
     allowance["mass_acc_m_s2"] = math.hypot(force_r, force_l) / p.mass
     return allowance, (force_r, force_l)
 

@@ -50,7 +50,7 @@ STIFFNESS_OFFSET_SD = 0.05  # of the stiffness, by what instruments do at one mo
 SAME_LOG_AMPLITUDE = 0.1  # difference up to which motions of one frequency are the same
 LASER_ERROR_SD_M = 1e-4  # of a gap per e-fold of the amplitude
 LASER_LINEARITY = 0.006  # of the displacement, two lasers with 0.15 % of their range each
-LASER_DRIFT_M = 3e-5  # of u, while two lasers of 100 mm range warm up by 0.015 % each
+LEAST_GAP_DRIFT_M = 1e-4  # what a feeler gauge and lasers that warm up leave open
 TREND_COLUMNS = (0, 1, 1)  # index of the linear parameter of each law that may drift
 
 
@@ -253,7 +253,7 @@ def _report_drift(
     for name, value, estimate, judged in zip(names, values, columns, changes, strict=True):
         min_change = MIN_STIFFNESS_DRIFT * abs(value)
         if name.startswith("gap"):
-            min_change = max(MIN_GAP_DRIFT * state.max_depth_m, LASER_DRIFT_M)
+            min_change = max(MIN_GAP_DRIFT * state.max_depth_m, LEAST_GAP_DRIFT_M)
         is_significant = all(
             abs(change) > sigmas * spread and abs(change) > min_change
             for change, spread, sigmas in ((*estimate[2:], MIN_DRIFT_SIGMA), judged)
