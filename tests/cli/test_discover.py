@@ -24,8 +24,8 @@ from twin.identification.selection import Cancelled
 from twin.model.effects import EFFECTS
 from twin.recording.reader import read_recording
 from twin.reports.discovery.free_running import run_log_free
+from twin.reports.discovery.headline import format_verdict
 from twin.reports.discovery.loading import load_logs
-from twin.reports.discovery.page import format_verdict
 from twin.reports.discovery.serialize import REFITTED_SUFFIX
 from twin.reports.finalize import EXIT_INTERRUPTED
 from twin.run.run_config import read_model_template, read_run_config

@@ -17,6 +17,7 @@ from twin.cli.run import list_model_warnings
 from twin.identification.discover import Discovery, PreparedLog, discover_effects
 from twin.identification.parameters import GapKey
 from twin.model.config import ModelConfig
+from twin.model.effects.typesetting import typeset_law
 from twin.model.inverse_dynamics import forces_along
 from twin.reports.discovery.figure_data import (
     DiscoveryView,
@@ -25,7 +26,7 @@ from twin.reports.discovery.figure_data import (
     measured_forces,
 )
 from twin.reports.discovery.free_running import compute_misfits, run_log_free, run_logs_free
-from twin.reports.discovery.headline import format_verdict, typeset_law
+from twin.reports.discovery.headline import format_verdict
 from twin.reports.discovery.loading import load_logs, name_logs
 from twin.reports.discovery.page import count_digits, format_rounded
 from twin.reports.discovery.serialize import Json, verdict_to_json

@@ -84,7 +84,7 @@ def summary(run: Path) -> dict[str, Any]:
 def test_they_are_recorded_and_the_recording_is_whole(run: Path) -> None:
     assert json.loads(shaketwin("verify", run, "--json"))["sound"] is True
     log = open_log(run)
-    assert log.channels[-3:] == EXTRA
+    assert log.channels[-4:] == (*EXTRA, "rel_disp_m")
     assert log.units[SECOND_ACC] == "m/s2"
     assert log.units[TEMPERATURE] == "degC"
     noise = log[SECOND_ACC] + log["mass_acc_m_s2"]

@@ -138,7 +138,7 @@ def call_command(words: tuple[object, ...], report: bool) -> tuple[str, str]:
     kept, argv = reports.write_report, sys.argv
     sys.argv = ["shaketwin", *map(str, words)]
     if not report:
-        reports.write_report = lambda folder, recording=None: folder
+        reports.write_report = lambda folder, recording=None, more_formats=(): folder
     code: object = 0
     try:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
