@@ -40,7 +40,7 @@ KEY = re.compile(r"(# )?\w+ = ")  # at the start of a line, perhaps commented ou
 def test_every_name_of_a_kind_is_listed(kind: str, names: set[str]) -> None:
     result = call_main("list", kind)
     assert result.returncode == 0
-    assert all(f" {name} " in result.stdout for name in names)
+    assert all(re.search(rf"(?<!\w){name}(?!\w)", result.stdout) for name in names)
 
 
 def test_a_list_shows_the_files_of_the_user_and_where_they_are(tmp_path: Path) -> None:
@@ -50,7 +50,7 @@ def test_a_list_shows_the_files_of_the_user_and_where_they_are(tmp_path: Path) -
     (line,) = (
         row
         for row in call_main("list", "models", cwd=tmp_path).stdout.splitlines()
-        if " mine " in row
+        if re.search(r"\bmine\b", row)
     )
     assert "Our specimen" in line
     assert str(folder) in line

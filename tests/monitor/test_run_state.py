@@ -133,7 +133,7 @@ def test_gaps_of_a_channel_are_one_sentence_with_their_sum() -> None:
     state = board([start(), *gaps, *gaps])
     assert state.gaps == {("mass_acc_m_s2", "clipped"): (200, 100)}
     assert [event.text for event in state.events.values()] == [
-        "gap: 100 samples of mass_acc_m_s2 clipped"
+        "dropout: 100 samples of mass_acc_m_s2 clipped"
     ]
 
 
