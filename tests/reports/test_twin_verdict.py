@@ -6,11 +6,18 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from table_io.block import Block
 from twin.recording.reader import read_recording
 from twin.reports.summary import Json, summarise, write_summary
-from twin.reports.twin_verdict import judge_twin
+from twin.reports.twin_verdict import (
+    _extend_ranges,
+    _median_half_range,
+    judge_twin,
+    name_command,
+)
 from twin.run.run_config import read_run_config
 from twin.run.unpaced import play_unpaced
 from twin.validation.study.rig_setup import NOMINAL_RIG, format_toml
@@ -151,7 +158,7 @@ def test_a_jump_warning_decides_where_one_direction_alone_was_driven(clean: Json
 @pytest.mark.parametrize(("nrmse", "verdict"), [(0.03, "agrees"), (0.27, "departs")])
 def test_a_history_is_judged_by_its_nrmse(clean: Json, nrmse: float, verdict: str) -> None:
     comparison = {"rel_disp_m": {"nrmse": nrmse, "free_nrmse": 0.5, "noise_floor": 0.003}}
-    history: Json = {"steps": [], "jumps": [], "twin_jumps": []}
+    history: Json = {"planned_steps": 0, "steps": [], "jumps": [], "twin_jumps": []}
     judged = judge_changed(clean, **history, comparison=comparison)
     assert judged["verdict"] == verdict
     assert "jump" not in judged["reason"]
@@ -161,3 +168,48 @@ def test_a_history_is_judged_by_its_nrmse(clean: Json, nrmse: float, verdict: st
 def test_a_model_alone_is_not_judged(clean: Json) -> None:
     judged = judge_changed(clean, run=clean["run"] | {"source": "model"})
     assert judged["verdict"] == "not judged"
+
+
+def without_agreement(clean: Json, count: int) -> list[Json]:
+    """The steps, of which all but the first `count` have no band."""
+    steps = deepcopy(clean["steps"])
+    for step in steps[count:]:
+        step.pop("agreement")
+    return steps
+
+
+def test_agreement_needs_half_of_the_measured_steps(clean: Json) -> None:
+    total = len(clean["steps"])
+    few = judge_changed(clean, steps=without_agreement(clean, 1), verdict="aborted")
+    assert few["verdict"] == "not judged"
+    assert f"1 of {total} steps judged" in few["reason"]
+
+
+def test_a_stopped_run_claims_what_was_measured(clean: Json) -> None:
+    stopped = judge_changed(clean, steps=clean["steps"][:3], verdict="stopped")
+    assert stopped["verdict"] == "agrees"
+    assert stopped["reason"] == f"within the tolerance, 3 of {clean['planned_steps']} steps judged"
+    assert "every jump in its place" in clean["twin_verdict"]["reason"]
+
+
+def test_steps_without_noise_are_not_judged_as_a_history(clean: Json) -> None:
+    comparison = {"rel_disp_m": {"nrmse": 0.01, "free_nrmse": 0.5, "noise_floor": None}}
+    judged = judge_changed(clean, steps=without_agreement(clean, 0), comparison=comparison)
+    assert (judged["verdict"], judged["worst"]) == ("not judged", None)
+    assert "the noise of the sensors is unknown" in judged["reason"]
+
+
+def test_a_spike_does_not_widen_the_travel() -> None:
+    position = np.tile([-0.01, 0.03], 30)
+    position[7] = 0.5
+    step, label, cycle = np.zeros(60, int), np.zeros(60, int), np.repeat(np.arange(3), 20)
+    values = position[np.newaxis]
+    block = Block("meas", 0, 100.0, ("table_disp_m",), values, step, label, cycle)
+    ranges: dict[int, tuple[float, float]] = {}
+    _extend_ranges(ranges, block, np.ones(60, bool))
+    assert _median_half_range(ranges) == pytest.approx(0.02)
+
+
+def test_the_next_command_quotes_the_folder(clean: Json) -> None:
+    command = name_command(clean["twin_verdict"], Path("my runs/first"))
+    assert command == "shaketwin view 'my runs/first'"

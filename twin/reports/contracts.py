@@ -381,6 +381,7 @@ class RunSummary(SummaryKeys, Contract):
 
     run: RunInfo = Field(description="origin and length of the recording")
     steps: list[PlannedStep] = Field(description="planned steps that were measured, in order")
+    planned_steps: int | None = Field(None, description="of the sweep; absent in old files")
     reason: str = Field(description="why the test ended")
     gaps: int = Field(description="gaps in the recording")
     lost_samples: Index = Field(description="samples missing in the file")

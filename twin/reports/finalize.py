@@ -6,11 +6,11 @@ from rich.markup import escape
 
 from twin.recording.reader import read_recording
 from twin.reports import summary as summaries
-from twin.reports.twin_verdict import format_twin_verdict
+from twin.reports.twin_verdict import NOTHING_MEASURED, format_twin_verdict
 from twin.run.run_config import RunConfig
 from twin.run.terminal import console, print_line
 
-VERDICT_COLOURS = {"agrees": "green", "departs": "red"}
+VERDICT_COLOURS = {"agrees": "green", "departs": "red", "not judged": "yellow"}
 EXIT_ABORTED, EXIT_GAPS, EXIT_NOT_IDENTICAL, EXIT_INTERRUPTED = 3, 4, 5, 130
 
 
@@ -40,7 +40,7 @@ def finalize_run(
 def print_twin_verdict(summary: summaries.Json, folder: Path) -> None:
     """Print the verdict on the twin and the next command, coloured; nothing without a twin."""
     verdict = summary["twin_verdict"]
-    if verdict["verdict"] == "not judged":
+    if verdict["reason"] == NOTHING_MEASURED:
         return
     colour = VERDICT_COLOURS[verdict["verdict"]]
     first, *lines = format_twin_verdict(verdict, folder)

@@ -12,7 +12,7 @@ from twin.reports.figures import draw_figures
 from twin.reports.plot_style import FIGURE_WIDTH_IN, RC_PARAMS
 from twin.reports.report import format_headline
 from twin.reports.report_data import ReportData, step_quantity
-from twin.reports.twin_verdict import format_twin_verdict
+from twin.reports.twin_verdict import NOTHING_MEASURED, format_twin_verdict
 
 PAGE_IN = (FIGURE_WIDTH_IN, FIGURE_WIDTH_IN * 2**0.5)  # as A4
 LINES_PER_PAGE, COLUMNS = 78, 122
@@ -41,7 +41,7 @@ def _describe_run(run: ReportData) -> list[str]:
         f"Test {summary['verdict']} ({summary.get('reason') or ''}): {format_headline(run)}", "",
     ]  # fmt: skip
     verdict = summary.get("twin_verdict")
-    if verdict and verdict["verdict"] != "not judged":
+    if verdict and verdict["reason"] != NOTHING_MEASURED:
         lines += [*format_twin_verdict(verdict, run.recording.path.parent), ""]
     lines += [f"Run      {start.run}", f"Started  {start.started_at} on {start.host}"]
     lines.append(f"Gap      {_format_gap(run)}")

@@ -35,7 +35,7 @@ from twin.reports.report_data import (
 )
 from twin.reports.sensor_table import build_sensor_rows
 from twin.reports.summary import load_summary, parse_toml_tables
-from twin.reports.twin_verdict import describe_worst, format_jump, name_command
+from twin.reports.twin_verdict import NOTHING_MEASURED, describe_worst, format_jump, name_command
 
 MAX_ROWS = 200
 MAX_TEXT_LENGTH = 20_000  # of a configuration as recorded
@@ -108,11 +108,11 @@ def render_report(run: ReportData, pictures: list[Picture]) -> str:
 def _describe_twin_verdict(run: ReportData) -> dict[str, Any]:
     """Return the values of the page for the verdict on the twin; None without one."""
     verdict = run.summary.get("twin_verdict")
-    if verdict is None or verdict["verdict"] == "not judged":
+    if verdict is None or verdict["reason"] == NOTHING_MEASURED:
         return {"twin_verdict": None}
     return {
         "twin_verdict": verdict,
-        "worst": describe_worst(verdict["worst"]),
+        "worst": describe_worst(verdict["worst"]) if verdict["worst"] else None,
         "next_command": name_command(verdict, run.recording.path.parent),
         "format_jump": format_jump,
     }

@@ -100,6 +100,7 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         "a_star_m_s2": a_star,
         "checks": [asdict(check) for check in recording.records(Check)],
         "trips": [asdict(trip) for trip in recording.records(Trip)],
+        "planned_steps": len(start.steps),
         "steps": [describe_step(point) | _level_entry(point, levels) for point in planned],
         **_windows_entry(recording, parameters, profile),
         **_orbits_entry(recording, profile),

@@ -8,19 +8,23 @@ the free-running twin only the jumps are judged: it must jump within a step of t
 the uncertainty of a gap. A displacement history has no cycles: its NRMSE is judged, against
 sqrt(noise^2 + 5 %^2).
 
+One step outside is a departure; agreement needs at least half of the measured steps judged, and
+holds for what was measured: the reason states its share of the planned steps.
+
 A bumper touched 0.1 mm too early or late belongs to every set-up, so its share of the error is
 added to the band. Forces are not judged by step, because the cells of a side may share their force
 unequally; the monitoring judges their sum, and its warning counts here.
 """
 
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from table_io.block import Float1D
+from table_io.block import Block, Bool2D, Float1D
 from table_io.config.profile import Profile
 from table_io.records import Agreement
 from twin.compare.monitoring.agreement import (
@@ -43,6 +47,7 @@ PHASES = ("flight", "contact_right", "contact_left")
 DEPARTURE_KIND = "disagreement"  # of warnings
 JUMP_KINDS = ("no jump", "unexpected jump")  # hints, where one direction alone shows no branches
 MAX_UNREMARKABLE_MISFIT = 3.0  # times the noise: beyond it, parameters or effects can be found
+NOTHING_MEASURED = "nothing was measured that the twin predicts"
 HISTORY_TOLERANCE_TEXT = f"{100 * AMPLITUDE_TOLERANCE:g} % of the rms, beyond the noise"
 TOLERANCE_TEXT = (
     f"{NOISE_FACTOR:g} x noise at rest + {100 * AMPLITUDE_TOLERANCE:g} % of the amplitude"
@@ -75,10 +80,10 @@ def _measure_motion(
 ) -> dict[int, tuple[float, float, float]]:
     """Return by step the shares of held cycles in contact right and left, and the table's travel.
 
-    The travel is its largest displacement in m.
+    The travel is half the range of its displacement in m, the median over the held cycles.
     """
     counts: dict[int, Float1D] = {}
-    travel: dict[int, float] = {}
+    ranges: dict[int, dict[int, tuple[float, float]]] = {}
     for block in recording.contiguous_blocks("meas"):
         contact = detect_contact(block, profile.comparison.contact_n, profile.specimen.gaps_m)
         held = block.cycle >= 0
@@ -87,12 +92,28 @@ def _measure_motion(
             sums = np.array([samples.sum(), *(side[samples].sum() for side in contact)])
             counts[step] = counts.get(step, 0.0) + sums
             if "table_disp_m" in block.channels:
-                position = np.abs(block.channel("table_disp_m")[samples])
-                travel[step] = max(travel.get(step, 0.0), float(np.nanmax(position, initial=0.0)))
+                _extend_ranges(ranges.setdefault(step, {}), block, samples)
     return {
-        step: (right / total, left / total, travel.get(step, math.nan))
+        step: (right / total, left / total, _median_half_range(ranges.get(step, {})))
         for step, (total, right, left) in counts.items()
     }
+
+
+def _extend_ranges(ranges: dict[int, tuple[float, float]], block: Block, samples: Bool2D) -> None:
+    """Extend the range (low, high) in m of the table's displacement by cycle, in place."""
+    position = block.channel("table_disp_m")
+    known = samples & np.isfinite(position)
+    for cycle in np.unique(block.cycle[known]).tolist():
+        values = position[known & (block.cycle == cycle)]
+        low, high = ranges.get(cycle, (math.inf, -math.inf))
+        ranges[cycle] = min(low, float(values.min())), max(high, float(values.max()))
+
+
+def _median_half_range(ranges: Mapping[int, tuple[float, float]]) -> float:
+    """Return half the range of a cycle, the median over cycles; NaN without cycles."""
+    if not ranges:
+        return math.nan
+    return float(np.median([0.5 * (high - low) for low, high in ranges.values()]))
 
 
 def _summarise_step(
@@ -153,25 +174,30 @@ def judge_twin(summary: Mapping[str, Any]) -> Json:
         )
         if items
     ]
-    if (summary.get("run") or {}).get("source") == "model" or worst is None:
-        verdict, reasons = "not judged", ["nothing was measured that the twin predicts"]
-    else:
-        verdict = "departs" if reasons else "agrees"
+    judged = _count_judged(summary)
+    is_covered = 2 * judged >= len(summary["steps"])
     misfit = _overall_misfit(summary)
-    if not reasons:
-        reasons = [
-            "within the tolerance",
-            *(["every jump in its place"] if summary["steps"] else []),
-        ]
+    if (summary.get("run") or {}).get("source") == "model" or worst is None:
+        verdict, reasons = "not judged", [_explain_no_tolerance(summary)]
+    elif reasons:
+        verdict = "departs"
+    else:
+        verdict = "agrees" if is_covered else "not judged"
+        reasons = ["within the tolerance"] if is_covered else ["too few steps have a tolerance"]
+        if is_covered and summary["steps"] and summary["verdict"] == "complete":
+            reasons.append("every jump in its place")
         if _is_remarkable(misfit):
             reasons.append(f"but u differs by {misfit:.2g} times the noise")
+    planned = _count_planned(summary)
+    if worst and judged < planned:
+        reasons.append(f"{judged} of {planned} steps judged")
     return {
         "verdict": verdict,
         "reason": ", ".join(reasons),
-        "tolerance": TOLERANCE_TEXT if summary["steps"] else HISTORY_TOLERANCE_TEXT,
+        "tolerance": TOLERANCE_TEXT if planned else HISTORY_TOLERANCE_TEXT,
         "worst": worst,
         "steps_outside": len(outside),
-        "steps_judged": _count_judged(summary),
+        "steps_judged": judged,
         "misfit": misfit,
         "missing_jumps": missing,
         "unexpected_jumps": unexpected,
@@ -194,6 +220,22 @@ def _count_judged(summary: Mapping[str, Any]) -> int:
     return sum(bool(_band_shares(step)) for step in summary["steps"])
 
 
+def _count_planned(summary: Mapping[str, Any]) -> int:
+    """Return the planned steps, without a plan the measured ones; 0 for a history."""
+    return max(summary.get("planned_steps") or 0, len(summary["steps"]))
+
+
+def _explain_no_tolerance(summary: Mapping[str, Any]) -> str:
+    """Return the reason why nothing of a run can be judged."""
+    error = (summary.get("comparison") or {}).get(JUDGED_CHANNELS[0]) or {}
+    is_compared = (summary.get("run") or {}).get("source") != "model" and error.get("nrmse")
+    if not is_compared or not _count_planned(summary):
+        return NOTHING_MEASURED
+    if error.get("noise_floor"):
+        return "no step has a whole cycle of twin and rig to compare"
+    return "the noise of the sensors is unknown, so no step has a tolerance"
+
+
 def _find_worst(summary: Mapping[str, Any]) -> Json | None:
     """Return the step and channel, or of a history the channel, with the largest misfit."""
     places = [
@@ -211,6 +253,8 @@ def _find_worst(summary: Mapping[str, Any]) -> Json | None:
             "share": share,
             **step["agreement"][name],
         }
+    if _count_planned(summary):
+        return None
     errors = {name: (summary.get("comparison") or {}).get(name) or {} for name in JUDGED_CHANNELS}
     shares = {
         name: error["nrmse"] / math.hypot(error.get("noise_floor") or 0.0, AMPLITUDE_TOLERANCE)
@@ -307,7 +351,7 @@ def format_twin_verdict(verdict: Mapping[str, Any], folder: Path) -> list[str]:
 
 def name_command(verdict: Mapping[str, Any], folder: Path) -> str:
     """Return the next command with the folder of the run in place of DIR."""
-    return str(verdict["next_command"]).replace("DIR", str(folder))
+    return str(verdict["next_command"]).replace("DIR", shlex.quote(str(folder)))
 
 
 def describe_worst(worst: Mapping[str, Any]) -> str:
