@@ -157,8 +157,9 @@ class FittedModel(ModelResult):
     """Model fitted to recordings.
 
     `parameters` are those of the specimen by name, with 95 % intervals in SI; `log_parameters` are
-    the corrections of single logs (gaps, tare). `rms_over_noise` is the misfit in multiples of the
-    noise. `model_toml` is the text of a model file, which `save_model(path)` writes.
+    the corrections of single logs (gaps, tare). An interval is None if too few
+    cycles determine it. `rms_over_noise` is the misfit in multiples of the noise; `notes` include
+    the warnings. `model_toml` is the text of a model file, which `save_model(path)` writes.
     """
 
     parameters: Mapping[str, Interval]
@@ -166,6 +167,7 @@ class FittedModel(ModelResult):
     rms_over_noise: float
     undetermined: tuple[str, ...]
     notes: tuple[str, ...]
+    converged: bool
 
 
 def identify(logs: Sequence[PathLike], model: PathLike = "snm") -> FittedModel:
@@ -184,7 +186,9 @@ def identify(logs: Sequence[PathLike], model: PathLike = "snm") -> FittedModel:
         replace(result.fit, values=shared), f"{config.title}; identified", "identify", names
     )
     intervals = {
-        parameter: Interval.model_validate(parameter_to_json(result.fit, parameter))
+        parameter: Interval.model_validate_json(
+            dump_contract(Interval, parameter_to_json(result.fit, parameter))
+        )
         for parameter in result.fit.free
     }
     return FittedModel(
@@ -193,7 +197,14 @@ def identify(logs: Sequence[PathLike], model: PathLike = "snm") -> FittedModel:
         {p.name: value for p, value in intervals.items() if get_log(p.key) is not None},
         result.rms_over_noise,
         tuple(map(str, result.undetermined)),
-        (*(note for entry in loaded for note in entry.notes), *result.notes, *omitted),
+        (
+            *(note for entry in loaded for note in entry.notes),
+            *result.notes,
+            *omitted,
+            *result.warnings,
+            *(f"{key} is at its bound" for key in result.fit.at_bound),
+        ),
+        result.fit.converged,
     )
 
 

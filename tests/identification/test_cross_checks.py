@@ -1,6 +1,7 @@
 """Warnings of an identification on estimates that disagree."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -8,8 +9,10 @@ from twin.identification.cross_checks import SubsetEstimate, list_disagreements
 from twin.identification.least_squares import FitResult
 from twin.identification.motion import RecordScale
 from twin.identification.parameters import FreeParameter, GapKey, ParameterKey, ParameterSet
+from twin.reports.contracts import Interval
 from twin.reports.discovery.identify_page import format_estimate
-from twin.reports.discovery.serialize import interval_to_json
+from twin.reports.discovery.serialize import interval_to_json, parameter_to_json
+from twin.reports.summary import dump_contract
 
 KEYS: list[ParameterKey] = [GapKey(log) for log in range(12)]
 
@@ -39,3 +42,7 @@ def test_too_few_cycles_give_no_interval() -> None:
     assert fit.interval_error(many) == 0.1
     estimate = interval_to_json(36e3, fit.interval_error(few), "N/m")
     assert format_estimate(estimate) == "36.00 kN/m"
+    fitted = replace(fit, values={few: 36e3})
+    parameter = parameter_to_json(fitted, FreeParameter(few, 0.0, 1e6, 1.0, "N/m"))
+    limits = Interval.model_validate_json(dump_contract(Interval, parameter))
+    assert (limits.value, limits.low, limits.high) == (36e3, None, None)

@@ -27,6 +27,8 @@ def format_quantity(
     """
     if value is None or not math.isfinite(value):
         return "–"
+    if half_width is not None and not math.isfinite(half_width):
+        half_width = None
     size = max(abs(value), half_width or 0.0)
     shown = next(
         (name for least, name in SCALES.get(unit, ()) if size >= least),
@@ -34,7 +36,7 @@ def format_quantity(
     )
     factor = FACTORS.get(shown, 1.0)
     value *= factor
-    half = half_width * factor if half_width is not None and math.isfinite(half_width) else None
+    half = half_width * factor if half_width is not None else None
     exponent = math.floor(math.log10(abs(value))) if value else 0
     power = ""
     if abs(value) >= MAX_PLAIN or 0 < abs(value) < MIN_PLAIN:

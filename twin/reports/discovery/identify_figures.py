@@ -173,13 +173,14 @@ def _draw_subsets(result: IdentificationResult) -> Figure:
     axes = figure.subplots(1, len(free), sharey=True, squeeze=False)[0]
     for ax, parameter in zip(axes, free, strict=True):
         scale = 1e3 if parameter.unit == "m" else 1.0
-        value, sd = result.fit.values[parameter.key], result.fit.std_errors[parameter.key]
-        ax.axvspan(
-            scale * (value - INTERVAL_SIGMA * sd),
-            scale * (value + INTERVAL_SIGMA * sd),
-            color="#d4d4d4",
-            lw=0,
-        )
+        value, sd = result.fit.values[parameter.key], result.fit.interval_error(parameter.key)
+        if np.isfinite(sd):
+            ax.axvspan(
+                scale * (value - INTERVAL_SIGMA * sd),
+                scale * (value + INTERVAL_SIGMA * sd),
+                color="#d4d4d4",
+                lw=0,
+            )
         ax.axvline(scale * value, color=GUIDE_COLOUR, lw=0.9)
         for row, part in enumerate(result.subsets):
             if parameter.key in part.values:

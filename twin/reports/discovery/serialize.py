@@ -224,8 +224,8 @@ def effect_to_json(candidate: Candidate, fit: FitResult, confidence: float) -> J
 
 
 def parameter_to_json(fit: FitResult, free: FreeParameter) -> Json:
-    """Return a fitted value with its 95 % interval and unit."""
-    return interval_to_json(fit.values[free.key], fit.std_errors[free.key], free.unit)
+    """Return a fitted value with its 95 % interval, infinite for too few cycles, and unit."""
+    return interval_to_json(fit.values[free.key], fit.interval_error(free.key), free.unit)
 
 
 def interval_to_json(value: float, sd: float, unit: str) -> Json:
@@ -356,7 +356,10 @@ def model_to_toml(
         ]
     lines += ["[intervals]  # 95 %"]
     for free in fit.free:
-        if isinstance(free.key, BaseKey | EffectKey | SlipKey) and fit.std_errors[free.key] > 0:
+        if (
+            isinstance(free.key, BaseKey | EffectKey | SlipKey)
+            and 0 < fit.interval_error(free.key) < math.inf
+        ):
             interval = parameter_to_json(fit, free)
             lines.append(f"{_quote_toml(free.name)} = [{interval['low']!r}, {interval['high']!r}]")
     gaps = {key: value for key, value in fit.values.items() if isinstance(key, GapKey)}
