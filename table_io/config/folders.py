@@ -28,6 +28,7 @@ def list_configs(kind: str, profile_path: Path | None = None) -> dict[str, Path]
     """Return the paths of the configs of a kind by their bare names, sorted."""
     folders = list_config_folders(kind, profile_path)
     paths = [path for folder in reversed(folders) for path in folder.glob("*.toml")]
+    paths = [path for path in paths if path.is_file()]
     by_name = {path.stem: path for path in paths}  # the last one, of the first folder, stays
     return {name: by_name[name] for name in sorted(by_name)}
 
@@ -55,5 +56,9 @@ def find_config(name: str, folder: str, profile_path: Path | None = None, option
 
 
 def resolve_config(path: Path, folder: str) -> Path:
-    """Return the path of a config file given as a path, or as the bare name of one."""
-    return path if path.is_file() or len(path.parts) > 1 else find_config(str(path), folder)
+    """Return the path of a config file given as a path, or as the bare name of one.
+
+    A file without the suffix .toml in the working folder never hides a name.
+    """
+    is_path = path.suffix == ".toml" or len(path.parts) > 1
+    return path if is_path else find_config(str(path), folder)
