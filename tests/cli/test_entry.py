@@ -46,6 +46,21 @@ def test_an_order_to_nobody_is_an_input_error(
     assert "udp/x" in capsys.readouterr().err
 
 
+def test_whatever_fails_an_order_to_a_moving_table_names_the_way_out(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("session closed")
+
+    monkeypatch.setattr("sys.argv", ["shaketwin", "control", "stop"])
+    monkeypatch.setattr(control, "request_command", fail)
+    with pytest.raises(SystemExit, match="2"):
+        entry.main()
+    error = capsys.readouterr().err
+    assert "session closed" in error
+    assert "emergency stop" in error
+
+
 @pytest.mark.parametrize(("command", "expected"), [("run", True), ("list", False)])
 def test_only_the_first_start_of_what_computes_is_announced(
     command: str,

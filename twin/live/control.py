@@ -62,7 +62,13 @@ def send_command(
     command: str, reason: str, connect: str, rig: str, keys: "Credentials | None" = None
 ) -> str:
     """Send a command as the user; return a confirmation, InputError if it is not accepted."""
-    run, answer = request_command(command, reason, connect, rig, keys)
+    try:
+        run, answer = request_command(command, reason, connect, rig, keys)
+    except InputError:
+        raise
+    # Whatever failed, bus or account, the operator of a moving table needs the way out, no trace.
+    except Exception as error:
+        answer = f"could not be sent: {error}"
     if answer != "yes":
         raise InputError(
             answer or f"the rig did not respond within {ANSWER_TIMEOUT_S:g} s",
