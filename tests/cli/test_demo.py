@@ -63,10 +63,22 @@ def test_the_seal_is_compared_with_what_discovery_named(tmp_path: Path) -> None:
     (hidden,) = open_seal(tmp_path, seal_effect(tmp_path, 9)).effects
     name, value = next(iter(hidden.parameters.items()))
     fit = {name: {"value": 1.01 * value, "low": value, "high": 1.02 * value, "unit": "X"}}
-    right = compare_with_seal(hidden, {"effects": [{"id": hidden.id, "parameters": fit}]})
-    wrong = compare_with_seal(hidden, {"effects": []})
-    assert [f"{1.01 * value:.4g}" in line for line in right] == [False, True]
-    assert len(wrong) == 1
+    right, false = {"id": hidden.id, "parameters": fit}, {"id": "other", "parameters": {}}
+    lines = {
+        key: compare_with_seal(hidden, {"verdict": word, "effects": effects})
+        for key, word, effects in (
+            ("right", "named", [right]),
+            ("more", "named", [right, false]),
+            ("unsure", "ambiguous", [right]),
+            ("none", "none", []),
+        )
+    }
+    value_found = f"{1.01 * value:.4g}"
+    has_value = {key: [value_found in line for line in told] for key, told in lines.items()}
+    assert has_value == {
+        "right": [False, True], "more": [False, True, False], "unsure": [False], "none": [False]
+    }  # fmt: skip
+    assert "other" in lines["more"][-1]
 
 
 @pytest.mark.slow  # 25 s; the check of the wheel runs it too

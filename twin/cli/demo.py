@@ -100,10 +100,11 @@ def run_demo(out: Path | None, seed: int | None, keep: Path | None, show_page: b
     story.add_line("Only the simulated table reads it; twin and discovery see the sensors alone.")
 
     story.begin_chapter("Run the test, with the twin beside it and the model as it is")
-    code, before = _run_twin(folder, FIRST_RUN, None)
-    story.add_line(f"Twin error: {before}.")
+    code = _run_twin(folder, FIRST_RUN, None)
     if code:
         return code
+    before = read_twin_error(folder / FIRST_RUN)
+    story.add_line(f"Twin error: {before}.")
 
     story.begin_chapter("Discover what the model lacks, from the recording")
     code = discover_command([folder / FIRST_RUN], "snm", folder / DISCOVERY)
@@ -114,10 +115,11 @@ def run_demo(out: Path | None, seed: int | None, keep: Path | None, show_page: b
 
     story.begin_chapter("Add it to the model and run again, with new noise")
     write_rig(folder, digest, seed + 1)
-    code, after = _run_twin(folder, SECOND_RUN, str(folder / DISCOVERY / "model.toml"))
-    story.add_line(f"Twin error: {after}.")
+    code = _run_twin(folder, SECOND_RUN, str(folder / DISCOVERY / "model.toml"))
     if code:
         return code
+    after = read_twin_error(folder / SECOND_RUN)
+    story.add_line(f"Twin error: {after}.")
 
     story.begin_chapter("Open the seal")
     (hidden,) = open_seal(folder, digest).effects
@@ -176,13 +178,17 @@ def _read_simulated_rig(noise_seed: int) -> str:
     return text.replace("\nseed = 1\n", f"\nseed = {noise_seed}\n")
 
 
-def _run_twin(folder: Path, name: str, model: str | None) -> tuple[int, TwinError]:
-    """Run the test into a folder of this name, as fast as possible; return (exit code, error)."""
+def _run_twin(folder: Path, name: str, model: str | None) -> int:
+    """Run the test into a folder of this name, as fast as possible; return the exit code."""
     test, rig = PROFILES_DIR / "tests" / f"{TEST}.toml", str(folder / RIG_FILE)
-    code = run_test(test, folder / name, True, model, rig, False, "")
-    summary = json.loads((folder / name / "summary.json").read_text(encoding="utf-8"))
+    return run_test(test, folder / name, True, model, rig, False, "")
+
+
+def read_twin_error(run: Path) -> TwinError:
+    """Read the error of the twin from the summary of a run."""
+    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     entry = summary["comparison"][CHANNEL]
-    return code, TwinError(entry["nrmse"], entry["noise_floor"], summary["steps"])
+    return TwinError(entry["nrmse"], entry["noise_floor"], summary["steps"])
 
 
 def _describe_verdict(verdict: dict[str, Any]) -> str:
@@ -197,20 +203,26 @@ def open_seal(folder: Path, digest: str) -> GroundTruth:
 
 
 def compare_with_seal(hidden: HiddenEffect, verdict: dict[str, Any]) -> list[str]:
-    """Return a line whether the hidden effect was named, and one on each of its parameters."""
-    named = {effect["id"]: effect["parameters"] for effect in verdict["effects"]}
-    if hidden.id not in named:
-        return [f"It was {hidden.id}, which discovery did not name this time."]
-    lines = [
-        f"It was {hidden.id}: named from the recording alone. The rig's law has a form of its own, "
-        "so parameters may differ by a few per cent."
-    ]
-    for name, fit in named[hidden.id].items():
-        half = 0.5 * (fit["high"] - fit["low"])
-        lines.append(
-            f"{name}: hidden {hidden.parameters[name]:.4g}, found {fit['value']:.4g} +- {half:.1g} "
-            f"{fit['unit']}".rstrip()
-        )
+    """Return a line whether the hidden effect was named, and one per parameter and false name."""
+    found = {effect["id"]: effect["parameters"] for effect in verdict["effects"]}
+    is_named = verdict["verdict"] == "named" and hidden.id in found
+    if not is_named:
+        lines = [f"It was {hidden.id}, which discovery did not name this time."]
+    else:
+        lines = [
+            f"It was {hidden.id}: named from the recording alone. The rig's law has a form of its "
+            "own, so parameters may differ by a few per cent."
+        ]
+        for name, fit in found[hidden.id].items():
+            half = 0.5 * (fit["high"] - fit["low"])
+            truth = hidden.parameters.get(name)
+            known = "" if truth is None else f"hidden {truth:.4g}, "
+            lines.append(
+                f"{name}: {known}found {fit['value']:.4g} +- {half:.1g} {fit['unit']}".rstrip()
+            )
+    false = [name for name in found if name != hidden.id]
+    if false:
+        lines.append(f"Not hidden, but found: {', '.join(false)}.")
     return lines
 
 
