@@ -12,7 +12,12 @@ from tests.input_errors import raises_input_error
 from tests.reports.folders import make
 from tests.reports.recordings import summary
 from twin.cli.run_path import parse_run_path
-from twin.reports.run_index import find_run_folders, index_runs, write_run_index
+from twin.reports.run_index import (
+    find_last_run,
+    find_run_folders,
+    index_runs,
+    write_run_index,
+)
 
 MODEL = 'title = "m"\n[base]\nstiffness_n_m = {}\n'
 
@@ -25,7 +30,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
         run_folder = root / folder
         run_folder.mkdir(parents=True)
         make(run_folder, items=[], run_summary=make_summary(number))
-        os.utime(run_folder / "run.mcap", (1e9 + number, 1e9 + number))
+        os.utime(run_folder / "run.mcap", (1.75e9 + number, 1.75e9 + number))
     (root / "runs/campaign/g4/summary.json").unlink()
     return root
 
@@ -73,6 +78,24 @@ def test_last_is_the_newest_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         parse_run_path("last")
     Path("last").mkdir()
     assert parse_run_path("last") == Path("last")
+
+
+def test_the_start_of_a_run_orders_it_not_the_date_of_a_copy(tmp_path: Path) -> None:
+    for number, folder in enumerate(("older", "newer")):
+        (tmp_path / folder).mkdir()
+        make(tmp_path / folder, items=[], run_summary=make_summary(number))
+        os.utime(tmp_path / folder / "run.mcap", (2e9 - number, 2e9 - number))
+    assert [path.name for path in find_run_folders(tmp_path)] == ["newer", "older"]
+
+
+def test_the_last_measured_run_is_no_simulation(tmp_path: Path) -> None:
+    for number, source in enumerate(("table", "model")):
+        (tmp_path / source).mkdir()
+        values = make_summary(number)
+        values["run"]["source"] = source
+        make(tmp_path / source, items=[], run_summary=values)
+    assert find_last_run(tmp_path).name == "model"
+    assert find_last_run(tmp_path, measured=True).name == "table"
 
 
 def test_last_works_on_the_command_line(root: Path) -> None:

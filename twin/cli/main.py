@@ -14,7 +14,7 @@ from twin.cli.entry import DEFAULT_ENDPOINT
 from twin.cli.examples import add_examples, complete_names, describe_names
 from twin.cli.file_commands import StepsOption, files_app, require_view_extra
 from twin.cli.hardware_commands import hardware_app
-from twin.cli.identification_commands import LogPaths, identification_app
+from twin.cli.identification_commands import identification_app
 from twin.cli.live_commands import WebListenOption, WebOption, live_app
 from twin.cli.reference_commands import reference_app
 from twin.cli.run_path import LOG_HELP, parse_run_path
@@ -33,8 +33,8 @@ app = typer.Typer(
 )
 
 COMPUTING_COMMANDS = frozenset({
-    "branches", "campaign", "check", "demo", "discover", "explain", "identify", "paper",
-    "replay", "run", "schema", "simulate",
+    "branches", "campaign", "check", "compare", "demo", "discover", "explain", "identify", "import",
+    "paper", "prc", "replay", "report", "run", "schema", "simulate", "study", "verify", "view",
 })  # fmt: skip
 PLAN_PANEL, DRIVE_PANEL, LOOK_PANEL = (
     "Before a test",
@@ -53,6 +53,10 @@ ProfileArgument = Annotated[
 LogArgument = Annotated[
     Path,
     typer.Argument(metavar="LOG", parser=parse_run_path, help=LOG_HELP),
+]
+LogArguments = Annotated[
+    list[Path],
+    typer.Argument(metavar="LOG...", parser=parse_run_path, help=f"{LOG_HELP} Repeatable."),
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
 ModelOption = Annotated[
@@ -364,7 +368,7 @@ def branches_command(
 
 @app.command("replay", rich_help_panel=LOOK_PANEL)
 def replay_command(
-    logs: LogPaths,
+    logs: LogArguments,
     model: Annotated[
         list[str] | None,
         typer.Option(

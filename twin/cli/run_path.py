@@ -1,5 +1,6 @@
 """Argument LOG, DIR or RUN: a path, or `last` for the newest run."""
 
+import sys
 from pathlib import Path
 
 LAST = "last"
@@ -11,9 +12,20 @@ def parse_run_path(text: str) -> Path:
 
     A file or folder of this name comes first.
     """
+    return _find_run(text, measured=False)
+
+
+def parse_measured_path(text: str) -> Path:
+    """Parse a log or folder as `parse_run_path` does; `last` is no simulation."""
+    return _find_run(text, measured=True)
+
+
+def _find_run(text: str, *, measured: bool) -> Path:
     path = Path(text)
     if text != LAST or path.exists():
         return path
     from twin.reports.run_index import find_last_run
 
-    return find_last_run(Path())
+    found = find_last_run(Path(), measured=measured)
+    print(f"last: {found}", file=sys.stderr)  # standard output may be JSON
+    return found

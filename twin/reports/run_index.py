@@ -4,6 +4,7 @@ import html
 import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -36,22 +37,48 @@ class RunRow:
 
 
 def find_run_folders(folder: Path) -> list[Path]:
-    """Return the folders of runs in or below a folder, the newest recording first."""
-    recordings: dict[Path, float] = {}
+    """Return the folders of runs in or below a folder, the newest recording first.
+
+    The start of a run is in its summary; of one without, still recording or killed, it is the last
+    change of its files. A copied folder keeps its place that way.
+    """
+    starts: dict[Path, tuple[float, float]] = {}
     for place in PLACES:
         for name in (LOG_NAME, PARTS_FOLDER):
             for path in folder.glob(f"{place}{name}"):
                 if not any(part.startswith(".") for part in path.relative_to(folder).parts[:-1]):
-                    recordings.setdefault(path.parent, path.stat().st_mtime)
-    return sorted(recordings, key=lambda run: recordings[run], reverse=True)
+                    starts.setdefault(path.parent, _read_start(path))
+    return sorted(starts, key=lambda run: starts[run], reverse=True)
 
 
-def find_last_run(folder: Path) -> Path:
-    """Return the folder of the newest run in or below a folder; InputError without one."""
+def _read_start(recording: Path) -> tuple[float, float]:
+    """Return the start of a run and the last change of its recording, in s since 1970.
+
+    The second orders runs that started within the same second.
+    """
+    try:
+        changed_s = recording.stat().st_mtime
+    except OSError:  # merged or moved since it was listed
+        changed_s = 0.0
+    try:
+        text = (recording.parent / "summary.json").read_text(encoding="utf-8")
+        started = datetime.fromisoformat(json.loads(text)["run"]["started_at"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return changed_s, changed_s
+    return started.timestamp(), changed_s
+
+
+def find_last_run(folder: Path, *, measured: bool = False) -> Path:
+    """Return the folder of the newest run in or below a folder; InputError without one.
+
+    With `measured`, no simulation: the model's own motion lacks no physics.
+    """
     folders = find_run_folders(folder)
+    if measured:
+        folders = [run for run in folders if _read_row(folder, run).source != "model"]
     if not folders:
         raise InputError(
-            "no run in this folder or in its folder runs",
+            f"no {'measured ' if measured else ''}run in this folder or in its folder runs",
             where=folder.resolve(),
             key="last",
             remedy="give the folder of a run, or change to the folder that holds the runs",
