@@ -128,6 +128,20 @@ def test_the_build_refuses_links_that_lead_nowhere(tmp_path: Path) -> None:
     assert [fault.value for fault in caught.value.faults] == ["b.md", "a.html#nowhere"]
 
 
+def test_only_a_guide_is_replaced(tmp_path: Path) -> None:
+    text = tmp_path / "a.md"
+    text.write_text("# A")
+    chapters = (Chapter("Start", (GuidePage("index", "A", text),)),)
+    folder = tmp_path / "site"
+    first = build_guide(folder, app, chapters)
+    text.write_text("# B")
+    assert "B</h1>" in build_guide(folder, app, chapters).read_text()
+    first.write_text("mine")
+    with raises_input_error(key="--out", value=str(folder)):
+        build_guide(folder, app, chapters)
+    assert first.read_text() == "mine"
+
+
 def test_formulas_are_mathml_and_names_of_pages_are_links() -> None:
     page = render_markdown(
         "# A\n\n$$\\frac{u}{2}$$\n\n## B `c`\n\n`KEYS.md` costs 3$ or 4$",

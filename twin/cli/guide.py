@@ -5,7 +5,6 @@ from tempfile import mkdtemp
 
 import typer
 
-from table_io.errors import InputError
 from twin.guide.site import build_guide
 from twin.run.system import open_in_browser
 from twin.run.terminal import print_line
@@ -13,8 +12,6 @@ from twin.run.terminal import print_line
 
 def open_guide(out: Path | None, app: typer.Typer) -> None:
     """Write the guide to `out`, or to a new temporary folder and open it in the browser."""
-    if out is not None and out.exists() and not out.is_dir():
-        raise InputError("not a folder", where=f"--out {out}", remedy="give a folder")
     index = build_guide(out or Path(mkdtemp(prefix="shaketwin-guide-")), app)
     print_line(f"{index}")
     if out is None and not open_in_browser(index):

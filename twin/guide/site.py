@@ -26,6 +26,7 @@ from twin.guide.reference import (
 PAGES_DIR = Path(__file__).parent / "pages"
 TUTORIALS_DIR = Path(__file__).parent / "tutorials"
 FILES_FOLDER = "files"  # pictures and notebooks
+GUIDE_MARK = '<meta name="generator" content="shaketwin guide">'
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,12 +140,12 @@ CHAPTERS = (
 
 
 def build_guide(folder: Path, app: typer.Typer, chapters: Sequence[Chapter] = CHAPTERS) -> Path:
-    """Write all pages to `folder`, replacing older ones; return the path of the first page.
+    """Write all pages to `folder`, replacing an older guide; return the path of the first page.
 
-    InputError lists every link of a page that leads nowhere.
+    InputError if the folder holds anything else, or lists every link that leads nowhere.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     pages = [page for chapter in chapters for page in chapter.pages]
+    _prepare_folder(folder, folder / pages[0].file_name)
     links = _PageLinks(pages, folder)
     rendered = {page: links.render(page, page.read(app)) for page in pages}
     faults = links.find_broken(rendered)
@@ -168,6 +169,21 @@ def build_guide(folder: Path, app: typer.Typer, chapters: Sequence[Chapter] = CH
         )
         (folder / page.file_name).write_text(html, encoding="utf-8")
     return folder / pages[0].file_name
+
+
+def _prepare_folder(folder: Path, first_page: Path) -> None:
+    """Create the folder of a guide; InputError if it has content and is no guide."""
+    is_guide = first_page.is_file() and GUIDE_MARK in first_page.read_text(
+        encoding="utf-8", errors="replace"
+    )
+    if folder.exists() and not is_guide and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(
+            "exists and is no guide; nothing is overwritten",
+            key="--out",
+            value=str(folder),
+            remedy="give a new folder",
+        )
+    folder.mkdir(parents=True, exist_ok=True)
 
 
 class _PageLinks:
