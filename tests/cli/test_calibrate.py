@@ -232,6 +232,15 @@ def test_a_converter_that_stood_still_is_not_exact() -> None:
     assert record.volts_per_unit_sd == pytest.approx(0.05, rel=1e-3)
 
 
+def test_no_record_is_written_into_the_installed_package(calibrate: Calibrate) -> None:
+    folder = PROFILES_DIR / "rigs"
+    before = sorted(folder.rglob("*"))
+    with raises_input_error(key="--table", value="simulated"):
+        calibrate("--points", "0,10", "--table", "simulated")
+    assert calibrate("--points", "0,10", "--table", "simulated", "--out", "mine.record")[0] == 0
+    assert sorted(folder.rglob("*")) == before
+
+
 def test_a_machine_that_is_lost_is_said(calibrate: Calibrate) -> None:
     Applied.gone = True
     with raises_input_error(

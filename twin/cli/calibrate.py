@@ -12,6 +12,7 @@ import numpy as np
 from table_io.backends import MachineLost
 from table_io.block import Float1D
 from table_io.clock import RealClock, local_datetime
+from table_io.config.base import PROFILES_DIR
 from table_io.config.calibration_fit import MeanVoltage, fit_calibration, mean_voltage
 from table_io.config.calibration_record import CalibrationRecord, format_calibration_toml
 from table_io.config.folders import find_config
@@ -66,6 +67,13 @@ def calibrate_sensor(request: CalibrationRequest) -> int:
         )
     applied, prompts = _plan_points(request, sensor)
     timestamp = f"{local_datetime():%Y%m%d-%H%M%S}"
+    if request.out is None and path.resolve().is_relative_to(PROFILES_DIR):
+        raise InputError(
+            "this rig file comes with shaketwin; records are kept next to a rig file of your own",
+            key="--table",
+            value=request.table,
+            remedy="make one with `shaketwin new rig FILE`, or name a file with --out",
+        )
     record_path = request.out or calibrations_dir(path) / f"{timestamp}-{sensor.channel}.toml"
     if record_path.exists():
         raise InputError(
