@@ -73,7 +73,7 @@ def test_two_effects_are_both_named() -> None:
     "truth",
     [
         pytest.param(format_truth("cubic_damping", c3=3e4), marks=pytest.mark.slow),
-        format_truth("bumper_cubic", kc=2e9),
+        pytest.param(format_truth("bumper_cubic", kc=2e9), marks=pytest.mark.slow),
         format_truth("appendage", mass=5.0, frequency=6.0),
     ],
 )

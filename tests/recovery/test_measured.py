@@ -91,6 +91,7 @@ def test_silverbox_has_a_cubic_spring() -> None:
     assert missed_mv(named=True) < 1.0
 
 
+@pytest.mark.slow  # 70 s
 def test_rubber_bearings_have_hysteresis_and_more() -> None:
     """Trained on one motion at 50 and 140 %, judged on another: spring and dashpot 0.479 there."""
 
