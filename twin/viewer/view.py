@@ -54,6 +54,8 @@ from twin.viewer.text import (
 )
 
 BATCH_ITEMS = 1000  # items of a log per call of `feed`
+LINE_RATE_HZ = 500  # of the lines over time; all samples would be 25 MB a minute at 2 kHz
+FRAME_RATE_HZ = 50  # of the moving rig
 
 
 class RerunView:
@@ -66,7 +68,8 @@ class RerunView:
         self._start = start
         self._scene = Scene.from_profile(profile)
         self._mass_kg = profile.specimen.mass_kg
-        self._frame_stride = max(1, round(start.rate_hz / 100))
+        self._frame_stride = max(1, round(start.rate_hz / FRAME_RATE_HZ))
+        self._line_stride = max(1, round(start.rate_hz / LINE_RATE_HZ))
         self._next_index: dict[str, int] = {}
         self._styled: set[str] = set()
         self._logged: set[tuple[int, str, str]] = set()
@@ -122,10 +125,12 @@ class RerunView:
 
     def _send_lines(self, entity: str, index: Int1D, *columns: Float1D) -> None:
         """Send the lines of an entity, (sample,) each; a NaN at a lost sample interrupts them."""
-        values = np.stack(columns, axis=1)
         expected_index = self._next_index.get(entity, int(index[0]))
+        is_interrupted = expected_index < index[0]
         self._next_index[entity] = int(index[-1]) + 1
-        if expected_index < index[0]:
+        is_drawn = index % self._line_stride == 0
+        values, index = np.stack(columns, axis=1)[is_drawn], index[is_drawn]
+        if is_interrupted:
             index = np.concatenate([[expected_index], index])
             values = np.concatenate([np.full((1, len(columns)), np.nan), values])
         self._sink.send_scalars(entity, index, values)
@@ -273,7 +278,7 @@ class RerunView:
 
 
 def write_rrd(recording: Recording, out: Path) -> None:
-    """Write a whole recording to a new .rrd file, with every sample at its time."""
+    """Write a whole recording to a new .rrd file, with lines of LINE_RATE_HZ at most."""
     view = RerunView(recording.start, save=out)
     for first in range(0, len(recording.items), BATCH_ITEMS):
         view.feed(recording.items[first : first + BATCH_ITEMS])
