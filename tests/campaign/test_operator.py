@@ -1,5 +1,8 @@
 """What the operator is asked between the runs of a campaign, and what an answer does."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +75,24 @@ def test_a_run_is_skipped_and_asked_for_again_on_resume(
     assert run_campaign(make_options(attended_campaign, unpaced=False, resume=True)) == 0
     assert operator.asked == 1
     assert [Path(run.folder).name for run in Players.given] == ["02-g4"]
+
+
+def test_one_page_shows_all_runs_and_none_at_full_speed(
+    attended_campaign: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers(monkeypatch, "", "")
+    runs_shown: dict[str, int] = {}
+
+    @contextmanager
+    def start_page(rig: str) -> Iterator[None]:
+        yield
+        runs_shown[rig] = len(Players.given)
+
+    options = make_options(attended_campaign, unpaced=False, start_page=start_page)
+    assert run_campaign(options) == 0
+    assert runs_shown == {"simulated": 3}
+    with raises_input_error(key="--web"):
+        run_campaign(replace(options, unpaced=True, out=attended_campaign / "other"))
 
 
 @pytest.mark.parametrize("answer", ["q", "^C"])

@@ -2,6 +2,8 @@
 
 import shlex
 import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,6 +44,7 @@ class CampaignOptions:
     unattended: bool
     listen: str
     keys: Credentials | None = None
+    start_page: Callable[[str], AbstractContextManager[None]] | None = None  # of a rig's tests
 
     def resume_command(self, folder: Path) -> str:
         """Return the command line that resumes the campaign of a folder."""
@@ -55,9 +58,17 @@ class CampaignOptions:
 
 def run_campaign(options: CampaignOptions) -> int:
     """Play all runs of a campaign that are not complete; return the exit code."""
-    allowed = _require_any_speed if options.unpaced else check_realtime
+    has_page = options.start_page is not None
+
+    def check_run(config: RunConfig, profile_path: Path) -> None:
+        if options.unpaced:
+            check_full_speed(config.rig, has_page)
+        else:
+            check_realtime(config, profile_path)
+
     with show_status("checking the runs"):
-        plan = read_plan(options.path, options.table, options.model, allowed)
+        plan = read_plan(options.path, options.table, options.model, check_run)
+    rig = plan.runs[0].bundle.rig
     compile_kernels(plan.runs[0].bundle, table=True)
     ask_operator = not (options.unpaced or options.unattended)
     if ask_operator and not sys.stdin.isatty():
@@ -77,24 +88,21 @@ def run_campaign(options: CampaignOptions) -> int:
         for warning in (
             *warnings,
             *list_campaign_warnings(plan),
-            *find_overdue_calibrations(plan.runs[0].bundle.rig, local_datetime().date()),
+            *find_overdue_calibrations(rig, local_datetime().date()),
         ):
             print_line(f"warning: {warning}")
         require_disk_space([run.bundle for run in active.pending_runs()], folder)
         _print_plan(active)
         try:
-            code = (
-                play_offline(active, lock)
-                if options.unpaced
-                else play_realtime(active, ask_operator, options.listen, options.keys)
-            )
+            with nullcontext() if options.start_page is None else options.start_page(rig.name):
+                code = (
+                    play_offline(active, lock)
+                    if options.unpaced
+                    else play_realtime(active, ask_operator, options.listen, options.keys)
+                )
         finally:
             page = write_campaign_report(folder)
     return _print_outcome(active, code, page, options)
-
-
-def _require_any_speed(bundle: RunConfig, _: Path) -> None:
-    check_full_speed(bundle.rig)
 
 
 def _prepare_folder(options: CampaignOptions) -> Path:

@@ -1,13 +1,17 @@
 """Commands to watch or join a running test; each imports its implementation when called."""
 
 import enum
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from twin.cli.credential_commands import KeysOption, read_keys_option
 from twin.cli.entry import DEFAULT_ENDPOINT
+
+if TYPE_CHECKING:
+    from twin.security.credentials import Credentials
 
 LIVE_PANEL = "Run a test"
 live_app = typer.Typer()
@@ -23,6 +27,15 @@ WebListenOption = Annotated[
         help="Address of the page, implies --web; beyond this computer with the rig's --keys.",
     ),
 ]
+
+
+def start_page(
+    web_listen: str, listen: str, keys: "Credentials | None", rig: str
+) -> AbstractContextManager[None]:
+    """Serve the page of the tests of a rig while the returned context lasts."""
+    from twin.monitor.web import start_page_process  # slow import
+
+    return start_page_process(web_listen, listen, rig, keys)
 
 
 class RunCommand(enum.StrEnum):

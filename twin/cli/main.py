@@ -4,6 +4,7 @@ import contextlib
 import enum
 import os
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +16,7 @@ from twin.cli.examples import add_examples, complete_names, describe_names
 from twin.cli.file_commands import StepsOption, files_app, require_view_extra
 from twin.cli.hardware_commands import hardware_app
 from twin.cli.identification_commands import identification_app
-from twin.cli.live_commands import WebListenOption, WebOption, live_app
+from twin.cli.live_commands import WebListenOption, WebOption, live_app, start_page
 from twin.cli.reference_commands import reference_app
 from twin.cli.run_path import LOG_HELP, parse_run_path
 from twin.run.diagnostics import configure_logging
@@ -203,13 +204,18 @@ def campaign_command(
     ] = False,
     listen: ListenOption = DEFAULT_ENDPOINT,
     keys: KeysOption = None,
+    web: WebOption = False,
+    web_listen: WebListenOption = "",
 ) -> None:
     """Run a list of tests with set-up changes between them; resume where it stopped."""
     from twin.campaign.command import CampaignOptions
     from twin.campaign.command import run_campaign as command
 
     unpaced, credentials = speed is Speed.max, read_keys_option(keys, rig=True)
-    request = CampaignOptions(file, out, resume, unpaced, model, table, yes, listen, credentials)
+    page = partial(start_page, web_listen, listen, credentials) if web or web_listen else None
+    request = CampaignOptions(
+        file, out, resume, unpaced, model, table, yes, listen, credentials, page
+    )
     raise typer.Exit(command(request))
 
 

@@ -1,14 +1,14 @@
 """`check` and `run`: check a test before the table moves, and run it."""
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 
 from table_io.clock import RealClock, local_datetime
 from table_io.config.base import parse_toml
 from table_io.config.calibration_due import find_overdue_calibrations
-from table_io.errors import InputError
 from table_io.safety.preflight import list_drive_warnings, list_setup_warnings
+from twin.cli.live_commands import start_page
 from twin.model.config import ModelConfig
 from twin.reports.finalize import EXIT_ABORTED, EXIT_INTERRUPTED, finalize_run
 from twin.run.disk import require_disk_space
@@ -54,13 +54,7 @@ def run_test(
     with show_status("checking the test"):
         config = read_run_config(profile, table, model)
     if unpaced:
-        check_full_speed(config.rig)
-        if web is not None:
-            raise InputError(
-                "a test at full speed has no page",
-                key="--web",
-                remedy="run it in real time, or look at the recording: `shaketwin view --web LOG`",
-            )
+        check_full_speed(config.rig, has_page=web is not None)
     else:
         check_endpoint(config.rig.name, listen, has_keys=keys is not None)
         check_realtime(config, profile)
@@ -79,7 +73,7 @@ def run_test(
         f"{config.expected_s:.0f} s on {config.rig.title} "
         f"-> {folder}"
     )
-    with nullcontext() if web is None else _start_page(web, listen, config.rig.name, keys):
+    with nullcontext() if web is None else start_page(web, listen, keys, config.rig.name):
         with catch_interrupts() as poll_interrupt:
             if unpaced:
                 _run_unpaced(config, run_id, folder, poll_interrupt)
@@ -90,14 +84,6 @@ def run_test(
                     return EXIT_INTERRUPTED
         code = finalize_run(folder, config, view)
     return EXIT_INTERRUPTED if poll_interrupt() and code == EXIT_ABORTED else code
-
-
-def _start_page(
-    web: str, listen: str, rig: str, keys: Credentials | None
-) -> AbstractContextManager[None]:
-    from twin.monitor.web import start_page_process
-
-    return start_page_process(web, listen, rig, keys)
 
 
 def list_model_warnings(model_toml: str) -> list[str]:

@@ -37,8 +37,14 @@ def check_realtime(config: RunConfig, profile_path: Path) -> None:
     check_reachable(config.rig)
 
 
-def check_full_speed(rig: RigConfig) -> None:
-    """Raise InputError if a rig cannot run at full speed, because it is not simulated."""
+def check_full_speed(rig: RigConfig, has_page: bool = False) -> None:
+    """Raise InputError if a rig cannot run at full speed: not simulated, or with a page."""
+    if has_page:
+        raise InputError(
+            "a test at full speed has no page",
+            key="--web",
+            remedy="run it in real time, or look at the recording: `shaketwin view --web LOG`",
+        )
     if not rig.runs_at_any_speed:
         raise InputError(
             "this rig runs in real time only",
