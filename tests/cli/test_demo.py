@@ -73,8 +73,10 @@ def test_the_seal_is_compared_with_what_discovery_named(tmp_path: Path) -> None:
             ("none", "none", []),
         )
     }
-    value_found = f"{1.01 * value:.4g}"
-    has_value = {key: [value_found in line for line in told] for key, told in lines.items()}
+    number = f"{1.01 * value:.4g}"
+    has_value = {
+        key: [number in line for line in lines_of_case] for key, lines_of_case in lines.items()
+    }
     assert has_value == {
         "right": [False, True], "more": [False, True, False], "unsure": [False], "none": [False]
     }  # fmt: skip

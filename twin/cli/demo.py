@@ -204,8 +204,8 @@ def open_seal(folder: Path, digest: str) -> GroundTruth:
 
 def compare_with_seal(hidden: HiddenEffect, verdict: dict[str, Any]) -> list[str]:
     """Return a line whether the hidden effect was named, and one per parameter and false name."""
-    found = {effect["id"]: effect["parameters"] for effect in verdict["effects"]}
-    is_named = verdict["verdict"] == "named" and hidden.id in found
+    parameters_by_id = {effect["id"]: effect["parameters"] for effect in verdict["effects"]}
+    is_named = verdict["verdict"] == "named" and hidden.id in parameters_by_id
     if not is_named:
         lines = [f"It was {hidden.id}, which discovery did not name this time."]
     else:
@@ -213,16 +213,16 @@ def compare_with_seal(hidden: HiddenEffect, verdict: dict[str, Any]) -> list[str
             f"It was {hidden.id}: named from the recording alone. The rig's law has a form of its "
             "own, so parameters may differ by a few per cent."
         ]
-        for name, fit in found[hidden.id].items():
+        for name, fit in parameters_by_id[hidden.id].items():
             half = 0.5 * (fit["high"] - fit["low"])
             truth = hidden.parameters.get(name)
             known = "" if truth is None else f"hidden {truth:.4g}, "
             lines.append(
                 f"{name}: {known}found {fit['value']:.4g} +- {half:.1g} {fit['unit']}".rstrip()
             )
-    false = [name for name in found if name != hidden.id]
-    if false:
-        lines.append(f"Not hidden, but found: {', '.join(false)}.")
+    false_names = [name for name in parameters_by_id if name != hidden.id]
+    if false_names:
+        lines.append(f"Not hidden, but found: {', '.join(false_names)}.")
     return lines
 
 

@@ -26,6 +26,6 @@ def _find_run(text: str, *, measured: bool) -> Path:
         return path
     from twin.reports.run_index import find_last_run
 
-    found = find_last_run(Path(), measured=measured)
-    print(f"last: {found}", file=sys.stderr)  # standard output may be JSON
-    return found
+    folder = find_last_run(Path(), measured=measured)
+    print(f"last: {folder}", file=sys.stderr)  # standard output may be JSON
+    return folder
