@@ -28,7 +28,7 @@ from twin.reports.discovery.figure_data import (
 from twin.reports.discovery.free_running import compute_misfits, run_log_free, run_logs_free
 from twin.reports.discovery.headline import format_verdict
 from twin.reports.discovery.loading import load_logs, name_logs
-from twin.reports.discovery.page import count_digits, format_rounded
+from twin.reports.discovery.page import format_with_interval
 from twin.reports.discovery.serialize import Json, verdict_to_json
 from twin.reports.page import format_significant
 from twin.reports.plot_style import RC_PARAMS
@@ -166,9 +166,7 @@ def test_the_page_says_the_verdict_the_gap_and_what_to_do(output: DiscoveryOutpu
         assert effect["id"] in page
         for name, value in effect["parameters"].items():
             numbers = [value[key] for key in ("value", "low", "high")]
-            cells = "".join(
-                f"<td>{format_rounded(number, count_digits(*numbers))}</td>" for number in numbers
-            )
+            cells = "".join(f"<td>{text}</td>" for text in format_with_interval(*numbers))
             assert f'<td class="text">{name}</td>{cells}' in page
 
 
@@ -373,16 +371,16 @@ def test_laws_are_typeset(term: str, typeset: str) -> None:
 
 @pytest.mark.parametrize(
     ("value", "half", "texts"),
-    [(12345.678, 0.05, ("12\u2009345.678", "12\u2009345.628", "12\u2009345.728")),
-     (510000.0, 300.0, ("510\u2009000", "509\u2009700", "510\u2009300")),
-     (1500.4, 0.45, ("1500.40", "1499.95", "1500.85")), (0.4, 0.2, ("0.4000", "0.2000", "0.6000")),
-     (3.0, 0.0, ("3.000", "3.000", "3.000"))],
+    [(12345.678, 0.05, ["12\u2009345.678", "12\u2009345.628", "12\u2009345.728"]),
+     (510000.0, 300.0, ["510\u2009000", "509\u2009700", "510\u2009300"]),
+     (1500.4, 0.45, ["1500.40", "1499.95", "1500.85"]), (0.4, 0.2, ["0.40", "0.20", "0.60"]),
+     (3.8e-4, 3.7e-4, ["0.00038", "0.00001", "0.00075"]), (-2.0, 30.0, ["−2", "−32", "28"]),
+     (3.0, 0.0, ["3.000", "3.000", "3.000"])],
 )  # fmt: skip
 def test_an_interval_can_be_told_from_its_value(
-    value: float, half: float, texts: tuple[str, ...]
+    value: float, half: float, texts: list[str]
 ) -> None:
-    numbers = (value, value - half, value + half)
-    assert tuple(format_rounded(number, count_digits(*numbers)) for number in numbers) == texts
+    assert format_with_interval(value, value - half, value + half) == texts
 
 
 def test_the_gates_pass_where_no_sensor_errs_and_fail_where_one_does(

@@ -31,7 +31,7 @@ from twin.reports.discovery.serialize import Json
 from twin.reports.page import embed_images, format_significant, render_page
 from twin.reports.quantities import format_quantity
 
-MIN_DIGITS, MAX_DIGITS = 4, 8  # significant digits of a fitted value
+DIGITS, MAX_DECIMALS = 4, 9  # of a fitted value
 SECTIONS = {
     "where": "Location of the discrepancy", "candidates": "Candidates", "gates": "Sensor checks",
     "forces": "Residual forces", "histories": "Before and after, on the measured motion",
@@ -99,8 +99,7 @@ def list_parameter_rows(
         for k, (name, value) in enumerate(parameters.items()):
             factor, unit = (1e3, "mm") if value["unit"] == "m" else (1.0, value["unit"] or "–")
             numbers = [factor * value[key] for key in ("value", "low", "high")]
-            digits = count_digits(*numbers)
-            texts = [format_rounded(number, digits) for number in numbers]
+            texts = format_with_interval(*numbers)
             rows.append(("" if k else title, name, texts, unit))
     return rows
 
@@ -110,22 +109,24 @@ def _gap_label(name: str, logs: Sequence[str]) -> str:
     return f"gap correction per side, {logs[int(number)]}" if number.isdigit() else name
 
 
-def count_digits(value: float, low: float, high: float) -> int:
-    """Return the significant digits of a value that show two digits of its half interval."""
-    half_width, largest = 0.5 * (high - low), max(map(abs, (value, low, high)))
+def format_with_interval(value: float, low: float, high: float) -> list[str]:
+    """Format a value and its bounds with the decimals that show two digits of half the interval.
+
+    Without an interval each has `DIGITS` significant digits.
+    """
+    half_width = 0.5 * (high - low)
     if not (half_width > 0 and math.isfinite(half_width)):
-        return MIN_DIGITS
-    digits = math.floor(math.log10(largest)) - math.floor(math.log10(half_width)) + 2
-    return min(max(digits, MIN_DIGITS), MAX_DIGITS)
+        return [format_significant(number, DIGITS) for number in (value, low, high)]
+    decimals = max(0, 1 - math.floor(math.log10(half_width)))
+    if decimals > MAX_DECIMALS:
+        return [format_significant(number, DIGITS) for number in (value, low, high)]
+    return [_group_thousands(f"{number:,.{decimals}f}") for number in (value, low, high)]
 
 
-def format_rounded(value: float, digits: int = MIN_DIGITS) -> str:
-    """Format a value with `digits` significant digits and thousands separators."""
-    if math.isfinite(value) and abs(value) >= 1e4:
-        decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
-        rounded = float(f"{value:.{digits}g}")
-        return f"{rounded:,.{decimals}f}".replace(",", "\u2009").replace("-", "−")
-    return format_significant(value, digits)
+def _group_thousands(text: str) -> str:
+    """Separate the thousands of a number with commas by thin spaces, from five digits on."""
+    separator = "" if len(text.partition(".")[0].lstrip("-")) < len("10,000") else "\u2009"
+    return text.replace(",", separator).replace("-", "−")
 
 
 def describe_held_out(view: DiscoveryView) -> str:
