@@ -217,14 +217,15 @@ def independent_return_error(orbit: Orbit) -> float:
     model, period_map = orbit.period_map.model, orbit.period_map
     w = 2 * math.pi * orbit.frequency_hz
     base = model.base
-    if base.gap_r == base.gap_l == 0 and not base.bumper_damping_r:
-        # Both guards would be zero at once, and scipy would not see the second one.
-        model = Model(replace(base, gap_r=1e-9, gap_l=1e-9), model.effects)
-    witness = Witness(model, lambda t: orbit.acceleration_m_s2 * math.sin(w * t))
     u, v = orbit.x[:2]
     out = period_map.sample_motion(
-        orbit.x, orbit.frequency_hz, orbit.acceleration_m_s2, orbit.periods, orbit.periods * 4
+        orbit.x, orbit.frequency_hz, orbit.acceleration_m_s2, orbit.periods, orbit.periods * 100
     )
+    size = max(np.abs(out[0]).max(), 1e-12)
+    if base.gap_r == base.gap_l == 0 and not base.bumper_damping_r:
+        # Both guards would be zero at once, and scipy would not see the second one.
+        model = Model(replace(base, gap_r=1e-5 * size, gap_l=1e-5 * size), model.effects)
+    witness = Witness(model, lambda t: orbit.acceleration_m_s2 * math.sin(w * t))
     witness.contact = [bool(out[3, -1] > 0), bool(out[4, -1] < 0)]
     witness.way = (
         math.copysign(1.0, v) if v else (0.0 if witness.get("coulomb_friction", "fc") else 1.0)
@@ -237,7 +238,6 @@ def independent_return_error(orbit: Orbit) -> float:
     period = 2 * math.pi / w
     times = np.linspace(0, orbit.periods * period, 120 * orbit.periods + 1)
     end = witness.run(start, times, 1e-10)[:, -1]
-    size = max(np.abs(out[0]).max(), 1e-12)
     speed = max(np.abs(out[1]).max(), 1e-12)
     growth = max(1.0, abs(orbit.multipliers[0]))
     return max(abs(end[0] - u) / size, abs(end[1] - v) / speed) / growth

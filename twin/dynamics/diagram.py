@@ -6,9 +6,11 @@ pitchforks are followed too where the orbit loses or gains its stability there, 
 orbits within chaos; so are mirror images of asymmetric orbits of a symmetric model. Where starts
 settle to no orbit of up to `MAX_PERIODS` periods, the Lyapunov exponent tells chaos.
 
-What it cannot know: a stable orbit that no start reaches, in a window of the parameter narrower
-than the distance of the values, or in a basin smaller than one start in `starts`, unless a branch
-connects it to what is known.
+Then random starts at random values, between the others too, until `values * starts //
+CONFIRMING_SHARE` in a row settle to known orbits.
+
+What it cannot know: a stable orbit that less than one start in as many reaches, in a narrow window
+of the parameter or a small basin, unless a branch connects it to what is known.
 """
 
 import math
@@ -36,6 +38,8 @@ MIN_EXPONENT = 0.02  # per period: a smaller exponent is not told from zero
 MAX_BRANCH_POINTS = 1200  # divided by the periods of its orbits: long orbits are costly
 MAX_SWITCHES = 48  # of branches; there is no end to period doublings near chaos
 FINER_VALUES = 4  # values in place of one where the motion is not periodic
+CONFIRMING_SHARE = 3  # starts per confirming start
+MAX_CONFIRMATION = 10  # confirming starts in all, as a multiple of those in a row
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,6 +176,22 @@ class _Search:
             fine |= {value + step * k / FINER_VALUES for k in range(1 - FINER_VALUES, FINER_VALUES)}
         own = sorted(v for v in fine if self._limits[0] < v < self._limits[1])
         self._sweep([v for v in own if v not in self._exponents], max(2, self._starts // 2))
+        self._confirm(values * self._starts // CONFIRMING_SHARE)
+
+    def _confirm(self, starts_in_a_row: int) -> None:
+        """Try random starts at random values until so many in a row lead to no new branch."""
+        confirmed = 0
+        for _ in range(MAX_CONFIRMATION * starts_in_a_row):
+            value = self._random.uniform(*self._limits)
+            period_map, frequency_hz, level = self._problem.at([value])
+            start = draw_start(period_map, frequency_hz, level, self._random)
+            motion = settle(period_map, frequency_hz, level, start)
+            branch_count = len(self.branches)
+            if motion.orbit is not None:
+                self.add_orbit(motion.orbit)
+            confirmed = confirmed + 1 if len(self.branches) == branch_count else 0
+            if confirmed >= starts_in_a_row:
+                return
 
     def _sweep(self, values: Sequence[float] | Float1D, starts: int) -> None:
         """Settle the last motions and new starts at each value in turn."""
@@ -225,8 +245,9 @@ class _Search:
         waiting = [branch]
         while waiting:
             for bifurcation in self._find_origins(waiting.pop(0)):
-                # A period later, the other side of a period doubling is the same branch.
-                for side in (1,) if bifurcation.kind == "period doubling" else (1, -1):
+                # A period later, the other side of a period doubling is the same branch; it is
+                # followed all the same, in case this one turns back at a grazing orbit too early.
+                for side in (1, -1):
                     if self._switches >= MAX_SWITCHES:
                         self.unfollowed.append(bifurcation)
                         break
