@@ -8,6 +8,7 @@ import json
 import random
 import secrets
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,9 @@ from twin.reports.plot_style import (
     save_figures,
     twin_style,
 )
-from twin.reports.report_data import DIRECTIONS
+from twin.reports.prc_drawing import break_at_jumps, plot_prc
+from twin.reports.report_data import extract_prc
+from twin.reports.summary import parse_jumps, prc_points
 from twin.run.folders import make_output_folder, make_run_folder
 from twin.run.system import open_in_browser
 from twin.run.terminal import print_line
@@ -49,6 +52,7 @@ HIDEABLE_EFFECTS = (
     "bouc_wen", "bumper_asymmetry", "bumper_hardening", "bumper_maxwell", "coulomb_friction",
     "hunt_crossley", "maxwell_damper", "quadratic_damping",
 )  # fmt: skip
+MARKERS: LineStyle = {"marker": "o", "ms": 3}
 MIN_SIZE, MAX_SIZE = 0.8, 1.5  # of the typical one
 
 
@@ -73,7 +77,7 @@ class TwinError:
 
     error: float
     noise_floor: float
-    steps: list[dict[str, Any]]
+    summary: dict[str, Any]
 
     def __str__(self) -> str:
         return (
@@ -188,7 +192,7 @@ def read_twin_error(run: Path) -> TwinError:
     """Read the error of the twin from the summary of a run."""
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     entry = summary["comparison"][CHANNEL]
-    return TwinError(entry["nrmse"], entry["noise_floor"], summary["steps"])
+    return TwinError(entry["nrmse"], entry["noise_floor"], summary)
 
 
 def _describe_verdict(verdict: dict[str, Any]) -> str:
@@ -262,15 +266,11 @@ def _draw_runs(before: TwinError, after: TwinError) -> CaptionedFigures:
     runs = {"first run, model as it was": before, "second run, effect added": after}
     panels = figure.subplots(1, len(runs), sharex=True, sharey=True)
     for panel, (title, run) in zip(panels, runs.items(), strict=True):
-        for direction in DIRECTIONS:
-            for source, make_style in (("measured", _rig_style), ("twin", _twin_style)):
-                points = [
-                    (step["frequency_hz"], step[source]["eta_d"])
-                    for step in run.steps
-                    if step["direction"] == direction and step.get(source)
-                ]
-                line = zip(*sorted(points), strict=True)
-                panel.plot(*line, **make_style(direction), marker="o", ms=3)
+        points = prc_points(run.summary["steps"])
+        for source, make_style in (("measured", _rig_style), ("twin", _twin_style)):
+            jumps = parse_jumps(run.summary, source)
+            curves = break_at_jumps(partial(extract_prc, points, source), jumps)
+            plot_prc([(panel, {"eta_d": 1})], curves, make_style)
         panel.set_title(f"{title}: twin error {100 * run.error:.2g} %")
         panel.set_xlabel("frequency of the table in Hz")
     panels[0].set_ylabel("excursion of the mass, normalized")
@@ -279,14 +279,14 @@ def _draw_runs(before: TwinError, after: TwinError) -> CaptionedFigures:
     )
     yield CaptionedFigure(
         "runs", "Rig and twin over frequency, before and after",
-        "Excursion of the mass at each frequency of the sweep, up (forward) and down (backward). "
-        "Wide and pale: measured; thin: the twin, which runs beside the rig.", figure,
+        "Excursion of the mass at each frequency of the sweep, up (forward) and down (backward), "
+        "broken where it jumps. Wide and pale: measured; thin: the twin.", figure,
     )  # fmt: skip
 
 
 def _rig_style(direction: str) -> LineStyle:
-    return {**measured_style(direction, 4.0), "alpha": 0.45}
+    return {**measured_style(direction, 4.0), "alpha": 0.45, **MARKERS}
 
 
 def _twin_style(direction: str) -> LineStyle:
-    return twin_style(direction, 1.2)
+    return {**twin_style(direction, 1.2), **MARKERS}

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from table_io.block import Block
 from table_io.records import Level, PrcPoint
 from table_io.units import GRAVITY_M_S2
-from twin.compare.curves import Hysteresis, PrcJump
+from twin.compare.curves import Hysteresis
 from twin.reports.branches.curves import FREE_QUANTITIES
 from twin.reports.branches.figures import branch_handles, plot_branches
 from twin.reports.branches.model_branches import follow_model_branches
@@ -56,6 +56,7 @@ from twin.reports.report_data import (
     extract_prc,
 )
 from twin.reports.step_figures import draw_histories, draw_legend, draw_loop_figures
+from twin.reports.summary import parse_jumps
 from twin.reports.window_figure import draw_window_histories
 
 MARKER_SIZES = {"forward": 4.6, "backward": 2.6}  # both show where they coincide
@@ -104,9 +105,7 @@ def _draw_prc(run: ReportData) -> CaptionedFigures:
     prestress = compute_prestress(run)
     shade_hysteresis(panels, intervals)
     shade_precompression(panels, prestress)
-    jumps, twin_jumps = (
-        [PrcJump(**jump) for jump in run.summary.get(key) or []] for key in ("jumps", "twin_jumps")
-    )
+    jumps, twin_jumps = (parse_jumps(run.summary, source) for source in ("measured", "twin"))
     measured_jumps = jumps if run.source == "measured" else []
     plot_prc(panels, break_at_jumps(measured, measured_jumps), _dotted_style)
     plot_prc(panels, break_at_jumps(twin, twin_jumps), twin_style)

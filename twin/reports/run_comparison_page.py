@@ -16,11 +16,17 @@ from twin.reports.plot_style import (
     LineStyle,
     save_figures,
 )
-from twin.reports.prc_drawing import FREE_PANELS, PRC_PANELS, make_prc_panels, plot_prc
+from twin.reports.prc_drawing import (
+    FREE_PANELS,
+    PRC_PANELS,
+    break_at_jumps,
+    make_prc_panels,
+    plot_prc,
+)
 from twin.reports.quantities import format_quantity
 from twin.reports.report_data import DIRECTIONS, extract_prc
 from twin.reports.run_comparison import ComparedRun
-from twin.reports.summary import Json, prc_points
+from twin.reports.summary import Json, parse_jumps, prc_points
 from twin.reports.twin_verdict import CHANNEL_SYMBOLS
 
 RUN_COLOURS = ("#c8741a", "#0f7b7b")  # first, second: neither is that of a direction
@@ -61,9 +67,11 @@ def draw_comparison(first: ComparedRun, second: ComparedRun) -> CaptionedFigures
     axes = figure.subplots(len(contents) // 2, 2, sharex=True, squeeze=False)
     panels = make_prc_panels(axes, contents)
     handles = []
-    for of_run, colour, name in zip(points, RUN_COLOURS, ("first", "second"), strict=True):
+    named_runs = zip((first, second), points, RUN_COLOURS, ("first", "second"), strict=True)
+    for run, of_run, colour, name in named_runs:
         for source in ("measured", "twin"):
-            curves = partial(extract_prc, of_run, source)
+            jumps = parse_jumps(run.summary, source)
+            curves = break_at_jumps(partial(extract_prc, of_run, source), jumps)
             plot_prc(panels, curves, partial(_run_style, colour, source))
             handles.append(
                 Line2D([], [], **_run_style(colour, source, "forward"), label=f"{name}, {source}")
@@ -74,7 +82,7 @@ def draw_comparison(first: ComparedRun, second: ComparedRun) -> CaptionedFigures
     figure.legend(handles=handles, loc="outside upper center", ncols=6)
     caption = (
         "One point per frequency step. Measured wide and pale, twin thin; solid forward, dashed "
-        "backward. Each run is divided by its own u* and a*."
+        "backward; broken where it jumps. Each run is divided by its own u* and a*."
     )
     yield CaptionedFigure("prc", "Pseudo-resonance curves of both runs", caption, figure)
 

@@ -32,7 +32,7 @@ from table_io.records import (
     Trip,
 )
 from twin.compare import COMPARED_CHANNELS
-from twin.compare.curves import detect_hysteresis
+from twin.compare.curves import PrcJump, detect_hysteresis
 from twin.compare.extra_channels import select_predicted
 from twin.compare.monitoring import EVENT_KINDS as MONITOR_KINDS
 from twin.compare.monitoring.cycle import ChannelNoise
@@ -229,6 +229,12 @@ def prc_points(steps: Iterable[Json]) -> list[PrcPoint]:
         )
         for step in steps
     ]  # fmt: skip
+
+
+def parse_jumps(summary: Json, source: str) -> list[PrcJump]:
+    """Return the jumps in a summary, of "measured" or "twin"."""
+    key = "jumps" if source == "measured" else "twin_jumps"
+    return [PrcJump(**jump) for jump in summary.get(key) or []]
 
 
 def _parse_response(values: Json | None) -> NormalizedResponse | None:
