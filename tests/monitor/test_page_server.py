@@ -231,6 +231,31 @@ def test_a_slow_client_is_dropped_and_slows_nobody(
     slow.close()
 
 
+def test_a_request_that_trickles_in_is_dropped(
+    page: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page_server, "CLIENT_TIMEOUT_S", 0.5)
+    with socket.create_connection(("127.0.0.1", page.port)) as client, suppress(ConnectionError):
+        client.settimeout(0.1)
+        begun = time.monotonic()
+        while time.monotonic() < begun + PATIENCE_S:
+            client.sendall(b"a")
+            with suppress(TimeoutError):
+                assert client.recv(1) == b""
+                return
+        pytest.fail("the connection is still open")
+
+
+def test_headers_are_limited_in_all(page: Served) -> None:
+    """Otherwise 99 headers of 64 kB from each client fill the memory of the rig's computer."""
+    with socket.create_connection(("127.0.0.1", page.port), PATIENCE_S) as client:
+        with suppress(ConnectionError):
+            client.sendall(b"GET / HTTP/1.0\r\n" + 2 * (b"X: " + b"a" * 60_000 + b"\r\n"))
+            client.sendall(f"Host: 127.0.0.1:{page.port}\r\n\r\n".encode())
+        assert client.recv(12) == b"HTTP/1.0 431"
+    assert is_served(page)
+
+
 def test_the_number_of_streams_and_of_connections_is_limited(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -5,6 +5,7 @@ sections only: a slow client skips to the newest, and is dropped once it takes n
 `CLIENT_TIMEOUT_S`. Nothing is queued, and nothing of a client reaches the rig but a command.
 """
 
+import io
 import json
 import logging
 import re
@@ -12,6 +13,7 @@ import socket
 import ssl
 import threading
 from collections.abc import Callable, Mapping
+from http.client import HTTPException
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,7 +31,8 @@ PAGE_FILES = {
     "/page.css": ("page.css", "text/css; charset=utf-8"),
 }
 MAX_CONNECTIONS, MAX_STREAMS = 64, 32
-CLIENT_TIMEOUT_S = 5.0  # for a request, and for taking what is sent
+CLIENT_TIMEOUT_S = 5.0  # for a whole request, and for taking what is sent
+MAX_REQUEST_BYTES = 2**16  # with its headers
 SEND_BUFFER_BYTES = 2**16  # in the kernel, of one client
 MAX_BODY_BYTES = 1024
 POLL_S = 0.1  # within which the server ends
@@ -155,11 +158,42 @@ class PageServer(ThreadingHTTPServer):
         log.info("connection from %s ended", client_address, exc_info=True)
 
 
+class RequestReader(io.RawIOBase):
+    """Bytes of one request, at most `MAX_REQUEST_BYTES` and within `CLIENT_TIMEOUT_S` in all."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._connection, self._clock = connection, RealClock()
+        self._deadline_s = self._clock.now() + CLIENT_TIMEOUT_S
+        self._bytes_left = MAX_REQUEST_BYTES
+
+    def readable(self) -> bool:
+        """Return True."""
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        """Read received bytes; raise TimeoutError or HTTPException beyond the limits."""
+        seconds_left = self._deadline_s - self._clock.now()
+        if seconds_left <= 0:
+            raise TimeoutError("the request is incomplete")
+        if self._bytes_left == 0:
+            raise HTTPException("the request is too large")
+        self._connection.settimeout(seconds_left)
+        count = self._connection.recv_into(memoryview(buffer)[: self._bytes_left])
+        self._connection.settimeout(CLIENT_TIMEOUT_S)
+        self._bytes_left -= count
+        return count
+
+
 class PageRequest(BaseHTTPRequestHandler):
     """One request; the connection is closed after it."""
 
     server: PageServer
     server_version, sys_version = "shaketwin", ""
+
+    def setup(self) -> None:
+        """Limit size and duration of the request: each byte restarts the timeout of a socket."""
+        super().setup()
+        self.rfile = io.BufferedReader(RequestReader(self.connection))
 
     def do_GET(self) -> None:
         """Send a file of the page, or the stream of events."""
