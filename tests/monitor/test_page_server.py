@@ -395,8 +395,34 @@ def test_the_gateway_judges_commands_of_the_page_by_the_person(lab: Path) -> Non
     assert submit_page_command(PageCommand("hold", RUN, "anna"), request, keys).status == 504
 
 
-def test_one_command_at_a_time(page: Served) -> None:
-    """Two people press at once: the handler never runs twice at the same time."""
+def test_no_command_waits_for_those_of_others(
+    lab: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Otherwise an observer delays a stop with orders that are refused one after another."""
+    anna, bob = (new_code(lab, name, capsys) for name in ("anna", "bob"))
+    begun, over = threading.Event(), threading.Event()
+
+    def slow_for_bob(command: PageCommand) -> CommandAnswer:
+        if command.user == "bob":
+            begun.set()
+            over.wait(2 * PATIENCE_S)
+        return CommandAnswer(200, command.user)
+
+    body = b'{"command": "stop", "run": "r1"}'
+    with serving(lab) as page:
+        page.server.handle_command = slow_for_bob
+        post = threading.Thread(target=page.post, args=(body,), kwargs=as_person(bob))
+        post.start()
+        assert begun.wait(PATIENCE_S)
+        try:
+            assert page.post(body, **as_person(anna)) == (200, "anna")
+        finally:
+            over.set()
+            post.join()
+
+
+def test_one_command_of_a_person_at_a_time(page: Served) -> None:
+    """One person presses several times: the handler never runs twice at the same time."""
     active, most = 0, 0
 
     def slow_handler(_: PageCommand) -> CommandAnswer:

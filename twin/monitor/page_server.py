@@ -12,6 +12,7 @@ import re
 import socket
 import ssl
 import threading
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from http.client import HTTPException
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -116,7 +117,8 @@ class PageServer(ThreadingHTTPServer):
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         self.access, self.feed = access, feed
         self.handle_command = handle_command
-        self.command_lock = threading.Lock()  # one command at a time
+        # One command of a person at a time: no other person's command waits for it.
+        self.command_locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
         self.streams = threading.BoundedSemaphore(MAX_STREAMS)
         self._connections = threading.BoundedSemaphore(MAX_CONNECTIONS)
         super().__init__((host.strip("[]"), port), PageRequest)
@@ -225,7 +227,7 @@ class PageRequest(BaseHTTPRequestHandler):
             if command is None:
                 self._reply_message(400, f"not a command; allowed: {', '.join(COMMAND_NAMES)}")
                 return
-            with self.server.command_lock:
+            with self.server.command_locks[user]:
                 answer = self.server.handle_command(command)
             log.info("%s by %s: %d %s", command.name, user, *answer)
             self._reply_message(*answer)
