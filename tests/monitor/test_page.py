@@ -70,6 +70,23 @@ def test_the_page_shows_a_test_as_it_goes_on(browser: Browser) -> None:
     assert [text for text in browser.console if "403" not in text] == []
 
 
+def test_the_page_draws_sections_as_they_arrive(browser: Browser) -> None:
+    """A slow network delivers the first message in pieces; drawing survives a damaged one."""
+    state = watch_items(*records(), *stream())
+    sections = build_sections(state, SessionStatus())
+    with serving() as page:
+        page.feed.publish({name: sections[name] for name in ("run", "state")})
+        browser.open(f"http://127.0.0.1:{page.port}/")
+        browser.wait_for("$('state').textContent === 'running'")
+        page.feed.publish(sections)
+        browser.wait_for("$('points').textContent.startsWith('3 ')")
+        page.feed.publish(sections | {"trace": "{}"})
+        browser.wait_for("!state.trace.tracks && !dirty")
+        update_run_state(state, RUN, RunStop(9000, "stopped", "asked to stop"))
+        show(page, state)
+        browser.wait_for("$('state').textContent === 'ended: stopped'")
+
+
 def test_the_page_finds_its_server_again(browser: Browser) -> None:
     state = watch_items(*records())
     with serving() as page:

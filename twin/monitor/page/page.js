@@ -105,16 +105,19 @@ function element(tag, className, ...children) {
   return node;
 }
 
+// By the last section that each needs: a slow network delivers the sections one by one.
+const drawings = { state: drawHeader, level: drawLevel, trace: drawTraces, prc: drawPrc, events: drawEvents,
+  margins: drawMargins, twin: drawTwin, timing: drawTiming, user: drawUser };
+
 function draw() {
+  requestAnimationFrame(() => setTimeout(draw, 100)); // first: an error below does not end the drawing
   const stale = Date.now() - lastMessage > silenceMs;
   if (stale !== document.body.classList.contains("stale")) dirty = true;
   if (dirty && state.state) {
     dirty = false;
     document.body.classList.toggle("stale", stale);
-    for (const part of [drawHeader, drawLevel, drawTraces, drawPrc, drawEvents, drawMargins, drawTwin, drawTiming, drawUser])
-      part(stale);
+    for (const [section, drawSection] of Object.entries(drawings)) if (state[section]) drawSection(stale);
   } else if (stale && !state.state && lastMessage) setState("page disconnected", "bad");
-  requestAnimationFrame(() => setTimeout(draw, 100));
 }
 
 function setState(text, tone) {
