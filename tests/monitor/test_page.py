@@ -1,16 +1,17 @@
 """The page in a real browser, fed with a test as it goes on; a live run is in `test_page_live`."""
 
+import threading
 from collections.abc import Iterator
 
 import pytest
 
 from table_io.records import Event, RunStop
-from tests.monitor.browser import CHROMIUM, Browser, open_browser
+from tests.monitor.browser import CHROMIUM, PATIENCE_S, Browser, open_browser
 from tests.monitor.monitored import RUN, point, records, stream
 from tests.monitor.test_page_data import watch_items
 from tests.monitor.test_page_server import Served, serving
 from twin.monitor.page_data import build_sections
-from twin.monitor.page_server import PageCommand, PageServer, open_page_server
+from twin.monitor.page_server import CommandAnswer, PageCommand, PageServer, open_page_server
 from twin.monitor.panels import SessionStatus
 from twin.monitor.run_state import LiveRunState, update_run_state
 from twin.security.access_control import user_name
@@ -85,6 +86,28 @@ def test_the_page_draws_sections_as_they_arrive(browser: Browser) -> None:
         update_run_state(state, RUN, RunStop(9000, "stopped", "asked to stop"))
         show(page, state)
         browser.wait_for("$('state').textContent === 'ended: stopped'")
+
+
+def test_a_command_without_an_answer_points_to_the_emergency_stop(browser: Browser) -> None:
+    over = threading.Event()
+
+    def never_answer(_: PageCommand) -> CommandAnswer:
+        over.wait(2 * PATIENCE_S)
+        return CommandAnswer(200, "")
+
+    with serving() as page:
+        page.server.handle_command = never_answer
+        page.feed.role = "command"
+        show(page, watch_items(*records()))
+        browser.open(f"http://127.0.0.1:{page.port}/")
+        browser.evaluate("answerMs = 500")
+        browser.wait_for("!$('commands').hidden")
+        browser.evaluate("document.querySelector('[data-command=stop]').click()")
+        browser.evaluate("$('yes').click()")
+        try:
+            browser.wait_for("$('answer').textContent.includes('use the machine\\'s own stop')")
+        finally:
+            over.set()
 
 
 def test_the_page_finds_its_server_again(browser: Browser) -> None:

@@ -5,7 +5,7 @@
 const $ = (id) => document.getElementById(id);
 const state = {}; // newest section by name
 const retryMs = 1000;
-let silenceMs = 6000, lastMessage = 0, dirty = true, code = takeCode();
+let silenceMs = 6000, answerMs = 8000, lastMessage = 0, dirty = true, code = takeCode();
 
 function takeCode() {
   const fresh = decodeURIComponent(location.hash.slice(1));
@@ -66,7 +66,7 @@ async function send(command) {
   $("answer").className = "";
   $("answer").textContent = `${command} …`;
   const request = { method: "POST", headers: { ...headers(), "Content-Type": "application/json" },
-    body: JSON.stringify({ command, run: state.run.run }) };
+    body: JSON.stringify({ command, run: state.run.run }), signal: AbortSignal.timeout(answerMs) };
   try {
     const response = await fetch("command", request);
     $("answer").className = response.ok ? "good" : "bad";
