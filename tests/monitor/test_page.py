@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -10,6 +11,7 @@ from tests.monitor.browser import CHROMIUM, PATIENCE_S, Browser, open_browser
 from tests.monitor.monitored import RUN, point, records, stream
 from tests.monitor.test_page_data import watch_items
 from tests.monitor.test_page_server import Served, serving
+from tests.security.laboratory import laboratory, own
 from twin.monitor.page_data import build_sections
 from twin.monitor.page_server import CommandAnswer, PageCommand, PageServer, open_page_server
 from twin.monitor.panels import SessionStatus
@@ -108,6 +110,20 @@ def test_a_command_without_an_answer_points_to_the_emergency_stop(browser: Brows
             browser.wait_for("$('answer').textContent.includes('use the machine\\'s own stop')")
         finally:
             over.set()
+
+
+def test_a_code_is_taken_as_keyboards_write_it(browser: Browser, tmp_path: Path) -> None:
+    """A dash for a hyphen, as phones write it; a wrong code asks again."""
+    with serving(own(laboratory(tmp_path / "lab"), "anna")) as page:
+        show(page, watch_items(*records()))
+        browser.open("about:blank")
+        browser.open(f"http://127.0.0.1:{page.port}/")
+        dashed = page.server.access.code.upper().replace("-", "–")
+        for code in ("–", "wrong", dashed):
+            browser.wait_for("!$('login').hidden")
+            browser.evaluate(f"$('code').value = {code!r}; $('login').requestSubmit()")
+        browser.wait_for("$('user').textContent === 'anna'")
+        assert browser.evaluate("$('login').hidden")
 
 
 def test_the_page_finds_its_server_again(browser: Browser) -> None:
