@@ -1,9 +1,10 @@
 """The page as an observer of a bus: it waits for a run, shows it, and outlives its gateway."""
 
 import http.client
+import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from tests.monitor.test_page_server import PATIENCE_S, read_event
 from tests.security.laboratory import free_port
 from twin.cli.main import app
 from twin.cli.run import run_test
-from twin.monitor.web import PageRequestConfig, serve_page
+from twin.monitor.web import PageRequestConfig, serve_page, start_page_process
 from twin.transport.zenoh_link import BusLink
 
 
@@ -71,6 +72,35 @@ def test_a_page_waits_for_a_run_and_outlives_its_gateway() -> None:
         with hub_at(place) as hub:
             publish(hub, [*records(), point(3)])
             wait_for(events, hub, "prc", lambda prc: prc["count"] == 4)
+
+
+def is_free(port: int) -> bool:
+    with suppress(OSError), socket.create_server(("127.0.0.1", port)):
+        return True
+    return False
+
+
+def test_the_page_of_a_run_is_a_process_that_ends_with_it(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    port = free_port()
+    with start_page_process(f"127.0.0.1:{port}", endpoint(), "simulated", None):
+        assert f"page: http://127.0.0.1:{port}/" in capsys.readouterr().out
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
+        connection.request("GET", "/")
+        with connection.getresponse() as answer:
+            assert answer.status == 200
+    assert is_free(port)
+
+
+def test_the_server_of_somebody_else_is_not_announced_as_the_page(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other, raises_input_error(key="--web"):
+        address = f"127.0.0.1:{other.getsockname()[1]}"
+        with start_page_process(address, endpoint(), "simulated", None):
+            pass
+    assert "page:" not in capsys.readouterr().out
 
 
 def test_a_page_goes_with_a_test_in_real_time_only() -> None:

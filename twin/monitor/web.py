@@ -4,15 +4,15 @@
 """
 
 import os
+import select
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, NamedTuple, cast
 
-from table_io.clock import RealClock
 from table_io.errors import InputError
 from twin.live.control import request_command
 from twin.live.gateway import GATEWAY_NICENESS
@@ -31,7 +31,7 @@ from twin.security.credentials import (
 )
 from twin.security.page_access import PageAccess, grant_page_access, is_loopback_host
 from twin.transport.endpoint import PRED_TOPIC, split_host_port
-from twin.viewer.address import find_free_address, is_listening
+from twin.viewer.address import find_free_address
 
 PAGE_ADDRESS = "127.0.0.1:7480"
 START_TIMEOUT_S = 20.0  # of the process of a page
@@ -157,32 +157,34 @@ def announce_page(url: str) -> None:
 def start_page_process(
     web_listen: str, listen: str, rig: str, credentials: Credentials | None
 ) -> Iterator[None]:
-    """Run the page of a run in a process of its own and print its address; ends with the block."""
+    """Run the page of a run in a process of its own and print its address; ends with the block.
+
+    The address comes from the process: another server may listen where the page could not.
+    """
     address = choose_page_address(web_listen)
     keys = credentials_folder(credentials)
     request = PageRequestConfig(address, _reach_endpoint(listen), rig, keys)
     host, port = split_host_port(f"/{address}")
-    access = grant_page_access(host, port, credentials)
+    grant_page_access(host, port, credentials)  # refuses before a process starts
     command = [sys.executable, "-P", "-m", "twin.monitor.web", *request]
     process = subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
     )
     try:
-        _wait_for_server(process, address)
-        announce_page(format_page_url(address, access, credentials))
+        announce_page(_read_page_url(process))
         yield
     finally:
         process.communicate()  # closes its input
 
 
-def _wait_for_server(process: "subprocess.Popen[bytes]", address: str) -> None:
-    """Wait until the process serves its page, at most `START_TIMEOUT_S`."""
-    clock = RealClock()
-    deadline_s = clock.now() + START_TIMEOUT_S
-    while not is_listening(address):
-        if process.poll() is not None or clock.now() > deadline_s:
-            raise InputError("the page did not start", key="--web", remedy="run without it")
-        clock.wait_until(clock.now() + 0.1)
+def _read_page_url(process: "subprocess.Popen[bytes]") -> str:
+    """Return the URL that the process prints once it serves, within `START_TIMEOUT_S`."""
+    output = cast("IO[bytes]", process.stdout)
+    is_ready = bool(select.select([output], [], [], START_TIMEOUT_S)[0])
+    url = output.readline().decode().strip() if is_ready else ""
+    if not url:
+        raise InputError("the page did not start", key="--web", remedy="run without it")
+    return url
 
 
 def _reach_endpoint(listen: str) -> str:
@@ -197,7 +199,8 @@ def main() -> None:
         os.nice(GATEWAY_NICENESS)
     configure_logging("page")
     try:
-        serve_page(PageRequestConfig(*sys.argv[1:]), lambda _: None, is_orphaned)
+        request = PageRequestConfig(*sys.argv[1:])
+        serve_page(request, lambda url: print(url, flush=True), is_orphaned)
     except InputError as error:
         print(f"the page ended: {error}", file=sys.stderr)
 
