@@ -1,7 +1,9 @@
 """The page as an observer of a bus: it waits for a run, shows it, and outlives its gateway."""
 
 import http.client
+import signal
 import socket
+import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -19,6 +21,7 @@ from tests.monitor.test_page_server import PATIENCE_S, read_event
 from tests.security.laboratory import free_port
 from twin.cli.main import app
 from twin.cli.run import run_test
+from twin.monitor import web
 from twin.monitor.web import PageRequestConfig, serve_page, start_page_process
 from twin.transport.zenoh_link import BusLink
 
@@ -101,6 +104,25 @@ def test_the_server_of_somebody_else_is_not_announced_as_the_page(
         with start_page_process(address, endpoint(), "simulated", None):
             pass
     assert "page:" not in capsys.readouterr().out
+
+
+def test_a_page_that_hangs_does_not_keep_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    processes: list[subprocess.Popen[bytes]] = []
+
+    def note_process(*args: Any, **options: Any) -> "subprocess.Popen[bytes]":
+        processes.append(popen(*args, **options))
+        return processes[-1]
+
+    popen = subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", note_process)
+    monkeypatch.setattr(web, "END_TIMEOUT_S", 0.5)
+    with start_page_process(f"127.0.0.1:{free_port()}", endpoint(), "simulated", None):
+        processes[0].send_signal(signal.SIGSTOP)
+        rescue = threading.Timer(PATIENCE_S, processes[0].kill)
+        rescue.start()
+    assert rescue.is_alive()
+    rescue.cancel()
+    assert processes[0].returncode == -signal.SIGKILL
 
 
 def test_a_page_goes_with_a_test_in_real_time_only() -> None:

@@ -35,6 +35,7 @@ from twin.viewer.address import find_free_address
 
 PAGE_ADDRESS = "127.0.0.1:7480"
 START_TIMEOUT_S = 20.0  # of the process of a page
+END_TIMEOUT_S = 10.0  # of the same process
 FINAL_FRAMES_S = 1.0  # for which the last state is shown before the server ends
 
 
@@ -174,7 +175,7 @@ def start_page_process(
         announce_page(_read_page_url(process))
         yield
     finally:
-        process.communicate()  # closes its input
+        _end_process(process)
 
 
 def _read_page_url(process: "subprocess.Popen[bytes]") -> str:
@@ -185,6 +186,15 @@ def _read_page_url(process: "subprocess.Popen[bytes]") -> str:
     if not url:
         raise InputError("the page did not start", key="--web", remedy="run without it")
     return url
+
+
+def _end_process(process: "subprocess.Popen[bytes]") -> None:
+    """End the process by closing its input; kill it after `END_TIMEOUT_S`."""
+    try:
+        process.communicate(timeout=END_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.communicate()
 
 
 def _reach_endpoint(listen: str) -> str:
