@@ -1,8 +1,10 @@
 """The page as an observer of a bus: it waits for a run, shows it, and outlives its gateway."""
 
 import http.client
+import json
 import signal
 import socket
+import ssl
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
@@ -17,12 +19,13 @@ from tests.input_errors import raises_input_error
 from tests.live.test_live import endpoint
 from tests.monitor.monitored import point, records
 from tests.monitor.test_app import hub_at, publish
-from tests.monitor.test_page_server import PATIENCE_S, read_event
-from tests.security.laboratory import free_port
+from tests.monitor.test_page_server import PATIENCE_S, as_person, new_code, read_event
+from tests.security.laboratory import RIG, RUN, door, free_port, laboratory
 from twin.cli.main import app
 from twin.cli.run import run_test
 from twin.monitor import web
 from twin.monitor.web import PageRequestConfig, serve_page, start_page_process
+from twin.security.credentials import read_credentials
 from twin.transport.zenoh_link import BusLink
 
 
@@ -104,6 +107,22 @@ def test_the_server_of_somebody_else_is_not_announced_as_the_page(
         with start_page_process(address, endpoint(), "simulated", None):
             pass
     assert "page:" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "[::]"])
+def test_the_page_of_a_run_reaches_a_gateway_on_all_interfaces(
+    host: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lab, port, place = laboratory(tmp_path / "lab"), free_port(), f"tls/{host}:{free_port()}"
+    keys, code = read_credentials(lab), new_code(lab, "anna", capsys)
+    headers = {"Content-Type": "application/json", "Origin": f"https://127.0.0.1:{port}"}
+    with door(place, keys=keys), start_page_process(f"127.0.0.1:{port}", place, RIG, keys):
+        tls = ssl.create_default_context(cafile=str(lab / "ca.pem"))
+        connection = http.client.HTTPSConnection("127.0.0.1", port, context=tls)
+        body = json.dumps({"command": "hold", "run": RUN})
+        connection.request("POST", "/command", body, headers | as_person(code))
+        with connection.getresponse() as answer:
+            assert json.loads(answer.read())["message"] == "hold accepted"
 
 
 def test_a_page_that_hangs_does_not_keep_the_run(monkeypatch: pytest.MonkeyPatch) -> None:

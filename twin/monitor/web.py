@@ -4,6 +4,7 @@
 """
 
 import os
+import re
 import select
 import signal
 import subprocess
@@ -199,7 +200,7 @@ def _end_process(process: "subprocess.Popen[bytes]") -> None:
 
 def _reach_endpoint(listen: str) -> str:
     """Return the endpoint at which this computer reaches a run that listens at `listen`."""
-    return listen.replace("/0.0.0.0:", "/127.0.0.1:")
+    return re.sub(r"/(0\.0\.0\.0|\[::\]):", "/127.0.0.1:", listen)
 
 
 def main() -> None:
