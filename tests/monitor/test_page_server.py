@@ -20,7 +20,7 @@ import pytest
 from table_io.clock import local_datetime
 from tests.input_errors import raises_input_error
 from tests.security.laboratory import RIG, RUN, door, free_port, laboratory, own
-from twin.cli.credentials import issue_code, remove_person
+from twin.cli.credentials import issue_code, remove_person, renew_keys
 from twin.monitor import page_server
 from twin.monitor.page_server import (
     PAGE_FILES,
@@ -177,6 +177,29 @@ def test_nothing_else_is_served(page: Served, path: str) -> None:
 def test_a_name_that_is_not_its_own_is_refused(page: Served, host: str, path: str) -> None:
     assert page.get(path, Host=host.format(port=page.port)).status == 421
     assert page.post(b"{}", Host=host.format(port=page.port))[0] == 421
+
+
+@pytest.mark.parametrize(
+    ("host", "port", "header"),
+    [
+        ("127.0.0.1", 7480, "localhost:7480"),
+        ("127.0.0.2", 7480, "127.0.0.2:7480"),
+        ("[::1]", 7480, "[::1]:7480"),
+        ("127.0.0.1", 80, "127.0.0.1"),  # the port of the scheme is not sent
+    ],
+)
+def test_the_names_that_a_browser_sends_are_its_own(host: str, port: int, header: str) -> None:
+    assert header in grant_page_access(host, port, None).hosts
+
+
+def test_a_certificate_names_the_page_as_a_browser_does(tmp_path: Path) -> None:
+    lab = laboratory(tmp_path / "lab")
+    renew_keys(lab, None, ["Rig.lab.example"])
+    keys = read_credentials(lab)
+    assert "rig.lab.example" in grant_page_access("0.0.0.0", 443, keys).hosts
+    names = grant_page_access("0.0.0.0", 7480, keys).hosts
+    assert "rig.lab.example:7480" in names
+    assert "rig.lab.example" not in names
 
 
 def test_the_stream_has_all_sections_first_and_then_what_changed(page: Served) -> None:

@@ -16,7 +16,7 @@ import hashlib
 import hmac
 import secrets
 import ssl
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import date
 from ipaddress import ip_address
@@ -34,7 +34,8 @@ from twin.security.credentials import CERTIFICATE_FILE, Credentials, check_name,
 CODES_FILE = "codes.toml"
 CODE_BYTES = 15  # 120 bits, 24 characters
 CODE_DAYS = 90  # for which a code is valid
-LOOPBACK_HOSTS = ("127.0.0.1", "localhost", "[::1]")
+LOOPBACK_HOSTS = ("127.0.0.1", "localhost", "::1")
+HTTP_PORT, HTTPS_PORT = 80, 443
 
 
 class CodeEntry(ConfigModel):
@@ -110,7 +111,7 @@ def grant_page_access(host: str, port: int, keys: Credentials | None) -> PageAcc
         names = certificate_hosts((keys.folder / CERTIFICATE_FILE).read_bytes())
         tls = create_tls_context(keys.folder, ssl.PROTOCOL_TLS_SERVER)
         tls.verify_mode = ssl.CERT_NONE  # browsers log in with a code
-        hosts = frozenset(f"{_bracket(name)}:{port}" for name in names)
+        hosts = _host_headers(names, port, HTTPS_PORT)
         return PageAccess(hosts, tls, lambda code: identify_person(keys, code), keys.role_of)
     if not is_loopback:
         raise InputError(
@@ -120,7 +121,7 @@ def grant_page_access(host: str, port: int, keys: Credentials | None) -> PageAcc
             allowed="127.0.0.1:PORT, or any address with the rig's --keys FOLDER",
             remedy="make keys with `shaketwin keys new FOLDER --host HOST`",
         )
-    hosts = frozenset(f"{name}:{port}" for name in LOOPBACK_HOSTS)
+    hosts = _host_headers((*LOOPBACK_HOSTS, host.strip("[]")), port, HTTP_PORT)
     name = user_name(keys)
     if keys is None:
         return PageAccess(hosts, None, lambda _: name, None)
@@ -143,6 +144,12 @@ def is_loopback_host(host: str) -> bool:
         return ip_address(host.strip("[]")).is_loopback
     except ValueError:
         return False
+
+
+def _host_headers(names: Iterable[str], port: int, default_port: int) -> frozenset[str]:
+    """Return the values of the header Host for these names; browsers omit a default port."""
+    suffixes = (f":{port}", "") if port == default_port else (f":{port}",)
+    return frozenset(_bracket(name).lower() + suffix for name in names for suffix in suffixes)
 
 
 def _bracket(host: str) -> str:
