@@ -279,6 +279,18 @@ def test_headers_are_limited_in_all(page: Served) -> None:
     assert is_served(page)
 
 
+def test_a_request_writes_no_control_characters_to_the_log(
+    page: Served, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("DEBUG", "twin")
+    with socket.create_connection(("127.0.0.1", page.port), PATIENCE_S) as client:
+        client.sendall(b"GET /\x1b[2J\rforged HTTP/1.0\r\n\r\n")
+        client.recv(100)
+    assert "forged" in caplog.text
+    assert "\x1b" not in caplog.text
+    assert "\r" not in caplog.text
+
+
 def test_the_number_of_streams_and_of_connections_is_limited(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

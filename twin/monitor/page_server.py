@@ -306,8 +306,8 @@ class PageRequest(BaseHTTPRequestHandler):
         self.end_headers()
 
     def log_message(self, format: str, *args: object) -> None:
-        """Log at the level of details; an address holds no secret, a header is not logged."""
-        log.debug(format, *args)
+        """Log at the level of details, control characters escaped; an address holds no secret."""
+        log.debug("%a", format % args)
 
 
 def _parse_command(body: bytes, user: str) -> PageCommand | None:
