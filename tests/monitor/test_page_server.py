@@ -391,6 +391,19 @@ def test_codes_are_hashed_replaced_and_expire(
         issue_code(lab, "rec", "http://rig:7480")
 
 
+def test_codes_that_others_may_change_are_not_taken(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lab = laboratory(tmp_path / "lab")
+    code, keys, file = new_code(lab, "anna", capsys), read_credentials(lab), lab / "codes.toml"
+    file.chmod(0o640)
+    assert identify_person(keys, code) == "anna"
+    file.chmod(0o660)
+    assert identify_person(keys, code) == ""
+    with raises_input_error(where=file, key="mode", value="0660"):
+        issue_code(lab, "anna", "")
+
+
 @pytest.mark.parametrize("name", ["", "bob"])
 def test_no_page_beyond_this_computer_without_the_keys_of_the_rig(lab: Path, name: str) -> None:
     keys = read_credentials(own(lab, name)) if name else None

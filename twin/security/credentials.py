@@ -68,7 +68,7 @@ class AccessList(ConfigModel):
 def read_people(folder: Path) -> dict[str, str]:
     """Read the access list of a rig's folder; return role by name."""
     path = folder / ACCESS_FILE
-    _check_file_mode(path, WRITE_BY_OTHERS_MODE_BITS, "others may change it", "go-w")
+    check_file_mode(path, WRITE_BY_OTHERS_MODE_BITS, "others may change it", "go-w")
     return dict(parse_toml(read_text(path, "access list"), AccessList, str(path)).people)
 
 
@@ -141,7 +141,7 @@ def read_credentials(folder: Path) -> Credentials:
                 value=str(folder),
                 remedy="give a folder made by `shaketwin keys new` or `shaketwin keys add`",
             )
-    _check_file_mode(
+    check_file_mode(
         folder / KEY_FILE, OTHERS_MODE_BITS, "others on this machine may read it", "go-rwx"
     )
     create_tls_context(folder, ssl.PROTOCOL_TLS_CLIENT)  # the files are sound, the key matches
@@ -187,7 +187,8 @@ def read_rig_credentials(folder: Path) -> Credentials:
     return keys
 
 
-def _check_file_mode(path: Path, bits: int, reason: str, remedy: str) -> None:
+def check_file_mode(path: Path, bits: int, reason: str, remedy: str) -> None:
+    """Raise InputError with a reason if the mode of a file has one of these bits."""
     try:
         mode = path.stat().st_mode
     except OSError as error:

@@ -29,7 +29,14 @@ from table_io.clock import local_datetime
 from table_io.config.base import ConfigModel, parse_toml, read_text
 from table_io.errors import InputError
 from twin.security.access_control import NO_ROLE, user_name
-from twin.security.credentials import CERTIFICATE_FILE, Credentials, check_name, create_tls_context
+from twin.security.credentials import (
+    CERTIFICATE_FILE,
+    WRITE_BY_OTHERS_MODE_BITS,
+    Credentials,
+    check_file_mode,
+    check_name,
+    create_tls_context,
+)
 
 CODES_FILE = "codes.toml"
 CODE_BYTES = 15  # 120 bits, 24 characters
@@ -83,6 +90,7 @@ def read_codes(folder: Path) -> dict[str, CodeEntry]:
     path = folder / CODES_FILE
     if not path.exists():
         return {}
+    check_file_mode(path, WRITE_BY_OTHERS_MODE_BITS, "others may change it", "go-w")
     return parse_toml(read_text(path, "access codes"), CodeList, str(path)).codes
 
 
