@@ -44,7 +44,7 @@ class InputError(ValueError):
         if self.faults:
             lines = (line for fault in self.faults for line in str(fault).splitlines())
             message = "\n".join([f"{message}:", *(f"  {line}" for line in lines)])
-        super().__init__(message)
+        super().__init__(replace_escapes(message))
 
     def replace(self, **changes: Any) -> "InputError":
         """Return a copy with other fields."""
@@ -62,6 +62,16 @@ class InputError(ValueError):
     def add_place(self, place: object) -> "InputError":
         """Return a copy with `place` before `where`."""
         return self.replace(where=f"{place}: {self.where}" if self.where else place)
+
+
+def replace_nonprintable(line: str) -> str:
+    """Return a line with nonprintable characters replaced by ?: foreign text may hold escapes."""
+    return "".join(character if character.isprintable() else "?" for character in line)
+
+
+def replace_escapes(text: str) -> str:
+    """Return a text with the nonprintable characters of its lines replaced by ?."""
+    return "\n".join(map(replace_nonprintable, text.split("\n")))
 
 
 def suggest(name: str, known: Iterable[str]) -> str:

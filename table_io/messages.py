@@ -36,11 +36,6 @@ SEVERITY_KINDS = {
 }  # fmt: skip
 
 
-def replace_nonprintable(text: str) -> str:
-    """Return the text with nonprintable characters replaced by ?: foreign text may hold escapes."""
-    return "".join(character if character.isprintable() else "?" for character in text)
-
-
 def format_record(record: Record, rate_hz: float) -> tuple[str, str] | None:
     """Return (INFO, WARN or ERROR, text) of a record, or None for a record that is only data."""
     match record:

@@ -173,7 +173,7 @@ def test_foxglove_and_rerun_show_them(run: Path, lab: Path) -> None:
     log = open_log(run)
     for name in EXTRA:
         values = scalars(lab / "shown.rrd", f"/other/{name}")[1]
-        np.testing.assert_array_equal(values[:, 0], log[name])
+        np.testing.assert_array_equal(values[:, 0], log[name][::2])  # lines of 500 Hz
 
 
 def test_the_report_lists_their_sensors(run: Path) -> None:

@@ -1,7 +1,10 @@
 """Entry point of the program: a stop order does not wait for the imports of the command line."""
 
+import io
+import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from table_io.errors import InputError
 
@@ -11,6 +14,7 @@ DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 def main() -> None:
     """Run the program; an input error is one message on standard error and exit code 2."""
+    prepare_streams()
     try:
         was_order = send_order(sys.argv[1:])
     except InputError as error:
@@ -20,6 +24,17 @@ def main() -> None:
         from twin.cli.main import main as run_command_line
 
         run_command_line()
+
+
+def prepare_streams() -> None:
+    """Make output never fail: what an encoding lacks becomes ?, a closed stream takes all."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            sink = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115  open to the end
+            setattr(sys, name, sink)
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 def send_order(words: Sequence[str]) -> bool:

@@ -5,7 +5,7 @@ from pathlib import Path
 from rich.table import Table
 from rich.text import Text
 
-from table_io.errors import InputError
+from table_io.errors import InputError, replace_escapes
 from twin.reports.finalize import VERDICT_COLOURS
 from twin.reports.run_index import RunRow, index_runs, rows_to_json
 from twin.reports.summary import dump_strict_json
@@ -62,4 +62,4 @@ def _format(value: float | None, scale: float, digits: int = 4) -> str:
 
 def _colour(word: str) -> Text:
     is_bad = word in ("aborted", "halted", "departs", "no summary")
-    return Text(word, style=COLOURS.get(word, "red" if is_bad else ""))
+    return Text(replace_escapes(word), style=COLOURS.get(word, "red" if is_bad else ""))

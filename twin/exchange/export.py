@@ -6,14 +6,12 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from table_io.errors import InputError, format_pip_line
 from table_io.records import RunStart
 from twin.recording.run_paths import resolve_log_path
 from twin.recording.tabular import LogTable, iter_batches, read_log_table
 from twin.run.recordings import open_recording
-from twin.run.terminal import print_line
+from twin.run.terminal import error_console, print_line
 
 # File suffix by format. The Foxglove layout is a second file.
 SUFFIXES = {
@@ -81,7 +79,7 @@ def _read_rows(path: Path, channels: tuple[str, ...], steps: tuple[int, int] | N
             f"warning: {path} is unfinished or has invalid items; "
             f"`shaketwin verify {path}` lists what is missing"
         )
-        Console(stderr=True).print(warning, highlight=False, soft_wrap=True)
+        error_console.print(warning, highlight=False, soft_wrap=True)
     return rows
 
 

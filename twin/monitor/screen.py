@@ -9,7 +9,8 @@ from rich.text import Text
 
 from table_io.block import Label
 from table_io.config.excitation.stepped_sine import Sweep
-from table_io.messages import LABEL_TEXTS, replace_nonprintable
+from table_io.errors import replace_nonprintable
+from table_io.messages import LABEL_TEXTS
 from twin.monitor import curves, panels
 from twin.monitor.panels import (
     BAD_STYLE,

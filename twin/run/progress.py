@@ -5,7 +5,8 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from table_io.messages import format_record, replace_nonprintable
+from table_io.errors import replace_nonprintable
+from table_io.messages import format_record
 from table_io.records import (
     Check,
     Comparison,

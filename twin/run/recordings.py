@@ -3,11 +3,10 @@
 from dataclasses import replace
 from pathlib import Path
 
-from rich.console import Console
-
 from twin.recording.reader import Recording, read_recording
 from twin.recording.run_paths import PARTS_FOLDER, explain_unmerged_parts, resolve_log_path
 from twin.run.run_config import RunConfig, from_texts, read_model
+from twin.run.terminal import error_console
 
 
 def list_parts(log: Path) -> list[Path]:
@@ -31,7 +30,7 @@ def warn_if_damaged(recording: Recording) -> None:
             if recording.contiguous_blocks("meas")
             else 0
         )
-        Console(stderr=True).print(
+        error_console.print(
             f"warning: {recording.path} is cut off or damaged; it is readable to sample {end}; "
             f"`shaketwin verify {recording.path}` lists what is lost",
             highlight=False,

@@ -5,11 +5,15 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from typing import Any
 
 from rich.console import Console
 from rich.errors import LiveError
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
+
+from table_io.errors import replace_escapes
 
 DECAY_MESSAGE = "stopping: the table decays to rest"
 ANNOUNCE_AFTER_S = 1.5  # longer than loading from a cache
@@ -22,7 +26,15 @@ def _console_columns() -> int | None:
     return None if sys.stdout.isatty() or is_set else FILE_COLUMNS
 
 
-console = Console(width=_console_columns())
+class SafeConsole(Console):
+    """Console that replaces what a terminal would obey in text: names and titles may be foreign."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        return super().render_str(replace_escapes(text), **options)
+
+
+console = SafeConsole(width=_console_columns())
+error_console = SafeConsole(stderr=True)
 
 
 def print_line(text: str) -> None:
