@@ -3,6 +3,8 @@
 import io
 import re
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -83,6 +85,26 @@ def test_a_folder_with_content_is_refused_an_empty_one_taken(tmp_path: Path) -> 
     for folder, problem in ((tmp_path, "has content"), (Path("/dev/null/x"), "cannot write here")):
         with raises_input_error(key="--out", value=str(folder), problem=problem, remedy="give a"):
             make_output_folder(folder, "x")
+
+
+def test_two_commands_never_write_into_one_folder(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    code = f"""
+from pathlib import Path
+from twin.run.folders import make_output_folder
+make_output_folder(Path({str(out)!r}), "")
+print("mine", flush=True)
+input()
+"""
+    other = subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert other.stdout is not None
+    assert other.stdout.readline() == "mine\n"
+    with raises_input_error(key="--out", value=str(out)):
+        make_output_folder(out, "")
+    other.communicate("\n", timeout=60)
+    assert make_output_folder(out, "") == out, "the other has ended and left nothing"
 
 
 def test_only_a_long_wait_is_told(capsys: pytest.CaptureFixture[str]) -> None:

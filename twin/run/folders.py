@@ -5,6 +5,7 @@ from pathlib import Path
 
 from table_io.errors import InputError
 from twin.run.run_config import make_run_id
+from twin.run.system import lock_folder
 
 RUNS_FOLDER = Path("runs")
 
@@ -19,23 +20,30 @@ def make_run_folder(out: Path | None, name: str) -> tuple[Path, str]:
 def make_output_folder(out: Path | None, run_name: str) -> Path:
     """Create an empty folder for results: `out`, or runs/<run_name>, numbered if that exists.
 
-    InputError if `out` has content or is not writable.
+    InputError if `out` has content or is not writable, or if another command writes there: a folder
+    is locked until the process ends.
     """
     folder = RUNS_FOLDER / run_name if out is None else out
     try:
         if out is None:
             folder = _make_free_folder(folder)
-        elif out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise InputError(
-                "exists and has content; nothing recorded is ever overwritten",
-                key="--out",
-                value=str(out),
-                remedy="give a new folder",
-            )
-        folder.mkdir(parents=True, exist_ok=True)
+        elif out.exists() and not out.is_dir():
+            raise _make_content_error(out)
+        else:
+            folder.mkdir(parents=True, exist_ok=True)
+            lock_folder(folder)
+            if any(folder.iterdir()):
+                raise _make_content_error(folder)
         probe = folder / ".probe"
         probe.touch()
         probe.unlink()
+    except BlockingIOError:
+        raise InputError(
+            "another command is writing there",
+            key="--out",
+            value=str(folder),
+            remedy="give another folder",
+        ) from None
     except OSError as error:
         raise InputError(
             f"cannot write here: {error.strerror}",
@@ -44,6 +52,15 @@ def make_output_folder(out: Path | None, run_name: str) -> Path:
             remedy="give a folder on a disk that you may write to",
         ) from None
     return folder
+
+
+def _make_content_error(folder: Path) -> InputError:
+    return InputError(
+        "exists and has content; nothing recorded is ever overwritten",
+        key="--out",
+        value=str(folder),
+        remedy="give a new folder",
+    )
 
 
 def _make_free_folder(folder: Path) -> Path:

@@ -27,6 +27,23 @@ def lock_file(file: TextIO, exclusive: bool = False) -> None:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB if exclusive else fcntl.LOCK_SH)
 
 
+_locked_folders: dict[Path, int] = {}  # their descriptors, open until this process ends
+
+
+def lock_folder(folder: Path) -> None:
+    """Lock a folder until this process ends; BlockingIOError if another process has locked it."""
+    path = folder.resolve()
+    if not HAS_FILE_LOCKS or path in _locked_folders:
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        raise
+    _locked_folders[path] = descriptor
+
+
 def count_cores() -> int:
     """Return the number of cores that this process may use."""
     if sys.platform == "linux":
