@@ -2,6 +2,7 @@
 
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import time
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from table_io.records import Event
+from table_io.records import Event, RunStop
 from tests.live.test_live import (
     QUICK,
     assert_at_rest,
@@ -65,6 +66,28 @@ def test_a_disk_that_has_room_again_loses_nothing_but_the_table_rests(tmp_path: 
     assert_at_rest(recording)
     assert summary["verdict"] == "stopped"
     assert [event.kind for event in recording.records(Event)].count("disk") == 2
+    assert "identical to the bit" in replay_run(tmp_path).stdout
+
+
+@pytest.mark.parametrize("loss", ["deleted", "moved"])
+def test_a_folder_that_is_taken_away_loses_nothing_but_the_table_rests(
+    tmp_path: Path, loss: str
+) -> None:
+    process = start(tmp_path)
+    running(process)
+    if loss == "deleted":
+        shutil.rmtree(tmp_path / "out")
+    else:
+        (tmp_path / "out").rename(tmp_path / "elsewhere")
+    code, output, recording, summary = finish(process, tmp_path)
+    assert code == 3, output
+    assert_whole(recording)
+    assert_at_rest(recording)
+    assert summary["verdict"] == "stopped"
+    assert "Traceback" not in output
+    stop = recording.records(RunStop)[0].index / recording.start.rate_hz
+    (lost,) = (event.index for event in recording.records(Event) if event.kind == "disk")
+    assert lost / recording.start.rate_hz < stop
     assert "identical to the bit" in replay_run(tmp_path).stdout
 
 

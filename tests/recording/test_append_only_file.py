@@ -53,6 +53,45 @@ def test_what_does_not_fit_waits_and_is_written_once(tmp_path: Path, limit: Limi
     assert (tmp_path / "a").read_bytes() == expected
 
 
+@pytest.mark.parametrize("loss", ["file deleted", "folder deleted", "folder moved"])
+def test_a_recording_that_is_taken_away_is_written_again(tmp_path: Path, loss: str) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    path = folder / "a"
+    file = AppendOnlyFile(path)
+    file.write(b"before ")
+    file.drain()
+    assert not file.restore()
+    if loss == "folder moved":
+        folder.rename(tmp_path / "elsewhere")
+    else:
+        path.unlink()
+    if loss == "folder deleted":
+        folder.rmdir()
+    assert file.restore()
+    file.write(b"after")
+    file.drain()
+    assert path.read_bytes() == b"before after"
+    assert not file.restore()
+    path.unlink()
+    file.close()
+    assert path.read_bytes() == b"before after"
+
+
+def test_another_file_in_its_place_is_never_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    file = AppendOnlyFile(path)
+    file.write(b"recorded")
+    path.unlink()
+    path.write_bytes(b"of another")
+    with pytest.raises(OSError, match="File exists"):
+        file.close()
+    assert path.read_bytes() == b"of another"
+    path.unlink()
+    file.close()
+    assert path.read_bytes() == b"recorded"
+
+
 @pytest.mark.parametrize("room", [0, 500, 2_000, 9_000, 13_777, 20_000])
 def test_a_log_goes_on_where_the_disk_was_full(tmp_path: Path, limit: Limit, room: int) -> None:
     write(tmp_path / "whole.mcap", run(), flush_every=3)

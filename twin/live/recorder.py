@@ -173,6 +173,12 @@ class Recorder:
                 "the rest is kept if there is room soon"
             )
 
+    def _stop_after_loss(self) -> None:
+        """Request a stop of the table: what deleted or moved the recording may do so again."""
+        folder = self.writer.path.parent.parent
+        self.stop_reason = f"the recording in {folder} was deleted or moved, and is written again"
+        self._publish_event(f"{self.stop_reason}: the table is stopped; nothing is lost")
+
     def _report(self) -> None:
         """Publish Timing, check disk space, and repeat a stop request until it is accepted."""
         if not self.completion.has_started or self.completion.end is not None:
@@ -184,6 +190,9 @@ class Recorder:
             self.stop_accepted = self.link.send_command("stop", text, timeout_s=0.5) == "yes"
         elif not self.stop_reason:
             try:
+                if self.writer.restore():
+                    self._stop_after_loss()
+                    return
                 free = free_bytes(self.writer.path.parent)
             except OSError as error:
                 self._handle_disk_error(error)

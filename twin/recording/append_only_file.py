@@ -1,6 +1,7 @@
 """Append-only file: always a clean prefix of the data written, also when the disk fails."""
 
 import os
+import shutil
 from pathlib import Path
 
 from table_io.errors import InputError
@@ -55,6 +56,31 @@ class AppendOnlyFile:
         except OSError as error:
             raise self._with_path(error) from None
 
+    def restore(self) -> bool:
+        """Write the file again where it, or its folder, was deleted or moved; True if it was.
+
+        The open file still holds all data; the descriptor then is that of the new file. OSError if
+        the new file cannot be written, or if another file has taken the place.
+        """
+        opened = os.fstat(self._descriptor)
+        try:
+            if os.path.samestat(opened, self.path.stat()):
+                return False
+        except FileNotFoundError:
+            pass
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with (
+                Path(f"/proc/self/fd/{self._descriptor}").open("rb") as lost,
+                self.path.open("xb") as new,
+            ):
+                shutil.copyfileobj(lost, new, WRITE_CHUNK_BYTES)
+                new.flush()
+                os.dup2(new.fileno(), self._descriptor, inheritable=False)
+        except OSError as error:
+            raise self._with_path(error) from None
+        return True
+
     def sync(self) -> None:
         """Wait until drained data are on the disk (fsync)."""
         try:
@@ -63,9 +89,13 @@ class AppendOnlyFile:
             raise self._with_path(error) from None
 
     def close(self) -> None:
-        """Drain and close; may be called again, also after an OSError."""
+        """Drain and close; may be called again, also after an OSError.
+
+        A file that was deleted or moved is written again.
+        """
         self.drain()
         if self._descriptor >= 0:
+            self.restore()
             os.close(self._descriptor)
             self._descriptor = -1
 

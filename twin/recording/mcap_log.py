@@ -116,6 +116,10 @@ class LogWriter:
         self._writer.flush()
         self._file.drain()
 
+    def restore(self) -> bool:
+        """Write the file again if it was deleted or moved; return whether it was."""
+        return self._file.restore()
+
     def sync(self) -> None:
         """Wait until flushed data are on the disk, so that they survive a power failure."""
         self._file.sync()
