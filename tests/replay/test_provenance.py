@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from table_io.records import Comparison, Event
+from table_io.records import Comparison, Event, Fault, Timing
 from tests.replay.in_memory import recorded_in
 from twin.cli.replay import ReplayRequest, replay_logs
 from twin.cli.verify import examine_logs, verify_logs
@@ -138,6 +138,28 @@ def test_where_none_was_recorded_nothing_differs(
     output = " ".join(capsys.readouterr().out.split())
     assert f"no comparisons were recorded; {made} are made" in output
     assert report["identical"] is None
+
+
+@pytest.mark.parametrize("is_faulted", [True, False])
+def test_what_died_with_the_twin_is_no_difference(
+    recording: Recording, tmp_path: Path, report: dict[str, Any], is_faulted: bool
+) -> None:
+    """Twin and recorder, or twin and supervisor, killed at once: its last results are lost."""
+    comparisons, stop = recording.records(Comparison), recording.stop
+    assert stop is not None
+    lost = comparisons[290:]
+    made_count = 10 if is_faulted else len(lost)
+    sign = (
+        Fault(stop.index, "twin", comparisons[300].index, stop.index, "it died")
+        if is_faulted
+        else Timing(comparisons[280].index, "twin", 1.0, 1.0, 1.0, 0, 10, 0.1, "")
+    )
+    items = [item for item in recording.items if not any(item is gone for gone in lost)]
+    end = items.index(stop)
+    write_items(tmp_path / "a.mcap", [*items[:end], sign, *items[end:]], recording.start)
+    assert replay_logs(ReplayRequest([tmp_path / "a.mcap"], [], tmp_path / "one")) == 0
+    counts = [report[name] for name in ("identical", "unrecorded", "lost_with_twin")]
+    assert counts == [True, 0, made_count]
 
 
 def test_one_that_differs_is_told_alone_and_among_many(

@@ -159,6 +159,7 @@ def describe_replay(
         "differing": identity.differing,
         "missing": identity.missing,
         "unrecorded": identity.unrecorded,
+        "lost_with_twin": identity.lost_with_twin,
         "first_difference_index": identity.first_difference,
         "largest_difference_of_error_sums": identity.largest,
         "relative_difference": compute_deviation(recording.path, log) if identity.differing else {},
@@ -175,7 +176,9 @@ def describe_replay(
 def format_identity(identity: ReplayComparison, comparison: summaries.Json) -> str:
     """Format in one line whether a replay is identical, or the differences and their cause."""
     if identity.is_identical:
-        return f"{identity.compared} comparisons, identical to the bit"
+        lost = identity.lost_with_twin
+        suffix = f"; {lost} more died with the twin before they were recorded" if lost else ""
+        return f"{identity.compared} comparisons, identical to the bit{suffix}"
     if not identity.recorded:
         return f"no comparisons were recorded; {identity.made} are made"
     parts = [f"its beginning is in {identity.beginning}"] if identity.beginning else []

@@ -2,7 +2,8 @@
 
 import heapq
 import math
-from collections.abc import Iterable, Iterator
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
@@ -37,6 +38,7 @@ from twin.run.unpaced import ItemHandler, record_items
 from twin.transport.codec import RECORD_TOPICS, TOPIC_TYPES, Item, WireError, decode_item, strip_run
 from twin.transport.endpoint import CMP_TOPIC, PRED_TOPIC
 
+TIMING_TOPIC = RECORD_TOPICS[Timing]
 MAX_COMPARISON_SAMPLES = 10_000  # covered by one comparison
 BLOCK_DURATION_S = 1.0  # offline; results do not depend on the block size
 STAMPED_AT_END = (
@@ -54,25 +56,40 @@ TWIN_TOPICS = {PRED_TOPIC, *(RECORD_TOPICS[kind] for kind in (Comparison, *STAMP
 class RecordedRun:
     """Recording to replay, and its encoded comparisons by sample index.
 
-    Comparisons stay encoded: a replay reproduces them and compares their bytes.
+    Comparisons stay encoded: a replay reproduces them and compares their bytes. `twin_died`: the
+    twin of a live run did not report the end of the run.
     """
 
     recording: Recording
     comparisons: dict[int, bytes]
+    twin_died: bool = False
 
     @classmethod
     def open(cls, path: Path) -> "RecordedRun":
         """Read from a log what a replay needs."""
-        recovered = recover_log(path, frozenset(TOPIC_TYPES.keys() - TWIN_TOPICS | {CMP_TOPIC}))
-        compared = [message for message in recovered.messages if message.topic == CMP_TOPIC]
+        own_topics = {CMP_TOPIC, TIMING_TOPIC}
+        recovered = recover_log(path, frozenset(TOPIC_TYPES.keys() - TWIN_TOPICS | own_topics))
+        own = [message for message in recovered.messages if message.topic in own_topics]
         recovered.messages = [
-            message for message in recovered.messages if message.topic != CMP_TOPIC
+            message for message in recovered.messages if message.topic not in own_topics
         ]
         recording = build_recording(path, recovered)[0]
-        rate = recording.start.rate_hz
+        rate, stop = recording.start.rate_hz, recording.stop
+        timing_ends = [
+            item.index
+            for message in own
+            if message.topic == TIMING_TOPIC
+            and isinstance(item := _decode(TIMING_TOPIC, message.payload), Timing)
+            and item.component == "twin"
+        ]
         return cls(
             recording,
-            {round(message.log_time * rate / 1e9): message.payload for message in compared},
+            {
+                round(message.log_time * rate / 1e9): message.payload
+                for message in own
+                if message.topic == CMP_TOPIC
+            },
+            twin_died=bool(timing_ends) and stop is not None and max(timing_ends) < stop.index,
         )
 
     @property
@@ -147,6 +164,7 @@ class ReplayComparison:
     differing: int = 0
     missing: int = 0  # recorded, but not made by the replay
     unrecorded: int = 0  # made by the replay, but missing in a finished recording
+    lost_with_twin: int = 0  # the same, where a twin had died before it was recorded
     made: int = 0
     beginning: str = ""  # run with the samples before the recording, see `find_earlier_run`
     first_difference: int | None = None  # sample index
@@ -186,15 +204,43 @@ def replay_recording(
     result.recorded = sum(span.contains_comparison(entry) for entry in recorded.comparisons.items())
     block_samples = block_samples or round(BLOCK_DURATION_S * recording.start.rate_hz)
 
-    compare = partial(_compare_item, result, recorded, run)
+    unrecorded: list[int] = []
+    compare = partial(_compare_item, result, recorded, run, unrecorded)
     items = replay_items(recording, config, run, span, block_samples)
     record_items(items, path, run, recording.start.rate_hz, on_item, compare)
     result.missing = result.recorded - result.compared
+    result.lost_with_twin = _count_lost_with_twin(recorded, unrecorded)
+    result.unrecorded = len(unrecorded) - result.lost_with_twin
     return result
 
 
+def _count_lost_with_twin(recorded: RecordedRun, unrecorded: Sequence[int]) -> int:
+    """Return how many unrecorded comparisons a twin made last before it died.
+
+    They lie directly before a Fault of the twin, or after the last recorded one of a twin that did
+    not report the end of the run.
+    """
+    known = sorted(recorded.comparisons)
+    deaths = sorted(
+        fault.from_index for fault in recorded.recording.records(Fault) if fault.component == "twin"
+    )
+    if recorded.twin_died:
+        deaths.append(2**62)
+    count = 0
+    for index in unrecorded:
+        following = bisect_right(known, index)
+        next_known = known[following] if following < len(known) else 2**62
+        count += any(index < death <= next_known for death in deaths)
+    return count
+
+
 def _compare_item(
-    result: ReplayComparison, recorded: RecordedRun, run: str, new: Item, payload: bytes
+    result: ReplayComparison,
+    recorded: RecordedRun,
+    run: str,
+    unrecorded: list[int],
+    new: Item,
+    payload: bytes,
 ) -> None:
     """Update `result` with an item of the replay and its payload, if it is a comparison."""
     if not isinstance(new, Comparison):
@@ -202,8 +248,8 @@ def _compare_item(
     result.made += 1
     old = recorded.comparisons.get(new.index)
     if old is None:
-        # an unfinished recording may lack its last comparisons
-        result.unrecorded += recorded.recording.stop is not None
+        if recorded.recording.stop is not None:  # else the last comparisons may be missing
+            unrecorded.append(new.index)
         return
     result.compared += 1
     if strip_run(old, Comparison, recorded.recording.run) == strip_run(payload, Comparison, run):
@@ -223,11 +269,15 @@ def _compare_item(
 
 def _decode_comparison(payload: bytes) -> Comparison | None:
     """Decode a recorded comparison; return None if it is damaged."""
+    item = _decode(CMP_TOPIC, payload)
+    return item if isinstance(item, Comparison) else None
+
+
+def _decode(topic: str, payload: bytes) -> Item | None:
     try:
-        item = decode_item(CMP_TOPIC, payload)[1]
+        return decode_item(topic, payload)[1]
     except WireError:
         return None
-    return item if isinstance(item, Comparison) else None
 
 
 def replay_items(

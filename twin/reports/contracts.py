@@ -359,6 +359,9 @@ class ReplayResult(Contract):
     differing: int = Field(description="comparisons that differ")
     missing: int = Field(description="recorded, but not made by the replay")
     unrecorded: int = Field(description="made by the replay, but not recorded")
+    lost_with_twin: int = Field(
+        0, description="made by the replay, not recorded because the twin died"
+    )
     first_difference_index: Index | None = Field(description="first sample that differs")
     largest_difference_of_error_sums: dict[str, SI] = Field(description="by channel, SI squared")
     relative_difference: dict[str, Ratio] = Field(
