@@ -82,13 +82,18 @@ def running(process: subprocess.Popen[str]) -> None:
 
 def kill(process: subprocess.Popen[str], component: str) -> None:
     """kill -9 of one process of the run."""
+    os.kill(find_component(process, component), signal.SIGKILL)
+
+
+def find_component(process: subprocess.Popen[str], component: str) -> int:
+    """Process id of a component of the run."""
     ours = subprocess.run(
         ["pgrep", "-P", str(process.pid), "-f", f"processes {component}"],
         capture_output=True,
         text=True,
         check=True,
     )
-    os.kill(int(ours.stdout.split()[0]), signal.SIGKILL)
+    return int(ours.stdout.split()[0])
 
 
 def finish(process: subprocess.Popen[str], folder: Path) -> tuple[int, str, Recording, dict]:
@@ -249,6 +254,29 @@ def test_a_dead_supervisor_leaves_a_table_at_rest_and_a_readable_recording(
     recording = read_recording(tmp_path / "out" / "run.mcap")
     assert_whole(recording)
     assert_at_rest(recording)
+
+
+@pytest.mark.slow  # 25 s each
+@pytest.mark.parametrize("other", ["recorder", "supervisor"])
+def test_two_that_die_at_once_leave_a_recording_that_replays(tmp_path: Path, other: str) -> None:
+    with start(tmp_path) as process:
+        running(process)
+        twin = find_component(process, "twin")
+        second = process.pid if other == "supervisor" else find_component(process, other)
+        for number in (twin, second):
+            os.kill(number, signal.SIGKILL)
+        process.communicate()
+    until = time.monotonic() + 30
+    while time.monotonic() < until and pids(tmp_path):
+        time.sleep(0.2)
+    if other == "supervisor":
+        assert call_main("report", tmp_path / "out").returncode == 0
+    recording = read_recording(tmp_path / "out" / "run.mcap")
+    assert_whole(recording)
+    assert_at_rest(recording)
+    replay_run(tmp_path)
+    report = json.loads((tmp_path / "again" / "summary.json").read_text())["replay"]
+    assert (report["identical"], report["unrecorded"]) == (True, 0)
 
 
 def pids(folder: Path) -> list[str]:
