@@ -1,5 +1,6 @@
 """Orders to a running test: what is sent without the command line, and what it parses."""
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -42,7 +43,7 @@ def test_an_order_to_nobody_is_an_input_error(
 ) -> None:
     monkeypatch.setattr("sys.argv", ["shaketwin", "control", "stop", "--connect", "udp/x"])
     with pytest.raises(SystemExit, match="2"):
-        entry.main()
+        entry.run_words(sys.argv[1:])
     assert "udp/x" in capsys.readouterr().err
 
 
@@ -55,7 +56,7 @@ def test_whatever_fails_an_order_to_a_moving_table_names_the_way_out(
     monkeypatch.setattr("sys.argv", ["shaketwin", "control", "stop"])
     monkeypatch.setattr(control, "request_command", fail)
     with pytest.raises(SystemExit, match="2"):
-        entry.main()
+        entry.run_words(sys.argv[1:])
     error = capsys.readouterr().err
     assert "session closed" in error
     assert "emergency stop" in error

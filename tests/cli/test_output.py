@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -26,6 +27,27 @@ def test_closed_streams_end_nothing(tmp_path: Path) -> None:
     line = f"exec {PROGRAM[0]} -c '{PROGRAM[2]}' new test {tmp_path / 'new.toml'} >&- 2>&-"
     subprocess.run(line, shell=True, check=True, timeout=120)
     assert (tmp_path / "new.toml").stat().st_size > 100
+
+
+def test_a_reader_that_leaves_ends_nothing(tmp_path: Path) -> None:
+    """As `shaketwin ... | true`: the command goes on to its end."""
+    line = f"({PROGRAM[0]} -c '{PROGRAM[2]}' simulate demo --out out; echo $? > code) | true"
+    subprocess.run(line, shell=True, check=True, timeout=120, cwd=tmp_path)
+    until = time.monotonic() + 60
+    while time.monotonic() < until and not (tmp_path / "code").is_file():
+        time.sleep(0.1)
+    assert (tmp_path / "code").read_text() == "0\n"
+    assert (tmp_path / "out" / "report.html").is_file()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+def test_output_that_is_lost_is_an_error_of_its_own() -> None:
+    with Path("/dev/full").open("w") as full:
+        words = [*PROGRAM, "list", "effects"]
+        ended = subprocess.run(words, stdout=full, stderr=-1, check=False, timeout=120)
+    assert ended.returncode == 2
+    assert b"No space left" in ended.stderr
+    assert b"Traceback" not in ended.stderr
 
 
 @pytest.mark.parametrize("words", [("check",), ("simulate", "--gap", "4", "--out", "out")])

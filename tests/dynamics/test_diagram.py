@@ -17,6 +17,7 @@ from tests.dynamics.random_models import (
 )
 from tests.input_errors import raises_input_error
 from tests.model.reference import AG, snm
+from twin.dynamics import diagram as diagram_module
 from twin.dynamics.bifurcations import BifurcationKind
 from twin.dynamics.diagram import (
     Diagram,
@@ -127,6 +128,19 @@ def test_a_model_with_friction_has_a_diagram():
     assert [orbit.stable for orbit in orbits] == [True, False, True]
     for orbit in orbits:
         assert independent_return_error(orbit) < 1e-4
+
+
+def test_random_starts_find_what_lies_between_the_values(monkeypatch):
+    """A model with narrow isolas, at a few values of the frequency only."""
+    case = draw_case(55)
+
+    def count_branches():
+        diagram = compute_diagram(case.model, case.limits, case.level, values=6, starts=8, seed=1)
+        return len(diagram.branches)
+
+    confirmed = count_branches()
+    monkeypatch.setattr(diagram_module, "CONFIRMING_SHARE", 1000)
+    assert count_branches() < confirmed
 
 
 @pytest.mark.parametrize("seed", FAST_SEEDS)

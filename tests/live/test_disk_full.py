@@ -86,7 +86,7 @@ def test_a_folder_that_is_taken_away_loses_nothing_but_the_table_rests(
     assert summary["verdict"] == "stopped"
     assert "Traceback" not in output
     stop = recording.records(RunStop)[0].index / recording.start.rate_hz
-    (lost,) = (event.index for event in recording.records(Event) if event.kind == "disk")
+    lost, _restored = (event.index for event in recording.records(Event) if event.kind == "disk")
     assert lost / recording.start.rate_hz < stop
     assert "identical to the bit" in replay_run(tmp_path).stdout
 

@@ -61,35 +61,71 @@ def test_a_recording_that_is_taken_away_is_written_again(tmp_path: Path, loss: s
     file = AppendOnlyFile(path)
     file.write(b"before ")
     file.drain()
-    assert not file.restore()
+    assert not file.is_lost
     if loss == "folder moved":
         folder.rename(tmp_path / "elsewhere")
     else:
         path.unlink()
     if loss == "folder deleted":
         folder.rmdir()
+    assert file.is_lost
     assert file.restore()
     file.write(b"after")
     file.drain()
     assert path.read_bytes() == b"before after"
-    assert not file.restore()
+    assert not file.is_lost
     path.unlink()
     file.close()
     assert path.read_bytes() == b"before after"
 
 
-def test_another_file_in_its_place_is_never_overwritten(tmp_path: Path) -> None:
+def test_a_lost_file_grows_while_it_is_written_again(tmp_path: Path) -> None:
     path = tmp_path / "a"
     file = AppendOnlyFile(path)
+    expected = random.Random(1).randbytes(10_000)
+    file.write(expected)
+    file.drain()
+    path.unlink()
+    calls = 0
+    while not file.restore(max_bytes=3000):
+        calls += 1
+        file.write(b"more")
+        file.drain()
+        expected += b"more"
+        assert file.is_lost
+    assert calls == 3
+    assert path.read_bytes() == expected
+    assert not file.is_lost
+
+
+def test_a_lost_file_waits_for_room(tmp_path: Path, limit: Limit) -> None:
+    path, expected = tmp_path / "a", random.Random(1).randbytes(3_000_000)
+    file = AppendOnlyFile(path)
+    file.write(expected)
+    file.drain()
+    path.unlink()
+    limit(2_000_000)
+    for _ in range(2):
+        with pytest.raises(OSError, match="File too large"):
+            file.close()
+        assert not path.exists()
+    limit(-1)
+    file.close()
+    assert path.read_bytes() == expected
+
+
+def test_another_file_in_its_place_is_never_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "part-001.mcap"
+    file = AppendOnlyFile(path)
     file.write(b"recorded")
+    file.drain()
     path.unlink()
     path.write_bytes(b"of another")
-    with pytest.raises(OSError, match="File exists"):
-        file.close()
-    assert path.read_bytes() == b"of another"
-    path.unlink()
+    assert file.is_lost
     file.close()
-    assert path.read_bytes() == b"recorded"
+    assert path.read_bytes() == b"of another"
+    assert file.path == tmp_path / "part-001-2.mcap"
+    assert file.path.read_bytes() == b"recorded"
 
 
 @pytest.mark.parametrize("room", [0, 500, 2_000, 9_000, 13_777, 20_000])

@@ -149,17 +149,39 @@ def test_what_died_with_the_twin_is_no_difference(
     assert stop is not None
     lost = comparisons[290:]
     made_count = 10 if is_faulted else len(lost)
-    sign = (
+    mark = (
         Fault(stop.index, "twin", comparisons[300].index, stop.index, "it died")
         if is_faulted
         else Timing(comparisons[280].index, "twin", 1.0, 1.0, 1.0, 0, 10, 0.1, "")
     )
-    items = [item for item in recording.items if not any(item is gone for gone in lost)]
+    items = [item for item in recording.items if not any(item is missed for missed in lost)]
     end = items.index(stop)
-    write_items(tmp_path / "a.mcap", [*items[:end], sign, *items[end:]], recording.start)
+    write_items(tmp_path / "a.mcap", [*items[:end], mark, *items[end:]], recording.start)
     assert replay_logs(ReplayRequest([tmp_path / "a.mcap"], [], tmp_path / "one")) == 0
     counts = [report[name] for name in ("identical", "unrecorded", "lost_with_twin")]
     assert counts == [True, 0, made_count]
+
+
+@pytest.mark.parametrize("marked", ["fault", "timing"])
+def test_what_a_living_twin_made_is_missed(
+    recording: Recording, tmp_path: Path, report: dict[str, Any], marked: str
+) -> None:
+    """Comparisons long before its death, or while it reported latencies, are not excused."""
+    comparisons, stop = recording.records(Comparison), recording.stop
+    assert stop is not None
+    end = stop.index
+    marks: dict[str, Item] = {
+        "fault": Fault(end, "twin", comparisons[-1].index, end, "it died"),
+        "timing": Timing(end - 1, "twin", 1.0, 1.0, 1.0, 0, 10, 0.1, ""),
+    }
+    items = [i for i in recording.items if not any(i is missed for missed in comparisons[200:])]
+    place = items.index(stop)
+    write_items(
+        tmp_path / "a.mcap", [*items[:place], marks[marked], *items[place:]], recording.start
+    )
+    asked = ReplayRequest([tmp_path / "a.mcap"], [], tmp_path / "one")
+    assert replay_logs(asked) == EXIT_NOT_IDENTICAL
+    assert report["unrecorded"] > 300
 
 
 def test_one_that_differs_is_told_alone_and_among_many(

@@ -14,9 +14,23 @@ DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 def main() -> None:
     """Run the program; an input error is one message on standard error and exit code 2."""
-    prepare_streams()
+    streams = prepare_streams()
+    code: str | int | None = 0
     try:
-        was_order = send_order(sys.argv[1:])
+        run_words(sys.argv[1:])
+    except SystemExit as end:
+        code = end.code
+    failures = [stream.failure for stream in streams if stream.failure]
+    if failures and not code:
+        print(f"shaketwin: cannot write the output: {failures[0]}", file=sys.stderr)
+        code = 2
+    raise SystemExit(code)
+
+
+def run_words(words: Sequence[str]) -> None:
+    """Run a command line."""
+    try:
+        was_order = send_order(words)
     except InputError as error:
         print(f"shaketwin: {error}", file=sys.stderr)
         raise SystemExit(2) from None
@@ -26,15 +40,51 @@ def main() -> None:
         run_command_line()
 
 
-def prepare_streams() -> None:
-    """Make output never fail: what an encoding lacks becomes ?, a closed stream takes all."""
+class SteadyOutput(io.TextIOWrapper):
+    """Output that never ends a command: a test goes on without readers, or on a full disk.
+
+    What the encoding lacks becomes ?. `failure` is the first error; a reader who leaves is none.
+    """
+
+    failure = ""
+
+    def write(self, text: str) -> int:
+        try:
+            return super().write(text)
+        except OSError as error:
+            self._discard_from_now(error)
+            return len(text)
+
+    def flush(self) -> None:
+        try:
+            super().flush()
+        except OSError as error:
+            self._discard_from_now(error)
+
+    def _discard_from_now(self, error: OSError) -> None:
+        if not isinstance(error, BrokenPipeError):
+            self.failure = self.failure or str(error.strerror)
+        devnull = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(devnull, self.fileno())
+        os.close(devnull)
+
+
+def prepare_streams() -> list[SteadyOutput]:
+    """Make standard output and error steady; a closed one takes all and shows nothing."""
+    streams = []
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
             sink = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115  open to the end
             setattr(sys, name, sink)
         elif isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
+            is_direct, encoding = stream.line_buffering, stream.encoding
+            steady = SteadyOutput(
+                stream.detach(), encoding, errors="replace", line_buffering=is_direct
+            )
+            setattr(sys, name, steady)
+            streams.append(steady)
+    return streams
 
 
 def send_order(words: Sequence[str]) -> bool:

@@ -179,17 +179,25 @@ class _Search:
         self._confirm(values * self._starts // CONFIRMING_SHARE)
 
     def _confirm(self, starts_in_a_row: int) -> None:
-        """Try random starts at random values until so many in a row lead to no new branch."""
+        """Try random starts at random values until so many in a row settle to known orbits.
+
+        Starts that settle to no orbit do not count.
+        """
+        is_logarithmic = self._parameter == FREQUENCY
+        limits = np.log(self._limits) if is_logarithmic else self._limits
         confirmed = 0
         for _ in range(MAX_CONFIRMATION * starts_in_a_row):
-            value = self._random.uniform(*self._limits)
+            drawn = self._random.uniform(*limits)
+            value = float(np.exp(drawn) if is_logarithmic else drawn)
             period_map, frequency_hz, level = self._problem.at([value])
             start = draw_start(period_map, frequency_hz, level, self._random)
             motion = settle(period_map, frequency_hz, level, start)
-            branch_count = len(self.branches)
             if motion.orbit is not None:
-                self.add_orbit(motion.orbit)
-            confirmed = confirmed + 1 if len(self.branches) == branch_count else 0
+                confirmed = 0 if self.add_orbit(motion.orbit) else confirmed + 1
+            elif motion.is_chaotic:
+                self._exponents[value] = motion.exponent
+            elif math.isfinite(motion.x[0]):
+                self.irregular.add(value)
             if confirmed >= starts_in_a_row:
                 return
 
@@ -221,10 +229,13 @@ class _Search:
             self._exponents[value] = exponent
             carried = ends[:MAX_PERIODS]
 
-    def add_orbit(self, orbit: Orbit) -> None:
-        """Continue an orbit that lies on no known branch, and all that leaves its branch."""
+    def add_orbit(self, orbit: Orbit) -> bool:
+        """Continue an orbit that lies on no known branch, and all that leaves its branch.
+
+        Return whether it was such an orbit.
+        """
         if any(lies_on(orbit, branch) for branch in self.branches):
-            return
+            return False
         branch = cut_repetition(
             continue_branch(
                 orbit, self._parameter, self._limits, max_points=MAX_BRANCH_POINTS // orbit.periods
@@ -238,6 +249,7 @@ class _Search:
         mirrored = mirror_orbit(orbit)
         if mirrored is not None:
             self.add_orbit(mirrored)
+        return True
 
     def _add_branch(self, branch: Branch) -> None:
         """Add a branch and, nearest first, what leaves it, up to `MAX_SWITCHES` in all."""

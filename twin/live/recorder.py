@@ -33,6 +33,7 @@ RECORDER_NICENESS = -10  # ahead of other programs, behind the rig and the twin
 FLUSH_INTERVAL_S = 0.15  # so that a crash loses at most 0.25 s, on a busy computer too
 SYNC_INTERVAL_S = 5.0
 REPORT_INTERVAL_S = 1.0  # between checks of free disk space, and between Timing records
+RESTORE_BYTES = 32 * 2**20  # of a lost file, between two messages
 MAX_CLOSE_TRIES = 20  # to close the file on a failing disk, one every CLOSE_RETRY_S
 CLOSE_RETRY_S = 0.25
 
@@ -92,6 +93,7 @@ class Recorder:
     disk_error: str = ""
     stop_reason: str = ""
     stop_accepted: bool = False
+    is_restoring: bool = False  # the file was deleted or moved, and is written again
     sync_failed: bool = False  # data written since the last good sync may be lost
     busy_s: float = 0.0  # since the last measured block
     impossible_count: int = 0  # payloads whose sample index is out of range
@@ -109,6 +111,8 @@ class Recorder:
                 self.completion.end is not None or is_orphaned()
             ):
                 break
+            if self.is_restoring:
+                self._restore()
             if time_s - flushed_s > FLUSH_INTERVAL_S:
                 self._flush(sync=time_s - synced_s > self.sync_interval_s)
                 synced_s = time_s if time_s - synced_s > self.sync_interval_s else synced_s
@@ -148,7 +152,7 @@ class Recorder:
         except OSError as error:
             self._handle_disk_error(error)
         else:
-            if self.disk_error and not self.sync_failed:
+            if self.disk_error and not self.sync_failed and not self.is_restoring:
                 self._publish_event("the disk takes the recording again; what waited is written")
                 self.disk_error = ""
 
@@ -175,9 +179,19 @@ class Recorder:
 
     def _stop_after_loss(self) -> None:
         """Request a stop of the table: what deleted or moved the recording may do so again."""
-        folder = self.writer.path.parent.parent
-        self.stop_reason = f"the recording in {folder} was deleted or moved, and is written again"
-        self._publish_event(f"{self.stop_reason}: the table is stopped; nothing is lost")
+        self.is_restoring = True
+        self.stop_reason = f"the recording in {self.writer.path.parent.parent} was deleted or moved"
+        self._publish_event(f"{self.stop_reason}: the table is stopped, the file written again")
+
+    def _restore(self) -> None:
+        """Write on at a lost file: a part at a time, so that the run is recorded meanwhile."""
+        try:
+            self.is_restoring = not self.writer.restore(RESTORE_BYTES)
+        except OSError as error:
+            self._handle_disk_error(error)
+        else:
+            if not self.is_restoring:
+                self._publish_event(f"the recording is whole again: {self.writer.path}")
 
     def _report(self) -> None:
         """Publish Timing, check disk space, and repeat a stop request until it is accepted."""
@@ -190,7 +204,7 @@ class Recorder:
             self.stop_accepted = self.link.send_command("stop", text, timeout_s=0.5) == "yes"
         elif not self.stop_reason:
             try:
-                if self.writer.restore():
+                if self.writer.is_lost:
                     self._stop_after_loss()
                     return
                 free = free_bytes(self.writer.path.parent)

@@ -52,7 +52,6 @@ class LogWriter:
     """
 
     def __init__(self, path: Path, rate_hz: float, chunk_bytes: int = CHUNK_BYTES) -> None:
-        self.path = path
         self._rate_hz = rate_hz
         self._file = AppendOnlyFile(path)
         # the checksum of the data section reveals a record lost inside the file
@@ -62,6 +61,11 @@ class LogWriter:
         self._next_sequence: dict[str, int] = {}
         self._content = ContentHash()
         self._finished = False
+
+    @property
+    def path(self) -> Path:
+        """Path of the file; another one than asked for if it was lost and its place taken."""
+        return self._file.path
 
     @property
     def size(self) -> int:
@@ -116,9 +120,14 @@ class LogWriter:
         self._writer.flush()
         self._file.drain()
 
-    def restore(self) -> bool:
-        """Write the file again if it was deleted or moved; return whether it was."""
-        return self._file.restore()
+    @property
+    def is_lost(self) -> bool:
+        """Whether the file was deleted or moved, and is not whole again."""
+        return self._file.is_lost
+
+    def restore(self, max_bytes: int) -> bool:
+        """Write a lost file again, at most so many bytes at once; return True once it is whole."""
+        return self._file.restore(max_bytes)
 
     def sync(self) -> None:
         """Wait until flushed data are on the disk, so that they survive a power failure."""

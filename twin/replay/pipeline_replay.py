@@ -40,6 +40,7 @@ from twin.transport.endpoint import CMP_TOPIC, PRED_TOPIC
 
 TIMING_TOPIC = RECORD_TOPICS[Timing]
 MAX_COMPARISON_SAMPLES = 10_000  # covered by one comparison
+LAST_WORDS_S = 1.5  # what a twin and a recorder that die together may take with them
 BLOCK_DURATION_S = 1.0  # offline; results do not depend on the block size
 STAMPED_AT_END = (
     CycleExtremes,
@@ -56,13 +57,13 @@ TWIN_TOPICS = {PRED_TOPIC, *(RECORD_TOPICS[kind] for kind in (Comparison, *STAMP
 class RecordedRun:
     """Recording to replay, and its encoded comparisons by sample index.
 
-    Comparisons stay encoded: a replay reproduces them and compares their bytes. `twin_died`: the
-    twin of a live run did not report the end of the run.
+    Comparisons stay encoded: a replay reproduces them and compares their bytes. A live twin that is
+    at work reports its latencies every second, and at the end; -1 if none was recorded.
     """
 
     recording: Recording
     comparisons: dict[int, bytes]
-    twin_died: bool = False
+    last_twin_timing: int = -1
 
     @classmethod
     def open(cls, path: Path) -> "RecordedRun":
@@ -74,7 +75,7 @@ class RecordedRun:
             message for message in recovered.messages if message.topic not in own_topics
         ]
         recording = build_recording(path, recovered)[0]
-        rate, stop = recording.start.rate_hz, recording.stop
+        rate = recording.start.rate_hz
         timing_ends = [
             item.index
             for message in own
@@ -89,7 +90,7 @@ class RecordedRun:
                 for message in own
                 if message.topic == CMP_TOPIC
             },
-            twin_died=bool(timing_ends) and stop is not None and max(timing_ends) < stop.index,
+            last_twin_timing=max(timing_ends, default=-1),
         )
 
     @property
@@ -215,22 +216,27 @@ def replay_recording(
 
 
 def _count_lost_with_twin(recorded: RecordedRun, unrecorded: Sequence[int]) -> int:
-    """Return how many unrecorded comparisons a twin made last before it died.
+    """Return how many unrecorded comparisons a twin made last before it died, or never made.
 
-    They lie directly before a Fault of the twin, or after the last recorded one of a twin that did
-    not report the end of the run.
+    They lie in the `LAST_WORDS_S` before a Fault of the twin, with no recorded one behind them; or
+    after the last recorded one, if a twin whose latencies were recorded reported none from then on.
+    Nothing is excused in a damaged recording.
     """
+    recording = recorded.recording
+    if not recording.is_intact:
+        return 0
     known = sorted(recorded.comparisons)
-    deaths = sorted(
-        fault.from_index for fault in recorded.recording.records(Fault) if fault.component == "twin"
-    )
-    if recorded.twin_died:
-        deaths.append(2**62)
+    last_known = max(known, default=-1)
+    last_words = round(LAST_WORDS_S * recording.start.rate_hz)
+    deaths = [fault.from_index for fault in recording.records(Fault) if fault.component == "twin"]
+    is_silent = 0 <= recorded.last_twin_timing <= last_known + last_words
     count = 0
     for index in unrecorded:
         following = bisect_right(known, index)
-        next_known = known[following] if following < len(known) else 2**62
-        count += any(index < death <= next_known for death in deaths)
+        next_known = known[following] if following < len(known) else index + last_words
+        end = min(next_known, index + last_words)
+        is_before_death = any(index < death <= end for death in deaths)
+        count += is_before_death or (is_silent and index > last_known)
     return count
 
 

@@ -27,23 +27,17 @@ def make_output_folder(out: Path | None, run_name: str) -> Path:
     try:
         if out is None:
             folder = _make_free_folder(folder)
+            claim_folder(folder)
         elif out.exists() and not out.is_dir():
             raise _make_content_error(out)
         else:
             folder.mkdir(parents=True, exist_ok=True)
-            lock_folder(folder)
+            claim_folder(folder)
             if any(folder.iterdir()):
                 raise _make_content_error(folder)
         probe = folder / ".probe"
         probe.touch()
         probe.unlink()
-    except BlockingIOError:
-        raise InputError(
-            "another command is writing there",
-            key="--out",
-            value=str(folder),
-            remedy="give another folder",
-        ) from None
     except OSError as error:
         raise InputError(
             f"cannot write here: {error.strerror}",
@@ -52,6 +46,19 @@ def make_output_folder(out: Path | None, run_name: str) -> Path:
             remedy="give a folder on a disk that you may write to",
         ) from None
     return folder
+
+
+def claim_folder(folder: Path) -> None:
+    """Lock a folder until this process ends; InputError if another command writes there."""
+    try:
+        lock_folder(folder)
+    except BlockingIOError:
+        raise InputError(
+            "another command is writing there",
+            key="--out",
+            value=str(folder),
+            remedy="give another folder",
+        ) from None
 
 
 def _make_content_error(folder: Path) -> InputError:

@@ -32,9 +32,13 @@ _locked_folders: dict[Path, int] = {}  # their descriptors, open until this proc
 
 def lock_folder(folder: Path) -> None:
     """Lock a folder until this process ends; BlockingIOError if another process has locked it."""
-    path = folder.resolve()
-    if not HAS_FILE_LOCKS or path in _locked_folders:
+    if not HAS_FILE_LOCKS:
         return
+    path = folder.resolve()
+    if path in _locked_folders:
+        if os.path.samestat(os.fstat(_locked_folders[path]), path.stat()):
+            return
+        os.close(_locked_folders.pop(path))  # deleted since, and made again
     descriptor = os.open(path, os.O_RDONLY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

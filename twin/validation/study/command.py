@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from table_io.clock import RealClock
 from table_io.errors import InputError, suggest
 from twin.reports.finalize import EXIT_INTERRUPTED
-from twin.run.folders import make_output_folder
+from twin.run.folders import claim_folder, make_output_folder
 from twin.run.system import count_cores
 from twin.run.terminal import catch_interrupts, console, print_line
 from twin.validation.study.baselines import describe_missing
@@ -169,6 +169,7 @@ def _open_folder(out: Path | None, resume: bool) -> Path:
                 key="--resume",
                 remedy="omit --resume to start one",
             )
+        claim_folder(folder)
         return folder
     return make_output_folder(folder, folder.name)
 
