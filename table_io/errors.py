@@ -4,9 +4,11 @@ import difflib
 from collections.abc import Iterable, Sequence
 from importlib.util import find_spec
 from typing import Any
+from unicodedata import category
 
 MIN_SIMILARITY = 0.5  # of a known name that is suggested, 1 for the same
 MAX_LISTED_NAMES = 40
+CONTROL_CATEGORIES = {"Cc", "Cf", "Cn", "Co", "Cs", "Zl", "Zp"}  # of Unicode
 
 
 class InputError(ValueError):
@@ -65,8 +67,15 @@ class InputError(ValueError):
 
 
 def replace_nonprintable(line: str) -> str:
-    """Return a line with nonprintable characters replaced by ?: foreign text may hold escapes."""
-    return "".join(character if character.isprintable() else "?" for character in line)
+    """Return a line with control characters replaced by ?: foreign text may hold escapes."""
+    if line.isprintable():
+        return line
+    return "".join("?" if is_control(character) else character for character in line)
+
+
+def is_control(character: str) -> bool:
+    """Return whether a terminal may obey a character instead of showing it; tabs are shown."""
+    return category(character) in CONTROL_CATEGORIES and character != "\t"
 
 
 def replace_escapes(text: str) -> str:

@@ -58,7 +58,12 @@ def find_config(name: str, folder: str, profile_path: Path | None = None, option
 def resolve_config(path: Path, folder: str) -> Path:
     """Return the path of a config file given as a path, or as the bare name of one.
 
-    A file without the suffix .toml in the working folder never hides a name.
+    A name comes before a file of that name without the suffix .toml in the working folder.
     """
-    is_path = path.suffix == ".toml" or len(path.parts) > 1
-    return path if is_path else find_config(str(path), folder)
+    if path.suffix.lower() == ".toml" or len(path.parts) > 1:
+        return path
+    return (
+        path
+        if path.is_file() and str(path) not in list_configs(folder)
+        else find_config(str(path), folder)
+    )

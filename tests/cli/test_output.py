@@ -7,9 +7,12 @@ import time
 from pathlib import Path
 
 import pytest
+from rich.table import Table
+from rich.text import Text
 
 from table_io.config.base import PROFILES_DIR
 from tests.command_line import call_main
+from twin.run.terminal import SafeConsole
 
 PROGRAM = [sys.executable, "-c", "from twin.cli.entry import main; main()"]
 
@@ -69,3 +72,15 @@ def test_an_error_shows_no_escapes(tmp_path: Path) -> None:
     assert ended.returncode == 2
     assert "owned" in ended.stderr
     assert "\x1b" not in ended.stderr
+
+
+def test_whatever_is_printed_is_shown_without_escapes(capsys: pytest.CaptureFixture[str]) -> None:
+    hostile = "a\x1b]0;owned\x07 Versuch\u00a04\tend"
+    table = Table(hostile)
+    table.add_row(Text(hostile))
+    for printed in (hostile, Text(hostile), table):
+        SafeConsole(width=100).print(printed)
+        output = capsys.readouterr().out
+        assert "owned" in output
+        assert "\x1b" not in output
+        assert "Versuch\u00a04" in output, "text of other languages stays"

@@ -88,6 +88,14 @@ def test_the_start_of_a_run_orders_it_not_the_date_of_a_copy(tmp_path: Path) -> 
     assert [path.name for path in find_run_folders(tmp_path)] == ["newer", "older"]
 
 
+@pytest.mark.parametrize("start", ["0001-01-01T00:00:00", "yesterday", 5, None])
+def test_a_summary_without_a_date_hides_no_run(tmp_path: Path, start: object) -> None:
+    values = make_summary(0)
+    values["run"]["started_at"] = start
+    make(tmp_path, items=[], run_summary=values)
+    assert find_run_folders(tmp_path) == [tmp_path]
+
+
 def test_the_last_measured_run_is_no_simulation(tmp_path: Path) -> None:
     for number, source in enumerate(("table", "model")):
         (tmp_path / source).mkdir()

@@ -174,6 +174,16 @@ def test_batches_and_blocks_do_not_matter(tmp_path: Path) -> None:
         assert repr(whole[entity]) == repr(two[entity]), entity
 
 
+def test_a_short_dropout_interrupts_the_line(tmp_path: Path) -> None:
+    dropped = blocks()
+    values = dropped[50].values.copy()
+    values[:, 5:8] = np.nan  # samples 505 to 507, none of which is drawn
+    dropped[50] = replace(dropped[50], values=values)
+    write_rrd(recording(dropped), tmp_path / "gap.rrd")
+    times, drawn = scalars(tmp_path / "gap.rrd", "/u/measured")
+    assert np.rint(times[np.isnan(drawn[:, 0])] * RATE_HZ).tolist() == [504]
+
+
 def test_a_lost_block_lifts_the_pen(tmp_path: Path) -> None:
     write_rrd(recording(blocks(skip=[50])), tmp_path / "gap.rrd")
     times, values = scalars(tmp_path / "gap.rrd", "/u/measured")

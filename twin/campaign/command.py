@@ -78,30 +78,32 @@ def run_campaign(options: CampaignOptions) -> int:
         )
     if not options.resume:
         require_disk_space([run.bundle for run in plan.runs], options.out or RUNS_FOLDER)
-    folder = _prepare_folder(options)
-    with hold_lock(folder / LOCK_FILE) as lock:
-        if options.resume:
-            print_line(f"reading the recordings in {folder}")
-        active, warnings = (
-            resume_campaign(folder, plan) if options.resume else (begin_campaign(folder, plan), [])
-        )
-        for warning in (
-            *warnings,
-            *list_campaign_warnings(plan),
-            *find_overdue_calibrations(rig, local_datetime().date()),
-        ):
-            print_line(f"warning: {warning}")
-        require_disk_space([run.bundle for run in active.pending_runs()], folder)
-        _print_plan(active)
-        try:
-            with nullcontext() if options.start_page is None else options.start_page(rig.name):
+    with nullcontext() if options.start_page is None else options.start_page(rig.name):
+        folder = _prepare_folder(options)
+        with hold_lock(folder / LOCK_FILE) as lock:
+            if options.resume:
+                print_line(f"reading the recordings in {folder}")
+            active, warnings = (
+                resume_campaign(folder, plan)
+                if options.resume
+                else (begin_campaign(folder, plan), [])
+            )
+            for warning in (
+                *warnings,
+                *list_campaign_warnings(plan),
+                *find_overdue_calibrations(rig, local_datetime().date()),
+            ):
+                print_line(f"warning: {warning}")
+            require_disk_space([run.bundle for run in active.pending_runs()], folder)
+            _print_plan(active)
+            try:
                 code = (
                     play_offline(active, lock)
                     if options.unpaced
                     else play_realtime(active, ask_operator, options.listen, options.keys)
                 )
-        finally:
-            page = write_campaign_report(folder)
+            finally:
+                page = write_campaign_report(folder)
     return _print_outcome(active, code, page, options)
 
 

@@ -226,7 +226,8 @@ def compare_with_seal(hidden: HiddenEffect, verdict: dict[str, Any]) -> list[str
             )
     false_names = [name for name in parameters_by_id if name != hidden.id]
     if false_names:
-        lines.append(f"Not hidden, but found: {', '.join(false_names)}.")
+        word = "found" if verdict["verdict"] == "named" else "proposed"
+        lines.append(f"Not hidden, but {word}: {', '.join(false_names)}.")
     return lines
 
 

@@ -5,12 +5,14 @@ from typing import Annotated
 
 import typer
 
-from twin.cli.run_path import LOG_HELP, parse_measured_path
+from twin.cli.run_path import MEASURED_LOG_HELP, parse_measured_path
 
 LEARN_PANEL = "Identification from recordings"
 LogPaths = Annotated[
     list[Path],
-    typer.Argument(metavar="LOG...", parser=parse_measured_path, help=f"{LOG_HELP} Repeatable."),
+    typer.Argument(
+        metavar="LOG...", parser=parse_measured_path, help=f"{MEASURED_LOG_HELP} Repeatable."
+    ),
 ]
 
 

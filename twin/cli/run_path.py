@@ -3,8 +3,11 @@
 import sys
 from pathlib import Path
 
+from table_io.errors import replace_escapes
+
 LAST = "last"
 LOG_HELP = "A run.mcap, the folder of a run, or `last`, the newest run here or in runs."
+MEASURED_LOG_HELP = LOG_HELP.replace("newest run", "newest run that is no simulation,")
 
 
 def parse_run_path(text: str) -> Path:
@@ -27,5 +30,5 @@ def _find_run(text: str, *, measured: bool) -> Path:
     from twin.reports.run_index import find_last_run
 
     folder = find_last_run(Path(), measured=measured)
-    print(f"last: {folder}", file=sys.stderr)  # standard output may be JSON
+    print(replace_escapes(f"last: {folder}"), file=sys.stderr)  # standard output may be JSON
     return folder

@@ -13,6 +13,9 @@ from twin.reports.plot_style import Picture
 TEMPLATE_DIR = Path(__file__).parent  # contains the shared parts.html and style.html
 
 
+MAX_PLAIN = 1e12  # larger numbers are written as a power of ten
+
+
 def format_significant(value: Any, digits: int = 3) -> str:
     """Format a number with `digits` significant digits, never in E notation; a dash if invalid."""
     if not isinstance(value, int | float) or not math.isfinite(value):
@@ -20,7 +23,7 @@ def format_significant(value: Any, digits: int = 3) -> str:
     if value == 0:
         return "0"
     decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
-    if decimals > 9:
+    if decimals > 9 or abs(value) >= MAX_PLAIN:
         mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
         return f"{mantissa}·10^{int(exponent)}".replace("-", "−")
     return f"{value:.{decimals}f}".replace("-", "−")

@@ -62,10 +62,9 @@ def _read_start(recording: Path) -> tuple[float, float]:
         changed_s = 0.0
     try:
         text = (recording.parent / "summary.json").read_text(encoding="utf-8")
-        started = datetime.fromisoformat(json.loads(text)["run"]["started_at"])
-    except (OSError, ValueError, KeyError, TypeError):
+        return datetime.fromisoformat(json.loads(text)["run"]["started_at"]).timestamp(), changed_s
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return changed_s, changed_s
-    return started.timestamp(), changed_s
 
 
 def find_last_run(folder: Path, *, measured: bool = False) -> Path:

@@ -5,13 +5,12 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Any
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.errors import LiveError
 from rich.markup import escape
+from rich.segment import Segment
 from rich.table import Table
-from rich.text import Text
 
 from table_io.errors import replace_escapes
 
@@ -29,8 +28,12 @@ def _console_columns() -> int | None:
 class SafeConsole(Console):
     """Console that replaces what a terminal would obey in text: names and titles may be foreign."""
 
-    def render_str(self, text: str, **options: Any) -> Text:
-        return super().render_str(replace_escapes(text), **options)
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterator[Segment]:
+        for segment in super().render(renderable, options):
+            is_text = segment.control is None
+            yield Segment(replace_escapes(segment.text), segment.style) if is_text else segment
 
 
 console = SafeConsole(width=_console_columns())

@@ -3,6 +3,7 @@
 The drawing depends on the samples only, not on their division into blocks or batches.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -54,7 +55,7 @@ from twin.viewer.text import (
 )
 
 BATCH_ITEMS = 1000  # items of a log per call of `feed`
-LINE_RATE_HZ = 500  # of the lines over time; all samples would be 25 MB a minute at 2 kHz
+LINE_RATE_HZ = 500  # of the lines over time, at most; all samples would be 25 MB a minute at 2 kHz
 FRAME_RATE_HZ = 50  # of the moving rig
 
 
@@ -69,7 +70,7 @@ class RerunView:
         self._scene = Scene.from_profile(profile)
         self._mass_kg = profile.specimen.mass_kg
         self._frame_stride = max(1, round(start.rate_hz / FRAME_RATE_HZ))
-        self._line_stride = max(1, round(start.rate_hz / LINE_RATE_HZ))
+        self._line_stride = math.ceil(start.rate_hz / LINE_RATE_HZ)
         self._next_index: dict[str, int] = {}
         self._styled: set[str] = set()
         self._logged: set[tuple[int, str, str]] = set()
@@ -124,12 +125,17 @@ class RerunView:
         self._sink.close()
 
     def _send_lines(self, entity: str, index: Int1D, *columns: Float1D) -> None:
-        """Send the lines of an entity, (sample,) each; a NaN at a lost sample interrupts them."""
+        """Send the lines of an entity, (sample,) each; a NaN at a lost sample interrupts them.
+
+        Of `_line_stride` samples the first is drawn, as NaN if one of them is lost.
+        """
         expected_index = self._next_index.get(entity, int(index[0]))
         is_interrupted = expected_index < index[0]
         self._next_index[entity] = int(index[-1]) + 1
-        is_drawn = index % self._line_stride == 0
-        values, index = np.stack(columns, axis=1)[is_drawn], index[is_drawn]
+        samples, drawn = np.stack(columns, axis=1), np.flatnonzero(index % self._line_stride == 0)
+        values, index = samples[drawn], index[drawn]
+        if drawn.size:
+            values[np.logical_or.reduceat(np.isnan(samples), drawn)] = np.nan
         if is_interrupted:
             index = np.concatenate([[expected_index], index])
             values = np.concatenate([np.full((1, len(columns)), np.nan), values])

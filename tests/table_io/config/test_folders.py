@@ -43,6 +43,12 @@ def test_neither_files_without_suffix_nor_folders_hide_a_name(user_folder: Path)
     assert list_configs("tests")["quickstart"] == shipped
 
 
+def test_a_file_without_the_suffix_is_taken_where_no_config_has_its_name(user_folder: Path) -> None:
+    for name in ("mytest", "Quick.TOML"):
+        (user_folder / name).touch()
+        assert resolve_config(Path(f"./{name}"), "tests") == Path(name)
+
+
 @pytest.mark.usefixtures("user_folder")
 def test_a_path_stays_a_path_and_an_unknown_name_is_an_input_error() -> None:
     assert resolve_config(Path("quickstart.toml"), "tests") == Path("quickstart.toml")

@@ -28,7 +28,7 @@ from twin.reports.discovery.sensor_section import (
     tabulate_comparisons,
 )
 from twin.reports.discovery.serialize import Json
-from twin.reports.page import embed_images, format_significant, render_page
+from twin.reports.page import MAX_PLAIN, embed_images, format_significant, render_page
 from twin.reports.quantities import format_quantity
 
 DIGITS, MAX_DECIMALS = 4, 9  # of a fitted value
@@ -118,9 +118,11 @@ def format_with_interval(value: float, low: float, high: float) -> list[str]:
     if not (half_width > 0 and math.isfinite(half_width)):
         return [format_significant(number, DIGITS) for number in (value, low, high)]
     decimals = max(0, 1 - math.floor(math.log10(half_width)))
-    if decimals > MAX_DECIMALS:
-        return [format_significant(number, DIGITS) for number in (value, low, high)]
-    return [_group_thousands(f"{number:,.{decimals}f}") for number in (value, low, high)]
+    if decimals > MAX_DECIMALS or max(abs(low), abs(high)) >= MAX_PLAIN:
+        size = max(abs(value), half_width)
+        digits = max(DIGITS, 2 + math.floor(math.log10(size)) - math.floor(math.log10(half_width)))
+        return [format_significant(number, digits) for number in (value, low, high)]
+    return [_group_thousands(f"{number:z,.{decimals}f}") for number in (value, low, high)]
 
 
 def _group_thousands(text: str) -> str:
