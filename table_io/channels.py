@@ -72,6 +72,13 @@ def list_derived_channels(channels: Collection[str]) -> tuple[str, ...]:
     return (RELATIVE_DISP,) if is_derived else ()
 
 
+def measure_mass(block: Block) -> Float1D:
+    """Return the displacement of the mass in the laboratory frame in m, (sample,)."""
+    if "mass_disp_m" in block.channels:
+        return block.channel("mass_disp_m")
+    return block.channel("rel_disp_m") + block.channel("table_disp_m")
+
+
 def relative_displacement(block: Block) -> Float1D:
     """Return u in m, right positive, (sample,): measured directly, else mass minus table.
 

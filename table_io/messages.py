@@ -94,4 +94,6 @@ def _format_orbit(orbit: OrbitPoint) -> str:
         f"orbit {orbit.step}: +-{1e3 * orbit.amplitude_m:.4g} mm at {orbit.frequency_hz:.5g} Hz; "
         f"feedback {1e6 * feedback:.2g} um, {share:.2g} % of the command; {orbit.periods} periods"
     )
+    if orbit.multiplier_sd is not None:
+        text += f"; multiplier {orbit.multiplier:.3g} +-{orbit.multiplier_sd:.1g}"
     return text if orbit.accepted else f"{text}; not accepted: {orbit.reason}"

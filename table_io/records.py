@@ -308,6 +308,8 @@ class OrbitPoint:
     acceleration is a sin(phi). `feedback_m` are the amplitudes of harmonics 0, 1, ... of the
     correction, `noise_m` the part of their root sum of squares that sensor noise explains, and
     `command_m` is the amplitude of the command. `periods` counts from the change of point.
+    `multiplier` is the largest Floquet multiplier without feedback, `multiplier_sd` its standard
+    deviation.
     """
 
     index: int
@@ -325,6 +327,7 @@ class OrbitPoint:
     multiplier: float  # measured; NaN if it was not
     accepted: bool
     reason: str
+    multiplier_sd: float | None = None  # None if the multiplier was not measured
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ ends at rest.
     check --(passes)--> tune --(level accepted)---> hold, then tune at the next step, ...
                         tune --(not accepted)-----> blend to the corrected level, tune again
                         hold --(policy decides)---> the next step, or the end
-    check --(passes)--> orbit, evaluated and corrected: a continuation (`orbits.py`)
+    check --(passes)--> orbit, evaluated and corrected, then release: a continuation (`orbits.py`)
     check --(passes)--> the end, with a displacement history played as it is, if that is the test
     open: the operator holds the test at its step; on resume the step is tuned and measured again.
 """

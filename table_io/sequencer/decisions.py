@@ -15,7 +15,12 @@ from table_io.records import Check, Event, Level, Record, Step, StepAdded
 from table_io.safety import loop_check
 from table_io.safety.preflight import check_corrected_drive
 from table_io.sequencer.actions import approach_step, begin_excitation, measure_step, start_tuning
-from table_io.sequencer.orbits import begin_continuation, check_latency, decide_orbit
+from table_io.sequencer.orbits import (
+    begin_continuation,
+    check_latency,
+    decide_multiplier,
+    decide_orbit,
+)
 from table_io.sequencer.state import SequencerState, Stage
 
 
@@ -165,4 +170,5 @@ DECISION_FUNCTIONS: dict[str, Callable[[SequencerState], SequencerState]] = {
     "tune": decide_tuning,
     "hold": decide_next_step,
     "orbit": decide_orbit,
+    "release": decide_multiplier,
 }

@@ -1,7 +1,8 @@
 """Continuation in the sequencer: hold, evaluate and correct each orbit; retry where it is lost.
 
     approach --> hold --(window complete)--> update of the reference, hold again, ...
-                                       `---> accepted, or updates used up: the next point
+                                       |---> accepted --> release (`releases.py`): the next point
+                                       `---> updates used up: the next point
     lost --> decay to rest, capture of the first orbit, along the measured ones to this point, or
              to the next one when its retries are used up
     last point, or three in a row lost --> the end, with the feedback blended out
@@ -27,7 +28,7 @@ from table_io.adaptive.continuation import (
 )
 from table_io.adaptive.result import mean_swing
 from table_io.block import Block, Float1D, Label, join_blocks
-from table_io.channels import relative_displacement
+from table_io.channels import measure_mass, relative_displacement
 from table_io.config.excitation.continuation import Continuation
 from table_io.config.excitation.orbit_plan import pack_harmonics, unpack_harmonics
 from table_io.control.frf import evaluate_transfer
@@ -35,12 +36,18 @@ from table_io.control.orbit_feedback import FeedbackState, ReferenceSegment, adv
 from table_io.control.order_tracking import HarmonicFit, track_harmonics
 from table_io.excitation.trajectory import SineTarget, Trajectory
 from table_io.records import Event, FrequencyResponse, OrbitPoint
-from table_io.sequencer.state import OrbitSearch, SequencerState, Stage
+from table_io.sequencer.releases import (
+    advance_releases,
+    end_releases,
+    estimate_from_releases,
+    find_departure_limit,
+)
+from table_io.sequencer.state import OrbitSearch, ReleaseSeries, SequencerState, Stage
 
 CAPTURE_CYCLES = 20  # held at the first orbit after a soft start
 UPDATE_BLEND_CYCLES = 2.0  # between references of one point
 RELEASE_S = 0.1  # of the feedback when an orbit is lost
-REST_S = 1.0  # before an orbit is captured again
+REST_S = 4.0  # until the motion has decayed, before an orbit is captured again
 MAX_SATURATED_CYCLES = 2.0  # at the limit of the feedback: the orbit is lost
 MAX_DEVIATION = 0.25  # of the amplitude of u from the reference: the orbit is lost
 LEVEL_TOLERANCE = 0.003  # of the fundamental of the table's acceleration
@@ -191,8 +198,12 @@ def apply_feedback(state: SequencerState, block: Block, earliest: int) -> Sequen
 
     An orbit that stays at the limit of the feedback is lost.
     """
-    search, drive = _search(state), state.drive
     changed = state.changed_from
+    if state.stage.kind == "release":
+        state = advance_releases(state, block)
+    elif _search(state).releases is not None:  # the operator holds the test
+        state = replace(state, search=end_releases(_search(state), block.end, state.drive.rate_hz))
+    search, drive = _search(state), state.drive
     feedback, correction, first = advance_feedback(
         search.feedback, drive, block.index, measure_mass(block), earliest,
         min(state.stage.first, block.index) if state.stage.kind == "orbit" else block.index,
@@ -204,16 +215,10 @@ def apply_feedback(state: SequencerState, block: Block, earliest: int) -> Sequen
         changed_from=min(changed, first),
     )
     cycles = feedback.saturated_samples * search.target.frequency_hz / drive.rate_hz
-    if cycles > MAX_SATURATED_CYCLES and search.is_captured and state.stage.kind == "orbit":
+    is_held = state.stage.kind in ("orbit", "release")
+    if cycles > MAX_SATURATED_CYCLES and search.is_captured and is_held:
         return retry_orbit(state, block.end, "the feedback stayed at its limit")
     return state
-
-
-def measure_mass(block: Block) -> Float1D:
-    """Return the displacement of the mass in the laboratory frame in m, (sample,)."""
-    if "mass_disp_m" in block.channels:
-        return block.channel("mass_disp_m")
-    return block.channel("rel_disp_m") + block.channel("table_disp_m")
 
 
 def decide_orbit(state: SequencerState) -> SequencerState:
@@ -290,6 +295,9 @@ def decide_orbit(state: SequencerState) -> SequencerState:
         if not reason:
             accepted = MeasuredOrbit(target.position, measured.x, target.frequency_hz)
             search = replace(search, measured=(*search.measured, accepted), losses=0, lost_points=0)
+            if config.multiplier_periods:
+                motion = _to_vector(fits[1])
+                return _begin_releases(replace(state, search=search), point, motion)
         state = replace(state, search=search, records=(*state.records, point))
         return _next_orbit(state)
     factor = min(max(1.0 / level_ratio, 1.0 / MAX_LEVEL_FACTOR), MAX_LEVEL_FACTOR)
@@ -301,6 +309,55 @@ def decide_orbit(state: SequencerState) -> SequencerState:
     return _approach(
         replace(state, search=search), state.trajectory, (), blend_cycles=UPDATE_BLEND_CYCLES
     )
+
+
+def _begin_releases(state: SequencerState, point: OrbitPoint, motion: Float1D) -> SequencerState:
+    """Hold an accepted orbit on for the releases that give its Floquet multiplier."""
+    search, stage, trajectory = _search(state), state.stage, state.trajectory
+    period = trajectory.rate_hz / point.frequency_hz
+    last = stage.last + math.ceil(_config(state).multiplier_periods * period)
+    changed = trajectory.end
+    trajectory = trajectory.append_hold(
+        last + state.plan.margin - changed, point.step, Label.SETTLE
+    )
+    series = ReleaseSeries(
+        point,
+        search.feedback.segment_at(stage.last).after,
+        motion,
+        max(_config(state).orbit_plan.points[point.step].multiplier_size, 1.0),
+        find_departure_limit(point, state.plan.profile.specimen.gaps_m),
+        next_start=stage.last,
+    )
+    return replace(
+        state,
+        trajectory=trajectory,
+        drive=replace(trajectory.to_drive(state.steps), correction=state.drive.correction),
+        stage=Stage("release", point.step, stage.last, last),
+        search=replace(search, releases=series),
+        changed_from=changed,
+    )
+
+
+def decide_multiplier(state: SequencerState) -> SequencerState:
+    """Record the accepted orbit with its multiplier and approach the next one."""
+    return _next_orbit(_record_multiplier(state, state.stage.last))
+
+
+def _record_multiplier(state: SequencerState, index: int) -> SequencerState:
+    """Return the state with the accepted orbit recorded at sample `index`."""
+    search = _search(state)
+    assert search.releases is not None
+    point, estimate = search.releases.point, estimate_from_releases(state)
+    cycles = (index - search.since) * point.frequency_hz / state.trajectory.rate_hz
+    point = replace(
+        point,
+        index=index,
+        periods=point.periods + round(cycles),
+        multiplier=estimate.value,
+        multiplier_sd=estimate.sd if math.isfinite(estimate.sd) else None,
+    )
+    search = replace(search, releases=None, since=index)
+    return replace(state, search=search, records=(*state.records, point))
 
 
 def _to_vector(fit: HarmonicFit) -> Float1D:
@@ -350,10 +407,13 @@ def _next_orbit(state: SequencerState) -> SequencerState:
 
 def retry_orbit(state: SequencerState, index: int, reason: str) -> SequencerState:
     """Bring the table to rest and approach the lost orbit along those measured before."""
+    is_measured = state.stage.kind == "release"
+    if is_measured:
+        state = _record_multiplier(state, index)
     search, config = _search(state), _config(state)
     position = search.target.position
-    is_given_up = search.losses >= config.retries
-    lost_points = search.lost_points + is_given_up
+    is_given_up = is_measured or search.losses >= config.retries
+    lost_points = search.lost_points + (is_given_up and not is_measured)
     next_position = position + is_given_up
     is_last = lost_points >= MAX_LOST_POINTS or next_position == len(config.orbit_plan.points)
     action = "it is approached again from rest"

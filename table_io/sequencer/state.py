@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 from table_io.adaptive import Policy, StepResult
 from table_io.adaptive.continuation import MeasuredOrbit, OrbitTarget
-from table_io.block import Block
+from table_io.block import Block, Float1D
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.amplitude_control import Tuning
@@ -12,7 +12,7 @@ from table_io.control.orbit_feedback import FeedbackState
 from table_io.control.order_tracking import NO_FIT, HarmonicFit
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import Trajectory
-from table_io.records import Record, Step
+from table_io.records import OrbitPoint, Record, Step
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,12 +33,34 @@ class TestPlan:
 class Stage:
     """Next decision; it is made on samples first .. last - 1 once they are acquired."""
 
-    kind: str  # check, tune, hold, orbit, open, end
+    kind: str  # check, tune, hold, orbit, release, open, end
     step: int = -1
     first: int = 0
     last: int = 0
     update: int = 0
     first_fit: HarmonicFit = NO_FIT  # first harmonic fit at this step
+
+
+@dataclass(frozen=True, eq=False)
+class ReleaseSeries:
+    """Releases of the feedback at an accepted orbit, for its Floquet multiplier.
+
+    `point` is recorded when the multiplier is known. `reference` are the harmonics of x in m that
+    the feedback holds, and `motion` those measured, at the phase of the drive. `multiplier` is that
+    of the plan, at least 1, by which releases are timed, `limit_m` the departure at which they end.
+    `spans` are the
+    samples first .. last - 1 without feedback so far, the last one of which may be open. Another
+    release begins at sample `next_start` or later.
+    """
+
+    point: OrbitPoint
+    reference: Float1D
+    motion: Float1D
+    multiplier: float
+    limit_m: float
+    next_start: int
+    spans: tuple[tuple[int, int], ...] = ()
+    is_released: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +82,7 @@ class OrbitSearch:
     is_captured: bool = False
     periods: int = 0
     since: int = 0
+    releases: ReleaseSeries | None = None
 
 
 @dataclass(frozen=True)

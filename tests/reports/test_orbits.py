@@ -18,6 +18,7 @@ from twin.recording.reader import read_recording
 from twin.reports.orbits import read_planned_branch
 from twin.reports.report import write_report
 from twin.reports.summary import parse_toml_tables, summarise, write_summary
+from twin.transport.codec import decode_item, encode_item, topic_for
 from twin.viewer.plots import OrbitCurves
 
 AMPLITUDE_M = 2e-3
@@ -51,10 +52,12 @@ def make_plan() -> OrbitPlan:
 
 
 def make_point(step: int, reason: str = "") -> OrbitPoint:
+    """Return an orbit; only that of step 1 has a measured multiplier."""
+    multiplier, sd = (4.123, 0.07) if step == 1 else (np.nan, None)
     return OrbitPoint(
         1000 * (step + 1), step, 3.01 + 0.1 * step, 0.491, 2.1e-3 * (1 + step),
-        (1e-4, 0.0, 3e-4, 4e-4, 0.0, 0.0), (0.0, 3e-6, 4e-6), 1e-6, 1e-3, 50, 1, step == 0, np.nan,
-        not reason, reason,
+        (1e-4, 0.0, 3e-4, 4e-4, 0.0, 0.0), (0.0, 3e-6, 4e-6), 1e-6, 1e-3, 50, 1, step == 0,
+        multiplier, not reason, reason, sd,
     )  # fmt: skip
 
 
@@ -78,6 +81,18 @@ def test_summary_has_each_orbit_with_its_feedback(folder):
     assert orbits[1]["fundamental_m"] == pytest.approx(5e-4)
     assert orbits[2]["planned"]["amplitude_m"] == pytest.approx(3 * AMPLITUDE_M, rel=1e-4)
     assert orbits[2]["planned"]["multiplier"] == 5.0
+    assert np.array_equal(
+        [orbit["multiplier"] for orbit in orbits], [np.nan, 4.123, np.nan], equal_nan=True
+    )
+    assert [orbit["multiplier_sd"] for orbit in orbits] == [None, 0.07, None]
+
+
+def test_uncertainty_of_a_multiplier_survives_the_wire():
+    point = make_point(0)
+    decoded = decode_item(topic_for(point), encode_item(point, "r"))[1]
+    assert isinstance(decoded, OrbitPoint)
+    assert decoded.multiplier_sd is None
+    assert decode_item(topic_for(point), encode_item(make_point(1), "r"))[1] == make_point(1)
 
 
 def test_planned_branch_is_read_from_the_recorded_profile():
@@ -93,6 +108,7 @@ def test_report_shows_branch_and_table(folder):
     text = path.read_text(encoding="utf-8")
     assert (folder[0] / "figures" / "orbits.png").stat().st_size > 10_000
     assert "3.1100" in text
+    assert "4.12 ± 0.07" in text
     assert "2 of 3 orbits measured, 1 of them unstable" in text
 
 

@@ -126,7 +126,7 @@ def test_limits_and_duration_count_the_feedback_and_its_updates(planned_config):
         steady_m = orbit.acceleration_m_s2 / (2 * math.pi * orbit.frequency_hz) ** 2
         least_m = (1 + continuation.max_feedback) * steady_m
         assert least_m * 0.999 < demand.displacement_m < 1.2 * least_m
-    cycles = 2 * (10 + 10 + 4)
+    cycles = 2 * (10 + 10 + 4) + 24
     planned_s = config.drive.planned_end / config.drive.rate_hz
     assert config.expected_s - planned_s == pytest.approx(
         sum(cycles / orbit.frequency_hz for orbit in config.steps)

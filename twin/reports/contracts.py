@@ -290,6 +290,7 @@ class OrbitResult(Contract):
     reason: str = Field(description="why it is not accepted; empty if it is")
     stable: bool = Field(description="without feedback, by the plan")
     multiplier: Ratio = Field(description="measured Floquet multiplier; null if it was not")
+    multiplier_sd: Ratio | None = Field(description="its standard deviation; null without one")
     planned: PlannedOrbitKeys = Field(description="orbit of the twin")
 
 

@@ -1,4 +1,4 @@
-"""Figure of a continuation: the measured branch over the twin's, and what the feedback leaves."""
+"""Figure of a continuation: branch and multipliers over the twin's, and the feedback's rest."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -20,12 +20,15 @@ REFUSED_COLOUR = "#f4ac3d"
 
 
 def draw_orbits(run: ReportData) -> CaptionedFigures:
-    """Draw amplitude and feedback of the measured orbits over frequency."""
+    """Draw amplitude, feedback and Floquet multiplier of the measured orbits over frequency."""
     orbits = run.summary.get("orbits") or []
     if not orbits:
         return
-    figure = Figure(figsize=(FIGURE_WIDTH_IN, 6.2))
-    branch_axis, feedback_axis = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1.0))
+    measured = [orbit for orbit in orbits if orbit["multiplier_sd"] is not None]
+    heights = (2.2, 1.0, 1.2) if measured else (2.2, 1.0)
+    figure = Figure(figsize=(FIGURE_WIDTH_IN, 8.0 if measured else 6.2))
+    axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
+    branch_axis, feedback_axis = axes[:2]
     branch = read_planned_branch(parse_toml_tables(run.recording.start.profile_toml))
     if branch is not None:
         amplitudes_mm = 1e3 * branch.amplitudes_m
@@ -60,7 +63,18 @@ def draw_orbits(run: ReportData) -> CaptionedFigures:
     branch_axis.set_ylabel("amplitude of $u$ in mm")
     feedback_axis.set_ylabel("feedback in % of the command")
     feedback_axis.set_yscale("log")
-    feedback_axis.set_xlabel("frequency in Hz")
+    if measured:
+        if branch is not None:
+            axes[2].plot(branch.frequencies_hz, branch.multipliers, color=TWIN_COLOUR, lw=1.0)
+        axes[2].errorbar(
+            [orbit["frequency_hz"] for orbit in measured],
+            [orbit["multiplier"] for orbit in measured],
+            [orbit["multiplier_sd"] for orbit in measured],
+            fmt="o", color=DIRECTION_COLOURS["forward"], capsize=2.0,
+        )  # fmt: skip
+        axes[2].axhline(1.0, color=GUIDE_COLOUR, lw=0.8)
+        axes[2].set_ylabel("multiplier")
+    axes[-1].set_xlabel("frequency in Hz")
     branch_axis.legend()
     feedback_axis.legend()
     accepted = sum(orbit["accepted"] for orbit in orbits)
@@ -69,6 +83,7 @@ def draw_orbits(run: ReportData) -> CaptionedFigures:
         "Measured branch of periodic orbits",
         f"{accepted} of {len(orbits)} orbits accepted. Each was held by feedback until the "
         "feedback had vanished, so it is an orbit of the specimen without feedback, stable or not. "
-        "Lines: orbits of the twin as planned before the test.",
+        "Lines: orbits of the twin as planned before the test. Multiplier: growth of a departure "
+        "in one period while the feedback was released, with its standard deviation.",
         figure,
     )

@@ -39,6 +39,7 @@ def _summarise_orbit(orbit: OrbitPoint, plan: OrbitPlan) -> dict[str, Any]:
         "reason": orbit.reason,
         "stable": orbit.stable,
         "multiplier": orbit.multiplier,
+        "multiplier_sd": orbit.multiplier_sd,
         "planned": {
             "frequency_hz": planned.frequency_hz,
             "amplitude_m": planned.amplitude_m,
@@ -49,11 +50,12 @@ def _summarise_orbit(orbit: OrbitPoint, plan: OrbitPlan) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class PlannedBranch:
-    """Frequencies in Hz, amplitudes in m and stability of the planned orbits, (orbit,) each."""
+    """Planned orbits: Hz, m, whether stable, largest Floquet multiplier; (orbit,) each."""
 
     frequencies_hz: Float1D
     amplitudes_m: Float1D
     stable: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    multipliers: Float1D
 
 
 def read_planned_branch(profile_tables: dict[str, Any]) -> PlannedBranch | None:
@@ -66,4 +68,5 @@ def read_planned_branch(profile_tables: dict[str, Any]) -> PlannedBranch | None:
         np.array([orbit.frequency_hz for orbit in plan.points]),
         np.array([orbit.amplitude_m for orbit in plan.points]),
         np.array([orbit.stable for orbit in plan.points]),
+        np.array([orbit.multiplier_size for orbit in plan.points]),
     )

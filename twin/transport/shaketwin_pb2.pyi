@@ -388,7 +388,7 @@ class Decided(_message.Message):
     def __init__(self, index: _Optional[int] = ..., step: _Optional[int] = ..., direction: _Optional[str] = ..., frequency_hz: _Optional[float] = ..., acceleration_m_s2: _Optional[float] = ..., reason: _Optional[str] = ..., run: _Optional[str] = ...) -> None: ...
 
 class Orbit(_message.Message):
-    __slots__ = ("index", "step", "frequency_hz", "acceleration_m_s2", "amplitude_m", "u_m", "feedback_m", "noise_m", "command_m", "periods", "updates", "stable", "multiplier", "accepted", "reason", "run")
+    __slots__ = ("index", "step", "frequency_hz", "acceleration_m_s2", "amplitude_m", "u_m", "feedback_m", "noise_m", "command_m", "periods", "updates", "stable", "multiplier", "accepted", "reason", "run", "multiplier_sd")
     INDEX_FIELD_NUMBER: _ClassVar[int]
     STEP_FIELD_NUMBER: _ClassVar[int]
     FREQUENCY_HZ_FIELD_NUMBER: _ClassVar[int]
@@ -405,6 +405,7 @@ class Orbit(_message.Message):
     ACCEPTED_FIELD_NUMBER: _ClassVar[int]
     REASON_FIELD_NUMBER: _ClassVar[int]
     RUN_FIELD_NUMBER: _ClassVar[int]
+    MULTIPLIER_SD_FIELD_NUMBER: _ClassVar[int]
     index: int
     step: int
     frequency_hz: float
@@ -421,7 +422,8 @@ class Orbit(_message.Message):
     accepted: bool
     reason: str
     run: str
-    def __init__(self, index: _Optional[int] = ..., step: _Optional[int] = ..., frequency_hz: _Optional[float] = ..., acceleration_m_s2: _Optional[float] = ..., amplitude_m: _Optional[float] = ..., u_m: _Optional[_Iterable[float]] = ..., feedback_m: _Optional[_Iterable[float]] = ..., noise_m: _Optional[float] = ..., command_m: _Optional[float] = ..., periods: _Optional[int] = ..., updates: _Optional[int] = ..., stable: _Optional[bool] = ..., multiplier: _Optional[float] = ..., accepted: _Optional[bool] = ..., reason: _Optional[str] = ..., run: _Optional[str] = ...) -> None: ...
+    multiplier_sd: float
+    def __init__(self, index: _Optional[int] = ..., step: _Optional[int] = ..., frequency_hz: _Optional[float] = ..., acceleration_m_s2: _Optional[float] = ..., amplitude_m: _Optional[float] = ..., u_m: _Optional[_Iterable[float]] = ..., feedback_m: _Optional[_Iterable[float]] = ..., noise_m: _Optional[float] = ..., command_m: _Optional[float] = ..., periods: _Optional[int] = ..., updates: _Optional[int] = ..., stable: _Optional[bool] = ..., multiplier: _Optional[float] = ..., accepted: _Optional[bool] = ..., reason: _Optional[str] = ..., run: _Optional[str] = ..., multiplier_sd: _Optional[float] = ...) -> None: ...
 
 class Trip(_message.Message):
     __slots__ = ("index", "decided", "kind", "channel", "value", "limit", "text", "run")

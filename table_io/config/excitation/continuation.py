@@ -43,6 +43,12 @@ class Continuation(Excitation):
     max_feedback: Number = Field(
         0.5, gt=0, le=1.0, description="Largest feedback over the amplitude of the command."
     )
+    multiplier_periods: Count = Field(
+        24,
+        ge=0,
+        le=1000,
+        description="Of an accepted orbit, to measure its Floquet multiplier; 0: not measured.",
+    )
     retries: Count = Field(3, ge=0, le=100, description="Of a point where the orbit is lost.")
     table_lag_ms: Positive = Field(
         15.0, le=200, description="Lag of the table behind its command, which the gains allow for."
@@ -83,6 +89,7 @@ class Continuation(Excitation):
     def expected_s(self) -> float:
         """Duration in s if each orbit needs one update of its reference."""
         cycles = 2 * (self.settle_cycles + self.measured_cycles + self.blend_cycles)
+        cycles += self.multiplier_periods
         return sum(cycles / orbit.frequency_hz for orbit in self.orbit_plan.points)
 
     def plan(self, rate_hz: float) -> ExcitationPlan:
