@@ -73,8 +73,10 @@ def run(
     stop_s: float = math.inf,
     rig: RigConfig = RIG,
     operate: Callable[[], OperatorCommand | None] = lambda: None,
+    clock: ManualClock | None = None,
 ) -> Run:
-    clock, position, parts, masses, result = ManualClock(), [0], [], [], Run()
+    clock = clock or ManualClock()
+    position, parts, masses, result = [0], [], [], Run()
 
     def describe(tare: dict[str, float], epoch_s: float) -> RunStart:
         return RunStart(

@@ -1,0 +1,134 @@
+"""Faults while the feedback holds an orbit: trip, underrun, late or lost samples, a dead rig."""
+
+import math
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from table_io.acquisition.session import SessionSetup, run_session
+from table_io.backends import open_backend
+from table_io.block import Block, Float1D
+from table_io.clock import ManualClock
+from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.rig import RigConfig
+from table_io.records import Event, RunStart, RunStop, Trip
+from table_io.sim.simulated_table import SimulatedBackend
+from tests.table_io.acquisition.test_orbit_session import RATE_HZ, RIG, Run, make_profile, run
+
+CAPTURE_S, HELD_S = 10.5, 25.0  # of the first orbit; its feedback is large, then small
+MAX_REST_S = 2.0  # from a fault to rest
+LEVEL_M_S2 = 0.4903
+# Of the level: itself, the feedback at its limit of half the command, and a change of it.
+MAX_ACCELERATION = 1.0 + 0.5 + 1.0
+NO_COMMAND_M = 1e-6
+TIMES = pytest.mark.parametrize("fault_s", [CAPTURE_S, HELD_S])
+
+
+def make_rig(kind: str, at_s: float, **keys: float | str) -> RigConfig:
+    """Return the simulated rig with a fault."""
+    lines = [f"at_s = {at_s}", *(f"{name} = {value!r}" for name, value in keys.items())]
+    text = (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")
+    fault = "\n".join([*lines, f'kind = "{kind}"']).replace("'", '"')
+    return parse_toml(f"{text}\n[[simulated.faults]]\n{fault}\n", RigConfig, "rig")
+
+
+def assert_rests_smoothly(command_m: Float1D, fault_s: float) -> None:
+    """The command is at rest MAX_REST_S after a fault, and nowhere jumps on the way."""
+    first = round(fault_s * RATE_HZ)
+    assert np.abs(command_m[:first]).max() > 1e-4  # it did move
+    moving = np.flatnonzero(np.abs(command_m) > NO_COMMAND_M)
+    assert moving[-1] < first + MAX_REST_S * RATE_HZ
+    assert moving[-1] < command_m.size - 50
+    # Over 40 samples, as the converter has steps of 0.46 um: 2 m/s2 in a second difference.
+    acceleration = np.convolve(np.diff(command_m, 2), np.ones(40) / 40, "valid") * RATE_HZ**2
+    assert np.abs(acceleration[first - 100 :]).max() < MAX_ACCELERATION * LEVEL_M_S2
+
+
+def assert_recorded(result: Run) -> None:
+    """Every sample up to the end was delivered."""
+    assert result.select(RunStop)[0].index == result.command_m.size
+
+
+@TIMES
+@pytest.mark.parametrize(
+    ("kind", "channel", "trip"),
+    [
+        ("cable_off", "table_disp_m", "following"),
+        ("nan", "mass_disp_m", "lost"),
+        ("stuck", "mass_disp_m", "stuck"),
+        ("rail", "mass_disp_m", "rail"),
+    ],
+)
+def test_protection_stops_a_held_orbit(kind: str, channel: str, trip: str, fault_s: float) -> None:
+    """Among others where the feedback's own sensor fails, before the feedback can do harm."""
+    result = run(make_profile(), fault_s + 20.0, make_rig(kind, fault_s, channel=channel))
+    assert [(t.kind, t.channel) for t in result.select(Trip)] == [(trip, channel)]
+    assert result.select(RunStop)[0].verdict == "aborted"
+    assert_rests_smoothly(result.command_m, fault_s)
+    assert_recorded(result)
+
+
+@TIMES
+def test_rig_that_stalls_runs_out_of_queue_and_rests(fault_s: float) -> None:
+    clock = ManualClock()
+    stalls = iter([3.0])
+
+    def stall() -> None:
+        if clock.now() > fault_s:
+            clock.wait_until(clock.now() + next(stalls, 0.0))
+
+    result = run(make_profile(), fault_s + 20.0, operate=stall, clock=clock)
+    assert [trip.kind for trip in result.select(Trip)] == ["late"]
+    assert result.select(RunStop)[0].verdict == "aborted"
+    assert_rests_smoothly(result.command_m, fault_s)
+    assert_recorded(result)
+
+
+@TIMES
+def test_samples_that_come_late_do_not_lose_the_orbit(fault_s: float) -> None:
+    """The feedback answers later; during the capture it fades for a while."""
+    result = run(make_profile(slice(1)), fault_s + 8.0, make_rig("late", fault_s, size=0.15))
+    assert any(event.kind == "late" for event in result.select(Event))
+    assert not any(event.kind == "lost" for event in result.select(Event))
+    assert result.select(RunStop)[0].verdict == "stopped"
+    assert_rests_smoothly(result.command_m, fault_s + 8.1)
+    steady = slice(round((fault_s + 4.0) * RATE_HZ), round((fault_s + 7.0) * RATE_HZ))
+    undisturbed = run(make_profile(slice(1)), fault_s + 8.0).mass_m
+    assert np.ptp(result.mass_m[steady]) == pytest.approx(np.ptp(undisturbed[steady]), rel=0.05)
+
+
+def test_machine_that_falls_silent_halts_the_test_and_what_came_is_kept() -> None:
+    result = run(make_profile(), HELD_S + 20.0, make_rig("stall", HELD_S))
+    (stop,) = result.select(RunStop)
+    assert stop.verdict == "halted"
+    assert_recorded(result)
+    assert result.command_m.size >= HELD_S * RATE_HZ
+
+
+def test_queue_that_a_dead_rig_leaves_behind_ends_at_rest() -> None:
+    """At every tenth block, from the capture to the releases at the first orbit."""
+    profile, clock = make_profile(slice(1)), ManualClock()
+    backend = open_backend(RIG, profile, clock)
+    assert isinstance(backend, SimulatedBackend)
+
+    def describe(tare: dict[str, float], epoch_s: float) -> RunStart:
+        return RunStart(
+            0, "r", "n", "table", "", "", "", RATE_HZ, 20, RIG.channels, profile.steps, 0, tare,
+            {}, "", "", epoch_s,
+        )  # fmt: skip
+
+    session = run_session(SessionSetup(profile, RIG), backend, clock, describe, lambda: None)
+    blocks = (item for item in session if isinstance(item, Block))
+    played: list[Float1D] = []
+    checked = 0
+    for block in islice(blocks, round(56.0 * RATE_HZ / 20)):
+        played.append(block.channel("drive_disp_m"))
+        if len(played) % 10 == 0 and block.end > CAPTURE_S * RATE_HZ:
+            left = backend._command_between(block.end, block.end + round(3.0 * RATE_HZ))
+            recent = np.concatenate([*played[-50:], left])
+            assert_rests_smoothly(recent, (recent.size - left.size) / RATE_HZ)
+            checked += 1
+    assert checked > 400
+    session.close()
+    assert math.isclose(float(backend._command[-1]), 0.0, abs_tol=NO_COMMAND_M)
