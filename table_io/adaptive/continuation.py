@@ -8,7 +8,8 @@ x - J c, with J the derivative of x with respect to the command. Newton's residu
     rho(r, f) = x - J c - r,    d rho / d(r, f) = [-1, dx/df] at first, by Broyden afterwards
 
 One more equation selects the point: the corrections stay across the direction of the branch in the
-space of U_1 and f (pseudo-arclength), which passes through folds and resonances.
+space of U_1 and f (pseudo-arclength), which passes through folds and resonances. On a backbone it
+is phase resonance instead: u leads the table's acceleration by 90 degrees, Im U_1 = 0.
 """
 
 import math
@@ -91,6 +92,11 @@ def fundamental(vector: Float1D) -> float:
     return float(math.hypot(vector[1], vector[2]))
 
 
+def measure_phase(vector: Float1D) -> float:
+    """Return the phase in degrees by which the fundamental leads the table's acceleration."""
+    return math.degrees(math.atan2(vector[2], vector[1])) + 90.0
+
+
 def rotate_harmonics(vector: Float1D, angle: float) -> Float1D:
     """Return the harmonics at a phase that lags by `angle` rad: X_k exp(i k angle)."""
     coefficients = unpack_harmonics(vector)
@@ -152,11 +158,14 @@ def frequency_slope(orbit: PlannedOrbit) -> Float1D:
 def _difference_from_plan(plan: OrbitPlan, measured: MeasuredOrbit) -> Float1D:
     """Return reference and frequency minus those planned, across the planned branch, (2 H + 2,).
 
-    A difference along the branch is none: carried on, it would add up from point to point.
+    A difference along the branch is none: carried on, it would add up from point to point. On a
+    backbone the level fixes the place, so it counts.
     """
     orbit = plan.points[measured.position]
     reference = measured.reference - planned_reference(orbit)
     frequency_hz = measured.frequency_hz - orbit.frequency_hz
+    if plan.condition == "phase":
+        return np.append(reference, frequency_hz)
     tangent, tangent_hz = _planned_change(plan, measured.position)
     along = _relative_position(orbit, tangent, tangent_hz)
     square = float(along @ along)
@@ -199,7 +208,6 @@ def _relative_position(orbit: PlannedOrbit, reference: Float1D, frequency_hz: fl
 def correct_target(plan: OrbitPlan, target: OrbitTarget, measured: OrbitMeasurement) -> OrbitTarget:
     """Return the target after one Newton step with Broyden's derivative."""
     orbit = plan.points[target.position]
-    size = target.reference.size
     residual = _free_motion(orbit, measured) - target.reference
     slopes = target.slopes
     if (
@@ -210,11 +218,11 @@ def correct_target(plan: OrbitPlan, target: OrbitTarget, measured: OrbitMeasurem
         change = target.last_change
         error = residual - target.last_residual - slopes @ change
         slopes = slopes + np.outer(error, change) / (change @ change)
-    here = _relative_position(orbit, target.reference, target.frequency_hz)
-    goal = float(target.direction @ (target.origin - here))
-    condition = np.zeros(size + 1)
-    condition[1:3] = target.direction[:2] / fundamental(orbit.harmonics_m)
-    condition[-1] = target.direction[2] * FREQUENCY_WEIGHT * target.scale_hz_m / orbit.frequency_hz
+    condition, goal = (
+        _phase_condition(orbit, target)
+        if plan.condition == "phase"
+        else _arclength_condition(orbit, target)
+    )
     matrix = np.vstack([slopes, condition])
     change = np.linalg.solve(matrix, np.append(-residual, goal))
     shares = (
@@ -231,6 +239,26 @@ def correct_target(plan: OrbitPlan, target: OrbitTarget, measured: OrbitMeasurem
         last_change=change,
         last_residual=residual,
     )
+
+
+def _arclength_condition(orbit: PlannedOrbit, target: OrbitTarget) -> tuple[Float1D, float]:
+    """Return (row, right side) of the equation by which a target stays across the branch."""
+    here = _relative_position(orbit, target.reference, target.frequency_hz)
+    goal = float(target.direction @ (target.origin - here))
+    condition = np.zeros(target.reference.size + 1)
+    condition[1:3] = target.direction[:2] / fundamental(orbit.harmonics_m)
+    condition[-1] = target.direction[2] * FREQUENCY_WEIGHT * target.scale_hz_m / orbit.frequency_hz
+    return condition, goal
+
+
+def _phase_condition(orbit: PlannedOrbit, target: OrbitTarget) -> tuple[Float1D, float]:
+    """Return (row, right side) of Im U_1 = 0, over |U_1|: that of x less that of the table."""
+    size = fundamental(orbit.harmonics_m)
+    table_m = table_harmonics(target.frequency_hz, orbit.acceleration_m_s2, 1)[2]
+    condition = np.zeros(target.reference.size + 1)
+    condition[2] = 1.0 / size
+    condition[-1] = 2.0 * table_m / target.frequency_hz * target.scale_hz_m / size
+    return condition, -float(target.reference[2] - table_m) / size
 
 
 def _bounded_jacobian(orbit: PlannedOrbit) -> Float2D:

@@ -31,7 +31,7 @@ from table_io.config.base import (
     parse_toml,
     read_text,
 )
-from table_io.config.excitation import Excitation, ExcitationPlan, record  # noqa: F401  registers
+from table_io.config.excitation import Excitation, ExcitationPlan, backbone, record  # noqa: F401  registers
 from table_io.config.excitation.continuation import Continuation
 from table_io.config.excitation.stepped_sine import Sweep
 from table_io.errors import InputError

@@ -13,6 +13,7 @@ references, ahead of time, like every other change of the drive.
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,14 +24,20 @@ from table_io.adaptive.continuation import (
     correct_target,
     fundamental,
     is_on_branch,
+    measure_phase,
     plan_target,
+    planned_reference,
     rotate_harmonics,
 )
 from table_io.adaptive.result import mean_swing
 from table_io.block import Block, Float1D, Label, join_blocks
 from table_io.channels import measure_mass, relative_displacement
-from table_io.config.excitation.continuation import Continuation
-from table_io.config.excitation.orbit_plan import pack_harmonics, unpack_harmonics
+from table_io.config.excitation.continuation import (
+    CAPTURE_CYCLES,
+    UPDATE_BLEND_CYCLES,
+    Continuation,
+)
+from table_io.config.excitation.orbit_plan import OrbitPlan, pack_harmonics, unpack_harmonics
 from table_io.control.frf import evaluate_transfer
 from table_io.control.orbit_feedback import FeedbackState, ReferenceSegment, advance_feedback
 from table_io.control.order_tracking import HarmonicFit, track_harmonics
@@ -44,17 +51,29 @@ from table_io.sequencer.releases import (
 )
 from table_io.sequencer.state import OrbitSearch, ReleaseSeries, SequencerState, Stage
 
-CAPTURE_CYCLES = 20  # held at the first orbit after a soft start
-UPDATE_BLEND_CYCLES = 2.0  # between references of one point
-RELEASE_S = 0.1  # of the feedback when an orbit is lost
+RELEASE_S = 0.1  # of the feedback when an orbit is lost, or when it begins to act
 REST_S = 4.0  # until the motion has decayed, before an orbit is captured again
 MAX_SATURATED_CYCLES = 2.0  # at the limit of the feedback: the orbit is lost
 MAX_DEVIATION = 0.25  # of the amplitude of u from the reference: the orbit is lost
+PHASE_TOLERANCE_DEG = 1.0  # of phase resonance
 LEVEL_TOLERANCE = 0.003  # of the fundamental of the table's acceleration
 MAX_LEVEL_FACTOR = 1.25  # of the command in one update
 LATENCY_TOLERANCE_S = 0.003  # of the measured latency, beyond that of the plan
 MAX_LOST_POINTS = 3  # in a row, before the test ends
 NOISE_FACTOR = 1.5  # accepted feedback over what sensor noise explains
+
+
+class Waypoint(NamedTuple):
+    """Orbit on the way to the sought one: reference, frequency, planned point, feedback's share.
+
+    Where rest leads to no other solution the share is 0: a feedback at its limit would hold the
+    motion off the orbit.
+    """
+
+    reference: Float1D
+    frequency_hz: float
+    step: int
+    share: float = 1.0
 
 
 def begin_continuation(state: SequencerState) -> SequencerState:
@@ -75,7 +94,15 @@ def begin_continuation(state: SequencerState) -> SequencerState:
         correction,
         since=state.trajectory.end,
     )
-    return _approach(replace(state, search=search), state.trajectory, (), CAPTURE_CYCLES)
+    state = replace(state, search=search)
+    return _approach(state, state.trajectory, _list_leads(plan), CAPTURE_CYCLES)
+
+
+def _list_leads(plan: OrbitPlan) -> tuple[Waypoint, ...]:
+    """Return the orbits that lead from rest to the first point, as they are planned."""
+    return tuple(
+        Waypoint(planned_reference(orbit), orbit.frequency_hz, 0, 0.0) for orbit in plan.leads
+    )
 
 
 def check_latency(state: SequencerState) -> str:
@@ -108,23 +135,27 @@ def _config(state: SequencerState) -> Continuation:
 def _approach(
     state: SequencerState,
     trajectory: Trajectory,
-    waypoints: tuple[MeasuredOrbit, ...],
+    waypoints: tuple[Waypoint, ...],
     capture_cycles: float = 0.0,
     blend_cycles: float | None = None,
 ) -> SequencerState:
-    """Blend through orbits measured before to the target, and hold it for one evaluation."""
+    """Blend through other orbits to the target, and hold it for one evaluation.
+
+    capture_cycles: held at the first of them. The periods of a point count from the last blend
+    on, without a capture.
+    """
     search, config, changed = _search(state), _config(state), trajectory.end
     target, position = search.target, search.target.position
-    path = [(orbit.reference, orbit.frequency_hz, orbit.position) for orbit in waypoints]
-    path.append((target.reference, target.frequency_hz, position))
-    feedback = search.feedback
-    for reference, frequency_hz, step in path:
+    feedback, since = search.feedback, search.since
+    for waypoint in (*waypoints, Waypoint(target.reference, target.frequency_hz, position)):
+        since = trajectory.end if waypoints else since
         trajectory, feedback = _append_orbit(
-            state, trajectory, feedback, reference, frequency_hz, step,
+            state, trajectory, feedback, waypoint,
             config.blend_cycles if blend_cycles is None else blend_cycles,
         )  # fmt: skip
         if capture_cycles:
-            trajectory = _append_cycles(trajectory, capture_cycles, step)
+            trajectory = _append_cycles(trajectory, capture_cycles, waypoint.step)
+            since = trajectory.end
             capture_cycles = 0.0
     rate_hz, cycle = trajectory.rate_hz, trajectory.rate_hz / target.frequency_hz
     first = trajectory.end + math.ceil(config.settle_cycles * cycle)
@@ -138,7 +169,7 @@ def _approach(
         trajectory=trajectory,
         drive=replace(trajectory.to_drive(state.steps), correction=state.drive.correction),
         stage=Stage("orbit", position, first, last, target.update),
-        search=replace(search, feedback=feedback),
+        search=replace(search, feedback=feedback, since=since),
         changed_from=changed,
     )
 
@@ -152,13 +183,14 @@ def _append_orbit(
     state: SequencerState,
     trajectory: Trajectory,
     feedback: FeedbackState,
-    reference: Float1D,
-    frequency_hz: float,
-    step: int,
+    waypoint: Waypoint,
     blend_cycles: float,
 ) -> tuple[Trajectory, FeedbackState]:
     """Return the trajectory and the references with a blend to an orbit appended."""
     search, config = _search(state), _config(state)
+    reference, frequency_hz, step, share = waypoint
+    if feedback.segments and trajectory.target.level_m_s2 and feedback.segments[-1].share1 < share:
+        trajectory, feedback = _engage(trajectory, feedback, step, blend_cycles)
     orbit, start = config.orbit_plan.points[step], trajectory.end
     from_rest = trajectory.target.level_m_s2 == 0.0
     sine = SineTarget(frequency_hz, orbit.acceleration_m_s2, search.correction)
@@ -173,14 +205,27 @@ def _append_orbit(
         trajectory.end - start,
         np.zeros_like(after) if from_rest or not feedback.segments else feedback.segments[-1].after,
         after,
-        0.0 if from_rest else 1.0,
-        1.0,
+        0.0 if from_rest or not feedback.segments else feedback.segments[-1].share1,
+        share,
         orbit.gain,
         orbit.rate_gain_s,
         config.max_feedback * command_m,
         orbit.acceleration_m_s2,
     )
     return trajectory, feedback.append(segment)
+
+
+def _engage(
+    trajectory: Trajectory, feedback: FeedbackState, step: int, cycles: float
+) -> tuple[Trajectory, FeedbackState]:
+    """Return the trajectory held for some cycles, in which the feedback begins to act.
+
+    At once: a part of the gain may be unstable where the whole gain and none are stable.
+    """
+    last = feedback.segments[-1]
+    count = round(RELEASE_S * trajectory.rate_hz)
+    engaged = replace(last, start=trajectory.end, count=count, before=last.after, share1=1.0)
+    return _append_cycles(trajectory, cycles, step), feedback.append(engaged)
 
 
 def resume_continuation(state: SequencerState) -> SequencerState:
@@ -389,6 +434,9 @@ def _find_fault(
         return f"the feedback is {100 * measured.feedback_m / command_m:.2g} % of the command"
     if not is_on_branch(config.orbit_plan, target, measured):
         return "the amplitude is not that of the sought branch"
+    phase_deg = measure_phase(measured.u)
+    if config.orbit_plan.condition == "phase" and abs(phase_deg - 90.0) > PHASE_TOLERANCE_DEG:
+        return f"u leads the table's acceleration by {phase_deg:.4g} degrees, not by 90"
     if abs(level_ratio - 1.0) > LEVEL_TOLERANCE:
         return f"the table is at {100 * level_ratio:.4g} % of its level"
     return ""
@@ -438,7 +486,9 @@ def retry_orbit(state: SequencerState, index: int, reason: str) -> SequencerStat
     trajectory = trajectory.append_rest(round(REST_S * trajectory.rate_hz))
     target = plan_target(config.orbit_plan, next_position, search.measured)
     search = replace(search, target=target, periods=0, since=trajectory.end)
-    state = _approach(replace(state, search=search), trajectory, search.measured, CAPTURE_CYCLES)
+    measured = (Waypoint(m.reference, m.frequency_hz, m.position) for m in search.measured)
+    waypoints = (*_list_leads(config.orbit_plan), *measured)
+    state = _approach(replace(state, search=search), trajectory, waypoints, CAPTURE_CYCLES)
     return replace(state, changed_from=changed)
 
 

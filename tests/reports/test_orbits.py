@@ -112,6 +112,24 @@ def test_report_shows_branch_and_table(folder):
     assert "2 of 3 orbits measured, 1 of them unstable" in text
 
 
+def test_report_of_a_backbone_shows_the_phase(tmp_path):
+    plan = make_plan().model_copy(update={"condition": "phase"})
+    profile = PROFILE.format(plan=plan.to_json()).replace('"continuation"', '"backbone"')
+    start = replace(start_record(), profile_toml=profile)
+    points = [make_point(0), make_point(1), make_point(2)]
+    write_items(tmp_path / "run.mcap", [start, *points, RunStop(4000, "complete", "", ())], start)
+    summary = summarise(read_recording(tmp_path / "run.mcap"), snm())
+    write_summary(summary, tmp_path / "summary.json")
+    assert summary["orbits"][0]["phase_deg"] == pytest.approx(90.0 + np.degrees(np.arctan2(4, 3)))
+    branch = read_planned_branch(parse_toml_tables(profile))
+    assert branch is not None
+    assert branch.is_backbone
+    text = write_report(tmp_path).read_text(encoding="utf-8")
+    assert "3 of 3 points of the backbone measured" in text
+    assert "Measured backbone" in text
+    assert "<dt>Backbone</dt>" in text
+
+
 def test_view_draws_accepted_orbits_over_the_planned_ones():
     curves = OrbitCurves(make_plan())
     assert curves.get_curves("measured") == []

@@ -100,10 +100,13 @@ def _orbit_lines(config: Continuation) -> list[tuple[str, str]]:
     plan = config.orbit_plan
     orbits = plan.points
     unstable = [orbit for orbit in orbits if not orbit.stable]
+    place = "in phase resonance" if plan.condition == "phase" else "along one branch"
+    levels_g = [orbit.acceleration_m_s2 / GRAVITY_M_S2 for orbit in orbits]
+    extent = f"{min(levels_g):.4g} to " if min(levels_g) < max(levels_g) else ""
     return [
         (
             "orbits",
-            f"{len(orbits)} along one branch, {len(unstable)} of them unstable, "
+            f"{len(orbits)} {place}, {len(unstable)} of them unstable, "
             f"{min(orbit.frequency_hz for orbit in orbits):.5g} to "
             f"{max(orbit.frequency_hz for orbit in orbits):.5g} Hz, each held by feedback",
         ),
@@ -112,7 +115,7 @@ def _orbit_lines(config: Continuation) -> list[tuple[str, str]]:
             f"at most {100 * config.max_feedback:g} % of the command; planned for a latency of "
             f"{1e3 * plan.latency_s:.3g} ms and {1e3 * plan.jitter_s:.3g} ms of jitter",
         ),
-        ("level", f"{orbits[0].acceleration_m_s2 / GRAVITY_M_S2:.4g} g peak table acceleration"),
+        ("level", f"{extent}{max(levels_g):.4g} g peak table acceleration"),
     ]
 
 

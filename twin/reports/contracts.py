@@ -22,6 +22,7 @@ Acceleration = Annotated[Number, _declare_unit("m/s2")]
 Seconds = Annotated[float, _declare_unit("s")]
 Milliseconds = Annotated[Number, _declare_unit("ms")]
 Hertz = Annotated[float, _declare_unit("Hz")]
+Degrees = Annotated[Number, _declare_unit("deg")]
 Index = Annotated[int, _declare_unit("sample")]
 SI = Annotated[Number, _declare_unit("SI unit of the quantity")]
 Direction = Literal["forward", "backward"]
@@ -280,6 +281,7 @@ class OrbitResult(Contract):
     acceleration_m_s2: Acceleration = Field(description="fundamental of the table, measured")
     amplitude_m: Metres = Field(description="half of max u - min u")
     fundamental_m: Metres = Field(description="fundamental of u")
+    phase_deg: Degrees = Field(description="its lead over that of the table's acceleration")
     feedback_m: Metres = Field(description="root of the sum of squares of its harmonics")
     feedback_share: Ratio = Field(description="the same over the amplitude of the command")
     feedback_harmonics_m: list[Metres] = Field(description="amplitudes of harmonics 0, 1, ...")

@@ -24,12 +24,13 @@ def draw_orbits(run: ReportData) -> CaptionedFigures:
     orbits = run.summary.get("orbits") or []
     if not orbits:
         return
+    branch = read_planned_branch(parse_toml_tables(run.recording.start.profile_toml))
     measured = [orbit for orbit in orbits if orbit["multiplier_sd"] is not None]
-    heights = (2.2, 1.0, 1.2) if measured else (2.2, 1.0)
-    figure = Figure(figsize=(FIGURE_WIDTH_IN, 8.0 if measured else 6.2))
+    is_backbone = branch is not None and branch.is_backbone
+    heights = (2.2, 1.0, 1.2) if measured or is_backbone else (2.2, 1.0)
+    figure = Figure(figsize=(FIGURE_WIDTH_IN, 6.2 if len(heights) == 2 else 8.0))
     axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
     branch_axis, feedback_axis = axes[:2]
-    branch = read_planned_branch(parse_toml_tables(run.recording.start.profile_toml))
     if branch is not None:
         amplitudes_mm = 1e3 * branch.amplitudes_m
         stable, unstable = (
@@ -63,7 +64,15 @@ def draw_orbits(run: ReportData) -> CaptionedFigures:
     branch_axis.set_ylabel("amplitude of $u$ in mm")
     feedback_axis.set_ylabel("feedback in % of the command")
     feedback_axis.set_yscale("log")
-    if measured:
+    if is_backbone:
+        axes[2].plot(
+            [orbit["frequency_hz"] for orbit in orbits],
+            [orbit["phase_deg"] for orbit in orbits],
+            "o", color=DIRECTION_COLOURS["forward"],
+        )  # fmt: skip
+        axes[2].axhline(90.0, color=GUIDE_COLOUR, lw=0.8)
+        axes[2].set_ylabel("phase in degrees")
+    elif measured:
         if branch is not None:
             axes[2].plot(branch.frequencies_hz, branch.multipliers, color=TWIN_COLOUR, lw=1.0)
         axes[2].errorbar(
@@ -78,6 +87,16 @@ def draw_orbits(run: ReportData) -> CaptionedFigures:
     branch_axis.legend()
     feedback_axis.legend()
     accepted = sum(orbit["accepted"] for orbit in orbits)
+    if is_backbone:
+        yield CaptionedFigure(
+            "orbits",
+            "Measured backbone",
+            f"{accepted} of {len(orbits)} points accepted. At each level of the table the "
+            "frequency was controlled until u led the table's acceleration by 90 degrees (phase, "
+            "below), held by feedback until the feedback had vanished. Line: backbone of the twin.",
+            figure,
+        )
+        return
     yield CaptionedFigure(
         "orbits",
         "Measured branch of periodic orbits",

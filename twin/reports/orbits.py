@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from table_io.block import Float1D
+from table_io.config.excitation import find_excitation
 from table_io.config.excitation.continuation import Continuation
 from table_io.config.excitation.orbit_plan import OrbitPlan
 from table_io.errors import InputError
@@ -29,6 +30,7 @@ def _summarise_orbit(orbit: OrbitPoint, plan: OrbitPlan) -> dict[str, Any]:
         "acceleration_m_s2": orbit.acceleration_m_s2,
         "amplitude_m": orbit.amplitude_m,
         "fundamental_m": math.hypot(*orbit.u_m[2:4]),
+        "phase_deg": 90.0 + math.degrees(math.atan2(orbit.u_m[3], orbit.u_m[2])),
         "feedback_m": feedback,
         "feedback_share": feedback / orbit.command_m,
         "feedback_harmonics_m": list(orbit.feedback_m),
@@ -50,18 +52,26 @@ def _summarise_orbit(orbit: OrbitPoint, plan: OrbitPlan) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class PlannedBranch:
-    """Planned orbits: Hz, m, whether stable, largest Floquet multiplier; (orbit,) each."""
+    """Planned orbits: Hz, m, whether stable, largest Floquet multiplier; (orbit,) each.
+
+    is_backbone: in phase resonance by level, not along a branch at one level.
+    """
 
     frequencies_hz: Float1D
     amplitudes_m: Float1D
     stable: np.ndarray[tuple[int], np.dtype[np.bool_]]
     multipliers: Float1D
+    is_backbone: bool
 
 
 def read_planned_branch(profile_tables: dict[str, Any]) -> PlannedBranch | None:
     """Return the branch of the plan in a recorded profile; None without one."""
     try:
-        plan = Continuation.model_validate(profile_tables.get("excitation")).orbit_plan
+        table = profile_tables.get("excitation") or {}
+        kind = find_excitation(table.get("kind"))
+        if not issubclass(kind, Continuation):
+            return None
+        plan = kind.model_validate(table).orbit_plan
     except (ValidationError, InputError):
         return None
     return PlannedBranch(
@@ -69,4 +79,5 @@ def read_planned_branch(profile_tables: dict[str, Any]) -> PlannedBranch | None:
         np.array([orbit.amplitude_m for orbit in plan.points]),
         np.array([orbit.stable for orbit in plan.points]),
         np.array([orbit.multiplier_size for orbit in plan.points]),
+        plan.condition == "phase",
     )

@@ -142,7 +142,7 @@ def worst_level(run: ReportData) -> dict[str, float] | None:
     }
 
 
-def format_orbit_headline(orbits: list[dict[str, Any]]) -> str:
+def format_orbit_headline(orbits: list[dict[str, Any]], is_backbone: bool) -> str:
     """Format the headline of a continuation: orbits accepted, their range and the feedback."""
     accepted = [orbit for orbit in orbits if orbit["accepted"]]
     if not accepted:
@@ -150,6 +150,12 @@ def format_orbit_headline(orbits: list[dict[str, Any]]) -> str:
     unstable = [orbit for orbit in accepted if not orbit["stable"]] or accepted
     frequencies = [orbit["frequency_hz"] for orbit in unstable]
     share = max(orbit["feedback_share"] for orbit in accepted)
+    if is_backbone:
+        return (
+            f"{len(accepted)} of {len(orbits)} points of the backbone measured, "
+            f"{min(frequencies):.4g} to {max(frequencies):.4g} Hz; feedback at most "
+            f"{100 * share:.2g} % of the command."
+        )
     return (
         f"{len(accepted)} of {len(orbits)} orbits measured, {len(unstable)} of them unstable from "
         f"{min(frequencies):.4g} to {max(frequencies):.4g} Hz; feedback at most "
@@ -164,7 +170,8 @@ def format_headline(run: ReportData) -> str:
         kind = planned.get("kind", "history")
         return f"{len(run.windows)} windows of a displacement history ({kind}), open loop."
     if run.orbits:
-        return format_orbit_headline(run.orbits)
+        planned = parse_toml_tables(run.recording.start.profile_toml).get("excitation") or {}
+        return format_orbit_headline(run.orbits, planned.get("kind") == "backbone")
     done_count = sum(1 for step in run.steps if step.get("measured") or step.get("twin"))
     parts = [f"{done_count} of {len(run.recording.start.steps) or len(run.steps)} steps"]
     parts += [

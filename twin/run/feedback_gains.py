@@ -9,7 +9,7 @@ deviation decays with the feedback.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from table_io.block import Float1D, Float2D
 from table_io.control.orbit_feedback import BLEND_S, WINDOW_S
+from table_io.errors import InputError
 from table_io.excitation.drive import smoothstep
 from twin.dynamics.linearized_orbit import LinearizedOrbit, LinearPart
 from twin.dynamics.orbits import Orbit
@@ -26,6 +27,9 @@ TABLE_LAG_S = 0.01  # of the latency, the part that is a low pass: a servo of ab
 COMMAND_ERROR = 0.1  # relative error of the table's gain that a margin includes
 MAX_GAIN, GAIN_STEP, FINE_GAIN_STEP = 1.2, 0.1, 0.025
 MAX_RATE_GAIN_S, RATE_GAIN_STEP_S, FINE_RATE_GAIN_STEP_S = 0.04, 0.005, 0.00125
+GAIN_STATIONS = 8  # orbits at which the gains are settled; they vary slowly along the branch
+MAX_MULTIPLIER = 0.8  # of the closed loop with every error: a deviation must decay
+LATENCY_RESOLUTION_S = 0.002  # of the largest allowed latency in a refusal
 COARSE_CANDIDATES = 12  # of the coarse grid, that are compared with every error
 
 
@@ -172,6 +176,51 @@ def settle_gains(loops: Sequence[OpenLoop], timing: FeedbackTiming) -> FeedbackG
     best = int(multipliers.argmin())
     gain, rate_gain = fine[best].round(6).tolist()
     return FeedbackGains(gain, rate_gain, float(multipliers[best]))
+
+
+def interpolate_gains(
+    list_orbits: Callable[[int], list[Orbit]], positions: Sequence[float], timing: FeedbackTiming
+) -> list[tuple[float, float]]:
+    """Return (gain, rate gain in s) at ascending positions, settled at GAIN_STATIONS of them.
+
+    list_orbits: by index of a position, its orbit first, then those of models with errors.
+    InputError if the latency is too large at one of them.
+    """
+    stations = np.unique(np.linspace(0, len(positions) - 1, GAIN_STATIONS).round().astype(int))
+    settled = []
+    for station in stations.tolist():
+        loops = [OpenLoop.from_orbit(orbit, timing.block_s) for orbit in list_orbits(station)]
+        gains = settle_gains(loops, timing)
+        if gains.multiplier > MAX_MULTIPLIER:
+            raise _make_latency_error(loops, timing, gains)
+        settled.append(gains)
+    own = [positions[station] for station in stations]
+    gain = np.interp(positions, own, [gains.gain for gains in settled])
+    rate_gain = np.interp(positions, own, [gains.rate_gain_s for gains in settled])
+    return list(zip(gain.tolist(), rate_gain.tolist(), strict=True))
+
+
+def _make_latency_error(
+    loops: Sequence[OpenLoop], timing: FeedbackTiming, gains: FeedbackGains
+) -> InputError:
+    """Return the error that no gains hold an orbit at this latency, with the largest allowed."""
+    low, high = 0.0, timing.latency_s
+    while high - low > LATENCY_RESOLUTION_S:
+        middle = (low + high) / 2
+        shorter = FeedbackTiming(middle, timing.jitter_s, timing.block_s)
+        if settle_gains(loops, shorter).multiplier > MAX_MULTIPLIER:
+            high = middle
+        else:
+            low = middle
+    return InputError(
+        f"no feedback holds the unstable orbit at {loops[0].frequency_hz:.4g} Hz with this "
+        f"latency: a deviation grows {gains.multiplier:.2g} times in a period, allowed are "
+        f"{MAX_MULTIPLIER:g}",
+        key="latency",
+        value=f"{1e3 * timing.latency_s:.3g} ms",
+        allowed=f"up to {1e3 * low:.3g} ms, with a jitter of {1e3 * timing.jitter_s:.3g} ms",
+        remedy="use shorter blocks, or a device in which the command can be replaced later",
+    )
 
 
 def _make_grid(*ranges: tuple[float, float, float]) -> Float2D:

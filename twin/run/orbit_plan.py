@@ -1,12 +1,12 @@
-"""Orbit plan of a continuation test: orbits through both folds, with Jacobian and feedback gains.
+"""Orbit plan of a continuation or a backbone: orbits with Jacobian and feedback gains.
 
 Everything that the rig needs of the model is computed here, before the table moves, and refused
-here if it cannot be done: no unstable orbit in the range, or a latency at which no gains hold them.
+here if it cannot be done: no unstable orbit or no phase resonance in the range, or a latency at
+which no gains hold them.
 """
 
 import re
 import tomllib
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from table_io.backends import open_backend
 from table_io.block import Float1D
 from table_io.clock import ManualClock
+from table_io.config.excitation.backbone import Backbone
 from table_io.config.excitation.orbit_plan import OrbitPlan, PlannedOrbit
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
@@ -26,18 +27,16 @@ from twin.dynamics.linearized_orbit import LinearizedOrbit, find_harmonics
 from twin.dynamics.orbits import Orbit, settle_to_orbit
 from twin.dynamics.period_map import FREQUENCY, PeriodMap, make_period_map
 from twin.model.model import Model
-from twin.run.feedback_gains import FeedbackGains, FeedbackTiming, OpenLoop, settle_gains
+from twin.run.feedback_gains import FeedbackTiming, interpolate_gains
+from twin.run.phase_resonance import find_phase_resonance, find_resonance_approach
 
 RANGE_MARGIN = 1.2  # ratio of frequencies by which the branch is followed beyond the range
 REFUSAL_MARGIN = 1.6  # the same, to tell where unstable orbits are
 LEAD_ORBITS = 3  # stable ones before and after the unstable ones
 PLAN_HARMONICS = 9
 MODEL_ERROR = 0.05  # relative error of mass and of stiffness with which the gains must hold
-GAIN_STATIONS = 8  # orbits at which the gains are settled; they vary slowly along the branch
-MAX_MULTIPLIER = 0.8  # of the closed loop with every error: a deviation must decay
 JITTER_S = 0.005  # of blocks that arrive late; the feedback horizon absorbs smaller ones
 PLAN_FILE = "orbit_plan.json"
-LATENCY_RESOLUTION_S = 0.002  # of the largest allowed latency in a refusal
 FINE_POSITIONS = 2001  # at which the range is looked for along the unstable part
 MIN_UNSTABLE_POINTS = 3  # of a followed branch, between its folds
 
@@ -104,7 +103,11 @@ def make_orbit_plan(
     variants = _find_variants(period_map, range_hz, acceleration_m_s2)
     positions = stretch.divide(range_hz, points)
     orbits = [stretch.orbit_at(position) for position in positions]
-    gains = _interpolate_gains(stretch, variants, positions, timing)
+
+    def list_orbits(station: int) -> list[Orbit]:
+        return [source.orbit_at(positions[station]) for source in (stretch, *variants)]
+
+    gains = interpolate_gains(list_orbits, positions, timing)
     return OrbitPlan(
         harmonics=PLAN_HARMONICS,
         latency_s=timing.latency_s,
@@ -215,68 +218,59 @@ def _reverse(stretch: UnstableStretch) -> UnstableStretch:
     return UnstableStretch(stretch.orbits[::-1], 1.0 - stretch.positions[::-1])
 
 
+def _vary_parameters(period_map: PeriodMap) -> list[PeriodMap]:
+    """Return models with errors of mass and stiffness."""
+    return [
+        period_map.with_parameter(name, factor * period_map.parameter(name))
+        for name in ("mass", "stiffness")
+        for factor in (1.0 - MODEL_ERROR, 1.0 + MODEL_ERROR)
+    ]
+
+
 def _find_variants(
     period_map: PeriodMap, range_hz: tuple[float, float], acceleration_m_s2: float
 ) -> list[UnstableStretch]:
     """Return the unstable parts of models with errors of mass and stiffness, where they exist."""
     variants = []
-    for name in ("mass", "stiffness"):
-        for factor in (1.0 - MODEL_ERROR, 1.0 + MODEL_ERROR):
-            varied = period_map.with_parameter(name, factor * period_map.parameter(name))
-            try:
-                variants.append(find_unstable_stretch(varied, range_hz, acceleration_m_s2))
-            except InputError:
-                continue
+    for varied in _vary_parameters(period_map):
+        try:
+            variants.append(find_unstable_stretch(varied, range_hz, acceleration_m_s2))
+        except InputError:
+            continue
     return variants
 
 
-def _interpolate_gains(
-    stretch: UnstableStretch,
-    variants: Sequence[UnstableStretch],
-    positions: Sequence[float],
-    timing: FeedbackTiming,
-) -> list[tuple[float, float]]:
-    """Return (gain, rate gain) at positions, settled at GAIN_STATIONS of them.
+def make_backbone_plan(
+    model: Model, range_hz: tuple[float, float], levels_m_s2: Float1D, timing: FeedbackTiming
+) -> OrbitPlan:
+    """Return the plan of a backbone: the orbit in phase resonance at each level, (level,) in m/s2.
 
-    InputError if the latency is too large at one of them.
+    InputError if a level has none in the range, or if the latency is too large.
     """
-    stations = np.unique(np.linspace(0, len(positions) - 1, GAIN_STATIONS).round().astype(int))
-    settled = []
-    for station in stations.tolist():
-        loops = [
-            OpenLoop.from_orbit(source.orbit_at(positions[station]), timing.block_s)
-            for source in (stretch, *variants)
-        ]
-        gains = settle_gains(loops, timing)
-        if gains.multiplier > MAX_MULTIPLIER:
-            raise _make_latency_error(loops, timing, gains)
-        settled.append(gains)
-    own = [positions[station] for station in stations]
-    gain = np.interp(positions, own, [gains.gain for gains in settled])
-    rate_gain = np.interp(positions, own, [gains.rate_gain_s for gains in settled])
-    return list(zip(gain.tolist(), rate_gain.tolist(), strict=True))
+    period_map = make_period_map(model)
+    *leads, first = find_resonance_approach(period_map, range_hz, float(levels_m_s2[0]))
+    orbits = [first] + [
+        find_phase_resonance(period_map, range_hz, level) for level in levels_m_s2[1:].tolist()
+    ]
+    variants = _vary_parameters(period_map)
 
+    def list_orbits(station: int) -> list[Orbit]:
+        listed = [orbits[station]]
+        for variant in variants:
+            try:
+                listed.append(find_phase_resonance(variant, range_hz, float(levels_m_s2[station])))
+            except InputError:  # beyond the range
+                continue
+        return listed
 
-def _make_latency_error(
-    loops: Sequence[OpenLoop], timing: FeedbackTiming, gains: FeedbackGains
-) -> InputError:
-    """Return the error that no gains hold an orbit at this latency, with the largest allowed."""
-    low, high = 0.0, timing.latency_s
-    while high - low > LATENCY_RESOLUTION_S:
-        middle = (low + high) / 2
-        shorter = FeedbackTiming(middle, timing.jitter_s, timing.block_s)
-        if settle_gains(loops, shorter).multiplier > MAX_MULTIPLIER:
-            high = middle
-        else:
-            low = middle
-    return InputError(
-        f"no feedback holds the unstable orbit at {loops[0].frequency_hz:.4g} Hz with this "
-        f"latency: a deviation grows {gains.multiplier:.2g} times in a period, allowed are "
-        f"{MAX_MULTIPLIER:g}",
-        key="latency",
-        value=f"{1e3 * timing.latency_s:.3g} ms",
-        allowed=f"up to {1e3 * low:.3g} ms, with a jitter of {1e3 * timing.jitter_s:.3g} ms",
-        remedy="use shorter blocks, or a device in which the command can be replaced later",
+    gains = interpolate_gains(list_orbits, np.log(levels_m_s2).tolist(), timing)
+    return OrbitPlan(
+        condition="phase",
+        harmonics=PLAN_HARMONICS,
+        latency_s=timing.latency_s,
+        jitter_s=timing.jitter_s,
+        points=tuple(_plan_orbit(orbit, own) for orbit, own in zip(orbits, gains, strict=True)),
+        leads=tuple(_plan_orbit(orbit, gains[0]) for orbit in leads),
     )
 
 
@@ -289,13 +283,14 @@ def attach_orbit_plan(text: str, profile: Profile, rig: RigConfig, model: Model,
     assert config is not None
     timing = find_timing(profile, rig)
     _attach_file(text, "", where)  # refuses before the plan is computed
-    plan = make_orbit_plan(
-        model,
-        (config.start_hz, config.stop_hz),
-        config.acceleration_g * GRAVITY_M_S2,
-        config.points,
-        timing,
-    )
+    range_hz = (config.start_hz, config.stop_hz)
+    largest = config.acceleration_g * GRAVITY_M_S2
+    if isinstance(config, Backbone):
+        smallest = config.min_acceleration_g * GRAVITY_M_S2
+        levels = np.geomspace(smallest, largest, config.points) if config.points > 1 else [largest]
+        plan = make_backbone_plan(model, range_hz, np.array(levels), timing)
+    else:
+        plan = make_orbit_plan(model, range_hz, largest, config.points, timing)
     return _attach_file(text, plan.to_json(), where)
 
 

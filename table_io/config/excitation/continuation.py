@@ -19,6 +19,9 @@ from table_io.config.excitation.orbit_plan import OrbitPlan, parse_orbit_plan
 from table_io.errors import InputError
 from table_io.records import Step
 
+CAPTURE_CYCLES = 20  # held at the first orbit after a soft start
+UPDATE_BLEND_CYCLES = 2.0  # between references of one point
+
 
 @register_excitation("continuation")
 class Continuation(Excitation):

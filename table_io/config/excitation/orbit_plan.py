@@ -85,15 +85,22 @@ class PlannedOrbit(ConfigModel):
 
 
 class OrbitPlan(ConfigModel):
-    """Orbits of one branch in order along it, through its folds."""
+    """Orbits in order: of one branch, through its folds, or in phase resonance by rising level."""
 
     version: Literal[1] = 1
+    condition: Literal["arclength", "phase"] = Field(
+        "arclength",
+        description="What selects a point: its place along the branch, or a phase of 90 degrees.",
+    )
     harmonics: Count = Field(ge=1, le=MAX_HARMONICS)
     latency_s: NonNegative = Field(description="From motion to the table's answer to it.")
     jitter_s: NonNegative = Field(0.0, description="Variation of the latency.")
     points: tuple[PlannedOrbit, ...] = Field(min_length=1)
+    leads: tuple[PlannedOrbit, ...] = Field(
+        (), description="Orbits from one that rest leads to, to the first point; not measured."
+    )
 
-    @field_validator("points")
+    @field_validator("points", "leads")
     @classmethod
     def _check_harmonics(
         cls, points: tuple[PlannedOrbit, ...], info: ValidationInfo
@@ -109,16 +116,21 @@ class OrbitPlan(ConfigModel):
 
     def to_json(self) -> str:
         """Return the plan as JSON text, one point a line."""
-        head = self.model_dump(exclude={"points"})
-        lines = []
-        for point in self.points:
-            table = point.model_dump()
-            table["jacobian"] = [
-                [float(f"{value:.{JACOBIAN_DIGITS}g}") for value in row] for row in point.jacobian
-            ]
-            lines.append(json.dumps(table, separators=(",", ":")))
-        points = ",\n".join(lines)
-        return f'{json.dumps(head)[:-1]}, "points": [\n{points}\n]}}\n'
+        head = self.model_dump(exclude={"points", "leads"})
+        points, leads = (
+            ",\n".join(_to_line(orbit) for orbit in orbits) for orbits in (self.points, self.leads)
+        )
+        tail = f', "leads": [\n{leads}\n]' if self.leads else ""
+        return f'{json.dumps(head)[:-1]}, "points": [\n{points}\n]{tail}}}\n'
+
+
+def _to_line(orbit: PlannedOrbit) -> str:
+    """Return an orbit as one line of JSON."""
+    table = orbit.model_dump()
+    table["jacobian"] = [
+        [float(f"{value:.{JACOBIAN_DIGITS}g}") for value in row] for row in orbit.jacobian
+    ]
+    return json.dumps(table, separators=(",", ":"))
 
 
 def parse_orbit_plan(text: str, name: str) -> OrbitPlan:

@@ -11,6 +11,7 @@ from table_io.adaptive.continuation import (
     correct_target,
     fundamental,
     is_on_branch,
+    measure_phase,
     plan_target,
     planned_reference,
     rotate_harmonics,
@@ -90,6 +91,23 @@ def test_broyden_corrects_a_wrong_jacobian() -> None:
         target = correct_target(plan, target, measured)
     assert sizes[-1] < 0.02 * sizes[0]
     assert np.abs(target.reference - u - table).max() < 0.02 * fundamental(u)
+
+
+def test_phase_resonance_of_a_linear_specimen_is_found_by_the_measured_phase() -> None:
+    resonance_hz, start_hz = math.sqrt(200e3 / MASS) / (2 * math.pi), 3.1
+    jacobian = real_matrix(linear_response(start_hz, 200e3))
+    planned = jacobian @ table_harmonics(start_hz, A, 1)
+    orbit = make_orbit(start_hz, complex(planned[1], planned[2]), jacobian)
+    plan = OrbitPlan(harmonics=1, latency_s=0.046, condition="phase", points=(orbit,))
+    target = plan_target(plan, 0, ())
+    for _ in range(8):
+        response = real_matrix(linear_response(target.frequency_hz, 200e3))
+        table = table_harmonics(target.frequency_hz, A, 1)
+        measured = hold(target.reference, response @ table + table, response, 0.5 - 0.3j)
+        target = correct_target(plan, target, measured)
+    assert target.frequency_hz == pytest.approx(resonance_hz, rel=1e-4)
+    assert measure_phase(measured.x - table) == pytest.approx(90.0, abs=0.1)
+    assert measured.feedback_m < 1e-3 * fundamental(table)
 
 
 def branch_orbit(amplitude_m: float) -> PlannedOrbit:

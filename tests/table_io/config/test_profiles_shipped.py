@@ -28,7 +28,10 @@ PAPER = {
     "gm10": (-10.0, TALL),
 }
 TOOLS = {"dwell", "track", "refine_g4"}
-PLANNED_BY_TWIN = {"g4_unstable"}  # without a drive before the twin has made its orbit plan
+PLANNED_BY_TWIN = {
+    "g4_unstable",
+    "g4_backbone",
+}  # without a drive before the twin has made its orbit plan
 
 
 def read(path: Path) -> Profile:

@@ -31,17 +31,19 @@ from tests.table_io.excitation.pulse_train import PulseTrain
 ORBITS = Path(__file__).parents[1] / "acquisition" / "unstable_orbits.json"
 RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "rig")[0]
 SWEEP = {"start_hz": 2.0, "stop_hz": 3.0, "step_hz": 0.5, "cycles": 3, "measured_cycles": 1}
+HELD_ORBITS = {
+    "start_hz": 2.85,
+    "stop_hz": 3.0,
+    "file": ORBITS.name,
+    "files": {ORBITS.name: ORBITS.read_text(encoding="utf-8")},
+}
 EXAMPLES: dict[str, dict[str, Any]] = {
     "stepped_sine": SWEEP,
     "record": load_profile(PROFILES_DIR / "tests" / "record_example.toml")[
         0
     ].excitation.model_dump(),
-    "continuation": {
-        "start_hz": 2.85,
-        "stop_hz": 3.0,
-        "file": ORBITS.name,
-        "files": {ORBITS.name: ORBITS.read_text(encoding="utf-8")},
-    },
+    "continuation": HELD_ORBITS,
+    "backbone": HELD_ORBITS,
     "pulse_train": {"height_mm": 5.0, "width_s": 0.8, "period_s": 1.5, "windows": 3},
 }
 every_kind = pytest.mark.parametrize("kind", sorted(EXCITATIONS))
@@ -135,7 +137,7 @@ def test_labels_are_steps_or_windows_in_order(kind: str) -> None:
         assert not subject.phase(0, subject.planned_end).any()
         assert np.ptp(np.bincount(counted)) <= 1
     else:
-        held = 20 if kind == "continuation" else SWEEP["cycles"]
+        held = {"continuation": 20, "backbone": 16}.get(kind, SWEEP["cycles"])
         assert cycle.max() == held - 1
 
 
