@@ -39,7 +39,8 @@ def draw_orbits(run: ReportData) -> CaptionedFigures:
         )
         frequencies = branch.frequencies_hz
         branch_axis.plot(frequencies, stable, color=TWIN_COLOUR, lw=1.0, label="twin, stable")
-        branch_axis.plot(frequencies, unstable, **UNSTABLE_STYLE, label="twin, unstable")
+        if not branch.stable.all():
+            branch_axis.plot(frequencies, unstable, **UNSTABLE_STYLE, label="twin, unstable")
     for is_accepted, colour, label in (
         (True, DIRECTION_COLOURS["forward"], "measured"),
         (False, REFUSED_COLOUR, "not accepted"),
