@@ -190,12 +190,14 @@ class _Session:
         """Return the state and records after a block, its changes of the drive being queued.
 
         What a feedback changes is due at once: if the machine played past it meanwhile, the
-        feedback answers again from a later sample on, each time with more room.
+        feedback answers again from a later sample on, each time with more room. Decisions, which
+        may take longer than a block, are made once.
         """
         queue = self.output_queue
+        decided = sequencer.decide_block(self._state, block)
         for attempt in range(MAX_FEEDBACK_TRIES):
             earliest = queue.first_changeable() + attempt * len(block)
-            state, records = sequencer.advance_test(self._state, block, earliest)
+            state, records = sequencer.answer_block(decided, block, earliest)
             if state.search is None:
                 if state.drive is not self._state.drive:
                     queue.change_drive(state.drive, state.changed_from)

@@ -33,8 +33,8 @@ from table_io.sequencer.orbits import apply_feedback, begin_continuation, resume
 from table_io.sequencer.state import SequencerState, Stage, TestPlan
 
 __all__ = [
-    "SequencerState", "Stage", "TestPlan", "advance_test", "hold_test", "make_test_plan",
-    "nominal_drive", "resume_test", "start_test",
+    "SequencerState", "Stage", "TestPlan", "advance_test", "answer_block", "decide_block",
+    "hold_test", "make_test_plan", "nominal_drive", "resume_test", "start_test",
 ]  # fmt: skip
 
 DECISION_HORIZON_S = 0.25  # from an evaluation to the change of the command; a block is shorter
@@ -113,13 +113,25 @@ def advance_test(
 
     A feedback changes the command from sample `earliest` on at the soonest.
     """
+    return answer_block(decide_block(state, block), block, earliest)
+
+
+def decide_block(state: SequencerState, block: Block) -> SequencerState:
+    """Return the state after the decisions that a measured block makes due, without feedback."""
     drive = state.drive
     state = replace(state, blocks=(*state.blocks, block), records=())
     while state.stage.kind in DECISION_FUNCTIONS and state.stage.last <= block.end:
         state = DECISION_FUNCTIONS[state.stage.kind](state)
+    if state.search is not None and state.drive is drive:
+        state = replace(state, changed_from=state.drive.planned_end)
+    return state
+
+
+def answer_block(
+    state: SequencerState, block: Block, earliest: int
+) -> tuple[SequencerState, tuple[Record, ...]]:
+    """Return (state, new records) with the feedback's answer to a block that was decided on."""
     if state.search is not None:
-        if state.drive is drive:
-            state = replace(state, changed_from=state.drive.planned_end)
         state = apply_feedback(state, block, earliest)
     blocks = tuple(kept_block for kept_block in state.blocks if kept_block.end > state.stage.first)
     return replace(state, blocks=blocks if not state.is_finished else (), records=()), state.records

@@ -2,6 +2,7 @@
 
 import math
 from itertools import islice
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.rig import RigConfig
 from table_io.records import Event, RunStart, RunStop, Trip
+from table_io.safety import loop_check
 from table_io.sim.simulated_table import SimulatedBackend
 from tests.table_io.acquisition.test_orbit_session import RATE_HZ, RIG, Run, make_profile, run
 
@@ -132,3 +134,19 @@ def test_queue_that_a_dead_rig_leaves_behind_ends_at_rest() -> None:
     assert checked > 400
     session.close()
     assert math.isclose(float(backend._command[-1]), 0.0, abs_tol=NO_COMMAND_M)
+
+
+def test_slow_decision_is_made_once_and_the_feedback_answers_after_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The loop check takes 0.2 s to evaluate, twenty blocks; the orbit is captured all the same."""
+    clock, evaluate = ManualClock(), loop_check.evaluate
+
+    def evaluate_slowly(*arguments: Any) -> Any:
+        clock.wait_until(clock.now() + 0.2)
+        return evaluate(*arguments)
+
+    monkeypatch.setattr(loop_check, "evaluate", evaluate_slowly)
+    result = run(make_profile(slice(1)), CAPTURE_S + 2.0, clock=clock)
+    assert result.select(RunStop)[0].verdict == "stopped"
+    assert np.abs(result.command_m[round(CAPTURE_S * RATE_HZ) :]).max() > 1e-3
