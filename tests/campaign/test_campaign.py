@@ -232,7 +232,7 @@ def test_every_test_is_judged_before_the_first_one_moves(
 ) -> None:
     judged = []
 
-    def judge(bundle: RunConfig, _: Path) -> None:
+    def judge(_has_page: bool, bundle: RunConfig, _: Path) -> None:
         judged.append(bundle.name)
         if bundle.name == "g4":
             raise InputError("the machine does not answer")

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from table_io.clock import local_datetime
@@ -59,13 +60,7 @@ class CampaignOptions:
 def run_campaign(options: CampaignOptions) -> int:
     """Play all runs of a campaign that are not complete; return the exit code."""
     has_page = options.start_page is not None
-
-    def check_run(config: RunConfig, profile_path: Path) -> None:
-        if options.unpaced:
-            check_full_speed(config.rig, has_page)
-        else:
-            check_realtime(config, profile_path)
-
+    check_run = partial(_require_any_speed, has_page) if options.unpaced else check_realtime
     with show_status("checking the runs"):
         plan = read_plan(options.path, options.table, options.model, check_run)
     rig = plan.runs[0].bundle.rig
@@ -105,6 +100,10 @@ def run_campaign(options: CampaignOptions) -> int:
             finally:
                 page = write_campaign_report(folder)
     return _print_outcome(active, code, page, options)
+
+
+def _require_any_speed(has_page: bool, bundle: RunConfig, _: Path) -> None:
+    check_full_speed(bundle.rig, has_page)
 
 
 def _prepare_folder(options: CampaignOptions) -> Path:

@@ -29,6 +29,7 @@ def render_campaign_report(campaign: CampaignData, pictures: list[Picture]) -> s
         state=campaign.state,
         runs=list(zip(campaign.summary["runs"], campaign.runs, strict=True)),
         stars=campaign.stars,
+        reports={path.parent.name for path in campaign.folder.glob("*/report.html")},
         images=embed_images(pictures),
         gap_name=format_gap,
         text=text,
