@@ -338,6 +338,7 @@ def test_an_interrupt_before_the_start_moves_nothing(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow  # 20 s
 def test_a_twin_dead_at_the_very_end_is_a_fault_too(tmp_path: Path) -> None:
     process = start(tmp_path, profile=QUICK.replace("stop_hz = 4.0", "stop_hz = 3.6"))
     read_until(process, "1/1 ")
