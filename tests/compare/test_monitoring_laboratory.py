@@ -44,6 +44,7 @@ def test_a_bad_instrument_is_named_as_such_if_at_all(only: str) -> None:
     assert {warning.kind for warning in list_warnings(draw_truth("bad", 1, only))} <= {"instrument"}
 
 
+@pytest.mark.slow  # 10 s
 @pytest.mark.parametrize(
     ("effect", "kind"),
     [

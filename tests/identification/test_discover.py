@@ -84,6 +84,7 @@ def test_what_is_not_in_the_library_is_unexplained(truth: str) -> None:
     assert discovery.verdict.generic is not None
 
 
+@pytest.mark.slow  # 5 s
 def test_friction_that_falls_with_speed_is_not_made_of_two_names() -> None:
     """Coulomb friction and quadratic damping on a smaller dashpot come near it."""
     truth = format_truth("coulomb_friction", form="stribeck", fc=10.0, fs=60.0, stribeck_speed=0.02)
@@ -157,6 +158,7 @@ def test_where_several_sets_do_as_well_what_they_share_is_named() -> None:
     )
 
 
+@pytest.mark.slow  # 5 s
 def test_several_logs_count_together() -> None:
     truth = format_truth("bumper_hardening", k2=1e7)
     both = discover_effects([log(truth), log(truth, gap_mm=2.0)], SNM).verdict

@@ -204,6 +204,7 @@ def test_a_dead_twin_is_a_fault_a_dead_recorder_no_gap_and_a_dead_viewer_nothing
     assert "identical to the bit" in again.stdout
 
 
+@pytest.mark.slow  # 20 s
 def test_a_dead_twin_stops_the_table_where_so_configured(tmp_path: Path) -> None:
     process = start(tmp_path, profile=QUICK + '[on_death]\ntwin = "stop"\n')
     running(process)
@@ -237,6 +238,7 @@ def test_ctrl_c_decays_to_rest_and_closes_the_recording(tmp_path: Path) -> None:
     assert recording.contiguous_blocks("meas")[-1].end < recording.start.planned_samples
 
 
+@pytest.mark.slow  # 20 s
 def test_a_dead_supervisor_leaves_a_table_at_rest_and_a_readable_recording(
     tmp_path: Path,
 ) -> None:

@@ -71,6 +71,7 @@ def test_an_orbit_is_held_on_though_the_twin_dies(tmp_path: Path) -> None:
     assert "identical to the bit" in again.stdout, again.stdout + again.stderr
 
 
+@pytest.mark.slow  # 20 s
 def test_a_rig_that_dies_while_the_feedback_acts_leaves_its_recording(tmp_path: Path) -> None:
     """What its queue plays then is shown in `test_orbit_faults.py`."""
     process = start(tmp_path, profile=PROFILE)

@@ -99,6 +99,7 @@ def test_what_is_heard_is_what_is_recorded(
     assert listener.alive == {f"{start.run}.rig", f"{start.run}.twin"}
 
 
+@pytest.mark.slow  # 5 s each
 @pytest.mark.parametrize("waits", [True, False])
 def test_who_is_slow_is_waited_for(
     log_file: Path, endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, waits: bool

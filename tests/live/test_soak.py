@@ -217,6 +217,7 @@ def check_told(life: RecordedSession, outcome: Outcome) -> None:
         assert any(loss in why for loss in LOSSES[outcome.case.deed]), where
 
 
+@pytest.mark.slow  # 10 s
 def test_a_rig_that_dies_leaves_a_table_that_comes_to_rest(tmp_path: Path) -> None:
     """Three ways to die, one after another on one machine."""
     deeds = [("kill -9", 1.7), ("freeze", 1.3), ("long pause", 2.2)]

@@ -44,6 +44,7 @@ def expected_ratio(key: ParameterKey, force: float, length: float) -> float:
     return force
 
 
+@pytest.mark.slow  # 20 s
 @pytest.mark.parametrize(
     ("force", "length"), [(0.01, 1.0), (1000.0, 1.0), (1.0, 0.01), (1.0, 1000.0)]
 )

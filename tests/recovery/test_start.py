@@ -46,6 +46,7 @@ def discover_from_near(name: str) -> Discovery:
     return discover_effects([recording(name)], start_model())
 
 
+@pytest.mark.slow  # 10 s
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("name", HIDDEN)
 def test_a_rough_start_leaves_the_verdict(name: str, seed: int) -> None:

@@ -76,6 +76,7 @@ def test_table_under_external_control_is_refused() -> None:
         read_run_config(PROFILES_DIR / "tests" / "g4_backbone.toml", "follow_simulated")
 
 
+@pytest.mark.slow  # 7 s
 def test_levels_of_the_plan_rise_and_a_latency_that_is_too_large_leaves_no_gain() -> None:
     """The orbits are stable, so without feedback they are measured all the same."""
     levels = np.array([0.3, 0.49])

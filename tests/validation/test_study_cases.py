@@ -244,6 +244,7 @@ def test_nothing_that_is_shown_holds_the_truth(generated_case: tuple[Case, CaseP
     assert f'truth_sha256 = "{hashlib.sha256(text.encode()).hexdigest()}"' in start.rig_toml
 
 
+@pytest.mark.slow  # 5 s
 def test_a_case_that_was_cut_off_is_made_anew_and_the_same(
     generated_case: tuple[Case, CasePaths],
 ) -> None:

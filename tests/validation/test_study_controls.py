@@ -40,6 +40,7 @@ def test_a_log_backwards_is_the_same_motion_with_its_velocity_turned() -> None:
     np.testing.assert_allclose(again.u, forward.u, atol=1e-12)
 
 
+@pytest.mark.slow  # 5 s
 def test_no_control_is_given_a_confident_name() -> None:
     """The same log and library name the truth when it runs forwards and the truth is in it."""
     logs = [log(QUADRATIC)]

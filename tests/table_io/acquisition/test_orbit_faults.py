@@ -24,7 +24,9 @@ LEVEL_M_S2 = 0.4903
 # Of the level: itself, the feedback at its limit of half the command, and a change of it.
 MAX_ACCELERATION = 1.0 + 0.5 + 1.0
 NO_COMMAND_M = 1e-6
-TIMES = pytest.mark.parametrize("fault_s", [CAPTURE_S, HELD_S])
+TIMES = pytest.mark.parametrize(
+    "fault_s", [CAPTURE_S, pytest.param(HELD_S, marks=pytest.mark.slow)]
+)
 
 
 def make_rig(kind: str, at_s: float, **keys: float | str) -> RigConfig:
@@ -87,6 +89,7 @@ def test_rig_that_stalls_runs_out_of_queue_and_rests(fault_s: float) -> None:
     assert_recorded(result)
 
 
+@pytest.mark.slow  # 10 s
 @TIMES
 def test_samples_that_come_late_do_not_lose_the_orbit(fault_s: float) -> None:
     """The feedback answers later; during the capture it fades for a while."""

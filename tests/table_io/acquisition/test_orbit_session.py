@@ -176,6 +176,7 @@ def assert_left_for_rest(lost: Run, event: Event) -> None:
     assert moving[pauses[0]] < 2.0 * RATE_HZ
 
 
+@pytest.mark.slow  # 8 s
 def test_orbit_lost_in_a_release_is_recorded_and_the_next_one_found_from_rest(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -196,6 +197,7 @@ def test_orbit_lost_in_a_release_is_recorded_and_the_next_one_found_from_rest(
     assert lost.select(RunStop)[0].verdict == "complete"
 
 
+@pytest.mark.slow  # 6 s
 def test_operator_hold_in_a_release_lets_the_feedback_act_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -44,6 +44,7 @@ def reads(backend: NiBackend, blocks: int) -> None:
         backend.read(20)
 
 
+@pytest.mark.slow  # 20 s
 def test_a_server_that_stands_still_in_motion_holds_neither_read_nor_close(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
