@@ -143,7 +143,7 @@ def test_the_specimen_is_identified_within_its_spread(gap: float) -> None:
         assert not estimates(monitor_session("", gap), "gap_r")
 
 
-@pytest.mark.parametrize("rate", [1.5e-3, -1.5e-3])
+@pytest.mark.parametrize("rate", [1.5e-3, pytest.param(-1.5e-3, marks=pytest.mark.slow)])
 def test_a_stiffness_that_drifts_is_seen_and_measured(rate: float) -> None:
     truth = EFFECT.format("stiffness_drift", "", f"rate = {rate}")
     items = monitor_session(truth)

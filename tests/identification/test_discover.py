@@ -62,6 +62,7 @@ def test_an_effect_is_named_with_its_parameter(truth: str, key: EffectKey, value
     assert gap > 0.95
 
 
+@pytest.mark.slow  # 4 s
 def test_two_effects_are_both_named() -> None:
     truth = format_truth("bumper_hardening", k2=3e7) + format_truth("coulomb_friction", fc=30.0)
     verdict = discover_effects([log(truth)], SNM).verdict

@@ -353,6 +353,7 @@ def test_a_twin_dead_at_the_very_end_is_a_fault_too(tmp_path: Path) -> None:
     assert again.returncode == 0, again.stdout + again.stderr
 
 
+@pytest.mark.slow  # 20 s
 def test_a_dead_rig_halts_the_run_and_keeps_what_was_recorded(tmp_path: Path) -> None:
     process = start(tmp_path)
     running(process)

@@ -10,6 +10,7 @@ from tests.live.namespaces import refusal, start_isolated
 WHY = refusal()
 
 
+@pytest.mark.slow  # 6 s
 @pytest.mark.skipif(bool(WHY), reason=f"no network namespaces here: {WHY}")
 def test_a_cable_pulled_for_two_seconds_leaves_no_gap() -> None:
     process = start_isolated("tests.live.cable_pull")

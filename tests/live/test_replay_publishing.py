@@ -78,7 +78,7 @@ def publish_replay(
     return listener
 
 
-@pytest.mark.parametrize("speed", ["max", "4"])
+@pytest.mark.parametrize("speed", ["max", pytest.param("4", marks=pytest.mark.slow)])
 def test_what_is_heard_is_what_is_recorded(
     log_file: Path, endpoint: str, tmp_path: Path, speed: str
 ) -> None:

@@ -22,7 +22,8 @@ PAIRS = [
 ]  # fmt: skip
 BARE = {"bumper_damping_r": 0.0, "bumper_damping_l": 0.0}
 MODELS = [having(effect) for effect in FORCES]
-MODELS += [having(*map(find_effect, pair)) for pair in PAIRS]
+COUPLED = [having(*map(find_effect, pair)) for pair in PAIRS]
+MODELS += COUPLED
 MODELS += [having(find_effect("bumper_maxwell"), base=snm(-0.001)),
            having(find_effect("bumper_hardening"), base=snm(-0.002)),
            having(find_effect("hunt_crossley"), base=snm(**BARE)),
@@ -35,7 +36,11 @@ def name(model: Model) -> str:
     return "+".join(effect.name for effect in model.effects)
 
 
-@pytest.mark.parametrize("model", MODELS, ids=name)
+@pytest.mark.parametrize(
+    "model",
+    [pytest.param(m, marks=[pytest.mark.slow] if m in COUPLED else []) for m in MODELS],
+    ids=name,
+)
 def test_agrees_with_dop853(model):
     """Two cycles of a drive that is linear between samples, from a blow; contacts and reversals."""
     rate, hz = 2000.0, 2.6

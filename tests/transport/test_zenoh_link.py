@@ -349,6 +349,7 @@ def test_what_is_held_no_more_is_counted_as_missed(
     assert inbox.missed == 30
 
 
+@pytest.mark.slow  # 6 s
 def test_a_stopped_listener_slows_nobody_and_gets_everything_afterwards(
     hub: BusLink, endpoint: str, start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:

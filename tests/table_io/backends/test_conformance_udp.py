@@ -16,7 +16,10 @@ FAR_SIDES = {"python": python_target, "c": c_target}
 CLEAN = [pytest.param(side, marks=pytest.mark.slow) for side in FAR_SIDES]
 
 
-@pytest.fixture(scope="module", params=["python, lossy", "c, lossy", *CLEAN])
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param("python, lossy", marks=pytest.mark.slow), "c, lossy", *CLEAN],
+)
 def bench(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Bench]:
