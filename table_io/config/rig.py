@@ -19,7 +19,7 @@ from pydantic_core import InitErrorDetails
 
 from table_io.channels import CHANNEL_BY_NAME, Channel
 from table_io.config.backend import BACKEND_GROUP, BackendConfig, load_backend
-from table_io.config.base import ConfigModel, Number, Positive
+from table_io.config.base import ConfigModel, NonNegative, Number, Positive
 from table_io.config.calibration_record import CalibrationRecord
 from table_io.config.channel import ChannelConfig
 from table_io.config.plugins import list_entry_points
@@ -63,6 +63,39 @@ class OutputConfig(ConfigModel):
         return replace_after + round(self.lead_s * rate_hz)
 
 
+class TableResponse(ConfigModel):
+    """What the loop check accepts of the table; a hydraulic one with friction needs wider ranges.
+
+    Gains are those of the fundamental over the command at the level of the check.
+    """
+
+    least_level_g: NonNegative = Field(
+        0.0,
+        description="Acceleration below which friction holds the table back: the loop check moves "
+        "no less than that, but no more than the test.",
+    )
+    gain: tuple[Positive, Positive] = Field(
+        (0.8, 1.2), description="Gain at the lowest frequency, from and to."
+    )
+    top_gain: tuple[Positive, Positive] = Field(
+        (0.5, 1.25),
+        description="Gain at the end of the sweep; amplitude control doubles a command at most.",
+    )
+    gain_residual_percent: Positive = Field(
+        10.0, description="Gain off a straight line of its logarithm over the square of frequency."
+    )
+    delay_spread_ms: Positive = Field(
+        5.0, description="Spread of the delay over the frequencies; at least half of its mean."
+    )
+
+    @field_validator("gain", "top_gain")
+    @classmethod
+    def _check_order(cls, limits: tuple[float, float]) -> tuple[float, float]:
+        if limits[0] >= limits[1]:
+            raise InputError(f"{limits[0]:g} to {limits[1]:g} is no range", allowed="low, high")
+        return limits
+
+
 class RigConfig(ConfigModel):
     """Rig file of a shaking table: its limits, output, channels, sensors, sections of backends.
 
@@ -87,6 +120,9 @@ class RigConfig(ConfigModel):
     moving_mass_kg: Positive = Field(description="Table without payload, for the force margin.")
     limits: MachineLimits
     output: OutputConfig
+    table_response: TableResponse = Field(
+        TableResponse(), description="What the loop check accepts of the table."
+    )
     extra_channels: tuple[ChannelConfig, ...] = Field(
         (), alias="channels", description="Channels declared next to the canonical ones."
     )

@@ -9,6 +9,7 @@ from table_io.config.base import ConfigModel, Finite, NonNegative, Positive
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError, suggest
 from table_io.sim.ground_truth import GroundTruth
+from table_io.sim.hydraulic_table import HydraulicTableConfig
 
 
 class FaultKind(NamedTuple):
@@ -82,8 +83,15 @@ class InjectedFault(ConfigModel):
 class SimulatedTableConfig(BackendConfig):
     """Simulated machine: servo, payload reaction and the true specimen on it."""
 
-    servo_bandwidth_hz: Positive = Field(description="-3 dB of the closed displacement loop.")
-    servo_delay_ms: NonNegative = Field(description="Delay of the servo.")
+    hydraulic: HydraulicTableConfig | None = Field(
+        None, description="A hydraulic table; omitted: an ideal servo of a bandwidth."
+    )
+    servo_bandwidth_hz: Positive | None = Field(
+        None,
+        validate_default=True,
+        description="-3 dB of the closed displacement loop of an ideal servo.",
+    )
+    servo_delay_ms: NonNegative = Field(description="Delay from the output to the servo.")
     moving_mass_kg: Positive = Field(description="Moving mass of the table without payload.")
     payload_reaction: bool = Field(
         True, description="Whether the force of the specimen moves the table."
@@ -107,6 +115,16 @@ class SimulatedTableConfig(BackendConfig):
         validate_default=True,
         description="SHA-256 of the sealed file.",
     )
+
+    @field_validator("servo_bandwidth_hz")
+    @classmethod
+    def _check_servo(cls, bandwidth_hz: float | None, info: ValidationInfo) -> float | None:
+        if "hydraulic" in info.data and (info.data["hydraulic"] is None) == (bandwidth_hz is None):
+            raise InputError(
+                "what moves the table is not stated once",
+                allowed="servo_bandwidth_hz, or a table [simulated.hydraulic]",
+            )
+        return bandwidth_hz
 
     @field_validator("truth_sha256")
     @classmethod

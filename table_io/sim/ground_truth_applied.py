@@ -29,7 +29,9 @@ COEFFICIENT_NAMES = {
 
 def build_hidden_plant(plant: Plant, truth: GroundTruth) -> HiddenPlant:
     """Build the plant with hidden effects from the nominal plant."""
-    parameters: dict[str, Any] = {field.name: getattr(plant, field.name) for field in fields(Plant)}
+    parameters: dict[str, Any] = {
+        field.name: getattr(plant, field.name) for field in fields(plant) if field.name != "hidden"
+    }
     parameters |= truth.base.model_dump(exclude_none=True)
     coefficients: dict[str, Any] = {}
     for effect in truth.effects:

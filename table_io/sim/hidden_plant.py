@@ -1,4 +1,5 @@
-"""Hidden plant: the plant of `plant.py` with all effects of `ground_truth.DEFINITION_BY_ID`.
+"""Hidden plant: the plant of `plant.py` with all effects of `ground_truth.DEFINITION_BY_ID`,
+on a servo or on the table of `hydraulic_table.py`.
 
     R + damper + N_R - N_L + M g sin(tilt y + pitch y'') = m2 p,  R = M x''
     free face:     static_j + dashpot_j d_j' = 0
@@ -8,7 +9,7 @@ p is the pull of the appendage over m2, tilt and pitch are those of the table.
 Force laws are smooth versions of their textbook forms, so classical Runge-Kutta with steps divided
 at contact changes keeps its fourth order (except for z of Bouc-Wen at z = 0, where it is once
 differentiable only). The table bears R of the mass and of the appendage. Without a ground truth
-`Plant` is used instead.
+and without oil `Plant` is used instead.
 """
 
 import math
@@ -21,6 +22,12 @@ from numba import njit
 from table_io.block import Float1D, Float2D
 from table_io.errors import InputError
 from table_io.sim import plant as base_plant
+from table_io.sim.hydraulic_table import (
+    HYDRAULIC_STATE_SIZE,
+    MAX_HYDRAULIC_SUBSTEP_S,
+    HydraulicCoefficients,
+    _write_hydraulic_rates,
+)
 from table_io.sim.plant import (
     TOUCHED,
     VX,
@@ -160,13 +167,19 @@ def _face_state(s, j, params, hidden):  # type: ignore[no-untyped-def]
 
 
 @inline_jit
-def _rates(s, command, params, hidden, rate):  # type: ignore[no-untyped-def]
-    """Write the time derivative of the state into `rate`; command in m."""
+def _rates(s, path, t, params, hidden, oil, rate):  # type: ignore[no-untyped-def]
+    """Write the time derivative of the state into `rate`, at t seconds on the command's path."""
     v = s[VX] - s[VY]
     right, right_rate = _face_state(s, 0, params, hidden)
     left, left_rate = _face_state(s, 1, params, hidden)
     specimen_force = _damper_force(s, params, hidden) + right - left
-    servo = params.p * (params.p * (command - s[Y]) - 2.0 * s[VY])
+    command = _evaluate_path(path, t)
+    if oil.area > 0.0:
+        command_rate = path[1] + 2.0 * t * path[2]
+        drive = _write_hydraulic_rates(s, s[Y], s[VY], command, command_rate, oil, rate)
+        servo = drive / oil.table_mass
+    else:
+        servo = params.p * (params.p * (command - s[Y]) - 2.0 * s[VY])
     if hidden.pitch != 0.0:
         # Table acceleration and pitch cause each other; their loop gain is below 0.01.
         table_acc, thrust = servo + specimen_force * params.inv_table_mass, 0.0
@@ -197,16 +210,16 @@ def _rates(s, command, params, hidden, rate):  # type: ignore[no-untyped-def]
 
 
 @inline_jit
-def _step_runge_kutta(s, path, h, params, hidden, work):  # type: ignore[no-untyped-def]
+def _step_runge_kutta(s, path, h, params, hidden, oil, work):  # type: ignore[no-untyped-def]
     """Integrate one step of h seconds, contacts fixed, into the last row of `work`."""
     stage, end = work[4], work[5]
-    _rates(s, path[0], params, hidden, work[0])
+    _rates(s, path, 0.0, params, hidden, oil, work[0])
     for i in range(1, 4):
         dt = h if i == 3 else 0.5 * h
-        for n in range(STATE_SIZE):
+        for n in range(s.size):
             stage[n] = s[n] + dt * work[i - 1, n]
-        _rates(stage, _evaluate_path(path, dt), params, hidden, work[i])
-    for n in range(STATE_SIZE):
+        _rates(stage, path, dt, params, hidden, oil, work[i])
+    for n in range(s.size):
         mean = work[0, n] + 2.0 * (work[1, n] + work[2, n]) + work[3, n]
         end[n] = s[n] + h / 6.0 * mean
 
@@ -236,11 +249,11 @@ def _tie_faces(s, params, hidden):  # type: ignore[no-untyped-def]
 
 
 @inline_jit
-def _advance_substep(s, path, h, params, hidden, work):  # type: ignore[no-untyped-def]
+def _advance_substep(s, path, h, params, hidden, oil, work):  # type: ignore[no-untyped-def]
     """Advance the state by h, divided at contact changes."""
     remaining, trial = h, work[5]
     for switch in range(base_plant.MAX_CONTACT_CHANGES + 1):
-        _step_runge_kutta(s, path, remaining, params, hidden, work)
+        _step_runge_kutta(s, path, remaining, params, hidden, oil, work)
         if (
             switch == base_plant.MAX_CONTACT_CHANGES
             or _find_changed_contact(trial, params, hidden) < 0
@@ -249,12 +262,12 @@ def _advance_substep(s, path, h, params, hidden, work):  # type: ignore[no-untyp
         low, high = 0.0, remaining
         for _ in range(BISECTION_STEPS):
             middle = 0.5 * (low + high)
-            _step_runge_kutta(s, path, middle, params, hidden, work)
+            _step_runge_kutta(s, path, middle, params, hidden, oil, work)
             if _find_changed_contact(trial, params, hidden) < 0:
                 low = middle
             else:
                 high = middle
-        _step_runge_kutta(s, path, high, params, hidden, work)
+        _step_runge_kutta(s, path, high, params, hidden, oil, work)
         side = _find_changed_contact(trial, params, hidden)
         s[:] = trial
         s[TOUCHED + side] = 1.0 - s[TOUCHED + side]
@@ -266,19 +279,19 @@ def _advance_substep(s, path, h, params, hidden, work):  # type: ignore[no-untyp
 
 
 @njit(cache=True, nogil=True)
-def _advance_samples(s, command, params, hidden, work, out):  # type: ignore[no-untyped-def]
+def _advance_samples(s, command, params, hidden, oil, work, out):  # type: ignore[no-untyped-def]
     """Advance `s` by out.shape[1] samples; command[k : k + 4] spans the delayed sample k."""
     corner, rest = params.phi * params.h, (1.0 - params.phi) * params.h
     for k in range(out.shape[1]):
         path = _shift_path(_spline_path(command, k, params.h), rest)
         h = corner / max(params.substeps_before, 1)
         for i in range(params.substeps_before):
-            _advance_substep(s, _shift_path(path, i * h), h, params, hidden, work)
+            _advance_substep(s, _shift_path(path, i * h), h, params, hidden, oil, work)
         path = _spline_path(command, k + 1, params.h)
         h = rest / params.substeps_after
         for i in range(params.substeps_after):
-            _advance_substep(s, _shift_path(path, i * h), h, params, hidden, work)
-        _rates(s, _evaluate_path(path, rest), params, hidden, work[0])
+            _advance_substep(s, _shift_path(path, i * h), h, params, hidden, oil, work)
+        _rates(s, path, rest, params, hidden, oil, work[0])
         out[0, k], out[1, k] = s[Y], work[0, VY]
         out[2, k], out[3, k] = s[X], work[0, VX]
         out[4, k], out[5, k] = (
@@ -290,9 +303,13 @@ def _advance_samples(s, command, params, hidden, work, out):  # type: ignore[no-
 
 @dataclass(frozen=True)
 class HiddenPlant(Plant):
-    """Plant with hidden effects; `state` is float64 (15,), and a signal `damper_force` is added."""
+    """Plant with hidden effects; a signal `damper_force` is added.
+
+    `state` is float64 (15,), or (22,) on a hydraulic table: then the bandwidth is not used.
+    """
 
     hidden: HiddenCoefficients = field(default_factory=HiddenCoefficients)
+    oil: HydraulicCoefficients = field(default_factory=HydraulicCoefficients)
     signals = (*base_plant.SIGNALS, "damper_force")
 
     def __post_init__(self) -> None:
@@ -309,8 +326,9 @@ class HiddenPlant(Plant):
                 allowed=f"at least {min_time_s:.2g} s at {self.rate_hz:g} Hz",
                 remedy="change the parameters of the effects, or raise the sampling rate",
             )
+        longest_s = MAX_HYDRAULIC_SUBSTEP_S if self.oil.area else self.substep_s
         object.__setattr__(
-            self, "substep_s", min(self.substep_s, base_plant.MAX_SUBSTEP_RATIO * shortest_s)
+            self, "substep_s", min(longest_s, base_plant.MAX_SUBSTEP_RATIO * shortest_s)
         )
 
     def rest_state(self) -> Float1D:
@@ -335,7 +353,8 @@ class HiddenPlant(Plant):
             middle = 0.5 * (low + high)
             low, high = (middle, high) if force(middle) < 0.0 else (low, middle)
         u = 0.5 * (low + high)
-        state, compressions = np.zeros(STATE_SIZE), compress_bumpers(u)
+        size = HYDRAULIC_STATE_SIZE if self.oil.area else STATE_SIZE
+        state, compressions = np.zeros(size), compress_bumpers(u)
         state[[X, W, T]] = u, u, -1.0 / self.rate_hz  # sample 0 is then at 0 s
         state[D : D + 2], state[TOUCHED : TOUCHED + 2] = compressions, np.array(compressions) > 0.0
         return state
@@ -351,6 +370,7 @@ class HiddenPlant(Plant):
             command_m,
             self._params,
             self.hidden,
-            np.empty((base_plant.WORK_ROWS, STATE_SIZE)),
+            self.oil,
+            np.empty((base_plant.WORK_ROWS, state.size)),
             out,
         )

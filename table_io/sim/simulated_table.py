@@ -6,7 +6,7 @@ time and as fast as possible. Injected faults are in `faults.py`.
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -24,6 +24,8 @@ from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.faults import build_faults
 from table_io.sim.ground_truth import GroundTruth, parse_ground_truth
 from table_io.sim.ground_truth_applied import SensorDistortion, build_hidden_plant
+from table_io.sim.hidden_plant import HiddenPlant
+from table_io.sim.hydraulic_table import make_coefficients
 from table_io.sim.imperfections import Imperfection
 from table_io.sim.laboratory import Laboratory
 from table_io.sim.plant import SIGNALS, Plant
@@ -34,7 +36,7 @@ MIN_REPLACE_AHEAD_S = 0.02
 def build_plant(table: SimulatedTableConfig, specimen: Specimen, rate_hz: float) -> Plant:
     """Build the nominal plant of a simulated table and a specimen."""
     right, left = specimen.gaps_m
-    return Plant(
+    plant = Plant(
         mass_kg=specimen.mass_kg,
         damper_stiffness_n_m=table.damper_stiffness_n_m,
         damper_damping_n_s_m=table.damper_damping_n_s_m,
@@ -43,11 +45,15 @@ def build_plant(table: SimulatedTableConfig, specimen: Specimen, rate_hz: float)
         gap_right_m=right,
         gap_left_m=left,
         table_mass_kg=table.moving_mass_kg,
-        servo_bandwidth_hz=table.servo_bandwidth_hz,
+        servo_bandwidth_hz=table.servo_bandwidth_hz or math.inf,
         servo_delay_s=table.servo_delay_ms * 1e-3,
         payload_reaction=table.payload_reaction,
         rate_hz=rate_hz,
     )
+    if table.hydraulic is None:
+        return plant
+    values = {field.name: getattr(plant, field.name) for field in fields(Plant)}
+    return HiddenPlant(**values, oil=make_coefficients(table.hydraulic, table.moving_mass_kg))
 
 
 def load_ground_truth(table: SimulatedTableConfig) -> GroundTruth | None:
@@ -252,9 +258,12 @@ class SimulatedBackend:
         return Laboratory(self._imperfections, self._rig, rate_hz, self._seed, noise, first)
 
     def _build_plant_with_share(self, share: float) -> Plant:
-        """Return the plant with this fraction of its servo's bandwidth."""
-        bandwidth = share * self._plant.servo_bandwidth_hz
-        return self._plant if share == 1.0 else replace(self._plant, servo_bandwidth_hz=bandwidth)
+        """Return the plant with this fraction of its servo's bandwidth, or of its oil supply."""
+        if share == 1.0:
+            return self._plant
+        if isinstance(self._plant, HiddenPlant) and self._plant.oil.area:
+            return replace(self._plant, oil=self._plant.oil.with_supply(share))
+        return replace(self._plant, servo_bandwidth_hz=share * self._plant.servo_bandwidth_hz)
 
     def _require(self, condition: bool, remedy: str) -> None:
         if not condition:

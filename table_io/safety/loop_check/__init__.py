@@ -32,6 +32,7 @@ from table_io.safety.loop_check.checks import (
 )
 from table_io.safety.loop_check.data import LoopCheckData
 from table_io.safety.loop_check.load_cells import check_load_cells
+from table_io.units import GRAVITY_M_S2
 
 __all__ = [
     "count_hold_cycles",
@@ -87,10 +88,12 @@ def plan_targets(profile: Profile, rig: RigConfig) -> tuple[SineTarget, ...]:
     starts below and ends above it); two more, up to the fifth harmonic of the highest frequency, if
     harmonics are canceled. Where an amplitude has fewer DAC steps than `output.least_lsb`, the
     level is raised to at most a tenth of the test level; beyond that the frequency is lowered, and
-    the response above it is extrapolated.
+    the response above it is extrapolated. A rig with friction may ask for a larger level.
     """
     plan, settings = profile.plan, profile.loop_check
     test_level = plan.level_m_s2
+    least = min(rig.table_response.least_level_g * GRAVITY_M_S2, test_level)
+    lowest = max(settings.level * test_level, least)
     min_amplitude_m = rig.output.least_lsb * rig.output.lsb_m
 
     def limit_frequency(f: float) -> float:
@@ -110,11 +113,7 @@ def plan_targets(profile: Profile, rig: RigConfig) -> tuple[SineTarget, ...]:
     targets: list[SineTarget] = []
     for f in sorted(map(limit_frequency, requested_hz)):
         if not targets or f > MIN_FREQUENCY_RATIO * targets[-1].frequency_hz:
-            targets.append(
-                SineTarget(
-                    f, max(settings.level * test_level, min_amplitude_m * (2 * math.pi * f) ** 2)
-                )
-            )
+            targets.append(SineTarget(f, max(lowest, min_amplitude_m * (2 * math.pi * f) ** 2)))
     return tuple(targets)
 
 

@@ -20,14 +20,8 @@ MOTION_CHANNELS = (*TABLE_CHANNELS, *MASS_CHANNELS, "rel_disp_m")
 
 MAX_LOST_PERCENT = 1.0  # of the samples
 MIN_TONE_SNR = 10.0  # tone over its standard error
-GAIN_RANGE = (0.8, 1.2)  # at the lowest frequency, where a servo follows its command
-TOP_GAIN_RANGE = (0.5, 1.25)  # at the end of the sweep: amplitude control doubles a command at most
-MAX_GAIN_RESIDUAL_PERCENT = 10.0  # from a straight line of ln gain over f^2
 DELAY_RANGE_MS = (-2.0, 100.0)
-MAX_DELAY_SPREAD_MS, MAX_DELAY_SPREAD_RATIO = (
-    5.0,
-    0.5,
-)  # absolute, and of the mean delay; the larger one applies
+MAX_DELAY_SPREAD_RATIO = 0.5  # of the mean delay, if that is more than the rig's limit
 MAX_READ_BACK_LSB, MAX_READ_BACK_RATIO = 4.0, 0.005  # DAC steps, and fraction of the command
 MIN_NOISE_MARGIN_DB = 20.0
 MAX_OFFSET_RATIO = 0.05  # of the motion of the test, or of the gap
@@ -91,9 +85,11 @@ def check_read_back(data: LoopCheckData) -> Iterator[Check]:
 def check_table_response(data: LoopCheckData) -> Iterator[Check]:
     """Check polarity, gain and delay of the table's sensors against the command.
 
-    A servo rolls off, so the gain is within +-20 % at the lowest frequency only; above it the gain
-    must follow a smooth curve, within the range that amplitude control can correct.
+    A servo rolls off, so the gain is near 1 at the lowest frequency only; above it the gain must
+    follow a smooth curve, within the range that amplitude control can correct. The rig file states
+    the ranges.
     """
+    allowed = data.rig.table_response
     frequencies_hz = data.frequencies_hz
     for name in TABLE_CHANNELS:
         if not _has_clear_tone(data, name):
@@ -101,19 +97,25 @@ def check_table_response(data: LoopCheckData) -> Iterator[Check]:
         tones = data.tones(name)
         polarity = float(np.cos(np.angle(tones[0])))
         yield make_check(data, "polarity against the command", name, polarity, 0.0, 1.0, "")
-        yield make_check(data, "gain", name, abs(tones[0]), *GAIN_RANGE, "")
+        yield make_check(data, "gain", name, abs(tones[0]), *allowed.gain, "")
         swept = np.flatnonzero(frequencies_hz <= data.profile.plan.high_hz * (1 + 1e-9))
         if swept.size > 1:
             top_gain = abs(tones[swept[-1]])
             yield make_check(
-                data, "gain at the highest frequency", name, top_gain, *TOP_GAIN_RANGE, ""
+                data, "gain at the highest frequency", name, top_gain, *allowed.top_gain, ""
             )
         if swept.size > 2:
             residual = 100.0 * _max_line_residual(
                 frequencies_hz[swept] ** 2, np.log(np.abs(tones[swept]))
             )
             yield make_check(
-                data, "gain off a smooth curve", name, residual, 0.0, MAX_GAIN_RESIDUAL_PERCENT, "%"
+                data,
+                "gain off a smooth curve",
+                name,
+                residual,
+                0.0,
+                allowed.gain_residual_percent,
+                "%",
             )
         delays = (
             -1e3
@@ -124,7 +126,7 @@ def check_table_response(data: LoopCheckData) -> Iterator[Check]:
         yield make_check(data, "delay", name, longest, *DELAY_RANGE_MS, "ms")
         if frequencies_hz.size > 1:
             max_spread = max(
-                MAX_DELAY_SPREAD_MS, MAX_DELAY_SPREAD_RATIO * abs(float(delays.mean()))
+                allowed.delay_spread_ms, MAX_DELAY_SPREAD_RATIO * abs(float(delays.mean()))
             )
             spread = float(np.ptp(delays))
             yield make_check(
