@@ -64,7 +64,7 @@ class OutputConfig(ConfigModel):
 
 
 class TableResponse(ConfigModel):
-    """What the loop check accepts of the table; a hydraulic one with friction needs wider ranges.
+    """What is known of the table, and what the loop check accepts of it.
 
     Gains are those of the fundamental over the command at the level of the check.
     """
@@ -83,6 +83,11 @@ class TableResponse(ConfigModel):
     )
     gain_residual_percent: Positive = Field(
         10.0, description="Gain off a straight line of its logarithm over the square of frequency."
+    )
+    stall_force_kn: Positive | None = Field(
+        None,
+        description="Supply pressure times piston area, for the table's twin; omitted: no load "
+        "slows the flow of the valve.",
     )
     delay_spread_ms: Positive = Field(
         5.0, description="Spread of the delay over the frequencies; at least half of its mean."
@@ -121,7 +126,7 @@ class RigConfig(ConfigModel):
     limits: MachineLimits
     output: OutputConfig
     table_response: TableResponse = Field(
-        TableResponse(), description="What the loop check accepts of the table."
+        TableResponse(), description="What is known of the table, and accepted of it."
     )
     extra_channels: tuple[ChannelConfig, ...] = Field(
         (), alias="channels", description="Channels declared next to the canonical ones."

@@ -65,6 +65,19 @@ def identify_from_logs(
     raise typer.Exit(command(logs, model, out))
 
 
+@identification_app.command("table-twin", rich_help_panel=LEARN_PANEL)
+def identify_table_from_log(
+    logs: LogPaths,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE", help="New .toml file for the table's twin.")
+    ] = Path("table.toml"),
+) -> None:
+    """Identify the table itself from a rehearsal: oil, valve, friction, loop and frame."""
+    from twin.cli.table_drive import identify_table_command as command
+
+    raise typer.Exit(command(logs, out))
+
+
 identification_app.add_typer(study_app, name="study", rich_help_panel=LEARN_PANEL)
 
 

@@ -35,7 +35,8 @@ app = typer.Typer(
 
 COMPUTING_COMMANDS = frozenset({
     "branches", "campaign", "check", "compare", "demo", "discover", "explain", "identify", "import",
-    "paper", "prc", "replay", "report", "run", "schema", "simulate", "study", "verify", "view",
+    "paper", "prc", "replay", "report", "run", "schema", "simulate", "study", "table-drive",
+    "table-twin", "verify", "view",
 })  # fmt: skip
 PLAN_PANEL, DRIVE_PANEL, LOOK_PANEL = (
     "Before a test",
@@ -157,6 +158,42 @@ def run_command(
         profile, out, unpaced, model, table, view, listen, credentials, router, remote_twin, page
     )
     raise typer.Exit(code)
+
+
+@app.command("table-drive", rich_help_panel=PLAN_PANEL)
+def table_drive_command(
+    profile: ProfileArgument,
+    twin: Annotated[
+        Path, typer.Option("--table-twin", metavar="FILE", help="File of `shaketwin table-twin`.")
+    ],
+    band_hz: Annotated[
+        tuple[float, float],
+        typer.Option("--band", metavar="LOW HIGH", help="Frequencies to be right, in Hz."),
+    ] = (0.3, 18.0),
+    out: OutOption = None,
+    table: TableOption = None,
+    after: Annotated[
+        Path | None,
+        typer.Option(
+            "--after",
+            metavar="LOG",
+            parser=parse_run_path,
+            help="Correct the drive of this run by what its table lacked.",
+        ),
+    ] = None,
+    iterate: Annotated[
+        int | None,
+        typer.Option("--iterate", min=0, max=20, help="Run it, and so often a corrected drive."),
+    ] = None,
+    speed: Annotated[
+        Speed, typer.Option("--speed", help="Of the runs: in real time, or as fast as possible.")
+    ] = Speed.realtime,
+) -> None:
+    """Compute the command by which the table follows a record, on the table's twin."""
+    from twin.cli.table_drive import compute_drive_command as command
+
+    unpaced = speed is Speed.max
+    raise typer.Exit(command(profile, twin, band_hz, out, table, after, iterate, unpaced))
 
 
 @app.command("demo", rich_help_panel=DRIVE_PANEL)

@@ -26,6 +26,7 @@ DEFAULT_KIND = "stepped_sine"
 MIN_BLEND_CYCLES = 1.5  # between two steady sine motions
 BAND_ENERGY_SHARES = 0.05, 0.95  # of the acceleration, below the ends of the band of a history
 MAX_REST_RATIO = 1e-3  # of the peaks of a history: largest motion at its ends
+DRIVE_MARGIN_S = 1.0  # of rest around a target that has a drive, which begins before it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,8 +34,9 @@ class ExcitationPlan:
     """What an excitation plays: held sine steps, or a displacement history.
 
     `steps` are approached, tuned and measured one by one. Without steps `history_m`, (sample,), is
-    played as it is, from rest to rest, open loop and without a phase, in `windows` equal parts. The
-    loop check takes its motions from the peak table acceleration and the frequency band.
+    played as it is, from rest to rest, open loop and without a phase, in `windows` equal parts;
+    `target_m`, (sample,), is then the displacement that the table should have. The loop check takes
+    its motions from the peak table acceleration and the frequency band.
     """
 
     level_m_s2: float
@@ -42,6 +44,7 @@ class ExcitationPlan:
     high_hz: float
     steps: tuple[Step, ...] = ()
     history_m: Float1D = field(default_factory=lambda: np.empty(0))
+    target_m: Float1D = field(default_factory=lambda: np.empty(0))
     windows: int = 0
     blend_cycles: float = MIN_BLEND_CYCLES
 
@@ -74,8 +77,19 @@ class Excitation(ConfigModel):
 
 
 class History(Excitation):
-    """Base class of the kinds that play a displacement history: they return it in m."""
+    """Base class of the kinds that play a displacement history: they return it in m.
 
+    With a drive the command of that file is played, so that the table follows the displacement.
+    """
+
+    FILE_KEYS: ClassVar[tuple[str, ...]] = ("drive",)
+
+    files: dict[str, str] = Field({}, description="Texts of files by name; loading attaches them.")
+    drive: str | None = Field(
+        None,
+        description="CSV file of `shaketwin table-drive` next to the profile: the command by which "
+        "this table follows. Omitted: the displacement is commanded.",
+    )
     windows: Count = Field(8, ge=1, le=1000, description="Equal parts in time, for the results.")
 
     @abstractmethod
@@ -84,7 +98,10 @@ class History(Excitation):
         raise NotImplementedError
 
     def plan(self, rate_hz: float) -> ExcitationPlan:
-        """Return the history with its peak acceleration and band; InputError if it has no rest."""
+        """Return what is played, with the target's peak acceleration and band.
+
+        InputError if the target is not at rest at its ends, or the drive is not one of it.
+        """
         history = np.ascontiguousarray(self.displacement(rate_hz), dtype=np.float64)
         where = f"excitation {self.kind!r}"
         if history.size <= self.windows or not np.isfinite(history).all() or not history.any():
@@ -100,7 +117,46 @@ class History(Excitation):
         acceleration = history_acceleration(history, rate_hz)
         low_hz, high_hz = _find_band(acceleration, rate_hz)
         level = float(np.abs(acceleration).max())
-        return ExcitationPlan(level, low_hz, high_hz, history_m=history, windows=self.windows)
+        command = history
+        if self.drive is not None:
+            history = np.pad(history, round(DRIVE_MARGIN_S * rate_hz))
+            command = _parse_drive(self.files.get(self.drive, ""), self.drive)
+            if command.size != history.size:
+                raise InputError(
+                    f"{self.drive}: {command.size} samples, the target has {history.size}",
+                    where=where,
+                    key="excitation.drive",
+                    remedy="compute it anew with `shaketwin table-drive`",
+                )
+        return ExcitationPlan(
+            level, low_hz, high_hz, history_m=command, target_m=history, windows=self.windows
+        )
+
+
+def format_drive(command_m: Float1D, comment: str) -> str:
+    """Return the text of a drive file: command in m, (sample,), at the rate of the run."""
+    lines = [f"# {line}" for line in comment.splitlines()]
+    return "\n".join([*lines, "drive_mm", *(f"{1e3 * value:.6f}" for value in command_m), ""])
+
+
+def _parse_drive(text: str, name: str) -> Float1D:
+    """Return the command in m of a drive file, (sample,); InputError if it does not rest."""
+    lines = [line for line in text.splitlines() if line and not line.startswith("#")]
+    try:
+        command: Float1D = 1e-3 * np.array(lines[1:], dtype=np.float64)
+    except ValueError as error:
+        raise InputError(f"{name}: {error}", key="excitation.drive") from None
+    if lines[:1] != ["drive_mm"] or command.size < 2 or not np.isfinite(command).all():
+        raise InputError(
+            f"{name} is no drive",
+            key="excitation.drive",
+            allowed="a line drive_mm, then one finite number a line",
+            remedy="compute it with `shaketwin table-drive`",
+        )
+    peak = max(float(np.abs(command).max()), 1e-9)
+    if max(abs(command[0]), abs(command[-1])) > MAX_REST_RATIO * peak:
+        raise InputError(f"{name} does not begin and end at rest", key="excitation.drive")
+    return command
 
 
 def history_acceleration(history_m: Float1D, rate_hz: float) -> Float1D:

@@ -32,9 +32,8 @@ KERNEL_BETA = 14.0
 class RecordedHistory(History):
     """Displacement history read from a file."""
 
-    FILE_KEYS: ClassVar[tuple[str, ...]] = ("file",)
+    FILE_KEYS: ClassVar[tuple[str, ...]] = ("file", *History.FILE_KEYS)
 
-    files: dict[str, str] = Field({}, description="Texts of files by name; loading attaches them.")
     unit: Literal["m", "cm", "mm", "in"] | None = Field(None, description="Omitted: of the header.")
     scale: Finite = Field(1.0, description="Factor on the displacement; negative turns it around.")
     blend_s: Number = Field(1.0, ge=0.1, le=60, description="From rest to the record, and back.")

@@ -14,7 +14,7 @@ from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.hidden_plant import HiddenPlant
-from table_io.sim.hydraulic_table import BRISTLE, P, SPOOL, HydraulicCoefficients
+from table_io.sim.hydraulic_table import BRISTLE, SPOOL, HydraulicCoefficients, P
 from table_io.sim.simulated_table import build_plant
 
 RATE_HZ = 1000.0

@@ -1,0 +1,50 @@
+"""The simulated hydraulic table as a laboratory: another code than the twin that is tested on it."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from table_io.block import Float1D, Float2D
+from table_io.config.base import PROFILES_DIR, load_config
+from table_io.config.profile import Specimen
+from table_io.config.rig import RigConfig
+from table_io.sim.config import SimulatedTableConfig
+from table_io.sim.hidden_plant import HiddenPlant
+from table_io.sim.simulated_table import build_plant
+
+RATE_HZ = 1000.0
+RIG = load_config(PROFILES_DIR / "rigs" / "hydraulic.toml", RigConfig, "rig")[0]
+TABLE = RIG.require_section("simulated", SimulatedTableConfig)
+SPECIMEN_KG = 550.0
+
+
+def build_rig(friction_n: float = 500.0, gap_mm: float = math.inf) -> HiddenPlant:
+    """Return the shipped table with this friction, and a specimen on it."""
+    plant = build_plant(TABLE, Specimen(mass_kg=SPECIMEN_KG, gap_mm=gap_mm), RATE_HZ)
+    assert isinstance(plant, HiddenPlant)
+    return replace(plant, oil=plant.oil._replace(fc=friction_n, fs=1.3 * friction_n))
+
+
+def play(plant: HiddenPlant, command: Float1D) -> Float2D:
+    """Return the true signals, (7, sample), for a command in m."""
+    out = np.empty((len(plant.signals), command.size))
+    before = np.zeros(plant.history_samples)
+    plant.advance(plant.rest_state(), np.concatenate([before, command]), out)
+    return out
+
+
+def make_random_motion(
+    seconds: float, band_hz: tuple[float, float], rms_m_s2: float, seed: int
+) -> Float1D:
+    """Return a displacement in m with flat random acceleration in a band, at rest at its ends."""
+    count = round(seconds * RATE_HZ)
+    hz = np.fft.rfftfreq(count, 1.0 / RATE_HZ)
+    inside = (hz > band_hz[0]) & (hz < band_hz[1])
+    phase = np.exp(2j * math.pi * np.random.default_rng(seed).random(hz.size))
+    spectrum = np.where(inside, phase / np.where(hz > 0.0, hz, 1.0) ** 2, 0.0)
+    edge = np.clip(np.minimum(np.arange(count), np.arange(count)[::-1]) / (3.0 * RATE_HZ), 0.0, 1.0)
+    motion = np.fft.irfft(spectrum, count) * edge**2 * (3.0 - 2.0 * edge)
+    acceleration = np.gradient(np.gradient(motion)) * RATE_HZ**2
+    scaled: Float1D = motion * rms_m_s2 / acceleration.std()
+    return scaled

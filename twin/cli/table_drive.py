@@ -1,0 +1,226 @@
+"""`table-twin` and `drive`: identify the table, and compute the command by which it follows."""
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.table import Table
+
+from table_io.block import Float1D, Label
+from table_io.config.base import parse_toml
+from table_io.config.excitation import DRIVE_MARGIN_S, History, format_drive
+from table_io.config.folders import resolve_config
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.errors import InputError
+from twin.drive.drive_computation import compute_drive, correct_drive, measure_error
+from twin.drive.rehearsal import read_followed_target, read_table_motion
+from twin.drive.table_file import TableTwinConfig, format_table_twin, load_table_twin
+from twin.drive.table_identification import identify_table
+from twin.drive.table_model import TableModel
+from twin.run.folders import make_output_folder
+from twin.run.recordings import open_recording
+from twin.run.run_config import RunConfig, make_run_id, read_run_config
+from twin.run.terminal import console, print_line, print_table, show_status
+
+DRIVE_FILE, PROFILE_FILE = "drive.csv", "profile.toml"
+UNITS = {
+    "gain_1_s": "1/s", "delay_s": "s", "pressure_feedback_s": "s", "presliding_m": "m",
+    "stribeck_speed_m_s": "m/s", "friction_n": "N", "static_excess_n": "N", "stall_force_n": "N",
+    "stick_damping_n_s_m": "N s/m", "viscous_n_s_m": "N s/m",
+    "valve_hz": "Hz", "oil_hz": "Hz", "frame_hz": "Hz",
+}  # fmt: skip
+
+
+def identify_table_command(logs: Sequence[Path], out: Path) -> int:
+    """Identify the twin of the table from a rehearsal and write it to a new file."""
+    if out.exists():
+        raise InputError("exists already", where=out, remedy="name a new file with --out")
+    if len(logs) != 1:
+        raise InputError(f"{len(logs)} recordings", allowed="one rehearsal of at most 60 s")
+    recording = open_recording(logs[0])
+    rig = parse_toml(recording.start.rig_toml, RigConfig, str(logs[0]))
+    stall_kn = rig.table_response.stall_force_kn
+    with show_status("fitting the twin of the table"):
+        identification = identify_table(
+            read_table_motion(recording),
+            rig.moving_mass_kg,
+            math.inf if stall_kn is None else 1e3 * stall_kn,
+        )
+    title = f"{rig.title}, from {recording.run}"
+    out.write_text(format_table_twin(title, identification), encoding="utf-8")
+    table = Table("parameter", "value", "95 %", "unit", title=title)
+    for name, value in identification.model.parameters._asdict().items():
+        width = identification.half_widths.get(name)
+        table.add_row(
+            name.rsplit("_1_s")[0] if name == "gain_1_s" else name,
+            f"{value:.4g}",
+            "stated" if width is None else f"+- {width:.2g}",
+            UNITS.get(name, ""),
+        )
+    print_table(console, table)
+    print_line(f"it leaves {100 * identification.residual:.2g} % of the measured motion -> {out}")
+    return 0
+
+
+@dataclass(frozen=True, eq=False)
+class DriveTask:
+    """Target of a test, the specimen's force on the table during it, and the table's twin."""
+
+    config: RunConfig
+    profile_path: Path
+    target_m: Float1D
+    reaction_n: Float1D
+    model: TableModel
+    twin: TableTwinConfig
+    band_hz: tuple[float, float]
+
+    @property
+    def rate_hz(self) -> float:
+        return self.config.profile.acquisition.rate_hz
+
+
+def compute_drive_command(
+    profile: Path,
+    twin_file: Path,
+    band_hz: tuple[float, float],
+    out: Path | None,
+    table: str | None,
+    after: Path | None,
+    iterations: int | None,
+    unpaced: bool,
+) -> int:
+    """Write a profile with the drive for its target; with iterations, run it and correct it."""
+    task = _prepare_task(profile, twin_file, band_hz, table)
+    if after is None:
+        with show_status("computing the drive on the twin of the table"):
+            drive = compute_drive(
+                task.model, task.target_m, task.rate_hz, task.band_hz, task.reaction_n
+            )
+        command = drive.command_m
+        print_line(f"error that the twin expects in the band: {100 * drive.expected_error:.2g} %")
+    else:
+        command = _correct_after(task, after)
+    folder = make_output_folder(out, make_run_id(f"{task.config.name}-drive"))
+    if iterations is None:
+        written = write_driven_profile(task, command, folder)
+        print_line(f"{written}; next: shaketwin run {written}")
+        return 0
+    return _iterate(task, command, folder, table, iterations, unpaced)
+
+
+def write_driven_profile(task: DriveTask, command_m: Float1D, folder: Path) -> Path:
+    """Write the profile with its files and the drive to a folder; return the profile's path."""
+    folder.mkdir(parents=True, exist_ok=True)
+    text = task.profile_path.read_text(encoding="utf-8")
+    text = re.sub(r'(?m)^drive = ".*"\n', "", text)
+    line = f'drive = "{DRIVE_FILE}"'
+    text = re.sub(
+        r"(?m)^\[excitation\][^\n]*$", lambda header: f"{header[0]}\n{line}", text, count=1
+    )
+    excitation = task.config.profile.excitation
+    assert isinstance(excitation, History)  # see _prepare_task
+    for name in excitation.files:
+        if name != excitation.drive:
+            source = task.profile_path.parent / name
+            (folder / Path(name).name).write_bytes(source.read_bytes())
+    (folder / DRIVE_FILE).write_text(
+        format_drive(command_m, f"drive of {task.config.name} on {task.twin.title}"),
+        encoding="utf-8",
+    )
+    path = folder / PROFILE_FILE
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def _prepare_task(
+    profile: Path, twin_file: Path, band_hz: tuple[float, float], table: str | None
+) -> DriveTask:
+    path = resolve_config(profile, "tests")
+    config = read_run_config(path, table)
+    excitation = config.profile.excitation
+    if not isinstance(excitation, History):
+        raise InputError(
+            "a drive is computed for a displacement history",
+            where=path,
+            key="excitation.kind",
+            value=excitation.kind,
+            remedy="the level of a stepped sine is tuned while it runs",
+        )
+    twin = load_table_twin(twin_file)
+    rate_hz = config.profile.acquisition.rate_hz
+    target = np.pad(excitation.displacement(rate_hz), round(DRIVE_MARGIN_S * rate_hz))
+    with show_status("simulating the specimen"):
+        reaction = _simulate_reaction(config, target.size)
+    return DriveTask(config, path, target, reaction, twin.build_model(), twin, band_hz)
+
+
+def _simulate_reaction(config: RunConfig, count: int) -> Float1D:
+    """Return the force of the specimen on a table that follows the target, N, (sample,)."""
+    from dataclasses import replace
+
+    from twin.run.unpaced import generate_ideal_twin
+
+    excitation = config.profile.excitation.model_copy(update={"drive": None})
+    profile = config.profile.model_copy(update={"excitation": excitation})
+    profile.__dict__.pop("plan", None)  # cached with the drive
+    rows, labels = [], []
+    for block in generate_ideal_twin(replace(config, profile=profile)):
+        if block.stream == "pred":
+            rows.append(block.channel("free/mass_acc_m_s2"))
+            labels.append(block.label)
+    acceleration, label = np.concatenate(rows), np.concatenate(labels)
+    first = int(np.flatnonzero(label == Label.MEASURE)[0])
+    margin = round(DRIVE_MARGIN_S * config.profile.acquisition.rate_hz)
+    reaction = np.zeros(count)
+    played = -config.profile.specimen.mass_kg * acceleration[first : first + count - margin]
+    reaction[margin : margin + played.size] = played
+    return reaction
+
+
+def _correct_after(task: DriveTask, log: Path) -> Float1D:
+    """Return the drive of a recording, corrected by what its table lacked."""
+    recording = open_recording(log)
+    target, achieved = read_followed_target(recording)
+    if target.size != task.target_m.size:
+        raise InputError("the recording is that of another target", where=log)
+    played = parse_toml(recording.start.profile_toml, Profile, str(log)).plan.history_m
+    return correct_drive(played, target - achieved, task.model, task.rate_hz, task.band_hz)
+
+
+def _iterate(
+    task: DriveTask,
+    command_m: Float1D,
+    folder: Path,
+    table: str | None,
+    iterations: int,
+    unpaced: bool,
+) -> int:
+    """Run the drive and correct it, until the error grows; return the exit code."""
+    from twin.cli.entry import DEFAULT_ENDPOINT
+    from twin.cli.run import run_test
+
+    rows = Table("run", "rms error in the band", "peak acceleration", title="iteration")
+    errors: list[float] = []
+    for number in range(iterations + 1):
+        profile = write_driven_profile(task, command_m, folder / f"drive-{number}")
+        run = folder / f"run-{number}"
+        code = run_test(profile, run, unpaced, None, table, False, DEFAULT_ENDPOINT)
+        if code:
+            return code
+        target, achieved = read_followed_target(open_recording(run))
+        errors.append(measure_error(achieved, target, task.rate_hz, task.band_hz))
+        rows.add_row(str(number), f"{100 * errors[-1]:.2f} %", "")
+        if number and errors[-1] > errors[-2]:
+            console.print("the error grows: no further iteration")
+            break
+        command_m = correct_drive(
+            command_m, target - achieved, task.model, task.rate_hz, task.band_hz
+        )
+    print_table(console, rows)
+    best = int(np.argmin(errors))
+    print_line(f"best drive: {folder / f'drive-{best}' / PROFILE_FILE}")
+    return 0

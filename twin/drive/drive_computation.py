@@ -1,0 +1,116 @@
+"""Drive: the command by which a table follows its target, from its twin and from earlier runs.
+
+A target motion is played on the table's twin, and what the twin lacks is added to the command
+through the inverse of its linear frequency response, until nothing more is gained: the inverse of
+the nonlinear twin within the band. What a real run lacks is added in the same way, which is the
+usual iteration of a laboratory (for instance De Cuyper, Swevers, Mech. Syst. Signal Process. 2003);
+friction, valve and impacts are then those of the last run.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.fft import next_fast_len
+
+from table_io.block import Float1D
+from twin.drive.table_model import TableModel
+
+BAND_EDGE_RATIO = 1.25  # the inverse falls to nothing between the band's end and this multiple
+MAX_AMPLIFICATION = 5.0  # of the inverse
+MAX_ROUNDS = 25
+LEAST_GAIN = 0.01  # relative fall of the error below which the search ends
+PADDING_S = 4.0  # of rest around the motion, so that its end does not reach its beginning
+
+
+@dataclass(frozen=True, eq=False)
+class ComputedDrive:
+    """Command in m, (sample,), and the twin's expected acceleration error in the band, relative."""
+
+    command_m: Float1D
+    expected_error: float
+
+
+def compute_drive(
+    model: TableModel,
+    target_m: Float1D,
+    rate_hz: float,
+    band_hz: tuple[float, float],
+    reaction_n: Float1D | None = None,
+    start_m: Float1D | None = None,
+) -> ComputedDrive:
+    """Compute the command for a target displacement in m, (sample,), at rest at both ends.
+
+    `reaction_n`, (sample,), is the force of the specimen on the table during the target motion;
+    `start_m` the command to begin with, if not the linear inverse.
+    """
+    command = start_m
+    if command is None:
+        command = correct_drive(np.zeros_like(target_m), target_m, model, rate_hz, band_hz)
+    best, best_error, step = command, math.inf, 1.0
+    for _ in range(MAX_ROUNDS):
+        achieved = model.simulate(command, rate_hz, reaction_n)[0]
+        error = measure_error(achieved, target_m, rate_hz, band_hz)
+        if error >= best_error:
+            step *= 0.5
+            if step < 0.2:
+                break
+        else:
+            if best_error - error < LEAST_GAIN * best_error:
+                best, best_error = command, error
+                break
+            best, best_error, lacking = command, error, target_m - achieved
+        command = best + step * correct_drive(np.zeros_like(best), lacking, model, rate_hz, band_hz)
+    return ComputedDrive(best, best_error)
+
+
+def correct_drive(
+    command_m: Float1D,
+    lacking_m: Float1D,
+    model: TableModel,
+    rate_hz: float,
+    band_hz: tuple[float, float],
+) -> Float1D:
+    """Return a command with what the table lacks added, (sample,), through the linear inverse."""
+    count = lacking_m.size
+    padding = round(PADDING_S * rate_hz)
+    size = next_fast_len(count + 2 * padding)
+    spectrum = np.fft.rfft(lacking_m, size)
+    frequency_hz = np.fft.rfftfreq(size, 1.0 / rate_hz)
+    inverse = _invert_response(model, np.asarray(frequency_hz, float), band_hz[1])
+    correction = np.fft.irfft(spectrum * inverse, size)
+    # The inverse leads: what it asks for before the first sample lies at the end of the period.
+    corrected: Float1D = command_m + correction[:count]
+    return corrected * _rest_at_ends(count, rate_hz)
+
+
+def measure_error(
+    achieved_m: Float1D, target_m: Float1D, rate_hz: float, band_hz: tuple[float, float]
+) -> float:
+    """Return the rms error of acceleration in a band over that of the target, from m."""
+    frequency_hz = np.fft.rfftfreq(target_m.size, 1.0 / rate_hz)
+    inside = (frequency_hz >= band_hz[0]) & (frequency_hz <= band_hz[1])
+    square = frequency_hz[inside] ** 2
+    error = np.fft.rfft(achieved_m - target_m)[inside] * square
+    return float(np.linalg.norm(error) / np.linalg.norm(np.fft.rfft(target_m)[inside] * square))
+
+
+def _invert_response(
+    model: TableModel, frequency_hz: Float1D, highest_hz: float
+) -> npt.NDArray[np.complex128]:
+    """Return the inverse of the linear response, tapered above the band and bounded."""
+    response = model.frequency_response(frequency_hz)
+    size = np.maximum(np.abs(response), 1.0 / MAX_AMPLIFICATION)
+    beyond = (frequency_hz / highest_hz - 1.0) / (BAND_EDGE_RATIO - 1.0)
+    taper = np.cos(0.5 * math.pi * np.clip(beyond, 0.0, 1.0)) ** 2
+    inverse: npt.NDArray[np.complex128] = np.conj(response) / size**2 * taper
+    return inverse
+
+
+def _rest_at_ends(count: int, rate_hz: float) -> Float1D:
+    """Return a window that is 1 but for half a second at either end, where it rises from 0."""
+    edge = np.arange(count) / (0.5 * rate_hz)
+    x = np.clip(np.minimum(edge, edge[::-1]), 0.0, 1.0)
+    window: Float1D = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
+    return window

@@ -1,0 +1,50 @@
+"""File of a table's twin, as `shaketwin table-twin` writes it."""
+
+import math
+from pathlib import Path
+
+from pydantic import Field
+
+from table_io.config.base import ConfigModel, NonNegative, Positive, load_config
+from twin.drive.table_identification import TableIdentification
+from twin.drive.table_model import TableModel, TableParameters
+
+
+class TableTwinConfig(ConfigModel):
+    """Twin of a table: its moving mass, the parameters of `TableParameters` and intervals."""
+
+    title: str = Field(description="Table and recordings that it was identified from.")
+    mass_kg: Positive = Field(description="Moving mass without payload that forces refer to.")
+    residual: NonNegative = Field(description="Share of the measured motion that it leaves, rms.")
+    parameters: dict[str, float] = Field(description="Parameters of the table's twin, SI.")
+    half_widths: dict[str, float] = Field({}, description="Half widths of their 95 % intervals.")
+
+    def build_model(self) -> TableModel:
+        """Return the twin of the table."""
+        return TableModel(self.mass_kg, TableParameters(**self.parameters))
+
+
+def load_table_twin(path: Path) -> TableTwinConfig:
+    """Load the twin of a table from its file; InputError if it is none."""
+    return load_config(path, TableTwinConfig, "table twin")[0]
+
+
+def format_table_twin(title: str, identification: TableIdentification) -> str:
+    """Return the TOML text of an identified table."""
+    values = identification.model.parameters._asdict()
+    lines = [
+        f'title = "{title}"',
+        f"mass_kg = {identification.model.mass_kg!r}",
+        f"residual = {identification.residual:.4g}",
+        "",
+        "[parameters]",
+        *(f"{name} = {_format_number(value)}" for name, value in values.items()),
+        "",
+        "[half_widths]",
+        *(f"{name} = {width:.3g}" for name, width in identification.half_widths.items()),
+    ]
+    return "\n".join([*lines, ""])
+
+
+def _format_number(value: float) -> str:
+    return "inf" if math.isinf(value) else f"{value:.9g}"

@@ -1,0 +1,175 @@
+"""Twin of the table: oil column, valve, stroke loop, delay, friction and frame.
+
+    m a = f - F(v) + R,  v = y' - y_f'          (table: force f of the oil, friction F, specimen R)
+    f' = K (u phi - v - l f),  K = m w_o^2,  phi = sqrt(1 - f sign(u) / f_s),  l = 2 z_o w_o / K
+    u'' = w_v^2 (e - u) - 2 z_v w_v u'          (valve: speed at no load)
+    e = k (s - (y - y_f)) + k_ff s' - g h / m   (stroke loop; h: f above 1 Hz)
+    F = z (F_c + (F_s - F_c) exp(-(v / v_s)^2)) + c v + b (1 - z sign(v)) v
+    z' = v / d (1 - z sign(v))
+    y_f'' = -r (f - F(v)) / m - w_f (w_f y_f + 2 z_f y_f')
+
+s is the command after a delay. Presliding is Dahl's (1968), with the Stribeck force at low speed;
+d is the presliding displacement. z is integrated exactly over a step of constant speed, the rest by
+the classical Runge-Kutta method. Equations, friction law and integrator are not those of the
+simulated table. Only ratios of force to mass show in a motion: forces are those of the stated mass.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from table_io.block import Float1D, Float2D
+
+MAX_STEP_S = 2.6e-4  # of the integrator: a tenth of the period of the fastest valve
+PRESSURE_CORNER = math.tau * 1.0  # rad/s, below it the load is not fed back
+Y, V, OIL, VALVE, VALVE_RATE, LOW_OIL, FRAME, FRAME_SPEED, STATE_SIZE = 0, 1, 2, 3, 4, 5, 6, 7, 8
+
+
+class TableParameters(NamedTuple):
+    """Parameters of the table's twin, SI; what is 0 is absent.
+
+    `oil_hz` is that of the stated mass on the oil, `static_excess_n` the breakaway force above
+    the friction in motion, `frame_ratio` the mass of the table over that of the frame.
+    """
+
+    gain_1_s: float = 20.0
+    velocity_feedforward: float = 0.0
+    delay_s: float = 0.004
+    valve_hz: float = 80.0
+    valve_damping: float = 0.8
+    oil_hz: float = 30.0
+    oil_damping: float = 0.05
+    pressure_feedback_s: float = 0.0
+    friction_n: float = 0.0
+    static_excess_n: float = 0.0
+    presliding_m: float = 2e-5
+    stribeck_speed_m_s: float = 0.01
+    stick_damping_n_s_m: float = 0.0
+    viscous_n_s_m: float = 0.0
+    frame_hz: float = 15.0
+    frame_damping: float = 0.05
+    frame_ratio: float = 0.0
+    stall_force_n: float = math.inf
+
+
+@njit(cache=True, nogil=True)
+def _write_rates(s, z, command, command_rate, reaction, m, p, rate):  # type: ignore[no-untyped-def]
+    """Write the time derivative of the state; SI."""
+    v = s[V] - s[FRAME_SPEED]
+    dry = p.friction_n + p.static_excess_n * math.exp(-((v / p.stribeck_speed_m_s) ** 2))
+    sticking = 1.0 - z if v > 0.0 else 1.0 + z
+    drive = s[OIL] - z * dry - (p.viscous_n_s_m + p.stick_damping_n_s_m * sticking) * v
+    oil = math.tau * p.oil_hz
+    stiffness = m * oil * oil
+    share = 1.0 - s[OIL] / p.stall_force_n if s[VALVE] > 0.0 else 1.0 + s[OIL] / p.stall_force_n
+    flow = s[VALVE] * math.sqrt(max(share, 0.0))
+    valve = math.tau * p.valve_hz
+    asked = (
+        p.gain_1_s * (command - (s[Y] - s[FRAME]))
+        + p.velocity_feedforward * command_rate
+        - p.pressure_feedback_s * (s[OIL] - s[LOW_OIL]) / m
+    )
+    frame = math.tau * p.frame_hz
+    rate[Y] = s[V]
+    rate[V] = (drive + reaction) / m
+    rate[OIL] = stiffness * (flow - v) - 2.0 * p.oil_damping * oil * s[OIL]
+    rate[VALVE] = s[VALVE_RATE]
+    rate[VALVE_RATE] = valve * (valve * (asked - s[VALVE]) - 2.0 * p.valve_damping * s[VALVE_RATE])
+    rate[LOW_OIL] = PRESSURE_CORNER * (s[OIL] - s[LOW_OIL])
+    rate[FRAME] = s[FRAME_SPEED]
+    rate[FRAME_SPEED] = -p.frame_ratio * drive / m - frame * (
+        frame * s[FRAME] + 2.0 * p.frame_damping * s[FRAME_SPEED]
+    )
+
+
+@njit(cache=True, nogil=True)
+def _simulate(command, reaction, m, rate_hz, steps, p, out):  # type: ignore[no-untyped-def]
+    """Simulate from rest; command (sample,) in m, out (2, sample): table in m and m/s2."""
+    s, stage, total = np.zeros(STATE_SIZE), np.zeros(STATE_SIZE), np.zeros(STATE_SIZE)
+    rate = np.zeros(STATE_SIZE)
+    h, z, lag = 1.0 / (rate_hz * steps), 0.0, p.delay_s * rate_hz
+    count = command.size
+    for k in range(count):
+        for i in range(steps):
+            # Dahl's state over half a step before, and half a step after, the rest.
+            for half in range(2):
+                v = s[V] - s[FRAME_SPEED]
+                sign = 1.0 if v > 0.0 else -1.0
+                z = sign + (z - sign) * math.exp(-abs(v) * 0.5 * h / p.presliding_m)
+                if half == 1:
+                    break
+                total[:] = 0.0
+                for j in range(4):
+                    share = 0.0 if j == 0 else (1.0 if j == 3 else 0.5)
+                    weight = 1.0 if j in (0, 3) else 2.0
+                    for n in range(STATE_SIZE):
+                        stage[n] = s[n] + (share * h * rate[n] if j else 0.0)
+                    at = k - 1 + (i + share) / steps - lag
+                    # Quadratic B-spline through three samples: continuous speed.
+                    nearest = math.floor(at + 0.5)
+                    x = at - nearest
+                    a = command[min(max(nearest - 1, 0), count - 1)]
+                    b = command[min(max(nearest, 0), count - 1)]
+                    c = command[min(max(nearest + 1, 0), count - 1)]
+                    value = 0.5 * (0.5 - x) ** 2 * a + (0.75 - x * x) * b + 0.5 * (0.5 + x) ** 2 * c
+                    slope = ((x - 0.5) * a - 2.0 * x * b + (x + 0.5) * c) * rate_hz
+                    at_r = min(max(k - 1 + (i + share) / steps, 0.0), count - 1.0)
+                    low = int(at_r)
+                    high = min(low + 1, count - 1)
+                    force = reaction[low] + (at_r - low) * (reaction[high] - reaction[low])
+                    _write_rates(stage, z, value, slope, force, m, p, rate)
+                    for n in range(STATE_SIZE):
+                        total[n] += weight * rate[n]
+                for n in range(STATE_SIZE):
+                    s[n] += h / 6.0 * total[n]
+        _write_rates(s, z, 0.0, 0.0, reaction[k], m, p, rate)
+        out[0, k], out[1, k] = s[Y], rate[V]
+
+
+@dataclass(frozen=True)
+class TableModel:
+    """Table of a stated moving mass in kg with its parameters."""
+
+    mass_kg: float
+    parameters: TableParameters = field(default_factory=TableParameters)
+
+    def simulate(
+        self, command_m: Float1D, rate_hz: float, reaction_n: Float1D | None = None
+    ) -> Float2D:
+        """Return table displacement in m and acceleration in m/s2, (2, sample), from rest.
+
+        `command_m` and `reaction_n`, the force of the specimen on the table, are (sample,).
+        """
+        reaction = np.zeros(command_m.size) if reaction_n is None else reaction_n
+        out = np.empty((2, command_m.size))
+        steps = math.ceil(1.0 / (rate_hz * MAX_STEP_S))
+        _simulate(
+            np.ascontiguousarray(command_m), np.ascontiguousarray(reaction), self.mass_kg,
+            rate_hz, steps, self.parameters, out,
+        )  # fmt: skip
+        return out
+
+    def frequency_response(self, frequency_hz: Float1D) -> npt.NDArray[np.complex128]:
+        """Return table displacement over command without friction, (frequency,), complex."""
+        p, m, w = self.parameters, self.mass_kg, np.asarray(math.tau * frequency_hz, complex)
+        s = 1j * w
+        valve, oil, frame = (math.tau * hz for hz in (p.valve_hz, p.oil_hz, p.frame_hz))
+        spool = valve**2 / (s**2 + 2 * p.valve_damping * valve * s + valve**2)
+        delayed = np.exp(-s * p.delay_s)
+        # Table y = d / (m s^2) with drive d; frame y_f = -r d / (m (...)); stroke q = y - y_f.
+        safe = np.where(w == 0.0, 1.0, s**2)
+        table = 1.0 / (m * safe)
+        block = -p.frame_ratio / (m * (s**2 + 2 * p.frame_damping * frame * s + frame**2))
+        stroke = table - block  # per drive; the oil bears drive + c v
+        oil_force = 1.0 + p.viscous_n_s_m * s * stroke
+        high_pass = s / (s + PRESSURE_CORNER)
+        # f' = K (u - v) - 2 z w f
+        needed = (oil_force * (s + 2 * p.oil_damping * oil)) / (m * oil**2) + s * stroke
+        loop = spool * (p.gain_1_s * stroke + p.pressure_feedback_s * high_pass * oil_force / m)
+        asked = (p.gain_1_s + p.velocity_feedforward * s) * delayed
+        response: npt.NDArray[np.complex128] = spool * asked * table / (needed + loop)
+        return np.where(w == 0.0, 1.0 + 0.0j, response)
