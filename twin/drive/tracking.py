@@ -20,6 +20,7 @@ from table_io.block import Float1D
 from table_io.config.excitation import BAND_ENERGY_SHARES
 from twin.drive.spectra import (
     DEFAULT_DAMPING,
+    FINE_PER_OCTAVE,
     USUAL_PER_OCTAVE,
     compute_absolute_velocity,
     compute_arias_intensity,
@@ -45,6 +46,7 @@ class TrackingError:
     left out, not replaced. `lag_s` is positive if the table is late. `sa_share` is the share of the
     `sa_count` ordinates of the 1/6-octave spectrum of the absolute acceleration in the band within
     10 % of the target; `sa_worst_ratio` is the one farthest from it, achieved over target.
+    `sa_fine_share` is the share of the 1/72-octave spectrum, which shows narrow faults.
     """
 
     band_hz: tuple[float, float]
@@ -58,6 +60,7 @@ class TrackingError:
     sa_count: int
     sa_worst_ratio: float
     sa_worst_hz: float
+    sa_fine_share: float
     arias_ratio: float
     cav_ratio: float
     disp_rms_error_band: float
@@ -93,9 +96,8 @@ def judge_tracking(
     lag_s = find_lag(target_acc, achieved_acc, rate_hz, band)
     target = delay_record(target_acc, lag_s, rate_hz)
     rms_band, rms_full = _find_rms_errors(target, achieved_acc, rate_hz, band)
-    pga_band, sa_share, sa_count, worst_ratio, worst_hz, arias, cav = (
-        math.nan, math.nan, 0, math.nan, math.nan, math.nan, math.nan,
-    )  # fmt: skip
+    pga_band = sa_share = worst_ratio = worst_hz = fine_share = arias = cav = math.nan
+    sa_count = 0
     if known.all():
         pga_band = _divide(
             _find_peak(keep_band(achieved_acc, rate_hz, band)),
@@ -104,7 +106,10 @@ def judge_tracking(
         hz, ratios = compare_spectra(target_acc, achieved_acc, rate_hz, band, damping)
         sa_count = hz.size
         if sa_count:
-            sa_share = float(np.mean(np.abs(ratios - 1.0) <= SA_TOLERANCE))
+            sa_share = _find_share(ratios)
+            fine_share = _find_share(
+                compare_spectra(target_acc, achieved_acc, rate_hz, band, damping, FINE_PER_OCTAVE)[1]
+            )
             worst = int(np.argmax(np.abs(np.log(ratios))))
             worst_ratio, worst_hz = float(ratios[worst]), float(hz[worst])
         arias = float(
@@ -123,7 +128,7 @@ def judge_tracking(
     return TrackingError(
         (float(low_hz), float(high_hz)), damping, lag_s, rms_band, rms_full, pga_band,
         _divide(_find_peak(achieved_acc[known]), _find_peak(target[known])),
-        sa_share, sa_count, worst_ratio, worst_hz, arias, cav, disp_band, disp_full,
+        sa_share, sa_count, worst_ratio, worst_hz, fine_share, arias, cav, disp_band, disp_full,
         int(np.count_nonzero(~known)),
     )  # fmt: skip
 
@@ -274,6 +279,11 @@ def _is_inside(w: Float1D, band_hz: tuple[float, float]) -> Bool1D:
 def _find_rms(values: Float1D) -> float:
     """Return the rms; NaN of nothing."""
     return float(np.sqrt(np.mean(np.square(values)))) if values.size else math.nan
+
+
+def _find_share(ratios: Float1D) -> float:
+    """Return the share of ordinates within SA_TOLERANCE of the target."""
+    return float(np.mean(np.abs(ratios - 1.0) <= SA_TOLERANCE))
 
 
 def _divide(value: float, by: float) -> float:
