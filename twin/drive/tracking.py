@@ -107,9 +107,10 @@ def judge_tracking(
         sa_count = hz.size
         if sa_count:
             sa_share = _find_share(ratios)
-            fine_share = _find_share(
-                compare_spectra(target_acc, achieved_acc, rate_hz, band, damping, FINE_PER_OCTAVE)[1]
+            fine = compare_spectra(
+                target_acc, achieved_acc, rate_hz, band, damping, FINE_PER_OCTAVE
             )
+            fine_share = _find_share(fine[1])
             worst = int(np.argmax(np.abs(np.log(ratios))))
             worst_ratio, worst_hz = float(ratios[worst]), float(hz[worst])
         arias = float(

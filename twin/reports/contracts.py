@@ -297,9 +297,7 @@ class TrackingResult(Contract):
         description="rms error of the acceleration in the band, of the rms of the target there"
     )
     acc_rms_error_full: Ratio = Field(description="the same at all frequencies")
-    pga_ratio_band: Ratio = Field(
-        description="peak acceleration in the band, achieved over target"
-    )
+    pga_ratio_band: Ratio = Field(description="peak acceleration in the band, achieved over target")
     pga_ratio_full: Ratio = Field(description="the same at all frequencies")
     sa_share: Ratio = Field(
         description="share of the ordinates of the 1/6-octave response spectrum in the band that "

@@ -38,12 +38,17 @@ from twin.reports.report_data import ReportData
 from twin.reports.table_motion import TableMotion, find_table_motion
 from twin.reports.windows import cut_blocks, extract_free_twin, join_channel
 
-STRONG_SHARES = 0.05, 0.95  # of the Arias intensity: begin and end of the strong motion
 DETAIL_PERIODS = 6.0  # of the middle of the band, that the detail shows around the peak
 BAND_MARGIN = 2.0  # factor beyond the band that is drawn of a spectrum
-FOURIER_SMOOTHING = 24  # intervals per octave over which a Fourier spectrum is averaged
-SHOCK_LOW_HZ = 1.0
-MIN_IMPACTS = 1
+FOURIER_SMOOTHING = 12  # intervals per octave over which a Fourier spectrum is averaged
+SHOCK_LOW_HZ, SHOCK_PER_OCTAVE = 1.0, 24
+MOTION_FIGURES = (  # names, in order
+    "table_acceleration",
+    "table_displacement",
+    "table_spectrum",
+    "table_fourier",
+    "mass_srs",
+)
 CORRIDOR_COLOUR, REQUIRED_COLOUR = "#8b929c", "#1559b0"
 ACHIEVED_STYLE, TARGET_STYLE = measured_style("forward"), twin_style("forward")
 MAX_PLOTTED_SAMPLES = 20_000
@@ -119,7 +124,11 @@ def _draw_acceleration(drawing: MotionDrawing) -> CaptionedFigure:
     rest.set_xlabel("time in s")
     for axis in (whole, rest):
         axis.set_xlim(motion.time_s[0], motion.time_s[-1])
-    _add_legend(figure)
+    peaks = [
+        f", PGA {np.nanmax(np.abs(record)) / GRAVITY_M_S2:.3g} g"
+        for record in (motion.achieved_acc_m_s2, motion.target_acc_m_s2)
+    ]
+    _add_legend(figure, *peaks)
     return CaptionedFigure(
         "table_acceleration",
         "Acceleration of the table",
@@ -224,7 +233,7 @@ def _draw_fourier_and_energy(drawing: MotionDrawing) -> CaptionedFigure:
     high_hz = MAX_BAND_RATIO * motion.rate_hz
     for record, style in (
         (motion.achieved_acc_m_s2, ACHIEVED_STYLE),
-        (motion.target_acc_m_s2, TARGET_STYLE),
+        (drawing.late_acc_m_s2, TARGET_STYLE),
     ):
         spectra.loglog(*_smooth_fourier(record, motion.rate_hz, low_hz, high_hz), **style)
         energy.plot(motion.time_s, compute_arias_intensity(record, motion.rate_hz), **style)
@@ -258,9 +267,9 @@ def _draw_shock_spectrum(run: ReportData, motion: TableMotion) -> CaptionedFigur
         for name in ("impacts_right", "impacts_left")
     )
     records = dict(_extract_mass_records(run, motion))
-    if impacts < MIN_IMPACTS or "measured" not in records:
+    if not impacts or "measured" not in records:
         return
-    hz = list_octave_frequencies(SHOCK_LOW_HZ, MAX_BAND_RATIO * motion.rate_hz, 12)
+    hz = list_octave_frequencies(SHOCK_LOW_HZ, MAX_BAND_RATIO * motion.rate_hz, SHOCK_PER_OCTAVE)
     figure = Figure(figsize=(FIGURE_WIDTH_IN, 3.9))
     axis = figure.subplots()
     handles = []
@@ -279,9 +288,9 @@ def _draw_shock_spectrum(run: ReportData, motion: TableMotion) -> CaptionedFigur
     _format_frequency_axis(axis, hz[0], hz[-1])
     figure.legend(handles=handles, loc="outside upper center", ncols=4)
     caption = (
-        "Shock response spectrum (ISO 18431-4, Q = 10) of the total acceleration of the mass, right "
-        "positive: what an instrument mounted on it would respond. It is 1/12 octave apart, up to "
-        "a tenth of the sampling rate."
+        "Shock response spectrum (ISO 18431-4, Q = 10) of the total acceleration of the mass: peak "
+        "acceleration of an oscillator mounted on it, to the right (positive) and to the left. Up "
+        "to a tenth of the sampling rate, 1/24 octave apart."
     )
     if "twin" in records:
         caption += " Thin: free-running twin."
@@ -306,10 +315,11 @@ def _plot_pair(
     axis.plot(time_s[::stride], target[::stride], **TARGET_STYLE)
 
 
-def _add_legend(figure: Figure) -> None:
+def _add_legend(figure: Figure, achieved: str = "", target: str = "") -> None:
+    """Add the legend of the pair, with what follows either name."""
     handles = [
-        Line2D([], [], **ACHIEVED_STYLE, label="achieved"),
-        Line2D([], [], **TARGET_STYLE, label="target"),
+        Line2D([], [], **ACHIEVED_STYLE, label=f"achieved{achieved}"),
+        Line2D([], [], **TARGET_STYLE, label=f"target{target}"),
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=2)
 
@@ -336,9 +346,9 @@ def _widen(drawing: MotionDrawing) -> tuple[float, float]:
 def _smooth_fourier(
     record: Float1D, rate_hz: float, low_hz: float, high_hz: float
 ) -> tuple[Float1D, Float1D]:
-    """Return (frequency in Hz, rms Fourier amplitude in m/s), (interval,) each, of parts of octaves.
+    """Return (frequency in Hz, rms Fourier amplitude in m/s), (interval,) each, by octave parts.
 
-    An interval without a frequency of the spectrum is left out.
+    A part without a frequency of the spectrum is left out.
     """
     hz, amplitude = compute_fourier_spectrum(record, rate_hz)
     edges = list_octave_frequencies(low_hz, high_hz, FOURIER_SMOOTHING)
@@ -369,8 +379,9 @@ def _format_frequency_axis(axis: Axes, low_hz: float, high_hz: float) -> None:
     """Give an axis a logarithmic frequency with plain numbers."""
     axis.set_xscale("log")
     axis.set_xlim(low_hz, high_hz)
-    axis.xaxis.set_major_formatter(FuncFormatter(lambda hz, _: f"{hz:g}"))
     axis.xaxis.set_minor_formatter(NullFormatter())
+    if axis.get_yscale() == "log":
+        axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     ticks = [hz for hz in _list_ticks() if low_hz <= hz <= high_hz]
     axis.set_xticks(ticks, [f"{hz:g}" for hz in ticks])
 
