@@ -41,8 +41,8 @@ class RequiredSpectrum:
 class TrackingConfig(ConfigModel):
     """How the motion of the table is judged against its target, a displacement history.
 
-    The tolerance of a required spectrum is that of ICC-ES AC156: not more than 10 % below it, and
-    not more than 30 % above.
+    The tolerance of a required spectrum is that of usual seismic qualification (ICC-ES AC156): not
+    more than 10 % below it, and not more than 30 % above.
     """
 
     FILE_KEYS: ClassVar[tuple[str, ...]] = ("required_spectrum",)

@@ -17,7 +17,8 @@ from table_io.units import GRAVITY_M_S2
 from tests.run.test_record import NO_CHECK, RIG, Run, play_run
 from twin.drive.spectra import compute_response_spectrum
 from twin.drive.tracking import TrackingError, judge_tracking
-from twin.recording.reader import Recording
+from twin.recording.mcap_log import write_items
+from twin.recording.reader import Recording, read_recording
 from twin.reports.contracts import RunSummary, TrackingResult
 from twin.reports.report import write_report
 from twin.reports.summary import dump_contract, format_summary, write_summary
@@ -193,6 +194,17 @@ def test_lost_samples_are_stated_and_the_spectra_are_not(tmp_path: Path) -> None
     assert "10 samples of the table" in page
     names = {path.stem for path in (tmp_path / "figures").glob("*.png")}
     assert names & {*MOTION_FIGURES} == {"table_acceleration", "table_displacement"}
+
+
+def test_a_recording_without_its_begin_has_no_target(run: Run, tmp_path: Path) -> None:
+    """The windows that are left do not say where the history began."""
+    _, recording, summary = run
+    first = round(summary["tracking"]["from_s"] * recording.start.rate_hz)
+    blocks = [block for block in recording.blocks("meas") if block.index > first + 500]
+    write_items(tmp_path / "run.mcap", list(blocks), recording.start)
+    late = read_recording(tmp_path / "run.mcap")
+    assert len(late.blocks("meas")) == len(blocks)
+    assert summarise_tracking(late, read_profile(recording)) is None
 
 
 def test_the_report_has_a_section_with_its_figures(run: Run) -> None:

@@ -138,8 +138,7 @@ def compute_shock_spectrum(
     """Return the shock response spectrum of an acceleration in m/s2, (sample,); Q = 1 / (2 zeta).
 
     Above a tenth of the sampling rate the straight lines between the samples are no longer the
-    shock: ISO 18431-4 asks for at least that rate. Arguments and ValueError as
-    `compute_response_spectrum`.
+    shock. Arguments and ValueError as `compute_response_spectrum`.
     """
     peaks = _compute_peaks(acceleration, rate_hz, frequencies_hz, damping, points_per_cycle)
     return ShockSpectrum(
@@ -171,7 +170,7 @@ def compute_arias_intensity(acceleration: Float1D, rate_hz: float) -> Float1D:
 
 
 def compute_absolute_velocity(acceleration: Float1D, rate_hz: float) -> float:
-    """Return the cumulative absolute velocity, integral |a| dt, in m/s (CAV; Reed et al., 1988).
+    """Return the cumulative absolute velocity, integral |a| dt, in m/s (CAV; EPRI NP-5930).
 
     ValueError if a sample is missing.
     """

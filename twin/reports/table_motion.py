@@ -45,7 +45,8 @@ class TableMotion:
 def find_table_motion(recording: Recording, profile: Profile) -> TableMotion | None:
     """Return the motion of the table of a displacement history; None of other tests.
 
-    None too if nothing was measured, or the test ended before the history moved.
+    None too if nothing was measured, the test ended before the history moved, or the recording
+    lacks its begin, without which the target has no place in time.
     """
     blocks = recording.contiguous_blocks("meas")
     windows = find_windows(blocks)
@@ -60,6 +61,8 @@ def find_table_motion(recording: Recording, profile: Profile) -> TableMotion | N
     end = min(max(last for _, last in windows.values()), start + history.size)
     margin = round(MAX_LAG_S * rate_hz)
     before = _count_rest(blocks, range(start - 1, start - 1 - margin, -1))
+    if 0 not in windows or (before == 0 and start > recording.start.index):
+        return None
     is_whole = end == start + history.size
     after = _count_rest(blocks, range(end, end + margin)) if is_whole else 0
     target = np.pad(history[: end - start], (before, after))

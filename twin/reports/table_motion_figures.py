@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from table_io.block import Block, Float1D
 from table_io.config.base import parse_toml
@@ -52,6 +52,7 @@ MOTION_FIGURES = (  # names, in order
 CORRIDOR_COLOUR, REQUIRED_COLOUR = "#8b929c", "#1559b0"
 ACHIEVED_STYLE, TARGET_STYLE = measured_style("forward"), twin_style("forward")
 MAX_PLOTTED_SAMPLES = 20_000
+MAX_DIGITS_RATIO = 1e3  # of a logarithmic axis: up to it 1, 2 and 5 are labelled, not 1 alone
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +126,7 @@ def _draw_acceleration(drawing: MotionDrawing) -> CaptionedFigure:
     for axis in (whole, rest):
         axis.set_xlim(motion.time_s[0], motion.time_s[-1])
     peaks = [
-        f", PGA {np.nanmax(np.abs(record)) / GRAVITY_M_S2:.3g} g"
+        f", PGA {np.nanmax(np.abs(record)) / GRAVITY_M_S2:#.3g} g"
         for record in (motion.achieved_acc_m_s2, motion.target_acc_m_s2)
     ]
     _add_legend(figure, *peaks)
@@ -376,12 +377,16 @@ def _shade_outside(axis: Axes, band_hz: tuple[float, float]) -> None:
 
 
 def _format_frequency_axis(axis: Axes, low_hz: float, high_hz: float) -> None:
-    """Give an axis a logarithmic frequency with plain numbers."""
+    """Give an axis a logarithmic frequency, and plain numbers on both."""
     axis.set_xscale("log")
     axis.set_xlim(low_hz, high_hz)
     axis.xaxis.set_minor_formatter(NullFormatter())
     if axis.get_yscale() == "log":
+        low, high = axis.get_ylim()
+        digits = (1.0, 2.0, 5.0) if high < MAX_DIGITS_RATIO * low else (1.0,)
+        axis.yaxis.set_major_locator(LogLocator(subs=digits))
         axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.yaxis.set_minor_formatter(NullFormatter())
     ticks = [hz for hz in _list_ticks() if low_hz <= hz <= high_hz]
     axis.set_xticks(ticks, [f"{hz:g}" for hz in ticks])
 
