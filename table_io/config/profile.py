@@ -31,14 +31,16 @@ from table_io.config.base import (
     parse_toml,
     read_text,
 )
-from table_io.config.excitation import Excitation, ExcitationPlan, backbone, record  # noqa: F401  registers
+from table_io.config.excitation import Excitation, ExcitationPlan, History, backbone, record  # noqa: F401  registers
 from table_io.config.excitation.continuation import Continuation
 from table_io.config.excitation.stepped_sine import Sweep
+from table_io.config.tracking import TrackingConfig
 from table_io.errors import InputError
 from table_io.records import Step
 
-# Of a file of the excitation: it travels with the profile in one message of the bus, 4 MiB at most.
-MAX_FILE_BYTES = 2 * 2**20
+# Of the files of the excitation and of [tracking]: they travel with the profile in one message of
+# the bus, 4 MiB at most.
+MAX_FILE_BYTES, MAX_SPECTRUM_BYTES = 2 * 2**20, 2**18
 
 
 class Specimen(ConfigModel):
@@ -181,6 +183,7 @@ class Profile(ConfigModel):
     loop_check: LoopCheckConfig = LoopCheckConfig()
     control: ControlConfig = ControlConfig()
     protection: ProtectionConfig = ProtectionConfig()
+    tracking: TrackingConfig = TrackingConfig()
     on_death: OnDeathConfig = OnDeathConfig()
     dwell: DwellConfig | None = None
     track: TrackConfig | None = None
@@ -247,6 +250,25 @@ class Profile(ConfigModel):
             )
         return control
 
+    @field_validator("tracking")
+    @classmethod
+    def _check_tracking(cls, tracking: TrackingConfig, info: ValidationInfo) -> TrackingConfig:
+        excitation, acquisition = info.data.get("excitation"), info.data.get("acquisition")
+        if excitation is not None and not isinstance(excitation, History):
+            if tracking != TrackingConfig():
+                raise InputError(
+                    f"kind {excitation.kind!r} plays no displacement history to be tracked",
+                    remedy="remove [tracking]",
+                )
+        elif acquisition is not None and tracking.band_hz is not None:
+            limit_hz = acquisition.rate_hz / 2
+            if tracking.band_hz[1] > limit_hz:
+                raise InputError(
+                    f"band_hz ends at {tracking.band_hz[1]:g} Hz",
+                    allowed=f"up to {limit_hz:g} Hz, half of acquisition.rate_hz",
+                )
+        return tracking
+
     @field_validator("dwell", "track", "refine")
     @classmethod
     def _check_adaptive(
@@ -295,47 +317,54 @@ class Profile(ConfigModel):
 
 
 def load_profile(path: Path) -> tuple[Profile, str]:
-    """Load a test profile and the files of its excitation: return (profile, text with the files).
+    """Load a test profile and the files that it names: return (profile, text with the files).
 
     The text holds all that the test needs, so a recording that keeps it needs no other file.
     """
-    text = _attach_files(read_text(path, "test profile"), path)
+    text = read_text(path, "test profile")
+    for table in ("excitation", "tracking"):
+        text = _attach_files(text, path, table)
     return parse_toml(text, Profile, str(path)), text
 
 
-def _attach_files(text: str, path: Path) -> str:
-    """Return the text of a profile with a table of its excitation's files appended."""
+def _attach_files(text: str, path: Path, table_name: str) -> str:
+    """Return the text of a profile with a table of the files of its table appended."""
     try:
-        table = tomllib.loads(text)["excitation"]
-        keys = Excitation.select_class(table).FILE_KEYS
-        names = [table[key] for key in keys if key in table]
+        table = tomllib.loads(text)[table_name]
+        is_tracking = table_name == "tracking"
+        model = TrackingConfig if is_tracking else Excitation.select_class(table)
+        names = {key: table[key] for key in model.FILE_KEYS if key in table}
     except (KeyError, TypeError, AttributeError, ValueError, RecursionError):
         return text  # which is reported when it is parsed
     if "files" in table or not names:
         return text
-    lines = [f"{json.dumps(name)} = '''\n{_read_file(str(name), path)}'''" for name in names]
-    attached = "\n".join([text, "[excitation.files]", *lines, ""])
+    lines = [
+        f"{json.dumps(name)} = '''\n{_read_file(str(name), path, table_name, key)}'''"
+        for key, name in names.items()
+    ]
+    attached = "\n".join([text, f"[{table_name}.files]", *lines, ""])
     try:
         tomllib.loads(attached)
     except tomllib.TOMLDecodeError as error:
         raise InputError(
             f"its file cannot be attached ({error})",
             where=path,
-            key="excitation",
-            remedy="write it as a table, [excitation], and the file as plain text",
+            key=table_name,
+            remedy=f"write it as a table, [{table_name}], and the file as plain text",
         ) from None
     return attached
 
 
-def _read_file(name: str, profile_path: Path) -> str:
-    """Read a file named in a profile, next to which it lies."""
+def _read_file(name: str, profile_path: Path, table_name: str, key: str) -> str:
+    """Read a file named at a key of a table of a profile, next to which it lies."""
     path = profile_path.parent / name
+    limit = MAX_SPECTRUM_BYTES if table_name == "tracking" else MAX_FILE_BYTES
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
+        if path.stat().st_size > limit:
             raise InputError(
                 f"{path.stat().st_size / 2**20:.1f} MB are too large",
                 where=path,
-                allowed=f"at most {MAX_FILE_BYTES / 2**20:g} MB",
+                allowed=f"at most {limit / 2**20:g} MB",
                 remedy="resample it, or write fewer digits",
             )
         return path.read_text(encoding="utf-8")
@@ -343,7 +372,7 @@ def _read_file(name: str, profile_path: Path) -> str:
         raise InputError(
             f"cannot read this file: {getattr(error, 'strerror', None) or error}",
             where=profile_path,
-            key="excitation.file",
+            key=f"{table_name}.{key}",
             value=name,
             remedy="give its path relative to the profile",
         ) from None

@@ -265,6 +265,60 @@ class WindowResult(Contract):
     comparison: dict[str, ChannelError] = Field(description="errors of the twin by channel")
 
 
+class RequiredSpectrumResult(Contract):
+    """Test response spectrum (TRS) of the table against the required one (RRS), at 1/6 octave."""
+
+    lower: Ratio = Field(description="least allowed TRS over RRS")
+    upper: Ratio = Field(description="largest allowed TRS over RRS; null without a limit")
+    count: int = Field(description="ordinates of the RRS that were checked")
+    outside: int | None = Field(description="ordinates outside; null if samples are lost")
+    lowest_ratio: Ratio = Field(description="smallest TRS over RRS")
+    lowest_hz: Number = Field(description="its frequency", json_schema_extra={"unit": "Hz"})
+    highest_ratio: Ratio = Field(description="largest TRS over RRS")
+    highest_hz: Number = Field(description="its frequency", json_schema_extra={"unit": "Hz"})
+    passed: bool = Field(description="whether every ordinate is allowed")
+
+
+class TrackingResult(Contract):
+    """Motion of the table against the displacement history that it should follow.
+
+    See `twin.drive.tracking`; the criteria are those of Chen et al. (2018). The lag is taken out
+    first. In the band, of spectra and of energy null if samples are lost.
+    """
+
+    from_s: Seconds = Field(description="begin of the history")
+    to_s: Seconds = Field(description="end of the part that was played")
+    band_hz: Annotated[list[Hertz], Field(min_length=2, max_length=2)] = Field(
+        description="band of interest, as in the profile or from the energy of the target"
+    )
+    damping: Ratio = Field(description="ratio, of the response spectra")
+    lag_s: Seconds = Field(description="of the table behind its target")
+    acc_rms_error_band: Ratio = Field(
+        description="rms error of the acceleration in the band, of the rms of the target there"
+    )
+    acc_rms_error_full: Ratio = Field(description="the same at all frequencies")
+    pga_ratio_band: Ratio = Field(description="peak acceleration in the band, achieved over target")
+    pga_ratio_full: Ratio = Field(description="the same at all frequencies")
+    sa_share: Ratio = Field(
+        description="share of the ordinates of the 1/6-octave response spectrum in the band that "
+        "are within 10 % of the target"
+    )
+    sa_count: int = Field(description="ordinates of it")
+    sa_worst_ratio: Ratio = Field(description="ordinate farthest from the target, over it")
+    sa_worst_hz: Number = Field(description="its frequency", json_schema_extra={"unit": "Hz"})
+    sa_fine_share: Ratio = Field(description="as `sa_share`, at 1/72 octave")
+    arias_ratio: Ratio = Field(description="Arias intensity, achieved over target")
+    cav_ratio: Ratio = Field(description="cumulative absolute velocity, achieved over target")
+    disp_rms_error_band: Ratio = Field(
+        description="rms error of the displacement in the band, of the rms of the target there"
+    )
+    disp_rms_error_full: Ratio = Field(description="the same at all frequencies")
+    lost_samples: Index = Field(description="samples of the acceleration that are missing")
+    required_spectrum: RequiredSpectrumResult | None = Field(
+        description="null without one in the profile"
+    )
+
+
 class PlannedOrbitKeys(Contract):
     """Orbit of the twin at a planned point."""
 
@@ -398,6 +452,9 @@ class RunSummary(SummaryKeys, Contract):
     trips: list[TripEntry] = Field(description="trips of the protection")
     windows: list[WindowResult] | None = Field(
         None, description="of a displacement history; absent for a stepped sine"
+    )
+    tracking: TrackingResult | None = Field(
+        None, description="of the table, in a displacement history that was measured"
     )
     orbits: list[OrbitResult] | None = Field(
         None, description="of a continuation, in order of measurement; absent otherwise"

@@ -57,6 +57,7 @@ from twin.reports.report_data import (
 )
 from twin.reports.step_figures import draw_histories, draw_legend, draw_loop_figures
 from twin.reports.summary import parse_jumps
+from twin.reports.table_motion_figures import draw_table_motion
 from twin.reports.window_figure import draw_window_histories
 
 MARKER_SIZES = {"forward": 4.6, "backward": 2.6}  # both show where they coincide
@@ -87,6 +88,7 @@ def draw_figures(run: ReportData) -> CaptionedFigures:
         _draw_errors,
         _draw_overview,
         _draw_level,
+        draw_table_motion,
     ):
         yield from draw(run)
 

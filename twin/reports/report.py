@@ -35,6 +35,8 @@ from twin.reports.report_data import (
 )
 from twin.reports.sensor_table import build_sensor_rows
 from twin.reports.summary import load_summary, parse_toml_tables
+from twin.reports.table_motion import format_required, format_tracking
+from twin.reports.table_motion_figures import MOTION_FIGURES
 from twin.reports.twin_verdict import NOTHING_MEASURED, describe_worst, format_jump, name_command
 
 MAX_ROWS = 200
@@ -67,6 +69,8 @@ def render_report(run: ReportData, pictures: list[Picture]) -> str:
     """Render the report page as HTML text with every figure embedded."""
     start, recording = run.recording.start, run.recording
     texts = {name: getattr(start, f"{name}_toml") for name in ("profile", "rig", "model")}
+    motion_pictures = [picture for picture in pictures if picture.path.stem in MOTION_FIGURES]
+    other_pictures = [picture for picture in pictures if picture not in motion_pictures]
     return render_page(
         TEMPLATE_DIR / "report.html",
         run=run,
@@ -75,7 +79,9 @@ def render_report(run: ReportData, pictures: list[Picture]) -> str:
         headline=format_headline(run),
         **_describe_twin_verdict(run),
         configs={name: parse_toml_tables(text) for name, text in texts.items()},
-        images=embed_images(pictures),
+        images=embed_images(other_pictures),
+        motion_images=embed_images(motion_pictures),
+        format_required=format_required,
         demand={step.index: step.acceleration_m_s2 for step in start.steps},
         texts=[
             (name, sha256(text.encode()).hexdigest(), _shorten(text))
@@ -168,7 +174,9 @@ def format_headline(run: ReportData) -> str:
     if run.windows:
         planned = parse_toml_tables(run.recording.start.profile_toml).get("excitation") or {}
         kind = planned.get("kind", "history")
-        return f"{len(run.windows)} windows of a displacement history ({kind}), open loop."
+        headline = f"{len(run.windows)} windows of a displacement history ({kind}), open loop"
+        tracking = run.summary.get("tracking")
+        return f"{headline}; {format_tracking(tracking)}." if tracking else f"{headline}."
     if run.orbits:
         planned = parse_toml_tables(run.recording.start.profile_toml).get("excitation") or {}
         return format_orbit_headline(run.orbits, planned.get("kind") == "backbone")

@@ -41,6 +41,7 @@ from twin.model.parameters import Parameters, free_flight_resonance
 from twin.recording.reader import Recording
 from twin.reports.contracts import Contract, RunSummary
 from twin.reports.orbits import summarise_orbits
+from twin.reports.table_motion import format_tracking, summarise_tracking
 from twin.reports.twin_verdict import judge_twin, summarise_agreement
 from twin.reports.windows import summarise_windows
 
@@ -153,7 +154,7 @@ def _find_normalisation(
 
 
 def _windows_entry(recording: Recording, parameters: Parameters, profile: Profile) -> Json:
-    """Return the windows of a displacement history; {} for a stepped sine."""
+    """Return windows and tracking error of a displacement history; {} for a stepped sine."""
     if recording.start.steps:
         return {}
 
@@ -162,7 +163,8 @@ def _windows_entry(recording: Recording, parameters: Parameters, profile: Profil
     def compare(comparisons: tuple[Comparison, ...]) -> Json:
         return channel_nrmse(comparisons, parameters, channels, noise)
 
-    return {"windows": summarise_windows(recording, profile.comparison.contact_n, compare)}
+    windows = summarise_windows(recording, profile.comparison.contact_n, compare)
+    return {"windows": windows, "tracking": summarise_tracking(recording, profile)}
 
 
 def _orbits_entry(recording: Recording, profile: Profile) -> Json:
@@ -383,6 +385,8 @@ def format_summary(summary: Json) -> str:
     else:
         done = f"{len(summary['steps'])} steps" if windows is None else f"{len(windows)} windows"
     parts = [f"{summary['verdict']}: {done}"]
+    if summary.get("tracking"):
+        parts.append(format_tracking(summary["tracking"]))
     if summary.get("visits"):
         parts.append(f"{len(summary['visits'])} steps added during the test")
     parts += summary.get("found", [])
