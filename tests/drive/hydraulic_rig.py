@@ -1,4 +1,4 @@
-"""The simulated hydraulic table as a laboratory: another code than the twin that is tested on it."""
+"""The simulated hydraulic table as a laboratory: another code than its twin."""
 
 import math
 from dataclasses import replace

@@ -17,7 +17,7 @@ from tests.drive.hydraulic_rig import (
     play,
 )
 from twin.drive.drive_computation import compute_drive, correct_drive, measure_error
-from twin.drive.table_identification import TableIdentification, TableMotion, identify_table
+from twin.drive.table_identification import TableIdentification, TableRehearsal, identify_table
 from twin.drive.table_model import TableModel, TableParameters
 
 MASS_KG, STALL_N = TABLE.moving_mass_kg, 42_000.0
@@ -25,14 +25,14 @@ BAND_HZ = 0.3, 18.0
 LINEAR = TableParameters(pressure_feedback_s=0.003, viscous_n_s_m=2e3, frame_ratio=0.05)
 
 
-def rehearse(friction_n: float, noise: bool = True) -> TableMotion:
+def rehearse(friction_n: float, noise: bool = True) -> TableRehearsal:
     """Return 40 s of random motion of 0.02 g rms, with the noise of the rig's sensors."""
     command = make_random_motion(40.0, (0.3, 35.0), 0.02 * GRAVITY_M_S2, seed=4)
     signals = play(build_rig(friction_n), command)
     rng = np.random.default_rng(5)
     y = signals[0] + noise * 5e-6 * rng.standard_normal(command.size)
     acceleration = signals[1] + noise * 5e-3 * rng.standard_normal(command.size)
-    return TableMotion(RATE_HZ, command, y, acceleration, -SPECIMEN_KG * signals[3])
+    return TableRehearsal(RATE_HZ, command, y, acceleration, -SPECIMEN_KG * signals[3])
 
 
 @pytest.fixture(scope="module", params=[500.0, pytest.param(1500.0, marks=pytest.mark.slow)])
@@ -107,4 +107,4 @@ def test_what_is_no_rehearsal_is_refused(seconds: float) -> None:
     zeros = np.zeros(round(seconds * RATE_HZ))
     command = zeros if seconds > 10.0 else np.sin(np.arange(zeros.size) / 100.0)
     with pytest.raises(InputError):
-        identify_table(TableMotion(RATE_HZ, command, zeros, zeros, zeros), MASS_KG)
+        identify_table(TableRehearsal(RATE_HZ, command, zeros, zeros, zeros), MASS_KG)

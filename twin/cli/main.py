@@ -167,9 +167,13 @@ def table_drive_command(
         Path, typer.Option("--table-twin", metavar="FILE", help="File of `shaketwin table-twin`.")
     ],
     band_hz: Annotated[
-        tuple[float, float],
-        typer.Option("--band", metavar="LOW HIGH", help="Frequencies to be right, in Hz."),
-    ] = (0.3, 18.0),
+        tuple[float, float] | None,
+        typer.Option(
+            "--band",
+            metavar="LOW HIGH",
+            help="Frequencies to be right, in Hz; omitted: tracking.band_hz of the profile.",
+        ),
+    ] = None,
     out: OutOption = None,
     table: TableOption = None,
     after: Annotated[

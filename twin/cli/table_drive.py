@@ -11,21 +11,24 @@ from rich.table import Table
 
 from table_io.block import Float1D, Label
 from table_io.config.base import parse_toml
-from table_io.config.excitation import DRIVE_MARGIN_S, History, format_drive
+from table_io.config.excitation import DRIVE_MARGIN_S, History, format_drive, history_acceleration
 from table_io.config.folders import resolve_config
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
-from twin.drive.drive_computation import compute_drive, correct_drive, measure_error
-from twin.drive.rehearsal import read_followed_target, read_table_motion
+from twin.drive.drive_computation import PlayedDrive, compute_drive, correct_played_drive
+from twin.drive.rehearsal import read_played_drive, read_table_motion
 from twin.drive.table_file import TableTwinConfig, format_table_twin, load_table_twin
 from twin.drive.table_identification import identify_table
 from twin.drive.table_model import TableModel
+from twin.drive.tracking import find_band
+from twin.reports.table_motion import summarise_tracking
 from twin.run.folders import make_output_folder
 from twin.run.recordings import open_recording
 from twin.run.run_config import RunConfig, make_run_id, read_run_config
 from twin.run.terminal import console, print_line, print_table, show_status
 
+STOP_RATIO = 1.2  # of the smallest error so far: beyond it an iteration diverges
 DRIVE_FILE, PROFILE_FILE = "drive.csv", "profile.toml"
 UNITS = {
     "gain_1_s": "1/s", "delay_s": "s", "pressure_feedback_s": "s", "presliding_m": "m",
@@ -86,7 +89,7 @@ class DriveTask:
 def compute_drive_command(
     profile: Path,
     twin_file: Path,
-    band_hz: tuple[float, float],
+    band_hz: tuple[float, float] | None,
     out: Path | None,
     table: str | None,
     after: Path | None,
@@ -137,7 +140,7 @@ def write_driven_profile(task: DriveTask, command_m: Float1D, folder: Path) -> P
 
 
 def _prepare_task(
-    profile: Path, twin_file: Path, band_hz: tuple[float, float], table: str | None
+    profile: Path, twin_file: Path, band_hz: tuple[float, float] | None, table: str | None
 ) -> DriveTask:
     path = resolve_config(profile, "tests")
     config = read_run_config(path, table)
@@ -153,6 +156,9 @@ def _prepare_task(
     twin = load_table_twin(twin_file)
     rate_hz = config.profile.acquisition.rate_hz
     target = np.pad(excitation.displacement(rate_hz), round(DRIVE_MARGIN_S * rate_hz))
+    band_hz = band_hz or config.profile.tracking.band_hz
+    if band_hz is None:
+        band_hz = find_band(history_acceleration(target, rate_hz), rate_hz)
     with show_status("simulating the specimen"):
         reaction = _simulate_reaction(config, target.size)
     return DriveTask(config, path, target, reaction, twin.build_model(), twin, band_hz)
@@ -183,12 +189,20 @@ def _simulate_reaction(config: RunConfig, count: int) -> Float1D:
 
 def _correct_after(task: DriveTask, log: Path) -> Float1D:
     """Return the drive of a recording, corrected by what its table lacked."""
-    recording = open_recording(log)
-    target, achieved = read_followed_target(recording)
-    if target.size != task.target_m.size:
-        raise InputError("the recording is that of another target", where=log)
-    played = parse_toml(recording.start.profile_toml, Profile, str(log)).plan.history_m
-    return correct_drive(played, target - achieved, task.model, task.rate_hz, task.band_hz)
+    target, run = read_played_drive(open_recording(log))
+    if target.size != task.target_m.size or not np.allclose(target, task.target_m, atol=1e-7):
+        raise InputError(
+            "the recording is that of another target",
+            where=log,
+            remedy="give a run of a drive for this profile, at the same level",
+        )
+    return _correct(task, run)
+
+
+def _correct(task: DriveTask, run: PlayedDrive) -> Float1D:
+    return correct_played_drive(
+        run, task.model, task.target_m, task.reaction_n, task.rate_hz, task.band_hz
+    )
 
 
 def _iterate(
@@ -203,23 +217,30 @@ def _iterate(
     from twin.cli.entry import DEFAULT_ENDPOINT
     from twin.cli.run import run_test
 
-    rows = Table("run", "rms error in the band", "peak acceleration", title="iteration")
+    rows = Table("run", "rms error", "peak ratio", "SA within 10 %", title="iteration, in the band")
     errors: list[float] = []
     for number in range(iterations + 1):
-        profile = write_driven_profile(task, command_m, folder / f"drive-{number}")
-        run = folder / f"run-{number}"
-        code = run_test(profile, run, unpaced, None, table, False, DEFAULT_ENDPOINT)
+        profile_path = write_driven_profile(task, command_m, folder / f"drive-{number}")
+        run_folder = folder / f"run-{number}"
+        code = run_test(profile_path, run_folder, unpaced, None, table, False, DEFAULT_ENDPOINT)
         if code:
             return code
-        target, achieved = read_followed_target(open_recording(run))
-        errors.append(measure_error(achieved, target, task.rate_hz, task.band_hz))
-        rows.add_row(str(number), f"{100 * errors[-1]:.2f} %", "")
-        if number and errors[-1] > errors[-2]:
+        recording = open_recording(run_folder)
+        profile = parse_toml(recording.start.profile_toml, Profile, str(profile_path))
+        tracking = summarise_tracking(recording, profile)
+        if tracking is None:
+            raise InputError("the run has no motion of the table to judge", where=run_folder)
+        errors.append(tracking["acc_rms_error_band"])
+        rows.add_row(
+            str(number),
+            f"{100 * errors[-1]:.2f} %",
+            f"{100 * tracking['pga_ratio_band']:.1f} %",
+            f"{100 * tracking['sa_share']:.0f} %",
+        )
+        if number and errors[-1] > STOP_RATIO * min(errors):
             console.print("the error grows: no further iteration")
             break
-        command_m = correct_drive(
-            command_m, target - achieved, task.model, task.rate_hz, task.band_hz
-        )
+        command_m = _correct(task, read_played_drive(recording)[1])
     print_table(console, rows)
     best = int(np.argmin(errors))
     print_line(f"best drive: {folder / f'drive-{best}' / PROFILE_FILE}")

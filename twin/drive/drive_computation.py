@@ -15,12 +15,14 @@ import numpy.typing as npt
 from scipy.fft import next_fast_len
 
 from table_io.block import Float1D
+from twin.drive.table_identification import CROSSOVER_HZ
 from twin.drive.table_model import TableModel
 
 BAND_EDGE_RATIO = 1.25  # the inverse falls to nothing between the band's end and this multiple
 MAX_AMPLIFICATION = 5.0  # of the inverse
 MAX_ROUNDS = 25
 LEAST_GAIN = 0.01  # relative fall of the error below which the search ends
+SMOOTHING_HZ = 0.5  # of the ratio of what a run lacked to the noise
 PADDING_S = 4.0  # of rest around the motion, so that its end does not reach its beginning
 
 
@@ -83,6 +85,49 @@ def correct_drive(
     # The inverse leads: what it asks for before the first sample lies at the end of the period.
     corrected: Float1D = command_m + correction[:count]
     return corrected * _rest_at_ends(count, rate_hz)
+
+
+@dataclass(frozen=True, eq=False)
+class PlayedDrive:
+    """A run of a drive: command and achieved table in m, specimen's force in N, (sample,) each.
+
+    `noise_m` is the rms of the laser's noise in m, `noise_m_s2` that of the accelerometer's.
+    """
+
+    command_m: Float1D
+    achieved_m: Float1D
+    reaction_n: Float1D
+    noise_m: float
+    noise_m_s2: float
+
+
+def correct_played_drive(
+    run: PlayedDrive,
+    model: TableModel,
+    target_m: Float1D,
+    reaction_n: Float1D,
+    rate_hz: float,
+    band_hz: tuple[float, float],
+) -> Float1D:
+    """Return the next command, (sample,), for a target in m with the specimen's force in N.
+
+    What another force of the specimen did in the run, for instance an impact at another time, is
+    taken out by the twin: the next run will not repeat it. What is no larger than the noise of the
+    sensors is left.
+    """
+    by_target, by_run = (
+        model.simulate(run.command_m, rate_hz, force)[0] for force in (reaction_n, run.reaction_n)
+    )
+    lacking = target_m - (run.achieved_m + by_target - by_run)
+    spectrum = np.fft.rfft(lacking)
+    frequency_hz = np.fft.rfftfreq(lacking.size, 1.0 / rate_hz)
+    square = np.where(frequency_hz > 0.0, (math.tau * frequency_hz) ** 2, 1.0)
+    slow = frequency_hz < CROSSOVER_HZ
+    noise = lacking.size * np.where(slow, run.noise_m, run.noise_m_s2 / square) ** 2
+    width = max(round(SMOOTHING_HZ * lacking.size / rate_hz), 1)
+    ratio = np.convolve(np.abs(spectrum) ** 2 / noise, np.ones(width) / width, mode="same")
+    known = np.fft.irfft(spectrum * np.clip(1.0 - 1.0 / ratio, 0.0, 1.0), lacking.size)
+    return correct_drive(run.command_m, known, model, rate_hz, band_hz)
 
 
 def measure_error(

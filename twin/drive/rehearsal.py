@@ -9,22 +9,24 @@ from table_io.config.base import parse_toml
 from table_io.config.excitation import History
 from table_io.config.profile import Profile
 from table_io.errors import InputError
-from twin.drive.table_identification import CROSSOVER_HZ, TableMotion
+from twin.drive.drive_computation import PlayedDrive
+from twin.drive.table_identification import CROSSOVER_HZ, TableRehearsal
 from twin.recording.reader import Recording
 
 CHANNELS = "drive_disp_m", "table_disp_m", "table_acc_m_s2"
+NOISE_S = 0.4  # at the start, where the table rests
 REST_S = 0.5  # kept before and after the motion
 BLEND_HZ = 0.5  # half width of the change from displacement to acceleration
 
 
-def read_table_motion(recording: Recording) -> TableMotion:
+def read_table_motion(recording: Recording) -> TableRehearsal:
     """Return command and table of a whole recording, from rest to rest.
 
     The specimen's force on the table is that of its measured acceleration. InputError if samples
     or channels are missing.
     """
     block = _find_whole_block(recording)
-    mass_kg = _read_profile(recording).specimen.mass_kg
+    profile = _read_profile(recording)
     moving = np.flatnonzero(block.label != Label.REST)
     if moving.size == 0:
         raise InputError("the table does not move in it", where=recording.path)
@@ -32,34 +34,38 @@ def read_table_motion(recording: Recording) -> TableMotion:
     first = max(int(moving[0]) - margin, 0)
     last = min(int(moving[-1]) + margin, len(block))
     block = block.cut(block.index + first, block.index + last)
-    reaction = np.zeros(len(block))
-    if "mass_acc_m_s2" in block.channels:
-        reaction = -mass_kg * block.channel("mass_acc_m_s2")
+    reaction = _measure_reaction(block, profile)
     command, displacement, acceleration = (block.channel(name) for name in CHANNELS)
-    return TableMotion(block.rate_hz, command, displacement, acceleration, reaction)
+    return TableRehearsal(block.rate_hz, command, displacement, acceleration, reaction)
 
 
-def read_followed_target(recording: Recording) -> tuple[Float1D, Float1D]:
-    """Return (target, achieved) table displacement in m of a history, (sample,) each.
+def read_played_drive(recording: Recording) -> tuple[Float1D, PlayedDrive]:
+    """Return the target displacement of a history in m, (sample,), and its run.
 
-    The achieved one is that of the laser at low frequencies and of the accelerometer above.
+    InputError if the recording is not that of a history that was played to its end.
     """
     profile = _read_profile(recording)
     if not isinstance(profile.excitation, History):
         raise InputError(
             "the recording is not that of a displacement history", where=recording.path
         )
-    block = _find_whole_block(recording)
-    played = np.flatnonzero((block.label == Label.MEASURE) & (block.cycle < 0))
-    target = profile.plan.target_m
-    if played.size == 0 or int(played[0]) + target.size > len(block):
+    whole = _find_whole_block(recording)
+    played = np.flatnonzero((whole.label == Label.MEASURE) & (whole.cycle < 0))
+    plan, rate_hz = profile.plan, whole.rate_hz
+    if played.size == 0 or int(played[0]) + plan.target_m.size > len(whole):
         raise InputError("its history was not played to the end", where=recording.path)
-    first = block.index + int(played[0])
-    block = block.cut(first, first + target.size)
-    achieved = fuse_displacement(
-        block.channel("table_disp_m"), block.channel("table_acc_m_s2"), block.rate_hz
+    first = whole.index + int(played[0])
+    block = whole.cut(first, first + plan.target_m.size)
+    displacement, acceleration = (block.channel(name) for name in CHANNELS[1:])
+    resting = whole.cut(whole.index, whole.index + round(NOISE_S * rate_hz))
+    noise_m, noise_m_s2 = (float(resting.channel(name).std()) for name in CHANNELS[1:])
+    return plan.target_m, PlayedDrive(
+        plan.history_m,
+        fuse_displacement(displacement, acceleration, rate_hz),
+        _measure_reaction(block, profile),
+        noise_m,
+        noise_m_s2,
     )
-    return target, achieved
 
 
 def fuse_displacement(displacement: Float1D, acceleration: Float1D, rate_hz: float) -> Float1D:
@@ -72,6 +78,14 @@ def fuse_displacement(displacement: Float1D, acceleration: Float1D, rate_hz: flo
     spectrum = (1.0 - share) * np.fft.rfft(displacement) + share * fast
     fused: Float1D = np.fft.irfft(spectrum, count)
     return fused
+
+
+def _measure_reaction(block: Block, profile: Profile) -> Float1D:
+    """Return the specimen's force on the table by its acceleration, N, (sample,); 0 without one."""
+    if "mass_acc_m_s2" not in block.channels:
+        return np.zeros(len(block))
+    reaction: Float1D = -profile.specimen.mass_kg * block.channel("mass_acc_m_s2")
+    return reaction
 
 
 def _read_profile(recording: Recording) -> Profile:

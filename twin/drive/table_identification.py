@@ -43,7 +43,7 @@ STARTING_GAINS_1_S = 8.0, 20.0, 50.0
 
 
 @dataclass(frozen=True, eq=False)
-class TableMotion:
+class TableRehearsal:
     """Rehearsal: command and table in SI, (sample,) each, from rest; reaction of the specimen."""
 
     rate_hz: float
@@ -66,7 +66,7 @@ class TableIdentification:
 
 
 def identify_table(
-    motion: TableMotion, mass_kg: float, stall_force_n: float = math.inf
+    motion: TableRehearsal, mass_kg: float, stall_force_n: float = math.inf
 ) -> TableIdentification:
     """Fit the table's twin to a rehearsal; InputError if that is too short or shows no motion."""
     count = motion.command_m.size
@@ -124,7 +124,7 @@ def identify_table(
     )
 
 
-def _weigh_frequencies(motion: TableMotion, used: npt.NDArray[np.bool_]) -> Float1D:
+def _weigh_frequencies(motion: TableRehearsal, used: npt.NDArray[np.bool_]) -> Float1D:
     """Return the weight of each frequency: less where the motion is large, so that all count."""
     spectrum = np.abs(np.fft.rfft(motion.acceleration_m_s2)[used])
     width = max(int(2.0 * motion.command_m.size / motion.rate_hz), 1)  # 2 Hz

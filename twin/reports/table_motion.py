@@ -54,7 +54,7 @@ def find_table_motion(recording: Recording, profile: Profile) -> TableMotion | N
     if not isinstance(excitation, History) or not windows or recording.start.source != "table":
         return None
     if rate_hz == profile.acquisition.rate_hz:
-        history = profile.plan.history_m
+        history = profile.plan.target_m
     else:
         history = excitation.displacement(rate_hz)
     start = min(first for first, _ in windows.values())
