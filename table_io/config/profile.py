@@ -307,13 +307,17 @@ def _attach_files(text: str, path: Path) -> str:
     """Return the text of a profile with a table of its excitation's files appended."""
     try:
         table = tomllib.loads(text)["excitation"]
-        keys = Excitation.select_class(table).FILE_KEYS
-        names = [table[key] for key in keys if key in table]
+        kind = Excitation.select_class(table)
+        names = [table[key] for key in kind.FILE_KEYS if key in table]
     except (KeyError, TypeError, AttributeError, ValueError, RecursionError):
         return text  # which is reported when it is parsed
     if "files" in table or not names:
         return text
-    lines = [f"{json.dumps(name)} = '''\n{_read_file(str(name), path)}'''" for name in names]
+    lines = [
+        f"{json.dumps(entry)} = '''\n{content}'''"
+        for name in names
+        for entry, content in _read_file(str(name), path, kind, table).items()
+    ]
     attached = "\n".join([text, "[excitation.files]", *lines, ""])
     try:
         tomllib.loads(attached)
@@ -327,18 +331,18 @@ def _attach_files(text: str, path: Path) -> str:
     return attached
 
 
-def _read_file(name: str, profile_path: Path) -> str:
-    """Read a file named in a profile, next to which it lies."""
+def _read_file(
+    name: str, profile_path: Path, kind: type[Excitation], table: Mapping[str, Any]
+) -> dict[str, str]:
+    """Read a file named in a profile, next to which it lies: return its texts by name."""
     path = profile_path.parent / name
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise InputError(
-                f"{path.stat().st_size / 2**20:.1f} MB are too large",
-                where=path,
-                allowed=f"at most {MAX_FILE_BYTES / 2**20:g} MB",
-                remedy="resample it, or write fewer digits",
-            )
-        return path.read_text(encoding="utf-8")
+        _check_size(path.stat().st_size, path)
+        files = kind.convert_file(path.read_bytes(), name, table)
+    except InputError as error:
+        if error.where == str(path):
+            raise
+        raise error.replace(key=error.key or "excitation.file").add_place(profile_path) from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
             f"cannot read this file: {getattr(error, 'strerror', None) or error}",
@@ -347,3 +351,16 @@ def _read_file(name: str, profile_path: Path) -> str:
             value=name,
             remedy="give its path relative to the profile",
         ) from None
+    _check_size(sum(len(content.encode()) for content in files.values()), path)
+    return files
+
+
+def _check_size(size: int, path: Path) -> None:
+    """Raise InputError if a file is too large to travel with the profile."""
+    if size > MAX_FILE_BYTES:
+        raise InputError(
+            f"{size / 2**20:.1f} MB are too large",
+            where=path,
+            allowed=f"at most {MAX_FILE_BYTES / 2**20:g} MB as text",
+            remedy="resample it, or write fewer digits, or the needed column alone",
+        )
