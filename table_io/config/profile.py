@@ -266,6 +266,11 @@ class Profile(ConfigModel):
         if tool is not None and tables:
             raise InputError(f"[{tables[0]}] is given too", allowed="one of dwell, track, refine")
         sweep = info.data.get("excitation")
+        if tool is not None and isinstance(sweep, Sweep) and not sweep.has_one_level:
+            raise InputError(
+                "the level of the sweep varies",
+                remedy=f"remove [{info.field_name}], or state acceleration_g alone",
+            )
         if tool is not None and isinstance(sweep, Sweep):
             tool.check_sweep(SweepGrid(sweep.start_hz, sweep.stop_hz, sweep.step_hz))
         elif tool is not None and sweep is not None:

@@ -15,6 +15,7 @@ from table_io.clock import ManualClock, local_datetime
 from table_io.config.calibration_due import find_overdue_calibrations
 from table_io.config.excitation.continuation import Continuation
 from table_io.config.excitation.record import RecordedHistory
+from table_io.config.excitation.stepped_sine import Sweep
 from table_io.config.profile import Profile
 from table_io.excitation.drive import Drive, HistorySegment
 from table_io.safety.loop_check import plan_targets
@@ -132,8 +133,18 @@ def _sweep_lines(profile: Profile) -> list[tuple[str, str]]:
             f"the last {sweep.measured_cycles} measured",
         ),
         *([("then", then)] if then else []),
-        ("level", f"{sweep.acceleration_g:g} g peak table acceleration"),
+        ("level", _describe_level(sweep)),
     ]
+
+
+def _describe_level(sweep: Sweep) -> str:
+    text = f"{sweep.acceleration_g:g} g peak table acceleration"
+    if sweep.level_points:
+        points = ", ".join(f"{level:g} g at {f:g} Hz" for f, level in sweep.level_points)
+        text = f"peak table acceleration {points}"
+    if sweep.schedule_db:
+        text += f"; whole sweeps at {', '.join(f'{level:g}' for level in sweep.schedule_db)} dB"
+    return text
 
 
 def _history_lines(profile: Profile) -> list[tuple[str, str]]:

@@ -70,6 +70,31 @@ def predict_jumps(
 ) -> JumpPrediction:
     """Predict the jumps of the model, driven slowly up and down the sweep's range.
 
+    Of a schedule, at each of its levels. None are predicted where the level varies with frequency.
+    """
+    if profile.sweep.level_points:
+        return JumpPrediction()
+    groups = [steps]
+    if profile.sweep.schedule_db:
+        levels = sorted({step.acceleration_m_s2 for step in steps})
+        groups = [tuple(step for step in steps if step.acceleration_m_s2 == a) for a in levels]
+    predictions = [_predict_at_level(profile, model, group, u_star_m) for group in groups]
+    jumps = (jump for prediction in predictions for jump in prediction.jumps)
+    return JumpPrediction(
+        tuple(sorted(jumps, key=lambda jump: jump.after.index)),
+        {
+            index: log_amplitude
+            for prediction in predictions
+            for index, log_amplitude in prediction.log_amplitudes.items()
+        },
+    )
+
+
+def _predict_at_level(
+    profile: Profile, model: Model, steps: tuple[Step, ...], u_star_m: float
+) -> JumpPrediction:
+    """Predict the jumps between steps of one level, from a slow drive up and down their range.
+
     In steps of at most `MAX_STEP_HZ`; where effects make cycles expensive, in those of the test or
     coarser ones, so that about `MAX_CYCLES` cycles are computed at most.
     """
