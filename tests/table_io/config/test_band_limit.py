@@ -7,9 +7,11 @@ import pytest
 from scipy import signal
 
 from table_io.block import Float1D
+from table_io.config.base import PROFILES_DIR
 from table_io.config.excitation.band_limit import correct_baseline, cut_rest, limit_band
 from table_io.config.excitation.record import RecordedHistory
 from table_io.config.profile import Profile, load_profile
+from table_io.units import GRAVITY_M_S2
 from tests.input_errors import raises_input_error
 
 RATE_HZ = 200.0
@@ -140,6 +142,37 @@ def test_a_displacement_is_filtered_if_a_band_is_set(tmp_path: Path) -> None:
     (tmp_path / "test.toml").write_text(TEST + "band_hz = [0.2, 5.0]\n")
     plan = load_profile(tmp_path / "test.toml")[0].plan
     assert np.abs(plan.history_m).max() == pytest.approx(5e-3, rel=0.02)  # 1.5 Hz alone
+
+
+def test_el_centro_as_shipped_is_played_as_its_source_states() -> None:
+    profile, _ = load_profile(PROFILES_DIR / "tests" / "el_centro.toml")
+    record = profile.excitation
+    assert isinstance(record, RecordedHistory)
+    assert (record.scale, record.applied_band_hz) == (0.4, (0.1, 18.0))
+    ground = record.series.values
+    assert (ground.size, record.series.rate_hz) == (6000, pytest.approx(200.0))
+    assert (np.abs(ground).max(), int(np.argmax(np.abs(ground)))) == (pytest.approx(3.07), 430)
+    assert (
+        "e5ebedced27b2498195dd564d85255a894e2c76cdf310cec087167abfd34d4bd"
+        in record.files[record.file]
+    )
+    played = profile.plan.history_m
+    acceleration = np.diff(played, 2)[::10] * 2000.0**2
+    x = np.linspace(-1.0, 1.0, 6000)
+    padded = np.pad(0.4 * (ground - np.polyval(np.polyfit(x, ground, 1), x)), 12000)
+    for kind, corner_hz in (("highpass", 0.1), ("lowpass", 18.0)):
+        filter_sections = signal.butter(4, corner_hz, kind, fs=RATE_HZ, output="sos")
+        padded = signal.sosfiltfilt(filter_sections, padded)
+    lag = int(np.argmax(np.correlate(padded, acceleration[1000:9000], "valid"))) - 1000
+    expected = padded[lag : lag + acceleration.size]
+    error = np.sqrt(np.mean((acceleration - expected) ** 2) / np.mean(expected**2))
+    assert error < 0.03
+    peaks = (
+        np.abs(acceleration).max() / GRAVITY_M_S2,
+        np.abs(np.diff(played)).max() * 2000.0,
+        np.abs(played).max(),
+    )
+    assert peaks == pytest.approx((0.4 * 0.308, 0.118, 0.0302), rel=0.02)
 
 
 @pytest.mark.parametrize(
