@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
 
+from table_io.block import Float1D
 from table_io.config.base import Count, Finite, Number, Positive
 from table_io.config.excitation import (
     MIN_BLEND_CYCLES,
@@ -156,14 +157,17 @@ class Sweep(Excitation):
         step_count = round((self.stop_hz - self.start_hz) / self.step_hz)
         return tuple(round(self.start_hz + k * self.step_hz, 9) for k in range(step_count + 1))
 
+    def levels_m_s2(self, frequencies_hz: Float1D) -> Float1D:
+        """Return the peak table acceleration in m/s2 at frequencies, (frequency,), at 0 dB."""
+        if self.level_points:
+            return interpolate_level(self.level_points, frequencies_hz) * GRAVITY_M_S2
+        return np.full(frequencies_hz.size, self.acceleration_g * GRAVITY_M_S2)
+
     @property
     def steps(self) -> tuple[Step, ...]:
         """All planned steps in driving order; both directions use the identical grid."""
         grid = self.frequencies_hz
-        levels = [self.acceleration_g * GRAVITY_M_S2] * len(grid)
-        if self.level_points:
-            levels = (interpolate_level(self.level_points, np.array(grid)) * GRAVITY_M_S2).tolist()
-        upwards = list(zip(grid, levels, strict=True))
+        upwards = list(zip(grid, self.levels_m_s2(np.array(grid)).tolist(), strict=True))
         return tuple(
             Step(index, direction, frequency, 10.0 ** (level_db / 20.0) * acceleration)
             for index, (level_db, direction, (frequency, acceleration)) in enumerate(
