@@ -352,11 +352,10 @@ def _read_file(
     """Read a file named in a profile, next to which it lies: return its texts by name."""
     path = profile_path.parent / name
     try:
-        _check_size(path.stat().st_size, path)
-        files = kind.convert_file(path.read_bytes(), name, table)
+        size = path.stat().st_size
+        data = path.read_bytes() if size <= MAX_FILE_BYTES else b""
+        files = kind.convert_file(data, name, table) if data else {name: ""}
     except InputError as error:
-        if error.where == str(path):
-            raise
         raise error.replace(key=error.key or "excitation.file").add_place(profile_path) from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
@@ -366,6 +365,7 @@ def _read_file(
             value=name,
             remedy="give its path relative to the profile",
         ) from None
+    _check_size(size, path)
     _check_size(sum(len(content.encode()) for content in files.values()), path)
     return files
 

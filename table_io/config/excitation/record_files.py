@@ -30,6 +30,7 @@ HEADER_UNITS = {
 }  # fmt: skip
 MIN_SAMPLES, MAX_SAMPLES = 16, 1_000_000
 MAX_JITTER = 0.01  # of the sampling interval; the times of a file are rounded
+MAX_HEADER_CHARS = 200  # of a line, in which a header is looked for
 MAX_ARRAY_BYTES = 64 * 2**20  # of an array of a mat or npz file, which may be compressed
 COSMOS_STEP_ENTRY = 34  # of the real header: time between samples in s
 BINARY_SUFFIXES = ".mat", ".npz"
@@ -188,7 +189,11 @@ def _read_volume_2(text: str, name: str, request: SeriesRequest) -> RecordedSeri
         rf"|acceleration pts)(?P<rest>.*)",
         re.IGNORECASE,
     )
-    matches = [(at, match) for at, line in enumerate(lines) if (match := pattern.match(line))]
+    matches = [
+        (at, match)
+        for at, line in enumerate(lines)
+        if (match := pattern.match(line[:MAX_HEADER_CHARS]))
+    ]
     channel = 1 if request.column is None and len(matches) == 1 else request.column
     if not isinstance(channel, int) or not 1 <= channel <= len(matches):
         raise InputError(
@@ -227,7 +232,11 @@ def _make_splitter(width: re.Match[str] | None) -> Callable[[str], list[str]]:
 def _find_cosmos_step(lines: list[str], name: str) -> str:
     """Return the time step of the last real header in a part of a COSMOS file, as text."""
     pattern = re.compile(r"real-header values follow on\s*(\d+)\s*lines.*?\(\d*[FEG](\d+)", re.I)
-    headers = [(at, match) for at, line in enumerate(lines) if (match := pattern.search(line))]
+    headers = [
+        (at, match)
+        for at, line in enumerate(lines)
+        if (match := pattern.search(line[:MAX_HEADER_CHARS]))
+    ]
     if not headers:
         raise InputError(f"{name} has no real header, which states the time step")
     at, match = headers[-1]
@@ -243,7 +252,7 @@ def _find_cosmos_step(lines: list[str], name: str) -> str:
 def _find_line(lines: list[str], pattern: re.Pattern[str]) -> tuple[re.Match[str] | None, int]:
     """Return the first match in the lines and its index; (None, -1) if there is none."""
     for at, line in enumerate(lines):
-        match = pattern.search(line)
+        match = pattern.search(line[:MAX_HEADER_CHARS])
         if match:
             return match, at
     return None, -1

@@ -3,6 +3,7 @@
 import hashlib
 import io
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -180,6 +181,21 @@ def test_a_fault_of_a_file_is_named_with_what_to_do(
         read(text, name, **request_keys)
 
 
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("x.at2", "NPTS= 1 " * 200_000),
+        ("x.v2", "20 points of accel data equally spaced at " + "1" * 1_500_000),
+        ("x.txt", " " * 1_500_000 + "x"),
+    ],
+)
+def test_a_hostile_line_is_refused_at_once(name: str, line: str) -> None:
+    begin = monotonic()
+    with raises_input_error():
+        read(line, name, unit="g")
+    assert monotonic() - begin < 2.0
+
+
 def make_mat(**arrays: Any) -> bytes:
     stream = io.BytesIO()
     scipy_io.savemat(stream, arrays, do_compression=True)
@@ -220,6 +236,14 @@ def test_an_unclear_array_is_refused_with_those_that_there_are(suffix: str, make
     with raises_input_error(where=f"x.{suffix}", remedy="as csv"):
         convert_binary(data[: len(data) // 2], f"x.{suffix}", None)
     assert convert_binary(data, f"x.{suffix}", "ew").count("\n") == 31
+
+
+def test_a_fault_of_a_binary_file_names_profile_file_and_key(tmp_path: Path) -> None:
+    (tmp_path / "motion.npz").write_bytes(make_npz(ns=EXACT, ew=EXACT))
+    path = tmp_path / "test.toml"
+    path.write_text(TEST + 'file = "motion.npz"\nunit = "g"\n')
+    with raises_input_error(where=f"{path}: motion.npz", key="excitation.file", allowed="ew 2 x"):
+        load_profile(path)
 
 
 def test_a_huge_compressed_array_is_refused_unread() -> None:
