@@ -188,9 +188,11 @@ def check_limits(
     rows: tuple[StepDemand, ...], profile: Profile, rig: RigConfig, source: str
 ) -> None:
     """Raise an InputError with step, limit and remedy for every limit that is exceeded."""
+    has_points = getattr(profile.excitation, "level_points", ())
+    level_key = "sweep.level_points" if has_points else "sweep.acceleration_g"
     faults = [
         *_find_rate_faults(profile, rig),
-        *_find_exceeded_limits(rows, rig, _suggest_level(rows, profile, rig)),
+        *_find_exceeded_limits(rows, rig, _suggest_level(rows, profile, rig), level_key),
         *_find_clipped_sensors(rows, rig),
     ]
     steps = [row for row in rows if row.step >= 0 and row.frequency_hz > 0]
@@ -202,7 +204,7 @@ def check_limits(
                 where=f"step {coarsest.step} ({coarsest.frequency_hz:g} Hz)",
                 key="amplitude",
                 allowed=f"at least {rig.output.least_lsb}",
-                remedy="raise sweep.acceleration_g, lower sweep.stop_hz, or use an output with "
+                remedy=f"raise {level_key}, lower sweep.stop_hz, or use an output with "
                 "more bits or a smaller span",
             )
         )
@@ -270,7 +272,10 @@ def _round_towards_zero(value: float) -> float:
 
 
 def _find_exceeded_limits(
-    rows: tuple[StepDemand, ...], rig: RigConfig, history_remedy: str = ""
+    rows: tuple[StepDemand, ...],
+    rig: RigConfig,
+    history_remedy: str = "",
+    level_key: str = "sweep.acceleration_g",
 ) -> list[InputError]:
     """List a fault per exceeded limit: its first row and the number of further rows."""
     faults = []
@@ -284,7 +289,7 @@ def _find_exceeded_limits(
                 if first.step < 0
                 else history_remedy
                 if math.isnan(first.frequency_hz)
-                else "lower sweep.acceleration_g or raise sweep.start_hz"
+                else f"lower {level_key} or raise sweep.start_hz"
             )
             faults.append(
                 InputError(

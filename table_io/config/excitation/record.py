@@ -81,7 +81,8 @@ class RecordedHistory(History):
     band_hz: tuple[Positive, Positive] | None = Field(
         None,
         description="Lower and upper corner of the zero-phase filter, at the time scale of the "
-        "table; omitted: 0.1 to 25 for an acceleration, no filter for a displacement.",
+        "table; omitted: 0.1 to 25 for an acceleration, or from 1 / its duration, or to 0.4 of its "
+        "rate; no filter for a displacement.",
     )
     blend_s: Number = Field(1.0, ge=0.1, le=60, description="From rest to the record, and back.")
     file: str = Field(description="File with the history, next to the profile.")
@@ -167,7 +168,7 @@ class RecordedHistory(History):
     def applied_band_hz(self) -> tuple[float, float] | None:
         """Corners of the filter in Hz at the time scale of the table; None for no filter."""
         rate_hz = self.series.rate_hz / self.time_ratio
-        return _choose_band(self.band_hz, self.series.quantity, rate_hz)
+        return _choose_band(self.band_hz, self.series, rate_hz)
 
     def displacement(self, rate_hz: float) -> Float1D:
         """Return the history from rest to rest in m at a sampling rate, (sample,)."""
@@ -207,13 +208,13 @@ def _find_checksum(files: Mapping[str, str], name: str) -> str:
 
 
 def _choose_band(
-    band_hz: tuple[float, float] | None, quantity: Quantity, rate_hz: float
+    band_hz: tuple[float, float] | None, series: RecordedSeries, rate_hz: float
 ) -> tuple[float, float] | None:
     """Return the band of the filter in Hz at a sampling rate; None for no filter."""
-    if band_hz is not None or quantity == "displacement":
+    if band_hz is not None or series.quantity == "displacement":
         return band_hz
     low_hz, high_hz = ACCELERATION_BAND_HZ
-    return low_hz, min(high_hz, MAX_BAND_RATIO * rate_hz)
+    return max(low_hz, rate_hz / series.values.size), min(high_hz, MAX_BAND_RATIO * rate_hz)
 
 
 def _check_processing(series: RecordedSeries, values: Mapping[str, Any]) -> None:
@@ -224,7 +225,7 @@ def _check_processing(series: RecordedSeries, values: Mapping[str, Any]) -> None
             remedy="remove baseline",
         )
     rate_hz = series.rate_hz / math.sqrt(values["length_ratio"] / values["acceleration_ratio"])
-    band_hz = _choose_band(values["band_hz"], series.quantity, rate_hz)
+    band_hz = _choose_band(values["band_hz"], series, rate_hz)
     if band_hz is None:
         return
     low_hz, high_hz = band_hz
@@ -234,7 +235,7 @@ def _check_processing(series: RecordedSeries, values: Mapping[str, Any]) -> None
             allowed=f"band_hz up to {MAX_BAND_RATIO * rate_hz:.4g} Hz",
         )
     duration_s = series.values.size / rate_hz
-    if low_hz * duration_s < 1.0:
+    if low_hz * duration_s < 1.0 - 1e-9:
         raise InputError(
             f"band_hz begins at {low_hz:g} Hz, but the record lasts {duration_s:.3g} s only",
             allowed=f"band_hz from {1.0 / duration_s:.3g} Hz",

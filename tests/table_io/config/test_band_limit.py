@@ -194,6 +194,13 @@ def test_a_processing_that_cannot_be_is_refused(
         load(tmp_path, keys)
 
 
+def test_a_short_record_is_filtered_from_one_cycle_in_its_duration(tmp_path: Path) -> None:
+    _, record = load(tmp_path)
+    assert record.applied_band_hz == (0.1, 25.0)
+    _, record = load(tmp_path, "length_ratio = 0.0625")  # 5 s on the table
+    assert record.applied_band_hz == (pytest.approx(0.2), 25.0)
+
+
 def test_a_baseline_of_a_displacement_is_refused(tmp_path: Path) -> None:
     rows = "".join(f"{t:.3f},{np.sin(t)}\n" for t in TIME_S.tolist())
     (tmp_path / "motion.csv").write_text("time_s,disp_mm\n" + rows)

@@ -10,7 +10,7 @@ from table_io.config.excitation.stepped_sine import Sweep
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.excitation.trajectory import plan_excitation
-from table_io.safety.preflight import compute_demands
+from table_io.safety.preflight import check_limits, compute_demands
 from table_io.units import GRAVITY_M_S2
 from tests.input_errors import raises_input_error
 
@@ -98,6 +98,13 @@ def test_levels_that_cannot_be_are_named(
 ) -> None:
     with raises_input_error(key=key, **fields):
         make(**keys)
+
+
+def test_a_level_beyond_a_limit_is_refused_at_its_break_points() -> None:
+    profile = make(level_points=[[1.0, 0.5], [4.0, 0.01]])
+    rows = compute_demands(plan_excitation(profile), profile, RIG)
+    with raises_input_error(key="displacement", remedy="sweep.level_points"):
+        check_limits(rows, profile, RIG, "x.toml")
 
 
 def test_what_needs_one_level_says_so() -> None:
