@@ -47,7 +47,8 @@ from table_io.config.excitation.stepped_sine import Sweep
 from table_io.errors import InputError
 from table_io.records import Step
 
-# Of a file of the excitation: it travels with the profile in one message of the bus, 4 MiB at most.
+MAX_SOURCE_BYTES = 32 * 2**20  # of a file of the excitation, before its conversion to text
+# Of its text: it travels with the profile in one message of the bus, 4 MiB at most.
 MAX_FILE_BYTES = 2 * 2**20
 
 
@@ -353,7 +354,7 @@ def _read_file(
     path = profile_path.parent / name
     try:
         size = path.stat().st_size
-        data = path.read_bytes() if size <= MAX_FILE_BYTES else b""
+        data = path.read_bytes() if size <= MAX_SOURCE_BYTES else b""
         files = kind.convert_file(data, name, table) if data else {name: ""}
     except InputError as error:
         raise error.replace(key=error.key or "excitation.file").add_place(profile_path) from None
@@ -365,8 +366,8 @@ def _read_file(
             value=name,
             remedy="give its path relative to the profile",
         ) from None
-    _check_size(size, path)
-    _check_size(sum(len(content.encode()) for content in files.values()), path)
+    text_size = sum(len(content.encode()) for content in files.values())
+    _check_size(text_size if data else size, path)
     return files
 
 

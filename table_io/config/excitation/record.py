@@ -37,6 +37,8 @@ from table_io.config.excitation.record_files import (
     RecordUnit,
     SeriesRequest,
     convert_binary,
+    drop_integrals,
+    is_volume_2,
     read_series,
 )
 from table_io.errors import InputError, is_control
@@ -95,6 +97,7 @@ class RecordedHistory(History):
             text = convert_binary(data, name, variable if isinstance(variable, str) else None)
         else:
             text = _decode(data)
+            text = drop_integrals(text) if is_volume_2(name) else text
         files = {name: text}
         if text.encode() != data:
             files[name + CHECKSUM_SUFFIX] = hashlib.sha256(data).hexdigest()

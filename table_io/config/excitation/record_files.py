@@ -65,7 +65,7 @@ def read_series(text: str, name: str, request: SeriesRequest) -> RecordedSeries:
     suffix = PurePath(name).suffix.lower()
     if suffix in (".at2", ".dt2", ".vt2"):
         return _read_peer(text, name, request)
-    if suffix.startswith(".v2"):
+    if is_volume_2(name):
         return _read_volume_2(text, name, request)
     lines = _list_rows(text)
     first = lines[0][1] if lines else ""
@@ -73,6 +73,11 @@ def read_series(text: str, name: str, request: SeriesRequest) -> RecordedSeries:
     if is_columns and not first.lower().startswith("time_s"):
         return _read_columns(lines, name, request)
     return _read_csv(lines, name, request)
+
+
+def is_volume_2(name: str) -> bool:
+    """Return whether a file is a corrected accelerogram by its name: .v2, .V2c."""
+    return PurePath(name).suffix.lower().startswith(".v2")
 
 
 def _list_rows(text: str) -> list[tuple[int, str]]:
@@ -219,6 +224,23 @@ def _read_volume_2(text: str, name: str, request: SeriesRequest) -> RecordedSeri
     return _make_series(
         np.array(values), 1.0 / _parse_step(step_text, name, at + 1), unit, name, request
     )
+
+
+def drop_integrals(text: str) -> str:
+    """Return the text of a V2 file without its blocks of velocity and displacement."""
+    begin = re.compile(
+        r"\s*\d+\s+(?:points of (?:veloc|displ)\w* data equally|(?:velocity|displacement) pts)",
+        re.IGNORECASE,
+    )
+    kept, is_integral = list[str](), False
+    for line in text.split("\n"):
+        if begin.match(line[:MAX_HEADER_CHARS]):
+            is_integral = True
+        elif line.lower().startswith(("/&", "end-of-data")):
+            is_integral = False
+        if not is_integral:
+            kept.append(line)
+    return "\n".join(kept)
 
 
 def _make_splitter(width: re.Match[str] | None) -> Callable[[str], list[str]]:

@@ -98,6 +98,20 @@ def test_one_channel_of_a_csmip_file_is_read() -> None:
     assert series.values == pytest.approx(0.01 * (2 * np.array(VALUES) - 1000))
 
 
+def test_a_v2_file_is_kept_without_velocity_and_displacement(tmp_path: Path) -> None:
+    """Files of three channels are larger than a profile may be; the checksum is of the whole."""
+    whole = csmip(VALUES, [2 * v for v in VALUES])
+    data = (whole + "\n").replace("\n", "\r\n").encode()
+    files = RecordedHistory.convert_file(data, "CHAN.V2", {})
+    text = files["CHAN.V2"]
+    assert "veloc data" not in text
+    assert len(text) < 0.5 * len(data)
+    assert files["CHAN.V2.sha256"] == hashlib.sha256(data).hexdigest()
+    for channel in (1, 2):
+        kept, original = (read(t, "CHAN.V2", column=channel) for t in (text, whole))
+        assert kept.values.tobytes() == original.values.tobytes()
+
+
 def test_a_cosmos_file_is_read_with_the_step_of_its_real_header() -> None:
     series = read(cosmos(), "x.V2c")
     assert (series.quantity, series.rate_hz) == ("acceleration", pytest.approx(200.0))
