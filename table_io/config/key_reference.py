@@ -11,10 +11,10 @@ from table_io.config.base import ConfigModel
 
 # Unit by the ending of a key, the longest that fits.
 UNIT_ENDINGS = {
-    "mm_s": "mm/s", "m_s2": "m/s2", "n_m": "N/m", "n_s_m": "N s/m", "mm": "mm", "m": "m",
-    "hz": "Hz", "s": "s", "ms": "ms", "g": "g", "kn": "kN", "n": "N", "kg": "kg", "db": "dB",
-    "deg": "degrees", "c": "degC", "v": "V", "lsb": "LSB", "percent": "%", "samples": "samples",
-    "months": "months",
+    "mm_s": "mm/s", "l_min": "l/min", "cm2": "cm2", "m_s2": "m/s2", "n_m": "N/m",
+    "n_s_m": "N s/m", "mm": "mm", "m": "m", "hz": "Hz", "s": "s", "ms": "ms", "g": "g", "kn": "kN",
+    "n": "N", "kg": "kg", "db": "dB", "deg": "degrees", "c": "degC", "v": "V", "lsb": "LSB",
+    "percent": "%", "samples": "samples", "months": "months",
 }  # fmt: skip
 TYPE_NAMES = {str: "text", float: "number", int: "integer", bool: "true or false", dict: "table"}
 

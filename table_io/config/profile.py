@@ -31,15 +31,27 @@ from table_io.config.base import (
     parse_toml,
     read_text,
 )
-from table_io.config.excitation import Excitation, ExcitationPlan, History, backbone, record  # noqa: F401  registers
+from table_io.config.excitation import (  # those without a use here register their kind
+    Excitation,
+    ExcitationPlan,
+    History,
+    backbone,  # noqa: F401
+    band_random,  # noqa: F401
+    chirp,  # noqa: F401
+    cyclic,  # noqa: F401
+    half_sine,  # noqa: F401
+    record,  # noqa: F401
+    sine_pulse,  # noqa: F401
+)
 from table_io.config.excitation.continuation import Continuation
 from table_io.config.excitation.stepped_sine import Sweep
 from table_io.config.tracking import TrackingConfig
 from table_io.errors import InputError
 from table_io.records import Step
 
-# Of the files of the excitation and of [tracking]: they travel with the profile in one message of
-# the bus, 4 MiB at most.
+MAX_SOURCE_BYTES = 32 * 2**20  # of a file of the excitation, before its conversion to text
+# Of its text, and of that of [tracking]: they travel with the profile in one message of the bus,
+# 4 MiB at most.
 MAX_FILE_BYTES, MAX_SPECTRUM_BYTES = 2 * 2**20, 2**18
 
 
@@ -278,6 +290,11 @@ class Profile(ConfigModel):
         if tool is not None and tables:
             raise InputError(f"[{tables[0]}] is given too", allowed="one of dwell, track, refine")
         sweep = info.data.get("excitation")
+        if tool is not None and isinstance(sweep, Sweep) and not sweep.has_one_level:
+            raise InputError(
+                "the level of the sweep varies",
+                remedy=f"remove [{info.field_name}], or state acceleration_g alone",
+            )
         if tool is not None and isinstance(sweep, Sweep):
             tool.check_sweep(SweepGrid(sweep.start_hz, sweep.stop_hz, sweep.step_hz))
         elif tool is not None and sweep is not None:
@@ -339,8 +356,11 @@ def _attach_files(text: str, path: Path, table_name: str) -> str:
     if "files" in table or not names:
         return text
     lines = [
-        f"{json.dumps(name)} = '''\n{_read_file(str(name), path, table_name, key)}'''"
+        f"{json.dumps(entry)} = '''\n{content}'''"
         for key, name in names.items()
+        for entry, content in _read_file(
+            str(name), path, f"{table_name}.{key}", model, table
+        ).items()
     ]
     attached = "\n".join([text, f"[{table_name}.files]", *lines, ""])
     try:
@@ -355,24 +375,38 @@ def _attach_files(text: str, path: Path, table_name: str) -> str:
     return attached
 
 
-def _read_file(name: str, profile_path: Path, table_name: str, key: str) -> str:
-    """Read a file named at a key of a table of a profile, next to which it lies."""
+def _read_file(
+    name: str, profile_path: Path, key: str, model: type[ConfigModel], table: Mapping[str, Any]
+) -> dict[str, str]:
+    """Read a file named at a key of a profile, next to which it lies: return its texts by name."""
     path = profile_path.parent / name
-    limit = MAX_SPECTRUM_BYTES if table_name == "tracking" else MAX_FILE_BYTES
+    limit = MAX_FILE_BYTES if issubclass(model, Excitation) else MAX_SPECTRUM_BYTES
     try:
-        if path.stat().st_size > limit:
-            raise InputError(
-                f"{path.stat().st_size / 2**20:.1f} MB are too large",
-                where=path,
-                allowed=f"at most {limit / 2**20:g} MB",
-                remedy="resample it, or write fewer digits",
-            )
-        return path.read_text(encoding="utf-8")
+        size = path.stat().st_size
+        data = path.read_bytes() if size <= MAX_SOURCE_BYTES else b""
+        kind = model if issubclass(model, Excitation) else Excitation
+        files = kind.convert_file(data, name, table) if data else {name: ""}
+    except InputError as error:
+        raise error.replace(key=error.key or key).add_place(profile_path) from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
             f"cannot read this file: {getattr(error, 'strerror', None) or error}",
             where=profile_path,
-            key=f"{table_name}.{key}",
+            key=key,
             value=name,
             remedy="give its path relative to the profile",
         ) from None
+    text_size = sum(len(content.encode()) for content in files.values())
+    _check_size(text_size if data else size, path, limit)
+    return files
+
+
+def _check_size(size: int, path: Path, limit: int) -> None:
+    """Raise InputError if a file is too large to travel with the profile."""
+    if size > limit:
+        raise InputError(
+            f"{size / 2**20:.1f} MB are too large",
+            where=path,
+            allowed=f"at most {limit / 2**20:g} MB as text",
+            remedy="resample it, or write fewer digits, or the needed column alone",
+        )

@@ -37,6 +37,25 @@ class MachineLimits(ConfigModel):
     acceleration_g: Positive = Field(description="Largest acceleration.")
     force_kn: Positive = Field(description="Largest force of the actuator.")
     frequency_hz: Positive = Field(description="Highest frequency of a command.")
+    piston_area_cm2: Positive | None = Field(
+        None, description="Of a hydraulic actuator, for its flow; omitted: no limit of flow."
+    )
+    peak_flow_l_min: Positive | None = Field(
+        None,
+        validate_default=True,
+        description="Largest flow of servo-valve and accumulators together.",
+    )
+
+    @field_validator("peak_flow_l_min")
+    @classmethod
+    def _check_flow(cls, flow: float | None, info: ValidationInfo) -> float | None:
+        if "piston_area_cm2" in info.data and (info.data["piston_area_cm2"] is None) != (
+            flow is None
+        ):
+            raise InputError(
+                "piston_area_cm2 and peak_flow_l_min go together", remedy="give both or neither"
+            )
+        return flow
 
 
 class OutputConfig(ConfigModel):

@@ -62,8 +62,12 @@ class RigLimit:
 
 
 def list_limits(rig: RigConfig) -> tuple[RigLimit, ...]:
-    """List the limits of a rig (displacement, velocity, acceleration, force)."""
+    """List the limits of a rig: displacement, velocity, acceleration, force, flow if stated."""
     limits = rig.limits
+    area_m2, flow_l_min = (limits.piston_area_cm2 or 0.0) * 1e-4, limits.peak_flow_l_min
+    flow = RigLimit(
+        "flow", "l/min", flow_l_min or math.inf, lambda row: row.velocity_m_s * area_m2 * 6e4
+    )
     stroke = min(limits.stroke_mm, rig.output.span_mm)
     return (
         RigLimit("displacement", "mm", stroke, lambda row: row.displacement_m * 1e3),
@@ -75,6 +79,7 @@ def list_limits(rig: RigConfig) -> tuple[RigLimit, ...]:
             lambda row: row.acceleration_m_s2 / GRAVITY_M_S2,
         ),
         RigLimit("force", "kN", limits.force_kn, lambda row: row.force_n * 1e-3),
+        *([flow] if flow_l_min is not None else []),
     )
 
 
@@ -183,9 +188,11 @@ def check_limits(
     rows: tuple[StepDemand, ...], profile: Profile, rig: RigConfig, source: str
 ) -> None:
     """Raise an InputError with step, limit and remedy for every limit that is exceeded."""
+    has_points = getattr(profile.excitation, "level_points", ())
+    level_key = "sweep.level_points" if has_points else "sweep.acceleration_g"
     faults = [
         *_find_rate_faults(profile, rig),
-        *_find_exceeded_limits(rows, rig),
+        *_find_exceeded_limits(rows, rig, _suggest_level(rows, profile, rig), level_key),
         *_find_clipped_sensors(rows, rig),
     ]
     steps = [row for row in rows if row.step >= 0 and row.frequency_hz > 0]
@@ -197,7 +204,7 @@ def check_limits(
                 where=f"step {coarsest.step} ({coarsest.frequency_hz:g} Hz)",
                 key="amplitude",
                 allowed=f"at least {rig.output.least_lsb}",
-                remedy="raise sweep.acceleration_g, lower sweep.stop_hz, or use an output with "
+                remedy=f"raise {level_key}, lower sweep.stop_hz, or use an output with "
                 "more bits or a smaller span",
             )
         )
@@ -235,7 +242,41 @@ def _find_rate_faults(profile: Profile, rig: RigConfig) -> list[InputError]:
     return faults
 
 
-def _find_exceeded_limits(rows: tuple[StepDemand, ...], rig: RigConfig) -> list[InputError]:
+def _suggest_level(rows: tuple[StepDemand, ...], profile: Profile, rig: RigConfig) -> str:
+    """Return the remedy for a history beyond the limits: the largest level that fits them all.
+
+    All demands of a history are in proportion to its level, those of its worst stop included.
+    """
+    history = [row for row in rows if math.isnan(row.frequency_hz)]
+    bounds = [(limit.demand, limit.allowed) for limit in list_limits(rig)]
+    bounds += [
+        (TABLE_SENSORS[sensor.channel], sensor.range * sensor.si_per_unit)
+        for sensor in rig.sensors
+        if sensor.channel in TABLE_SENSORS
+    ]
+    shares = [allowed / peak for row in history for demand, allowed in bounds
+              if (peak := demand(row)) > 0.0]  # fmt: skip
+    share = min(shares, default=1.0)
+    excitation = profile.excitation
+    key = "level_points" if getattr(excitation, "level_points", ()) else excitation.LEVEL_KEY
+    level = getattr(excitation, key, None) if key else None
+    if isinstance(level, int | float):
+        return f"the largest that fits: {key} = {_round_towards_zero(level * share):g}"
+    return f"multiply {key or 'the history'} by {_round_towards_zero(share):g}, which fits"
+
+
+def _round_towards_zero(value: float) -> float:
+    """Return a value with three significant digits, none larger than it in magnitude."""
+    unit = 10.0 ** (math.floor(math.log10(abs(value))) - 2)
+    return math.trunc(value / unit) * unit
+
+
+def _find_exceeded_limits(
+    rows: tuple[StepDemand, ...],
+    rig: RigConfig,
+    history_remedy: str = "",
+    level_key: str = "sweep.acceleration_g",
+) -> list[InputError]:
     """List a fault per exceeded limit: its first row and the number of further rows."""
     faults = []
     for limit in list_limits(rig):
@@ -246,9 +287,9 @@ def _find_exceeded_limits(rows: tuple[StepDemand, ...], rig: RigConfig) -> list[
             remedy = (
                 "raise loop_check.frequencies_hz or lower loop_check.level"
                 if first.step < 0
-                else "scale the history down"
+                else history_remedy
                 if math.isnan(first.frequency_hz)
-                else "lower sweep.acceleration_g or raise sweep.start_hz"
+                else f"lower {level_key} or raise sweep.start_hz"
             )
             faults.append(
                 InputError(

@@ -1,5 +1,6 @@
 """What `check` says and draws before anything moves."""
 
+import hashlib
 import math
 from dataclasses import replace
 from io import StringIO
@@ -166,3 +167,22 @@ def test_the_drawing_shows_every_kind_of_drive(test: str, tmp_path: Path) -> Non
     assert min(float(part.mean()) for part in panels) > 0.005
     settling = np.array([0x5C, 0x8F, 0xC2]) / 255
     assert (np.abs(picture[:, :, :3] - settling).max(axis=2) < 0.02).mean() > 0.004
+
+
+def test_a_record_is_identified_by_checksum_and_peaks() -> None:
+    config = read_shipped("record_example")
+    text = format_plan(config)
+    file = PROFILES_DIR / "tests" / "record_example.csv"
+    assert hashlib.sha256(file.read_bytes()).hexdigest() in text
+    history = config.profile.plan.history_m
+    rate_hz = config.drive.rate_hz
+    words = next(line for line in text.splitlines() if line.startswith("  target")).split()
+    peaks = [float(words[k]) for k in (2, 4, 6)]
+    assert peaks == pytest.approx(
+        [
+            np.abs(np.diff(history, 2)).max() * rate_hz**2 / GRAVITY_M_S2,
+            1e3 * np.abs(np.diff(history)).max() * rate_hz,
+            1e3 * np.abs(history).max(),
+        ],
+        rel=1e-3,
+    )

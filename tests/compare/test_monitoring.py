@@ -35,6 +35,7 @@ from twin.compare.monitoring.cycle import ChannelNoise, CycleData, weight_functi
 from twin.compare.monitoring.jumps import (
     MAX_STEP_HZ,
     ExpectedJump,
+    JumpPrediction,
     JumpTracking,
     predict_jumps,
     track_jumps,
@@ -209,6 +210,33 @@ def test_warnings_are_of_the_kinds_that_a_replay_says_anew() -> None:
 
 
 # Jumps
+
+
+@pytest.mark.parametrize("keys", ["level_points = [[2.4, 0.05], [4.4, 0.05]]", ""])
+def test_jumps_of_a_varying_level_are_those_of_each_level(keys: str) -> None:
+    """At constant break points as without them; of a schedule as of sweeps of its levels."""
+    rig, model = (PROFILES_DIR / name for name in ("rigs/simulated.toml", "models/snm.toml"))
+
+    def predict(more: str) -> JumpPrediction:
+        text = PROFILE.format(gap=4.0).replace("step_hz = 0.5", f"step_hz = 0.1\n{more}")
+        bundle = from_texts("x", text, rig.read_text(), model.read_text(), "x")
+        return predict_jumps(bundle.profile, bundle.model, bundle.steps, 0.03)
+
+    def list_places(prediction: JumpPrediction, offset: int = 0) -> list[Any]:
+        return [(jump.after.index + offset, pytest.approx(jump.at_hz)) for jump in prediction.jumps]
+
+    constant = predict("")
+    if keys:
+        assert list_places(predict(keys)) == list_places(constant)
+        assert predict(keys).log_amplitudes == pytest.approx(dict(constant.log_amplitudes))
+        return
+    half = predict("acceleration_g = 0.04")
+    scheduled = predict(f"schedule_db = [{20 * math.log10(0.8)}, 0.0]")
+    count = len(constant.log_amplitudes)
+    assert len(half.jumps) == len(constant.jumps) == 2
+    assert list_places(scheduled) == list_places(half) + list_places(constant, count)
+    shifted = {index + count: value for index, value in constant.log_amplitudes.items()}
+    assert scheduled.log_amplitudes == pytest.approx({**half.log_amplitudes, **shifted})
 
 
 def test_the_jumps_of_the_model_lie_at_the_folds_of_its_branches() -> None:

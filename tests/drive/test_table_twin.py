@@ -36,7 +36,7 @@ def rehearse(friction_n: float, noise: bool = True) -> TableRehearsal:
 
 
 @pytest.fixture(scope="module", params=[500.0, pytest.param(1500.0, marks=pytest.mark.slow)])
-def identified(request: pytest.FixtureRequest) -> tuple[float, TableIdentification]:
+def identification(request: pytest.FixtureRequest) -> tuple[float, TableIdentification]:
     return request.param, identify_table(rehearse(request.param), MASS_KG, STALL_N)
 
 
@@ -61,9 +61,9 @@ def test_acceleration_is_that_of_the_displacement() -> None:
 
 
 def test_friction_and_oil_column_are_those_of_the_rig(
-    identified: tuple[float, TableIdentification],
+    identification: tuple[float, TableIdentification],
 ) -> None:
-    friction_n, result = identified
+    friction_n, result = identification
     p = result.model.parameters
     assert TABLE.hydraulic is not None
     assert p.friction_n == pytest.approx(friction_n, rel=0.15)
@@ -73,10 +73,10 @@ def test_friction_and_oil_column_are_those_of_the_rig(
 
 
 def test_the_first_run_of_its_drive_is_right_and_the_next_ones_are_better(
-    identified: tuple[float, TableIdentification],
+    identification: tuple[float, TableIdentification],
 ) -> None:
     """At ten times the level of the rehearsal; truth is the plant without noise."""
-    friction_n, result = identified
+    friction_n, result = identification
     target = make_random_motion(20.0, (0.4, 12.0), 0.05 * GRAVITY_M_S2, seed=9)
     rig = build_rig(friction_n)
     open_loop = measure_error(play(rig, target)[0], target, RATE_HZ, BAND_HZ)
@@ -94,9 +94,9 @@ def test_the_first_run_of_its_drive_is_right_and_the_next_ones_are_better(
     assert errors[2] < 0.02
 
 
-def test_a_drive_rests_at_its_ends(identified: tuple[float, TableIdentification]) -> None:
+def test_a_drive_rests_at_its_ends(identification: tuple[float, TableIdentification]) -> None:
     target = np.pad(make_random_motion(12.0, (0.5, 10.0), 0.5, seed=2), 1000)
-    command = compute_drive(identified[1].model, target, RATE_HZ, BAND_HZ).command_m
+    command = compute_drive(identification[1].model, target, RATE_HZ, BAND_HZ).command_m
     assert command[0] == command[-1] == 0.0
     assert np.abs(np.diff(command)[[0, -1]]).max() < 1e-7
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from table_io.acquisition.session import OperatorCommand, run_session
 from table_io.backends import open_backend
@@ -304,3 +305,32 @@ def test_an_export_comes_back_with_its_windows(run: Run, kind: str, tmp_path: Pa
     assert [window["measured"] for window in windows] == [
         window["measured"] for window in summary["windows"]
     ]
+
+
+def test_an_acceleration_of_a_mat_file_is_played_and_replayed_from_the_recording(
+    tmp_path: Path,
+) -> None:
+    """2 Hz at 0.1 g in an envelope of 8 s: the table follows, and the replay needs no mat file."""
+    t = np.arange(801) / 100.0
+    ground = np.sin(np.pi * t / 8) ** 4 * np.sin(2 * np.pi * 2.0 * t)
+    savemat(tmp_path / "ground.mat", {"ground": 0.1 * ground, "note": np.zeros(2)})
+    keys = 'unit = "g"\nstep_s = 0.01\nband_hz = [0.4, 20.0]\n'
+    text = RECORD.replace("motion.csv", "ground.mat") + keys + NO_CHECK
+    path = tmp_path / "record.toml"
+    path.write_text(f"rig = 'simulated'\n{text}")
+    config = read_run_config(path)
+    play_unpaced(config, "record", tmp_path / "run.mcap", lambda: None, lambda _: None)
+    (tmp_path / "ground.mat").unlink()
+    recording = read_recording(tmp_path / "run.mcap")
+    block = measured(recording)
+    acceleration = np.abs(block.channel("table_acc_m_s2")).max()
+    assert acceleration == pytest.approx(0.1 * 9.80665, rel=0.05)
+    start = recording.start
+    again = from_texts(
+        start.name, start.profile_toml, start.rig_toml, start.model_toml, "recording"
+    )
+    assert again.profile.plan.history_m.tobytes() == config.profile.plan.history_m.tobytes()
+    identity = replay_recording(
+        recorded_in(recording), again, tmp_path / "again.mcap", "again", lambda _: None
+    )
+    assert identity.is_identical

@@ -200,8 +200,8 @@ def list_campaign_warnings(plan: CampaignPlan) -> list[str]:
             f"free flight ({free[0].label}) is not the first run: u* and a*, by which every curve "
             "is divided, are unknown until then"
         )
-    level = free[0].bundle.profile.sweep.acceleration_g
-    other_levels = [run for run in plan.runs if run.bundle.profile.sweep.acceleration_g != level]
+    level = free[0].bundle.profile.sweep.one_level_g
+    other_levels = [run for run in plan.runs if run.bundle.profile.sweep.one_level_g != level]
     if other_levels:
         warnings.append(
             f"{', '.join(run.label for run in other_levels)}: another level than the free flight's "

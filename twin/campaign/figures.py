@@ -117,7 +117,7 @@ def _draw_levels(campaign: CampaignData) -> CaptionedFigure:
     band = 100 * max(run.profile.control.tolerance for run in campaign.runs)
     ax.axhspan(-band, band, color="#1a7f37", alpha=0.10, lw=0)
     for run in list_swept_runs(campaign):
-        level = run.profile.sweep.acceleration_g * GRAVITY_M_S2
+        level = run.profile.sweep.one_level_g * GRAVITY_M_S2
         for direction in DIRECTIONS:
             direction_points = [
                 point for point in prc_points(run.summary["steps"]) if point.direction == direction

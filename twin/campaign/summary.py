@@ -96,7 +96,7 @@ def measured_maxima(run: CampaignRunData) -> Json | None:
         stars[f"{key}_at"] = [best[1]["frequency_hz"], best[1]["direction"]]
         stars[f"twin_{key}"] = twin[0] * summary[key] if twin else None
         stars[f"twin_{key}_at"] = [twin[1]["frequency_hz"], twin[1]["direction"]] if twin else None
-    level = sweep.acceleration_g * GRAVITY_M_S2
+    level = sweep.one_level_g * GRAVITY_M_S2
     u, a, hz = free_flight_resonance(run.model.parameters, level)
     return stars | {"model_u_star_m": u, "model_a_star_m_s2": a, "model_at_hz": hz}
 

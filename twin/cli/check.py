@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
@@ -13,6 +14,8 @@ from table_io.block import Label
 from table_io.clock import ManualClock, local_datetime
 from table_io.config.calibration_due import find_overdue_calibrations
 from table_io.config.excitation.continuation import Continuation
+from table_io.config.excitation.record import RecordedHistory
+from table_io.config.excitation.stepped_sine import Sweep
 from table_io.config.profile import Profile
 from table_io.excitation.drive import Drive, HistorySegment
 from table_io.safety.loop_check import plan_targets
@@ -130,14 +133,29 @@ def _sweep_lines(profile: Profile) -> list[tuple[str, str]]:
             f"the last {sweep.measured_cycles} measured",
         ),
         *([("then", then)] if then else []),
-        ("level", f"{sweep.acceleration_g:g} g peak table acceleration"),
+        ("level", _describe_level(sweep)),
     ]
+
+
+def _describe_level(sweep: Sweep) -> str:
+    text = f"{sweep.acceleration_g:g} g peak table acceleration"
+    if sweep.level_points:
+        points = ", ".join(f"{level:g} g at {f:g} Hz" for f, level in sweep.level_points)
+        text = f"peak table acceleration {points}"
+    if sweep.schedule_db:
+        text += f"; whole sweeps at {', '.join(f'{level:g}' for level in sweep.schedule_db)} dB"
+    return text
 
 
 def _history_lines(profile: Profile) -> list[tuple[str, str]]:
     plan = profile.plan
-    seconds = plan.history_m.size / profile.acquisition.rate_hz
+    rate_hz = profile.acquisition.rate_hz
+    seconds = plan.history_m.size / rate_hz
+    displacement_mm = 1e3 * float(np.abs(plan.history_m).max())
+    velocity_mm_s = 1e3 * float(np.abs(np.diff(plan.history_m)).max()) * rate_hz
+    source = profile.excitation
     return [
+        *(_record_lines(source) if isinstance(source, RecordedHistory) else ()),
         (
             profile.excitation.kind,
             f"a displacement history of {seconds:.1f} s, {plan.low_hz:.3g} to {plan.high_hz:.3g} "
@@ -148,6 +166,39 @@ def _history_lines(profile: Profile) -> list[tuple[str, str]]:
             f"{plan.level_m_s2 / GRAVITY_M_S2:.3g} g peak table acceleration, open loop: no "
             "amplitude is tuned, only the checks of every sample protect it",
         ),
+        (
+            "target",
+            f"peak {plan.level_m_s2 / GRAVITY_M_S2:.4g} g, {velocity_mm_s:.4g} mm/s, "
+            f"{displacement_mm:.4g} mm",
+        ),
+    ]
+
+
+def _record_lines(record: RecordedHistory) -> list[tuple[str, str]]:
+    """Return the lines that identify a record: its file, peak and checksum, and its scaling."""
+    series = record.series
+    peak = float(np.abs(series.values).max())
+    amount = (
+        f"{peak / GRAVITY_M_S2:.4g} g"
+        if series.quantity == "acceleration"
+        else f"{1e3 * peak:.4g} mm"
+    )
+    similitude = (
+        f", length {record.length_ratio:g}, acceleration {record.acceleration_ratio:g}, "
+        f"time {record.time_ratio:.4g}"
+        if (record.length_ratio, record.acceleration_ratio) != (1.0, 1.0)
+        else ""
+    )
+    band_hz = record.applied_band_hz
+    band = "" if band_hz is None else f", band {band_hz[0]:g} to {band_hz[1]:g} Hz"
+    return [
+        (
+            "file",
+            f"{record.file}: {series.quantity}, {series.values.size} samples at "
+            f"{series.rate_hz:.6g} Hz, peak {amount}",
+        ),
+        ("SHA-256", record.checksum),
+        ("scale", f"{record.scale:g}{similitude}{band}"),
     ]
 
 

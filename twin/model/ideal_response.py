@@ -19,22 +19,27 @@ MIN_SAMPLES_PER_CYCLE = 1000  # underestimates extremes by at most 5e-6 of their
 
 
 def simulate_sweep(
-    model: Model, frequencies_hz: Sequence[float] | Float1D, acceleration: float, cycles: int
+    model: Model,
+    frequencies_hz: Sequence[float] | Float1D,
+    acceleration: float | Float1D,
+    cycles: int,
 ) -> SteppedSineResponse:
     """Simulate whole `cycles` of A = acceleration sin(2 pi f t) at each frequency, from rest.
 
-    The state carries over between frequencies. `stepped_sine` computes it if effects only change
-    parameters. Otherwise the drive is linear between `MIN_SAMPLES_PER_CYCLE` samples (a multiple,
-    where a contact needs it) and extremes are those of the samples; the table displacement is
-    -A / w^2. Sensor effects are not applied: this is the true motion.
+    `acceleration` in m/s2 is one, or one at each frequency, (frequency,). The state carries over
+    between frequencies. `stepped_sine` computes it if effects only change parameters. Otherwise the
+    drive is linear between `MIN_SAMPLES_PER_CYCLE` samples (a multiple, where a contact needs it)
+    and extremes are those of the samples; the table displacement is -A / w^2. Sensor effects are
+    not applied: this is the true motion.
     """
     if model.changes_only_parameters:
         return simulate_stepped_sine(model.parameters, frequencies_hz, acceleration, cycles)
     frequencies = validate_frequencies(frequencies_hz, acceleration, cycles)
+    levels = np.broadcast_to(np.float64(acceleration), frequencies.shape).tolist()
     extremes = np.empty((frequencies.size, cycles, len(EXTREME_NAMES)))
     end_states, state = [], None
     time, in_contact = 0.0, (False, False)
-    for index, frequency_hz in enumerate(frequencies.tolist()):
+    for index, (frequency_hz, level) in enumerate(zip(frequencies.tolist(), levels, strict=True)):
         samples = MIN_SAMPLES_PER_CYCLE * max(
             1, math.ceil(model.min_rate_hz / (MIN_SAMPLES_PER_CYCLE * frequency_hz))
         )
@@ -44,8 +49,8 @@ def simulate_sweep(
         if state is None:
             state = solver.rest_state()
         solver.set_clock(state, time * rate_hz)
-        table_disp = -acceleration / (2 * math.pi * frequency_hz) ** 2 * wave
-        solver.advance(state, acceleration * wave, table_disp, out)
+        table_disp = -level / (2 * math.pi * frequency_hz) ** 2 * wave
+        solver.advance(state, level * wave, table_disp, out)
         time += cycles / frequency_hz
         extremes[index] = sampled_extremes(out, cycles, in_contact)
         in_contact = bool(out[3, -1] > 0), bool(out[4, -1] < 0)

@@ -35,7 +35,7 @@ class SteppedSineResponse:
 
 
 def validate_frequencies(
-    frequencies_hz: Sequence[float] | Float1D, acceleration: float, cycles: int
+    frequencies_hz: Sequence[float] | Float1D, acceleration: float | Float1D, cycles: int
 ) -> Float1D:
     """Return the frequencies of a sweep in Hz, (n,); InputError if it cannot be driven."""
     frequencies = np.asarray(frequencies_hz, dtype=np.float64)
@@ -48,7 +48,7 @@ def validate_frequencies(
             value=float(frequencies[first]),
             allowed="above 0 Hz, finite",
         )
-    if not math.isfinite(acceleration):
+    if not np.isfinite(acceleration).all():
         raise InputError(
             "not an acceleration", key="acceleration", value=acceleration, allowed="m/s2, finite"
         )
@@ -60,13 +60,14 @@ def validate_frequencies(
 def simulate_stepped_sine(
     parameters: Parameters,
     frequencies_hz: Sequence[float] | Float1D,
-    acceleration: float,
+    acceleration: float | Float1D,
     cycles: int,
     steps_per_cycle: int = 16,
     state: Float1D | None = None,
 ) -> SteppedSineResponse:
     """Simulate whole `cycles` of A = acceleration sin(2 pi f t) in m/s2 at each frequency in turn.
 
+    `acceleration` is one, or one at each frequency, (frequency,).
     Starts from `state` (not modified) or from rest. A is continuous at a change of frequency; the
     velocity of the table is not, so this is the ideal sweep, which no table can drive.
     `steps_per_cycle` is raised where a mode turns more than `closed_form.MAX_PHASE_STEP_RAD` in a
@@ -90,7 +91,7 @@ def simulate_stepped_sine(
     current[BASE] = 0.0
     extremes = np.empty((frequencies.size, cycles, len(EXTREME_NAMES)))
     end_states = np.empty((frequencies.size, STATE_SIZE))
-    peaks = np.full(frequencies.size, acceleration)
+    peaks = np.broadcast_to(np.float64(acceleration), frequencies.shape).copy()
     work_arrays = np.empty((2, int(steps.max(initial=0)) + 1)), np.empty((4, 3))
     run_stepped_sine(
         current,

@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from table_io.clock import RealClock, local_datetime
 from table_io.errors import InputError
 from table_io.records import PrcPoint
+from table_io.units import GRAVITY_M_S2
 from twin.compare.curves import detect_hysteresis
 from twin.model.parameters import free_flight_resonance
 from twin.reports import ideal_points
@@ -88,7 +89,7 @@ def _run_cases(
     sweep, steps = run_config.profile.sweep, run_config.profile.sweep.steps
     sweeps = iterate_sweeps(
         [case.model for case in cases], [step.frequency_hz for step in steps],
-        steps[0].acceleration_m_s2, sweep.cycles, cores, stop,
+        sweep.one_level_g * GRAVITY_M_S2, sweep.cycles, cores, stop,
     )  # fmt: skip
     with BatchTable(folder / TABLE_FILE) as table, _make_progress_bar() as bar:
         task = bar.add_task("sweeps", total=len(cases))
@@ -98,7 +99,7 @@ def _run_cases(
                 case.model, steps, response, sweep.measured_cycles
             )
             table.write(make_rows(case, points))
-            entry = _case_entry(case, points, steps[0].acceleration_m_s2)
+            entry = _case_entry(case, points, sweep.one_level_g * GRAVITY_M_S2)
             print_line(f"{index + 1:>4}/{len(cases):<4} {case.name}: {format_case(entry)}")
             bar.advance(task)
             yield entry
@@ -170,7 +171,7 @@ def _run_entry(run_config: RunConfig, run: str, cores: int, seconds: float) -> J
         "versions": {name: version(name) for name in LIBRARIES},
         "drive": "ideal stepped sine: every step begins and ends at a zero of the table "
         "acceleration, without blends between steps, table dynamics or sensors",
-        "acceleration_m_s2": run_config.profile.sweep.steps[0].acceleration_m_s2,
+        "acceleration_m_s2": sweep.one_level_g * GRAVITY_M_S2,
         "cycles": sweep.cycles,
         "measured_cycles": sweep.measured_cycles,
         "normalisation": "u* and a* are the maxima in free flight of each model's linear part, "

@@ -6,6 +6,7 @@ imports of `table_io/config/profile.py`. Other packages add kinds through entry 
 `shaketwin.excitations`: the name is the kind, the value the class.
 """
 
+import re
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -58,6 +59,15 @@ class Excitation(ConfigModel):
 
     kind: str = Field(DEFAULT_KIND, description="What is played; it decides the other keys.")
     FILE_KEYS: ClassVar[tuple[str, ...]] = ()
+    LEVEL_KEY: ClassVar[str] = ""  # key that a too large motion is reduced with, in proportion
+
+    @classmethod
+    def convert_file(cls, data: bytes, name: str, table: Mapping[str, Any]) -> dict[str, str]:
+        """Return the texts by name that stand for a file; `table` is [excitation], unchecked.
+
+        UnicodeDecodeError or InputError if the file has no text.
+        """
+        return {name: "\n".join(re.split("\r\n?|\n", data.decode("utf-8")))}
 
     @classmethod
     def select_class(cls, table: Mapping[str, Any]) -> "type[Excitation]":

@@ -1,27 +1,51 @@
-"""Record: a displacement history from a CSV file, such as the displacement of an earthquake.
+"""Record: a displacement or acceleration history from a file, such as an earthquake.
 
-The file has a line of headers, `time_s` and one displacement whose name ends with its unit
-(`disp_mm`), uniform sampling, and comments after #. It is scaled and resampled to the rate of the
-rig by band-limited interpolation. Its first and last samples need not be at rest: quintic blends
-before and after them, continuous in value and velocity, lead from rest and to rest.
+The format follows from the name of the file and its first line (`record_files.py`). A displacement
+is scaled and resampled to the rate of the rig by band-limited interpolation; its first and last
+samples need not be at rest: quintic blends before and after it, continuous in value and velocity,
+lead from rest and to rest. An acceleration is freed of its baseline, limited to a band and
+integrated twice (`band_limit.py`).
+
+Similitude: with the ratios l of length and a of acceleration, model over prototype, displacements
+are multiplied by l, accelerations by a and times by sqrt(l / a). Source: Harris and Sabnis,
+Structural Modeling and Experimental Techniques, 2nd ed. 1999, chapter 2.
 """
 
+import hashlib
 import math
+from collections.abc import Mapping
 from functools import cached_property
-from typing import ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field, ValidationInfo, field_validator
 
 from table_io.block import Float1D
-from table_io.config.base import Finite, Number
+from table_io.config.base import Finite, Number, Positive
 from table_io.config.excitation import History, register_excitation
-from table_io.errors import InputError
+from table_io.config.excitation.band_limit import (
+    Baseline,
+    correct_baseline,
+    cut_rest,
+    limit_band,
+)
+from table_io.config.excitation.record_files import (
+    BINARY_SUFFIXES,
+    Quantity,
+    RecordedSeries,
+    RecordUnit,
+    SeriesRequest,
+    convert_binary,
+    drop_integrals,
+    is_volume_2,
+    read_series,
+)
+from table_io.errors import InputError, is_control
 
-UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
-MIN_SAMPLES, MAX_SAMPLES = 16, 1_000_000
-MAX_JITTER = 0.01  # of the sampling interval; the times of a file are rounded
+CHECKSUM_SUFFIX = ".sha256"  # of the entry of `files` with the checksum of a converted file
+ACCELERATION_BAND_HZ = 0.1, 25.0
+MAX_BAND_RATIO = 0.4  # of the sampling rate: resampling keeps what lies below
 KERNEL_HALF_WIDTH = 32  # samples, of the interpolation
 # Of its Kaiser window: images are 140 dB below the signal, because the acceleration amplifies them;
 # the pass band ends at 0.42 of the lower rate.
@@ -30,16 +54,53 @@ KERNEL_BETA = 14.0
 
 @register_excitation("record")
 class RecordedHistory(History):
-    """Displacement history read from a file."""
+    """Displacement or acceleration history read from a file: csv, txt, AT2, V2, mat or npz."""
 
     FILE_KEYS: ClassVar[tuple[str, ...]] = ("file", *History.FILE_KEYS)
+    LEVEL_KEY: ClassVar[str] = "scale"
 
-    unit: Literal["m", "cm", "mm", "in"] | None = Field(None, description="Omitted: of the header.")
-    scale: Finite = Field(1.0, description="Factor on the displacement; negative turns it around.")
-    blend_s: Number = Field(1.0, ge=0.1, le=60, description="From rest to the record, and back.")
-    file: str = Field(
-        description="CSV file next to the profile with `time_s` and one displacement."
+    quantity: Quantity | None = Field(None, description="Of the history; omitted: by the unit.")
+    unit: RecordUnit | None = Field(None, description="Omitted: of the header.")
+    step_s: Positive | None = Field(None, description="Time between samples, if the file has none.")
+    variable: str | None = Field(None, description="Array of a mat or npz file, if it has several.")
+    column: int | str | None = Field(
+        None, description="Number from 1 or header of the history; of a V2 file, the channel."
     )
+    sha256: str | None = Field(
+        None, pattern="^[0-9a-fA-F]{64}$", description="Checksum that the file must have."
+    )
+    scale: Finite = Field(1.0, description="Factor on the motion; negative turns it around.")
+    length_ratio: Positive = Field(1.0, description="Similitude: length of model over prototype.")
+    acceleration_ratio: Positive = Field(
+        1.0,
+        description="Similitude: acceleration of model over prototype; "
+        "time is scaled by the root of length_ratio / acceleration_ratio.",
+    )
+    baseline: Baseline | None = Field(
+        None, description="Removed from an acceleration; omitted: linear."
+    )
+    band_hz: tuple[Positive, Positive] | None = Field(
+        None,
+        description="Lower and upper corner of the zero-phase filter, at the time scale of the "
+        "table; omitted: 0.1 to 25 for an acceleration, or from 1 / its duration, or to 0.4 of its "
+        "rate; no filter for a displacement.",
+    )
+    blend_s: Number = Field(1.0, ge=0.1, le=60, description="From rest to the record, and back.")
+    file: str = Field(description="File with the history, next to the profile.")
+
+    @classmethod
+    def convert_file(cls, data: bytes, name: str, table: Mapping[str, Any]) -> dict[str, str]:
+        """Return the text of a file, and its checksum if the text is not the file as it is."""
+        if name.lower().endswith(BINARY_SUFFIXES):
+            variable = table.get("variable")
+            text = convert_binary(data, name, variable if isinstance(variable, str) else None)
+        else:
+            text = _decode(data)
+            text = drop_integrals(text) if is_volume_2(name) else text
+        files = {name: text}
+        if text.encode() != data:
+            files[name + CHECKSUM_SUFFIX] = hashlib.sha256(data).hexdigest()
+        return files
 
     @field_validator("scale")
     @classmethod
@@ -48,92 +109,139 @@ class RecordedHistory(History):
             raise InputError("scale is 0, so nothing would move", allowed="any other number")
         return scale
 
+    @field_validator("band_hz")
+    @classmethod
+    def _check_band(cls, band_hz: tuple[float, float] | None) -> tuple[float, float] | None:
+        if band_hz is not None and not band_hz[0] < band_hz[1]:
+            raise InputError(f"band_hz {list(band_hz)} is empty", allowed="[lower, upper]")
+        return band_hz
+
     @field_validator("file")
     @classmethod
     def _check_file(cls, name: str, info: ValidationInfo) -> str:
-        files = info.data.get("files")
+        values = info.data
+        files = values.get("files")
         if files is None:
             return name
         if name not in files:
             raise InputError(f"{name!r} is not attached", remedy="load the profile from its file")
-        if "unit" in info.data:
-            parse_history(files[name], name, info.data["unit"])
+        if not {"quantity", "unit", "step_s", "column", "sha256"} <= values.keys():
+            return name
+        checksum = _find_checksum(files, name)
+        if values["sha256"] is not None and values["sha256"].lower() != checksum:
+            raise InputError(
+                f"{name} has the SHA-256 {checksum}",
+                allowed=values["sha256"],
+                remedy="get the record that the profile names, or correct sha256",
+            )
+        keys = SeriesRequest.__dataclass_fields__
+        request = SeriesRequest(**{key: values[key] for key in keys})
+        try:
+            series = read_series(files[name], name, request)
+        except InputError as error:  # the place is that of the key, so the line is in the words
+            place = f"{error.where}: " if error.where else ""
+            raise error.replace(problem=place + error.problem, where="") from None
+        if {"baseline", "band_hz", "length_ratio", "acceleration_ratio"} <= values.keys():
+            _check_processing(series, values)
         return name
 
+    @property
+    def checksum(self) -> str:
+        """SHA-256 of the file, hexadecimal: records of one name differ."""
+        return _find_checksum(self.files, self.file)
+
     @cached_property
+    def series(self) -> RecordedSeries:
+        """History of the file in SI, unscaled."""
+        request = SeriesRequest(self.quantity, self.unit, self.step_s, self.column)
+        return read_series(self.files[self.file], self.file, request)
+
+    @property
     def samples(self) -> tuple[Float1D, float]:
-        """Displacement in m, unscaled, (sample,), and sampling rate in Hz of the file."""
-        return parse_history(self.files[self.file], self.file, self.unit)
+        """Values of the file in SI, unscaled, (sample,), and its sampling rate in Hz."""
+        return self.series.values, self.series.rate_hz
+
+    @property
+    def time_ratio(self) -> float:
+        """Time on the table over time in the file, by similitude."""
+        return math.sqrt(self.length_ratio / self.acceleration_ratio)
+
+    @property
+    def applied_band_hz(self) -> tuple[float, float] | None:
+        """Corners of the filter in Hz at the time scale of the table; None for no filter."""
+        rate_hz = self.series.rate_hz / self.time_ratio
+        return _choose_band(self.band_hz, self.series, rate_hz)
 
     def displacement(self, rate_hz: float) -> Float1D:
-        """Return blend, scaled record and blend in m at a sampling rate, (sample,)."""
-        history, file_rate_hz = self.samples
-        blended = _add_blends(self.scale * history, round(self.blend_s * file_rate_hz))
-        return resample(blended, file_rate_hz, rate_hz)
+        """Return the history from rest to rest in m at a sampling rate, (sample,)."""
+        values, file_rate_hz = self.samples
+        file_rate_hz /= self.time_ratio
+        is_acceleration = self.series.quantity == "acceleration"
+        ratio = self.acceleration_ratio if is_acceleration else self.length_ratio
+        band_hz = self.applied_band_hz
+        history = self.scale * ratio * values
+        if band_hz is None:
+            blended = _add_blends(history, round(self.blend_s * file_rate_hz))
+            return resample(blended, file_rate_hz, rate_hz)
+        if is_acceleration:
+            history = correct_baseline(history, self.baseline or "linear")
+        motion = limit_band(history, file_rate_hz, band_hz, integrate=is_acceleration)
+        rest = np.zeros(KERNEL_HALF_WIDTH)
+        moving = cut_rest(motion, round(self.blend_s * file_rate_hz))
+        return resample(np.concatenate([rest, moving, rest]), file_rate_hz, rate_hz)
 
 
-def parse_history(text: str, name: str, unit: str | None) -> tuple[Float1D, float]:
-    """Parse a CSV text: return (displacement in m, (sample,), sampling rate in Hz).
-
-    ValueError names the line at fault.
-    """
-    numbered = [
-        (number, line.strip())
-        for number, line in enumerate(text.splitlines(), 1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    columns = [column.strip() for column in numbered[0][1].split(",")] if numbered else []
-    if len(columns) != 2 or columns[0] != "time_s":
-        raise InputError(
-            f"{name}: the headers are {', '.join(columns) or 'missing'}",
-            allowed="time_s and one displacement, such as time_s,disp_mm",
-        )
-    factor = _find_unit(columns[1], name, unit)
-    rows = numbered[1:]
-    if not MIN_SAMPLES <= len(rows) <= MAX_SAMPLES:
-        raise InputError(f"{name}: {len(rows)} samples", allowed=f"{MIN_SAMPLES} to {MAX_SAMPLES}")
-    table = np.array([_parse_row(name, number, line) for number, line in rows])
-    time_s, displacement = table.T
-    intervals = np.diff(time_s)
-    interval_s = float(time_s[-1] - time_s[0]) / (time_s.size - 1)
-    for problem, at_fault in (
-        ("time_s does not increase", intervals <= 0.0),
-        (
-            f"the sampling is not uniform: {interval_s:.6g} s on average",
-            np.abs(intervals - interval_s) > MAX_JITTER * abs(interval_s),
-        ),
-    ):
-        if at_fault.any():
-            raise ValueError(f"{name} line {rows[int(np.argmax(at_fault)) + 1][0]}: {problem}")
-    return factor * displacement, 1.0 / interval_s
-
-
-def _find_unit(column: str, name: str, unit: str | None) -> float:
-    """Return m per unit of a column, by the end of its name or as stated; ValueError if unclear."""
-    suffix = column.rpartition("_")[2]
-    named = suffix if suffix in UNITS_M and "_" in column else None
-    if unit is not None and named is not None and unit != named:
-        raise InputError(
-            f"{name}: unit = {unit!r}, but its column is {column}", remedy="remove the unit"
-        )
-    if unit is None and named is None:
-        raise InputError(
-            f"{name}: the unit of column {column!r} is unknown",
-            remedy=(
-                f"set unit, allowed: {', '.join(UNITS_M)}, or end the name with it, such as disp_mm"
-            ),
-        )
-    return UNITS_M[unit or named or "m"]
-
-
-def _parse_row(name: str, number: int, line: str) -> tuple[float, float]:
+def _decode(data: bytes) -> str:
+    """Return the text of a file with line feeds, without the control characters of old systems."""
     try:
-        time_s, displacement = map(float, line.split(","))
-    except ValueError:
-        raise ValueError(f"{name} line {number}: {line[:40]!r} is not two numbers") from None
-    if not (math.isfinite(time_s) and math.isfinite(displacement)):
-        raise ValueError(f"{name} line {number}: {line[:40]!r} is not finite")
-    return time_s, displacement
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("latin-1")  # which old strong-motion files use in their headers
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    if text.isascii() and text.replace("\n", "").isprintable():
+        return text
+    return "".join(" " if is_control(c) and c != "\n" else c for c in text)
+
+
+def _find_checksum(files: Mapping[str, str], name: str) -> str:
+    """Return the SHA-256 of a file from its entry, or else of its text, which is the file."""
+    entry = files.get(name + CHECKSUM_SUFFIX)
+    return entry or hashlib.sha256(files[name].encode()).hexdigest()
+
+
+def _choose_band(
+    band_hz: tuple[float, float] | None, series: RecordedSeries, rate_hz: float
+) -> tuple[float, float] | None:
+    """Return the band of the filter in Hz at a sampling rate; None for no filter."""
+    if band_hz is not None or series.quantity == "displacement":
+        return band_hz
+    low_hz, high_hz = ACCELERATION_BAND_HZ
+    return max(low_hz, rate_hz / series.values.size), min(high_hz, MAX_BAND_RATIO * rate_hz)
+
+
+def _check_processing(series: RecordedSeries, values: Mapping[str, Any]) -> None:
+    """Raise InputError if the baseline or the band does not suit the history."""
+    if series.quantity == "displacement" and values["baseline"] is not None:
+        raise InputError(
+            "baseline is for an acceleration, but the file has a displacement",
+            remedy="remove baseline",
+        )
+    rate_hz = series.rate_hz / math.sqrt(values["length_ratio"] / values["acceleration_ratio"])
+    band_hz = _choose_band(values["band_hz"], series, rate_hz)
+    if band_hz is None:
+        return
+    low_hz, high_hz = band_hz
+    if not low_hz < high_hz <= MAX_BAND_RATIO * rate_hz * (1 + 1e-9):
+        raise InputError(
+            f"band_hz ends at {high_hz:g} Hz, but the record has {rate_hz:g} samples per second",
+            allowed=f"band_hz up to {MAX_BAND_RATIO * rate_hz:.4g} Hz",
+        )
+    duration_s = series.values.size / rate_hz
+    if low_hz * duration_s < 1.0 - 1e-9:
+        raise InputError(
+            f"band_hz begins at {low_hz:g} Hz, but the record lasts {duration_s:.3g} s only",
+            allowed=f"band_hz from {1.0 / duration_s:.3g} Hz",
+        )
 
 
 def _add_blends(history: Float1D, count: int) -> Float1D:

@@ -1,27 +1,38 @@
-"""Stepped sine: held sine steps of constant peak acceleration, up and down a frequency grid.
+"""Stepped sine: held sine steps of stated peak acceleration, up and down a frequency grid.
 
-The table [sweep] of a profile is this kind under its older name.
+The level is constant, or follows break points over frequency, and a schedule of levels repeats the
+sweep, from the lowest level to the full one, say. The table [sweep] of a profile is this kind under
+its older name.
 """
 
 from typing import Literal
 
+import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
 
-from table_io.config.base import Count, Number, Positive
+from table_io.block import Float1D
+from table_io.config.base import Count, Finite, Number, Positive
 from table_io.config.excitation import (
     MIN_BLEND_CYCLES,
     Excitation,
     ExcitationPlan,
     register_excitation,
 )
+from table_io.config.excitation.waveform import (
+    LevelPoints,
+    check_level_points,
+    interpolate_level,
+)
 from table_io.errors import InputError
 from table_io.records import Step
 from table_io.units import GRAVITY_M_S2
 
+MIN_LEVEL_DB, MAX_LEVEL_DB = -60.0, 20.0  # of a schedule
+
 
 @register_excitation("stepped_sine")
 class Sweep(Excitation):
-    """Stepped sine sweep of constant peak table acceleration, up and down one frequency grid."""
+    """Stepped sine sweep of stated peak table acceleration, up and down one frequency grid."""
 
     start_hz: float = Field(ge=0.01, allow_inf_nan=False, description="Lowest frequency.")
     stop_hz: Positive = Field(description="Highest frequency.")
@@ -32,6 +43,18 @@ class Sweep(Excitation):
     )
     acceleration_g: Positive = Field(
         0.05, description="Peak table acceleration, the same at every frequency."
+    )
+    level_points: LevelPoints = Field(
+        (),
+        max_length=100,
+        description="Instead of acceleration_g: [[frequency in Hz, level in g], ...], "
+        "interpolated in logarithms.",
+    )
+    schedule_db: tuple[Finite, ...] = Field(
+        (),
+        max_length=10,
+        description="Levels of whole sweeps one after another, relative to the stated one: "
+        "[-12, -6, 0]; empty: one sweep.",
     )
     directions: tuple[Literal["forward", "backward"], ...] = Field(
         ("forward", "backward"), description="Order of the passes over the grid."
@@ -92,22 +115,66 @@ class Sweep(Excitation):
             raise InputError("directions contains one twice", allowed="each once, in any order")
         return directions
 
+    @field_validator("level_points")
+    @classmethod
+    def _check_level_points(cls, points: LevelPoints, info: ValidationInfo) -> LevelPoints:
+        if points and {"start_hz", "stop_hz"} <= info.data.keys():
+            check_level_points(points, (info.data["start_hz"], info.data["stop_hz"]))
+        return points
+
+    @field_validator("schedule_db")
+    @classmethod
+    def _check_schedule(cls, schedule_db: tuple[float, ...]) -> tuple[float, ...]:
+        if any(not MIN_LEVEL_DB <= level <= MAX_LEVEL_DB for level in schedule_db):
+            raise InputError(
+                f"schedule_db {list(schedule_db)}",
+                allowed=f"{MIN_LEVEL_DB:g} to {MAX_LEVEL_DB:g} dB each",
+                remedy="change acceleration_g or level_points for other levels",
+            )
+        if len(set(schedule_db)) < len(schedule_db):
+            raise InputError("schedule_db contains a level twice", allowed="each once")
+        return schedule_db
+
+    @property
+    def has_one_level(self) -> bool:
+        """True if all steps have the same level."""
+        return not self.level_points and len(self.schedule_db) <= 1
+
+    @property
+    def one_level_g(self) -> float:
+        """Peak table acceleration of all steps in g; InputError if it varies."""
+        if not self.has_one_level:
+            raise InputError(
+                "this needs a sweep of one level",
+                key="excitation.level_points" if self.level_points else "excitation.schedule_db",
+                remedy="state acceleration_g alone",
+            )
+        return self.acceleration_g * 10.0 ** (sum(self.schedule_db) / 20.0)
+
     @property
     def frequencies_hz(self) -> tuple[float, ...]:
         """Frequency grid in Hz, ascending, rounded to the decimal value."""
         step_count = round((self.stop_hz - self.start_hz) / self.step_hz)
         return tuple(round(self.start_hz + k * self.step_hz, 9) for k in range(step_count + 1))
 
+    def levels_m_s2(self, frequencies_hz: Float1D) -> Float1D:
+        """Return the peak table acceleration in m/s2 at frequencies, (frequency,), at 0 dB."""
+        if self.level_points:
+            return interpolate_level(self.level_points, frequencies_hz) * GRAVITY_M_S2
+        return np.full(frequencies_hz.size, self.acceleration_g * GRAVITY_M_S2)
+
     @property
     def steps(self) -> tuple[Step, ...]:
         """All planned steps in driving order; both directions use the identical grid."""
-        acceleration = self.acceleration_g * GRAVITY_M_S2
+        grid = self.frequencies_hz
+        upwards = list(zip(grid, self.levels_m_s2(np.array(grid)).tolist(), strict=True))
         return tuple(
-            Step(index, direction, frequency, acceleration)
-            for index, (direction, frequency) in enumerate(
-                (direction, frequency)
+            Step(index, direction, frequency, 10.0 ** (level_db / 20.0) * acceleration)
+            for index, (level_db, direction, (frequency, acceleration)) in enumerate(
+                (level_db, direction, step)
+                for level_db in self.schedule_db or (0.0,)
                 for direction in self.directions
-                for frequency in self.frequencies_hz[:: 1 if direction == "forward" else -1]
+                for step in upwards[:: 1 if direction == "forward" else -1]
             )
         )
 
@@ -115,7 +182,7 @@ class Sweep(Excitation):
         """Return the steps to approach, tune and measure."""
         steps = self.steps
         return ExcitationPlan(
-            steps[0].acceleration_m_s2,
+            max(step.acceleration_m_s2 for step in steps),
             self.start_hz,
             self.stop_hz,
             steps,

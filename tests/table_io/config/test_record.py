@@ -8,7 +8,8 @@ import pytest
 
 from table_io.block import Float1D
 from table_io.config.base import PROFILES_DIR, load_config, parse_toml
-from table_io.config.excitation.record import RecordedHistory, parse_history, resample
+from table_io.config.excitation.record import RecordedHistory, resample
+from table_io.config.excitation.record_files import SeriesRequest, read_series
 from table_io.config.profile import MAX_FILE_BYTES, Profile, load_profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
@@ -258,14 +259,14 @@ def test_a_rate_that_the_rig_lacks_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_drive_file_of_this_program_is_a_record() -> None:
-    values, rate_hz = parse_history(
+    series = read_series(
         "# shaketwin drive of x\n# unit mm\ntime_s,drive_disp_mm\n"
         + "".join(f"{k / 2000:.7f},{k:.9f}\n" for k in range(20)),
         "x.csv",
-        None,
+        SeriesRequest(),
     )
-    assert rate_hz == pytest.approx(2000.0, rel=1e-6)
-    assert values.tolist() == pytest.approx([k * 1e-3 for k in range(20)])
+    assert series.rate_hz == pytest.approx(2000.0, rel=1e-6)
+    assert series.values.tolist() == pytest.approx([k * 1e-3 for k in range(20)])
 
 
 def test_other_parts_ask_for_a_sweep_in_one_message(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
-from table_io.excitation.trajectory import plan_sweep
+from table_io.excitation.trajectory import plan_excitation, plan_sweep
 from table_io.records import FrequencyResponse
 from table_io.safety.preflight import (
     StepDemand,
@@ -262,3 +262,68 @@ def test_a_correction_beyond_what_control_may_do_is_said_before_the_sweep() -> N
     (warning,) = check_corrected_drive(profile().sweep.steps, response(0.4), RIG)
     assert warning.startswith("step 1 (10 Hz forward): the table follows with a gain of 0.4")
     assert "2.5 times as large; allowed: at most 2" in warning
+
+
+HISTORIES: dict[str, dict[str, Any]] = {
+    "sine_pulse": {"frequency_hz": 1.0, "acceleration_g": 0.9},
+    "half_sine": {"duration_s": 0.3, "acceleration_g": 0.5},
+    "chirp": {"start_hz": 0.4, "stop_hz": 5.0, "duration_s": 20.0, "acceleration_g": 0.2},
+    "random": {"low_hz": 0.3, "high_hz": 10.0, "duration_s": 20.0, "rms_g": 0.3},
+    "cyclic": {"protocol": [[80.0, 1.5, 3]]},
+}
+
+
+def history_profile(kind: str, keys: dict[str, Any]) -> Profile:
+    raw = {"title": kind, "specimen": {"mass_kg": 550.0, "gap_mm": 4.0}}
+    return Profile.model_validate(raw | {"excitation": {"kind": kind, **keys}})
+
+
+@pytest.mark.parametrize("kind", HISTORIES)
+def test_a_history_beyond_a_limit_is_refused_with_the_level_that_fits(kind: str) -> None:
+    test = history_profile(kind, HISTORIES[kind])
+    with pytest.raises(InputError) as caught:
+        check_limits(compute_demands(plan_excitation(test), test, RIG), test, RIG, "a.toml")
+    limits = {fault.key: fault for fault in caught.value.faults}
+    assert {"displacement", "table_disp_m"} <= limits.keys()
+    remedy = limits["displacement"].remedy
+    value = float(remedy.split("by ")[1].split(",")[0] if "by " in remedy else remedy.split()[-1])
+    for share, fits in ((1.0, True), (1.02, False)):
+        if kind == "cyclic":
+            keys = {"protocol": [[80.0 * value * share, 1.5, 3]]}
+        else:
+            key = type(test.excitation).LEVEL_KEY
+            assert f"{key} = " in remedy
+            keys = HISTORIES[kind] | {key: value * share}
+        lower = history_profile(kind, keys)
+        demands = compute_demands(plan_excitation(lower), lower, RIG)
+        if fits:
+            check_limits(demands, lower, RIG, "a.toml")
+        else:
+            with pytest.raises(InputError):
+                check_limits(demands, lower, RIG, "a.toml")
+
+
+def test_break_points_beyond_a_limit_are_to_be_multiplied() -> None:
+    keys = {"start_hz": 0.4, "stop_hz": 5.0, "duration_s": 20.0}
+    test = history_profile("chirp", keys | {"level_points": [[0.4, 0.2], [5.0, 0.2]]})
+    with pytest.raises(InputError) as caught:
+        check_limits(compute_demands(plan_excitation(test), test, RIG), test, RIG, "a.toml")
+    assert caught.value.faults[0].remedy.startswith("multiply level_points by 0.")
+
+
+def test_a_flow_beyond_that_of_the_valve_is_refused() -> None:
+    """Q = A v: 100 cm2 at 156 mm/s are 93.7 l/min."""
+    card = rig(piston_area_cm2=100.0, peak_flow_l_min=90.0)
+    (fault,) = list_faults(profile(), card)
+    assert (fault.where.split(" and ")[0], fault.key) == (SLOWEST, "flow")
+    assert fault.allowed == "at most 90 l/min"
+    assert stated_number(fault) == pytest.approx(93.7, rel=0.05)
+    check_limits(
+        rows(profile(), card), profile(), rig(piston_area_cm2=100.0, peak_flow_l_min=110.0), "a"
+    )
+
+
+@pytest.mark.parametrize("key", ["piston_area_cm2", "peak_flow_l_min"])
+def test_a_flow_without_its_area_is_no_limit(key: str) -> None:
+    with pytest.raises(ValueError, match="go together"):
+        rig("limits", **{key: 100.0})

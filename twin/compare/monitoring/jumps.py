@@ -70,6 +70,42 @@ def predict_jumps(
 ) -> JumpPrediction:
     """Predict the jumps of the model, driven slowly up and down the sweep's range.
 
+    Of a schedule, at each of its levels.
+    """
+    groups = _group_by_level(profile, steps)
+    predictions = [_predict_at_level(profile, model, group, u_star_m) for group in groups]
+    jumps = (jump for prediction in predictions for jump in prediction.jumps)
+    return JumpPrediction(
+        tuple(sorted(jumps, key=lambda jump: jump.after.index)),
+        {
+            index: log_amplitude
+            for prediction in predictions
+            for index, log_amplitude in prediction.log_amplitudes.items()
+        },
+    )
+
+
+def _group_by_level(profile: Profile, steps: tuple[Step, ...]) -> list[tuple[Step, ...]]:
+    """Return the steps of each level of a schedule; all of them in one group without a schedule."""
+    schedule_db = profile.sweep.schedule_db
+    if len(schedule_db) < 2:
+        return [steps]
+    stated = profile.sweep.levels_m_s2(np.array([step.frequency_hz for step in steps]))
+    driven = np.array([step.acceleration_m_s2 for step in steps])
+    distance_db = np.abs(20.0 * np.log10(driven / stated) - np.array(schedule_db)[:, None])
+    nearest = np.argmin(distance_db, axis=0)
+    groups = (
+        tuple(step for step, row in zip(steps, nearest, strict=True) if row == level)
+        for level in range(len(schedule_db))
+    )
+    return [group for group in groups if group]
+
+
+def _predict_at_level(
+    profile: Profile, model: Model, steps: tuple[Step, ...], u_star_m: float
+) -> JumpPrediction:
+    """Predict the jumps between steps of one level, from a slow drive up and down their range.
+
     In steps of at most `MAX_STEP_HZ`; where effects make cycles expensive, in those of the test or
     coarser ones, so that about `MAX_CYCLES` cycles are computed at most.
     """
@@ -83,8 +119,12 @@ def predict_jumps(
         cycles = min(profile.sweep.cycles, CYCLES_PER_STEP // 2)
         up = grid[:: math.ceil(2 * grid.size * cycles / MAX_CYCLES)]
     frequencies_hz = np.concatenate([up, up[::-1]])
-    max_acceleration = max(step.acceleration_m_s2 for step in steps)
-    response = simulate_sweep(model, frequencies_hz, max_acceleration, cycles)
+    acceleration: float | Float1D = max(step.acceleration_m_s2 for step in steps)
+    if profile.sweep.level_points:
+        levels = profile.sweep.levels_m_s2(frequencies_hz)
+        stated = profile.sweep.levels_m_s2(np.array([steps[0].frequency_hz]))[0]
+        acceleration = levels * steps[0].acceleration_m_s2 / stated
+    response = simulate_sweep(model, frequencies_hz, acceleration, cycles)
     amplitudes = 0.5 * (response.column("u_max") - response.column("u_min"))[:, -AVERAGED_CYCLES:]
     directions = ["forward"] * up.size + ["backward"] * up.size
     points = [
