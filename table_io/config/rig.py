@@ -83,7 +83,7 @@ class OutputConfig(ConfigModel):
 
 
 class TableResponse(ConfigModel):
-    """What is known of the table, and what the loop check accepts of it.
+    """What is known of the table, and what loop check and protection accept of it.
 
     Gains are those of the fundamental over the command at the level of the check.
     """
@@ -102,6 +102,11 @@ class TableResponse(ConfigModel):
     )
     gain_residual_percent: Positive = Field(
         10.0, description="Gain off a straight line of its logarithm over the square of frequency."
+    )
+    following_ratio: Positive = Field(
+        0.15,
+        description="Deviation of the table from the response to its command at which protection "
+        "stops, over the recent peak of the command.",
     )
     stall_force_kn: Positive | None = Field(
         None,

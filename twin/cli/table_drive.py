@@ -1,5 +1,6 @@
 """`table-twin` and `drive`: identify the table, and compute the command by which it follows."""
 
+import json
 import math
 import re
 from collections.abc import Sequence
@@ -80,6 +81,7 @@ class DriveTask:
     model: TableModel
     twin: TableTwinConfig
     band_hz: tuple[float, float]
+    table: str | None
 
     @property
     def rate_hz(self) -> float:
@@ -120,6 +122,8 @@ def write_driven_profile(task: DriveTask, command_m: Float1D, folder: Path) -> P
     folder.mkdir(parents=True, exist_ok=True)
     text = task.profile_path.read_text(encoding="utf-8")
     text = re.sub(r'(?m)^drive = ".*"\n', "", text)
+    if task.table is not None:
+        text = re.sub(r"(?m)^rig = .*$", f"rig = {json.dumps(task.table)}", text)
     line = f'drive = "{DRIVE_FILE}"'
     text = re.sub(
         r"(?m)^\[excitation\][^\n]*$", lambda header: f"{header[0]}\n{line}", text, count=1
@@ -161,7 +165,7 @@ def _prepare_task(
         band_hz = find_band(history_acceleration(target, rate_hz), rate_hz)
     with show_status("simulating the specimen"):
         reaction = _simulate_reaction(config, target.size)
-    return DriveTask(config, path, target, reaction, twin.build_model(), twin, band_hz)
+    return DriveTask(config, path, target, reaction, twin.build_model(), twin, band_hz, table)
 
 
 def _simulate_reaction(config: RunConfig, count: int) -> Float1D:

@@ -3,9 +3,10 @@
 import math
 from pathlib import Path
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from table_io.config.base import ConfigModel, NonNegative, Positive, load_config
+from table_io.errors import InputError, suggest
 from twin.drive.table_identification import TableIdentification
 from twin.drive.table_model import TableModel, TableParameters
 
@@ -18,6 +19,16 @@ class TableTwinConfig(ConfigModel):
     residual: NonNegative = Field(description="Share of the measured motion that it leaves, rms.")
     parameters: dict[str, float] = Field(description="Parameters of the table's twin, SI.")
     half_widths: dict[str, float] = Field({}, description="Half widths of their 95 % intervals.")
+
+    @field_validator("parameters")
+    @classmethod
+    def _check_names(cls, parameters: dict[str, float]) -> dict[str, float]:
+        unknown = sorted(set(parameters) - set(TableParameters._fields))
+        if unknown:
+            raise InputError(
+                f"{', '.join(unknown)} unknown", remedy=suggest(unknown[0], TableParameters._fields)
+            )
+        return parameters
 
     def build_model(self) -> TableModel:
         """Return the twin of the table."""

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from table_io.block import Float1D, Float2D, Int1D
 from table_io.config.profile import Profile
-from table_io.config.rig import RigConfig
+from table_io.config.rig import RigConfig, TableResponse
 from table_io.config.sensor import SensorConfig
 from table_io.safety.protection.sample_checks import (
     CHANNEL_ROWS,
@@ -49,7 +49,6 @@ MAX_READ_BACK_RATIO = 0.01  # of the command
 MAX_READ_BACK_RANGE = 5e-4
 # Of the amplitude: includes the gain of +-20 % that the loop check allows.
 MAX_INITIAL_FOLLOWING_RATIO = 0.25
-MAX_FOLLOWING_RATIO = 0.15  # of the amplitude, from the response one cycle earlier
 # Before the sweep: more than a sensor of wrong sign or offset shows, which the loop check reports.
 MAX_CHECK_ERROR_RATIO, MAX_CHECK_ERROR_STROKE = 2.5, 0.02
 MAX_FOLLOWING_STROKE = 1e-3
@@ -91,7 +90,7 @@ class Thresholds(NamedTuple):
     error_run: int = MIN_ERROR_SAMPLES
     command_ratio: float = MAX_READ_BACK_RATIO
     initial_following_ratio: float = MAX_INITIAL_FOLLOWING_RATIO
-    following_ratio: float = MAX_FOLLOWING_RATIO
+    following_ratio: float = TableResponse().following_ratio
     loop_check_ratio: float = MAX_CHECK_ERROR_RATIO
     loss_decay: float = 0.1  # per valid sample: slow, so that losses of a loose contact add up
     noise_window: float = 64.0
@@ -134,6 +133,7 @@ def compute_thresholds(
     steps = np.maximum(lsb, math.sqrt(12.0) * sigma)
     steps[[drive, table]] = np.maximum(steps[[drive, table]], rig.output.lsb_m)
     # Where noise proves a sensor alive, slow motion may show as many equal samples as rest.
+    following_ratio = rig.table_response.following_ratio
     must_move = np.isin(names, needed) & ~informative
     return Thresholds(
         rate_hz,
@@ -163,6 +163,8 @@ def compute_thresholds(
         + 10 * sigma[drive],
         MAX_FOLLOWING_STROKE * limits.stroke_mm * 1e-3 + 10 * sigma[table],
         MAX_CHECK_ERROR_STROKE * limits.stroke_mm * 1e-3,
+        initial_following_ratio=max(MAX_INITIAL_FOLLOWING_RATIO, following_ratio),
+        following_ratio=following_ratio,
     )
 
 

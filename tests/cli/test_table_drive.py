@@ -1,0 +1,131 @@
+"""`table-twin` and `table-drive` as a user runs them on the simulated hydraulic table."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from table_io.config.excitation import History
+from table_io.config.profile import load_profile
+from table_io.errors import InputError
+from tests.command_line import call_main
+from twin.drive.table_file import load_table_twin
+from twin.drive.table_model import TableParameters
+from twin.recording.reader import read_recording
+
+RECORD = """
+title = "Short pulse"
+rig = "hydraulic"
+[specimen]
+mass_kg = 550.0
+gap_mm = 8.0
+[acquisition]
+rate_hz = 1000.0
+[excitation]
+kind = "random"
+low_hz = 0.5
+high_hz = 10.0
+rms_g = 0.03
+duration_s = 8.0
+seed = 3
+[tracking]
+band_hz = [0.5, 10.0]
+"""
+TWIN = """
+title = "Table"
+mass_kg = 2000.0
+residual = 0.01
+[parameters]
+gain_1_s = 20.0
+velocity_feedforward = 0.2
+delay_s = 0.004
+oil_hz = 26.9
+friction_n = 480.0
+static_excess_n = 150.0
+pressure_feedback_s = 0.0034
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "record.toml").write_text(RECORD)
+    (tmp_path / "table.toml").write_text(TWIN)
+    return tmp_path
+
+
+def compute(folder: Path, *options: str) -> int:
+    return call_main(
+        "table-drive", str(folder / "record.toml"), "--table-twin", str(folder / "table.toml"),
+        "--out", str(folder / "out"), *options,
+    ).returncode  # fmt: skip
+
+
+def test_the_drive_is_played_and_the_target_stays(folder: Path) -> None:
+    assert compute(folder) == 0
+    before = load_profile(folder / "record.toml")[0]
+    after = load_profile(folder / "out" / "profile.toml")[0]
+    margin = (after.plan.target_m.size - before.plan.target_m.size) // 2
+    target = np.pad(before.plan.target_m, margin)
+    np.testing.assert_allclose(after.plan.target_m, target, atol=1e-12)
+    assert np.abs(after.plan.history_m - target).max() > 0.05 * np.abs(target).max()
+
+
+def test_iterations_are_runs_of_their_own_with_smaller_errors(folder: Path) -> None:
+    assert compute(folder, "--iterate", "1", "--speed", "max") == 0
+    errors = []
+    for number in range(2):
+        run = folder / "out" / f"run-{number}"
+        errors.append(json.loads((run / "summary.json").read_text())["tracking"])
+        recording = read_recording(run / "run.mcap")
+        assert "drive.csv" in recording.start.profile_toml
+    assert errors[0]["acc_rms_error_band"] < 0.1
+    assert errors[1]["acc_rms_error_band"] < errors[0]["acc_rms_error_band"]
+
+
+def test_the_run_of_another_target_does_not_correct_a_drive(folder: Path) -> None:
+    assert compute(folder) == 0
+    profile = folder / "out" / "profile.toml"
+    run = folder / "run"
+    assert call_main("run", profile, "--speed", "max", "--out", run).returncode == 0
+    (folder / "record.toml").write_text(RECORD.replace("seed = 3", "seed = 4"))
+    with pytest.raises(InputError) as error:
+        compute_after(folder, run)
+    assert "another target" in str(error.value)
+
+
+def compute_after(folder: Path, run: Path) -> None:
+    from twin.cli.table_drive import compute_drive_command
+
+    compute_drive_command(
+        folder / "record.toml", folder / "table.toml", None, folder / "next", None, run, None, True
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        ("drive_mm\n0.0\n1.0\n0.0\n", "excitation.drive"),
+        ("drive_mm\n" + "0.0\n" * 10 + "nan\n", "excitation.drive"),
+        ("disp_mm\n0.0\n0.0\n", "excitation.drive"),
+        ("drive_mm\n0.0\nmuch\n", "excitation.drive"),
+    ],
+)
+def test_a_drive_that_does_not_fit_is_refused(folder: Path, text: str, key: str) -> None:
+    (folder / "drive.csv").write_text(text)
+    driven = RECORD.replace('kind = "random"', 'kind = "random"\ndrive = "drive.csv"')
+    (folder / "driven.toml").write_text(driven)
+    profile = load_profile(folder / "driven.toml")[0]
+    assert isinstance(profile.excitation, History)
+    with pytest.raises(InputError) as error:
+        _ = profile.plan
+    assert error.value.key == key
+
+
+def test_a_table_twin_keeps_its_parameters(folder: Path) -> None:
+    parameters = load_table_twin(folder / "table.toml").build_model().parameters
+    assert parameters.friction_n == 480.0
+    assert parameters.valve_hz == TableParameters().valve_hz
+    (folder / "table.toml").write_text(TWIN + "colour = 1.0\n")
+    with pytest.raises(InputError, match="colour"):
+        load_table_twin(folder / "table.toml").build_model()
