@@ -9,7 +9,7 @@ from table_io.config.base import ConfigModel, Finite, NonNegative, Positive
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError, suggest
 from table_io.sim.ground_truth import GroundTruth
-from table_io.sim.hydraulic_table import HydraulicTableConfig
+from table_io.sim.hydraulic_config import HydraulicTableConfig
 
 
 class FaultKind(NamedTuple):

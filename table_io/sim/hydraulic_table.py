@@ -20,64 +20,14 @@ import math
 from typing import NamedTuple
 
 from numba import njit
-from pydantic import Field, ValidationInfo, field_validator
 
-from table_io.config.base import ConfigModel, NonNegative, Positive
-from table_io.errors import InputError
+from table_io.sim.hydraulic_config import HydraulicTableConfig
 
 # Continues the state of `hidden_plant.py`: load pressure in Pa and its slow part, spool and its
 # rate in 1/s, bristles in m, frame in m and m/s.
 P, P_LOW, SPOOL, SPOOL_RATE, BRISTLE, YF, VYF = 15, 16, 17, 18, 19, 20, 21
 HYDRAULIC_STATE_SIZE = 22
 MAX_HYDRAULIC_SUBSTEP_S = 3.2e-5  # the bristles relax in 40 us at 0.5 m/s; stable below 110 us
-
-
-class HydraulicTableConfig(ConfigModel):
-    """Servo valve, actuator, friction, controller and frame of a hydraulic table."""
-
-    piston_area_cm2: Positive = Field(description="Effective area of the piston, A.")
-    oil_volume_cm3: Positive = Field(description="Oil under pressure in both chambers, V.")
-    bulk_modulus_mpa: Positive = Field(description="Effective bulk modulus of the oil, B.")
-    supply_pressure_mpa: Positive = Field(description="Supply above the return, P.")
-    leakage_l_min_mpa: NonNegative = Field(description="Leakage across the piston, L.")
-    rated_flow_l_min: Positive = Field(
-        description="Flow of the open valve, Q_r, at the drop below."
-    )
-    rated_drop_mpa: Positive = Field(7.0, description="Pressure drop of the rated flow, P_r.")
-    valve_frequency_hz: Positive = Field(description="Natural frequency of the spool; -90 degrees.")
-    valve_damping: Positive = Field(description="Damping ratio of the spool, z.")
-    friction_n: NonNegative = Field(description="Friction in motion, F_c.")
-    static_friction_n: NonNegative = Field(description="Friction that must be overcome, F_s.")
-    stribeck_speed_m_s: Positive = Field(0.01, description="Speed of the fall to F_c, v_s.")
-    stick_stiffness_n_m: Positive = Field(2.5e7, description="Stiffness while it sticks, s0.")
-    stick_damping_n_s_m: NonNegative = Field(2.0e4, description="Damping while it sticks, s1.")
-    viscous_friction_n_s_m: NonNegative = Field(description="Viscous friction, c.")
-    gain_1_s: Positive = Field(description="Gain of the stroke loop: speed over error, k.")
-    velocity_feedforward: NonNegative = Field(
-        description="Feed-forward of the command's speed, k_ff; 1 in full."
-    )
-    pressure_feedback: NonNegative = Field(
-        description="Valve opening that the supply pressure takes back as load pressure, k_p."
-    )
-    pressure_corner_hz: Positive = Field(
-        1.0, description="Below it the load pressure is not fed back, 1 / (2 pi t_p)."
-    )
-    frame_mass_kg: Positive = Field(description="Mass of the frame that bears the actuator, m_f.")
-    frame_frequency_hz: Positive = Field(description="Its natural frequency, w_f / (2 pi).")
-    frame_damping: NonNegative = Field(description="Its damping ratio, z_f.")
-
-    @field_validator("static_friction_n")
-    @classmethod
-    def _check_static_friction(cls, static_n: float, info: ValidationInfo) -> float:
-        if static_n < info.data.get("friction_n", 0.0):
-            raise InputError("static_friction_n is below friction_n", allowed="at least friction_n")
-        return static_n
-
-    def oil_column_hz(self, mass_kg: float) -> float:
-        """Return the natural frequency of a moving mass in kg on the oil column, Hz."""
-        area_m2, volume_m3 = self.piston_area_cm2 * 1e-4, self.oil_volume_cm3 * 1e-6
-        stiffness_n_m = 4.0 * self.bulk_modulus_mpa * 1e6 * area_m2**2 / volume_m3
-        return math.sqrt(stiffness_n_m / mass_kg) / math.tau
 
 
 class HydraulicCoefficients(NamedTuple):

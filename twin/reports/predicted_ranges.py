@@ -74,12 +74,17 @@ def _compute_peaks(run_config: RunConfig) -> dict[str, Float1D]:
     """
     profile = run_config.profile
     frequencies = np.array([step.frequency_hz for step in run_config.steps])
-    level = profile.plan.level_m_s2
+    levels = np.array([step.acceleration_m_s2 for step in run_config.steps])
     # Between the orbits of a continuation the motion may fall to any other solution.
     cycles = SETTLING_CYCLES if profile.continuation is not None else profile.sweep.cycles
     # The first step runs twice and the first run is dropped: the real drive has a soft start.
-    motion = simulate_sweep(run_config.model, np.r_[frequencies[:1], frequencies], level, cycles)
-    table = level / (2 * np.pi * frequencies) ** 2
+    motion = simulate_sweep(
+        run_config.model,
+        np.r_[frequencies[:1], frequencies],
+        np.r_[levels[:1], levels],
+        cycles,
+    )
+    table = levels / (2 * np.pi * frequencies) ** 2
 
     def max_magnitude(*names: str) -> Float1D:
         rows = [np.abs(motion.column(name)[1:]).max(axis=1) for name in names]
@@ -91,7 +96,7 @@ def _compute_peaks(run_config: RunConfig) -> dict[str, Float1D]:
     peaks = {
         "drive_disp_m": table,
         "table_disp_m": table,
-        "table_acc_m_s2": np.full(frequencies.size, level),
+        "table_acc_m_s2": levels,
         "mass_disp_m": u + table,
         "mass_acc_m_s2": a,
         "rel_disp_m": u,

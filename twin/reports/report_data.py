@@ -119,13 +119,21 @@ def step_quantity(step: dict[str, Any], source: str, name: str) -> float:
 def extract_prc(points: Sequence[PrcPoint], source: str, direction: str, name: str) -> Curve:
     """Return (frequency in Hz, quantity), (point,) each, of one direction in ascending frequency.
 
-    `source` is "twin" or "measured". Impacts are means per cycle. NaN where there is no value.
+    `source` is "twin" or "measured". Impacts are means per cycle. NaN where there is no value, and
+    between the sweeps of a test that goes through the same frequencies at several levels.
     """
-    rows = sorted(
-        (point.frequency_hz, _mean_quantity(point, source, name))
-        for point in points
-        if point.direction == direction
-    )
+    sweeps: list[dict[float, float]] = []
+    for point in points:
+        if point.direction != direction:
+            continue
+        sweep = next((known for known in sweeps if point.frequency_hz not in known), None)
+        if sweep is None:
+            sweeps.append(sweep := {})
+        sweep[point.frequency_hz] = _mean_quantity(point, source, name)
+    rows: list[tuple[float, float]] = []
+    for sweep in sweeps:
+        rows += [(math.nan, math.nan)] if rows else []
+        rows += sorted(sweep.items())
     table = np.array(rows, dtype=np.float64).reshape(-1, 2)
     return table[:, 0], table[:, 1]
 
