@@ -34,6 +34,7 @@ import twin.campaign.report, twin.exchange.import_table, twin.monitor.app, twin.
 """
 
 
+@pytest.mark.slow  # 8 s
 def test_recordings_are_used_without_extras_and_linux(log_file: Path, tmp_path: Path) -> None:
     commands = {
         f"replay {log_file} --steps 0 --out {tmp_path / 'again'}": 0,

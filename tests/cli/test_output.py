@@ -32,6 +32,7 @@ def test_closed_streams_end_nothing(tmp_path: Path) -> None:
     assert (tmp_path / "new.toml").stat().st_size > 100
 
 
+@pytest.mark.slow  # 6 s
 def test_a_reader_that_leaves_ends_nothing(tmp_path: Path) -> None:
     """As `shaketwin ... | true`: the command goes on to its end."""
     line = f"({PROGRAM[0]} -c '{PROGRAM[2]}' simulate demo --out out; echo $? > code) | true"

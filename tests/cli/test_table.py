@@ -65,6 +65,7 @@ def test_a_run_without_its_table_says_how_to_start_it_and_leaves_nothing(tmp_pat
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow  # 3 s each
 @pytest.mark.parametrize("gone", [False, True])
 def test_a_terminal_that_is_held_or_gone_does_not_hold_the_machine(
     tmp_path: Path, gone: bool

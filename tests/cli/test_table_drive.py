@@ -71,6 +71,7 @@ def test_the_drive_is_played_and_the_target_stays(folder: Path) -> None:
     assert np.abs(after.plan.history_m - target).max() > 0.05 * np.abs(target).max()
 
 
+@pytest.mark.slow  # 15 s
 def test_iterations_are_runs_of_their_own_with_smaller_errors(folder: Path) -> None:
     assert compute(folder, "--iterate", "1", "--speed", "max") == 0
     errors = []

@@ -39,6 +39,7 @@ def test_the_low_cut_of_accelerometers_leaves_the_twin_within_its_band() -> None
     assert list_warnings(draw_truth("bad", 1, "highpass")) == []
 
 
+@pytest.mark.slow  # 10 s
 @pytest.mark.parametrize("only", ["load_sharing", "plate_mass", "laser_nonlinearity"])
 def test_a_bad_instrument_is_named_as_such_if_at_all(only: str) -> None:
     assert {warning.kind for warning in list_warnings(draw_truth("bad", 1, only))} <= {"instrument"}

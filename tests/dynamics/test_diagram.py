@@ -130,6 +130,7 @@ def test_a_model_with_friction_has_a_diagram():
         assert independent_return_error(orbit) < 1e-4
 
 
+@pytest.mark.slow  # 5 s
 def test_random_starts_find_what_lies_between_the_values(monkeypatch):
     """A model with narrow isolas, at a few values of the frequency only."""
     case = draw_case(55)

@@ -112,7 +112,9 @@ def test_a_fault_is_found_on_its_channel_with_its_size(name: str) -> None:
     assert places <= {*MASS, *channels} if channel.startswith("mass") else places <= {*channels}
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize(
+    "seed", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)]
+)
 def test_a_usual_laboratory_is_healthy(seed: int) -> None:
     laboratory = draw_laboratory("typical", np.random.default_rng(seed))
     truth = ""

@@ -76,6 +76,7 @@ def stepped_errors(seed: int) -> tuple[float, float, int]:
     return error, np.abs(impacts[:, 0] / hz - contacts[:, 0]).max(initial=0.0), len(impacts)
 
 
+@pytest.mark.slow  # 2 s each
 @pytest.mark.parametrize("driver", [sampled_errors, stepped_errors])
 def test_random_models_agree_with_dop853(driver):
     """To 1e-9 m; what is between that and 1e-15 is how a motion with many contacts spreads."""

@@ -65,6 +65,7 @@ def simulate_displacement(model: Model, acceleration: np.ndarray, rate_hz: float
     return out[::parts]
 
 
+@pytest.mark.slow  # 5 s
 def test_silverbox_has_a_cubic_spring() -> None:
     """Named on multisines, judged by simulation on the growing noise that goes beyond them.
 

@@ -94,6 +94,7 @@ def test_a_model_without_folds_is_refused():
         make_orbit_plan(Model(snm(np.inf)), RANGE_HZ, AG, UNSTABLE_POINTS, FEEDBACK_TIMING)
 
 
+@pytest.mark.slow  # 4 s
 def test_too_large_a_latency_is_refused_with_the_largest_allowed():
     with raises_input_error(key="latency") as error:
         make_orbit_plan(

@@ -62,6 +62,7 @@ def test_without_a_display_it_says_what_to_do(
         open_viewer("rerun+http://127.0.0.1:9876/proxy")
 
 
+@pytest.mark.slow  # 5 s
 def test_the_picture_of_a_running_test(tmp_path: Path) -> None:
     address = f"127.0.0.1:{free_port()}"
     view = RerunView(start(), serve=address)

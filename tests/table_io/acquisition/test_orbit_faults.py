@@ -111,6 +111,7 @@ def test_machine_that_falls_silent_halts_the_test_and_what_came_is_kept() -> Non
     assert result.command_m.size >= HELD_S * RATE_HZ
 
 
+@pytest.mark.slow  # 5 s
 def test_queue_that_a_dead_rig_leaves_behind_ends_at_rest() -> None:
     """At every tenth block, from the capture to the releases at the first orbit."""
     profile, clock = make_profile(slice(1)), ManualClock()

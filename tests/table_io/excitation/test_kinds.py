@@ -96,7 +96,10 @@ def test_the_command_begins_and_ends_at_rest_without_a_jump(kind: str) -> None:
 
 
 @every_kind
-@pytest.mark.parametrize("samples", [1, 7, 64, 500])
+@pytest.mark.parametrize(
+    "samples",
+    [pytest.param(1, marks=pytest.mark.slow), 7, pytest.param(64, marks=pytest.mark.slow), 500],
+)
 def test_cutting_into_blocks_changes_no_bit(kind: str, samples: int) -> None:
     subject = plan_excitation(profile(kind)).decay_from(5000)
     end = min(subject.rest_start + 100, 9000)
