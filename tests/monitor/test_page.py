@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from table_io.records import Event, RunStop
-from tests.monitor.browser import CHROMIUM, PATIENCE_S, Browser, open_browser
+from tests.monitor.browser import PATIENCE_S, Browser, open_browser
 from tests.monitor.monitored import RUN, point, records, stream
 from tests.monitor.test_page_data import watch_items
 from tests.monitor.test_page_server import Served, serving
@@ -18,7 +18,6 @@ from twin.monitor.panels import SessionStatus
 from twin.monitor.run_state import LiveRunState, update_run_state
 from twin.security.access_control import user_name
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
 HAS_INK = """((canvas) => canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height)
   .data.some((value) => value > 0))(document.getElementById(ID))"""
 

@@ -7,15 +7,11 @@ from pathlib import Path
 import pytest
 
 from tests.live.test_live import QUICK, finish, kill, read_until, start
-from tests.monitor.browser import CHROMIUM, Browser, open_browser
+from tests.monitor.browser import Browser, open_browser
 from tests.security.laboratory import free_port, laboratory
 from twin.cli.credentials import issue_code
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium"),
-    pytest.mark.usefixtures("drafts"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("drafts")]
 TEST = QUICK.replace("cycles = 5", "cycles = 8", 1)
 SEND_STOP = """fetch("command", {
   method: "POST", headers: { ...headers(), "Content-Type": "application/json" },
