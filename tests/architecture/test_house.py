@@ -1,6 +1,7 @@
 """The house rules, each with a planted violation that must turn it red."""
 
 import ast
+import os
 import shutil
 import subprocess
 import sys
@@ -155,7 +156,13 @@ def test_top_level_holds_only_what_was_given() -> None:
 
 
 @pytest.mark.parametrize(
-    "program", [["ruff", "check", "."], ["ruff", "format", "--check", "."], ["mypy"]]
+    "program",
+    [
+        ["ruff", "check", "."],
+        ["ruff", "format", "--check", "."],
+        ["mypy", "--cache-dir", os.devnull, "table_io", "twin"],
+        pytest.param(["mypy"], marks=pytest.mark.slow),  # the tests too
+    ],
 )
 def test_lint_and_types(program: list[str]) -> None:
     tool = Path(sys.executable).parent / program[0]

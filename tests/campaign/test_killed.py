@@ -25,6 +25,7 @@ from twin.recording.reader import read_recording
 from twin.reports.prc_families import draw_all_gaps
 from twin.run.unpaced import play_unpaced
 
+pytestmark = pytest.mark.slow  # 30 s
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
 LISTED = """
 title = "Free flight and G4 <i>"

@@ -123,6 +123,23 @@ def test_a_drive_that_does_not_fit_is_refused(folder: Path, text: str, key: str)
     assert error.value.key == key
 
 
+def test_a_drive_is_not_played_for_another_level(folder: Path) -> None:
+    assert compute(folder) == 0
+    path = folder / "out" / "profile.toml"
+    path.write_text(path.read_text().replace("rms_g = 0.03", "rms_g = 0.06"))
+    with pytest.raises(InputError) as error:
+        _ = load_profile(path)[0].plan
+    assert error.value.key == "excitation.drive"
+
+
+def test_a_drive_beyond_the_limits_is_not_written_as_ready(folder: Path) -> None:
+    """A table of little gain needs more stroke than the rig has."""
+    (folder / "record.toml").write_text(RECORD.replace("rms_g = 0.03", "rms_g = 0.2"))
+    slow = TWIN.replace("gain_1_s = 20.0", "gain_1_s = 2.0").replace("forward = 0.2", "forward = 0")
+    (folder / "table.toml").write_text(slow)
+    assert compute(folder) == 2
+
+
 def test_a_table_twin_keeps_its_parameters(folder: Path) -> None:
     parameters = load_table_twin(folder / "table.toml").build_model().parameters
     assert parameters.friction_n == 480.0

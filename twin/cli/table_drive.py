@@ -12,7 +12,8 @@ from rich.table import Table
 
 from table_io.block import Float1D, Label
 from table_io.config.base import parse_toml
-from table_io.config.excitation import DRIVE_MARGIN_S, History, format_drive, history_acceleration
+from table_io.config.excitation import DRIVE_MARGIN_S, History, history_acceleration
+from table_io.config.excitation.drive_file import format_drive
 from table_io.config.folders import resolve_config
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
@@ -118,29 +119,58 @@ def compute_drive_command(
 
 
 def write_driven_profile(task: DriveTask, command_m: Float1D, folder: Path) -> Path:
-    """Write the profile with its files and the drive to a folder; return the profile's path."""
+    """Write the profile with its files and the drive to a folder; return the profile's path.
+
+    InputError if the drive exceeds a limit of the rig, or a file cannot be copied.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    text = task.profile_path.read_text(encoding="utf-8")
-    text = re.sub(r'(?m)^drive = ".*"\n', "", text)
-    if task.table is not None:
-        text = re.sub(r"(?m)^rig = .*$", f"rig = {json.dumps(task.table)}", text)
-    line = f'drive = "{DRIVE_FILE}"'
-    text = re.sub(
-        r"(?m)^\[excitation\][^\n]*$", lambda header: f"{header[0]}\n{line}", text, count=1
+    profile, source = task.config.profile, task.profile_path.parent
+    text = re.sub(r"(?m)^drive\s*=.*\n", "", task.profile_path.read_text(encoding="utf-8"))
+    text, count = re.subn(
+        r"(?m)^\[excitation\][^\n]*$",
+        lambda header: f'{header[0]}\ndrive = "{DRIVE_FILE}"',
+        text,
+        count=1,
     )
-    excitation = task.config.profile.excitation
-    assert isinstance(excitation, History)  # see _prepare_task
-    for name in excitation.files:
-        if name != excitation.drive:
-            source = task.profile_path.parent / name
-            (folder / Path(name).name).write_bytes(source.read_bytes())
-    (folder / DRIVE_FILE).write_text(
-        format_drive(command_m, f"drive of {task.config.name} on {task.twin.title}"),
-        encoding="utf-8",
-    )
+    if count == 0:
+        raise InputError(
+            "no line [excitation] to which the drive can be added",
+            where=task.profile_path,
+            remedy="write the excitation as a table of its own",
+        )
+    for key, name in (("rig", task.table or profile.rig), ("model", profile.model)):
+        # A path is relative to the profile, which is written elsewhere.
+        paths = [path for path in (source / name, Path(name)) if path.is_file()]
+        value = str(paths[0].resolve()) if name.endswith(".toml") and paths else name
+        # First, since what follows a table would belong to it.
+        text = re.sub(rf"(?m)^{key}\s*=.*\n", "", text)
+        text = f"{key} = {json.dumps(value)}\n{text}"
+    for name in _list_files(profile):
+        if Path(name).is_absolute():
+            continue
+        copy = folder / name
+        if not copy.resolve().is_relative_to(folder.resolve()):
+            raise InputError(
+                f"{name} lies outside the folder of the profile",
+                where=task.profile_path,
+                remedy="put it next to the profile",
+            )
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.write_bytes((source / name).read_bytes())
+    comment = f"drive of {task.config.name} on {task.twin.title}"
+    drive = format_drive(command_m, task.target_m, comment)
+    (folder / DRIVE_FILE).write_text(drive, encoding="utf-8")
     path = folder / PROFILE_FILE
     path.write_text(text, encoding="utf-8")
+    read_run_config(path, task.table)  # InputError beyond the limits of the rig
     return path
+
+
+def _list_files(profile: Profile) -> list[str]:
+    """Return the names of the files that a profile needs, without its drive."""
+    tables = (profile.excitation, profile.tracking)
+    names = [getattr(table, key) for table in tables for key in table.FILE_KEYS if key != "drive"]
+    return [name for name in names if name is not None]
 
 
 def _prepare_task(

@@ -18,6 +18,7 @@ from pydantic import Field
 
 from table_io.block import Float1D
 from table_io.config.base import ConfigModel, Count
+from table_io.config.excitation.drive_file import parse_drive
 from table_io.config.plugins import list_entry_points, load_entry, make_plugin_error
 from table_io.errors import InputError, suggest
 from table_io.records import Step
@@ -130,43 +131,10 @@ class History(Excitation):
         command = history
         if self.drive is not None:
             history = np.pad(history, round(DRIVE_MARGIN_S * rate_hz))
-            command = _parse_drive(self.files.get(self.drive, ""), self.drive)
-            if command.size != history.size:
-                raise InputError(
-                    f"{self.drive}: {command.size} samples, the target has {history.size}",
-                    where=where,
-                    key="excitation.drive",
-                    remedy="compute it anew with `shaketwin table-drive`",
-                )
+            command = parse_drive(self.files.get(self.drive, ""), self.drive, history)
         return ExcitationPlan(
             level, low_hz, high_hz, history_m=command, target_m=history, windows=self.windows
         )
-
-
-def format_drive(command_m: Float1D, comment: str) -> str:
-    """Return the text of a drive file: command in m, (sample,), at the rate of the run."""
-    lines = [f"# {line}" for line in comment.splitlines()]
-    return "\n".join([*lines, "drive_mm", *(f"{1e3 * value:.6f}" for value in command_m), ""])
-
-
-def _parse_drive(text: str, name: str) -> Float1D:
-    """Return the command in m of a drive file, (sample,); InputError if it does not rest."""
-    lines = [line for line in text.splitlines() if line and not line.startswith("#")]
-    try:
-        command: Float1D = 1e-3 * np.array(lines[1:], dtype=np.float64)
-    except ValueError as error:
-        raise InputError(f"{name}: {error}", key="excitation.drive") from None
-    if lines[:1] != ["drive_mm"] or command.size < 2 or not np.isfinite(command).all():
-        raise InputError(
-            f"{name} is no drive",
-            key="excitation.drive",
-            allowed="a line drive_mm, then one finite number a line",
-            remedy="compute it with `shaketwin table-drive`",
-        )
-    peak = max(float(np.abs(command).max()), 1e-9)
-    if max(abs(command[0]), abs(command[-1])) > MAX_REST_RATIO * peak:
-        raise InputError(f"{name} does not begin and end at rest", key="excitation.drive")
-    return command
 
 
 def history_acceleration(history_m: Float1D, rate_hz: float) -> Float1D:
