@@ -195,7 +195,8 @@ def test_a_dead_twin_is_a_fault_a_dead_recorder_no_gap_and_a_dead_viewer_nothing
     assert 0 < fault.from_index < fault.to_index <= summary["run"]["samples"]
     compared = [block.index for block in recording.blocks("pred")]
     assert not [index for index in compared if fault.from_index <= index < fault.to_index]
-    assert fault.to_index in compared
+    # On a loaded machine the new twin may be ready only when the test has ended.
+    assert fault.to_index in compared or fault.to_index == summary["run"]["samples"]
     # what was measured while the twin was dead is in the summary all the same
     assert len(summary["steps"]) == 3
     assert (tmp_path / "out" / "view.rrd").stat().st_size > 10_000
