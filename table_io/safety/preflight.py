@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from table_io.block import Float2D
+from table_io.config.excitation.waveform import smoothstep
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.amplitude_control import MAX_CORRECTION
 from table_io.control.frf import evaluate_gain
 from table_io.errors import InputError
-from table_io.excitation.drive import Drive, HistorySegment, Segment, smoothstep
+from table_io.excitation.drive import Drive, HistorySegment, Segment
 from table_io.records import FrequencyResponse, Step
 from table_io.safety.loop_check import plan_targets
 from table_io.units import GRAVITY_M_S2

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from scipy.fft import next_fast_len
 
 from table_io.block import Float1D
+from table_io.config.excitation.waveform import smoothstep
 from twin.drive.table_identification import CROSSOVER_HZ
 from twin.drive.table_model import TableModel
 
@@ -156,6 +157,4 @@ def _invert_response(
 def _rest_at_ends(count: int, rate_hz: float) -> Float1D:
     """Return a window that is 1 but for half a second at either end, where it rises from 0."""
     edge = np.arange(count) / (0.5 * rate_hz)
-    x = np.clip(np.minimum(edge, edge[::-1]), 0.0, 1.0)
-    window: Float1D = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
-    return window
+    return smoothstep(np.minimum(edge, edge[::-1]))
