@@ -126,7 +126,7 @@ class History(Excitation):
                 remedy="blend it in and out",
             )
         acceleration = history_acceleration(history, rate_hz)
-        low_hz, high_hz = _find_band(acceleration, rate_hz)
+        low_hz, high_hz = find_energy_band(acceleration, rate_hz)
         level = float(np.abs(acceleration).max())
         command = history
         if self.drive is not None:
@@ -142,9 +142,14 @@ def history_acceleration(history_m: Float1D, rate_hz: float) -> Float1D:
     return np.diff(history_m, 2, prepend=history_m[:1], append=history_m[-1:]) * rate_hz**2
 
 
-def _find_band(acceleration: Float1D, rate_hz: float) -> tuple[float, float]:
-    """Return the frequencies in Hz below which 5 % and 95 % of the energy lie."""
+def find_energy_band(acceleration: Float1D, rate_hz: float) -> tuple[float, float]:
+    """Return the frequencies in Hz below which 5 % and 95 % of the energy of (sample,) lie.
+
+    ValueError if it is at rest throughout.
+    """
     energy = np.cumsum(np.abs(np.fft.rfft(acceleration)) ** 2)
+    if not energy[-1] > 0.0:
+        raise ValueError("the motion is at rest throughout")
     low, high = np.searchsorted(energy, np.multiply(BAND_ENERGY_SHARES, energy[-1])) + 0.5
     resolution_hz = rate_hz / acceleration.size
     return float(low * resolution_hz), float(high * resolution_hz)
