@@ -50,7 +50,7 @@ def read_played_drive(recording: Recording) -> tuple[Float1D, PlayedDrive]:
             "the recording is not that of a displacement history", where=recording.path
         )
     whole = _find_whole_block(recording)
-    played = np.flatnonzero((whole.label == Label.MEASURE) & (whole.cycle < 0))
+    played = np.flatnonzero(whole.is_history)
     plan, rate_hz = profile.plan, whole.rate_hz
     if played.size == 0 or int(played[0]) + plan.target_m.size > len(whole):
         raise InputError("its history was not played to the end", where=recording.path)
