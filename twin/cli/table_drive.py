@@ -1,4 +1,4 @@
-"""`table-twin` and `drive`: identify the table, and compute the command by which it follows."""
+"""`table-twin` and `table-drive`: identify the table, compute the command by which it follows."""
 
 import json
 import math
@@ -12,7 +12,12 @@ from rich.table import Table
 
 from table_io.block import Float1D, Label
 from table_io.config.base import parse_toml
-from table_io.config.excitation import DRIVE_MARGIN_S, History, history_acceleration
+from table_io.config.excitation import (
+    DRIVE_MARGIN_S,
+    History,
+    add_drive_margin,
+    history_acceleration,
+)
 from table_io.config.excitation.drive_file import format_drive
 from table_io.config.folders import resolve_config
 from table_io.config.profile import Profile
@@ -61,7 +66,7 @@ def identify_table_command(logs: Sequence[Path], out: Path) -> int:
     for name, value in identification.model.parameters._asdict().items():
         width = identification.half_widths.get(name)
         table.add_row(
-            name.rsplit("_1_s")[0] if name == "gain_1_s" else name,
+            name.removesuffix("_1_s"),
             f"{value:.4g}",
             "stated" if width is None else f"+- {width:.2g}",
             UNITS.get(name, ""),
@@ -189,7 +194,7 @@ def _prepare_task(
         )
     twin = load_table_twin(twin_file)
     rate_hz = config.profile.acquisition.rate_hz
-    target = np.pad(excitation.displacement(rate_hz), round(DRIVE_MARGIN_S * rate_hz))
+    target = add_drive_margin(excitation.displacement(rate_hz), rate_hz)
     band_hz = band_hz or config.profile.tracking.band_hz
     if band_hz is None:
         band_hz = find_band(history_acceleration(target, rate_hz), rate_hz)

@@ -1,6 +1,6 @@
 """File of a table's twin, as `shaketwin table-twin` writes it."""
 
-import math
+import json
 from pathlib import Path
 
 from pydantic import Field, field_validator
@@ -44,18 +44,14 @@ def format_table_twin(title: str, identification: TableIdentification) -> str:
     """Return the TOML text of an identified table."""
     values = identification.model.parameters._asdict()
     lines = [
-        f'title = "{title}"',
+        f"title = {json.dumps(title, ensure_ascii=False)}",
         f"mass_kg = {identification.model.mass_kg!r}",
         f"residual = {identification.residual:.4g}",
         "",
         "[parameters]",
-        *(f"{name} = {_format_number(value)}" for name, value in values.items()),
+        *(f"{name} = {value:.9g}" for name, value in values.items()),
         "",
         "[half_widths]",
         *(f"{name} = {width:.3g}" for name, width in identification.half_widths.items()),
     ]
     return "\n".join([*lines, ""])
-
-
-def _format_number(value: float) -> str:
-    return "inf" if math.isinf(value) else f"{value:.9g}"

@@ -108,12 +108,22 @@ class History(Excitation):
         """Return the displacement in m, right positive, at rest at both ends, (sample,)."""
         raise NotImplementedError
 
+    def target(self, rate_hz: float) -> Float1D:
+        """Return the displacement that the table should have in m, (sample,).
+
+        It is `displacement`, with the rest around it in which a drive, if there is one, begins.
+        """
+        displacement = np.ascontiguousarray(self.displacement(rate_hz), dtype=np.float64)
+        return displacement if self.drive is None else add_drive_margin(displacement, rate_hz)
+
     def plan(self, rate_hz: float) -> ExcitationPlan:
         """Return what is played, with the target's peak acceleration and band.
 
         InputError if the target is not at rest at its ends, or the drive is not one of it.
         """
-        history = np.ascontiguousarray(self.displacement(rate_hz), dtype=np.float64)
+        target = self.target(rate_hz)
+        margin = 0 if self.drive is None else round(DRIVE_MARGIN_S * rate_hz)
+        history = target[margin : target.size - margin]
         where = f"excitation {self.kind!r}"
         if history.size <= self.windows or not np.isfinite(history).all() or not history.any():
             raise InputError("its history is empty, at rest throughout, or not finite", where=where)
@@ -128,13 +138,17 @@ class History(Excitation):
         acceleration = history_acceleration(history, rate_hz)
         low_hz, high_hz = find_energy_band(acceleration, rate_hz)
         level = float(np.abs(acceleration).max())
-        command = history
+        command = target
         if self.drive is not None:
-            history = np.pad(history, round(DRIVE_MARGIN_S * rate_hz))
-            command = parse_drive(self.files.get(self.drive, ""), self.drive, history)
+            command = parse_drive(self.files.get(self.drive, ""), self.drive, target)
         return ExcitationPlan(
-            level, low_hz, high_hz, history_m=command, target_m=history, windows=self.windows
+            level, low_hz, high_hz, history_m=command, target_m=target, windows=self.windows
         )
+
+
+def add_drive_margin(history_m: Float1D, rate_hz: float) -> Float1D:
+    """Return a history in m with the rest around it in which its drive begins, (sample,)."""
+    return np.pad(history_m, round(DRIVE_MARGIN_S * rate_hz))
 
 
 def history_acceleration(history_m: Float1D, rate_hz: float) -> Float1D:
