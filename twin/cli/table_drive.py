@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
-from table_io.block import Float1D, Label
+from table_io.block import Float1D, join_blocks
 from table_io.config.base import parse_toml
 from table_io.config.excitation import (
-    DRIVE_MARGIN_S,
     History,
     add_drive_margin,
     history_acceleration,
@@ -205,21 +204,12 @@ def _prepare_task(
 
 def _simulate_reaction(config: RunConfig, count: int) -> Float1D:
     """Return the force of the specimen on a table that follows the target, N, (sample,)."""
-    from dataclasses import replace
-
     from twin.run.unpaced import generate_ideal_twin
 
-    excitation = config.profile.excitation.model_copy(update={"drive": None})
-    profile = config.profile.model_copy(update={"excitation": excitation})
-    profile.__dict__.pop("plan", None)  # cached with the drive
-    rows, labels = [], []
-    for block in generate_ideal_twin(replace(config, profile=profile)):
-        if block.stream == "pred":
-            rows.append(block.channel("free/mass_acc_m_s2"))
-            labels.append(block.label)
-    acceleration, label = np.concatenate(rows), np.concatenate(labels)
-    first = int(np.flatnonzero(label == Label.MEASURE)[0])
-    margin = round(DRIVE_MARGIN_S * config.profile.acquisition.rate_hz)
+    predicted = join_blocks([b for b in generate_ideal_twin(config) if b.stream == "pred"])
+    acceleration = predicted.channel("free/mass_acc_m_s2")
+    first = int(np.flatnonzero(predicted.is_history)[0])
+    margin = (count - config.profile.plan.target_m.size) // 2  # 0 if it has a drive already
     reaction = np.zeros(count)
     played = -config.profile.specimen.mass_kg * acceleration[first : first + count - margin]
     reaction[margin : margin + played.size] = played
