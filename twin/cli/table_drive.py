@@ -46,16 +46,21 @@ UNITS = {
 
 def identify_table_command(logs: Sequence[Path], out: Path) -> int:
     """Identify the twin of the table from a rehearsal and write it to a new file."""
-    if out.exists():
-        raise InputError("exists already", where=out, remedy="name a new file with --out")
+    from twin.reports.table_twin_figure import draw_table_twin
+
+    drawing = out.with_suffix(".png")
+    for path in (out, drawing):
+        if path.exists():
+            raise InputError("exists already", where=path, remedy="name a new file with --out")
     if len(logs) != 1:
         raise InputError(f"{len(logs)} recordings", allowed="one rehearsal of at most 60 s")
     recording = open_recording(logs[0])
     rig = parse_toml(recording.start.rig_toml, RigConfig, str(logs[0]))
     stall_kn = rig.table_response.stall_force_kn
+    rehearsal = read_table_motion(recording)
     with show_status("fitting the twin of the table"):
         identification = identify_table(
-            read_table_motion(recording),
+            rehearsal,
             rig.moving_mass_kg,
             math.inf if stall_kn is None else 1e3 * stall_kn,
         )
@@ -71,7 +76,9 @@ def identify_table_command(logs: Sequence[Path], out: Path) -> int:
             UNITS.get(name, ""),
         )
     print_table(console, table)
+    draw_table_twin(identification.model, rehearsal, title, drawing)
     print_line(f"it leaves {100 * identification.residual:.2g} % of the measured motion -> {out}")
+    print_line(f"frequency response and steps -> {drawing}")
     return 0
 
 
