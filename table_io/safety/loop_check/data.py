@@ -115,12 +115,12 @@ class LoopCheckData:
         without the low cut and delay that explain all of them best; NaN if there is none.
         """
         sensors = (*displacements, acceleration)
-        if sensors not in self._compared:  # the table waits at rest for the verdict
-            self._compared[sensors] = self._compare(displacements, acceleration)
-        return self._compared[sensors]
+        if sensors not in self._comparisons:  # the table waits at rest for the verdict
+            self._comparisons[sensors] = self._compare(displacements, acceleration)
+        return self._comparisons[sensors]
 
     @cached_property
-    def _compared(self) -> dict[tuple[str, ...], tuple[float, PairErrors]]:
+    def _comparisons(self) -> dict[tuple[str, ...], tuple[float, PairErrors]]:
         return {}
 
     def _compare(
