@@ -209,6 +209,19 @@ def check_limits(
                 "more bits or a smaller span",
             )
         )
+    peak_lsb = max(
+        (row.amplitude_lsb for row in rows if math.isnan(row.frequency_hz)), default=None
+    )
+    if peak_lsb is not None and peak_lsb < rig.output.least_lsb:
+        faults.append(
+            InputError(
+                f"{peak_lsb:.1f} steps of the DAC",
+                where="the peak of the history",
+                key="displacement",
+                allowed=f"at least {rig.output.least_lsb}",
+                remedy="raise its level, or use an output with more bits or a smaller span",
+            )
+        )
     if faults:
         raise InputError(
             f"the table {rig.name!r} cannot do this test; nothing was started",

@@ -104,6 +104,7 @@ def test_iterations_are_runs_of_their_own_with_smaller_errors(folder: Path) -> N
     assert errors[1]["acc_rms_error_band"] < errors[0]["acc_rms_error_band"]
 
 
+@pytest.mark.slow  # 10 s
 def test_the_run_of_another_target_does_not_correct_a_drive(folder: Path) -> None:
     assert compute(folder) == 0
     profile = folder / "out" / "profile.toml"
@@ -129,6 +130,7 @@ def compute_after(folder: Path, run: Path) -> None:
         ("drive_mm\n0.0\n1.0\n0.0\n", "excitation.drive"),
         ("drive_mm\n" + "0.0\n" * 10 + "nan\n", "excitation.drive"),
         ("disp_mm\n0.0\n0.0\n", "excitation.drive"),
+        ("drive_mm\n" + "0.0\n" * 10000, "excitation.drive"),
         ("drive_mm\n0.0\nmuch\n", "excitation.drive"),
     ],
 )
