@@ -16,7 +16,7 @@ from twin.model.config import ModelConfig
 from twin.recording.mcap_log import write_items
 from twin.reports.quantities import format_quantity
 from twin.run.run_config import from_texts, read_model
-from twin.validation.study.rig_setup import format_toml
+from table_io.config.toml_text import format_toml
 
 GAPS = (2.0, 2.0)
 

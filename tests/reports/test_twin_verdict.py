@@ -20,7 +20,8 @@ from twin.reports.twin_verdict import (
 )
 from twin.run.run_config import read_run_config
 from twin.run.unpaced import play_unpaced
-from twin.validation.study.rig_setup import NOMINAL_RIG, format_toml
+from table_io.config.toml_text import format_toml
+from twin.validation.study.rig_setup import NOMINAL_RIG
 
 TEST = """
 title = "{name}"

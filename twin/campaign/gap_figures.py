@@ -1,0 +1,200 @@
+"""Figures of the comparison of gaps: responses over the gap, and the trade-off of two of them."""
+
+import math
+from collections.abc import Sequence
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from table_io.block import Float1D, Float2D
+from twin.campaign.gap_comparison import (
+    ETA_A,
+    ETA_D,
+    FORCE_RATIO,
+    GapComparison,
+    format_gap,
+)
+from twin.reports.plot_style import CaptionedFigure, CaptionedFigures, LineStyle
+
+FIGURE_SIZE_IN = 11.0, 4.1
+TRADE_OFF_SIZE_IN = 11.0, 5.6
+# Distinct on a light and on a dark ground.
+RECORD_COLOURS = (
+    "#4477aa", "#ee6677", "#228833", "#c0a030", "#3aa6c9", "#aa3377", "#888888", "#e08030",
+)  # fmt: skip
+PANELS = {
+    ETA_A: "peak acceleration of the mass, $\\eta_a$",
+    ETA_D: "peak displacement of the bearing, $\\eta_d$",
+    FORCE_RATIO: "peak force of a bumper over weight, $r$",
+}
+MIN_LABEL_DISTANCE = 0.052  # of the height of a panel, between the labels of two lines
+BETTER_COLOUR = "#1a7f37"
+
+
+def draw_gap_figures(comparison: GapComparison) -> CaptionedFigures:
+    """Draw the responses over the gap, and acceleration against displacement."""
+    yield _draw_over_gap(comparison)
+    if np.isfinite(comparison.values["measured", ETA_A]).sum() > len(comparison.records):
+        yield _draw_trade_off(comparison)
+
+
+def _draw_over_gap(comparison: GapComparison) -> CaptionedFigure:
+    figure = Figure(figsize=FIGURE_SIZE_IN)
+    for axis, (criterion, title) in zip(figure.subplots(1, 3), PANELS.items(), strict=True):
+        _draw_panel(axis, comparison, criterion)
+        axis.set_title(title)
+    figure.legend(handles=_make_handles(), loc="outside upper center", ncols=3)
+    return CaptionedFigure(
+        "gaps",
+        "Response to each record over the gap",
+        f"η_a and η_d are peaks over the record, divided by those of the same record "
+        f"{comparison.reference}: below the line at 1 the bumpers help. r is the larger force of "
+        "the two bumpers over the weight of the mass. Thin: one record, measured. Thick: median "
+        "of the records. Dashed: median of the twin, which is driven by the measured motion of "
+        "the table and knows nothing of the specimen.",
+        figure,
+    )
+
+
+def _draw_panel(axis: Axes, comparison: GapComparison, criterion: str) -> None:
+    places = np.arange(len(comparison.gaps_mm), dtype=np.float64)
+    measured = comparison.values["measured", criterion]
+    for row, values in enumerate(measured):
+        axis.plot(places, values, **_record_style(row), marker="o", ms=2.4)
+    for source, style in (("measured", _median_style()), ("twin", _twin_style())):
+        axis.plot(places, _median(comparison.values[source, criterion]), **style)
+    axis.set_xticks(places, [format_gap(gap_mm) for gap_mm in comparison.gaps_mm])
+    axis.set_ylim(bottom=0.0)
+    axis.set_xlim(-0.25, places[-1] + 0.25)
+    if criterion != FORCE_RATIO:
+        axis.axhline(1.0, color=mpl.rcParams["axes.edgecolor"], lw=0.8, ls=(0, (5, 3)))
+    axis.set_xlabel("total gap in mm")
+    _label_ends(axis, places, measured, comparison.records)
+
+
+def _label_ends(
+    axis: Axes, places: Float1D, table: Float2D, names: Sequence[str]
+) -> None:
+    """Write the name of each line at its right end, (line, place), without overlap."""
+    ends = []
+    for row, values in enumerate(table):
+        known = np.flatnonzero(np.isfinite(values))
+        if known.size:
+            ends.append((float(values[known[-1]]), row))
+    low, high = axis.get_ylim()
+    wanted = sorted((value - low) / (high - low) for value, _ in ends)
+    heights = spread_labels(np.array(wanted), MIN_LABEL_DISTANCE)
+    for (value, row), height in zip(sorted(ends), heights, strict=True):
+        axis.annotate(
+            names[row],
+            xy=(places[-1], value),
+            xytext=(1.02, height),
+            textcoords="axes fraction",
+            va="center",
+            fontsize=7.5,
+            color=_record_style(row)["color"],
+            arrowprops={"arrowstyle": "-", "lw": 0.5, "color": _record_style(row)["color"]},
+            annotation_clip=False,
+        )
+
+
+def spread_labels(heights: Float1D, distance: float) -> Float1D:
+    """Return ascending heights, (label,), moved as little as needed to lie `distance` apart."""
+    # Least squares under h[k + 1] - h[k] >= distance: isotonic regression of h[k] - k * distance.
+    offsets = distance * np.arange(heights.size)
+    groups: list[list[float]] = []
+    for value in heights - offsets:
+        groups.append([float(value)])
+        while len(groups) > 1 and np.mean(groups[-2]) > np.mean(groups[-1]):
+            groups[-2:] = [groups[-2] + groups[-1]]
+    means = [float(np.mean(group)) for group in groups for _ in group]
+    return np.array(means) + offsets
+
+
+def _draw_trade_off(comparison: GapComparison) -> CaptionedFigure:
+    figure = Figure(figsize=TRADE_OFF_SIZE_IN)
+    axis = figure.subplots()
+    eta_d, eta_a = (comparison.values["measured", name] for name in (ETA_D, ETA_A))
+    for row in range(len(comparison.records)):
+        axis.plot(eta_d[row], eta_a[row], **_record_style(row), marker="o", ms=2.4)
+    for source, style in (("measured", _median_style()), ("twin", _twin_style())):
+        medians = [_median(comparison.values[source, name]) for name in (ETA_D, ETA_A)]
+        axis.plot(*medians, **style, marker="o", ms=6.0 if source == "measured" else 3.0)
+        if source == "measured":
+            _label_gaps(axis, *medians, comparison)
+    top = 1.06 * max(1.0, float(np.nanmax(eta_a)))
+    right = 1.16 * max(1.0, float(np.nanmax(eta_d)))
+    axis.set_xlim(0.0, right)
+    axis.set_ylim(0.0, top)
+    axis.fill_between([0.0, 1.0], 0.0, 1.0, color=BETTER_COLOUR, alpha=0.10, lw=0)
+    axis.text(0.012, 0.03, "both smaller than " + comparison.reference, color=BETTER_COLOUR,
+              fontsize=8.5)  # fmt: skip
+    angle = np.linspace(0.0, np.pi / 2, 100)
+    for level in np.arange(0.25, 1.3 * max(right, top), 0.25):
+        radius = math.sqrt(2.0) * level
+        axis.plot(
+            radius * np.cos(angle), radius * np.sin(angle),
+            color=mpl.rcParams["axes.edgecolor"], lw=0.5, ls=(0, (1, 3)), zorder=0,
+        )  # fmt: skip
+    for row, name in enumerate(comparison.records):
+        _label_record(axis, eta_d[row], eta_a[row], name, row)
+    axis.set_xlabel(f"$\\eta_d$: peak displacement of the bearing over that {comparison.reference}")
+    axis.set_ylabel(f"$\\eta_a$: peak acceleration over that\n{comparison.reference}")
+    figure.legend(handles=_make_handles(), loc="outside upper center", ncols=3)
+    return CaptionedFigure(
+        "gaps_trade_off",
+        "Trade-off of acceleration and displacement",
+        "Each line leads from the widest gap, at (1, 1), to the smallest. Down is less "
+        "acceleration, left is less displacement; on a dotted arc the compromise, the root mean "
+        "square of η_a and η_d, is the same. Thin: one record, measured. Thick with the names of "
+        "the gaps: median of the records. Dashed: median of the twin.",
+        figure,
+    )
+
+
+def _label_gaps(axis: Axes, eta_d: Float1D, eta_a: Float1D, comparison: GapComparison) -> None:
+    for gap_mm, x, y in zip(comparison.gaps_mm, eta_d, eta_a, strict=True):
+        if np.isfinite([x, y]).all():
+            axis.annotate(
+                format_gap(gap_mm), (x, y), xytext=(0, 8), textcoords="offset points",
+                ha="center", fontsize=10, weight="bold", zorder=6,
+            )  # fmt: skip
+
+
+def _label_record(axis: Axes, eta_d: Float1D, eta_a: Float1D, name: str, row: int) -> None:
+    """Write the name of a record at the peak of its line."""
+    known = np.flatnonzero(np.isfinite(eta_d) & np.isfinite(eta_a))
+    if known.size:
+        highest = known[int(np.argmax(eta_a[known]))]
+        axis.annotate(
+            name, (eta_d[highest], eta_a[highest]), xytext=(4, 3), textcoords="offset points",
+            fontsize=7.5, color=_record_style(row)["color"],
+        )  # fmt: skip
+
+
+def _median(table: Float2D) -> Float1D:
+    """Return the median over the records, (gap,); NaN where a record is missing."""
+    return np.median(table, axis=0)
+
+
+def _record_style(row: int) -> LineStyle:
+    return {"color": RECORD_COLOURS[row % len(RECORD_COLOURS)], "lw": 0.9}
+
+
+def _median_style() -> LineStyle:
+    return {"color": mpl.rcParams["text.color"], "lw": 3.0, "zorder": 4}
+
+
+def _twin_style() -> LineStyle:
+    return {"color": "#d9730d", "lw": 1.4, "ls": (0, (4, 2)), "zorder": 5}
+
+
+def _make_handles() -> list[Line2D]:
+    return [
+        Line2D([], [], color="#888888", lw=0.9, marker="o", ms=2.4, label="one record, measured"),
+        Line2D([], [], **_median_style(), label="median, measured"),
+        Line2D([], [], **_twin_style(), label="median, twin"),
+    ]
