@@ -234,7 +234,7 @@ class Profile(ConfigModel):
     @property
     def steps(self) -> tuple[Step, ...]:
         """Planned steps in driving order; none if a displacement history is played."""
-        return self.plan.steps
+        return () if isinstance(self.excitation, History) else self.plan.steps
 
     @model_validator(mode="before")
     @classmethod

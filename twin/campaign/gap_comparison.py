@@ -176,7 +176,7 @@ def rank_gaps(comparison: GapComparison, source: str, criterion: str) -> Json | 
     """Return the best gap by the median over the records, and how clear it is.
 
     `best_in` counts the records in which it is the best, `margin` is by how much the median of the
-    next gap is larger. Gaps at which a record is missing are left out; None with fewer than two.
+    next gap is larger. If the best gap is the smallest one tested, a smaller one may be better. Gaps at which a record is missing are left out; None with fewer than two.
     """
     table = comparison.values[source, criterion]
     complete = np.flatnonzero(np.isfinite(table).all(axis=0))
@@ -188,6 +188,7 @@ def rank_gaps(comparison: GapComparison, source: str, criterion: str) -> Json | 
     best_in = int(np.count_nonzero(np.argmin(ranked, axis=1) == best))
     return {
         "gap_mm": comparison.gaps_mm[complete[best]],
+        "is_smallest_gap": bool(complete[best] == len(comparison.gaps_mm) - 1),
         "median": float(medians[best]),
         "smallest": float(ranked[:, best].min()),
         "largest": float(ranked[:, best].max()),
@@ -252,14 +253,17 @@ def _describe_spread(values: Any) -> Json:
     }
 
 
-def format_best(comparison: GapComparison, criterion: str, source: str = "measured") -> str:
-    """Format the best gap by a criterion with how clear it is; a dash if gaps cannot be ranked."""
-    best = rank_gaps(comparison, source, criterion)
+def format_best(best: Json | None) -> str:
+    """Format the best gap of a summary with how clear it is; `gap_mm` is null without bumpers."""
     if best is None:
-        return "–"
+        return "not ranked: fewer than two gaps with every record"
+    name, following = (
+        format_gap(math.inf if best[key] is None else best[key])
+        for key in ("gap_mm", "next_gap_mm")
+    )
+    edge = ", the smallest gap tested" if best["is_smallest_gap"] else ""
     margin = "" if best["margin"] is None else f" (+{100 * best['margin']:.0f} %)"
     return (
-        f"{format_gap(best['gap_mm'])}: {best['median']:.2f}, best in {best['best_in']} of "
-        f"{best['of']} records; next {format_gap(best['next_gap_mm'])}: "
-        f"{best['next_median']:.2f}{margin}"
+        f"{name}{edge}: {best['median']:.2f}, best in {best['best_in']} of {best['of']} records; "
+        f"next {following}: {best['next_median']:.2f}{margin}"
     )

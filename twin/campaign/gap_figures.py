@@ -31,6 +31,7 @@ PANELS = {
     FORCE_RATIO: "peak force of a bumper over weight, $r$",
 }
 MIN_LABEL_DISTANCE = 0.052  # of the height of a panel, between the labels of two lines
+PEAK_LABEL_RISE, PEAK_LABEL_DISTANCE, PEAK_LABEL_SHIFT = 0.03, 0.045, 0.03  # of the panel
 BETTER_COLOUR = "#1a7f37"
 
 
@@ -50,11 +51,11 @@ def _draw_over_gap(comparison: GapComparison) -> CaptionedFigure:
     return CaptionedFigure(
         "gaps",
         "Response to each record over the gap",
-        f"η_a and η_d are peaks over the record, divided by those of the same record "
-        f"{comparison.reference}: below the line at 1 the bumpers help. r is the larger force of "
+        f"Left and middle: peaks over the record, divided by those of the same record "
+        f"{comparison.reference}; below the line at 1 a gap is better. Right: the larger force of "
         "the two bumpers over the weight of the mass. Thin: one record, measured. Thick: median "
-        "of the records. Dashed: median of the twin, which is driven by the measured motion of "
-        "the table and knows nothing of the specimen.",
+        "of the records, measured. Dashed: median of the twin, which is driven by the measured "
+        "motion of the table.",
         figure,
     )
 
@@ -71,7 +72,7 @@ def _draw_panel(axis: Axes, comparison: GapComparison, criterion: str) -> None:
     axis.set_xlim(-0.25, places[-1] + 0.25)
     if criterion != FORCE_RATIO:
         axis.axhline(1.0, color=mpl.rcParams["axes.edgecolor"], lw=0.8, ls=(0, (5, 3)))
-    axis.set_xlabel("total gap in mm")
+    axis.set_xlabel("gap; G16: 16 mm in total")
     _label_ends(axis, places, measured, comparison.records)
 
 
@@ -139,8 +140,7 @@ def _draw_trade_off(comparison: GapComparison) -> CaptionedFigure:
             radius * np.cos(angle), radius * np.sin(angle),
             color=mpl.rcParams["axes.edgecolor"], lw=0.5, ls=(0, (1, 3)), zorder=0,
         )  # fmt: skip
-    for row, name in enumerate(comparison.records):
-        _label_record(axis, eta_d[row], eta_a[row], name, row)
+    _label_peaks(axis, eta_d, eta_a, comparison.records)
     axis.set_xlabel(f"$\\eta_d$: peak displacement of the bearing over that {comparison.reference}")
     axis.set_ylabel(f"$\\eta_a$: peak acceleration over that\n{comparison.reference}")
     figure.legend(handles=_make_handles(), loc="outside upper center", ncols=3)
@@ -149,8 +149,9 @@ def _draw_trade_off(comparison: GapComparison) -> CaptionedFigure:
         "Trade-off of acceleration and displacement",
         "Each line leads from the widest gap, at (1, 1), to the smallest. Down is less "
         "acceleration, left is less displacement; on a dotted arc the compromise, the root mean "
-        "square of η_a and η_d, is the same. Thin: one record, measured. Thick with the names of "
-        "the gaps: median of the records. Dashed: median of the twin.",
+        "square of both, is the same. Thin: one record, measured; its name is at its largest "
+        "acceleration. Thick, with the names of the gaps: median of the records, measured. "
+        "Dashed: median of the twin.",
         figure,
     )
 
@@ -159,19 +160,29 @@ def _label_gaps(axis: Axes, eta_d: Float1D, eta_a: Float1D, comparison: GapCompa
     for gap_mm, x, y in zip(comparison.gaps_mm, eta_d, eta_a, strict=True):
         if np.isfinite([x, y]).all():
             axis.annotate(
-                format_gap(gap_mm), (x, y), xytext=(0, 8), textcoords="offset points",
-                ha="center", fontsize=10, weight="bold", zorder=6,
+                format_gap(gap_mm), (x, y), xytext=(0, -16), textcoords="offset points",
+                ha="center", fontsize=10.5, weight="bold", zorder=8,
             )  # fmt: skip
 
 
-def _label_record(axis: Axes, eta_d: Float1D, eta_a: Float1D, name: str, row: int) -> None:
-    """Write the name of a record at the peak of its line."""
-    known = np.flatnonzero(np.isfinite(eta_d) & np.isfinite(eta_a))
-    if known.size:
-        highest = known[int(np.argmax(eta_a[known]))]
+def _label_peaks(axis: Axes, eta_d: Float2D, eta_a: Float2D, names: Sequence[str]) -> None:
+    """Write the name of each line, (record, gap), above its largest acceleration."""
+    peaks = []
+    for row in range(len(names)):
+        known = np.flatnonzero(np.isfinite(eta_d[row]) & np.isfinite(eta_a[row]))
+        if known.size:
+            highest = known[int(np.argmax(eta_a[row][known]))]
+            peaks.append((float(eta_a[row][highest]), float(eta_d[row][highest]), row))
+    top, right = axis.get_ylim()[1], axis.get_xlim()[1]
+    wanted = np.array(sorted(a / top for a, _, _ in peaks)) + PEAK_LABEL_RISE
+    heights = spread_labels(wanted, PEAK_LABEL_DISTANCE)
+    for (a, d, row), height in zip(sorted(peaks), heights, strict=True):
         axis.annotate(
-            name, (eta_d[highest], eta_a[highest]), xytext=(4, 3), textcoords="offset points",
-            fontsize=7.5, color=_record_style(row)["color"],
+            names[row], (d, a), xytext=(d / right + PEAK_LABEL_SHIFT, height),
+            textcoords="axes fraction", va="center", fontsize=8.5, zorder=7,
+            color=_record_style(row)["color"],
+            bbox={"facecolor": axis.get_facecolor(), "edgecolor": "none", "alpha": 0.8, "pad": 0.6},
+            arrowprops={"arrowstyle": "-", "lw": 0.6, "color": _record_style(row)["color"]},
         )  # fmt: skip
 
 

@@ -21,16 +21,17 @@ from twin.campaign.summary import CampaignData, read_campaign
 from twin.reports import summary as summaries
 from twin.reports.page import embed_images, format_significant, render_page
 from twin.reports.plot_style import Picture
+from twin.reports.summary import Json
 
 SYMBOLS = {
     ETA_A: "η<sub>a</sub>",
     ETA_D: "η<sub>d</sub>",
-    COMPROMISE: "√((η<sub>a</sub>² + η<sub>d</sub>²) / 2)",
+    COMPROMISE: "√½(η<sub>a</sub>² + η<sub>d</sub>²)",
     FORCE_RATIO: "r",
 }
 SMALLER, LARGER, FORCE = "#1a9850", "#d6404e", "#3f7fc1"  # colours of the cells of the tables
 MAX_SHARE = 62.0  # of a colour over the ground of the page, in percent
-FULL_RATIO = 2.0  # ratio to the reference, or its inverse, at which a colour is full
+FULL_RATIO = 4.0  # ratio to the reference, or its inverse, at which a colour is full
 
 
 def write_campaign_report(folder: Path) -> Path:
@@ -52,11 +53,16 @@ def render_campaign_report(
     `pairs` are the figures of the comparison of gaps, on a light and on a dark ground.
     """
     text = (campaign.folder / "campaign.toml").read_text(encoding="utf-8")
+    runs = list(zip(campaign.summary["runs"], campaign.runs, strict=True))
     return render_page(
         Path(__file__).with_name("campaign.html"),
         summary=campaign.summary,
         state=campaign.state,
-        runs=list(zip(campaign.summary["runs"], campaign.runs, strict=True)),
+        runs=runs,
+        swept=[(run, data) for run, data in runs if data.profile.steps],
+        histories=[
+            (run, data, find_history_peaks(run)) for run, data in runs if not data.profile.steps
+        ],
         stars=campaign.stars,
         has_sweeps=any(run.profile.steps for run in campaign.runs),
         gaps=campaign.summary["gap_comparison"],
@@ -71,6 +77,28 @@ def render_campaign_report(
         text=text,
         digest=sha256(text.encode()).hexdigest(),
     )
+
+
+def find_history_peaks(run: Json) -> Json:
+    """Return the measured peaks of a displacement history in display units; NaN if unknown."""
+    windows = run.get("windows") or []
+    measured = [window["measured"] for window in windows if window.get("measured")]
+
+    def find_largest(entries: list[Json], *names: str) -> float:
+        peaks = [entry[name]["peak"] for entry in entries for name in names]
+        return max((peak for peak in peaks if peak is not None), default=np.nan)
+
+    counts = [
+        [entry[f"impacts_{side}"] for entry in measured if entry[f"impacts_{side}"] is not None]
+        for side in ("right", "left")
+    ]
+    return {
+        "table_g": find_largest(windows, "table_acc") / GRAVITY_M_S2,
+        "u_mm": 1e3 * find_largest(measured, "u"),
+        "a_g": find_largest(measured, "a") / GRAVITY_M_S2,
+        "force_kn": 1e-3 * find_largest(measured, "force_r", "force_l"),
+        "impacts": " / ".join(str(sum(side)) if side else "–" for side in counts),
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,9 +140,9 @@ def list_gap_tables(comparison: GapComparison) -> list[GapTable]:
     without = [""] * len(comparison.records)
     return [
         _make_table(comparison, ETA_A, "Acceleration of the mass, η<sub>a</sub>",
-                    f"peak {where}", _format_all(peak_a, "g")),
+                    f", peak {where}", _format_all(peak_a, "g")),
         _make_table(comparison, ETA_D, "Displacement of the bearing, η<sub>d</sub>",
-                    f"peak {where}", _format_all(peak_u, "mm")),
+                    f", peak {where}", _format_all(peak_u, "mm")),
         _make_table(comparison, COMPROMISE, "Compromise of both", "", without),
         _make_table(comparison, FORCE_RATIO, "Force of a bumper over weight, r", "", without),
     ]  # fmt: skip
