@@ -43,8 +43,7 @@ class CampaignRun(ConfigModel):
 
 
 class CampaignConfig(ConfigModel):
-    """A campaign: its runs in order, then those of its grid, and where an interrupted run continues.
-    """
+    """A campaign: its runs, then those of its grid, and where an interrupted run continues."""
 
     title: str = Field(description="Title of the campaign in every report.")
     citation: str = Field("", description="Source of the programme.")

@@ -97,9 +97,7 @@ def list_record_runs(
             name = plain[key]
             name = f"{name} × {excitation.scale:g}" if name in shared else name
             specimen = profile.specimen
-            record_runs.append(
-                RecordRun(name, specimen.gap_mm, specimen.mass_kg, label, summary)
-            )
+            record_runs.append(RecordRun(name, specimen.gap_mm, specimen.mass_kg, label, summary))
     return record_runs
 
 
@@ -109,9 +107,7 @@ def _identify(excitation: RecordedHistory) -> str:
     return json.dumps([excitation.checksum, keys], sort_keys=True)
 
 
-def _name_record(
-    key: str, runs: list[tuple[str, Profile, Json]], names: Mapping[str, str]
-) -> str:
+def _name_record(key: str, runs: list[tuple[str, Profile, Json]], names: Mapping[str, str]) -> str:
     """Return the name of the record that these runs play."""
     for label, _, _ in runs:
         if label in names:
@@ -123,7 +119,8 @@ def _name_record(
 def compare_gaps(runs: Sequence[RecordRun]) -> GapComparison | None:
     """Return the comparison; None unless a record was played at two gaps, one the reference.
 
-    A record without a run at the reference, the widest gap, is left out. Several runs of one record at one gap count with their mean.
+    A record without a run at the reference, the widest gap, is left out. Several runs of one record
+    at one gap count with their mean.
     """
     gaps_mm = tuple(sorted({run.gap_mm for run in runs}, reverse=True))
     if len(gaps_mm) < 2:
@@ -148,9 +145,7 @@ def compare_gaps(runs: Sequence[RecordRun]) -> GapComparison | None:
         eta_d, eta_a = u / u[:, :1], a / a[:, :1]
         compromise = np.sqrt((eta_d**2 + eta_a**2) / 2.0)
         quantities = (*PEAKS, FORCE_RATIO, ETA_D, ETA_A, COMPROMISE)
-        for name, table in zip(
-            quantities, (u, a, force, r, eta_d, eta_a, compromise), strict=True
-        ):
+        for name, table in zip(quantities, (u, a, force, r, eta_d, eta_a, compromise), strict=True):
             values[source, name] = table
     return GapComparison(records, gaps_mm, values)
 
@@ -176,7 +171,8 @@ def rank_gaps(comparison: GapComparison, source: str, criterion: str) -> Json | 
     """Return the best gap by the median over the records, and how clear it is.
 
     `best_in` counts the records in which it is the best, `margin` is by how much the median of the
-    next gap is larger. If the best gap is the smallest one tested, a smaller one may be better. Gaps at which a record is missing are left out; None with fewer than two.
+    next gap is larger. If the best gap is the smallest one tested, a smaller one may be better.
+    Gaps at which a record is missing are left out; None with fewer than two.
     """
     table = comparison.values[source, criterion]
     complete = np.flatnonzero(np.isfinite(table).all(axis=0))
@@ -229,8 +225,7 @@ def describe_comparison(comparison: GapComparison) -> Json:
             {"record": record, "gap_mm": gap_mm}
             | {
                 source: {
-                    name: float(comparison.values[source, name][row, column])
-                    for name in quantities
+                    name: float(comparison.values[source, name][row, column]) for name in quantities
                 }
                 for source in SOURCES
             }
@@ -241,7 +236,7 @@ def describe_comparison(comparison: GapComparison) -> Json:
 
 
 def _describe_spread(values: Any) -> Json:
-    """Return smallest, median and largest of one gap over the records with a value, and how many."""
+    """Return smallest, median and largest over the records of (record,), and their number."""
     known = values[np.isfinite(values)]
     if not known.size:
         return {"smallest": None, "median": None, "largest": None, "count": 0}

@@ -23,7 +23,7 @@ FIGURE_SIZE_IN = 11.0, 4.1
 TRADE_OFF_SIZE_IN = 11.0, 5.6
 # Distinct on a light and on a dark ground.
 RECORD_COLOURS = (
-    "#4477aa", "#ee6677", "#228833", "#c0a030", "#3aa6c9", "#aa3377", "#888888", "#e08030",
+    "#4a86c5", "#ee6677", "#2b9a4f", "#c0a030", "#3aa6c9", "#bb4a92", "#8c8c8c", "#e08030",
 )  # fmt: skip
 PANELS = {
     ETA_A: "peak acceleration of the mass, $\\eta_a$",
@@ -31,8 +31,8 @@ PANELS = {
     FORCE_RATIO: "peak force of a bumper over weight, $r$",
 }
 MIN_LABEL_DISTANCE = 0.052  # of the height of a panel, between the labels of two lines
-PEAK_LABEL_RISE, PEAK_LABEL_DISTANCE, PEAK_LABEL_SHIFT = 0.03, 0.045, 0.03  # of the panel
-BETTER_COLOUR = "#1a7f37"
+PEAK_LABEL_RISE, PEAK_LABEL_DISTANCE, PEAK_LABEL_SHIFT = 0.03, 0.045, 0.015  # of the panel
+BETTER_COLOUR = "#2b8f46"
 
 
 def draw_gap_figures(comparison: GapComparison) -> CaptionedFigures:
@@ -76,9 +76,7 @@ def _draw_panel(axis: Axes, comparison: GapComparison, criterion: str) -> None:
     _label_ends(axis, places, measured, comparison.records)
 
 
-def _label_ends(
-    axis: Axes, places: Float1D, table: Float2D, names: Sequence[str]
-) -> None:
+def _label_ends(axis: Axes, places: Float1D, table: Float2D, names: Sequence[str]) -> None:
     """Write the name of each line at its right end, (line, place), without overlap."""
     ends = []
     for row, values in enumerate(table):
@@ -125,7 +123,7 @@ def _draw_trade_off(comparison: GapComparison) -> CaptionedFigure:
         medians = [_median(comparison.values[source, name]) for name in (ETA_D, ETA_A)]
         axis.plot(*medians, **style, marker="o", ms=6.0 if source == "measured" else 3.0)
         if source == "measured":
-            _label_gaps(axis, *medians, comparison)
+            _label_gaps(axis, medians[0], medians[1], comparison)
     top = 1.06 * max(1.0, float(np.nanmax(eta_a)))
     right = 1.16 * max(1.0, float(np.nanmax(eta_d)))
     axis.set_xlim(0.0, right)
@@ -149,8 +147,8 @@ def _draw_trade_off(comparison: GapComparison) -> CaptionedFigure:
         "Trade-off of acceleration and displacement",
         "Each line leads from the widest gap, at (1, 1), to the smallest. Down is less "
         "acceleration, left is less displacement; on a dotted arc the compromise, the root mean "
-        "square of both, is the same. Thin: one record, measured; its name is at its largest "
-        "acceleration. Thick, with the names of the gaps: median of the records, measured. "
+        "square of both, is the same. Thin: one record, measured; its name points to its "
+        "largest acceleration. Thick, with the names of the gaps: median of the records, measured. "
         "Dashed: median of the twin.",
         figure,
     )
@@ -166,7 +164,9 @@ def _label_gaps(axis: Axes, eta_d: Float1D, eta_a: Float1D, comparison: GapCompa
 
 
 def _label_peaks(axis: Axes, eta_d: Float2D, eta_a: Float2D, names: Sequence[str]) -> None:
-    """Write the name of each line, (record, gap), above its largest acceleration."""
+    """Write the names of the lines, (record, gap), above the medians, each with a pointer to its
+    largest acceleration.
+    """
     peaks = []
     for row in range(len(names)):
         known = np.flatnonzero(np.isfinite(eta_d[row]) & np.isfinite(eta_a[row]))
@@ -174,8 +174,10 @@ def _label_peaks(axis: Axes, eta_d: Float2D, eta_a: Float2D, names: Sequence[str
             highest = known[int(np.argmax(eta_a[row][known]))]
             peaks.append((float(eta_a[row][highest]), float(eta_d[row][highest]), row))
     top, right = axis.get_ylim()[1], axis.get_xlim()[1]
-    wanted = np.array(sorted(a / top for a, _, _ in peaks)) + PEAK_LABEL_RISE
-    heights = spread_labels(wanted, PEAK_LABEL_DISTANCE)
+    lowest = float(np.nanmax(_median(eta_a))) / top + PEAK_LABEL_RISE
+    wanted = np.array([max(a / top, lowest) for a, _, _ in sorted(peaks)]) + PEAK_LABEL_RISE
+    heights = np.maximum.accumulate(wanted - PEAK_LABEL_DISTANCE * np.arange(wanted.size))
+    heights += PEAK_LABEL_DISTANCE * np.arange(wanted.size)
     for (a, d, row), height in zip(sorted(peaks), heights, strict=True):
         axis.annotate(
             names[row], (d, a), xytext=(d / right + PEAK_LABEL_SHIFT, height),

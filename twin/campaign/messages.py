@@ -88,11 +88,11 @@ def ask_operator(campaign: ActiveCampaign, run: PlannedRun, first: bool) -> Oper
 
 
 def print_gap_comparison(comparison: Json) -> None:
-    """Print the entry `gap_comparison` of a summary: medians over the records, and the best gaps."""
+    """Print the entry `gap_comparison` of a summary: medians over the records, best gaps."""
     count = len(comparison["records"])
     title = (
-        f"median (smallest to largest) over {count} records, measured; 1 is {comparison['reference']}, "
-        "* is best"
+        f"median (smallest to largest) over {count} records, measured; "
+        f"1 is {comparison['reference']}, * is best"
     )
     headers = ("acceleration", "displacement", "compromise", "force / weight")
     table = Table("gap", *headers, title=title)

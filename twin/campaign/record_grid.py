@@ -110,9 +110,7 @@ class RecordGrid(RecordKeys):
                 raise InputError(f"a gap is {gap_mm}", allowed="numbers in mm, or inf")
         twice = sorted({gap_mm for gap_mm in gaps_mm if gaps_mm.count(gap_mm) > 1})
         if twice:
-            raise InputError(
-                f"the gap {twice[0]:g} is listed twice", remedy="list each gap once"
-            )
+            raise InputError(f"the gap {twice[0]:g} is listed twice", remedy="list each gap once")
         return gaps_mm
 
     @field_validator("files")
@@ -146,9 +144,7 @@ def describe_set_up(gap_mm: float) -> str:
     if gap_mm > 0:
         return f"Set the gap to {gap_mm:g} mm a total, {gap_mm / 2:g} mm a side."
     if gap_mm == 0:
-        return (
-            "Close the gap: both bumpers just touch the mass, without force on the load cells."
-        )
+        return "Close the gap: both bumpers just touch the mass, without force on the load cells."
     return (
         "Tare with the bumpers clear of the mass. Then precompress to "
         f"{gap_mm:g} mm a total, {-gap_mm / 2:g} mm a side."
@@ -202,9 +198,7 @@ def write_profile(grid: RecordGrid, base: GridBase, cell: GridCell, campaign: Pa
     record, tables = cell.record, dict(base.tables)
     source = find_record(record, [campaign.parent, base.path.parent])
     processing = {
-        key: value
-        for key, value in tables["excitation"].items()
-        if key not in KEYS_OF_BASE_RECORD
+        key: value for key, value in tables["excitation"].items() if key not in KEYS_OF_BASE_RECORD
     }
     own = {"file": source.name, "scale": record.scale} | (
         {"sha256": record.sha256} if record.sha256 else {}

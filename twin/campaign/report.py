@@ -68,9 +68,7 @@ def render_campaign_report(
         gaps=campaign.summary["gap_comparison"],
         tables=[] if campaign.gaps is None else list_gap_tables(campaign.gaps),
         symbols=SYMBOLS,
-        pictures=[
-            (*embed_images(pair), number) for number, pair in enumerate(pairs, 1)
-        ],
+        pictures=[(*embed_images(pair), number) for number, pair in enumerate(pairs, 1)],
         reports={path.parent.name for path in campaign.folder.glob("*/report.html")},
         images=embed_images(pictures),
         gap_name=format_gap,
@@ -167,11 +165,13 @@ def _make_table(
         best = known.min() if known.size else None
         return [
             GapCell(
-                _format_cell(value), _format_cell(predicted), *_choose_colour(value, criterion, full),
+                _format_cell(value),
+                _format_cell(predicted),
+                *_choose_colour(value, criterion, full),
                 value == best,
             )
             for value, predicted in zip(first.tolist(), second.tolist(), strict=True)
-        ]  # fmt: skip
+        ]
 
     rows = [
         GapRow(name, reference, make_cells(measured[k], twin[k]))
