@@ -192,7 +192,7 @@ def test_bad_input_is_refused(
         ("gap_mm = 7.0", "gap_mm = 7.0\ngap_right_mm = 3.0\ngap_left_mm = 4.0",
          "specimen.gap_right_mm"),
     ],
-    ids=["sweep", "measured-gaps"],
+    ids=["sweep", "measured-gaps", "drive"],
 )  # fmt: skip
 def test_a_base_that_cannot_be_one_is_refused(tmp_path: Path, old: str, new: str, key: str) -> None:
     assert old in BASE
@@ -266,27 +266,30 @@ def test_a_grid_is_played_and_resumed_as_any_campaign(
 
 
 @pytest.fixture(scope="module")
-def shipped() -> CampaignPlan:
+def shipped_grid() -> CampaignPlan:
     return read_plan(PROFILES_DIR / "campaigns" / "records.toml", None, None, lambda *_: None)
 
 
-def test_the_shipped_grid_is_seven_records_at_the_gaps_of_the_paper(shipped: CampaignPlan) -> None:
+def test_the_shipped_grid_is_seven_records_at_the_gaps_of_the_paper(
+    shipped_grid: CampaignPlan,
+) -> None:
     gaps = [math.inf, 30.0, 16.0, 10.0, 4.0, 0.0]
     names = ["el_centro", "erzincan", "chi_chi", "kobe", "newhall", "rinaldi", "sylmar"]
     played = [
-        (run.bundle.profile.specimen.gap_mm, run.label.split("-", 1)[1]) for run in shipped.runs
+        (run.bundle.profile.specimen.gap_mm, run.label.split("-", 1)[1])
+        for run in shipped_grid.runs
     ]
     assert played == [(gap, name) for gap in gaps for name in names]
-    assert [run.number for run in shipped.runs if run.prompt] == [1, 8, 15, 22, 29, 36]
-    assert list_campaign_warnings(shipped) == []
+    assert [run.number for run in shipped_grid.runs if run.prompt] == [1, 8, 15, 22, 29, 36]
+    assert list_campaign_warnings(shipped_grid) == []
 
 
 def test_the_shipped_records_have_one_level_within_the_hydraulic_table(
-    shipped: CampaignPlan,
+    shipped_grid: CampaignPlan,
 ) -> None:
     rig, _ = load_config(PROFILES_DIR / "rigs" / "hydraulic.toml", RigConfig, "rig file")
     strokes = []
-    for run in shipped.runs[:7]:
+    for run in shipped_grid.runs[:7]:
         bundle: RunConfig = run.bundle
         target = bundle.profile.plan.target_m
         level = np.abs(np.diff(target, 2)).max() * 2000.0**2 / 9.80665

@@ -183,10 +183,7 @@ def _read_grid(
     check_run: CheckRun,
     faults: FaultList,
 ) -> dict[str, RunConfig]:
-    """Return the configurations of the runs of a grid by label; add what is wrong to `faults`.
-
-    A record is not read at further gaps after a fault, which would be the same.
-    """
+    """Return the configurations of the runs of a grid by label; add what is wrong to `faults`."""
     place = path
     try:
         place = _find_profile(grid.profile, path)
@@ -196,11 +193,8 @@ def _read_grid(
         return {}
     bundles: dict[str, RunConfig] = {}
     by_record: dict[str, RunConfig] = {}
-    faulty: set[str] = set()
     for cell in grid.list_cells():
         name = cell.record.name
-        if name in faulty:
-            continue
         try:
             bundle = read_cell(grid, base, cell, path, table, model, by_record.get(name))
             if name not in by_record:
@@ -210,7 +204,6 @@ def _read_grid(
         except InputError as error:
             fault = _drop_place(_drop_place(error, path), Path(cell.label))
             faults.add(fault, f"records, {name}")
-            faulty.add(name)
     return bundles
 
 
