@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 
 from table_io.block import Label
+from table_io.config.base import PROFILES_DIR
 from table_io.config.profile import Profile
 from tests.campaign.test_record_grid import BASE, make_record, write_grid
+from tests.input_errors import raises_input_error
 from twin.campaign.command import CampaignOptions, run_campaign
+from twin.campaign.config import find_campaign, read_plan
 from twin.campaign.gap_comparison import (
     CRITERIA,
     GapComparison,
@@ -28,6 +31,7 @@ from twin.campaign.gap_figures import draw_gap_figures, spread_labels
 from twin.campaign.messages import print_gap_comparison
 from twin.campaign.report import LARGER, SMALLER, list_gap_tables
 from twin.campaign.summary import read_campaign
+from twin.cli.simulate import simulate_profile
 from twin.recording.reader import read_recording
 
 Json = dict[str, Any]
@@ -341,3 +345,61 @@ def test_a_played_grid_reports_what_its_recordings_hold(
     assert "smallest displacement of the bearing: G2" in output
     assert read_campaign(folder).gaps is not None
     assert format_gap(-1.5) == "G−1.5"
+
+
+def test_the_model_alone_gives_the_same_page(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    grid = SHORT_GRID.replace("gaps_mm = [inf, 2.0]", "gaps_mm = [inf, 2.0, 1.0]")
+    path = write_grid(tmp_path, grid, BASE)
+    assert simulate_profile(path, [], [], None, tmp_path / "model", False) == 0
+    entry = json.loads((tmp_path / "model" / "summary.json").read_text())["gap_comparison"]
+    assert entry["sources"] == ["twin"]
+    assert [row["gap_mm"] for row in entry["gaps"]] == [None, 2.0, 1.0]
+    profile = read_plan(path, None, None, lambda *_: None).runs[0].bundle.profile
+    history = profile.plan.target_m
+    acceleration = np.diff(history, 2, prepend=history[0], append=history[-1]) * 1000.0**2
+    u, velocity = integrate_free_flight(acceleration, 1000.0, 550.0, 36e3, 1.1e3)
+    first = entry["responses"][0]["twin"]
+    assert first["u_m"] == pytest.approx(np.abs(u).max(), rel=2e-3)
+    absolute = np.abs(36e3 * u + 1.1e3 * velocity).max() / 550.0
+    assert first["a_m_s2"] == pytest.approx(absolute, rel=2e-3)
+    assert entry["responses"][2]["twin"]["u_m"] < first["u_m"]
+    page = (tmp_path / "model" / "report.html").read_text()
+    assert "Nothing was measured" in page
+    assert '<th colspan="5">model</th>' in page
+    assert 'class="text twin"' not in page
+    output = capsys.readouterr().out
+    assert "smallest displacement of the bearing: G1, the smallest gap tested" in output
+
+
+def integrate_free_flight(
+    acceleration: Any, rate_hz: float, mass: float, stiffness: float, damping: float
+) -> tuple[Any, Any]:
+    """Relative displacement and velocity by Newmark's average acceleration."""
+    step, u, v, a = 1.0 / rate_hz, 0.0, 0.0, 0.0
+    effective = stiffness + 2 * damping / step + 4 * mass / step**2
+    rows = []
+    for ground in acceleration:
+        load = -mass * ground
+        load += mass * (4 * u / step**2 + 4 * v / step + a) + damping * (2 * u / step + v)
+        new_u = load / effective
+        new_v = 2 * (new_u - u) / step - v
+        a = 4 * (new_u - u) / step**2 - 4 * v / step - a
+        u, v = new_u, new_v
+        rows.append((u, v))
+    table = np.array(rows)
+    return table[:, 0], table[:, 1]
+
+
+def test_a_campaign_without_records_at_several_gaps_is_not_simulated(tmp_path: Path) -> None:
+    path = write_grid(tmp_path, SHORT_GRID.replace("[inf, 2.0]", "[2.0]"), BASE)
+    with raises_input_error(where=path, allowed="[records]"):
+        simulate_profile(path, [], [], None, tmp_path / "model", False)
+    for models, gaps, view in (([], ["4"], False), (["snm", "snm"], [], False), ([], [], True)):
+        with raises_input_error(where=path, remedy="--gap"):
+            simulate_profile(path, models, gaps, None, tmp_path / "model", view)
+    assert not (tmp_path / "model").exists()
+    assert find_campaign(Path("records")) == PROFILES_DIR / "campaigns" / "records.toml"
+    assert find_campaign(Path("el_centro")) is None
+    assert find_campaign(tmp_path / "base.toml") is None

@@ -216,6 +216,19 @@ def _parse_grid(text: str) -> RecordGrid | None:
         return None  # reported when the whole file is parsed
 
 
+def find_campaign(name: Path) -> Path | None:
+    """Return the path of a campaign file given by its path or bare name; None if it is a test."""
+    if name.suffix.lower() != ".toml":
+        is_test = name.is_file() or str(name) in list_configs("tests")
+        is_campaign = not is_test and str(name) in list_configs("campaigns")
+        return resolve_config(name, "campaigns") if is_campaign else None
+    try:
+        tables = tomllib.loads(name.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None  # reported as a test that cannot be read
+    return name if {"records", "runs"} & tables.keys() else None
+
+
 def _list_runs(text: str) -> list[CampaignRun]:
     """Return the runs listed in a campaign file, except those that cannot be parsed."""
     try:

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from table_io.config.excitation.stepped_sine import Sweep
 from table_io.records import PrcPoint
 from table_io.units import GRAVITY_M_S2
+from twin.campaign.gap_comparison import GapComparison
 from twin.campaign.gap_figures import draw_gap_figures
 from twin.campaign.summary import CampaignData, CampaignRunData, describe_normalization
 from twin.reports.measured_campaign import MeasuredCampaign
@@ -38,12 +39,12 @@ def draw_campaign_figures(campaign: CampaignData, folder: Path) -> list[Picture]
     return save_figures(_draw_each(campaign), folder)
 
 
-def draw_dark_pairs(campaign: CampaignData, folder: Path) -> list[tuple[Picture, Picture]]:
+def draw_gap_pairs(comparison: GapComparison | None, folder: Path) -> list[tuple[Picture, Picture]]:
     """Draw the comparison of gaps in `folder`; return pairs on a light and on a dark ground."""
-    if campaign.gaps is None:
+    if comparison is None:
         return []
-    light = save_figures(draw_gap_figures(campaign.gaps), folder)
-    dark = save_figures(draw_gap_figures(campaign.gaps), folder / "dark", dark=True)
+    light = save_figures(draw_gap_figures(comparison), folder)
+    dark = save_figures(draw_gap_figures(comparison), folder / "dark", dark=True)
     return list(zip(light, dark, strict=True))
 
 

@@ -50,12 +50,24 @@ class GapComparison:
 
     `values` holds (record, gap) by source and quantity: PEAKS in SI, and the CRITERIA. The
     compromise is the root mean square of eta_a and eta_d: 1 is no better than the reference. NaN
-    where there is no complete run, and for the force without bumpers.
+    where there is no complete run, and for the force without bumpers. Of a simulation the twin is
+    the only source.
     """
 
     records: tuple[str, ...]
     gaps_mm: tuple[float, ...]
     values: Mapping[tuple[str, str], Float2D]
+    sources: tuple[str, ...] = SOURCES
+
+    @property
+    def main_source(self) -> str:
+        """Source by which the gaps are judged first."""
+        return self.sources[0]
+
+    @property
+    def main_name(self) -> str:
+        """The main source in words."""
+        return "measured" if self.main_source == "measured" else "model"
 
     @property
     def reference_mm(self) -> float:
@@ -116,7 +128,9 @@ def _name_record(key: str, runs: list[tuple[str, Profile, Json]], names: Mapping
     return Path(excitation.file).stem if isinstance(excitation, RecordedHistory) else key
 
 
-def compare_gaps(runs: Sequence[RecordRun]) -> GapComparison | None:
+def compare_gaps(
+    runs: Sequence[RecordRun], sources: tuple[str, ...] = SOURCES
+) -> GapComparison | None:
     """Return the comparison; None unless a record was played at two gaps, one the reference.
 
     A record without a run at the reference, the widest gap, is left out. Several runs of one record
@@ -130,7 +144,7 @@ def compare_gaps(runs: Sequence[RecordRun]) -> GapComparison | None:
     if not any(run.record in at_reference and run.gap_mm != gaps_mm[0] for run in runs):
         return None
     values: dict[tuple[str, str], Float2D] = {}
-    for source in SOURCES:
+    for source in sources:
         peaks = np.full((len(PEAKS) + 1, len(records), len(gaps_mm)), np.nan)
         for row, record in enumerate(records):
             for column, gap_mm in enumerate(gaps_mm):
@@ -147,7 +161,7 @@ def compare_gaps(runs: Sequence[RecordRun]) -> GapComparison | None:
         quantities = (*PEAKS, FORCE_RATIO, ETA_D, ETA_A, COMPROMISE)
         for name, table in zip(quantities, (u, a, force, r, eta_d, eta_a, compromise), strict=True):
             values[source, name] = table
-    return GapComparison(records, gaps_mm, values)
+    return GapComparison(records, gaps_mm, values, sources)
 
 
 def find_record_peaks(run: RecordRun, source: str) -> tuple[float, float, float, float]:
@@ -203,12 +217,13 @@ def describe_comparison(comparison: GapComparison) -> Json:
     return {
         "reference_gap_mm": comparison.reference_mm,
         "reference": comparison.reference,
+        "sources": list(comparison.sources),
         "records": list(comparison.records),
         "gaps_mm": list(comparison.gaps_mm),
         "criteria": CRITERIA,
         "best": {
             source: {name: rank_gaps(comparison, source, name) for name in CRITERIA}
-            for source in SOURCES
+            for source in comparison.sources
         },
         "gaps": [
             {"gap_mm": gap_mm}
@@ -217,7 +232,7 @@ def describe_comparison(comparison: GapComparison) -> Json:
                     name: _describe_spread(comparison.values[source, name][:, column])
                     for name in CRITERIA
                 }
-                for source in SOURCES
+                for source in comparison.sources
             }
             for column, gap_mm in enumerate(comparison.gaps_mm)
         ],
@@ -227,7 +242,7 @@ def describe_comparison(comparison: GapComparison) -> Json:
                 source: {
                     name: float(comparison.values[source, name][row, column]) for name in quantities
                 }
-                for source in SOURCES
+                for source in comparison.sources
             }
             for column, gap_mm in enumerate(comparison.gaps_mm)
             for row, record in enumerate(comparison.records)

@@ -38,7 +38,9 @@ BETTER_COLOUR = "#2b8f46"
 def draw_gap_figures(comparison: GapComparison) -> CaptionedFigures:
     """Draw the responses over the gap, and acceleration against displacement."""
     yield _draw_over_gap(comparison)
-    if np.isfinite(comparison.values["measured", ETA_A]).sum() > len(comparison.records):
+    if np.isfinite(comparison.values[comparison.main_source, ETA_A]).sum() > len(
+        comparison.records
+    ):
         yield _draw_trade_off(comparison)
 
 
@@ -47,25 +49,23 @@ def _draw_over_gap(comparison: GapComparison) -> CaptionedFigure:
     for axis, (criterion, title) in zip(figure.subplots(1, 3), PANELS.items(), strict=True):
         _draw_panel(axis, comparison, criterion)
         axis.set_title(title)
-    figure.legend(handles=_make_handles(), loc="outside upper center", ncols=3)
+    figure.legend(handles=_make_handles(comparison), loc="outside upper center", ncols=3)
     return CaptionedFigure(
         "gaps",
         "Response to each record over the gap",
         f"Left and middle: peaks over the record, divided by those of the same record "
         f"{comparison.reference}; below the line at 1 a gap is better. Right: the larger force of "
-        "the two bumpers over the weight of the mass. Thin: one record, measured. Thick: median "
-        "of the records, measured. Dashed: median of the twin, which is driven by the measured "
-        "motion of the table.",
+        f"the two bumpers over the weight of the mass. {_describe_lines(comparison)}",
         figure,
     )
 
 
 def _draw_panel(axis: Axes, comparison: GapComparison, criterion: str) -> None:
     places = np.arange(len(comparison.gaps_mm), dtype=np.float64)
-    measured = comparison.values["measured", criterion]
-    for row, values in enumerate(measured):
+    table = comparison.values[comparison.main_source, criterion]
+    for row, values in enumerate(table):
         axis.plot(places, values, **_record_style(row), marker="o", ms=2.4)
-    for source, style in (("measured", _median_style()), ("twin", _twin_style())):
+    for source, style in _list_median_styles(comparison):
         axis.plot(places, _median(comparison.values[source, criterion]), **style)
     axis.set_xticks(places, [format_gap(gap_mm) for gap_mm in comparison.gaps_mm])
     axis.set_ylim(bottom=0.0)
@@ -73,7 +73,7 @@ def _draw_panel(axis: Axes, comparison: GapComparison, criterion: str) -> None:
     if criterion != FORCE_RATIO:
         axis.axhline(1.0, color=mpl.rcParams["axes.edgecolor"], lw=0.8, ls=(0, (5, 3)))
     axis.set_xlabel("gap; G16: 16 mm in total")
-    _label_ends(axis, places, measured, comparison.records)
+    _label_ends(axis, places, table, comparison.records)
 
 
 def _label_ends(axis: Axes, places: Float1D, table: Float2D, names: Sequence[str]) -> None:
@@ -116,13 +116,15 @@ def spread_labels(heights: Float1D, distance: float) -> Float1D:
 def _draw_trade_off(comparison: GapComparison) -> CaptionedFigure:
     figure = Figure(figsize=TRADE_OFF_SIZE_IN)
     axis = figure.subplots()
-    eta_d, eta_a = (comparison.values["measured", name] for name in (ETA_D, ETA_A))
+    eta_d, eta_a = (comparison.values[comparison.main_source, name] for name in (ETA_D, ETA_A))
     for row in range(len(comparison.records)):
         axis.plot(eta_d[row], eta_a[row], **_record_style(row), marker="o", ms=2.4)
-    for source, style in (("measured", _median_style()), ("twin", _twin_style())):
+    for source, style in _list_median_styles(comparison):
         medians = [_median(comparison.values[source, name]) for name in (ETA_D, ETA_A)]
-        axis.plot(*medians, **style, marker="o", ms=6.0 if source == "measured" else 3.0)
-        if source == "measured":
+        axis.plot(
+            *medians, **style, marker="o", ms=6.0 if source == comparison.main_source else 3.0
+        )
+        if source == comparison.main_source:
             _label_gaps(axis, medians[0], medians[1], comparison)
     top = 1.06 * max(1.0, float(np.nanmax(eta_a)))
     right = 1.16 * max(1.0, float(np.nanmax(eta_d)))
@@ -141,15 +143,14 @@ def _draw_trade_off(comparison: GapComparison) -> CaptionedFigure:
     _label_peaks(axis, eta_d, eta_a, comparison.records)
     axis.set_xlabel(f"$\\eta_d$: peak displacement of the bearing over that {comparison.reference}")
     axis.set_ylabel(f"$\\eta_a$: peak acceleration over that\n{comparison.reference}")
-    figure.legend(handles=_make_handles(), loc="outside upper center", ncols=3)
+    figure.legend(handles=_make_handles(comparison), loc="outside upper center", ncols=3)
     return CaptionedFigure(
         "gaps_trade_off",
         "Trade-off of acceleration and displacement",
         "Each line leads from the widest gap, at (1, 1), to the smallest. Down is less "
         "acceleration, left is less displacement; on a dotted arc the compromise, the root mean "
-        "square of both, is the same. Thin: one record, measured; its name points to its "
-        "largest acceleration. Thick, with the names of the gaps: median of the records, measured. "
-        "Dashed: median of the twin.",
+        "square of both, is the same. The name of a record points to its largest acceleration. "
+        + _describe_lines(comparison, ", with the names of the gaps"),
         figure,
     )
 
@@ -205,9 +206,26 @@ def _twin_style() -> LineStyle:
     return {"color": "#d9730d", "lw": 1.4, "ls": (0, (4, 2)), "zorder": 5}
 
 
-def _make_handles() -> list[Line2D]:
-    return [
-        Line2D([], [], color="#888888", lw=0.9, marker="o", ms=2.4, label="one record, measured"),
-        Line2D([], [], **_median_style(), label="median, measured"),
-        Line2D([], [], **_twin_style(), label="median, twin"),
+def _list_median_styles(comparison: GapComparison) -> list[tuple[str, LineStyle]]:
+    """Return the style of the median of each source."""
+    return list(zip(comparison.sources, (_median_style(), _twin_style()), strict=False))
+
+
+def _make_handles(comparison: GapComparison) -> list[Line2D]:
+    name = comparison.main_name
+    handles = [
+        Line2D([], [], color="#888888", lw=0.9, marker="o", ms=2.4, label=f"one record, {name}"),
+        Line2D([], [], **_median_style(), label=f"median, {name}"),
     ]
+    if len(comparison.sources) > 1:
+        handles.append(Line2D([], [], **_twin_style(), label="median, twin"))
+    return handles
+
+
+def _describe_lines(comparison: GapComparison, of_median: str = "") -> str:
+    """Return the sentences of a caption that say what the lines are."""
+    name = comparison.main_name
+    text = f"Thin: one record, {name}. Thick{of_median}: median of the records, {name}."
+    if len(comparison.sources) > 1:
+        text += " Dashed: median of the twin, which is driven by the measured motion of the table."
+    return text

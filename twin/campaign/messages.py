@@ -89,18 +89,17 @@ def ask_operator(campaign: ActiveCampaign, run: PlannedRun, first: bool) -> Oper
 
 def print_gap_comparison(comparison: Json) -> None:
     """Print the entry `gap_comparison` of a summary: medians over the records, best gaps."""
-    count = len(comparison["records"])
+    count, source = len(comparison["records"]), comparison["sources"][0]
+    name = "measured" if source == "measured" else "model"
     title = (
-        f"median (smallest to largest) over {count} records, measured; "
+        f"median (smallest to largest) over {count} records, {name}; "
         f"1 is {comparison['reference']}, * is best"
     )
     headers = ("acceleration", "displacement", "compromise", "force / weight")
     table = Table("gap", *headers, title=title)
-    best = comparison["best"]["measured"]
+    best = comparison["best"][source]
     for row in comparison["gaps"]:
-        cells = [
-            _format_spread(row["measured"][name], _is_best(best[name], row)) for name in CRITERIA
-        ]
+        cells = [_format_spread(row[source][name], _is_best(best[name], row)) for name in CRITERIA]
         table.add_row(_name_gap(row), *cells)
     print_table(console, table)
     for name, meaning in CRITERIA.items():

@@ -3,12 +3,13 @@
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from table_io.block import Float1D
 from table_io.units import GRAVITY_M_S2
-from twin.campaign.figures import draw_campaign_figures, draw_dark_pairs
+from twin.campaign.figures import draw_campaign_figures, draw_gap_pairs
 from twin.campaign.gap_comparison import (
     COMPROMISE,
     ETA_A,
@@ -39,7 +40,7 @@ def write_campaign_report(folder: Path) -> Path:
     campaign = read_campaign(folder)
     summaries.write_json(campaign.summary, folder / "summary.json")
     pictures = draw_campaign_figures(campaign, folder / "figures")
-    pairs = draw_dark_pairs(campaign, folder / "figures")
+    pairs = draw_gap_pairs(campaign.gaps, folder / "figures")
     path = folder / "report.html"
     path.write_text(render_campaign_report(campaign, pictures, pairs), encoding="utf-8")
     return path
@@ -66,15 +67,29 @@ def render_campaign_report(
         stars=campaign.stars,
         has_sweeps=any(run.profile.steps for run in campaign.runs),
         gaps=campaign.summary["gap_comparison"],
-        tables=[] if campaign.gaps is None else list_gap_tables(campaign.gaps),
-        symbols=SYMBOLS,
-        pictures=[(*embed_images(pair), number) for number, pair in enumerate(pairs, 1)],
+        **list_gap_values(campaign.gaps),
+        pictures=embed_pairs(pairs),
         reports={path.parent.name for path in campaign.folder.glob("*/report.html")},
         images=embed_images(pictures),
-        gap_name=format_gap,
         text=text,
         digest=sha256(text.encode()).hexdigest(),
     )
+
+
+def list_gap_values(comparison: GapComparison | None) -> Json:
+    """Return the values of the section "Records and gaps" of a page, by their names in it."""
+    return {
+        "tables": [] if comparison is None else list_gap_tables(comparison),
+        "source_name": "" if comparison is None else comparison.main_name,
+        "symbols": SYMBOLS,
+        "gap_name": format_gap,
+    }
+
+
+def embed_pairs(pairs: list[tuple[Picture, Picture]]) -> list[tuple[Any, Any, int]]:
+    """Return ((picture, its PNG in base64), the same on a dark ground, number) of each pair."""
+    embedded = [embed_images(pair) for pair in pairs]
+    return [(light, dark, number) for number, (light, dark) in enumerate(embedded, 1)]
 
 
 def find_history_peaks(run: Json) -> Json:
@@ -132,8 +147,8 @@ class GapTable:
 
 def list_gap_tables(comparison: GapComparison) -> list[GapTable]:
     """Return the tables of acceleration, displacement and force, with median and largest."""
-    peak_a = comparison.values["measured", "a_m_s2"][:, 0] / GRAVITY_M_S2
-    peak_u = comparison.values["measured", "u_m"][:, 0] * 1e3
+    peak_a = comparison.values[comparison.main_source, "a_m_s2"][:, 0] / GRAVITY_M_S2
+    peak_u = comparison.values[comparison.main_source, "u_m"][:, 0] * 1e3
     where = comparison.reference
     without = [""] * len(comparison.records)
     return [
@@ -156,7 +171,8 @@ def _make_table(
     # The reference itself is 1, or has no force.
     skipped = 0 if criterion == FORCE_RATIO and np.isfinite(comparison.reference_mm) else 1
     measured, twin = (
-        comparison.values[source, criterion][:, skipped:] for source in ("measured", "twin")
+        comparison.values[source, criterion][:, skipped:]
+        for source in (comparison.main_source, "twin")
     )
     full = float(np.nanmax(measured)) if np.isfinite(measured).any() else 1.0
 
