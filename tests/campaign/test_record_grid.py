@@ -273,14 +273,14 @@ def shipped_grid() -> CampaignPlan:
 def test_the_shipped_grid_is_seven_records_at_the_gaps_of_the_paper(
     shipped_grid: CampaignPlan,
 ) -> None:
-    gaps = [math.inf, 30.0, 16.0, 10.0, 4.0, 0.0]
+    gaps = [math.inf, 30.0, 16.0, 10.0, 4.0, 0.0, -1.0, -2.0]
     names = ["el_centro", "erzincan", "chi_chi", "kobe", "newhall", "rinaldi", "sylmar"]
     played = [
         (run.bundle.profile.specimen.gap_mm, run.label.split("-", 1)[1])
         for run in shipped_grid.runs
     ]
     assert played == [(gap, name) for gap in gaps for name in names]
-    assert [run.number for run in shipped_grid.runs if run.prompt] == [1, 8, 15, 22, 29, 36]
+    assert [run.number for run in shipped_grid.runs if run.prompt] == [1, 8, 15, 22, 29, 36, 43, 50]
     assert list_campaign_warnings(shipped_grid) == []
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import NullLocator
 
 from table_io.block import Float1D, Float2D
 from twin.campaign.gap_comparison import (
@@ -31,7 +32,10 @@ PANELS = {
     FORCE_RATIO: "peak force of a bumper over weight, $r$",
 }
 MIN_LABEL_DISTANCE = 0.052  # of the height of a panel, between the labels of two lines
-PEAK_LABEL_RISE, PEAK_LABEL_DISTANCE, PEAK_LABEL_SHIFT = 0.03, 0.045, 0.015  # of the panel
+LINE_LABEL_DISTANCE, LINE_LABEL_SHIFT = 0.042, 0.025  # of the panel
+RATIO_TICKS = 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 20.0
+COMPROMISE_LEVELS = 0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6
+AXIS_MARGIN, LABEL_MARGIN = 0.07, 0.22  # of the length of a logarithmic axis
 BETTER_COLOUR = "#2b8f46"
 
 
@@ -67,7 +71,7 @@ def _draw_panel(axis: Axes, comparison: GapComparison, criterion: str) -> None:
         axis.plot(places, values, **_record_style(row), marker="o", ms=2.4)
     for source, style in _list_median_styles(comparison):
         axis.plot(places, _median(comparison.values[source, criterion]), **style)
-    axis.set_xticks(places, [format_gap(gap_mm) for gap_mm in comparison.gaps_mm])
+    axis.set_xticks(places, [format_gap(gap_mm) for gap_mm in comparison.gaps_mm], fontsize=8)
     axis.set_ylim(bottom=0.0)
     axis.set_xlim(-0.25, places[-1] + 0.25)
     if criterion != FORCE_RATIO:
@@ -126,31 +130,43 @@ def _draw_trade_off(comparison: GapComparison) -> CaptionedFigure:
         )
         if source == comparison.main_source:
             _label_gaps(axis, medians[0], medians[1], comparison)
-    top = 1.06 * max(1.0, float(np.nanmax(eta_a)))
-    right = 1.16 * max(1.0, float(np.nanmax(eta_d)))
-    axis.set_xlim(0.0, right)
-    axis.set_ylim(0.0, top)
-    axis.fill_between([0.0, 1.0], 0.0, 1.0, color=BETTER_COLOUR, alpha=0.10, lw=0)
-    axis.text(0.012, 0.03, "both smaller than " + comparison.reference, color=BETTER_COLOUR,
-              fontsize=8.5)  # fmt: skip
-    angle = np.linspace(0.0, np.pi / 2, 100)
-    for level in np.arange(0.25, 1.3 * max(right, top), 0.25):
+    for name, scale, values in (("x", axis.set_xscale, eta_d), ("y", axis.set_yscale, eta_a)):
+        scale("log")
+        low, high = _find_range(values, LABEL_MARGIN if name == "x" else AXIS_MARGIN)
+        axis.set(**{f"{name}lim": (low, high)})
+        ticks = [tick for tick in RATIO_TICKS if low <= tick <= high]
+        axis.set(**{f"{name}ticks": ticks, f"{name}ticklabels": [f"{tick:g}" for tick in ticks]})
+        getattr(axis, f"{name}axis").set_minor_locator(NullLocator())
+    left, (bottom, top) = axis.get_xlim()[0], axis.get_ylim()
+    axis.fill_between([left, 1.0], bottom, 1.0, color=BETTER_COLOUR, alpha=0.10, lw=0)
+    axis.text(
+        0.99, 0.03, f"green: both smaller than {comparison.reference}", color=BETTER_COLOUR,
+        fontsize=8.5, ha="right", transform=axis.transAxes,
+    )  # fmt: skip
+    angle = np.linspace(0.001, np.pi / 2 - 0.001, 400)
+    for level in COMPROMISE_LEVELS:
         radius = math.sqrt(2.0) * level
         axis.plot(
             radius * np.cos(angle), radius * np.sin(angle),
-            color=mpl.rcParams["axes.edgecolor"], lw=0.5, ls=(0, (1, 3)), zorder=0,
+            color=mpl.rcParams["axes.edgecolor"], lw=0.6, ls=(0, (1, 3)), zorder=0,
         )  # fmt: skip
-    _label_peaks(axis, eta_d, eta_a, comparison.records)
+        height = math.sqrt(max(radius**2 - left**2, 0.0))
+        if bottom < height < top:
+            axis.annotate(
+                f"{level:g}", (left, height), xytext=(3, 1), textcoords="offset points",
+                fontsize=7, color=mpl.rcParams["axes.edgecolor"],
+            )  # fmt: skip
+    _label_lines(axis, eta_d, eta_a, comparison.records)
     axis.set_xlabel(f"$\\eta_d$: peak displacement of the bearing over that {comparison.reference}")
     axis.set_ylabel(f"$\\eta_a$: peak acceleration over that\n{comparison.reference}")
     figure.legend(handles=_make_handles(comparison), loc="outside upper center", ncols=3)
     return CaptionedFigure(
         "gaps_trade_off",
         "Trade-off of acceleration and displacement",
-        "Each line leads from the widest gap, at (1, 1), to the smallest. Down is less "
-        "acceleration, left is less displacement; on a dotted arc the compromise, the root mean "
-        "square of both, is the same. The name of a record points to its largest acceleration. "
-        + _describe_lines(comparison, ", with the names of the gaps"),
+        "Each line leads from the widest gap, at (1, 1), to the smallest, with the name of the "
+        "record. Down is less acceleration, left is less displacement; on a dotted line the "
+        "compromise, the root mean square of both, has the value at its left end. Both scales are "
+        "logarithmic. " + _describe_lines(comparison, ", with the names of the gaps"),
         figure,
     )
 
@@ -164,29 +180,39 @@ def _label_gaps(axis: Axes, eta_d: Float1D, eta_a: Float1D, comparison: GapCompa
             )  # fmt: skip
 
 
-def _label_peaks(axis: Axes, eta_d: Float2D, eta_a: Float2D, names: Sequence[str]) -> None:
-    """Write the names of the lines, (record, gap), above the medians, each with a pointer to its
-    largest acceleration.
-    """
-    peaks = []
+def _label_lines(axis: Axes, eta_d: Float2D, eta_a: Float2D, names: Sequence[str]) -> None:
+    """Write the names of the lines, (record, gap), left of their ends at the smallest gap."""
+    ends = []
     for row in range(len(names)):
         known = np.flatnonzero(np.isfinite(eta_d[row]) & np.isfinite(eta_a[row]))
         if known.size:
-            highest = known[int(np.argmax(eta_a[row][known]))]
-            peaks.append((float(eta_a[row][highest]), float(eta_d[row][highest]), row))
-    top, right = axis.get_ylim()[1], axis.get_xlim()[1]
-    lowest = float(np.nanmax(_median(eta_a))) / top + PEAK_LABEL_RISE
-    wanted = np.array([max(a / top, lowest) for a, _, _ in sorted(peaks)]) + PEAK_LABEL_RISE
-    heights = np.maximum.accumulate(wanted - PEAK_LABEL_DISTANCE * np.arange(wanted.size))
-    heights += PEAK_LABEL_DISTANCE * np.arange(wanted.size)
-    for (a, d, row), height in zip(sorted(peaks), heights, strict=True):
+            ends.append((float(eta_a[row][known[-1]]), float(eta_d[row][known[-1]]), row))
+    wanted = [_to_fraction(a, axis.get_ylim()) for a, _, _ in sorted(ends)]
+    heights = spread_labels(np.array(wanted), LINE_LABEL_DISTANCE)
+    leftmost = min(_to_fraction(d, axis.get_xlim()) for _, d, _ in ends)
+    for (a, d, row), height in zip(sorted(ends), heights, strict=True):
+        colour = _record_style(row)["color"]
         axis.annotate(
-            names[row], (d, a), xytext=(d / right + PEAK_LABEL_SHIFT, height),
-            textcoords="axes fraction", va="center", fontsize=8.5, zorder=7,
-            color=_record_style(row)["color"],
-            bbox={"facecolor": axis.get_facecolor(), "edgecolor": "none", "alpha": 0.8, "pad": 0.6},
-            arrowprops={"arrowstyle": "-", "lw": 0.6, "color": _record_style(row)["color"]},
+            names[row], (d, a), xytext=(leftmost - LINE_LABEL_SHIFT, height),
+            textcoords="axes fraction", va="center", ha="right", fontsize=8.5, zorder=7,
+            color=colour, arrowprops={"arrowstyle": "-", "lw": 0.5, "color": colour, "alpha": 0.6},
         )  # fmt: skip
+
+
+def _find_range(ratios: Float2D, margin: float) -> tuple[float, float]:
+    """Return the ends of a logarithmic axis that holds 1 and these ratios.
+
+    `margin` is that at the lower end, as a share of the length; AXIS_MARGIN at the upper end.
+    """
+    known = ratios[np.isfinite(ratios) & (ratios > 0.0)]
+    low, high = min(1.0, float(known.min())), max(1.0, float(known.max()))
+    length = max(math.log(high / low), math.log(2.0))
+    return low * math.exp(-margin * length), high * math.exp(AXIS_MARGIN * length)
+
+
+def _to_fraction(value: float, limits: tuple[float, float]) -> float:
+    """Return the place of a value on a logarithmic axis, 0 to 1."""
+    return math.log(value / limits[0]) / math.log(limits[1] / limits[0])
 
 
 def _median(table: Float2D) -> Float1D:

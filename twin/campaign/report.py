@@ -62,7 +62,9 @@ def render_campaign_report(
         runs=runs,
         swept=[(run, data) for run, data in runs if data.profile.steps],
         histories=[
-            (run, data, find_history_peaks(run)) for run, data in runs if not data.profile.steps
+            (run, data, find_history_peaks(run, data.profile.specimen.gap_mm))
+            for run, data in runs
+            if not data.profile.steps
         ],
         stars=campaign.stars,
         has_sweeps=any(run.profile.steps for run in campaign.runs),
@@ -92,8 +94,11 @@ def embed_pairs(pairs: list[tuple[Picture, Picture]]) -> list[tuple[Any, Any, in
     return [(light, dark, number) for number, (light, dark) in enumerate(embedded, 1)]
 
 
-def find_history_peaks(run: Json) -> Json:
-    """Return the measured peaks of a displacement history in display units; NaN if unknown."""
+def find_history_peaks(run: Json, gap_mm: float) -> Json:
+    """Return the measured peaks of a displacement history in display units; NaN if unknown.
+
+    The force without bumpers is noise, and NaN.
+    """
     windows = run.get("windows") or []
     measured = [window["measured"] for window in windows if window.get("measured")]
 
@@ -109,7 +114,9 @@ def find_history_peaks(run: Json) -> Json:
         "table_g": find_largest(windows, "table_acc") / GRAVITY_M_S2,
         "u_mm": 1e3 * find_largest(measured, "u"),
         "a_g": find_largest(measured, "a") / GRAVITY_M_S2,
-        "force_kn": 1e-3 * find_largest(measured, "force_r", "force_l"),
+        "force_kn": np.nan
+        if np.isinf(gap_mm)
+        else 1e-3 * find_largest(measured, "force_r", "force_l"),
         "impacts": " / ".join(str(sum(side)) if side else "–" for side in counts),
     }
 
