@@ -86,14 +86,14 @@ def _label_ends(axis: Axes, places: Float1D, table: Float2D, names: Sequence[str
     for row, values in enumerate(table):
         known = np.flatnonzero(np.isfinite(values))
         if known.size:
-            ends.append((float(values[known[-1]]), row))
+            ends.append((float(values[known[-1]]), float(places[known[-1]]), row))
     low, high = axis.get_ylim()
-    wanted = sorted((value - low) / (high - low) for value, _ in ends)
+    wanted = sorted((value - low) / (high - low) for value, _, _ in ends)
     heights = spread_labels(np.array(wanted), MIN_LABEL_DISTANCE)
-    for (value, row), height in zip(sorted(ends), heights, strict=True):
+    for (value, place, row), height in zip(sorted(ends), heights, strict=True):
         axis.annotate(
             names[row],
-            xy=(places[-1], value),
+            xy=(place, value),
             xytext=(1.02, height),
             textcoords="axes fraction",
             va="center",
@@ -130,6 +130,25 @@ def _draw_trade_off(comparison: GapComparison) -> CaptionedFigure:
         )
         if source == comparison.main_source:
             _label_gaps(axis, medians[0], medians[1], comparison)
+    _set_ratio_axes(axis, eta_d, eta_a)
+    _draw_compromise(axis, comparison.reference)
+    _label_lines(axis, eta_d, eta_a, comparison.records)
+    axis.set_xlabel(f"$\\eta_d$: peak displacement of the bearing over that {comparison.reference}")
+    axis.set_ylabel(f"$\\eta_a$: peak acceleration over that\n{comparison.reference}")
+    figure.legend(handles=_make_handles(comparison), loc="outside upper center", ncols=3)
+    return CaptionedFigure(
+        "gaps_trade_off",
+        "Trade-off of acceleration and displacement",
+        "Each line leads from the widest gap, at (1, 1), to the smallest, with the name of the "
+        "record. Down is less acceleration, left is less displacement; on a dotted line the "
+        "compromise, the root mean square of both, has the value at its left end. Both scales are "
+        "logarithmic. " + _describe_lines(comparison, ", with the names of the gaps"),
+        figure,
+    )
+
+
+def _set_ratio_axes(axis: Axes, eta_d: Float2D, eta_a: Float2D) -> None:
+    """Give both axes a logarithmic scale with plain numbers, and room for the names at the left."""
     for name, scale, values in (("x", axis.set_xscale, eta_d), ("y", axis.set_yscale, eta_a)):
         scale("log")
         low, high = _find_range(values, LABEL_MARGIN if name == "x" else AXIS_MARGIN)
@@ -137,10 +156,14 @@ def _draw_trade_off(comparison: GapComparison) -> CaptionedFigure:
         ticks = [tick for tick in RATIO_TICKS if low <= tick <= high]
         axis.set(**{f"{name}ticks": ticks, f"{name}ticklabels": [f"{tick:g}" for tick in ticks]})
         getattr(axis, f"{name}axis").set_minor_locator(NullLocator())
+
+
+def _draw_compromise(axis: Axes, reference: str) -> None:
+    """Shade where both ratios are below 1, and draw lines of the same compromise."""
     left, (bottom, top) = axis.get_xlim()[0], axis.get_ylim()
     axis.fill_between([left, 1.0], bottom, 1.0, color=BETTER_COLOUR, alpha=0.10, lw=0)
     axis.text(
-        0.99, 0.03, f"green: both smaller than {comparison.reference}", color=BETTER_COLOUR,
+        0.99, 0.03, f"green: both smaller than {reference}", color=BETTER_COLOUR,
         fontsize=8.5, ha="right", transform=axis.transAxes,
     )  # fmt: skip
     angle = np.linspace(0.001, np.pi / 2 - 0.001, 400)
@@ -156,19 +179,6 @@ def _draw_trade_off(comparison: GapComparison) -> CaptionedFigure:
                 f"{level:g}", (left, height), xytext=(3, 1), textcoords="offset points",
                 fontsize=7, color=mpl.rcParams["axes.edgecolor"],
             )  # fmt: skip
-    _label_lines(axis, eta_d, eta_a, comparison.records)
-    axis.set_xlabel(f"$\\eta_d$: peak displacement of the bearing over that {comparison.reference}")
-    axis.set_ylabel(f"$\\eta_a$: peak acceleration over that\n{comparison.reference}")
-    figure.legend(handles=_make_handles(comparison), loc="outside upper center", ncols=3)
-    return CaptionedFigure(
-        "gaps_trade_off",
-        "Trade-off of acceleration and displacement",
-        "Each line leads from the widest gap, at (1, 1), to the smallest, with the name of the "
-        "record. Down is less acceleration, left is less displacement; on a dotted line the "
-        "compromise, the root mean square of both, has the value at its left end. Both scales are "
-        "logarithmic. " + _describe_lines(comparison, ", with the names of the gaps"),
-        figure,
-    )
 
 
 def _label_gaps(axis: Axes, eta_d: Float1D, eta_a: Float1D, comparison: GapComparison) -> None:
