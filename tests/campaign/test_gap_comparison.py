@@ -402,4 +402,5 @@ def test_a_campaign_without_records_at_several_gaps_is_not_simulated(tmp_path: P
     assert not (tmp_path / "model").exists()
     assert find_campaign(Path("records")) == PROFILES_DIR / "campaigns" / "records.toml"
     assert find_campaign(Path("el_centro")) is None
+    assert find_campaign(Path("nothing")) is None
     assert find_campaign(tmp_path / "base.toml") is None
