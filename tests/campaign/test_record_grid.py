@@ -191,6 +191,7 @@ def test_bad_input_is_refused(
          "acceleration_g = 0.05\n", "excitation.kind"),
         ("gap_mm = 7.0", "gap_mm = 7.0\ngap_right_mm = 3.0\ngap_left_mm = 4.0",
          "specimen.gap_right_mm"),
+        ("blend_s = 0.5", 'blend_s = 0.5\ndrive = "first.csv"', "excitation.drive"),
     ],
     ids=["sweep", "measured-gaps", "drive"],
 )  # fmt: skip
