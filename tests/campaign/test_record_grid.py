@@ -197,8 +197,10 @@ def test_bad_input_is_refused(
 )  # fmt: skip
 def test_a_base_that_cannot_be_one_is_refused(tmp_path: Path, old: str, new: str, key: str) -> None:
     assert old in BASE
-    with raises_input_error(key=key):
-        plan(tmp_path, base=BASE.replace(old, new))
+    path = write_grid(tmp_path, base=BASE.replace(old, new))
+    words = "one record" if key == "excitation.drive" else "[records]"
+    with raises_input_error(key=key, problem=words):
+        read_plan(path, None, None, lambda *_: None)
 
 
 def list_faults(error: InputError) -> list[InputError]:
