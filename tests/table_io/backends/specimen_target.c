@@ -20,7 +20,7 @@
 enum { Y, VY, X, VX, RIGHT, LEFT, STATES };
 #define SUBSTEPS 20
 #define TABLE_KG 2000.0
-#define SERVO_RAD_S 125.66 /* 20 Hz */
+#define SERVO_RAD_S 195.25 /* of a double pole: -3 dB at 20 Hz */
 #define BUMPER_N_M 510e3
 #define BUMPER_N_S_M 900.0
 
@@ -32,21 +32,18 @@ static double read_setting(const char *name, double otherwise) {
     return text ? atof(text) : otherwise;
 }
 
-/* Force of a bumper of compression d whose face is at `reach` under the mass, closing at `speed`. */
-static double press(double d, double reach, double speed, double *rate) {
-    double force = BUMPER_N_M * d + BUMPER_N_S_M * speed;
-    if (reach >= d - 1e-12 && force > 0.0) {
-        *rate = speed + (reach - d) * 1e4; /* the face stays on the mass */
-        return force;
-    }
-    *rate = -BUMPER_N_M / BUMPER_N_S_M * d;
-    return 0.0;
+static int touched[2]; /* right, left; fixed during a step of the integrator */
+
+/* Force of a bumper of compression d whose face closes at `speed` with the mass, if touched. */
+static double press(int side, double d, double speed, double *rate) {
+    *rate = touched[side] ? speed : -BUMPER_N_M / BUMPER_N_S_M * d;
+    return touched[side] ? BUMPER_N_M * d + BUMPER_N_S_M * speed : 0.0;
 }
 
 static void find_rates(const double *s, double *rate) {
     double u = s[X] - s[Y], v = s[VX] - s[VY];
-    right_n = press(s[RIGHT], u - half_gap_m, v, &rate[RIGHT]);
-    left_n = press(s[LEFT], -u - half_gap_m, -v, &rate[LEFT]);
+    right_n = press(0, s[RIGHT], v, &rate[RIGHT]);
+    left_n = press(1, s[LEFT], -v, &rate[LEFT]);
     double on_table = stiffness * u + damping * v + right_n - left_n;
     mass_acc = -on_table / mass_kg;
     table_acc = SERVO_RAD_S * (SERVO_RAD_S * (command_m - s[Y]) - 2.0 * s[VY]) + on_table / TABLE_KG;
@@ -63,6 +60,15 @@ static void advance(double h) {
     }
     for (int n = 0; n < STATES; n++)
         state[n] += h / 6.0 * (k[0][n] + 2.0 * (k[1][n] + k[2][n]) + k[3][n]);
+    find_rates(state, k[0]);
+    for (int side = 0; side < 2; side++) {
+        double u = state[X] - state[Y], *d = &state[side ? LEFT : RIGHT];
+        double reach = (side ? -u : u) - half_gap_m;
+        if (touched[side])
+            *d = reach, touched[side] = (side ? left_n : right_n) > 0.0;
+        else
+            touched[side] = reach > *d;
+    }
 }
 
 void write_output(double volts) { command_m = volts * METRES_PER_VOLT; }
