@@ -26,7 +26,7 @@ from table_io.safety.preflight import list_limits
 from table_io.units import GRAVITY_M_S2
 from twin.run.run_config import RunConfig, read_run_config
 
-ROUNDING = 1.01  # of the converter and of differences
+ROUNDING_RATIO = 1.01  # of the converter and of differences
 TABLE_ALLOWANCE = 1.3  # by which a table may ring beyond the motion of its command
 
 
@@ -206,7 +206,7 @@ def find_faults(outcome: RecordOutcome) -> list[str]:
     if outcome.verdict == "refused":
         return []
     faults = []
-    if outcome.command_ratio > ROUNDING:
+    if outcome.command_ratio > ROUNDING_RATIO:
         faults.append(f"command {outcome.command_ratio:.3f} of a limit")
     if outcome.table_ratio > TABLE_ALLOWANCE and not outcome.tripped:
         faults.append(f"table {outcome.table_ratio:.3f} of a limit without a trip")
