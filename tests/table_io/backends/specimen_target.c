@@ -71,14 +71,24 @@ static void advance(double h) {
     }
 }
 
-void write_output(double volts) { command_m = volts * METRES_PER_VOLT; }
+/* The output stage interpolates: the acceleration of a servo would show the steps of a hold. */
+static double command_before_m, command_next_m;
+
+void write_output(double volts) {
+    command_before_m = command_next_m, command_next_m = volts * METRES_PER_VOLT;
+}
 
 int read_inputs(double volts[CHANNELS]) {
     if (mass_kg == 0.0) {
         mass_kg = read_setting("MASS_KG", 550.0), stiffness = read_setting("STIFFNESS", 36e3);
         damping = read_setting("DAMPING", 1100.0), half_gap_m = 0.5 * read_setting("GAP_M", 4e-3);
     }
-    for (int step = 0; step < SUBSTEPS; step++) advance(1.0 / (SUBSTEPS * target_rate_hz()));
+    for (int step = 0; step < SUBSTEPS; step++) {
+        double share = (step + 0.5) / SUBSTEPS;
+        command_m = command_before_m + share * (command_next_m - command_before_m);
+        advance(1.0 / (SUBSTEPS * target_rate_hz()));
+    }
+    command_m = command_next_m;
     double rates[STATES], g = 9.80665;
     find_rates(state, rates);
     volts[0] = command_m / METRES_PER_VOLT;

@@ -252,3 +252,20 @@ def test_a_sensor_that_comes_back_is_believed_again(rate_hz: float, row: int, se
 
     assert not is_lost(inspect(profile, lose(pause), seed))
     assert is_lost(inspect(profile, lose(round(1.5 * loss)), seed))
+
+
+@pytest.mark.parametrize("rate_hz", RATES_HZ)
+def test_errors_of_the_command_do_not_count_across_a_repetition(rate_hz: float) -> None:
+    """Eight in a row are an error: seven before a repetition and five after it are none."""
+    profile = make_profile(rate_hz)
+    at = find_held(profile)
+
+    def change(values: Float2D) -> None:
+        values[DRIVE, at : at + 40] += 5e-3
+        for first in range(at + 3, at + 24, 3):
+            values[:, first : first + 3] = values[:, at : at + 3]
+        values[DRIVE, at + 29 :] = simulate_channels(plan_sweep(profile), 3)[DRIVE, at + 29 :]
+
+    found = kinds(inspect(profile, change))
+    assert "repeated" in found
+    assert "command" not in found
