@@ -1,5 +1,6 @@
 """A campaign from its file to its end: order, refusals, what a resume keeps."""
 
+import shlex
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,9 +18,10 @@ from tests.campaign.campaigns import (
     prepare_campaign,
     statuses,
 )
+from tests.command_line import call_main
 from tests.input_errors import raises_input_error
 from twin.campaign import command
-from twin.campaign.command import run_campaign
+from twin.campaign.command import CampaignOptions, run_campaign
 from twin.campaign.config import CampaignPlan
 from twin.campaign.state import (
     LOCK_FILE,
@@ -242,3 +244,32 @@ def test_every_test_is_judged_before_the_first_one_moves(
         run_campaign(make_options(folder))
     assert judged == ["free", "g4"]
     assert not (folder / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--yes", "--speed", "max", "--table", "hydraulic"],
+        ["--web", "--listen", "tcp/127.0.0.1:7555"],
+        ["--web-listen", "127.0.0.1:8123", "--model", "snm"],
+    ],
+)
+def test_the_resume_command_repeats_every_option(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[CampaignOptions] = []
+
+    def note(options: CampaignOptions) -> int:
+        asked.append(options)
+        return 0
+
+    monkeypatch.setattr(command, "run_campaign", note)
+    folder = tmp_path / "out"
+    call_main("campaign", "paper", "--out", folder, *words)
+    call_main(*shlex.split(asked[0].resume_command(folder))[1:])
+    first, again = asked
+    assert (first.resume, again.resume) == (False, True)
+    for name in ("path", "out", "unpaced", "model", "table", "unattended", "listen"):
+        assert getattr(again, name) == getattr(first, name)
+    assert again.access_words == first.access_words
+    assert (again.start_page is None) == (first.start_page is None)

@@ -48,6 +48,7 @@ class CampaignOptions:
     listen: str
     keys: Credentials | None = None
     start_page: Callable[[str], AbstractContextManager[None]] | None = None  # of a rig's tests
+    access_words: tuple[str, ...] = ()  # of the command line, for endpoint, keys and page
 
     def resume_command(self, folder: Path) -> str:
         """Return the command line that resumes the campaign of a folder."""
@@ -56,6 +57,7 @@ class CampaignOptions:
             words += [option, value] if value else []
         words += ["--speed", "max"] if self.unpaced else []
         words += ["--yes"] if self.unattended else []
+        words += self.access_words
         return shlex.join(words)
 
 

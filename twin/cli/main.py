@@ -254,8 +254,11 @@ def campaign_command(
 
     unpaced, credentials = speed is Speed.max, read_keys_option(keys, rig=True)
     page = partial(start_page, web_listen, listen, credentials) if web or web_listen else None
+    access = ["--listen", listen] if listen != DEFAULT_ENDPOINT else []
+    access += ["--keys", str(keys)] if keys is not None else []
+    access += ["--web-listen", web_listen] if web_listen else ["--web"] if web else []
     request = CampaignOptions(
-        file, out, resume, unpaced, model, table, yes, listen, credentials, page
+        file, out, resume, unpaced, model, table, yes, listen, credentials, page, tuple(access)
     )
     raise typer.Exit(command(request))
 
