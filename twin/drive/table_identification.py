@@ -6,13 +6,14 @@ accelerometer says little, the acceleration above, both as acceleration.
 """
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from scipy import optimize, stats
 
-from table_io.block import Float1D
+from table_io.block import Float1D, Float2D, Int1D
 from table_io.errors import InputError
 from twin.drive.table_model import TableModel, TableParameters
 
@@ -20,6 +21,10 @@ CROSSOVER_HZ = 1.5  # below: displacement; above: acceleration
 LOWEST_HZ, HIGHEST_HZ = 0.2, 45.0  # of the fit
 MIN_DURATION_S = 10.0
 CONFIDENCE_LEVEL = 0.95  # of the intervals
+RESIDUAL_RATE_RATIO = 2.2  # of the residuals over the highest frequency
+BLOCK_S, MIN_BLOCKS = 2.5, 8  # of time that is left out together
+DIFFERENCE_STEP = 2e-3  # of a parameter, or of its typical value if that is larger
+MODEL_ERRORS: dict[str, float] = {}  # relative, of the half widths: what the laws of the twin err
 # Starting value, smallest and largest value of each parameter that is fitted.
 BOUNDS: dict[str, tuple[float, float, float]] = {
     "gain_1_s": (20.0, 1.0, 200.0),
@@ -65,63 +70,187 @@ class TableIdentification:
     residual: float
 
 
+@dataclass(frozen=True, eq=False)
+class RehearsalProblem:
+    """Regression of a table's twin on a rehearsal: weighted residuals and their blocks of time.
+
+    The residuals are the weighted spectrum of simulation less measurement, back in the time domain
+    at RESIDUAL_RATE_RATIO times the highest frequency of the fit: their squares sum up to 1 for a
+    table that does not move, and each belongs to a block of about BLOCK_S.
+    """
+
+    motion: TableRehearsal
+    mass_kg: float
+    stall_force_n: float
+    used: npt.NDArray[np.bool_]
+    weights: Float1D  # (frequency used,)
+    measured: npt.NDArray[np.complex128]  # (frequency used,), weighted
+    block: Int1D  # of each residual, (residual,)
+
+    @classmethod
+    def from_rehearsal(
+        cls, motion: TableRehearsal, mass_kg: float, stall_force_n: float = math.inf
+    ) -> "RehearsalProblem":
+        """Return the problem; InputError if the rehearsal is too short or shows no motion."""
+        count = motion.command_m.size
+        if count < MIN_DURATION_S * motion.rate_hz or not motion.command_m.any():
+            raise InputError(
+                f"the rehearsal has {count / motion.rate_hz:.0f} s of motion",
+                allowed=f"at least {MIN_DURATION_S:g} s",
+            )
+        frequency_hz = np.fft.rfftfreq(count, 1.0 / motion.rate_hz)
+        used = (frequency_hz >= LOWEST_HZ) & (frequency_hz <= HIGHEST_HZ)
+        weights = _weigh_frequencies(motion, used)
+        measured = _transform_motion(
+            motion.displacement_m, motion.acceleration_m_s2, frequency_hz[used], used
+        )
+        size = 2 * math.ceil(0.5 * RESIDUAL_RATE_RATIO * HIGHEST_HZ * count / motion.rate_hz)
+        blocks = max(round(count / motion.rate_hz / BLOCK_S), MIN_BLOCKS)
+        block = (np.arange(size) * blocks) // size
+        scale = float(np.linalg.norm(measured * weights))
+        return cls(
+            motion, mass_kg, stall_force_n, used, weights / scale, measured * weights / scale, block
+        )
+
+    def compute_residuals(self, parameters: TableParameters) -> Float1D:
+        """Return the residuals of a twin of the table, (residual,)."""
+        motion = self.motion
+        model = TableModel(self.mass_kg, parameters)
+        out = model.simulate(motion.command_m, motion.rate_hz, motion.reaction_n)
+        if not np.isfinite(out).all():
+            return np.full(self.block.size, 10.0)
+        frequency_hz = np.fft.rfftfreq(motion.command_m.size, 1.0 / motion.rate_hz)[self.used]
+        values = _transform_motion(out[0], out[1], frequency_hz, self.used) * self.weights
+        spectrum = np.zeros(self.block.size // 2 + 1, complex)
+        first = int(np.flatnonzero(self.used)[0])
+        spectrum[first : first + values.size] = values - self.measured
+        # Parseval: the squares of the residuals sum up to those of the spectrum.
+        return np.fft.irfft(spectrum, self.block.size) * math.sqrt(0.5 * self.block.size)
+
+
+@dataclass(frozen=True, eq=False)
+class TableFit:
+    """Least-squares fit of a twin: scaled values of the free parameters, residuals and slopes.
+
+    `jacobian`, (residual, parameter), is that of the residuals over the scaled values; parameters
+    at a bound are marked in `is_free`, (parameter,).
+    """
+
+    problem: RehearsalProblem
+    names: tuple[str, ...]
+    values: Float1D
+    residuals: Float1D
+    jacobian: Float2D
+    is_free: npt.NDArray[np.bool_]
+
+    @property
+    def parameters(self) -> TableParameters:
+        return build_parameters(self.names, self.values, self.problem)
+
+    @property
+    def cost(self) -> float:
+        """Sum of the squares of the residuals: 1 for a table that does not move."""
+        return float(self.residuals @ self.residuals)
+
+    def estimate_half_widths(self) -> dict[str, float]:
+        """Return the half widths of the 95 % intervals, SI, by parameter: jackknife over blocks.
+
+        Each block of time is left out in turn (one Gauss-Newton step each): errors of the model are
+        correlated within a block, so samples are not counted one by one. MODEL_ERRORS is added.
+        """
+        count = int(self.problem.block.max()) + 1
+        estimates = np.zeros((count, self.values.size))
+        for block in range(count):
+            estimates[block] = self.step_without(self.problem.block == block)
+        spread = np.sqrt((count - 1) / count * ((estimates - estimates.mean(axis=0)) ** 2).sum(0))
+        half = stats.t.ppf(0.5 + 0.5 * CONFIDENCE_LEVEL, count - 1) * spread
+        units = _to_si(self.names, np.ones(half.size), self.problem.mass_kg)
+        values = self.parameters._asdict()
+        widths = {}
+        for name, width, unit in zip(self.names, half, units, strict=True):
+            share = MODEL_ERRORS.get(name, 0.0)
+            widths[name] = math.hypot(float(width * unit), share * values[name])
+        return widths
+
+    def step_without(self, is_left_out: npt.NDArray[np.bool_]) -> Float1D:
+        """Return the change of the scaled values, (parameter,), if residuals are left out."""
+        step = np.zeros(self.values.size)
+        slopes = self.jacobian[~is_left_out][:, self.is_free]
+        size = np.sqrt((slopes**2).sum(axis=0)) + 1e-30
+        solution = np.linalg.lstsq(slopes / size, -self.residuals[~is_left_out], rcond=1e-8)[0]
+        step[self.is_free] = solution / size
+        return step
+
+
 def identify_table(
     motion: TableRehearsal, mass_kg: float, stall_force_n: float = math.inf
 ) -> TableIdentification:
     """Fit the table's twin to a rehearsal; InputError if that is too short or shows no motion."""
-    count = motion.command_m.size
-    if count < MIN_DURATION_S * motion.rate_hz or not motion.command_m.any():
-        raise InputError(
-            f"the rehearsal has {count / motion.rate_hz:.0f} s of motion",
-            allowed=f"at least {MIN_DURATION_S:g} s",
-        )
-    frequency_hz = np.fft.rfftfreq(count, 1.0 / motion.rate_hz)
-    used = (frequency_hz >= LOWEST_HZ) & (frequency_hz <= HIGHEST_HZ)
-    slow = frequency_hz[used] < CROSSOVER_HZ
-    square = (math.tau * frequency_hz[used]) ** 2
-    weights = _weigh_frequencies(motion, used)
+    problem = RehearsalProblem.from_rehearsal(motion, mass_kg, stall_force_n)
+    fit = fit_basic_twin(problem)
+    return TableIdentification(
+        TableModel(mass_kg, fit.parameters), fit.estimate_half_widths(), math.sqrt(fit.cost)
+    )
 
-    def spectrum(displacement: Float1D, acceleration: Float1D) -> Float1D:
-        by_displacement = -square * np.fft.rfft(displacement)[used]
-        by_acceleration = np.fft.rfft(acceleration)[used]
-        values = np.where(slow, by_displacement, by_acceleration) * weights
-        return np.concatenate([values.real, values.imag])
 
-    measured = spectrum(motion.displacement_m, motion.acceleration_m_s2)
-    scale = float(np.linalg.norm(measured))
+def fit_basic_twin(problem: RehearsalProblem) -> TableFit:
+    """Fit the twin without further effects, from the best of a few starts."""
+    start = {name: values[0] for name, values in BOUNDS.items()}
+    starts = [start | {"gain_1_s": gain} for gain in STARTING_GAINS_1_S]
 
-    def build(values: Float1D) -> TableModel:
-        return _build_model(values, mass_kg, stall_force_n)
+    def measure_misfit(values: dict[str, float]) -> float:
+        parameters = build_parameters(tuple(values), np.array(list(values.values())), problem)
+        return float(np.linalg.norm(problem.compute_residuals(parameters)))
+
+    return fit_table(problem, BOUNDS, min(starts, key=measure_misfit))
+
+
+def fit_table(
+    problem: RehearsalProblem,
+    bounds: Mapping[str, tuple[float, float, float]],
+    start: Mapping[str, float],
+    max_evaluations: int = 60,
+) -> TableFit:
+    """Fit free parameters, each with a typical, smallest and largest value, from a start."""
+    names = tuple(bounds)
+    typical, low, high = (np.array(column) for column in zip(*bounds.values(), strict=True))
 
     def residuals(values: Float1D) -> Float1D:
-        out = build(values).simulate(motion.command_m, motion.rate_hz, motion.reaction_n)
-        if not np.isfinite(out).all():
-            return np.full(measured.size, 10.0)
-        return (spectrum(out[0], out[1]) - measured) / scale
+        return problem.compute_residuals(build_parameters(names, values, problem))
 
-    start, low, high = (np.array(column) for column in zip(*BOUNDS.values(), strict=True))
-    typical = np.where(start > 0.0, start, 1.0)
-    starts = []
-    for gain in STARTING_GAINS_1_S:
-        trial = start.copy()
-        trial[0] = gain
-        starts.append(trial)
-    first = min(starts, key=lambda trial: float(np.linalg.norm(residuals(trial))))
+    def slopes(values: Float1D) -> Float2D:
+        """Return the Jacobian by differences whose steps do not vanish with a parameter."""
+        before, jacobian = residuals(values), np.empty((problem.block.size, values.size))
+        for index, size in enumerate(np.maximum(np.abs(values), typical)):
+            trial = values.copy()
+            step = DIFFERENCE_STEP * size
+            trial[index] += -step if values[index] + step > high[index] else step
+            jacobian[:, index] = (residuals(trial) - before) / (trial[index] - values[index])
+        return jacobian
+
+    values = np.clip([start[name] for name in names], low, high)
     fit = optimize.least_squares(
-        residuals, first, bounds=(low, high), x_scale=typical, diff_step=1e-3, max_nfev=60,
-        loss="linear", xtol=1e-6, ftol=1e-7,
+        residuals, values, slopes, bounds=(low, high), x_scale=typical, max_nfev=max_evaluations,
+        xtol=1e-6, ftol=1e-5,
     )  # fmt: skip
-    scaled = fit.jac * typical  # parameters of one size, so that the inverse is well conditioned
-    covariance = np.linalg.pinv(scaled.T @ scaled) * 2.0 * fit.cost / max(measured.size - 1, 1)
-    deviation = typical * np.sqrt(np.clip(np.diag(covariance), 0.0, None))
-    half = stats.norm.ppf(0.5 + 0.5 * CONFIDENCE_LEVEL) * deviation
-    units = _to_si(np.ones(half.size), mass_kg)
-    names = list(BOUNDS)
-    return TableIdentification(
-        build(fit.x),
-        {name: float(width * unit) for name, width, unit in zip(names, half, units, strict=True)},
-        math.sqrt(2.0 * fit.cost),
+    margin = 1e-3 * typical
+    is_free = (fit.x > low + margin) & (fit.x < high - margin)
+    return TableFit(problem, names, fit.x, fit.fun, fit.jac, is_free)
+
+
+def _transform_motion(
+    displacement_m: Float1D,
+    acceleration_m_s2: Float1D,
+    frequency_hz: Float1D,
+    used: npt.NDArray[np.bool_],
+) -> npt.NDArray[np.complex128]:
+    """Return the spectrum of the acceleration, below CROSSOVER_HZ by the displacement."""
+    by_displacement = -((math.tau * frequency_hz) ** 2) * np.fft.rfft(displacement_m)[used]
+    by_acceleration = np.fft.rfft(acceleration_m_s2)[used]
+    spectrum: npt.NDArray[np.complex128] = np.where(
+        frequency_hz < CROSSOVER_HZ, by_displacement, by_acceleration
     )
+    return spectrum
 
 
 def _weigh_frequencies(motion: TableRehearsal, used: npt.NDArray[np.bool_]) -> Float1D:
@@ -133,7 +262,7 @@ def _weigh_frequencies(motion: TableRehearsal, used: npt.NDArray[np.bool_]) -> F
     return weights
 
 
-def _to_si(values: Float1D, mass_kg: float) -> Float1D:
+def _to_si(names: Sequence[str], values: Float1D, mass_kg: float) -> Float1D:
     """Return fitted values in SI: friction over weight, viscous friction over mass."""
     factors = {
         "friction_n": 9.81 * mass_kg,
@@ -141,12 +270,15 @@ def _to_si(values: Float1D, mass_kg: float) -> Float1D:
         "stick_damping_n_s_m": mass_kg,
         "viscous_n_s_m": mass_kg,
     }
-    return values * np.array([factors.get(name, 1.0) for name in BOUNDS])
+    return values * np.array([factors.get(name, 1.0) for name in names])
 
 
-def _build_model(values: Float1D, mass_kg: float, stall_force_n: float) -> TableModel:
-    fitted = dict(zip(BOUNDS, map(float, _to_si(values, mass_kg)), strict=True))
+def build_parameters(
+    names: Sequence[str], values: Float1D, problem: RehearsalProblem
+) -> TableParameters:
+    """Return the parameters of a twin from the scaled values of some of them."""
+    fitted = dict(zip(names, map(float, _to_si(names, values, problem.mass_kg)), strict=True))
     damping = TableParameters().valve_damping
     valve_lag_s = 2.0 * damping / (math.tau * fitted["valve_hz"])
     fitted["delay_s"] = max(fitted["delay_s"] - valve_lag_s, 0.0)
-    return TableModel(mass_kg, TableParameters(**fitted, stall_force_n=stall_force_n))
+    return TableParameters(**fitted, stall_force_n=problem.stall_force_n)
