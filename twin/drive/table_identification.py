@@ -7,7 +7,7 @@ accelerometer says little, the acceleration above, both as acceleration.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +31,7 @@ BOUNDS: dict[str, tuple[float, float, float]] = {
     "velocity_feedforward": (0.3, 0.0, 1.5),
     "delay_s": (0.006, 0.001, 0.15),  # with that of the valve
     "valve_hz": (80.0, 30.0, 200.0),
+    "valve_damping": (0.8, 0.4, 1.4),
     "oil_hz": (30.0, 6.0, 150.0),
     "oil_damping": (0.1, 0.001, 1.0),
     "pressure_feedback_s": (0.002, 0.0, 0.1),
@@ -38,6 +39,7 @@ BOUNDS: dict[str, tuple[float, float, float]] = {
     "static_excess_n": (0.003, 0.0, 0.3),  # likewise
     "presliding_m": (2e-5, 1e-6, 5e-4),
     "stribeck_speed_m_s": (0.01, 0.004, 0.025),
+    "friction_memory": (0.8, 0.0, 3.0),
     "stick_damping_n_s_m": (5.0, 0.0, 100.0),  # likewise
     "viscous_n_s_m": (0.1, 0.0, 20.0),  # over the mass of the table, 1/s
     "frame_hz": (15.0, 4.0, 60.0),
@@ -45,6 +47,11 @@ BOUNDS: dict[str, tuple[float, float, float]] = {
     "frame_ratio": (0.02, 0.0, 1.0),
 }
 STARTING_GAINS_1_S = 8.0, 20.0, 50.0
+FRAME_NAMES = "frame_hz", "frame_damping", "frame_ratio"
+STARTING_FRAMES_HZ = 5.0, 40.0, 24  # first, last, number
+ROUGH_EVALUATIONS = 6  # of the fit without a frame
+VALVE_DAMPING = 0.8, 0.2  # mean and standard deviation before the rehearsal: data sheets
+NO_BLOCK = -1
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +83,9 @@ class RehearsalProblem:
 
     The residuals are the weighted spectrum of simulation less measurement, back in the time domain
     at RESIDUAL_RATE_RATIO times the highest frequency of the fit: their squares sum up to 1 for a
-    table that does not move, and each belongs to a block of about BLOCK_S.
+    table that does not move, and each belongs to a block of about BLOCK_S. The last one, of no block,
+    is what is known beforehand, the damping of a valve: its departure from VALVE_DAMPING in standard
+    deviations, times `noise`, the size of the other residuals.
     """
 
     motion: TableRehearsal
@@ -85,7 +94,8 @@ class RehearsalProblem:
     used: npt.NDArray[np.bool_]
     weights: Float1D  # (frequency used,)
     measured: npt.NDArray[np.complex128]  # (frequency used,), weighted
-    block: Int1D  # of each residual, (residual,)
+    block: Int1D  # of each residual, (residual,); NO_BLOCK for the last one
+    noise: float
 
     @classmethod
     def from_rehearsal(
@@ -108,8 +118,10 @@ class RehearsalProblem:
         blocks = max(round(count / motion.rate_hz / BLOCK_S), MIN_BLOCKS)
         block = (np.arange(size) * blocks) // size
         scale = float(np.linalg.norm(measured * weights))
+        weights /= scale
+        block = np.append(block, NO_BLOCK)
         return cls(
-            motion, mass_kg, stall_force_n, used, weights / scale, measured * weights / scale, block
+            motion, mass_kg, stall_force_n, used, weights, measured * weights, block, 0.1 / size**0.5
         )
 
     def compute_residuals(self, parameters: TableParameters) -> Float1D:
@@ -121,11 +133,18 @@ class RehearsalProblem:
             return np.full(self.block.size, 10.0)
         frequency_hz = np.fft.rfftfreq(motion.command_m.size, 1.0 / motion.rate_hz)[self.used]
         values = _transform_motion(out[0], out[1], frequency_hz, self.used) * self.weights
-        spectrum = np.zeros(self.block.size // 2 + 1, complex)
+        size = self.block.size - 1
+        spectrum = np.zeros(size // 2 + 1, complex)
         first = int(np.flatnonzero(self.used)[0])
         spectrum[first : first + values.size] = values - self.measured
         # Parseval: the squares of the residuals sum up to those of the spectrum.
-        return np.fft.irfft(spectrum, self.block.size) * math.sqrt(0.5 * self.block.size)
+        residuals = np.fft.irfft(spectrum, size) * math.sqrt(0.5 * size)
+        mean, deviation = VALVE_DAMPING
+        return np.append(residuals, self.noise * (parameters.valve_damping - mean) / deviation)
+
+    def with_noise_of(self, fit: "TableFit") -> "RehearsalProblem":
+        """Return the problem with the size of the residuals that a fit leaves."""
+        return replace(self, noise=math.sqrt(fit.cost / (self.block.size - 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +169,7 @@ class TableFit:
     @property
     def cost(self) -> float:
         """Sum of the squares of the residuals: 1 for a table that does not move."""
-        return float(self.residuals @ self.residuals)
+        return float(self.residuals[:-1] @ self.residuals[:-1])
 
     def estimate_half_widths(self) -> dict[str, float]:
         """Return the half widths of the 95 % intervals, SI, by parameter: jackknife over blocks.
@@ -161,7 +180,7 @@ class TableFit:
         count = int(self.problem.block.max()) + 1
         estimates = np.zeros((count, self.values.size))
         for block in range(count):
-            estimates[block] = self.step_without(self.problem.block == block)
+            estimates[block] = self.step_without(self.problem.block == block, all_free=True)
         spread = np.sqrt((count - 1) / count * ((estimates - estimates.mean(axis=0)) ** 2).sum(0))
         half = stats.t.ppf(0.5 + 0.5 * CONFIDENCE_LEVEL, count - 1) * spread
         units = _to_si(self.names, np.ones(half.size), self.problem.mass_kg)
@@ -172,13 +191,19 @@ class TableFit:
             widths[name] = math.hypot(float(width * unit), share * values[name])
         return widths
 
-    def step_without(self, is_left_out: npt.NDArray[np.bool_]) -> Float1D:
-        """Return the change of the scaled values, (parameter,), if residuals are left out."""
+    def step_without(
+        self, is_left_out: npt.NDArray[np.bool_], all_free: bool = False
+    ) -> Float1D:
+        """Return the change of the scaled values, (parameter,), if residuals are left out.
+
+        Parameters at a bound stay, unless all are free: then the change has no bounds.
+        """
         step = np.zeros(self.values.size)
-        slopes = self.jacobian[~is_left_out][:, self.is_free]
+        is_free = np.ones(step.size, bool) if all_free else self.is_free
+        slopes = self.jacobian[~is_left_out][:, is_free]
         size = np.sqrt((slopes**2).sum(axis=0)) + 1e-30
         solution = np.linalg.lstsq(slopes / size, -self.residuals[~is_left_out], rcond=1e-8)[0]
-        step[self.is_free] = solution / size
+        step[is_free] = solution / size
         return step
 
 
@@ -194,15 +219,29 @@ def identify_table(
 
 
 def fit_basic_twin(problem: RehearsalProblem) -> TableFit:
-    """Fit the twin without further effects, from the best of a few starts."""
-    start = {name: values[0] for name, values in BOUNDS.items()}
-    starts = [start | {"gain_1_s": gain} for gain in STARTING_GAINS_1_S]
+    """Fit the twin without further effects.
 
-    def measure_misfit(values: dict[str, float]) -> float:
+    First without a frame, whose resonance is narrow; then from the frequency of the frame that
+    leaves least.
+    """
+    start = {name: values[0] for name, values in BOUNDS.items()}
+    rough_bounds = {name: values for name, values in BOUNDS.items() if name not in FRAME_NAMES}
+
+    def measure_misfit(values: Mapping[str, float]) -> float:
         parameters = build_parameters(tuple(values), np.array(list(values.values())), problem)
         return float(np.linalg.norm(problem.compute_residuals(parameters)))
 
-    return fit_table(problem, BOUNDS, min(starts, key=measure_misfit))
+    starts = [start | {"gain_1_s": gain, "frame_ratio": 0.0} for gain in STARTING_GAINS_1_S]
+    first = min(starts, key=measure_misfit)
+    rough = fit_table(
+        problem, rough_bounds, {name: first[name] for name in rough_bounds}, ROUGH_EVALUATIONS
+    )
+    start |= dict(zip(rough.names, map(float, rough.values), strict=True))
+    frames = [start | {"frame_hz": float(hz)} for hz in np.geomspace(*STARTING_FRAMES_HZ)]
+    near = fit_table(problem, BOUNDS, min(frames, key=measure_misfit))
+    return fit_table(
+        problem.with_noise_of(near), BOUNDS, dict(zip(near.names, near.values, strict=True))
+    )
 
 
 def fit_table(
@@ -231,7 +270,7 @@ def fit_table(
     values = np.clip([start[name] for name in names], low, high)
     fit = optimize.least_squares(
         residuals, values, slopes, bounds=(low, high), x_scale=typical, max_nfev=max_evaluations,
-        xtol=1e-6, ftol=1e-5,
+        xtol=1e-6, ftol=1e-4,
     )  # fmt: skip
     margin = 1e-3 * typical
     is_free = (fit.x > low + margin) & (fit.x < high - margin)
@@ -278,7 +317,6 @@ def build_parameters(
 ) -> TableParameters:
     """Return the parameters of a twin from the scaled values of some of them."""
     fitted = dict(zip(names, map(float, _to_si(names, values, problem.mass_kg)), strict=True))
-    damping = TableParameters().valve_damping
-    valve_lag_s = 2.0 * damping / (math.tau * fitted["valve_hz"])
+    valve_lag_s = 2.0 * fitted["valve_damping"] / (math.tau * fitted["valve_hz"])
     fitted["delay_s"] = max(fitted["delay_s"] - valve_lag_s, 0.0)
     return TableParameters(**fitted, stall_force_n=problem.stall_force_n)

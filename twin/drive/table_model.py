@@ -5,7 +5,7 @@
     u'' = w_v^2 (e - u) - 2 z_v w_v u'          (valve: speed at no load)
     e = k (s - (y - y_f)) + k_ff s' - g h / m   (stroke loop; h: f above 1 Hz)
     F = z (F_c + (F_s - F_c) exp(-(v / v_s)^2)) + c v + b (1 - z sign(v)) v
-    z' = v / d (1 - z sign(v))
+    z' = v / d (1 - z sign(v)),  the exponential with a lag over the travel n d
     y_f'' = -r (f - F(v)) / m - w_f (w_f y_f + 2 z_f y_f')
 
 s is the command after a delay. Presliding is Dahl's (1968), with the Stribeck force at low speed;
@@ -80,11 +80,15 @@ class TableParameters(NamedTuple):
     second_frame_hz: float = 30.0
     second_frame_damping: float = 0.05
     second_frame_ratio: float = 0.0
+    friction_memory: float = 0.0
 
 
 @njit(cache=True, nogil=True)
-def _write_rates(s, z, z_valve, command, command_rate, reaction, m, p, rate):  # type: ignore[no-untyped-def]
-    """Write the time derivative of the state; SI. `z_valve` is that of the valve's hysteresis."""
+def _write_rates(s, z, memory, z_valve, command, command_rate, reaction, m, p, rate):  # type: ignore[no-untyped-def]
+    """Write the time derivative of the state; SI.
+
+    `memory` is the exponential of the Stribeck force with its lag, `z_valve` is that of the valve.
+    """
     oil = math.tau * p.oil_hz
     stiffness = m * oil * oil
     stroke, v, force = s[Y] - s[FRAME], s[V] - s[FRAME_SPEED], s[OIL]
@@ -94,7 +98,10 @@ def _write_rates(s, z, z_valve, command, command_rate, reaction, m, p, rate):  #
     if p.backlash_m > 0.0:
         play = 0.5 * stiffness * p.backlash_m
         force -= min(max(force, -play), play)
-    dry = p.friction_n + p.static_excess_n * math.exp(-((v / p.stribeck_speed_m_s) ** 2))
+    if p.friction_memory > 0.0:
+        dry = p.friction_n + p.static_excess_n * memory
+    else:
+        dry = p.friction_n + p.static_excess_n * math.exp(-((v / p.stribeck_speed_m_s) ** 2))
     if p.friction_asymmetry != 0.0 or p.friction_slope_1_m != 0.0:
         along = max(1.0 + p.friction_slope_1_m * stroke, LEAST_FRICTION_SHARE)
         dry *= (1.0 + p.friction_asymmetry * z) * along
@@ -144,7 +151,8 @@ def _simulate(command, reaction, m, rate_hz, steps, p, out):  # type: ignore[no-
     extended = p.second_frame_ratio != 0.0 or p.transducer_lag_s > 0.0
     size = EXTENDED_STATE_SIZE if extended else STATE_SIZE
     s, stage, total, rate = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
-    h, z, z_valve, lag = 1.0 / (rate_hz * steps), 0.0, 0.0, p.delay_s * rate_hz
+    h, z, memory, z_valve = 1.0 / (rate_hz * steps), 0.0, 1.0, 0.0
+    lag = p.delay_s * rate_hz
     count = command.size
     for k in range(count):
         for i in range(steps):
@@ -155,6 +163,10 @@ def _simulate(command, reaction, m, rate_hz, steps, p, out):  # type: ignore[no-
                     v -= s[FRAME_2_SPEED]
                 sign = 1.0 if v > 0.0 else -1.0
                 z = sign + (z - sign) * math.exp(-abs(v) * 0.5 * h / p.presliding_m)
+                if p.friction_memory > 0.0:
+                    level = math.exp(-((v / p.stribeck_speed_m_s) ** 2))
+                    travel = abs(v) * 0.5 * h / (p.friction_memory * p.presliding_m)
+                    memory = level + (memory - level) * math.exp(-travel)
                 if p.valve_hysteresis_m_s > 0.0:
                     sign = 1.0 if s[VALVE_RATE] > 0.0 else -1.0
                     travel = abs(s[VALVE_RATE]) * h / p.valve_hysteresis_m_s
@@ -180,12 +192,12 @@ def _simulate(command, reaction, m, rate_hz, steps, p, out):  # type: ignore[no-
                     low = int(at_r)
                     high = min(low + 1, count - 1)
                     force = reaction[low] + (at_r - low) * (reaction[high] - reaction[low])
-                    _write_rates(stage, z, z_valve, value, slope, force, m, p, rate)
+                    _write_rates(stage, z, memory, z_valve, value, slope, force, m, p, rate)
                     for n in range(size):
                         total[n] += weight * rate[n]
                 for n in range(size):
                     s[n] += h / 6.0 * total[n]
-        _write_rates(s, z, z_valve, 0.0, 0.0, reaction[k], m, p, rate)
+        _write_rates(s, z, memory, z_valve, 0.0, 0.0, reaction[k], m, p, rate)
         out[0, k], out[1, k] = s[Y], rate[V]
 
 
