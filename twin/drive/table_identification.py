@@ -234,11 +234,11 @@ def fit_basic_twin(problem: RehearsalProblem) -> TableFit:
     starts = [start | {"gain_1_s": gain, "frame_ratio": 0.0} for gain in STARTING_GAINS_1_S]
     first = min(starts, key=measure_misfit)
     rough = fit_table(
-        problem, rough_bounds, {name: first[name] for name in rough_bounds}, ROUGH_EVALUATIONS
+        problem, rough_bounds, {name: first[name] for name in rough_bounds}, ROUGH_EVALUATIONS, 1e-2
     )
     start |= dict(zip(rough.names, map(float, rough.values), strict=True))
     frames = [start | {"frame_hz": float(hz)} for hz in np.geomspace(*STARTING_FRAMES_HZ)]
-    near = fit_table(problem, BOUNDS, min(frames, key=measure_misfit))
+    near = fit_table(problem, BOUNDS, min(frames, key=measure_misfit), tolerance=1e-3)
     return fit_table(
         problem.with_noise_of(near), BOUNDS, dict(zip(near.names, near.values, strict=True))
     )
@@ -248,9 +248,13 @@ def fit_table(
     problem: RehearsalProblem,
     bounds: Mapping[str, tuple[float, float, float]],
     start: Mapping[str, float],
-    max_evaluations: int = 60,
+    max_evaluations: int = 20,
+    tolerance: float = 1e-4,
 ) -> TableFit:
-    """Fit free parameters, each with a typical, smallest and largest value, from a start."""
+    """Fit free parameters, each with a typical, smallest and largest value, from a start.
+
+    It ends when the squares fall by less than the relative `tolerance`.
+    """
     names = tuple(bounds)
     typical, low, high = (np.array(column) for column in zip(*bounds.values(), strict=True))
 
@@ -269,8 +273,8 @@ def fit_table(
 
     values = np.clip([start[name] for name in names], low, high)
     fit = optimize.least_squares(
-        residuals, values, slopes, bounds=(low, high), x_scale=typical, max_nfev=max_evaluations,
-        xtol=1e-6, ftol=1e-4,
+        residuals, values, slopes, bounds=(low, high), x_scale="jac", max_nfev=max_evaluations,
+        xtol=1e-6, ftol=tolerance,
     )  # fmt: skip
     margin = 1e-3 * typical
     is_free = (fit.x > low + margin) & (fit.x < high - margin)
