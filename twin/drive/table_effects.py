@@ -118,7 +118,7 @@ LIBRARY: tuple[TableEffect, ...] = (
     TableEffect(
         "friction_asymmetry",
         "friction that differs with direction",
-        "F -> F (1 + a_F z)",
+        "z -> +-(1 + a_F sign(v)) instead of +-1, of the same stiffness",
         "Armstrong-Hélouvry et al., Automatica 30 (1994) 1083",
         (
             TableEffectParameter(
@@ -130,7 +130,7 @@ LIBRARY: tuple[TableEffect, ...] = (
     TableEffect(
         "friction_slope",
         "friction that changes along the stroke",
-        "F -> F (1 + g_F (y - y_f))",
+        "z -> +-(1 + g_F (y - y_f)) instead of +-1, of the same stiffness",
         "Armstrong-Hélouvry et al. (1994)",
         (
             TableEffectParameter(

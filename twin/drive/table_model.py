@@ -19,7 +19,7 @@ describes them and finds out which one a table has:
     u -> u - d_v sat(u / d_v), u -> u - w_h z_h / 2 with z_h' = 2 u' / w_h (1 - z_h sign(u')),
     u -> u (1 + a_u sign(u))                          (valve: dead band, hysteresis, direction)
     f -> f - K b/2 sat(2 f / (K b))                              (coupling: backlash b)
-    F_c, F_s -> F_c (1 + a_F z) (1 + g_F (y - y_f)), and F_s alike         (friction)
+    z -> +-z_m instead of +-1, z_m = (1 + a_F sign(v)) (1 + g_F (y - y_f))  (friction)
     y - y_f -> q_t in e, t_t q_t' = (1 + g_t) (y - y_f) - q_t              (transducer)
     y_f -> y_f + y_2, y_2'' = -r_2 (f - F(v)) / m - w_2 (w_2 y_2 + 2 z_2 y_2')  (second frame mode)
 
@@ -84,6 +84,13 @@ class TableParameters(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
+def _find_friction_share(sign, stroke, p):  # type: ignore[no-untyped-def]
+    """Return the limit of |z| in this direction, at this stroke in m."""
+    along = max(1.0 + p.friction_slope_1_m * stroke, LEAST_FRICTION_SHARE)
+    return (1.0 + p.friction_asymmetry * sign) * along
+
+
+@njit(cache=True, nogil=True)
 def _write_rates(s, z, memory, z_valve, command, command_rate, reaction, m, p, rate):  # type: ignore[no-untyped-def]
     """Write the time derivative of the state; SI.
 
@@ -102,10 +109,10 @@ def _write_rates(s, z, memory, z_valve, command, command_rate, reaction, m, p, r
         dry = p.friction_n + p.static_excess_n * memory
     else:
         dry = p.friction_n + p.static_excess_n * math.exp(-((v / p.stribeck_speed_m_s) ** 2))
-    if p.friction_asymmetry != 0.0 or p.friction_slope_1_m != 0.0:
-        along = max(1.0 + p.friction_slope_1_m * stroke, LEAST_FRICTION_SHARE)
-        dry *= (1.0 + p.friction_asymmetry * z) * along
     sticking = 1.0 - z if v > 0.0 else 1.0 + z
+    if p.friction_asymmetry != 0.0 or p.friction_slope_1_m != 0.0:
+        sign = 1.0 if v > 0.0 else -1.0
+        sticking = 1.0 - sign * z / _find_friction_share(sign, stroke, p)
     drive = force - z * dry - (p.viscous_n_s_m + p.stick_damping_n_s_m * sticking) * v
     opening = s[VALVE] - 0.5 * p.valve_hysteresis_m_s * z_valve
     if p.dead_band_m_s > 0.0:
@@ -162,7 +169,16 @@ def _simulate(command, reaction, m, rate_hz, steps, p, out):  # type: ignore[no-
                 if p.second_frame_ratio != 0.0:
                     v -= s[FRAME_2_SPEED]
                 sign = 1.0 if v > 0.0 else -1.0
-                z = sign + (z - sign) * math.exp(-abs(v) * 0.5 * h / p.presliding_m)
+                if p.friction_asymmetry != 0.0 or p.friction_slope_1_m != 0.0:
+                    stroke = s[Y] - s[FRAME]
+                    if p.second_frame_ratio != 0.0:
+                        stroke -= s[FRAME_2]
+                    limit = _find_friction_share(sign, stroke, p)
+                    z = sign * limit + (z - sign * limit) * math.exp(
+                        -abs(v) * 0.5 * h / (p.presliding_m * limit)
+                    )
+                else:
+                    z = sign + (z - sign) * math.exp(-abs(v) * 0.5 * h / p.presliding_m)
                 if p.friction_memory > 0.0:
                     level = math.exp(-((v / p.stribeck_speed_m_s) ** 2))
                     travel = abs(v) * 0.5 * h / (p.friction_memory * p.presliding_m)
