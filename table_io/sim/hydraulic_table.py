@@ -26,8 +26,8 @@ What a worn or badly adjusted table has in addition; each is absent where its ke
     q -> (1 + n) q, then twice 1 / (1 + s t_n / 2), in e                   transducer of the stroke
     m_a y_a'' = k_a (y_f - y_a) + c_a (y_f' - y_a')                        mass attached to the frame
 
-The overlap has rounded edges (Merritt, chapter 5.3); hysteresis is play that a fast first-order lag
-follows; with play in the coupling the piston is a mass of its own and hits its stops elastically.
+The overlap has rounded edges (Merritt, chapter 5.3); hysteresis is play that a fast lag follows;
+with play in the coupling the piston is a mass of its own and hits its stops elastically.
 """
 
 import math

@@ -25,12 +25,12 @@ RATE_HZ = PROFILE.acquisition.rate_hz
 REST_S = 0.5
 # Effect of the twin's library: keys of [simulated.hydraulic], each with the ends of its size.
 SIZES: dict[str, dict[str, tuple[float, float]]] = {
-    "dead_band": {"valve_overlap_percent": (0.15, 1.5)},
-    "valve_hysteresis": {"valve_hysteresis_percent": (0.2, 1.5)},
+    "dead_band": {"valve_overlap_percent": (0.1, 0.8)},
+    "valve_hysteresis": {"valve_hysteresis_percent": (0.15, 0.8)},
     "flow_asymmetry": {"flow_asymmetry": (0.08, 0.3)},
     "friction_asymmetry": {"friction_asymmetry": (0.1, 0.4)},
     "friction_slope": {"friction_slope_1_m": (20.0, 80.0)},
-    "backlash": {"coupling_play_mm": (0.05, 0.5)},
+    "backlash": {"coupling_play_mm": (0.02, 0.15)},
     "transducer_gain": {"transducer_gain_error": (0.02, 0.1)},
     "transducer_lag": {"transducer_lag_ms": (4.0, 20.0)},
     "second_frame_mode": {
@@ -85,9 +85,7 @@ def draw_table(rng: np.random.Generator, effect: str = "") -> PlantedTable:
         signed = effect in ("flow_asymmetry", "friction_asymmetry", "friction_slope",
                             "transducer_gain")  # fmt: skip
         hydraulic[key] = size * (rng.choice([-1.0, 1.0]) if signed else 1.0)
-    return PlantedTable(
-        hydraulic, rng.uniform(1.0, 4.0), int(rng.integers(1, 1_000_000)), effect
-    )
+    return PlantedTable(hydraulic, rng.uniform(1.0, 4.0), int(rng.integers(1, 1_000_000)), effect)
 
 
 def record_rehearsal(table: PlantedTable, excitation_seed: int = 0) -> TableRehearsal:

@@ -1,12 +1,12 @@
 """Missing effects of a table: library, and which of them a rehearsal shows.
 
-The basic twin of `table_identification.py` is fitted first. Every effect of LIBRARY is then screened:
+The basic twin of `table_identification.py` is fitted first. Every effect of LIBRARY is screened:
 its slope, the change of the residuals by a small size of it, is added to those of the basic
-parameters, and the linear problem is solved and judged by three-fold cross-validation over blocks of
-time. The few that promise most are fitted in full together with all basic parameters, and judged
-again on blocks that the last step did not use. An effect is named if its gain there is a clear share
-of the residual squares, is many standard errors of the scatter over the blocks, and if its interval
-excludes 0. A second effect is looked for on top of the first.
+parameters, and the linear problem is solved and judged by three-fold cross-validation over blocks
+of time. The few that promise most are fitted in full together with all basic parameters, and judged
+again on blocks that the last step did not use. An effect is named if its gain there is a clear
+share of the residual squares, is many standard errors of the scatter over the blocks, and if its
+interval excludes 0. A second effect is looked for on top of the first.
 
 No term of a twin is exact, so that some further term always reduces the residuals by a little: the
 limits below are therefore shares, not the chance of a given noise.
@@ -23,20 +23,24 @@ from twin.drive.table_identification import (
     BOUNDS,
     RehearsalProblem,
     TableFit,
+    TableIdentification,
+    TableRehearsal,
     build_parameters,
+    fit_basic_twin,
     fit_table,
 )
 from twin.drive.table_model import TableParameters
 
 FOLD_COUNT = 3  # blocks of time are held out by turns
 MAX_EFFECTS = 2
-MAX_REFITS = 3  # candidates that are fitted in full in a round
+MAX_REFITS = 2  # candidates that are fitted in full in a round
 MIN_PROMISED_SHARE = 0.03  # of the held-out squares: a candidate that promises less is not fitted
 MIN_GAIN_SHARE = 0.1  # of the held-out squares that an effect must remove
 MIN_GAIN_SIGMA = 4.0  # standard errors of its gain, from the scatter over the blocks
 MIN_EFFECT_SIGMA = 2.0  # half widths of its 95 % interval by which its size must differ from 0
 RIVAL_SHARE = 0.8  # of the gain of the best: another effect with as much is not told apart
 MAX_EVALUATIONS = 12  # of a fit with an effect, which begins near its solution
+MAX_WARM_GAP = 0.25  # beyond it the parameters of the twin without the effect are no start
 
 
 @dataclass(frozen=True)
@@ -89,7 +93,7 @@ LIBRARY: tuple[TableEffect, ...] = (
                 "dead_band_m_s", "m/s", 1e-3, 0.0, 0.1, "No-load speed lost on either side."
             ),
         ),
-        _list_trials(5e-4, 3e-3, 8e-3),
+        _list_trials(1e-4, 5e-4, 1.5e-3, 4e-3, 1e-2),
     ),
     TableEffect(
         "valve_hysteresis",
@@ -101,7 +105,7 @@ LIBRARY: tuple[TableEffect, ...] = (
                 "valve_hysteresis_m_s", "m/s", 1e-3, 0.0, 0.1, "Width of the loop, no-load speed."
             ),
         ),
-        _list_trials(1e-3, 5e-3),
+        _list_trials(2e-4, 1e-3, 3e-3, 8e-3),
     ),
     TableEffect(
         "flow_asymmetry",
@@ -149,7 +153,7 @@ LIBRARY: tuple[TableEffect, ...] = (
                 "backlash_m", "m", 1e-5, 0.0, 5e-3, "Free travel from stop to stop."
             ),
         ),
-        _list_trials(1e-5, 1e-4),
+        _list_trials(3e-6, 1e-5, 4e-5, 1.5e-4),
     ),
     TableEffect(
         "transducer_gain",
@@ -169,7 +173,7 @@ LIBRARY: tuple[TableEffect, ...] = (
         "t_t q_t' = y - y_f - q_t",
         "Conte, Trombetti (2000)",
         (TableEffectParameter("transducer_lag_s", "s", 1e-3, 0.0, 0.05, "Time constant."),),
-        _list_trials(2e-3),
+        _list_trials(2e-3, 8e-3),
     ),
     TableEffect(
         "second_frame_mode",
@@ -253,6 +257,22 @@ class EffectDiscovery:
     smallest_visible: dict[str, float]
 
 
+def identify_table_and_effects(
+    motion: TableRehearsal,
+    mass_kg: float,
+    stall_force_n: float = math.inf,
+    report: Callable[[str], None] = lambda stage: None,
+) -> tuple[TableIdentification, EffectDiscovery]:
+    """Identify the twin of a table with the effects that its rehearsal shows, and say which.
+
+    InputError if the rehearsal is too short or shows no motion.
+    """
+    report("fitting the twin of the table")
+    problem = RehearsalProblem.from_rehearsal(motion, mass_kg, stall_force_n)
+    discovery = discover_effects(fit_basic_twin(problem), report)
+    return discovery.fit.to_identification(), discovery
+
+
 def discover_effects(
     basic: TableFit, report: Callable[[str], None] = lambda stage: None
 ) -> EffectDiscovery:
@@ -293,7 +313,7 @@ def discover_effects(
 
 
 def is_worthwhile(before: EffectFit, after: EffectFit) -> bool:
-    """Return True if an effect is visible, and better by a clear share that chance does not give."""
+    """Return True if an effect is visible and gains a clear share that chance does not give."""
     share, sigma = compute_gain(before, after)
     effect = after.effects[-1]
     name = effect.parameters[0].name
@@ -317,7 +337,7 @@ def compute_gain(before: EffectFit, after: EffectFit) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class ScreenedEffect:
-    """Effect by the linear problem: promised share of the held-out squares, start and half width."""
+    """Effect by the linear problem: share of the held-out squares promised, start, half width."""
 
     effect: TableEffect
     start: dict[str, float]
@@ -340,11 +360,11 @@ def screen_effects(current: EffectFit) -> list[ScreenedEffect]:
             share = 1.0 - float(held_out @ held_out) / before
             size, half_width = _solve_amplitude(base, slope, fit.residuals)
             first = effect.parameters[0]
-            if first.low <= size <= first.high or first.low < 0.0:
-                size = min(max(size, 0.5 * first.low), 0.5 * first.high)
-            else:
-                # A negative dead band is none; one that is too large begins at its trial.
-                share, size = (0.0, trial[0]) if size < first.low else (share, trial[0])
+            # Of the size of its trial: the law need not be linear, nor a dead band negative.
+            held_out = _cross_validate(base, fit.residuals + trial[0] * slope, fit.problem)
+            share_of_trial = 1.0 - float(held_out @ held_out) / before
+            if share_of_trial > share or not first.low <= size <= first.high:
+                share, size = share_of_trial, trial[0]
             values = (size, *trial[1:])
             names = (parameter.name for parameter in effect.parameters)
             start = dict(zip(names, values, strict=True))
@@ -384,15 +404,64 @@ def _solve_amplitude(base: Float2D, slope: Float1D, residuals: Float1D) -> tuple
 def _refit(current: EffectFit, candidate: ScreenedEffect) -> EffectFit:
     """Fit the twin with an effect in addition, from the current fit."""
     fit, effects = current.fit, (*current.effects, candidate.effect)
-    bounds = dict(BOUNDS)
+    bounds: dict[str, tuple[float, float, float]] = {}
     for effect in effects:
         bounds |= effect.bounds
-    start = dict(zip(fit.names, map(float, fit.values), strict=True)) | candidate.start
-    problem = fit.problem
-    after = fit_table(problem, bounds, start, MAX_EVALUATIONS)
+    names = [parameter.name for parameter in candidate.effect.parameters]
+    trials = [candidate.start]
+    trials += [dict(zip(names, trial, strict=True)) for trial in candidate.effect.trials]
+    starts = [fit.scaled_values | trial for trial in trials]
+    start = min(starts, key=fit.problem.measure_misfit)
+    after = fit_table(fit.problem, {**BOUNDS, **bounds}, start, MAX_EVALUATIONS)
+    if current.gap > MAX_WARM_GAP:
+        kept = {name: fit.scaled_values[name] for name in bounds if name not in names}
+        from_nothing = fit_basic_twin(fit.problem, bounds, [kept | trial for trial in trials])
+        after = min(after, from_nothing, key=lambda trial: trial.cost)
     return EffectFit.from_fit(effects, after)
 
 
 def describe_size(effect: TableEffect, parameters: TableParameters) -> float:
     """Return the size of an effect in a twin, SI: its first parameter."""
     return float(getattr(parameters, effect.parameters[0].name))
+
+
+def describe_discovery(discovery: EffectDiscovery) -> list[str]:
+    """Return the outcome in words, a line each: effects, what remains, what cannot be judged."""
+    lines = []
+    widths, parameters = discovery.fit.estimate_half_widths(), discovery.fit.parameters
+    for finding in discovery.findings:
+        effect = EFFECT_BY_ID[finding.id]
+        lines.append(f"missing effect: {effect.description}")
+        for parameter in effect.parameters:
+            value = getattr(parameters, parameter.name)
+            lines.append(
+                f"  {parameter.name} = {value:.4g} +- {widths[parameter.name]:.2g} {parameter.unit}"
+                f" (95 %): {parameter.meaning}"
+            )
+        lines.append(
+            f"  left on held-out data: {100 * finding.gap_before:.3g} % -> "
+            f"{100 * finding.gap_after:.3g} % of the motion"
+        )
+        if finding.undecided:
+            lines.append(f"  cannot be told apart from {_list_names(finding.undecided)}")
+        elif finding.rivals:
+            rival = finding.rivals[0]
+            lines.append(f"  next best: {_list_names([rival.id])}, {100 * rival.gap:.3g} %")
+    if not discovery.findings:
+        lines.append("missing effects: none is named")
+        lines.append(f"  left on held-out data: {100 * discovery.gap:.3g} % of the motion")
+    if discovery.closest is not None:
+        lines.append(
+            f"  {_list_names([discovery.closest.id])} would leave "
+            f"{100 * discovery.closest.gap:.3g} %: too little gained to name it"
+        )
+    largest = {effect.id: effect.parameters[0].high for effect in LIBRARY}
+    hidden = [name for name, width in discovery.smallest_visible.items() if width > largest[name]]
+    lines.append("cannot be judged from this rehearsal:")
+    lines += [f"  {_list_names([name])}: its interval is too wide" for name in hidden]
+    lines += [f"  {name}: {reason}" for name, reason in UNTESTED.items()]
+    return lines
+
+
+def _list_names(ids: Sequence[str]) -> str:
+    return ", ".join(name.replace("_", " ") for name in ids)

@@ -7,7 +7,8 @@ accelerometer says little, the acceleration above, both as acceleration.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
@@ -52,6 +53,7 @@ STARTING_FRAMES_HZ = 5.0, 40.0, 24  # first, last, number
 ROUGH_EVALUATIONS = 6  # of the fit without a frame
 VALVE_DAMPING = 0.8, 0.2  # mean and standard deviation before the rehearsal: data sheets
 NO_BLOCK = -1
+LENGTH_STEP = 100  # samples, of which a rehearsal is a multiple
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,9 +85,9 @@ class RehearsalProblem:
 
     The residuals are the weighted spectrum of simulation less measurement, back in the time domain
     at RESIDUAL_RATE_RATIO times the highest frequency of the fit: their squares sum up to 1 for a
-    table that does not move, and each belongs to a block of about BLOCK_S. The last one, of no block,
-    is what is known beforehand, the damping of a valve: its departure from VALVE_DAMPING in standard
-    deviations, times `noise`, the size of the other residuals.
+    table that does not move, and each belongs to a block of about BLOCK_S. The last one, of no
+    block, is what is known beforehand, the damping of a valve: its departure from VALVE_DAMPING in
+    standard deviations, times `noise`, the size of the other residuals.
     """
 
     motion: TableRehearsal
@@ -108,6 +110,12 @@ class RehearsalProblem:
                 f"the rehearsal has {count / motion.rate_hz:.0f} s of motion",
                 allowed=f"at least {MIN_DURATION_S:g} s",
             )
+        # A length that is quick to transform; the table rests at the end.
+        count -= count % LENGTH_STEP
+        motion = replace(
+            motion,
+            **{row.name: getattr(motion, row.name)[:count] for row in fields(motion)[1:]},
+        )
         frequency_hz = np.fft.rfftfreq(count, 1.0 / motion.rate_hz)
         used = (frequency_hz >= LOWEST_HZ) & (frequency_hz <= HIGHEST_HZ)
         weights = _weigh_frequencies(motion, used)
@@ -121,7 +129,14 @@ class RehearsalProblem:
         weights /= scale
         block = np.append(block, NO_BLOCK)
         return cls(
-            motion, mass_kg, stall_force_n, used, weights, measured * weights, block, 0.1 / size**0.5
+            motion,
+            mass_kg,
+            stall_force_n,
+            used,
+            weights,
+            measured * weights,
+            block,
+            0.1 / size**0.5,
         )
 
     def compute_residuals(self, parameters: TableParameters) -> Float1D:
@@ -141,6 +156,15 @@ class RehearsalProblem:
         residuals = np.fft.irfft(spectrum, size) * math.sqrt(0.5 * size)
         mean, deviation = VALVE_DAMPING
         return np.append(residuals, self.noise * (parameters.valve_damping - mean) / deviation)
+
+    def measure_misfit(self, scaled_values: Mapping[str, float]) -> float:
+        """Return the rms of the residuals over that of the motion, for scaled values by name."""
+        values = np.array(list(scaled_values.values()))
+        return float(
+            np.linalg.norm(
+                self.compute_residuals(build_parameters(tuple(scaled_values), values, self))
+            )
+        )
 
     def with_noise_of(self, fit: "TableFit") -> "RehearsalProblem":
         """Return the problem with the size of the residuals that a fit leaves."""
@@ -167,6 +191,10 @@ class TableFit:
         return build_parameters(self.names, self.values, self.problem)
 
     @property
+    def scaled_values(self) -> dict[str, float]:
+        return dict(zip(self.names, map(float, self.values), strict=True))
+
+    @property
     def cost(self) -> float:
         """Sum of the squares of the residuals: 1 for a table that does not move."""
         return float(self.residuals[:-1] @ self.residuals[:-1])
@@ -191,9 +219,15 @@ class TableFit:
             widths[name] = math.hypot(float(width * unit), share * values[name])
         return widths
 
-    def step_without(
-        self, is_left_out: npt.NDArray[np.bool_], all_free: bool = False
-    ) -> Float1D:
+    def to_identification(self) -> TableIdentification:
+        """Return the twin with its intervals."""
+        return TableIdentification(
+            TableModel(self.problem.mass_kg, self.parameters),
+            self.estimate_half_widths(),
+            math.sqrt(self.cost),
+        )
+
+    def step_without(self, is_left_out: npt.NDArray[np.bool_], all_free: bool = False) -> Float1D:
         """Return the change of the scaled values, (parameter,), if residuals are left out.
 
         Parameters at a bound stay, unless all are free: then the change has no bounds.
@@ -212,36 +246,35 @@ def identify_table(
 ) -> TableIdentification:
     """Fit the table's twin to a rehearsal; InputError if that is too short or shows no motion."""
     problem = RehearsalProblem.from_rehearsal(motion, mass_kg, stall_force_n)
-    fit = fit_basic_twin(problem)
-    return TableIdentification(
-        TableModel(mass_kg, fit.parameters), fit.estimate_half_widths(), math.sqrt(fit.cost)
-    )
+    return fit_basic_twin(problem).to_identification()
 
 
-def fit_basic_twin(problem: RehearsalProblem) -> TableFit:
-    """Fit the twin without further effects.
+def fit_basic_twin(
+    problem: RehearsalProblem,
+    effect_bounds: Mapping[str, tuple[float, float, float]] = MappingProxyType({}),
+    trials: Sequence[Mapping[str, float]] = (MappingProxyType({}),),
+) -> TableFit:
+    """Fit the twin from nothing, without further effects or with those whose bounds are given.
 
     First without a frame, whose resonance is narrow; then from the frequency of the frame that
-    leaves least.
+    leaves least. `trials` are starting values of the parameters of the effects.
     """
-    start = {name: values[0] for name, values in BOUNDS.items()}
-    rough_bounds = {name: values for name, values in BOUNDS.items() if name not in FRAME_NAMES}
-
-    def measure_misfit(values: Mapping[str, float]) -> float:
-        parameters = build_parameters(tuple(values), np.array(list(values.values())), problem)
-        return float(np.linalg.norm(problem.compute_residuals(parameters)))
-
-    starts = [start | {"gain_1_s": gain, "frame_ratio": 0.0} for gain in STARTING_GAINS_1_S]
-    first = min(starts, key=measure_misfit)
+    bounds = {**BOUNDS, **effect_bounds}
+    start = {name: values[0] for name, values in bounds.items()}
+    rough_bounds = {name: values for name, values in bounds.items() if name not in FRAME_NAMES}
+    starts = [
+        start | {"gain_1_s": gain, "frame_ratio": 0.0} | dict(trial)
+        for gain in STARTING_GAINS_1_S
+        for trial in trials
+    ]
+    first = min(starts, key=problem.measure_misfit)
     rough = fit_table(
         problem, rough_bounds, {name: first[name] for name in rough_bounds}, ROUGH_EVALUATIONS, 1e-2
     )
-    start |= dict(zip(rough.names, map(float, rough.values), strict=True))
+    start |= rough.scaled_values
     frames = [start | {"frame_hz": float(hz)} for hz in np.geomspace(*STARTING_FRAMES_HZ)]
-    near = fit_table(problem, BOUNDS, min(frames, key=measure_misfit), tolerance=1e-3)
-    return fit_table(
-        problem.with_noise_of(near), BOUNDS, dict(zip(near.names, near.values, strict=True))
-    )
+    near = fit_table(problem, bounds, min(frames, key=problem.measure_misfit), tolerance=1e-3)
+    return fit_table(problem.with_noise_of(near), bounds, near.scaled_values)
 
 
 def fit_table(

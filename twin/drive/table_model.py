@@ -153,6 +153,31 @@ def _write_rates(s, z, memory, z_valve, command, command_rate, reaction, m, p, r
 
 
 @njit(cache=True, nogil=True)
+def _advance_memories(s, z, memory, z_valve, h, p):  # type: ignore[no-untyped-def]
+    """Return z, the lagging Stribeck exponential and z of the valve after half a step h in s."""
+    stroke, v = s[Y] - s[FRAME], s[V] - s[FRAME_SPEED]
+    if p.second_frame_ratio != 0.0:
+        stroke -= s[FRAME_2]
+        v -= s[FRAME_2_SPEED]
+    sign = 1.0 if v > 0.0 else -1.0
+    if p.friction_asymmetry != 0.0 or p.friction_slope_1_m != 0.0:
+        limit = _find_friction_share(sign, stroke, p)
+        travel = abs(v) * 0.5 * h / (p.presliding_m * limit)
+        z = sign * limit + (z - sign * limit) * math.exp(-travel)
+    else:
+        z = sign + (z - sign) * math.exp(-abs(v) * 0.5 * h / p.presliding_m)
+    if p.friction_memory > 0.0:
+        level = math.exp(-((v / p.stribeck_speed_m_s) ** 2))
+        travel = abs(v) * 0.5 * h / (p.friction_memory * p.presliding_m)
+        memory = level + (memory - level) * math.exp(-travel)
+    if p.valve_hysteresis_m_s > 0.0:
+        sign = 1.0 if s[VALVE_RATE] > 0.0 else -1.0
+        travel = abs(s[VALVE_RATE]) * h / p.valve_hysteresis_m_s
+        z_valve = sign + (z_valve - sign) * math.exp(-travel)
+    return z, memory, z_valve
+
+
+@njit(cache=True, nogil=True)
 def _simulate(command, reaction, m, rate_hz, steps, p, out):  # type: ignore[no-untyped-def]
     """Simulate from rest; command (sample,) in m, out (2, sample): table in m and m/s2."""
     extended = p.second_frame_ratio != 0.0 or p.transducer_lag_s > 0.0
@@ -165,28 +190,7 @@ def _simulate(command, reaction, m, rate_hz, steps, p, out):  # type: ignore[no-
         for i in range(steps):
             # Dahl's state over half a step before, and half a step after, the rest.
             for half in range(2):
-                v = s[V] - s[FRAME_SPEED]
-                if p.second_frame_ratio != 0.0:
-                    v -= s[FRAME_2_SPEED]
-                sign = 1.0 if v > 0.0 else -1.0
-                if p.friction_asymmetry != 0.0 or p.friction_slope_1_m != 0.0:
-                    stroke = s[Y] - s[FRAME]
-                    if p.second_frame_ratio != 0.0:
-                        stroke -= s[FRAME_2]
-                    limit = _find_friction_share(sign, stroke, p)
-                    z = sign * limit + (z - sign * limit) * math.exp(
-                        -abs(v) * 0.5 * h / (p.presliding_m * limit)
-                    )
-                else:
-                    z = sign + (z - sign) * math.exp(-abs(v) * 0.5 * h / p.presliding_m)
-                if p.friction_memory > 0.0:
-                    level = math.exp(-((v / p.stribeck_speed_m_s) ** 2))
-                    travel = abs(v) * 0.5 * h / (p.friction_memory * p.presliding_m)
-                    memory = level + (memory - level) * math.exp(-travel)
-                if p.valve_hysteresis_m_s > 0.0:
-                    sign = 1.0 if s[VALVE_RATE] > 0.0 else -1.0
-                    travel = abs(s[VALVE_RATE]) * h / p.valve_hysteresis_m_s
-                    z_valve = sign + (z_valve - sign) * math.exp(-travel)
+                z, memory, z_valve = _advance_memories(s, z, memory, z_valve, h, p)
                 if half == 1:
                     break
                 total[:] = 0.0
@@ -261,7 +265,9 @@ class TableModel:
         high_pass = s / (s + PRESSURE_CORNER)
         # f' = K (u - v) - 2 z w f
         needed = (oil_force * (s + 2 * p.oil_damping * oil)) / (m * oil**2) + s * stroke
-        loop = spool * (p.gain_1_s * reading * stroke + p.pressure_feedback_s * high_pass * oil_force / m)
+        loop = spool * (
+            p.gain_1_s * reading * stroke + p.pressure_feedback_s * high_pass * oil_force / m
+        )
         asked = (p.gain_1_s + p.velocity_feedforward * s) * delayed
         response: npt.NDArray[np.complex128] = spool * asked * table / (needed + loop)
         return np.where(w == 0.0, 1.0 / reading, response)
