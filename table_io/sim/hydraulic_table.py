@@ -24,7 +24,7 @@ What a worn or badly adjusted table has in addition; each is absent where its ke
     g -> g (1 + tanh(s q))                                                 friction along the stroke
     m_p y_p'' = A p - N, N = k_p d + c_p d' with d = y_p - y beyond +-j/2  play j of the coupling
     q -> (1 + n) q, then twice 1 / (1 + s t_n / 2), in e                   transducer of the stroke
-    m_a y_a'' = k_a (y_f - y_a) + c_a (y_f' - y_a')                        mass attached to the frame
+    m_a y_a'' = k_a (y_f - y_a) + c_a (y_f' - y_a')                      mass attached to the frame
 
 The overlap has rounded edges (Merritt, chapter 5.3); hysteresis is play that a fast lag follows;
 with play in the coupling the piston is a mass of its own and hits its stops elastically.
