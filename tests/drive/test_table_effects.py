@@ -29,7 +29,7 @@ from twin.drive.table_effects import (
     EffectDiscovery,
     describe_discovery,
     describe_size,
-    discover_effects,
+    discover_table_effects,
 )
 from twin.drive.table_file import format_table_twin, load_table_twin
 from twin.drive.table_identification import (
@@ -227,7 +227,7 @@ def rehearse_on_twin(name: str, seconds: float = 24.0) -> EffectDiscovery:
         "frame_ratio": 0.05, "frame_damping": 0.05, "pressure_feedback_s": 0.003,
         "oil_damping": 0.05,
     }  # fmt: skip
-    return discover_effects(fit_table(problem, BOUNDS, start))
+    return discover_table_effects(fit_table(problem, BOUNDS, start))
 
 
 @pytest.mark.slow  # 5 s
@@ -253,7 +253,7 @@ def test_the_effect_of_a_simulated_table_is_named(name: str) -> None:
     table = PlantedTable(PLANTED.get(name, {}), seed=77, effect=name)
     problem = RehearsalProblem.from_rehearsal(record_rehearsal(table), MASS_KG, STALL_N)
     basic = fit_basic_twin(problem)
-    discovery = discover_effects(basic)
+    discovery = discover_table_effects(basic)
     assert [finding.id for finding in discovery.findings] == ([name] if name else [])
     if not name:
         return

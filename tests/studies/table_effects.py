@@ -18,7 +18,7 @@ import numpy as np
 
 from tests.drive.hydraulic_rig import TABLE
 from tests.drive.planted_tables import SIZES, PlantedTable, draw_table, record_rehearsal
-from twin.drive.table_effects import EFFECT_BY_ID, describe_size, discover_effects
+from twin.drive.table_effects import EFFECT_BY_ID, describe_size, discover_table_effects
 from twin.drive.table_identification import RehearsalProblem, fit_basic_twin
 
 MASS_KG, STALL_N = TABLE.moving_mass_kg, 42_000.0
@@ -53,7 +53,7 @@ def run_case(table: PlantedTable) -> dict[str, Any]:
     problem = RehearsalProblem.from_rehearsal(record_rehearsal(table), MASS_KG, STALL_N)
     basic = fit_basic_twin(problem)
     fitted_s = time.process_time() - begin
-    discovery = discover_effects(basic)
+    discovery = discover_table_effects(basic)
     parameters, widths = discovery.fit.parameters, discovery.fit.estimate_half_widths()
     planted = {key: float(table.hydraulic[key]) for key in SIZES.get(table.effect, {})}
     return {

@@ -269,11 +269,11 @@ def identify_table_and_effects(
     """
     report("fitting the twin of the table")
     problem = RehearsalProblem.from_rehearsal(motion, mass_kg, stall_force_n)
-    discovery = discover_effects(fit_basic_twin(problem), report)
+    discovery = discover_table_effects(fit_basic_twin(problem), report)
     return discovery.fit.to_identification(), discovery
 
 
-def discover_effects(
+def discover_table_effects(
     basic: TableFit, report: Callable[[str], None] = lambda stage: None
 ) -> EffectDiscovery:
     """Find which effects of LIBRARY the basic twin lacks; `report` gets the stage in words."""

@@ -116,7 +116,7 @@ class RehearsalProblem:
             motion,
             **{row.name: getattr(motion, row.name)[:count] for row in fields(motion)[1:]},
         )
-        frequency_hz = np.fft.rfftfreq(count, 1.0 / motion.rate_hz)
+        frequency_hz = np.asarray(np.fft.rfftfreq(count, 1.0 / motion.rate_hz), np.float64)
         used = (frequency_hz >= LOWEST_HZ) & (frequency_hz <= HIGHEST_HZ)
         weights = _weigh_frequencies(motion, used)
         measured = _transform_motion(
@@ -146,7 +146,8 @@ class RehearsalProblem:
         out = model.simulate(motion.command_m, motion.rate_hz, motion.reaction_n)
         if not np.isfinite(out).all():
             return np.full(self.block.size, 10.0)
-        frequency_hz = np.fft.rfftfreq(motion.command_m.size, 1.0 / motion.rate_hz)[self.used]
+        all_hz = np.fft.rfftfreq(motion.command_m.size, 1.0 / motion.rate_hz)
+        frequency_hz = np.asarray(all_hz[self.used], np.float64)
         values = _transform_motion(out[0], out[1], frequency_hz, self.used) * self.weights
         size = self.block.size - 1
         spectrum = np.zeros(size // 2 + 1, complex)
