@@ -247,7 +247,7 @@ def test_nothing_is_named_where_nothing_is_missing() -> None:
 
 
 @pytest.mark.slow  # 60 s each
-@pytest.mark.parametrize("name", ["dead_band", "friction_asymmetry", ""])
+@pytest.mark.parametrize("name", ["friction_asymmetry", ""])
 def test_the_effect_of_a_simulated_table_is_named(name: str) -> None:
     """As the rig records it; the drive computed with the effect is better than without."""
     table = PlantedTable(PLANTED.get(name, {}), seed=77, effect=name)
