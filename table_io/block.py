@@ -15,6 +15,7 @@ import numpy.typing as npt
 Float1D = npt.NDArray[np.float64]
 Float2D = npt.NDArray[np.float64]
 Int1D = npt.NDArray[np.int64]
+Bool1D = npt.NDArray[np.bool_]
 Bool2D = npt.NDArray[np.bool_]
 
 
@@ -66,6 +67,11 @@ class Block:
     def time_s(self) -> Float1D:
         """Time of each sample since the start of the run in s, (sample,)."""
         return (self.index + np.arange(len(self), dtype=np.float64)) / self.rate_hz
+
+    @property
+    def is_history(self) -> Bool1D:
+        """Whether each sample belongs to a displacement history that is played, (sample,)."""
+        return (self.label == Label.MEASURE) & (self.cycle < 0)
 
     def channel(self, name: str) -> Float1D:
         """Return the samples of one channel, (sample,); a KeyError lists the available channels."""

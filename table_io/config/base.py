@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo
 from pydantic.fields import FieldInfo
 
 from table_io.config.shipped import PROFILES_DIR as PROFILES_DIR  # noqa: PLC0414  exports it
@@ -74,6 +74,21 @@ class ConfigModel(BaseModel):
 
 
 ConfigT = TypeVar("ConfigT", bound=ConfigModel)
+
+
+def find_attached_text(name: str | None, info: ValidationInfo) -> str | None:
+    """Return the text of a file that a key names; None without one, or if `files` is at fault.
+
+    For a validator of a model with a field `files`: the texts by name, which loading attaches.
+    InputError if the file is not among them.
+    """
+    files = info.data.get("files")
+    if name is None or files is None:
+        return None
+    if name not in files:
+        raise InputError(f"{name!r} is not attached", remedy="load the profile from its file")
+    text: str = files[name]
+    return text
 
 
 def _known_keys(model: type[ConfigModel], location: tuple[int | str, ...], raw: Any) -> list[str]:

@@ -234,7 +234,7 @@ class Profile(ConfigModel):
     @property
     def steps(self) -> tuple[Step, ...]:
         """Planned steps in driving order; none if a displacement history is played."""
-        return self.plan.steps
+        return () if isinstance(self.excitation, History) else self.plan.steps
 
     @model_validator(mode="before")
     @classmethod
@@ -340,12 +340,15 @@ def load_profile(path: Path) -> tuple[Profile, str]:
     """
     text = read_text(path, "test profile")
     for table in ("excitation", "tracking"):
-        text = _attach_files(text, path, table)
+        text = attach_files(text, path, table)
     return parse_toml(text, Profile, str(path)), text
 
 
-def _attach_files(text: str, path: Path, table_name: str) -> str:
-    """Return the text of a profile with a table of the files of its table appended."""
+def attach_files(text: str, path: Path, table_name: str) -> str:
+    """Return the text of a profile with a table of the files of its table appended.
+
+    The files lie next to `path`. InputError if one cannot be read.
+    """
     try:
         table = tomllib.loads(text)[table_name]
         is_tracking = table_name == "tracking"

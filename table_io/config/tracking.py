@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
 
 from table_io.block import Float1D
-from table_io.config.base import ConfigModel, Number, Positive
+from table_io.config.base import ConfigModel, Number, Positive, find_attached_text
 from table_io.errors import InputError
 from table_io.units import GRAVITY_M_S2
 
@@ -76,12 +76,9 @@ class TrackingConfig(ConfigModel):
     @field_validator("required_spectrum")
     @classmethod
     def _check_spectrum(cls, name: str | None, info: ValidationInfo) -> str | None:
-        files = info.data.get("files")
-        if name is None or files is None:
-            return name
-        if name not in files:
-            raise InputError(f"{name!r} is not attached", remedy="load the profile from its file")
-        parse_required_spectrum(files[name], name)
+        text = find_attached_text(name, info)
+        if text is not None:
+            parse_required_spectrum(text, str(name))
         return name
 
     @cached_property

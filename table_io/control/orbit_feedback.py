@@ -22,8 +22,9 @@ import numpy as np
 
 from table_io.block import Float1D, Int1D
 from table_io.config.excitation.orbit_plan import unpack_harmonics
+from table_io.config.excitation.waveform import smoothstep
 from table_io.excitation.correction import Correction
-from table_io.excitation.drive import MAX_BLEND_CURVATURE, Drive, smoothstep
+from table_io.excitation.drive import MAX_BLEND_CURVATURE, Drive
 
 WINDOW_S = 0.03  # of the fit: longer rejects more noise, shorter follows a faster growth
 BLEND_S = 0.02  # from the previous function to the next
@@ -62,7 +63,7 @@ class ReferenceSegment:
         return before + (evaluate_harmonics(after, phase) - before) * self._blend(indices)
 
     def _blend(self, indices: Int1D) -> Float1D:
-        return smoothstep(np.clip((indices - self.start) / max(self.count, 1), 0.0, 1.0))
+        return smoothstep((indices - self.start) / max(self.count, 1))
 
 
 def evaluate_harmonics(vector: Float1D, phase: Float1D) -> Float1D:
@@ -133,9 +134,9 @@ def advance_feedback(
     indices = np.arange(start, start + count)
     values = np.real(
         state.phasor_m * np.exp(1j * w * (indices - end - state.horizon) / rate_hz)
-    ) * (1.0 - smoothstep(np.clip((indices - indices[-1]) / (FADE_S * rate_hz) + 1.0, 0.0, 1.0)))
+    ) * (1.0 - smoothstep((indices - indices[-1]) / (FADE_S * rate_hz) + 1.0))
     values *= segment.share(indices)
-    blend = smoothstep(np.minimum(np.arange(count) / (BLEND_S * rate_hz), 1.0))
+    blend = smoothstep(np.arange(count) / (BLEND_S * rate_hz))
     previous = drive.correction.displacement(start, count)
     values = previous + (values - previous) * blend
     return state, drive.correction.replace_from(start, values, keep_from), start

@@ -22,6 +22,7 @@ from functools import cached_property
 import numpy as np
 
 from table_io.block import Float1D, Int1D, Label
+from table_io.config.excitation.waveform import smoothstep
 from table_io.excitation.correction import NO_CORRECTION, Correction
 from table_io.records import Step
 
@@ -167,11 +168,6 @@ class HistorySegment:
         index = self._indices(x) + shift
         inside = (index >= 0) & (index < self.count)
         return np.where(inside, self.history_m[np.clip(index, 0, self.count - 1)], 0.0)
-
-
-def smoothstep(x: Float1D) -> Float1D:
-    """Return the quintic blend from 0 to 1 at x, with zero first and second end derivatives."""
-    return x**3 * (10.0 + x * (-15.0 + 6.0 * x))
 
 
 def segment_displacement(segment: Segment, x: Float1D, rate_hz: float) -> Float1D:
@@ -354,7 +350,7 @@ class Drive:
         if self.decay_start is None:
             return np.ones(count)
         x = (np.arange(first, first + count) - self.decay_start) / self.decay_samples
-        return 1.0 - smoothstep(np.clip(x, 0.0, 1.0))
+        return 1.0 - smoothstep(x)
 
     def labels(self, first: int, count: int) -> tuple[Int1D, Int1D, Int1D]:
         """Return (step, label, held cycle) of each sample, (count,) each; -1 outside the sweep."""

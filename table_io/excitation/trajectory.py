@@ -179,11 +179,11 @@ def cycles_to_samples(step: Step, cycles: int, rate_hz: float) -> int:
 
 
 def plan_excitation(profile: Profile) -> Drive:
-    """Return the drive of the excitation alone, as an ideal table plays it."""
+    """Return the drive of the excitation alone for an ideal table, which needs no other command."""
     plan = profile.plan
     if plan.steps:
         return plan_sweep(profile)
-    return start_trajectory(profile).append_history(plan.history_m, plan.windows).to_drive(())
+    return start_trajectory(profile).append_history(plan.target_m, plan.windows).to_drive(())
 
 
 def plan_sweep(profile: Profile) -> Drive:

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from table_io.block import Float2D
+from table_io.config.excitation.waveform import smoothstep
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.amplitude_control import MAX_CORRECTION
 from table_io.control.frf import evaluate_gain
 from table_io.errors import InputError
-from table_io.excitation.drive import Drive, HistorySegment, Segment, smoothstep
+from table_io.excitation.drive import Drive, HistorySegment, Segment
 from table_io.records import FrequencyResponse, Step
 from table_io.safety.loop_check import plan_targets
 from table_io.units import GRAVITY_M_S2
@@ -206,6 +207,19 @@ def check_limits(
                 allowed=f"at least {rig.output.least_lsb}",
                 remedy=f"raise {level_key}, lower sweep.stop_hz, or use an output with "
                 "more bits or a smaller span",
+            )
+        )
+    peak_lsb = max(
+        (row.amplitude_lsb for row in rows if math.isnan(row.frequency_hz)), default=None
+    )
+    if peak_lsb is not None and peak_lsb < rig.output.least_lsb:
+        faults.append(
+            InputError(
+                f"{peak_lsb:.1f} steps of the DAC",
+                where="the peak of the history",
+                key="displacement",
+                allowed=f"at least {rig.output.least_lsb}",
+                remedy="raise its level, or use an output with more bits or a smaller span",
             )
         )
     if faults:

@@ -13,8 +13,8 @@ and without oil `Plant` is used instead.
 """
 
 import math
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, Self
 
 import numpy as np
 from numba import njit
@@ -330,6 +330,12 @@ class HiddenPlant(Plant):
         object.__setattr__(
             self, "substep_s", min(longest_s, base_plant.MAX_SUBSTEP_RATIO * shortest_s)
         )
+
+    def with_servo_share(self, share: float) -> Self:
+        """Return the plant with this share of its oil supply, or of its servo's bandwidth."""
+        if not self.oil.area:
+            return super().with_servo_share(share)
+        return replace(self, oil=self.oil.with_supply(share))
 
     def rest_state(self) -> Float1D:
         """Return the state of static equilibrium with the table at 0 and all forces relaxed.

@@ -17,9 +17,9 @@ within one sub-step is missed (less than 0.2 N with the paper's rig).
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 from numba import njit
@@ -259,6 +259,10 @@ class Plant:
                 value=self.bumper_damping_n_s_m,
                 allowed=f"at least {min_damping:.3g} at {self.rate_hz:g} Hz",
             )
+
+    def with_servo_share(self, share: float) -> Self:
+        """Return the plant with this share of its servo's bandwidth."""
+        return replace(self, servo_bandwidth_hz=share * self.servo_bandwidth_hz)
 
     @property
     def history_samples(self) -> int:

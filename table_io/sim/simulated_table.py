@@ -6,7 +6,7 @@ time and as fast as possible. Injected faults are in `faults.py`.
 
 import math
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -24,7 +24,6 @@ from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.faults import build_faults
 from table_io.sim.ground_truth import GroundTruth, parse_ground_truth
 from table_io.sim.ground_truth_applied import SensorDistortion, build_hidden_plant
-from table_io.sim.hidden_plant import HiddenPlant
 from table_io.sim.hydraulic_table import make_coefficients
 from table_io.sim.imperfections import Imperfection
 from table_io.sim.laboratory import Laboratory
@@ -52,8 +51,8 @@ def build_plant(table: SimulatedTableConfig, specimen: Specimen, rate_hz: float)
     )
     if table.hydraulic is None:
         return plant
-    values = {field.name: getattr(plant, field.name) for field in fields(Plant)}
-    return HiddenPlant(**values, oil=make_coefficients(table.hydraulic, table.moving_mass_kg))
+    oil = make_coefficients(table.hydraulic, table.moving_mass_kg)
+    return replace(build_hidden_plant(plant, GroundTruth()), oil=oil)
 
 
 def load_ground_truth(table: SimulatedTableConfig) -> GroundTruth | None:
@@ -131,7 +130,7 @@ class SimulatedBackend:
             self._plant = build_hidden_plant(self._plant, truth)
             self._distortion = SensorDistortion(truth, rig.channels, self._plant.rate_hz)
             self._imperfections = truth.imperfections
-        self._plant_with_share = lru_cache(2)(self._build_plant_with_share)
+        self._plant_with_share = lru_cache(2)(self._plant.with_servo_share)
         self._faults = build_faults(table.faults, rig, rate_hz, table.seed)
         self._state = self._plant.rest_state()
         self._seed = table.seed
@@ -256,14 +255,6 @@ class SimulatedBackend:
         """Return the laboratory at rest, its next sample being `first`."""
         rate_hz = self._plant.rate_hz
         return Laboratory(self._imperfections, self._rig, rate_hz, self._seed, noise, first)
-
-    def _build_plant_with_share(self, share: float) -> Plant:
-        """Return the plant with this fraction of its servo's bandwidth, or of its oil supply."""
-        if share == 1.0:
-            return self._plant
-        if isinstance(self._plant, HiddenPlant) and self._plant.oil.area:
-            return replace(self._plant, oil=self._plant.oil.with_supply(share))
-        return replace(self._plant, servo_bandwidth_hz=share * self._plant.servo_bandwidth_hz)
 
     def _require(self, condition: bool, remedy: str) -> None:
         if not condition:

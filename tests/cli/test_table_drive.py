@@ -13,6 +13,7 @@ from tests.command_line import call_main
 from twin.drive.table_file import load_table_twin
 from twin.drive.table_model import TableParameters
 from twin.recording.reader import read_recording
+from twin.run.run_config import read_run_config
 
 RECORD = """
 title = "Short pulse"
@@ -71,6 +72,25 @@ def test_the_drive_is_played_and_the_target_stays(folder: Path) -> None:
     assert np.abs(after.plan.history_m - target).max() > 0.05 * np.abs(target).max()
 
 
+def test_an_ideal_table_plays_the_target_and_its_specimen_knows_no_drive(folder: Path) -> None:
+    """The reaction of the specimen, and with it the drive, is the same with a drive at hand."""
+    assert compute(folder) == 0
+    driven = folder / "out" / "profile.toml"
+    config = read_run_config(driven)
+    first = config.ideal_drive.segments[-1].start
+    target = config.profile.plan.target_m
+    np.testing.assert_array_equal(config.ideal_drive.command(first, target.size), target)
+    again = call_main(
+        "table-drive", str(driven), "--table-twin", str(folder / "table.toml"),
+        "--out", str(folder / "again"),
+    )  # fmt: skip
+    assert again.returncode == 0
+    drives = [
+        load_profile(folder / name / "profile.toml")[0].plan.history_m for name in ("out", "again")
+    ]
+    np.testing.assert_allclose(drives[1], drives[0], atol=5e-6)
+
+
 @pytest.mark.slow  # 15 s
 def test_iterations_are_runs_of_their_own_with_smaller_errors(folder: Path) -> None:
     assert compute(folder, "--iterate", "1", "--speed", "max") == 0
@@ -84,6 +104,7 @@ def test_iterations_are_runs_of_their_own_with_smaller_errors(folder: Path) -> N
     assert errors[1]["acc_rms_error_band"] < errors[0]["acc_rms_error_band"]
 
 
+@pytest.mark.slow  # 10 s
 def test_the_run_of_another_target_does_not_correct_a_drive(folder: Path) -> None:
     assert compute(folder) == 0
     profile = folder / "out" / "profile.toml"
@@ -109,6 +130,7 @@ def compute_after(folder: Path, run: Path) -> None:
         ("drive_mm\n0.0\n1.0\n0.0\n", "excitation.drive"),
         ("drive_mm\n" + "0.0\n" * 10 + "nan\n", "excitation.drive"),
         ("disp_mm\n0.0\n0.0\n", "excitation.drive"),
+        ("drive_mm\n" + "0.0\n" * 10000, "excitation.drive"),
         ("drive_mm\n0.0\nmuch\n", "excitation.drive"),
     ],
 )

@@ -16,7 +16,7 @@ from tests.drive.hydraulic_rig import (
     make_random_motion,
     play,
 )
-from twin.drive.drive_computation import compute_drive, correct_drive, measure_error
+from twin.drive.drive_computation import compute_correction, compute_drive, measure_error
 from twin.drive.table_identification import TableIdentification, TableRehearsal, identify_table
 from twin.drive.table_model import TableModel, TableParameters
 
@@ -80,7 +80,7 @@ def test_the_first_run_of_its_drive_is_right_and_the_next_ones_are_better(
     target = make_random_motion(20.0, (0.4, 12.0), 0.05 * GRAVITY_M_S2, seed=9)
     rig = build_rig(friction_n)
     open_loop = measure_error(play(rig, target)[0], target, RATE_HZ, BAND_HZ)
-    linear = correct_drive(np.zeros_like(target), target, result.model, RATE_HZ, BAND_HZ)
+    linear = compute_correction(target, result.model, RATE_HZ, BAND_HZ)
     by_linear = measure_error(play(rig, linear)[0], target, RATE_HZ, BAND_HZ)
     reaction = -SPECIMEN_KG * play(replace(rig, payload_reaction=False), target)[3]
     command = compute_drive(result.model, target, RATE_HZ, BAND_HZ, reaction).command_m
@@ -88,7 +88,7 @@ def test_the_first_run_of_its_drive_is_right_and_the_next_ones_are_better(
     for _ in range(3):
         achieved = play(rig, command)[0]
         errors.append(measure_error(achieved, target, RATE_HZ, BAND_HZ))
-        command = correct_drive(command, target - achieved, result.model, RATE_HZ, BAND_HZ)
+        command += compute_correction(target - achieved, result.model, RATE_HZ, BAND_HZ)
     assert open_loop > 0.25
     assert errors[0] < min(0.05, by_linear)
     assert errors[2] < 0.02

@@ -9,6 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from table_io.config.base import PROFILES_DIR
+from table_io.config.toml_text import format_toml
 from table_io.records import RunStop
 from tests.recovery.recordings import CHANNELS, TRUTH, card, make_noisy_blocks
 from twin.cli.main import app
@@ -16,7 +17,6 @@ from twin.model.config import ModelConfig
 from twin.recording.mcap_log import write_items
 from twin.reports.quantities import format_quantity
 from twin.run.run_config import from_texts, read_model
-from twin.validation.study.rig_setup import format_toml
 
 GAPS = (2.0, 2.0)
 

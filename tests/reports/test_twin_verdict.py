@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from table_io.block import Block
+from table_io.config.toml_text import format_toml
 from twin.recording.reader import read_recording
 from twin.reports.summary import Json, summarise, write_summary
 from twin.reports.twin_verdict import (
@@ -20,7 +21,7 @@ from twin.reports.twin_verdict import (
 )
 from twin.run.run_config import read_run_config
 from twin.run.unpaced import play_unpaced
-from twin.validation.study.rig_setup import NOMINAL_RIG, format_toml
+from twin.validation.study.rig_setup import NOMINAL_RIG
 
 TEST = """
 title = "{name}"

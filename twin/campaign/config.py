@@ -6,12 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, ValidationError, ValidationInfo, field_validator
 
 from table_io.config.base import ConfigModel, Count, parse_toml, read_text
+from table_io.config.excitation.stepped_sine import Sweep
 from table_io.config.folders import find_config, list_configs, resolve_config
 from table_io.errors import InputError, suggest
 from table_io.safety.preflight import list_drive_warnings as coarse
+from twin.campaign.record_grid import LABEL_PATTERN, GridCell, RecordGrid, read_base, read_cell
 from twin.run.run_config import RunConfig, read_run_config
 
 ResumeMode = Literal["direction", "step", "run"]
@@ -26,7 +28,7 @@ class CampaignRun(ConfigModel):
     )
     label: str = Field(
         "",
-        pattern=r"^([A-Za-z0-9][A-Za-z0-9_.-]*)?$",
+        pattern=LABEL_PATTERN,
         description="Name of the run; empty: name of the profile.",
     )
     prompt: str = Field("", description="Set-up change to confirm before the run; empty: none.")
@@ -41,7 +43,7 @@ class CampaignRun(ConfigModel):
 
 
 class CampaignConfig(ConfigModel):
-    """A campaign: its runs in order, and where an interrupted run continues."""
+    """A campaign: its runs, then those of its grid, and where an interrupted run continues."""
 
     title: str = Field(description="Title of the campaign in every report.")
     citation: str = Field("", description="Source of the programme.")
@@ -49,14 +51,30 @@ class CampaignConfig(ConfigModel):
     resume: ResumeMode = Field(
         "direction", description="Part of an interrupted run to repeat: direction, step or run."
     )
+    records: RecordGrid | None = None
     runs: tuple[CampaignRun, ...] = Field((), validate_default=True)
 
     @field_validator("runs")
     @classmethod
-    def _require_runs(cls, runs: tuple[CampaignRun, ...]) -> tuple[CampaignRun, ...]:
-        if not runs:
-            raise ValueError('no runs; add at least one [[runs]] with profile = "..."')
+    def _require_runs(
+        cls, runs: tuple[CampaignRun, ...], info: ValidationInfo
+    ) -> tuple[CampaignRun, ...]:
+        if not runs and "records" in info.data and info.data["records"] is None:
+            raise ValueError(
+                'no runs; add at least one [[runs]] with profile = "...", or [records] with gaps_mm'
+            )
         return runs
+
+    @property
+    def tests(self) -> tuple[str, ...]:
+        """Names of the tests of all runs in order; a run of the grid has its own test."""
+        listed = [Path(run.profile).stem for run in self.runs for _ in run.labels]
+        return (*listed, *(cell.label for cell in self.cells))
+
+    @property
+    def cells(self) -> tuple[GridCell, ...]:
+        """Runs of the grid of records and gaps, in order; none without a grid."""
+        return () if self.records is None else tuple(self.records.list_cells())
 
 
 @dataclass(frozen=True)
@@ -96,9 +114,9 @@ def read_plan(
     """Return the plan of a campaign file; one InputError lists every fault in it and its tests."""
     path = resolve_config(path, "campaigns")
     text = read_text(path, "campaign")
-    faults: dict[str, tuple[InputError, list[str]]] = {}
+    faults = FaultList()
     bundles: dict[str, RunConfig] = {}
-    entries = _list_runs(text)
+    entries, grid = _list_runs(text), _parse_grid(text)
     for name in dict.fromkeys(run.profile for run in entries):
         place = path
         try:
@@ -107,14 +125,14 @@ def read_plan(
             _refuse_own_sections(bundles[name])
             check_run(bundles[name], place)
         except InputError as error:
-            fault = _drop_place(error, place)
-            faults.setdefault(str(fault), (fault, []))[1].append(name)
-    labels = [label for run in entries for label in run.labels]
+            faults.add(_drop_place(error, place), name)
+    grid_bundles = {} if grid is None else _read_grid(grid, path, table, model, check_run, faults)
+    cells = () if grid is None else tuple(grid.list_cells())
+    labels = [label for run in entries for label in run.labels] + [cell.label for cell in cells]
     for label in sorted({label for label in labels if labels.count(label) > 1}):
         fault = InputError("used twice", key="label", value=label, remedy="give each run its own")
-        faults[str(fault)] = fault, ["runs"]
-    # A fault that several profiles share is listed once.
-    listed = [InputError("", where=", ".join(at), faults=[fault]) for fault, at in faults.values()]
+        faults.add(fault, "runs")
+    listed = faults.list_by_place()
     try:
         config = parse_toml(text, CampaignConfig, str(path))
     except InputError as error:
@@ -128,9 +146,87 @@ def read_plan(
         for run in config.runs
         for k, label in enumerate(run.labels)
     ]
+    runs += [
+        (cell.label, cell.prompt, cell.record.notes, grid_bundles[cell.label])
+        for cell in config.cells
+    ]
     return CampaignPlan(
         path, config, text, tuple(PlannedRun(n, *fields) for n, fields in enumerate(runs, 1))
     )
+
+
+class FaultList:
+    """Faults of the tests of a campaign; what several of them share is listed once."""
+
+    def __init__(self) -> None:
+        self._faults: dict[str, tuple[InputError, list[str]]] = {}
+
+    def add(self, fault: InputError, place: str) -> None:
+        """Add a fault of the test or table at `place`."""
+        places = self._faults.setdefault(str(fault), (fault, []))[1]
+        if place not in places:
+            places.append(place)
+
+    def list_by_place(self) -> list[InputError]:
+        """Return one error per different fault, with the places that share it."""
+        return [
+            InputError("", where=", ".join(places), faults=[fault])
+            for fault, places in self._faults.values()
+        ]
+
+
+def _read_grid(
+    grid: RecordGrid,
+    path: Path,
+    table: str | None,
+    model: str | None,
+    check_run: CheckRun,
+    faults: FaultList,
+) -> dict[str, RunConfig]:
+    """Return the configurations of the runs of a grid by label; add what is wrong to `faults`."""
+    place = path
+    try:
+        place = _find_profile(grid.profile, path)
+        base = read_base(place)
+    except InputError as error:
+        faults.add(_drop_place(error, place), f"records, profile {grid.profile}")
+        return {}
+    bundles: dict[str, RunConfig] = {}
+    by_record: dict[str, RunConfig] = {}
+    for cell in grid.list_cells():
+        name = cell.record.name
+        try:
+            bundle = read_cell(grid, base, cell, path, table, model, by_record.get(name))
+            if name not in by_record:
+                _refuse_own_sections(bundle)
+                check_run(bundle, path)
+            bundles[cell.label] = by_record[name] = bundle
+        except InputError as error:
+            fault = _drop_place(_drop_place(error, path), Path(cell.label))
+            faults.add(fault, f"records, {name}")
+    return bundles
+
+
+def _parse_grid(text: str) -> RecordGrid | None:
+    """Return the grid of a campaign file; None without one, or if it cannot be parsed."""
+    try:
+        table = tomllib.loads(text).get("records")
+        return None if table is None else RecordGrid.model_validate(table)
+    except (tomllib.TOMLDecodeError, ValidationError, TypeError):
+        return None  # reported when the whole file is parsed
+
+
+def find_campaign(name: Path) -> Path | None:
+    """Return the path of a campaign file given by its path or bare name; None if it is a test."""
+    if name.suffix.lower() != ".toml":
+        is_test = name.is_file() or str(name) in list_configs("tests")
+        is_campaign = not is_test and str(name) in list_configs("campaigns")
+        return resolve_config(name, "campaigns") if is_campaign else None
+    try:
+        tables = tomllib.loads(name.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None  # reported as a test that cannot be read
+    return name if {"records", "runs"} & tables.keys() else None
 
 
 def _list_runs(text: str) -> list[CampaignRun]:
@@ -191,17 +287,20 @@ def list_campaign_warnings(plan: CampaignPlan) -> list[str]:
         for run in plan.runs
         for sentence in coarse(run.bundle.margins, run.bundle.rig)
     ]
-    free = [run for run in plan.runs if is_free_flight(run.bundle)]
+    swept = [run for run in plan.runs if isinstance(run.bundle.profile.excitation, Sweep)]
+    if not swept:
+        return warnings  # no curve is divided by u* and a*
+    free = [run for run in swept if is_free_flight(run.bundle)]
     if not free:
         return [*warnings, "no free flight in this campaign: its curves are divided by u* and a* "
                 "of the model, not by measured ones"]  # fmt: skip
-    if free[0].number != 1:
+    if free[0] is not swept[0]:
         warnings.append(
             f"free flight ({free[0].label}) is not the first run: u* and a*, by which every curve "
             "is divided, are unknown until then"
         )
     level = free[0].bundle.profile.sweep.one_level_g
-    other_levels = [run for run in plan.runs if run.bundle.profile.sweep.one_level_g != level]
+    other_levels = [run for run in swept if run.bundle.profile.sweep.one_level_g != level]
     if other_levels:
         warnings.append(
             f"{', '.join(run.label for run in other_levels)}: another level than the free flight's "

@@ -11,6 +11,8 @@ from matplotlib.figure import Figure
 from table_io.config.excitation.stepped_sine import Sweep
 from table_io.records import PrcPoint
 from table_io.units import GRAVITY_M_S2
+from twin.campaign.gap_comparison import GapComparison
+from twin.campaign.gap_figures import draw_gap_figures
 from twin.campaign.summary import CampaignData, CampaignRunData, describe_normalization
 from twin.reports.measured_campaign import MeasuredCampaign
 from twin.reports.paper_cases import PaperCase, PaperTest
@@ -23,7 +25,6 @@ from twin.reports.plot_style import (
     LineStyle,
     Picture,
     direction_handles,
-    format_minus,
     save_figures,
 )
 from twin.reports.prc_families import draw_all_gaps, draw_transition
@@ -36,6 +37,15 @@ NEAR_HZ = 1e-9
 def draw_campaign_figures(campaign: CampaignData, folder: Path) -> list[Picture]:
     """Draw the figures as PNG files in `folder`; return them with titles and captions."""
     return save_figures(_draw_each(campaign), folder)
+
+
+def draw_gap_pairs(comparison: GapComparison | None, folder: Path) -> list[tuple[Picture, Picture]]:
+    """Draw the comparison of gaps in `folder`; return pairs on a light and on a dark ground."""
+    if comparison is None:
+        return []
+    light = save_figures(draw_gap_figures(comparison), folder)
+    dark = save_figures(draw_gap_figures(comparison), folder / "dark", dark=True)
+    return list(zip(light, dark, strict=True))
 
 
 def _draw_each(campaign: CampaignData) -> CaptionedFigures:
@@ -142,8 +152,3 @@ def _draw_levels(campaign: CampaignData) -> CaptionedFigure:
 
 def _dot_style(direction: str) -> LineStyle:
     return {"color": DIRECTION_COLOURS[direction], "ls": "", "marker": "o", "ms": 2.8, "mew": 0}
-
-
-def format_gap(gap_mm: float) -> str:
-    """Return the name of a gap as in the paper: G16, G−1, G∞."""
-    return "G∞" if math.isinf(gap_mm) else format_minus(f"G{gap_mm:g}")

@@ -5,6 +5,7 @@ the beginning of its direction.
 """
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import groupby
@@ -93,7 +94,7 @@ def _describe_branch(run: RunState, profile: Profile, steps: list[Json], directi
 
 def _summarize_quality(profile: Profile, steps: list[Json], summaries: Sequence[Json]) -> Json:
     """Return quality figures of a run: level errors, checks, trips, faults, latency, gaps."""
-    demanded = profile.plan.level_m_s2
+    demanded = profile.plan.level_m_s2 if steps else math.nan
     errors = [number_or_nan(step["table_acc_fundamental_m_s2"]) / demanded - 1 for step in steps]
     worst = max(range(len(steps)), key=lambda k: abs(errors[k]), default=None)
     levels = [step["level"] for step in steps if step.get("level")]

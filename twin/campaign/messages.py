@@ -1,14 +1,18 @@
 """Terminal messages of a campaign, and prompts for the operator."""
 
 import getpass
+import math
 from typing import Literal
+
+from rich.table import Table
 
 from table_io.clock import local_datetime
 from twin.campaign.config import PlannedRun
+from twin.campaign.gap_comparison import CRITERIA, format_best, format_gap
 from twin.campaign.merge import merge_summaries, read_summary
 from twin.campaign.state import ActiveCampaign, OperatorAnswer
-from twin.reports.summary import format_summary
-from twin.run.terminal import console, print_line
+from twin.reports.summary import Json, format_summary
+from twin.run.terminal import console, print_line, print_table
 
 Reply = Literal["done", "skipped", "unattended", "not asked"]
 
@@ -81,3 +85,37 @@ def ask_operator(campaign: ActiveCampaign, run: PlannedRun, first: bool) -> Oper
                 return make_answer(prompt, "skipped")
             case "q":
                 return None
+
+
+def print_gap_comparison(comparison: Json) -> None:
+    """Print the entry `gap_comparison` of a summary: medians over the records, best gaps."""
+    count, source = len(comparison["records"]), comparison["sources"][0]
+    name = "measured" if source == "measured" else "model"
+    title = (
+        f"median (smallest to largest) over {count} records, {name}; "
+        f"1 is {comparison['reference']}, * is best"
+    )
+    headers = ("acceleration", "displacement", "compromise", "force / weight")
+    table = Table("gap", *headers, title=title)
+    best = comparison["best"][source]
+    for row in comparison["gaps"]:
+        cells = [_format_spread(row[source][name], _is_best(best[name], row)) for name in CRITERIA]
+        table.add_row(_name_gap(row), *cells)
+    print_table(console, table)
+    for name, meaning in CRITERIA.items():
+        print_line(f"{meaning}: {format_best(best[name])}")
+
+
+def _name_gap(row: Json) -> str:
+    return format_gap(math.inf if row["gap_mm"] is None else row["gap_mm"])
+
+
+def _is_best(best: Json | None, row: Json) -> bool:
+    return best is not None and bool(best["gap_mm"] == row["gap_mm"])
+
+
+def _format_spread(spread: Json, is_best: bool) -> str:
+    if not spread["count"]:
+        return "–"
+    text = f"{spread['median']:.2f} ({spread['smallest']:.2f} to {spread['largest']:.2f})"
+    return f"{text} *" if is_best else text

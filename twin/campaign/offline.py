@@ -85,6 +85,15 @@ class RunWorker:
         assert self.process.stdout is not None
         return self.process.stdout.fileno()
 
+    def close(self) -> int:
+        """Wait until the process has ended; close its pipes and return its exit code."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.close()
+        code = self.process.wait()
+        self.process.stdout.close()
+        return code
+
 
 class WorkerPool:
     """Worker processes that play runs; use as a context manager."""
@@ -105,9 +114,7 @@ class WorkerPool:
         """Stop all workers; the table of a run in progress comes to rest."""
         self.stop()
         for worker in self._workers:
-            assert worker.process.stdin is not None
-            worker.process.stdin.close()
-            worker.process.wait()
+            worker.close()
 
     @property
     def free(self) -> bool:
@@ -151,7 +158,7 @@ class WorkerPool:
                     worker.run = ""
                 yield run, message
             if not new:
-                run, code = worker.run, worker.process.wait()
+                run, code = worker.run, worker.close()
                 self._workers.remove(worker)
                 outcome = signal.Signals(-code).name if code < 0 else f"exit {code}"
                 yield run, {"failed": f"its worker process died ({outcome})"}

@@ -1,13 +1,38 @@
 """Write report.html, summary.json and figures/ of a campaign from the files in its folder."""
 
+from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
-from twin.campaign.figures import draw_campaign_figures, format_gap
+import numpy as np
+
+from table_io.block import Float1D
+from table_io.units import GRAVITY_M_S2
+from twin.campaign.figures import draw_campaign_figures, draw_gap_pairs
+from twin.campaign.gap_comparison import (
+    COMPROMISE,
+    ETA_A,
+    ETA_D,
+    FORCE_RATIO,
+    GapComparison,
+    format_gap,
+)
 from twin.campaign.summary import CampaignData, read_campaign
 from twin.reports import summary as summaries
-from twin.reports.page import embed_images, render_page
+from twin.reports.page import embed_images, format_significant, render_page
 from twin.reports.plot_style import Picture
+from twin.reports.summary import Json
+
+SYMBOLS = {
+    ETA_A: "η<sub>a</sub>",
+    ETA_D: "η<sub>d</sub>",
+    COMPROMISE: "√½(η<sub>a</sub>² + η<sub>d</sub>²)",
+    FORCE_RATIO: "r",
+}
+SMALLER, LARGER, FORCE = "#1a9850", "#d6404e", "#3f7fc1"  # colours of the cells of the tables
+MAX_SHARE = 62.0  # of a colour over the ground of the page, in percent
+FULL_RATIO = 4.0  # ratio to the reference, or its inverse, at which a colour is full
 
 
 def write_campaign_report(folder: Path) -> Path:
@@ -15,23 +40,182 @@ def write_campaign_report(folder: Path) -> Path:
     campaign = read_campaign(folder)
     summaries.write_json(campaign.summary, folder / "summary.json")
     pictures = draw_campaign_figures(campaign, folder / "figures")
+    pairs = draw_gap_pairs(campaign.gaps, folder / "figures")
     path = folder / "report.html"
-    path.write_text(render_campaign_report(campaign, pictures), encoding="utf-8")
+    path.write_text(render_campaign_report(campaign, pictures, pairs), encoding="utf-8")
     return path
 
 
-def render_campaign_report(campaign: CampaignData, pictures: list[Picture]) -> str:
-    """Return the HTML page with embedded figures and relative links to the reports of the runs."""
+def render_campaign_report(
+    campaign: CampaignData, pictures: list[Picture], pairs: list[tuple[Picture, Picture]]
+) -> str:
+    """Return the HTML page with embedded figures and relative links to the reports of the runs.
+
+    `pairs` are the figures of the comparison of gaps, on a light and on a dark ground.
+    """
     text = (campaign.folder / "campaign.toml").read_text(encoding="utf-8")
+    runs = list(zip(campaign.summary["runs"], campaign.runs, strict=True))
     return render_page(
         Path(__file__).with_name("campaign.html"),
         summary=campaign.summary,
         state=campaign.state,
-        runs=list(zip(campaign.summary["runs"], campaign.runs, strict=True)),
+        runs=runs,
+        swept=[(run, data) for run, data in runs if data.profile.steps],
+        histories=[
+            (run, data, find_history_peaks(run, data.profile.specimen.gap_mm))
+            for run, data in runs
+            if not data.profile.steps
+        ],
         stars=campaign.stars,
+        has_sweeps=any(run.profile.steps for run in campaign.runs),
+        gaps=campaign.summary["gap_comparison"],
+        **list_gap_values(campaign.gaps),
+        pictures=embed_pairs(pairs),
         reports={path.parent.name for path in campaign.folder.glob("*/report.html")},
         images=embed_images(pictures),
-        gap_name=format_gap,
         text=text,
         digest=sha256(text.encode()).hexdigest(),
     )
+
+
+def list_gap_values(comparison: GapComparison | None) -> Json:
+    """Return the values of the section "Records and gaps" of a page, by their names in it."""
+    return {
+        "tables": [] if comparison is None else list_gap_tables(comparison),
+        "source_name": "" if comparison is None else comparison.main_name,
+        "symbols": SYMBOLS,
+        "gap_name": format_gap,
+    }
+
+
+def embed_pairs(pairs: list[tuple[Picture, Picture]]) -> list[tuple[Any, Any, int]]:
+    """Return ((picture, its PNG in base64), the same on a dark ground, number) of each pair."""
+    embedded = [embed_images(pair) for pair in pairs]
+    return [(light, dark, number) for number, (light, dark) in enumerate(embedded, 1)]
+
+
+def find_history_peaks(run: Json, gap_mm: float) -> Json:
+    """Return the measured peaks of a displacement history in display units; NaN if unknown.
+
+    The force without bumpers is noise, and NaN.
+    """
+    windows = run.get("windows") or []
+    measured = [window["measured"] for window in windows if window.get("measured")]
+
+    def find_largest(entries: list[Json], *names: str) -> float:
+        peaks = [entry[name]["peak"] for entry in entries for name in names]
+        return max((peak for peak in peaks if peak is not None), default=np.nan)
+
+    counts = [
+        [entry[f"impacts_{side}"] for entry in measured if entry[f"impacts_{side}"] is not None]
+        for side in ("right", "left")
+    ]
+    return {
+        "table_g": find_largest(windows, "table_acc") / GRAVITY_M_S2,
+        "u_mm": 1e3 * find_largest(measured, "u"),
+        "a_g": find_largest(measured, "a") / GRAVITY_M_S2,
+        "force_kn": np.nan
+        if np.isinf(gap_mm)
+        else 1e-3 * find_largest(measured, "force_r", "force_l"),
+        "impacts": " / ".join(str(sum(side)) if side else "–" for side in counts),
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class GapCell:
+    """Cell of a table of records and gaps: the measured value, that of the twin, its colour."""
+
+    measured: str
+    twin: str
+    heat: str
+    share: str  # of the colour, in percent
+    is_best: bool
+
+
+@dataclass(frozen=True, slots=True)
+class GapRow:
+    """Row of a table of records and gaps; `reference` is the peak at the reference, with unit."""
+
+    name: str
+    reference: str
+    cells: list[GapCell]
+    is_median: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class GapTable:
+    """Table of records and gaps of one criterion."""
+
+    title: str
+    reference_header: str
+    gaps: list[str]
+    rows: list[GapRow]
+
+
+def list_gap_tables(comparison: GapComparison) -> list[GapTable]:
+    """Return the tables of acceleration, displacement and force, with median and largest."""
+    peak_a = comparison.values[comparison.main_source, "a_m_s2"][:, 0] / GRAVITY_M_S2
+    peak_u = comparison.values[comparison.main_source, "u_m"][:, 0] * 1e3
+    where = comparison.reference
+    without = [""] * len(comparison.records)
+    return [
+        _make_table(comparison, ETA_A, "Acceleration of the mass, η<sub>a</sub>",
+                    f", peak {where}", _format_all(peak_a, "g")),
+        _make_table(comparison, ETA_D, "Displacement of the bearing, η<sub>d</sub>",
+                    f", peak {where}", _format_all(peak_u, "mm")),
+        _make_table(comparison, COMPROMISE, "Compromise of both", "", without),
+        _make_table(comparison, FORCE_RATIO, "Force of a bumper over weight, r", "", without),
+    ]  # fmt: skip
+
+
+def _format_all(values: Float1D, unit: str) -> list[str]:
+    return [f"{format_significant(value)} {unit}" for value in values.tolist()]
+
+
+def _make_table(
+    comparison: GapComparison, criterion: str, title: str, header: str, references: list[str]
+) -> GapTable:
+    # The reference itself is 1, or has no force.
+    skipped = 0 if criterion == FORCE_RATIO and np.isfinite(comparison.reference_mm) else 1
+    measured, twin = (
+        comparison.values[source, criterion][:, skipped:]
+        for source in (comparison.main_source, "twin")
+    )
+    full = float(np.nanmax(measured)) if np.isfinite(measured).any() else 1.0
+
+    def make_cells(first: Float1D, second: Float1D) -> list[GapCell]:
+        known = first[np.isfinite(first)]
+        best = known.min() if known.size else None
+        return [
+            GapCell(
+                _format_cell(value),
+                _format_cell(predicted),
+                *_choose_colour(value, criterion, full),
+                value == best,
+            )
+            for value, predicted in zip(first.tolist(), second.tolist(), strict=True)
+        ]
+
+    rows = [
+        GapRow(name, reference, make_cells(measured[k], twin[k]))
+        for k, (name, reference) in enumerate(zip(comparison.records, references, strict=True))
+    ]
+    for name, combine in (("median", np.median), ("largest", np.max)):
+        cells = make_cells(combine(measured, axis=0), combine(twin, axis=0))
+        rows.append(GapRow(name, "", cells, is_median=True))
+    gaps = [format_gap(gap_mm) for gap_mm in comparison.gaps_mm[skipped:]]
+    return GapTable(title, header, gaps, rows)
+
+
+def _format_cell(value: float) -> str:
+    return f"{value:.2f}" if np.isfinite(value) else "–"
+
+
+def _choose_colour(value: float, criterion: str, full: float) -> tuple[str, str]:
+    """Return the colour of a cell and its share in percent, as text."""
+    if not np.isfinite(value):
+        return FORCE, "0"
+    if criterion == FORCE_RATIO:
+        return FORCE, f"{MAX_SHARE * value / full if full > 0 else 0.0:.0f}"
+    octaves = np.log(max(value, 1e-9)) / np.log(FULL_RATIO)
+    return LARGER if octaves > 0 else SMALLER, f"{MAX_SHARE * min(abs(octaves), 1.0):.0f}"

@@ -8,6 +8,12 @@ from table_io.config.base import load_config, parse_toml
 from table_io.config.profile import Profile
 from table_io.units import GRAVITY_M_S2
 from twin.campaign.config import CampaignConfig
+from twin.campaign.gap_comparison import (
+    GapComparison,
+    compare_gaps,
+    describe_comparison,
+    list_record_runs,
+)
 from twin.campaign.merge import (
     find_most_impacts,
     find_peak,
@@ -44,6 +50,7 @@ class CampaignData:
     state: CampaignState
     runs: tuple[CampaignRunData, ...]
     stars: Json | None  # u* and a* from the free flight
+    gaps: GapComparison | None  # of the runs of records, if there are several gaps
     summary: Json
 
 
@@ -51,8 +58,9 @@ def read_campaign(folder: Path) -> CampaignData:
     """Read the folder of a campaign; curves are divided by the measured u* and a*."""
     config, _ = load_config(folder / CAMPAIGN_FILE, CampaignConfig, "campaign")
     state = read_state(folder)
-    tests = [Path(run.profile).stem for run in config.runs for _ in run.labels]
-    runs_read = [_read_run(folder, run, test) for run, test in zip(state.runs, tests, strict=True)]
+    runs_read = [
+        _read_run(folder, run, test) for run, test in zip(state.runs, config.tests, strict=True)
+    ]
     stars = next((maxima for run in runs_read if (maxima := measured_maxima(run))), None)
     divide = (stars["u_star_m"], stars["a_star_m_s2"]) if stars else None
     runs = tuple(
@@ -61,9 +69,12 @@ def read_campaign(folder: Path) -> CampaignData:
         )
         for run in runs_read
     )
-    return CampaignData(
-        folder, config, state, runs, stars, _summarize_campaign(config, state, runs, stars)
+    names = {cell.label: cell.record.title or cell.record.name for cell in config.cells}
+    gaps = compare_gaps(
+        list_record_runs([(run.state.label, run.profile, run.summary) for run in runs], names)
     )
+    summary = _summarize_campaign(config, state, runs, stars, gaps)
+    return CampaignData(folder, config, state, runs, stars, gaps, summary)
 
 
 def _read_run(folder: Path, run: RunState, test: str) -> CampaignRunData:
@@ -119,6 +130,7 @@ def _summarize_campaign(
     state: CampaignState,
     runs: tuple[CampaignRunData, ...],
     stars: Json | None,
+    gaps: GapComparison | None,
 ) -> Json:
     complete_runs = [run_state for run_state in state.runs if run_state.status == "complete"]
     verdicts = [run.summary["verdict"] for run in runs if run.state.parts]
@@ -143,6 +155,7 @@ def _summarize_campaign(
         "u_star_m": stars["u_star_m"] if stars else None,
         "a_star_m_s2": stars["a_star_m_s2"] if stars else None,
         "free_flight": stars,
+        "gap_comparison": None if gaps is None else describe_comparison(gaps),
         "runs": [
             {
                 **run.summary,

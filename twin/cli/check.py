@@ -150,9 +150,9 @@ def _describe_level(sweep: Sweep) -> str:
 def _history_lines(profile: Profile) -> list[tuple[str, str]]:
     plan = profile.plan
     rate_hz = profile.acquisition.rate_hz
-    seconds = plan.history_m.size / rate_hz
-    displacement_mm = 1e3 * float(np.abs(plan.history_m).max())
-    velocity_mm_s = 1e3 * float(np.abs(np.diff(plan.history_m)).max()) * rate_hz
+    seconds = plan.target_m.size / rate_hz
+    displacement_mm = 1e3 * float(np.abs(plan.target_m).max())
+    velocity_mm_s = 1e3 * float(np.abs(np.diff(plan.target_m)).max()) * rate_hz
     source = profile.excitation
     return [
         *(_record_lines(source) if isinstance(source, RecordedHistory) else ()),

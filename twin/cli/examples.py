@@ -9,7 +9,7 @@ from table_io.config.shipped import list_shipped_names
 EXAMPLES: dict[str, tuple[str, ...]] = {
     "run": ("run quickstart --speed max", "run quickstart --model runs/found/model.toml --view"),
     "demo": ("demo", "demo --seed 3 --keep my_rig --no-open"),
-    "campaign": ("campaign paper --speed max --out paper_runs",
+    "campaign": ("campaign records --speed max --yes --out records_runs",
                  "campaign paper --out paper_runs --resume"),
     "table": ("table", "table --rig ni_simulated"),
     "drive": ("drive quickstart -o drive.csv", "drive g4_ss3 -o drive.rpc --table machine"),

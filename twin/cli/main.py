@@ -343,7 +343,7 @@ def simulate_command(
         bool, typer.Option("--view", callback=require_view_extra, help="Also write view.rrd.")
     ] = False,
 ) -> None:
-    """Run the model alone on the ideal drive; or compare many models and gaps."""
+    """Run the model alone on the ideal drive; compare models and gaps, or gaps over records."""
     from twin.cli.simulate import simulate_profile as command
 
     raise typer.Exit(command(profile, model or [], gap or [], workers, out, view))

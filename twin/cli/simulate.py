@@ -1,9 +1,10 @@
-"""`simulate`: simulate one model on the ideal drive, or a batch of models and gaps."""
+"""`simulate`: one model on the ideal drive, a batch of models and gaps, or a grid of records."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 from table_io.errors import InputError
+from twin.campaign.config import find_campaign
 from twin.reports.finalize import finalize_run
 from twin.run.folders import make_run_folder
 from twin.run.progress import RunProgress
@@ -20,7 +21,18 @@ def simulate_profile(
     out: Path | None,
     view: bool,
 ) -> int:
-    """Simulate one model, recorded like a run, or several models or gaps as a batch."""
+    """Simulate one model, recorded like a run, several models or gaps, or records at gaps."""
+    campaign = find_campaign(profile)
+    if campaign is not None:
+        if gaps or view or len(models) > 1:
+            raise InputError(
+                "a campaign states its gaps and is simulated with one model",
+                where=profile,
+                remedy="omit --gap and --view, and give one --model",
+            )
+        from twin.campaign.simulate_grid import simulate_grid
+
+        return simulate_grid(campaign, models[0] if models else None, out)
     if len(models) <= 1 and not gaps:
         return _simulate_one(profile, models[0] if models else None, out, view)
     if view:

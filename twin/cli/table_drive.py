@@ -1,4 +1,4 @@
-"""`table-twin` and `drive`: identify the table, and compute the command by which it follows."""
+"""`table-twin` and `table-drive`: identify the table, compute the command by which it follows."""
 
 import json
 import math
@@ -10,9 +10,13 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
-from table_io.block import Float1D, Label
+from table_io.block import Float1D, join_blocks
 from table_io.config.base import parse_toml
-from table_io.config.excitation import DRIVE_MARGIN_S, History, history_acceleration
+from table_io.config.excitation import (
+    History,
+    add_drive_margin,
+    history_acceleration,
+)
 from table_io.config.excitation.drive_file import format_drive
 from table_io.config.folders import resolve_config
 from table_io.config.profile import Profile
@@ -45,22 +49,26 @@ UNITS = {
 
 def identify_table_command(logs: Sequence[Path], out: Path, with_effects: bool = True) -> int:
     """Identify the twin of the table and its missing effects from a rehearsal; write a new file."""
-    if out.exists():
-        raise InputError("exists already", where=out, remedy="name a new file with --out")
+    from twin.reports.table_twin_figure import draw_table_twin
+
+    drawing = out.with_suffix(".png")
+    for path in (out, drawing):
+        if path.exists():
+            raise InputError("exists already", where=path, remedy="name a new file with --out")
     if len(logs) != 1:
         raise InputError(f"{len(logs)} recordings", allowed="one rehearsal of at most 60 s")
     recording = open_recording(logs[0])
     rig = parse_toml(recording.start.rig_toml, RigConfig, str(logs[0]))
     stall_kn = rig.table_response.stall_force_kn
-    motion, mass_kg = read_table_motion(recording), rig.moving_mass_kg
+    rehearsal, mass_kg = read_table_motion(recording), rig.moving_mass_kg
     stall_n = math.inf if stall_kn is None else 1e3 * stall_kn
     discovery, effects = None, []
     with show_status("fitting the twin of the table"):
         if with_effects:
-            identification, discovery = identify_table_and_effects(motion, mass_kg, stall_n)
+            identification, discovery = identify_table_and_effects(rehearsal, mass_kg, stall_n)
             effects = [finding.id for finding in discovery.findings]
         else:
-            identification = identify_table(motion, mass_kg, stall_n)
+            identification = identify_table(rehearsal, mass_kg, stall_n)
     title = f"{rig.title}, from {recording.run}"
     out.write_text(format_table_twin(title, identification, effects), encoding="utf-8")
     table = Table("parameter", "value", "95 %", "unit", title=title)
@@ -70,7 +78,7 @@ def identify_table_command(logs: Sequence[Path], out: Path, with_effects: bool =
         if width is None and value == absent[name]:
             continue  # of an effect that the table does not show
         table.add_row(
-            name.rsplit("_1_s")[0] if name == "gain_1_s" else name,
+            name.removesuffix("_1_s"),
             f"{value:.4g}",
             "stated" if width is None else f"+- {width:.2g}",
             UNITS.get(name, ""),
@@ -78,7 +86,9 @@ def identify_table_command(logs: Sequence[Path], out: Path, with_effects: bool =
     print_table(console, table)
     for line in describe_discovery(discovery) if discovery is not None else ():
         print_line(line)
+    draw_table_twin(identification.model, rehearsal, title, drawing)
     print_line(f"it leaves {100 * identification.residual:.2g} % of the measured motion -> {out}")
+    print_line(f"frequency response and steps -> {drawing}")
     return 0
 
 
@@ -200,7 +210,7 @@ def _prepare_task(
         )
     twin = load_table_twin(twin_file)
     rate_hz = config.profile.acquisition.rate_hz
-    target = np.pad(excitation.displacement(rate_hz), round(DRIVE_MARGIN_S * rate_hz))
+    target = add_drive_margin(excitation.displacement(rate_hz), rate_hz)
     band_hz = band_hz or config.profile.tracking.band_hz
     if band_hz is None:
         band_hz = find_band(history_acceleration(target, rate_hz), rate_hz)
@@ -211,21 +221,12 @@ def _prepare_task(
 
 def _simulate_reaction(config: RunConfig, count: int) -> Float1D:
     """Return the force of the specimen on a table that follows the target, N, (sample,)."""
-    from dataclasses import replace
-
     from twin.run.unpaced import generate_ideal_twin
 
-    excitation = config.profile.excitation.model_copy(update={"drive": None})
-    profile = config.profile.model_copy(update={"excitation": excitation})
-    profile.__dict__.pop("plan", None)  # cached with the drive
-    rows, labels = [], []
-    for block in generate_ideal_twin(replace(config, profile=profile)):
-        if block.stream == "pred":
-            rows.append(block.channel("free/mass_acc_m_s2"))
-            labels.append(block.label)
-    acceleration, label = np.concatenate(rows), np.concatenate(labels)
-    first = int(np.flatnonzero(label == Label.MEASURE)[0])
-    margin = round(DRIVE_MARGIN_S * config.profile.acquisition.rate_hz)
+    predicted = join_blocks([b for b in generate_ideal_twin(config) if b.stream == "pred"])
+    acceleration = predicted.channel("free/mass_acc_m_s2")
+    first = int(np.flatnonzero(predicted.is_history)[0])
+    margin = (count - config.profile.plan.target_m.size) // 2  # 0 if it has a drive already
     reaction = np.zeros(count)
     played = -config.profile.specimen.mass_kg * acceleration[first : first + count - margin]
     reaction[margin : margin + played.size] = played

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from scipy.fft import next_fast_len
 
 from table_io.block import Float1D
+from table_io.config.excitation.waveform import smoothstep
 from twin.drive.table_identification import CROSSOVER_HZ
 from twin.drive.table_model import TableModel
 
@@ -40,16 +41,12 @@ def compute_drive(
     rate_hz: float,
     band_hz: tuple[float, float],
     reaction_n: Float1D | None = None,
-    start_m: Float1D | None = None,
 ) -> ComputedDrive:
     """Compute the command for a target displacement in m, (sample,), at rest at both ends.
 
-    `reaction_n`, (sample,), is the force of the specimen on the table during the target motion;
-    `start_m` the command to begin with, if not the linear inverse.
+    `reaction_n`, (sample,), is the force of the specimen on the table during the target motion.
     """
-    command = start_m
-    if command is None:
-        command = correct_drive(np.zeros_like(target_m), target_m, model, rate_hz, band_hz)
+    command = compute_correction(target_m, model, rate_hz, band_hz)
     best, best_error, step = command, math.inf, 1.0
     for _ in range(MAX_ROUNDS):
         achieved = model.simulate(command, rate_hz, reaction_n)[0]
@@ -63,18 +60,14 @@ def compute_drive(
                 best, best_error = command, error
                 break
             best, best_error, lacking = command, error, target_m - achieved
-        command = best + step * correct_drive(np.zeros_like(best), lacking, model, rate_hz, band_hz)
+        command = best + step * compute_correction(lacking, model, rate_hz, band_hz)
     return ComputedDrive(best, best_error)
 
 
-def correct_drive(
-    command_m: Float1D,
-    lacking_m: Float1D,
-    model: TableModel,
-    rate_hz: float,
-    band_hz: tuple[float, float],
+def compute_correction(
+    lacking_m: Float1D, model: TableModel, rate_hz: float, band_hz: tuple[float, float]
 ) -> Float1D:
-    """Return a command with what the table lacks added, (sample,), through the linear inverse."""
+    """Return the command for what the table lacks in m, (sample,), by the linear inverse."""
     count = lacking_m.size
     padding = round(PADDING_S * rate_hz)
     size = next_fast_len(count + 2 * padding)
@@ -83,8 +76,8 @@ def correct_drive(
     inverse = _invert_response(model, np.asarray(frequency_hz, float), band_hz[1])
     correction = np.fft.irfft(spectrum * inverse, size)
     # The inverse leads: what it asks for before the first sample lies at the end of the period.
-    corrected: Float1D = command_m + correction[:count]
-    return corrected * _rest_at_ends(count, rate_hz)
+    limited: Float1D = correction[:count] * _rest_at_ends(count, rate_hz)
+    return limited
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +120,7 @@ def correct_played_drive(
     width = max(round(SMOOTHING_HZ * lacking.size / rate_hz), 1)
     ratio = np.convolve(np.abs(spectrum) ** 2 / noise, np.ones(width) / width, mode="same")
     known = np.fft.irfft(spectrum * np.clip(1.0 - 1.0 / ratio, 0.0, 1.0), lacking.size)
-    return correct_drive(run.command_m, known, model, rate_hz, band_hz)
+    return run.command_m + compute_correction(known, model, rate_hz, band_hz)
 
 
 def measure_error(
@@ -156,6 +149,4 @@ def _invert_response(
 def _rest_at_ends(count: int, rate_hz: float) -> Float1D:
     """Return a window that is 1 but for half a second at either end, where it rises from 0."""
     edge = np.arange(count) / (0.5 * rate_hz)
-    x = np.clip(np.minimum(edge, edge[::-1]), 0.0, 1.0)
-    window: Float1D = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
-    return window
+    return smoothstep(np.minimum(edge, edge[::-1]))

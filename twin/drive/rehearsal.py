@@ -14,6 +14,7 @@ from twin.drive.table_identification import CROSSOVER_HZ, TableRehearsal
 from twin.recording.reader import Recording
 
 CHANNELS = "drive_disp_m", "table_disp_m", "table_acc_m_s2"
+MASS_CHANNEL = "mass_acc_m_s2"
 NOISE_S = 0.4  # at the start, where the table rests
 REST_S = 0.5  # kept before and after the motion
 BLEND_HZ = 0.5  # half width of the change from displacement to acceleration
@@ -50,7 +51,7 @@ def read_played_drive(recording: Recording) -> tuple[Float1D, PlayedDrive]:
             "the recording is not that of a displacement history", where=recording.path
         )
     whole = _find_whole_block(recording)
-    played = np.flatnonzero((whole.label == Label.MEASURE) & (whole.cycle < 0))
+    played = np.flatnonzero(whole.is_history)
     plan, rate_hz = profile.plan, whole.rate_hz
     if played.size == 0 or int(played[0]) + plan.target_m.size > len(whole):
         raise InputError("its history was not played to the end", where=recording.path)
@@ -82,9 +83,9 @@ def fuse_displacement(displacement: Float1D, acceleration: Float1D, rate_hz: flo
 
 def _measure_reaction(block: Block, profile: Profile) -> Float1D:
     """Return the specimen's force on the table by its acceleration, N, (sample,); 0 without one."""
-    if "mass_acc_m_s2" not in block.channels:
+    if MASS_CHANNEL not in block.channels:
         return np.zeros(len(block))
-    reaction: Float1D = -profile.specimen.mass_kg * block.channel("mass_acc_m_s2")
+    reaction: Float1D = -profile.specimen.mass_kg * block.channel(MASS_CHANNEL)
     return reaction
 
 
@@ -104,7 +105,8 @@ def _find_whole_block(recording: Recording) -> Block:
     missing = [name for name in CHANNELS if name not in blocks[0].channels]
     if missing:
         raise InputError(f"it has no {', '.join(missing)}", where=recording.path)
-    rows = [blocks[0].channel(name) for name in CHANNELS]
+    used = [name for name in (*CHANNELS, MASS_CHANNEL) if name in blocks[0].channels]
+    rows = [blocks[0].channel(name) for name in used]
     if not all(np.isfinite(row).all() for row in rows):
         raise InputError("samples were lost in it", where=recording.path)
     return blocks[0]

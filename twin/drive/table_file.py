@@ -1,6 +1,6 @@
 """File of a table's twin, as `shaketwin table-twin` writes it."""
 
-import math
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -59,19 +59,15 @@ def format_table_twin(
     """Return the TOML text of an identified table, with the names of the effects found in it."""
     values = identification.model.parameters._asdict()
     lines = [
-        f'title = "{title}"',
+        f"title = {json.dumps(title, ensure_ascii=False)}",
         f"mass_kg = {identification.model.mass_kg!r}",
         f"residual = {identification.residual:.4g}",
-        f"effects = {list(effects)}".replace("'", '"'),
+        f"effects = {json.dumps(list(effects))}",
         "",
         "[parameters]",
-        *(f"{name} = {_format_number(value)}" for name, value in values.items()),
+        *(f"{name} = {value:.9g}" for name, value in values.items()),
         "",
         "[half_widths]",
         *(f"{name} = {width:.3g}" for name, width in identification.half_widths.items()),
     ]
     return "\n".join([*lines, ""])
-
-
-def _format_number(value: float) -> str:
-    return "inf" if math.isinf(value) else f"{value:.9g}"

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from table_io.block import Float1D
-from table_io.config.excitation import BAND_ENERGY_SHARES
+from table_io.config.excitation import find_energy_band
 from twin.drive.spectra import (
     DEFAULT_DAMPING,
     FINE_PER_OCTAVE,
@@ -143,13 +143,9 @@ def find_band(target_acc: Float1D, rate_hz: float) -> tuple[float, float]:
     record; the octave is what a spectral ordinate at either end takes its motion from. ValueError
     if the target is at rest throughout.
     """
-    energy = np.cumsum(np.abs(np.fft.rfft(target_acc)) ** 2)
-    if not energy[-1] > 0.0:
-        raise ValueError("the target is at rest throughout")
-    low, high = np.searchsorted(energy, np.multiply(BAND_ENERGY_SHARES, energy[-1])) + 0.5
-    resolution_hz = rate_hz / target_acc.size
-    high_hz = min(float(high) * resolution_hz * BAND_WIDENING, MAX_BAND_RATIO * rate_hz)
-    return min(float(low) * resolution_hz, high_hz) / BAND_WIDENING, high_hz
+    low_hz, high_hz = find_energy_band(target_acc, rate_hz)
+    high_hz = min(high_hz * BAND_WIDENING, MAX_BAND_RATIO * rate_hz)
+    return min(low_hz, high_hz) / BAND_WIDENING, high_hz
 
 
 def find_lag(

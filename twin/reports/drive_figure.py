@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from table_io.block import Bool2D, Float1D, Label
-from table_io.excitation.drive import Drive, Segment, smoothstep
+from table_io.config.excitation.waveform import smoothstep
+from table_io.excitation.drive import Drive, Segment
 from table_io.safety.preflight import CORRECTION_HEADROOM, list_limits
 from table_io.units import GRAVITY_M_S2
 from twin.run.run_config import RunConfig

@@ -53,10 +53,7 @@ def find_table_motion(recording: Recording, profile: Profile) -> TableMotion | N
     excitation, rate_hz = profile.excitation, recording.start.rate_hz
     if not isinstance(excitation, History) or not windows or recording.start.source != "table":
         return None
-    if rate_hz == profile.acquisition.rate_hz:
-        history = profile.plan.target_m
-    else:
-        history = excitation.displacement(rate_hz)
+    history = excitation.target(rate_hz)
     start = min(first for first, _ in windows.values())
     end = min(max(last for _, last in windows.values()), start + history.size)
     margin = round(MAX_LAG_S * rate_hz)

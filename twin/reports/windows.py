@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from table_io.block import Block, Float1D, Label
+from table_io.block import Block, Float1D
 from table_io.channels import contact_forces, relative_displacement
 from table_io.records import Comparison
 from twin.compare.cycles import detect_onsets
@@ -54,9 +54,8 @@ def find_windows(blocks: tuple[Block, ...]) -> dict[int, tuple[int, int]]:
     """Return the samples (first, end) of each window, by its number."""
     windows: dict[int, tuple[int, int]] = {}
     for block in blocks:
-        is_played = (block.label == Label.MEASURE) & (block.cycle < 0)
-        for number in np.unique(block.step[is_played]).tolist():
-            samples = np.flatnonzero(is_played & (block.step == number)) + block.index
+        for number in np.unique(block.step[block.is_history]).tolist():
+            samples = np.flatnonzero(block.is_history & (block.step == number)) + block.index
             first, _ = windows.get(number, (int(samples[0]), 0))
             windows[number] = first, int(samples[-1]) + 1
     return windows

@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from table_io.block import Float1D, Float2D
+from table_io.config.excitation.waveform import smoothstep
 from table_io.control.orbit_feedback import BLEND_S, WINDOW_S
 from table_io.errors import InputError
-from table_io.excitation.drive import smoothstep
 from twin.dynamics.linearized_orbit import LinearizedOrbit, LinearPart
 from twin.dynamics.orbits import Orbit
 
@@ -123,7 +123,7 @@ def _answer_weights(index: int, dead: int, part_s: float, w: float) -> Float1D:
     weights, remaining, answer = [], 1.0, 0
     while remaining > 0.0:
         time_s = (index + answer * PARTS_PER_BLOCK - dead + 0.5) * part_s
-        blend = float(smoothstep(np.array(min(max(time_s / BLEND_S, 0.0), 1.0))))
+        blend = float(smoothstep(np.array(time_s / BLEND_S)))
         weight = remaining * blend
         weights += [weight * math.cos(w * time_s), -weight * math.sin(w * time_s)]
         remaining -= weight

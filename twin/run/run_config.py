@@ -150,19 +150,35 @@ def read_run_config(path: Path, table: str | None = None, model: str | None = No
     """Read the `RunConfig` of a test profile; InputError if the test exceeds the table's limits."""
     path = resolve_config(path, "tests")
     profile, profile_toml = load_profile(path)
+    return build_run_config(path.stem, profile, profile_toml, path, str(path), table, model)
+
+
+def build_run_config(
+    name: str,
+    profile: Profile,
+    profile_toml: str,
+    relative_to: Path,
+    source: str,
+    table: str | None = None,
+    model: str | None = None,
+) -> RunConfig:
+    """Return the `RunConfig` of a profile, whose rig and model are found from `relative_to`.
+
+    InputError if the test exceeds the limits of the table; `source` names the test in it.
+    """
     rig, rig_toml = load_rig(
-        find_config(table or profile.rig, "rigs", path, option="--table" if table else "")
+        find_config(table or profile.rig, "rigs", relative_to, option="--table" if table else "")
     )
     model_config, model_toml = read_model(
-        model or profile.model, path, option="--model" if model else ""
+        model or profile.model, relative_to, option="--model" if model else ""
     )
     if profile.continuation is not None and profile.continuation.file is None:
         from twin.run.orbit_plan import attach_orbit_plan
 
         own_model = model_config.build_model(profile.specimen)
-        profile_toml = attach_orbit_plan(profile_toml, profile, rig, own_model, str(path))
-    config = from_texts(path.stem, profile_toml, rig_toml, model_toml, str(path))
-    check_limits(config.margins, config.profile, config.rig, str(path))
+        profile_toml = attach_orbit_plan(profile_toml, profile, rig, own_model, source)
+    config = from_texts(name, profile_toml, rig_toml, model_toml, source)
+    check_limits(config.margins, config.profile, config.rig, source)
     return config
 
 

@@ -108,12 +108,22 @@ class History(Excitation):
         """Return the displacement in m, right positive, at rest at both ends, (sample,)."""
         raise NotImplementedError
 
+    def target(self, rate_hz: float) -> Float1D:
+        """Return the displacement that the table should have in m, (sample,).
+
+        It is `displacement`, with the rest around it in which a drive, if there is one, begins.
+        """
+        displacement = np.ascontiguousarray(self.displacement(rate_hz), dtype=np.float64)
+        return displacement if self.drive is None else add_drive_margin(displacement, rate_hz)
+
     def plan(self, rate_hz: float) -> ExcitationPlan:
         """Return what is played, with the target's peak acceleration and band.
 
         InputError if the target is not at rest at its ends, or the drive is not one of it.
         """
-        history = np.ascontiguousarray(self.displacement(rate_hz), dtype=np.float64)
+        target = self.target(rate_hz)
+        margin = 0 if self.drive is None else round(DRIVE_MARGIN_S * rate_hz)
+        history = target[margin : target.size - margin]
         where = f"excitation {self.kind!r}"
         if history.size <= self.windows or not np.isfinite(history).all() or not history.any():
             raise InputError("its history is empty, at rest throughout, or not finite", where=where)
@@ -126,15 +136,19 @@ class History(Excitation):
                 remedy="blend it in and out",
             )
         acceleration = history_acceleration(history, rate_hz)
-        low_hz, high_hz = _find_band(acceleration, rate_hz)
+        low_hz, high_hz = find_energy_band(acceleration, rate_hz)
         level = float(np.abs(acceleration).max())
-        command = history
+        command = target
         if self.drive is not None:
-            history = np.pad(history, round(DRIVE_MARGIN_S * rate_hz))
-            command = parse_drive(self.files.get(self.drive, ""), self.drive, history)
+            command = parse_drive(self.files.get(self.drive, ""), self.drive, target)
         return ExcitationPlan(
-            level, low_hz, high_hz, history_m=command, target_m=history, windows=self.windows
+            level, low_hz, high_hz, history_m=command, target_m=target, windows=self.windows
         )
+
+
+def add_drive_margin(history_m: Float1D, rate_hz: float) -> Float1D:
+    """Return a history in m with the rest around it in which its drive begins, (sample,)."""
+    return np.pad(history_m, round(DRIVE_MARGIN_S * rate_hz))
 
 
 def history_acceleration(history_m: Float1D, rate_hz: float) -> Float1D:
@@ -142,9 +156,14 @@ def history_acceleration(history_m: Float1D, rate_hz: float) -> Float1D:
     return np.diff(history_m, 2, prepend=history_m[:1], append=history_m[-1:]) * rate_hz**2
 
 
-def _find_band(acceleration: Float1D, rate_hz: float) -> tuple[float, float]:
-    """Return the frequencies in Hz below which 5 % and 95 % of the energy lie."""
+def find_energy_band(acceleration: Float1D, rate_hz: float) -> tuple[float, float]:
+    """Return the frequencies in Hz below which 5 % and 95 % of the energy of (sample,) lie.
+
+    ValueError if it is at rest throughout.
+    """
     energy = np.cumsum(np.abs(np.fft.rfft(acceleration)) ** 2)
+    if not energy[-1] > 0.0:
+        raise ValueError("the motion is at rest throughout")
     low, high = np.searchsorted(energy, np.multiply(BAND_ENERGY_SHARES, energy[-1])) + 0.5
     resolution_hz = rate_hz / acceleration.size
     return float(low * resolution_hz), float(high * resolution_hz)

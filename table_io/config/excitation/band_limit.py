@@ -17,6 +17,7 @@ from typing import Literal
 import numpy as np
 
 from table_io.block import Float1D
+from table_io.config.excitation.waveform import smoothstep
 
 Baseline = Literal["none", "mean", "linear"]
 FILTER_ORDER = 4
@@ -67,8 +68,7 @@ def cut_rest(displacement: Float1D, ramp: int) -> Float1D:
     before, after = moving[0] - ramp, moving[-1] + 1 + ramp
     padded = np.concatenate([np.zeros(ramp), displacement, np.zeros(ramp)])
     kept = padded[before + ramp : after + ramp].copy()
-    x = np.arange(ramp) / ramp
-    rise = x**3 * (10.0 + x * (-15.0 + 6.0 * x))
+    rise = smoothstep(np.arange(ramp) / ramp)
     kept[:ramp] *= rise
     kept[-ramp:] *= rise[::-1]
     return kept

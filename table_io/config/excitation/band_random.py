@@ -8,7 +8,7 @@ from pydantic import Field, ValidationInfo, field_validator
 from table_io.block import Float1D
 from table_io.config.base import Count, Number, Positive
 from table_io.config.excitation import History, register_excitation
-from table_io.config.excitation.waveform import evaluate_ramp
+from table_io.config.excitation.waveform import smoothstep
 from table_io.errors import InputError
 from table_io.units import GRAVITY_M_S2
 
@@ -95,4 +95,4 @@ class BandLimitedRandom(History):
         period = np.fft.irfft(spectrum, count) * (count / 2.0)
         played = np.take(period, np.arange(-ramp, count + ramp + 1), mode="wrap")
         x = np.arange(played.size)
-        return played * evaluate_ramp(x / ramp) * evaluate_ramp((played.size - 1 - x) / ramp)
+        return played * smoothstep(x / ramp) * smoothstep((played.size - 1 - x) / ramp)

@@ -11,9 +11,9 @@ from table_io.config.excitation import History, register_excitation
 from table_io.config.excitation.waveform import (
     LevelPoints,
     check_level_points,
-    evaluate_ramp,
     integrate_frequency,
     interpolate_level,
+    smoothstep,
 )
 from table_io.errors import InputError
 from table_io.units import GRAVITY_M_S2
@@ -76,7 +76,7 @@ class Chirp(History):
             frequency = self.start_hz + (self.stop_hz - self.start_hz) * share
         else:
             frequency = self.start_hz * (self.stop_hz / self.start_hz) ** share
-        envelope = evaluate_ramp(t / rise_s) * evaluate_ramp((end_s - t) / fall_s)
+        envelope = smoothstep(t / rise_s) * smoothstep((end_s - t) / fall_s)
         amplitude = self._level_m_s2(frequency, rate_hz) / (2.0 * np.pi * frequency) ** 2
         return -envelope * amplitude * np.sin(integrate_frequency(frequency, rate_hz))
 

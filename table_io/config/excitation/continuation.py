@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from table_io.config.base import Count, Number, Positive
+from table_io.config.base import Count, Number, Positive, find_attached_text
 from table_io.config.excitation import (
     MIN_BLEND_CYCLES,
     Excitation,
@@ -69,12 +69,9 @@ class Continuation(Excitation):
     @field_validator("file")
     @classmethod
     def _check_file(cls, name: str | None, info: ValidationInfo) -> str | None:
-        files = info.data.get("files")
-        if name is None or files is None:
-            return name
-        if name not in files:
-            raise InputError(f"{name!r} is not attached", remedy="load the profile from its file")
-        parse_orbit_plan(files[name], name)
+        text = find_attached_text(name, info)
+        if text is not None:
+            parse_orbit_plan(text, str(name))
         return name
 
     @cached_property

@@ -8,7 +8,7 @@ from pydantic import Field
 from table_io.block import Float1D
 from table_io.config.base import Count, Number, Positive
 from table_io.config.excitation import MIN_BLEND_CYCLES, History, register_excitation
-from table_io.config.excitation.waveform import evaluate_ramp, integrate_frequency
+from table_io.config.excitation.waveform import integrate_frequency, smoothstep
 
 
 @register_excitation("cyclic")
@@ -36,7 +36,7 @@ class CyclicProtocol(History):
         times, amplitudes, frequencies = np.array(knots).T
         t = np.arange(round(times[-1] * rate_hz) + 1) / rate_hz
         after = np.clip(np.searchsorted(times, t, side="right"), 1, times.size - 1)
-        share = evaluate_ramp((t - times[after - 1]) / (times[after] - times[after - 1]))
+        share = smoothstep((t - times[after - 1]) / (times[after] - times[after - 1]))
         amplitude, frequency = (
             values[after - 1] + share * (values[after] - values[after - 1])
             for values in (amplitudes, frequencies)

@@ -37,11 +37,11 @@ def parse_drive(text: str, name: str, target_m: Float1D) -> Float1D:
         command: Float1D = 1e-3 * np.array(lines[1:], dtype=np.float64)
     except ValueError as error:
         raise InputError(f"{name}: {error}", key=KEY, remedy=REMEDY) from None
-    if lines[:1] != [HEADER] or command.size < 2 or not np.isfinite(command).all():
+    if lines[:1] != [HEADER] or not command.any() or not np.isfinite(command).all():
         raise InputError(
             f"{name} is no drive",
             key=KEY,
-            allowed=f"a line {HEADER}, then one finite number a line",
+            allowed=f"a line {HEADER}, then one finite number a line, not all 0",
             remedy=REMEDY,
         )
     if max(abs(command[0]), abs(command[-1])) > MAX_REST_RATIO * np.abs(command).max():

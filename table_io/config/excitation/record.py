@@ -22,7 +22,7 @@ import numpy.typing as npt
 from pydantic import Field, ValidationInfo, field_validator
 
 from table_io.block import Float1D
-from table_io.config.base import Finite, Number, Positive
+from table_io.config.base import Finite, Number, Positive, find_attached_text
 from table_io.config.excitation import History, register_excitation
 from table_io.config.excitation.band_limit import (
     Baseline,
@@ -119,15 +119,10 @@ class RecordedHistory(History):
     @field_validator("file")
     @classmethod
     def _check_file(cls, name: str, info: ValidationInfo) -> str:
-        values = info.data
-        files = values.get("files")
-        if files is None:
+        text, values = find_attached_text(name, info), info.data
+        if text is None or not {"quantity", "unit", "step_s", "column", "sha256"} <= values.keys():
             return name
-        if name not in files:
-            raise InputError(f"{name!r} is not attached", remedy="load the profile from its file")
-        if not {"quantity", "unit", "step_s", "column", "sha256"} <= values.keys():
-            return name
-        checksum = _find_checksum(files, name)
+        checksum = _find_checksum(values["files"], name)
         if values["sha256"] is not None and values["sha256"].lower() != checksum:
             raise InputError(
                 f"{name} has the SHA-256 {checksum}",
@@ -137,7 +132,7 @@ class RecordedHistory(History):
         keys = SeriesRequest.__dataclass_fields__
         request = SeriesRequest(**{key: values[key] for key in keys})
         try:
-            series = read_series(files[name], name, request)
+            series = read_series(text, name, request)
         except InputError as error:  # the place is that of the key, so the line is in the words
             place = f"{error.where}: " if error.where else ""
             raise error.replace(problem=place + error.problem, where="") from None

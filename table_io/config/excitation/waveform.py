@@ -1,4 +1,4 @@
-"""Parts of the synthetic kinds: quintic ramps, varying frequency, level over frequency."""
+"""Parts of the synthetic kinds: quintic blend, varying frequency, level over frequency."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -13,8 +13,11 @@ LevelPoints = tuple[tuple[Positive, Positive], ...]  # (frequency in Hz, level i
 LEVEL_TOLERANCE = 1e-9  # of a frequency, at the ends of the break points
 
 
-def evaluate_ramp(x: Float1D) -> Float1D:
-    """Return the quintic ramp from 0 to 1 over x = 0 to 1 and constant outside, (x,)."""
+def smoothstep(x: Float1D) -> Float1D:
+    """Return the quintic blend from 0 to 1 over x = 0 to 1, constant outside, (x,).
+
+    Its first and second derivatives are 0 at both ends.
+    """
     x = np.clip(x, 0.0, 1.0)
     return x**3 * (10.0 + x * (-15.0 + 6.0 * x))
 

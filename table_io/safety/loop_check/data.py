@@ -114,6 +114,18 @@ class LoopCheckData:
         Return (|ratio - 1|, errors): the largest over the held motions with low enough noise,
         without the low cut and delay that explain all of them best; NaN if there is none.
         """
+        sensors = (*displacements, acceleration)
+        if sensors not in self._comparisons:  # the table waits at rest for the verdict
+            self._comparisons[sensors] = self._compare(displacements, acceleration)
+        return self._comparisons[sensors]
+
+    @cached_property
+    def _comparisons(self) -> dict[tuple[str, ...], tuple[float, PairErrors]]:
+        return {}
+
+    def _compare(
+        self, displacements: tuple[str, ...], acceleration: str
+    ) -> tuple[float, PairErrors]:
         block, rate_hz = self.block, self.block.rate_hz
         x = np.sum([block.channel(name) for name in displacements], axis=0)
         a = block.channel(acceleration)
@@ -137,10 +149,13 @@ class LoopCheckData:
             if not pairs:
                 return math.nan, PairErrors()
             equations = [pair.normal_equations() for pair in pairs]
+            low_cut = errors.low_cut
             errors = solve_errors(
                 np.sum([matrix for matrix, _ in equations], axis=0),
                 np.sum([rhs for _, rhs in equations], axis=0),
             )
+            if errors.low_cut == low_cut:  # so the next iteration would be this one again
+                break
         phase_errors = replace(errors, gain=1.0)
         corrected = [pair.remove_errors(phase_errors) for pair in pairs]
         mismatch = max(abs(pair.displacement[1] / pair.acceleration[1] - 1.0) for pair in corrected)

@@ -246,5 +246,5 @@ def _motion_keys(block: Block) -> Float1D:
     """
     keys = _LABEL_KEYS[block.label]
     keys = np.where(keys == FIRST_HOLD_KEY, FIRST_HOLD_KEY + block.step, keys)
-    keys = np.where((block.label == Label.MEASURE) & (block.cycle < 0), HISTORY_KEY, keys)
+    keys = np.where(block.is_history, HISTORY_KEY, keys)
     return np.where((block.step < 0) & (keys != 0), LOOP_CHECK_KEY, keys)

@@ -249,6 +249,16 @@ def test_a_record_beyond_a_limit_of_the_rig_is_refused(
     assert {fault.key: fault.allowed for fault in refusal.value.faults}[key] == allowed
 
 
+def test_a_record_too_small_for_the_output_is_refused(tmp_path: Path) -> None:
+    """Of some tens of millimetres, so that a hundred-thousandth is below one step of 18 bits."""
+    profile, _ = load_profile(write(tmp_path, csv(), "scale = 1e-5\n"))
+    rows = compute_demands(plan_excitation(profile), profile, RIG)
+    with pytest.raises(InputError) as refusal:
+        check_limits(rows, profile, RIG, "test")
+    (fault,) = refusal.value.faults
+    assert (fault.key, fault.allowed) == ("displacement", "at least 20")
+
+
 def test_a_rate_that_the_rig_lacks_is_refused(tmp_path: Path) -> None:
     profile, _ = load_profile(write(tmp_path, csv(), "[acquisition]\nrate_hz = 1500.0\n"))
     with pytest.raises(InputError) as refusal:

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from table_io.block import Float1D
 from table_io.config.base import parse_toml
 from table_io.config.excitation import History, find_excitation
-from table_io.config.excitation.waveform import evaluate_ramp, interpolate_level
+from table_io.config.excitation.waveform import interpolate_level, smoothstep
 from table_io.config.profile import Profile
 from table_io.errors import InputError
 from table_io.units import GRAVITY_M_S2
@@ -157,7 +157,7 @@ def test_a_cyclic_protocol_has_the_stated_cycles_of_each_amplitude() -> None:
 
 def test_the_ramp_has_no_kink() -> None:
     x = np.linspace(-0.5, 1.5, 2001)
-    ramp = evaluate_ramp(x)
+    ramp = smoothstep(x)
     assert (ramp[x <= 0] == 0).all()
     assert (ramp[x >= 1] == 1).all()
     assert np.abs(np.diff(ramp, 2)).max() / 1e-6 == pytest.approx(5.7735, rel=1e-3)

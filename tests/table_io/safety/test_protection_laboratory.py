@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from table_io.config.profile import Profile
+from table_io.config.toml_text import format_toml
 from table_io.safety.protection import Finding
 from table_io.sim.imperfections import draw_laboratory
 from tests.table_io.safety.guarded import machine, play
 from tests.table_io.safety.test_protection_simulated import identify_servo
-from twin.validation.study.rig_setup import format_toml
 
 RATE_HZ, FAULT_TIME_S = 1000.0, 9.0
 

@@ -23,6 +23,7 @@ from table_io.backends import Backend, open_backend
 from table_io.block import Block
 from table_io.clock import ManualClock
 from table_io.config.calibration import compute_tare, volts_to_si
+from table_io.config.toml_text import format_toml
 from table_io.records import Record, RunStop
 from table_io.sim.imperfections import SIDES, Imperfection, resolve_sides
 from twin.recording.mcap_log import write_items
@@ -48,7 +49,6 @@ from twin.validation.study.rig_setup import (
     SIGNAL_CHANNELS,
     StudySignals,
     compute_noise_rms,
-    format_toml,
     make_rig_toml,
     simulate_readings,
     simulate_signals,

@@ -5,7 +5,6 @@ below 1.6 Hz, the impacting branch up to 4.4 Hz forward, flight from 4.2 Hz back
 level control are off: the twin is driven by the measured table motion anyway.
 """
 
-import json
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
+from table_io.config.toml_text import format_toml
 from table_io.excitation.trajectory import plan_sweep
 from table_io.sim.simulated_table import SimulatedBackend
 
@@ -143,17 +143,3 @@ def simulate_readings(rig_text: str) -> tuple[StudySignals, dict[str, Float1D]]:
 def _si_per_unit(channel: str) -> float:
     rig = parse_toml(format_toml(NOMINAL_RIG), RigConfig, "simulated.toml")
     return next(sensor.si_per_unit for sensor in rig.sensors if sensor.channel == channel)
-
-
-def format_toml(table: Mapping[str, Any], path: str = "") -> str:
-    """Return the TOML text of a table of numbers, strings, lists and nested tables."""
-    plain, nested = [], []
-    for key, value in table.items():
-        where = f"{path}.{key}" if path else key
-        if isinstance(value, Mapping):
-            nested.append(f"\n[{where}]\n{format_toml(value, where)}")
-        elif isinstance(value, list | tuple) and value and isinstance(value[0], Mapping):
-            nested += [f"\n[[{where}]]\n{format_toml(entry, where)}" for entry in value]
-        else:
-            plain.append(f"{key} = {json.dumps(value, ensure_ascii=False)}\n")
-    return "".join(plain + nested)

@@ -1,0 +1,279 @@
+"""Comparison of gaps over records: which gap is best by acceleration, displacement and force.
+
+Peaks over the whole record, of the measured motion and of the free-running twin along the measured
+motion of the table: total acceleration of the mass, displacement relative to the table, and force
+of a bumper, the larger of both sides. eta_a and eta_d are the first two over those of the same
+record at the reference, without bumpers; r is the force over the weight of the mass, as in Eq. 1d
+of Stefani, De Angelis, Andreaus.
+"""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from table_io.block import Float2D
+from table_io.config.excitation.record import RecordedHistory
+from table_io.config.profile import Profile
+from table_io.units import GRAVITY_M_S2
+from twin.campaign.merge import SOURCES
+
+Json = dict[str, Any]
+PEAKS = ("u_m", "a_m_s2", "force_n")
+ETA_A, ETA_D, COMPROMISE, FORCE_RATIO = "eta_a", "eta_d", "compromise", "r"
+CRITERIA = {
+    ETA_A: "smallest acceleration of the mass",
+    ETA_D: "smallest displacement of the bearing",
+    COMPROMISE: "best compromise of both",
+    FORCE_RATIO: "smallest force of a bumper",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class RecordRun:
+    """One complete run of a record: name of the record, gap, mass and merged summary."""
+
+    record: str
+    gap_mm: float
+    mass_kg: float
+    label: str
+    summary: Json
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GapComparison:
+    """Responses to every record at every gap, the widest gap first.
+
+    `values` holds (record, gap) by source and quantity: PEAKS in SI, and the CRITERIA. The
+    compromise is the root mean square of eta_a and eta_d: 1 is no better than the reference. NaN
+    where there is no complete run, and for the force without bumpers. Of a simulation the twin is
+    the only source.
+    """
+
+    records: tuple[str, ...]
+    gaps_mm: tuple[float, ...]
+    values: Mapping[tuple[str, str], Float2D]
+    sources: tuple[str, ...] = SOURCES
+
+    @property
+    def main_source(self) -> str:
+        """Source by which the gaps are judged first."""
+        return self.sources[0]
+
+    @property
+    def main_name(self) -> str:
+        """The main source in words."""
+        return "measured" if self.main_source == "measured" else "model"
+
+    @property
+    def reference_mm(self) -> float:
+        """Gap at which eta_a and eta_d are 1: the widest, or none at all."""
+        return self.gaps_mm[0]
+
+    @property
+    def reference(self) -> str:
+        """The reference in words."""
+        if math.isinf(self.reference_mm):
+            return "without bumpers"
+        return f"at {format_gap(self.reference_mm)}"
+
+
+def format_gap(gap_mm: float) -> str:
+    """Return the name of a gap as in the paper: G16, G−1, G∞."""
+    return "G∞" if math.isinf(gap_mm) else f"G{gap_mm:g}".replace("-", "−")
+
+
+def list_record_runs(
+    runs: Sequence[tuple[str, Profile, Json]], names: Mapping[str, str]
+) -> list[RecordRun]:
+    """Return the complete runs of records of (label, profile, summary).
+
+    `names` are those of the records by the label of a run; else the name of the file counts, with
+    the scale where one file is played at several.
+    """
+    listed: dict[str, list[tuple[str, Profile, Json]]] = {}
+    for label, profile, summary in runs:
+        if isinstance(profile.excitation, RecordedHistory) and summary["verdict"] == "complete":
+            listed.setdefault(_identify(profile.excitation), []).append((label, profile, summary))
+    plain = {key: _name_record(key, several, names) for key, several in listed.items()}
+    shared = {name for name in plain.values() if list(plain.values()).count(name) > 1}
+    record_runs = []
+    for key, several in listed.items():
+        for label, profile, summary in several:
+            excitation = profile.excitation
+            assert isinstance(excitation, RecordedHistory)
+            name = plain[key]
+            name = f"{name} × {excitation.scale:g}" if name in shared else name
+            specimen = profile.specimen
+            record_runs.append(RecordRun(name, specimen.gap_mm, specimen.mass_kg, label, summary))
+    return record_runs
+
+
+def _identify(excitation: RecordedHistory) -> str:
+    """Return a text that two runs share if they play the same motion."""
+    keys = excitation.model_dump(exclude={"files", "windows", "drive", "file", "sha256"})
+    return json.dumps([excitation.checksum, keys], sort_keys=True)
+
+
+def _name_record(key: str, runs: list[tuple[str, Profile, Json]], names: Mapping[str, str]) -> str:
+    """Return the name of the record that these runs play."""
+    for label, _, _ in runs:
+        if label in names:
+            return names[label]
+    excitation = runs[0][1].excitation
+    return Path(excitation.file).stem if isinstance(excitation, RecordedHistory) else key
+
+
+def compare_gaps(
+    runs: Sequence[RecordRun], sources: tuple[str, ...] = SOURCES
+) -> GapComparison | None:
+    """Return the comparison; None unless a record was played at two gaps, one the reference.
+
+    A record without a run at the reference, the widest gap, is left out. Several runs of one record
+    at one gap count with their mean.
+    """
+    gaps_mm = tuple(sorted({run.gap_mm for run in runs}, reverse=True))
+    if len(gaps_mm) < 2:
+        return None
+    at_reference = {run.record for run in runs if run.gap_mm == gaps_mm[0]}
+    records = tuple(dict.fromkeys(run.record for run in runs if run.record in at_reference))
+    if not any(run.record in at_reference and run.gap_mm != gaps_mm[0] for run in runs):
+        return None
+    values: dict[tuple[str, str], Float2D] = {}
+    for source in sources:
+        peaks = np.full((len(PEAKS) + 1, len(records), len(gaps_mm)), np.nan)
+        for row, record in enumerate(records):
+            for column, gap_mm in enumerate(gaps_mm):
+                rows = [
+                    find_record_peaks(run, source)
+                    for run in runs
+                    if (run.record, run.gap_mm) == (record, gap_mm)
+                ]
+                if rows:
+                    peaks[:, row, column] = np.mean(rows, axis=0)
+        u, a, force, r = peaks
+        eta_d, eta_a = u / u[:, :1], a / a[:, :1]
+        compromise = np.sqrt((eta_d**2 + eta_a**2) / 2.0)
+        quantities = (*PEAKS, FORCE_RATIO, ETA_D, ETA_A, COMPROMISE)
+        for name, table in zip(quantities, (u, a, force, r, eta_d, eta_a, compromise), strict=True):
+            values[source, name] = table
+    return GapComparison(records, gaps_mm, values, sources)
+
+
+def find_record_peaks(run: RecordRun, source: str) -> tuple[float, float, float, float]:
+    """Return the peaks (u in m, a in m/s2, force in N, force over weight) of a run over its record.
+
+    NaN for what is missing, and for the force without bumpers.
+    """
+    windows = [window.get(source) or {} for window in run.summary.get("windows") or ()]
+
+    def find_largest(*names: str) -> float:
+        peaks = [(window.get(name) or {}).get("peak") for window in windows for name in names]
+        known = [peak for peak in peaks if peak is not None]
+        return float(max(known)) if known and len(known) == len(peaks) else math.nan
+
+    force = math.nan if math.isinf(run.gap_mm) else find_largest("force_r", "force_l")
+    weight = run.mass_kg * GRAVITY_M_S2
+    return find_largest("u"), find_largest("a"), force, force / weight
+
+
+def rank_gaps(comparison: GapComparison, source: str, criterion: str) -> Json | None:
+    """Return the best gap by the median over the records, and how clear it is.
+
+    `best_in` counts the records in which it is the best, `margin` is by how much the median of the
+    next gap is larger. If the best gap is the smallest one tested, a smaller one may be better.
+    Gaps at which a record is missing are left out; None with fewer than two.
+    """
+    table = comparison.values[source, criterion]
+    complete = np.flatnonzero(np.isfinite(table).all(axis=0))
+    if complete.size < 2:
+        return None
+    ranked = table[:, complete]
+    medians = np.median(ranked, axis=0)
+    best, following = np.argsort(medians, kind="stable")[:2]
+    best_in = int(np.count_nonzero(np.argmin(ranked, axis=1) == best))
+    return {
+        "gap_mm": comparison.gaps_mm[complete[best]],
+        "is_smallest_gap": bool(complete[best] == len(comparison.gaps_mm) - 1),
+        "median": float(medians[best]),
+        "smallest": float(ranked[:, best].min()),
+        "largest": float(ranked[:, best].max()),
+        "best_in": best_in,
+        "of": len(comparison.records),
+        "next_gap_mm": comparison.gaps_mm[complete[following]],
+        "next_median": float(medians[following]),
+        "margin": float(medians[following] / medians[best] - 1.0) if medians[best] > 0 else None,
+        "compared_gaps_mm": [comparison.gaps_mm[column] for column in complete],
+    }
+
+
+def describe_comparison(comparison: GapComparison) -> Json:
+    """Return the entry `gap_comparison` of a campaign's summary; gap_mm is null without bumpers."""
+    quantities = (*PEAKS, *CRITERIA)
+    return {
+        "reference_gap_mm": comparison.reference_mm,
+        "reference": comparison.reference,
+        "sources": list(comparison.sources),
+        "records": list(comparison.records),
+        "gaps_mm": list(comparison.gaps_mm),
+        "criteria": CRITERIA,
+        "best": {
+            source: {name: rank_gaps(comparison, source, name) for name in CRITERIA}
+            for source in comparison.sources
+        },
+        "gaps": [
+            {"gap_mm": gap_mm}
+            | {
+                source: {
+                    name: _describe_spread(comparison.values[source, name][:, column])
+                    for name in CRITERIA
+                }
+                for source in comparison.sources
+            }
+            for column, gap_mm in enumerate(comparison.gaps_mm)
+        ],
+        "responses": [
+            {"record": record, "gap_mm": gap_mm}
+            | {
+                source: {
+                    name: float(comparison.values[source, name][row, column]) for name in quantities
+                }
+                for source in comparison.sources
+            }
+            for column, gap_mm in enumerate(comparison.gaps_mm)
+            for row, record in enumerate(comparison.records)
+        ],
+    }
+
+
+def _describe_spread(values: Any) -> Json:
+    """Return smallest, median and largest over the records of (record,), and their number."""
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return {"smallest": None, "median": None, "largest": None, "count": 0}
+    return {
+        "smallest": float(known.min()),
+        "median": float(np.median(known)),
+        "largest": float(known.max()),
+        "count": int(known.size),
+    }
+
+
+def format_best(best: Json | None) -> str:
+    """Format the best gap of a summary with how clear it is; `gap_mm` is null without bumpers."""
+    if best is None:
+        return "not ranked: fewer than two gaps with every record"
+    name, following = (
+        format_gap(math.inf if best[key] is None else best[key])
+        for key in ("gap_mm", "next_gap_mm")
+    )
+    edge = ", the smallest gap tested" if best["is_smallest_gap"] else ""
+    margin = "" if best["margin"] is None else f" (+{100 * best['margin']:.0f} %)"
+    return (
+        f"{name}{edge}: {best['median']:.2f}, best in {best['best_in']} of {best['of']} records; "
+        f"next {following}: {best['next_median']:.2f}{margin}"
+    )

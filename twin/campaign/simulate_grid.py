@@ -1,0 +1,109 @@
+"""Comparison of gaps by the model alone: the records of a campaign at their gaps, no table."""
+
+import math
+import tomllib
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+
+from table_io.block import Float1D, Label
+from table_io.channels import contact_forces, relative_displacement
+from table_io.errors import InputError
+from twin.campaign.config import PlannedRun, read_plan
+from twin.campaign.figures import draw_gap_pairs
+from twin.campaign.gap_comparison import compare_gaps, describe_comparison, list_record_runs
+from twin.campaign.messages import print_gap_comparison
+from twin.campaign.report import embed_pairs, list_gap_values
+from twin.reports.page import render_page
+from twin.reports.summary import Json, write_json
+from twin.reports.windows import extract_free_twin
+from twin.run.folders import make_run_folder
+from twin.run.run_config import RunConfig
+from twin.run.terminal import print_line, show_status
+from twin.run.unpaced import generate_ideal_twin
+from twin.run.warm_up import compile_kernels
+
+
+def simulate_grid(path: Path, model: str | None, out: Path | None) -> int:
+    """Simulate the records of a campaign at their gaps; write and print the comparison of the gaps.
+
+    InputError if the campaign does not play a record at several gaps.
+    """
+    with show_status("checking the runs"):
+        plan = read_plan(path, None, model, lambda *_: None)
+    names = {cell.label: cell.record.title or cell.record.name for cell in plan.config.cells}
+    blank = [(run.label, run.bundle.profile, _describe_motion(math.nan)) for run in plan.runs]
+    if compare_gaps(list_record_runs(blank, names), ("twin",)) is None:
+        raise InputError(
+            "the model alone is simulated for records at several gaps",
+            where=path,
+            allowed="a campaign with [records]",
+            remedy="simulate a single test, or play the campaign with `shaketwin campaign`",
+        )
+    compile_kernels(plan.runs[0].bundle)
+    folder, _ = make_run_folder(out, f"{plan.path.stem}-model")
+    runs = []
+    with show_status("simulating") as show_part:
+        for run in plan.runs:
+            show_part(run.label)
+            runs.append((run.label, run.bundle.profile, simulate_peaks(run.bundle)))
+    comparison = compare_gaps(list_record_runs(runs, names), ("twin",))
+    assert comparison is not None
+    pairs = draw_gap_pairs(comparison, folder / "figures")
+    summary = {
+        "campaign": {
+            "title": plan.config.title,
+            "citation": plan.config.citation,
+            "notes": plan.config.notes,
+            "model": _name_models(plan.runs),
+        },
+        "verdict": "complete",
+        "reason": f"{len(comparison.records)} records at {len(comparison.gaps_mm)} gaps",
+        "gap_comparison": describe_comparison(comparison),
+    }
+    write_json(summary, folder / "summary.json")
+    page = render_page(
+        Path(__file__).with_name("gap_page.html"),
+        summary=summary,
+        gaps=summary["gap_comparison"],
+        pictures=embed_pairs(pairs),
+        text=plan.text,
+        digest=sha256(plan.text.encode()).hexdigest(),
+        **list_gap_values(comparison),
+    )
+    (folder / "report.html").write_text(page, encoding="utf-8")
+    print_gap_comparison(describe_comparison(comparison))
+    print_line(f"{summary['reason']}, model alone -> {folder / 'report.html'}")
+    return 0
+
+
+def simulate_peaks(config: RunConfig) -> Json:
+    """Return a summary with the peaks of the model on an ideal table, over the whole history."""
+    parts: dict[str, list[Float1D]] = {name: [] for name in ("u", "a", "force_r", "force_l")}
+    for block in generate_ideal_twin(config):
+        playing = block.label == Label.MEASURE
+        if block.stream != "pred" or not playing.any():
+            continue
+        twin = extract_free_twin(block)
+        right, left = contact_forces(twin)
+        motion = relative_displacement(twin), twin.channel("mass_acc_m_s2"), right, -left
+        for name, values in zip(parts, motion, strict=True):
+            parts[name].append(values[playing])
+    peaks = {name: float(np.abs(np.concatenate(blocks)).max()) for name, blocks in parts.items()}
+    return _describe_motion(**peaks)
+
+
+def _describe_motion(
+    u: float, a: float = math.nan, force_r: float = math.nan, force_l: float = math.nan
+) -> Json:
+    """Return the summary of a history with one window, by peaks in SI."""
+    peaks = {"u": u, "a": a, "force_r": force_r, "force_l": force_l}
+    twin = {name: {"peak": peak} for name, peak in peaks.items()}
+    return {"verdict": "complete", "windows": [{"measured": None, "twin": twin}]}
+
+
+def _name_models(runs: tuple[PlannedRun, ...]) -> str:
+    """Return the titles of the models of the runs."""
+    titles = [tomllib.loads(run.bundle.model_toml).get("title", "model") for run in runs]
+    return ", ".join(dict.fromkeys(titles))
