@@ -286,6 +286,7 @@ def measure_drive_errors(table: PlantedTable, *twins: TableParameters) -> list[f
     return errors
 
 
+@pytest.mark.slow  # 8 s
 def test_the_file_keeps_the_effect(tmp_path: Path) -> None:
     discovery = rehearse_on_twin("transducer_gain")
     path = tmp_path / "table.toml"

@@ -25,7 +25,6 @@ CONFIDENCE_LEVEL = 0.95  # of the intervals
 RESIDUAL_RATE_RATIO = 2.2  # of the residuals over the highest frequency
 BLOCK_S, MIN_BLOCKS = 2.5, 8  # of time that is left out together
 DIFFERENCE_STEP = 2e-3  # of a parameter, or of its typical value if that is larger
-MODEL_ERRORS: dict[str, float] = {}  # relative, of the half widths: what the laws of the twin err
 # Starting value, smallest and largest value of each parameter that is fitted.
 BOUNDS: dict[str, tuple[float, float, float]] = {
     "gain_1_s": (20.0, 1.0, 200.0),
@@ -50,7 +49,8 @@ BOUNDS: dict[str, tuple[float, float, float]] = {
 STARTING_GAINS_1_S = 8.0, 20.0, 50.0
 FRAME_NAMES = "frame_hz", "frame_damping", "frame_ratio"
 STARTING_FRAMES_HZ = 5.0, 40.0, 24  # first, last, number
-ROUGH_EVALUATIONS = 6  # of the fit without a frame
+MAX_FRAMES = 2  # a mode of the oil column may look like a frame
+ROUGH_EVALUATIONS = 6  # of the fits that only lead to a start
 VALVE_DAMPING = 0.8, 0.2  # mean and standard deviation before the rehearsal: data sheets
 NO_BLOCK = -1
 LENGTH_STEP = 100  # samples, of which a rehearsal is a multiple
@@ -204,7 +204,7 @@ class TableFit:
         """Return the half widths of the 95 % intervals, SI, by parameter: jackknife over blocks.
 
         Each block of time is left out in turn (one Gauss-Newton step each): errors of the model are
-        correlated within a block, so samples are not counted one by one. MODEL_ERRORS is added.
+        correlated within a block, so samples are not counted one by one.
         """
         count = int(self.problem.block.max()) + 1
         estimates = np.zeros((count, self.values.size))
@@ -213,12 +213,7 @@ class TableFit:
         spread = np.sqrt((count - 1) / count * ((estimates - estimates.mean(axis=0)) ** 2).sum(0))
         half = stats.t.ppf(0.5 + 0.5 * CONFIDENCE_LEVEL, count - 1) * spread
         units = _to_si(self.names, np.ones(half.size), self.problem.mass_kg)
-        values = self.parameters._asdict()
-        widths = {}
-        for name, width, unit in zip(self.names, half, units, strict=True):
-            share = MODEL_ERRORS.get(name, 0.0)
-            widths[name] = math.hypot(float(width * unit), share * values[name])
-        return widths
+        return dict(zip(self.names, map(float, half * units), strict=True))
 
     def to_identification(self) -> TableIdentification:
         """Return the twin with its intervals."""
@@ -257,8 +252,9 @@ def fit_basic_twin(
 ) -> TableFit:
     """Fit the twin from nothing, without further effects or with those whose bounds are given.
 
-    First without a frame, whose resonance is narrow; then from the frequency of the frame that
-    leaves least. `trials` are starting values of the parameters of the effects.
+    First without a frame, whose resonance is narrow; then from the MAX_FRAMES frequencies of the
+    frame at which the misfit has its lowest minima. `trials` are starting values of the parameters
+    of the effects.
     """
     bounds = {**BOUNDS, **effect_bounds}
     start = {name: values[0] for name, values in bounds.items()}
@@ -274,7 +270,14 @@ def fit_basic_twin(
     )
     start |= rough.scaled_values
     frames = [start | {"frame_hz": float(hz)} for hz in np.geomspace(*STARTING_FRAMES_HZ)]
-    near = fit_table(problem, bounds, min(frames, key=problem.measure_misfit), tolerance=1e-3)
+    misfits = np.array([problem.measure_misfit(frame) for frame in frames])
+    padded = np.pad(misfits, 1, constant_values=math.inf)
+    is_minimum = (misfits <= padded[:-2]) & (misfits <= padded[2:])
+    count = min(MAX_FRAMES, int(is_minimum.sum()))
+    lowest = np.argsort(np.where(is_minimum, misfits, math.inf))[:count].tolist()
+    fits = [fit_table(problem, bounds, frames[k], ROUGH_EVALUATIONS, 1e-2) for k in lowest]
+    rough = min(fits, key=lambda fit: fit.cost)
+    near = fit_table(problem, bounds, rough.scaled_values, tolerance=1e-3)
     return fit_table(problem.with_noise_of(near), bounds, near.scaled_values)
 
 
