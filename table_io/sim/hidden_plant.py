@@ -23,7 +23,6 @@ from table_io.block import Float1D, Float2D
 from table_io.errors import InputError
 from table_io.sim import plant as base_plant
 from table_io.sim.hydraulic_table import (
-    HYDRAULIC_STATE_SIZE,
     MAX_HYDRAULIC_SUBSTEP_S,
     HydraulicCoefficients,
     _write_hydraulic_rates,
@@ -305,7 +304,8 @@ def _advance_samples(s, command, params, hidden, oil, work, out):  # type: ignor
 class HiddenPlant(Plant):
     """Plant with hidden effects; a signal `damper_force` is added.
 
-    `state` is float64 (15,), or (22,) on a hydraulic table: then the bandwidth is not used.
+    `state` is float64 (15,), or on a hydraulic table that of `HydraulicCoefficients.state_size`:
+    then the bandwidth is not used.
     """
 
     hidden: HiddenCoefficients = field(default_factory=HiddenCoefficients)
@@ -359,7 +359,7 @@ class HiddenPlant(Plant):
             middle = 0.5 * (low + high)
             low, high = (middle, high) if force(middle) < 0.0 else (low, middle)
         u = 0.5 * (low + high)
-        size = HYDRAULIC_STATE_SIZE if self.oil.area else STATE_SIZE
+        size = self.oil.state_size if self.oil.area else STATE_SIZE
         state, compressions = np.zeros(size), compress_bumpers(u)
         state[[X, W, T]] = u, u, -1.0 / self.rate_hz  # sample 0 is then at 0 s
         state[D : D + 2], state[TOUCHED : TOUCHED + 2] = compressions, np.array(compressions) > 0.0

@@ -1,11 +1,18 @@
 """Table `[simulated.hydraulic]` of a rig file; `hydraulic_table.py` states the equations."""
 
 import math
+from typing import Annotated
 
 from pydantic import Field, ValidationInfo, field_validator
 
 from table_io.config.base import ConfigModel, NonNegative, Positive
 from table_io.errors import InputError
+
+Percent = Annotated[float, Field(ge=0.0, le=20.0)]
+Share = Annotated[float, Field(gt=-0.9, lt=0.9)]
+Slope = Annotated[float, Field(ge=-1000.0, le=1000.0)]
+# Time constants that the sub-step of the integrator, 32 us, still resolves.
+MIN_TRANSDUCER_LAG_MS, MAX_STOP_FREQUENCY_HZ = 0.2, 1000.0
 
 
 class HydraulicTableConfig(ConfigModel):
@@ -41,6 +48,39 @@ class HydraulicTableConfig(ConfigModel):
     frame_mass_kg: Positive = Field(description="Mass of the frame that bears the actuator, m_f.")
     frame_frequency_hz: Positive = Field(description="Its natural frequency, w_f / (2 pi).")
     frame_damping: NonNegative = Field(description="Its damping ratio, z_f.")
+    valve_overlap_percent: Percent = Field(
+        0.0, description="Overlap of the spool on either side, of its travel; no flow within it."
+    )
+    valve_hysteresis_percent: Percent = Field(
+        0.0, description="Width of the valve's hysteresis loop, of its travel."
+    )
+    flow_asymmetry: Share = Field(
+        0.0, description="Flow gain more in the positive direction, and less in the negative."
+    )
+    friction_asymmetry: Share = Field(
+        0.0, description="Friction more in the positive direction, and less in the negative."
+    )
+    friction_slope_1_m: Slope = Field(
+        0.0, description="Relative rise of the friction along the stroke, at its centre."
+    )
+    coupling_play_mm: NonNegative = Field(
+        0.0, description="Play between piston and table, from stop to stop."
+    )
+    coupling_stiffness_n_m: Positive = Field(
+        2e8, description="Stiffness of its stops; used with play only."
+    )
+    piston_mass_kg: Positive = Field(40.0, description="Piston and rod; used with play only.")
+    transducer_gain_error: Share = Field(
+        0.0, description="Gain error of the transducer that closes the stroke loop."
+    )
+    transducer_lag_ms: NonNegative = Field(
+        0.0, description="Delay of its filter, of two equal first-order stages."
+    )
+    attached_mass_kg: NonNegative = Field(
+        0.0, description="Mass attached to the frame, m_a: a floor or a wall that moves with it."
+    )
+    attached_frequency_hz: Positive = Field(30.0, description="Its frequency on a fixed frame.")
+    attached_damping: NonNegative = Field(0.05, description="Its damping ratio on a fixed frame.")
 
     @field_validator("static_friction_n")
     @classmethod
@@ -48,6 +88,28 @@ class HydraulicTableConfig(ConfigModel):
         if static_n < info.data.get("friction_n", 0.0):
             raise InputError("static_friction_n is below friction_n", allowed="at least friction_n")
         return static_n
+
+    @field_validator("transducer_lag_ms")
+    @classmethod
+    def _check_lag(cls, lag_ms: float) -> float:
+        if 0.0 < lag_ms < MIN_TRANSDUCER_LAG_MS:
+            raise InputError(
+                "transducer_lag_ms is too short for the integrator",
+                allowed=f"0, or at least {MIN_TRANSDUCER_LAG_MS:g}",
+            )
+        return lag_ms
+
+    @field_validator("piston_mass_kg")
+    @classmethod
+    def _check_stops(cls, piston_kg: float, info: ValidationInfo) -> float:
+        stiffness_n_m = info.data.get("coupling_stiffness_n_m", 0.0)
+        if math.sqrt(stiffness_n_m / piston_kg) > math.tau * MAX_STOP_FREQUENCY_HZ:
+            raise InputError(
+                "the piston between its stops is too fast for the integrator",
+                allowed=f"at most {MAX_STOP_FREQUENCY_HZ:g} Hz",
+                remedy="lower coupling_stiffness_n_m or raise piston_mass_kg",
+            )
+        return piston_kg
 
     def oil_column_hz(self, mass_kg: float) -> float:
         """Return the natural frequency of a moving mass in kg on the oil column, Hz."""

@@ -71,11 +71,17 @@ def identify_table_from_log(
     out: Annotated[
         Path, typer.Option("--out", metavar="FILE", help="New .toml file for the table's twin.")
     ] = Path("table.toml"),
+    with_effects: Annotated[
+        bool,
+        typer.Option(
+            "--effects/--no-effects", help="Name the effects that the table's twin lacks."
+        ),
+    ] = True,
 ) -> None:
-    """Identify the table itself from a rehearsal: oil, valve, friction, loop and frame."""
+    """Identify the table itself from a rehearsal: oil, valve, friction, loop, frame, effects."""
     from twin.cli.table_drive import identify_table_command as command
 
-    raise typer.Exit(command(logs, out))
+    raise typer.Exit(command(logs, out, with_effects))
 
 
 identification_app.add_typer(study_app, name="study", rich_help_panel=LEARN_PANEL)

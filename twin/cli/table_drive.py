@@ -24,9 +24,10 @@ from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from twin.drive.drive_computation import PlayedDrive, compute_drive, correct_played_drive
 from twin.drive.rehearsal import read_played_drive, read_table_motion
+from twin.drive.table_effects import describe_discovery, identify_table_and_effects
 from twin.drive.table_file import TableTwinConfig, format_table_twin, load_table_twin
 from twin.drive.table_identification import identify_table
-from twin.drive.table_model import TableModel
+from twin.drive.table_model import TableModel, TableParameters
 from twin.drive.tracking import find_band
 from twin.reports.table_motion import summarise_tracking
 from twin.run.folders import make_output_folder
@@ -40,12 +41,14 @@ UNITS = {
     "gain_1_s": "1/s", "delay_s": "s", "pressure_feedback_s": "s", "presliding_m": "m",
     "stribeck_speed_m_s": "m/s", "friction_n": "N", "static_excess_n": "N", "stall_force_n": "N",
     "stick_damping_n_s_m": "N s/m", "viscous_n_s_m": "N s/m",
+    "dead_band_m_s": "m/s", "valve_hysteresis_m_s": "m/s", "friction_slope_1_m": "1/m",
+    "backlash_m": "m", "transducer_lag_s": "s", "second_frame_hz": "Hz",
     "valve_hz": "Hz", "oil_hz": "Hz", "frame_hz": "Hz",
 }  # fmt: skip
 
 
-def identify_table_command(logs: Sequence[Path], out: Path) -> int:
-    """Identify the twin of the table from a rehearsal and write it to a new file."""
+def identify_table_command(logs: Sequence[Path], out: Path, with_effects: bool = True) -> int:
+    """Identify the twin of the table and its missing effects from a rehearsal; write a new file."""
     from twin.reports.table_twin_figure import draw_table_twin
 
     drawing = out.with_suffix(".png")
@@ -57,18 +60,23 @@ def identify_table_command(logs: Sequence[Path], out: Path) -> int:
     recording = open_recording(logs[0])
     rig = parse_toml(recording.start.rig_toml, RigConfig, str(logs[0]))
     stall_kn = rig.table_response.stall_force_kn
-    rehearsal = read_table_motion(recording)
+    rehearsal, mass_kg = read_table_motion(recording), rig.moving_mass_kg
+    stall_n = math.inf if stall_kn is None else 1e3 * stall_kn
+    discovery, effects = None, []
     with show_status("fitting the twin of the table"):
-        identification = identify_table(
-            rehearsal,
-            rig.moving_mass_kg,
-            math.inf if stall_kn is None else 1e3 * stall_kn,
-        )
+        if with_effects:
+            identification, discovery = identify_table_and_effects(rehearsal, mass_kg, stall_n)
+            effects = [finding.id for finding in discovery.findings]
+        else:
+            identification = identify_table(rehearsal, mass_kg, stall_n)
     title = f"{rig.title}, from {recording.run}"
-    out.write_text(format_table_twin(title, identification), encoding="utf-8")
+    out.write_text(format_table_twin(title, identification, effects), encoding="utf-8")
     table = Table("parameter", "value", "95 %", "unit", title=title)
+    absent = TableParameters()._asdict()
     for name, value in identification.model.parameters._asdict().items():
         width = identification.half_widths.get(name)
+        if width is None and value == absent[name]:
+            continue  # of an effect that the table does not show
         table.add_row(
             name.removesuffix("_1_s"),
             f"{value:.4g}",
@@ -76,6 +84,8 @@ def identify_table_command(logs: Sequence[Path], out: Path) -> int:
             UNITS.get(name, ""),
         )
     print_table(console, table)
+    for line in describe_discovery(discovery) if discovery is not None else ():
+        print_line(line)
     draw_table_twin(identification.model, rehearsal, title, drawing)
     print_line(f"it leaves {100 * identification.residual:.2g} % of the measured motion -> {out}")
     print_line(f"frequency response and steps -> {drawing}")

@@ -1,12 +1,14 @@
 """File of a table's twin, as `shaketwin table-twin` writes it."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 from pydantic import Field, field_validator
 
 from table_io.config.base import ConfigModel, NonNegative, Positive, load_config
 from table_io.errors import InputError, suggest
+from twin.drive.table_effects import EFFECT_BY_ID
 from twin.drive.table_identification import TableIdentification
 from twin.drive.table_model import TableModel, TableParameters
 
@@ -19,6 +21,7 @@ class TableTwinConfig(ConfigModel):
     residual: NonNegative = Field(description="Share of the measured motion that it leaves, rms.")
     parameters: dict[str, float] = Field(description="Parameters of the table's twin, SI.")
     half_widths: dict[str, float] = Field({}, description="Half widths of their 95 % intervals.")
+    effects: tuple[str, ...] = Field((), description="Effects that the rehearsal showed.")
 
     @field_validator("parameters")
     @classmethod
@@ -30,6 +33,16 @@ class TableTwinConfig(ConfigModel):
             )
         return parameters
 
+    @field_validator("effects")
+    @classmethod
+    def _check_effects(cls, effects: tuple[str, ...]) -> tuple[str, ...]:
+        unknown = sorted(set(effects) - set(EFFECT_BY_ID))
+        if unknown:
+            raise InputError(
+                f"effect {', '.join(unknown)} unknown", remedy=suggest(unknown[0], EFFECT_BY_ID)
+            )
+        return effects
+
     def build_model(self) -> TableModel:
         """Return the twin of the table."""
         return TableModel(self.mass_kg, TableParameters(**self.parameters))
@@ -40,13 +53,16 @@ def load_table_twin(path: Path) -> TableTwinConfig:
     return load_config(path, TableTwinConfig, "table twin")[0]
 
 
-def format_table_twin(title: str, identification: TableIdentification) -> str:
-    """Return the TOML text of an identified table."""
+def format_table_twin(
+    title: str, identification: TableIdentification, effects: Sequence[str] = ()
+) -> str:
+    """Return the TOML text of an identified table, with the names of the effects found in it."""
     values = identification.model.parameters._asdict()
     lines = [
         f"title = {json.dumps(title, ensure_ascii=False)}",
         f"mass_kg = {identification.model.mass_kg!r}",
         f"residual = {identification.residual:.4g}",
+        f"effects = {json.dumps(list(effects))}",
         "",
         "[parameters]",
         *(f"{name} = {value:.9g}" for name, value in values.items()),

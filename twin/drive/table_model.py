@@ -5,13 +5,25 @@
     u'' = w_v^2 (e - u) - 2 z_v w_v u'          (valve: speed at no load)
     e = k (s - (y - y_f)) + k_ff s' - g h / m   (stroke loop; h: f above 1 Hz)
     F = z (F_c + (F_s - F_c) exp(-(v / v_s)^2)) + c v + b (1 - z sign(v)) v
-    z' = v / d (1 - z sign(v))
+    z' = v / d (1 - z sign(v)),  the exponential with a lag over the travel n d
     y_f'' = -r (f - F(v)) / m - w_f (w_f y_f + 2 z_f y_f')
 
 s is the command after a delay. Presliding is Dahl's (1968), with the Stribeck force at low speed;
 d is the presliding displacement. z is integrated exactly over a step of constant speed, the rest by
 the classical Runge-Kutta method. Equations, friction law and integrator are not those of the
 simulated table. Only ratios of force to mass show in a motion: forces are those of the stated mass.
+
+Effects that a table may have in addition, each absent where its parameter is 0; `table_effects.py`
+describes them and finds out which one a table has:
+
+    u -> u - d_v sat(u / d_v), u -> u - w_h z_h / 2 with z_h' = 2 u' / w_h (1 - z_h sign(u')),
+    u -> u (1 + a_u sign(u))                          (valve: dead band, hysteresis, direction)
+    f -> f - K b/2 sat(2 f / (K b))                              (coupling: backlash b)
+    z -> +-z_m instead of +-1, z_m = (1 + a_F sign(v)) (1 + g_F (y - y_f))  (friction)
+    y - y_f -> q_t in e, t_t q_t' = (1 + g_t) (y - y_f) - q_t              (transducer)
+    y_f -> y_f + y_2, y_2'' = -r_2 (f - F(v)) / m - w_2 (w_2 y_2 + 2 z_2 y_2')  (second frame mode)
+
+sat(x) is x within -1 .. 1.
 """
 
 import math
@@ -27,6 +39,9 @@ from table_io.block import Float1D, Float2D
 MAX_STEP_S = 2.6e-4  # of the integrator: a tenth of the period of the fastest valve
 PRESSURE_CORNER = math.tau * 1.0  # rad/s, below it the load is not fed back
 Y, V, OIL, VALVE, VALVE_RATE, LOW_OIL, FRAME, FRAME_SPEED, STATE_SIZE = 0, 1, 2, 3, 4, 5, 6, 7, 8
+# States of effects in addition: second mode of the frame, and the stroke as the loop reads it.
+FRAME_2, FRAME_2_SPEED, STROKE_READ, EXTENDED_STATE_SIZE = 8, 9, 10, 11
+LEAST_FRICTION_SHARE = 0.05  # of the friction, however it changes along the stroke
 
 
 class TableParameters(NamedTuple):
@@ -54,59 +69,135 @@ class TableParameters(NamedTuple):
     frame_damping: float = 0.05
     frame_ratio: float = 0.0
     stall_force_n: float = math.inf
+    dead_band_m_s: float = 0.0
+    valve_hysteresis_m_s: float = 0.0
+    flow_asymmetry: float = 0.0
+    friction_asymmetry: float = 0.0
+    friction_slope_1_m: float = 0.0
+    backlash_m: float = 0.0
+    transducer_gain_error: float = 0.0
+    transducer_lag_s: float = 0.0
+    second_frame_hz: float = 30.0
+    second_frame_damping: float = 0.05
+    second_frame_ratio: float = 0.0
+    friction_memory: float = 0.0
 
 
 @njit(cache=True, nogil=True)
-def _write_rates(s, z, command, command_rate, reaction, m, p, rate):  # type: ignore[no-untyped-def]
-    """Write the time derivative of the state; SI."""
-    v = s[V] - s[FRAME_SPEED]
-    dry = p.friction_n + p.static_excess_n * math.exp(-((v / p.stribeck_speed_m_s) ** 2))
-    sticking = 1.0 - z if v > 0.0 else 1.0 + z
-    drive = s[OIL] - z * dry - (p.viscous_n_s_m + p.stick_damping_n_s_m * sticking) * v
+def _find_friction_share(sign, stroke, p):  # type: ignore[no-untyped-def]
+    """Return the limit of |z| in this direction, at this stroke in m."""
+    along = max(1.0 + p.friction_slope_1_m * stroke, LEAST_FRICTION_SHARE)
+    return (1.0 + p.friction_asymmetry * sign) * along
+
+
+@njit(cache=True, nogil=True)
+def _write_rates(s, z, memory, z_valve, command, command_rate, reaction, m, p, rate):  # type: ignore[no-untyped-def]
+    """Write the time derivative of the state; SI.
+
+    `memory` is the exponential of the Stribeck force with its lag, `z_valve` is that of the valve.
+    """
     oil = math.tau * p.oil_hz
     stiffness = m * oil * oil
-    share = 1.0 - s[OIL] / p.stall_force_n if s[VALVE] > 0.0 else 1.0 + s[OIL] / p.stall_force_n
-    flow = s[VALVE] * math.sqrt(max(share, 0.0))
+    stroke, v, force = s[Y] - s[FRAME], s[V] - s[FRAME_SPEED], s[OIL]
+    if p.second_frame_ratio != 0.0:
+        stroke -= s[FRAME_2]
+        v -= s[FRAME_2_SPEED]
+    if p.backlash_m > 0.0:
+        play = 0.5 * stiffness * p.backlash_m
+        force -= min(max(force, -play), play)
+    if p.friction_memory > 0.0:
+        dry = p.friction_n + p.static_excess_n * memory
+    else:
+        dry = p.friction_n + p.static_excess_n * math.exp(-((v / p.stribeck_speed_m_s) ** 2))
+    sticking = 1.0 - z if v > 0.0 else 1.0 + z
+    if p.friction_asymmetry != 0.0 or p.friction_slope_1_m != 0.0:
+        sign = 1.0 if v > 0.0 else -1.0
+        sticking = 1.0 - sign * z / _find_friction_share(sign, stroke, p)
+    drive = force - z * dry - (p.viscous_n_s_m + p.stick_damping_n_s_m * sticking) * v
+    opening = s[VALVE] - 0.5 * p.valve_hysteresis_m_s * z_valve
+    if p.dead_band_m_s > 0.0:
+        opening -= min(max(opening, -p.dead_band_m_s), p.dead_band_m_s)
+    share = 1.0 - force / p.stall_force_n if opening > 0.0 else 1.0 + force / p.stall_force_n
+    flow = opening * math.sqrt(max(share, 0.0))
+    if p.flow_asymmetry != 0.0:
+        flow += p.flow_asymmetry * abs(flow)
     valve = math.tau * p.valve_hz
+    reading = stroke
+    if p.transducer_gain_error != 0.0:
+        reading *= 1.0 + p.transducer_gain_error
+    if p.transducer_lag_s > 0.0:
+        rate[STROKE_READ] = (reading - s[STROKE_READ]) / p.transducer_lag_s
+        reading = s[STROKE_READ]
     asked = (
-        p.gain_1_s * (command - (s[Y] - s[FRAME]))
+        p.gain_1_s * (command - reading)
         + p.velocity_feedforward * command_rate
-        - p.pressure_feedback_s * (s[OIL] - s[LOW_OIL]) / m
+        - p.pressure_feedback_s * (force - s[LOW_OIL]) / m
     )
     frame = math.tau * p.frame_hz
     rate[Y] = s[V]
     rate[V] = (drive + reaction) / m
-    rate[OIL] = stiffness * (flow - v) - 2.0 * p.oil_damping * oil * s[OIL]
+    rate[OIL] = stiffness * (flow - v) - 2.0 * p.oil_damping * oil * force
     rate[VALVE] = s[VALVE_RATE]
     rate[VALVE_RATE] = valve * (valve * (asked - s[VALVE]) - 2.0 * p.valve_damping * s[VALVE_RATE])
-    rate[LOW_OIL] = PRESSURE_CORNER * (s[OIL] - s[LOW_OIL])
+    rate[LOW_OIL] = PRESSURE_CORNER * (force - s[LOW_OIL])
     rate[FRAME] = s[FRAME_SPEED]
     rate[FRAME_SPEED] = -p.frame_ratio * drive / m - frame * (
         frame * s[FRAME] + 2.0 * p.frame_damping * s[FRAME_SPEED]
     )
+    if p.second_frame_ratio != 0.0:
+        frame = math.tau * p.second_frame_hz
+        rate[FRAME_2] = s[FRAME_2_SPEED]
+        rate[FRAME_2_SPEED] = -p.second_frame_ratio * drive / m - frame * (
+            frame * s[FRAME_2] + 2.0 * p.second_frame_damping * s[FRAME_2_SPEED]
+        )
+
+
+@njit(cache=True, nogil=True)
+def _advance_memories(s, z, memory, z_valve, h, p):  # type: ignore[no-untyped-def]
+    """Return z, the lagging Stribeck exponential and z of the valve after half a step h in s."""
+    stroke, v = s[Y] - s[FRAME], s[V] - s[FRAME_SPEED]
+    if p.second_frame_ratio != 0.0:
+        stroke -= s[FRAME_2]
+        v -= s[FRAME_2_SPEED]
+    sign = 1.0 if v > 0.0 else -1.0
+    if p.friction_asymmetry != 0.0 or p.friction_slope_1_m != 0.0:
+        limit = _find_friction_share(sign, stroke, p)
+        travel = abs(v) * 0.5 * h / (p.presliding_m * limit)
+        z = sign * limit + (z - sign * limit) * math.exp(-travel)
+    else:
+        z = sign + (z - sign) * math.exp(-abs(v) * 0.5 * h / p.presliding_m)
+    if p.friction_memory > 0.0:
+        level = math.exp(-((v / p.stribeck_speed_m_s) ** 2))
+        travel = abs(v) * 0.5 * h / (p.friction_memory * p.presliding_m)
+        memory = level + (memory - level) * math.exp(-travel)
+    if p.valve_hysteresis_m_s > 0.0:
+        sign = 1.0 if s[VALVE_RATE] > 0.0 else -1.0
+        travel = abs(s[VALVE_RATE]) * h / p.valve_hysteresis_m_s
+        z_valve = sign + (z_valve - sign) * math.exp(-travel)
+    return z, memory, z_valve
 
 
 @njit(cache=True, nogil=True)
 def _simulate(command, reaction, m, rate_hz, steps, p, out):  # type: ignore[no-untyped-def]
     """Simulate from rest; command (sample,) in m, out (2, sample): table in m and m/s2."""
-    s, stage, total = np.zeros(STATE_SIZE), np.zeros(STATE_SIZE), np.zeros(STATE_SIZE)
-    rate = np.zeros(STATE_SIZE)
-    h, z, lag = 1.0 / (rate_hz * steps), 0.0, p.delay_s * rate_hz
+    extended = p.second_frame_ratio != 0.0 or p.transducer_lag_s > 0.0
+    size = EXTENDED_STATE_SIZE if extended else STATE_SIZE
+    s, stage, total, rate = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
+    h, z, memory, z_valve = 1.0 / (rate_hz * steps), 0.0, 1.0, 0.0
+    lag = p.delay_s * rate_hz
     count = command.size
     for k in range(count):
         for i in range(steps):
             # Dahl's state over half a step before, and half a step after, the rest.
             for half in range(2):
-                v = s[V] - s[FRAME_SPEED]
-                sign = 1.0 if v > 0.0 else -1.0
-                z = sign + (z - sign) * math.exp(-abs(v) * 0.5 * h / p.presliding_m)
+                z, memory, z_valve = _advance_memories(s, z, memory, z_valve, h, p)
                 if half == 1:
                     break
                 total[:] = 0.0
                 for j in range(4):
                     share = 0.0 if j == 0 else (1.0 if j == 3 else 0.5)
                     weight = 1.0 if j in (0, 3) else 2.0
-                    for n in range(STATE_SIZE):
+                    for n in range(size):
                         stage[n] = s[n] + (share * h * rate[n] if j else 0.0)
                     at = k - 1 + (i + share) / steps - lag
                     # Quadratic B-spline through three samples: continuous speed.
@@ -121,12 +212,12 @@ def _simulate(command, reaction, m, rate_hz, steps, p, out):  # type: ignore[no-
                     low = int(at_r)
                     high = min(low + 1, count - 1)
                     force = reaction[low] + (at_r - low) * (reaction[high] - reaction[low])
-                    _write_rates(stage, z, value, slope, force, m, p, rate)
-                    for n in range(STATE_SIZE):
+                    _write_rates(stage, z, memory, z_valve, value, slope, force, m, p, rate)
+                    for n in range(size):
                         total[n] += weight * rate[n]
-                for n in range(STATE_SIZE):
+                for n in range(size):
                     s[n] += h / 6.0 * total[n]
-        _write_rates(s, z, 0.0, 0.0, reaction[k], m, p, rate)
+        _write_rates(s, z, memory, z_valve, 0.0, 0.0, reaction[k], m, p, rate)
         out[0, k], out[1, k] = s[Y], rate[V]
 
 
@@ -164,12 +255,19 @@ class TableModel:
         safe = np.where(w == 0.0, 1.0, s**2)
         table = 1.0 / (m * safe)
         block = -p.frame_ratio / (m * (s**2 + 2 * p.frame_damping * frame * s + frame**2))
+        frame = math.tau * p.second_frame_hz
+        block -= p.second_frame_ratio / (
+            m * (s**2 + 2 * p.second_frame_damping * frame * s + frame**2)
+        )
+        reading = (1.0 + p.transducer_gain_error) / (1.0 + p.transducer_lag_s * s)
         stroke = table - block  # per drive; the oil bears drive + c v
         oil_force = 1.0 + p.viscous_n_s_m * s * stroke
         high_pass = s / (s + PRESSURE_CORNER)
         # f' = K (u - v) - 2 z w f
         needed = (oil_force * (s + 2 * p.oil_damping * oil)) / (m * oil**2) + s * stroke
-        loop = spool * (p.gain_1_s * stroke + p.pressure_feedback_s * high_pass * oil_force / m)
+        loop = spool * (
+            p.gain_1_s * reading * stroke + p.pressure_feedback_s * high_pass * oil_force / m
+        )
         asked = (p.gain_1_s + p.velocity_feedforward * s) * delayed
         response: npt.NDArray[np.complex128] = spool * asked * table / (needed + loop)
-        return np.where(w == 0.0, 1.0 + 0.0j, response)
+        return np.where(w == 0.0, 1.0 / reading, response)

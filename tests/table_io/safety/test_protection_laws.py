@@ -23,7 +23,7 @@ NAMES = RIG.channels
 DRIVE, TABLE, ACC, MASS, MASS_ACC = range(5)
 RATES_HZ = (1000.0, 2000.0, 4000.0)
 LAW = settings(
-    max_examples=25, deadline=None, derandomize=True,
+    max_examples=10, deadline=None, derandomize=True,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )  # fmt: skip
 SIGNS = st.sampled_from([-1.0, 1.0])
