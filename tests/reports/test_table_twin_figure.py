@@ -4,13 +4,14 @@ import math
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 from PIL import Image
 from scipy import signal
 
 from tests.drive.hydraulic_rig import RATE_HZ, make_random_motion
 from twin.drive.table_identification import TableRehearsal
-from twin.drive.table_model import TableModel
-from twin.reports.table_twin_figure import draw_table_twin, estimate_response
+from twin.drive.table_model import TableModel, TableParameters
+from twin.reports.table_twin_figure import draw_table_twin, estimate_response, plot_steps
 
 CORNER_HZ, DELAY = 4.0, 12  # of a first-order table, Hz and samples
 
@@ -42,3 +43,13 @@ def test_the_figure_is_drawn(tmp_path: Path) -> None:
     pixels = np.asarray(Image.open(tmp_path / "table.png").convert("L"))
     assert pixels.shape[1] > 1000
     assert np.mean(pixels < 128) > 0.003  # lines and text
+
+
+def test_a_step_is_drawn_with_its_delay() -> None:
+    """The curve of a table with 100 ms of delay rests for 100 ms."""
+    figure = Figure()
+    axis = figure.subplots()
+    plot_steps(axis, TableModel(2000.0, TableParameters(delay_s=0.1)))
+    time_s, reached = axis.lines[0].get_data()
+    assert np.abs(np.asarray(reached)[np.asarray(time_s) < 0.095]).max() < 1e-3
+    assert np.asarray(reached)[-1] > 0.8

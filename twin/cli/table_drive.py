@@ -51,6 +51,8 @@ def identify_table_command(logs: Sequence[Path], out: Path, with_effects: bool =
     """Identify the twin of the table and its missing effects from a rehearsal; write a new file."""
     from twin.reports.table_twin_figure import draw_table_twin
 
+    if out.suffix != ".toml":
+        raise InputError("is no name for a table's twin", where=out, allowed="a file NAME.toml")
     drawing = out.with_suffix(".png")
     for path in (out, drawing):
         if path.exists():

@@ -1,5 +1,6 @@
 """Figure of a table's twin: frequency response against the rehearsal, and step responses."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ SEGMENT_S = 5.0  # of the estimate of the frequency response
 EXCITED_SHARE = 0.01  # of the largest power of the command: less says nothing of the table
 STEPS_MM = 0.1, 1.0, 5.0
 STEP_S, STEP_RATE_HZ = 1.0, 2000.0
+REST_S = 0.01  # before a step, besides the delay
 
 
 def draw_table_twin(model: TableModel, rehearsal: TableRehearsal, title: str, out: Path) -> None:
@@ -52,7 +54,7 @@ def draw_table_twin(model: TableModel, rehearsal: TableRehearsal, title: str, ou
             axis.set_title(f"{text}, table over command, by the rehearsal")
         coherence.set_ylim(0.0, 1.05)
         coherence.set_title("coherence: what is missing to 1 is nonlinear, or noise")
-        _plot_steps(step, model)
+        plot_steps(step, model)
         figure.suptitle(title, x=0.01, ha="left", fontsize=10)
         figure.savefig(out)
 
@@ -75,12 +77,13 @@ def estimate_response(
     return hz[inside], cross[inside] / power[inside], shared[inside]
 
 
-def _plot_steps(axis: Axes, model: TableModel) -> None:
+def plot_steps(axis: Axes, model: TableModel) -> None:
     """Plot responses of the twin to steps of several sizes, each over its size."""
     time_s = np.arange(round(STEP_S * STEP_RATE_HZ)) / STEP_RATE_HZ
+    rest = math.ceil((model.parameters.delay_s + REST_S) * STEP_RATE_HZ)
     for step_mm, shade in zip(STEPS_MM, (0.35, 0.65, 1.0), strict=True):
-        command = np.full(time_s.size, 1e-3 * step_mm)
-        reached = model.simulate(command, STEP_RATE_HZ)[0] / command
+        command = np.concatenate([np.zeros(rest), np.full(time_s.size, 1e-3 * step_mm)])
+        reached = model.simulate(command, STEP_RATE_HZ)[0][rest:] / command[-1]
         axis.plot(time_s, reached, color="#1559b0", alpha=shade, lw=1.3, label=f"{step_mm:g} mm")
     axis.axhline(1.0, color=GUIDE_COLOUR, lw=0.6)
     axis.set_title("steps of the twin: friction holds small ones back")

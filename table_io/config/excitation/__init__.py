@@ -136,7 +136,8 @@ class History(Excitation):
                 remedy="blend it in and out",
             )
         acceleration = history_acceleration(history, rate_hz)
-        low_hz, high_hz = find_energy_band(acceleration, rate_hz)
+        # Of the shape: the squares of a tiny motion are 0 in double precision.
+        low_hz, high_hz = find_energy_band(acceleration / np.abs(acceleration).max(), rate_hz)
         level = float(np.abs(acceleration).max())
         command = target
         if self.drive is not None:

@@ -249,9 +249,10 @@ def test_a_record_beyond_a_limit_of_the_rig_is_refused(
     assert {fault.key: fault.allowed for fault in refusal.value.faults}[key] == allowed
 
 
-def test_a_record_too_small_for_the_output_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("scale", ["1e-5", "1e-170"])
+def test_a_record_too_small_for_the_output_is_refused(scale: str, tmp_path: Path) -> None:
     """Of some tens of millimetres, so that a hundred-thousandth is below one step of 18 bits."""
-    profile, _ = load_profile(write(tmp_path, csv(), "scale = 1e-5\n"))
+    profile, _ = load_profile(write(tmp_path, csv(), f"scale = {scale}\n"))
     rows = compute_demands(plan_excitation(profile), profile, RIG)
     with pytest.raises(InputError) as refusal:
         check_limits(rows, profile, RIG, "test")
