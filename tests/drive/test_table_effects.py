@@ -38,6 +38,7 @@ from twin.drive.table_identification import (
     TableRehearsal,
     fit_basic_twin,
     fit_table,
+    identify_table,
 )
 from twin.drive.table_model import TableModel, TableParameters
 
@@ -324,3 +325,30 @@ def test_the_library_is_whole() -> None:
             assert parameter.name in TableParameters._fields
         assert getattr(TableParameters(), effect.parameters[0].name) == 0.0
         assert all(len(trial) == len(effect.parameters) for trial in effect.trials)
+
+
+@pytest.mark.slow  # 30 s
+def test_the_fit_begins_where_it_can_reach_the_table() -> None:
+    """Much friction, an oil column of 21 Hz and little pressure feedback: typical values mislead.
+
+    From these alone the fit left half of the motion.
+    """
+    table = PlantedTable(
+        {
+            "friction_n": 1465.0,
+            "static_friction_n": 1753.0,
+            "stick_stiffness_n_m": 7.28e7,
+            "viscous_friction_n_s_m": 504.0,
+            "bulk_modulus_mpa": 629.3,
+            "gain_1_s": 26.3,
+            "velocity_feedforward": 0.051,
+            "pressure_feedback": 0.054,
+            "frame_frequency_hz": 16.3,
+            "frame_mass_kg": 3e4,
+        },
+        delay_ms=3.5,
+    )
+    result = identify_table(record_rehearsal(table), TABLE.moving_mass_kg, 42_000.0)
+    assert result.residual < 0.06
+    assert result.model.parameters.friction_n == pytest.approx(1465.0, rel=0.05)
+    assert result.model.parameters.oil_hz == pytest.approx(21.34, rel=0.03)

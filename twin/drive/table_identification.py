@@ -8,6 +8,7 @@ accelerometer says little, the acceleration above, both as acceleration.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import product
 from types import MappingProxyType
 
 import numpy as np
@@ -46,7 +47,13 @@ BOUNDS: dict[str, tuple[float, float, float]] = {
     "frame_damping": (0.08, 0.005, 1.0),
     "frame_ratio": (0.02, 0.0, 1.0),
 }
-STARTING_GAINS_1_S = 8.0, 20.0, 50.0
+# Values from which the fit may begin, in all combinations.
+STARTING_VALUES: dict[str, tuple[float, ...]] = {
+    "gain_1_s": (8.0, 20.0, 50.0),
+    "oil_hz": (12.0, 18.0, 26.0, 38.0, 60.0),
+    "friction_n": (0.01, 0.03, 0.08),  # over the weight of the table
+    "pressure_feedback_s": (0.001, 0.004),
+}
 FRAME_NAMES = "frame_hz", "frame_damping", "frame_ratio"
 STARTING_FRAMES_HZ = 5.0, 40.0, 24  # first, last, number
 MAX_FRAMES = 2  # a mode of the oil column may look like a frame
@@ -260,8 +267,8 @@ def fit_basic_twin(
     start = {name: values[0] for name, values in bounds.items()}
     rough_bounds = {name: values for name, values in bounds.items() if name not in FRAME_NAMES}
     starts = [
-        start | {"gain_1_s": gain, "frame_ratio": 0.0} | dict(trial)
-        for gain in STARTING_GAINS_1_S
+        start | dict(zip(STARTING_VALUES, values, strict=True)) | {"frame_ratio": 0.0} | dict(trial)
+        for values in product(*STARTING_VALUES.values())
         for trial in trials
     ]
     first = min(starts, key=problem.measure_misfit)
