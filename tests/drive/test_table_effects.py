@@ -182,6 +182,21 @@ def test_shapes_of_an_absent_effect_do_not_matter(name: str) -> None:
     np.testing.assert_array_equal(plain, shaped)
 
 
+def test_a_short_lag_of_the_transducer_is_integrated() -> None:
+    """Shorter than a step, across it and in between: the change grows with the lag."""
+    command = make_random_motion(4.0, (0.3, 35.0), 0.2, seed=4)
+    lags_s = [1e-9, 1e-5, 5e-5, 9e-5, 2e-4, 2.4e-4, 2.5e-4, 2.6e-4, 3e-4, 6e-4]
+    plain, *lagging = (
+        TableModel(MASS_KG, BASIC._replace(transducer_lag_s=lag_s)).simulate(command, RATE_HZ)[0]
+        for lag_s in [0.0, *lags_s]
+    )
+    per_lag = [
+        (out - plain).std() / lag_s for out, lag_s in zip(lagging[1:], lags_s[1:], strict=True)
+    ]
+    np.testing.assert_allclose(per_lag, per_lag[0], rtol=0.02)
+    np.testing.assert_allclose(lagging[0], plain, atol=1e-9)
+
+
 @pytest.mark.parametrize("name", list(PLANTED))
 def test_table_and_twin_are_changed_alike(name: str) -> None:
     """Two codes and two forms of each law: the change of the acceleration has one shape and size.
