@@ -153,8 +153,8 @@ def test_the_term_is_that_of_an_independent_solution(effect) -> None:
     )
 
 
-def test_an_absent_effect_changes_no_bit() -> None:
-    """Values of twin and simulated table from before there were effects."""
+def test_without_effects_twin_and_table_keep_their_values_within_1e_9() -> None:
+    """Three samples of twin and simulated table from before there were effects."""
     command = make_random_motion(8.0, (0.3, 35.0), 0.2, seed=4)
     out = TableModel(2000.0, BASIC._replace(viscous_n_s_m=500.0)).simulate(command, RATE_HZ)
     samples = [2500, 5000, 7000]
