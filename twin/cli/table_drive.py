@@ -63,9 +63,11 @@ def identify_table_command(logs: Sequence[Path], out: Path, with_effects: bool =
     rehearsal, mass_kg = read_table_motion(recording), rig.moving_mass_kg
     stall_n = math.inf if stall_kn is None else 1e3 * stall_kn
     discovery, effects = None, []
-    with show_status("fitting the twin of the table"):
+    with show_status("identifying the table") as show_part:
         if with_effects:
-            identification, discovery = identify_table_and_effects(rehearsal, mass_kg, stall_n)
+            identification, discovery = identify_table_and_effects(
+                rehearsal, mass_kg, stall_n, report=show_part
+            )
             effects = [finding.id for finding in discovery.findings]
         else:
             identification = identify_table(rehearsal, mass_kg, stall_n)
