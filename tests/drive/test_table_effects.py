@@ -3,6 +3,8 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -259,6 +261,14 @@ def test_nothing_is_named_where_nothing_is_missing() -> None:
     discovery = rehearse_on_twin("")
     assert discovery.findings == ()
     assert describe_discovery(discovery)[0] == "missing effects: none is named"
+
+
+def test_the_smallest_visible_size_of_an_effect_not_found_is_stated() -> None:
+    fit: Any = SimpleNamespace(estimate_half_widths=dict, parameters=BASIC)
+    visible = {"backlash": 1.234e-5, "flow_asymmetry": 0.031}
+    lines = describe_discovery(EffectDiscovery(fit, (), 0.05, None, visible))
+    (line,) = (line for line in lines if "backlash" in line)
+    assert line.endswith("(half width, 95 %): backlash 1.2e-05 m, flow asymmetry 0.031")
 
 
 @pytest.mark.slow  # 60 s each
