@@ -29,6 +29,7 @@ from twin.drive.table_effects import (
     EFFECT_BY_ID,
     LIBRARY,
     EffectDiscovery,
+    EffectFinding,
     describe_discovery,
     describe_size,
     discover_table_effects,
@@ -261,6 +262,17 @@ def test_nothing_is_named_where_nothing_is_missing() -> None:
     discovery = rehearse_on_twin("")
     assert discovery.findings == ()
     assert describe_discovery(discovery)[0] == "missing effects: none is named"
+
+
+def test_a_named_effect_is_described_with_equation_and_source() -> None:
+    fit: Any = SimpleNamespace(
+        estimate_half_widths=lambda: {"backlash_m": 1e-6},
+        parameters=BASIC._replace(backlash_m=5e-5),
+    )
+    finding = EffectFinding("backlash", 0.1, 0.05)
+    lines = describe_discovery(EffectDiscovery(fit, (finding,), 0.05, None, {}))
+    assert lines[1].startswith("  equation: f -> f - K b/2 sat(2 f / (K b)) (Nordin, Gutman")
+    assert lines[2].startswith("  backlash_m = 5e-05 +- 1e-06 m (95 %)")
 
 
 def test_the_smallest_visible_size_of_an_effect_not_found_is_stated() -> None:

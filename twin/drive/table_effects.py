@@ -316,9 +316,8 @@ def is_worthwhile(before: EffectFit, after: EffectFit) -> bool:
     """Return True if an effect is visible and gains a clear share that chance does not give."""
     share, sigma = compute_gain(before, after)
     effect = after.effects[-1]
-    name = effect.parameters[0].name
-    size = abs(getattr(after.fit.parameters, name))
-    half_width = after.fit.estimate_half_widths()[name]
+    size = abs(describe_size(effect, after.fit.parameters))
+    half_width = after.fit.estimate_half_widths()[effect.parameters[0].name]
     return (
         share > MIN_GAIN_SHARE and sigma > MIN_GAIN_SIGMA and size > MIN_EFFECT_SIGMA * half_width
     )
@@ -432,6 +431,7 @@ def describe_discovery(discovery: EffectDiscovery) -> list[str]:
     for finding in discovery.findings:
         effect = EFFECT_BY_ID[finding.id]
         lines.append(f"missing effect: {effect.description}")
+        lines.append(f"  equation: {effect.equation} ({effect.source})")
         for parameter in effect.parameters:
             value = getattr(parameters, parameter.name)
             lines.append(
