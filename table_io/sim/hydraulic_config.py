@@ -12,7 +12,7 @@ Percent = Annotated[float, Field(ge=0.0, le=20.0)]
 Share = Annotated[float, Field(gt=-0.9, lt=0.9)]
 Slope = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 # Time constants that the sub-step of the integrator, 32 us, still resolves.
-MIN_TRANSDUCER_LAG_MS, MAX_STOP_FREQUENCY_HZ = 0.2, 1000.0
+MIN_TRANSDUCER_LAG_MS, MAX_FREQUENCY_HZ = 0.2, 1000.0
 
 
 class HydraulicTableConfig(ConfigModel):
@@ -69,7 +69,9 @@ class HydraulicTableConfig(ConfigModel):
     coupling_stiffness_n_m: Positive = Field(
         2e8, description="Stiffness of its stops; used with play only."
     )
-    piston_mass_kg: Positive = Field(40.0, description="Piston and rod; used with play only.")
+    piston_mass_kg: Positive = Field(
+        40.0, validate_default=True, description="Piston and rod; used with play only."
+    )
     transducer_gain_error: Share = Field(
         0.0, description="Gain error of the transducer that closes the stroke loop."
     )
@@ -79,7 +81,9 @@ class HydraulicTableConfig(ConfigModel):
     attached_mass_kg: NonNegative = Field(
         0.0, description="Mass attached to the frame, m_a: a floor or a wall that moves with it."
     )
-    attached_frequency_hz: Positive = Field(30.0, description="Its frequency on a fixed frame.")
+    attached_frequency_hz: Positive = Field(
+        30.0, validate_default=True, description="Its frequency on a fixed frame."
+    )
     attached_damping: NonNegative = Field(0.05, description="Its damping ratio on a fixed frame.")
 
     @field_validator("static_friction_n")
@@ -103,13 +107,30 @@ class HydraulicTableConfig(ConfigModel):
     @classmethod
     def _check_stops(cls, piston_kg: float, info: ValidationInfo) -> float:
         stiffness_n_m = info.data.get("coupling_stiffness_n_m", 0.0)
-        if math.sqrt(stiffness_n_m / piston_kg) > math.tau * MAX_STOP_FREQUENCY_HZ:
+        stop_hz = math.sqrt(stiffness_n_m / piston_kg) / math.tau
+        if info.data.get("coupling_play_mm", 0.0) > 0.0 and stop_hz > MAX_FREQUENCY_HZ:
             raise InputError(
-                "the piston between its stops is too fast for the integrator",
-                allowed=f"at most {MAX_STOP_FREQUENCY_HZ:g} Hz",
+                f"the piston between its stops, at {stop_hz:.4g} Hz, is too fast to integrate",
+                allowed=f"at most {MAX_FREQUENCY_HZ:g} Hz",
                 remedy="lower coupling_stiffness_n_m or raise piston_mass_kg",
             )
         return piston_kg
+
+    @field_validator("attached_frequency_hz")
+    @classmethod
+    def _check_attached(cls, frequency_hz: float, info: ValidationInfo) -> float:
+        attached_kg = info.data.get("attached_mass_kg", 0.0)
+        # Of mass and frame against each other; on a fixed frame it is lower.
+        frame_kg = info.data.get("frame_mass_kg", math.inf)
+        free_hz = frequency_hz * math.sqrt(1.0 + attached_kg / frame_kg)
+        if attached_kg > 0.0 and free_hz > MAX_FREQUENCY_HZ:
+            raise InputError(
+                f"the attached mass against the frame, at {free_hz:.4g} Hz, is too fast to "
+                "integrate",
+                allowed=f"at most {MAX_FREQUENCY_HZ:g} Hz",
+                remedy="lower attached_frequency_hz or attached_mass_kg",
+            )
+        return frequency_hz
 
     def oil_column_hz(self, mass_kg: float) -> float:
         """Return the natural frequency of a moving mass in kg on the oil column, Hz."""

@@ -21,13 +21,15 @@ What a worn or badly adjusted table has in addition; each is absent where its ke
     e -> e_h, t e_h' = max(e - e_h - h/2, 0) + min(e - e_h + h/2, 0)       hysteresis h of the valve
     Q -> Q (1 + a tanh(x / x_a))                                           flow gains differ
     g -> g (1 + b) for q' > 0, g (1 - b) for q' < 0                        friction by direction
-    g -> g (1 + tanh(s q))                                                 friction along the stroke
+    g -> g max(1 + tanh(s q), 0.05)                                        friction along the stroke
     m_p y_p'' = A p - N, N = k_p d + c_p d' with d = y_p - y beyond +-j/2  play j of the coupling
     q -> (1 + n) q, then twice 1 / (1 + s t_n / 2), in e                   transducer of the stroke
     m_a y_a'' = k_a (y_f - y_a) + c_a (y_f' - y_a')                      mass attached to the frame
 
 The overlap has rounded edges (Merritt, chapter 5.3); hysteresis is play that a fast lag follows;
-with play in the coupling the piston is a mass of its own and hits its stops elastically.
+with play in the coupling the piston is a mass of its own and hits its stops elastically. Where
+friction differs by direction or along the stroke, its bristles relax at the rate s0 |q'| / g, but
+not faster than the integrator resolves; the friction in steady motion stays g.
 """
 
 import math
@@ -50,6 +52,8 @@ HYSTERESIS_LAG_S = 2e-4  # with which play in the valve's input is followed
 FLOW_ROUNDING = 1e-4  # opening over which the gain of the flow changes
 PISTON_DAMPING = 0.3  # damping ratio of the piston against its stops in the coupling
 MAX_HYDRAULIC_SUBSTEP_S = 3.2e-5  # the bristles relax in 40 us at 0.5 m/s; stable below 110 us
+LEAST_STROKE_SHARE = 0.05  # of the friction, however it falls along the stroke
+MAX_RELAXATION_1_S = 1.0 / MAX_HYDRAULIC_SUBSTEP_S  # of bristles under little friction
 
 
 class HydraulicCoefficients(NamedTuple):
@@ -191,11 +195,15 @@ def _write_hydraulic_rates(s, y, vy, command, command_rate, oil, rate):  # type:
     if oil.friction_asymmetry != 0.0:
         g *= 1.0 + oil.friction_asymmetry if speed > 0.0 else 1.0 - oil.friction_asymmetry
     if oil.friction_slope != 0.0:
-        g *= 1.0 + math.tanh(oil.friction_slope * stroke)
+        g *= max(1.0 + math.tanh(oil.friction_slope * stroke), LEAST_STROKE_SHARE)
     rate[BRISTLE] = 0.0
     friction = oil.viscous * speed
     if g > 0.0:
         rate[BRISTLE] = speed - oil.s0 * abs(speed) * s[BRISTLE] / g
+        if oil.friction_asymmetry != 0.0 or oil.friction_slope != 0.0:
+            relaxation = oil.s0 * abs(speed) / g
+            if relaxation > MAX_RELAXATION_1_S:
+                rate[BRISTLE] *= MAX_RELAXATION_1_S / relaxation
         friction += oil.s0 * s[BRISTLE] + oil.s1 * rate[BRISTLE]
     # Controller: stroke, feed-forward and the fast part of the load pressure.
     velocity = oil.gain * (command - _read_stroke(s, stroke, oil, rate))

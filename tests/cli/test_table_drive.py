@@ -1,15 +1,21 @@
 """`table-twin` and `table-drive` as a user runs them on the simulated hydraulic table."""
 
 import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from table_io.config.base import PROFILES_DIR
 from table_io.config.excitation import History
 from table_io.config.profile import load_profile
 from table_io.errors import InputError
 from tests.command_line import call_main
+from twin.cli import table_drive
 from twin.drive.table_file import load_table_twin
 from twin.drive.table_model import TableParameters
 from twin.recording.reader import read_recording
@@ -116,10 +122,33 @@ def test_the_run_of_another_target_does_not_correct_a_drive(folder: Path) -> Non
     assert "another target" in str(error.value)
 
 
-def compute_after(folder: Path, run: Path) -> None:
-    from twin.cli.table_drive import compute_drive_command
+def test_the_search_for_effects_shows_its_stages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[str] = []
 
-    compute_drive_command(
+    @contextmanager
+    def show_status(text: str) -> Iterator[Callable[[str], None]]:
+        yield lambda part: shown.append(f"{text}: {part}")
+
+    def identify(*args: Any, **options: Any) -> None:
+        report = options["report"]
+        report("screening")
+        raise InputError("enough")
+
+    rig_toml = (PROFILES_DIR / "rigs" / "hydraulic.toml").read_text(encoding="utf-8")
+    recording = SimpleNamespace(start=SimpleNamespace(rig_toml=rig_toml), run="run")
+    monkeypatch.setattr(table_drive, "show_status", show_status)
+    monkeypatch.setattr(table_drive, "open_recording", lambda path: recording)
+    monkeypatch.setattr(table_drive, "read_table_motion", lambda recording: None)
+    monkeypatch.setattr(table_drive, "identify_table_and_effects", identify)
+    with pytest.raises(InputError, match="enough"):
+        table_drive.identify_table_command([tmp_path / "run.mcap"], tmp_path / "table.toml")
+    assert shown == ["identifying the table: screening"]
+
+
+def compute_after(folder: Path, run: Path) -> None:
+    table_drive.compute_drive_command(
         folder / "record.toml", folder / "table.toml", None, folder / "next", None, run, None, True
     )
 

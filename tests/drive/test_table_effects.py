@@ -3,6 +3,8 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,6 +29,7 @@ from twin.drive.table_effects import (
     EFFECT_BY_ID,
     LIBRARY,
     EffectDiscovery,
+    EffectFinding,
     describe_discovery,
     describe_size,
     discover_table_effects,
@@ -154,8 +157,8 @@ def test_the_term_is_that_of_an_independent_solution(effect) -> None:
     )
 
 
-def test_an_absent_effect_changes_no_bit() -> None:
-    """Values of twin and simulated table from before there were effects."""
+def test_without_effects_twin_and_table_keep_their_values_within_1e_9() -> None:
+    """Three samples of twin and simulated table from before there were effects."""
     command = make_random_motion(8.0, (0.3, 35.0), 0.2, seed=4)
     out = TableModel(2000.0, BASIC._replace(viscous_n_s_m=500.0)).simulate(command, RATE_HZ)
     samples = [2500, 5000, 7000]
@@ -181,6 +184,21 @@ def test_shapes_of_an_absent_effect_do_not_matter(name: str) -> None:
         for parameters in (BASIC, BASIC._replace(**shapes))
     )
     np.testing.assert_array_equal(plain, shaped)
+
+
+def test_a_short_lag_of_the_transducer_is_integrated() -> None:
+    """Shorter than a step, across it and in between: the change grows with the lag."""
+    command = make_random_motion(4.0, (0.3, 35.0), 0.2, seed=4)
+    lags_s = [1e-9, 1e-5, 5e-5, 9e-5, 2e-4, 2.4e-4, 2.5e-4, 2.6e-4, 3e-4, 6e-4]
+    plain, *lagging = (
+        TableModel(MASS_KG, BASIC._replace(transducer_lag_s=lag_s)).simulate(command, RATE_HZ)[0]
+        for lag_s in [0.0, *lags_s]
+    )
+    per_lag = [
+        (out - plain).std() / lag_s for out, lag_s in zip(lagging[1:], lags_s[1:], strict=True)
+    ]
+    np.testing.assert_allclose(per_lag, per_lag[0], rtol=0.02)
+    np.testing.assert_allclose(lagging[0], plain, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", list(PLANTED))
@@ -247,6 +265,25 @@ def test_nothing_is_named_where_nothing_is_missing() -> None:
     assert describe_discovery(discovery)[0] == "missing effects: none is named"
 
 
+def test_a_named_effect_is_described_with_equation_and_source() -> None:
+    fit: Any = SimpleNamespace(
+        estimate_half_widths=lambda: {"backlash_m": 1e-6},
+        parameters=BASIC._replace(backlash_m=5e-5),
+    )
+    finding = EffectFinding("backlash", 0.1, 0.05)
+    lines = describe_discovery(EffectDiscovery(fit, (finding,), 0.05, None, {}))
+    assert lines[1].startswith("  equation: f -> f - K b/2 sat(2 f / (K b)) (Nordin, Gutman")
+    assert lines[2].startswith("  backlash_m = 5e-05 +- 1e-06 m (95 %)")
+
+
+def test_the_smallest_visible_size_of_an_effect_not_found_is_stated() -> None:
+    fit: Any = SimpleNamespace(estimate_half_widths=dict, parameters=BASIC)
+    visible = {"backlash": 1.234e-5, "flow_asymmetry": 0.031}
+    lines = describe_discovery(EffectDiscovery(fit, (), 0.05, None, visible))
+    (line,) = (line for line in lines if "backlash" in line)
+    assert line.endswith("(half width, 95 %): backlash 1.2e-05 m, flow asymmetry 0.031")
+
+
 @pytest.mark.slow  # 60 s each
 @pytest.mark.parametrize("name", ["friction_asymmetry", ""])
 def test_the_effect_of_a_simulated_table_is_named(name: str) -> None:
@@ -306,12 +343,29 @@ def test_the_file_keeps_the_effect(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "change",
     [{"valve_overlap_percent": -1.0}, {"flow_asymmetry": 1.0}, {"transducer_lag_ms": 0.1},
-     {"coupling_play_mm": -0.1}, {"coupling_stiffness_n_m": 1e12}],
+     {"coupling_play_mm": -0.1}, {"coupling_play_mm": 0.1, "coupling_stiffness_n_m": 1e10},
+     {"coupling_play_mm": 0.1, "piston_mass_kg": 4.0},
+     {"attached_mass_kg": 1e3, "attached_frequency_hz": 1e5}, {"attached_mass_kg": 1e9}],
 )  # fmt: skip
 def test_an_effect_that_cannot_be_is_refused(change: dict[str, float]) -> None:
-    assert TABLE.hydraulic is not None
     with pytest.raises((ValidationError, InputError)):
-        HydraulicTableConfig.model_validate(TABLE.hydraulic.model_dump() | change)
+        read_changed_table(change)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"coupling_stiffness_n_m": 1e10}, {"piston_mass_kg": 4.0}, {"attached_frequency_hz": 1e5},
+     {"coupling_play_mm": 0.1}, {"attached_mass_kg": 1e3}],
+)  # fmt: skip
+def test_a_single_key_of_an_absent_effect_is_accepted(change: dict[str, float]) -> None:
+    read_changed_table(change)
+
+
+def read_changed_table(change: dict[str, float]) -> HydraulicTableConfig:
+    """Return the table of the rig file with these keys; keys it does not state are not given."""
+    assert TABLE.hydraulic is not None
+    stated = TABLE.hydraulic.model_dump(exclude_unset=True)
+    return HydraulicTableConfig.model_validate(stated | change)
 
 
 def test_the_library_is_whole() -> None:

@@ -24,7 +24,7 @@ from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from twin.drive.drive_computation import PlayedDrive, compute_drive, correct_played_drive
 from twin.drive.rehearsal import read_played_drive, read_table_motion
-from twin.drive.table_effects import describe_discovery, identify_table_and_effects
+from twin.drive.table_effects import LIBRARY, describe_discovery, identify_table_and_effects
 from twin.drive.table_file import TableTwinConfig, format_table_twin, load_table_twin
 from twin.drive.table_identification import identify_table
 from twin.drive.table_model import TableModel, TableParameters
@@ -41,10 +41,9 @@ UNITS = {
     "gain_1_s": "1/s", "delay_s": "s", "pressure_feedback_s": "s", "presliding_m": "m",
     "stribeck_speed_m_s": "m/s", "friction_n": "N", "static_excess_n": "N", "stall_force_n": "N",
     "stick_damping_n_s_m": "N s/m", "viscous_n_s_m": "N s/m",
-    "dead_band_m_s": "m/s", "valve_hysteresis_m_s": "m/s", "friction_slope_1_m": "1/m",
-    "backlash_m": "m", "transducer_lag_s": "s", "second_frame_hz": "Hz",
     "valve_hz": "Hz", "oil_hz": "Hz", "frame_hz": "Hz",
 }  # fmt: skip
+UNITS |= {parameter.name: parameter.unit for effect in LIBRARY for parameter in effect.parameters}
 
 
 def identify_table_command(logs: Sequence[Path], out: Path, with_effects: bool = True) -> int:
@@ -65,9 +64,11 @@ def identify_table_command(logs: Sequence[Path], out: Path, with_effects: bool =
     rehearsal, mass_kg = read_table_motion(recording), rig.moving_mass_kg
     stall_n = math.inf if stall_kn is None else 1e3 * stall_kn
     discovery, effects = None, []
-    with show_status("fitting the twin of the table"):
+    with show_status("identifying the table") as show_part:
         if with_effects:
-            identification, discovery = identify_table_and_effects(rehearsal, mass_kg, stall_n)
+            identification, discovery = identify_table_and_effects(
+                rehearsal, mass_kg, stall_n, report=show_part
+            )
             effects = [finding.id for finding in discovery.findings]
         else:
             identification = identify_table(rehearsal, mass_kg, stall_n)

@@ -316,9 +316,8 @@ def is_worthwhile(before: EffectFit, after: EffectFit) -> bool:
     """Return True if an effect is visible and gains a clear share that chance does not give."""
     share, sigma = compute_gain(before, after)
     effect = after.effects[-1]
-    name = effect.parameters[0].name
-    size = abs(getattr(after.fit.parameters, name))
-    half_width = after.fit.estimate_half_widths()[name]
+    size = abs(describe_size(effect, after.fit.parameters))
+    half_width = after.fit.estimate_half_widths()[effect.parameters[0].name]
     return (
         share > MIN_GAIN_SHARE and sigma > MIN_GAIN_SIGMA and size > MIN_EFFECT_SIGMA * half_width
     )
@@ -426,12 +425,13 @@ def describe_size(effect: TableEffect, parameters: TableParameters) -> float:
 
 
 def describe_discovery(discovery: EffectDiscovery) -> list[str]:
-    """Return the outcome in words, a line each: effects, what remains, what cannot be judged."""
+    """Return the outcome in words, a line each: effects, what remains, what is not visible."""
     lines = []
     widths, parameters = discovery.fit.estimate_half_widths(), discovery.fit.parameters
     for finding in discovery.findings:
         effect = EFFECT_BY_ID[finding.id]
         lines.append(f"missing effect: {effect.description}")
+        lines.append(f"  equation: {effect.equation} ({effect.source})")
         for parameter in effect.parameters:
             value = getattr(parameters, parameter.name)
             lines.append(
@@ -455,10 +455,13 @@ def describe_discovery(discovery: EffectDiscovery) -> list[str]:
             f"  {_list_names([discovery.closest.id])} would leave "
             f"{100 * discovery.closest.gap:.3g} %: too little gained to name it"
         )
-    largest = {effect.id: effect.parameters[0].high for effect in LIBRARY}
-    hidden = [name for name, width in discovery.smallest_visible.items() if width > largest[name]]
+    sizes = [
+        f"{_list_names([name])} {width:.2g} {EFFECT_BY_ID[name].parameters[0].unit}".rstrip()
+        for name, width in discovery.smallest_visible.items()
+    ]
+    if sizes:
+        lines.append(f"smallest visible size of the others (half width, 95 %): {', '.join(sizes)}")
     lines.append("cannot be judged from this rehearsal:")
-    lines += [f"  {_list_names([name])}: its interval is too wide" for name in hidden]
     lines += [f"  {name}: {reason}" for name, reason in UNTESTED.items()]
     return lines
 

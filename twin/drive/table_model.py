@@ -23,7 +23,8 @@ describes them and finds out which one a table has:
     y - y_f -> q_t in e, t_t q_t' = (1 + g_t) (y - y_f) - q_t              (transducer)
     y_f -> y_f + y_2, y_2'' = -r_2 (f - F(v)) / m - w_2 (w_2 y_2 + 2 z_2 y_2')  (second frame mode)
 
-sat(x) is x within -1 .. 1.
+sat(x) is x within -1 .. 1. A lag t_t shorter than a step of the integrator is its first-order term,
+q_t = (1 + g_t) (y - y_f - t_t v), which needs no state and differs by t_t^2 only.
 """
 
 import math
@@ -91,10 +92,11 @@ def _find_friction_share(sign, stroke, p):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _write_rates(s, z, memory, z_valve, command, command_rate, reaction, m, p, rate):  # type: ignore[no-untyped-def]
+def _write_rates(s, z, memory, z_valve, command, command_rate, reaction, h, m, p, rate):  # type: ignore[no-untyped-def]
     """Write the time derivative of the state; SI.
 
-    `memory` is the exponential of the Stribeck force with its lag, `z_valve` is that of the valve.
+    `memory` is the exponential of the Stribeck force with its lag, `z_valve` is that of the valve,
+    h the step in s.
     """
     oil = math.tau * p.oil_hz
     stiffness = m * oil * oil
@@ -125,7 +127,9 @@ def _write_rates(s, z, memory, z_valve, command, command_rate, reaction, m, p, r
     reading = stroke
     if p.transducer_gain_error != 0.0:
         reading *= 1.0 + p.transducer_gain_error
-    if p.transducer_lag_s > 0.0:
+    if 0.0 < p.transducer_lag_s < h:
+        reading -= (1.0 + p.transducer_gain_error) * p.transducer_lag_s * v
+    elif p.transducer_lag_s > 0.0:
         rate[STROKE_READ] = (reading - s[STROKE_READ]) / p.transducer_lag_s
         reading = s[STROKE_READ]
     asked = (
@@ -212,12 +216,12 @@ def _simulate(command, reaction, m, rate_hz, steps, p, out):  # type: ignore[no-
                     low = int(at_r)
                     high = min(low + 1, count - 1)
                     force = reaction[low] + (at_r - low) * (reaction[high] - reaction[low])
-                    _write_rates(stage, z, memory, z_valve, value, slope, force, m, p, rate)
+                    _write_rates(stage, z, memory, z_valve, value, slope, force, h, m, p, rate)
                     for n in range(size):
                         total[n] += weight * rate[n]
                 for n in range(size):
                     s[n] += h / 6.0 * total[n]
-        _write_rates(s, z, memory, z_valve, 0.0, 0.0, reaction[k], m, p, rate)
+        _write_rates(s, z, memory, z_valve, 0.0, 0.0, reaction[k], h, m, p, rate)
         out[0, k], out[1, k] = s[Y], rate[V]
 
 

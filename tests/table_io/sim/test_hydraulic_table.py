@@ -170,6 +170,25 @@ def test_the_open_valve_bounds_the_speed_and_the_supply_the_pressure() -> None:
     assert np.abs(play(heavy, np.full(150, 10.0))[1]).max() <= 21e6 * 20e-4 / 1e5 * 1.001
 
 
+@pytest.mark.parametrize("hz", [0.6, 2.0])
+@pytest.mark.parametrize(
+    "changes",
+    [{"friction_slope": slope} for slope in (-1000.0, 60.0, 300.0, 1000.0)]
+    + [{"friction_slope": 1000.0, "friction_asymmetry": -0.89}],
+)
+def test_little_friction_at_an_end_of_the_stroke_is_integrated(
+    changes: dict[str, float], hz: float
+) -> None:
+    """Over +-50 mm, with up to 0.6 m/s, the motion is nearly that of even friction."""
+    times = np.arange(3000) / RATE_HZ
+    command = 0.05 * np.minimum(times, 1.0) * np.sin(2.0 * math.pi * hz * times)
+    even, uneven = play(build_table(), command), play(build_table(**changes), command)
+    assert np.abs(even[0]).max() > 0.03
+    # Friction of up to twice 500 N on 2000 kg.
+    assert np.abs(uneven[1]).max() < np.abs(even[1]).max() + 0.5
+    assert np.abs(uneven[0] - even[0]).max() < 2e-3
+
+
 def test_no_cut_into_blocks_changes_a_bit() -> None:
     plant = build_table()
     rng = np.random.default_rng(2)
