@@ -59,12 +59,15 @@ def unattended_answer(asked: str) -> OperatorAnswer:
     return make_answer(asked, "unattended" if asked else "not asked")
 
 
-def ask_operator(campaign: ActiveCampaign, run: PlannedRun, first: bool) -> OperatorAnswer | None:
+def ask_operator(
+    campaign: ActiveCampaign, run: PlannedRun, confirmed: str | None
+) -> OperatorAnswer | None:
     """Ask the operator to confirm the set-up of a run; return the answer, or None to stop.
 
-    The first run after a resume asks for its set-up even if the run before it had the same one.
+    A run that needs the set-up `confirmed` last in this session asks only for a prompt of its own.
     """
-    prompt = campaign.required_set_up(run) if first and campaign.resumed else run.prompt
+    required = campaign.required_set_up(run)
+    prompt = run.prompt if required == confirmed else required
     if not prompt:
         return make_answer("", "not asked")
     if run.notes:
