@@ -203,6 +203,15 @@ def test_a_base_that_cannot_be_one_is_refused(tmp_path: Path, old: str, new: str
         read_plan(path, None, None, lambda *_: None)
 
 
+def test_a_rate_too_low_for_the_bumper_is_refused_at_any_gap(tmp_path: Path) -> None:
+    model = (PROFILES_DIR / "models" / "snm.toml").read_text()
+    assert "bumper_stiffness_n_m = 510000.0" in model
+    (tmp_path / "stiff.toml").write_text(model.replace("510000.0", "5.1e8"))
+    path = write_grid(tmp_path, base=f'model = "stiff.toml"\n{BASE}')
+    with raises_input_error(key="rate_hz", value=1000.0, problem="too low for the bumper"):
+        read_plan(path, None, None, lambda *_: None)
+
+
 def list_faults(error: InputError) -> list[InputError]:
     """The error and all faults in it, at any depth."""
     return [error, *(inner for fault in error.faults for inner in list_faults(fault))]

@@ -267,10 +267,8 @@ def read_cell(
     if at_other_gap is None:
         return build_run_config(cell.label, profile, text, base.path, cell.label, table, model)
     model_config = parse_toml(at_other_gap.model_toml, ModelConfig, "model file")
+    own_model = model_config.build_model(profile.specimen)
+    own_model.check_rate(profile.acquisition.rate_hz)  # a contact needs a higher rate than none
     return replace(
-        at_other_gap,
-        name=cell.label,
-        profile=profile,
-        profile_toml=text,
-        model=model_config.build_model(profile.specimen),
+        at_other_gap, name=cell.label, profile=profile, profile_toml=text, model=own_model
     )
