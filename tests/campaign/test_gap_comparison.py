@@ -250,6 +250,15 @@ def test_the_lines_of_the_figures_are_the_values() -> None:
     assert {*PLANTED, "G∞", "G16", "G4", "G0"} <= names
 
 
+def test_without_displacement_no_trade_off_is_drawn() -> None:
+    runs = make_runs()
+    for run in runs:
+        for window in run.summary["windows"]:
+            window["measured"]["u"]["peak"] = None
+    (over_gap,) = draw_gap_figures(compare(runs))
+    assert over_gap.name == "gaps"
+
+
 def test_labels_are_moved_as_little_as_needed() -> None:
     heights = spread_labels(np.array([0.1, 0.1, 0.5, 0.9]), 0.1)
     np.testing.assert_allclose(heights, [0.05, 0.15, 0.5, 0.9])
