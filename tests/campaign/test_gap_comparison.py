@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +70,7 @@ def make_summary(u: float, a: float, force: float, twin: float = 1.0) -> Json:
 
 def make_runs() -> list[RecordRun]:
     return [
-        RecordRun(name, gap_mm, 550.0, f"{name}-{gap_mm}", make_summary(*peaks, twin=1.1))
+        RecordRun(name, name, gap_mm, 550.0, f"{name}-{gap_mm}", make_summary(*peaks, twin=1.1))
         for name, rows in PLANTED.items()
         for gap_mm, peaks in zip(GAPS, rows, strict=True)
     ]
@@ -143,10 +144,22 @@ def test_a_gap_at_which_a_record_is_missing_is_not_ranked() -> None:
 
 
 def test_repetitions_count_with_their_mean() -> None:
-    runs = [*make_runs(), RecordRun("long", 4.0, 550.0, "rep2", make_summary(0.01, 2.5, 0.0))]
+    runs = [
+        *make_runs(),
+        RecordRun("long", "long", 4.0, 550.0, "rep2", make_summary(0.01, 2.5, 0.0)),
+    ]
     values = compare(runs).values
     assert values["measured", "u_m"][0, 2] == pytest.approx(0.015)
     assert values["measured", "eta_a"][0, 2] == pytest.approx(1.0)
+
+
+def test_different_motions_of_one_name_are_no_repetitions() -> None:
+    other = RecordRun("filtered", "long", 4.0, 550.0, "other", make_summary(0.01, 2.5, 0.0))
+    at_reference = replace(other, gap_mm=math.inf)
+    comparison = compare([*make_runs(), at_reference, other])
+    assert comparison.records == (*PLANTED, "long")
+    assert comparison.values["measured", "u_m"][0, 2] == pytest.approx(0.02)
+    assert comparison.values["measured", "eta_d"][3, 2] == pytest.approx(1.0)
 
 
 def test_a_record_without_its_reference_is_left_out() -> None:
@@ -179,9 +192,9 @@ def test_a_channel_that_is_missing_gives_no_number() -> None:
 def test_records_are_told_apart_by_their_motion(tmp_path: Path) -> None:
     write_grid(tmp_path)
 
-    def make_profile(file: str, scale: float, gap_mm: float) -> Profile:
+    def make_profile(file: str, scale: float, gap_mm: float, **keys: Any) -> Profile:
         excitation = {
-            "kind": "record", "file": file, "scale": scale,
+            "kind": "record", "file": file, "scale": scale, **keys,
             "files": {file: (tmp_path / file).read_text()},
         }  # fmt: skip
         specimen = {"mass_kg": 550.0, "gap_mm": gap_mm}
@@ -201,6 +214,12 @@ def test_records_are_told_apart_by_their_motion(tmp_path: Path) -> None:
     assert [run.record for run in listed] == ["own × 1", "own × 1", "own × 0.5", "first"]
     named = list_record_runs(runs, {"run3": "First 1999"})
     assert named[-1].record == "First 1999"
+    filtered = ("filtered", make_profile("own.csv", 0.5, 4.0, band_hz=[1.0, 8.0]), summary)
+    listed = list_record_runs([*runs, filtered], {})
+    assert [run.record for run in listed] == [
+        "own × 1", "own × 1", "own × 0.5 (run2)", "first", "own × 0.5 (filtered)",
+    ]  # fmt: skip
+    assert len({run.motion for run in listed}) == 4
 
 
 def test_the_terminal_shows_the_table_and_the_best_gaps(

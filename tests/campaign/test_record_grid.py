@@ -170,6 +170,8 @@ def test_listed_runs_come_before_the_grid(tmp_path: Path) -> None:
         ("[inf, 4.0, 0, -1.5]", "[]", {"key": "records.gaps_mm"}),
         ("gaps_mm", "gap_mm", {"key": "records.gap_mm", "remedy": "gaps_mm"}),
         ('label = "other"', 'label = "first"', {"key": "records.files", "problem": "first"}),
+        ('label = "other"\nnotes = "turned around"\nscale = -2.0', 'title = "First"\nscale = 1.0',
+         {"key": "records.files", "problem": "'First' and the scale 1"}),
         ('label = "other"', 'label = "a/b"', {"key": "records.files.1.label"}),
         ('"base.toml"', '"bas.toml"', {"where": "bas.toml", "remedy": "base.toml"}),
         ("step_s = 0.01", "step_s = 0.0", {"key": "records.files.1.step_s"}),

@@ -122,6 +122,14 @@ class RecordGrid(RecordKeys):
             raise InputError(
                 f"two records have the label {twice[0]!r}", remedy="give each its own label"
             )
+        reported = [(record.title or record.name, record.scale) for record in files]
+        equal = sorted({entry for entry in reported if reported.count(entry) > 1})
+        if equal:
+            title, scale = equal[0]
+            raise InputError(
+                f"two records have the title {title!r} and the scale {scale:g}",
+                remedy="give each its own title, by which the reports name it",
+            )
         return files
 
     def list_cells(self) -> Iterator[GridCell]:
