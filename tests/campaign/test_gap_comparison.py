@@ -15,6 +15,7 @@ from table_io.config.base import PROFILES_DIR
 from table_io.config.profile import Profile
 from tests.campaign.test_record_grid import BASE, make_record, write_grid
 from tests.input_errors import raises_input_error
+from twin.campaign import gap_comparison
 from twin.campaign.command import CampaignOptions, run_campaign
 from twin.campaign.config import find_campaign, read_plan
 from twin.campaign.gap_comparison import (
@@ -30,10 +31,11 @@ from twin.campaign.gap_comparison import (
 )
 from twin.campaign.gap_figures import draw_gap_figures, spread_labels
 from twin.campaign.messages import print_gap_comparison
-from twin.campaign.report import LARGER, SMALLER, list_gap_tables
+from twin.campaign.report import LARGER, SMALLER, list_gap_tables, list_gap_values
 from twin.campaign.summary import read_campaign
 from twin.cli.simulate import simulate_profile
 from twin.recording.reader import read_recording
+from twin.reports.page import render_page
 
 Json = dict[str, Any]
 WEIGHT_N = 550.0 * 9.80665
@@ -175,6 +177,27 @@ def test_without_a_free_flight_the_widest_gap_is_the_reference() -> None:
     assert comparison.reference == "at G16"
     np.testing.assert_array_equal(comparison.values["measured", "eta_a"][:, 0], 1.0)
     assert comparison.values["measured", "eta_d"][0, 1] == pytest.approx(0.02 / 0.03)
+
+
+def test_a_run_with_dropouts_is_left_out_and_named(capsys: pytest.CaptureFixture[str]) -> None:
+    runs = make_runs()
+    runs[2].summary["gaps"] = 3  # of "long" at 4 mm
+    # Dropouts of a recording that was repeated do not count.
+    runs[3].summary.update(gaps=2, parts=[{"gaps": 2}, {"gaps": 0}])
+    comparison = compare(runs)
+    assert comparison.left_out == ("long-4.0",)
+    best = rank_gaps(comparison, "measured", "eta_a")
+    assert best is not None
+    assert best["compared_gaps_mm"] == [math.inf, 16.0, 0.0]
+    print_gap_comparison(describe_comparison(comparison))
+    assert "dropouts in the recording: long-4.0" in capsys.readouterr().out
+    page = render_page(
+        Path(gap_comparison.__file__).with_suffix(".html"),
+        gaps=describe_comparison(comparison),
+        pictures=[],
+        **list_gap_values(comparison),
+    )
+    assert "dropouts in the recording: long-4.0." in page
 
 
 def test_a_channel_that_is_missing_gives_no_number() -> None:

@@ -48,6 +48,12 @@ class RecordRun:
     label: str
     summary: Json
 
+    @property
+    def has_dropouts(self) -> bool:
+        """Whether samples are missing in its last recording, which holds the whole record."""
+        parts = self.summary.get("parts")
+        return bool(parts[-1]["gaps"] if parts else self.summary.get("gaps"))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GapComparison:
@@ -56,13 +62,14 @@ class GapComparison:
     `values` holds (record, gap) by source and quantity: PEAKS in SI, and the CRITERIA. The
     compromise is the root mean square of eta_a and eta_d: 1 is no better than the reference. NaN
     where there is no complete run, and for the force without bumpers. Of a simulation the twin is
-    the only source.
+    the only source. `left_out` are the labels of complete runs with dropouts.
     """
 
     records: tuple[str, ...]
     gaps_mm: tuple[float, ...]
     values: Mapping[tuple[str, str], Float2D]
     sources: tuple[str, ...] = SOURCES
+    left_out: tuple[str, ...] = ()
 
     @property
     def main_source(self) -> str:
@@ -151,9 +158,11 @@ def compare_gaps(
 ) -> GapComparison | None:
     """Return the comparison; None unless a record was played at two gaps, one the reference.
 
-    A record without a run at the reference, the widest gap, is left out. Several runs of one record
-    at one gap count with their mean.
+    A record without a run at the reference, the widest gap, is left out, and so is a run with
+    dropouts, which may hide a peak. Several runs of one record at one gap count with their mean.
     """
+    left_out = tuple(run.label for run in runs if run.has_dropouts)
+    runs = [run for run in runs if not run.has_dropouts]
     gaps_mm = tuple(sorted({run.gap_mm for run in runs}, reverse=True))
     if len(gaps_mm) < 2:
         return None
@@ -179,7 +188,7 @@ def compare_gaps(
         quantities = (*PEAKS, FORCE_RATIO, ETA_D, ETA_A, COMPROMISE)
         for name, table in zip(quantities, (u, a, force, r, eta_d, eta_a, compromise), strict=True):
             values[source, name] = table
-    return GapComparison(tuple(records.values()), gaps_mm, values, sources)
+    return GapComparison(tuple(records.values()), gaps_mm, values, sources, left_out)
 
 
 def find_record_peaks(run: RecordRun, source: str) -> tuple[float, float, float, float]:
@@ -236,7 +245,9 @@ def describe_comparison(comparison: GapComparison) -> Json:
         "reference_gap_mm": comparison.reference_mm,
         "reference": comparison.reference,
         "sources": list(comparison.sources),
+        "main_name": comparison.main_name,
         "records": list(comparison.records),
+        "left_out": list(comparison.left_out),
         "gaps_mm": list(comparison.gaps_mm),
         "criteria": CRITERIA,
         "best": {

@@ -107,6 +107,8 @@ def print_gap_comparison(comparison: Json) -> None:
     print_table(console, table)
     for name, meaning in CRITERIA.items():
         print_line(f"{meaning}: {format_best(best[name])}")
+    if comparison["left_out"]:
+        print_line(f"left out, for dropouts in the recording: {', '.join(comparison['left_out'])}")
 
 
 def _name_gap(row: Json) -> str:
