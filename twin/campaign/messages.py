@@ -93,9 +93,8 @@ def ask_operator(
 def print_gap_comparison(comparison: Json) -> None:
     """Print the entry `gap_comparison` of a summary: medians over the records, best gaps."""
     count, source = len(comparison["records"]), comparison["sources"][0]
-    name = "measured" if source == "measured" else "model"
     title = (
-        f"median (smallest to largest) over {count} records, {name}; "
+        f"median (smallest to largest) over {count} records, {comparison['main_name']}; "
         f"1 is {comparison['reference']}, * is best"
     )
     headers = ("acceleration", "displacement", "compromise", "force / weight")
