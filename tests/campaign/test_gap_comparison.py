@@ -13,9 +13,10 @@ import pytest
 from table_io.block import Label
 from table_io.config.base import PROFILES_DIR
 from table_io.config.profile import Profile
+from tests.campaign.campaigns import write
 from tests.campaign.test_record_grid import BASE, make_record, write_grid
 from tests.input_errors import raises_input_error
-from twin.campaign import gap_comparison
+from twin.campaign import gap_comparison, simulate_grid
 from twin.campaign.command import CampaignOptions, run_campaign
 from twin.campaign.config import find_campaign, read_plan
 from twin.campaign.gap_comparison import (
@@ -36,6 +37,7 @@ from twin.campaign.summary import read_campaign
 from twin.cli.simulate import simulate_profile
 from twin.recording.reader import read_recording
 from twin.reports.page import render_page
+from twin.run.run_config import RunConfig
 
 Json = dict[str, Any]
 WEIGHT_N = 550.0 * 9.80665
@@ -443,6 +445,22 @@ def integrate_free_flight(
     return table[:, 0], table[:, 1]
 
 
+def test_only_the_records_of_a_campaign_are_simulated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(tmp_path, sweep="4.0")
+    path = write_grid(tmp_path, SHORT_GRID + '[[runs]]\nprofile = "sweep.toml"\n', BASE)
+    simulated = []
+
+    def simulate(config: RunConfig) -> Json:
+        simulated.append(config.name)
+        return {"verdict": "complete", "windows": make_summary(0.01, 1.0, 100.0)["windows"]}
+
+    monkeypatch.setattr(simulate_grid, "simulate_peaks", simulate)
+    assert simulate_profile(path, [], [], None, tmp_path / "model", False) == 0
+    assert simulated == ["ginf-first", "ginf-own", "g2-first", "g2-own"]
+
+
 def test_a_campaign_without_records_at_several_gaps_is_not_simulated(tmp_path: Path) -> None:
     path = write_grid(tmp_path, SHORT_GRID.replace("[inf, 2.0]", "[2.0]"), BASE)
     with raises_input_error(where=path, allowed="[records]"):
@@ -450,6 +468,8 @@ def test_a_campaign_without_records_at_several_gaps_is_not_simulated(tmp_path: P
     for models, gaps, view in (([], ["4"], False), (["snm", "snm"], [], False), ([], [], True)):
         with raises_input_error(where=path, remedy="--gap"):
             simulate_profile(path, models, gaps, None, tmp_path / "model", view)
+    with raises_input_error(where=path, remedy="--workers"):
+        simulate_profile(path, [], [], 2, tmp_path / "model", False)
     assert not (tmp_path / "model").exists()
     assert find_campaign(Path("records")) == PROFILES_DIR / "campaigns" / "records.toml"
     assert find_campaign(Path("el_centro")) is None
