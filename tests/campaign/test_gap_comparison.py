@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,10 @@ import pytest
 from table_io.block import Label
 from table_io.config.base import PROFILES_DIR
 from table_io.config.profile import Profile
+from tests.campaign.campaigns import write
 from tests.campaign.test_record_grid import BASE, make_record, write_grid
 from tests.input_errors import raises_input_error
+from twin.campaign import gap_comparison, simulate_grid
 from twin.campaign.command import CampaignOptions, run_campaign
 from twin.campaign.config import find_campaign, read_plan
 from twin.campaign.gap_comparison import (
@@ -29,10 +32,12 @@ from twin.campaign.gap_comparison import (
 )
 from twin.campaign.gap_figures import draw_gap_figures, spread_labels
 from twin.campaign.messages import print_gap_comparison
-from twin.campaign.report import LARGER, SMALLER, list_gap_tables
+from twin.campaign.report import LARGER, SMALLER, list_gap_tables, list_gap_values
 from twin.campaign.summary import read_campaign
 from twin.cli.simulate import simulate_profile
 from twin.recording.reader import read_recording
+from twin.reports.page import render_page
+from twin.run.run_config import RunConfig
 
 Json = dict[str, Any]
 WEIGHT_N = 550.0 * 9.80665
@@ -69,7 +74,7 @@ def make_summary(u: float, a: float, force: float, twin: float = 1.0) -> Json:
 
 def make_runs() -> list[RecordRun]:
     return [
-        RecordRun(name, gap_mm, 550.0, f"{name}-{gap_mm}", make_summary(*peaks, twin=1.1))
+        RecordRun(name, name, gap_mm, 550.0, f"{name}-{gap_mm}", make_summary(*peaks, twin=1.1))
         for name, rows in PLANTED.items()
         for gap_mm, peaks in zip(GAPS, rows, strict=True)
     ]
@@ -143,10 +148,22 @@ def test_a_gap_at_which_a_record_is_missing_is_not_ranked() -> None:
 
 
 def test_repetitions_count_with_their_mean() -> None:
-    runs = [*make_runs(), RecordRun("long", 4.0, 550.0, "rep2", make_summary(0.01, 2.5, 0.0))]
+    runs = [
+        *make_runs(),
+        RecordRun("long", "long", 4.0, 550.0, "rep2", make_summary(0.01, 2.5, 0.0)),
+    ]
     values = compare(runs).values
     assert values["measured", "u_m"][0, 2] == pytest.approx(0.015)
     assert values["measured", "eta_a"][0, 2] == pytest.approx(1.0)
+
+
+def test_different_motions_of_one_name_are_no_repetitions() -> None:
+    other = RecordRun("filtered", "long", 4.0, 550.0, "other", make_summary(0.01, 2.5, 0.0))
+    at_reference = replace(other, gap_mm=math.inf)
+    comparison = compare([*make_runs(), at_reference, other])
+    assert comparison.records == (*PLANTED, "long")
+    assert comparison.values["measured", "u_m"][0, 2] == pytest.approx(0.02)
+    assert comparison.values["measured", "eta_d"][3, 2] == pytest.approx(1.0)
 
 
 def test_a_record_without_its_reference_is_left_out() -> None:
@@ -164,6 +181,27 @@ def test_without_a_free_flight_the_widest_gap_is_the_reference() -> None:
     assert comparison.values["measured", "eta_d"][0, 1] == pytest.approx(0.02 / 0.03)
 
 
+def test_a_run_with_dropouts_is_left_out_and_named(capsys: pytest.CaptureFixture[str]) -> None:
+    runs = make_runs()
+    runs[2].summary["gaps"] = 3  # of "long" at 4 mm
+    # Dropouts of a recording that was repeated do not count.
+    runs[3].summary.update(gaps=2, parts=[{"gaps": 2}, {"gaps": 0}])
+    comparison = compare(runs)
+    assert comparison.left_out == ("long-4.0",)
+    best = rank_gaps(comparison, "measured", "eta_a")
+    assert best is not None
+    assert best["compared_gaps_mm"] == [math.inf, 16.0, 0.0]
+    print_gap_comparison(describe_comparison(comparison))
+    assert "dropouts in the recording: long-4.0" in capsys.readouterr().out
+    page = render_page(
+        Path(gap_comparison.__file__).with_suffix(".html"),
+        gaps=describe_comparison(comparison),
+        pictures=[],
+        **list_gap_values(comparison),
+    )
+    assert "dropouts in the recording: long-4.0." in page
+
+
 def test_a_channel_that_is_missing_gives_no_number() -> None:
     runs = make_runs()
     for run in runs:
@@ -179,9 +217,9 @@ def test_a_channel_that_is_missing_gives_no_number() -> None:
 def test_records_are_told_apart_by_their_motion(tmp_path: Path) -> None:
     write_grid(tmp_path)
 
-    def make_profile(file: str, scale: float, gap_mm: float) -> Profile:
+    def make_profile(file: str, scale: float, gap_mm: float, **keys: Any) -> Profile:
         excitation = {
-            "kind": "record", "file": file, "scale": scale,
+            "kind": "record", "file": file, "scale": scale, **keys,
             "files": {file: (tmp_path / file).read_text()},
         }  # fmt: skip
         specimen = {"mass_kg": 550.0, "gap_mm": gap_mm}
@@ -201,6 +239,12 @@ def test_records_are_told_apart_by_their_motion(tmp_path: Path) -> None:
     assert [run.record for run in listed] == ["own × 1", "own × 1", "own × 0.5", "first"]
     named = list_record_runs(runs, {"run3": "First 1999"})
     assert named[-1].record == "First 1999"
+    filtered = ("filtered", make_profile("own.csv", 0.5, 4.0, band_hz=[1.0, 8.0]), summary)
+    listed = list_record_runs([*runs, filtered], {})
+    assert [run.record for run in listed] == [
+        "own × 1", "own × 1", "own × 0.5 (run2)", "first", "own × 0.5 (filtered)",
+    ]  # fmt: skip
+    assert len({run.motion for run in listed}) == 4
 
 
 def test_the_terminal_shows_the_table_and_the_best_gaps(
@@ -248,6 +292,15 @@ def test_the_lines_of_the_figures_are_the_values() -> None:
     np.testing.assert_allclose(np.asarray(median.get_ydata()), [1.0, 2.0, 0.8, 0.9])
     names = {text.get_text() for text in trade_off.figure.axes[0].texts}
     assert {*PLANTED, "G∞", "G16", "G4", "G0"} <= names
+
+
+def test_without_displacement_no_trade_off_is_drawn() -> None:
+    runs = make_runs()
+    for run in runs:
+        for window in run.summary["windows"]:
+            window["measured"]["u"]["peak"] = None
+    (over_gap,) = draw_gap_figures(compare(runs))
+    assert over_gap.name == "gaps"
 
 
 def test_labels_are_moved_as_little_as_needed() -> None:
@@ -392,6 +445,22 @@ def integrate_free_flight(
     return table[:, 0], table[:, 1]
 
 
+def test_only_the_records_of_a_campaign_are_simulated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(tmp_path, sweep="4.0")
+    path = write_grid(tmp_path, SHORT_GRID + '[[runs]]\nprofile = "sweep.toml"\n', BASE)
+    simulated = []
+
+    def simulate(config: RunConfig) -> Json:
+        simulated.append(config.name)
+        return {"verdict": "complete", "windows": make_summary(0.01, 1.0, 100.0)["windows"]}
+
+    monkeypatch.setattr(simulate_grid, "simulate_peaks", simulate)
+    assert simulate_profile(path, [], [], None, tmp_path / "model", False) == 0
+    assert simulated == ["ginf-first", "ginf-own", "g2-first", "g2-own"]
+
+
 def test_a_campaign_without_records_at_several_gaps_is_not_simulated(tmp_path: Path) -> None:
     path = write_grid(tmp_path, SHORT_GRID.replace("[inf, 2.0]", "[2.0]"), BASE)
     with raises_input_error(where=path, allowed="[records]"):
@@ -399,6 +468,8 @@ def test_a_campaign_without_records_at_several_gaps_is_not_simulated(tmp_path: P
     for models, gaps, view in (([], ["4"], False), (["snm", "snm"], [], False), ([], [], True)):
         with raises_input_error(where=path, remedy="--gap"):
             simulate_profile(path, models, gaps, None, tmp_path / "model", view)
+    with raises_input_error(where=path, remedy="--workers"):
+        simulate_profile(path, [], [], 2, tmp_path / "model", False)
     assert not (tmp_path / "model").exists()
     assert find_campaign(Path("records")) == PROFILES_DIR / "campaigns" / "records.toml"
     assert find_campaign(Path("el_centro")) is None

@@ -8,7 +8,14 @@ from typing import Any
 
 import pytest
 
-from tests.campaign.campaigns import Players, make_options, prepare_campaign, record, statuses
+from tests.campaign.campaigns import (
+    LISTED,
+    Players,
+    make_options,
+    prepare_campaign,
+    record,
+    statuses,
+)
 from tests.input_errors import raises_input_error
 from twin.campaign import command, realtime
 from twin.campaign.command import run_campaign
@@ -67,7 +74,7 @@ def test_the_operator_is_asked_where_the_set_up_changes(
 def test_a_run_is_skipped_and_asked_for_again_on_resume(
     attended_campaign: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    answers(monkeypatch, "", "what?", "s")
+    answers(monkeypatch, "", "what?", "s", "")
     assert run_campaign(make_options(attended_campaign, unpaced=False)) == 0
     assert statuses(attended_campaign) == ["complete", "skipped", "complete"]
     operator = answers(monkeypatch, "")
@@ -75,6 +82,40 @@ def test_a_run_is_skipped_and_asked_for_again_on_resume(
     assert run_campaign(make_options(attended_campaign, unpaced=False, resume=True)) == 0
     assert operator.asked == 1
     assert [Path(run.folder).name for run in Players.given] == ["02-g4"]
+
+
+def test_a_skip_confirms_no_set_up(
+    attended_campaign: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    operator = answers(monkeypatch, "", "s", "s")
+    assert run_campaign(make_options(attended_campaign, unpaced=False)) == 0
+    assert operator.asked == 3
+    assert capsys.readouterr().out.count("SET-UP: Set 4 mm") == 2
+    assert statuses(attended_campaign) == ["complete", "skipped", "skipped"]
+    operator = answers(monkeypatch, "s", "")
+    assert run_campaign(make_options(attended_campaign, unpaced=False, resume=True)) == 0
+    assert operator.asked == 2
+    assert statuses(attended_campaign) == ["complete", "skipped", "complete"]
+    again = read_state(attended_campaign / "out").runs[2].set_up[-1]
+    assert (again.asked, again.answer) == ("Set 4 mm", "done")
+
+
+def test_a_set_up_is_asked_for_where_the_run_that_prompts_for_it_is_complete(
+    attended_campaign: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    second = '[[runs]]\nprofile = "free.toml"\nlabel = "second"\n'
+    before, separator, g4 = LISTED.rpartition('[[runs]]\nprofile = "g4.toml"\nprompt')
+    (attended_campaign / "c.toml").write_text(before + second + separator + g4)
+    answers(monkeypatch, "", "")
+    assert run_campaign(make_options(attended_campaign, unpaced=False)) == 0
+    for folder in ("02-second", "04-again"):
+        (attended_campaign / "out" / folder / "run.mcap").write_bytes(b"altered")
+    operator = answers(monkeypatch, "", "")
+    capsys.readouterr()
+    assert run_campaign(make_options(attended_campaign, unpaced=False, resume=True)) == 0
+    assert operator.asked == 2
+    shown = [line for line in capsys.readouterr().out.splitlines() if line.startswith("SET-UP")]
+    assert shown == ["SET-UP: Take the bumpers away", "SET-UP: Set 4 mm"]
 
 
 def test_one_page_shows_all_runs_and_none_at_full_speed(

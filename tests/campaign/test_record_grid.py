@@ -170,6 +170,8 @@ def test_listed_runs_come_before_the_grid(tmp_path: Path) -> None:
         ("[inf, 4.0, 0, -1.5]", "[]", {"key": "records.gaps_mm"}),
         ("gaps_mm", "gap_mm", {"key": "records.gap_mm", "remedy": "gaps_mm"}),
         ('label = "other"', 'label = "first"', {"key": "records.files", "problem": "first"}),
+        ('label = "other"\nnotes = "turned around"\nscale = -2.0', 'title = "First"\nscale = 1.0',
+         {"key": "records.files", "problem": "'First' and the scale 1"}),
         ('label = "other"', 'label = "a/b"', {"key": "records.files.1.label"}),
         ('"base.toml"', '"bas.toml"', {"where": "bas.toml", "remedy": "base.toml"}),
         ("step_s = 0.01", "step_s = 0.0", {"key": "records.files.1.step_s"}),
@@ -200,6 +202,15 @@ def test_a_base_that_cannot_be_one_is_refused(tmp_path: Path, old: str, new: str
     path = write_grid(tmp_path, base=BASE.replace(old, new))
     words = "one record" if key == "excitation.drive" else "[records]"
     with raises_input_error(key=key, problem=words):
+        read_plan(path, None, None, lambda *_: None)
+
+
+def test_a_rate_too_low_for_the_bumper_is_refused_at_any_gap(tmp_path: Path) -> None:
+    model = (PROFILES_DIR / "models" / "snm.toml").read_text()
+    assert "bumper_stiffness_n_m = 510000.0" in model
+    (tmp_path / "stiff.toml").write_text(model.replace("510000.0", "5.1e8"))
+    path = write_grid(tmp_path, base=f'model = "stiff.toml"\n{BASE}')
+    with raises_input_error(key="rate_hz", value=1000.0, problem="too low for the bumper"):
         read_plan(path, None, None, lambda *_: None)
 
 

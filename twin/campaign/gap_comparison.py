@@ -9,6 +9,7 @@ of Stefani, De Angelis, Andreaus.
 
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,13 +36,23 @@ CRITERIA = {
 
 @dataclass(frozen=True, slots=True)
 class RecordRun:
-    """One complete run of a record: name of the record, gap, mass and merged summary."""
+    """One complete run of a record: name of the record, gap, mass and merged summary.
 
+    Runs of equal `motion` are repetitions.
+    """
+
+    motion: str
     record: str
     gap_mm: float
     mass_kg: float
     label: str
     summary: Json
+
+    @property
+    def has_dropouts(self) -> bool:
+        """Whether samples are missing in its last recording, which holds the whole record."""
+        parts = self.summary.get("parts")
+        return bool(parts[-1]["gaps"] if parts else self.summary.get("gaps"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,13 +62,14 @@ class GapComparison:
     `values` holds (record, gap) by source and quantity: PEAKS in SI, and the CRITERIA. The
     compromise is the root mean square of eta_a and eta_d: 1 is no better than the reference. NaN
     where there is no complete run, and for the force without bumpers. Of a simulation the twin is
-    the only source.
+    the only source. `left_out` are the labels of complete runs with dropouts.
     """
 
     records: tuple[str, ...]
     gaps_mm: tuple[float, ...]
     values: Mapping[tuple[str, str], Float2D]
     sources: tuple[str, ...] = SOURCES
+    left_out: tuple[str, ...] = ()
 
     @property
     def main_source(self) -> str:
@@ -92,25 +104,26 @@ def list_record_runs(
 ) -> list[RecordRun]:
     """Return the complete runs of records of (label, profile, summary).
 
-    `names` are those of the records by the label of a run; else the name of the file counts, with
-    the scale where one file is played at several.
+    `names` are those of the records by the label of a run; else the name of the file counts.
+    Different motions of one name have the scale added, and the label of a run if that is equal too.
     """
     listed: dict[str, list[tuple[str, Profile, Json]]] = {}
     for label, profile, summary in runs:
         if isinstance(profile.excitation, RecordedHistory) and summary["verdict"] == "complete":
             listed.setdefault(_identify(profile.excitation), []).append((label, profile, summary))
-    plain = {key: _name_record(key, several, names) for key, several in listed.items()}
-    shared = {name for name in plain.values() if list(plain.values()).count(name) > 1}
-    record_runs = []
-    for key, several in listed.items():
-        for label, profile, summary in several:
-            excitation = profile.excitation
-            assert isinstance(excitation, RecordedHistory)
-            name = plain[key]
-            name = f"{name} × {excitation.scale:g}" if name in shared else name
-            specimen = profile.specimen
-            record_runs.append(RecordRun(name, specimen.gap_mm, specimen.mass_kg, label, summary))
-    return record_runs
+    record_names = _name_records(listed, names)
+    return [
+        RecordRun(
+            key,
+            record_names[key],
+            profile.specimen.gap_mm,
+            profile.specimen.mass_kg,
+            label,
+            summary,
+        )
+        for key, several in listed.items()
+        for label, profile, summary in several
+    ]
 
 
 def _identify(excitation: RecordedHistory) -> str:
@@ -119,13 +132,25 @@ def _identify(excitation: RecordedHistory) -> str:
     return json.dumps([excitation.checksum, keys], sort_keys=True)
 
 
-def _name_record(key: str, runs: list[tuple[str, Profile, Json]], names: Mapping[str, str]) -> str:
-    """Return the name of the record that these runs play."""
-    for label, _, _ in runs:
-        if label in names:
-            return names[label]
-    excitation = runs[0][1].excitation
-    return Path(excitation.file).stem if isinstance(excitation, RecordedHistory) else key
+def _name_records(
+    listed: Mapping[str, list[tuple[str, Profile, Json]]], names: Mapping[str, str]
+) -> dict[str, str]:
+    """Return a different name for each motion, by its key, of the runs that play it."""
+    record_names, scales, labels = {}, {}, {}
+    for key, several in listed.items():
+        labels[key], profile, _ = several[0]
+        excitation = profile.excitation
+        assert isinstance(excitation, RecordedHistory)
+        scales[key] = f"{excitation.scale:g}"
+        stated = [names[label] for label, _, _ in several if label in names]
+        record_names[key] = stated[0] if stated else Path(excitation.file).stem
+    for additions, pattern in ((scales, "{} × {}"), (labels, "{} ({})")):
+        counts = Counter(record_names.values())
+        record_names = {
+            key: pattern.format(name, additions[key]) if counts[name] > 1 else name
+            for key, name in record_names.items()
+        }
+    return record_names
 
 
 def compare_gaps(
@@ -133,25 +158,27 @@ def compare_gaps(
 ) -> GapComparison | None:
     """Return the comparison; None unless a record was played at two gaps, one the reference.
 
-    A record without a run at the reference, the widest gap, is left out. Several runs of one record
-    at one gap count with their mean.
+    A record without a run at the reference, the widest gap, is left out, and so is a run with
+    dropouts, which may hide a peak. Several runs of one record at one gap count with their mean.
     """
+    left_out = tuple(run.label for run in runs if run.has_dropouts)
+    runs = [run for run in runs if not run.has_dropouts]
     gaps_mm = tuple(sorted({run.gap_mm for run in runs}, reverse=True))
     if len(gaps_mm) < 2:
         return None
-    at_reference = {run.record for run in runs if run.gap_mm == gaps_mm[0]}
-    records = tuple(dict.fromkeys(run.record for run in runs if run.record in at_reference))
-    if not any(run.record in at_reference and run.gap_mm != gaps_mm[0] for run in runs):
+    at_reference = {run.motion for run in runs if run.gap_mm == gaps_mm[0]}
+    records = {run.motion: run.record for run in runs if run.motion in at_reference}
+    if not any(run.motion in at_reference and run.gap_mm != gaps_mm[0] for run in runs):
         return None
     values: dict[tuple[str, str], Float2D] = {}
     for source in sources:
         peaks = np.full((len(PEAKS) + 1, len(records), len(gaps_mm)), np.nan)
-        for row, record in enumerate(records):
+        for row, motion in enumerate(records):
             for column, gap_mm in enumerate(gaps_mm):
                 rows = [
                     find_record_peaks(run, source)
                     for run in runs
-                    if (run.record, run.gap_mm) == (record, gap_mm)
+                    if (run.motion, run.gap_mm) == (motion, gap_mm)
                 ]
                 if rows:
                     peaks[:, row, column] = np.mean(rows, axis=0)
@@ -161,7 +188,7 @@ def compare_gaps(
         quantities = (*PEAKS, FORCE_RATIO, ETA_D, ETA_A, COMPROMISE)
         for name, table in zip(quantities, (u, a, force, r, eta_d, eta_a, compromise), strict=True):
             values[source, name] = table
-    return GapComparison(records, gaps_mm, values, sources)
+    return GapComparison(tuple(records.values()), gaps_mm, values, sources, left_out)
 
 
 def find_record_peaks(run: RecordRun, source: str) -> tuple[float, float, float, float]:
@@ -218,7 +245,9 @@ def describe_comparison(comparison: GapComparison) -> Json:
         "reference_gap_mm": comparison.reference_mm,
         "reference": comparison.reference,
         "sources": list(comparison.sources),
+        "main_name": comparison.main_name,
         "records": list(comparison.records),
+        "left_out": list(comparison.left_out),
         "gaps_mm": list(comparison.gaps_mm),
         "criteria": CRITERIA,
         "best": {

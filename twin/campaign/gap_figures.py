@@ -42,10 +42,14 @@ BETTER_COLOUR = "#2b8f46"
 def draw_gap_figures(comparison: GapComparison) -> CaptionedFigures:
     """Draw the responses over the gap, and acceleration against displacement."""
     yield _draw_over_gap(comparison)
-    if np.isfinite(comparison.values[comparison.main_source, ETA_A]).sum() > len(
-        comparison.records
-    ):
+    if _has_trade_off(comparison):
         yield _draw_trade_off(comparison)
+
+
+def _has_trade_off(comparison: GapComparison) -> bool:
+    """Return whether a record has both ratios at a gap beyond the reference."""
+    ratios = [comparison.values[comparison.main_source, name][:, 1:] for name in (ETA_A, ETA_D)]
+    return bool(np.isfinite(ratios).all(axis=0).any())
 
 
 def _draw_over_gap(comparison: GapComparison) -> CaptionedFigure:

@@ -59,12 +59,15 @@ def unattended_answer(asked: str) -> OperatorAnswer:
     return make_answer(asked, "unattended" if asked else "not asked")
 
 
-def ask_operator(campaign: ActiveCampaign, run: PlannedRun, first: bool) -> OperatorAnswer | None:
+def ask_operator(
+    campaign: ActiveCampaign, run: PlannedRun, confirmed: str | None
+) -> OperatorAnswer | None:
     """Ask the operator to confirm the set-up of a run; return the answer, or None to stop.
 
-    The first run after a resume asks for its set-up even if the run before it had the same one.
+    A run that needs the set-up `confirmed` last in this session asks only for a prompt of its own.
     """
-    prompt = campaign.required_set_up(run) if first and campaign.resumed else run.prompt
+    required = campaign.required_set_up(run)
+    prompt = run.prompt if required == confirmed else required
     if not prompt:
         return make_answer("", "not asked")
     if run.notes:
@@ -90,9 +93,8 @@ def ask_operator(campaign: ActiveCampaign, run: PlannedRun, first: bool) -> Oper
 def print_gap_comparison(comparison: Json) -> None:
     """Print the entry `gap_comparison` of a summary: medians over the records, best gaps."""
     count, source = len(comparison["records"]), comparison["sources"][0]
-    name = "measured" if source == "measured" else "model"
     title = (
-        f"median (smallest to largest) over {count} records, {name}; "
+        f"median (smallest to largest) over {count} records, {comparison['main_name']}; "
         f"1 is {comparison['reference']}, * is best"
     )
     headers = ("acceleration", "displacement", "compromise", "force / weight")
@@ -104,6 +106,8 @@ def print_gap_comparison(comparison: Json) -> None:
     print_table(console, table)
     for name, meaning in CRITERIA.items():
         print_line(f"{meaning}: {format_best(best[name])}")
+    if comparison["left_out"]:
+        print_line(f"left out, for dropouts in the recording: {', '.join(comparison['left_out'])}")
 
 
 def _name_gap(row: Json) -> str:

@@ -27,14 +27,18 @@ def play_realtime(
     campaign: ActiveCampaign, asks: bool, listen: str, keys: Credentials | None
 ) -> int:
     """Play the pending runs; return the exit code. No run starts after one that is incomplete."""
-    for index, run in enumerate(campaign.pending_runs()):
+    confirmed = None if campaign.resumed else ""  # the set-up; None: unknown
+    for run in campaign.pending_runs():
         print_line(format_run_start(campaign, run))
-        answer = ask_operator(campaign, run, index == 0) if asks else unattended_answer(run.prompt)
+        answer = ask_operator(campaign, run, confirmed) if asks else unattended_answer(run.prompt)
         if answer is None:
             return EXIT_INTERRUPTED
         if answer.answer == "skipped":
+            confirmed = None  # the change may have been begun
             campaign.skip_run(run, answer)
             continue
+        if answer.answer == "done":
+            confirmed = answer.asked
         code = _play_run(campaign, run, answer, listen, keys)
         if code:
             return code

@@ -122,6 +122,14 @@ class RecordGrid(RecordKeys):
             raise InputError(
                 f"two records have the label {twice[0]!r}", remedy="give each its own label"
             )
+        reported = [(record.title or record.name, record.scale) for record in files]
+        equal = sorted({entry for entry in reported if reported.count(entry) > 1})
+        if equal:
+            title, scale = equal[0]
+            raise InputError(
+                f"two records have the title {title!r} and the scale {scale:g}",
+                remedy="give each its own title, by which the reports name it",
+            )
         return files
 
     def list_cells(self) -> Iterator[GridCell]:
@@ -267,10 +275,8 @@ def read_cell(
     if at_other_gap is None:
         return build_run_config(cell.label, profile, text, base.path, cell.label, table, model)
     model_config = parse_toml(at_other_gap.model_toml, ModelConfig, "model file")
+    own_model = model_config.build_model(profile.specimen)
+    own_model.check_rate(profile.acquisition.rate_hz)  # a contact needs a higher rate than none
     return replace(
-        at_other_gap,
-        name=cell.label,
-        profile=profile,
-        profile_toml=text,
-        model=model_config.build_model(profile.specimen),
+        at_other_gap, name=cell.label, profile=profile, profile_toml=text, model=own_model
     )

@@ -9,6 +9,7 @@ import numpy as np
 
 from table_io.block import Float1D, Label
 from table_io.channels import contact_forces, relative_displacement
+from table_io.config.excitation.record import RecordedHistory
 from table_io.errors import InputError
 from twin.campaign.config import PlannedRun, read_plan
 from twin.campaign.figures import draw_gap_pairs
@@ -33,7 +34,10 @@ def simulate_grid(path: Path, model: str | None, out: Path | None) -> int:
     with show_status("checking the runs"):
         plan = read_plan(path, None, model, lambda *_: None)
     names = {cell.label: cell.record.title or cell.record.name for cell in plan.config.cells}
-    blank = [(run.label, run.bundle.profile, _describe_motion(math.nan)) for run in plan.runs]
+    planned = [
+        run for run in plan.runs if isinstance(run.bundle.profile.excitation, RecordedHistory)
+    ]
+    blank = [(run.label, run.bundle.profile, _describe_motion(math.nan)) for run in planned]
     if compare_gaps(list_record_runs(blank, names), ("twin",)) is None:
         raise InputError(
             "the model alone is simulated for records at several gaps",
@@ -41,11 +45,11 @@ def simulate_grid(path: Path, model: str | None, out: Path | None) -> int:
             allowed="a campaign with [records]",
             remedy="simulate a single test, or play the campaign with `shaketwin campaign`",
         )
-    compile_kernels(plan.runs[0].bundle)
+    compile_kernels(planned[0].bundle)
     folder, _ = make_run_folder(out, f"{plan.path.stem}-model")
     runs = []
     with show_status("simulating") as show_part:
-        for run in plan.runs:
+        for run in planned:
             show_part(run.label)
             runs.append((run.label, run.bundle.profile, simulate_peaks(run.bundle)))
     comparison = compare_gaps(list_record_runs(runs, names), ("twin",))
@@ -56,7 +60,7 @@ def simulate_grid(path: Path, model: str | None, out: Path | None) -> int:
             "title": plan.config.title,
             "citation": plan.config.citation,
             "notes": plan.config.notes,
-            "model": _name_models(plan.runs),
+            "model": _name_models(planned),
         },
         "verdict": "complete",
         "reason": f"{len(comparison.records)} records at {len(comparison.gaps_mm)} gaps",
@@ -103,7 +107,7 @@ def _describe_motion(
     return {"verdict": "complete", "windows": [{"measured": None, "twin": twin}]}
 
 
-def _name_models(runs: tuple[PlannedRun, ...]) -> str:
+def _name_models(runs: list[PlannedRun]) -> str:
     """Return the titles of the models of the runs."""
     titles = [tomllib.loads(run.bundle.model_toml).get("title", "model") for run in runs]
     return ", ".join(dict.fromkeys(titles))

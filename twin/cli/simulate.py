@@ -24,11 +24,11 @@ def simulate_profile(
     """Simulate one model, recorded like a run, several models or gaps, or records at gaps."""
     campaign = find_campaign(profile)
     if campaign is not None:
-        if gaps or view or len(models) > 1:
+        if gaps or view or workers is not None or len(models) > 1:
             raise InputError(
-                "a campaign states its gaps and is simulated with one model",
+                "a campaign states its gaps and is simulated with one model, in one process",
                 where=profile,
-                remedy="omit --gap and --view, and give one --model",
+                remedy="omit --gap, --view and --workers, and give one --model",
             )
         from twin.campaign.simulate_grid import simulate_grid
 
