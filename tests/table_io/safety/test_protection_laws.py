@@ -266,6 +266,6 @@ def test_errors_of_the_command_do_not_count_across_a_repetition(rate_hz: float) 
             values[:, first : first + 3] = values[:, at : at + 3]
         values[DRIVE, at + 29 :] = simulate_channels(plan_sweep(profile), 3)[DRIVE, at + 29 :]
 
-    found = kinds(inspect(profile, change))
-    assert "repeated" in found
-    assert "command" not in found
+    kinds_seen = kinds(inspect(profile, change))
+    assert "repeated" in kinds_seen
+    assert "command" not in kinds_seen
