@@ -10,6 +10,9 @@ Force laws are smooth versions of their textbook forms, so classical Runge-Kutta
 at contact changes keeps its fourth order (except for z of Bouc-Wen at z = 0, where it is once
 differentiable only). The table bears R of the mass and of the appendage. Without a ground truth
 and without oil `Plant` is used instead.
+
+Compiled kernels are kept by the text of this file alone: where a function that is inlined here
+changes in `hydraulic_table.py`, this text has to change with it. Revision 2: worn friction.
 """
 
 import math
