@@ -271,17 +271,9 @@ def test_a_named_effect_is_described_with_equation_and_source() -> None:
         parameters=BASIC._replace(backlash_m=5e-5),
     )
     finding = EffectFinding("backlash", 0.1, 0.05)
-    lines = describe_discovery(EffectDiscovery(fit, (finding,), 0.05, None, {}))
+    lines = describe_discovery(EffectDiscovery(fit, (finding,), 0.05, None))
     assert lines[1].startswith("  equation: f -> f - K b/2 sat(2 f / (K b)) (Nordin, Gutman")
     assert lines[2].startswith("  backlash_m = 5e-05 +- 1e-06 m (95 %)")
-
-
-def test_the_smallest_visible_size_of_an_effect_not_found_is_stated() -> None:
-    fit: Any = SimpleNamespace(estimate_half_widths=dict, parameters=BASIC)
-    visible = {"backlash": 1.234e-5, "flow_asymmetry": 0.031}
-    lines = describe_discovery(EffectDiscovery(fit, (), 0.05, None, visible))
-    (line,) = (line for line in lines if "backlash" in line)
-    assert line.endswith("(half width, 95 %): backlash 1.2e-05 m, flow asymmetry 0.031")
 
 
 @pytest.mark.slow  # 60 s each

@@ -245,16 +245,12 @@ class EffectFinding:
 
 @dataclass(frozen=True, eq=False)
 class EffectDiscovery:
-    """Outcome: the final fit, the effects found, and those that the rehearsal cannot show.
-
-    `smallest_visible` is for each effect not found the half width of the interval of its size.
-    """
+    """Outcome: the final fit, the effects found, and the nearest one that was not named."""
 
     fit: TableFit
     findings: tuple[EffectFinding, ...]
     gap: float
     closest: RivalEffect | None
-    smallest_visible: dict[str, float]
 
 
 def identify_table_and_effects(
@@ -280,11 +276,9 @@ def discover_table_effects(
     best = EffectFit.from_fit((), basic)
     findings: list[EffectFinding] = []
     closest: RivalEffect | None = None
-    visible: dict[str, float] = {}
     while len(best.effects) < MAX_EFFECTS:
         report(f"screening the effects of a table ({len(best.effects)} named)")
         screened = screen_effects(best)
-        visible |= {candidate.effect.id: candidate.half_width for candidate in screened}
         fitted = []
         for candidate in screened[:MAX_REFITS]:
             if candidate.gain_share < MIN_PROMISED_SHARE:
@@ -307,9 +301,7 @@ def discover_table_effects(
             EffectFinding(winner.effects[-1].id, best.gap, winner.gap, rivals, undecided)
         )
         best = winner
-    names = {finding.id for finding in findings}
-    visible = {name: width for name, width in visible.items() if name not in names}
-    return EffectDiscovery(best.fit, tuple(findings), best.gap, closest, visible)
+    return EffectDiscovery(best.fit, tuple(findings), best.gap, closest)
 
 
 def is_worthwhile(before: EffectFit, after: EffectFit) -> bool:
@@ -336,12 +328,11 @@ def compute_gain(before: EffectFit, after: EffectFit) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class ScreenedEffect:
-    """Effect by the linear problem: share of the held-out squares promised, start, half width."""
+    """Effect by the linear problem: share of the held-out squares promised, and start."""
 
     effect: TableEffect
     start: dict[str, float]
     gain_share: float
-    half_width: float
 
 
 def screen_effects(current: EffectFit) -> list[ScreenedEffect]:
@@ -357,7 +348,7 @@ def screen_effects(current: EffectFit) -> list[ScreenedEffect]:
             slope = _compute_trial_slope(fit, effect, trial)
             held_out = _cross_validate(np.column_stack([base, slope]), fit.residuals, fit.problem)
             share = 1.0 - float(held_out @ held_out) / before
-            size, half_width = _solve_amplitude(base, slope, fit.residuals)
+            size = _solve_amplitude(base, slope, fit.residuals)
             first = effect.parameters[0]
             # Of the size of its trial: the law need not be linear, nor a dead band negative.
             held_out = _cross_validate(base, fit.residuals + trial[0] * slope, fit.problem)
@@ -367,7 +358,7 @@ def screen_effects(current: EffectFit) -> list[ScreenedEffect]:
             values = (size, *trial[1:])
             names = (parameter.name for parameter in effect.parameters)
             start = dict(zip(names, values, strict=True))
-            trials.append(ScreenedEffect(effect, start, share, half_width))
+            trials.append(ScreenedEffect(effect, start, share))
         screened.append(max(trials, key=lambda candidate: candidate.gain_share))
     return sorted(screened, key=lambda candidate: -candidate.gain_share)
 
@@ -391,13 +382,11 @@ def _cross_validate(jacobian: Float2D, residuals: Float1D, problem: RehearsalPro
     return held_out[:-1]
 
 
-def _solve_amplitude(base: Float2D, slope: Float1D, residuals: Float1D) -> tuple[float, float]:
-    """Return size of an effect and half width of its 95 % interval by the linear problem."""
+def _solve_amplitude(base: Float2D, slope: Float1D, residuals: Float1D) -> float:
+    """Return the size of an effect by the linear problem."""
     scaled = base / (np.linalg.norm(base, axis=0) + 1e-30)
     own = slope - scaled @ np.linalg.lstsq(scaled, slope, rcond=1e-8)[0]
-    square = max(float(own @ own), 1e-300)
-    noise = math.sqrt(float(residuals @ residuals) / residuals.size)
-    return -float(own @ residuals) / square, 2.0 * noise / math.sqrt(square)
+    return -float(own @ residuals) / max(float(own @ own), 1e-300)
 
 
 def _refit(current: EffectFit, candidate: ScreenedEffect) -> EffectFit:
@@ -425,7 +414,7 @@ def describe_size(effect: TableEffect, parameters: TableParameters) -> float:
 
 
 def describe_discovery(discovery: EffectDiscovery) -> list[str]:
-    """Return the outcome in words, a line each: effects, what remains, what is not visible."""
+    """Return the outcome in words, a line each: effects, what remains, what is not judged."""
     lines = []
     widths, parameters = discovery.fit.estimate_half_widths(), discovery.fit.parameters
     for finding in discovery.findings:
@@ -455,12 +444,6 @@ def describe_discovery(discovery: EffectDiscovery) -> list[str]:
             f"  {_list_names([discovery.closest.id])} would leave "
             f"{100 * discovery.closest.gap:.3g} %: too little gained to name it"
         )
-    sizes = [
-        f"{_list_names([name])} {width:.2g} {EFFECT_BY_ID[name].parameters[0].unit}".rstrip()
-        for name, width in discovery.smallest_visible.items()
-    ]
-    if sizes:
-        lines.append(f"smallest visible size of the others (half width, 95 %): {', '.join(sizes)}")
     lines.append("cannot be judged from this rehearsal:")
     lines += [f"  {name}: {reason}" for name, reason in UNTESTED.items()]
     return lines
