@@ -17,6 +17,7 @@ from table_io.adaptive import make_policy
 from table_io.clock import RealClock, local_datetime
 from table_io.config.base import ConfigModel
 from table_io.config.profile import Profile, ResumeConfig, SetUpConfirmation
+from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from twin.campaign import STATE_FILE
 from twin.campaign.config import CampaignPlan, PlannedRun, ResumeMode
@@ -308,17 +309,9 @@ class ActiveCampaign:
 
 
 def append_sections(profile_toml: str, sections: dict[str, ConfigModel]) -> str:
-    """Return a profile's TOML text with sections appended.
-
-    A JSON string is a valid TOML string, except for the control character DEL.
-    """
-    lines = [profile_toml.rstrip("\n")]
-    for name, section in sections.items():
-        lines += ["", f"[{name}]"]
-        for key, value in section.model_dump().items():
-            text = json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-            lines.append(f"{key} = {text}")
-    return "\n".join(lines) + "\n"
+    """Return a profile's TOML text with sections appended."""
+    tables = {name: section.model_dump() for name, section in sections.items()}
+    return profile_toml.rstrip("\n") + "\n" + format_toml(tables)
 
 
 def begin_campaign(folder: Path, plan: CampaignPlan) -> ActiveCampaign:

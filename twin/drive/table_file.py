@@ -1,12 +1,12 @@
 """File of a table's twin, as `shaketwin table-twin` writes it."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 from pydantic import Field, field_validator
 
 from table_io.config.base import ConfigModel, NonNegative, Positive, load_config
+from table_io.config.toml_text import format_toml
 from table_io.errors import InputError, suggest
 from twin.drive.table_effects import EFFECT_BY_ID
 from twin.drive.table_identification import TableIdentification
@@ -58,16 +58,14 @@ def format_table_twin(
 ) -> str:
     """Return the TOML text of an identified table, with the names of the effects found in it."""
     values = identification.model.parameters._asdict()
-    lines = [
-        f"title = {json.dumps(title, ensure_ascii=False)}",
-        f"mass_kg = {identification.model.mass_kg!r}",
-        f"residual = {identification.residual:.4g}",
-        f"effects = {json.dumps(list(effects))}",
-        "",
-        "[parameters]",
-        *(f"{name} = {value:.9g}" for name, value in values.items()),
-        "",
-        "[half_widths]",
-        *(f"{name} = {width:.3g}" for name, width in identification.half_widths.items()),
-    ]
-    return "\n".join([*lines, ""])
+    widths = identification.half_widths
+    return format_toml(
+        {
+            "title": title,
+            "mass_kg": identification.model.mass_kg,
+            "residual": float(f"{identification.residual:.4g}"),
+            "effects": effects,
+            "parameters": {name: float(f"{value:.9g}") for name, value in values.items()},
+            "half_widths": {name: float(f"{width:.3g}") for name, width in widths.items()},
+        }
+    )
