@@ -72,6 +72,11 @@ class CampaignConfig(ConfigModel):
         return (*listed, *(cell.label for cell in self.cells))
 
     @property
+    def record_names(self) -> dict[str, str]:
+        """Names of the records of the grid in every report, by the labels of their runs."""
+        return {cell.label: cell.record.reported_name for cell in self.cells}
+
+    @property
     def cells(self) -> tuple[GridCell, ...]:
         """Runs of the grid of records and gaps, in order; none without a grid."""
         return () if self.records is None else tuple(self.records.list_cells())

@@ -79,6 +79,11 @@ class GridRecord(RecordKeys):
         """Label of the record, by default the name of its file without its suffix."""
         return self.label or Path(self.file).stem
 
+    @property
+    def reported_name(self) -> str:
+        """Name of the record in every report."""
+        return self.title or self.name
+
 
 @dataclass(frozen=True, slots=True)
 class GridCell:
@@ -122,7 +127,7 @@ class RecordGrid(RecordKeys):
             raise InputError(
                 f"two records have the label {twice[0]!r}", remedy="give each its own label"
             )
-        reported = [(record.title or record.name, record.scale) for record in files]
+        reported = [(record.reported_name, record.scale) for record in files]
         equal = sorted({entry for entry in reported if reported.count(entry) > 1})
         if equal:
             title, scale = equal[0]
@@ -253,7 +258,7 @@ def describe_run(record: GridRecord, gap_mm: float) -> str:
         set_up = f"bumpers precompressed by {-gap_mm:g} mm"
     else:
         set_up = f"with bumpers at {gap_mm:g} mm"
-    return f"{record.title or record.name} at {record.scale:g} of its level, {set_up}"
+    return f"{record.reported_name} at {record.scale:g} of its level, {set_up}"
 
 
 def read_cell(

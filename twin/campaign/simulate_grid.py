@@ -33,7 +33,7 @@ def simulate_grid(path: Path, model: str | None, out: Path | None) -> int:
     """
     with show_status("checking the runs"):
         plan = read_plan(path, None, model, lambda *_: None)
-    names = {cell.label: cell.record.title or cell.record.name for cell in plan.config.cells}
+    names = plan.config.record_names
     planned = [
         run for run in plan.runs if isinstance(run.bundle.profile.excitation, RecordedHistory)
     ]
@@ -55,6 +55,7 @@ def simulate_grid(path: Path, model: str | None, out: Path | None) -> int:
     comparison = compare_gaps(list_record_runs(runs, names), ("twin",))
     assert comparison is not None
     pairs = draw_gap_pairs(comparison, folder / "figures")
+    described = describe_comparison(comparison)
     summary = {
         "campaign": {
             "title": plan.config.title,
@@ -64,20 +65,20 @@ def simulate_grid(path: Path, model: str | None, out: Path | None) -> int:
         },
         "verdict": "complete",
         "reason": f"{len(comparison.records)} records at {len(comparison.gaps_mm)} gaps",
-        "gap_comparison": describe_comparison(comparison),
+        "gap_comparison": described,
     }
     write_json(summary, folder / "summary.json")
     page = render_page(
         Path(__file__).with_name("gap_page.html"),
         summary=summary,
-        gaps=summary["gap_comparison"],
+        gaps=described,
         pictures=embed_pairs(pairs),
         text=plan.text,
         digest=sha256(plan.text.encode()).hexdigest(),
         **list_gap_values(comparison),
     )
     (folder / "report.html").write_text(page, encoding="utf-8")
-    print_gap_comparison(describe_comparison(comparison))
+    print_gap_comparison(described)
     print_line(f"{summary['reason']}, model alone -> {folder / 'report.html'}")
     return 0
 

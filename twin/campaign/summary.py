@@ -69,10 +69,8 @@ def read_campaign(folder: Path) -> CampaignData:
         )
         for run in runs_read
     )
-    names = {cell.label: cell.record.title or cell.record.name for cell in config.cells}
-    gaps = compare_gaps(
-        list_record_runs([(run.state.label, run.profile, run.summary) for run in runs], names)
-    )
+    listed = [(run.state.label, run.profile, run.summary) for run in runs]
+    gaps = compare_gaps(list_record_runs(listed, config.record_names))
     summary = _summarize_campaign(config, state, runs, stars, gaps)
     return CampaignData(folder, config, state, runs, stars, gaps, summary)
 
