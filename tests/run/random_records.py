@@ -19,6 +19,7 @@ from table_io.acquisition.session import run_session
 from table_io.backends import open_backend
 from table_io.block import Block, Float1D
 from table_io.clock import ManualClock
+from table_io.config.excitation import add_drive_margin
 from table_io.config.excitation.drive_file import format_drive
 from table_io.errors import InputError
 from table_io.records import RunStop, Trip
@@ -125,7 +126,7 @@ def write_wrong_drive(path: Path, rng: np.random.Generator) -> None:
         config = read_run_config(path)
     except InputError:
         return
-    target = np.pad(config.profile.plan.target_m, 1000)
+    target = add_drive_margin(config.profile.plan.target_m, config.drive.rate_hz)
     hz = np.fft.rfftfreq(target.size, 1e-3)
     gain = 1.0 + rng.uniform(-0.5, 3.0) * hz / (hz + rng.uniform(0.5, 20.0))
     wrong = np.fft.irfft(np.fft.rfft(target) * gain, target.size) * rng.choice([1.0, 1.0, 5.0])

@@ -54,8 +54,9 @@ def find_windows(blocks: tuple[Block, ...]) -> dict[int, tuple[int, int]]:
     """Return the samples (first, end) of each window, by its number."""
     windows: dict[int, tuple[int, int]] = {}
     for block in blocks:
-        for number in np.unique(block.step[block.is_history]).tolist():
-            samples = np.flatnonzero(block.is_history & (block.step == number)) + block.index
+        is_played = block.is_history
+        for number in np.unique(block.step[is_played]).tolist():
+            samples = np.flatnonzero(is_played & (block.step == number)) + block.index
             first, _ = windows.get(number, (int(samples[0]), 0))
             windows[number] = first, int(samples[-1]) + 1
     return windows
