@@ -267,3 +267,14 @@ def test_every_built_in_effect_is_on_a_path():
     for effect in EFFECTS:
         assert (effect.change is not None) == (effect.acts == "parameters")
         assert effect.force is None
+
+
+@pytest.mark.parametrize("effect", [None, "gap_drift"])
+@pytest.mark.parametrize("measured", [1, 3, 6])
+def test_measuring_fewer_cycles_changes_no_bit_of_them(effect, measured):
+    """Neither of those that are measured, nor of the state that goes on to the next step."""
+    model = Model(snm()) if effect is None else Model(snm()).with_effect(effect, rate=1e-6)
+    whole = simulate_sweep(model, [2.0, 2.9, 3.0], AG, 6)
+    part = simulate_sweep(model, [2.0, 2.9, 3.0], AG, 6, measured)
+    assert np.array_equal(part.extremes, whole.extremes[:, -measured:])
+    assert np.array_equal(part.states, whole.states)

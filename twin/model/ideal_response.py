@@ -23,17 +23,21 @@ def simulate_sweep(
     frequencies_hz: Sequence[float] | Float1D,
     acceleration: float | Float1D,
     cycles: int,
+    measured_cycles: int | None = None,
 ) -> SteppedSineResponse:
     """Simulate whole `cycles` of A = acceleration sin(2 pi f t) at each frequency, from rest.
 
     `acceleration` in m/s2 is one, or one at each frequency, (frequency,). The state carries over
-    between frequencies. `stepped_sine` computes it if effects only change parameters. Otherwise the
+    between frequencies. Extremes are returned of the last `measured_cycles` at each frequency, by
+    default of all. `stepped_sine` computes it if effects only change parameters. Otherwise the
     drive is linear between `MIN_SAMPLES_PER_CYCLE` samples (a multiple, where a contact needs it)
     and extremes are those of the samples; the table displacement is -A / w^2. Sensor effects are
     not applied: this is the true motion.
     """
     if model.changes_only_parameters:
-        return simulate_stepped_sine(model.parameters, frequencies_hz, acceleration, cycles)
+        return simulate_stepped_sine(
+            model.parameters, frequencies_hz, acceleration, cycles, measured_cycles=measured_cycles
+        )
     frequencies = validate_frequencies(frequencies_hz, acceleration, cycles)
     levels = np.broadcast_to(np.float64(acceleration), frequencies.shape).tolist()
     extremes = np.empty((frequencies.size, cycles, len(EXTREME_NAMES)))
@@ -55,7 +59,8 @@ def simulate_sweep(
         extremes[index] = sampled_extremes(out, cycles, in_contact)
         in_contact = bool(out[3, -1] > 0), bool(out[4, -1] < 0)
         end_states.append(state.copy())
-    return SteppedSineResponse(extremes, np.array(end_states))
+    measured = cycles if measured_cycles is None else measured_cycles
+    return SteppedSineResponse(extremes[:, -measured:], np.array(end_states))
 
 
 def sampled_extremes(out: Float2D, cycles: int, in_contact: tuple[bool, bool]) -> Float2D:

@@ -21,9 +21,9 @@ MIN_STEPS_PER_CYCLE = 8  # with fewer, a contact could begin and end undetected
 class SteppedSineResponse:
     """Extremes of each cycle and final state of each step of a stepped sine, SI.
 
-    extremes (step, cycle, 8), `EXTREME_NAMES`; states (step, STATE_SIZE). Extremes are true ones,
-    from roots of the slope and from both sides of a jump, not samples. F_R >= 0, F_L <= 0; onsets
-    are counted in the cycle in which they happen.
+    extremes (step, measured cycle, 8), `EXTREME_NAMES`; states (step, STATE_SIZE). Extremes are
+    true ones, from roots of the slope and from both sides of a jump, not samples. F_R >= 0,
+    F_L <= 0; onsets are counted in the cycle in which they happen.
     """
 
     extremes: Float3D
@@ -64,6 +64,7 @@ def simulate_stepped_sine(
     cycles: int,
     steps_per_cycle: int = 16,
     state: Float1D | None = None,
+    measured_cycles: int | None = None,
 ) -> SteppedSineResponse:
     """Simulate whole `cycles` of A = acceleration sin(2 pi f t) in m/s2 at each frequency in turn.
 
@@ -71,8 +72,9 @@ def simulate_stepped_sine(
     Starts from `state` (not modified) or from rest. A is continuous at a change of frequency; the
     velocity of the table is not, so this is the ideal sweep, which no table can drive.
     `steps_per_cycle` is raised where a mode turns more than `closed_form.MAX_PHASE_STEP_RAD` in a
-    step; the result does not depend on it unless the motion is chaotic. InputError names inputs
-    that cannot be driven.
+    step; the result does not depend on it unless the motion is chaotic. Extremes are computed of
+    the last `measured_cycles` of each step, by default of all. InputError names inputs that cannot
+    be driven.
     """
     frequencies = validate_frequencies(frequencies_hz, acceleration, cycles)
     if steps_per_cycle < MIN_STEPS_PER_CYCLE:
@@ -89,7 +91,8 @@ def simulate_stepped_sine(
     )
     current = rest_state(parameters) if state is None else state.copy()
     current[BASE] = 0.0
-    extremes = np.empty((frequencies.size, cycles, len(EXTREME_NAMES)))
+    measured = cycles if measured_cycles is None else min(measured_cycles, cycles)
+    extremes = np.empty((frequencies.size, measured, len(EXTREME_NAMES)))
     end_states = np.empty((frequencies.size, STATE_SIZE))
     peaks = np.broadcast_to(np.float64(acceleration), frequencies.shape).copy()
     work_arrays = np.empty((2, int(steps.max(initial=0)) + 1)), np.empty((4, 3))

@@ -98,9 +98,10 @@ def widen_extremes(
 
 @jit_helper()
 def widen_through_events(
-    state: Float1D, params: Float1D, h: float, peak: float, w: float, phase: float, row: Float1D
-) -> None:
-    """Advance `state` over a step through any events, and widen `row` by its extremes."""
+    state: Float1D, params: Float1D, h: float, peak: float, w: float, phase: float, row: Float1D,
+    measured: bool,
+) -> None:  # fmt: skip
+    """Advance `state` over a step through any events; widen `row` by its extremes if `measured`."""
     t = 0.0
     for attempt in range(MAX_EVENTS_PER_STEP):
         mode = contact_mode(state)
@@ -108,7 +109,8 @@ def widen_through_events(
         dt, side, m, x0, x1 = advance_to_event(
             state, params, h - t, 0.0, 0.0, (peak, w, phase + w * t), search
         )
-        widen_extremes(row, params, mode, dt, m, x0, x1)
+        if measured:
+            widen_extremes(row, params, mode, dt, m, x0, x1)
         t += dt
         if side < 0:
             break
@@ -154,9 +156,11 @@ def reset_extremes(row: Float1D, state: Float1D, params: Float1D) -> None:
 @jit_helper()
 def advance_cycle(
     state: Float1D, params: Float1D, table: Float2D, particular: Float2D,
-    peak: float, w: float, steps: int, row: Float1D,
+    peak: float, w: float, steps: int, row: Float1D, measured: bool,
 ) -> None:  # fmt: skip
     """Advance `state` through one cycle in `steps` steps; row (8,) becomes its `EXTREME_NAMES`.
+
+    Unless `measured`, row is undefined afterwards: roots are sought of events only.
 
     A step whose guards r, l (slopes rs, ls) may have turned negative is repeated in
     `widen_through_events`. Otherwise a quantity has its extremum at an end of the step, or where
@@ -184,14 +188,19 @@ def advance_cycle(
             row[2], row[3] = max(row[2], a1), min(row[3], a1)
             row[4] = max(row[4], r1) if mode & 1 else row[4]
             row[5] = min(row[5], -l1) if mode & 2 else row[5]
-            has_extremum = v * v1 < 0 or (c * d0 + k * v) * (c * d1 + k * v1) < 0
-            if has_extremum or (mode & 1) * rs0 > 0 > rs1 or (mode & 2) * ls0 > 0 > ls1:
+            has_extremum = measured and (
+                v * v1 < 0
+                or (c * d0 + k * v) * (c * d1 + k * v1) < 0
+                or (mode & 1) * rs0 > 0 > rs1
+                or (mode & 2) * ls0 > 0 > ls1
+            )
+            if has_extremum:
                 m, start = mode_solution(params, mode, u, v, 0.0, 0.0, (peak, w, phase_step * i))
                 widen_extremes(row, params, mode, h, m, start, solution_at(h, m))
             u, v, ur, ul = u1, v1, flush_denormal(ur1), flush_denormal(ul1)
         else:
             state[U], state[V], state[U_R], state[U_L] = u, v, ur, ul
-            widen_through_events(state, params, h, peak, w, phase_step * i, row)
+            widen_through_events(state, params, h, peak, w, phase_step * i, row, measured)
             u, v, ur, ul = state[U], state[V], state[U_R], state[U_L]
             mode = contact_mode(state)
     state[U], state[V], state[U_R], state[U_L] = u, v, ur, ul
@@ -220,15 +229,20 @@ def run_stepped_sine(
 ) -> None:
     """Run whole cycles of A = peak sin(w t) at each w in 1/s in turn, `steps` steps per cycle.
 
+    The last cycles at each w, as many as `extremes` has, are measured.
+
     table (2, max steps + 1) and particular (4, 3) are workspace, `params` is updated for each w.
-    extremes (w, cycle, 8), `EXTREME_NAMES`; end_states (w, STATE_SIZE): the state after each w.
+    extremes (w, measured cycle, 8), `EXTREME_NAMES`; end_states (w, STATE_SIZE): the state after
+    each w.
     """
     for i in range(w.size):
         if i == 0 or w[i] != w[i - 1] or peaks[i] != peaks[i - 1] or steps[i] != steps[i - 1]:
             prepare_frequency(params, table, particular, peaks[i], w[i], steps[i])
+        unmeasured = cycles - extremes.shape[1]
         for cycle in range(cycles):
-            row = extremes[i, cycle]
-            advance_cycle(state, params, table, particular, peaks[i], w[i], steps[i], row)
+            row = extremes[i, max(cycle - unmeasured, 0)]
+            measured = cycle >= unmeasured
+            advance_cycle(state, params, table, particular, peaks[i], w[i], steps[i], row, measured)
         # Entry by entry: copying a row makes numba compile an error message for unequal lengths.
         for index in range(state.size):
             end_states[i, index] = state[index]

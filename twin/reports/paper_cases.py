@@ -71,9 +71,9 @@ class PaperTest:
     @cached_property
     def points(self) -> tuple[PrcPoint, ...]:
         """PRC point of every step, as `twin`."""
-        measured = self.profile.sweep.measured_cycles
+        sweep = self.profile.sweep
         return ideal_points.compute_prc_points(
-            self.model, self.steps, self.response, measured, self.scale
+            self.model, self.steps, self.response, sweep.cycles, sweep.measured_cycles, self.scale
         )
 
     def compute_state(self, index: int, cycles: int) -> Float1D:

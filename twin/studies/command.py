@@ -96,7 +96,7 @@ def _run_cases(
         for index, response in sweeps:
             case = cases[index]
             points = ideal_points.compute_prc_points(
-                case.model, steps, response, sweep.measured_cycles
+                case.model, steps, response, sweep.cycles, sweep.measured_cycles
             )
             table.write(make_rows(case, points))
             entry = _case_entry(case, points, sweep.one_level_g * GRAVITY_M_S2)

@@ -124,8 +124,8 @@ def _predict_at_level(
         levels = profile.sweep.levels_m_s2(frequencies_hz)
         stated = profile.sweep.levels_m_s2(np.array([steps[0].frequency_hz]))[0]
         acceleration = levels * steps[0].acceleration_m_s2 / stated
-    response = simulate_sweep(model, frequencies_hz, acceleration, cycles)
-    amplitudes = 0.5 * (response.column("u_max") - response.column("u_min"))[:, -AVERAGED_CYCLES:]
+    response = simulate_sweep(model, frequencies_hz, acceleration, cycles, AVERAGED_CYCLES)
+    amplitudes = 0.5 * (response.column("u_max") - response.column("u_min"))
     directions = ["forward"] * up.size + ["backward"] * up.size
     points = [
         _model_point(*arguments)

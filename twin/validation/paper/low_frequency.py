@@ -56,7 +56,7 @@ def find_secondary_resonances(case: PaperCase) -> SecondaryResonances:
         for index, hz in enumerate(frequencies_hz.tolist())
     ]
     points = ideal_points.compute_prc_points(
-        simulator.model, steps, response, EVALUATED_CYCLES, case.scale
+        simulator.model, steps, response, effort.fine_cycles, EVALUATED_CYCLES, case.scale
     )
     intervals = [
         interval
