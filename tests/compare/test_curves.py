@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from table_io.records import NormalizedResponse, PrcPoint
-from twin.compare.curves import Hysteresis, PrcJump, describe_sudden_change, detect_hysteresis
+from twin.compare.curves import (
+    Hysteresis,
+    PrcJump,
+    Solutions,
+    describe_sudden_change,
+    detect_all_hysteresis,
+    detect_hysteresis,
+)
 from twin.model.parameters import Parameters, free_flight_resonance
 from twin.model.stepped_sine import simulate_stepped_sine
 from twin.reports.paper_cases import load_paper_cases
@@ -352,3 +359,32 @@ def test_no_hint_without_a_leap_or_over_a_turn() -> None:
     assert describe_sudden_change(point("forward", 4.0, None), b) is None
     assert describe_sudden_change(a, point("forward", 4.2, measured(0.0))) is None
     assert describe_sudden_change(a, point("forward", 4.2, measured(math.nan))) is None
+
+
+def test_many_sweeps_at_once_are_judged_as_one_by_one() -> None:
+    """Sweeps with and without hysteresis, a jump at every place, in one array."""
+    forwards: list[Curve] = [upper, lower, *(high_until(hz) for hz in GRID[2:-2:3])]
+    sweeps = [sweep(forward, lower) for forward in forwards]
+    columns = [
+        [
+            Solutions.from_responses(
+                [p.measured for p in sorted(points, key=lambda p: p.frequency_hz)
+                 if p.direction == direction and p.measured is not None]
+            )
+            for points in sweeps
+        ]
+        for direction in ("forward", "backward")
+    ]  # fmt: skip
+    forward, backward = (
+        Solutions(*(np.stack(rows) for rows in zip(*solutions, strict=True)))
+        for solutions in columns
+    )
+    together = detect_all_hysteresis(GRID, forward, backward)
+    assert [together[index,] for index in range(len(sweeps))] == [
+        detect_hysteresis(points, "measured") for points in sweeps
+    ]
+    assert sum(bool(jumps) for jumps, _ in together.values()) >= 4
+
+
+def high_until(jump_hz: float) -> Curve:
+    return lambda hz: upper(hz) if hz <= jump_hz else lower(hz)

@@ -18,11 +18,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from table_io.records import NormalizedResponse, PrcPoint
+
+FloatND = NDArray[np.float64]
+BoolND = NDArray[np.bool_]
 
 MIN_BRANCH_DIFFERENCE = 0.10  # of the larger eta: beyond it the solutions differ
 MIN_COUNTED_DIFFERENCE = 0.03  # the same, if the impact counts differ in every cycle
@@ -49,104 +53,170 @@ class Hysteresis:
     to_hz: float
 
 
-@dataclass(frozen=True, slots=True)
-class _DirectionPair:
-    frequency_hz: float
-    forward: NormalizedResponse
-    backward: NormalizedResponse
+class Solutions(NamedTuple):
+    """Motions at the frequencies of a sweep, for one model or more: arrays (..., frequency).
 
-    @property
-    def difference(self) -> float:
-        """Relative difference, > 0 if the forward branch is larger; 0 for the same solution."""
-        return _compare_solutions(self.forward, self.backward).value
+    Mean eta_d and eta_a, their ranges over the measured cycles relative to the means, and the
+    smallest and largest count of impacts of a cycle on each side. NaN is unknown.
+    """
+
+    eta_d: FloatND
+    eta_a: FloatND
+    spread: FloatND
+    spread_a: FloatND
+    fewest_right: FloatND
+    most_right: FloatND
+    fewest_left: FloatND
+    most_left: FloatND
+
+    def take(self, index: Any) -> "Solutions":
+        """Return the motions at an index or slice of the frequencies."""
+        return Solutions(*(values[..., index] for values in self))
+
+    @classmethod
+    def from_responses(cls, responses: Sequence[NormalizedResponse]) -> "Solutions":
+        """Return the motions of one direction of a sweep, (frequency,)."""
+        rows = [
+            (
+                response.eta_d, response.eta_a, response.spread, response.spread_a,
+                *(
+                    limit(counts) if counts else math.nan
+                    for counts in (response.impacts_right, response.impacts_left)
+                    for limit in (min, max)
+                ),
+            )
+            for response in responses
+        ]  # fmt: skip
+        return cls(*np.array(rows, dtype=np.float64).reshape(-1, len(cls._fields)).T)
 
 
 class _Difference(NamedTuple):
-    """Relative difference of two solutions, > 0 if the first is larger, and what exceeds scatter.
+    """Relative differences of two motions, > 0 if the first is larger, and what exceeds scatter.
 
-    Both are relative to the larger one, and 0 for the same solution.
+    Both are relative to the larger motion, and 0 for the same solution.
     """
 
-    value: float
-    excess: float
+    value: FloatND
+    excess: FloatND
 
 
+@np.errstate(invalid="ignore", divide="ignore")
 def _compare_solutions(
-    first: NormalizedResponse,
-    second: NormalizedResponse,
-    limit: float | None = None,
-    scatter_factor: float = 1.0,
+    first: Solutions, second: Solutions, limit: float | None = None, scatter_factor: float = 1.0
 ) -> _Difference:
-    """Return by how much the first solution is larger; 0 if they are the same.
+    """Return by how much each first solution is larger; 0 if they are the same.
 
     Of eta_d and eta_a the one that differs more beyond its scatter decides. A quantity of a lost
     sensor, or without a known scatter, is left out. `limit`: as in the head of this file.
     """
+    limits: Any = limit
     if limit is None:
-        has_other_counts = _have_other_counts(first, second)
-        limit = MIN_COUNTED_DIFFERENCE if has_other_counts else MIN_BRANCH_DIFFERENCE
-    largest = _Difference(0.0, 0.0)
-    for eta, spread in (("eta_d", "spread"), ("eta_a", "spread_a")):
-        a, b = getattr(first, eta), getattr(second, eta)
-        spread_a, spread_b = getattr(first, spread), getattr(second, spread)
-        larger = max(a, b)
-        if spread_a is None or spread_b is None or not larger > 0:
-            continue
-        difference = (a - b) / larger
-        excess = abs(difference) - limit - scatter_factor * (a * spread_a + b * spread_b) / larger
-        if excess > abs(largest.excess):
-            largest = _Difference(difference, math.copysign(excess, difference))
-    return largest
-
-
-def _have_other_counts(first: NormalizedResponse, second: NormalizedResponse) -> bool:
-    """Return whether the impact counts of a side differ between all cycles of both motions."""
-    return any(
-        bool(a and b) and (max(a) < min(b) or max(b) < min(a))
-        for a, b in (
-            (first.impacts_right, second.impacts_right),
-            (first.impacts_left, second.impacts_left),
+        limits = np.where(
+            _have_other_counts(first, second), MIN_COUNTED_DIFFERENCE, MIN_BRANCH_DIFFERENCE
         )
-    )
+    value = excess = np.zeros(first.eta_d.shape)
+    for a, b, spread_a, spread_b in (
+        (first.eta_d, second.eta_d, first.spread, second.spread),
+        (first.eta_a, second.eta_a, first.spread_a, second.spread_a),
+    ):
+        larger = np.maximum(a, b)
+        difference = (a - b) / larger
+        own = abs(difference) - limits - scatter_factor * (a * spread_a + b * spread_b) / larger
+        decides = (larger > 0) & (own > abs(excess))  # False where anything is unknown
+        value = np.where(decides, difference, value)
+        excess = np.where(decides, np.copysign(own, difference), excess)
+    return _Difference(value, excess)
 
 
-def _pair_directions(points: Sequence[PrcPoint], source: str) -> list[_DirectionPair]:
-    """Return both directions of every grid frequency that has both, by frequency."""
-    by_direction: dict[str, dict[float, NormalizedResponse]] = {"forward": {}, "backward": {}}
-    for point in points:
-        values = getattr(point, source)
-        if values is not None:
-            by_direction[point.direction][point.frequency_hz] = values
-    common = sorted(by_direction["forward"].keys() & by_direction["backward"].keys())
-    return [
-        _DirectionPair(f, by_direction["forward"][f], by_direction["backward"][f]) for f in common
-    ]
+def _have_other_counts(first: Solutions, second: Solutions) -> BoolND:
+    """Return whether the impact counts of a side differ between all cycles of both motions."""
+    a, b = first, second
+    return (
+        (a.most_right < b.fewest_right) | (b.most_right < a.fewest_right)
+        | (a.most_left < b.fewest_left) | (b.most_left < a.fewest_left)
+    )  # fmt: skip
 
 
 def detect_hysteresis(
     points: Sequence[PrcPoint], source: str
 ) -> tuple[list[PrcJump], list[Hysteresis]]:
     """Detect jumps and hysteresis intervals of the "measured" or "twin" points."""
-    pairs = _pair_directions(points, source)
-    differences = [pair.difference for pair in pairs]
+    by_direction: dict[str, dict[float, NormalizedResponse]] = {"forward": {}, "backward": {}}
+    for point in points:
+        values = getattr(point, source)
+        if values is not None:
+            by_direction[point.direction][point.frequency_hz] = values
+    common = sorted(by_direction["forward"].keys() & by_direction["backward"].keys())
+    forward, backward = (
+        Solutions.from_responses([responses[frequency] for frequency in common])
+        for responses in by_direction.values()
+    )
+    return detect_all_hysteresis(common, forward, backward)[()]
+
+
+def detect_all_hysteresis(
+    frequencies_hz: Sequence[float], forward: Solutions, backward: Solutions
+) -> dict[tuple[int, ...], tuple[list[PrcJump], list[Hysteresis]]]:
+    """Detect jumps and hysteresis of many sweeps at ascending frequencies, (..., frequency).
+
+    Returns them by the index of each sweep; the index of a single sweep is ().
+    """
+    pairs = _DirectionPairs(
+        _compare_solutions(forward, backward).value,
+        _compare_solutions(forward, backward, limit=0.0).excess,
+        # The scatter of a point in which the motion is jumping would hide the jump.
+        _compare_solutions(
+            forward.take(slice(1, None)), forward.take(slice(-1)), scatter_factor=0.0
+        ).value,
+        _compare_solutions(
+            backward.take(slice(-1)), backward.take(slice(1, None)), scatter_factor=0.0
+        ).value,
+    )
+    return {
+        index: _detect_in_sweep(frequencies_hz, _DirectionPairs(*(v[index] for v in pairs)))
+        for index in np.ndindex(pairs.difference.shape[:-1])
+    }
+
+
+class _DirectionPairs(NamedTuple):
+    """Differences at each frequency of a sweep, > 0 if the forward branch is larger.
+
+    `remaining` exceeds the scatter alone. Changes: of the next point of a direction from the point
+    before, (frequency - 1,), each at the lower of the two frequencies.
+    """
+
+    difference: FloatND
+    remaining: FloatND
+    forward_change: FloatND
+    backward_change: FloatND
+
+
+def _detect_in_sweep(
+    frequencies_hz: Sequence[float], pairs: _DirectionPairs
+) -> tuple[list[PrcJump], list[Hysteresis]]:
     jumps: list[PrcJump] = []
     intervals: list[Hysteresis] = []
-    for sign, group in groupby(range(len(pairs)), key=lambda index: np.sign(differences[index])):
+    if not pairs.difference.any():
+        return jumps, intervals
+    signs = np.sign(pairs.difference).tolist()
+    for sign, group in groupby(range(len(signs)), key=lambda index: signs[index]):
         indices = list(group)
         first, last = indices[0], indices[-1]
         if sign == 0:
             continue
-        ends = _interval_jumps(pairs, first, last)
+        ends = _interval_jumps(frequencies_hz, pairs, first, last)
         if not ends or (first == last and len(ends) < 2):
             continue
         jumps.extend(ends)
         if first < last:
             kind = "right" if sign > 0 else "left"
-            intervals.append(Hysteresis(kind, pairs[first].frequency_hz, pairs[last].frequency_hz))
+            intervals.append(Hysteresis(kind, frequencies_hz[first], frequencies_hz[last]))
     return jumps, intervals
 
 
-def _interval_jumps(pairs: list[_DirectionPair], first: int, last: int) -> list[PrcJump]:
+def _interval_jumps(
+    frequencies_hz: Sequence[float], pairs: _DirectionPairs, first: int, last: int
+) -> list[PrcJump]:
     """Return the jumps at the ends of an interval; none if neither direction changes solution.
 
     Without a jump at either end the difference is scatter of an irregular motion, or a slow change
@@ -157,21 +227,17 @@ def _interval_jumps(pairs: list[_DirectionPair], first: int, last: int) -> list[
         ("backward", first, first - 1),  # the backward sweep at the lower one
     )
     jumps = []
-    for direction, before, after in ends:
-        if not 0 <= after < len(pairs):
+    for direction, inside, outside in ends:
+        if not 0 <= outside < len(frequencies_hz):
             continue
-        inside, outside = pairs[before], pairs[after]
-        # The scatter of a point in which the motion is jumping would hide the jump.
-        change = _compare_solutions(
-            getattr(outside, direction), getattr(inside, direction), scatter_factor=0.0
-        ).value
         sign = 1 if direction == "backward" else -1
+        changes = pairs.backward_change if direction == "backward" else pairs.forward_change
+        change, difference = float(changes[min(inside, outside)]), float(pairs.difference[inside])
         # What the scatter explains does not remain: a motion that is jumping scatters most.
-        remaining = _compare_solutions(outside.forward, outside.backward, limit=0.0).excess
-        closes = remaining / inside.difference <= MAX_REMAINING_DIFFERENCE
-        if change * inside.difference * sign > 0 and closes:
+        closes = pairs.remaining[outside] / difference <= MAX_REMAINING_DIFFERENCE
+        if change * difference * sign > 0 and closes:
             kind = "up" if change > 0 else "down"
-            jumps.append(PrcJump(direction, inside.frequency_hz, outside.frequency_hz, kind))
+            jumps.append(PrcJump(direction, frequencies_hz[inside], frequencies_hz[outside], kind))
     return jumps
 
 
