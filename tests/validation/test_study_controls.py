@@ -10,6 +10,7 @@ import pytest
 from tests.identification.played import SNM, format_truth, log
 from tests.validation import study_work
 from tests.validation.test_study_scores import about, verdict
+from twin.run.tasks import Workers
 from twin.validation.study.command import run_cases
 from twin.validation.study.comparison_tables import compute_shuffled_rates
 from twin.validation.study.controls import discover_without, reverse_log, summarize_verdict
@@ -89,7 +90,7 @@ def test_the_page_has_the_controls_and_goes_on_where_it_stopped(tmp_path: Path) 
     lines = write_study_pages(tmp_path).read_text().splitlines()
     assert any("time reversed" in line and "(0/2;" in line for line in lines)
     assert any("not in the library: confident" in line and "(1/2;" in line for line in lines)
-    assert run_cases(tmp_path, [7000, 16000], 1, study_work.fine, CONTROLS_FILE) == 0
+    assert run_cases(tmp_path, [7000, 16000], Workers(1), study_work.fine, CONTROLS_FILE) == 0
     assert (tmp_path / CONTROLS_FILE).read_text().count("\n") == 3
     assert not (tmp_path / RESULTS_FILE).exists()
     assert (tmp_path / TABLE_FILE).is_file()

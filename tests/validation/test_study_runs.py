@@ -2,27 +2,22 @@
 
 import json
 import math
-import multiprocessing
-import subprocess
-import sys
-from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from table_io.clock import RealClock
 from table_io.errors import InputError
 from tests.input_errors import raises_input_error
 from tests.validation import study_work
 from tests.validation.test_study_scores import OTHER, TRUE, about, verdict
+from twin.run.tasks import Workers
 from twin.validation.study import evaluation
 from twin.validation.study.command import run_cases, run_discovery_study
 from twin.validation.study.generation import CasePaths
 from twin.validation.study.report import RESULTS_FILE, TABLE_FILE, read_rows
 from twin.validation.study.strata import draw_case
-from twin.validation.study.worker_pool import map_in_processes
 
 Json = dict[str, Any]
 
@@ -32,69 +27,12 @@ def test_a_study_goes_on_after_a_line_that_was_cut(tmp_path: Path) -> None:
     rows = [study_work.fine(0), study_work.fine(2) | {"failed": "why"}]
     text = "".join(json.dumps(row) + "\n" for row in rows) + '{"number": 4, "ri'
     (tmp_path / RESULTS_FILE).write_text(text)
-    assert run_cases(tmp_path, [0, 2, 4], 1, study_work.fine) == 0
+    assert run_cases(tmp_path, [0, 2, 4], Workers(1), study_work.fine) == 0
     after = read_rows(tmp_path / RESULTS_FILE)
     assert [row["number"] for row in after] == [0, 2, 2, 4]
     assert after[0]["process"] == rows[0]["process"]
     assert "failed" not in after[2]
     assert (tmp_path / RESULTS_FILE).read_text().startswith(text)
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_a_process_that_dies_loses_only_its_case(workers: int) -> None:
-    rows = {
-        row["number"]: row
-        for row in map_in_processes(range(4), workers, study_work.deadly, lambda: False)
-    }
-    assert sorted(rows) == [0, 1, 2, 3]
-    for number, row in rows.items():
-        assert ("failed" in row) == bool(number % 2)
-    assert rows[1]["failed"] == "its process died (exit code -9)"
-
-
-def test_a_case_that_does_not_end_is_ended() -> None:
-    rows = list(map_in_processes([1, 3], 1, study_work.endless, lambda: False, 0.3))
-    assert [row["number"] for row in rows] == [1, 3]
-    assert all(row["failed"] == "took longer than 0.3 s" for row in rows)
-
-
-def test_leaving_early_ends_the_processes_at_once() -> None:
-    max_case_s, clock = 20.0, RealClock()  # of the case that is left behind
-    rows = map_in_processes([0, 1], 2, study_work.endless_if_odd, lambda: False, max_case_s)
-    assert next(rows)["number"] == 0
-    left_s = clock.now()
-    assert isinstance(rows, Generator)
-    rows.close()
-    assert clock.now() - left_s < 10.0
-    assert not multiprocessing.active_children()
-
-
-def test_a_killed_study_leaves_no_processes() -> None:
-    """A worker that has nothing to do ends, although nobody tells it to."""
-    with subprocess.Popen(
-        [sys.executable, study_work.__file__], stdout=subprocess.PIPE, text=True
-    ) as study:
-        assert study.stdout is not None
-        worker = Path("/proc", study.stdout.readline().strip())
-        assert worker.is_dir()
-        study.kill()
-    deadline_s = RealClock().now() + 20.0
-    while worker.is_dir() and RealClock().now() < deadline_s:
-        RealClock().wait_until(RealClock().now() + 0.05)
-    assert not worker.is_dir()
-
-
-def test_a_stop_hands_out_what_is_under_way() -> None:
-    asked: list[int] = []
-
-    def stop() -> bool:
-        return len(asked) > 0
-
-    numbers = []
-    for row in map_in_processes(range(100), 1, study_work.fine, stop):
-        numbers.append(row["number"])
-        asked.append(1)
-    assert numbers == [0, 1]
 
 
 def test_a_verdict_that_fails_is_a_miss_that_says_why(

@@ -114,6 +114,9 @@ def discovery_command(
     workers: Annotated[
         int | None, typer.Option("--workers", help="Processes; default: all cores.")
     ] = None,
+    scheduler: Annotated[
+        str, typer.Option("--scheduler", help="Address of a Dask scheduler whose workers compute.")
+    ] = "",
     resume: Annotated[bool, typer.Option("--resume", help="Continue the study in --out.")] = False,
     laboratory: Annotated[
         str,
@@ -133,4 +136,6 @@ def discovery_command(
     """Score discovery on blind cases with sealed ground truth."""
     from twin.validation.study.command import run_discovery_study as command
 
-    raise typer.Exit(command(out, seeds, cells or [], workers, resume, controls, laboratory))
+    raise typer.Exit(
+        command(out, seeds, cells or [], workers, resume, controls, laboratory, scheduler)
+    )

@@ -12,7 +12,7 @@ from table_io.clock import RealClock
 from table_io.errors import InputError, suggest
 from twin.reports.finalize import EXIT_INTERRUPTED
 from twin.run.folders import claim_folder, make_output_folder
-from twin.run.system import count_cores
+from twin.run.tasks import Task, Workers, run_tasks
 from twin.run.terminal import catch_interrupts, console, print_line
 from twin.validation.study.baselines import describe_missing
 from twin.validation.study.comparison_tables import CONTROL_TITLES
@@ -31,7 +31,6 @@ from twin.validation.study.strata import (
     draw_case,
     list_case_numbers,
 )
-from twin.validation.study.worker_pool import Work, map_in_processes
 
 Json = dict[str, Any]
 DEFAULT_DIR = Path("runs") / "study-discovery"
@@ -46,21 +45,14 @@ def run_discovery_study(
     resume: bool,
     controls: bool = False,
     laboratory: str = "none",
+    scheduler: str = "",
 ) -> int:
     """Evaluate the requested cases that have no result, then the controls; return the exit code."""
-    if workers is not None and workers < 1:
-        raise InputError(
-            "invalid number of processes",
-            key="--workers",
-            value=workers,
-            allowed="1 or more",
-            remedy="omit --workers to use all cores",
-        )
+    processes = Workers.from_options(workers, scheduler)
     numbers = _parse_cases(seeds, patterns, _parse_laboratory(laboratory))
     folder = _open_folder(out, resume)
     if describe_missing():
         print_line(describe_missing())
-    processes = workers or count_cores()
     exit_code = run_cases(folder, numbers, processes, partial(evaluate_case, folder))
     if controls and exit_code == 0:
         print_line(f"negative controls on {CONTROL_CELLS}")
@@ -75,14 +67,12 @@ def run_discovery_study(
 
 
 def run_cases(
-    folder: Path, numbers: Sequence[int], workers: int, work: Work, results: str = RESULTS_FILE
+    folder: Path, numbers: Sequence[int], workers: Workers, work: Task, results: str = RESULTS_FILE
 ) -> int:
     """Evaluate the cases without a row in `results`, then write the pages; return the exit code."""
     rows = {row["number"]: row for row in read_rows(folder / results)}
     pending = [number for number in numbers if number not in rows or rows[number].get("failed")]
-    print_line(
-        f"{len(pending)} of {len(numbers)} cases to evaluate on {workers} processes -> {folder}"
-    )
+    print_line(f"{len(pending)} of {len(numbers)} cases to evaluate on {workers} -> {folder}")
     clock = RealClock()
     start_s = clock.now()
     with (
@@ -101,13 +91,14 @@ def run_cases(
 
 
 def _evaluate_cases(
-    pending: Sequence[int], workers: int, work: Work, stop: Callable[[], object], file: TextIO
+    pending: Sequence[int], workers: Workers, work: Task, stop: Callable[[], object], file: TextIO
 ) -> Iterator[Json]:
     """Evaluate the pending cases; yield each row after it is written to the file."""
     right_count = 0
     with _make_progress() as bar:
         task = bar.add_task("cases", total=len(pending))
-        for index, row in enumerate(map_in_processes(pending, workers, work, stop), 1):
+        for index, result in enumerate(run_tasks(work, pending, workers, stop), 1):
+            row = result.value or {"number": result.number, "failed": result.failure}
             row.setdefault("cell", draw_case(row["number"]).cell.name)
             file.write(json.dumps(row) + "\n")
             file.flush()

@@ -1,0 +1,151 @@
+"""Tasks in processes and on a cluster: deaths, retries, stops, and workers that cannot be used."""
+
+import multiprocessing
+import os
+import subprocess
+import sys
+from collections.abc import Generator, Iterator
+from functools import partial
+from pathlib import Path
+
+import distributed
+import pytest
+
+from table_io.clock import RealClock
+from tests.input_errors import raises_input_error
+from tests.run import task_functions
+from twin.run.tasks import TaskResult, Workers, run_tasks
+from twin.run.versions import read_installed_versions
+
+
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[str]:
+    """Address of a scheduler with two workers, in processes of their own."""
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None
+    ) as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_process_that_dies_loses_only_its_task(count: int) -> None:
+    results = {r.number: r for r in run_tasks(task_functions.die_of_odd, range(4), Workers(count))}
+    assert sorted(results) == [0, 1, 2, 3]
+    for number, result in results.items():
+        assert bool(result.failure) == bool(number % 2)
+    assert results[1].failure == "its process died (exit code -9)"
+
+
+def test_a_task_whose_process_dies_is_tried_again(tmp_path: Path) -> None:
+    task = partial(task_functions.die_at_first, tmp_path)
+    results = list(run_tasks(task, range(5), Workers(2), attempts=2))
+    assert sorted(result.value for result in results) == [0, 1, 2, 3, 4]
+    results = list(run_tasks(task_functions.die_of_odd, [1], Workers(1), attempts=3))
+    assert results == [TaskResult(1, failure="its process died (exit code -9)")]
+
+
+def test_a_task_that_does_not_end_is_ended() -> None:
+    results = list(
+        run_tasks(task_functions.hang_at_odd, [1, 3], Workers(1), max_task_s=0.3, attempts=1)
+    )
+    assert [result.number for result in results] == [1, 3]
+    assert all(result.failure == "took longer than 0.3 s" for result in results)
+
+
+def test_leaving_early_ends_the_processes_at_once() -> None:
+    max_task_s, clock = 20.0, RealClock()  # of the task that is left behind
+    results = run_tasks(task_functions.hang_at_odd, [0, 1], Workers(2), max_task_s=max_task_s)
+    assert next(results).number == 0
+    left_s = clock.now()
+    assert isinstance(results, Generator)
+    results.close()
+    assert clock.now() - left_s < max_task_s / 2
+    assert not multiprocessing.active_children()
+
+
+def test_a_killed_parent_leaves_no_processes() -> None:
+    """A worker that has nothing to do ends by itself."""
+    with subprocess.Popen(
+        [sys.executable, task_functions.__file__], stdout=subprocess.PIPE, text=True
+    ) as parent:
+        assert parent.stdout is not None
+        worker = Path("/proc", parent.stdout.readline().strip())
+        assert worker.is_dir()
+        parent.kill()
+    deadline_s = RealClock().now() + 20.0
+    while worker.is_dir() and RealClock().now() < deadline_s:
+        RealClock().wait_until(RealClock().now() + 0.05)
+    assert not worker.is_dir()
+
+
+def test_a_stop_hands_out_what_is_under_way() -> None:
+    numbers: list[int] = []
+    for result in run_tasks(
+        task_functions.return_process, range(100), Workers(1), lambda: bool(numbers)
+    ):
+        numbers.append(result.number)
+    assert numbers == [0, 1]
+
+
+def test_a_cluster_gives_the_results_of_local_processes(scheduler: str) -> None:
+    numbers = range(50)
+    local = {r.number: r for r in run_tasks(task_functions.square, numbers, Workers(2))}
+    remote = {r.number: r for r in run_tasks(task_functions.square, numbers, Workers(0, scheduler))}
+    assert remote == local
+
+
+def test_a_cluster_runs_the_tasks_elsewhere(scheduler: str) -> None:
+    results = run_tasks(task_functions.return_process, range(8), Workers(0, scheduler))
+    processes = {result.value for result in results}
+    assert os.getpid() not in processes
+    assert len(processes) == 2
+
+
+def test_a_task_that_fails_on_a_cluster_is_a_failure_with_its_reason(scheduler: str) -> None:
+    results = run_tasks(task_functions.raise_at_three, range(5), Workers(0, scheduler))
+    by_number = {result.number: result for result in results}
+    assert by_number.pop(3).failure == "three is refused"
+    assert all(result.value == number for number, result in by_number.items())
+
+
+def test_a_stop_ends_a_cluster_run(scheduler: str) -> None:
+    numbers: list[int] = []
+    for result in run_tasks(
+        task_functions.square, range(10_000), Workers(0, scheduler), lambda: len(numbers) > 3
+    ):
+        numbers.append(result.number)
+    assert 4 <= len(numbers) < 100
+
+
+def test_a_scheduler_that_does_not_answer_is_refused(unused_port: int) -> None:
+    with raises_input_error(key="--scheduler"):
+        list(run_tasks(task_functions.square, [1], Workers(0, f"tcp://127.0.0.1:{unused_port}")))
+
+
+@pytest.fixture
+def unused_port(monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setattr("twin.run.dask_cluster.CONNECT_TIMEOUT_S", 0.5)
+    return 9
+
+
+def test_a_worker_of_another_version_is_refused(
+    scheduler: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    versions = read_installed_versions() | {"numpy": "0.1"}
+    monkeypatch.setattr("twin.run.dask_cluster.read_installed_versions", lambda: versions)
+    with raises_input_error(problem="numpy 0.1", key="--scheduler"):
+        list(run_tasks(task_functions.square, [1], Workers(0, scheduler)))
+
+
+def test_a_worker_that_cannot_do_the_work_is_refused(scheduler: str) -> None:
+    results = run_tasks(
+        task_functions.square, [1], Workers(0, scheduler),
+        find_problem=task_functions.find_missing_folder,
+    )  # fmt: skip
+    with raises_input_error(problem="it has no folder", key="--scheduler"):
+        list(results)
+
+
+def test_processes_and_a_cluster_are_not_asked_for_at_once() -> None:
+    with raises_input_error(key="--workers"):
+        Workers.from_options(2, "tcp://host:8786")

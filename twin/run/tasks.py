@@ -1,0 +1,186 @@
+"""Independent numbered tasks in local processes, or on the workers of a Dask cluster.
+
+Results are yielded as they are completed. A task is a module-level function of its number, or a
+`functools.partial` of one: it is pickled. What it computes may depend on the number only, so that
+any number of workers gives the same results; what is large it writes to a file itself.
+"""
+
+import multiprocessing
+import os
+import signal
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from typing import Any
+
+from table_io.errors import InputError
+from twin.run.system import count_cores
+
+MAX_TASK_S = 900.0  # time limit of a task in a local process, which is then terminated
+Task = Callable[[int], Any]
+StopFunction = Callable[[], object]
+
+
+def find_no_problem() -> str:
+    """Accept every worker."""
+    return ""
+
+
+@dataclass(frozen=True, slots=True)
+class TaskResult:
+    """What the task of a number returned, or why it returned nothing."""
+
+    number: int
+    value: Any = None
+    failure: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Workers:
+    """Where tasks run: in `count` local processes, or on the cluster of a Dask scheduler."""
+
+    count: int
+    scheduler: str = ""
+
+    @classmethod
+    def from_options(cls, workers: int | None, scheduler: str = "") -> "Workers":
+        """Return the workers of `--workers` and `--scheduler`; by default a process per core."""
+        if workers is not None and workers < 1:
+            raise InputError(
+                "invalid number of processes",
+                key="--workers",
+                value=workers,
+                allowed="1 or more",
+                remedy="omit --workers to use all cores",
+            )
+        if workers is not None and scheduler:
+            raise InputError(
+                "a cluster has its own number of workers",
+                key="--workers",
+                value=workers,
+                remedy="omit --workers, or --scheduler to compute on this machine",
+            )
+        return cls(workers or count_cores(), scheduler)
+
+    def __str__(self) -> str:
+        if self.scheduler:
+            return f"the cluster of {self.scheduler}"
+        return f"{self.count} process{'es' if self.count > 1 else ''}"
+
+
+def run_tasks(
+    task: Task,
+    numbers: Iterable[int],
+    workers: Workers,
+    stop: StopFunction = lambda: False,
+    *,
+    max_task_s: float = MAX_TASK_S,
+    attempts: int = 1,
+    find_problem: Callable[[], str] = find_no_problem,
+) -> Iterator[TaskResult]:
+    """Yield the result of the task of every number, in the order of completion.
+
+    After `stop()` is true no task is started; those in progress are completed and yielded. A task
+    whose process dies is started again until it has had `attempts`. `find_problem` runs on every
+    worker of a cluster before anything starts and returns why it cannot be used, "" if it can.
+    InputError if the cluster cannot be used, or is lost.
+    """
+    if workers.scheduler:
+        from twin.run.dask_cluster import run_on_cluster
+
+        return run_on_cluster(workers.scheduler, task, numbers, stop, attempts, find_problem)
+    return _run_in_processes(task, numbers, workers.count, stop, max_task_s, attempts)
+
+
+def _run_in_processes(
+    task: Task,
+    numbers: Iterable[int],
+    count: int,
+    stop: StopFunction,
+    max_task_s: float,
+    attempts: int,
+) -> Iterator[TaskResult]:
+    os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    pending = iter(numbers)
+    repeated: deque[int] = deque()
+    failures = Counter[int]()  # of each number
+    running: dict[Future[TaskResult], _WorkerProcess] = {}
+
+    def start_next(worker: _WorkerProcess | None) -> bool:
+        number = None if stop() else repeated.popleft() if repeated else next(pending, None)
+        if number is None:
+            return False
+        if worker is None or not worker.process.is_alive():
+            worker = _start_worker(task)
+        running[threads.submit(worker.run, number, max_task_s)] = worker
+        return True
+
+    # One thread waits for each process. A ProcessPoolExecutor loses the tasks of all processes with
+    # one, cannot end a task that takes too long, and outlives this process if that is killed.
+    with ThreadPoolExecutor(count) as threads:
+        try:
+            while len(running) < count and start_next(None):
+                pass
+            while running:
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    worker, result = running.pop(future), future.result()
+                    failures[result.number] += bool(result.failure)
+                    is_final = not result.failure or failures[result.number] >= attempts
+                    if not is_final:
+                        repeated.append(result.number)
+                    if not start_next(worker):
+                        worker.pipe.close()
+                        worker.process.join()
+                    if is_final:
+                        yield result
+        finally:
+            for worker in running.values():
+                worker.process.terminate()
+
+
+@dataclass(frozen=True, slots=True)
+class _WorkerProcess:
+    """A process that runs one task after another, until its pipe is closed."""
+
+    process: BaseProcess
+    pipe: Connection
+
+    def run(self, number: int, max_task_s: float) -> TaskResult:
+        """Return the result of a task, or the reason why there is none."""
+        try:
+            self.pipe.send(number)
+            if self.pipe.poll(max_task_s):
+                return TaskResult(number, self.pipe.recv())
+            self.process.terminate()
+            reason = f"took longer than {max_task_s:g} s"
+            self.process.join()
+        except (EOFError, OSError):
+            self.process.join()
+            reason = f"its process died (exit code {self.process.exitcode})"
+        return TaskResult(number, failure=reason)
+
+
+def _start_worker(task: Task) -> _WorkerProcess:
+    """Start a process without a task."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_serve_tasks, args=(theirs, task), daemon=True)
+    process.start()
+    theirs.close()  # so that the death of the process closes the pipe
+    return _WorkerProcess(process, ours)
+
+
+def _serve_tasks(pipe: Connection, task: Task) -> None:
+    """Run tasks by the numbers from a pipe until it is closed; main function of a worker process.
+
+    Ctrl-C reaches every process of a terminal; only the parent process handles it.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        while True:
+            pipe.send(task(pipe.recv()))
+    except (EOFError, OSError):
+        return
