@@ -36,6 +36,7 @@ from twin.run.recordings import read_recorded_config
 from twin.run.run_config import read_model_template, read_run_config
 from twin.run.unpaced import play_unpaced, simulate_ideal
 from twin.run.warm_up import compile_kernels
+from twin.studies.maps.results import open_study
 
 __all__ = [
     "DiscoveredModel",
@@ -48,6 +49,7 @@ __all__ = [
     "identify",
     "import_data",
     "open_log",
+    "open_study",
     "replay",
     "run_simulated",
     "simulate",

@@ -30,7 +30,9 @@ OWNERS = {  # packages that may import a foreign library
     "segno": ("twin/run",),
     "sklearn": ("twin/validation/study",),
     "time": ("table_io/clock.py",),
-    "xarray": ("twin/log",),
+    "xarray": ("twin/log", "twin/studies/maps"),
+    "zarr": ("twin/studies/maps",),
+    "distributed": ("twin/run",),
     "zenoh": ("twin/transport", "twin/security"),
     "zstandard": ("twin/recording",),
 }

@@ -15,6 +15,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "drive": ("drive quickstart -o drive.csv", "drive g4_ss3 -o drive.rpc --table machine"),
     "simulate": ("simulate quickstart", "simulate quickstart --gap 0:16:4"),
     "branches": ("branches quickstart", "branches quickstart --over gap --from 0 --to 10"),
+    "map": ("map bumper_design --out bumpers", "map bumper_design --out bumpers --resume"),
     "replay": ("replay last", "replay runs/first --model snm --steps 0:5"),
     "prc": ("prc last", "prc runs/first --json"),
     "paper": ("paper", "paper --campaign paper_runs --out comparison"),

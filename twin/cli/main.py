@@ -35,7 +35,7 @@ app = typer.Typer(
 
 COMPUTING_COMMANDS = frozenset({
     "branches", "campaign", "check", "compare", "demo", "discover", "explain", "identify", "import",
-    "paper", "prc", "replay", "report", "run", "schema", "simulate", "study", "table-drive",
+    "map", "paper", "prc", "replay", "report", "run", "schema", "simulate", "study", "table-drive",
     "table-twin", "verify", "view",
 })  # fmt: skip
 PLAN_PANEL, DRIVE_PANEL, LOOK_PANEL = (
@@ -414,6 +414,39 @@ def branches_command(
         profile, model, gap, level, over, low, high, at, complete, attractors, basins, out
     )
     raise typer.Exit(command(request))
+
+
+@app.command("map", rich_help_panel=PLAN_PANEL)
+def map_command(
+    study: Annotated[
+        Path,
+        typer.Argument(
+            metavar="STUDY",
+            help=f"{describe_names('Study', 'studies')} Or the folder of one, to show it.",
+            autocompletion=complete_names("studies"),
+        ),
+    ],
+    out: OutOption = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the study in --out.")] = False,
+    workers: Annotated[
+        int | None, typer.Option("--workers", help="Processes; default: one per core.")
+    ] = None,
+    scheduler: Annotated[
+        str,
+        typer.Option(
+            "--scheduler",
+            metavar="ADDRESS",
+            help="Compute on the workers of this Dask scheduler, which share the folder.",
+        ),
+    ] = "",
+    show: Annotated[
+        bool, typer.Option("--show", help="Compute nothing; write the page of what is stored.")
+    ] = False,
+) -> None:
+    """Map outcomes of the model over any of its parameters, on all cores or a cluster."""
+    from twin.studies.maps.command import run_study as command
+
+    raise typer.Exit(command(study, out, workers, scheduler, resume, show))
 
 
 @app.command("replay", rich_help_panel=LOOK_PANEL)

@@ -23,8 +23,12 @@ from table_io.errors import InputError, suggest
 from twin.cli.reference_commands import FileKind, ListKind
 from twin.run.terminal import console, print_line, print_table
 
-TEMPLATES = {FileKind.rig: "rigs/simulated", FileKind.model: "models/snm",
-             FileKind.campaign: "campaigns/paper"}  # fmt: skip
+TEMPLATES = {
+    FileKind.rig: "rigs/simulated",
+    FileKind.model: "models/snm",
+    FileKind.campaign: "campaigns/paper",
+    FileKind.study: "studies/bumper_design",
+}
 EXAMPLE_KIND = 'kind = "stepped_sine"'  # of the excitation of a new test
 WRITTEN_BY_CAMPAIGNS = ("[set_up]", "[resume]")
 

@@ -18,6 +18,7 @@ class FileKind(enum.StrEnum):
     model = "model"
     campaign = "campaign"
     map = "map"
+    study = "study"
 
 
 class ListKind(enum.StrEnum):
@@ -27,12 +28,13 @@ class ListKind(enum.StrEnum):
     rigs = "rigs"
     models = "models"
     campaigns = "campaigns"
+    studies = "studies"
     effects = "effects"
     channels = "channels"
 
 
 KindArgument = Annotated[
-    FileKind, typer.Argument(metavar="test|rig|model|campaign|map", help="Kind of file.")
+    FileKind, typer.Argument(metavar="test|rig|model|campaign|map|study", help="Kind of file.")
 ]
 
 
@@ -49,7 +51,7 @@ def list_names_command(
 @reference_app.command("new", rich_help_panel=REFERENCE_PANEL)
 def new_file_command(
     kind: Annotated[
-        FileKind, typer.Argument(metavar="test|rig|model|campaign", help="Kind of file.")
+        FileKind, typer.Argument(metavar="test|rig|model|campaign|study", help="Kind of file.")
     ],
     file: Annotated[Path, typer.Argument(metavar="FILE", help="New .toml file.")],
 ) -> None:

@@ -15,6 +15,7 @@ from table_io.config.rig import RigConfig
 from twin.campaign.config import CampaignConfig
 from twin.exchange.columns import ColumnMap
 from twin.model.config import ModelConfig
+from twin.studies.maps.config import StudyConfig
 
 CONFIG_FILES: tuple[tuple[str, str, type[ConfigModel]], ...] = (
     ("Test profile", "One test: specimen, excitation, acquisition, control.", Profile),
@@ -22,11 +23,13 @@ CONFIG_FILES: tuple[tuple[str, str, type[ConfigModel]], ...] = (
     ("Model file", "Parameters of the model and the effects added to it.", ModelConfig),
     ("Campaign file", "A list of runs with set-up changes between them.", CampaignConfig),
     ("Column map", "Columns of a foreign file, for `import --columns`.", ColumnMap),
+    ("Study file", "Outcomes of the model over its parameters, for `map`.", StudyConfig),
 )
 
 PACKAGES_DIR = Path(__file__).resolve().parents[2]  # holds twin and table_io
 PUBLIC_FUNCTIONS = (
     "open_log", "run_simulated", "simulate", "replay", "import_data", "identify", "discover",
+    "open_study",
 )  # fmt: skip
 
 
@@ -125,7 +128,7 @@ def write_api_reference(_: typer.Typer) -> str:
     """
     modules = [
         ast.parse((PACKAGES_DIR / name).read_text(encoding="utf-8"))
-        for name in ("twin/api.py", "twin/log/__init__.py")
+        for name in ("twin/api.py", "twin/log/__init__.py", "twin/studies/maps/results.py")
     ]
     nodes = {
         node.name: node

@@ -98,6 +98,7 @@ def save_figures(
             show_part(drawing.title)
             path = folder / f"{drawing.name}.png"
             drawing.figure.savefig(path)
+            drawing.figure.set_layout_engine("none")  # keeps the layout just computed
             for suffix in more_formats:
                 other = path.with_suffix(f".{suffix}")
                 if suffix == "csv":

@@ -44,8 +44,8 @@ def require_disk_space(configs: Iterable[RunConfig], folder: Path) -> None:
     needed, free = sum(map(planned_bytes, configs)), free_bytes(folder)
     if needed > free:
         raise InputError(
-            f"{_format_size(free)} free on its disk, but the recording takes up to "
-            f"{_format_size(needed)}; nothing was started",
+            f"{format_size(free)} free on its disk, but the recording takes up to "
+            f"{format_size(needed)}; nothing was started",
             where=folder,
             remedy="make room, or give another disk with --out",
         )
@@ -78,7 +78,7 @@ class DiskForecast:
             return None
         self._warned_kinds.add(kind)
         return (
-            f"{_format_size(free)} left on the disk: room for {room_s:.0f} s of recording, the "
+            f"{format_size(free)} left on the disk: room for {room_s:.0f} s of recording, the "
             f"test needs {remaining_s:.0f} s more; make room, or the table is stopped when the "
             "disk is full"
         )
@@ -103,5 +103,5 @@ class DiskReserve:
             self._path.unlink(missing_ok=True)
 
 
-def _format_size(size_bytes: float) -> str:
+def format_size(size_bytes: float) -> str:
     return f"{size_bytes / 1e9:.3g} GB" if size_bytes >= 1e9 else f"{size_bytes / 1e6:.3g} MB"

@@ -1,0 +1,133 @@
+"""Cases of a study: the model and the level for given values of the varied parameters."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from table_io.errors import InputError, suggest
+from table_io.units import GRAVITY_M_S2
+from twin.model.effects import EFFECTS, find_effect
+from twin.model.model import EffectInstance, Model
+from twin.model.parameters import free_flight_resonance
+
+LEVEL = "sweep.acceleration_g"
+# Key -> (unit, fields of `Parameters`, SI value per unit of the key in each)
+BASE_KEYS: Mapping[str, tuple[str, tuple[str, ...], float]] = {
+    "specimen.mass_kg": ("kg", ("mass",), 1.0),
+    "specimen.gap_mm": ("mm", ("gap_r", "gap_l"), 0.5e-3),
+    "base.stiffness_n_m": ("N/m", ("stiffness",), 1.0),
+    "base.damping_n_s_m": ("N s/m", ("damping",), 1.0),
+    "base.bumper_stiffness_n_m": ("N/m", ("bumper_stiffness_r", "bumper_stiffness_l"), 1.0),
+    "base.bumper_damping_n_s_m": ("N s/m", ("bumper_damping_r", "bumper_damping_l"), 1.0),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SampledCase:
+    """Model and peak table acceleration of one case."""
+
+    model: Model
+    acceleration_m_s2: float
+
+    def find_resonance(self) -> tuple[float, float, float]:
+        """Return `free_flight_resonance`, by which the ratios are scaled; InputError without."""
+        return free_flight_resonance(self.model.parameters, self.acceleration_m_s2)
+
+
+@dataclass(frozen=True, slots=True)
+class CaseFactory:
+    """Builds cases from values of `names`, the keys of the parameters, and of the fixed keys."""
+
+    model: Model
+    acceleration_m_s2: float
+    fixed: Mapping[str, float]
+    names: tuple[str, ...]
+
+    def require_keys(self) -> None:
+        """Raise InputError for an unknown key, or an effect without values of all parameters."""
+        for name in (*self.fixed, *self.names):
+            parameter_unit(name)
+            if name in self.fixed and name in self.names:
+                raise InputError("both fixed and varied", key=name, remedy="keep one")
+        _require_whole_effects(self.model, (*self.fixed, *self.names))
+
+    def build(self, values: Sequence[float]) -> SampledCase:
+        """Return the case of these values, in the units of their keys.
+
+        InputError if they make no model.
+        """
+        level, base = self.acceleration_m_s2, dict[str, float]()
+        effects: dict[str, dict[str, float]] = {}
+        pairs = {**self.fixed, **dict(zip(self.names, values, strict=True))}
+        for name, value in pairs.items():
+            if name == LEVEL:
+                if not value > 0:
+                    raise InputError("not a level", key=name, value=value, allowed="above 0 g")
+                level = value * GRAVITY_M_S2
+            elif name in BASE_KEYS:
+                _, fields, factor = BASE_KEYS[name]
+                base |= dict.fromkeys(fields, value * factor)
+            else:
+                _, effect, parameter = name.split(".")
+                effects.setdefault(effect, {})[parameter] = value
+        instances = {instance.name: instance for instance in self.model.effects}
+        for effect, own in effects.items():
+            known = instances[effect].values if effect in instances else {}
+            instances[effect] = EffectInstance.create(find_effect(effect), {**known, **own})
+        return SampledCase(
+            Model(replace(self.model.base, **base), tuple(instances.values())), level
+        )
+
+
+def parameter_unit(name: str) -> str:
+    """Return the unit of a key that a study may vary; InputError if there is no such key."""
+    if name in BASE_KEYS:
+        return BASE_KEYS[name][0]
+    if name == LEVEL:
+        return "g"
+    if name.startswith("effects."):
+        _, effect_id, *rest = name.split(".")
+        effect = find_effect(effect_id)
+        if effect.acts == "sensor":
+            raise InputError(
+                "acts on a sensor, and the ideal sweep has none",
+                key=name,
+                allowed="effects of the specimen and the table",
+            )
+        units = {parameter.name: parameter.unit for parameter in effect.parameters}
+        if len(rest) == 1 and rest[0] in units:
+            return units[rest[0]]
+        known = [f"effects.{effect_id}.{parameter}" for parameter in units]
+    else:
+        known = list_parameter_names()
+    raise InputError("no parameter of a study", key=name, remedy=suggest(name, known))
+
+
+def list_parameter_names() -> list[str]:
+    """List the keys that a study may vary, of built-in effects."""
+    return [
+        *BASE_KEYS,
+        LEVEL,
+        *(
+            f"effects.{effect.id}.{parameter.name}"
+            for effect in EFFECTS
+            if effect.acts != "sensor"
+            for parameter in effect.parameters
+        ),
+    ]
+
+
+def _require_whole_effects(model: Model, names: Sequence[str]) -> None:
+    """Raise InputError if an effect that the model lacks has a parameter without a value."""
+    present = {instance.name for instance in model.effects}
+    for effect_id in dict.fromkeys(n.split(".")[1] for n in names if n.startswith("effects.")):
+        missing = [
+            f"effects.{effect_id}.{parameter.name}"
+            for parameter in find_effect(effect_id).parameters
+            if f"effects.{effect_id}.{parameter.name}" not in names
+        ]
+        if missing and effect_id not in present:
+            raise InputError(
+                f"the model has no {effect_id}, so that it has no value of {', '.join(missing)}",
+                key=f"effects.{effect_id}",
+                remedy="add it to [fixed] or to the parameters",
+            )

@@ -1,0 +1,106 @@
+"""Compute one chunk of a study and store it: the task of every worker."""
+
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from table_io.block import Float2D
+from table_io.errors import InputError
+from twin.studies.maps.cases import SampledCase
+from twin.studies.maps.outcomes import CaseChunk, SweepPlan
+from twin.studies.maps.store import (
+    DEFINITION_FILE,
+    RESULTS_FOLDER,
+    Json,
+    find_version_problem,
+    hash_arrays,
+    read_definition,
+)
+from twin.studies.maps.study import Study
+
+
+def make_sweep_plan(study: Study) -> SweepPlan:
+    """Return the sweep of every case."""
+    sweep = study.profile.sweep
+    return SweepPlan(sweep.steps, sweep.cycles, sweep.measured_cycles)
+
+
+def compute_outcomes(
+    study: Study, values: Float2D, seeds: npt.NDArray[np.uint64]
+) -> tuple[dict[str, npt.NDArray[Any]], dict[int, str]]:
+    """Return the arrays of cases by variable, and why cases have none by their place.
+
+    values (case, parameter) in the units of their keys; seeds (case,).
+    """
+    failures: dict[int, str] = {}
+    cases: list[SampledCase | None] = []
+    for index, row in enumerate(values.tolist()):
+        try:
+            cases.append(study.factory.build(row))
+        except InputError as error:
+            failures[index] = str(error)
+            cases.append(None)
+    chunk = CaseChunk(tuple(cases), tuple(seeds.tolist()), make_sweep_plan(study), failures)
+    arrays: dict[str, npt.NDArray[Any]] = {}
+    for outcome in study.outcomes:
+        computed = outcome.compute(chunk)
+        arrays |= {
+            variable.name: np.asarray(computed[variable.name], dtype=variable.dtype)
+            for variable in outcome.variables
+        }
+    return arrays, failures
+
+
+@lru_cache(maxsize=1)
+def _open_study(folder: Path, _: float) -> tuple[Study, Mapping[str, Any]]:
+    """Return the study in a folder and its arrays; the time of its definition is part of the key.
+
+    InputError if this process has other versions than the study.
+    """
+    import zarr
+
+    definition = read_definition(folder)
+    problem = find_version_problem(definition["versions"])
+    if problem:
+        raise InputError(f"a worker has other versions than the study: {problem}", where=folder)
+    study = Study.from_definition(definition, str(folder))
+    group = zarr.open_group(folder / RESULTS_FOLDER, mode="r+")
+    return study, dict(group.arrays())
+
+
+def compute_chunk(folder: Path, number: int) -> Json:
+    """Compute and store a chunk; return its line of the manifest, or {"error": reason}.
+
+    The reason is one that every other chunk would have too, such as a full disk.
+    """
+    try:
+        study, arrays = _open_study(folder, (folder / DEFINITION_FILE).stat().st_mtime)
+        first = number * study.config.chunk_size
+        span = slice(first, min(first + study.config.chunk_size, study.config.case_count))
+        names = [parameter.name for parameter in study.config.parameters]
+        values = np.stack([arrays[name][span] for name in names], axis=1)
+        results, failures = compute_outcomes(study, values, arrays["seed"][span])
+        for name, computed in results.items():
+            arrays[name][span] = computed
+    except (InputError, OSError, MemoryError) as error:
+        return {"error": str(error) or type(error).__name__}
+    return {
+        "chunk": number,
+        "first": first,
+        "cases": span.stop - first,
+        "sha256": hash_arrays(results),
+        "failures": {first + index: reason for index, reason in sorted(failures.items())},
+    }
+
+
+def find_folder_problem(folder: Path, token: str) -> str:
+    """Return why this process cannot store results of a study in a folder; "" if it can."""
+    try:
+        text = (folder / DEFINITION_FILE).read_text(encoding="utf-8")
+    except OSError as error:
+        return f"it does not see the folder {folder} ({error.strerror})"
+    return "" if text == token else f"it sees another study in {folder}"

@@ -1,0 +1,155 @@
+"""Page of a study: its plan, figures, indices and tables, from the stored results."""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from twin.reports.page import embed_images, render_page
+from twin.studies.maps.cases import parameter_unit
+from twin.studies.maps.figures import draw_outcome_figures, format_plain, group_front
+from twin.studies.maps.results import StudyResults, describe_parameter, format_unit
+from twin.studies.maps.sensitivity import SensitivityIndices, compute_sensitivity
+
+MAX_TABLE_CASES = 200_000  # in cases.csv
+MAX_FRONT_ROWS = 12  # of each front on the page
+MAX_REASONS = 5
+
+
+def write_map_page(folder: Path) -> Path:
+    """Write report.html, its figures and tables to the folder of a study; return the page."""
+    results = StudyResults(folder)
+    sensitivity = analyse_sensitivity(results)
+    pictures = draw_outcome_figures(results, sensitivity, folder / "figures")
+    has_table = write_case_table(results, folder / "cases.csv")
+    study, manifest = results.study, results.manifest
+    config = study.config
+    failures = manifest.failures
+    text = render_page(
+        Path(__file__).with_name("map.html"),
+        config=config,
+        profile_title=study.profile.title,
+        state="complete" if manifest.case_count == config.case_count else "stopped",
+        stored=manifest.case_count,
+        failures=len(failures),
+        reasons=sorted(set(failures.values()))[:MAX_REASONS],
+        parameters=[describe_range(results, index) for index in range(len(config.parameters))],
+        variables=[_summarise_variable(results, variable) for variable in results.scalars],
+        has_table=has_table,
+        sensitivity=_list_indices(results, sensitivity),
+        front=write_front_table(results, folder / "front.csv"),
+        images=embed_images(pictures),
+        study_toml=study.study_toml,
+        model_toml=study.model_toml,
+        profile_toml=study.profile_toml,
+    )
+    path = folder / "report.html"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def analyse_sensitivity(results: StudyResults) -> dict[str, SensitivityIndices]:
+    """Return the Sobol indices of each outcome; empty unless the study is made for them."""
+    config = results.study.config
+    if config.sampling != "sensitivity":
+        return {}
+    return {
+        variable.name: compute_sensitivity(
+            results.read_by_case(variable.name), len(config.parameters), config.seed
+        )
+        for variable in results.scalars
+    }
+
+
+def describe_range(results: StudyResults, index: int) -> dict[str, Any]:
+    """Return what the page says of a parameter."""
+    parameter = results.study.config.parameters[index]
+    low, high = parameter.limits
+    unit = parameter_unit(parameter.name)
+    values = f"{parameter.grid_size} values" if results.is_grid else "samples"
+    scale = ", evenly in the logarithm" if parameter.scale == "log" else ""
+    return {
+        "name": parameter.name,
+        "range": f"{format_plain(low)} to {format_plain(high)} {format_unit(unit)}".replace(
+            "-", "−"
+        ),
+        "values": values + scale,
+    }
+
+
+def _summarise_variable(results: StudyResults, variable: Any) -> dict[str, Any]:
+    values = results.read_by_case(variable.name)
+    finite = values[np.isfinite(values)]
+    quantiles = np.quantile(finite, [0, 0.5, 1]).tolist() if finite.size else [None] * 3
+    return {
+        "title": variable.title,
+        "name": variable.name,
+        "unit": "" if variable.unit == "1" else format_unit(variable.unit),
+        "quantiles": quantiles,
+        "missing": int(values.size - finite.size),
+    }
+
+
+def write_case_table(results: StudyResults, path: Path) -> bool:
+    """Write parameters and outcomes of every case as CSV; False where they are too many."""
+    config = results.study.config
+    if config.case_count > MAX_TABLE_CASES:
+        return False
+    names = [parameter.name for parameter in config.parameters]
+    names += [variable.name for variable in results.scalars]
+    columns = [results.read_by_case(name).tolist() for name in names]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["case", *names])
+        writer.writerows(zip(range(config.case_count), *columns, strict=True))
+    return True
+
+
+def write_front_table(results: StudyResults, path: Path) -> dict[str, Any] | None:
+    """Write the cases of every front as CSV; return what the page shows of them."""
+    front = results.study.config.front
+    if front is None:
+        return None
+    names = [parameter.name for parameter in results.study.config.parameters]
+    columns = {name: results.read_by_case(name) for name in (*names, *front.minimise)}
+    groups = []
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["case", *columns])
+        for group in group_front(results):
+            cases = group.cases[group.front]
+            rows = [[float(values[case]) for values in columns.values()] for case in cases]
+            writer.writerows([int(case), *row] for case, row in zip(cases, rows, strict=True))
+            thinned = np.unique(
+                np.linspace(0, len(rows) - 1, min(len(rows), MAX_FRONT_ROWS)).round().astype(int)
+            )
+            groups.append({"title": group.title, "rows": [rows[index] for index in thinned]})
+    heads = [describe_parameter(name, parameter_unit(name)) for name in names]
+    by_name = {variable.name: variable for variable in results.scalars}
+    heads += [
+        f"{by_name[name].title} in {format_unit(by_name[name].unit)}" for name in front.minimise
+    ]
+    return {"heads": heads, "groups": groups}
+
+
+def _list_indices(
+    results: StudyResults, sensitivity: dict[str, SensitivityIndices]
+) -> list[dict[str, Any]]:
+    """Return a row of the page per outcome and parameter."""
+    rows = []
+    titles = {variable.name: variable.title for variable in results.scalars}
+    for name, indices in sensitivity.items():
+        for column, parameter in enumerate(results.study.config.parameters):
+            rows.append(
+                {
+                    "outcome": titles[name],
+                    "parameter": parameter.name,
+                    "first": float(indices.first[column]),
+                    "first_interval": indices.first_interval[:, column].tolist(),
+                    "total": float(indices.total[column]),
+                    "total_interval": indices.total_interval[:, column].tolist(),
+                    "used_share": indices.used_share,
+                }
+            )
+    return rows

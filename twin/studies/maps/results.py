@@ -1,0 +1,145 @@
+"""Results of a study as labelled arrays, while it runs too."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from table_io.block import Float1D
+from table_io.errors import InputError, require_package, suggest
+from twin.compare.curves import FloatND
+from twin.studies.maps.outcomes import OutcomeVariable
+from twin.studies.maps.sampling import grid_axes
+from twin.studies.maps.store import RESULTS_FOLDER, Manifest, read_definition
+from twin.studies.maps.study import Study
+
+if TYPE_CHECKING:
+    import xarray
+
+
+def open_study(folder: Path | str, variables: Sequence[str] | None = None) -> "xarray.Dataset":
+    """Return the results of a study as a labelled dataset, with units, title and versions.
+
+    A grid has a dimension per parameter, named as its key, samples the dimension `case`; curves
+    also `direction` (1 forward, -1 backward) and `frequency_hz`. Cases without a result, such as
+    those still to come, are NaN. `variables`: only these are read. InputError for a folder without
+    a study, or an unknown variable.
+    """
+    require_package("xarray", "studies", "open_study")
+    return StudyResults(Path(folder)).to_dataset(variables)
+
+
+@dataclass(frozen=True)
+class StudyResults:
+    """The results in the folder of a study, read as they are asked for."""
+
+    folder: Path
+
+    @cached_property
+    def study(self) -> Study:
+        return Study.from_definition(read_definition(self.folder), str(self.folder))
+
+    @cached_property
+    def manifest(self) -> Manifest:
+        return Manifest(self.folder)
+
+    @cached_property
+    def _group(self) -> Any:
+        import zarr
+
+        return zarr.open_group(self.folder / RESULTS_FOLDER, mode="r")
+
+    @property
+    def scalars(self) -> tuple[OutcomeVariable, ...]:
+        """Variables with one number of each case."""
+        return tuple(variable for variable in self.study.variables if not variable.dims)
+
+    @property
+    def is_grid(self) -> bool:
+        return self.study.config.sampling == "grid"
+
+    def read_by_case(self, name: str) -> FloatND:
+        """Return a variable or parameter, (case, ...)."""
+        values: FloatND = self._group[name][:]
+        return values
+
+    def read_array(self, name: str) -> FloatND:
+        """Return a variable: of a grid (*shape, ...), of samples (case, ...)."""
+        values = self.read_by_case(name)
+        return values.reshape(*self.study.config.shape, *values.shape[1:])
+
+    def grid_axes(self) -> dict[str, Float1D]:
+        """Return the values of each parameter of a grid, by its key."""
+        config = self.study.config
+        names = [parameter.name for parameter in config.parameters]
+        return dict(zip(names, grid_axes(config), strict=True))
+
+    def to_dataset(self, variables: Sequence[str] | None = None) -> "xarray.Dataset":
+        """Return the dataset of `open_study`."""
+        import xarray
+
+        known = {variable.name: variable for variable in self.study.variables}
+        for name in variables or ():
+            if name not in known:
+                raise InputError("no variable of this study", key=name, remedy=suggest(name, known))
+        names = [parameter.name for parameter in self.study.config.parameters]
+        own_dims = tuple(names) if self.is_grid else ("case",)
+        coordinates: dict[str, Any] = {
+            dim: (dim, self._group[dim][:], dict(self._group[dim].attrs))
+            for dim in ("direction", "frequency_hz")
+        }
+        axes = self.grid_axes() if self.is_grid else {}
+        for name in names:
+            attributes = dict(self._group[name].attrs)
+            coordinates[name] = (
+                (name, axes[name], attributes)
+                if self.is_grid
+                else ("case", self.read_by_case(name), attributes)
+            )
+        seeds = self._group["seed"][:].reshape(self.study.config.shape)
+        coordinates["seed"] = (own_dims, seeds, dict(self._group["seed"].attrs))
+        data = {
+            name: (
+                (*own_dims, *known[name].dims),
+                self.read_array(name),
+                dict(self._group[name].attrs),
+            )
+            for name in (variables if variables is not None else known)
+        }
+        attributes = {
+            name: value for name, value in self._group.attrs.items() if name != "coordinates"
+        }
+        return xarray.Dataset(data, coordinates, attributes | {"cases": self.manifest.case_count})
+
+
+def describe_parameter(name: str, unit: str) -> str:
+    """Return the name of a parameter for a label: its key without the file's table, and its unit.
+
+    The unit is not repeated: specimen.gap_mm is "gap in mm".
+    """
+    plain = name.split(".", 1)[1]
+    suffix = "_" + unit.replace("/", "_").replace(" ", "_").lower()
+    plain = plain.removesuffix(suffix).replace("_", " ").replace(".", " ")
+    return f"{plain} in {format_unit(unit)}" if unit not in ("", "1") else plain
+
+
+def format_unit(unit: str) -> str:
+    """Return a unit with raised exponents: m/s2 is m/s²."""
+    return re.sub(r"(?<=[a-z])[23]", lambda match: "²³"[int(match.group()) - 2], unit)
+
+
+def find_front(first: Float1D, second: Float1D) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    """Return the indices of the points that no other betters in both values, by the first.
+
+    Points with NaN are none.
+    """
+    known = np.flatnonzero(np.isfinite(first) & np.isfinite(second))
+    order = known[np.lexsort((second[known], first[known]))]
+    if not order.size:
+        return order
+    best_before = np.r_[np.inf, np.minimum.accumulate(second[order])[:-1]]
+    return order[second[order] < best_before]

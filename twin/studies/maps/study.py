@@ -1,0 +1,136 @@
+"""A study with all that it names: test, model, outcomes; checked before anything is computed."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from table_io.config.base import parse_toml, read_text
+from table_io.config.folders import find_config, resolve_config
+from table_io.config.profile import Profile, load_profile
+from table_io.errors import InputError, suggest
+from table_io.units import GRAVITY_M_S2
+from twin.model.config import ModelConfig
+from twin.model.stepped_sine import validate_frequencies
+from twin.run.run_config import read_model
+from twin.studies.maps.cases import CaseFactory
+from twin.studies.maps.config import StudyConfig
+from twin.studies.maps.outcomes import Outcome, OutcomeVariable, find_outcome
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study with the test and the model that it names, as validated objects and TOML texts."""
+
+    config: StudyConfig
+    profile: Profile
+    model_config: ModelConfig
+    study_toml: str
+    profile_toml: str
+    model_toml: str
+
+    @classmethod
+    def read(cls, path: Path) -> "Study":
+        """Read a study file, found by its name in studies/ or its path, with what it names."""
+        path = resolve_config(path, "studies")
+        study_toml = read_text(path, "study")
+        config = parse_toml(study_toml, StudyConfig, str(path))
+        _, profile_toml = load_profile(find_config(config.profile, "tests", path))
+        profile = parse_toml(profile_toml, Profile, config.profile)
+        _, model_toml = read_model(config.model or profile.model, path)
+        texts = {
+            "study_toml": study_toml,
+            "profile_toml": profile_toml,
+            "model_toml": model_toml,
+        }
+        return cls.from_definition(texts, str(path))
+
+    @classmethod
+    def from_definition(cls, texts: Mapping[str, str], source: str) -> "Study":
+        """Return the study of the TOML texts of study, test and model; errors name `source`."""
+        study_toml, profile_toml, model_toml = (
+            texts[f"{name}_toml"] for name in ("study", "profile", "model")
+        )
+        config = parse_toml(study_toml, StudyConfig, source)
+        profile = parse_toml(profile_toml, Profile, f"{source}: profile")
+        model_config = parse_toml(model_toml, ModelConfig, f"{source}: model")
+        study = cls(config, profile, model_config, study_toml, profile_toml, model_toml)
+        try:
+            study.check_cases()
+        except InputError as error:
+            raise error.add_place(source) from None
+        return study
+
+    @cached_property
+    def outcomes(self) -> tuple[Outcome, ...]:
+        return tuple(find_outcome(name) for name in self.config.outcomes)
+
+    @cached_property
+    def variables(self) -> tuple[OutcomeVariable, ...]:
+        """Variables of all outcomes."""
+        return tuple(variable for outcome in self.outcomes for variable in outcome.variables)
+
+    @cached_property
+    def factory(self) -> CaseFactory:
+        """Builds the model and the level of a case from the values of the varied parameters."""
+        return CaseFactory(
+            self.model_config.build_model(self.profile.specimen),
+            self.profile.sweep.one_level_g * GRAVITY_M_S2,
+            self.config.fixed,
+            tuple(parameter.name for parameter in self.config.parameters),
+        )
+
+    def check_cases(self) -> None:
+        """Raise InputError for an unknown parameter or outcome, or a range without a model."""
+        sweep = self.profile.sweep
+        self._check_outcomes()
+        frequencies = [step.frequency_hz for step in sweep.steps]
+        validate_frequencies(frequencies, sweep.one_level_g, sweep.cycles)
+        if sweep.schedule_db or not sweep.has_one_level:
+            raise InputError(
+                "its sweep has several levels",
+                key="profile",
+                value=self.config.profile,
+                allowed="a stepped sine of one level",
+                remedy="vary sweep.acceleration_g",
+            )
+        self.factory.require_keys()
+        middle = [sum(parameter.limits) / 2 for parameter in self.config.parameters]
+        for index, parameter in enumerate(self.config.parameters):
+            for value in parameter.limits:
+                values: Sequence[float] = [*middle[:index], value, *middle[index + 1 :]]
+                try:
+                    self.factory.build(values).find_resonance()
+                except InputError as error:
+                    raise error.add_place(f"{parameter.name} = {value:g}") from None
+
+    def _check_outcomes(self) -> None:
+        """Raise InputError for outcomes that are unknown, repeated, or need another sweep."""
+        names = [variable.name for variable in self.variables]
+        if len(set(names)) < len(names):
+            raise InputError("each outcome, and each variable of one, at most once", key="outcomes")
+        for outcome in self.outcomes:
+            if outcome.needs_both_directions and len(self.profile.sweep.directions) < 2:
+                raise InputError(
+                    f"{outcome.title} need a sweep in both directions",
+                    key="outcomes",
+                    value=outcome.name,
+                    remedy="give a test that sweeps forward and backward",
+                )
+        front = self.config.front
+        if front is None:
+            return
+        scalars = [variable.name for variable in self.variables if not variable.dims]
+        for name in front.minimise:
+            if name not in scalars:
+                raise InputError(
+                    "not computed", key="front.minimise", value=name, remedy=suggest(name, scalars)
+                )
+        parameters = [parameter.name for parameter in self.config.parameters]
+        if front.each and (front.each not in parameters or self.config.sampling != "grid"):
+            raise InputError(
+                "no parameter of a grid",
+                key="front.each",
+                value=front.each,
+                remedy=suggest(front.each, parameters),
+            )
