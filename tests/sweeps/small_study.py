@@ -1,0 +1,46 @@
+"""A study of seconds, and the bytes that it leaves."""
+
+from pathlib import Path
+
+TEST = """
+title = "Across the jumps of G4"
+[specimen]
+mass_kg = 550.0
+gap_mm = 4.0
+[sweep]
+start_hz = 2.4
+stop_hz = 4.4
+step_hz = 0.2
+cycles = 8
+"""
+STUDY = """
+title = "Gap and stiffness"
+profile = "{profile}"
+outcomes = ["curves", "peaks", "forces", "hysteresis"]
+chunk = 5
+[[parameters]]
+name = "specimen.gap_mm"
+values = [2.0, 4.0, 6.0, 9.0]
+[[parameters]]
+name = "base.bumper_stiffness_n_m"
+start = 2e5
+stop = 8e5
+count = 6
+scale = "log"
+"""
+
+
+def write_study(folder: Path, text: str = STUDY, test: str = TEST) -> Path:
+    """Write a test and a study of it; return the study's path."""
+    profile = folder / "across.toml"
+    profile.write_text(test)
+    path = folder / "study.toml"
+    path.write_text(text.replace("{profile}", str(profile)))
+    return path
+
+
+def read_stored_bytes(folder: Path) -> dict[str, bytes]:
+    """Return everything that a study has computed, by path; not its page."""
+    paths = [folder / "chunks.jsonl", folder / "study.json"]
+    paths += [path for path in (folder / "results.zarr").rglob("*") if path.is_file()]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}

@@ -1,0 +1,334 @@
+"""A study that is killed, stopped, resumed, crowded out or spread over other workers."""
+
+import json
+import os
+import random
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from pathlib import Path
+
+import distributed
+import numpy as np
+import pytest
+
+from tests.command_line import call_main
+from tests.input_errors import raises_input_error
+from tests.plugin_package import install_package
+from tests.sweeps.small_study import STUDY, read_stored_bytes, write_study
+from twin.api import open_study
+from twin.run.tasks import TaskResult
+from twin.studies.maps import command
+from twin.studies.maps.compute import compute_chunk, find_folder_problem, make_sweep_plan
+from twin.studies.maps.sampling import sample_parameters
+from twin.studies.maps.store import (
+    DEFINITION_FILE,
+    MANIFEST_FILE,
+    Manifest,
+    create_store,
+    remove_partial_files,
+)
+from twin.studies.maps.study import Study
+
+PROGRAM = [sys.executable, "-c", "from twin.cli.entry import main; main()"]
+
+
+@pytest.fixture(autouse=True)
+def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing takes longer than these studies."""
+    monkeypatch.setattr(command, "write_map_page", lambda folder: folder / "report.html")
+
+
+@pytest.fixture(scope="module")
+def whole_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with the study and, in out, its results."""
+    folder = tmp_path_factory.mktemp("study")
+    make_stored_study(write_study(folder), folder / "out", range(5))
+    return folder
+
+
+def make_stored_study(path: Path, out: Path, chunks: range) -> Study:
+    """Compute these chunks of a study in this process."""
+    study = Study.read(path)
+    out.mkdir()
+    create_store(out, study, make_sweep_plan(study), sample_parameters(study.config))
+    manifest = Manifest(out)
+    for chunk in chunks:
+        manifest.add(compute_chunk(out, chunk))
+    return study
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_any_number_of_processes_stores_the_same_bytes(
+    whole_study: Path, tmp_path: Path, workers: int
+) -> None:
+    result = call_main("map", whole_study / "study.toml", "--out", tmp_path, "--workers", workers)
+    assert result.returncode == 0, result.stderr
+    assert read_stored_bytes(tmp_path) == read_stored_bytes(whole_study / "out")
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[distributed.LocalCluster]:
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=2, dashboard_address=None
+    ) as cluster:
+        yield cluster
+
+
+def test_a_cluster_stores_the_same_bytes(
+    whole_study: Path, tmp_path: Path, cluster: distributed.LocalCluster
+) -> None:
+    """Two chunks at once in each process: what they share must not mix them."""
+    result = call_main(
+        "map", whole_study / "study.toml", "--out", tmp_path,
+        "--scheduler", cluster.scheduler_address,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    assert read_stored_bytes(tmp_path) == read_stored_bytes(whole_study / "out")
+
+
+def test_a_cluster_that_does_not_share_the_folder_is_refused(tmp_path: Path) -> None:
+    assert "does not see" in find_folder_problem(tmp_path, "token")
+    (tmp_path / DEFINITION_FILE).write_text("token")
+    assert find_folder_problem(tmp_path, "token") == ""
+    assert find_folder_problem(tmp_path, "of another study")
+
+
+def test_a_stopped_study_goes_on_where_it_was(whole_study: Path, tmp_path: Path) -> None:
+    """Some chunks stored, a line cut, a file half written: the rest is computed, none twice."""
+    out = tmp_path / "out"
+    study = make_stored_study(whole_study / "study.toml", out, range(1, 3))
+    with (out / MANIFEST_FILE).open("a") as file:
+        file.write('{"chunk": 4, "fir')
+    half = out / "results.zarr" / "peak_disp_m" / "c" / "0.0123.partial"
+    half.write_bytes(b"half")
+    data = open_study(out)
+    assert int(data["peak_disp_m"].notnull().sum()) == 10
+    assert data.attrs["cases"] == 10
+    result = call_main("map", whole_study / "study.toml", "--out", out, "--resume", "--workers", 1)
+    assert result.returncode == 0, result.stderr
+    assert read_stored_bytes(out) == read_stored_bytes(whole_study / "out")
+    assert study.config.chunk_count == 5
+
+
+def test_a_finished_study_computes_nothing_again(
+    whole_study: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = read_stored_bytes(whole_study / "out")
+    monkeypatch.setattr(command, "run_tasks", run_no_task)
+    out = whole_study / "out"
+    assert call_main("map", whole_study / "study.toml", "--out", out, "--resume").returncode == 0
+    assert read_stored_bytes(out) == before
+
+
+def run_no_task(task: object, numbers: list[int], *_: object, **__: object) -> list[TaskResult]:
+    assert numbers == []
+    return []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("on_cluster", [False, True])
+def test_kills_at_random_lose_and_double_nothing(
+    whole_study: Path, tmp_path: Path, on_cluster: bool
+) -> None:
+    """50 deaths: of the client and its processes, or also of a scheduler and its workers."""
+    rng = random.Random(3)
+    kills, round_number = 50, 0
+    while kills > 0:
+        out = tmp_path / f"out{round_number}"
+        kills -= run_with_kills(whole_study / "study.toml", out, min(kills, 6), rng, on_cluster)
+        assert read_stored_bytes(out) == read_stored_bytes(whole_study / "out")
+        round_number += 1
+    assert round_number >= 8
+
+
+def run_with_kills(
+    study: Path, out: Path, max_kills: int, rng: random.Random, on_cluster: bool
+) -> int:
+    """Start or resume a study until it is complete, with deaths on the way; return their number."""
+    kills = 0
+    while True:
+        resume = ["--resume"] if (out / DEFINITION_FILE).exists() else []
+        if not resume and out.exists():
+            out.rename(out.with_name(f"{out.name}-{kills}"))  # died before it began
+        with ExitStack() as stack:
+            helpers: list[subprocess.Popen[bytes]] = []
+            options = ["--workers", "2"]
+            if on_cluster:
+                helpers, address = start_cluster(stack)
+                options = ["--scheduler", address]
+            words = ["map", str(study), "--out", str(out), *options, *resume]
+            client = stack.enter_context(start_quietly([*PROGRAM, *words]))
+            while kills < max_kills and client.poll() is None:
+                time.sleep(rng.uniform(0.3, 3.5))
+                victims = [client.pid, *list_children(client.pid)]
+                victims += [pid for each in helpers for pid in (each.pid, *list_children(each.pid))]
+                with suppress(ProcessLookupError):
+                    os.kill(rng.choice(victims), signal.SIGKILL)
+                    kills += 1
+            code = client.wait(timeout=120)
+            for helper in helpers:
+                helper.kill()
+        if code == 0:
+            return max(kills, 1)
+
+
+def start_cluster(stack: ExitStack) -> tuple[list[subprocess.Popen[bytes]], str]:
+    """Start a scheduler and two workers with nannies; return them and the address."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{probe.getsockname()[1]}"
+    dask = [sys.executable, "-m", "dask"]
+    scheduler = [*dask, "scheduler", "--no-dashboard", "--host", address]
+    worker = [*dask, "worker", address, "--nthreads", "1", "--no-dashboard"]
+    helpers = [stack.enter_context(start_quietly(each)) for each in (scheduler, worker, worker)]
+    with distributed.Client(address, timeout="60s", set_as_default=False) as client:
+        client.wait_for_workers(2)
+    return helpers, address
+
+
+def start_quietly(words: list[str]) -> "subprocess.Popen[bytes]":
+    return subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def list_children(pid: int) -> list[int]:
+    try:
+        text = Path(f"/proc/{pid}/task/{pid}/children").read_text()
+    except FileNotFoundError:
+        return []
+    return [int(word) for word in text.split()]
+
+
+def test_another_study_is_not_mixed_into_the_first(whole_study: Path, tmp_path: Path) -> None:
+    changed = write_study(tmp_path, STUDY.replace("count = 6", "count = 7"))
+    with raises_input_error(key="--resume", problem="study"):
+        command.run_study(changed, whole_study / "out", 1, "", True, False)
+    with raises_input_error(key="--out"):
+        command.run_study(changed, whole_study / "out", 1, "", False, False)
+    with raises_input_error(where=tmp_path / "none"):
+        command.run_study(changed, tmp_path / "none", 1, "", True, False)
+
+
+def test_other_versions_are_refused(
+    whole_study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    make_stored_study(whole_study / "study.toml", out, range(1))
+    definition = json.loads((out / DEFINITION_FILE).read_text())
+    definition["versions"]["numpy"] = "0.1"
+    (out / DEFINITION_FILE).write_text(json.dumps(definition))
+    with raises_input_error(key="--resume", problem="numpy 0.1"):
+        command.run_study(whole_study / "study.toml", out, 1, "", True, False)
+    assert "numpy 0.1" in compute_chunk(out, 1)["error"]
+
+
+def test_what_does_not_fit_on_the_disk_is_not_started(
+    whole_study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(command, "free_bytes", lambda _: 1000)
+    with raises_input_error(where=tmp_path):
+        command.run_study(whole_study / "study.toml", tmp_path, 1, "", False, False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_does_not_fit_into_memory_is_not_started(tmp_path: Path) -> None:
+    names = ("specimen.gap_mm", "specimen.mass_kg", "base.stiffness_n_m")
+    text = 'title = "T"\nprofile = "g4_ss3"\noutcomes = ["peaks"]\n' + "".join(
+        f'[[parameters]]\nname = "{name}"\nstart = 1.0\nstop = 2.0\ncount = 464\n' for name in names
+    )
+    path = write_study(tmp_path, text)
+    limit = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "sysconf", lambda name: 1 if "PAGES" in name else min(limit, 10**9))
+        with raises_input_error(key="parameters"):
+            command.run_study(path, tmp_path / "out", 1, "", False, False)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_disk_that_fills_up_ends_the_study_with_what_is_stored(
+    whole_study: Path, tmp_path: Path
+) -> None:
+    """Every write beyond a size fails in the processes; then there is room again."""
+    out = tmp_path / "out"
+    make_stored_study(whole_study / "study.toml", out, range(1))
+    words = ["map", str(whole_study / "study.toml"), "--out", str(out), "--resume"]
+
+    def limit_files() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (600, resource.RLIM_INFINITY))
+
+    result = subprocess.run(
+        [*PROGRAM, *words], preexec_fn=limit_files, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 2
+    assert "Traceback" not in result.stderr
+    assert call_main(*words).returncode == 0
+    assert read_stored_bytes(out) == read_stored_bytes(whole_study / "out")
+
+
+def test_a_chunk_that_always_dies_ends_the_study_with_its_number(
+    whole_study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failure = TaskResult(3, failure="its process died (exit code -9)")
+    monkeypatch.setattr(command, "run_tasks", lambda *_, **__: [failure])
+    with raises_input_error(problem="chunk 3"):
+        command.run_study(whole_study / "study.toml", tmp_path / "out", 1, "", False, False)
+
+
+def test_what_zarr_leaves_behind_is_removed_and_nothing_else(
+    whole_study: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    make_stored_study(whole_study / "study.toml", out, range(5))
+    before = read_stored_bytes(out)
+    (out / "results.zarr" / "eta_d" / "c" / "0.abc.partial").write_bytes(b"1")
+    remove_partial_files(out)
+    assert read_stored_bytes(out) == before
+
+
+OUTCOME = """
+import numpy as np
+from twin.studies.maps.outcomes import Outcome, OutcomeVariable
+
+def compute(chunk):
+    draws = np.array([np.random.default_rng(seed).normal() for seed in chunk.seeds])
+    return {"mass_kg": np.array([case.model.base.mass for case in chunk.cases]), "draw": draws}
+
+WEIGHT = Outcome("weight", "mass and a random number", (
+    OutcomeVariable("mass_kg", "kg", "mass"), OutcomeVariable("draw", "1", "random number"),
+), compute)
+WRONG = 3
+"""
+
+
+def test_a_package_adds_an_outcome(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its numbers come from the seed of the case, whoever computes it."""
+    entries = {"shaketwin.outcomes": {"weight": "our_outcome:WEIGHT", "wrong": "our_outcome:WRONG"}}
+    site = install_package(tmp_path, "our_outcome", OUTCOME, entries)
+    monkeypatch.syspath_prepend(str(site))
+    text = STUDY.replace('["curves", "peaks", "forces", "hysteresis"]', '["weight"]')
+    path = write_study(tmp_path, text.replace("specimen.gap_mm", "specimen.mass_kg"))
+    make_stored_study(path, tmp_path / "out", range(5))
+    data = open_study(tmp_path / "out")
+    assert np.array_equal(data["mass_kg"].isel({"base.bumper_stiffness_n_m": 0}), [2, 4, 6, 9])
+    draws = [np.random.default_rng(seed).normal() for seed in data["seed"].values.ravel().tolist()]
+    assert data["draw"].values.ravel().tolist() == draws
+    wrong = write_study(tmp_path, text.replace('["weight"]', '["wrong"]'))
+    with raises_input_error(problem="Outcome"):
+        Study.read(wrong)
+
+
+def test_options_that_exclude_each_other_are_refused(whole_study: Path, tmp_path: Path) -> None:
+    path = whole_study / "study.toml"
+    with raises_input_error(key="--workers"):
+        command.run_study(path, tmp_path / "out", 0, "", False, False)
+    with raises_input_error(key="--workers"):
+        command.run_study(path, tmp_path / "out", 2, "tcp://host:1", False, False)
+    with raises_input_error(key="--out"):
+        command.run_study(path, None, 2, "", True, False)

@@ -1,0 +1,322 @@
+"""What a study computes: against single sweeps, continuation, closed forms and SALib."""
+
+import itertools
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from SALib.analyze import sobol
+from SALib.test_functions import Ishigami
+
+from table_io.config.base import parse_toml
+from table_io.errors import InputError
+from table_io.units import GRAVITY_M_S2
+from tests.command_line import call_main
+from tests.input_errors import raises_input_error
+from tests.sweeps.small_study import write_study
+from twin.api import open_study
+from twin.compare.curves import detect_hysteresis
+from twin.model.ideal_response import simulate_sweep
+from twin.model.model import Model
+from twin.reports.ideal_points import compute_prc_points
+from twin.studies.maps.cases import list_parameter_names, parameter_unit
+from twin.studies.maps.compute import compute_outcomes
+from twin.studies.maps.config import StudyConfig
+from twin.studies.maps.results import find_front
+from twin.studies.maps.sampling import sample_parameters
+from twin.studies.maps.sensitivity import compute_sensitivity
+from twin.studies.maps.store import make_seeds
+from twin.studies.maps.study import Study
+
+HEAD = 'title = "T"\nprofile = "g4_ss3"\n'
+GAP = '[[parameters]]\nname = "specimen.gap_mm"\n'
+
+
+@pytest.fixture(scope="module")
+def study_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the small study, run as its user would."""
+    folder = tmp_path_factory.mktemp("study")
+    path = write_study(folder)
+    result = call_main("map", path, "--out", folder / "out", "--workers", 1)
+    assert result.returncode == 0, result.stderr
+    return folder / "out"
+
+
+def test_every_case_is_the_sweep_of_its_parameters(study_folder: Path) -> None:
+    """Curves, jumps and hysteresis as a single sweep and `prc` give them."""
+    study = open_study(study_folder)
+    profile = Study.read(study_folder.parent / "study.toml").profile
+    base = Study.read(study_folder.parent / "study.toml").model_config.build_model(profile.specimen)
+    steps = profile.sweep.steps
+    hysteretic = 0
+    for gap, stiffness in itertools.product([2.0, 9.0], study["base.bumper_stiffness_n_m"].values):
+        case = study.sel({"specimen.gap_mm": gap, "base.bumper_stiffness_n_m": stiffness})
+        model = Model(
+            replace(
+                base.base, gap_r=gap / 2e3, gap_l=gap / 2e3, bumper_stiffness_r=float(stiffness),
+                bumper_stiffness_l=float(stiffness),
+            )
+        )  # fmt: skip
+        frequencies = [step.frequency_hz for step in steps]
+        response = simulate_sweep(model, frequencies, 0.05 * GRAVITY_M_S2, 8)
+        points = compute_prc_points(model, steps, response, 8, 3)
+        for point in points:
+            direction = 1 if point.direction == "forward" else -1
+            stored = case.sel(direction=direction, frequency_hz=point.frequency_hz)
+            assert point.twin is not None
+            for name in ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l"):
+                assert float(stored[name]) == pytest.approx(getattr(point.twin, name), rel=1e-6)
+            assert float(stored["impacts_right"]) == pytest.approx(
+                np.mean(point.twin.impacts_right), rel=1e-6
+            )
+        jumps, intervals = detect_hysteresis(points, "twin")
+        widths = [i.to_hz - i.from_hz for i in intervals if i.kind == "right"]
+        assert float(case["right_width_hz"]) == pytest.approx(max(widths, default=0.0))
+        assert int(case["jump_count"]) == len(jumps)
+        hysteretic += bool(widths)
+        u = response.extremes[:, -3:]
+        swing = ((u[..., 0] - u[..., 1]) / 2).mean(axis=1)
+        assert float(case["peak_disp_m"]) == pytest.approx(swing.max())
+        assert float(case["peak_disp_hz"]) == frequencies[int(swing.argmax())]
+        largest = np.abs(u[..., 2:4]).max()
+        assert float(case["transmitted_force_n"]) == pytest.approx(550.0 * largest)
+    assert hysteretic >= 4
+
+
+def test_results_have_names_units_and_coordinates(study_folder: Path) -> None:
+    study = open_study(study_folder)
+    assert dict(study.sizes) == {
+        "specimen.gap_mm": 4, "base.bumper_stiffness_n_m": 6, "direction": 2, "frequency_hz": 11
+    }  # fmt: skip
+    assert study["specimen.gap_mm"].attrs["units"] == "mm"
+    assert study["peak_disp_m"].attrs["units"] == "m"
+    assert study["peak_disp_m"].attrs["long_name"]
+    assert study.attrs["title"] == "Gap and stiffness"
+    assert study.attrs["cases"] == 24
+    assert "numpy" in study.attrs["versions"]
+    assert len(np.unique(study["seed"])) == 24
+    assert list(open_study(study_folder, ["peak_acc_hz"])) == ["peak_acc_hz"]
+    with raises_input_error(key="peak_acc"):
+        open_study(study_folder, ["peak_acc"])
+
+
+def test_a_map_of_the_folds_is_the_continuation_of_each_case(tmp_path: Path) -> None:
+    """Published folds of G4 at 0.05 g: 4.027372 and 2.787294 Hz, grazing 2.79359 Hz."""
+    text = HEAD + 'outcomes = ["folds"]\n' + GAP + "values = [4.0, 10.0]\n"
+    study = Study.read(write_study(tmp_path, text))
+    arrays, failures = compute_outcomes(study, np.array([[4.0], [10.0]]), make_seeds(0, range(2)))
+    assert not failures
+    assert arrays["upper_fold_hz"] == pytest.approx([4.027372, 3.157626], abs=1e-4)
+    assert arrays["lower_fold_hz"] == pytest.approx([2.787294, 2.013866], abs=1e-4)
+    assert arrays["grazing_hz"] == pytest.approx([2.79359, 2.01441], abs=1e-4)
+    assert arrays["stable_disp_hz"] == pytest.approx(arrays["upper_fold_hz"], abs=0.05)
+
+
+@pytest.mark.parametrize("name", list_parameter_names())
+def test_every_parameter_can_be_varied_and_changes_the_model(tmp_path: Path, name: str) -> None:
+    """Within limits that suit the specimen, and without saying what other effects are."""
+    around = {
+        "specimen.mass_kg": (500.0, 600.0),
+        "specimen.gap_mm": (2.0, 8.0),
+        "sweep.acceleration_g": (0.03, 0.06),
+    }
+    low, high = around.get(name, (1e-3, 2e-3))
+    if name.startswith("base."):
+        low, high = 1e3, 1e5
+    fixed = ""
+    if name.startswith("effects."):
+        effect = name.split(".")[1]
+        others = [
+            other
+            for other in list_parameter_names()
+            if other.startswith(f"effects.{effect}.") and other != name
+        ]
+        fixed = "[fixed]\n" + "".join(f'"{other}" = 1e-3\n' for other in others)
+        if name.endswith("ratio"):
+            low, high = 0.9, 1.1
+    text = (
+        f'{HEAD}outcomes = ["peaks"]\n[[parameters]]\nname = "{name}"\n'
+        f"start = {low}\nstop = {high}\ncount = 2\n{fixed}"
+    )
+    study = Study.read(write_study(tmp_path, text))
+    first, second = (study.factory.build([value]) for value in (low, high))
+    assert (first.model, first.acceleration_m_s2) != (second.model, second.acceleration_m_s2)
+    assert parameter_unit(name) or name.endswith("ratio")
+
+
+@pytest.mark.parametrize(
+    ("line", "fields"),
+    [
+        ('name = "specimen.gap_m"', {"key": "specimen.gap_m", "remedy": "specimen.gap_mm"}),
+        ('name = "effects.coulomb_friction.f"', {"remedy": "effects.coulomb_friction.fc"}),
+        ('name = "effects.coulomb.fc"', {"remedy": "coulomb_friction"}),
+        ('name = "effects.sensor_gain.gain"', {"key": "effects.sensor_gain.gain"}),
+        ('name = "effects.bouc_wen.force"', {"key": "effects.bouc_wen"}),
+        ('name = "base.stiffness_n_m"\nstart = -1.0', {"key": "stiffness"}),
+        ('name = "effects.coulomb_friction.fc"\nstart = -5.0', {"key": "fc"}),
+        ('name = "sweep.acceleration_g"\nstart = -1.0', {"key": "sweep.acceleration_g"}),
+        ('name = "base.damping_n_s_m"\nstart = 0.0', {"key": "damping"}),
+    ],
+)
+def test_what_makes_no_model_is_refused(
+    tmp_path: Path, line: str, fields: dict[str, object]
+) -> None:
+    start = "" if "start" in line else "\nstart = 1.0"
+    text = f'{HEAD}outcomes = ["peaks"]\n[[parameters]]\n{line}{start}\nstop = 2.0\ncount = 3\n'
+    with raises_input_error(**fields):
+        Study.read(write_study(tmp_path, text))
+
+
+@pytest.mark.parametrize(
+    ("text", "fields"),
+    [
+        ('outcomes = ["peak"]\n' + GAP + "values = [1.0, 2.0]", {"key": "outcomes"}),
+        ('outcomes = ["peaks", "peaks"]\n' + GAP + "values = [1.0, 2.0]", {"key": "outcomes"}),
+        ('outcomes = ["peaks"]\n' + GAP + "start = 1.0\nstop = 2.0", {"key": "specimen.gap_mm"}),
+        ('outcomes = ["peaks"]\nsampling = "sobol"\nsamples = 100\n' + GAP
+         + "start = 1.0\nstop = 2.0", {"key": "samples", "remedy": "128"}),
+        ('outcomes = ["peaks"]\nsampling = "sobol"\n' + GAP + "start = 1.0\nstop = 2.0",
+         {"key": "samples"}),
+        ('outcomes = ["peaks"]\n' + GAP + "values = [1.0, 2.0]\n[fixed]\n"
+         '"specimen.gap_mm" = 3.0', {"key": "specimen.gap_mm"}),
+        ('outcomes = ["peaks"]\n' + GAP + "values = [1.0, 2.0]\n[front]\n"
+         'minimise = ["peak_disp_m", "peak_acc"]', {"key": "front.minimise"}),
+        ('outcomes = ["peaks"]\n' + GAP + "values = [1.0, 2.0]\n[front]\n"
+         'minimise = ["peak_disp_m", "peak_acc_m_s2"]\neach = "gap"', {"key": "front.each"}),
+    ],
+)  # fmt: skip
+def test_a_study_that_asks_for_nothing_possible_is_refused(
+    tmp_path: Path, text: str, fields: dict[str, object]
+) -> None:
+    with raises_input_error(**fields):
+        Study.read(write_study(tmp_path, HEAD + text))
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        "start = 2.0\nstop = 1.0\ncount = 3", "values = [2.0, 1.0]", "values = [1.0, 1.0]",
+        "start = 0.0\nstop = 1.0\nstep = 0.3", "start = 0.0\nstop = 1.0\nstep = -0.5",
+        "start = 0.0\nstop = 1.0\ncount = 3\nscale = 'log'", "start = 1.0\nstop = inf\ncount = 3",
+        "values = [1.0, 2.0]\nstart = 1.0\nstop = 2.0", "start = 0.0\nstop = 1.0\ncount = 1",
+    ],
+)  # fmt: skip
+def test_a_range_that_is_none_is_refused(values: str) -> None:
+    with pytest.raises(InputError):
+        parse_toml(f'{HEAD}outcomes = ["peaks"]\n{GAP}{values}\n', StudyConfig, "study")
+
+
+def make_config(sampling: str, samples: int | None, ranges: int = 3, seed: int = 4) -> StudyConfig:
+    names = ("specimen.gap_mm", "specimen.mass_kg", "base.stiffness_n_m")
+    lines = [HEAD, f'sampling = "{sampling}"\nseed = {seed}\noutcomes = ["peaks"]\n']
+    lines += [f"samples = {samples}\n"] if samples is not None else []
+    for name in names[:ranges]:
+        lines.append(f'[[parameters]]\nname = "{name}"\nstart = 1.0\nstop = 100.0\n')
+        lines.append("count = 5\n" if samples is None else 'scale = "log"\n')
+    return parse_toml("".join(lines), StudyConfig, "study")
+
+
+def test_a_grid_has_all_combinations_the_last_parameter_fastest() -> None:
+    axis = [1.0, 25.75, 50.5, 75.25, 100.0]
+    expected = np.array(list(itertools.product(axis, repeat=3)))
+    assert np.array_equal(sample_parameters(make_config("grid", None)), expected)
+
+
+@pytest.mark.parametrize("sampling", ["latin_hypercube", "sobol"])
+def test_samples_fill_every_range_evenly_on_its_scale(sampling: str) -> None:
+    """Each of 64 equal parts of the logarithm has one sample of a Latin hypercube or Sobol set."""
+    values = sample_parameters(make_config(sampling, 64))
+    assert values.shape == (64, 3)
+    parts = np.floor(np.log10(values) / 2 * 64).astype(int)
+    assert all(sorted(column) == list(range(64)) for column in parts.T.tolist())
+    again = sample_parameters(make_config(sampling, 64))
+    other = sample_parameters(make_config(sampling, 64, seed=5))
+    assert np.array_equal(values, again)
+    assert not np.array_equal(values, other)
+
+
+def test_sensitivity_agrees_with_salib_and_the_closed_form() -> None:
+    """Ishigami's function: first order 0.3139, 0.4424, 0; total 0.5576, 0.4424, 0.2437."""
+    count, size = 3, 8192
+    values = sample_parameters(make_config("sensitivity", size))
+    unit = np.log10(values) / 2  # back to 0 ... 1
+    result = Ishigami.evaluate(math.pi * (2 * unit - 1))
+    own = compute_sensitivity(result, count, 1)
+    assert own.first == pytest.approx([0.3139, 0.4424, 0.0], abs=0.02)
+    assert own.total == pytest.approx([0.5576, 0.4424, 0.2437], abs=0.02)
+    assert own.used_share == 1.0
+    # SALib takes the cases sample by sample: A, then the mixed ones, then B.
+    blocks = result.reshape(count + 2, size)
+    ordered = blocks[[0, *range(2, count + 2), 1]].T.ravel()
+    names = ["a", "b", "c"]
+    problem = {"num_vars": count, "names": names, "bounds": [[0.0, 1.0]] * count}
+    theirs = sobol.analyze(problem, ordered, calc_second_order=False, seed=1)
+    assert own.first == pytest.approx(theirs["S1"], abs=2e-3)
+    assert own.total == pytest.approx(theirs["ST"], abs=2e-3)
+    half_width = (own.first_interval[1] - own.first_interval[0]) / 2
+    assert half_width == pytest.approx(theirs["S1_conf"], rel=0.25)
+    truth = [0.3139, 0.4424, 0.0]
+    assert all(low - 0.01 < s < high + 0.01 for s, (low, high) in zip(
+        truth, own.first_interval.T, strict=True))  # fmt: skip
+
+
+def test_samples_without_a_value_are_left_out_of_the_indices() -> None:
+    values = sample_parameters(make_config("sensitivity", 1024, ranges=2))
+    result = np.log10(values[:, 0])  # only the first parameter acts
+    result[values[:, 1] > 80.0] = np.nan
+    indices = compute_sensitivity(result, 2, 1)
+    assert 0.7 < indices.used_share < 0.98
+    assert indices.total[0] == pytest.approx(1.0, abs=0.1)
+    assert indices.total[1] == 0.0
+    constant = compute_sensitivity(np.ones(4 * 1024), 2, 1)
+    assert np.isnan(constant.first).all()
+
+
+def test_the_front_holds_the_cases_that_no_other_betters() -> None:
+    rng = np.random.default_rng(8)
+    first, second = rng.integers(0, 30, (2, 300)).astype(float)
+    first[:20] = np.nan
+    front = set(find_front(first, second).tolist())
+    points = [(a, b) for a, b in zip(first, second, strict=True) if not math.isnan(a)]
+    for index, (a, b) in enumerate(zip(first, second, strict=True)):
+        bettered = any(x <= a and y <= b and (x, y) != (a, b) for x, y in points)
+        if index in front:
+            assert not bettered
+        elif not math.isnan(a):
+            assert bettered or (a, b) in {(first[k], second[k]) for k in front}
+
+
+def test_seeds_are_of_the_case_and_differ() -> None:
+    seeds = make_seeds(3, range(100_000))
+    assert len(np.unique(seeds)) == 100_000
+    assert np.array_equal(make_seeds(3, range(500, 600)), seeds[500:600])
+    assert not np.isin(make_seeds(4, range(1000)), seeds).any()
+    bits = np.unpackbits(seeds.view(np.uint8)).mean()
+    assert bits == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_case_that_fails_is_named_and_has_no_result(tmp_path: Path) -> None:
+    """Without damping there is no resonance to divide by; a negative one is no model at all."""
+    text = (
+        HEAD + 'outcomes = ["curves", "peaks", "hysteresis"]\n'
+        '[[parameters]]\nname = "base.damping_n_s_m"\nvalues = [900.0, 1000.0]\n'
+    )
+    study = Study.read(write_study(tmp_path, text))
+    arrays, failures = compute_outcomes(
+        study, np.array([[900.0], [0.0], [-5.0], [1000.0]]), make_seeds(0, range(4))
+    )
+    assert set(failures) == {1, 2}
+    assert "damping" in failures[1]
+    for name, values in arrays.items():
+        assert np.isnan(values[2]).all(), name
+        assert np.isfinite(values[3]).any(), name
+    alone, _ = compute_outcomes(study, np.array([[1000.0]]), make_seeds(0, range(1)))
+    assert all(np.array_equal(alone[name][0], values[3], equal_nan=True)
+               for name, values in arrays.items())  # fmt: skip
+
+
+def test_the_shipped_studies_are_valid() -> None:
+    for name in ("bumper_design", "fold_sensitivity"):
+        assert Study.read(Path(name)).config.case_count > 100
