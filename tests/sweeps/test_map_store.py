@@ -152,7 +152,7 @@ def run_with_kills(
 ) -> int:
     """Start or resume a study until it is complete, with deaths on the way; return their number."""
     kills = 0
-    while True:
+    for _ in range(8 * max_kills):
         resume = ["--resume"] if (out / DEFINITION_FILE).exists() else []
         if not resume and out.exists():
             out.rename(out.with_name(f"{out.name}-{kills}"))  # died before it began
@@ -176,6 +176,7 @@ def run_with_kills(
                 helper.kill()
         if code == 0:
             return max(kills, 1)
+    raise AssertionError(f"not complete after {kills} kills: the last client ended with {code}")
 
 
 def start_cluster(stack: ExitStack) -> tuple[list[subprocess.Popen[bytes]], str]:

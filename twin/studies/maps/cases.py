@@ -1,7 +1,7 @@
 """Cases of a study: the model and the level for given values of the varied parameters."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 from table_io.errors import InputError, suggest
 from table_io.units import GRAVITY_M_S2
@@ -23,10 +23,11 @@ BASE_KEYS: Mapping[str, tuple[str, tuple[str, ...], float]] = {
 
 @dataclass(frozen=True, slots=True)
 class SampledCase:
-    """Model and peak table acceleration of one case."""
+    """Model and peak table acceleration of one case, and the settings of its outcomes by key."""
 
     model: Model
     acceleration_m_s2: float
+    settings: Mapping[str, float] = field(default_factory=dict)
 
     def find_resonance(self) -> tuple[float, float, float]:
         """Return `free_flight_resonance`, by which the ratios are scaled; InputError without."""
@@ -35,17 +36,21 @@ class SampledCase:
 
 @dataclass(frozen=True, slots=True)
 class CaseFactory:
-    """Builds cases from values of `names`, the keys of the parameters, and of the fixed keys."""
+    """Builds cases from values of `names`, the keys of the parameters, and of the fixed keys.
+
+    `settings`: units of the keys of outcomes.
+    """
 
     model: Model
     acceleration_m_s2: float
     fixed: Mapping[str, float]
     names: tuple[str, ...]
+    settings: Mapping[str, str]
 
     def require_keys(self) -> None:
         """Raise InputError for an unknown key, or an effect without values of all parameters."""
         for name in (*self.fixed, *self.names):
-            parameter_unit(name)
+            self.find_unit(name)
             if name in self.fixed and name in self.names:
                 raise InputError("both fixed and varied", key=name, remedy="keep one")
         _require_whole_effects(self.model, (*self.fixed, *self.names))
@@ -56,6 +61,7 @@ class CaseFactory:
         InputError if they make no model.
         """
         level, base = self.acceleration_m_s2, dict[str, float]()
+        settings: dict[str, float] = {}
         effects: dict[str, dict[str, float]] = {}
         pairs = {**self.fixed, **dict(zip(self.names, values, strict=True))}
         for name, value in pairs.items():
@@ -63,6 +69,8 @@ class CaseFactory:
                 if not value > 0:
                     raise InputError("not a level", key=name, value=value, allowed="above 0 g")
                 level = value * GRAVITY_M_S2
+            elif name in self.settings:
+                settings[name] = value
             elif name in BASE_KEYS:
                 _, fields, factor = BASE_KEYS[name]
                 base |= dict.fromkeys(fields, value * factor)
@@ -73,13 +81,21 @@ class CaseFactory:
         for effect, own in effects.items():
             known = instances[effect].values if effect in instances else {}
             instances[effect] = EffectInstance.create(find_effect(effect), {**known, **own})
-        return SampledCase(
-            Model(replace(self.model.base, **base), tuple(instances.values())), level
-        )
+        model = Model(replace(self.model.base, **base), tuple(instances.values()))
+        return SampledCase(model, level, settings)
+
+    def find_unit(self, name: str) -> str:
+        """Return the unit of a key that this study may vary; InputError if there is no such key."""
+        if name in self.settings:
+            return self.settings[name]
+        return parameter_unit(name, self.settings)
 
 
-def parameter_unit(name: str) -> str:
-    """Return the unit of a key that a study may vary; InputError if there is no such key."""
+def parameter_unit(name: str, further_names: Iterable[str] = ()) -> str:
+    """Return the unit of a key of tests and models; InputError if there is no such key.
+
+    `further_names`: what else the message may suggest.
+    """
     if name in BASE_KEYS:
         return BASE_KEYS[name][0]
     if name == LEVEL:
@@ -98,7 +114,7 @@ def parameter_unit(name: str) -> str:
             return units[rest[0]]
         known = [f"effects.{effect_id}.{parameter}" for parameter in units]
     else:
-        known = list_parameter_names()
+        known = [*list_parameter_names(), *further_names]
     raise InputError("no parameter of a study", key=name, remedy=suggest(name, known))
 
 

@@ -106,6 +106,9 @@ class StudyConfig(ConfigModel):
         None, ge=2, le=MAX_CASES,
         description="Number of samples; of sensitivity, base samples, a power of 2.",
     )  # fmt: skip
+    repeats: Count = Field(
+        1, ge=1, le=1000, description="Cases of every combination of a grid, with other seeds."
+    )
     seed: Count = Field(0, ge=0, description="Seed of the samples, and of every case.")
     chunk: Count | None = Field(
         None, ge=1, le=MAX_CHUNK,
@@ -139,6 +142,8 @@ class StudyConfig(ConfigModel):
             if self.samples is not None:
                 raise InputError("a grid has its own number of cases", key="samples")
         else:
+            if self.repeats > 1:
+                raise InputError("of a grid only", key="repeats", remedy="give more samples")
             if self.samples is None:
                 raise InputError("missing", key="samples", allowed=f"2 to {MAX_CASES}")
             listed = [p.name for p in self.parameters if p.values]
@@ -164,9 +169,10 @@ class StudyConfig(ConfigModel):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Number of values of each parameter of a grid; of samples their number alone."""
+        """Number of values of each parameter of a grid, and of repeats; of samples their number."""
         if self.sampling == "grid":
-            return tuple(parameter.grid_size for parameter in self.parameters)
+            repeats = (self.repeats,) if self.repeats > 1 else ()
+            return (*(parameter.grid_size for parameter in self.parameters), *repeats)
         assert self.samples is not None
         if self.sampling == "sensitivity":
             return (self.samples * (len(self.parameters) + 2),)

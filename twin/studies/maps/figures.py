@@ -15,13 +15,12 @@ from matplotlib.ticker import FixedLocator, FuncFormatter
 from table_io.block import Float1D
 from twin.compare.curves import FloatND
 from twin.reports.plot_style import CaptionedFigure, CaptionedFigures, Picture, save_figures
-from twin.studies.maps.cases import parameter_unit
 from twin.studies.maps.config import VariedParameter
 from twin.studies.maps.outcomes import OutcomeVariable
 from twin.studies.maps.results import (
     StudyResults,
-    describe_parameter,
     find_front,
+    format_plain,
     format_unit,
 )
 from twin.studies.maps.sensitivity import SensitivityIndices
@@ -38,6 +37,7 @@ MISSING_COLOUR = "#e4e4e4"
 class PlotAxis:
     """Axis of a parameter: its positions, in the logarithm where the study is, and its label."""
 
+    results: StudyResults
     parameter: VariedParameter
     values: Float1D
 
@@ -47,7 +47,7 @@ class PlotAxis:
 
     @property
     def label(self) -> str:
-        return describe_parameter(self.parameter.name, parameter_unit(self.parameter.name))
+        return self.results.label_parameter(self.parameter.name)
 
     def place(self, values: Float1D) -> Float1D:
         """Return where values lie on the axis."""
@@ -61,7 +61,7 @@ class PlotAxis:
             axis.set_major_formatter(FuncFormatter(lambda position, _: format_plain(10**position)))
 
     def format_value(self, value: float) -> str:
-        return f"{describe_value(self.parameter.name, value)}"
+        return self.results.describe_value(self.parameter.name, value)
 
 
 def choose_log_ticks(low: float, high: float) -> list[float]:
@@ -70,18 +70,6 @@ def choose_log_ticks(low: float, high: float) -> list[float]:
     digits = (1,) if last - first > 3 else (1, 2, 5) if last - first > 1 else range(1, 10)
     values = [digit * 10.0**decade for decade in range(first, last + 1) for digit in digits]
     return [math.log10(value) for value in values if low * 0.999 <= value <= high * 1.001]
-
-
-def format_plain(value: float) -> str:
-    """Format a number without exponent, thousands apart."""
-    return f"{value:,.0f}".replace(",", " ") if value >= 1000 else f"{value:.4g}"
-
-
-def describe_value(name: str, value: float) -> str:
-    """Return a parameter and its value: "gap 4 mm"."""
-    unit = parameter_unit(name)
-    plain = describe_parameter(name, unit).split(" in ")[0]
-    return f"{plain} {format_plain(value)} {format_unit(unit)}".replace("-", "−").rstrip()
 
 
 def draw_outcome_figures(
@@ -109,7 +97,7 @@ def _draw_figures(
 
 def _grid_plot_axes(results: StudyResults) -> list[PlotAxis]:
     axes = results.grid_axes()
-    return [PlotAxis(p, axes[p.name]) for p in results.study.config.parameters]
+    return [PlotAxis(results, p, axes[p.name]) for p in results.study.config.parameters]
 
 
 def _label_unit(variable: OutcomeVariable) -> str:
@@ -130,7 +118,7 @@ def draw_line(results: StudyResults, variable: OutcomeVariable) -> CaptionedFigu
     (axis,) = _grid_plot_axes(results)
     figure = Figure(figsize=(10, 3.6))
     ax = figure.subplots()
-    ax.plot(axis.positions, results.read_array(variable.name), "o-", ms=3)
+    ax.plot(axis.positions, results.read_grid(variable.name), "o-", ms=3)
     axis.set_up(ax.xaxis)
     ax.set_ylabel(_label_variable(variable))
     return CaptionedFigure(variable.name, _title(variable), "", figure)
@@ -167,7 +155,7 @@ def draw_map(results: StudyResults, variable: OutcomeVariable) -> CaptionedFigur
     A panel for values of the third parameter; the slices are at its middle value.
     """
     axes = _grid_plot_axes(results)
-    values = results.read_array(variable.name)
+    values = results.read_grid(variable.name)
     panels = list(_choose_panels(axes))
     columns = min(3, len(panels))
     rows = -(-len(panels) // columns)
@@ -250,7 +238,7 @@ def draw_samples(results: StudyResults, variable: OutcomeVariable) -> CaptionedF
     grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
     shown = slice(None, None, max(1, values.size // MAX_POINTS))
     for ax, parameter in zip(grid.flat, parameters, strict=False):
-        axis = PlotAxis(parameter, results.read_by_case(parameter.name))
+        axis = PlotAxis(results, parameter, results.read_by_case(parameter.name))
         ax.plot(axis.positions[shown], values[shown], ".", ms=1.6, alpha=0.35, color="#1559b0",
                 mew=0, rasterized=True)  # fmt: skip
         centres, means = _mean_in_bins(axis.positions, values)
@@ -282,8 +270,7 @@ def draw_sensitivity(
 ) -> CaptionedFigure:
     """Draw first-order and total Sobol indices of each outcome with their intervals."""
     labels = [
-        describe_parameter(p.name, parameter_unit(p.name)).split(" in ")[0]
-        for p in results.study.config.parameters
+        results.label_parameter(p.name).split(" in ")[0] for p in results.study.config.parameters
     ]
     variables = [variable for variable in results.scalars if variable.name in sensitivity]
     columns = min(3, len(variables))
@@ -368,5 +355,5 @@ def group_front(results: StudyResults) -> Iterator[FrontGroup]:
     values = results.read_by_case(front.each)
     for value in np.unique(values):
         cases = np.flatnonzero(values == value)
-        title = describe_value(front.each, float(value))
+        title = results.describe_value(front.each, float(value))
         yield FrontGroup(title, cases, first[cases], second[cases])

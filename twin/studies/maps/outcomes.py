@@ -169,7 +169,8 @@ class Outcome:
     """What a study can compute: its variables, and a function of a chunk that returns them.
 
     The function returns an array (case, *dims) of every variable, by name.
-    `needs_both_directions`: of the sweep.
+    `needs_both_directions`: of the sweep. `settings`: further keys that a study may vary or fix,
+    with their units; they begin with the name of the outcome, and are in `SampledCase.settings`.
     """
 
     name: str
@@ -177,6 +178,7 @@ class Outcome:
     variables: tuple[OutcomeVariable, ...]
     compute: Callable[[CaseChunk], Mapping[str, npt.NDArray[Any]]]
     needs_both_directions: bool = False
+    settings: Mapping[str, str] = field(default_factory=dict)
 
 
 def find_outcome(name: str) -> Outcome:

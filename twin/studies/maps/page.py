@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from twin.reports.page import embed_images, render_page
-from twin.studies.maps.cases import parameter_unit
-from twin.studies.maps.figures import draw_outcome_figures, format_plain, group_front
-from twin.studies.maps.results import StudyResults, describe_parameter, format_unit
+from twin.studies.maps.figures import draw_outcome_figures, group_front
+from twin.studies.maps.results import StudyResults, format_plain, format_unit
 from twin.studies.maps.sensitivity import SensitivityIndices, compute_sensitivity
 
 MAX_TABLE_CASES = 200_000  # in cases.csv
@@ -66,14 +65,13 @@ def describe_range(results: StudyResults, index: int) -> dict[str, Any]:
     """Return what the page says of a parameter."""
     parameter = results.study.config.parameters[index]
     low, high = parameter.limits
-    unit = parameter_unit(parameter.name)
+    unit = results.find_unit(parameter.name)
+    ends = f"{format_plain(low)} to {format_plain(high)} {format_unit(unit)}"
     values = f"{parameter.grid_size} values" if results.is_grid else "samples"
     scale = ", evenly in the logarithm" if parameter.scale == "log" else ""
     return {
         "name": parameter.name,
-        "range": f"{format_plain(low)} to {format_plain(high)} {format_unit(unit)}".replace(
-            "-", "−"
-        ),
+        "range": ends.replace("-", "−"),
         "values": values + scale,
     }
 
@@ -85,7 +83,7 @@ def _summarise_variable(results: StudyResults, variable: Any) -> dict[str, Any]:
     return {
         "title": variable.title,
         "name": variable.name,
-        "unit": "" if variable.unit == "1" else format_unit(variable.unit),
+        "unit": format_unit(variable.unit),
         "quantiles": quantiles,
         "missing": int(values.size - finite.size),
     }
@@ -125,7 +123,7 @@ def write_front_table(results: StudyResults, path: Path) -> dict[str, Any] | Non
                 np.linspace(0, len(rows) - 1, min(len(rows), MAX_FRONT_ROWS)).round().astype(int)
             )
             groups.append({"title": group.title, "rows": [rows[index] for index in thinned]})
-    heads = [describe_parameter(name, parameter_unit(name)) for name in names]
+    heads = [results.label_parameter(name) for name in names]
     by_name = {variable.name: variable for variable in results.scalars}
     heads += [
         f"{by_name[name].title} in {format_unit(by_name[name].unit)}" for name in front.minimise

@@ -1,6 +1,7 @@
 """Results of a study as labelled arrays, while it runs too."""
 
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,10 +25,10 @@ if TYPE_CHECKING:
 def open_study(folder: Path | str, variables: Sequence[str] | None = None) -> "xarray.Dataset":
     """Return the results of a study as a labelled dataset, with units, title and versions.
 
-    A grid has a dimension per parameter, named as its key, samples the dimension `case`; curves
-    also `direction` (1 forward, -1 backward) and `frequency_hz`. Cases without a result, such as
-    those still to come, are NaN. `variables`: only these are read. InputError for a folder without
-    a study, or an unknown variable.
+    A grid has a dimension per parameter, named as its key, and `repeat` where cases are repeated;
+    samples have the dimension `case`; curves also `direction` (1 forward, -1 backward) and
+    `frequency_hz`. Cases without a result, such as those still to come, are NaN. `variables`: only
+    these are read. InputError for a folder without a study, or an unknown variable.
     """
     require_package("xarray", "studies", "open_study")
     return StudyResults(Path(folder)).to_dataset(variables)
@@ -72,6 +73,29 @@ class StudyResults:
         values = self.read_by_case(name)
         return values.reshape(*self.study.config.shape, *values.shape[1:])
 
+    def read_grid(self, name: str) -> FloatND:
+        """Return a variable of a grid, (*parameters), the mean over repeated cases."""
+        values = self.read_array(name)
+        if self.study.config.repeats == 1:
+            return values
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # all of a cell are missing
+            return np.nanmean(values, axis=-1)
+
+    def find_unit(self, name: str) -> str:
+        """Return the unit of a parameter."""
+        return self.study.factory.find_unit(name)
+
+    def label_parameter(self, name: str) -> str:
+        """Return the name of a parameter for a label, with its unit: "gap in mm"."""
+        return describe_parameter(name, self.find_unit(name))
+
+    def describe_value(self, name: str, value: float) -> str:
+        """Return a parameter and its value: "gap 4 mm"."""
+        plain, unit = self.label_parameter(name).split(" in ")[0], self.find_unit(name)
+        text = f"{plain} {format_plain(value)} {format_unit(unit)}"
+        return text.replace("-", "−").rstrip()
+
     def grid_axes(self) -> dict[str, Float1D]:
         """Return the values of each parameter of a grid, by its key."""
         config = self.study.config
@@ -87,7 +111,8 @@ class StudyResults:
             if name not in known:
                 raise InputError("no variable of this study", key=name, remedy=suggest(name, known))
         names = [parameter.name for parameter in self.study.config.parameters]
-        own_dims = tuple(names) if self.is_grid else ("case",)
+        repeats = ("repeat",) if self.study.config.repeats > 1 else ()
+        own_dims = (*names, *repeats) if self.is_grid else ("case",)
         coordinates: dict[str, Any] = {
             dim: (dim, self._group[dim][:], dict(self._group[dim].attrs))
             for dim in ("direction", "frequency_hz")
@@ -127,8 +152,15 @@ def describe_parameter(name: str, unit: str) -> str:
     return f"{plain} in {format_unit(unit)}" if unit not in ("", "1") else plain
 
 
+def format_plain(value: float) -> str:
+    """Format a number without exponent, thousands apart."""
+    return f"{value:,.0f}".replace(",", " ") if abs(value) >= 1000 else f"{value:.4g}"
+
+
 def format_unit(unit: str) -> str:
-    """Return a unit with raised exponents: m/s2 is m/s²."""
+    """Return a unit with raised exponents, m/s2 as m/s²; nothing for that of a ratio, 1."""
+    if unit == "1":
+        return ""
     return re.sub(r"(?<=[a-z])[23]", lambda match: "²³"[int(match.group()) - 2], unit)
 
 

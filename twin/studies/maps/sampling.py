@@ -24,12 +24,14 @@ def _grid_values(parameter: VariedParameter) -> Float1D:
 def sample_parameters(config: StudyConfig) -> Float2D:
     """Return the values of the parameters in every case, (case, parameter), by the seed alone.
 
-    Of a grid the last parameter varies fastest. Of a sensitivity design, with n base samples and
-    d parameters: A (n cases), B (n), then for each parameter A with its column from B (n each).
+    Of a grid the last parameter varies fastest, but for repeated cases. Of a sensitivity design,
+    with n base samples and d parameters: A (n cases), B (n), then for each parameter A with its
+    column from B (n each).
     """
     if config.sampling == "grid":
         axes = np.meshgrid(*grid_axes(config), indexing="ij")
-        return np.stack([axis.ravel() for axis in axes], axis=1)
+        cells = np.stack([axis.ravel() for axis in axes], axis=1)
+        return np.repeat(cells, config.repeats, axis=0)
     from scipy.stats import qmc
 
     assert config.samples is not None

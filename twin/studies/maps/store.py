@@ -20,7 +20,6 @@ import numpy.typing as npt
 from table_io.block import Float2D
 from table_io.errors import InputError
 from twin.run.versions import compare_versions, format_version_changes, read_installed_versions
-from twin.studies.maps.cases import parameter_unit
 from twin.studies.maps.outcomes import SweepPlan
 from twin.studies.maps.study import Study
 
@@ -46,7 +45,7 @@ def create_store(folder: Path, study: Study, sweep: SweepPlan, values: Float2D) 
     group = zarr.create_group(folder / RESULTS_FOLDER, attributes=_describe_study(study))
     count, size = study.config.case_count, study.config.chunk_size
     for parameter, column in zip(study.config.parameters, values.T, strict=True):
-        attributes = {"units": parameter_unit(parameter.name)}
+        attributes = {"units": study.factory.find_unit(parameter.name)}
         _add_coordinate(group, parameter.name, column, "case", attributes)
     seeds = make_seeds(study.config.seed, range(count))
     _add_coordinate(group, "seed", seeds, "case", {"long_name": "seed of the case"})

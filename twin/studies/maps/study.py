@@ -78,6 +78,7 @@ class Study:
             self.profile.sweep.one_level_g * GRAVITY_M_S2,
             self.config.fixed,
             tuple(parameter.name for parameter in self.config.parameters),
+            {key: unit for outcome in self.outcomes for key, unit in outcome.settings.items()},
         )
 
     def check_cases(self) -> None:
