@@ -1,15 +1,23 @@
 """Map of the resonance over the gap: peaks against slow sweeps, loci against single branches."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from table_io.config.base import PROFILES_DIR
 from table_io.units import GRAVITY_M_S2
 from twin.dynamics.continuation import continue_branch
-from twin.dynamics.main_branches import follow_main_branches
+from twin.dynamics.main_branches import follow_main_branches, follow_sweep_branches
 from twin.dynamics.orbits import settle_to_orbit
 from twin.dynamics.period_map import FREQUENCY, GAP, make_period_map
-from twin.dynamics.resonance_map import ResonanceMap, compute_resonance_map
+from twin.dynamics.resonance_map import (
+    ResonanceMap,
+    compute_resonance_map,
+    find_peaks,
+    half_swings,
+)
+from twin.model.model import Model
 from twin.model.stepped_sine import simulate_stepped_sine
 from twin.run.run_config import read_run_config
 
@@ -77,3 +85,20 @@ def test_the_main_branch_of_g4_holds_the_three_solutions_at_3_4_hz() -> None:
     amplitudes_mm = sorted(500 * (orbit.u_max - orbit.u_min) for orbit in orbits)
     assert amplitudes_mm == pytest.approx([1.247, 3.297, 5.123], abs=1e-3)
     assert [orbit.stable for orbit in orbits].count(False) == 1
+
+
+def test_a_small_motion_at_the_end_of_the_range_hides_no_peak() -> None:
+    """A subharmonic at the lower end, far below the primary resonance, is followed too."""
+    config = read_run_config(PROFILES_DIR / "tests" / "g4_ss3.toml")
+    base = replace(config.model.base, mass=528.585, gap_r=1.99611e-3, gap_l=1.99611e-3)
+    branches = follow_sweep_branches(
+        Model(base), config.profile.sweep.frequencies_hz, [0.0451172 * GRAVITY_M_S2]
+    )
+    assert any(
+        branch.ends[0].reason == "range end" and branch.values.max() < 1.0 for branch in branches
+    )
+    u, u_hz, a, a_hz = find_peaks(branches)
+    assert (u_hz, a_hz) == pytest.approx((3.9348, 3.9350), abs=1e-3)
+    main = max(branches, key=lambda branch: branch.values.max())
+    swings = np.array([half_swings(point.orbit) for point in main.points])[main.stable]
+    assert (u, a) == pytest.approx(swings.max(axis=0), rel=2e-3)

@@ -68,36 +68,41 @@ def compute_resonance_map(
 
 
 def find_peaks(branches: Sequence[Branch]) -> tuple[float, float, float, float]:
-    """Return (largest u in m, at Hz, largest total acceleration in m/s2, at Hz), half swings."""
-    nan = float("nan")
-    peaks = [(nan, nan), (nan, nan)]
+    """Return (largest u in m, at Hz, largest total acceleration in m/s2, at Hz), half swings.
+
+    NaN without a stable orbit, and where the largest one is at an end of the range: the peak is
+    outside.
+    """
+    peaks = [(0.0, float("nan"), True), (0.0, float("nan"), True)]
     for branch in branches:
         swings = np.array([half_swings(point.orbit) for point in branch.points])
         for column in range(2):
-            peak = _find_peak(branch, swings[:, column])
-            if not peak[0] <= peaks[column][0]:
-                peaks[column] = peak
-    return (*peaks[0], *peaks[1])
+            if branch.stable.any():
+                peaks[column] = max(peaks[column], _find_peak(branch, swings[:, column]))
+    swing_and_hz = [
+        (float("nan"), float("nan")) if is_outside else (swing, at_hz)
+        for swing, at_hz, is_outside in peaks
+    ]
+    return (*swing_and_hz[0], *swing_and_hz[1])
 
 
-def _find_peak(branch: Branch, swings: Float1D) -> tuple[float, float]:
-    """Return (largest swing of a stable orbit, its frequency in Hz) on a branch.
+def _find_peak(branch: Branch, swings: Float1D) -> tuple[float, float, bool]:
+    """Return (largest swing of a stable orbit, its frequency in Hz, whether at the range's end).
 
-    Between the points by the parabola through three of them; at a fold the point itself. NaN where
-    it lies at the end of the range: the peak is outside.
+    Between the points by the parabola through three of them; at a fold the point itself.
     """
     stable, frequencies_hz = branch.stable, branch.values
     top = int(np.where(stable, swings, -np.inf).argmax())
     ends = {0: branch.ends[0], len(swings) - 1: branch.ends[1]}
-    if not stable.any() or (top in ends and ends[top].reason == "range end"):
-        return float("nan"), float("nan")
+    if top in ends and ends[top].reason == "range end":
+        return float(swings[top]), float(frequencies_hz[top]), True
     x, y = frequencies_hz[top - 1 : top + 2], swings[top - 1 : top + 2]
     if x.size == 3 and stable[top - 1 : top + 2].all() and (x[1] - x[0]) * (x[2] - x[1]) > 0:
         bend, slope, _ = np.polyfit(x - x[1], y, 2)
         if bend < 0:
             shift = -slope / (2 * bend)
-            return float(y[1] + slope * shift / 2), float(x[1] + shift)
-    return float(swings[top]), float(frequencies_hz[top])
+            return float(y[1] + slope * shift / 2), float(x[1] + shift), False
+    return float(swings[top]), float(frequencies_hz[top]), False
 
 
 def half_swings(orbit: Orbit) -> tuple[float, float]:

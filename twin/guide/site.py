@@ -83,6 +83,7 @@ CHAPTERS = (
             _page("laboratory-day", "A laboratory day"),
             _page("while-it-runs", "While a test runs"),
             _page("earthquakes", "Earthquakes"),
+            _page("studies", "Studies over parameters"),
         ),
     ),
     Chapter(

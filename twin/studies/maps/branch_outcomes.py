@@ -12,6 +12,8 @@ from twin.dynamics.resonance_map import find_peaks
 from twin.studies.maps.cases import SampledCase
 from twin.studies.maps.outcomes import CaseChunk, Outcome, OutcomeVariable
 
+SAME_FOLD_DIGITS = 7  # of the frequency in Hz
+
 
 def find_branch_folds(chunk: CaseChunk) -> Mapping[str, npt.NDArray[Any]]:
     """Return the folds of the primary resonance, its grazing, and the largest stable motion."""
@@ -35,7 +37,10 @@ def locate_folds(branches: Sequence[Branch]) -> tuple[float, float, float]:
     if not folded:
         return nan, nan, nan
     branch = max(folded, key=lambda branch: max(fold.value for fold in branch.folds))
-    folds = sorted(fold.value for fold in branch.folds)
+    # A branch that is followed to and fro has its folds twice, to the tolerance of Newton's method.
+    folds = np.unique(np.round([fold.value for fold in branch.folds], SAME_FOLD_DIGITS)).tolist()
+    if len(folds) < 2:
+        return nan, nan, nan
     grazings = [bifurcation.value for bifurcation in branch.of_kind("grazing")]
     near = [value for value in grazings if value >= folds[-2]]
     return folds[-1], folds[-2], min(near, default=nan)
@@ -49,9 +54,9 @@ FOLDS = Outcome(
         OutcomeVariable("lower_fold_hz", "Hz", "lower fold, where a backward sweep jumps up"),
         OutcomeVariable("grazing_hz", "Hz", "grazing between the folds"),
         OutcomeVariable("stable_disp_m", "m", "largest stable relative displacement"),
-        OutcomeVariable("stable_disp_hz", "Hz", "its frequency"),
+        OutcomeVariable("stable_disp_hz", "Hz", "frequency of the largest displacement"),
         OutcomeVariable("stable_acc_m_s2", "m/s2", "largest stable total acceleration"),
-        OutcomeVariable("stable_acc_hz", "Hz", "its frequency"),
+        OutcomeVariable("stable_acc_hz", "Hz", "frequency of the largest acceleration"),
     ),
     find_branch_folds,
 )

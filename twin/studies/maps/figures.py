@@ -239,7 +239,7 @@ def draw_samples(results: StudyResults, variable: OutcomeVariable) -> CaptionedF
     shown = slice(None, None, max(1, values.size // MAX_POINTS))
     for ax, parameter in zip(grid.flat, parameters, strict=False):
         axis = PlotAxis(results, parameter, results.read_by_case(parameter.name))
-        ax.plot(axis.positions[shown], values[shown], ".", ms=1.6, alpha=0.35, color="#1559b0",
+        ax.plot(axis.positions[shown], values[shown], ".", ms=3, alpha=0.35, color="#1559b0",
                 mew=0, rasterized=True)  # fmt: skip
         centres, means = _mean_in_bins(axis.positions, values)
         ax.plot(centres, means, color="#c4161c", lw=1.8)
@@ -247,7 +247,7 @@ def draw_samples(results: StudyResults, variable: OutcomeVariable) -> CaptionedF
     for ax in grid.flat[len(parameters) :]:
         ax.set_visible(False)
     for ax in grid[:, 0]:
-        ax.set_ylabel(_label_variable(variable))
+        ax.set_ylabel(_label_unit(variable))
     missing = float(np.isnan(values).mean())
     caption = "Points: cases; line: mean over a fortieth of the range."
     if missing:
