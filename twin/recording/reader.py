@@ -16,6 +16,7 @@ from twin.recording.recovery import (
     Damage,
     LogMessage,
     RecoveredLog,
+    pause_collection,
     recover_log,
 )
 from twin.recording.validation import (
@@ -105,6 +106,7 @@ def read_recording(path: Path, topics: Iterable[str] = TOPIC_TYPES) -> Recording
     return build_recording(path, recover_log(path, frozenset((START_TOPIC, *topics))))[0]
 
 
+@pause_collection()
 def build_recording(path: Path, recovered: RecoveredLog) -> tuple[Recording, list[LogMessage]]:
     """Return (recording, message of each of its items) from a recovered log."""
     problems = _assign_unnamed_topics(recovered)

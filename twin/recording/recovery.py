@@ -5,8 +5,11 @@ latest at the end that it declares, and after other damage at the next valid rec
 are limited from the start.
 """
 
+import gc
 import os
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -89,6 +92,19 @@ class RecoveredLog:
     is_intact: bool = False
 
 
+@contextmanager
+def pause_collection() -> Iterator[None]:
+    """Pause the collection of reference cycles, which would visit all that was read many times."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
+@pause_collection()
 def recover_log(path: Path, topics: frozenset[str] | None = None) -> RecoveredLog:
     """Recover the readable content of `path`, only of `topics` if given.
 
