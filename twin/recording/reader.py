@@ -9,6 +9,7 @@ from typing import TypeVar
 from table_io.block import Block, join_blocks
 from table_io.errors import InputError
 from table_io.records import Record, RunStart, RunStop
+from twin.recording.garbage_collection import pause_collection
 from twin.recording.log_metadata import START_COPY_NAME, read_schema_version
 from twin.recording.mcap_log import iter_messages, read_leading_metadata
 from twin.recording.recovery import (
@@ -16,7 +17,6 @@ from twin.recording.recovery import (
     Damage,
     LogMessage,
     RecoveredLog,
-    pause_collection,
     recover_log,
 )
 from twin.recording.validation import (

@@ -5,16 +5,14 @@ latest at the end that it declares, and after other damage at the next valid rec
 are limited from the start.
 """
 
-import gc
 import os
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from table_io.errors import InputError
+from twin.recording.garbage_collection import pause_collection
 from twin.recording.mcap_records import (
     ATTACHMENT,
     CHANNEL,
@@ -90,18 +88,6 @@ class RecoveredLog:
     damage: list[Damage] = field(default_factory=list)
     topics: frozenset[str] = frozenset()  # of all messages, wanted or not
     is_intact: bool = False
-
-
-@contextmanager
-def pause_collection() -> Iterator[None]:
-    """Pause the collection of reference cycles, which would visit all that was read many times."""
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()
 
 
 @pause_collection()
