@@ -13,6 +13,7 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+from numba import njit
 
 from table_io.block import Float1D, Float2D
 
@@ -142,9 +143,15 @@ def filter_first_order(
     The numbers are those of `scipy.signal.lfilter`, whose import takes longer than the start of a
     command.
     """
-    b0, b1 = gains
     y = np.empty(x.size)
-    for i, value in enumerate(x.tolist()):
-        y[i] = b0 * value + state
-        state = b1 * value + pole * float(y[i])
-    return y, state
+    last: float = _filter(np.ascontiguousarray(x), *gains, pole, state, y)
+    return y, last
+
+
+@njit(cache=True, nogil=True)
+def _filter(x, b0, b1, pole, state, y):  # type: ignore[no-untyped-def]
+    """Write the output into `y`, return the last state."""
+    for i in range(x.size):
+        y[i] = b0 * x[i] + state
+        state = b1 * x[i] + pole * y[i]
+    return state

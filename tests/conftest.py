@@ -35,6 +35,14 @@ rate_hz = 1000.0
 """
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_configure(config: pytest.Config) -> None:
+    """Let --benchmark-only measure, in one process, which the default options forbid."""
+    if config.getoption("benchmark_only"):
+        config.option.benchmark_enable = True
+        config.option.dist, config.option.tx, config.option.numprocesses = "no", [], 0
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Give the long studies more time than a test has."""
     for item in items:

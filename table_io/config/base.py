@@ -1,7 +1,8 @@
 """Loading of TOML files into validated, frozen models; one message lists all faults of a file."""
 
 import tomllib
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
@@ -74,6 +75,12 @@ class ConfigModel(BaseModel):
 
 
 ConfigT = TypeVar("ConfigT", bound=ConfigModel)
+SortableT = TypeVar("SortableT", str, float, tuple[str, float])
+
+
+def list_duplicates(values: Sequence[SortableT]) -> list[SortableT]:
+    """List the values that occur more than once, each one time, sorted."""
+    return sorted(value for value, count in Counter(values).items() if count > 1)
 
 
 def find_attached_text(name: str | None, info: ValidationInfo) -> str | None:

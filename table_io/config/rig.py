@@ -19,7 +19,7 @@ from pydantic_core import InitErrorDetails
 
 from table_io.channels import CHANNEL_BY_NAME, Channel
 from table_io.config.backend import BACKEND_GROUP, BackendConfig, load_backend
-from table_io.config.base import ConfigModel, NonNegative, Number, Positive
+from table_io.config.base import ConfigModel, NonNegative, Number, Positive, list_duplicates
 from table_io.config.calibration_record import CalibrationRecord
 from table_io.config.channel import ChannelConfig
 from table_io.config.plugins import list_entry_points
@@ -163,8 +163,7 @@ class RigConfig(ConfigModel):
     @field_validator("extra_channels")
     @classmethod
     def _check_duplicates(cls, channels: tuple[ChannelConfig, ...]) -> tuple[ChannelConfig, ...]:
-        names = [channel.name for channel in channels]
-        duplicates = sorted({name for name in names if names.count(name) > 1})
+        duplicates = list_duplicates([channel.name for channel in channels])
         if duplicates:
             raise InputError(
                 f"channels declare {', '.join(duplicates)} more than once", remedy="keep one"
@@ -179,7 +178,7 @@ class RigConfig(ConfigModel):
         if "extra_channels" in info.data:  # else their faults are reported
             _check_sensor_channels(sensors, _build_registry(info.data["extra_channels"]))
         names = [sensor.channel for sensor in sensors]
-        duplicates = sorted({name for name in names if names.count(name) > 1})
+        duplicates = list_duplicates(names)
         if duplicates:
             raise InputError(
                 f"sensors name {', '.join(duplicates)} more than once",

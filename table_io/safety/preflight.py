@@ -195,39 +195,47 @@ def check_limits(
         *_find_rate_faults(profile, rig),
         *_find_exceeded_limits(rows, rig, _suggest_level(rows, profile, rig), level_key),
         *_find_clipped_sensors(rows, rig),
+        *_find_coarse_outputs(rows, rig, level_key),
     ]
-    steps = [row for row in rows if row.step >= 0 and row.frequency_hz > 0]
-    coarsest = min(steps, key=lambda row: row.amplitude_lsb, default=None)
-    if coarsest is not None and coarsest.amplitude_lsb < rig.output.least_lsb:
-        faults.append(
-            InputError(
-                f"{coarsest.amplitude_lsb:.1f} steps of the DAC",
-                where=f"step {coarsest.step} ({coarsest.frequency_hz:g} Hz)",
-                key="amplitude",
-                allowed=f"at least {rig.output.least_lsb}",
-                remedy=f"raise {level_key}, lower sweep.stop_hz, or use an output with "
-                "more bits or a smaller span",
-            )
-        )
-    peak_lsb = max(
-        (row.amplitude_lsb for row in rows if math.isnan(row.frequency_hz)), default=None
-    )
-    if peak_lsb is not None and peak_lsb < rig.output.least_lsb:
-        faults.append(
-            InputError(
-                f"{peak_lsb:.1f} steps of the DAC",
-                where="the peak of the history",
-                key="displacement",
-                allowed=f"at least {rig.output.least_lsb}",
-                remedy="raise its level, or use an output with more bits or a smaller span",
-            )
-        )
     if faults:
         raise InputError(
             f"the table {rig.name!r} cannot do this test; nothing was started",
             where=source,
             faults=tuple(faults),
         )
+
+
+def _find_coarse_outputs(
+    rows: tuple[StepDemand, ...], rig: RigConfig, level_key: str
+) -> list[InputError]:
+    """List a fault if the smallest step or the peak of a history is too few steps of the DAC."""
+    steps = [row for row in rows if row.step >= 0 and row.frequency_hz > 0]
+    histories = [row for row in rows if math.isnan(row.frequency_hz)]
+    candidates = []
+    if steps:
+        coarsest = min(steps, key=lambda row: row.amplitude_lsb)
+        candidates.append(
+            (
+                coarsest.amplitude_lsb,
+                f"step {coarsest.step} ({coarsest.frequency_hz:g} Hz)",
+                "amplitude",
+                f"raise {level_key}, lower sweep.stop_hz,",
+            )
+        )
+    if histories:
+        peak_lsb = max(row.amplitude_lsb for row in histories)
+        candidates.append((peak_lsb, "the peak of the history", "displacement", "raise its level,"))
+    return [
+        InputError(
+            f"{size_lsb:.1f} steps of the DAC",
+            where=where,
+            key=key,
+            allowed=f"at least {rig.output.least_lsb}",
+            remedy=f"{advice} or use an output with more bits or a smaller span",
+        )
+        for size_lsb, where, key, advice in candidates
+        if size_lsb < rig.output.least_lsb
+    ]
 
 
 def _find_rate_faults(profile: Profile, rig: RigConfig) -> list[InputError]:

@@ -6,7 +6,6 @@ Each starts in the steady state of its first sample, so the signal is constant b
 import math
 
 import numpy as np
-from scipy.signal import lfilter
 
 from table_io.block import Float1D, Float2D
 
@@ -49,6 +48,9 @@ class AnalogFilter:
     def __init__(
         self, zeros: list[complex], poles: list[complex], gain: float, rate_hz: float
     ) -> None:
+        from scipy.signal import lfilter  # slow to import, and few tables have such a filter
+
+        self._run_section = lfilter
         self._direct = gain if len(zeros) == len(poles) else 0.0
         self._sections = []
         self.settling_samples = math.ceil(
@@ -81,6 +83,6 @@ class AnalogFilter:
             self._states = [(static - b[0]) * start for b, _, static in self._sections]
         filtered: Float2D = self._direct * values
         for n, (b, a, _) in enumerate(self._sections):
-            response, self._states[n] = lfilter(b, a, values, axis=1, zi=self._states[n])
+            response, self._states[n] = self._run_section(b, a, values, axis=1, zi=self._states[n])
             filtered += response.real
         return filtered

@@ -31,7 +31,15 @@ from typing import Any, NamedTuple, TypeVar
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from table_io.config.base import ConfigModel, Finite, NonNegative, Number, Positive, parse_toml
+from table_io.config.base import (
+    ConfigModel,
+    Finite,
+    NonNegative,
+    Number,
+    Positive,
+    list_duplicates,
+    parse_toml,
+)
 from table_io.errors import InputError
 from table_io.sim.hidden_entry import HiddenEntry, HiddenParameter
 from table_io.sim.imperfections import Imperfection
@@ -195,8 +203,9 @@ class GroundTruth(ConfigModel):
     @field_validator("effects", "imperfections")
     @classmethod
     def _check_unique(cls, entries: tuple[EntryT, ...]) -> tuple[EntryT, ...]:
-        names = [(entry.id, entry.place or "") for entry in entries]
-        duplicates = sorted({" ".join(name).strip() for name in names if names.count(name) > 1})
+        duplicates = list_duplicates(
+            [f"{entry.id} {entry.place or ''}".strip() for entry in entries]
+        )
         if duplicates:
             raise InputError(f"{', '.join(duplicates)} more than once", remedy="keep one of each")
         return entries

@@ -13,7 +13,6 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg, signal
 
 from table_io.block import Float1D, Float2D
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS, Channel
@@ -280,6 +279,9 @@ class HalfOrderNoise:
         self.rows = rows
         self._scales = np.array(scales)[:, None]
         self._noise = noise
+        from scipy import signal  # slow to import, and few tables have such noise
+
+        self._filter = signal.sosfilt
         decades = math.log10(0.5 * rate_hz / ONE_OVER_F_START_HZ)
         ratio = 10.0 ** (1.0 / POLES_PER_DECADE)
         corners = ONE_OVER_F_START_HZ * ratio ** np.arange(math.floor(decades * POLES_PER_DECADE))
@@ -295,18 +297,20 @@ class HalfOrderNoise:
     def draw(self, count: int) -> Float2D:
         """Draw the next samples, (row, sample)."""
         white = self._scales * self._noise.standard_normal((count, len(self.rows))).T
-        coloured, self._state = signal.sosfilt(self._sos, white, axis=1, zi=self._state)
+        coloured, self._state = self._filter(self._sos, white, axis=1, zi=self._state)
         noise: Float2D = coloured
         return noise
 
     def _draw_stationary_state(self) -> Float2D:
         """Draw a state of the filter, (section, row, 2), as after an infinite time."""
+        from scipy import linalg
+
         sections = len(self._sos)
         size = 2 * sections
 
         def advance(sample: float, state: Float1D) -> Float1D:
             zi = state.reshape(sections, 2)
-            after: Float1D = signal.sosfilt(self._sos, np.array([sample]), zi=zi)[1].ravel()
+            after: Float1D = self._filter(self._sos, np.array([sample]), zi=zi)[1].ravel()
             return after
 
         transition = np.array([advance(0.0, unit) for unit in np.eye(size)]).T
@@ -396,6 +400,10 @@ def _group_alias_filters(
     items: list[RowImperfection], rate_hz: float
 ) -> list[tuple[list[int], AnalogFilter]]:
     """Return the anti-alias filters with their rows; channels with equal ones share one."""
+    if not items:
+        return []
+    from scipy import signal  # slow to import, and few tables have such filters
+
     rows: dict[tuple[str, float, float], list[int]] = {}
     for row, entry, p in items:
         rows.setdefault((entry.form, p["order"], p["corner_hz"]), []).append(row)

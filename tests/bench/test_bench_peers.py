@@ -61,7 +61,7 @@ def ratio(benchmark, frequencies: np.ndarray, peer_s: float, name: str, least: f
     if benchmark.stats is None:
         return
     time_ratio = peer_s / benchmark.stats.stats.min
-    benchmark.extra_info[f"{name}_ratio"] = round(time_ratio)
+    benchmark.extra_info[f"over_{name}"] = 1.0 / time_ratio
     motion = float(np.sum(CYCLES / frequencies))
     print(f"\n{name}: {1e3 * peer_s:.1f} ms, ours {1e3 * benchmark.stats.stats.min:.2f} ms for "
           f"{motion:.0f} s of motion: {time_ratio:.0f} times as long")  # fmt: skip

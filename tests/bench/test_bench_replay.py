@@ -18,10 +18,7 @@ from twin.run.run_config import RunConfig, read_run_config
 from twin.run.unpaced import play_unpaced
 from twin.transport import shaketwin_pb2 as pb
 
-# The limits of reading by protobuf lie at twice what was measured, those of real time far below.
-LEAST_TIMES_REAL_TIME = 20
-MOST_READINGS = 4.0
-MOST_READINGS_OF_A_CHANNEL = 1.0
+LEAST_TIMES_REAL_TIME = 20  # far below what was measured; the ratios are judged by ratios.py
 
 
 @pytest.fixture(scope="module")
@@ -82,9 +79,8 @@ def test_replay_beside_reading(benchmark, bundle: RunConfig, log: Path, tmp_path
     assert stop is not None
     seconds = stop.index / bundle.drive.rate_hz
     benchmark.extra_info["times_real_time"] = round(seconds / ours)
-    benchmark.extra_info["over_reading"] = round(ours / reading, 2)
+    benchmark.extra_info["over_reading"] = round(ours / reading, 3)
     print(f"\nreplay {seconds / ours:.0f} times real time, {ours / reading:.2f} times reading")
-    assert ours <= MOST_READINGS * reading
     assert seconds >= LEAST_TIMES_REAL_TIME * ours
 
 
@@ -102,4 +98,3 @@ def test_one_channel_of_a_log(benchmark, log: Path) -> None:
     reading = min(cpu_s(read_by_protobuf, log) for _ in range(3))
     benchmark.extra_info["over_reading"] = round(ours / reading, 2)
     print(f"\none channel {ours / reading:.2f} times reading")
-    assert ours <= MOST_READINGS_OF_A_CHANNEL * reading

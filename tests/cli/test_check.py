@@ -14,7 +14,8 @@ from rich.console import Console
 from table_io.config.base import PROFILES_DIR
 from table_io.safety.preflight import list_limits
 from table_io.units import GRAVITY_M_S2
-from twin.cli.check import draw_drive, find_worst_rows, print_plan, select_rows, sum_durations_s
+from twin.cli.check import find_worst_rows, print_plan, select_rows, sum_durations_s
+from twin.reports.drive_figure import draw_drive
 from twin.reports.predicted_ranges import format_clipping_warnings, predict_peaks
 from twin.run.run_config import RunConfig, from_texts, read_run_config
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationError, ValidationInfo, field_validator
 
-from table_io.config.base import ConfigModel, Count, parse_toml, read_text
+from table_io.config.base import ConfigModel, Count, list_duplicates, parse_toml, read_text
 from table_io.config.excitation.stepped_sine import Sweep
 from table_io.config.folders import find_config, list_configs, resolve_config
 from table_io.errors import InputError, suggest
@@ -134,7 +134,7 @@ def read_plan(
     grid_bundles = {} if grid is None else _read_grid(grid, path, table, model, check_run, faults)
     cells = () if grid is None else tuple(grid.list_cells())
     labels = [label for run in entries for label in run.labels] + [cell.label for cell in cells]
-    for label in sorted({label for label in labels if labels.count(label) > 1}):
+    for label in list_duplicates(labels):
         fault = InputError("used twice", key="label", value=label, remedy="give each run its own")
         faults.add(fault, "runs")
     listed = faults.list_by_place()

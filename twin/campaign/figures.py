@@ -1,6 +1,5 @@
 """Figures of a campaign: PRC families as in the paper's Figs. 2 and 5, and level errors."""
 
-import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +14,7 @@ from twin.campaign.gap_comparison import GapComparison
 from twin.campaign.gap_figures import draw_gap_figures
 from twin.campaign.summary import CampaignData, CampaignRunData, describe_normalization
 from twin.reports.measured_campaign import MeasuredCampaign
-from twin.reports.paper_cases import PaperCase, PaperTest
+from twin.reports.paper_cases import PaperCase, PaperTest, name_gap
 from twin.reports.plot_style import (
     DIRECTION_COLOURS,
     GUIDE_COLOUR,
@@ -101,7 +100,7 @@ def prc_families(campaign: CampaignData) -> tuple[dict[str, PaperCase], Measured
     measured_campaign = MeasuredCampaign()
     for gap_mm in sorted(by_gap, reverse=True):
         runs = by_gap[gap_mm]
-        name = "G∞" if math.isinf(gap_mm) else f"G{gap_mm:g}"
+        name = name_gap(gap_mm)
         tests = {
             (run.test, run.profile.sweep): PaperTest(
                 run.test, run.profile, run.model.parameters,

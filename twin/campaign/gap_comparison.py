@@ -22,6 +22,7 @@ from table_io.config.excitation.record import RecordedHistory
 from table_io.config.profile import Profile
 from table_io.units import GRAVITY_M_S2
 from twin.campaign.merge import SOURCES
+from twin.reports.paper_cases import name_gap
 
 Json = dict[str, Any]
 PEAKS = ("u_m", "a_m_s2", "force_n")
@@ -95,8 +96,8 @@ class GapComparison:
 
 
 def format_gap(gap_mm: float) -> str:
-    """Return the name of a gap as in the paper: G16, G−1, G∞."""
-    return "G∞" if math.isinf(gap_mm) else f"G{gap_mm:g}".replace("-", "−")
+    """Return the name of a gap as it is printed in the paper: G16, G−1, G∞."""
+    return name_gap(gap_mm).replace("-", "−")
 
 
 def list_record_runs(

@@ -13,10 +13,9 @@ from typing import Any
 
 from pydantic import Field, field_validator
 
-from table_io.config.base import ConfigModel, Finite, Number, Positive, parse_toml, read_text
+from table_io.config.base import Finite, Number, Positive, list_duplicates, parse_toml, read_text
 from table_io.config.excitation.band_limit import Baseline
-from table_io.config.excitation.record import RecordedHistory
-from table_io.config.excitation.record_files import Quantity, RecordUnit
+from table_io.config.excitation.record import RecordedHistory, SeriesKeys
 from table_io.config.profile import Profile, attach_files, load_profile
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError, suggest
@@ -29,16 +28,9 @@ KEYS_OF_BASE_RECORD = (
 )  # fmt: skip
 
 
-class RecordKeys(ConfigModel):
+class RecordKeys(SeriesKeys):
     """Keys of [excitation] that a grid states for all its records, or for a single one."""
 
-    quantity: Quantity | None = Field(None, description="Of the history; omitted: by the unit.")
-    unit: RecordUnit | None = Field(None, description="Omitted: of the header.")
-    step_s: Positive | None = Field(None, description="Time between samples, if the file has none.")
-    variable: str | None = Field(None, description="Array of a mat or npz file, if it has several.")
-    column: int | str | None = Field(
-        None, description="Number from 1 or header of the history; of a V2 file, the channel."
-    )
     length_ratio: Positive | None = Field(
         None, description="Similitude: length of model over prototype; omitted: of the base."
     )
@@ -113,7 +105,7 @@ class RecordGrid(RecordKeys):
         for gap_mm in gaps_mm:
             if math.isnan(gap_mm) or gap_mm == -math.inf:
                 raise InputError(f"a gap is {gap_mm}", allowed="numbers in mm, or inf")
-        twice = sorted({gap_mm for gap_mm in gaps_mm if gaps_mm.count(gap_mm) > 1})
+        twice = list_duplicates(gaps_mm)
         if twice:
             raise InputError(f"the gap {twice[0]:g} is listed twice", remedy="list each gap once")
         return gaps_mm
@@ -121,14 +113,12 @@ class RecordGrid(RecordKeys):
     @field_validator("files")
     @classmethod
     def _check_labels(cls, files: tuple[GridRecord, ...]) -> tuple[GridRecord, ...]:
-        names = [record.name for record in files]
-        twice = sorted({name for name in names if names.count(name) > 1})
+        twice = list_duplicates([record.name for record in files])
         if twice:
             raise InputError(
                 f"two records have the label {twice[0]!r}", remedy="give each its own label"
             )
-        reported = [(record.reported_name, record.scale) for record in files]
-        equal = sorted({entry for entry in reported if reported.count(entry) > 1})
+        equal = list_duplicates([(record.reported_name, record.scale) for record in files])
         if equal:
             title, scale = equal[0]
             raise InputError(

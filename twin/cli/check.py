@@ -1,7 +1,8 @@
-"""Output of `check`: the plan with its margins, and the predicted sensor peaks."""
+"""`check PROFILE`: the plan with its margins, and the predicted sensor peaks."""
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -31,12 +32,20 @@ from table_io.units import GRAVITY_M_S2
 from twin.reports.drive_figure import draw_drive
 from twin.reports.predicted_ranges import PredictedPeak, format_clipping_warnings, predict_peaks
 from twin.run.disk import planned_bytes
-from twin.run.run_config import RunConfig
-from twin.run.terminal import print_table
-
-__all__ = ["draw_drive", "print_plan"]
+from twin.run.folders import make_output_folder
+from twin.run.run_config import RunConfig, make_run_id, read_run_config
+from twin.run.terminal import console, print_line, print_table
 
 MAX_STEP_ROWS = 12  # frequencies in the table of steps
+
+
+def check_profile(profile: Path, table: str | None, out: Path | None) -> None:
+    """Print the plan and its margins; draw the drive if `out` is given."""
+    config = read_run_config(profile, table)
+    print_plan(console, config)
+    if out is not None:
+        folder = make_output_folder(out, make_run_id(config.name))
+        print_line(f"drive drawn: {draw_drive(config, folder / 'drive.png')}")
 
 
 def print_plan(console: Console, config: RunConfig) -> None:

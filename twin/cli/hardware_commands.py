@@ -41,7 +41,7 @@ def check_command(
     table and the mass; the table is not driven.
     """
     if profile is not None and not (unattended or json):
-        from twin.cli.run import check_profile as preflight
+        from twin.cli.check import check_profile as preflight
 
         preflight(profile, table, out)
     elif profile is None and table is not None and out is None:

@@ -1,4 +1,4 @@
-"""`check` and `run`: check a test before the table moves, and run it."""
+"""`run`: run a test on the table, in real time or at full speed."""
 
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -12,26 +12,15 @@ from twin.cli.live_commands import start_page
 from twin.model.config import ModelConfig
 from twin.reports.finalize import EXIT_ABORTED, EXIT_INTERRUPTED, finalize_run
 from twin.run.disk import require_disk_space
-from twin.run.folders import RUNS_FOLDER, make_output_folder, make_run_folder
+from twin.run.folders import RUNS_FOLDER, make_run_folder
 from twin.run.progress import RunProgress
 from twin.run.realtime import check_full_speed, check_realtime
-from twin.run.run_config import RunConfig, make_run_id, read_run_config
+from twin.run.run_config import RunConfig, read_run_config
 from twin.run.terminal import catch_interrupts, console, print_line, show_status
 from twin.run.warm_up import compile_kernels
 from twin.security.credentials import Credentials, credentials_folder
 from twin.transport.endpoint import check_endpoint
 from twin.viewer.address import VIEW_ADDRESS, find_free_address, format_live_view
-
-
-def check_profile(profile: Path, table: str | None, out: Path | None) -> None:
-    """Print the plan and its margins; draw the drive if `out` is given."""
-    from twin.cli.check import draw_drive, print_plan
-
-    config = read_run_config(profile, table)
-    print_plan(console, config)
-    if out is not None:
-        folder = make_output_folder(out, make_run_id(config.name))
-        print_line(f"drive drawn: {draw_drive(config, folder / 'drive.png')}")
 
 
 def run_test(

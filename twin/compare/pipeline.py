@@ -4,7 +4,7 @@ Pure: the same samples give bit-identical items for any division into blocks. Li
 `--speed max` call this same function.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -185,7 +185,7 @@ def _advance_piece(
     low_cuts, corrected = state.low_cuts.apply(piece)
     twins, predicted, comparisons = advance_twins(setup.twin, state.twins, corrected)
     blocks = (piece, predicted, corrected)
-    available = blocks if state.recent is None else _join_pieces([state.recent, blocks])
+    available = [blocks] if state.recent is None else [state.recent, blocks]
     start, end, lead = piece.index, piece.end, setup.scale.lead_samples
     monitoring_state = state.monitoring
     if not monitoring_state.noise.is_known:
@@ -194,7 +194,7 @@ def _advance_piece(
     if cycle_key[1] >= 0 and cycle_blocks:
         cycle_blocks = (*cycle_blocks, blocks)
     elif cycle_key[1] >= 0 and _is_cycle_start(state, cycle_key):
-        cycle_start, cycle_blocks = start, (_cut_piece(available, start - lead, end),)
+        cycle_start, cycle_blocks = start, (_cut_pieces(available, start - lead, end),)
     return (
         replace(
             state,
@@ -204,7 +204,7 @@ def _advance_piece(
             cycle_start=cycle_start,
             cycle_blocks=cycle_blocks,
             cycle_key=cycle_key,
-            recent=_cut_piece(available, end - lead, end),
+            recent=_cut_pieces(available, end - lead, end),
         ),
         predicted,
         comparisons,
@@ -216,10 +216,14 @@ def _join_pieces(pieces: Iterable[CycleBlocks]) -> CycleBlocks:
     return tuple(join_blocks(list(blocks)) for blocks in zip(*pieces, strict=True))
 
 
-def _cut_piece(piece: CycleBlocks, first: int, end: int) -> CycleBlocks:
-    """Return the samples first .. end - 1 of a piece, as far as it has them."""
-    first = max(first, piece[0].index)
-    return tuple(block.cut(first, end) for block in piece)
+def _cut_pieces(pieces: Sequence[CycleBlocks], first: int, end: int) -> CycleBlocks:
+    """Return the samples first .. end - 1 of consecutive pieces, as far as they have them."""
+    *earlier, last = pieces
+    used = [*(piece for piece in earlier if piece[0].end > first), last]
+    return _join_pieces(
+        tuple(block.cut(max(first, block.index), min(end, block.end)) for block in piece)
+        for piece in used
+    )
 
 
 def _is_cycle_start(state: PipelineState, cycle_key: tuple[int, int]) -> bool:

@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from table_io.block import Float1D, Float2D
 from twin.drive.table_identification import (
@@ -202,6 +203,56 @@ UNTESTED = {
 
 
 @dataclass(frozen=True, eq=False)
+class HeldOutBase:
+    """Slopes of the basic parameters and their pseudo-inverses, once for the trials of all effects.
+
+    `rows` are the residuals that the fit of each fold uses; the last fold holds out none.
+    """
+
+    jacobian: Float2D  # (residual, parameter), columns scaled
+    rows: tuple[npt.NDArray[np.bool_], ...]
+    inverses: tuple[Float2D, ...]  # (parameter, row)
+
+    @classmethod
+    def from_fit(cls, fit: TableFit) -> "HeldOutBase":
+        """Return the factorised slopes of the free parameters of a fit."""
+        slopes, block = fit.jacobian[:, fit.is_free], fit.problem.block
+        scaled = slopes / (np.linalg.norm(slopes, axis=0) + 1e-30)
+        fold = np.where(block >= 0, block % FOLD_COUNT, FOLD_COUNT)
+        rows = tuple(fold != index for index in range(FOLD_COUNT))
+        rows += (np.ones(fold.size, bool),)
+        return cls(scaled, rows, tuple(np.linalg.pinv(scaled[row], rcond=1e-8) for row in rows))
+
+    def cross_validate(self, residuals: Float1D, slope: Float1D | None = None) -> Float1D:
+        """Return the residuals after a Gauss-Newton step without their fold, (residual - 1,).
+
+        The step is of the basic parameters and, with its `slope`, of an effect.
+        """
+        held_out = residuals.copy()
+        for index in range(FOLD_COUNT):
+            own = self._project_out(residuals, index)
+            if slope is not None:
+                own_slope = self._project_out(slope, index)
+                row = self.rows[index]
+                own = own + _solve_size(own_slope[row], own[row]) * own_slope
+            inside = ~self.rows[index]
+            held_out[inside] = own[inside]
+        return held_out[:-1]
+
+    def solve_amplitude(self, slope: Float1D, residuals: Float1D) -> float:
+        """Return the size of an effect by the linear problem."""
+        return _solve_size(self._project_out(slope, FOLD_COUNT), residuals)
+
+    def _project_out(self, values: Float1D, index: int) -> Float1D:
+        """Return (residual,) less its fit by the slopes in the rows of one fold."""
+        return values - self.jacobian @ (self.inverses[index] @ values[self.rows[index]])
+
+
+def _solve_size(slope: Float1D, residuals: Float1D) -> float:
+    return -float(slope @ residuals) / max(float(slope @ slope), 1e-300)
+
+
+@dataclass(frozen=True, eq=False)
 class EffectFit:
     """Fit of the twin with some effects, and its residuals on held-out blocks."""
 
@@ -217,8 +268,7 @@ class EffectFit:
     @classmethod
     def from_fit(cls, effects: Sequence[TableEffect], fit: TableFit) -> "EffectFit":
         """Return the fit with its residuals on blocks that one Gauss-Newton step left out."""
-        held_out = _cross_validate(fit.jacobian[:, fit.is_free], fit.residuals, fit.problem)
-        return cls(tuple(effects), fit, held_out)
+        return cls(tuple(effects), fit, HeldOutBase.from_fit(fit).cross_validate(fit.residuals))
 
 
 @dataclass(frozen=True)
@@ -338,7 +388,7 @@ class ScreenedEffect:
 def screen_effects(current: EffectFit) -> list[ScreenedEffect]:
     """Return the effects not yet in a fit, that which promises most first."""
     fit, before = current.fit, current.gap**2
-    base = fit.jacobian[:, fit.is_free]
+    base = HeldOutBase.from_fit(fit)
     screened = []
     for effect in LIBRARY:
         if effect in current.effects:
@@ -346,12 +396,12 @@ def screen_effects(current: EffectFit) -> list[ScreenedEffect]:
         trials = []
         for trial in effect.trials:
             slope = _compute_trial_slope(fit, effect, trial)
-            held_out = _cross_validate(np.column_stack([base, slope]), fit.residuals, fit.problem)
+            held_out = base.cross_validate(fit.residuals, slope)
             share = 1.0 - float(held_out @ held_out) / before
-            size = _solve_amplitude(base, slope, fit.residuals)
+            size = base.solve_amplitude(slope, fit.residuals)
             first = effect.parameters[0]
             # Of the size of its trial: the law need not be linear, nor a dead band negative.
-            held_out = _cross_validate(base, fit.residuals + trial[0] * slope, fit.problem)
+            held_out = base.cross_validate(fit.residuals + trial[0] * slope)
             share_of_trial = 1.0 - float(held_out @ held_out) / before
             if share_of_trial > share or not first.low <= size <= first.high:
                 share, size = share_of_trial, trial[0]
@@ -368,25 +418,6 @@ def _compute_trial_slope(fit: TableFit, effect: TableEffect, trial: tuple[float,
     names = (*fit.names, *(parameter.name for parameter in effect.parameters))
     parameters = build_parameters(names, np.array([*fit.values, *trial]), fit.problem)
     return (fit.problem.compute_residuals(parameters) - fit.residuals) / trial[0]
-
-
-def _cross_validate(jacobian: Float2D, residuals: Float1D, problem: RehearsalProblem) -> Float1D:
-    """Return the residuals after a Gauss-Newton step fitted to the other folds, (residual - 1,)."""
-    fold = np.where(problem.block >= 0, problem.block % FOLD_COUNT, FOLD_COUNT)
-    scaled = jacobian / (np.linalg.norm(jacobian, axis=0) + 1e-30)
-    held_out = np.empty_like(residuals)
-    for index in range(FOLD_COUNT):
-        inside = fold == index
-        step = np.linalg.lstsq(scaled[~inside], -residuals[~inside], rcond=1e-8)[0]
-        held_out[inside] = residuals[inside] + scaled[inside] @ step
-    return held_out[:-1]
-
-
-def _solve_amplitude(base: Float2D, slope: Float1D, residuals: Float1D) -> float:
-    """Return the size of an effect by the linear problem."""
-    scaled = base / (np.linalg.norm(base, axis=0) + 1e-30)
-    own = slope - scaled @ np.linalg.lstsq(scaled, slope, rcond=1e-8)[0]
-    return -float(own @ residuals) / max(float(own @ own), 1e-300)
 
 
 def _refit(current: EffectFit, candidate: ScreenedEffect) -> EffectFit:

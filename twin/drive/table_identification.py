@@ -265,17 +265,23 @@ def fit_basic_twin(
     """
     bounds = {**BOUNDS, **effect_bounds}
     start = {name: values[0] for name, values in bounds.items()}
-    rough_bounds = {name: values for name, values in bounds.items() if name not in FRAME_NAMES}
+    frameless_bounds = dict(bounds)
+    for name in FRAME_NAMES:
+        del frameless_bounds[name]
     starts = [
         start | dict(zip(STARTING_VALUES, values, strict=True)) | {"frame_ratio": 0.0} | dict(trial)
         for values in product(*STARTING_VALUES.values())
         for trial in trials
     ]
     first = min(starts, key=problem.measure_misfit)
-    rough = fit_table(
-        problem, rough_bounds, {name: first[name] for name in rough_bounds}, ROUGH_EVALUATIONS, 1e-2
+    frameless = fit_table(
+        problem,
+        frameless_bounds,
+        {name: first[name] for name in frameless_bounds},
+        ROUGH_EVALUATIONS,
+        1e-2,
     )
-    start |= rough.scaled_values
+    start |= frameless.scaled_values
     frames = [start | {"frame_hz": float(hz)} for hz in np.geomspace(*STARTING_FRAMES_HZ)]
     misfits = np.array([problem.measure_misfit(frame) for frame in frames])
     padded = np.pad(misfits, 1, constant_values=math.inf)

@@ -85,6 +85,16 @@ class TableParameters(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
+def _find_stroke(s, p):  # type: ignore[no-untyped-def]
+    """Return the stroke of the table on its frame in m and its rate in m/s."""
+    stroke, v = s[Y] - s[FRAME], s[V] - s[FRAME_SPEED]
+    if p.second_frame_ratio != 0.0:
+        stroke -= s[FRAME_2]
+        v -= s[FRAME_2_SPEED]
+    return stroke, v
+
+
+@njit(cache=True, nogil=True)
 def _find_friction_share(sign, stroke, p):  # type: ignore[no-untyped-def]
     """Return the limit of |z| in this direction, at this stroke in m."""
     along = max(1.0 + p.friction_slope_1_m * stroke, LEAST_FRICTION_SHARE)
@@ -100,10 +110,7 @@ def _write_rates(s, z, memory, z_valve, command, command_rate, reaction, h, m, p
     """
     oil = math.tau * p.oil_hz
     stiffness = m * oil * oil
-    stroke, v, force = s[Y] - s[FRAME], s[V] - s[FRAME_SPEED], s[OIL]
-    if p.second_frame_ratio != 0.0:
-        stroke -= s[FRAME_2]
-        v -= s[FRAME_2_SPEED]
+    (stroke, v), force = _find_stroke(s, p), s[OIL]
     if p.backlash_m > 0.0:
         play = 0.5 * stiffness * p.backlash_m
         force -= min(max(force, -play), play)
@@ -159,10 +166,7 @@ def _write_rates(s, z, memory, z_valve, command, command_rate, reaction, h, m, p
 @njit(cache=True, nogil=True)
 def _advance_memories(s, z, memory, z_valve, h, p):  # type: ignore[no-untyped-def]
     """Return z, the lagging Stribeck exponential and z of the valve after half a step h in s."""
-    stroke, v = s[Y] - s[FRAME], s[V] - s[FRAME_SPEED]
-    if p.second_frame_ratio != 0.0:
-        stroke -= s[FRAME_2]
-        v -= s[FRAME_2_SPEED]
+    stroke, v = _find_stroke(s, p)
     sign = 1.0 if v > 0.0 else -1.0
     if p.friction_asymmetry != 0.0 or p.friction_slope_1_m != 0.0:
         limit = _find_friction_share(sign, stroke, p)

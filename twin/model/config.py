@@ -4,7 +4,7 @@ from typing import Any
 
 from pydantic import Field, field_validator, model_validator
 
-from table_io.config.base import ConfigModel, Finite, NonNegative, Positive
+from table_io.config.base import ConfigModel, Finite, NonNegative, Positive, list_duplicates
 from table_io.config.profile import Specimen
 from table_io.errors import InputError
 from twin.model.effects import find_effect
@@ -85,8 +85,7 @@ class ModelConfig(ConfigModel):
 
     @model_validator(mode="after")
     def _validate_unique(self) -> "ModelConfig":
-        names = [entry.instance.name for entry in self.effects]
-        repeated = sorted({name for name in names if names.count(name) > 1})
+        repeated = list_duplicates([entry.instance.name for entry in self.effects])
         if repeated:
             raise InputError(
                 f"{', '.join(repeated)} given more than once",

@@ -20,6 +20,7 @@ from twin.model.event_integrator_kernel import (
     STATE_BASE,
     STATE_F,
     STATE_SIZE,
+    build_laws_kernel,
     integrate_samples,
 )
 from twin.model.event_location import LINEAR_SIZE
@@ -53,6 +54,8 @@ class EventDrivenSolver:
         coefficients, laws = kernel_coefficients(model)
         coefficients = set_substeps(coefficients, rate_hz, sum_law_properties(model.added_laws))
         propagators = build_propagators(coefficients)
+        if laws is not None:
+            build_laws_kernel()  # before time matters
         return cls(model, model.parameters, coefficients, propagators, laws)
 
     def rest_state(self, index: int = 0) -> Float1D:
@@ -89,7 +92,8 @@ class EventDrivenSolver:
     def advance(self, state: Float1D, base_acc: Float1D, table_disp: Float1D, out: Float2D) -> None:
         added = self.model.added_acceleration(table_disp)
         base = base_acc if added is None else base_acc + added
-        integrate_samples(state, self.coefficients, self.propagators, self.laws, base, out)
+        integrate = integrate_samples if self.laws is None else build_laws_kernel()
+        integrate(state, self.coefficients, self.propagators, self.laws, base, out)
         if added is not None:
             out[2] -= added
 

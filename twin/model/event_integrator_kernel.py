@@ -11,6 +11,7 @@ There is no other memory: results are bit-identical for any division of the samp
 
 import math
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 from numba import float64, types
@@ -202,17 +203,16 @@ def contact_force(
 
 _READ = types.Array(float64, 1, "A", readonly=True)
 _OUT = types.Array(float64, 2, "A")
-_KERNELS = [
-    types.void(float64[::1], COEFFICIENTS_TYPE, float64[:, ::1], laws, _READ, _OUT)
-    for laws in (types.none, ADDED_LAWS_TYPE)
-]
 REVISION = source_revision(globals()) ^ EVENTS_REVISION
 
 
-def _build_kernel(revision: int) -> Callable[..., None]:
+def _build_kernel(revision: int, laws_type: types.Type) -> Callable[..., None]:
     """Return the kernel; `revision` is a free variable of it and so part of numba's cache key."""
+    kernel_type = types.void(
+        float64[::1], COEFFICIENTS_TYPE, float64[:, ::1], laws_type, _READ, _OUT
+    )
 
-    @jit_kernel(_KERNELS, cache=True)
+    @jit_kernel(kernel_type, cache=True)
     def integrate_samples(
         state: Float1D,
         p: Coefficients,
@@ -265,4 +265,10 @@ def _build_kernel(revision: int) -> Callable[..., None]:
     return integrate_samples
 
 
-integrate_samples = _build_kernel(REVISION)
+integrate_samples = _build_kernel(REVISION, types.none)
+
+
+@cache
+def build_laws_kernel() -> Callable[..., None]:
+    """Return `integrate_samples` for models with added laws; only they wait for its compilation."""
+    return _build_kernel(REVISION, ADDED_LAWS_TYPE)

@@ -9,6 +9,7 @@ from typing import TypeVar
 from table_io.block import Block, join_blocks
 from table_io.errors import InputError
 from table_io.records import Record, RunStart, RunStop
+from twin.recording.garbage_collection import pause_collection
 from twin.recording.log_metadata import START_COPY_NAME, read_schema_version
 from twin.recording.mcap_log import iter_messages, read_leading_metadata
 from twin.recording.recovery import (
@@ -105,6 +106,7 @@ def read_recording(path: Path, topics: Iterable[str] = TOPIC_TYPES) -> Recording
     return build_recording(path, recover_log(path, frozenset((START_TOPIC, *topics))))[0]
 
 
+@pause_collection()
 def build_recording(path: Path, recovered: RecoveredLog) -> tuple[Recording, list[LogMessage]]:
     """Return (recording, message of each of its items) from a recovered log."""
     problems = _assign_unnamed_topics(recovered)

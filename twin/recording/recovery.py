@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from table_io.errors import InputError
+from twin.recording.garbage_collection import pause_collection
 from twin.recording.mcap_records import (
     ATTACHMENT,
     CHANNEL,
@@ -89,6 +90,7 @@ class RecoveredLog:
     is_intact: bool = False
 
 
+@pause_collection()
 def recover_log(path: Path, topics: frozenset[str] | None = None) -> RecoveredLog:
     """Recover the readable content of `path`, only of `topics` if given.
 

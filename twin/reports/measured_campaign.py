@@ -11,7 +11,7 @@ from table_io.records import PrcPoint, StepAdded
 from twin.recording.reader import read_recording
 from twin.recording.run_paths import resolve_log_path
 from twin.reports import report_data
-from twin.reports.paper_cases import GAPS
+from twin.reports.paper_cases import GAPS, name_gap
 from twin.reports.players import SystemMotion
 from twin.reports.report_data import ReportData, build_report_data
 from twin.reports.summary import summarise
@@ -88,8 +88,8 @@ def load_measured_campaign(paths: list[Path]) -> MeasuredCampaign:
     for path in find_logs(paths):
         recording = read_recording(resolve_log_path(path))
         run_config = read_recorded_config(recording)
-        name = _paper_gap_name(run_config.profile.specimen.gap_mm)
-        if name is None:
+        name = name_gap(run_config.profile.specimen.gap_mm)
+        if name not in GAPS:
             raise InputError(
                 f"total gap {run_config.profile.specimen.gap_mm:g} mm is not in the paper",
                 where=path,
@@ -106,8 +106,3 @@ def load_measured_campaign(paths: list[Path]) -> MeasuredCampaign:
         points = [point for point in recording.records(PrcPoint) if point.step not in visits]
         campaign.points.setdefault(name, []).extend(points)
     return campaign
-
-
-def _paper_gap_name(gap_mm: float) -> str | None:
-    name = "G∞" if np.isinf(gap_mm) else f"G{gap_mm:g}"
-    return name if name in GAPS else None

@@ -30,6 +30,11 @@ GAPS: dict[str, tuple[str, ...]] = {
 SWEEP_END_HZ = {"g4_ss1": 0.79, "g4_ss2": 1.6}  # G4: frequency where the next sweep takes over
 
 
+def name_gap(gap_mm: float) -> str:
+    """Return the name of a gap as in GAPS: G16, G-1, G∞."""
+    return "G∞" if math.isinf(gap_mm) else f"G{gap_mm:g}"
+
+
 @dataclass(frozen=True, eq=False)
 class PaperTest:
     """One test profile of the paper and the simulated response of a model."""

@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from twin.recording.garbage_collection import pause_collection
 from twin.reports.report_data import DIRECTIONS
 from twin.run.terminal import show_status
 
@@ -93,7 +94,11 @@ def save_figures(
     folder.mkdir(parents=True, exist_ok=True)
     pictures = []
     style = RC_PARAMS | (DARK_RC_PARAMS if dark else {})
-    with mpl.rc_context(style), show_status("drawing the figures") as show_part:
+    with (
+        mpl.rc_context(style),
+        pause_collection(),
+        show_status("drawing the figures") as show_part,
+    ):
         for drawing in figures:
             show_part(drawing.title)
             path = folder / f"{drawing.name}.png"

@@ -17,7 +17,6 @@ from table_io.safety.preflight import CORRECTION_HEADROOM
 from twin.compare.extra_channels import PREDICTED_SUMS, select_predicted
 from twin.model.ideal_response import simulate_sweep
 from twin.run.run_config import RunConfig
-from twin.run.unpaced import generate_ideal_twin
 
 SETTLING_CYCLES = 30  # at each orbit of a continuation
 MAX_RANGE_SHARE = (
@@ -114,6 +113,8 @@ def _compute_peaks(run_config: RunConfig) -> dict[str, Float1D]:
 
 def _simulate_peaks(run_config: RunConfig) -> dict[str, Float1D]:
     """Simulate the model on the ideal history; return the peak of each channel by window, SI."""
+    from twin.run.unpaced import generate_ideal_twin  # with the twin's pipeline, slow to import
+
     specimen, windows = run_config.profile.specimen, run_config.profile.plan.windows
     peaks: dict[str, Float1D] = {}
     for block in generate_ideal_twin(run_config):

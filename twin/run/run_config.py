@@ -199,12 +199,14 @@ def make_run_id(name: str) -> str:
 
 
 def compile_twin_kernels() -> None:
-    """Compile or load the kernels of the exact solver by running them once on a few samples."""
+    """Compile or load the kernels of the twin by running them once on a few samples."""
     import numpy as np
 
+    from table_io.sensor_errors import highpass
     from twin.model.closed_form import advance_state, discretized_params, rest_state
 
     parameters = Parameters(550.0, 36e3, 1.1e3, 510e3, 900.0, 510e3, 900.0, 0.002, 0.002)
+    highpass(np.zeros(4), 1.0, 2000.0)
     state = rest_state(parameters)
     advance_state(state, discretized_params(parameters, 2000.0), np.zeros(4), np.empty((7, 4)))
 
@@ -218,10 +220,14 @@ def compile_rig_kernels(config: RunConfig) -> None:
     from contextlib import closing
     from itertools import islice
 
+    import numpy as np
+
     from table_io.acquisition.session import run_session
     from table_io.backends import open_backend
     from table_io.clock import ManualClock
+    from table_io.sensor_errors import highpass
 
+    highpass(np.zeros(4), 1.0, 2000.0)  # first called when a cycle is complete
     if not config.rig.runs_at_any_speed:
         config = read_run_config(PROFILES_DIR / "tests" / "quickstart.toml")
     clock = ManualClock()

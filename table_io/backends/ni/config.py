@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationInfo, field_validator
 
 from table_io.config.backend import BackendConfig
-from table_io.config.base import ConfigModel, NonNegative, Positive
+from table_io.config.base import ConfigModel, NonNegative, Positive, list_duplicates
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 
@@ -93,7 +93,7 @@ class NiWiring(BackendConfig):
             ([wire.channel for wire in inputs], "channel"),
             ([wire.physical for wire in inputs], "physical channel"),
         ):
-            duplicates = sorted({name for name in names if names.count(name) > 1})
+            duplicates = list_duplicates(names)
             if duplicates:
                 raise InputError(
                     f"{kind} {', '.join(duplicates)} is wired twice", remedy="keep one wire"

@@ -3,6 +3,7 @@
 from pydantic import Field, field_validator
 
 from table_io.config.backend import BackendConfig
+from table_io.config.base import list_duplicates
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 
@@ -31,8 +32,7 @@ class OpenDaqWiring(BackendConfig):
     @field_validator("signals")
     @classmethod
     def _check_signals(cls, signals: dict[str, str]) -> dict[str, str]:
-        ids = list(signals.values())
-        duplicates = sorted({signal for signal in ids if ids.count(signal) > 1})
+        duplicates = list_duplicates([*signals.values()])
         if duplicates:
             raise InputError(
                 f"signals wire {', '.join(duplicates)} to two channels",

@@ -113,17 +113,21 @@ class History(Excitation):
 
         It is `displacement`, with the rest around it in which a drive, if there is one, begins.
         """
-        displacement = np.ascontiguousarray(self.displacement(rate_hz), dtype=np.float64)
-        return displacement if self.drive is None else add_drive_margin(displacement, rate_hz)
+        return self._add_margin(self._compute_history(rate_hz), rate_hz)
+
+    def _compute_history(self, rate_hz: float) -> Float1D:
+        return np.ascontiguousarray(self.displacement(rate_hz), dtype=np.float64)
+
+    def _add_margin(self, history_m: Float1D, rate_hz: float) -> Float1D:
+        return history_m if self.drive is None else add_drive_margin(history_m, rate_hz)
 
     def plan(self, rate_hz: float) -> ExcitationPlan:
         """Return what is played, with the target's peak acceleration and band.
 
         InputError if the target is not at rest at its ends, or the drive is not one of it.
         """
-        target = self.target(rate_hz)
-        margin = 0 if self.drive is None else round(DRIVE_MARGIN_S * rate_hz)
-        history = target[margin : target.size - margin]
+        history = self._compute_history(rate_hz)
+        target = self._add_margin(history, rate_hz)
         where = f"excitation {self.kind!r}"
         if history.size <= self.windows or not np.isfinite(history).all() or not history.any():
             raise InputError("its history is empty, at rest throughout, or not finite", where=where)

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from pydantic import Field, ValidationInfo, field_validator
 
 from table_io.block import Float1D
-from table_io.config.base import Finite, Number, Positive, find_attached_text
+from table_io.config.base import ConfigModel, Finite, Number, Positive, find_attached_text
 from table_io.config.excitation import History, register_excitation
 from table_io.config.excitation.band_limit import (
     Baseline,
@@ -52,12 +52,8 @@ KERNEL_HALF_WIDTH = 32  # samples, of the interpolation
 KERNEL_BETA = 14.0
 
 
-@register_excitation("record")
-class RecordedHistory(History):
-    """Displacement or acceleration history read from a file: csv, txt, AT2, V2, mat or npz."""
-
-    FILE_KEYS: ClassVar[tuple[str, ...]] = ("file", *History.FILE_KEYS)
-    LEVEL_KEY: ClassVar[str] = "scale"
+class SeriesKeys(ConfigModel):
+    """Keys that say how the history is read from its file."""
 
     quantity: Quantity | None = Field(None, description="Of the history; omitted: by the unit.")
     unit: RecordUnit | None = Field(None, description="Omitted: of the header.")
@@ -66,6 +62,15 @@ class RecordedHistory(History):
     column: int | str | None = Field(
         None, description="Number from 1 or header of the history; of a V2 file, the channel."
     )
+
+
+@register_excitation("record")
+class RecordedHistory(SeriesKeys, History):
+    """Displacement or acceleration history read from a file: csv, txt, AT2, V2, mat or npz."""
+
+    FILE_KEYS: ClassVar[tuple[str, ...]] = ("file", *History.FILE_KEYS)
+    LEVEL_KEY: ClassVar[str] = "scale"
+
     sha256: str | None = Field(
         None, pattern="^[0-9a-fA-F]{64}$", description="Checksum that the file must have."
     )

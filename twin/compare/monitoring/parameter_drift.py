@@ -339,19 +339,19 @@ def _measure_drift(
 
 def _group_motions(chunks: list[Chunk]) -> Int1D:
     """Return the number of the motion of each chunk, (chunk,): by frequency and amplitude."""
-    motions: list[Chunk] = []
-    numbers = []
+    motions: dict[float, list[tuple[int, float]]] = {}  # number, log amplitude; by frequency
+    numbers: list[int] = []
+    count = 0
     for chunk in chunks:
-        same = (
-            number
-            for number, motion in enumerate(motions)
-            if motion.frequency_hz == chunk.frequency_hz
-            and abs(motion.log_amplitude - chunk.log_amplitude) < SAME_LOG_AMPLITUDE
-        )
-        number = next(same, len(motions))
-        if number == len(motions):
-            motions.append(chunk)
-        numbers.append(number)
+        candidates = motions.setdefault(chunk.frequency_hz, [])
+        for number, log_amplitude in candidates:
+            if abs(log_amplitude - chunk.log_amplitude) < SAME_LOG_AMPLITUDE:
+                numbers.append(number)
+                break
+        else:
+            candidates.append((count, chunk.log_amplitude))
+            numbers.append(count)
+            count += 1
     return np.array(numbers)
 
 
@@ -385,14 +385,14 @@ def _solve_chunks(
         prior[count] = law_curvature**-2
     rhs += (expansion.mT @ right_sides[:, :, None]).sum(axis=0)[:, 0]
     matrix = (expansion.mT @ matrices @ expansion).sum(axis=0) + np.diag(prior)
-    motion, column = _group_motions(chunks), trend or 0
-    coupling = _sum_by(motion, (matrices[:, None, column] @ expansion)[:, 0])
-    weight = _sum_by(motion, matrices[:, column, column])
-    weight += offset_sd**-2 if offset_sd else np.inf
-    offset_rhs = _sum_by(motion, right_sides[:, column])
-    eliminated = coupling / weight[:, None]
-    matrix -= eliminated.T @ coupling
-    rhs -= eliminated.T @ offset_rhs
+    if offset_sd:
+        motion, column = _group_motions(chunks), trend or 0
+        coupling = _sum_by(motion, (matrices[:, None, column] @ expansion)[:, 0])
+        weight = _sum_by(motion, matrices[:, column, column]) + offset_sd**-2
+        offset_rhs = _sum_by(motion, right_sides[:, column])
+        eliminated = coupling / weight[:, None]
+        matrix -= eliminated.T @ coupling
+        rhs -= eliminated.T @ offset_rhs
     size = np.sqrt(np.diag(matrix))
     if not (size > 0).all():
         return None
@@ -401,10 +401,13 @@ def _solve_chunks(
         return None
     inverse = np.linalg.inv(scaled) / np.outer(size, size)
     x: Float1D = inverse @ rhs
-    offset = (offset_rhs - coupling @ x) / weight
-    left = right_sides - (matrices @ expansion) @ x - matrices[:, :, column] * offset[motion, None]
+    left = right_sides - (matrices @ expansion) @ x
+    if offset_sd:
+        offset = (offset_rhs - coupling @ x) / weight
+        left -= matrices[:, :, column] * offset[motion, None]
     residuals = (expansion.mT @ left[:, :, None])[:, :, 0]
-    residuals -= eliminated[motion] * left[:, column, None]
+    if offset_sd:
+        residuals -= eliminated[motion] * left[:, column, None]
     dof_factor = len(chunks) / max(len(chunks) - x.size, 1)
     scatter = dof_factor * inverse @ (residuals.T @ residuals) @ inverse
     inflation = np.sqrt(np.maximum(np.diag(scatter) / np.diag(inverse), 1.0))

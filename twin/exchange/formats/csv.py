@@ -16,6 +16,7 @@ from typing import TextIO
 import numpy as np
 
 from table_io.channels import CHANNEL_BY_NAME
+from table_io.config.base import list_duplicates
 from table_io.errors import InputError
 from twin.exchange.formats import FORMATS, SampleTable, make_column
 from twin.exchange.formats.layout import MAX_HEAD_ROWS, TableLayout, find_layout, is_number
@@ -175,7 +176,7 @@ def _check_names(layout: TableLayout, head: list[str], delimiter: str, path: Pat
     row = f"row {layout.first_row}"
     if "" in names:
         raise InputError(f"column {names.index('') + 1} has no name", where=f"{path}: {row}")
-    repeated = sorted({name for name in names if names.count(name) > 1})
+    repeated = list_duplicates(names)
     if repeated:
         raise InputError(
             f"{row} names {', '.join(repeated)} more than once",

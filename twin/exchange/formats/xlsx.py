@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import openpyxl
 
+from table_io.config.base import list_duplicates
 from table_io.errors import InputError
 from twin.exchange.formats import MAX_EXPANSION, SampleTable, make_column
 from twin.exchange.formats.layout import MAX_HEAD_ROWS, find_layout
@@ -44,7 +45,7 @@ def _add_sheet(table: SampleTable, sheet: Any) -> None:
         table.skipped[sheet.title] = "no row of numbers"
         return
     names = layout.names or tuple(f"column {k}" for k in range(1, layout.width + 1))
-    repeated = sorted({name for name in names if not name or names.count(name) > 1})
+    repeated = [""] if "" in names else list_duplicates(names)
     if repeated:
         raise InputError(
             f"row {layout.first_row} leaves a column without a name, or names one twice",
