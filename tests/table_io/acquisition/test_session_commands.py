@@ -245,9 +245,14 @@ class Late(Machine):
         return values
 
 
-@pytest.mark.parametrize(("late_s", "expected"), [(0.12, [5020, 5520]), (0.08, [])])
-def test_late_blocks_are_reported_once_a_series(late_s: float, expected: list[int]) -> None:
-    subject = Late(plan_sweep(profile()), ManualClock(), late_s=late_s)
+@pytest.mark.parametrize(
+    ("late_s", "late_from", "expected"),
+    [(0.12, 5000, [5020, 5520]), (0.12, 0, [20, 5520]), (0.08, 5000, [])],
+)
+def test_late_blocks_are_reported_once_a_series(
+    late_s: float, late_from: int, expected: list[int]
+) -> None:
+    subject = Late(plan_sweep(profile()), ManualClock(), late_s=late_s, late_from=late_from)
     items = []
     for item in session(subject, Stop()):
         items.append(item)
