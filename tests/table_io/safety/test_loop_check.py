@@ -4,7 +4,7 @@ import cmath
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -587,7 +587,7 @@ def test_a_cell_may_be_off_by_half_the_contact_threshold(cell: str, sign: float)
     contact_n = check_run[0].comparison.contact_n
     for share, passes in ((0.4, True), (0.6, False)):
         offset = sign * share * contact_n
-        checks = evaluate_checks(check_run, {cell: lambda values, by=offset: values + by})
+        checks = evaluate_checks(check_run, {cell: partial(np.add, offset)})
         line = find_line(checks, "offset", cell)
         assert (line.low, line.high) == (-0.5 * contact_n, 0.5 * contact_n)
         assert line.passed == passes
