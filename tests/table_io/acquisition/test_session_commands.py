@@ -2,13 +2,15 @@
 
 import itertools
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from table_io import sequencer
 from table_io.acquisition.event_log import MAX_LATENESS_S
 from table_io.acquisition.output_queue import DECISION_S, OutputQueue
 from table_io.acquisition.session import COMMAND_DELAY_S, OperatorCommand
@@ -278,3 +280,28 @@ def test_gaps_hold_every_lost_sample_once(first: int, lengths: list[int], row: s
     gaps = [item for item in items if isinstance(item, SampleGap)]
     assert {gap.channel for gap in gaps} == {row}
     assert [gap.index + k for gap in gaps for k in range(gap.count)] == lost
+
+
+def test_a_feedback_that_comes_too_late_every_time_ends_the_test(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each try answers from a later sample on, by one block; the last one is the last."""
+    answer, earliest_samples = sequencer.answer_block, []
+
+    def answer_with_feedback(state: Any, block: Block, earliest: int) -> Any:
+        state, records = answer(state, block, earliest)
+        if block.index < 100 * BLOCK_SAMPLES:
+            return state, records
+        earliest_samples.append(earliest)
+        return replace(state, search=object()), records
+
+    monkeypatch.setattr(sequencer, "answer_block", answer_with_feedback)
+    monkeypatch.setattr(OutputQueue, "replace_drive", lambda *_: False)
+    subject = machine()
+    items = list(session(subject, Stop()))
+    stop = stop_record(items)
+    assert stop.verdict == "aborted"
+    assert stop.reason == "the feedback came too late 5 times in a row"
+    first = 101 * BLOCK_SAMPLES + subject.replace_after + round(DECISION_S * RATE_HZ)
+    assert earliest_samples == [first + BLOCK_SAMPLES * attempt for attempt in range(5)]
+    assert_ends_after_rest(items, subject)
