@@ -13,9 +13,9 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 
 from table_io.block import Float1D, Float2D
+from table_io.compilation import jit_untyped_kernel
 
 # Low cut and delay of sound sensors. IEPE accelerometers are down by 3 dB at 0.16 to 0.5 Hz; twice
 # that is no longer a sensor for tests from 0.5 Hz on. A low-pass of fourth order at 100 Hz delays
@@ -148,7 +148,7 @@ def filter_first_order(
     return y, last
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _filter(x, b0, b1, pole, state, y):  # type: ignore[no-untyped-def]
     """Write the output into `y`, return the last state."""
     for i in range(x.size):

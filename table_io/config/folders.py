@@ -49,7 +49,7 @@ def find_config(name: str, folder: str, profile_path: Path | None = None, option
     raise InputError(
         "not found",
         where=f"{option} {name}" if option else profile_path or "",
-        key="" if option else name,
+        key="" if option else name or folder.removesuffix("s"),
         allowed=f"a name in {folder} or the path of a .toml file",
         remedy=f"{suggest(name, configs)} (searched: {searched})",
     )

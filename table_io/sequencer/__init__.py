@@ -133,8 +133,10 @@ def answer_block(
     """Return (state, new records) with the feedback's answer to a block that was decided on."""
     if state.search is not None:
         state = apply_feedback(state, block, earliest)
+    if state.stage.kind in ("open", "end"):  # nothing is evaluated; a hold may last for an hour
+        return replace(state, blocks=(), records=()), state.records
     blocks = tuple(kept_block for kept_block in state.blocks if kept_block.end > state.stage.first)
-    return replace(state, blocks=blocks if not state.is_finished else (), records=()), state.records
+    return replace(state, blocks=blocks, records=()), state.records
 
 
 def hold_test(state: SequencerState, index: int) -> SequencerState:

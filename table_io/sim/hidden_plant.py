@@ -10,9 +10,6 @@ Force laws are smooth versions of their textbook forms, so classical Runge-Kutta
 at contact changes keeps its fourth order (except for z of Bouc-Wen at z = 0, where it is once
 differentiable only). The table bears R of the mass and of the appendage. Without a ground truth
 and without oil `Plant` is used instead.
-
-Compiled kernels are kept by the text of this file alone: where a function that is inlined here
-changes in `hydraulic_table.py`, this text has to change with it. Revision 2: worn friction.
 """
 
 import math
@@ -23,6 +20,7 @@ import numpy as np
 from numba import njit
 
 from table_io.block import Float1D, Float2D
+from table_io.compilation import jit_untyped_kernel
 from table_io.errors import InputError
 from table_io.sim import plant as base_plant
 from table_io.sim.hydraulic_table import (
@@ -280,7 +278,7 @@ def _advance_substep(s, path, h, params, hidden, oil, work):  # type: ignore[no-
     _tie_faces(s, params, hidden)
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _advance_samples(s, command, params, hidden, oil, work, out):  # type: ignore[no-untyped-def]
     """Advance `s` by out.shape[1] samples; command[k : k + 4] spans the delayed sample k."""
     corner, rest = params.phi * params.h, (1.0 - params.phi) * params.h

@@ -22,9 +22,9 @@ from functools import cached_property
 from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
-from numba import njit
 
 from table_io.block import Float1D, Float2D
+from table_io.compilation import jit_untyped_kernel
 from table_io.errors import InputError
 
 MAX_SUBSTEP_S = 6.25e-5  # bounds missed contacts; the integration error is far smaller
@@ -63,7 +63,7 @@ class _PlantParameters(NamedTuple):
     substeps_after: int
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _contact_force(s, j, params):  # type: ignore[no-untyped-def]
     """Return the contact force N_j >= 0 in N of the face j (0 right, 1 left)."""
     if s[TOUCHED + j] == 0.0:
@@ -72,19 +72,19 @@ def _contact_force(s, j, params):  # type: ignore[no-untyped-def]
     return params.kj * s[D + j] + params.cj * closing
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _evaluate_path(path, t):  # type: ignore[no-untyped-def]
     """Evaluate the parabola path = (m, m/s, m/s2) at t seconds: command in m."""
     return path[0] + t * (path[1] + t * path[2])
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _shift_path(path, t):  # type: ignore[no-untyped-def]
     """Shift the time origin of a parabola to t."""
     return _evaluate_path(path, t), path[1] + 2.0 * t * path[2], path[2]
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _rates(s, command, params, rate):  # type: ignore[no-untyped-def]
     """Write the time derivative of the first RATE_COUNT states into `rate`; command in m."""
     v = s[VX] - s[VY]
@@ -106,7 +106,7 @@ def _rates(s, command, params, rate):  # type: ignore[no-untyped-def]
         rate[D + j] = -params.kj / params.cj * s[D + j] if free else (1 - 2 * j) * v
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _step_runge_kutta(s, path, h, params, work):  # type: ignore[no-untyped-def]
     """Integrate one step of h seconds, contacts fixed, into the last row of `work`."""
     stage, end = work[4], work[5]
@@ -123,7 +123,7 @@ def _step_runge_kutta(s, path, h, params, work):  # type: ignore[no-untyped-def]
     end[TOUCHED], end[TOUCHED + 1] = s[TOUCHED], s[TOUCHED + 1]
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _contact_margin(s, j, params):  # type: ignore[no-untyped-def]
     """Return the margin in m to a contact change of face j: clearance, or N_j/K_j if touched."""
     if s[TOUCHED + j] != 0.0:
@@ -131,7 +131,7 @@ def _contact_margin(s, j, params):  # type: ignore[no-untyped-def]
     return params.gap[j] + s[D + j] - (1 - 2 * j) * (s[X] - s[Y])
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _find_contact_change(s, j, path, h, params, work):  # type: ignore[no-untyped-def]
     """Locate the contact change of face j: time in s within h at which its margin vanishes.
 
@@ -160,7 +160,7 @@ def _find_contact_change(s, j, path, h, params, work):  # type: ignore[no-untype
     return high
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _tie_faces(s, params):  # type: ignore[no-untyped-def]
     """Tie touched faces to the mass against rounding errors; flush denormals to zero."""
     for j in range(2):
@@ -170,7 +170,7 @@ def _tie_faces(s, params):  # type: ignore[no-untyped-def]
             s[D + j] = 0.0
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _advance_substep(s, path, h, params, work):  # type: ignore[no-untyped-def]
     """Advance the state by h, divided at contact changes."""
     remaining = h
@@ -200,14 +200,14 @@ def _advance_substep(s, path, h, params, work):  # type: ignore[no-untyped-def]
     _tie_faces(s, params)
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _spline_path(command, k, h):  # type: ignore[no-untyped-def]
     """Return the parabola of the quadratic B-spline over one sample interval h."""
     a, b, c = command[k], command[k + 1], command[k + 2]
     return 0.5 * (a + b), (b - a) / h, 0.5 * (a - 2.0 * b + c) / (h * h)
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _advance_samples(s, command, params, work, out):  # type: ignore[no-untyped-def]
     """Advance `s` by out.shape[1] samples; command[k : k + 4] spans the delayed sample k."""
     corner, rest = params.phi * params.h, (1.0 - params.phi) * params.h

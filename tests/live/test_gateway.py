@@ -22,8 +22,9 @@ from twin.live.gateway import (
     RefusalLimiter,
     validate_command,
 )
-from twin.live.process_config import ProcessConfig, make_private_folder, process_token
+from twin.live.process_config import ProcessConfig, process_token
 from twin.run.run_config import read_run_config
+from twin.run.temporary_folders import SOCKET_PREFIX, make_private_folder
 from twin.transport.codec import TOPIC_TYPES, decode_item, encode_item
 from twin.transport.endpoint import LOCAL_SOCKET_PREFIX, MEAS_TOPIC, key_expression, list_runs
 from twin.transport.reliable_subscriber import ReliableSubscriber
@@ -80,7 +81,7 @@ def until(true: Callable[[], object]) -> None:
 
 @pytest.fixture(scope="module")
 def spec() -> Iterator[ProcessConfig]:
-    room = make_private_folder()
+    room = make_private_folder(SOCKET_PREFIX)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         listen = f"tcp/127.0.0.1:{free.getsockname()[1]}"

@@ -1,10 +1,11 @@
-"""Damaged and lying files through `verify`, `replay`, `prc` and `import`: what comes of each.
+"""Damaged and lying files through the commands that read recordings: what comes of each.
 
     python tests/studies/hostile_files.py COUNT [FIRST]     mutants FIRST to FIRST + COUNT - 1
 
 A process makes them and calls the commands as the command line does; another watches that it goes
 on, and goes on itself after a crash. Its memory is limited. What is not an exit code of the
-contract is told, with the number of the mutant that brought it.
+contract is told, with the number of the mutant that brought it, and so is a message that does not
+name the file.
 """
 
 import contextlib
@@ -35,6 +36,7 @@ MEMORY = 2 * 2**30  # bytes a process may have
 HANGS_S = 60.0  # of computing for one mutant
 SILENT_S = 600.0  # of the clock, which others may slow
 REPORT_INTERVAL = 50  # one in so many replays makes its report too
+EXPORT_FORMATS = ("--csv", "--parquet", "--mat", "--foxglove")
 PROFILE = """
 title = "Short"
 [specimen]
@@ -69,6 +71,11 @@ class Trials:
         self.items, self.start = kept, recording.start
         self.messages = [(topic_for(item), encode_item(item, "run"), item.index) for item in kept]
         self.whole = mutants.whole(folder / "whole.mcap", kept, recording.start).read_bytes()
+        self.compared = folder / "compared"
+        self.compared.mkdir()
+        (self.compared / "run.mcap").write_bytes(self.whole)
+        call_command(("report", self.compared), report=False)
+        self.summary = (self.compared / "summary.json").read_bytes()
         write_csv(recording, folder / "table.csv")
         lines = (folder / "table.csv").read_bytes().split(b"\n")
         self.table = b"\n".join(lines[:1500])
@@ -99,6 +106,13 @@ class Trials:
         place.mkdir()
         file = place / f"a{ending}"
         file.write_bytes(content)
+        folder = place / "a"
+        folder.mkdir()
+        (folder / "run.mcap").write_bytes(content)
+        altered = place / "b"
+        altered.mkdir()
+        (altered / "run.mcap").write_bytes(self.whole)
+        (altered / "summary.json").write_bytes(mutants.damage(self.summary, random.Random(number)))
         outcomes: Counter[str] = Counter()
         calls: list[tuple[object, ...]] = [
             ("verify", file, "--repair", place / "repaired.mcap"),
@@ -106,9 +120,19 @@ class Trials:
             ("prc", file, "--json"),
             ("replay", file, "--out", place / "again"),
             ("import", file, "-o", place / "taken.mcap"),
+            ("export", file, *EXPORT_FORMATS, "-o", place / "out"),
+            ("report", folder),
+            ("compare", self.compared, folder, "--out", place / "compared"),
+            ("compare", self.compared, altered, "--out", place / "altered"),
         ]
+        if number % 10 == 8:  # bombs: one command of each reader
+            calls = calls[:-4]
         for words in calls if number % 20 == 0 else [calls[0], *calls[2:]]:
-            code, error = call_command(words, report=number % REPORT_INTERVAL == 0)
+            code, error = call_command(
+                words,
+                report=number % REPORT_INTERVAL == 0,
+                names=tuple(map(str, (file, folder, altered))),
+            )
             outcomes[f"{words[0]} {code}"] += 1
             if error:
                 print(f"CRASH {number} {words[0]}\n{error}", flush=True)
@@ -130,8 +154,14 @@ def _formats() -> list[tuple[str, Callable[[Path], bytes]]]:
     return [(name, partial(write_and_read, write)) for name, write, _ in FORMATS.values()]
 
 
-def call_command(words: tuple[object, ...], report: bool) -> tuple[str, str]:
-    """(exit code, traceback where there was one) of the command line."""
+def call_command(
+    words: tuple[object, ...], report: bool, names: tuple[str, ...] = ()
+) -> tuple[str, str]:
+    """(exit code, what is wrong with the answer) of the command line.
+
+    Wrong is a traceback, another exit code than those of the contract, and a refusal whose message
+    has none of `names` in it.
+    """
     from twin.cli import main
     from twin.reports import report as reports
 
@@ -140,8 +170,9 @@ def call_command(words: tuple[object, ...], report: bool) -> tuple[str, str]:
     if not report:
         reports.write_report = lambda folder, recording=None, more_formats=(): folder
     code: object = 0
+    message = io.StringIO()
     try:
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(message):
             main.main()
     except SystemExit as end:
         code = end.code or 0
@@ -149,7 +180,10 @@ def call_command(words: tuple[object, ...], report: bool) -> tuple[str, str]:
         return "crashed", traceback.format_exc()
     finally:
         reports.write_report, sys.argv = kept, argv
-    return str(code), "" if code in ALLOWED else f"exit code {code}"
+    if code not in ALLOWED:
+        return str(code), f"exit code {code}"
+    is_named = code != 2 or not names or any(name in message.getvalue() for name in names)
+    return str(code), "" if is_named else f"names no file: {message.getvalue()}"
 
 
 def work(first: int, last: int) -> None:

@@ -7,8 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from table_io.errors import InputError
+from twin.run.resource_limits import MIN_MEMORY_BYTES, require_memory
 
 ORDERS = ("hold", "resume", "stop", "abort")
+NO_MEMORY_MESSAGE = "not enough memory: close other programs, or raise the limit `ulimit -v`"
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 
@@ -20,6 +22,9 @@ def main() -> None:
         run_words(sys.argv[1:])
     except SystemExit as end:
         code = end.code
+    except MemoryError:
+        print(f"shaketwin: {NO_MEMORY_MESSAGE}", file=sys.stderr)
+        code = 2
     failures = [stream.failure for stream in streams if stream.failure]
     if failures and not code:
         print(f"shaketwin: cannot write the output: {failures[0]}", file=sys.stderr)
@@ -31,6 +36,8 @@ def run_words(words: Sequence[str]) -> None:
     """Run a command line."""
     try:
         was_order = send_order(words)
+        if not was_order:
+            require_memory(MIN_MEMORY_BYTES)
     except InputError as error:
         print(f"shaketwin: {error}", file=sys.stderr)
         raise SystemExit(2) from None

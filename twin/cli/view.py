@@ -10,6 +10,8 @@ from table_io.clock import RealClock
 from table_io.errors import InputError
 from twin.recording.reader import read_recording
 from twin.recording.run_paths import resolve_log_path
+from twin.run.system import lock_folder
+from twin.run.temporary_folders import VIEW_PREFIX, make_private_folder
 from twin.run.terminal import print_line
 from twin.security.access_control import user_name
 from twin.security.credentials import Credentials
@@ -59,7 +61,7 @@ def view_log(log: Path, save: Path | None, picture: Path | None) -> None:
         _require_parent(path)
     recording = read_recording(log)
     if save is None and picture is None:
-        rrd = Path(tempfile.mkdtemp(prefix="shaketwin-")) / "view.rrd"
+        rrd = make_private_folder(VIEW_PREFIX) / "view.rrd"
         write_rrd(recording, rrd)
         print_line(open_viewer(rrd))
         return
@@ -75,7 +77,8 @@ def view_log(log: Path, save: Path | None, picture: Path | None) -> None:
 
 def view_log_in_browser(log: Path) -> None:
     """Serve a recording with the web viewer of Rerun until Ctrl-C."""
-    with tempfile.TemporaryDirectory(prefix="shaketwin-") as folder, suppress(KeyboardInterrupt):
+    with tempfile.TemporaryDirectory(prefix=VIEW_PREFIX) as folder, suppress(KeyboardInterrupt):
+        lock_folder(Path(folder))
         rrd = Path(folder) / "view.rrd"
         write_rrd(read_recording(log), rrd)
         with serve_web_viewer(rrd) as url:

@@ -22,8 +22,8 @@ import numpy as np
 import numpy.typing as npt
 
 from table_io.block import Float1D, Float2D, Int1D
+from table_io.compilation import jit_kernel
 from table_io.units import GRAVITY_M_S2
-from twin.model.compilation import jit_kernel
 
 DEFAULT_DAMPING = 0.05
 USUAL_PER_OCTAVE, FINE_PER_OCTAVE = 6, 72  # natural frequencies

@@ -33,9 +33,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from table_io.block import Float1D, Float2D
+from table_io.compilation import jit_untyped_kernel
 
 MAX_STEP_S = 2.6e-4  # of the integrator: a tenth of the period of the fastest valve
 PRESSURE_CORNER = math.tau * 1.0  # rad/s, below it the load is not fed back
@@ -84,7 +84,7 @@ class TableParameters(NamedTuple):
     friction_memory: float = 0.0
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _find_stroke(s, p):  # type: ignore[no-untyped-def]
     """Return the stroke of the table on its frame in m and its rate in m/s."""
     stroke, v = s[Y] - s[FRAME], s[V] - s[FRAME_SPEED]
@@ -94,14 +94,14 @@ def _find_stroke(s, p):  # type: ignore[no-untyped-def]
     return stroke, v
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _find_friction_share(sign, stroke, p):  # type: ignore[no-untyped-def]
     """Return the limit of |z| in this direction, at this stroke in m."""
     along = max(1.0 + p.friction_slope_1_m * stroke, LEAST_FRICTION_SHARE)
     return (1.0 + p.friction_asymmetry * sign) * along
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _write_rates(s, z, memory, z_valve, command, command_rate, reaction, h, m, p, rate):  # type: ignore[no-untyped-def]
     """Write the time derivative of the state; SI.
 
@@ -163,7 +163,7 @@ def _write_rates(s, z, memory, z_valve, command, command_rate, reaction, h, m, p
         )
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _advance_memories(s, z, memory, z_valve, h, p):  # type: ignore[no-untyped-def]
     """Return z, the lagging Stribeck exponential and z of the valve after half a step h in s."""
     stroke, v = _find_stroke(s, p)
@@ -185,7 +185,7 @@ def _advance_memories(s, z, memory, z_valve, h, p):  # type: ignore[no-untyped-d
     return z, memory, z_valve
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _simulate(command, reaction, m, rate_hz, steps, p, out):  # type: ignore[no-untyped-def]
     """Simulate from rest; command (sample,) in m, out (2, sample): table in m and m/s2."""
     extended = p.second_frame_ratio != 0.0 or p.transducer_lag_s > 0.0

@@ -1,12 +1,11 @@
 """Compiled kernel of `event_driven_map`: whole periods of a periodic drive for many states."""
 
 import math
-from collections.abc import Callable
 
 from numba import float64, int64, types
 
 from table_io.block import Float1D, Float2D
-from twin.model.compilation import jit_kernel, source_revision
+from table_io.compilation import jit_kernel
 from twin.model.event_integrator_kernel import (
     CONTACT_L,
     CONTACT_R,
@@ -26,7 +25,6 @@ from twin.model.event_integrator_kernel import (
     set_start,
     write_states,
 )  # fmt: skip
-from twin.model.event_integrator_kernel import REVISION as INTEGRATOR_REVISION
 from twin.model.force_laws import (
     ADDED_LAWS_TYPE,
     COEFFICIENTS_TYPE,
@@ -43,67 +41,56 @@ _KERNELS = [
     )
     for laws in (types.none, ADDED_LAWS_TYPE)
 ]  # fmt: skip
-REVISION = source_revision(globals()) ^ INTEGRATOR_REVISION
 
 
-def _build_kernel(revision: int) -> Callable[..., None]:
-    """Return the kernel; `revision` is a free variable of it and so part of numba's cache key."""
+@jit_kernel(_KERNELS, cache=True)
+def advance_periods(
+    states: Float2D,
+    p: Coefficients,
+    propagators: Float2D,
+    laws: AddedLaws | None,
+    base_acc: Float1D,
+    periods: int,
+    events: Float2D,
+    motion: Float2D,
+) -> None:
+    """Advance each row of states (m, STATE_SIZE) through whole periods of A in m/s2, (n,).
 
-    @jit_kernel(_KERNELS, cache=True)
-    def advance_periods(
-        states: Float2D,
-        p: Coefficients,
-        propagators: Float2D,
-        laws: AddedLaws | None,
-        base_acc: Float1D,
-        periods: int,
-        events: Float2D,
-        motion: Float2D,
-    ) -> None:
-        """Advance each row of states (m, STATE_SIZE) through whole periods of A in m/s2, (n,).
-
-        The samples of A are those after the start of a period, A is linear between them, and
-        periodic. events: as in `advance_step`, of all rows in turn, times from the start of the
-        row. motion (7, n periods), unless empty: u, u', u'' + A, F_R, F_L, u_r and u_l of the
-        last row. A row that becomes infinite is NaN.
-        """
-        if revision < 0:
-            return
-        for row in range(states.shape[0]):
-            state = states[row]
-            x = Motion(
-                state[U], state[V], state[U_R], state[U_L],
-                state[STATE_F], state[STATE_B_R], state[STATE_B_L], read_states(state, laws),
-            )  # fmt: skip
-            mode = int(state[CONTACT_R] > 0) + 2 * int(state[CONTACT_L] > 0)
-            base = base_acc[-1]
-            start = Start(x.u, state[STATE_Z], 0.0, 0.0, base, 0.0, mode, state[DIRECTION])
-            for i in range(periods * base_acc.size):
-                sample = base_acc[i % base_acc.size]
-                acceleration = 0.0
-                for substep in range(p.substeps):
-                    slope = (sample - base) / (p.step * (p.substeps - substep))
-                    x, start = set_start(x, start, p, 0.0, base, slope)
-                    events[-1, 1] = (i + substep / p.substeps) * p.period
-                    end, start = advance_step(p.step, x, start, p, propagators, laws, events)
-                    x, acceleration = end[0], end[1].v + start.base
-                    base = base + slope * p.step if substep + 1 < p.substeps else sample
-                if motion.size:
-                    motion[0, i], motion[1, i], motion[2, i] = x.u, x.v, acceleration
-                    motion[3, i] = contact_force(x, start, p, 0, laws)
-                    motion[4, i] = contact_force(x, start, p, 1, laws)
-                    motion[5, i], motion[6, i] = x.u_r, x.u_l
-                if not math.isfinite(x.u):
-                    break
-            state[U], state[V], state[U_R], state[U_L] = x.u, x.v, x.u_r, x.u_l
-            state[STATE_F], state[STATE_B_R], state[STATE_B_L] = x.f, x.b_r, x.b_l
-            state[CONTACT_R], state[CONTACT_L] = float(start.mode & 1), float(start.mode >> 1)
-            state[STATE_BASE], state[STATE_Z], state[DIRECTION] = base, start.z, start.direction
-            write_states(state, x.s)
+    The samples of A are those after the start of a period, A is linear between them, and
+    periodic. events: as in `advance_step`, of all rows in turn, times from the start of the
+    row. motion (7, n periods), unless empty: u, u', u'' + A, F_R, F_L, u_r and u_l of the
+    last row. A row that becomes infinite is NaN.
+    """
+    for row in range(states.shape[0]):
+        state = states[row]
+        x = Motion(
+            state[U], state[V], state[U_R], state[U_L],
+            state[STATE_F], state[STATE_B_R], state[STATE_B_L], read_states(state, laws),
+        )  # fmt: skip
+        mode = int(state[CONTACT_R] > 0) + 2 * int(state[CONTACT_L] > 0)
+        base = base_acc[-1]
+        start = Start(x.u, state[STATE_Z], 0.0, 0.0, base, 0.0, mode, state[DIRECTION])
+        for i in range(periods * base_acc.size):
+            sample = base_acc[i % base_acc.size]
+            acceleration = 0.0
+            for substep in range(p.substeps):
+                slope = (sample - base) / (p.step * (p.substeps - substep))
+                x, start = set_start(x, start, p, 0.0, base, slope)
+                events[-1, 1] = (i + substep / p.substeps) * p.period
+                end, start = advance_step(p.step, x, start, p, propagators, laws, events)
+                x, acceleration = end[0], end[1].v + start.base
+                base = base + slope * p.step if substep + 1 < p.substeps else sample
+            if motion.size:
+                motion[0, i], motion[1, i], motion[2, i] = x.u, x.v, acceleration
+                motion[3, i] = contact_force(x, start, p, 0, laws)
+                motion[4, i] = contact_force(x, start, p, 1, laws)
+                motion[5, i], motion[6, i] = x.u_r, x.u_l
             if not math.isfinite(x.u):
-                state[:] = math.nan
-
-    return advance_periods
-
-
-advance_periods = _build_kernel(REVISION)
+                break
+        state[U], state[V], state[U_R], state[U_L] = x.u, x.v, x.u_r, x.u_l
+        state[STATE_F], state[STATE_B_R], state[STATE_B_L] = x.f, x.b_r, x.b_l
+        state[CONTACT_R], state[CONTACT_L] = float(start.mode & 1), float(start.mode >> 1)
+        state[STATE_BASE], state[STATE_Z], state[DIRECTION] = base, start.z, start.direction
+        write_states(state, x.s)
+        if not math.isfinite(x.u):
+            state[:] = math.nan

@@ -6,7 +6,6 @@ chaotic attractor visits.
 """
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +13,7 @@ import numpy.typing as npt
 from numba import boolean, float64, int64, types
 
 from table_io.block import Float1D, Float2D, Int1D
-from twin.model.compilation import jit_helper, jit_kernel, source_revision
+from table_io.compilation import jit_helper, jit_kernel
 from twin.model.contact_regime import (
     CONTACT_R,
     MASS,
@@ -31,7 +30,6 @@ from twin.model.contact_regime import (
     stays_positive,
     step_guard,
 )
-from twin.model.contact_regime import REVISION as REGIME_REVISION
 from twin.model.stepped_sine_kernel import Float3D
 
 Bool3D = npt.NDArray[np.bool_]
@@ -176,60 +174,43 @@ def update_capture(
     return (visitor if hits >= CAPTURE_HITS else UNDECIDED), visitor, hits
 
 
-REVISION = source_revision(globals()) ^ REGIME_REVISION
+@jit_kernel(
+    types.void(_VECTOR, _VECTOR, _DRIVE_TYPE, int64, int64, _MATRIX),
+    cache=True,
+)
+def record_points(
+    state: Float1D, params: Float1D, drive: SineDrive, first: int, last: int, points: Float2D
+) -> None:
+    """Advance `state` over steps `first` to `last` of a cycle, once per row of points.
+
+    Row i of points (n, state): the state after pass i.
+    """
+    for i in range(points.shape[0]):
+        advance_phase_steps(state, params, drive, first, last)
+        for j in range(points.shape[1]):
+            points[i, j] = state[j]
 
 
-Kernels = tuple[Callable[..., None], Callable[..., None]]
+@jit_kernel(
+    types.void(_MATRIX, _VECTOR, _DRIVE_TYPE, _REGIONS_TYPE, int64, _LABELS, _LABELS),
+    cache=True,
+)
+def capture_states(
+    states: Float2D, params: Float1D, drive: SineDrive, regions: CaptureRegions,
+    max_cycles: int, labels: Int1D, cycles: Int1D,
+) -> None:  # fmt: skip
+    """Advance each undecided state (n, state) until it is captured, at most `max_cycles`.
 
-
-def _build_kernels(revision: int) -> Kernels:
-    """Return the kernels; `revision` is a free variable of them, so part of numba's cache key."""
-
-    @jit_kernel(
-        types.void(_VECTOR, _VECTOR, _DRIVE_TYPE, int64, int64, _MATRIX),
-        cache=True,
-    )
-    def record_points(
-        state: Float1D, params: Float1D, drive: SineDrive, first: int, last: int, points: Float2D
-    ) -> None:
-        """Advance `state` over steps `first` to `last` of a cycle, once per row of points.
-
-        Row i of points (n, state): the state after pass i.
-        """
-        if revision < 0:
-            return  # never: a use of the variable
-        for i in range(points.shape[0]):
-            advance_phase_steps(state, params, drive, first, last)
-            for j in range(points.shape[1]):
-                points[i, j] = state[j]
-
-    @jit_kernel(
-        types.void(_MATRIX, _VECTOR, _DRIVE_TYPE, _REGIONS_TYPE, int64, _LABELS, _LABELS),
-        cache=True,
-    )
-    def capture_states(
-        states: Float2D, params: Float1D, drive: SineDrive, regions: CaptureRegions,
-        max_cycles: int, labels: Int1D, cycles: Int1D,
-    ) -> None:  # fmt: skip
-        """Advance each undecided state (n, state) until it is captured, at most `max_cycles`.
-
-        labels (n,) become the attractor or stay `UNDECIDED`; cycles (n,) count up. Allocates
-        nothing, so that threads scale.
-        """
-        if revision < 0:
-            return  # never: a use of the variable
-        for i in range(labels.size):
+    labels (n,) become the attractor or stay `UNDECIDED`; cycles (n,) count up. Allocates
+    nothing, so that threads scale.
+    """
+    for i in range(labels.size):
+        if labels[i] != UNDECIDED:
+            continue
+        state, visited, hits = states[i], UNDECIDED, 0
+        for _ in range(max_cycles):
+            advance_phase_steps(state, params, drive, 0, drive.steps)
+            cycles[i] += 1
+            labels[i], visited, hits = update_capture(state, regions, visited, hits)
             if labels[i] != UNDECIDED:
-                continue
-            state, visited, hits = states[i], UNDECIDED, 0
-            for _ in range(max_cycles):
-                advance_phase_steps(state, params, drive, 0, drive.steps)
-                cycles[i] += 1
-                labels[i], visited, hits = update_capture(state, regions, visited, hits)
-                if labels[i] != UNDECIDED:
-                    break
-
-    return record_points, capture_states
-
-
-record_points, capture_states = _build_kernels(REVISION)
+                break

@@ -4,7 +4,6 @@ import json
 import os
 import select
 import sys
-import tempfile
 import tomllib
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,7 +12,6 @@ from twin.run.run_config import RunConfig, from_texts
 
 CONNECT_TIMEOUT_S = 15.0
 INBOX_CAPACITY = 50_000  # fragments queued in an inbox
-MAX_TEMP_FOLDER_CHARS = 70  # socket paths are limited to about 100
 LINGER_S = 10.0  # for which a publisher stays up after the run for retransmission
 MAX_QUIET_S = 3.0  # of silence, after which a process stops waiting for final messages
 
@@ -64,9 +62,3 @@ def is_orphaned() -> bool:
     """Return True once the supervisor's end of our standard input is closed."""
     ready, _, _ = select.select([sys.stdin], [], [], 0.0)
     return bool(ready) and not os.read(sys.stdin.fileno(), 64)
-
-
-def make_private_folder() -> Path:
-    """Create a folder readable by this user only, with a path short enough for a socket."""
-    is_long = len(tempfile.gettempdir()) > MAX_TEMP_FOLDER_CHARS
-    return Path(tempfile.mkdtemp(prefix="shaketwin-", dir="/tmp" if is_long else None))

@@ -15,10 +15,11 @@ from table_io.clock import Clock
 from table_io.config.profile import OnDeathConfig
 from table_io.errors import InputError
 from table_io.records import Comparison, Event, Fault, RunStop, Timing
-from twin.live.process_config import ProcessConfig, make_private_folder, process_token
+from twin.live.process_config import ProcessConfig, process_token
 from twin.recording.run_paths import PARTS_FOLDER
 from twin.run.merge_parts import LOCK_FILE
 from twin.run.system import lock_file
+from twin.run.temporary_folders import SOCKET_PREFIX, make_private_folder
 from twin.transport.codec import RECORD_TOPICS, Item, decode_item, encode_item, topic_for
 from twin.transport.endpoint import LOCAL_SOCKET_PREFIX, check_can_listen
 from twin.transport.reliable_subscriber import ReliableSubscriber
@@ -108,7 +109,7 @@ class Supervisor:
         InputError if it cannot begin. A run that did not begin leaves no folder behind.
         """
         self.parts_folder.mkdir(parents=True)
-        socket_folder = make_private_folder()
+        socket_folder = make_private_folder(SOCKET_PREFIX)
         self.config = replace(self.config, endpoint=f"{LOCAL_SOCKET_PREFIX}{socket_folder / 'bus'}")
         self.config.write(self.parts_folder / "spec.json")
         lock = (self.parts_folder / LOCK_FILE).open("a")

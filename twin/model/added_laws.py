@@ -11,8 +11,8 @@ from typing import Any
 
 from numba.core.errors import NumbaError
 
+from table_io.compilation import jit_kernel
 from table_io.errors import InputError
-from twin.model.compilation import jit_kernel
 from twin.model.effects.effect import Effect
 from twin.model.effects.law import PLACES
 from twin.model.force_laws import (

@@ -5,7 +5,7 @@ import math
 from numba import float64, int64, types
 
 from table_io.block import Float1D, Float2D
-from twin.model.compilation import jit_helper, jit_kernel
+from table_io.compilation import jit_helper, jit_kernel
 from twin.model.contact_regime import (
     BASE,
     C_L,
@@ -22,7 +22,6 @@ from twin.model.contact_regime import (
     MODE_SIZE,
     MODES,
     R_R,
-    REVISION,
     STATE_SIZE,
     STEP,
     SUBSTEPS,
@@ -99,10 +98,9 @@ _READ = types.Array(float64, 1, "A", readonly=True)
 _WRITE = types.Array(float64, 2, "A")
 
 
-@jit_kernel(int64(float64[::1], _READ, _READ, _WRITE, _WRITE, types.Omitted(REVISION)), cache=True)
+@jit_kernel(int64(float64[::1], _READ, _READ, _WRITE, _WRITE), cache=True)
 def advance_samples(
     state: Float1D, params: Float1D, base_acc: Float1D, out: Float2D, events: Float2D,
-    revision: int = REVISION,
 ) -> int:  # fmt: skip
     """Advance `state` through the samples of A in m/s2, (n,), linear between; return the events.
 

@@ -11,7 +11,7 @@ event times need root finding. A guard is a quantity that stays positive until i
 import math
 
 from table_io.block import Float1D
-from twin.model.compilation import jit_helper, source_revision
+from table_io.compilation import jit_helper
 
 Sinusoid = tuple[float, float, float]  # peak in m/s2, angular frequency in 1/s, phase in rad
 # Returned by `mode_solution`.
@@ -274,6 +274,3 @@ def advance_to_event(
             if abs(state[U_R + s]) < DENORMAL_LIMIT:
                 state[U_R + s] = 0.0
     return dt, side, m, x0, x1
-
-
-REVISION = source_revision(globals())

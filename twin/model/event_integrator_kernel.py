@@ -17,14 +17,12 @@ from typing import Any
 from numba import float64, types
 
 from table_io.block import Float1D, Float2D
-from twin.model.compilation import (
+from table_io.compilation import (
     jit_helper,
     jit_helper_unless_none,
     jit_kernel,
-    source_revision,
 )
 from twin.model.event_location import REVERSAL_GUARD, StateAndRates, integrate_to_event
-from twin.model.event_location import REVISION as EVENTS_REVISION
 from twin.model.force_laws import (
     ADDED_LAWS_TYPE,
     COEFFICIENTS_TYPE,
@@ -203,72 +201,67 @@ def contact_force(
 
 _READ = types.Array(float64, 1, "A", readonly=True)
 _OUT = types.Array(float64, 2, "A")
-REVISION = source_revision(globals()) ^ EVENTS_REVISION
 
 
-def _build_kernel(revision: int, laws_type: types.Type) -> Callable[..., None]:
-    """Return the kernel; `revision` is a free variable of it and so part of numba's cache key."""
+def _integrate_samples(
+    state: Float1D,
+    p: Coefficients,
+    propagators: Float2D,
+    laws: AddedLaws | None,
+    base_acc: Float1D,
+    out: Float2D,
+) -> None:
+    """Advance `state` through the samples of A in m/s2, (n,), linear between; fill out (7, n).
+
+    After a sample that is not finite all but the clock is NaN until a restart.
+    """
+    if state.size < STATE_SIZE or out.shape[0] < OUTPUT_COUNT or out.shape[1] < base_acc.size:
+        raise ValueError("state or out is too small for these samples; see Solver.advance")
+    x = Motion(
+        state[U], state[V], state[U_R], state[U_L],
+        state[STATE_F], state[STATE_B_R], state[STATE_B_L], read_states(state, laws),
+    )  # fmt: skip
+    mode = int(state[CONTACT_R] > 0) + 2 * int(state[CONTACT_L] > 0)
+    clock, base = state[CLOCK], state[STATE_BASE]
+    start = Start(x.u, state[STATE_Z], 0.0, 0.0, base, 0.0, mode, state[DIRECTION])
+    for i in range(base_acc.size):
+        for substep in range(p.substeps):
+            slope = (base_acc[i] - base) / (p.step * (p.substeps - substep))
+            time = (clock + i + substep / p.substeps) * p.period
+            x, start = set_start(x, start, p, time, base, slope)
+            motion, start = advance_step(p.step, x, start, p, propagators, laws, None)
+            x = motion[0]
+            base = base + slope * p.step if substep + 1 < p.substeps else base_acc[i]
+        if not math.isfinite(base) or not math.isfinite(x.u):
+            base = math.nan
+            x = Motion(base, base, base, base, base, base, base, x.s)
+        x, start = set_start(x, start, p, (clock + i + 1) * p.period, base, 0.0)
+        flight_force = base - base
+        out[0, i], out[1, i], out[2, i] = x.u, x.v, motion[1].v + start.base
+        out[3, i] = contact_force(x, start, p, 0, laws) + flight_force
+        out[4, i] = contact_force(x, start, p, 1, laws) + flight_force
+        out[5, i], out[6, i] = x.u_r, x.u_l
+    state[U], state[V], state[U_R], state[U_L] = x.u, x.v, x.u_r, x.u_l
+    state[STATE_F], state[STATE_B_R], state[STATE_B_L] = x.f, x.b_r, x.b_l
+    state[CONTACT_R], state[CONTACT_L] = float(start.mode & 1), float(start.mode >> 1)
+    state[STATE_BASE], state[STATE_Z], state[DIRECTION] = base, start.z, start.direction
+    write_states(state, x.s)
+    if math.isnan(base):
+        state[:CLOCK] = math.nan
+    state[CLOCK] = clock + base_acc.size
+
+
+def _compile_kernel(laws_type: types.Type) -> Callable[..., None]:
     kernel_type = types.void(
         float64[::1], COEFFICIENTS_TYPE, float64[:, ::1], laws_type, _READ, _OUT
     )
-
-    @jit_kernel(kernel_type, cache=True)
-    def integrate_samples(
-        state: Float1D,
-        p: Coefficients,
-        propagators: Float2D,
-        laws: AddedLaws | None,
-        base_acc: Float1D,
-        out: Float2D,
-    ) -> None:
-        """Advance `state` through the samples of A in m/s2, (n,), linear between; fill out (7, n).
-
-        After a sample that is not finite all but the clock is NaN until a restart.
-        """
-        if revision < 0:
-            return
-        if state.size < STATE_SIZE or out.shape[0] < OUTPUT_COUNT or out.shape[1] < base_acc.size:
-            raise ValueError("state or out is too small for these samples; see Solver.advance")
-        x = Motion(
-            state[U], state[V], state[U_R], state[U_L],
-            state[STATE_F], state[STATE_B_R], state[STATE_B_L], read_states(state, laws),
-        )  # fmt: skip
-        mode = int(state[CONTACT_R] > 0) + 2 * int(state[CONTACT_L] > 0)
-        clock, base = state[CLOCK], state[STATE_BASE]
-        start = Start(x.u, state[STATE_Z], 0.0, 0.0, base, 0.0, mode, state[DIRECTION])
-        for i in range(base_acc.size):
-            for substep in range(p.substeps):
-                slope = (base_acc[i] - base) / (p.step * (p.substeps - substep))
-                time = (clock + i + substep / p.substeps) * p.period
-                x, start = set_start(x, start, p, time, base, slope)
-                motion, start = advance_step(p.step, x, start, p, propagators, laws, None)
-                x = motion[0]
-                base = base + slope * p.step if substep + 1 < p.substeps else base_acc[i]
-            if not math.isfinite(base) or not math.isfinite(x.u):
-                base = math.nan
-                x = Motion(base, base, base, base, base, base, base, x.s)
-            x, start = set_start(x, start, p, (clock + i + 1) * p.period, base, 0.0)
-            flight_force = base - base
-            out[0, i], out[1, i], out[2, i] = x.u, x.v, motion[1].v + start.base
-            out[3, i] = contact_force(x, start, p, 0, laws) + flight_force
-            out[4, i] = contact_force(x, start, p, 1, laws) + flight_force
-            out[5, i], out[6, i] = x.u_r, x.u_l
-        state[U], state[V], state[U_R], state[U_L] = x.u, x.v, x.u_r, x.u_l
-        state[STATE_F], state[STATE_B_R], state[STATE_B_L] = x.f, x.b_r, x.b_l
-        state[CONTACT_R], state[CONTACT_L] = float(start.mode & 1), float(start.mode >> 1)
-        state[STATE_BASE], state[STATE_Z], state[DIRECTION] = base, start.z, start.direction
-        write_states(state, x.s)
-        if math.isnan(base):
-            state[:CLOCK] = math.nan
-        state[CLOCK] = clock + base_acc.size
-
-    return integrate_samples
+    return jit_kernel(kernel_type, cache=True)(_integrate_samples)
 
 
-integrate_samples = _build_kernel(REVISION, types.none)
+integrate_samples = _compile_kernel(types.none)
 
 
 @cache
 def build_laws_kernel() -> Callable[..., None]:
     """Return `integrate_samples` for models with added laws; only they wait for its compilation."""
-    return _build_kernel(REVISION, ADDED_LAWS_TYPE)
+    return _compile_kernel(ADDED_LAWS_TYPE)

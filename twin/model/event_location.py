@@ -12,8 +12,7 @@ import math
 from typing import Any
 
 from table_io.block import Float1D, Float2D
-from twin.model.compilation import jit_helper, jit_helper_unless_none, source_revision
-from twin.model.force_laws import REVISION as LAWS_REVISION
+from table_io.compilation import jit_helper, jit_helper_unless_none
 from twin.model.force_laws import (
     AddedLaws,
     Coefficients,
@@ -307,6 +306,3 @@ def integrate_to_event(
     if event_guard >= 0:
         end = advance_in_mode(dt, x, k1, start, p, propagators, laws)
     return dt, event_guard, end
-
-
-REVISION = source_revision(globals()) ^ LAWS_REVISION

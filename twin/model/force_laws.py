@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, get_type_hints
 
 from numba import float64, int64, types
 
-from twin.model.compilation import jit_helper, jit_helper_unless_none, source_revision
+from table_io.compilation import jit_helper, jit_helper_unless_none
 from twin.model.effects import (
     bouc_wen,
     bumper_hardening,
@@ -288,6 +288,3 @@ def static_friction(
     """Return the friction in N that holds the mass in place."""
     force = internal_force(x, start, 0.0, p, t, laws)
     return -(p.m * (start.base + start.slope * t) + force)
-
-
-REVISION = source_revision(globals())

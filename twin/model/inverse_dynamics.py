@@ -10,7 +10,6 @@ this is what makes a fit converge (see `twin.identification`).
 """
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -18,11 +17,10 @@ import numpy.typing as npt
 from numba import float64, types
 
 from table_io.block import Float1D, Float2D
-from twin.model.compilation import (
+from table_io.compilation import (
     jit_helper,
     jit_helper_unless_none,
     jit_kernel,
-    source_revision,
 )
 from twin.model.effects.law import DAMPER, sum_law_properties
 from twin.model.event_integrator import kernel_coefficients
@@ -44,7 +42,6 @@ from twin.model.force_laws import (
     hysteretic_variable,
     quadratic_force,
 )
-from twin.model.force_laws import REVISION as LAWS_REVISION
 from twin.model.model import Model
 
 MAX_STATE_RELAXATIONS = 0.5  # relaxation times of an added law per step of its integration
@@ -195,77 +192,64 @@ def relaxed_states(laws: Any) -> LawStates:
     return RELAXED
 
 
-def _build_force_kernel(revision: int) -> Callable[..., None]:
-    """Return the kernel; `revision` is a free variable of it and so part of numba's cache key."""
-
-    @jit_kernel(_KERNELS, cache=True)
-    def kernel(  # noqa: PLR0912
-        u: Float1D,
-        v: Float1D,
-        time: Float1D,
-        contact: Float2D,
-        p: Coefficients,
-        laws: AddedLaws | None,
-        fastest_rate: float,
-        out: Float2D,
-    ) -> None:
-        """Fill `out` (3, sample): D, F_R, F_L in N; `contact` (2, sample) as `CONTACT_UNKNOWN`."""
-        if revision < 0:
-            return
-        z, f, b_r, b_l, s = 0.0, 0.0, 0.0, 0.0, relaxed_states(laws)
-        face_r, face_l = 0.0, 0.0  # face positions in m, tracked only with relaxation
-        in_contact_r, in_contact_l = False, False
-        for k in range(u.size):
-            h = time[k] - time[k - 1] if k else 0.0
-            if k:
-                du = u[k] - u[k - 1]
-                if p.fy > 0.0 and du != 0.0:
-                    z = hysteretic_variable(z, du, math.copysign(1.0, du), p.uy)
-                if p.k1 > 0.0 or f != 0.0:
-                    f = relax_branch(f, p.rate_1, p.k1, du, h)
-                if fastest_rate >= 0.0:
-                    steps = 1 + int(h * fastest_rate / MAX_STATE_RELAXATIONS)
-                    s = advance_law_states(DAMPER, s, u[k - 1], du / h, h, steps, p, laws)
-            direction = 1.0 if v[k] > 0.0 else -1.0
-            damper = p.k * u[k] + p.c * v[k] + cubic_force(u[k], p.k3)
-            damper += (
-                quadratic_force(v[k], direction, p.c2)
-                + coulomb_force(direction, p.fc)
-                + p.fy * z
-                + f
+@jit_kernel(_KERNELS, cache=True)
+def _force_kernel(
+    u: Float1D,
+    v: Float1D,
+    time: Float1D,
+    contact: Float2D,
+    p: Coefficients,
+    laws: AddedLaws | None,
+    fastest_rate: float,
+    out: Float2D,
+) -> None:
+    """Fill `out` (3, sample): D, F_R, F_L in N; `contact` (2, sample) as `CONTACT_UNKNOWN`."""
+    z, f, b_r, b_l, s = 0.0, 0.0, 0.0, 0.0, relaxed_states(laws)
+    face_r, face_l = 0.0, 0.0  # face positions in m, tracked only with relaxation
+    in_contact_r, in_contact_l = False, False
+    for k in range(u.size):
+        h = time[k] - time[k - 1] if k else 0.0
+        if k:
+            du = u[k] - u[k - 1]
+            if p.fy > 0.0 and du != 0.0:
+                z = hysteretic_variable(z, du, math.copysign(1.0, du), p.uy)
+            if p.k1 > 0.0 or f != 0.0:
+                f = relax_branch(f, p.rate_1, p.k1, du, h)
+            if fastest_rate >= 0.0:
+                steps = 1 + int(h * fastest_rate / MAX_STATE_RELAXATIONS)
+                s = advance_law_states(DAMPER, s, u[k - 1], du / h, h, steps, p, laws)
+        direction = 1.0 if v[k] > 0.0 else -1.0
+        damper = p.k * u[k] + p.c * v[k] + cubic_force(u[k], p.k3)
+        damper += (
+            quadratic_force(v[k], direction, p.c2) + coulomb_force(direction, p.fc) + p.fy * z + f
+        )
+        damper = add_law_force(damper, DAMPER, u[k], v[k], s, p, laws)
+        opening = p.drift * time[k]
+        out[0, k] = damper
+        for side in range(2):
+            sign = 1.0 if side == 0 else -1.0
+            gap = (p.gap_r if side == 0 else p.gap_l) + opening
+            d, dd = sign * u[k] - gap, sign * v[k] - p.drift
+            b, face, was_in_contact = (
+                (b_r, face_r, in_contact_r) if side == 0 else (b_l, face_l, in_contact_l)
             )
-            damper = add_law_force(damper, DAMPER, u[k], v[k], s, p, laws)
-            opening = p.drift * time[k]
-            out[0, k] = damper
-            for side in range(2):
-                sign = 1.0 if side == 0 else -1.0
-                gap = (p.gap_r if side == 0 else p.gap_l) + opening
-                d, dd = sign * u[k] - gap, sign * v[k] - p.drift
-                b, face, was_in_contact = (
-                    (b_r, face_r, in_contact_r) if side == 0 else (b_l, face_l, in_contact_l)
-                )
-                if p.has_bumper_states:
-                    face, b, s = track_face_with_laws(
-                        side, d, dd, face, b, s, was_in_contact, contact[side, k], h,
-                        fastest_rate, p, laws,
-                    )  # fmt: skip
-                elif p.kb > 0.0:
-                    face, b = track_face(p, side, d, face, b, was_in_contact, contact[side, k], h)
-                push = bumper_force(p, side, d, dd, b, s, laws) if d > -0.5 * NO_WALL_M else 0.0
-                if contact[side, k] < -0.5:
-                    in_contact = push > 0.0 and (was_in_contact or d >= face)
-                else:
-                    in_contact = contact[side, k] > 0.5
-                if side == 0:
-                    b_r, face_r, in_contact_r = b, face, in_contact
-                else:
-                    b_l, face_l, in_contact_l = b, face, in_contact
-                out[1 + side, k] = sign * push if in_contact else 0.0
-
-    return kernel
-
-
-_force_kernel = _build_force_kernel(source_revision(globals()) ^ LAWS_REVISION)
+            if p.has_bumper_states:
+                face, b, s = track_face_with_laws(
+                    side, d, dd, face, b, s, was_in_contact, contact[side, k], h,
+                    fastest_rate, p, laws,
+                )  # fmt: skip
+            elif p.kb > 0.0:
+                face, b = track_face(p, side, d, face, b, was_in_contact, contact[side, k], h)
+            push = bumper_force(p, side, d, dd, b, s, laws) if d > -0.5 * NO_WALL_M else 0.0
+            if contact[side, k] < -0.5:
+                in_contact = push > 0.0 and (was_in_contact or d >= face)
+            else:
+                in_contact = contact[side, k] > 0.5
+            if side == 0:
+                b_r, face_r, in_contact_r = b, face, in_contact
+            else:
+                b_l, face_l, in_contact_l = b, face, in_contact
+            out[1 + side, k] = sign * push if in_contact else 0.0
 
 
 def forces_along(

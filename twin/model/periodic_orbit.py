@@ -16,12 +16,12 @@ import numpy as np
 from numba import float64, int64, types
 
 from table_io.block import Float1D, Float2D
+from table_io.compilation import jit_helper, jit_kernel
 from twin.model.closed_form import (
     MAX_PHASE_STEP_RAD,
     continuous_params,
     highest_angular_frequency,
 )
-from twin.model.compilation import jit_helper, jit_kernel
 from twin.model.contact_regime import (
     BASE,
     C_R,
@@ -34,7 +34,6 @@ from twin.model.contact_regime import (
     MODE_SIZE,
     MODES,
     R_R,
-    REVISION,
     U_L,
     U_R,
     Kinematics,
@@ -231,14 +230,13 @@ def end_at_period(variations: Float2D, state: Float1D, params: Float1D, w: float
 @jit_kernel(
     types.UniTuple(int64, 2)(
         float64[::1], float64[::1], float64, float64, int64, int64, float64[:, ::1],
-        float64[::1], float64[:, ::1], float64[:, ::1], types.Omitted(REVISION),
+        float64[::1], float64[:, ::1], float64[:, ::1],
     ),
     cache=True,
 )  # fmt: skip
 def advance_cycles(
     state: Float1D, params: Float1D, peak: float, w: float, steps: int, cycles: int,
     variations: Float2D, growth: Float1D, events: Float2D, minima: Float2D,
-    revision: int = REVISION,
 ) -> tuple[int, int]:  # fmt: skip
     """Advance `state` and `variations` (4, n + 4) through whole cycles; return (events, minima).
 

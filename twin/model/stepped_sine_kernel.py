@@ -7,7 +7,7 @@ import numpy.typing as npt
 from numba import float64, int64, types
 
 from table_io.block import Float1D, Float2D, Int1D
-from twin.model.compilation import jit_helper, jit_kernel
+from table_io.compilation import jit_helper, jit_kernel
 from twin.model.contact_regime import (
     CONTACT_R,
     E_L,
@@ -18,7 +18,6 @@ from twin.model.contact_regime import (
     MODES,
     R_L,
     R_R,
-    REVISION,
     U_L,
     U_R,
     Kinematics,
@@ -210,7 +209,6 @@ def advance_cycle(
     types.void(
         float64[::1], float64[::1], float64[::1], float64[::1], int64, int64[::1],
         float64[:, ::1], float64[:, ::1], float64[:, :, ::1], float64[:, ::1],
-        types.Omitted(REVISION),
     ),
     cache=True,
 )  # fmt: skip
@@ -225,7 +223,6 @@ def run_stepped_sine(
     particular: Float2D,
     extremes: Float3D,
     end_states: Float2D,
-    revision: int = REVISION,
 ) -> None:
     """Run whole cycles of A = peak sin(w t) at each w in 1/s in turn, `steps` steps per cycle.
 

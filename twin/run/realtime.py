@@ -1,4 +1,4 @@
-"""Check that a test can run in real time: block length, and a machine that answers."""
+"""Check that a test can run in real time: block length, limits of the system, the machine."""
 
 import math
 from pathlib import Path
@@ -8,6 +8,11 @@ from table_io.backends import check_reachable, open_backend
 from table_io.clock import RealClock
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
+from twin.run.resource_limits import (
+    MIN_RUN_MEMORY_BYTES,
+    require_memory,
+    require_open_files,
+)
 from twin.run.run_config import RunConfig
 
 MIN_BLOCK_S, MAX_BLOCK_S = 0.002, 0.05  # protection checks once per block
@@ -16,7 +21,8 @@ MIN_BLOCK_S, MAX_BLOCK_S = 0.002, 0.05  # protection checks once per block
 def check_realtime(config: RunConfig, profile_path: Path) -> None:
     """Raise InputError if a block is too short or too long, or no machine answers.
 
-    Shorter blocks cannot be processed in time; longer ones delay protection too much.
+    Also if the system allows its processes too little memory or too few open files. Shorter blocks
+    cannot be processed in time; longer ones delay protection too much.
     """
     samples, rate_hz = config.profile.acquisition.block_samples, config.drive.rate_hz
     min_samples, max_samples = math.ceil(rate_hz * MIN_BLOCK_S), math.floor(rate_hz * MAX_BLOCK_S)
@@ -29,6 +35,8 @@ def check_realtime(config: RunConfig, profile_path: Path) -> None:
             allowed=f"{min_samples} to {max_samples}",
             remedy="change it, or use --speed max",
         )
+    require_open_files()
+    require_memory(MIN_RUN_MEMORY_BYTES)
     # Raises now if the test cannot be played by an external controller, or by the backend.
     if config.rig.under_external_control:
         plan_open_loop_drive(config.profile, config.rig)

@@ -131,8 +131,13 @@ def from_texts(
             where=source,
             remedy="look for a wrong power of ten",
         ) from None
+    except InputError as error:
+        raise (error if source in str(error) else error.add_place(source)) from None
     model = model_config.build_model(profile.specimen)
-    model.check_rate(profile.acquisition.rate_hz)
+    try:
+        model.check_rate(profile.acquisition.rate_hz)
+    except InputError as error:
+        raise error.add_place(source) from None
     return RunConfig(
         name,
         profile,
@@ -166,19 +171,29 @@ def build_run_config(
 
     InputError if the test exceeds the limits of the table; `source` names the test in it.
     """
-    rig, rig_toml = load_rig(
-        find_config(table or profile.rig, "rigs", relative_to, option="--table" if table else "")
+    rig_path = find_config(
+        table or profile.rig, "rigs", relative_to, option="--table" if table else ""
     )
-    model_config, model_toml = read_model(
-        model or profile.model, relative_to, option="--model" if model else ""
+    rig, rig_toml = load_rig(rig_path)
+    model_path = find_config(
+        model or profile.model, "models", relative_to, option="--model" if model else ""
     )
+    model_config, model_toml = load_config(model_path, ModelConfig, "model file")
     if profile.continuation is not None and profile.continuation.file is None:
         from twin.run.orbit_plan import attach_orbit_plan
 
         own_model = model_config.build_model(profile.specimen)
         profile_toml = attach_orbit_plan(profile_toml, profile, rig, own_model, source)
-    config = from_texts(name, profile_toml, rig_toml, model_toml, source)
-    check_limits(config.margins, config.profile, config.rig, source)
+    try:
+        config = from_texts(name, profile_toml, rig_toml, model_toml, source)
+    except InputError as error:
+        if error.key != "rate_hz":
+            raise
+        raise error.replace(remedy=f"{error.remedy}, or correct {model_path}") from None
+    try:
+        check_limits(config.margins, config.profile, config.rig, source)
+    except InputError as error:
+        raise error.replace(remedy=f"its limits are those of {rig_path}") from None
     return config
 
 

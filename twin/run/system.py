@@ -48,6 +48,20 @@ def lock_folder(folder: Path) -> None:
     _locked_folders[path] = descriptor
 
 
+def is_folder_locked(folder: Path) -> bool:
+    """Return True if a process has locked the folder with `lock_folder`."""
+    if not HAS_FILE_LOCKS:
+        return False
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
 def count_cores() -> int:
     """Return the number of cores that this process may use."""
     if sys.platform == "linux":

@@ -15,6 +15,7 @@ from rich.table import Table
 from table_io.errors import replace_escapes
 
 DECAY_MESSAGE = "stopping: the table decays to rest"
+STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")  # Ctrl-C, kill, a closed window, Ctrl-\\
 ANNOUNCE_AFTER_S = 1.5  # longer than loading from a cache
 FILE_COLUMNS = 400  # of output to a file or pipe, where lines need no wrapping
 
@@ -86,9 +87,10 @@ def print_table(on: Console, table: Table) -> None:
 def catch_interrupts(
     sentence: str = "stopping: the table decays to rest",
 ) -> Iterator[Callable[[], str | None]]:
-    """Catch SIGINT and SIGTERM; yield a function that returns the reason to stop, or None.
+    """Catch the signals of `STOP_SIGNALS`; yield a function that returns the reason to stop.
 
-    The sentence is printed at the first signal.
+    It returns None before a signal; the sentence is printed at the first one. A SIGHUP that is
+    ignored stays ignored: a test started with `nohup` outlives its terminal.
     """
     signals: list[int] = []
 
@@ -97,12 +99,16 @@ def catch_interrupts(
             print_line(sentence)
         signals.append(number)
 
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    old_handlers = [signal.signal(number, handle_signal) for number in numbers]
+    numbers = [getattr(signal, name) for name in STOP_SIGNALS if hasattr(signal, name)]
+    old_handlers = {
+        number: signal.signal(number, handle_signal)
+        for number in numbers
+        if number != getattr(signal, "SIGHUP", None) or signal.getsignal(number) != signal.SIG_IGN
+    }
     try:
         yield lambda: f"interrupted ({signal.Signals(signals[0]).name})" if signals else None
     finally:
-        for number, handler in zip(numbers, old_handlers, strict=True):
+        for number, handler in old_handlers.items():
             signal.signal(number, handler)
 
 

@@ -190,10 +190,11 @@ def register_excitation(kind: str) -> Callable[[ExcitationT], ExcitationT]:
 
 def find_excitation(kind: object) -> type[Excitation]:
     """Return the class of a kind, built-in before plug-in; ValueError lists the known kinds."""
-    if kind in EXCITATIONS:
+    is_text = isinstance(kind, str)  # a list is not even a key
+    if is_text and kind in EXCITATIONS:
         return EXCITATIONS[str(kind)]
     plugins = list_entry_points(ENTRY_POINT_GROUP)
-    if kind in plugins:
+    if is_text and kind in plugins:
         return _load_plugin(plugins[str(kind)][0])
     raise InputError(
         f"kind {kind!r} is unknown", remedy=suggest(str(kind), [*EXCITATIONS, *plugins])

@@ -77,8 +77,10 @@ class BandLimitedRandom(History):
         """Return the noise in m, between ramps that continue it periodically, (sample,)."""
         if self.high_hz > MAX_BAND_SHARE * rate_hz:
             raise InputError(
-                f"high_hz {self.high_hz:g} is too high for {rate_hz:g} samples per second",
+                f"too high for {rate_hz:g} samples per second",
                 where=f"excitation {self.kind!r}",
+                key="high_hz",
+                value=self.high_hz,
                 allowed=f"up to {MAX_BAND_SHARE * rate_hz:g}",
             )
         count, ramp = round(self.duration_s * rate_hz), round(self.ramp_s * rate_hz)

@@ -7,7 +7,7 @@ sample and delays the detection of a real excess by one sample.
 
 import math
 
-from numba import njit
+from table_io.compilation import jit_untyped_kernel
 
 # Codes of findings.
 STROKE, VELOCITY, ACCELERATION, FORCE, RAIL, LOST, BLIND = range(7)
@@ -45,7 +45,7 @@ SWEEP_STAGE = 1.0  # RUN_STAGE from the first step on; before it only gross devi
 HALF_CYCLE, NEW_MOTION = 1, 2  # marks: half a cycle is complete, another motion begins
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _median(row, i):  # type: ignore[no-untyped-def]
     """Return the median of the samples i - 2 .. i; NaN if one of them is NaN."""
     a, b, c = row[i - 2], row[i - 1], row[i]
@@ -54,7 +54,7 @@ def _median(row, i):  # type: ignore[no-untyped-def]
     return max(min(a, b), min(max(a, b), c))
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _report(state, findings, count, index, code, channel, value, limit, limits):  # type: ignore[no-untyped-def]
     """Add a finding, once per episode; return the number of findings."""
     last_index = state.last_true[code, channel]
@@ -66,7 +66,7 @@ def _report(state, findings, count, index, code, channel, value, limit, limits):
     return count + 1
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _check_delivery(values, clipped, i, index, repeated, limits, state, findings, count):  # type: ignore[no-untyped-def]
     """Detect samples at the sensor's range and lost samples; count repeated ones as lost."""
     channels, dropped = state.channels, True
@@ -96,7 +96,7 @@ def _check_delivery(values, clipped, i, index, repeated, limits, state, findings
     return count
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _check_stuck(values, i, index, command, demanded, limits, state, findings, count):  # type: ignore[no-untyped-def]
     """Detect stuck channels: runs of equal samples."""
     channels = state.channels
@@ -126,7 +126,7 @@ def _check_stuck(values, i, index, command, demanded, limits, state, findings, c
     return count
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _check_silence(values, i, index, limits, state, findings, count):  # type: ignore[no-untyped-def]
     """Detect channels whose noise, from second differences, fell below that at rest."""
     channels = state.channels
@@ -155,7 +155,7 @@ def _check_silence(values, i, index, limits, state, findings, count):  # type: i
     return count
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _check_spikes(values, i, index, limits, state, findings, count):  # type: ignore[no-untyped-def]
     """Detect a spike at sample i - 1 in exactly one channel; real motion shows in others too."""
     row, deviation, spike_count = -1, 0.0, 0
@@ -169,7 +169,7 @@ def _check_spikes(values, i, index, limits, state, findings, count):  # type: ig
     return count
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _check_limits(values, i, index, limits, state, findings, count):  # type: ignore[no-untyped-def]
     """Check stroke, velocity, acceleration and force of the table."""
     displacement = _median(values[limits.table_row], i)
@@ -234,7 +234,7 @@ def _check_limits(values, i, index, limits, state, findings, count):  # type: ig
     return count
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _is_repeated(values, i, limits, scalars):  # type: ignore[no-untyped-def]
     """Return True if the last samples repeat earlier ones in every noisy channel."""
     for distance in range(max(int(scalars[REPEAT_DISTANCE]), 1), limits.history):
@@ -255,7 +255,7 @@ def _is_repeated(values, i, limits, scalars):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _check_following(values, command, i, index, limits, state, findings, count):  # type: ignore[no-untyped-def]
     """Compare the command read back and the position of the table with the queued command."""
     scalars, last_command, in_loop_check = (
@@ -311,7 +311,7 @@ def _check_following(values, command, i, index, limits, state, findings, count):
     return count
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _following_error(displacement, command, i, limits, scalars):  # type: ignore[no-untyped-def]
     """Return the deviation of the table from the position that its command predicts, m.
 
@@ -335,7 +335,7 @@ def _following_error(displacement, command, i, limits, scalars):  # type: ignore
     )
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _payload_deflection(values, i, limits, scalars):  # type: ignore[no-untyped-def]
     """Return the possible table displacement caused by the specimen, m.
 
@@ -354,7 +354,7 @@ def _payload_deflection(values, i, limits, scalars):  # type: ignore[no-untyped-
     )
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def _find_mark(command, phase, i, key, scalars, limits):  # type: ignore[no-untyped-def]
     """Return HALF_CYCLE if half a cycle is complete, NEW_MOTION if a motion begins, else 0.
 
@@ -379,7 +379,7 @@ def _find_mark(command, phase, i, key, scalars, limits):  # type: ignore[no-unty
     return 0
 
 
-@njit(cache=True, nogil=True)
+@jit_untyped_kernel
 def check_samples(  # type: ignore[no-untyped-def]
     values, clipped, command, phase, demanded, keys, index, start, limits, state, findings
 ):

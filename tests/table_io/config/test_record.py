@@ -160,7 +160,7 @@ def test_a_fault_of_the_profile_or_its_file_is_named(
     assert all(word in str(fault) for word in words), fault
 
 
-@pytest.mark.parametrize("name", ["recrod", 3])
+@pytest.mark.parametrize("name", ["recrod", 3, [1.0]])
 def test_an_unknown_kind_is_refused_with_the_known_ones(name: object, tmp_path: Path) -> None:
     path = write(tmp_path, csv())
     path.write_text(path.read_text().replace('"record"', repr(name)))

@@ -4,11 +4,13 @@ import cmath
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from table_io.backends import open_backend
 from table_io.block import Block, Float1D, Label
@@ -31,6 +33,7 @@ from table_io.safety.loop_check import (
     find_remedy,
     plan_targets,
 )
+from table_io.safety.loop_check.checks import MIN_TONE_SNR, unwrap_phase
 from table_io.safety.protection.consistency import WeakFormPair, compare_motion, make_window
 from tests.table_io.excitation.sine_segments import sine_segments
 
@@ -551,3 +554,70 @@ def test_every_line_that_can_fail_says_what_to_do() -> None:
         assert bool(find_remedy(check)) == limited, check.name
     for start in REMEDIES:
         assert any(check.name.startswith(start) for check in checks)
+
+
+# ---- limits to the number
+
+
+def find_line(checks: tuple[Check, ...], name: str, channel: str) -> Check:
+    (line,) = (check for check in checks if (check.name, check.channel) == (name, channel))
+    return line
+
+
+@given(
+    frequencies=st.lists(st.floats(0.1, 20.0), min_size=2, max_size=6, unique=True),
+    delay_s=st.floats(-0.05, 0.05), start=st.floats(-1.0, 1.0),
+)  # fmt: skip
+@settings(deadline=None, derandomize=True)
+def test_phases_are_unwrapped_along_a_delay(
+    frequencies: list[float], delay_s: float, start: float
+) -> None:
+    frequencies_hz = np.sort(frequencies)
+    frequencies_hz *= 0.1 / frequencies_hz[0]  # the lowest phase is within half a turn
+    phase = -2.0 * math.pi * frequencies_hz * delay_s * (1.0 + start / 1e3)
+    np.testing.assert_allclose(
+        unwrap_phase(np.exp(1j * phase), frequencies_hz), phase, rtol=0, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_cell_may_be_off_by_half_the_contact_threshold(cell: str, sign: float) -> None:
+    check_run = record_loop_check("g10")
+    contact_n = check_run[0].comparison.contact_n
+    for share, passes in ((0.4, True), (0.6, False)):
+        offset = sign * share * contact_n
+        checks = evaluate_checks(check_run, {cell: partial(np.add, offset)})
+        line = find_line(checks, "offset", cell)
+        assert (line.low, line.high) == (-0.5 * contact_n, 0.5 * contact_n)
+        assert line.passed == passes
+
+
+@pytest.mark.parametrize(("test", "is_pressed"), [("g10", False), ("g0", False), ("gm2", True)])
+def test_preload_is_compared_and_the_position_of_the_mass_is_not_where_bumpers_press(
+    test: str, is_pressed: bool
+) -> None:
+    check_run = record_loop_check(test)
+    lines = {(check.name, check.channel) for check in evaluate_checks(check_run)}
+    assert (("preload, right over left", "force") in lines) == is_pressed
+    is_open = min(check_run[0].specimen.gaps_m) > 0
+    assert (("offset", "mass_disp_m") in lines) == is_open
+    assert ("offset", "table_disp_m") in lines
+    for cell in CELLS:
+        assert (("offset", cell) in lines) == is_open
+        assert (("preload", cell) in lines) != is_open
+
+
+def test_an_isolated_mass_may_move_less_than_the_table() -> None:
+    profile, block, drive, noise = record_loop_check("g10")
+    checks = evaluate(block, drive, profile, RIG, noise)[0]
+    for kind in ("disp_m", "acc_m_s2"):
+        table, mass = (find_line(checks, ALIVE, f"{body}_{kind}") for body in ("table", "mass"))
+        assert table.low == MIN_TONE_SNR
+        assert mass.low == min(MIN_TONE_SNR, 0.02 * table.value)
+    weak = {"table_disp_m": white(1e-2), "table_acc_m_s2": white(10.0)}
+    for kind in ("disp_m", "acc_m_s2"):
+        checks = evaluate_checks((profile, block, drive, noise), weak)
+        table, mass = (find_line(checks, ALIVE, f"{body}_{kind}") for body in ("table", "mass"))
+        assert mass.low == pytest.approx(0.02 * table.value)
+        assert mass.low < MIN_TONE_SNR

@@ -218,3 +218,21 @@ def test_a_shunt_that_nobody_switched() -> None:
     assert find_tap_onset(hand, make_response({"force_l2_n": press(0.2)}, rig)) is None
     (line,) = evaluate_tap(hand, None, "no operator")
     assert (line.name, line.verdict, line.do) == ("shunt", "not tested", "no operator")
+
+
+@pytest.mark.parametrize("channel", ["table_disp_m", "force_l2_n"])
+@pytest.mark.parametrize(
+    ("noise", "lsb_share", "expected"),
+    [(0.5, 1e-9, 0.5), (0.0, 1e-9, 1e-5), (np.nan, 1e-9, 1e-5), (0.0, 1e-3, 1e-3)],
+)
+def test_a_swing_stands_out_of_noise_converter_and_range(
+    channel: str, noise: float, lsb_share: float, expected: float
+) -> None:
+    """All in shares of the range; the smallest swing is ten times the largest of the three."""
+    row = RIG.channels.index(channel)
+    bits = round(np.log2(2.0 / lsb_share))
+    sensor = RIG.sensors[row].model_copy(update={"range": 40.0, "bits": bits})
+    sensors = (*RIG.sensors[:row], sensor, *RIG.sensors[row + 1 :])
+    rig = RIG.model_copy(update={"sensors": sensors})
+    response = replace(make_response({}, rig), noise_rms=np.full(len(sensors), noise * 40.0))
+    assert response.min_swing(channel) == pytest.approx(10.0 * expected * 40.0, rel=0.05)

@@ -14,6 +14,7 @@ from table_io.safety.wiring_check import (
     check_resting_inputs,
     check_zero_command,
 )
+from table_io.safety.wiring_check.mains_hum import fit_mains_hum
 
 RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 RATE, SAMPLES = 2000.0, 8000
@@ -246,3 +247,16 @@ def test_a_command_that_swings_about_0_volts_is_not_at_0_volts(hz: float) -> Non
     (line,) = check_zero_command(RestingInputs(RIG, RATE, values * GAIN))
     assert line.verdict == "fail"
     assert abs(line.value) == pytest.approx(48.0, rel=0.01)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.1, 1.0])
+def test_the_size_of_hum_is_free_of_the_noise_that_its_tones_catch(share: float) -> None:
+    rate_hz, count, trials = 2000.0, 1000, 40
+    t = np.arange(count) / rate_hz
+    noise = np.random.default_rng(2).standard_normal((trials, count))
+    hum = share * np.sqrt(2.0) * np.sin(2.0 * np.pi * 50.0 * t)
+    rms = fit_mains_hum(noise + hum, rate_hz).rms
+    # Ten tones catch 1 % of the power of white noise in a record of 1000 samples.
+    assert np.sqrt(np.mean(rms**2)) == pytest.approx(share, abs=0.03 if share > 0.05 else 0.07)
+    power = np.mean(fit_mains_hum(hum + np.sqrt(10.0) * noise, rate_hz).rms ** 2)
+    assert power == pytest.approx(share**2, abs=0.08)

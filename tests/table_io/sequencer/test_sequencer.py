@@ -197,6 +197,7 @@ def test_a_hold_stays_at_its_step_and_the_step_is_measured_anew(where: float) ->
     assert len(set(step)) == 1
     assert set(label) == {Label.SETTLE}
     assert set(cycle) == {-1}
+    assert table.state.blocks == (), "an hour of samples would be kept and copied at every block"
     table.state = resume_test(table.state, table.at + 100)
     table.play(20)
     command = np.concatenate(table.command)

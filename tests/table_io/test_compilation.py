@@ -1,0 +1,331 @@
+"""Compiled kernels on disk: none outlives a change of code that is compiled into it."""
+
+import importlib
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+
+from table_io import compilation
+from table_io.compilation import (
+    SOURCE_MARKER,
+    fingerprint_kernel,
+    jit_helper,
+    jit_kernel,
+    remove_abandoned_folders,
+    remove_outdated_kernels,
+)
+
+# A kernel of a package that is not ours, as a plug-in brings it; `{}` are changed by the tests.
+LAW_MODULE = """
+from numba import njit
+from table_io.compilation import jit_helper, jit_helper_unless_none
+from {package} import constants
+TABLE = ((1.0, 2.0), (3.0, {table}))
+
+@njit
+def dispatched(x):
+    return {dispatched} * x
+
+@jit_helper(inlined=True)
+def inlined(x):
+    return {inlined} * x + dispatched(x)
+
+@jit_helper_unless_none("x", lambda x: {absent})
+def present(x):
+    return {present} * x
+"""
+CONSTANTS_MODULE = "FACTOR = {factor}\n"
+KERNEL_MODULE = """
+from table_io.compilation import jit_kernel
+from {package} import constants
+from {package}.laws import TABLE, inlined, present
+
+@jit_kernel(cache=True)
+def kernel(x):
+    return later(x) + TABLE[1][1] + present(x) + present(None) + constants.FACTOR
+
+@jit_kernel()
+def later(x):  # defined below the kernel that calls it
+    return inlined(x)
+"""
+VALUES = {
+    "table": 4.0,
+    "dispatched": 5.0,
+    "inlined": 6.0,
+    "absent": 7.0,
+    "present": 8.0,
+    "factor": 9,
+}
+RUN_KERNEL = """
+from plant_laws.kernels import kernel
+print(kernel(1.0), sum(kernel.stats.cache_hits.values()))
+"""
+
+
+def write_package(folder: Path, name: str, **changed: float) -> None:
+    package = folder / name
+    package.mkdir(exist_ok=True)
+    (package / "__init__.py").touch()
+    for module, text in (
+        ("laws", LAW_MODULE), ("constants", CONSTANTS_MODULE), ("kernels", KERNEL_MODULE)
+    ):  # fmt: skip
+        (package / f"{module}.py").write_text(text.format(package=name, **VALUES | changed))
+
+
+def run_kernel(folder: Path, cache: Path) -> list[str]:
+    root = Path(__file__).parents[2]
+    completed = subprocess.run(
+        [sys.executable, "-B", "-c", RUN_KERNEL],
+        capture_output=True,
+        check=True,
+        text=True,
+        env={
+            **os.environ,
+            "NUMBA_CACHE_DIR": str(cache),
+            "PYTHONPATH": f"{root}{os.pathsep}{folder}",
+        },
+    )
+    return completed.stdout.split()
+
+
+def test_a_kernel_follows_a_function_in_another_file(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    write_package(tmp_path, "plant_laws")
+    (cache / "removed_installation").mkdir(parents=True)
+    (cache / "removed_installation" / SOURCE_MARKER).write_text(str(tmp_path / "no_folder"))
+    total = sum(VALUES.values())
+    assert run_kernel(tmp_path, cache) == [str(total), "0"]
+    assert [path.name.rpartition("_")[0] for path in cache.iterdir()] == ["plant_laws"]
+    assert run_kernel(tmp_path, cache) == [str(total), "1"]
+    files = sorted(cache.rglob("*"))
+    write_package(tmp_path, "plant_laws", dispatched=105.0)
+    assert run_kernel(tmp_path, cache) == [str(total + 100.0), "0"]
+    assert run_kernel(tmp_path, cache) == [str(total + 100.0), "1"]
+    assert sorted(cache.rglob("*")) == files, "the cache grows with every change"
+
+
+@pytest.fixture
+def import_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Return a function that imports the package with these values, each time under a new name."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+
+    def import_changed(**changed: float) -> ModuleType:
+        for name in [name for name in sys.modules if name.partition(".")[0] == "laws_package"]:
+            monkeypatch.delitem(sys.modules, name)
+        write_package(tmp_path, "laws_package", **changed)
+        monkeypatch.setattr(sys, "dont_write_bytecode", True)
+        importlib.invalidate_caches()
+        return importlib.import_module("laws_package.kernels")
+
+    return import_changed
+
+
+def test_every_constant_and_function_of_a_kernel_is_in_its_fingerprint(import_package: Any) -> None:
+    before = fingerprint_kernel(import_package().kernel)
+    assert fingerprint_kernel(import_package().kernel) == before
+    changed = {name: fingerprint_kernel(import_package(**{name: 99.0}).kernel) for name in VALUES}
+    assert len({before, *changed.values()}) == len(VALUES) + 1
+
+
+def make_multiplication(factor: Any):
+    def multiply(x: float) -> Any:
+        return x * factor
+
+    return multiply
+
+
+def call_itself(x: float) -> float:
+    return call_itself(x - 1.0) if x in {3.0, 4.0} else x
+
+
+@pytest.mark.parametrize(
+    ("value", "other"),
+    [(1, 2), (1.0, 1), ((1, (2,)), (1, (3,))), (np.arange(3), np.arange(3.0)), ("a", "b"),
+     (np.float64(1.0), np.float64(2.0)), (call_itself, abs)],
+)  # fmt: skip
+def test_values_of_a_closure_are_part_of_the_fingerprint(value: Any, other: Any) -> None:
+    fingerprint = fingerprint_kernel(make_multiplication(value))
+    assert fingerprint == fingerprint_kernel(make_multiplication(value))
+    assert fingerprint != fingerprint_kernel(make_multiplication(other))
+
+
+def test_defaults_are_part_of_the_fingerprint() -> None:
+    def make(default: float):
+        def kernel(x: float = default) -> float:
+            return x
+
+        return kernel
+
+    assert fingerprint_kernel(make(1.0)) != fingerprint_kernel(make(2.0))
+
+
+def test_fingerprints_are_the_same_in_every_process() -> None:
+    """Else no process would find what another one compiled."""
+    code = (
+        "from tests.table_io.test_compilation import call_itself, list_kernels;"
+        "from table_io.compilation import fingerprint_kernel;"
+        "print(fingerprint_kernel(call_itself), *map(fingerprint_kernel, list_kernels()))"
+    )
+    completed = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, check=True, text=True,
+        cwd=Path(__file__).parents[2], env={**os.environ, "PYTHONHASHSEED": "7"},
+    )  # fmt: skip
+    assert completed.stdout.split() == [
+        fingerprint_kernel(function) for function in (call_itself, *list_kernels())
+    ]
+
+
+def list_kernels() -> list[Any]:
+    """Return the kernels of this package that are kept on disk, in the order of their modules."""
+    from table_io import sensor_errors
+    from table_io.safety.protection import sample_checks
+    from table_io.sim import hidden_plant, plant
+    from twin.drive import spectra, table_model
+    from twin.dynamics import event_driven_kernel, stroboscopic_kernel
+    from twin.model import (
+        closed_form_kernel,
+        event_integrator_kernel,
+        inverse_dynamics,
+        periodic_orbit,
+        stepped_sine_kernel,
+    )
+
+    return [
+        kernel
+        for module in (
+            sensor_errors, sample_checks, hidden_plant, plant, spectra, table_model, event_driven_kernel,
+            stroboscopic_kernel, closed_form_kernel, event_integrator_kernel, inverse_dynamics,
+            periodic_orbit, stepped_sine_kernel,
+        )
+        for kernel in vars(module).values()
+        if getattr(kernel, "__module__", "") == module.__name__
+        and isinstance(getattr(kernel, "_cache", None), compilation._KernelCache)
+    ]  # fmt: skip
+
+
+def test_no_kernel_is_kept_by_numba_alone() -> None:
+    """Its cache would not follow functions of other files."""
+    root = Path(__file__).parents[2]
+    keepers = [
+        path.relative_to(root)
+        for package in ("table_io", "twin")
+        for path in (root / package).rglob("*.py")
+        if re.search(r"\bn?jit\([^)]*\bcache\b", path.read_text())
+    ]
+    assert keepers == []
+
+
+def test_kernels_name_all_modules_that_they_are_made_of() -> None:
+    kernels = {kernel.py_func.__qualname__: kernel for kernel in list_kernels()}
+    assert {
+        "check_samples", "advance_samples", "run_stepped_sine", "advance_cycles",
+        "_integrate_samples", "advance_periods", "record_points", "capture_states",
+        "follow_oscillators", "_force_kernel", "_simulate", "_advance_samples",
+    } <= set(kernels)  # fmt: skip
+    parts = set(compilation._describe_item(kernels["_integrate_samples"], set()))
+    assert {"hysteretic_variable", "find_event", "static_friction"} & parts
+    assert {"contact_mode", "advance_to_event"} <= set(
+        compilation._describe_item(kernels["advance_cycles"], set())
+    )
+
+
+def test_fingerprints_take_little_of_a_start() -> None:
+    kernels = list_kernels()
+    elapsed_s = []
+    for _ in range(5):
+        start = time.perf_counter()
+        for kernel in kernels:
+            fingerprint_kernel(kernel)
+        elapsed_s.append(time.perf_counter() - start)
+    assert min(elapsed_s) < 0.02  # 3 ms when nothing else runs; no command needs them all
+
+
+def test_a_cache_that_cannot_be_written_costs_only_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "/proc/no_folder")
+    monkeypatch.setattr(
+        numba.core.caching.CacheImpl,
+        "_locator_classes",
+        numba.core.caching.CacheImpl._locator_classes[:1],
+    )
+
+    @jit_kernel(cache=True)
+    def double(x: float) -> float:
+        return 2.0 * x
+
+    assert double(3.0) == 6.0
+    assert double.stats.cache_path is None  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("damaged", ["*.nbi", "*.nbc"])
+def test_a_damaged_file_is_compiled_and_written_again(
+    damaged: str, tmp_path: Path, import_package: Any
+) -> None:
+    total = sum(VALUES.values())
+    assert import_package().kernel(1.0) == total
+    paths = list((tmp_path / "cache").rglob(damaged))
+    assert paths
+    for path in paths:
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    for hits in (0, 1):
+        kernel = import_package().kernel
+        assert kernel(1.0) == total
+        assert sum(kernel.stats.cache_hits.values()) == hits
+
+
+def test_a_full_disk_costs_only_time(import_package: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(numba.core.caching.IndexDataCacheFile, "_save_data", refuse)
+    assert import_package().kernel(1.0) == sum(VALUES.values())
+
+
+def test_kernels_of_moved_functions_are_removed(tmp_path: Path) -> None:
+    source = tmp_path / "plant.py"
+    source.touch()
+    names = ("plant.step-7.py311.nbi", "plant.step-7.py311.1.nbc", "planting.step-7.py311.nbi")
+    for name in names:
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (1.0, 1.0))
+    (tmp_path / "plant.step-9.py311.nbi").touch()
+    os.utime(source, (2.0, 2.0))
+    remove_outdated_kernels(tmp_path, source)
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "plant.py", "plant.step-9.py311.nbi", "planting.step-7.py311.nbi"
+    }  # fmt: skip
+
+
+def test_kernels_of_removed_installations_are_removed(tmp_path: Path) -> None:
+    for name, source in (("gone", tmp_path / "no"), ("kept", tmp_path)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / SOURCE_MARKER).write_text(str(source))
+        (tmp_path / name / "plant.step-7.py311.nbi").touch()
+    (tmp_path / "foreign").mkdir()
+    remove_abandoned_folders(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["foreign", "kept"]
+
+
+def test_a_part_of_kernels_is_plain_python_outside_of_them() -> None:
+    @jit_helper()
+    def part(x: float) -> float:
+        return 2.0 * x
+
+    @jit_kernel()
+    def kernel(x: float) -> float:
+        return part(x) + 1.0
+
+    assert kernel(3.0) == 7.0
+    assert part(3.0) == 6.0
+    assert not hasattr(part, "py_func")
