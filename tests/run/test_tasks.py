@@ -22,7 +22,7 @@ from twin.run.versions import read_installed_versions
 def scheduler() -> Iterator[str]:
     """Address of a scheduler with two workers, in processes of their own."""
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None
+        n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0"
     ) as cluster:
         yield cluster.scheduler_address
 
@@ -126,6 +126,20 @@ def test_a_scheduler_that_does_not_answer_is_refused(unused_port: int) -> None:
 def unused_port(monkeypatch: pytest.MonkeyPatch) -> int:
     monkeypatch.setattr("twin.run.dask_cluster.CONNECT_TIMEOUT_S", 0.5)
     return 9
+
+
+def test_a_cluster_whose_workers_all_die_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("twin.run.dask_cluster.MAX_IDLE_S", 2.0)
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0"
+    ) as cluster:
+        results = run_tasks(
+            task_functions.hang_at_odd, [0, 1], Workers(0, cluster.scheduler_address)
+        )
+        assert next(results).number == 0
+        cluster.scale(0)
+        with raises_input_error(key="--scheduler", problem="no workers"):
+            list(results)
 
 
 def test_a_worker_of_another_version_is_refused(

@@ -75,7 +75,7 @@ def test_any_number_of_processes_stores_the_same_bytes(
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[distributed.LocalCluster]:
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=2, dashboard_address=None
+        n_workers=2, threads_per_worker=2, dashboard_address="127.0.0.1:0"
     ) as cluster:
         yield cluster
 
@@ -171,9 +171,11 @@ def run_with_kills(
                 with suppress(ProcessLookupError):
                     os.kill(rng.choice(victims), signal.SIGKILL)
                     kills += 1
-            code = client.wait(timeout=120)
-            for helper in helpers:
-                helper.kill()
+            try:
+                code = client.wait(timeout=240)
+            finally:
+                for process in (client, *helpers):
+                    process.kill()
         if code == 0:
             return max(kills, 1)
     raise AssertionError(f"not complete after {kills} kills: the last client ended with {code}")

@@ -204,8 +204,8 @@ def list_kernels() -> list[Any]:
         kernel
         for module in (
             sensor_errors, sample_checks, hidden_plant, plant, spectra, table_model,
-            event_driven_kernel, stroboscopic_kernel, closed_form_kernel, event_integrator_kernel, inverse_dynamics,
-            periodic_orbit, stepped_sine_kernel,
+            event_driven_kernel, stroboscopic_kernel, closed_form_kernel, event_integrator_kernel,
+            inverse_dynamics, periodic_orbit, stepped_sine_kernel,
         )
         for kernel in vars(module).values()
         if getattr(kernel, "__module__", "") == module.__name__

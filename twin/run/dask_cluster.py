@@ -5,15 +5,17 @@ from contextlib import contextmanager, suppress
 from itertools import islice
 from typing import Any
 
+from table_io.clock import RealClock
 from table_io.errors import InputError, require_package
 from twin.run.tasks import StopFunction, Task, TaskResult
 from twin.run.versions import compare_versions, format_version_changes, read_installed_versions
 
 CONNECT_TIMEOUT_S = 10.0
 POLL_S = 0.2  # period of polling `stop` and the connection
+MAX_IDLE_S = 60.0  # without any worker, which may come back
 TASKS_PER_THREAD = 2  # sent ahead, so that no thread waits for the next
 LOST_MESSAGE = "the Dask scheduler no longer answers; what is completed is kept"
-RESUME_REMEDY = "start the scheduler again and resume"
+RESUME_REMEDY = "start scheduler and workers again, and resume"
 
 
 def run_on_cluster(
@@ -32,6 +34,7 @@ def run_on_cluster(
         pending = iter(numbers)
         window = TASKS_PER_THREAD * max(sum(client.nthreads().values()), 1)
         running: dict[Any, int] = {}
+        watch = _WorkerWatch(client, address)
         while True:
             for number in () if stop() else islice(pending, window - len(running)):
                 future = client.submit(task, number, pure=False, retries=attempts - 1)
@@ -40,7 +43,7 @@ def run_on_cluster(
                 return
             with suppress(TimeoutError), client.as_current():
                 wait([*running], POLL_S, "FIRST_COMPLETED")
-            _require_connection(client, address)
+            watch.require_workers()
             for future in [future for future in running if future.done()]:
                 yield _read_result(future, running.pop(future), address)
 
@@ -75,9 +78,26 @@ def _connect(address: str) -> Iterator[Any]:
         client.close(timeout=CONNECT_TIMEOUT_S)
 
 
-def _require_connection(client: Any, address: str) -> None:
-    if client.status != "running":
-        raise InputError(LOST_MESSAGE, key="--scheduler", value=address, remedy=RESUME_REMEDY)
+class _WorkerWatch:
+    """Notices that the scheduler is lost, or has had no workers for too long."""
+
+    def __init__(self, client: Any, address: str) -> None:
+        self._client, self._address, self._clock = client, address, RealClock()
+        self._last_worker_s = self._last_look_s = self._clock.now()
+
+    def require_workers(self) -> None:
+        """Raise InputError if the scheduler is lost, or has no workers for `MAX_IDLE_S`."""
+        message = LOST_MESSAGE
+        is_lost = self._client.status != "running"
+        now_s = self._clock.now()
+        if not is_lost and now_s - self._last_look_s > MAX_IDLE_S / 20:
+            self._last_look_s = now_s
+            if self._client.nthreads():
+                self._last_worker_s = now_s
+            message = f"the cluster has had no workers for {MAX_IDLE_S:g} s"
+            is_lost = now_s - self._last_worker_s > MAX_IDLE_S
+        if is_lost:
+            raise InputError(message, key="--scheduler", value=self._address, remedy=RESUME_REMEDY)
 
 
 def _require_equal_workers(client: Any, address: str, find_problem: Callable[[], str]) -> None:
