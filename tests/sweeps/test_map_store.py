@@ -23,11 +23,11 @@ from tests.plugin_package import install_package
 from tests.sweeps.small_study import STUDY, read_stored_bytes, write_study
 from twin.api import open_study
 from twin.run.tasks import TaskResult
+from twin.studies import DEFINITION_FILE
 from twin.studies.maps import command
 from twin.studies.maps.compute import compute_chunk, find_folder_problem, make_sweep_plan
 from twin.studies.maps.sampling import sample_parameters
 from twin.studies.maps.store import (
-    DEFINITION_FILE,
     MANIFEST_FILE,
     Manifest,
     create_store,

@@ -102,6 +102,20 @@ def test_results_have_names_units_and_coordinates(study_folder: Path) -> None:
         open_study(study_folder, ["peak_acc"])
 
 
+def test_the_report_is_written_again_from_the_stored_arrays(study_folder: Path) -> None:
+    page = study_folder / "report.html"
+    before = page.read_text()
+    page.unlink()
+    assert call_main("report", study_folder).returncode == 0
+    assert page.read_text() == before
+    assert call_main("map", study_folder, "--show").returncode == 0
+    pictures = {path.stem for path in (study_folder / "figures").glob("*.svg")}
+    assert {"map_peak_disp_m", "map_down_jump_hz", "map_right_width_hz"} <= pictures
+    rows = (study_folder / "cases.csv").read_text().splitlines()
+    assert len(rows) == 25
+    assert call_main("report", study_folder, "--format", "pdf").returncode == 2
+
+
 def test_a_map_of_the_folds_is_the_continuation_of_each_case(tmp_path: Path) -> None:
     """Published folds of G4 at 0.05 g: 4.027372 and 2.787294 Hz, grazing 2.79359 Hz."""
     text = HEAD + 'outcomes = ["folds"]\n' + GAP + "values = [4.0, 10.0]\n"

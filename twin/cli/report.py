@@ -7,7 +7,7 @@ from twin.campaign import STATE_FILE
 from twin.reports import summary as summaries
 from twin.run.recordings import open_recording, read_recorded_config
 from twin.run.terminal import console, print_line
-from twin.studies import TABLE_FILE
+from twin.studies import DEFINITION_FILE, TABLE_FILE
 
 FIGURE_FORMATS = ("svg", "pdf", "csv")  # next to PNG
 
@@ -46,10 +46,10 @@ def print_recording_prc(log: Path, as_json: bool) -> None:
 
 
 def write_folder_report(folder: Path, as_pdf: bool = False, all_formats: bool = False) -> None:
-    """Rewrite report.html in the folder of a run, campaign or batch.
+    """Rewrite report.html in the folder of a run, campaign, batch or map.
 
-    A run or campaign is reported from its recordings, a batch from its table. Of a run also
-    report.pdf, and each figure in all formats, where asked for.
+    A run or campaign is reported from its recordings, a batch from its table, a map from its
+    arrays. Of a run also report.pdf, and each figure in all formats, where asked for.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give the folder of a run or a batch")
@@ -71,6 +71,11 @@ def write_folder_report(folder: Path, as_pdf: bool = False, all_formats: bool = 
 
         print_line(f"{write_study_page(folder)}")
         return
+    if (folder / DEFINITION_FILE).is_file():
+        from twin.studies.maps.page import write_map_page
+
+        print_line(f"{write_map_page(folder)}")
+        return
     recording = open_recording(folder)
     if not (folder / "summary.json").exists():
         summary = summaries.summarise(recording, read_recorded_config(recording).parameters)
@@ -85,10 +90,10 @@ def write_folder_report(folder: Path, as_pdf: bool = False, all_formats: bool = 
 
 
 def _require_run(folder: Path, option: str) -> None:
-    """Raise InputError if the folder is that of a campaign or batch."""
-    if (folder / STATE_FILE).is_file() or (folder / TABLE_FILE).is_file():
+    """Raise InputError if the folder is that of a campaign, batch or map."""
+    if any((folder / name).is_file() for name in (STATE_FILE, TABLE_FILE, DEFINITION_FILE)):
         raise InputError(
-            "the report of a campaign or batch is a page only",
+            "the report of a campaign, batch or map is a page only",
             where=option,
             allowed="the folder of a run",
             remedy="give the folder of one of its runs",

@@ -17,6 +17,7 @@ from twin.run.run_config import make_run_id
 from twin.run.tasks import TaskResult, Workers, run_tasks
 from twin.run.terminal import announce_if_slow, catch_interrupts, console, print_line
 from twin.run.warm_up import COMPILING_MESSAGE
+from twin.studies import DEFINITION_FILE
 from twin.studies.maps.compute import (
     compute_chunk,
     compute_outcomes,
@@ -26,7 +27,6 @@ from twin.studies.maps.compute import (
 from twin.studies.maps.page import write_map_page
 from twin.studies.maps.sampling import sample_parameters
 from twin.studies.maps.store import (
-    DEFINITION_FILE,
     Manifest,
     create_store,
     estimate_bytes_per_case,

@@ -10,10 +10,10 @@ import numpy.typing as npt
 
 from table_io.block import Float2D
 from table_io.errors import InputError
+from twin.studies import DEFINITION_FILE
 from twin.studies.maps.cases import SampledCase
 from twin.studies.maps.outcomes import CaseChunk, SweepPlan
 from twin.studies.maps.store import (
-    DEFINITION_FILE,
     RESULTS_FOLDER,
     Json,
     find_version_problem,

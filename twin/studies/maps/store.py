@@ -20,10 +20,11 @@ import numpy.typing as npt
 from table_io.block import Float2D
 from table_io.errors import InputError
 from twin.run.versions import compare_versions, format_version_changes, read_installed_versions
+from twin.studies import DEFINITION_FILE
 from twin.studies.maps.outcomes import SweepPlan
 from twin.studies.maps.study import Study
 
-RESULTS_FOLDER, DEFINITION_FILE, MANIFEST_FILE = "results.zarr", "study.json", "chunks.jsonl"
+RESULTS_FOLDER, MANIFEST_FILE = "results.zarr", "chunks.jsonl"
 COORDINATE_CHUNK = 100_000  # cases
 DIRECTION_VALUES = {"forward": 1, "backward": -1}
 Json = dict[str, Any]
