@@ -1,5 +1,6 @@
 """Other people's solvers on the same sweep, each as well as it can be driven."""
 
+import functools
 import math
 
 import numpy as np
@@ -66,10 +67,10 @@ def diffrax_model():
     import jax.numpy as jnp
 
     def field(t, x, args):
-        w, mode = args
+        w, mode, gap = args
         u, v, ur, ul = x
         right, left = mode == 1, mode == 2
-        push = CJ * v + KJ * jnp.where(right, u - GAP, u + GAP)
+        push = CJ * v + KJ * jnp.where(right, u - gap, u + gap)
         force = C * v + K * u + jnp.where(right | left, push, 0.0)
         return (
             v,
@@ -80,11 +81,13 @@ def diffrax_model():
 
     def right_guard(t, y, args, **kwargs):
         u, v, ur, _ = y
-        return jnp.where(args[1] == 1, CJ * v + KJ * (u - GAP), GAP + ur - u)
+        _, mode, gap = args
+        return jnp.where(mode == 1, CJ * v + KJ * (u - gap), gap + ur - u)
 
     def left_guard(t, y, args, **kwargs):
         u, v, _, ul = y
-        return jnp.where(args[1] == 2, -CJ * v - KJ * (u + GAP), GAP + u - ul)
+        _, mode, gap = args
+        return jnp.where(mode == 2, -CJ * v - KJ * (u + gap), gap + u - ul)
 
     return field, (right_guard, left_guard)
 
@@ -101,27 +104,29 @@ def diffrax_phase(rtol: float, atol: float):
     control = diffrax.PIDController(rtol=rtol, atol=atol)
     event = diffrax.Event(guards, optimistix.Newton(1e-10, 1e-10), direction=False)
 
-    def phase(w, end, loop):
+    def phase(w, end, gap, loop):
         t, x, mode, count = loop
         solution = diffrax.diffeqsolve(
-            term, solver, t, end, 1e-3, x, (w, mode), stepsize_controller=control, event=event,
+            term, solver, t, end, 1e-3, x, (w, mode, gap), stepsize_controller=control, event=event,
             saveat=diffrax.SaveAt(t1=True), max_steps=4096, throw=False,
         )  # fmt: skip
         t, (u, v, ur, ul) = solution.ts[-1], jax.tree.map(lambda y: y[-1], solution.ys)
         hit = solution.event_mask[0] | solution.event_mask[1]
         onset = hit & (mode == 0)
         new = jnp.where(hit, jnp.where(mode == 0, jnp.where(u > 0, 1, 2), 0), mode)
-        ur = jnp.where(onset & (new == 1), u - GAP, ur)
-        ul = jnp.where(onset & (new == 2), u + GAP, ul)
+        ur = jnp.where(onset & (new == 1), u - gap, ur)
+        ul = jnp.where(onset & (new == 2), u + gap, ul)
         x, away = (u, v, ur, ul), jnp.where(hit, 1e-9, 0.0)
-        x = jax.tree.map(lambda y, d: y + away * d, x, field(t, x, (w, new)))
+        x = jax.tree.map(lambda y, d: y + away * d, x, field(t, x, (w, new, gap)))
         return t + away, x, new, count + onset
 
     return phase
 
 
 def diffrax_sweep(cycles: int, rtol: float, atol: float):
-    """A compiled function: frequencies -> (state at the end of each, onsets), by diffrax.
+    """A compiled function: frequencies, gaps a side -> (state at the end of each, onsets).
+
+    Of one gap, or of all of a batch (gap, frequency, 4) by vmap, as the library intends it.
 
     Tsit5 with a PID controller, float64, the event located by its root finder, phases in a
     while_loop inside a scan over frequencies: one compilation, nothing goes back to Python. Steps
@@ -134,18 +139,24 @@ def diffrax_sweep(cycles: int, rtol: float, atol: float):
     jax.config.update("jax_enable_x64", True)
     phase = diffrax_phase(rtol, atol)
 
-    def one(carry, frequency):
+    def follow_frequency(gap, carry, frequency):
         x, mode, count = carry
         w, end = 2 * jnp.pi * frequency, cycles / frequency
         _, x, mode, count = jax.lax.while_loop(
-            lambda loop: loop[0] < end, lambda loop: phase(w, end, loop), (0.0, x, mode, count)
+            lambda loop: loop[0] < end, lambda loop: phase(w, end, gap, loop), (0.0, x, mode, count)
         )
         return (x, mode, count), jnp.stack(x)
 
-    @jax.jit
-    def sweep(frequencies):
+    def sweep(frequencies, gap):
         start = ((jnp.float64(0),) * 4, jnp.int64(0), jnp.int64(0))
-        (_, _, count), ends = jax.lax.scan(one, start, frequencies)
+        step = functools.partial(follow_frequency, gap)
+        (_, _, count), ends = jax.lax.scan(step, start, frequencies)
         return ends, count
 
-    return lambda frequencies: tuple(np.asarray(y) for y in sweep(jnp.asarray(frequencies)))
+    single, batch = jax.jit(sweep), jax.jit(jax.vmap(sweep, (None, 0)))
+
+    def run(frequencies, gaps=GAP):
+        function = batch if np.ndim(gaps) else single
+        return tuple(np.asarray(y) for y in function(jnp.asarray(frequencies), jnp.asarray(gaps)))
+
+    return run
