@@ -10,7 +10,6 @@ from pathlib import Path
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from table_io.clock import RealClock, local_datetime
-from table_io.errors import InputError
 from table_io.records import PrcPoint
 from table_io.units import GRAVITY_M_S2
 from twin.compare.curves import detect_hysteresis
@@ -20,7 +19,7 @@ from twin.reports.finalize import EXIT_INTERRUPTED
 from twin.reports.summary import Json, write_json
 from twin.run.folders import make_run_folder
 from twin.run.run_config import RunConfig, read_run_config
-from twin.run.system import count_cores
+from twin.run.tasks import Workers
 from twin.run.terminal import announce_if_slow, catch_interrupts, console, print_line
 from twin.run.versions import LIBRARIES
 from twin.run.warm_up import COMPILING_MESSAGE
@@ -39,20 +38,13 @@ def simulate_all(
     out: Path | None,
 ) -> int:
     """Simulate every model at every gap under the ideal stepped sine; return the exit code."""
-    if workers is not None and workers < 1:
-        raise InputError(
-            "invalid number of processes",
-            key="--workers",
-            value=workers,
-            allowed="1 or more",
-            remedy="omit --workers to use all cores",
-        )
+    cores = Workers.from_options(workers).count
     gaps = parse_gaps_mm(gap_words)
     run_config = read_run_config(profile, None, model_names[0] if model_names else None)
     configs = read_models(model_names or [run_config.profile.model], profile)
     with announce_if_slow(COMPILING_MESSAGE):
         cases = build_cases(run_config.profile, configs, gaps, str(profile))
-    cores = min(workers or count_cores(), len(cases))
+    cores = min(cores, len(cases))
     folder, run = make_run_folder(out, f"{run_config.name}-batch")
     print_line(
         f"{run_config.profile.title}: {len(cases)} sweeps of "
