@@ -102,3 +102,24 @@ def test_a_small_motion_at_the_end_of_the_range_hides_no_peak() -> None:
     main = max(branches, key=lambda branch: branch.values.max())
     swings = np.array([half_swings(point.orbit) for point in main.points])[main.stable]
     assert (u, a) == pytest.approx(swings.max(axis=0), rel=2e-3)
+
+
+def test_a_branch_passes_a_grazing_that_another_one_is_near() -> None:
+    """At 0.5939 Hz a second guard comes near zero; the branch goes on to its fold at 0.5934 Hz."""
+    config = read_run_config(PROFILES_DIR / "tests" / "g4_ss3.toml")
+    half_gap_m = 0.5e-3 * 4.331536849588156
+    base = replace(
+        config.model.base, mass=498.3017811458558, gap_r=half_gap_m, gap_l=half_gap_m
+    )  # fmt: skip
+    (main, *_) = sorted(
+        follow_sweep_branches(
+            Model(base),
+            config.profile.sweep.frequencies_hz,
+            [0.04756747011095285 * GRAVITY_M_S2],
+        ),
+        key=lambda branch: -np.ptp(branch.values),
+    )
+    assert sorted(end.value for end in main.ends) == pytest.approx([0.5, 5.0], abs=1e-9)
+    folds = sorted(fold.value for fold in main.folds)
+    assert np.diff(folds).min() > 1e-3  # none twice
+    assert folds == pytest.approx([0.5934, 0.6305, 0.8882, 0.9788, 2.6804, 3.9883], abs=1e-3)

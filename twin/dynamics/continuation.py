@@ -509,18 +509,20 @@ class _Trace:
         """Locate the grazing orbit between two points and go on behind it."""
         try:
             located = self._locate_grazing(last, last.z + 0.5 * (new.z - last.z))
-            if not last.distance(located[0]) <= 1.5 * last.distance(new.z):
+            is_near = last.distance(located[0]) <= 1.5 * last.distance(new.z)
+            beyond = self._probe_beyond(located[0], new.z - last.z)
+            if not is_near or beyond is None:
                 raise NoConvergence(math.nan)
         except NoConvergence:
             if self._step > 1e-6:
                 self._reject(0.3)
                 return
-            located = None
-        if located is None or last.distance(located[0]) < SAME_GRAZING:
+            beyond = None
+        if beyond is None or last.distance(located[0]) < SAME_GRAZING:
             self._key = key
             self._accept_beyond(new)
             return
-        self._turn_grazing(last, *located, new.z - last.z)
+        self._turn_grazing(last, *located, beyond, new.z - last.z)
 
     def _retry(self, last: Point, tangent: Float1D, weights: Float1D, error: NoConvergence) -> None:
         """Reduce the step; where it is small, pass a grazing orbit at which the branch turns."""
@@ -530,8 +532,10 @@ class _Trace:
             except NoConvergence:
                 located = None
             if located and SAME_GRAZING < last.distance(located[0]) < 10 * self._step:
-                self._turn_grazing(last, *located, tangent)
-                return
+                beyond = self._probe_beyond(located[0], tangent)
+                if beyond is not None:
+                    self._turn_grazing(last, *located, beyond, tangent)
+                    return
         self._reject(0.4, error)
 
     def _locate_grazing(self, last: Point, guess: Float1D) -> tuple[Float1D, GrazingProblem]:
@@ -539,10 +543,33 @@ class _Trace:
         z, _ = solve_square(grazing.evaluate, guess, last.weights)
         return z, grazing
 
+    def _probe_beyond(self, z: Float1D, ahead: Float1D) -> tuple[Float1D, Evaluation] | None:
+        """Return a point with other contacts just behind a grazing orbit z, and its residual.
+
+        None if the contacts stay the same: another guard touches zero there, not on this branch.
+        """
+        ahead = ahead / weighted_length(ahead, self._weights(z))
+        for distance in PROBE_DISTANCES:
+            probe = z + distance * ahead
+            beyond = self._problem.evaluate(probe)
+            if contact_key(beyond.result.contacts) != self._key:
+                return probe, beyond
+        return None
+
     def _turn_grazing(
-        self, last: Point, z: Float1D, grazing: GrazingProblem, ahead: Float1D
+        self,
+        last: Point,
+        z: Float1D,
+        grazing: GrazingProblem,
+        probed: tuple[Float1D, Evaluation],
+        ahead: Float1D,
     ) -> None:
-        """Add the grazing orbit z and leave it along the tangent on its other side."""
+        """Add the grazing orbit z and leave it along the tangent on its other side.
+
+        `probed`: a point there, as `_probe_beyond` returns it.
+        """
+        probe, beyond = probed
+        key = contact_key(beyond.result.contacts)
         assert grazing.minimum is not None
         evaluation = self._problem.evaluate(z)
         weights = self._weights(z)
@@ -552,12 +579,6 @@ class _Trace:
         if self._finished:
             return
         ahead = ahead / weighted_length(ahead, weights)
-        for distance in PROBE_DISTANCES:
-            probe = z + distance * ahead
-            beyond = self._problem.evaluate(probe)
-            key = contact_key(beyond.result.contacts)
-            if key != self._key:
-                break
         gradient = grazing.evaluate(probe).jacobian[-1]
         tangent = null_direction(beyond.jacobian, ahead, weights)
         if (gradient @ tangent) * (gradient @ approach) < 0:
