@@ -2,6 +2,11 @@
 
 from pathlib import Path
 
+from twin.studies.maps.compute import compute_chunk, make_sweep_plan
+from twin.studies.maps.sampling import sample_parameters
+from twin.studies.maps.store import Manifest, create_store
+from twin.studies.maps.study import Study
+
 TEST = """
 title = "Across the jumps of G4"
 [specimen]
@@ -44,3 +49,14 @@ def read_stored_bytes(folder: Path) -> dict[str, bytes]:
     paths = [folder / "chunks.jsonl", folder / "study.json"]
     paths += [path for path in (folder / "results.zarr").rglob("*") if path.is_file()]
     return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+def make_stored_study(path: Path, out: Path, chunks: range) -> Study:
+    """Compute these chunks of a study in this process."""
+    study = Study.read(path)
+    out.mkdir()
+    create_store(out, study, make_sweep_plan(study), sample_parameters(study.config))
+    manifest = Manifest(out, [variable.name for variable in study.variables])
+    for chunk in chunks:
+        manifest.add(compute_chunk(out, chunk))
+    return study

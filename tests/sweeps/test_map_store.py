@@ -20,17 +20,23 @@ import pytest
 from tests.command_line import call_main
 from tests.input_errors import raises_input_error
 from tests.plugin_package import install_package
-from tests.sweeps.small_study import STUDY, read_stored_bytes, write_study
+from tests.sweeps.small_study import (
+    STUDY,
+    make_stored_study,
+    read_stored_bytes,
+    write_study,
+)
 from twin.api import open_study
 from twin.run.tasks import TaskResult
 from twin.studies import DEFINITION_FILE
 from twin.studies.maps import command
-from twin.studies.maps.compute import compute_chunk, find_folder_problem, make_sweep_plan
-from twin.studies.maps.sampling import sample_parameters
+from twin.studies.maps.compute import (
+    compute_chunk,
+    compute_outcomes,
+    find_folder_problem,
+)
 from twin.studies.maps.store import (
     MANIFEST_FILE,
-    Manifest,
-    create_store,
     remove_partial_files,
 )
 from twin.studies.maps.study import Study
@@ -50,17 +56,6 @@ def whole_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("study")
     make_stored_study(write_study(folder), folder / "out", range(5))
     return folder
-
-
-def make_stored_study(path: Path, out: Path, chunks: range) -> Study:
-    """Compute these chunks of a study in this process."""
-    study = Study.read(path)
-    out.mkdir()
-    create_store(out, study, make_sweep_plan(study), sample_parameters(study.config))
-    manifest = Manifest(out)
-    for chunk in chunks:
-        manifest.add(compute_chunk(out, chunk))
-    return study
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -129,6 +124,51 @@ def test_a_finished_study_computes_nothing_again(
 def run_no_task(task: object, numbers: list[int], *_: object, **__: object) -> list[TaskResult]:
     assert numbers == []
     return []
+
+
+def test_a_chunk_that_was_lost_after_all_is_computed_again(
+    whole_study: Path, tmp_path: Path
+) -> None:
+    """Its line is on the disk, but a file of it is gone, another cut and a third other numbers."""
+    out = tmp_path / "out"
+    make_stored_study(whole_study / "study.toml", out, range(5))
+    arrays = out / "results.zarr"
+    (arrays / "peak_disp_m" / "c" / "0").unlink()
+    cut = arrays / "eta_d" / "c" / "1" / "0" / "0"
+    cut.write_bytes(cut.read_bytes()[:40])
+    (arrays / "peak_acc_hz" / "c" / "2").write_bytes(
+        (arrays / "peak_acc_m_s2" / "c" / "2").read_bytes()
+    )
+    assert call_main("map", out, "--resume", "--workers", 1).returncode == 0
+    assert read_stored_bytes(out) == read_stored_bytes(whole_study / "out")
+
+
+def test_a_store_without_a_study_is_begun_again(whole_study: Path, tmp_path: Path) -> None:
+    """The process died before anything was computed."""
+    out = tmp_path / "out"
+    make_stored_study(whole_study / "study.toml", out, range(0))
+    (out / DEFINITION_FILE).unlink()
+    result = call_main("map", whole_study / "study.toml", "--out", out, "--workers", 1)
+    assert result.returncode == 0, result.stderr
+    assert read_stored_bytes(out) == read_stored_bytes(whole_study / "out")
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        (DEFINITION_FILE, "{"),
+        (DEFINITION_FILE, '{"study_toml": ""}'),
+        (MANIFEST_FILE, "\0\n"),
+        (MANIFEST_FILE, '{"chunk": 1}\n'),
+        (MANIFEST_FILE, "3\n"),
+    ],
+)
+def test_a_damaged_file_is_named(whole_study: Path, tmp_path: Path, name: str, text: str) -> None:
+    out = tmp_path / "out"
+    make_stored_study(whole_study / "study.toml", out, range(1))
+    (out / name).write_text(text)
+    with raises_input_error(where=out / name):
+        command.run_study(whole_study / "study.toml", out, 1, "", True, False)
 
 
 @pytest.mark.slow
@@ -306,13 +346,22 @@ def compute(chunk):
 WEIGHT = Outcome("weight", "mass and a random number", (
     OutcomeVariable("mass_kg", "kg", "mass"), OutcomeVariable("draw", "1", "random number"),
 ), compute)
+def fail(chunk):
+    raise KeyError("mass")
+
+NAMED = (OutcomeVariable("silent", "1", "steps"),)
 WRONG = 3
+FAILING = Outcome("failing", "fails", NAMED, fail)
+LACKING = Outcome("lacking", "lacks", NAMED, lambda chunk: {})
+LONG = Outcome("long", "too long", NAMED, lambda chunk: {"silent": np.zeros(99)})
+WHOLE = Outcome("whole", "counts", (OutcomeVariable("n", "1", "n", dtype="int64"),), fail)
 """
 
 
 def test_a_package_adds_an_outcome(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its numbers come from the seed of the case, whoever computes it."""
-    entries = {"shaketwin.outcomes": {"weight": "our_outcome:WEIGHT", "wrong": "our_outcome:WRONG"}}
+    names = ("weight", "wrong", "failing", "lacking", "long", "whole")
+    entries = {"shaketwin.outcomes": {name: f"our_outcome:{name.upper()}" for name in names}}
     site = install_package(tmp_path, "our_outcome", OUTCOME, entries)
     monkeypatch.syspath_prepend(str(site))
     text = STUDY.replace('["curves", "peaks", "forces", "hysteresis"]', '["weight"]')
@@ -322,9 +371,15 @@ def test_a_package_adds_an_outcome(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert np.array_equal(data["mass_kg"].isel({"base.bumper_stiffness_n_m": 0}), [2, 4, 6, 9])
     draws = [np.random.default_rng(seed).normal() for seed in data["seed"].values.ravel().tolist()]
     assert data["draw"].values.ravel().tolist() == draws
-    wrong = write_study(tmp_path, text.replace('["weight"]', '["wrong"]'))
-    with raises_input_error(problem="Outcome"):
-        Study.read(wrong)
+    definition = json.loads((tmp_path / "out" / DEFINITION_FILE).read_text())
+    assert definition["versions"]["our_outcome"] == "1.0"
+    for name, problem in (("wrong", "Outcome"), ("whole", "float")):
+        with raises_input_error(problem=problem):
+            Study.read(write_study(tmp_path, text.replace('["weight"]', f'["{name}"]')))
+    for name, problem in (("failing", "mass"), ("lacking", "silent"), ("long", "(99,)")):
+        study = Study.read(write_study(tmp_path, text.replace('["weight"]', f'["{name}"]')))
+        with raises_input_error(where=f"outcome {name}", problem=problem):
+            compute_outcomes(study, np.array([[550.0, 5e5]]), np.zeros(1, dtype=np.uint64))
 
 
 def test_options_that_exclude_each_other_are_refused(whole_study: Path, tmp_path: Path) -> None:
@@ -335,3 +390,18 @@ def test_options_that_exclude_each_other_are_refused(whole_study: Path, tmp_path
         command.run_study(path, tmp_path / "out", 2, "tcp://host:1", False, False)
     with raises_input_error(key="--out"):
         command.run_study(path, None, 2, "", True, False)
+    with raises_input_error(where=whole_study / "out"):
+        command.run_study(whole_study / "out", None, 2, "", False, False)
+    with raises_input_error(where=tmp_path):
+        command.run_study(tmp_path, None, None, "", False, True)
+
+
+def test_a_scheduler_that_does_not_answer_leaves_no_folder(
+    whole_study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("twin.run.dask_cluster.CONNECT_TIMEOUT_S", 0.5)
+    with raises_input_error(key="--scheduler"):
+        command.run_study(
+            whole_study / "study.toml", tmp_path / "out", None, "tcp://127.0.0.1:9", False, False
+        )
+    assert not (tmp_path / "out").exists()

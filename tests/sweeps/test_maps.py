@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,12 +11,12 @@ import pytest
 from SALib.analyze import sobol
 from SALib.test_functions import Ishigami
 
-from table_io.config.base import parse_toml
+from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.errors import InputError
 from table_io.units import GRAVITY_M_S2
 from tests.command_line import call_main
 from tests.input_errors import raises_input_error
-from tests.sweeps.small_study import write_study
+from tests.sweeps.small_study import STUDY, TEST, make_stored_study, write_study
 from twin.api import open_study
 from twin.compare.curves import detect_hysteresis
 from twin.model.ideal_response import simulate_sweep
@@ -24,6 +25,7 @@ from twin.reports.ideal_points import compute_prc_points
 from twin.studies.maps.cases import list_parameter_names, parameter_unit
 from twin.studies.maps.compute import compute_outcomes
 from twin.studies.maps.config import StudyConfig
+from twin.studies.maps.page import write_map_page
 from twin.studies.maps.results import find_front
 from twin.studies.maps.sampling import sample_parameters
 from twin.studies.maps.sensitivity import compute_sensitivity
@@ -108,7 +110,6 @@ def test_the_report_is_written_again_from_the_stored_arrays(study_folder: Path) 
     page.unlink()
     assert call_main("report", study_folder).returncode == 0
     assert page.read_text() == before
-    assert call_main("map", study_folder, "--show").returncode == 0
     pictures = {path.stem for path in (study_folder / "figures").glob("*.svg")}
     assert {"map_peak_disp_m", "map_down_jump_hz", "map_right_width_hz"} <= pictures
     rows = (study_folder / "cases.csv").read_text().splitlines()
@@ -199,6 +200,16 @@ def test_what_makes_no_model_is_refused(
          'minimise = ["peak_disp_m", "peak_acc"]', {"key": "front.minimise"}),
         ('outcomes = ["peaks"]\n' + GAP + "values = [1.0, 2.0]\n[front]\n"
          'minimise = ["peak_disp_m", "peak_acc_m_s2"]\neach = "gap"', {"key": "front.each"}),
+        ('outcomes = ["folds"]\n[[parameters]]\nname = "effects.coulomb_friction.fc"\n'
+         "values = [1.0, 2.0]", {"key": "outcomes", "value": "folds"}),
+        ('outcomes = ["discovery"]\n[[parameters]]\nname = "sweep.acceleration_g"\n'
+         "values = [0.02, 0.05]", {"key": "outcomes", "value": "discovery"}),
+        ('outcomes = ["discovery"]\n' + GAP + "values = [3.0, 4.0]\n[fixed]\n"
+         '"specimen.mass_kg" = 500.0', {"key": "outcomes", "value": "discovery"}),
+        ('outcomes = ["peaks"]\n[[parameters]]\nname = "discovery.noise"\nvalues = [0.1, 0.2]',
+         {"key": "discovery.noise"}),
+        ('outcomes = ["peaks"]\nseed = 5000000000\n' + GAP + "values = [1.0, 2.0]",
+         {"key": "seed"}),
     ],
 )  # fmt: skip
 def test_a_study_that_asks_for_nothing_possible_is_refused(
@@ -214,7 +225,8 @@ def test_a_study_that_asks_for_nothing_possible_is_refused(
         "start = 2.0\nstop = 1.0\ncount = 3", "values = [2.0, 1.0]", "values = [1.0, 1.0]",
         "start = 0.0\nstop = 1.0\nstep = 0.3", "start = 0.0\nstop = 1.0\nstep = -0.5",
         "start = 0.0\nstop = 1.0\ncount = 3\nscale = 'log'", "start = 1.0\nstop = inf\ncount = 3",
-        "values = [1.0, 2.0]\nstart = 1.0\nstop = 2.0", "start = 0.0\nstop = 1.0\ncount = 1",
+        "values = [1.0, 2.0]\nstart = 1.0\nstop = 2.0", "values = [1.0, 2.0]\ncount = 7",
+        "values = [0.0, 2.0]\nscale = 'log'", "start = 0.0\nstop = 1.0\ncount = 1",
     ],
 )  # fmt: skip
 def test_a_range_that_is_none_is_refused(values: str) -> None:
@@ -332,5 +344,82 @@ def test_a_case_that_fails_is_named_and_has_no_result(tmp_path: Path) -> None:
 
 
 def test_the_shipped_studies_are_valid() -> None:
-    for name in ("bumper_design", "fold_sensitivity"):
-        assert Study.read(Path(name)).config.case_count > 100
+    for name in ("bumper_design", "fold_sensitivity", "discovery_power"):
+        assert Study.read(Path(name)).config.case_count > 90
+
+
+def test_magnitudes_count_an_offset_and_amplitudes_do_not(tmp_path: Path) -> None:
+    """Gaps moved by 2 mm to the right: the mass goes further to that side."""
+    text = HEAD + 'outcomes = ["peaks", "forces"]\n[[parameters]]\n' \
+        'name = "effects.gap_offset.offset"\nvalues = [0.0, 2e-3]\n'  # fmt: skip
+    study = Study.read(write_study(tmp_path, text))
+    arrays, _ = compute_outcomes(study, np.array([[0.0], [2e-3]]), make_seeds(0, range(2)))
+    ratio = arrays["max_disp_m"] / arrays["peak_disp_m"]
+    assert ratio[0] == pytest.approx(1.0, abs=0.02)
+    assert ratio[1] > 1.15
+    assert arrays["transmitted_force_n"] == pytest.approx(550.0 * arrays["max_acc_m_s2"])
+
+
+def test_a_model_is_found_beside_the_test_that_names_it(tmp_path: Path) -> None:
+    (tmp_path / "tests").mkdir()
+    model = (PROFILES_DIR / "models" / "snm.toml").read_text().replace("36000.0", "37000.0")
+    (tmp_path / "tests" / "own.toml").write_text(model)
+    (tmp_path / "tests" / "across.toml").write_text('model = "own.toml"\n' + TEST)
+    path = tmp_path / "study.toml"
+    path.write_text(STUDY.replace("{profile}", "tests/across.toml"))
+    assert Study.read(path).factory.model.base.stiffness == 37000.0
+
+
+PAGES = {
+    "line": ('[[parameters]]\nname = "specimen.mass_kg"\nvalues = [500.0, 550.0, 600.0]\n', 3),
+    "single": (GAP + "values = [4.0, 5.0]\n[[parameters]]\nname = 'sweep.acceleration_g'\n"
+               "values = [0.05]\n", 2),
+    "panels": (GAP + "values = [4.0, 5.0]\n[[parameters]]\nname = 'specimen.mass_kg'\n"
+               "values = [500.0, 600.0]\nscale = 'log'\n[[parameters]]\n"
+               "name = 'sweep.acceleration_g'\nvalues = [0.03, 0.05]\n[front]\n"
+               "minimise = ['transmitted_force_n', 'most_impacts']\neach = 'specimen.mass_kg'\n",
+               8),
+    "repeats": ("repeats = 3\n" + GAP + "values = [4.0, 5.0]\n", 6),
+    "samples": ("sampling = 'latin_hypercube'\nsamples = 6\n" + GAP
+                + "start = 4.0\nstop = 6.0\n", 6),
+    "sensitivity": ("sampling = 'sensitivity'\nsamples = 4\n" + GAP + "start = 4.0\nstop = 6.0\n"
+                    "[[parameters]]\nname = 'specimen.mass_kg'\nstart = 500.0\nstop = 600.0\n",
+                    16),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", PAGES)
+@pytest.mark.parametrize("is_partial", [False, True])
+def test_every_kind_of_study_has_a_page(tmp_path: Path, kind: str, is_partial: bool) -> None:
+    """Also one of which half of the chunks are stored."""
+    text, count = PAGES[kind]
+    head = 'title = "A page"\nprofile = "{profile}"\nchunk = 1\noutcomes = ["forces"]\n'
+    test = TEST.replace("step_hz = 0.2", "step_hz = 1.0").replace("cycles = 8", "cycles = 3")
+    path = write_study(tmp_path, head + text, test)
+    out = tmp_path / "out"
+    stored = count // 2 if is_partial else count
+    make_stored_study(path, out, range(stored))
+    page = write_map_page(out).read_text()
+    assert f"{stored} of {count} cases" in page
+    assert ("<b>stopped</b>" in page) == is_partial
+    assert not re.search(r">\s*nan\b", page)
+    names = {path.stem for path in (out / "figures").glob("*.png")}
+    prefix = "samples_" if kind in ("samples", "sensitivity") else "map_"
+    prefix = "" if kind in ("line", "repeats") else prefix
+    assert {f"{prefix}{name}" for name in ("transmitted_force_n", "most_impacts")} <= names
+    assert ("front" in names) == (kind == "panels")
+    assert ("sensitivity" in names) == (kind == "sensitivity")
+    forces = open_study(out)["transmitted_force_n"]
+    assert int(forces.notnull().sum()) == stored
+
+
+@pytest.mark.slow
+def test_discovery_names_a_large_friction_and_nothing_where_there_is_none() -> None:
+    study = Study.read(Path("discovery_power"))
+    arrays, failures = compute_outcomes(
+        study, np.array([[64.0, 0.01], [0.0, 0.01]]), make_seeds(1, range(2))
+    )
+    assert not failures
+    assert arrays["named_right"].tolist() == [1.0, 1.0]
+    assert arrays["named_wrong"].tolist() == [0.0, 0.0]
+    assert arrays["gap_closed"][0] > 0.9

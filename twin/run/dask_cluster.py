@@ -7,7 +7,7 @@ from typing import Any
 
 from table_io.clock import RealClock
 from table_io.errors import InputError, require_package
-from twin.run.tasks import StopFunction, Task, TaskResult
+from twin.run.tasks import StopFunction, Task, TaskResult, find_no_problem
 from twin.run.versions import compare_versions, format_version_changes, read_installed_versions
 
 CONNECT_TIMEOUT_S = 10.0
@@ -46,6 +46,12 @@ def run_on_cluster(
             watch.require_workers()
             for future in [future for future in running if future.done()]:
                 yield _read_result(future, running.pop(future), address)
+
+
+def require_cluster(address: str) -> None:
+    """Raise InputError unless a scheduler answers and has workers of these versions."""
+    with _connect(address) as client:
+        _require_equal_workers(client, address, find_no_problem)
 
 
 def _read_result(future: Any, number: int, address: str) -> TaskResult:
@@ -102,7 +108,10 @@ class _WorkerWatch:
 
 def _require_equal_workers(client: Any, address: str, find_problem: Callable[[], str]) -> None:
     """Raise InputError unless there are workers, all with these versions and able to work."""
-    problems = client.run(find_worker_problem, read_installed_versions(), find_problem)
+    try:
+        problems = client.run(find_worker_problem, read_installed_versions(), find_problem)
+    except Exception as error:  # of a worker that lacks our modules, or has others
+        problems = {"": f"it cannot run this version: {type(error).__name__}: {error}"}
     if not problems:
         raise InputError(
             "this scheduler has no workers",
@@ -113,7 +122,7 @@ def _require_equal_workers(client: Any, address: str, find_problem: Callable[[],
     for worker, problem in sorted(problems.items()):
         if problem:
             raise InputError(
-                f"its worker {worker} cannot be used: {problem}; nothing was started",
+                f"its worker {worker} cannot be used: {problem}; nothing was computed",
                 key="--scheduler",
                 value=address,
                 remedy="install the same versions on every worker, and share the folder of --out",

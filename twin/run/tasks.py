@@ -45,6 +45,13 @@ class Workers:
     count: int
     scheduler: str = ""
 
+    def require(self) -> None:
+        """Raise InputError if a cluster does not answer, or its workers have other versions."""
+        if self.scheduler:
+            from twin.run.dask_cluster import require_cluster
+
+            require_cluster(self.scheduler)
+
     @classmethod
     def from_options(cls, workers: int | None, scheduler: str = "") -> "Workers":
         """Return the workers of `--workers` and `--scheduler`; by default a process per core."""
@@ -84,7 +91,8 @@ def run_tasks(
     """Yield the result of the task of every number, in the order of completion.
 
     After `stop()` is true no task is started; those in progress are completed and yielded. A task
-    whose process dies is started again until it has had `attempts`. `find_problem` runs on every
+    whose process dies is started again until it has had `attempts`. A cluster has no `max_task_s`:
+    a task that does not end there must be stopped by its operator. `find_problem` runs on every
     worker of a cluster before anything starts and returns why it cannot be used, "" if it can.
     InputError if the cluster cannot be used, or is lost.
     """

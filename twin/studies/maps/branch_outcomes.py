@@ -20,6 +20,8 @@ def find_branch_folds(chunk: CaseChunk) -> Mapping[str, npt.NDArray[Any]]:
     branches = chunk.branches
 
     def describe(index: int, _: SampledCase) -> FloatND:
+        if not branches[index]:
+            return np.full(len(FOLDS.variables), np.nan)
         return np.array([*locate_folds(branches[index]), *find_peaks(branches[index])])
 
     rows = chunk.collect(describe, (len(FOLDS.variables),))
@@ -53,11 +55,12 @@ FOLDS = Outcome(
         OutcomeVariable("upper_fold_hz", "Hz", "upper fold, where a forward sweep falls"),
         OutcomeVariable("lower_fold_hz", "Hz", "lower fold, where a backward sweep jumps up"),
         OutcomeVariable("grazing_hz", "Hz", "grazing between the folds"),
-        OutcomeVariable("stable_disp_m", "m", "largest stable relative displacement"),
-        OutcomeVariable("stable_disp_hz", "Hz", "frequency of the largest displacement"),
-        OutcomeVariable("stable_acc_m_s2", "m/s2", "largest stable total acceleration"),
-        OutcomeVariable("stable_acc_hz", "Hz", "frequency of the largest acceleration"),
+        OutcomeVariable("stable_disp_m", "m", "largest stable amplitude of displacement"),
+        OutcomeVariable("stable_disp_hz", "Hz", "its frequency, displacement"),
+        OutcomeVariable("stable_acc_m_s2", "m/s2", "largest stable amplitude of acceleration"),
+        OutcomeVariable("stable_acc_hz", "Hz", "its frequency, acceleration"),
     ),
     find_branch_folds,
+    needs_closed_form=True,
 )
 BRANCH_OUTCOMES = (FOLDS,)

@@ -15,8 +15,7 @@ from twin.run.disk import format_size, free_bytes
 from twin.run.folders import claim_folder, make_output_folder
 from twin.run.run_config import make_run_id
 from twin.run.tasks import TaskResult, Workers, run_tasks
-from twin.run.terminal import announce_if_slow, catch_interrupts, console, print_line
-from twin.run.warm_up import COMPILING_MESSAGE
+from twin.run.terminal import catch_interrupts, console, print_line
 from twin.studies import DEFINITION_FILE
 from twin.studies.maps.compute import (
     compute_chunk,
@@ -31,8 +30,10 @@ from twin.studies.maps.store import (
     create_store,
     estimate_bytes_per_case,
     make_seeds,
+    open_group,
     read_definition,
     remove_partial_files,
+    remove_unfinished_store,
     require_same_study,
 )
 from twin.studies.maps.study import Study
@@ -55,21 +56,26 @@ def run_study(
     """Run a study, or show one that has been stored; return the exit code."""
     for package in ("xarray", "zarr"):
         require_package(package, "studies", "map")
-    if show_only or path.is_dir():
-        folder = path if path.is_dir() else out or path
-        read_definition(folder)
-        print_line(f"{write_map_page(folder)}")
+    is_stored = (path / DEFINITION_FILE).is_file()
+    if show_only or (is_stored and not resume):
+        _require_plain_show(path, out, workers, scheduler)
+        read_definition(path)
+        print_line(f"{write_map_page(path)}")
         return 0
     places = Workers.from_options(workers, scheduler)
-    study = Study.read(path)
-    with announce_if_slow(COMPILING_MESSAGE):
-        _print_plan(study, places, _estimate_seconds_per_case(study))
+    if is_stored:
+        study, out = Study.from_definition(read_definition(path), str(path)), path
+    else:
+        study = Study.read(path)
+    places.require()
     folder = _open_folder(study, path, out, resume)
-    _require_disk_space(study, folder)
+    manifest = Manifest(folder, [variable.name for variable in study.variables])
+    _require_disk_space(study, folder, study.config.case_count - manifest.case_count)
     if not resume:
         create_store(folder, study, make_sweep_plan(study), sample_parameters(study.config))
-    manifest = Manifest(folder)
-    manifest.start()
+    manifest.start(open_group(folder, "r"))
+    missing_count = study.config.case_count - manifest.case_count
+    _print_plan(study, places, missing_count)
     pending = [n for n in range(study.config.chunk_count) if n not in manifest.entries]
     with catch_interrupts(STOPPING_MESSAGE) as stop:
         _run_chunks(folder, study, manifest, pending, places, stop)
@@ -81,6 +87,16 @@ def run_study(
     state = "complete" if is_complete else f"stopped ({stop_reason}); continue with --resume"
     print_line(f"{manifest.case_count} of {study.config.case_count} cases, {state} -> {page}")
     return 0 if is_complete else EXIT_INTERRUPTED
+
+
+def _require_plain_show(path: Path, out: Path | None, workers: int | None, scheduler: str) -> None:
+    """Raise InputError for options that a stored study cannot be shown with."""
+    if out is not None or workers is not None or scheduler:
+        raise InputError(
+            "a stored study is shown as it is",
+            where=path,
+            remedy="give its folder alone, or --resume to go on with it",
+        )
 
 
 def _estimate_seconds_per_case(study: Study) -> float:
@@ -96,21 +112,24 @@ def _estimate_seconds_per_case(study: Study) -> float:
     return (clock.now() - started_s) / TRIAL_CASES
 
 
-def _print_plan(study: Study, workers: Workers, seconds_per_case: float) -> None:
+def _print_plan(study: Study, workers: Workers, missing_count: int) -> None:
+    """Print how many cases there are and what the missing ones take."""
     config, sweep = study.config, make_sweep_plan(study)
-    size = estimate_bytes_per_case(study, sweep) * config.case_count
-    seconds = seconds_per_case * config.case_count
-    duration = (
-        f"about {format_time_span(seconds)} of one core"
-        if workers.scheduler
-        else f"about {format_time_span(seconds / workers.count)} on {workers}"
-    )
     shape = " x ".join(map(str, config.shape)) + " = " if len(config.shape) > 1 else ""
     print_line(f"{config.title}")
     print_line(
         f"{shape}{config.case_count} cases of {len(sweep.steps)} steps in {config.chunk_count} "
-        f"chunks, {duration}, at most {format_size(size)} before compression"
+        "chunks"
     )
+    if missing_count:
+        seconds = _estimate_seconds_per_case(study) * missing_count
+        size = estimate_bytes_per_case(study, sweep) * missing_count
+        duration = (
+            f"about {format_time_span(seconds)} of one core on {workers}"
+            if workers.scheduler
+            else f"about {format_time_span(seconds / workers.count)} on {workers}"
+        )
+        print_line(f"{missing_count} to compute: {duration}, at most {format_size(size)} unpacked")
 
 
 def format_time_span(seconds: float) -> str:
@@ -125,6 +144,8 @@ def _open_folder(study: Study, path: Path, out: Path | None, resume: bool) -> Pa
     """Return the folder of the study: a new one, or with `resume` the one of an earlier start."""
     if not resume:
         _require_memory(study)
+        if out is not None:
+            remove_unfinished_store(out)
         return make_output_folder(out, make_run_id(f"{path.stem}-map"))
     if out is None:
         raise InputError("missing", key="--out", remedy="give the folder of the study to resume")
@@ -147,9 +168,9 @@ def _require_memory(study: Study) -> None:
         )
 
 
-def _require_disk_space(study: Study, folder: Path) -> None:
-    """Raise InputError if the results do not fit on the disk of the folder, uncompressed."""
-    needed = estimate_bytes_per_case(study, make_sweep_plan(study)) * study.config.case_count
+def _require_disk_space(study: Study, folder: Path, missing_count: int) -> None:
+    """Raise InputError if the missing results do not fit on the folder's disk, uncompressed."""
+    needed = estimate_bytes_per_case(study, make_sweep_plan(study)) * missing_count
     free = free_bytes(folder)
     if needed > free:
         raise InputError(
@@ -203,6 +224,6 @@ def _require_entry(folder: Path, result: TaskResult) -> dict[str, object]:
         raise InputError(
             f"chunk {result.number} failed: {reason}; the chunks before it are kept",
             where=folder,
-            remedy="mend the cause and continue with --resume",
+            remedy="remove the cause and continue with --resume",
         )
     return dict(result.value)

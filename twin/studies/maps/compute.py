@@ -12,12 +12,12 @@ from table_io.block import Float2D
 from table_io.errors import InputError
 from twin.studies import DEFINITION_FILE
 from twin.studies.maps.cases import SampledCase
-from twin.studies.maps.outcomes import CaseChunk, SweepPlan
+from twin.studies.maps.outcomes import CaseChunk, Outcome, SweepPlan
 from twin.studies.maps.store import (
-    RESULTS_FOLDER,
     Json,
     find_version_problem,
     hash_arrays,
+    open_group,
     read_definition,
 )
 from twin.studies.maps.study import Study
@@ -47,12 +47,33 @@ def compute_outcomes(
     chunk = CaseChunk(tuple(cases), tuple(seeds.tolist()), make_sweep_plan(study), failures)
     arrays: dict[str, npt.NDArray[Any]] = {}
     for outcome in study.outcomes:
+        arrays |= _compute_outcome(outcome, chunk)
+    without_result = [case is None for case in cases]
+    for computed in arrays.values():
+        computed[without_result] = np.nan  # whatever an outcome makes of what is missing
+    return arrays, failures
+
+
+def _compute_outcome(outcome: Outcome, chunk: CaseChunk) -> dict[str, npt.NDArray[Any]]:
+    """Return the arrays of an outcome, each its own; InputError if it fails or lacks one."""
+    sizes = {"direction": len(chunk.sweep.directions), "frequency_hz": chunk.sweep.grid_hz.size}
+    try:
         computed = outcome.compute(chunk)
-        arrays |= {
-            variable.name: np.asarray(computed[variable.name], dtype=variable.dtype)
+        arrays = {
+            variable.name: np.array(computed[variable.name], dtype=variable.dtype)
             for variable in outcome.variables
         }
-    return arrays, failures
+        for variable in outcome.variables:
+            shape = (len(chunk.cases), *(sizes[dim] for dim in variable.dims))
+            if arrays[variable.name].shape != shape:
+                raise ValueError(f"{variable.name} is {arrays[variable.name].shape}, not {shape}")
+    except InputError:
+        raise
+    except Exception as error:  # of a plug-in, which may raise anything
+        raise InputError(
+            f"fails: {type(error).__name__}: {error}", where=f"outcome {outcome.name}"
+        ) from error
+    return arrays
 
 
 @lru_cache(maxsize=1)
@@ -61,15 +82,12 @@ def _open_study(folder: Path, _: float) -> tuple[Study, Mapping[str, Any]]:
 
     InputError if this process has other versions than the study.
     """
-    import zarr
-
     definition = read_definition(folder)
     problem = find_version_problem(definition["versions"])
     if problem:
         raise InputError(f"a worker has other versions than the study: {problem}", where=folder)
     study = Study.from_definition(definition, str(folder))
-    group = zarr.open_group(folder / RESULTS_FOLDER, mode="r+")
-    return study, dict(group.arrays())
+    return study, dict(open_group(folder, "r+").arrays())
 
 
 def compute_chunk(folder: Path, number: int) -> Json:

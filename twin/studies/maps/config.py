@@ -39,10 +39,12 @@ class VariedParameter(ConfigModel):
     @model_validator(mode="after")
     def _require_values(self) -> "VariedParameter":
         if self.values:
-            if self.start is not None or self.stop is not None:
+            if (self.start, self.stop, self.step, self.count) != (None,) * 4:
                 raise ValueError("give either values, or start and stop")
             if len(set(self.values)) < len(self.values) or list(self.values) != sorted(self.values):
                 raise ValueError("values must ascend, each of them once")
+            if self.scale == "log" and self.values[0] <= 0:
+                raise ValueError("on a log scale, values must be above 0")
             return self
         if self.start is None or self.stop is None or not self.start < self.stop:
             raise ValueError("give values, or start and a larger stop")
@@ -104,19 +106,22 @@ class StudyConfig(ConfigModel):
     )  # fmt: skip
     samples: Count | None = Field(
         None, ge=2, le=MAX_CASES,
-        description="Number of samples; of sensitivity, base samples, a power of 2.",
+        description="Number of samples, of sobol and sensitivity a power of 2; of sensitivity, "
+        "base samples.",
     )  # fmt: skip
     repeats: Count = Field(
         1, ge=1, le=1000, description="Cases of every combination of a grid, with other seeds."
     )
-    seed: Count = Field(0, ge=0, description="Seed of the samples, and of every case.")
+    seed: Count = Field(0, ge=0, lt=2**32, description="Seed of the samples, and of every case.")
     chunk: Count | None = Field(
         None, ge=1, le=MAX_CHUNK,
         description="Cases that are computed and stored together; by default up to 1000.",
     )  # fmt: skip
     parameters: tuple[VariedParameter, ...] = Field(min_length=1)
     fixed: dict[str, Finite] = Field(
-        default={}, description="Values of other keys, in place of those of the test and model."
+        default={},
+        description="Values of other keys, in place of those of the test and model; the keys in "
+        'quotes: "specimen.mass_kg" = 500.0.',
     )
 
     front: FrontConfig | None = None

@@ -101,11 +101,12 @@ def _grid_plot_axes(results: StudyResults) -> list[PlotAxis]:
 
 
 def _label_unit(variable: OutcomeVariable) -> str:
-    """Return what a figure that is titled with the outcome says at its axis."""
+    """Return the label of an axis in a figure that is titled with the outcome."""
     return "ratio or count" if variable.unit == "1" else f"in {format_unit(variable.unit)}"
 
 
-def _label_variable(variable: OutcomeVariable) -> str:
+def label_variable(variable: OutcomeVariable) -> str:
+    """Return the title of an outcome with its unit."""
     return (
         variable.title
         if variable.unit == "1"
@@ -120,7 +121,7 @@ def draw_line(results: StudyResults, variable: OutcomeVariable) -> CaptionedFigu
     ax = figure.subplots()
     ax.plot(axis.positions, results.read_grid(variable.name), "o-", ms=3)
     axis.set_up(ax.xaxis)
-    ax.set_ylabel(_label_variable(variable))
+    ax.set_ylabel(label_variable(variable))
     return CaptionedFigure(variable.name, _title(variable), "", figure)
 
 
@@ -188,7 +189,7 @@ def draw_map(results: StudyResults, variable: OutcomeVariable) -> CaptionedFigur
     fixed = [axis.format_value(axis.values[k]) for axis, k in zip(axes[2:], middle, strict=True)]
     caption = f"Below: slices at {', '.join(fixed)}." if fixed else "Below: slices."
     if np.isnan(values).any():
-        caption = f"Gray: no such value, for example no jump. {caption}"
+        caption = f"Gray: no such value, for example no jump, or not stored. {caption}"
     if len(axes) > 3:
         caption = f"Parameters without a panel of their own are at their middle value. {caption}"
     return CaptionedFigure(f"map_{variable.name}", _title(variable), caption, figure)
@@ -209,6 +210,8 @@ def _draw_slices(
 
 def _edges(positions: Float1D) -> Float1D:
     """Return the edges of cells around ascending positions, (position + 1,)."""
+    if positions.size == 1:
+        return np.array([positions[0] - 0.5, positions[0] + 0.5])
     middles = (positions[1:] + positions[:-1]) / 2
     first, last = 2 * positions[0] - middles[0], 2 * positions[-1] - middles[-1]
     return np.r_[first, middles, last]
@@ -318,8 +321,8 @@ def draw_front(results: StudyResults) -> CaptionedFigure:
                 color=colour, rasterized=True)  # fmt: skip
         ax.plot(group.first[group.front], group.second[group.front], "o-", ms=4, lw=1.4,
                 color=colour, label=group.title or "front")  # fmt: skip
-    ax.set_xlabel(_label_variable(first))
-    ax.set_ylabel(_label_variable(second))
+    ax.set_xlabel(label_variable(first))
+    ax.set_ylabel(label_variable(second))
     ax.legend(loc="upper right")
     return CaptionedFigure(
         "front", f"{_title(first)} against {second.title}",

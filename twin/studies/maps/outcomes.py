@@ -26,6 +26,7 @@ from twin.reports.ideal_points import ResponseScale, compute_ratios
 from twin.studies.maps.cases import SampledCase
 
 ENTRY_POINT_GROUP = "shaketwin.outcomes"
+CURVE_DIMS = ("direction", "frequency_hz")
 Result = TypeVar("Result")
 Shape = tuple[int, ...]
 
@@ -145,7 +146,10 @@ class CaseChunk:
         grid_hz = self.sweep.grid_hz.tolist()
 
         def follow(_: int, case: SampledCase) -> tuple[Branch, ...]:
-            return follow_sweep_branches(case.model, grid_hz, [case.acceleration_m_s2])
+            branches = follow_sweep_branches(case.model, grid_hz, [case.acceleration_m_s2])
+            if not branches:
+                raise InputError("no branch of periodic motions was found")
+            return branches
 
         return [branches or () for branches in self.for_each(follow)]
 
@@ -154,7 +158,7 @@ class CaseChunk:
 class OutcomeVariable:
     """One array of an outcome: a number of each case, or one at each of further `dims`.
 
-    `dims` are of ("direction", "frequency_hz").
+    `dims` are of ("direction", "frequency_hz"). `dtype` is one of floats: NaN is no result.
     """
 
     name: str
@@ -171,6 +175,9 @@ class Outcome:
     The function returns an array (case, *dims) of every variable, by name.
     `needs_both_directions`: of the sweep. `settings`: further keys that a study may vary or fix,
     with their units; they begin with the name of the outcome, and are in `SampledCase.settings`.
+    `needs_closed_form`: of the model, whose effects then only change parameters. `keys`: how the
+    keys begin on which it depends; empty for all. `test`: what it computes in place of the model
+    under the sweep.
     """
 
     name: str
@@ -178,7 +185,10 @@ class Outcome:
     variables: tuple[OutcomeVariable, ...]
     compute: Callable[[CaseChunk], Mapping[str, npt.NDArray[Any]]]
     needs_both_directions: bool = False
+    needs_closed_form: bool = False
     settings: Mapping[str, str] = field(default_factory=dict)
+    keys: tuple[str, ...] = ()
+    test: str = ""
 
 
 def find_outcome(name: str) -> Outcome:
@@ -198,4 +208,9 @@ def find_outcome(name: str) -> Outcome:
         entry = list_entry_points(ENTRY_POINT_GROUP)[name][0]
         problem = f"expected an Outcome, got {type(plugin).__name__}"
         raise make_plugin_error(entry, ENTRY_POINT_GROUP, problem)
+    for variable in plugin.variables:
+        if np.dtype(variable.dtype).kind != "f" or not set(variable.dims) <= set(CURVE_DIMS):
+            entry = list_entry_points(ENTRY_POINT_GROUP)[name][0]
+            problem = f"variable {variable.name}: dtype a float, dims of {', '.join(CURVE_DIMS)}"
+            raise make_plugin_error(entry, ENTRY_POINT_GROUP, problem)
     return plugin

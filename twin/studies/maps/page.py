@@ -7,13 +7,15 @@ from typing import Any
 import numpy as np
 
 from twin.reports.page import embed_images, render_page
-from twin.studies.maps.figures import draw_outcome_figures, group_front
+from twin.run.system import is_folder_locked
+from twin.studies.maps.figures import draw_outcome_figures, group_front, label_variable
 from twin.studies.maps.results import StudyResults, format_plain, format_unit
 from twin.studies.maps.sensitivity import SensitivityIndices, compute_sensitivity
 
 MAX_TABLE_CASES = 200_000  # in cases.csv
 MAX_FRONT_ROWS = 12  # of each front on the page
 MAX_REASONS = 5
+IDEAL_SWEEP = "the model under the ideal stepped sine of “{}”"
 
 
 def write_map_page(folder: Path) -> Path:
@@ -28,8 +30,10 @@ def write_map_page(folder: Path) -> Path:
     text = render_page(
         Path(__file__).with_name("map.html"),
         config=config,
-        profile_title=study.profile.title,
-        state="complete" if manifest.case_count == config.case_count else "stopped",
+        state=find_state(results),
+        simulated=[
+            outcome.test or IDEAL_SWEEP.format(study.profile.title) for outcome in study.outcomes
+        ],
         stored=manifest.case_count,
         failures=len(failures),
         reasons=sorted(set(failures.values()))[:MAX_REASONS],
@@ -48,6 +52,13 @@ def write_map_page(folder: Path) -> Path:
     return path
 
 
+def find_state(results: StudyResults) -> str:
+    """Return "complete", "running" or "stopped"."""
+    if results.manifest.case_count == results.study.config.case_count:
+        return "complete"
+    return "running" if is_folder_locked(results.folder) else "stopped"
+
+
 def analyse_sensitivity(results: StudyResults) -> dict[str, SensitivityIndices]:
     """Return the Sobol indices of each outcome; empty unless the study is made for them."""
     config = results.study.config
@@ -62,7 +73,7 @@ def analyse_sensitivity(results: StudyResults) -> dict[str, SensitivityIndices]:
 
 
 def describe_range(results: StudyResults, index: int) -> dict[str, Any]:
-    """Return what the page says of a parameter."""
+    """Return name, range and number of values of a parameter, as the page shows them."""
     parameter = results.study.config.parameters[index]
     low, high = parameter.limits
     unit = results.find_unit(parameter.name)
@@ -77,7 +88,7 @@ def describe_range(results: StudyResults, index: int) -> dict[str, Any]:
 
 
 def _summarise_variable(results: StudyResults, variable: Any) -> dict[str, Any]:
-    values = results.read_by_case(variable.name)
+    values = results.read_by_case(variable.name)[results.stored_flags]
     finite = values[np.isfinite(values)]
     quantiles = np.quantile(finite, [0, 0.5, 1]).tolist() if finite.size else [None] * 3
     return {
@@ -125,9 +136,7 @@ def write_front_table(results: StudyResults, path: Path) -> dict[str, Any] | Non
             groups.append({"title": group.title, "rows": [rows[index] for index in thinned]})
     heads = [results.label_parameter(name) for name in names]
     by_name = {variable.name: variable for variable in results.scalars}
-    heads += [
-        f"{by_name[name].title} in {format_unit(by_name[name].unit)}" for name in front.minimise
-    ]
+    heads += [label_variable(by_name[name]) for name in front.minimise]
     return {"heads": heads, "groups": groups}
 
 

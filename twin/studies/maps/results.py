@@ -15,7 +15,7 @@ from table_io.errors import InputError, require_package, suggest
 from twin.compare.curves import FloatND
 from twin.studies.maps.outcomes import OutcomeVariable
 from twin.studies.maps.sampling import grid_axes
-from twin.studies.maps.store import RESULTS_FOLDER, Manifest, read_definition
+from twin.studies.maps.store import Manifest, open_group, read_definition
 from twin.studies.maps.study import Study
 
 if TYPE_CHECKING:
@@ -50,9 +50,7 @@ class StudyResults:
 
     @cached_property
     def _group(self) -> Any:
-        import zarr
-
-        return zarr.open_group(self.folder / RESULTS_FOLDER, mode="r")
+        return open_group(self.folder, "r")
 
     @property
     def scalars(self) -> tuple[OutcomeVariable, ...]:
@@ -67,6 +65,14 @@ class StudyResults:
         """Return a variable or parameter, (case, ...)."""
         values: FloatND = self._group[name][:]
         return values
+
+    @property
+    def stored_flags(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
+        """Which cases are stored, (case,)."""
+        flags = np.zeros(self.study.config.case_count, dtype=bool)
+        for entry in self.manifest.entries.values():
+            flags[entry["first"] : entry["first"] + entry["cases"]] = True
+        return flags
 
     def read_array(self, name: str) -> FloatND:
         """Return a variable: of a grid (*shape, ...), of samples (case, ...)."""

@@ -10,6 +10,7 @@ import hashlib
 import json
 import math
 import os
+import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,18 @@ import numpy as np
 import numpy.typing as npt
 
 from table_io.block import Float2D
+from table_io.config.plugins import list_entry_points
 from table_io.errors import InputError
-from twin.run.versions import compare_versions, format_version_changes, read_installed_versions
+from twin.model.effects import ENTRY_POINT_GROUP as EFFECT_GROUP
+from twin.run.versions import format_version_changes, read_installed_versions
 from twin.studies import DEFINITION_FILE
+from twin.studies.maps.outcomes import ENTRY_POINT_GROUP as OUTCOME_GROUP
 from twin.studies.maps.outcomes import SweepPlan
 from twin.studies.maps.study import Study
 
 RESULTS_FOLDER, MANIFEST_FILE = "results.zarr", "chunks.jsonl"
+DEFINITION_KEYS = {"study_toml", "profile_toml", "model_toml", "versions"}
+ENTRY_KEYS = {"chunk", "first", "cases", "sha256", "failures"}
 COORDINATE_CHUNK = 100_000  # cases
 DIRECTION_VALUES = {"forward": 1, "backward": -1}
 Json = dict[str, Any]
@@ -81,7 +87,7 @@ def _describe_study(study: Study) -> Json:
         "sampling": config.sampling,
         "shape": list(config.shape),
         "coordinates": " ".join([*names, "seed"]),  # of the cases, as xarray reads them
-        "versions": read_installed_versions(),
+        "versions": read_study_versions(),
     }
 
 
@@ -118,7 +124,7 @@ def make_definition(study: Study) -> Json:
         "study_toml": study.study_toml,
         "profile_toml": study.profile_toml,
         "model_toml": study.model_toml,
-        "versions": read_installed_versions(),
+        "versions": read_study_versions(),
     }
 
 
@@ -126,14 +132,38 @@ def read_definition(folder: Path) -> Json:
     """Read the definition of a study; InputError if the folder has none."""
     try:
         definition: Json = json.loads((folder / DEFINITION_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except OSError:
+        definition = {}
+    except ValueError as error:
+        raise _make_damage_error(folder / DEFINITION_FILE, str(error)) from None
+    if not definition:
         raise InputError(
-            "no study",
-            where=folder,
-            allowed="a folder written by `shaketwin map`",
-            remedy="omit --resume to start a study",
-        ) from None
+            "no study", where=folder, allowed="a folder in which `shaketwin map` has started one"
+        )
+    if missing := DEFINITION_KEYS - definition.keys():
+        raise _make_damage_error(folder / DEFINITION_FILE, f"lacks {', '.join(sorted(missing))}")
     return definition
+
+
+def _make_damage_error(path: Path, problem: str) -> InputError:
+    return InputError(
+        f"damaged: {problem}", where=path, remedy="restore it, or start a new study elsewhere"
+    )
+
+
+def read_study_versions() -> dict[str, str]:
+    """Return the versions that decide on the bytes: ours, those of zarr, and of all plug-ins."""
+    from importlib.metadata import version
+
+    plugins = {
+        entry.dist.name: entry.dist.version
+        for group in (EFFECT_GROUP, OUTCOME_GROUP)
+        for entries in list_entry_points(group).values()
+        for entry in entries
+        if entry.dist is not None
+    }
+    own = {name: version(name) for name in ("zarr", "numcodecs")}
+    return plugins | own | read_installed_versions()
 
 
 def find_version_problem(versions: Mapping[str, str]) -> str:
@@ -141,12 +171,14 @@ def find_version_problem(versions: Mapping[str, str]) -> str:
 
     The processor may differ, although its last bits may too.
     """
-    pairs = {
-        name: pair
-        for name, pair in compare_versions(dict(versions)).items()
-        if name != "machine" and pair["recorded"] != pair["installed"]
-    }
-    return format_version_changes(pairs)
+    installed = read_study_versions()
+    return format_version_changes(
+        {
+            name: {"recorded": versions.get(name), "installed": installed.get(name)}
+            for name in sorted({*versions, *installed} - {"machine"})
+            if versions.get(name) != installed.get(name)
+        }
+    )
 
 
 def require_same_study(folder: Path, study: Study) -> None:
@@ -189,6 +221,19 @@ def remove_partial_files(folder: Path) -> None:
         path.unlink(missing_ok=True)
 
 
+def open_group(folder: Path, mode: str) -> Any:
+    """Open the arrays of a study; `mode` as of `zarr.open_group`."""
+    import zarr
+
+    return zarr.open_group(folder / RESULTS_FOLDER, mode=mode)
+
+
+def remove_unfinished_store(folder: Path) -> None:
+    """Remove a store of a process that died before its study began; nothing is in it."""
+    if {path.name for path in folder.glob("*")} == {RESULTS_FOLDER}:
+        shutil.rmtree(folder / RESULTS_FOLDER)
+
+
 def replace_text(path: Path, text: str) -> None:
     """Write a file whole or not at all."""
     partial = path.with_suffix(path.suffix + ".new")
@@ -202,25 +247,51 @@ def replace_text(path: Path, text: str) -> None:
 class Manifest:
     """The stored chunks: a line of `chunks.jsonl` each, in the order in which they came."""
 
-    def __init__(self, folder: Path) -> None:
-        self._path = folder / MANIFEST_FILE
+    def __init__(self, folder: Path, names: Iterable[str] = ()) -> None:
+        """`names`: the variables of the study, in the order of the hash."""
+        self._path, self._names = folder / MANIFEST_FILE, tuple(names)
         self.entries = {entry["chunk"]: entry for entry in self._read_lines()}
 
     def _read_lines(self) -> list[Json]:
         if not self._path.exists():
             return []
         entries = []
-        for line in self._path.read_text(encoding="utf-8").splitlines(keepends=True):
-            if line.endswith("\n"):  # else the process died while it wrote it
-                entries.append(json.loads(line))
+        text = self._path.read_text(encoding="utf-8", errors="replace")
+        for number, line in enumerate(text.splitlines(keepends=True), 1):
+            if not line.endswith("\n"):  # the process died while it wrote it
+                continue
+            try:
+                entry = json.loads(line)
+                problem = ", ".join(sorted(ENTRY_KEYS - entry.keys()))
+            except (ValueError, AttributeError) as error:
+                problem = str(error)
+            if problem:
+                raise _make_damage_error(self._path, f"line {number}: {problem}")
+            entries.append(entry)
         return entries
 
-    def start(self) -> None:
-        """Drop a line that was cut."""
+    def start(self, group: Any) -> None:
+        """Drop a line that was cut, and those whose chunks are not what was stored.
+
+        After a loss of power the lines may be on the disk without their chunks.
+        """
+        self.entries = {
+            number: entry
+            for number, entry in self.entries.items()
+            if entry["sha256"] == self._hash_chunk(group, entry)
+        }
         self._rewrite(self.entries.values())
 
+    def _hash_chunk(self, group: Any, entry: Json) -> str:
+        """Return the hash of a chunk as it is on the disk; "" if it cannot be read."""
+        span = slice(entry["first"], entry["first"] + entry["cases"])
+        try:
+            return hash_arrays({name: group[name][span] for name in self._names})
+        except (OSError, ValueError, RuntimeError):
+            return ""
+
     def add(self, entry: Json) -> None:
-        """Add a stored chunk; it is on the disk when this returns."""
+        """Add the line of a stored chunk; the line is on the disk when this returns."""
         with self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
             file.flush()

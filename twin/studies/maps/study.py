@@ -13,7 +13,7 @@ from table_io.units import GRAVITY_M_S2
 from twin.model.config import ModelConfig
 from twin.model.stepped_sine import validate_frequencies
 from twin.run.run_config import read_model
-from twin.studies.maps.cases import CaseFactory
+from twin.studies.maps.cases import CaseFactory, SampledCase
 from twin.studies.maps.config import StudyConfig
 from twin.studies.maps.outcomes import Outcome, OutcomeVariable, find_outcome
 
@@ -35,9 +35,13 @@ class Study:
         path = resolve_config(path, "studies")
         study_toml = read_text(path, "study")
         config = parse_toml(study_toml, StudyConfig, str(path))
-        _, profile_toml = load_profile(find_config(config.profile, "tests", path))
-        profile = parse_toml(profile_toml, Profile, config.profile)
-        _, model_toml = read_model(config.model or profile.model, path)
+        profile_path = find_config(config.profile, "tests", path)
+        profile, profile_toml = load_profile(profile_path)
+        _, model_toml = (
+            read_model(config.model, path)
+            if config.model
+            else read_model(profile.model, profile_path)
+        )
         texts = {
             "study_toml": study_toml,
             "profile_toml": profile_toml,
@@ -84,10 +88,7 @@ class Study:
     def check_cases(self) -> None:
         """Raise InputError for an unknown parameter or outcome, or a range without a model."""
         sweep = self.profile.sweep
-        self._check_outcomes()
-        frequencies = [step.frequency_hz for step in sweep.steps]
-        validate_frequencies(frequencies, sweep.one_level_g, sweep.cycles)
-        if sweep.schedule_db or not sweep.has_one_level:
+        if not sweep.has_one_level:
             raise InputError(
                 "its sweep has several levels",
                 key="profile",
@@ -95,15 +96,35 @@ class Study:
                 allowed="a stepped sine of one level",
                 remedy="vary sweep.acceleration_g",
             )
+        self._check_outcomes()
+        frequencies = [step.frequency_hz for step in sweep.steps]
+        validate_frequencies(frequencies, sweep.one_level_g, sweep.cycles)
         self.factory.require_keys()
         middle = [sum(parameter.limits) / 2 for parameter in self.config.parameters]
         for index, parameter in enumerate(self.config.parameters):
             for value in parameter.limits:
                 values: Sequence[float] = [*middle[:index], value, *middle[index + 1 :]]
                 try:
-                    self.factory.build(values).find_resonance()
+                    case = self.factory.build(values)
+                    case.find_resonance()
                 except InputError as error:
                     raise error.add_place(f"{parameter.name} = {value:g}") from None
+                self._require_closed_forms(case)
+
+    def _require_closed_forms(self, case: SampledCase) -> None:
+        """Raise InputError if an outcome cannot be computed of a model with force laws."""
+        if case.model.changes_only_parameters:
+            return
+        laws = [i.name for i in case.model.present_effects if i.effect.acts != "parameters"]
+        for outcome in self.outcomes:
+            if outcome.needs_closed_form:
+                raise InputError(
+                    f"{outcome.title}: not of a model with {', '.join(laws)}, whose branches take "
+                    "minutes",
+                    key="outcomes",
+                    value=outcome.name,
+                    remedy="compute hysteresis instead, or follow single branches by `branches`",
+                )
 
     def _check_outcomes(self) -> None:
         """Raise InputError for outcomes that are unknown, repeated, or need another sweep."""
@@ -118,6 +139,15 @@ class Study:
                     value=outcome.name,
                     remedy="give a test that sweeps forward and backward",
                 )
+            for key in (*self.config.fixed, *(p.name for p in self.config.parameters)):
+                if outcome.keys and not key.startswith(outcome.keys):
+                    raise InputError(
+                        f"does not depend on {key}",
+                        key="outcomes",
+                        value=outcome.name,
+                        allowed=f"with parameters {', '.join(outcome.keys)}",
+                        remedy="leave out the outcome or the parameter",
+                    )
         front = self.config.front
         if front is None:
             return
@@ -128,9 +158,13 @@ class Study:
                     "not computed", key="front.minimise", value=name, remedy=suggest(name, scalars)
                 )
         parameters = [parameter.name for parameter in self.config.parameters]
-        if front.each and (front.each not in parameters or self.config.sampling != "grid"):
+        if front.each and self.config.sampling != "grid":
             raise InputError(
-                "no parameter of a grid",
+                "samples have no repeated values", key="front.each", remedy="omit it, or use a grid"
+            )
+        if front.each and front.each not in parameters:
+            raise InputError(
+                "no parameter of the study",
                 key="front.each",
                 value=front.each,
                 remedy=suggest(front.each, parameters),

@@ -8,11 +8,10 @@ import numpy.typing as npt
 
 from table_io.records import NormalizedResponse
 from twin.compare.curves import FloatND, Hysteresis, PrcJump
-from twin.studies.maps.outcomes import CaseChunk, Outcome, OutcomeVariable
+from twin.studies.maps.outcomes import CURVE_DIMS, CaseChunk, Outcome, OutcomeVariable
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 CURVE_NAMES = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l")
-CURVE_DIMS = ("direction", "frequency_hz")
 
 
 def compute_curves(chunk: CaseChunk) -> Arrays:
@@ -25,7 +24,7 @@ def compute_curves(chunk: CaseChunk) -> Arrays:
 
 
 def find_sweep_peaks(chunk: CaseChunk) -> Arrays:
-    """Return the largest amplitudes of the sweep and their frequencies."""
+    """Return the largest half swings of the sweep with their frequencies, and magnitudes."""
     disp = (chunk.extreme("u_max") - chunk.extreme("u_min")).mean(axis=-1) / 2
     acc = (chunk.extreme("a_max") - chunk.extreme("a_min")).mean(axis=-1) / 2
     frequencies = chunk.sweep.frequencies_hz
@@ -36,7 +35,15 @@ def find_sweep_peaks(chunk: CaseChunk) -> Arrays:
         "peak_acc_hz": _take_where_largest(frequencies, acc),
         "peak_eta_d": chunk.ratios["eta_d"].max(axis=-1),
         "peak_eta_a": chunk.ratios["eta_a"].max(axis=-1),
+        "max_disp_m": _find_magnitude(chunk, "u_max", "u_min"),
+        "max_acc_m_s2": _find_magnitude(chunk, "a_max", "a_min"),
     }
+
+
+def _find_magnitude(chunk: CaseChunk, highest: str, lowest: str) -> FloatND:
+    """Return the largest magnitude of the measured cycles, (case,)."""
+    magnitude: FloatND = np.maximum(chunk.extreme(highest), -chunk.extreme(lowest)).max(axis=(1, 2))
+    return magnitude
 
 
 def _take_where_largest(frequencies_hz: FloatND, values: FloatND) -> FloatND:
@@ -48,12 +55,10 @@ def _take_where_largest(frequencies_hz: FloatND, values: FloatND) -> FloatND:
 def find_sweep_forces(chunk: CaseChunk) -> Arrays:
     """Return the largest forces of the sweep, and impacts per cycle."""
     masses = np.array([np.nan if case is None else case.model.base.mass for case in chunk.cases])
-    acceleration = np.maximum(chunk.extreme("a_max"), -chunk.extreme("a_min")).max(axis=(1, 2))
-    bumper = np.maximum(chunk.extreme("f_r_max"), -chunk.extreme("f_l_min")).max(axis=(1, 2))
     impacts = (chunk.extreme("onsets_r") + chunk.extreme("onsets_l")).mean(axis=-1)
     return {
-        "transmitted_force_n": masses * acceleration,
-        "bumper_force_n": bumper,
+        "transmitted_force_n": masses * _find_magnitude(chunk, "a_max", "a_min"),
+        "bumper_force_n": _find_magnitude(chunk, "f_r_max", "f_l_min"),
         "most_impacts": impacts.max(axis=-1),
     }
 
@@ -114,12 +119,14 @@ PEAKS = Outcome(
     "peaks",
     "largest amplitudes of the sweep",
     (
-        OutcomeVariable("peak_disp_m", "m", "largest relative displacement"),
-        OutcomeVariable("peak_disp_hz", "Hz", "frequency of the largest displacement"),
-        OutcomeVariable("peak_acc_m_s2", "m/s2", "largest total acceleration"),
-        OutcomeVariable("peak_acc_hz", "Hz", "frequency of the largest acceleration"),
+        OutcomeVariable("peak_disp_m", "m", "largest amplitude of displacement"),
+        OutcomeVariable("peak_disp_hz", "Hz", "frequency of the largest amplitude of displacement"),
+        OutcomeVariable("peak_acc_m_s2", "m/s2", "largest amplitude of acceleration"),
+        OutcomeVariable("peak_acc_hz", "Hz", "frequency of the largest amplitude of acceleration"),
         OutcomeVariable("peak_eta_d", "1", "largest displacement ratio"),
         OutcomeVariable("peak_eta_a", "1", "largest acceleration ratio"),
+        OutcomeVariable("max_disp_m", "m", "largest relative displacement"),
+        OutcomeVariable("max_acc_m_s2", "m/s2", "largest total acceleration"),
     ),
     find_sweep_peaks,
 )

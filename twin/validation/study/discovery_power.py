@@ -114,4 +114,6 @@ DISCOVERY = Outcome(
     ),
     judge_chunk,
     settings={NOISE: "1"},
+    keys=("base.", "specimen.gap_mm", "effects.", "discovery."),
+    test="blind recordings of the simulated table in the test of the blind study",
 )
