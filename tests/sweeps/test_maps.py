@@ -129,6 +129,24 @@ def test_a_map_of_the_folds_is_the_continuation_of_each_case(tmp_path: Path) -> 
     assert arrays["stable_disp_hz"] == pytest.approx(arrays["upper_fold_hz"], abs=0.05)
 
 
+def test_a_map_of_basins_is_that_of_a_finer_grid(tmp_path: Path) -> None:
+    """G4 at 3.4 Hz: 87.4 % of 101 x 101 starts end in the motion with impacts; none at 4.5 Hz."""
+    text = (
+        HEAD + 'outcomes = ["basins"]\n[[parameters]]\nname = "basins.frequency_hz"\n'
+        'values = [3.4, 4.5]\n[fixed]\n"basins.starts_per_axis" = 21\n'
+    )
+    study = Study.read(write_study(tmp_path, text))
+    arrays, failures = compute_outcomes(study, np.array([[3.4], [4.5]]), make_seeds(0, range(2)))
+    assert not failures
+    assert arrays["contact_share"] == pytest.approx([0.874, 0.0], abs=0.03)
+    assert arrays["attractor_count"].tolist() == [2.0, 1.0]
+    assert arrays["undecided_share"].tolist() == [0.0, 0.0]
+    with raises_input_error(key="basins.frequency_hz"):
+        Study.read(
+            write_study(tmp_path, HEAD + 'outcomes = ["basins"]\n' + GAP + "values = [4, 5]")
+        )
+
+
 @pytest.mark.parametrize("name", list_parameter_names())
 def test_every_parameter_can_be_varied_and_changes_the_model(tmp_path: Path, name: str) -> None:
     """Within limits that suit the specimen, and without saying what other effects are."""

@@ -1,4 +1,4 @@
-"""Outcomes of continuation: folds, grazings and the largest stable motion."""
+"""Outcomes of nonlinear dynamics: folds and largest stable motion, basins of attraction."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -7,8 +7,10 @@ import numpy as np
 import numpy.typing as npt
 
 from twin.compare.curves import FloatND
+from twin.dynamics.basins import StartGrid, compute_basins
 from twin.dynamics.continuation import Branch
 from twin.dynamics.resonance_map import find_peaks
+from twin.dynamics.stroboscopic import OperatingPoint
 from twin.studies.maps.cases import SampledCase
 from twin.studies.maps.outcomes import CaseChunk, Outcome, OutcomeVariable
 
@@ -63,4 +65,50 @@ FOLDS = Outcome(
     find_branch_folds,
     needs_closed_form=True,
 )
-BRANCH_OUTCOMES = (FOLDS,)
+
+
+def measure_basins(chunk: CaseChunk) -> Mapping[str, npt.NDArray[Any]]:
+    """Return which share of the initial states each kind of motion attracts at one frequency."""
+
+    def measure(_: int, case: SampledCase) -> FloatND:
+        settings = {**BASIN_DEFAULTS, **case.settings}
+        side = round(settings["basins.starts_per_axis"])
+        grid = StartGrid.from_limits(
+            1e-3 * settings["basins.disp_mm"], settings["basins.vel_m_s"], side, side
+        )
+        point = OperatingPoint(case.model, settings["basins.frequency_hz"], case.acceleration_m_s2)
+        basins = compute_basins(point, grid)
+        in_contact = np.array([attractor.has_contact for attractor in basins.attractors])
+        shares = basins.fractions
+        return np.array(
+            [shares[in_contact].sum(), shares.max(), len(basins.attractors), basins.undecided_share]
+        )
+
+    rows = chunk.collect(measure, (len(BASINS.variables),))
+    return dict(zip([variable.name for variable in BASINS.variables], rows.T, strict=True))
+
+
+BASIN_DEFAULTS = {
+    "basins.disp_mm": 6.0,
+    "basins.vel_m_s": 0.15,
+    "basins.starts_per_axis": 15.0,
+}
+BASINS = Outcome(
+    "basins",
+    "basins of attraction at one frequency",
+    (
+        OutcomeVariable("contact_share", "1", "share of starts that end in motions with contact"),
+        OutcomeVariable("largest_share", "1", "share of the largest basin"),
+        OutcomeVariable("attractor_count", "1", "number of attractors"),
+        OutcomeVariable("undecided_share", "1", "share of starts that reach no attractor"),
+    ),
+    measure_basins,
+    settings={
+        "basins.frequency_hz": "Hz",
+        "basins.disp_mm": "mm",
+        "basins.vel_m_s": "m/s",
+        "basins.starts_per_axis": "1",
+    },
+    required=("basins.frequency_hz",),
+)
+BRANCH_OUTCOMES = (FOLDS, BASINS)

@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -64,6 +65,11 @@ def run_study(
         return 0
     places = Workers.from_options(workers, scheduler)
     if is_stored:
+        if out not in (None, path):
+            raise InputError(
+                "the study goes on where it is", where=path, key="--out", value=str(out),
+                remedy="omit it",
+            )  # fmt: skip
         study, out = Study.from_definition(read_definition(path), str(path)), path
     else:
         study = Study.read(path)
@@ -73,9 +79,10 @@ def run_study(
     _require_disk_space(study, folder, study.config.case_count - manifest.case_count)
     if not resume:
         create_store(folder, study, make_sweep_plan(study), sample_parameters(study.config))
-    manifest.start(open_group(folder, "r"))
+    group = open_group(folder, "r")
+    manifest.start(group)
     missing_count = study.config.case_count - manifest.case_count
-    _print_plan(study, places, missing_count)
+    _print_plan(study, group, places, missing_count)
     pending = [n for n in range(study.config.chunk_count) if n not in manifest.entries]
     with catch_interrupts(STOPPING_MESSAGE) as stop:
         _run_chunks(folder, study, manifest, pending, places, stop)
@@ -99,11 +106,12 @@ def _require_plain_show(path: Path, out: Path | None, workers: int | None, sched
         )
 
 
-def _estimate_seconds_per_case(study: Study) -> float:
-    """Return the processor time of a case, from a few that are spread over the study."""
-    limits = np.array([parameter.limits for parameter in study.config.parameters])
-    shares = (np.arange(TRIAL_CASES) + 0.5)[:, None] / TRIAL_CASES
-    values = limits[:, 0] + shares * (limits[:, 1] - limits[:, 0])
+def _estimate_seconds_per_case(study: Study, group: Any) -> float:
+    """Return the time of a case in s, from a few that are spread over the study."""
+    shares = (np.arange(TRIAL_CASES) + 0.5) / TRIAL_CASES
+    indices = (shares * study.config.case_count).astype(int)
+    names = [parameter.name for parameter in study.config.parameters]
+    values = np.stack([group[name].oindex[indices] for name in names], axis=1)
     seeds = make_seeds(study.config.seed, range(TRIAL_CASES))
     clock = RealClock()
     compute_outcomes(study, values[:1], seeds[:1])  # compiles
@@ -112,7 +120,7 @@ def _estimate_seconds_per_case(study: Study) -> float:
     return (clock.now() - started_s) / TRIAL_CASES
 
 
-def _print_plan(study: Study, workers: Workers, missing_count: int) -> None:
+def _print_plan(study: Study, group: Any, workers: Workers, missing_count: int) -> None:
     """Print how many cases there are and what the missing ones take."""
     config, sweep = study.config, make_sweep_plan(study)
     shape = " x ".join(map(str, config.shape)) + " = " if len(config.shape) > 1 else ""
@@ -122,7 +130,7 @@ def _print_plan(study: Study, workers: Workers, missing_count: int) -> None:
         "chunks"
     )
     if missing_count:
-        seconds = _estimate_seconds_per_case(study) * missing_count
+        seconds = _estimate_seconds_per_case(study, group) * missing_count
         size = estimate_bytes_per_case(study, sweep) * missing_count
         duration = (
             f"about {format_time_span(seconds)} of one core on {workers}"

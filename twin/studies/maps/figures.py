@@ -188,6 +188,8 @@ def draw_map(results: StudyResults, variable: OutcomeVariable) -> CaptionedFigur
     _draw_slices(bottom, axes, _take_plane(values, middle), variable)
     fixed = [axis.format_value(axis.values[k]) for axis, k in zip(axes[2:], middle, strict=True)]
     caption = f"Below: slices at {', '.join(fixed)}." if fixed else "Below: slices."
+    if results.study.config.repeats > 1:
+        caption = f"Means of {results.study.config.repeats} cases. {caption}"
     if np.isnan(values).any():
         caption = f"Gray: no such value, for example no jump, or not stored. {caption}"
     if len(axes) > 3:

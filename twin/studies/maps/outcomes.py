@@ -173,11 +173,11 @@ class Outcome:
     """What a study can compute: its variables, and a function of a chunk that returns them.
 
     The function returns an array (case, *dims) of every variable, by name.
-    `needs_both_directions`: of the sweep. `settings`: further keys that a study may vary or fix,
-    with their units; they begin with the name of the outcome, and are in `SampledCase.settings`.
-    `needs_closed_form`: of the model, whose effects then only change parameters. `keys`: how the
-    keys begin on which it depends; empty for all. `test`: what it computes in place of the model
-    under the sweep.
+    `needs_both_directions`: of the sweep. `needs_closed_form`: of the model, whose effects then
+    only change parameters. `settings`: further keys that a study may vary or fix, with their units;
+    they begin with the name of the outcome, and are in `SampledCase.settings`; `required`: those
+    that a study must state. `keys`: how the keys begin on which it depends; empty for all. `test`:
+    what it computes in place of the model under the sweep.
     """
 
     name: str
@@ -187,6 +187,7 @@ class Outcome:
     needs_both_directions: bool = False
     needs_closed_form: bool = False
     settings: Mapping[str, str] = field(default_factory=dict)
+    required: tuple[str, ...] = ()
     keys: tuple[str, ...] = ()
     test: str = ""
 

@@ -139,7 +139,15 @@ class Study:
                     value=outcome.name,
                     remedy="give a test that sweeps forward and backward",
                 )
-            for key in (*self.config.fixed, *(p.name for p in self.config.parameters)):
+            stated = [*self.config.fixed, *(p.name for p in self.config.parameters)]
+            for key in outcome.required:
+                if key not in stated:
+                    raise InputError(
+                        f"{outcome.title} need it",
+                        key=key,
+                        remedy="add it to [fixed] or to the parameters",
+                    )
+            for key in stated:
                 if outcome.keys and not key.startswith(outcome.keys):
                     raise InputError(
                         f"does not depend on {key}",
