@@ -3,7 +3,14 @@
 from types import TracebackType
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
 
 from table_io.errors import replace_nonprintable
 from table_io.messages import format_record
@@ -20,12 +27,23 @@ from table_io.records import (
     Trip,
 )
 from table_io.units import GRAVITY_M_S2
+from twin.run.terminal import console
 from twin.transport.codec import Item
+
 
 TABLE_HEADER = (
     f"{'step':>7}  {'direction':<9} {'f [Hz]':>7}  {'level [g]':>9}   "
     f"{'eta_d':>6} {'twin':>6}   {'impacts R/L':>11} {'twin':>7}   {'latency':>8}"
 )
+
+
+def make_task_bar(*columns: ProgressColumn) -> Progress:
+    """Return the bar of a study, shown on a terminal only, with further columns."""
+    return Progress(
+        TextColumn("[bold]{task.description}"), BarColumn(bar_width=40), MofNCompleteColumn(),
+        *columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal,
+        transient=True,
+    )  # fmt: skip
 
 
 class RunProgress:

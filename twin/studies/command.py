@@ -7,8 +7,6 @@ from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from table_io.clock import RealClock, local_datetime
 from table_io.records import PrcPoint
 from table_io.units import GRAVITY_M_S2
@@ -18,9 +16,10 @@ from twin.reports import ideal_points
 from twin.reports.finalize import EXIT_INTERRUPTED
 from twin.reports.summary import Json, write_json
 from twin.run.folders import make_run_folder
+from twin.run.progress import make_task_bar
 from twin.run.run_config import RunConfig, read_run_config
 from twin.run.tasks import Workers
-from twin.run.terminal import announce_if_slow, catch_interrupts, console, print_line
+from twin.run.terminal import announce_if_slow, catch_interrupts, print_line
 from twin.run.versions import LIBRARIES
 from twin.run.warm_up import COMPILING_MESSAGE
 from twin.studies import TABLE_FILE
@@ -83,7 +82,7 @@ def _run_cases(
         [case.model for case in cases], [step.frequency_hz for step in steps],
         sweep.one_level_g * GRAVITY_M_S2, sweep.cycles, cores, stop,
     )  # fmt: skip
-    with BatchTable(folder / TABLE_FILE) as table, _make_progress_bar() as bar:
+    with BatchTable(folder / TABLE_FILE) as table, make_task_bar() as bar:
         task = bar.add_task("sweeps", total=len(cases))
         for index, response in sweeps:
             case = cases[index]
@@ -95,13 +94,6 @@ def _run_cases(
             print_line(f"{index + 1:>4}/{len(cases):<4} {case.name}: {format_case(entry)}")
             bar.advance(task)
             yield entry
-
-
-def _make_progress_bar() -> Progress:
-    return Progress(
-        TextColumn("[bold]{task.description}"), BarColumn(bar_width=40), MofNCompleteColumn(),
-        TimeRemainingColumn(), console=console, disable=not console.is_terminal, transient=True,
-    )  # fmt: skip
 
 
 def _case_entry(case: StudyCase, points: tuple[PrcPoint, ...], acceleration: float) -> Json:

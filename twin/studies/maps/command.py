@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import TextColumn
 
 from table_io.clock import RealClock
 from table_io.errors import InputError, require_package
 from twin.reports.finalize import EXIT_INTERRUPTED
 from twin.run.disk import format_size, free_bytes
 from twin.run.folders import claim_folder, make_output_folder
+from twin.run.progress import make_task_bar
 from twin.run.run_config import make_run_id
 from twin.run.tasks import TaskResult, Workers, run_tasks
 from twin.run.terminal import catch_interrupts, console, print_line
@@ -208,11 +209,7 @@ def _run_chunks(
     clock = RealClock()
     started_s = last_line_s = clock.now()
     stored_before, total = manifest.case_count, study.config.case_count
-    with Progress(
-        TextColumn("[bold]{task.description}"), BarColumn(bar_width=40), MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"), TimeRemainingColumn(), console=console,
-        disable=not console.is_terminal, transient=True,
-    ) as bar:  # fmt: skip
+    with make_task_bar(TextColumn("{task.fields[rate]}")) as bar:
         task = bar.add_task("cases", total=total, completed=stored_before, rate="")
         for result in results:
             manifest.add(_require_entry(folder, result))

@@ -6,14 +6,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from table_io.clock import RealClock
 from table_io.errors import InputError, suggest
 from twin.reports.finalize import EXIT_INTERRUPTED
 from twin.run.folders import claim_folder, make_output_folder
+from twin.run.progress import make_task_bar
 from twin.run.tasks import Task, Workers, run_tasks
-from twin.run.terminal import catch_interrupts, console, print_line
+from twin.run.terminal import catch_interrupts, print_line
 from twin.validation.study.baselines import describe_missing
 from twin.validation.study.comparison_tables import CONTROL_TITLES
 from twin.validation.study.controls import CONTROL_CELLS, run_controls
@@ -95,7 +94,7 @@ def _evaluate_cases(
 ) -> Iterator[Json]:
     """Evaluate the pending cases; yield each row after it is written to the file."""
     right_count = 0
-    with _make_progress() as bar:
+    with make_task_bar() as bar:
         task = bar.add_task("cases", total=len(pending))
         for index, result in enumerate(run_tasks(work, pending, workers, stop), 1):
             row = result.value or {"number": result.number, "failed": result.failure}
@@ -171,10 +170,3 @@ def _terminate_last_line(path: Path, file: TextIO) -> None:
     if text and not text.endswith(b"\n"):
         file.write("\n")
         file.flush()
-
-
-def _make_progress() -> Progress:
-    return Progress(
-        TextColumn("[bold]{task.description}"), BarColumn(bar_width=40), MofNCompleteColumn(),
-        TimeRemainingColumn(), console=console, disable=not console.is_terminal, transient=True,
-    )  # fmt: skip
