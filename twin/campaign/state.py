@@ -3,7 +3,6 @@
 import difflib
 import hashlib
 import json
-import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,6 +26,7 @@ from twin.recording.run_paths import PARTS_FOLDER
 from twin.reports import summary as summaries
 from twin.reports.report import write_report
 from twin.reports.summary import Json
+from twin.run.folders import replace_text
 from twin.run.merge_parts import LOCK_FILE as PARTS_LOCK_FILE
 from twin.run.merge_parts import merge_run_parts
 from twin.run.recordings import read_recorded_config
@@ -87,12 +87,7 @@ class CampaignState(ConfigModel):
 
 def write_state(folder: Path, state: CampaignState) -> None:
     """Replace campaign.json atomically: a reader sees the old or the new file, never a part."""
-    new = folder / f"{STATE_FILE}.new"
-    with new.open("w", encoding="utf-8") as file:
-        file.write(state.model_dump_json(indent=1) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-    new.replace(folder / STATE_FILE)
+    replace_text(folder / STATE_FILE, state.model_dump_json(indent=1) + "\n")
 
 
 def read_state(folder: Path) -> CampaignState:

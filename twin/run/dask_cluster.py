@@ -8,7 +8,7 @@ from typing import Any
 from table_io.clock import RealClock
 from table_io.errors import InputError, require_package
 from twin.run.tasks import StopFunction, Task, TaskResult, find_no_problem
-from twin.run.versions import compare_versions, format_version_changes, read_installed_versions
+from twin.run.versions import find_version_problem, read_installed_versions
 
 CONNECT_TIMEOUT_S = 10.0
 POLL_S = 0.2  # period of polling `stop` and the connection
@@ -130,13 +130,6 @@ def _require_equal_workers(client: Any, address: str, find_problem: Callable[[],
 
 
 def find_worker_problem(versions: dict[str, str], find_problem: Callable[[], str]) -> str:
-    """Return why this process cannot work for a client with these versions; "" if it can.
-
-    The processor may differ: it is not a version.
-    """
-    pairs = {
-        name: pair
-        for name, pair in compare_versions(versions).items()
-        if name != "machine" and pair["recorded"] != pair["installed"]
-    }
-    return f"other versions: {format_version_changes(pairs)}" if pairs else find_problem()
+    """Return why this process cannot work for a client with these versions; "" if it can."""
+    changes = find_version_problem(versions, read_installed_versions())
+    return f"other versions: {changes}" if changes else find_problem()

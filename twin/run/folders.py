@@ -1,5 +1,6 @@
-"""Creation of result folders; existing content is never overwritten."""
+"""Result folders, whose content is never overwritten, and state files, replaced as a whole."""
 
+import os
 from itertools import count
 from pathlib import Path
 
@@ -59,6 +60,16 @@ def claim_folder(folder: Path) -> None:
             value=str(folder),
             remedy="give another folder",
         ) from None
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Replace a file atomically: a reader sees the old or the new one, never a part."""
+    new = path.with_name(f"{path.name}.new")
+    with new.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    new.replace(path)
 
 
 def _make_content_error(folder: Path) -> InputError:

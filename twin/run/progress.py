@@ -30,7 +30,6 @@ from table_io.units import GRAVITY_M_S2
 from twin.run.terminal import console
 from twin.transport.codec import Item
 
-
 TABLE_HEADER = (
     f"{'step':>7}  {'direction':<9} {'f [Hz]':>7}  {'level [g]':>9}   "
     f"{'eta_d':>6} {'twin':>6}   {'impacts R/L':>11} {'twin':>7}   {'latency':>8}"

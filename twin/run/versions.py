@@ -1,6 +1,7 @@
 """Versions that affect bitwise reproducibility: libraries, processor, numerics revision."""
 
 import platform
+from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import version
 
@@ -50,6 +51,20 @@ def find_version_changes(recorded: dict[str, str]) -> VersionPairs:
         for name, pair in compare_versions(recorded).items()
         if pair["recorded"] not in (None, pair["installed"])
     }
+
+
+def find_version_problem(recorded: Mapping[str, str], installed: Mapping[str, str]) -> str:
+    """Return how installed versions differ from recorded ones, missing ones too; "" if equal.
+
+    The processor may differ, although the last bits may too.
+    """
+    return format_version_changes(
+        {
+            name: {"recorded": recorded.get(name), "installed": installed.get(name)}
+            for name in sorted({*recorded, *installed} - {"machine"})
+            if recorded.get(name) != installed.get(name)
+        }
+    )
 
 
 def format_version_changes(pairs: VersionPairs) -> str:

@@ -26,8 +26,7 @@ def find_branch_folds(chunk: CaseChunk) -> Mapping[str, npt.NDArray[Any]]:
             return np.full(len(FOLDS.variables), np.nan)
         return np.array([*locate_folds(branches[index]), *find_peaks(branches[index])])
 
-    rows = chunk.collect(describe, (len(FOLDS.variables),))
-    return dict(zip([variable.name for variable in FOLDS.variables], rows.T, strict=True))
+    return chunk.collect_numbers(FOLDS.variables, describe)
 
 
 def locate_folds(branches: Sequence[Branch]) -> tuple[float, float, float]:
@@ -84,8 +83,7 @@ def measure_basins(chunk: CaseChunk) -> Mapping[str, npt.NDArray[Any]]:
             [shares[in_contact].sum(), shares.max(), len(basins.attractors), basins.undecided_share]
         )
 
-    rows = chunk.collect(measure, (len(BASINS.variables),))
-    return dict(zip([variable.name for variable in BASINS.variables], rows.T, strict=True))
+    return chunk.collect_numbers(BASINS.variables, measure)
 
 
 BASIN_DEFAULTS = {

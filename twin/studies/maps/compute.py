@@ -10,15 +10,16 @@ import numpy.typing as npt
 
 from table_io.block import Float2D
 from table_io.errors import InputError
+from twin.run.versions import find_version_problem
 from twin.studies import DEFINITION_FILE
 from twin.studies.maps.cases import SampledCase
 from twin.studies.maps.outcomes import CaseChunk, Outcome, SweepPlan
 from twin.studies.maps.store import (
     Json,
-    find_version_problem,
     hash_arrays,
     open_group,
     read_definition,
+    read_study_versions,
 )
 from twin.studies.maps.study import Study
 
@@ -56,7 +57,6 @@ def compute_outcomes(
 
 def _compute_outcome(outcome: Outcome, chunk: CaseChunk) -> dict[str, npt.NDArray[Any]]:
     """Return the arrays of an outcome, each its own; InputError if it fails or lacks one."""
-    sizes = {"direction": len(chunk.sweep.directions), "frequency_hz": chunk.sweep.grid_hz.size}
     try:
         computed = outcome.compute(chunk)
         arrays = {
@@ -64,7 +64,7 @@ def _compute_outcome(outcome: Outcome, chunk: CaseChunk) -> dict[str, npt.NDArra
             for variable in outcome.variables
         }
         for variable in outcome.variables:
-            shape = (len(chunk.cases), *(sizes[dim] for dim in variable.dims))
+            shape = (len(chunk.cases), *chunk.sweep.find_shape(variable.dims))
             if arrays[variable.name].shape != shape:
                 raise ValueError(f"{variable.name} is {arrays[variable.name].shape}, not {shape}")
     except InputError:
@@ -83,7 +83,7 @@ def _open_study(folder: Path, _: float) -> tuple[Study, Mapping[str, Any]]:
     InputError if this process has other versions than the study.
     """
     definition = read_definition(folder)
-    problem = find_version_problem(definition["versions"])
+    problem = find_version_problem(definition["versions"], read_study_versions())
     if problem:
         raise InputError(f"a worker has other versions than the study: {problem}", where=folder)
     study = Study.from_definition(definition, str(folder))

@@ -5,7 +5,7 @@ Other packages add outcomes through entry points of the group `shaketwin.outcome
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, TypeVar
@@ -54,6 +54,11 @@ class SweepPlan:
         """Directions, each a pass over the whole grid."""
         return tuple(dict.fromkeys(step.direction for step in self.steps))
 
+    def find_shape(self, dims: Sequence[str]) -> Shape:
+        """Return the sizes of dimensions of `CURVE_DIMS`."""
+        sizes = dict(zip(CURVE_DIMS, (len(self.directions), self.grid_hz.size), strict=True))
+        return tuple(sizes[dim] for dim in dims)
+
     def arrange(self, by_step: FloatND) -> FloatND:
         """Return values by step, (..., step), as (..., direction, frequency)."""
         passes = by_step.reshape(*by_step.shape[:-1], len(self.directions), -1)
@@ -90,6 +95,15 @@ class CaseChunk:
         arrays = self.for_each(compute)
         missing = np.full(shape, math.nan)
         return np.stack([missing if array is None else array for array in arrays])
+
+    def collect_numbers(
+        self,
+        variables: Sequence["OutcomeVariable"],
+        compute: Callable[[int, SampledCase], FloatND],
+    ) -> dict[str, FloatND]:
+        """Return the array of each variable, (case,), from a number of each in every case."""
+        rows = self.collect(compute, (len(variables),))
+        return dict(zip([variable.name for variable in variables], rows.T, strict=True))
 
     @cached_property
     def extremes(self) -> FloatND:

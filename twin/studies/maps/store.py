@@ -22,7 +22,8 @@ from table_io.block import Float2D
 from table_io.config.plugins import list_entry_points
 from table_io.errors import InputError
 from twin.model.effects import ENTRY_POINT_GROUP as EFFECT_GROUP
-from twin.run.versions import format_version_changes, read_installed_versions
+from twin.run.folders import replace_text
+from twin.run.versions import find_version_problem, read_installed_versions
 from twin.studies import DEFINITION_FILE
 from twin.studies.maps.outcomes import ENTRY_POINT_GROUP as OUTCOME_GROUP
 from twin.studies.maps.outcomes import SweepPlan
@@ -38,9 +39,8 @@ Json = dict[str, Any]
 
 def estimate_bytes_per_case(study: Study, sweep: SweepPlan) -> int:
     """Return the bytes that a case takes before compression, with its parameters and seed."""
-    sizes = {"direction": len(sweep.directions), "frequency_hz": sweep.grid_hz.size}
     return 8 * (len(study.config.parameters) + 1) + sum(
-        np.dtype(variable.dtype).itemsize * math.prod(sizes[dim] for dim in variable.dims)
+        np.dtype(variable.dtype).itemsize * math.prod(sweep.find_shape(variable.dims))
         for variable in study.variables
     )
 
@@ -60,9 +60,8 @@ def create_store(folder: Path, study: Study, sweep: SweepPlan, values: Float2D) 
     directions = np.array([DIRECTION_VALUES[name] for name in sweep.directions], dtype=np.int8)
     meanings = {"flag_values": [1, -1], "flag_meanings": "forward backward"}
     _add_coordinate(group, "direction", directions, "direction", meanings)
-    sizes = {"direction": directions.size, "frequency_hz": sweep.grid_hz.size}
     for variable in study.variables:
-        shape = tuple(sizes[dim] for dim in variable.dims)
+        shape = sweep.find_shape(variable.dims)
         group.create_array(
             variable.name,
             shape=(count, *shape),
@@ -166,21 +165,6 @@ def read_study_versions() -> dict[str, str]:
     return plugins | own | read_installed_versions()
 
 
-def find_version_problem(versions: Mapping[str, str]) -> str:
-    """Return how the installed versions differ from those of a study; "" if they do not.
-
-    The processor may differ, although its last bits may too.
-    """
-    installed = read_study_versions()
-    return format_version_changes(
-        {
-            name: {"recorded": versions.get(name), "installed": installed.get(name)}
-            for name in sorted({*versions, *installed} - {"machine"})
-            if versions.get(name) != installed.get(name)
-        }
-    )
-
-
 def require_same_study(folder: Path, study: Study) -> None:
     """Raise InputError unless the study in a folder is this one, of the same versions."""
     stored, new = read_definition(folder), make_definition(study)
@@ -189,14 +173,14 @@ def require_same_study(folder: Path, study: Study) -> None:
         ("profile_toml", "test"),
         ("model_toml", "model"),
     ):
-        if stored.get(key) != new[key]:
+        if stored[key] != new[key]:
             raise InputError(
                 f"the {name} has changed since the study was started",
                 where=folder,
                 key="--resume",
                 remedy="restore it, or start a new study in another folder",
             )
-    problem = find_version_problem(stored.get("versions", {}))
+    problem = find_version_problem(stored["versions"], new["versions"])
     if problem:
         raise InputError(
             f"the study was started with other versions: {problem}",
@@ -232,16 +216,6 @@ def remove_unfinished_store(folder: Path) -> None:
     """Remove a store of a process that died before its study began; nothing is in it."""
     if {path.name for path in folder.glob("*")} == {RESULTS_FOLDER}:
         shutil.rmtree(folder / RESULTS_FOLDER)
-
-
-def replace_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
-    partial = path.with_suffix(path.suffix + ".new")
-    with partial.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
 
 
 class Manifest:

@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from table_io.records import NormalizedResponse
 from twin.compare.curves import FloatND, Hysteresis, PrcJump
+from twin.studies.maps.cases import SampledCase
 from twin.studies.maps.outcomes import CURVE_DIMS, CaseChunk, Outcome, OutcomeVariable
 
 Arrays = Mapping[str, npt.NDArray[Any]]
@@ -66,20 +67,21 @@ def find_sweep_forces(chunk: CaseChunk) -> Arrays:
 def find_sweep_hysteresis(chunk: CaseChunk) -> Arrays:
     """Return the widest hysteresis of each kind, and its jumps."""
 
-    def describe(jumps: list[PrcJump], intervals: list[Hysteresis]) -> list[float]:
+    is_unknown: list[bool] = np.all(np.isnan(chunk.ratios["eta_d"]), axis=-1).tolist()
+
+    def describe(index: int, _: SampledCase) -> FloatND:
+        jumps, intervals = chunk.hysteresis[index]
         right, left = (_find_widest(intervals, kind) for kind in ("right", "left"))
-        return [
+        numbers = [
             right.to_hz - right.from_hz if right else 0.0,
             left.to_hz - left.from_hz if left else 0.0,
             _find_jump(jumps, "forward", right.to_hz) if right else np.nan,
             _find_jump(jumps, "backward", right.from_hz) if right else np.nan,
             float(len(jumps)),
         ]
+        return np.full(len(numbers), np.nan) if is_unknown[index] else np.array(numbers)
 
-    rows = np.array([describe(*entry) for entry in chunk.hysteresis])
-    rows[np.isnan(chunk.ratios["eta_d"]).all(axis=-1)] = np.nan
-    names = [variable.name for variable in HYSTERESIS.variables]
-    return dict(zip(names, rows.T, strict=True))
+    return chunk.collect_numbers(HYSTERESIS.variables, describe)
 
 
 def _find_widest(intervals: list[Hysteresis], kind: str) -> Hysteresis | None:

@@ -4,7 +4,6 @@ Each case is a blind recording of the simulated table, whose plant has the effec
 model with its own laws; discovery starts from the plain model. The test is that of the blind study.
 """
 
-import hashlib
 import math
 import tempfile
 from collections.abc import Mapping
@@ -14,20 +13,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from table_io.backends import open_backend
-from table_io.clock import ManualClock
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from table_io.sim.ground_truth import EFFECT_DEFINITIONS, EffectDefinition
 from twin.compare.curves import FloatND
 from twin.model.model import EffectInstance
-from twin.recording.mcap_log import write_items
-from twin.run.run_config import from_texts
 from twin.studies.maps.cases import SampledCase
 from twin.studies.maps.outcomes import CaseChunk, Outcome, OutcomeVariable
 from twin.validation.study.adapter import run_discovery
-from twin.validation.study.generation import play_unprotected
-from twin.validation.study.rig_setup import MODEL_TOML, PROFILE_TOML, make_rig_toml
+from twin.validation.study.generation import hash_truth, record_test
+from twin.validation.study.rig_setup import MODEL_TOML, make_rig_toml
 
 NOISE = "discovery.noise"
 DEFAULT_NOISE = 0.01  # of the rms of each channel
@@ -39,8 +34,7 @@ def judge_chunk(chunk: CaseChunk) -> Mapping[str, npt.NDArray[Any]]:
     def judge(index: int, case: SampledCase) -> FloatND:
         return judge_case(case, chunk.seeds[index])
 
-    rows = chunk.collect(judge, (len(DISCOVERY.variables),))
-    return dict(zip([variable.name for variable in DISCOVERY.variables], rows.T, strict=True))
+    return chunk.collect_numbers(DISCOVERY.variables, judge)
 
 
 def judge_case(case: SampledCase, seed: int) -> FloatND:
@@ -77,12 +71,8 @@ def record_case(case: SampledCase, seed: int, folder: Path) -> None:
     truth = folder / "truth.toml"
     truth.write_text(text, encoding="utf-8")
     noise = case.settings.get(NOISE, DEFAULT_NOISE)
-    digest = hashlib.sha256(text.encode()).hexdigest()
-    rig = make_rig_toml(noise, seed % 2**31, str(truth), digest)
-    config = from_texts("case", PROFILE_TOML, rig, MODEL_TOML, "case of a study")
-    backend = open_backend(config.rig, config.profile, ManualClock())
-    start, *rest = play_unprotected(config, backend, config.make_start_factory("case", "table"))
-    write_items(folder / "log.mcap", [start, *rest], start)  # type: ignore[arg-type]
+    rig = make_rig_toml(noise, seed % 2**31, str(truth), hash_truth(text))
+    record_test(rig, "case", folder / "log.mcap", is_protected=False)
     (folder / "model.toml").write_text(MODEL_TOML, encoding="utf-8")
 
 

@@ -111,7 +111,10 @@ def generate_case(case: Case, root: Path) -> CasePaths:
     truth_path.write_text(text, encoding="utf-8")
     outcome = f"not played: the effect reaches size {residual.size:.3g}"
     if case.cell.accepts(residual.size):
-        stop = _record_case(case, paths, truth_path.resolve(), _sha256(text))
+        rig = make_rig_toml(
+            case.cell.noise, case.noise_seed, str(truth_path.resolve()), hash_truth(text)
+        )
+        stop = record_test(rig, case.label, paths.log, not case.imperfections)
         outcome = stop.verdict if stop.verdict == "complete" else f"{stop.verdict}: {stop.reason}"
     (paths.case_dir / "profile.toml").write_text(PROFILE_TOML, encoding="utf-8")
     (paths.case_dir / "model.toml").write_text(MODEL_TOML, encoding="utf-8")
@@ -132,7 +135,7 @@ def generate_case(case: Case, root: Path) -> CasePaths:
         ],
     }
     if case.imperfections:
-        about["laboratory"] = _describe_laboratory(case, truth_path, _sha256(text))
+        about["laboratory"] = _describe_laboratory(case, truth_path, hash_truth(text))
     paths.about.write_text(json.dumps(about, indent=1), encoding="utf-8")
     return paths
 
@@ -255,22 +258,21 @@ def simulate_truth(
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "truth.toml"
         path.write_text(text, encoding="utf-8")
-        return simulate_signals(make_rig_toml(0.0, truth=str(path), sha256=_sha256(text)))
+        return simulate_signals(make_rig_toml(0.0, truth=str(path), sha256=hash_truth(text)))
 
 
-def _record_case(case: Case, paths: CasePaths, truth_path: Path, sha256: str) -> RunStop:
-    """Record a session of the case; return its final record."""
-    rig = make_rig_toml(case.cell.noise, case.noise_seed, str(truth_path), sha256)
-    bundle = from_texts("case", PROFILE_TOML, rig, MODEL_TOML, f"case {case.label}")
+def record_test(rig: str, label: str, log: Path, is_protected: bool) -> RunStop:
+    """Record the study's test on the machine of a rig config; return its final record."""
+    bundle = from_texts("case", PROFILE_TOML, rig, MODEL_TOML, f"case {label}")
     clock = ManualClock()
     backend = open_backend(bundle.rig, bundle.profile, clock)
-    make_start = bundle.make_start_factory(case.label, "table")
-    if case.imperfections:
-        start, *rest = play_unprotected(bundle, backend, make_start)
-    else:
+    make_start = bundle.make_start_factory(label, "table")
+    if is_protected:
         start, *rest = run_session(bundle.session_setup, backend, clock, make_start, lambda: None)
+    else:
+        start, *rest = play_unprotected(bundle, backend, make_start)
     assert not isinstance(start, RunStop)
-    write_items(paths.log, [start, *rest], start)  # type: ignore[arg-type]
+    write_items(log, [start, *rest], start)  # type: ignore[arg-type]
     stop = rest[-1]
     assert isinstance(stop, RunStop)
     return stop
@@ -307,5 +309,6 @@ def _round_values(values: dict[str, float]) -> dict[str, float]:
     }
 
 
-def _sha256(text: str) -> str:
+def hash_truth(text: str) -> str:
+    """Return the SHA-256 by which a recording seals its truth."""
     return hashlib.sha256(text.encode()).hexdigest()
