@@ -198,7 +198,7 @@ def test_a_model_with_every_effect_has_all_coordinates():
 
 def test_drifting_gaps_are_refused():
     drifting = find_effect("gap_drift")
-    with raises_input_error(key="rate", where="effect 'gap_drift'", allowed="0"):
+    with raises_input_error(where="effect 'gap_drift'", remedy="remove"):
         make_period_map(having(drifting))
 
 

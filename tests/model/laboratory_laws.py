@@ -153,7 +153,74 @@ SMOOTH_FRICTION = Effect(
     confused_with=("coulomb_friction",),
     force=smooth_friction,
 )
+
+
+def carried_force(a, c):
+    return c[0] * a
+
+
+CARRIED_MASS = Effect(
+    id="carried_mass",
+    term="m A on the left side, m a mass that does not move with the specimen",
+    parameters=(EffectParameter("mass", "kg", 0.0, 1e3, 0.0, 50.0, "m."),),
+    acts="force",
+    residual="Force in phase with the table's acceleration.",
+    confused_with=("mass_error",),
+    force=carried_force,
+)
+
+
+def pulling_force(t, c):
+    return c[0] * t
+
+
+PULLING_CABLE = Effect(
+    id="pulling_cable",
+    term="F' t",
+    parameters=(EffectParameter("rate", "N/s", -1e3, 1e3, 0.0, 40.0, "F'."),),
+    acts="force",
+    residual="A static force that grows.",
+    confused_with=("sensor_offset",),
+    force=pulling_force,
+)
+
+
+def dragged_force(s, c):
+    return c[0] * s[0]
+
+
+def table_rate(a):
+    return (a,)
+
+
+DRAGGED_FLOOR = Effect(
+    id="dragged_floor",
+    term="c times the velocity of the table",
+    parameters=(EffectParameter("damping", "N s/m", 0.0, 1e5, 0.0, 900.0, "c."),),
+    acts="force",
+    residual="Force in phase with the table's velocity.",
+    confused_with=("table_tilt",),
+    states=("table_velocity",),
+    force=dragged_force,
+    rates=table_rate,
+)
+
+
+def ageing_push(q, t, c):
+    return c[0] * t * q
+
+
+AGEING_BUMPER = Effect(
+    id="ageing_bumper",
+    term="k' t u_j in each bumper",
+    parameters=(EffectParameter("rate", "N/m/s", 0.0, 1e7, 0.0, 1e5, "k'."),),
+    acts="force",
+    place="bumpers",
+    residual="In contact only: a stiffness that grows with time.",
+    confused_with=("gap_drift",),
+    force=ageing_push,
+)
 EFFECTS = (
     CUBIC_BUMPER, ZENER_DAMPER, ZENER_BUMPER, SLIP_DAMPER, HARD_RIGHT, HARD_LEFT, DEEP_DASHPOT,
-    ROCKING, SMOOTH_FRICTION,
+    ROCKING, SMOOTH_FRICTION, CARRIED_MASS, PULLING_CABLE, DRAGGED_FLOOR, AGEING_BUMPER,
 )  # fmt: skip

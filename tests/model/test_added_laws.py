@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.integrate import cumulative_trapezoid
 
 from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
@@ -16,6 +17,8 @@ from tests.model.cases import RATE_HZ, drive, noisy, typical
 from tests.model.motion import sine
 from tests.model.reference import snm
 from tests.plugin_package import install_package
+from twin.dynamics.period_map import make_period_map
+from twin.dynamics.stroboscopic import OperatingPoint, make_stroboscopic_map
 from twin.identification.discover import discover_effects
 from twin.identification.parameters import EffectKey
 from twin.model.effects import find_effect, load_plugins
@@ -88,9 +91,9 @@ class TestInstalled:
         )[1][:5]
         time = np.arange(1, u.size + 1) / RATE_HZ
         contact = np.array([right > 0, left < 0]).astype(np.int8)
-        expected = forces_along(own, u, v, time, contact)
-        forces = forces_along(added, u, v, time, contact)
-        plain = forces_along(SNM, u, v, time, contact)
+        expected = forces_along(own, u, v, 0 * u, time, contact)
+        forces = forces_along(added, u, v, 0 * u, time, contact)
+        plain = forces_along(SNM, u, v, 0 * u, time, contact)
         row = 0 if ours in ("maxwell_damper", "bouc_wen") else 1
         effect_size = np.abs(plain - expected)[row].max()
         assert np.abs(forces - expected)[row].max() < 0.02 * effect_size
@@ -126,10 +129,70 @@ class TestInstalled:
         stored = force**2 / (2 * values["stiffness"])
         assert (work - stored > -0.01 * work.max()).all()
 
+    @pytest.mark.parametrize(
+        ("effect", "values", "added"),
+        [
+            ("carried_mass", {"mass": 60.0}, lambda base, time: 60.0 * base),
+            ("pulling_cable", {"rate": 80.0}, lambda base, time: 80.0 * time),
+            (
+                "dragged_floor", {"damping": 900.0},
+                lambda base, time: 900.0 * cumulative_trapezoid(base, time, initial=0.0),
+            ),
+        ],
+    )  # fmt: skip
+    def test_a_law_of_base_acceleration_and_time_is_a_force_of_that_history(
+        self, effect, values, added
+    ):
+        """Along with the forces on the same motion: M a + D + F_R + F_L = 0."""
+        p, time = snm(), np.arange(KICK.size + 1) / RATE_HZ
+        model = Model(p).with_effect(effect, "", **values)
+        force = added(np.concatenate([[0.0], KICK]), time)[1:]
+        expected = drive(Model(p), KICK + force / p.mass)[1]
+        out = drive(model, KICK)[1]
+        assert np.abs(out[0] - expected[0]).max() < 1e-6 * np.abs(expected[0]).max()
+        assert np.abs(drive(Model(p), KICK)[1][0] - expected[0]).max() > 1e-2 * np.abs(out[0]).max()
+        contact = np.array([out[3] > 0, out[4] < 0]).astype(np.int8)
+        damper, right, left = forces_along(model, out[0], out[1], KICK, time[1:], contact)
+        balance = p.mass * out[2] + damper + right + left
+        assert np.abs(balance).max() < 1e-3 * np.abs(force).max()
+
+    def test_time_is_that_of_the_run_after_a_restart(self):
+        model = add("pulling_cable", rate=80.0).with_effect("ageing_bumper", rate=1e6)
+        solver, whole = model.prepare(RATE_HZ), np.empty((7, KICK.size))
+        state, half = solver.rest_state(), KICK.size // 2
+        solver.advance(state, KICK[:half], 0.01 * KICK[:half], whole[:, :half])
+        u, v, _, right, left, u_r, u_l = whole[:, half - 1]
+        start = StateEstimate(half, u, v, u_r, u_l, right > 0, left < 0, KICK[half - 1])
+        restarted = solver.restart_state(start)
+        parts = [np.empty((7, half)) for _ in range(2)]
+        for at, part in zip((state, restarted), parts, strict=True):
+            solver.advance(at, KICK[half:], 0.01 * KICK[half:], part)
+        assert np.abs(parts[1][0] - parts[0][0]).max() < 1e-9
+
+    def test_a_law_of_time_moves_the_equilibrium_and_has_no_steady_state(self):
+        model = add("pulling_cable", rate=80.0)
+        solver = model.prepare(RATE_HZ)
+        assert solver.rest_state(0)[0] == 0.0
+        expected = -80.0 * 0.5 / model.parameters.stiffness
+        assert solver.rest_state(round(0.5 * RATE_HZ))[0] == pytest.approx(expected, rel=1e-12)
+        for make in (make_period_map, lambda m: make_stroboscopic_map(OperatingPoint(m, 3.0, 0.5))):
+            with pytest.raises(InputError) as error:
+                make(model)
+            assert "pulling_cable" in error.value.where
+
+    def test_an_ageing_bumper_pushes_as_it_says(self):
+        p = snm()
+        out = drive(add("ageing_bumper", rate=1e6), KICK)[1]
+        time, inside = np.arange(1, KICK.size + 1) / RATE_HZ, out[3] > 0
+        d = out[0, inside] - p.gap_r
+        push = (p.bumper_stiffness_r + 1e6 * time[inside]) * d + p.bumper_damping_r * out[1, inside]
+        assert inside.sum() > 100
+        assert out[3, inside] == pytest.approx(push, rel=1e-9)
+
     @pytest.mark.parametrize("size", [1, 7, 64, 500])
     def test_blocks_of_any_size_give_the_same_bits(self, size):
         model = add("zener_bumper").with_effect("slip_damper", force=100.0, yield_displacement=1e-3)
-        model = model.with_effect("cubic_bumper", k3=1e10)
+        model = model.with_effect("cubic_bumper", k3=1e10).with_effect("ageing_bumper", rate=1e6)
         whole, out = drive(model, KICK)
         solver, cut = model.prepare(RATE_HZ), np.empty_like(out)
         state = solver.rest_state()
@@ -183,6 +246,7 @@ LAW = laboratory_laws.ZENER_BUMPER
         (replace(LAW, rates=lambda q, w, s, c: (0.0, 0.0)), "2 values for 1 states"),
         (replace(LAW, force=lambda q, w, s, c: w * abs(w)), "linear in the rate"),
         (replace(LAW, force=lambda q, w, s, c: 5.0), "zero at deformation 0"),
+        (replace(LAW, force=lambda q, w, z, c: 0.0), "argument 'z'"),
         (replace(LAW, force=lambda q, w, s, c: s[3]), "IndexError"),
         (replace(LAW, force=lambda q, w, s, c: float("nan")), "not finite"),
     ],

@@ -27,7 +27,7 @@ def test_the_forces_are_those_that_the_motion_was_made_with(model: Model) -> Non
     u, v, _, right, left = out[:5]
     time = np.arange(1, u.size + 1) / RATE_HZ
     touched = np.array([right > 0.0, left < 0.0]).astype(np.int8)
-    forces = forces_along(model, u, v, time, touched)
+    forces = forces_along(model, u, v, base, time, touched)
     for side, (expected, measured) in enumerate(zip((right, left), touched, strict=True)):
         inside = (measured > 0) & (np.roll(measured, 1) > 0)  # a touch falls between two samples
         assert inside.sum() > 200

@@ -27,8 +27,8 @@ from twin.model.solver import StateEstimate
 G4 = Specimen(mass_kg=550.0, gap_mm=4.0)
 
 
-def quintic(u: float, v: float, c: tuple[float, ...]) -> float:
-    return c[0] * u**5 + c[1] * v * u * u
+def quintic(q: float, w: float, c: tuple[float, ...]) -> float:
+    return c[0] * q**5 + c[1] * w * q * q
 
 
 QUINTIC = Effect(
@@ -45,8 +45,8 @@ QUINTIC = Effect(
 )
 
 
-def cube(u: float, v: float, c: tuple[float, ...]) -> float:
-    return c[0] * u * u * u
+def cube(q: float, c: tuple[float, ...]) -> float:
+    return c[0] * q * q * q
 
 
 def install_effects(monkeypatch, *effects):

@@ -270,7 +270,9 @@ def test_measured_less_what_is_left_is_the_models_force(every: dict[str, Discove
     )
     m = sheet.motion()
     model_at_log = guess.model_for_log(0, m)
-    damper, right, left = forces_along(model_at_log, m.u, m.v, m.time_s, sheet.contact_state)
+    damper, right, left = forces_along(
+        model_at_log, m.u, m.v, m.table_acc, m.time_s, sheet.contact_state
+    )
     measured = measured_forces(sheet, guess)
     for row, model in enumerate((damper, right, -left)):
         away = entries_to_samples(sheet, row, sheet.evaluate(guess), guess)

@@ -197,7 +197,7 @@ def test_a_plug_in_effect_is_played_like_any_other(
 ) -> None:
     number = EffectParameter("k3", "N/m3", 0.0, 1e10, 0.0, 1e6, "")
     cubic = Effect("my_cubic", "k3 u^3", (number,), "force", "", (),
-                   force=lambda u, v, c: c[0] * u * u * u)  # fmt: skip
+                   force=lambda q, w, c: c[0] * q * q * q)  # fmt: skip
 
     @dataclass
     class Entry:

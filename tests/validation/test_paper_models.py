@@ -121,7 +121,7 @@ def test_a_model_whose_gaps_move_has_no_steady_motion(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(command, "write_comparison", lambda *_: None)
-    with raises_input_error(remedy="effect", problem="'gap_drift'"):
+    with raises_input_error(remedy="effect", where="effect 'gap_drift'"):
         command.compare_with_paper(tmp_path / "out", [], card(tmp_path, "gap_drift", "rate = 1e-6"))
     assert not (tmp_path / "out").exists()
     with raises_input_error(where="--model snn", remedy="'snm'"):

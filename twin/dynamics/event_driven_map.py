@@ -21,7 +21,6 @@ import numpy as np
 import numpy.typing as npt
 
 from table_io.block import Float1D, Float2D
-from table_io.errors import InputError
 from twin.dynamics.event_driven_kernel import advance_periods
 from twin.dynamics.period_map import (
     FREQUENCY,
@@ -99,16 +98,7 @@ class EventDrivenMap:
     model: Model
 
     def __post_init__(self) -> None:
-        rate = self.model.effect_parameter("gap_drift", "rate")
-        if rate:
-            raise InputError(
-                "a model whose gaps drift has no periodic motion",
-                where="effect 'gap_drift'",
-                key="rate",
-                value=rate,
-                allowed="0 m/s",
-                remedy="remove the effect, or study the gap as a parameter",
-            )
+        self.model.require_steady_state()
 
     @cached_property
     def _kernel(self) -> tuple[Coefficients, AddedLaws | None]:
@@ -170,7 +160,7 @@ class EventDrivenMap:
                 # The rates of a law may saturate: those of a small motion, scaled up.
                 small = SMALL_MOTION_M / u
                 rates = evaluate_law(effect, values)[1](
-                    small * u, small * v, (0.0,) * len(effect.states)
+                    small * u, small * v, 0.0, 0.0, (0.0,) * len(effect.states)
                 )
                 for _ in PLACES[effect.place]:
                     sizes[index : index + len(rates)] = np.abs(rates) / (small * w)
@@ -375,4 +365,6 @@ def has_dashpot(effect: Effect, values: Mapping[str, float]) -> bool:
     """Return whether a law in a bumper delays the recovery of its face: by rate or by states."""
     force, _ = evaluate_law(effect, values)
     d, relaxed = SMALL_MOTION_M, (0.0,) * len(effect.states)
-    return bool(effect.states) or force(d, 1.0, relaxed) != force(d, 0.0, relaxed)
+    return bool(effect.states) or force(d, 1.0, 0.0, 0.0, relaxed) != force(
+        d, 0.0, 0.0, 0.0, relaxed
+    )

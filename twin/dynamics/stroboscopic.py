@@ -11,7 +11,6 @@ from typing import Protocol
 import numpy as np
 
 from table_io.block import Float1D, Float2D, Int1D
-from table_io.errors import InputError
 from twin.dynamics.period_map import (
     FREQUENCY,
     LEVEL,
@@ -125,12 +124,7 @@ def make_stroboscopic_map(point: OperatingPoint) -> StroboscopicMap:
     """Return the stroboscopic map of a model at a drive; InputError if it has no steady state."""
     validate_frequencies([point.frequency_hz], point.acceleration_m_s2, 1)
     model = point.model
-    if model.effect_parameter("gap_drift", "rate"):
-        raise InputError(
-            "a model whose gaps drift has no steady state",
-            where="effect 'gap_drift'",
-            remedy="remove the effect",
-        )
+    model.require_steady_state()
     if model.changes_only_parameters:
         return ClosedFormMap(model, point.frequency_hz, point.acceleration_m_s2)
     return SampledMap(model, point.frequency_hz, point.acceleration_m_s2)

@@ -178,7 +178,9 @@ class LogResiduals:
         recent = np.concatenate([np.zeros(margin), np.ones(margin + 1)])
         contact = self.contact_state
         if (contact < 0).any():  # without load cells, as the model expects
-            forces = forces_along(self.reference_for(m), m.u, m.v, m.time_s, contact)[1:]
+            forces = forces_along(self.reference_for(m), m.u, m.v, m.table_acc, m.time_s, contact)[
+                1:
+            ]
             contact = np.array([forces[0] > 0, forces[1] < 0], dtype=np.int8)
         change = np.abs(np.diff(contact, axis=1, prepend=contact[:, :1])).any(axis=0)
         smooth = np.convolve(change, window, "same") == 0
@@ -453,11 +455,13 @@ class LogResiduals:
         """Return D, F_R >= 0 and F_L <= 0 of a model in N, (3, used)."""
         zero_error = parameters.tare_error(self.log_number, "u")
         if self._knows_contact and not depends_on_history(model):
-            m = sampled.m
-            return forces_along(model, m.u - zero_error, m.v, m.time_s, sampled.contact)
-        m = sampled.whole
-        forces = forces_along(model, m.u - zero_error, m.v, m.time_s, self.contact_state)
-        return forces[:, sampled.samples]
+            m, contact = sampled.m, sampled.contact
+        else:
+            m, contact = sampled.whole, self.contact_state
+        added = model.added_acceleration(m.table_disp)
+        base_acc = m.table_acc if added is None else m.table_acc + added
+        forces = forces_along(model, m.u - zero_error, m.v, base_acc, m.time_s, contact)
+        return forces if m is sampled.m else forces[:, sampled.samples]
 
     @cached_property
     def _knows_contact(self) -> bool:

@@ -1,8 +1,8 @@
 """Laws that effects bring themselves (`Effect.force`), compiled for the solver.
 
 The solver knows the laws of this package by their coefficients. All others become one compiled
-function of (place, deformation, rate, states, coefficients), so that the solver itself is compiled
-and cached only once, whatever effects a model has.
+function of (place, deformation, rate, base acceleration, time, states, coefficients), so that the
+solver itself is compiled and cached only once, whatever effects a model has.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from numba.core.errors import NumbaError
 from table_io.compilation import jit_kernel
 from table_io.errors import InputError
 from twin.model.effects.effect import Effect
-from twin.model.effects.law import PLACES
+from twin.model.effects.law import PLACES, list_arguments, take_all_arguments
 from twin.model.force_laws import (
     ADDED_LAWS_SIGNATURE,
     LAW_PARAMETERS,
@@ -67,23 +67,27 @@ def compile_laws(effects: tuple[Effect, ...]) -> AddedLaws | None:
 
 
 def _compile_law(effect: Effect) -> tuple[Any, Any]:
-    """Return force and rates of a law, both compiled functions of (q, w, s, c)."""
-    assert effect.force is not None
-    force = jit_kernel()(effect.force)
-    if effect.rates is None:
-        return jit_kernel()(lambda q, w, s, c: force(q, w, c)), _no_rates
-    return force, jit_kernel()(effect.rates)
+    """Return force and rates of a law, both compiled functions of `LAW_ARGUMENTS`."""
+
+    def compile_function(function: Any) -> Any:
+        names = list_arguments(function)
+        return jit_kernel()(take_all_arguments(jit_kernel()(function), names))
+
+    rates = _no_rates if effect.rates is None else compile_function(effect.rates)
+    return compile_function(effect.force), rates
 
 
 @jit_kernel()
 def _no_laws(
-    place: int, q: float, w: float, s: tuple[float, ...], c: tuple[float, ...]
+    place: int, q: float, w: float, a: float, t: float, s: tuple[float, ...], c: tuple[float, ...]
 ) -> tuple[float, ...]:
     return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @jit_kernel()
-def _no_rates(q: float, w: float, s: tuple[float, ...], c: tuple[float, ...]) -> tuple[float, ...]:
+def _no_rates(
+    q: float, w: float, a: float, t: float, s: tuple[float, ...], c: tuple[float, ...]
+) -> tuple[float, ...]:
     return (0.0,)
 
 
@@ -100,8 +104,8 @@ def _add_law(
     p, n = first_parameter, first_state
     P, S = LAW_PARAMETERS, LAW_STATES
 
-    def laws(place, q, w, s, c):  # type: ignore[no-untyped-def]
-        total = before(place, q, w, s, c)
+    def laws(place, q, w, a, t, s, c):  # type: ignore[no-untyped-def]
+        total = before(place, q, w, a, t, s, c)
         if place != own_place:
             return total
         # Numba unpacks no tuples: all states and parameters in turn, from the law's own on.
@@ -113,9 +117,9 @@ def _add_law(
             c[p % P], c[(p + 1) % P], c[(p + 2) % P], c[(p + 3) % P], c[(p + 4) % P],
             c[(p + 5) % P], c[(p + 6) % P], c[(p + 7) % P],
         )  # fmt: skip
-        own = rates(q, w, own_s, own_c)
+        own = rates(q, w, a, t, own_s, own_c)
         return (
-            total[0] + force(q, w, own_s, own_c),
+            total[0] + force(q, w, a, t, own_s, own_c),
             total[1] + _rate_of(own, -n), total[2] + _rate_of(own, 1 - n),
             total[3] + _rate_of(own, 2 - n), total[4] + _rate_of(own, 3 - n),
             total[5] + _rate_of(own, 4 - n), total[6] + _rate_of(own, 5 - n),

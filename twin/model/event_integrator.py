@@ -24,7 +24,14 @@ from twin.model.event_integrator_kernel import (
     integrate_samples,
 )
 from twin.model.event_location import LINEAR_SIZE
-from twin.model.force_laws import NO_WALL_M, RELAXED, AddedLaws, Coefficients, add_law_force
+from twin.model.force_laws import (
+    NO_STATES,
+    NO_WALL_M,
+    AddedLaws,
+    Coefficients,
+    LawInputs,
+    add_law_force,
+)
 from twin.model.parameters import Parameters
 from twin.model.solver import StateEstimate
 
@@ -63,7 +70,8 @@ class EventDrivenSolver:
         linear_state = closed_form.rest_state(p)
         u, coefficients = float(linear_state[0]), self.coefficients
         if coefficients.k3 or coefficients.k2 or self.laws:
-            u = equilibrium_disp(p, u, coefficients, self.laws)
+            time_s = index * coefficients.period
+            u = equilibrium_disp(p, u, coefficients, self.laws, time_s)
         state = self._blank_state(index)
         state[:6] = linear_state[:6]
         state[0] = u
@@ -240,26 +248,30 @@ def _generator_matrix(p: Coefficients, mode: int) -> Float2D:
 
 
 def equilibrium_disp(
-    p: Parameters, linear_disp: float, coefficients: Coefficients, laws: AddedLaws | None
+    p: Parameters,
+    linear_disp: float,
+    coefficients: Coefficients,
+    laws: AddedLaws | None,
+    time_s: float,
 ) -> float:
-    """Return u in m where the springs balance: `linear_disp` if it already does.
+    """Return u in m where the springs balance at a time: `linear_disp` if it already does.
 
     Bisection on a force that grows with u; k3 < 0 softens it less than the bumpers stiffen it.
     """
-    k3, k2 = coefficients.k3, coefficients.k2
+    k3, k2, relaxed = coefficients.k3, coefficients.k2, LawInputs(NO_STATES, 0.0, time_s)
 
     def push(side: int, d: float, k: float) -> float:
         if d <= 0:
             return 0.0
         return add_law_force(
-            k * d + bumper_hardening.force(d, k2), side, d, 0.0, RELAXED, coefficients, laws
+            k * d + bumper_hardening.force(d, k2), side, d, 0.0, relaxed, coefficients, laws
         )
 
     def force(u: float) -> float:
         right = push(0, u - p.gap_r, p.bumper_stiffness_r)
         left = push(1, -u - p.gap_l, p.bumper_stiffness_l)
         damper = p.stiffness * u + cubic_stiffness.force(u, k3)
-        damper = add_law_force(damper, DAMPER, u, 0.0, RELAXED, coefficients, laws)
+        damper = add_law_force(damper, DAMPER, u, 0.0, relaxed, coefficients, laws)
         return damper + right - left
 
     if force(linear_disp) == 0.0:

@@ -29,7 +29,7 @@ from twin.model.force_laws import (
     LAW_STATES,
     AddedLaws,
     Coefficients,
-    LawStates,
+    LawInputs,
     Motion,
     Start,
     bumper_coefficients,
@@ -37,6 +37,7 @@ from twin.model.force_laws import (
     bumper_deformation,
     bumper_force,
     hysteretic_variable,
+    set_drive,
     static_friction,
 )
 from twin.model.solver import OUTPUT_COUNT
@@ -109,28 +110,31 @@ def flush_value(value: float) -> float:
 
 
 @jit_helper_unless_none("s", lambda s: None)
-def flush_states(s: Any) -> LawStates:
-    """Return the states of added laws, zero where decayed."""
-    return (
-        flush_value(s[0]), flush_value(s[1]), flush_value(s[2]), flush_value(s[3]),
-        flush_value(s[4]), flush_value(s[5]),
+def flush_states(s: Any) -> LawInputs | None:
+    """Return the inputs of added laws, their states zero where decayed."""
+    states, base, time = s
+    states = (
+        flush_value(states[0]), flush_value(states[1]), flush_value(states[2]),
+        flush_value(states[3]), flush_value(states[4]), flush_value(states[5]),
     )  # fmt: skip
+    return LawInputs(states, base, time)
 
 
 @jit_helper_unless_none("laws", lambda state, laws: None)
-def read_states(state: Float1D, laws: Any) -> LawStates:
-    """Return the states of added laws in a state."""
-    return (
+def read_states(state: Float1D, laws: Any) -> LawInputs | None:
+    """Return the inputs of added laws with their states in a state, before `set_start`."""
+    states = (
         state[STATE_S], state[STATE_S + 1], state[STATE_S + 2], state[STATE_S + 3],
         state[STATE_S + 4], state[STATE_S + 5],
     )  # fmt: skip
+    return LawInputs(states, state[STATE_BASE], 0.0)
 
 
 @jit_helper_unless_none("s", lambda state, s: None)
 def write_states(state: Float1D, s: Any) -> None:
     """Write the states of added laws into a state."""
     for index in range(LAW_STATES):
-        state[STATE_S + index] = s[index]
+        state[STATE_S + index] = s.states[index]
 
 
 @jit_helper_unless_none("events", lambda events, t, guard, start: None)
@@ -184,7 +188,7 @@ def set_start(
     u, v, u_r, u_l, f, b_r, b_l, s = x
     u_r = u - gap_r if start.mode & 1 else u_r
     u_l = u + gap_l if start.mode & 2 else u_l
-    x = Motion(u, v, u_r, u_l, f, b_r, b_l, s)
+    x = Motion(u, v, u_r, u_l, f, b_r, b_l, set_drive(s, base, time))
     return x, Start(u, start.z, gap_r, gap_l, base, slope, start.mode, start.direction)
 
 

@@ -18,7 +18,8 @@ from twin.model.force_laws import (
     Coefficients,
     Motion,
     Start,
-    add_scaled_states,
+    add_law_force,
+    add_scaled_inputs,
     bumper_coefficients,
     bumper_deformation,
     bumper_force,
@@ -41,7 +42,7 @@ def add_scaled(x: Motion, h: float, k: Motion) -> Motion:
     """Return x + h k."""
     return Motion(
         x.u + h * k.u, x.v + h * k.v, x.u_r + h * k.u_r, x.u_l + h * k.u_l, x.f + h * k.f,
-        x.b_r + h * k.b_r, x.b_l + h * k.b_l, add_scaled_states(x.s, h, k.s),
+        x.b_r + h * k.b_r, x.b_l + h * k.b_l, add_scaled_inputs(x.s, h, k.s),
     )  # fmt: skip
 
 
@@ -160,9 +161,10 @@ def add_law_slope(
 ) -> float:  # fmt: skip
     """Return `slope` plus d/dt in N/s of the added laws' push: central difference in time."""
     h = LAW_SLOPE_STEP_S
-    after = laws(side, d + h * dd, dd + h * d2d, add_scaled_states(s, h, s_rates), p.laws)[0]
-    before = laws(side, d - h * dd, dd - h * d2d, add_scaled_states(s, -h, s_rates), p.laws)[0]
-    return slope + (after - before) / (2.0 * h)
+    after, before = add_scaled_inputs(s, h, s_rates), add_scaled_inputs(s, -h, s_rates)
+    rise = add_law_force(0.0, side, d + h * dd, dd + h * d2d, after, p, laws)
+    rise -= add_law_force(0.0, side, d - h * dd, dd - h * d2d, before, p, laws)
+    return slope + rise / (2.0 * h)
 
 
 @jit_helper(inlined=True)

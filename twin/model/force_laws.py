@@ -28,16 +28,19 @@ from twin.model.effects import (
 from twin.model.effects.law import DAMPER
 
 LAW_PARAMETERS, LAW_STATES = 8, 6  # of all added laws of a model together
-RELAXED = (0.0,) * LAW_STATES
+NO_STATES = (0.0,) * LAW_STATES
 REVERSAL_SPEED_M_S = 1e-300  # of the sign that follows a reversal
 NO_WALL_M = 1e9  # m: gap of an absent bumper; finite, so that zero times it is zero
 
-# Without added laws both are None: kernels are compiled for both cases and pay only for theirs.
-LawStates = tuple[float, ...] | None
-# (place, deformation, its rate, states, coefficients) -> (force in N, rate of each state)
-AddedLaws = Callable[[int, float, float, tuple[float, ...], tuple[float, ...]], tuple[float, ...]]
+# (place, deformation, its rate, base acceleration, time, states, coefficients) -> (force in N, rate
+# of each state)
+AddedLaws = Callable[
+    [int, float, float, float, float, tuple[float, ...], tuple[float, ...]], tuple[float, ...]
+]
 ADDED_LAWS_SIGNATURE = types.UniTuple(float64, 1 + LAW_STATES)(
     int64,
+    float64,
+    float64,
     float64,
     float64,
     types.UniTuple(float64, LAW_STATES),
@@ -45,8 +48,19 @@ ADDED_LAWS_SIGNATURE = types.UniTuple(float64, 1 + LAW_STATES)(
 )
 
 
+class LawInputs(NamedTuple):
+    """What added laws depend on besides the motion at their place, or the rates of it.
+
+    `base`: acceleration in m/s2 of the table as the mass feels it; `time` in s since sample 0.
+    """
+
+    states: tuple[float, ...]
+    base: float
+    time: float
+
+
 class Motion(NamedTuple):
-    """State at one time, or its rates: u, u', u_R, u_L, branch forces, states of added laws."""
+    """State at one time, or its rates: u, u', u_R, u_L, branch forces, inputs of added laws."""
 
     u: float
     v: float
@@ -55,7 +69,7 @@ class Motion(NamedTuple):
     f: float
     b_r: float
     b_l: float
-    s: LawStates
+    s: LawInputs | None
 
 
 class Start(NamedTuple):
@@ -137,7 +151,7 @@ def add_law_force(
     force: float, place: int, q: float, w: float, s: Any, p: Coefficients, laws: Any
 ) -> float:
     """Return `force` plus that of the added laws at a place, in N."""
-    return force + laws(place, q, w, s, p.laws)[0]
+    return force + laws(place, q, w, s.base, s.time, s.states, p.laws)[0]
 
 
 @jit_helper_unless_none("laws", lambda dashpot, side, d, s, p, laws: dashpot)
@@ -145,16 +159,32 @@ def add_law_dashpot(
     dashpot: float, side: int, d: float, s: Any, p: Coefficients, laws: Any
 ) -> float:
     """Return `dashpot` plus d(push)/d(rate) of the added laws in a bumper, in N s/m."""
-    return dashpot + laws(side, d, 1.0, s, p.laws)[0] - laws(side, d, 0.0, s, p.laws)[0]
+    fast = laws(side, d, 1.0, s.base, s.time, s.states, p.laws)[0]
+    return dashpot + fast - laws(side, d, 0.0, s.base, s.time, s.states, p.laws)[0]
+
+
+@jit_helper(inlined=True)
+def add_scaled_states(
+    states: tuple[float, ...], h: float, rates: tuple[float, ...]
+) -> tuple[float, ...]:
+    """Return states + h rates."""
+    return (
+        states[0] + h * rates[0], states[1] + h * rates[1], states[2] + h * rates[2],
+        states[3] + h * rates[3], states[4] + h * rates[4], states[5] + h * rates[5],
+    )  # fmt: skip
 
 
 @jit_helper_unless_none("s", lambda s, h, rates: None)
-def add_scaled_states(s: Any, h: float, rates: Any) -> LawStates:
+def add_scaled_inputs(s: Any, h: float, rates: Any) -> LawInputs | None:
     """Return s + h rates."""
-    return (
-        s[0] + h * rates[0], s[1] + h * rates[1], s[2] + h * rates[2], s[3] + h * rates[3],
-        s[4] + h * rates[4], s[5] + h * rates[5],
-    )  # fmt: skip
+    states = add_scaled_states(s.states, h, rates.states)
+    return LawInputs(states, s.base + h * rates.base, s.time + h * rates.time)
+
+
+@jit_helper_unless_none("s", lambda s, base, time: None)
+def set_drive(s: Any, base: float, time: float) -> LawInputs | None:
+    """Return s at a base acceleration in m/s2 and a time in s."""
+    return LawInputs(s.states, base, time)
 
 
 @jit_helper(inlined=True)
@@ -165,7 +195,13 @@ def bumper_coefficients(p: Coefficients, side: int) -> tuple[float, float]:
 
 @jit_helper(inlined=True)
 def bumper_force(
-    p: Coefficients, side: int, d: float, dd: float, b: float, s: LawStates, laws: AddedLaws | None
+    p: Coefficients,
+    side: int,
+    d: float,
+    dd: float,
+    b: float,
+    s: LawInputs | None,
+    laws: AddedLaws | None,
 ) -> float:
     """Return the push of a bumper in N; deformation d, rate dd, branch force b: compression > 0."""
     k, c = bumper_coefficients(p, side)
@@ -175,7 +211,7 @@ def bumper_force(
 
 @jit_helper(inlined=True)
 def bumper_dashpot(
-    p: Coefficients, side: int, d: float, s: LawStates, laws: AddedLaws | None
+    p: Coefficients, side: int, d: float, s: LawInputs | None, laws: AddedLaws | None
 ) -> float:
     """Return d(push)/d(rate) of a bumper in N s/m at deformation d."""
     _, c = bumper_coefficients(p, side)
@@ -184,7 +220,7 @@ def bumper_dashpot(
 
 @jit_helper(inlined=True)
 def recovery_rate(
-    p: Coefficients, side: int, d: float, b: float, s: LawStates, laws: AddedLaws | None
+    p: Coefficients, side: int, d: float, b: float, s: LawInputs | None, laws: AddedLaws | None
 ) -> float:
     """Return the rate in m/s of the deformation d of a free bumper; b as in `bumper_force`.
 
@@ -251,15 +287,24 @@ def internal_force(
     return force
 
 
-@jit_helper_unless_none("laws", lambda s, u, du, d_r, dd_r, d_l, dd_l, p, laws: None)
-def law_state_rates(
-    s: Any, u: float, du: float, d_r: float, dd_r: float, d_l: float, dd_l: float,
+@jit_helper(inlined=True)
+def law_rates(
+    place: int, q: float, w: float, s: Any, slope: float, p: Coefficients, laws: Any
+) -> LawInputs:
+    """Return d/dt of `s` by the added laws at a place; slope of the base acceleration."""
+    return LawInputs(laws(place, q, w, s.base, s.time, s.states, p.laws)[1:], slope, 1.0)
+
+
+@jit_helper_unless_none("laws", lambda s, slope, u, du, d_r, dd_r, d_l, dd_l, p, laws: None)
+def law_input_rates(
+    s: Any, slope: float, u: float, du: float, d_r: float, dd_r: float, d_l: float, dd_l: float,
     p: Coefficients, laws: Any,
-) -> LawStates:  # fmt: skip
-    """Return d/dt of the states of all added laws; deformations and rates of damper and bumpers."""
-    rates = laws(DAMPER, u, du, s, p.laws)[1:]
-    rates = add_scaled_states(rates, 1.0, laws(0, d_r, dd_r, s, p.laws)[1:])
-    return add_scaled_states(rates, 1.0, laws(1, d_l, dd_l, s, p.laws)[1:])
+) -> LawInputs | None:  # fmt: skip
+    """Return d/dt of `s` by all added laws; deformations and rates of damper and bumpers."""
+    rates = law_rates(DAMPER, u, du, s, slope, p, laws).states
+    rates = add_scaled_states(rates, 1.0, law_rates(0, d_r, dd_r, s, slope, p, laws).states)
+    rates = add_scaled_states(rates, 1.0, law_rates(1, d_l, dd_l, s, slope, p, laws).states)
+    return LawInputs(rates, slope, 1.0)
 
 
 @jit_helper(inlined=True)
@@ -274,7 +319,7 @@ def state_rates(
     d_r, right, b_r = bumper_deformation(x, start, p, 0, t, laws)
     d_l, left, b_l = bumper_deformation(x, start, p, 1, t, laws)
     law_du = damper_rate(du, start.direction)
-    s = law_state_rates(x.s, x.u, law_du, d_r, right, d_l, left, p, laws)
+    s = law_input_rates(x.s, start.slope, x.u, law_du, d_r, right, d_l, left, p, laws)
     return Motion(
         du, dv, right, -left, p.k1 * du - p.rate_1 * x.f,
         p.kb * right - p.rate_b * b_r, p.rate_b * b_l - p.kb * left, s,

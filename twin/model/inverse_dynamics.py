@@ -27,20 +27,22 @@ from twin.model.event_integrator import kernel_coefficients
 from twin.model.force_laws import (
     ADDED_LAWS_TYPE,
     COEFFICIENTS_TYPE,
+    NO_STATES,
     NO_WALL_M,
-    RELAXED,
     AddedLaws,
     Coefficients,
-    LawStates,
+    LawInputs,
     add_law_force,
-    add_scaled_states,
+    add_scaled_inputs,
     bumper_coefficients,
     bumper_dashpot,
     bumper_force,
     coulomb_force,
     cubic_force,
     hysteretic_variable,
+    law_rates,
     quadratic_force,
+    set_drive,
 )
 from twin.model.model import Model
 
@@ -50,7 +52,15 @@ FORCE_ROWS = ("damper", "right", "left")
 _READ = types.Array(float64, 1, "A", readonly=True)
 _KERNELS = [
     types.void(
-        _READ, _READ, _READ, float64[:, ::1], COEFFICIENTS_TYPE, laws, float64, float64[:, ::1]
+        _READ,
+        _READ,
+        _READ,
+        _READ,
+        float64[:, ::1],
+        COEFFICIENTS_TYPE,
+        laws,
+        float64,
+        float64[:, ::1],
     )
     for laws in (types.none, ADDED_LAWS_TYPE)
 ]
@@ -112,32 +122,36 @@ def track_face(
     return face, b
 
 
-@jit_helper_unless_none("laws", lambda place, s, q, w, h, steps, p, laws: None)
+@jit_helper_unless_none("laws", lambda place, s, q, w, slope, h, steps, p, laws: None)
 def advance_law_states(
-    place: int, s: Any, q: float, w: float, h: float, steps: int, p: Coefficients, laws: Any
-) -> LawStates:
-    """Return the states of the added laws at a place after h s, from deformation q at rate w.
+    place: int, s: Any, q: float, w: float, slope: float, h: float, steps: int,
+    p: Coefficients, laws: Any,
+) -> LawInputs | None:  # fmt: skip
+    """Return the inputs of the added laws after h s with the states of one place advanced.
 
-    Classical fourth-order Runge-Kutta in `steps` equal steps.
+    From deformation q at rate w and with the slope of the base acceleration in m/s3. Classical
+    fourth-order Runge-Kutta in `steps` equal steps.
     """
     dt = h / steps
     for n in range(steps):
         q0 = q + n * dt * w
-        k1 = laws(place, q0, w, s, p.laws)[1:]
-        k2 = laws(place, q0 + 0.5 * dt * w, w, add_scaled_states(s, 0.5 * dt, k1), p.laws)[1:]
-        k3 = laws(place, q0 + 0.5 * dt * w, w, add_scaled_states(s, 0.5 * dt, k2), p.laws)[1:]
-        k4 = laws(place, q0 + dt * w, w, add_scaled_states(s, dt, k3), p.laws)[1:]
-        s = add_scaled_states(s, dt / 6.0, k1)
-        s = add_scaled_states(add_scaled_states(s, dt / 3.0, k2), dt / 3.0, k3)
-        s = add_scaled_states(s, dt / 6.0, k4)
+        k1 = law_rates(place, q0, w, s, slope, p, laws)
+        middle = q0 + 0.5 * dt * w
+        k2 = law_rates(place, middle, w, add_scaled_inputs(s, 0.5 * dt, k1), slope, p, laws)
+        k3 = law_rates(place, middle, w, add_scaled_inputs(s, 0.5 * dt, k2), slope, p, laws)
+        k4 = law_rates(place, q0 + dt * w, w, add_scaled_inputs(s, dt, k3), slope, p, laws)
+        s = add_scaled_inputs(s, dt / 6.0, k1)
+        s = add_scaled_inputs(add_scaled_inputs(s, dt / 3.0, k2), dt / 3.0, k3)
+        s = add_scaled_inputs(s, dt / 6.0, k4)
     return s
 
 
 @jit_helper()
 def recover_face_and_states(
-    side: int, face: float, b: float, s: Any, h: float, steps: int, p: Coefficients, laws: Any
-) -> tuple[float, float, LawStates]:
-    """Return (face position, branch force, law states) of a free bumper after h s.
+    side: int, face: float, b: float, s: Any, slope: float, h: float, steps: int,
+    p: Coefficients, laws: Any,
+) -> tuple[float, float, LawInputs | None]:  # fmt: skip
+    """Return (face position, branch force, inputs of added laws) of a free bumper after h s.
 
     The face moves so that the bumper's force is zero; midpoint rule in `steps` equal steps.
     """
@@ -149,53 +163,54 @@ def recover_face_and_states(
             if dashpot <= 0.0:
                 return 0.0, 0.0, s
             w = -bumper_force(p, side, middle, 0.0, middle_b, middle_s, laws) / dashpot
-            rates = laws(side, middle, w, middle_s, p.laws)[1:]
+            rates = law_rates(side, middle, w, middle_s, slope, p, laws)
             b_rate = p.kb * w - p.rate_b * middle_b
             middle, middle_b = face + length * w, b + length * b_rate
-            middle_s = add_scaled_states(s, length, rates)
+            middle_s = add_scaled_inputs(s, length, rates)
         face, b, s = middle, middle_b, middle_s
     return face, b, s
 
 
 @jit_helper_unless_none(
-    "laws", lambda side, d, dd, face, b, s, was, contact, h, fastest_rate, p, laws: (face, b, s)
+    "laws", lambda side, d, dd, face, b, s, slope, was, contact, h, fastest, p, laws: (face, b, s)
 )
 def track_face_with_laws(
-    side: int, d: float, dd: float, face: float, b: float, s: Any, was_in_contact: bool,
-    contact: float, h: float, fastest_rate: float, p: Coefficients, laws: Any,
-) -> tuple[float, float, LawStates]:  # fmt: skip
-    """Return (face position in m, branch force in N, law states) as `track_face`."""
+    side: int, d: float, dd: float, face: float, b: float, s: Any, slope: float,
+    was_in_contact: bool, contact: float, h: float, fastest_rate: float, p: Coefficients, laws: Any,
+) -> tuple[float, float, LawInputs | None]:  # fmt: skip
+    """Return (face position in m, branch force in N, inputs of added laws) as `track_face`."""
     if h == 0.0:
         return max(d, 0.0) if contact > 0.5 else face, b, s
     steps = 1 + int(h * fastest_rate / MAX_STATE_RELAXATIONS)
     if was_in_contact:
-        s = advance_law_states(side, s, face, (d - face) / h, h, steps, p, laws)
+        s = advance_law_states(side, s, face, (d - face) / h, slope, h, steps, p, laws)
         return d, relax_branch(b, p.rate_b, p.kb, d - face, h), s
-    free_face, free_b, free_s = recover_face_and_states(side, face, b, s, h, steps, p, laws)
+    free_face, free_b, free_s = recover_face_and_states(side, face, b, s, slope, h, steps, p, laws)
     if contact > 0.5 or (contact < -0.5 and d > free_face):
         # The mass met the face on the way; the face follows it from where both were.
         share = 1.0
         if d > free_face and dd > 0.0:
             share = min(1.0, (d - free_face) / (dd * h))
         free_face, free_b, free_s = recover_face_and_states(
-            side, face, b, s, h * (1.0 - share), steps, p, laws
+            side, face, b, s, slope, h * (1.0 - share), steps, p, laws
         )
         w = (d - free_face) / (h * share) if share > 0.0 else 0.0
-        free_s = advance_law_states(side, free_s, free_face, w, h * share, steps, p, laws)
+        free_s = advance_law_states(side, free_s, free_face, w, slope, h * share, steps, p, laws)
         return d, free_b + p.kb * (d - free_face), free_s
     return free_face, free_b, free_s
 
 
 @jit_helper_unless_none("laws", lambda laws: None)
-def relaxed_states(laws: Any) -> LawStates:
-    """Return the relaxed states of the added laws."""
-    return RELAXED
+def relaxed_states(laws: Any) -> LawInputs | None:
+    """Return the inputs of the added laws with relaxed states."""
+    return LawInputs(NO_STATES, 0.0, 0.0)
 
 
 @jit_kernel(_KERNELS, cache=True)
 def _force_kernel(
     u: Float1D,
     v: Float1D,
+    base: Float1D,
     time: Float1D,
     contact: Float2D,
     p: Coefficients,
@@ -207,7 +222,9 @@ def _force_kernel(
     z, f, b_r, b_l, s = 0.0, 0.0, 0.0, 0.0, relaxed_states(laws)
     face_r, face_l = 0.0, 0.0  # face positions in m, tracked only with relaxation
     in_contact_r, in_contact_l = False, False
+    slope = 0.0  # of the base acceleration in m/s3, where states follow it
     for k in range(u.size):
+        previous = max(k - 1, 0)
         h = time[k] - time[k - 1] if k else 0.0
         if k:
             du = u[k] - u[k - 1]
@@ -217,7 +234,10 @@ def _force_kernel(
                 f = relax_branch(f, p.rate_1, p.k1, du, h)
             if fastest_rate >= 0.0:
                 steps = 1 + int(h * fastest_rate / MAX_STATE_RELAXATIONS)
-                s = advance_law_states(DAMPER, s, u[k - 1], du / h, h, steps, p, laws)
+                slope = (base[k] - base[k - 1]) / h
+                s = set_drive(s, base[previous], time[previous])
+                s = advance_law_states(DAMPER, s, u[k - 1], du / h, slope, h, steps, p, laws)
+        s = set_drive(s, base[k], time[k])
         direction = 1.0 if v[k] > 0.0 else -1.0
         damper = p.k * u[k] + p.c * v[k] + cubic_force(u[k], p.k3)
         damper += (
@@ -234,10 +254,12 @@ def _force_kernel(
                 (b_r, face_r, in_contact_r) if side == 0 else (b_l, face_l, in_contact_l)
             )
             if p.has_bumper_states:
+                s = set_drive(s, base[previous], time[previous])
                 face, b, s = track_face_with_laws(
-                    side, d, dd, face, b, s, was_in_contact, contact[side, k], h,
+                    side, d, dd, face, b, s, slope, was_in_contact, contact[side, k], h,
                     fastest_rate, p, laws,
                 )  # fmt: skip
+                s = set_drive(s, base[k], time[k])
             elif p.kb > 0.0:
                 face, b = track_face(p, side, d, face, b, was_in_contact, contact[side, k], h)
             push = bumper_force(p, side, d, dd, b, s, laws) if d > -0.5 * NO_WALL_M else 0.0
@@ -253,19 +275,25 @@ def _force_kernel(
 
 
 def forces_along(
-    model: Model, u: Float1D, v: Float1D, time_s: Float1D, contact: npt.NDArray[np.int8]
+    model: Model,
+    u: Float1D,
+    v: Float1D,
+    base_acc: Float1D,
+    time_s: Float1D,
+    contact: npt.NDArray[np.int8],
 ) -> Float2D:
     """Return D, F_R >= 0 and F_L <= 0 in N, (3, sample), of a model along a motion.
 
-    u in m and v in m/s, (sample,), at times `time_s` in s since the start of the run; `contact`
-    (2, sample) right and left: IN_CONTACT, NO_CONTACT, or CONTACT_UNKNOWN where the model decides.
-    Effects on the input (see `Model.added_acceleration`) and on sensors are not included.
+    u in m, v in m/s and the acceleration `base_acc` in m/s2 of the table as the mass feels it,
+    (sample,), at times `time_s` in s since the start of the run; `contact` (2, sample) right and
+    left: IN_CONTACT, NO_CONTACT, or CONTACT_UNKNOWN where the model decides. Effects on the input
+    (see `Model.added_acceleration`) and on sensors are not included.
     """
     coefficients, laws = kernel_coefficients(model)
     fastest_rate = _fastest_law_rate(model)
     out = np.empty((3, u.size))
     touched = contact.astype(np.float64, order="C")
-    _force_kernel(u, v, time_s, touched, coefficients, laws, fastest_rate, out)
+    _force_kernel(u, v, base_acc, time_s, touched, coefficients, laws, fastest_rate, out)
     return out
 
 

@@ -10,6 +10,7 @@ from table_io.block import Float1D
 from table_io.errors import InputError, suggest
 from twin.model.effects import find_effect
 from twin.model.effects.effect import Effect
+from twin.model.effects.law import changes_with_time
 from twin.model.parameters import Parameters
 from twin.model.solver import Solver
 
@@ -175,6 +176,16 @@ class Model:
     def gap_opening_m(self, time_s: float) -> float:
         """Return by how many m each gap has drifted open, `time_s` after sample 0."""
         return (self.effect_parameter("gap_drift", "rate") or 0.0) * time_s
+
+    def require_steady_state(self) -> None:
+        """Raise InputError if an effect changes with time: no motion repeats itself then."""
+        for instance in self.present_effects:
+            if changes_with_time(instance.effect):
+                raise InputError(
+                    "a model that changes with time has no periodic motion",
+                    where=f"effect {instance.name!r}",
+                    remedy="remove the effect, or vary what it changes as a parameter",
+                )
 
     def with_effect(self, effect: str, channel: str = "", **values: float) -> "Model":
         """Return this model with an added effect, or with new values of one that it has."""

@@ -11,7 +11,6 @@ from functools import cached_property
 from table_io.block import Float1D
 from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.profile import Profile
-from table_io.errors import InputError
 from table_io.records import PrcPoint, Step
 from table_io.units import GRAVITY_M_S2
 from twin.model.ideal_response import simulate_sweep
@@ -170,17 +169,7 @@ def load_paper_cases(
             )
             config, _ = read_model(model or profile.model)
             case_model = config.build_model(profile.specimen)
-            _require_steady(case_model, model or profile.model)
+            case_model.require_steady_state()
             tests.append(PaperTest(name, profile, case_model.parameters, case_model, scale))
         paper_cases[gap] = PaperCase(gap, tuple(tests))
     return paper_cases
-
-
-def _require_steady(model: Model, name: str) -> None:
-    """Raise InputError if the model has no steady motion."""
-    if any(term.effect.id == "gap_drift" for term in model.present_effects):
-        raise InputError(
-            "effect 'gap_drift' has no steady motion to compare with the paper",
-            where=f"--model {name}",
-            remedy="remove the effect from the model",
-        )

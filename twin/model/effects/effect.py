@@ -48,16 +48,21 @@ class Effect:
     - parameters: `change(parameters, values)`, the changed parameters.
     - input: `input_acceleration(table_disp, values)` in m/s2, added to the table acceleration as
       the mass feels it; table_disp in m, (n,) or a number.
-    - force: a law, `force(q, w, c)` in N at deformation q in m and its rate w in m/s. At the damper
-      these are u and u', and the force is on the left side of the equation of motion; in a bumper
-      they are its compression and rate, and the force pushes. `place` "bumpers" is the same law in
-      both. A law with memory has `states`, zero when relaxed, with `force(q, w, s, c)` and
-      `rates(q, w, s, c)`, the d/dt of each state as a tuple of floats. c[i] is the value of
-      parameters[i], s[i] that of states[i].
+    - force: a law, `force` in N. A law with memory has `states`, zero when relaxed, and `rates`,
+      their d/dt as a tuple of floats. `place` "bumpers" is the same law in both bumpers.
 
-    A law is plain Python that numba can compile, continuous, and smooth where w keeps its sign. In
-    a bumper it is elastic plus a dashpot, linear in w, and zero where q, w and s are. Force laws
-    of this package may instead be compiled into the solver and leave `force` None.
+    Both functions take, by these names, those of their arguments that they need:
+        q, w  deformation in m and its rate in m/s. At the damper u and u', and the force is on the
+              left side of the equation of motion; in a bumper its compression and the rate of it,
+              and the force pushes
+        a     acceleration in m/s2 of the table, as the mass feels it
+        t     time in s since sample 0 of the run; a law with it has no steady state
+        s     s[i] is the value of states[i]
+        c     c[i] is the value of parameters[i]
+    so `force(q, w, c)` is a law without memory, and `rates(q, w, a, s, c)` are those of a mass that
+    rides along. They are plain Python that numba can compile, continuous, and smooth where w keeps
+    its sign. In a bumper the force is elastic plus a dashpot, linear in w, and zero where q, w and
+    s are. Force laws of this package may instead be compiled into the solver: `force` is None.
     """
 
     id: str
@@ -73,6 +78,7 @@ class Effect:
     rates: Callable[..., tuple[float, ...]] | None = None
     input_acceleration: Callable[[Any, Mapping[str, float]], Any] | None = None
     required_channels: tuple[str, ...] = ()  # without which it is not observable
+    is_drift: bool = False  # changes with time otherwise than by a law that takes t
 
     @property
     def is_in_bumpers(self) -> bool:

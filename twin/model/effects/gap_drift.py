@@ -18,6 +18,7 @@ GAP_DRIFT = Effect(
     ),
     acts="linear",
     place="bumpers",
+    is_drift=True,
     residual=(
         "Onset and release move with time on both sides alike, not with frequency: the backward "
         "sweep has other gaps than the forward sweep."

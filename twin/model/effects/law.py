@@ -4,56 +4,100 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from inspect import signature
+from itertools import product
+from typing import Any
+
+import numpy as np
 
 from twin.model.effects.effect import Effect
 
 DAMPER = -1  # a bumper has the number of its side: 0 right, 1 left
 PLACES = {"damper": (DAMPER,), "bumpers": (0, 1), "right_bumper": (0,), "left_bumper": (1,)}
-# Deformations in m and rates in m/s at which stiffness and relaxation rate of a law are taken.
+LAW_ARGUMENTS = ("q", "w", "a", "t", "s", "c")  # see `Effect`
+# Deformations in m, rates in m/s, base accelerations in m/s2 and times in s at which laws are
+# evaluated for their properties and checks.
 PROBED_DEFORMATIONS = {True: (1e-4, 1e-3, 3e-3), False: (-0.03, -3e-3, -1e-4, 1e-4, 3e-3, 0.03)}
 PROBED_RATES = (-0.3, -0.01, 0.01, 0.3)
+PROBED_DRIVES = ((0.0, 0.0), (1.0, 100.0))
+STATE_STEP = 1e-6  # of differences by a state, in its unit
 
 
 @dataclass(frozen=True, slots=True)
 class LawProperties:
-    """Largest stiffness in N/m and relaxation rate in 1/s of the laws at a place."""
+    """Largest stiffness in N/m and rate in 1/s of the states of the laws at a place."""
 
     stiffness: float = 0.0
     relaxation_rate: float = 0.0
 
 
+@cache
+def list_arguments(function: Callable[..., Any]) -> tuple[str, ...]:
+    """Return the names of the arguments of `force` or `rates`."""
+    return tuple(signature(function).parameters)
+
+
+def take_all_arguments(function: Callable[..., Any], names: Sequence[str]) -> Callable[..., Any]:
+    """Return a function of all `LAW_ARGUMENTS` that calls one of those with these names.
+
+    Made from its text, because numba compiles no call whose number of arguments varies.
+    """
+    text = f"lambda {', '.join(LAW_ARGUMENTS)}: function({', '.join(names)})"
+    return eval(text, {"function": function})
+
+
+def changes_with_time(effect: Effect) -> bool:
+    """Return whether an effect depends on the time since the start of the run."""
+    functions = [function for function in (effect.force, effect.rates) if function is not None]
+    return effect.is_drift or any("t" in list_arguments(function) for function in functions)
+
+
 def law_properties(effect: Effect, values: Mapping[str, float]) -> LawProperties:
-    """Return the largest stiffness and relaxation rate of a law over the probed motions.
+    """Return the largest stiffness and rate of the states of a law over the probed motions.
 
     The stiffness is the instantaneous one, dF/dq + dF/ds ds'/dw: fast motion also loads the states.
+    The rate is the largest eigenvalue of d rates / d states: of a relaxation or an oscillation.
     """
     force, rates = evaluate_law(effect, values)
     stiffness = relaxation = 0.0
-    relaxed = (0.0,) * len(effect.states)
-    for q in PROBED_DEFORMATIONS[effect.place != "damper"]:
-        for w in PROBED_RATES:
-            h = 1e-6 * abs(q)
-            k = (force(q + h, w, relaxed) - force(q - h, w, relaxed)) / (2 * h)
-            for i in range(len(relaxed)):
-                up, down = ((*relaxed[:i], sign * 1e-6, *relaxed[i + 1 :]) for sign in (1, -1))
-                f_s = (force(q, w, up) - force(q, w, down)) / 2e-6
-                r_w = rates(q, w * (1 + 1e-6), relaxed)[i] - rates(q, w * (1 - 1e-6), relaxed)[i]
-                k += f_s * r_w / (2e-6 * w)
-                r_s = (rates(q, w, up)[i] - rates(q, w, down)[i]) / 2e-6
-                relaxation = max(relaxation, abs(r_s))
-            stiffness = max(stiffness, abs(k))
+    count = len(effect.states)
+    relaxed, steps = (0.0,) * count, STATE_STEP * np.eye(count)
+    probes = product(
+        PROBED_DEFORMATIONS[effect.place != "damper"], PROBED_RATES,
+        PROBED_DRIVES if changes_with_time(effect) else PROBED_DRIVES[:1],
+    )  # fmt: skip
+    for q, w, (a, t) in probes:
+        h = 1e-6 * abs(q)
+        k = (force(q + h, w, a, t, relaxed) - force(q - h, w, a, t, relaxed)) / (2 * h)
+        slopes = np.zeros((count, count))
+        for i, step in enumerate(steps.tolist()):
+            up, down = tuple(step), tuple(-value for value in step)
+            f_s = (force(q, w, a, t, up) - force(q, w, a, t, down)) / (2 * STATE_STEP)
+            r_w = rates(q, w * (1 + 1e-6), a, t, relaxed)[i]
+            r_w -= rates(q, w * (1 - 1e-6), a, t, relaxed)[i]
+            k += f_s * r_w / (2e-6 * w)
+            change = np.subtract(rates(q, w, a, t, up), rates(q, w, a, t, down))
+            slopes[:, i] = change / (2 * STATE_STEP)
+        stiffness = max(stiffness, abs(k))
+        if count:
+            relaxation = max(relaxation, float(np.abs(np.linalg.eigvals(slopes)).max()))
     return LawProperties(stiffness, relaxation)
 
 
 def evaluate_law(
     effect: Effect, values: Mapping[str, float]
 ) -> tuple[Callable[..., float], Callable[..., tuple[float, ...]]]:
-    """Return force(q, w, s) and rates(q, w, s) of a law in plain Python."""
-    c, law, law_rates = tuple(values[p.name] for p in effect.parameters), effect.force, effect.rates
-    assert law is not None
-    if law_rates is None:
-        return lambda q, w, s: law(q, w, c), lambda q, w, s: ()
-    return lambda q, w, s: law(q, w, s, c), lambda q, w, s: law_rates(q, w, s, c)
+    """Return force(q, w, a, t, s) and rates(q, w, a, t, s) of a law in plain Python."""
+    c = tuple(values[p.name] for p in effect.parameters)
+    assert effect.force is not None
+    force = take_all_arguments(effect.force, list_arguments(effect.force))
+    if effect.rates is None:
+        return lambda q, w, a, t, s: force(q, w, a, t, s, c), lambda q, w, a, t, s: ()
+    rates = take_all_arguments(effect.rates, list_arguments(effect.rates))
+    return (
+        lambda q, w, a, t, s: force(q, w, a, t, s, c),
+        lambda q, w, a, t, s: rates(q, w, a, t, s, c),
+    )
 
 
 @cache
@@ -68,36 +112,49 @@ def find_law_problem(effect: Effect) -> str:
         return f"acts as a force at {effect.place!r}; allowed: {', '.join(PLACES)}"
     if bool(effect.states) != (effect.rates is not None):
         return "`states` and `rates` belong together: give both or neither"
+    try:
+        return _find_argument_problem(effect) or _find_value_problem(effect)
+    except Exception as error:  # the law is foreign code and may raise anything
+        return f"its law cannot be evaluated: {type(error).__name__}: {error}"
+
+
+def _find_argument_problem(effect: Effect) -> str:
+    """Return which argument of a law is unknown, "" if none."""
+    for function in (effect.force, effect.rates):
+        for name in () if function is None else list_arguments(function):
+            if name not in LAW_ARGUMENTS:
+                return f"its law has the argument {name!r}; allowed: {', '.join(LAW_ARGUMENTS)}"
+    return ""
+
+
+def _find_value_problem(effect: Effect) -> str:
+    """Return what is wrong with the values of a law, "" if nothing."""
     force, rates = evaluate_law(effect, {p.name: p.typical for p in effect.parameters})
     relaxed = (0.0,) * len(effect.states)
     in_bumper = effect.place != "damper"
-    try:
-        for q in PROBED_DEFORMATIONS[in_bumper]:
-            for w in PROBED_RATES:
-                push, slow = force(q, w, relaxed), force(q, 0.0, relaxed)
-                own = rates(q, w, relaxed)
-                if not all(math.isfinite(value) for value in (push, *own)):
-                    return f"its law is not finite at deformation {q:g} m, rate {w:g} m/s"
-                if len(own) != len(effect.states):
-                    return f"`rates` returns {len(own)} values for {len(effect.states)} states"
-                if in_bumper:
-                    linear = slow + w * (force(q, 1.0, relaxed) - slow)
-                    if abs(push - linear) > 1e-6 * (abs(push) + abs(slow) + abs(linear)):
-                        return (
-                            "in a bumper the force must be elastic plus a dashpot: linear in the "
-                            "rate, whose zero in flight gives the recovery of the face"
-                        )
-        if in_bumper and force(0.0, 0.0, relaxed) != 0.0:
-            return "in a bumper the force must be zero at deformation 0, rate 0, states relaxed"
-    except Exception as error:  # the law is foreign code and may raise anything
-        return f"its law cannot be evaluated: {type(error).__name__}: {error}"
+    for q, w, (a, t) in product(PROBED_DEFORMATIONS[in_bumper], PROBED_RATES, PROBED_DRIVES):
+        push, slow = force(q, w, a, t, relaxed), force(q, 0.0, a, t, relaxed)
+        own = rates(q, w, a, t, relaxed)
+        if not all(math.isfinite(value) for value in (push, *own)):
+            return f"its law is not finite at deformation {q:g} m, rate {w:g} m/s"
+        if len(own) != len(effect.states):
+            return f"`rates` returns {len(own)} values for {len(effect.states)} states"
+        if in_bumper:
+            linear = slow + w * (force(q, 1.0, a, t, relaxed) - slow)
+            if abs(push - linear) > 1e-6 * (abs(push) + abs(slow) + abs(linear)):
+                return (
+                    "in a bumper the force must be elastic plus a dashpot: linear in the "
+                    "rate, whose zero in flight gives the recovery of the face"
+                )
+    if in_bumper and any(force(0.0, 0.0, a, t, relaxed) != 0.0 for a, t in PROBED_DRIVES):
+        return "in a bumper the force must be zero at deformation 0, rate 0, states relaxed"
     return ""
 
 
 def sum_law_properties(
     laws: Sequence[tuple[Effect, Mapping[str, float]]],
 ) -> dict[int, LawProperties]:
-    """Return the summed stiffness and the fastest relaxation rate of laws, by place."""
+    """Return the summed stiffness and the fastest rate of the states of laws, by place."""
     sums = {place: LawProperties() for place in (DAMPER, 0, 1)}
     for effect, values in laws:
         own = law_properties(effect, values)
