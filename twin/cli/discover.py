@@ -17,16 +17,22 @@ from twin.identification.discover import (
     PreparedLog,
     discover_effects,
 )
+from twin.identification.law_search import LawProposal, propose_law
 from twin.identification.least_squares import MapFunction
 from twin.identification.selection import Cancelled, ProgressCallback, SelectionProgress
 from twin.model.config import ModelConfig
 from twin.model.effects import find_effect
 from twin.reports.contracts import Verdict
-from twin.reports.discovery.headline import describe_excluded, format_verdict
+from twin.reports.discovery.headline import describe_excluded, describe_proposal, format_verdict
 from twin.reports.discovery.loading import load_logs
 from twin.reports.discovery.page import format_interval, write_discovery_page
 from twin.reports.discovery.sensor_section import describe_sensors
-from twin.reports.discovery.serialize import Json, model_to_toml, verdict_to_json
+from twin.reports.discovery.serialize import (
+    Json,
+    list_effect_files,
+    model_to_toml,
+    verdict_to_json,
+)
 from twin.reports.finalize import EXIT_INTERRUPTED
 from twin.reports.summary import dump_contract
 from twin.run.folders import make_run_folder
@@ -66,6 +72,7 @@ def discover_command(
             held_out_logs = load_logs(held_out)[0] if held_out else ()
             with open_mapper(logs) as mapper:
                 discovery = discover_effects(logs, start, report, without, mapper)
+                proposal = propose_law(discovery, report)
     except (InputError, Cancelled) as error:
         folder.rmdir()  # leave no empty folder after a failure
         if isinstance(error, InputError):
@@ -73,8 +80,8 @@ def discover_command(
         print_line("interrupted before any result; nothing is written")
         return EXIT_INTERRUPTED
     seconds = clock.now() - start_s
-    verdict = verdict_to_json(discovery, seconds, notes, held_out_logs, start)
-    write_results(folder, discovery, config, logs, verdict)
+    verdict = verdict_to_json(discovery, seconds, notes, held_out_logs, start, proposal)
+    write_results(folder, discovery, config, logs, verdict, proposal)
     print_verdict(verdict)
     print_line(f"{folder}")
     return 0 if discovery.selection.complete else EXIT_INTERRUPTED
@@ -141,15 +148,20 @@ def write_results(
     config: ModelConfig,
     logs: Sequence[PreparedLog],
     verdict: Json,
+    proposal: LawProposal | None = None,
 ) -> None:
-    """Write verdict.json, model.toml, figures and report.html to the folder."""
+    """Write verdict.json, model.toml, effect files, figures and report.html to the folder."""
     names = ", ".join(log.signals.name for log in logs)
-    added = " + ".join(discovery.verdict.best.names) or "nothing added"
+    best = proposal.fitted if proposal else discovery.verdict.best
+    added = " + ".join(best.names) or "nothing added"
     title = f"{config.title}; {added}"
     provisional = verdict["why"] if verdict["verdict"] in ("ambiguous", "unexplained") else ""
-    text, omitted = model_to_toml(
-        discovery.verdict.best.fit, title, config.citation, names, provisional
-    )
+    if proposal:
+        provisional = "the law was found in these recordings and holds in its range alone"
+    text, omitted = model_to_toml(best.fit, title, config.citation, names, provisional)
+    laws = proposal.laws if proposal else ()
+    for name, law_text in list_effect_files(best.fit, laws).items():
+        (folder / name).write_text(law_text, encoding="utf-8")
     verdict["notes"] += omitted
     (folder / "model.toml").write_text(text, encoding="utf-8")
     (folder / "verdict.json").write_text(dump_contract(Verdict, verdict), encoding="utf-8")
@@ -171,6 +183,8 @@ def print_verdict(verdict: Json) -> None:
         )
     )
     print_line(f"  misfit in multiples of the noise: {columns}")
+    for line in describe_proposal(verdict["law"]) if verdict["law"] else ():
+        print_line(f"  {line}")
     for effect in verdict["effects"]:
         for name, value in effect["parameters"].items():
             print_line(f"  {effect['id']} {name} = {format_interval(value)}")

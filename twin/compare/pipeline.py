@@ -13,7 +13,7 @@ import numpy as np
 from table_io.block import Block, Float1D, Label, join_blocks
 from table_io.channels import Channel, contact_forces, relative_displacement
 from table_io.config.profile import Profile
-from table_io.records import Comparison, CycleExtremes, Params, Record, Step, StepAdded
+from table_io.records import Comparison, CycleExtremes, Event, Params, Record, Step, StepAdded
 from twin.compare import monitoring
 from twin.compare.cycles import (
     UNKNOWN_CONTACT,
@@ -34,6 +34,7 @@ from twin.compare.sensors import remove_sensor_errors
 from twin.compare.twins import TwinSetup, TwinStates, advance_twins, start_twins
 from twin.model.model import Model
 from twin.model.parameters import free_flight_resonance
+from twin.model.valid_range import find_range_exits, list_ranges
 
 CycleBlocks = tuple[Block, ...]  # the same samples measured, predicted, and without low cuts
 MAX_MISSING_SAMPLES = 3  # samples that a whole held cycle may lack
@@ -87,6 +88,7 @@ class PipelineState:
     )  # measured, twin
     monitoring: MonitoringState = field(default_factory=MonitoringState)
     low_cuts: LowCutRemoval = field(default_factory=LowCutRemoval)
+    range_exits: frozenset[tuple[str, str]] = frozenset()  # (effect, variable) reported so far
 
 
 def prepare_pipeline(
@@ -137,7 +139,7 @@ def add_steps(setup: PipelineSetup, *decisions: StepAdded) -> PipelineSetup:
 
 def adopt_params(setup: PipelineSetup, params: Params) -> PipelineSetup:
     """Return the setup with a model of these values; u* and a* stay those of the run."""
-    model = Model.from_flat(params.values)
+    model = setup.twin.model.with_flat(params.values)
     scale = replace(setup.scale, parameters=model.parameters)
     return replace(setup, twin=replace(setup.twin, model=model), scale=scale)
 
@@ -160,7 +162,12 @@ def step(
     """
     if block.index != state.twins.index:
         twins = start_twins(setup.twin, block.index)
-        state = PipelineState(twins, monitoring=state.monitoring, low_cuts=state.low_cuts)
+        state = PipelineState(
+            twins,
+            monitoring=state.monitoring,
+            low_cuts=state.low_cuts,
+            range_exits=state.range_exits,
+        )
     pieces: list[Block] = []
     compared: list[Comparison] = []
     records: list[Block | Record] = []
@@ -175,7 +182,38 @@ def step(
         state, predicted, comparisons = _advance_piece(setup, state, piece, cycle_key)
         pieces.append(predicted)
         compared.extend(comparisons)
-    return state, [join_blocks(pieces), *compared, *records]
+    predicted = join_blocks(pieces)
+    state, events = _watch_ranges(setup, state, block, predicted)
+    return state, [predicted, *compared, *records, *events]
+
+
+def _watch_ranges(
+    setup: PipelineSetup, state: PipelineState, block: Block, predicted: Block
+) -> tuple[PipelineState, list[Record]]:
+    """Return the state and an event for each law that the free twin takes out of its range."""
+    model = setup.twin.model
+    if not list_ranges(model):
+        return state, []
+    motion = {
+        "u": predicted.channel("free/rel_disp_m"),
+        "v": predicted.channel("free/rel_vel_m_s"),
+        "t": np.arange(block.index, block.end) / setup.twin.rate_hz,
+    }
+    measured = {"a": "table_acc_m_s2", "y": "table_disp_m"}
+    motion |= {
+        variable: block.channel(name)
+        for variable, name in measured.items()
+        if name in block.channels
+    }
+    exits = [
+        range_exit
+        for range_exit in find_range_exits(model, motion)
+        if (range_exit.effect, range_exit.variable) not in state.range_exits
+    ]
+    reported = {(range_exit.effect, range_exit.variable) for range_exit in exits}
+    return replace(state, range_exits=state.range_exits | reported), [
+        Event(block.index + range_exit.sample, "law_range", str(range_exit)) for range_exit in exits
+    ]
 
 
 def _advance_piece(

@@ -325,7 +325,7 @@ def change_parameter(model: Model, name: str, value: float) -> Model:
     if name in base.as_dict():
         return Model(replace(base, **{name: value}), model.effects)
     find_parameter(model, name)
-    return Model.from_flat(model.flatten() | {name: value})
+    return model.with_flat(model.flatten() | {name: value})
 
 
 def make_period_map(model: Model) -> PeriodMap:

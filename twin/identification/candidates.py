@@ -4,8 +4,8 @@ Forces depend (nearly) linearly on the amplitude of a candidate, but not on its 
 Each candidate therefore has a ladder of trial shapes; the fit interpolates between them.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -46,6 +46,7 @@ class Candidate:
     shapes: tuple[tuple[float, ...], ...]  # trial values of the other parameters, in their order
     effect: Effect | None = None
     channel: str = ""
+    constants: Mapping[ParameterKey, float] = field(default_factory=dict)  # fixed values
 
     @classmethod
     def from_effect(cls, effect: Effect, channel: str, scale: RecordScale) -> "Candidate":
@@ -71,9 +72,17 @@ class Candidate:
     ) -> ParameterSet:
         """Add the candidate, free, to a parameter set; by default its amplitude vanishes."""
         shape_keys = [free.key for free in self.free if free is not self.amplitude]
-        values: dict[ParameterKey, float] = dict(zip(shape_keys, shape, strict=True))
+        values = {**self.constants, **dict(zip(shape_keys, shape, strict=True))}
         values[self.amplitude.key] = self.vanishing if amplitude is None else amplitude
+        if self.effect is not None:
+            parameters = parameters.with_effect(self.effect)
         return parameters.with_values(values).with_free((*parameters.free, *self.free))
+
+    def remove_from(self, parameters: ParameterSet) -> ParameterSet:
+        """Return a parameter set without the parameters of the candidate."""
+        reduced = parameters.without(self.free)
+        values = {key: v for key, v in reduced.values.items() if key not in self.constants}
+        return replace(reduced, values=values)
 
 
 def list_generic_candidates(log_residuals: Sequence[LogResiduals]) -> tuple[Candidate, ...]:

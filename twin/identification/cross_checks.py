@@ -23,7 +23,6 @@ from twin.identification.parameters import (
     is_correction,
 )
 from twin.identification.residuals import LogResiduals
-from twin.model.effects import find_effect
 
 MIN_SUBSET_BLOCKS = 6  # with fewer blocks the standard error of a subset is unreliable
 MIN_DETERMINING_BLOCKS = 4.0  # with fewer, a warning
@@ -76,7 +75,10 @@ def estimate_subsets(
     """Estimate the parameters from free flight, contacts of each side, and opposed halves."""
     # errors of instruments are determined by all samples together
     free = [parameter for parameter in joint.free if not is_correction(parameter.key)]
-    flight = [parameter for parameter in free if not _is_of_contact(parameter.key)]
+    of_contact = [
+        parameter for parameter in free if _is_of_contact(parameter.key, joint.parameters)
+    ]
+    flight = [parameter for parameter in free if parameter not in of_contact]
     estimates = [
         _estimate_subset(
             "free flight", log_residuals, joint, flight, [*map(_flight_mask, log_residuals)]
@@ -87,8 +89,8 @@ def estimate_subsets(
             replace(parameter, tied=(BaseKey(f"{parameter.name}_{side[0]}"),))
             if parameter.key in (BUMPER_STIFFNESS, BUMPER_DAMPING)
             else parameter
-            for parameter in free
-            if _is_of_contact(parameter.key) and not isinstance(parameter.key, EffectKey)
+            for parameter in of_contact
+            if not isinstance(parameter.key, EffectKey)
         ]
         side_masks = [residuals.entry_row == row for residuals in log_residuals]
         estimates.append(
@@ -105,10 +107,10 @@ def estimate_subsets(
     return tuple(estimate for estimate in estimates if estimate.values)
 
 
-def _is_of_contact(key: ParameterKey) -> bool:
+def _is_of_contact(key: ParameterKey, parameters: ParameterSet) -> bool:
     """Return True for a parameter of the gaps, of the bumpers, or of an effect in them."""
     if isinstance(key, EffectKey):
-        return find_effect(key.effect).is_in_bumpers
+        return parameters.get_effect(key.effect).is_in_bumpers
     return isinstance(key, GapKey) or key in (BUMPER_STIFFNESS, BUMPER_DAMPING)
 
 

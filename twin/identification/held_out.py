@@ -1,7 +1,7 @@
 """Errors of a model on a log that no fit has seen."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from table_io.block import Float1D
 from twin.identification.discover import PreparedLog
@@ -28,7 +28,7 @@ def compute_force_error(log: PreparedLog, parameters: ParameterSet) -> ForceErro
     gap corrections, tare errors and nuisances are those of other logs.
     """
     kept = {key: value for key, value in parameters.values.items() if get_log(key) is None}
-    parameters = ParameterSet({**kept, GapKey(0): 0.0})
+    parameters = replace(parameters, values={**kept, GapKey(0): 0.0}, free=())
     (residuals,) = build_log_residuals([(log.signals, log.contact_n)], parameters.to_model())
     m = residuals.motion(parameters.assumed_sensors())
     mass = parameters.model_for_log(0, m).parameters.mass

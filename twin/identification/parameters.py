@@ -7,7 +7,7 @@ Each parameter has a key: `BaseKey`, `EffectKey`, `TermKey`, `SlipKey`, `GapKey`
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -155,6 +155,7 @@ class ParameterSet:
 
     values: Mapping[ParameterKey, float]
     free: tuple[FreeParameter, ...] = ()
+    effects: Mapping[str, Effect] = field(default_factory=dict)  # those that are in no library
 
     @classmethod
     def from_model(cls, model: Model, logs: int) -> "ParameterSet":
@@ -165,7 +166,8 @@ class ParameterSet:
         for instance in model.effects:
             for name, value in instance.values.items():
                 values[EffectKey(instance.effect.id, name, instance.channel)] = value
-        return cls(values | {GapKey(log): 0.0 for log in range(logs)})
+        effects = {instance.effect.id: instance.effect for instance in model.effects}
+        return cls(values | {GapKey(log): 0.0 for log in range(logs)}, (), effects)
 
     def to_model(self) -> Model:
         """Return the model of the forces, without sensor errors and corrections per log."""
@@ -181,7 +183,8 @@ class ParameterSet:
             Parameters.from_dict(base),
             # not `create`: a fit has bounds of its own, from the record
             tuple(
-                EffectInstance(find_effect(effect), values) for effect, values in effects.items()
+                EffectInstance(self.get_effect(effect), values)
+                for effect, values in effects.items()
             ),
         )
 
@@ -222,6 +225,14 @@ class ParameterSet:
         """Return a copy with values replaced or added."""
         return replace(self, values={**self.values, **values})
 
+    def get_effect(self, name: str) -> Effect:
+        """Return the effect of this id; InputError if it is unknown."""
+        return self.effects.get(name) or find_effect(name)
+
+    def with_effect(self, effect: Effect) -> "ParameterSet":
+        """Return a copy that knows this effect; its values are set apart from it."""
+        return replace(self, effects={**self.effects, effect.id: effect})
+
     def with_free(self, free: Iterable[FreeParameter]) -> "ParameterSet":
         """Return a copy in which exactly these parameters are free."""
         return replace(self, free=tuple(free))
@@ -229,9 +240,10 @@ class ParameterSet:
     def without(self, removed: Sequence[FreeParameter]) -> "ParameterSet":
         """Return a copy without these parameters."""
         keys = {key for parameter in removed for key in parameter.keys}
-        return ParameterSet(
-            {key: value for key, value in self.values.items() if key not in keys},
-            tuple(free for free in self.free if keys.isdisjoint(free.keys)),
+        return replace(
+            self,
+            values={key: value for key, value in self.values.items() if key not in keys},
+            free=tuple(free for free in self.free if keys.isdisjoint(free.keys)),
         )
 
 

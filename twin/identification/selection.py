@@ -318,7 +318,7 @@ def _refit_candidates(
     if not library:
         return []
     fitted_sets: list[FittedSet] = []
-    promising = _select_promising(
+    promising = select_promising(
         build_normal_equations(problem.log_residuals, parameters, library, problem.mapper),
         max_refits,
     )
@@ -341,7 +341,7 @@ def _refit_candidates(
     return fitted_sets
 
 
-def _select_promising(equations: NormalEquations, max_count: int) -> list[ScreenedCandidate]:
+def select_promising(equations: NormalEquations, max_count: int) -> list[ScreenedCandidate]:
     """Return the best candidates, without those far worse than the first or with little gain."""
     ranked = rank_candidates(equations, max_count)
 

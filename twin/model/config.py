@@ -1,16 +1,30 @@
 """Model files: validated base parameters and effects from TOML."""
 
+import tomllib
+from pathlib import Path
 from typing import Any
 
 from pydantic import Field, field_validator, model_validator
 
-from table_io.config.base import ConfigModel, Finite, NonNegative, Positive, list_duplicates
+from table_io.config.base import (
+    ConfigModel,
+    Finite,
+    NonNegative,
+    Positive,
+    list_duplicates,
+    parse_toml,
+    read_text,
+)
 from table_io.config.profile import Specimen
+from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from twin.model.effects import find_effect
 from twin.model.effects.effect import Effect
+from twin.model.effects.effect_file import EffectFile
 from twin.model.model import EffectInstance, Model
 from twin.model.parameters import Parameters
+
+MAX_EFFECT_FILE_BYTES = 100_000
 
 
 class BaseModelConfig(ConfigModel):
@@ -28,7 +42,13 @@ class EffectConfig(ConfigModel):
     Sensor effects name their channel among the parameters: `channel = "mass_acc_m_s2"`.
     """
 
-    id: str = Field(description="Name of the effect, built in or of a plug-in.")
+    id: str = Field("", description="Name of the effect, built in or of a plug-in.")
+    file: str | None = Field(
+        None, description="Effect file with a law of its own, next to the model file."
+    )
+    law: EffectFile | None = Field(
+        None, description="The same law in the model file; loading attaches that of `file`."
+    )
     parameters: dict[str, float | str] = Field(
         default_factory=dict, description="A value in SI for each parameter of the effect."
     )
@@ -46,11 +66,24 @@ class EffectConfig(ConfigModel):
 
     @model_validator(mode="after")
     def _validate_effect(self) -> "EffectConfig":
+        if self.law is not None and self.id not in ("", self.law.id):
+            raise InputError(
+                "two names for one effect", key="id", value=self.id, allowed=self.law.id,
+                remedy="omit id",
+            )  # fmt: skip
+        if not (self.id or self.law or self.file):
+            raise InputError("missing", key="id", remedy="give id, file or law")
         self.instance  # noqa: B018
         return self
 
     @property
     def effect(self) -> Effect:
+        if self.law is not None:
+            return self.law.build_effect()
+        if self.file is not None:
+            raise InputError(
+                f"{self.file!r} is not attached", key="file", remedy="load the model from its file"
+            )
         return find_effect(self.id)
 
     @property
@@ -82,6 +115,26 @@ class ModelConfig(ConfigModel):
     )
     base: BaseModelConfig
     effects: tuple[EffectConfig, ...] = ()
+    files: dict[str, str] = Field({}, description="Texts of files by name; loading attaches them.")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _attach_laws(cls, raw: Any) -> Any:
+        """Return the table with the law of each attached effect file in its entry."""
+        if not isinstance(raw, dict) or not isinstance(raw.get("files"), dict):
+            return raw
+        effects = raw.get("effects")
+        if not isinstance(effects, list):
+            return raw
+        attached = []
+        for entry in effects:
+            name = entry.get("file") if isinstance(entry, dict) else None
+            if isinstance(name, str) and "law" not in entry and name in raw["files"]:
+                law = parse_toml(str(raw["files"][name]), EffectFile, name)
+                attached.append({**entry, "law": law})
+            else:
+                attached.append(entry)
+        return {**raw, "effects": attached}
 
     @model_validator(mode="after")
     def _validate_unique(self) -> "ModelConfig":
@@ -119,3 +172,35 @@ class ModelConfig(ConfigModel):
                 remedy="use a model without the others",
             )
         return model.parameters
+
+
+def load_model_config(path: Path) -> tuple[ModelConfig, str]:
+    """Load a model file and the effect files that it names: return (config, text with them).
+
+    The text holds all that the model needs, so a recording that keeps it needs no other file.
+    """
+    text = read_text(path, "model file")
+    try:
+        entries = tomllib.loads(text).get("effects", [])
+        names = {entry["file"]: None for entry in entries if isinstance(entry.get("file"), str)}
+    except (tomllib.TOMLDecodeError, AttributeError, TypeError, RecursionError):
+        names = {}  # reported when the text is parsed
+    if names:
+        texts = {name: _read_effect_file(path.parent / name, path) for name in names}
+        text = f"{text}\n{format_toml({'files': texts})}"
+    return parse_toml(text, ModelConfig, str(path)), text
+
+
+def _read_effect_file(path: Path, model_path: Path) -> str:
+    """Return the text of an effect file; InputError if it cannot be read or is too large."""
+    try:
+        if path.stat().st_size <= MAX_EFFECT_FILE_BYTES:
+            return read_text(path, "effect file")
+    except OSError as error:
+        raise InputError(
+            f"cannot read this effect file: {error.strerror}", where=model_path, key="file",
+            value=path.name, remedy="put it next to the model file",
+        ) from None  # fmt: skip
+    raise InputError(
+        "too large for an effect file", where=path, allowed=f"at most {MAX_EFFECT_FILE_BYTES} bytes"
+    )

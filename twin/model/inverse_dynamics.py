@@ -22,7 +22,8 @@ from table_io.compilation import (
     jit_helper_unless_none,
     jit_kernel,
 )
-from twin.model.effects.law import DAMPER, sum_law_properties
+from twin.model.effects.effect_file import WrittenEffect
+from twin.model.effects.law import DAMPER, PLACES, sum_law_properties
 from twin.model.event_integrator import kernel_coefficients
 from twin.model.force_laws import (
     ADDED_LAWS_TYPE,
@@ -289,12 +290,49 @@ def forces_along(
     left: IN_CONTACT, NO_CONTACT, or CONTACT_UNKNOWN where the model decides. Effects on the input
     (see `Model.added_acceleration`) and on sensors are not included.
     """
-    coefficients, laws = kernel_coefficients(model)
-    fastest_rate = _fastest_law_rate(model)
+    compiled, on_arrays = _split_laws(model, bool((contact >= 0).all()))
+    coefficients, laws = kernel_coefficients(compiled)
+    fastest_rate = _fastest_law_rate(compiled)
     out = np.empty((3, u.size))
     touched = contact.astype(np.float64, order="C")
     _force_kernel(u, v, base_acc, time_s, touched, coefficients, laws, fastest_rate, out)
+    for effect, values in on_arrays:
+        inputs = {"v": v, "a": base_acc, "t": time_s}
+        for place in PLACES[effect.place]:
+            if place == DAMPER:
+                out[0] += effect.expression.evaluate(values | inputs | {"u": u})
+                continue
+            sign, gap = (1.0, coefficients.gap_r) if place == 0 else (-1.0, coefficients.gap_l)
+            opening = gap + coefficients.drift * time_s
+            inputs |= {"d": sign * u - opening, "v": sign * v - coefficients.drift}
+            push = effect.expression.evaluate(values | inputs)
+            out[1 + place] += np.where(contact[place] == IN_CONTACT, sign * push, 0.0)
     return out
+
+
+def _split_laws(
+    model: Model, is_contact_known: bool
+) -> tuple[Model, list[tuple[WrittenEffect, dict[str, float]]]]:
+    """Return (model to compile, laws of effect files that can be evaluated on whole arrays).
+
+    A search tries hundreds of laws, and compiling one takes a second. Laws with states, and those
+    in bumpers where the model decides on contact, depend on the motion before.
+    """
+    direct = []
+    faces_have_memory = model.effect_parameter("bumper_maxwell", "kb") or any(
+        effect.is_in_bumpers and effect.states for effect, _ in model.added_laws
+    )
+    for instance in model.present_effects:
+        effect = instance.effect
+        if not isinstance(effect, WrittenEffect) or effect.states or effect.acts != "force":
+            continue
+        if effect.place == "damper" or (is_contact_known and not faces_have_memory):
+            direct.append((effect, dict(instance.values)))
+    if not direct:
+        return model, []
+    own = [effect for effect, _ in direct]
+    rest = tuple(instance for instance in model.effects if instance.effect not in own)
+    return Model(model.base, rest), direct
 
 
 def depends_on_history(model: Model) -> bool:
@@ -302,7 +340,7 @@ def depends_on_history(model: Model) -> bool:
 
     Where it was not, every force does: a face that is touched stays touched while it pushes.
     """
-    p, _ = kernel_coefficients(model)
+    p, _ = kernel_coefficients(_split_laws(model, is_contact_known=True)[0])
     has_states = any(effect.states for effect, _ in model.added_laws)
     return has_states or max(p.fy, p.k1, p.kb) > 0.0
 

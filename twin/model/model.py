@@ -1,7 +1,7 @@
 """`Model`: base parameters and the effects added to them; selects its solver."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, overload
@@ -203,9 +203,17 @@ class Model:
             values |= {f"{instance.name}.{name}": value for name, value in instance.values.items()}
         return values
 
+    def with_flat(self, values: Mapping[str, float]) -> "Model":
+        """Return a model of the values of `flatten`, which may have effects of effect files."""
+        return Model.from_flat(values, tuple(instance.effect for instance in self.effects))
+
     @classmethod
-    def from_flat(cls, values: Mapping[str, float]) -> "Model":
-        """Build a model from the values of `flatten`; InputError names missing or unknown ones."""
+    def from_flat(cls, values: Mapping[str, float], known: Sequence[Effect] = ()) -> "Model":
+        """Build a model from the values of `flatten`; InputError names missing or unknown ones.
+
+        `known` are effects that are not in the library.
+        """
+        own_effects = {effect.id: effect for effect in known}
         base = {name: value for name, value in values.items() if "." not in name}
         effects: dict[tuple[str, str], dict[str, float]] = {}
         for name, value in values.items():
@@ -215,7 +223,7 @@ class Model:
         return cls(
             Parameters.from_dict(base),
             tuple(
-                EffectInstance.create(find_effect(effect), own, channel)
+                EffectInstance.create(own_effects.get(effect) or find_effect(effect), own, channel)
                 for (effect, channel), own in effects.items()
             ),
         )

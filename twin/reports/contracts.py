@@ -595,6 +595,41 @@ class Sensors(Contract):
     checks: list[SensorCheckResult] = Field(description="what was checked")
 
 
+class LawTerm(Contract):
+    """Term of a proposed law: an effect file next to the model file."""
+
+    id: str = Field(description="name of the effect and of its file")
+    title: str = Field(description="the law in words")
+    place: str = Field(description="where it acts")
+    force: str = Field(description="expression of the force in N, or acceleration in m/s2")
+    states: dict[str, str] = Field(description="expressions of the rates of internal states")
+    parameters: dict[str, Interval] = Field(description="fitted parameters and references")
+    range: dict[str, list[SI]] = Field(description="measured range of the variables")
+
+
+class LawClass(Contract):
+    """Best law of a class."""
+
+    law_class: str = Field(description="class of laws")
+    id: str = Field(description="best law of the class")
+    held_out_error: Ratio = Field(description="rms over the noise, on held-out steps")
+
+
+class ProposedLaw(Contract):
+    """Law for what no effect of the library explains."""
+
+    terms: list[LawTerm] = Field(description="terms of the law, added up")
+    with_effects: list[str] = Field(description="effects of the library that it needs")
+    law_class: str = Field(description="class of the law")
+    held_out_before: Ratio = Field(description="misfit without the law, on held-out steps")
+    held_out_after: Ratio = Field(description="misfit with it")
+    noise_floor: Ratio = Field(description="misfit that noise alone leaves")
+    closed_fraction: Ratio = Field(description="share of the misfit over the floor that it closes")
+    sufficient: bool = Field(description="whether it leaves hardly more than the floor")
+    nearest: str = Field(description="best single effect of the library")
+    classes: list[LawClass] = Field(description="best law of each class, best first")
+
+
 class Verdict(Contract):
     """verdict.json of a discovery."""
 
@@ -614,6 +649,9 @@ class Verdict(Contract):
         None, description="rivals of the effects, best first; absent in old files"
     )
     remainder: Remainder = Field(description="part of the misfit that remains")
+    law: ProposedLaw | None = Field(
+        None, description="law for what no effect explains; absent in old files"
+    )
     sensors: Sensors | None = Field(None, description="on the instruments; absent in old files")
     base: dict[str, Interval] = Field(description="refitted parameters of the given model")
     fell_away: dict[str, str] = Field(description="reason of each effect that was not tested")

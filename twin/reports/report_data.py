@@ -166,9 +166,10 @@ def read_initial_model(run: ReportData) -> Model | None:
     """Return the initial model: as recorded, else from the model file; None if it is unknown."""
     recorded = run.recording.records(Params)
     try:
-        if recorded:
-            return Model.from_flat(recorded[0].values)
         config = ModelConfig.model_validate(parse_toml_tables(run.recording.start.model_toml))
+        if recorded:
+            known = [entry.effect for entry in config.effects]
+            return Model.from_flat(recorded[0].values, known)
         return config.build_model(run.specimen) if run.specimen else None
     except ValueError:
         return None

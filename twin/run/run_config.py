@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from table_io.acquisition.session import SessionSetup
 from table_io.clock import local_datetime
-from table_io.config.base import PROFILES_DIR, load_config, parse_toml
+from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.folders import find_config, resolve_config
 from table_io.config.profile import Profile, Specimen, load_profile
 from table_io.config.rig import RigConfig
@@ -19,7 +19,7 @@ from table_io.excitation.trajectory import plan_excitation
 from table_io.records import RunStart, Step
 from table_io.safety.preflight import StepDemand, check_limits, compute_demands
 from table_io.sequencer import make_test_plan, nominal_drive
-from twin.model.config import ModelConfig
+from twin.model.config import ModelConfig, load_model_config
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 from twin.run.versions import read_installed_versions
@@ -178,7 +178,7 @@ def build_run_config(
     model_path = find_config(
         model or profile.model, "models", relative_to, option="--model" if model else ""
     )
-    model_config, model_toml = load_config(model_path, ModelConfig, "model file")
+    model_config, model_toml = load_model_config(model_path)
     if profile.continuation is not None and profile.continuation.file is None:
         from twin.run.orbit_plan import attach_orbit_plan
 
@@ -205,7 +205,7 @@ def read_model(
     InputError names the option that gave the name, as in `find_config`.
     """
     path = find_config(name, "models", relative_to, option)
-    return load_config(path, ModelConfig, "model file")
+    return load_model_config(path)
 
 
 def make_run_id(name: str) -> str:

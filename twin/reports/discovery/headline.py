@@ -3,6 +3,7 @@
 from twin.model.effects import describe_effect, find_effect
 from twin.model.effects.typesetting import typeset_law
 from twin.reports.discovery.serialize import REFITTED_SUFFIX, Json
+from twin.reports.quantities import format_quantity
 
 MAX_EXCLUDED = 3  # rivals that the headline names
 VERDICT_SENTENCES = {
@@ -68,3 +69,32 @@ def describe_laws(verdict: Json) -> list[Json]:
 def describe_excluded(verdict: Json) -> list[Json]:
     """Return the rivals that are named next to the effects: those that fit best."""
     return list((verdict.get("excluded") or [])[:MAX_EXCLUDED])
+
+
+def describe_proposal(law: Json) -> list[str]:
+    """Return a proposed law as lines: its equation, numbers, range and what it explains."""
+    lines = []
+    for term in law["terms"]:
+        symbol = "A" if term["place"] == "input" else "F"
+        where = {"damper": "in the damper", "input": "on the table"}.get(
+            term["place"], "in contact"
+        )
+        lines.append(f"proposed law, {term['title']} {where}: {symbol} = {term['force']}")
+        lines += [f"  with d{name}/dt = {rate}" for name, rate in term["states"].items()]
+        lines += [
+            f"  {name} = {format_quantity(value['value'], value['unit'], _half_width(value))}"
+            for name, value in term["parameters"].items()
+        ]
+        limits = [f"{name} {low:.3g} to {high:.3g}" for name, (low, high) in term["range"].items()]
+        lines.append(f"  fitted for {', '.join(limits)} (SI)")
+    lines.append(
+        f"  it closes {100 * law['closed_fraction']:.0f} % of the misfit: "
+        f"{law['held_out_before']:.3g} -> {law['held_out_after']:.3g} times the noise on held-out "
+        f"steps (floor {law['noise_floor']:.3g}); nearest effect of the library: "
+        f"{law['nearest'] or 'none'}"
+    )
+    return lines
+
+
+def _half_width(value: Json) -> float:
+    return 0.5 * float(value["high"] - value["low"])

@@ -7,6 +7,7 @@ from typing import Any
 from twin.identification.candidates import Candidate
 from twin.identification.discover import Discovery, PreparedLog
 from twin.identification.held_out import compute_force_error
+from twin.identification.law_search import LawProposal
 from twin.identification.least_squares import INTERVAL_SIGMA, FitResult
 from twin.identification.parameters import (
     SLIP_SPEED,
@@ -24,6 +25,7 @@ from twin.identification.parameters import (
 from twin.identification.selection import FittedSet
 from twin.identification.sensor_checks import SensorCheck, check_sensors
 from twin.identification.verdict import closed_fraction, suggest_next_run
+from twin.model.effects.effect_file import EffectFile, WrittenEffect
 from twin.model.model import SENSOR_CHANNELS, Model
 
 Json = dict[str, Any]
@@ -42,6 +44,7 @@ def verdict_to_json(
     notes: Sequence[str] = (),
     held_out_logs: Sequence[PreparedLog] = (),
     given: Model | None = None,
+    proposal: LawProposal | None = None,
 ) -> Json:
     """Return the content of verdict.json, see `twin.reports.contracts.Verdict`.
 
@@ -85,6 +88,7 @@ def verdict_to_json(
             "unexplained": verdict.has_remainder,
             "evidence": generic_term_to_json(verdict.generic, factor),
         },
+        "law": law_to_json(proposal, factor) if proposal else None,
         "sensors": sensors_to_json(check_discovery_sensors(discovery)),
         "base": base_to_json(best),
         "fell_away": dict(discovery.prepared.excluded),
@@ -347,11 +351,14 @@ def model_to_toml(
                 "channel and does not predict it; repair or calibrate the sensor"
             )
             continue
+        definition = fit.parameters.effects.get(effect)
         numbers = [f"{name} = {value!r}" for name, value in values.items()]
         numbers += [f"channel = {_quote_toml(channel)}"] if channel else []
         lines += [
             "[[effects]]",
-            f"id = {_quote_toml(effect)}",
+            f"file = {_quote_toml(effect_file_name(definition))}"
+            if isinstance(definition, WrittenEffect)
+            else f"id = {_quote_toml(effect)}",
             f"parameters = {{ {', '.join(numbers)} }}",
         ]
     lines += ["[intervals]  # 95 %"]
@@ -371,6 +378,65 @@ def model_to_toml(
             f"correct the gaps in the test profile of each log: each side differs by {differences}"
         )
     return "\n".join(lines) + "\n", omitted
+
+
+def effect_file_name(effect: WrittenEffect) -> str:
+    """Return the name of the effect file that a model file refers to."""
+    return f"{effect.id}.toml"
+
+
+def list_effect_files(fit: FitResult, laws: Sequence[EffectFile] = ()) -> dict[str, str]:
+    """Return the texts by name of the effect files of a fitted model; `laws` describe new ones."""
+    texts = {law.id: law.format_text() for law in laws}
+    return {
+        effect_file_name(effect): texts.get(effect.id, effect.source)
+        for effect in fit.parameters.effects.values()
+        if isinstance(effect, WrittenEffect)
+        and any(
+            isinstance(key, EffectKey) and key.effect == effect.id for key in fit.parameters.values
+        )
+    }
+
+
+def law_to_json(proposal: LawProposal, factor: float) -> Json:
+    """Return a proposed law, see `twin.reports.contracts.ProposedLaw`."""
+    fitted = proposal.fitted
+    terms = fitted.effects[len(proposal.start.effects) :]
+    return {
+        "terms": [
+            {
+                "id": law.id,
+                "title": law.title,
+                "place": law.place,
+                "force": law.force,
+                "states": {name: state.rate for name, state in law.states.items()},
+                "parameters": effect_to_json(term, fitted.fit, 1.0)["parameters"]
+                | {
+                    key.name: interval_to_json(value, 0.0, law.parameters[key.name].unit)
+                    for key, value in term.constants.items()
+                    if isinstance(key, EffectKey)
+                },
+                "range": {name: [*limits] for name, limits in law.range.items()},
+            }
+            for law, term in zip(proposal.laws, terms, strict=True)
+        ],
+        "with_effects": [*proposal.start.names],
+        "law_class": proposal.law_class,
+        "held_out_before": factor * math.sqrt(proposal.start.cost),
+        "held_out_after": factor * math.sqrt(fitted.cost),
+        "noise_floor": factor * math.sqrt(proposal.floor),
+        "closed_fraction": proposal.closed_share,
+        "sufficient": proposal.is_sufficient,
+        "nearest": proposal.nearest,
+        "classes": [
+            {
+                "law_class": name,
+                "id": best.names[-1],
+                "held_out_error": factor * math.sqrt(best.cost),
+            }
+            for name, best in proposal.by_class
+        ],
+    }
 
 
 def _quote_toml(text: str) -> str:

@@ -79,8 +79,10 @@ class CaseFactory:
                 effects.setdefault(effect, {})[parameter] = value
         instances = {instance.name: instance for instance in self.model.effects}
         for effect, own in effects.items():
-            known = instances[effect].values if effect in instances else {}
-            instances[effect] = EffectInstance.create(find_effect(effect), {**known, **own})
+            present = instances.get(effect)
+            known = present.values if present else {}
+            definition = present.effect if present else find_effect(effect)
+            instances[effect] = EffectInstance.create(definition, {**known, **own})
         model = Model(replace(self.model.base, **base), tuple(instances.values()))
         return SampledCase(model, level, settings)
 

@@ -1,0 +1,88 @@
+"""Search of laws that the library lacks, on recordings of the simulated rig."""
+
+import math
+
+import pytest
+
+from tests.identification.played import SNM, format_truth, log
+from twin.identification.discover import prepare_problem
+from twin.identification.law_search import propose_law, search_laws
+from twin.identification.law_terms import FAMILIES, list_law_candidates
+from twin.model.effects.expression import parse_unit
+
+
+def search(truth):
+    prepared = prepare_problem([log(truth)], SNM)
+    null = prepared.problem.fit_effects(prepared.parameters, ())
+    return prepared, null, search_laws(prepared.problem, [null])
+
+
+class TestTerms:
+    def test_every_family_is_a_law_on_any_scale(self):
+        prepared = prepare_problem([log()], SNM)
+        scale = prepared.problem.log_residuals[0].scale
+        candidates = list_law_candidates(scale, has_contact=True)
+        assert len({candidate.name for candidate in candidates}) == len(FAMILIES)
+        for candidate in candidates:
+            assert candidate.shapes
+            assert candidate.amplitude.vanishing == 0.0
+
+    def test_laws_of_bumpers_need_contact(self):
+        scale = prepare_problem([log()], SNM).problem.log_residuals[0].scale
+        free = list_law_candidates(scale, has_contact=False)
+        assert all(
+            candidate.effect and candidate.effect.place in ("damper", "input") for candidate in free
+        )
+
+
+@pytest.mark.parametrize(
+    ("truth", "name", "place"),
+    [
+        (format_truth("cubic_damping", c3=4e4), "law_damping_power", "damper"),
+        pytest.param(
+            format_truth("bumper_cubic", kc=2e11),
+            "law_bumper_power",
+            "bumpers",
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_the_planted_law_is_the_best(truth, name, place):
+    prepared, null, fitted_sets = search(truth)
+    best = fitted_sets[0]
+    effect = best.effects[-1].effect
+    assert effect is not None
+    assert best.effects[-1].name == name
+    assert effect.place == place
+    assert null.cost > 1.5
+    assert best.cost < 1.1 * prepared.problem.noise
+
+
+@pytest.mark.slow
+class TestProposal:
+    @pytest.mark.parametrize(
+        ("truth", "exponent", "value", "unit"),
+        [
+            (format_truth("cubic_damping", c3=4e4), 3, 4e4, "N s3/m3"),
+            (format_truth("even_stiffness", ke=1e6), 2, 1e6, "N/m2"),
+        ],
+    )
+    def test_the_planted_law_is_written_with_its_number(self, truth, exponent, value, unit):
+        from twin.identification.discover import discover_effects
+
+        discovery = discover_effects([log(truth)], SNM)
+        proposal = propose_law(discovery)
+        assert proposal is not None
+        (law,) = proposal.laws
+        (parameter,) = law.parameters.values()
+        assert f"**{exponent}" in law.force
+        assert parse_unit(parameter.unit) == parse_unit(unit)
+        assert parameter.typical == pytest.approx(value, rel=0.05)
+        assert proposal.is_sufficient
+        assert proposal.closed_share > 0.9
+        assert math.sqrt(proposal.fitted.cost / proposal.floor) < 1.1
+
+    def test_nothing_hidden_proposes_nothing(self):
+        from twin.identification.discover import discover_effects
+
+        assert propose_law(discover_effects([log()], SNM)) is None

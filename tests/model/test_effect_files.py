@@ -1,0 +1,207 @@
+"""Effect files: the grammar, units, and laws that equal those of the library."""
+
+import math
+import pickle
+
+import numpy as np
+import pytest
+
+from table_io.config.base import parse_toml
+from table_io.errors import InputError
+from tests.identification.played import SNM
+from twin.model.config import ModelConfig, load_model_config
+from twin.model.effects.effect_file import EffectFile, build_written_effect
+from twin.model.effects.expression import FUNCTIONS, build_function, parse_expression, parse_unit
+from twin.model.inverse_dynamics import forces_along
+from twin.model.model import EffectInstance, Model
+from twin.model.valid_range import find_range_exits
+
+HEADER = """title = "x"
+[base]
+stiffness_n_m = 36000.0
+damping_n_s_m = 1100.0
+bumper_stiffness_n_m = 510000.0
+bumper_damping_n_s_m = 900.0
+"""
+K = (
+    "[parameters.k]\nunit = '{unit}'\nlow = -1e15\nhigh = 1e15\nvanishing = 0.0\n"
+    "typical = {typical}\n"
+)
+TAU = "[parameters.tau]\nunit = 's'\nlow = 1e-4\nhigh = 100.0\ntypical = 0.05\n"
+CUBIC = "id = 'own_cubic'\nforce = 'k * u**3'\n" + K.format(unit="N/m3", typical=1e7)
+DEEP = "id = 'deep'\nplace = 'bumpers'\nforce = 'k * d * abs(d)'\n" + K.format(
+    unit="N/m2", typical=1e8
+)
+BRANCH = (
+    "id = 'branch'\nforce = 'f'\n[states.f]\nunit = 'N'\nrate = 'k * v - f / tau'\n"
+    + K.format(unit="N/m", typical=8e3)
+    + TAU
+)
+TILT = "id = 'lean'\nplace = 'input'\nforce = 'k * y'\n" + K.format(unit="1/s2", typical=1.0)
+
+
+def add(effect, **values):
+    instance = EffectInstance.create(effect, values)
+    return Model(SNM.base, (instance,))
+
+
+def simulate(model, level=1.0, frequency=3.0, seconds=4.0):
+    """Run a model under a growing sine at 1 kHz; return its outputs."""
+    time = np.arange(round(seconds * 1000)) / 1000
+    drive = level * time / seconds * np.sin(2 * np.pi * frequency * time)
+    solver = model.prepare(1000.0)
+    out = np.empty((7, time.size))
+    solver.advance(solver.rest_state(), drive, -drive / (2 * np.pi * frequency) ** 2, out)
+    return out
+
+
+class TestGrammar:
+    @pytest.mark.parametrize(
+        "text",
+        [
+            "__import__('os').system('true')", "u.real", "u[0]", "[u]", "(lambda: u)()",
+            "u if u else v", "'u'", "True", "u and v", "u < v", "abs(*u)", "abs(x=u)", "max(u)",
+            "w", "exec(u)", "u := v", "1e999 * u", "u" + " + u" * 200, "-" * 40 + "u", "u @ v",
+            "u // v", "~u", "f'{u}'", "u\nv", "",
+        ],
+    )  # fmt: skip
+    def test_all_else_is_refused(self, text):
+        with pytest.raises(InputError) as caught:
+            parse_expression(text, ["u", "v"])
+        assert caught.value.allowed
+
+    @pytest.mark.parametrize("name", FUNCTIONS)
+    def test_the_function_equals_the_array(self, name):
+        count = FUNCTIONS[name][2]
+        text = f"2 * {name}({', '.join(['u', 'v'][:count])}) - u**3 / 7 + -v**2"
+        expression = parse_expression(text, ["u", "v"])
+        function = build_function("f", ["u", "v"], expression, {}, {})
+        for u, v in ((0.3, 0.7), (1.2, -0.4), (0.0, 0.1)):
+            if name == "log" and u == 0.0:
+                continue
+            assert function(u, v) == pytest.approx(float(expression.evaluate({"u": u, "v": v})))
+
+    @pytest.mark.parametrize(
+        ("unit", "dimension"),
+        [("N s2/m2", (1, -1, 0)), ("", (0, 0, 0)), ("1/s", (0, 0, -1)), ("N/m3", (1, -2, -2))],
+    )
+    def test_units(self, unit, dimension):
+        assert parse_unit(unit) == dimension
+
+    @pytest.mark.parametrize(
+        ("force", "key"),
+        [
+            ("k * u**2", "force"), ("k * u**3 + u", "force"), ("k * tanh(u)", "force"),
+            ("k * u**k", "force"), ("k * u**3 + max(u, v)", "force"), ("k * u**4 / u", "force"),
+            ("k * z", "force"),
+        ],
+    )  # fmt: skip
+    def test_a_wrong_unit_or_value_names_the_key(self, force, key):
+        with pytest.raises(InputError) as caught:
+            build_written_effect(CUBIC.replace("k * u**3", force))
+        assert key in str(caught.value.faults[0])
+        assert caught.value.faults[0].remedy
+
+    def test_a_law_that_feeds_energy_is_no_damper(self):
+        text = "id = 'x'\ndissipates = true\nforce = '-k * v'\n" + K.format(
+            unit="N s/m", typical=9.0
+        )
+        with pytest.raises(InputError):
+            build_written_effect(text)
+        build_written_effect(text.replace("-k", "k"))
+
+
+class TestLaws:
+    @pytest.mark.parametrize(
+        ("text", "values", "library"),
+        [
+            (CUBIC, {"k": 3e7}, ("cubic_stiffness", {"k3": 3e7})),
+            (DEEP, {"k": 2e8}, ("bumper_hardening", {"k2": 2e8})),
+            (BRANCH, {"k": 9e3, "tau": 0.03}, ("maxwell_damper", {"k1": 9e3, "tau": 0.03})),
+            (TILT, {"k": 9.80665 * 0.2}, ("table_tilt", {"tilt": 0.2})),
+        ],
+        ids=("damper", "bumpers", "state", "input"),
+    )
+    def test_a_written_law_moves_as_that_of_the_library(self, text, values, library):
+        name, own = library
+        written, built_in = add(build_written_effect(text), **values), SNM.with_effect(name, **own)
+        difference = simulate(written) - simulate(built_in)
+        scale = np.abs(simulate(built_in)).max(axis=1, keepdims=True)
+        assert np.abs(difference / np.maximum(scale, 1e-12)).max() < 2e-4
+
+    @pytest.mark.parametrize("contact", [-1, 0])
+    def test_forces_on_arrays_equal_the_compiled_ones(self, contact):
+        generator = np.random.default_rng(3)
+        time = np.arange(2000) / 1000
+        u = 4e-3 * np.sin(7 * time) + 1e-3 * np.sin(31 * time)
+        v = np.gradient(u, 1e-3)
+        acc = generator.normal(size=time.size)
+        state = np.full((2, time.size), contact, dtype=np.int8)
+        if contact == 0:
+            state[0], state[1] = u > 0.002, u < -0.002
+        for text, values, name, own in (
+            (CUBIC, {"k": 3e7}, "cubic_stiffness", {"k3": 3e7}),
+            (DEEP, {"k": 2e8}, "bumper_hardening", {"k2": 2e8}),
+        ):
+            model = add(build_written_effect(text), **values)
+            expected = forces_along(SNM.with_effect(name, "", **own), u, v, acc, time, state)
+            np.testing.assert_allclose(
+                forces_along(model, u, v, acc, time, state), expected, rtol=1e-9, atol=1e-9
+            )
+
+    def test_the_same_text_is_the_same_effect_also_when_pickled(self):
+        effect = build_written_effect(BRANCH)
+        assert pickle.loads(pickle.dumps(effect)) is effect
+        law = parse_toml(BRANCH, EffectFile, "x")
+        assert effect.rates is not None
+        assert effect.rates(0.0, 0.5, (2.0,), (4.0, 0.1)) == (-18.0,)
+        again = parse_toml(law.format_text(), EffectFile, "x")
+        assert again == law
+
+
+class TestModelFile:
+    def test_a_law_is_found_next_to_the_model_and_kept_in_its_text(self, tmp_path):
+        (tmp_path / "own.toml").write_text(CUBIC)
+        entry = "[[effects]]\nfile = 'own.toml'\nparameters = { k = 2e7 }\n"
+        (tmp_path / "model.toml").write_text(HEADER + entry)
+        config, text = load_model_config(tmp_path / "model.toml")
+        assert config.effects[0].instance.values == {"k": 2e7}
+        (tmp_path / "own.toml").unlink()
+        assert parse_toml(text, ModelConfig, "x").effects[0].effect is config.effects[0].effect
+
+    @pytest.mark.parametrize(
+        ("entry", "law"),
+        [
+            ("file = 'gone.toml'", None), ("file = 'own.toml'\nid = 'other'", CUBIC),
+            ("file = 'own.toml'", CUBIC + "x = 1\n"), ("file = 'own.toml'", "x" * 200_000),
+            ("parameters = { k = 1 }", None),
+        ],
+    )  # fmt: skip
+    def test_a_bad_entry_is_one_message(self, tmp_path, entry, law):
+        if law:
+            (tmp_path / "own.toml").write_text(law)
+        (tmp_path / "model.toml").write_text(f"{HEADER}[[effects]]\n{entry}\n")
+        with pytest.raises(InputError):
+            load_model_config(tmp_path / "model.toml")
+
+    def test_an_unattached_law_says_so(self):
+        with pytest.raises(InputError):
+            parse_toml(HEADER + "[[effects]]\nfile = 'own.toml'\n", ModelConfig, "x")
+
+
+class TestRange:
+    def test_the_first_sample_outside_is_found(self):
+        effect = build_written_effect(CUBIC + "[range]\nu = [-1e-3, 2e-3]\n")
+        u = np.array([0.0, 1e-3, 2.05e-3, 2.1e-3, -2e-3])
+        (range_exit,) = find_range_exits(add(effect, k=1e7), {"u": u})
+        assert (range_exit.sample, range_exit.value) == (3, 2.1e-3)
+        assert not [*find_range_exits(add(effect, k=1e7), {"u": u[:3]})]
+
+    def test_a_bumper_in_flight_is_inside(self):
+        effect = build_written_effect(DEEP + "[range]\nd = [0.0, 1e-3]\n")
+        gap = SNM.base.gap_r
+        assert not [*find_range_exits(add(effect, k=1e8), {"u": np.array([-0.5 * gap, gap])})]
+        deep = {"u": np.array([0.0, -gap - 1.1e-3])}
+        (range_exit,) = find_range_exits(add(effect, k=1e8), deep)
+        assert range_exit.sample == 1
+        assert math.isclose(range_exit.value, 1.1e-3)

@@ -1,0 +1,257 @@
+"""Search for a force law where no effect of the library explains a residual.
+
+Terms of `law_terms` are screened, refitted with the base in the same likelihood and judged on
+held-out steps, as effects are: forward selection with a small beam, over all classes at once.
+Exponents that the data allow to be round are rounded.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin.identification.candidates import Candidate
+from twin.identification.discover import Discovery
+from twin.identification.law_terms import (
+    find_family,
+    list_law_candidates,
+    round_exponent,
+)
+from twin.identification.parameters import EffectKey, ParameterSet
+from twin.identification.residuals import LogResiduals
+from twin.identification.screening import build_normal_equations
+from twin.identification.selection import (
+    FittedSet,
+    ProgressCallback,
+    SelectionProblem,
+    SelectionProgress,
+    select_promising,
+)
+from twin.identification.verdict import closed_fraction
+from twin.model.effects.effect_file import EffectFile, WrittenEffect
+
+FIRST_REFITS, NEXT_REFITS, BEAM_WIDTH = 8, 4, 3
+MAX_EXPLAINED_RATIO = 1.05  # of the mean square to the noise: with less no second term is tried
+MIN_CLOSED_SHARE = 0.5  # of the misfit that a law must close to be proposed
+SUFFICIENT_RATIO = 1.1  # of the held-out error to the floor: with less, the law explains the record
+MAX_WORSE_SIGMA = 2.0  # standard errors by which a law with a rounded exponent may be worse
+MAX_WORSE_SHARE = 1e-4  # of the held-out squares, which no one would miss
+
+
+@dataclass(frozen=True, eq=False)
+class LawProposal:
+    """A law for what the library does not explain: the fitted set and how good it is.
+
+    `start` is the set to which its terms were added, `laws` an effect file for each term;
+    `nearest` the effect of the library that does best alone. `by_class` are the best single terms
+    of each class, best first.
+    """
+
+    fitted: FittedSet
+    start: FittedSet
+    laws: tuple[EffectFile, ...]
+    floor: float
+    nearest: str
+    law_class: str
+    by_class: tuple[tuple[str, FittedSet], ...]
+
+    @property
+    def closed_share(self) -> float:
+        """Share of the held-out misfit over the floor that the law closes."""
+        return closed_fraction(self.start.cost, self.fitted.cost, self.floor)
+
+    @property
+    def is_sufficient(self) -> bool:
+        """True if the held-out error is at most `SUFFICIENT_RATIO` of the floor."""
+        return math.sqrt(self.fitted.cost / self.floor) <= SUFFICIENT_RATIO
+
+
+def propose_law(
+    discovery: Discovery, report: ProgressCallback = lambda progress: None
+) -> LawProposal | None:
+    """Return a law for what a discovery leaves unexplained; None if nothing is, or none helps."""
+    verdict, selection = discovery.verdict, discovery.selection
+    if verdict.outcome != "unexplained" and not verdict.has_remainder:
+        return None
+    problem = discovery.prepared.problem
+    starts = [selection.null, *([verdict.best] if verdict.best.effects else [])]
+    fitted_sets = search_laws(problem, starts, report)
+    if not fitted_sets:
+        return None
+    best = _round_exponents(problem, _select_simplest(problem, fitted_sets))
+    start = max(
+        (start for start in starts if start.effects == best.effects[: len(start.effects)]),
+        key=lambda start: len(start.effects),
+    )
+    floor = min(verdict.floor, best.cost)
+    if (
+        not problem.is_worthwhile(start, best)
+        or closed_fraction(selection.null.cost, best.cost, floor) < MIN_CLOSED_SHARE
+    ):
+        return None
+    terms = [effect for effect in best.effects if effect not in start.effects]
+    singles = [fitted for fitted in selection.tried if len(fitted.effects) == 1]
+    nearest = min(singles, key=lambda fitted: fitted.cost, default=None)
+    nearest_name = nearest.names[0] if nearest else ""
+    laws = tuple(_describe_law(problem, best, term, nearest_name) for term in terms)
+    family = find_family(terms[0])
+    assert family is not None
+    return LawProposal(
+        best, start, laws, floor, nearest_name, family.law_class, _list_best_by_class(fitted_sets)
+    )
+
+
+def search_laws(
+    problem: SelectionProblem,
+    starts: Sequence[FittedSet],
+    report: ProgressCallback = lambda progress: None,
+) -> list[FittedSet]:
+    """Return the sets of a start and one or two terms that were fitted, best first.
+
+    Later starts are tried only if the earlier ones lead to no explanation.
+    """
+    has_contact = any((log.contact_state > 0).any() for log in problem.log_residuals)
+    library = list_law_candidates(problem.log_residuals[0].scale, has_contact)
+    fitted_sets: list[FittedSet] = []
+    for start in starts:
+        if not _explains(problem, fitted_sets):
+            fitted_sets += _search_from(problem, start, library, report)
+    return sorted(fitted_sets, key=lambda fitted: fitted.cost)
+
+
+def _search_from(
+    problem: SelectionProblem,
+    start: FittedSet,
+    library: Sequence[Candidate],
+    report: ProgressCallback,
+) -> list[FittedSet]:
+    """Return the sets of `start` and one or two terms that were fitted."""
+    fitted_sets = _extend(problem, start, library, FIRST_REFITS, report)
+    for current in fitted_sets[:BEAM_WIDTH]:
+        if _explains(problem, fitted_sets):
+            break
+        further = [term for term in library if term.name not in current.names]
+        fitted_sets = [*fitted_sets, *_extend(problem, current, further, NEXT_REFITS, report)]
+    return fitted_sets
+
+
+def _explains(problem: SelectionProblem, fitted_sets: Sequence[FittedSet]) -> bool:
+    """Return whether one of the sets leaves hardly more than noise."""
+    return any(fitted.cost <= MAX_EXPLAINED_RATIO * problem.noise for fitted in fitted_sets)
+
+
+def _extend(
+    problem: SelectionProblem,
+    current: FittedSet,
+    library: Sequence[Candidate],
+    max_refits: int,
+    report: ProgressCallback,
+) -> list[FittedSet]:
+    """Return the sets of `current` and the best screened terms, each refitted, best first."""
+    parameters = current.fit.parameters
+    equations = build_normal_equations(problem.log_residuals, parameters, library, problem.mapper)
+    fitted_sets: list[FittedSet] = []
+    screened_terms = select_promising(equations, max_refits)
+    for index, screened in enumerate(screened_terms, 1):
+        effects = (*current.effects, screened.candidate)
+        names = tuple(effect.name for effect in effects)
+        best = min((current, *fitted_sets), key=lambda fitted: fitted.cost)
+        report(SelectionProgress("a law", names, index, len(screened_terms), best))
+        fitted_sets.append(problem.fit_effects(screened.add_to(parameters), effects))
+    return sorted(fitted_sets, key=lambda fitted: fitted.cost)
+
+
+def _select_simplest(problem: SelectionProblem, fitted_sets: Sequence[FittedSet]) -> FittedSet:
+    """Return the set with the fewest parameters than which the best is not worth more."""
+    best = min(fitted_sets, key=lambda fitted: fitted.cost)
+    as_good = [
+        fitted
+        for fitted in fitted_sets
+        if fitted is best or not problem.is_worthwhile(fitted, best)
+    ]
+
+    def complexity(fitted: FittedSet) -> tuple[int, float]:
+        return sum(len(effect.free) for effect in fitted.effects), fitted.cost
+
+    return min(as_good, key=complexity)
+
+
+def _round_exponents(problem: SelectionProblem, fitted: FittedSet) -> FittedSet:
+    """Return the set with round exponents where held-out steps do not tell the difference."""
+    for term in fitted.effects:
+        scale = problem.log_residuals[0].scale
+        rounded = round_exponent(term, fitted.fit.parameters, scale)
+        if rounded is None:
+            continue
+        candidate, amplitude = rounded
+        shape = candidate.shapes[0]
+        start = candidate.add_to(term.remove_from(fitted.fit.parameters), shape, amplitude)
+        effects = tuple(candidate if effect is term else effect for effect in fitted.effects)
+        refitted = problem.fit_effects(start, effects)
+        is_as_good = refitted.cost <= (1 + MAX_WORSE_SHARE) * fitted.cost
+        if is_as_good or problem.compute_gain(refitted, fitted)[2] < MAX_WORSE_SIGMA:
+            fitted = refitted
+    return fitted
+
+
+def _list_best_by_class(fitted_sets: Sequence[FittedSet]) -> tuple[tuple[str, FittedSet], ...]:
+    """Return (class, its best single term) of each class that was fitted, best first."""
+    best: dict[str, FittedSet] = {}
+    for fitted in fitted_sets:
+        family = find_family(fitted.effects[-1])
+        if (
+            family is not None
+            and sum(find_family(term) is not None for term in fitted.effects) == 1
+        ):
+            best.setdefault(family.law_class, fitted)
+    return tuple(best.items())
+
+
+def _describe_law(
+    problem: SelectionProblem, fitted: FittedSet, term: Candidate, nearest: str
+) -> EffectFile:
+    """Return the effect file of a fitted term: its values as typical ones, its measured range."""
+    assert isinstance(term.effect, WrittenEffect)
+    law = term.effect.law
+    values = {
+        name: fitted.fit.parameters.values[EffectKey(term.name, name)] for name in law.parameters
+    }
+    parameters = {
+        name: parameter.model_copy(
+            update={
+                "typical": values[name],
+                "low": min(parameter.low, values[name]),
+                "high": max(parameter.high, values[name]),
+            }
+        )
+        for name, parameter in law.parameters.items()
+    }
+    names = law.parsed_force.names.union(*(rate.names for rate in law.parsed_rates.values()))
+    valid_range = measure_range(problem.log_residuals, fitted.fit.parameters)
+    return law.model_copy(
+        update={
+            "parameters": parameters,
+            "range": {name: valid_range[name] for name in valid_range if name in names},
+            "nearest": nearest,
+            "residual": f"A {law.title or 'law'} found where no effect of the library fits.",
+        }
+    )
+
+
+def measure_range(
+    log_residuals: Sequence[LogResiduals], parameters: ParameterSet
+) -> Mapping[str, tuple[float, float]]:
+    """Return the least and largest value of each variable of a law in the logs, SI."""
+    rows: dict[str, list[float]] = {}
+    for residuals in log_residuals:
+        m = residuals.motion(parameters.assumed_sensors())
+        p = parameters.model_for_log(residuals.log_number, m).parameters
+        moving = m.moving
+        variables = {"u": m.u, "v": m.v, "a": m.table_acc, "t": m.time_s, "y": m.table_disp}
+        if math.isfinite(min(p.gap_r, p.gap_l)):
+            variables["d"] = np.maximum(np.maximum(m.u - p.gap_r, -m.u - p.gap_l), 0.0)
+        for name, values in variables.items():
+            kept = values[moving & np.isfinite(values)]
+            rows.setdefault(name, []).extend((float(kept.min()), float(kept.max())))
+    return {name: (min(ends), max(ends)) for name, ends in rows.items()}

@@ -1,0 +1,333 @@
+"""Expressions of effect files: a small grammar, checked for names and units, without `eval`.
+
+An expression is arithmetic (+ - * / **), numbers, names and the functions of `FUNCTIONS`, written
+as in Python. The parsed tree is checked node by node; anything else (attributes, subscripts,
+strings, other calls) is refused. It is evaluated on arrays, and becomes a function of plain Python
+that numba compiles, from the same tree.
+"""
+
+import ast
+import copy
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import CodeType, FunctionType
+from typing import Any
+
+import numpy as np
+
+from table_io.errors import InputError, suggest
+
+MAX_TEXT_LENGTH = 1000  # characters
+MAX_NODES, MAX_DEPTH = 100, 30  # of the tree of one expression
+BASE_UNITS: Mapping[str, tuple[float, float, float]] = {  # exponents of kg, m, s
+    "N": (1, 1, -2), "m": (0, 1, 0), "s": (0, 0, 1), "kg": (1, 0, 0), "rad": (0, 0, 0),
+    "Hz": (0, 0, -1), "1": (0, 0, 0),
+}  # fmt: skip
+Dimension = tuple[float, float, float]
+DIMENSIONLESS: Dimension = (0.0, 0.0, 0.0)
+
+
+def sign(x: float) -> float:
+    """Return +1 or -1, the sign of a zero included: a force law has a side at a reversal."""
+    return math.copysign(1.0, x)
+
+
+# function -> (of one number, of an array, number of arguments)
+FUNCTIONS: Mapping[str, tuple[Callable[..., float], Callable[..., Any], int]] = {
+    "abs": (abs, np.abs, 1),
+    "sign": (sign, lambda x: np.copysign(1.0, x), 1),
+    "sqrt": (math.sqrt, np.sqrt, 1),
+    "exp": (math.exp, np.exp, 1),
+    "log": (math.log, np.log, 1),
+    "sin": (math.sin, np.sin, 1),
+    "cos": (math.cos, np.cos, 1),
+    "sinh": (math.sinh, np.sinh, 1),
+    "tanh": (math.tanh, np.tanh, 1),
+    "min": (min, np.minimum, 2),
+    "max": (max, np.maximum, 2),
+}
+OPERATORS: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = {
+    ast.Add: np.add,
+    ast.Sub: np.subtract,
+    ast.Mult: np.multiply,
+    ast.Div: np.divide,
+    ast.Pow: np.power,
+}
+SIGNS: Mapping[type[ast.unaryop], Callable[[Any], Any]] = {
+    ast.USub: np.negative,
+    ast.UAdd: np.positive,
+}
+ALLOWED = f"numbers, names, + - * / **, brackets and {', '.join(FUNCTIONS)}"
+
+
+@dataclass(frozen=True, eq=False)
+class Expression:
+    """A checked expression: its text, tree, names of variables and number of nodes."""
+
+    text: str
+    tree: ast.expr
+    names: frozenset[str]
+    node_count: int
+
+    def evaluate(self, values: Mapping[str, Any]) -> Any:
+        """Return the value for numbers or arrays of the names."""
+        with np.errstate(all="ignore"):
+            return _evaluate(self.tree, values)
+
+    def find_dimension(self, units: Mapping[str, str]) -> Dimension:
+        """Return the exponents of kg, m and s for units of the names; InputError at a mismatch."""
+        dimensions = {name: parse_unit(unit) for name, unit in units.items()}
+        return _DimensionCheck(dimensions, self.text).find(self.tree)
+
+
+def parse_expression(text: str, known_names: Sequence[str]) -> Expression:
+    """Return the checked expression of a text; InputError says what is outside the grammar."""
+    if len(text) > MAX_TEXT_LENGTH:
+        raise _refuse("too long", text[:40], allowed=f"at most {MAX_TEXT_LENGTH} characters")
+    try:
+        tree = ast.parse(text.strip(), mode="eval").body
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        raise _refuse("not an expression", text) from None
+    names: set[str] = set()
+    node_count = _check_node(tree, text, known_names, names, 0)
+    if node_count > MAX_NODES:
+        raise _refuse(f"has {node_count} nodes", text, allowed=f"at most {MAX_NODES}")
+    return Expression(text.strip(), tree, frozenset(names), node_count)
+
+
+def _refuse(problem: str, text: str, allowed: str = ALLOWED, remedy: str = "") -> InputError:
+    return InputError(f"{problem}", value=text, allowed=allowed, remedy=remedy)
+
+
+def _check_node(
+    node: ast.expr, text: str, known_names: Sequence[str], names: set[str], depth: int
+) -> int:
+    """Return the number of nodes below and with this one; InputError if one is not allowed."""
+    if depth > MAX_DEPTH:
+        raise _refuse("nested too deeply", text, allowed=f"at most {MAX_DEPTH} levels")
+    match node:
+        case ast.Constant(value=float() | int() as value) if not isinstance(value, bool):
+            if not abs(value) < math.inf:
+                raise _refuse("has a number that is not finite", text)
+            return 1
+        case ast.Name(id=name):
+            if name not in known_names:
+                raise _refuse(
+                    f"{name!r} is unknown", text, allowed=", ".join(known_names),
+                    remedy=suggest(name, [*known_names, *FUNCTIONS]),
+                )  # fmt: skip
+            names.add(name)
+            return 1
+        case ast.UnaryOp(op=op, operand=operand) if type(op) in SIGNS:
+            parts = [operand]
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in OPERATORS:
+            parts = [left, right]
+        case ast.Call(func=ast.Name(id=function), args=parts, keywords=[]):
+            if function not in FUNCTIONS:
+                raise _refuse(
+                    f"function {function!r} is unknown", text, remedy=suggest(function, FUNCTIONS)
+                )
+            if len(parts) != FUNCTIONS[function][2]:
+                raise _refuse(
+                    f"{function} has {len(parts)} arguments", text,
+                    allowed=f"{FUNCTIONS[function][2]}",
+                )  # fmt: skip
+        case _:
+            raise _refuse(f"{ast.unparse(node)!r} is outside the grammar", text)
+    return 1 + sum(_check_node(part, text, known_names, names, depth + 1) for part in parts)
+
+
+def _evaluate(node: ast.expr, values: Mapping[str, Any]) -> Any:
+    match node:
+        case ast.Constant(value=value):
+            return float(value)  # type: ignore[arg-type]
+        case ast.Name(id=name):
+            return values[name]
+        case ast.UnaryOp(op=op, operand=operand):
+            return SIGNS[type(op)](_evaluate(operand, values))
+        case ast.BinOp(left=left, op=op, right=right):
+            return OPERATORS[type(op)](_evaluate(left, values), _evaluate(right, values))
+        case ast.Call(func=ast.Name(id=function), args=parts):
+            return FUNCTIONS[function][1](*(_evaluate(part, values) for part in parts))
+    raise AssertionError(ast.dump(node))  # checked when it was parsed
+
+
+def parse_unit(unit: str) -> Dimension:
+    """Return the exponents of kg, m and s of a unit such as "N s2/m2"; InputError if unknown."""
+    total = [0.0, 0.0, 0.0]
+    numerator, _, denominator = unit.partition("/")
+    for factors, direction in ((numerator, 1.0), (denominator, -1.0)):
+        for factor in factors.split():
+            matched = re.fullmatch(r"([A-Za-z]+|1)(\d*)", factor)
+            if matched is None or matched[1] not in BASE_UNITS:
+                raise InputError(
+                    f"unit {factor!r} is unknown",
+                    value=unit,
+                    allowed=f"products of {', '.join(BASE_UNITS)} with powers, as in N s2/m2",
+                )
+            for index, exponent in enumerate(BASE_UNITS[matched[1]]):
+                total[index] += direction * exponent * int(matched[2] or 1)
+    return (total[0], total[1], total[2])
+
+
+def format_dimension(dimension: Dimension) -> str:
+    """Return a unit with this dimension, in N, m and s."""
+    kg, m, s = dimension
+    powers = {"N": kg, "m": m - kg, "s": s + 2 * kg}
+
+    def write(direction: float) -> str:
+        return " ".join(
+            name if abs(power) == 1 else f"{name}{abs(power):g}"
+            for name, power in powers.items()
+            if power * direction > 0
+        )
+
+    above, below = write(1.0), write(-1.0)
+    return f"{above or '1'}/{below}" if below else above
+
+
+@dataclass(frozen=True)
+class _DimensionCheck:
+    """Finds the dimension of each part of an expression from those of the names."""
+
+    known: Mapping[str, Dimension]
+    text: str
+
+    def find(self, node: ast.expr) -> Dimension:
+        match node:
+            case ast.Constant():
+                return DIMENSIONLESS
+            case ast.Name(id=name):
+                return self.known[name]
+            case ast.UnaryOp(operand=operand):
+                return self.find(operand)
+            case ast.BinOp(left=left, op=op, right=right):
+                return self._find_of_operator(op, left, right)
+            case ast.Call(func=ast.Name(id=function), args=parts):
+                return self._find_of_call(function, parts)
+        raise AssertionError(ast.dump(node))  # checked when it was parsed
+
+    def _find_of_operator(self, op: ast.operator, left: ast.expr, right: ast.expr) -> Dimension:
+        match op:
+            case ast.Mult():
+                return _combine(self.find(left), self.find(right), 1.0)
+            case ast.Div():
+                return _combine(self.find(left), self.find(right), -1.0)
+            case ast.Pow():
+                return self._find_of_power(left, right)
+        return self._find_common(left, right)
+
+    def _find_of_power(self, base: ast.expr, exponent: ast.expr) -> Dimension:
+        self._require_number(exponent)
+        dimension = self.find(base)
+        if dimension == DIMENSIONLESS:
+            return dimension
+        if not isinstance(exponent, ast.Constant):
+            raise self._refuse(base, dimension, "a pure number below a variable exponent")
+        return _combine(DIMENSIONLESS, dimension, float(exponent.value))  # type: ignore[arg-type]
+
+    def _find_of_call(self, function: str, parts: Sequence[ast.expr]) -> Dimension:
+        match function:
+            case "abs":
+                return self.find(parts[0])
+            case "sign":
+                return DIMENSIONLESS
+            case "sqrt":
+                return _combine(DIMENSIONLESS, self.find(parts[0]), 0.5)
+            case "min" | "max":
+                return self._find_common(*parts)
+        for part in parts:
+            self._require_number(part)
+        return DIMENSIONLESS
+
+    def _find_common(self, first: ast.expr, second: ast.expr) -> Dimension:
+        """Return the dimension of two terms, which must agree; a zero has any."""
+        dimensions = [
+            self.find(part)
+            for part in (first, second)
+            if not (isinstance(part, ast.Constant) and part.value == 0)
+        ]
+        if len({*dimensions}) > 1:
+            raise self._refuse(second, dimensions[1], format_dimension(dimensions[0]))
+        return dimensions[0] if dimensions else DIMENSIONLESS
+
+    def _require_number(self, part: ast.expr) -> None:
+        if self.find(part) != DIMENSIONLESS:
+            raise self._refuse(part, self.find(part), "a pure number")
+
+    def _refuse(self, part: ast.expr, dimension: Dimension, expected: str) -> InputError:
+        unit = format_dimension(dimension) or "a pure number"
+        return InputError(
+            f"the unit of {ast.unparse(part)!r} is {unit}",
+            value=self.text,
+            allowed=expected or "a pure number",
+            remedy="correct the expression or the units of its parameters",
+        )
+
+
+def _combine(first: Dimension, second: Dimension, power: float) -> Dimension:
+    a, b, c = (x + power * y for x, y in zip(first, second, strict=True))
+    return (a, b, c)
+
+
+def build_function(
+    name: str,
+    arguments: Sequence[str],
+    result: Expression | Sequence[Expression],
+    places: Mapping[str, tuple[str, int]],
+    renamed: Mapping[str, str],
+) -> Callable[..., Any]:
+    """Return a function of plain Python: of one expression a number, of several a tuple.
+
+    `places` gives, for a name that is no argument, the tuple argument and the index that hold it;
+    `renamed` the argument of a name that is called otherwise.
+    The function is built from the checked trees; no text is executed.
+    """
+
+    class Placing(ast.NodeTransformer):
+        def visit_Name(self, node: ast.Name) -> ast.expr:
+            if node.id not in places:
+                return ast.Name(renamed.get(node.id, node.id), ast.Load())
+            holder, index = places[node.id]
+            return ast.Subscript(ast.Name(holder, ast.Load()), ast.Constant(index), ast.Load())
+
+        def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
+            left, right = self.visit(node.left), self.visit(node.right)
+            if isinstance(node.op, ast.Pow) and isinstance(node.right, ast.Constant):
+                exponent = float(node.right.value)  # type: ignore[arg-type]
+                if exponent.is_integer():  # compiled to products
+                    right = ast.Constant(int(exponent))
+            return ast.BinOp(left, node.op, right)
+
+        def visit_Constant(self, node: ast.Constant) -> ast.expr:
+            return ast.Constant(float(node.value))  # type: ignore[arg-type]
+
+        def visit_Call(self, node: ast.Call) -> ast.expr:
+            arguments = [self.visit(part) for part in node.args]
+            if isinstance(node.func, ast.Name) and node.func.id == "sign":
+                # a function that numba knows
+                return ast.Call(
+                    ast.Name("copysign", ast.Load()), [ast.Constant(1.0), *arguments], []
+                )
+            return ast.Call(node.func, arguments, [])
+
+    def place(expression: Expression) -> ast.expr:
+        placed: ast.expr = Placing().visit(copy.deepcopy(expression.tree))
+        return placed
+
+    body = (
+        place(result)
+        if isinstance(result, Expression)
+        else ast.Tuple([place(part) for part in result], ast.Load())
+    )
+    parameters = ast.arguments(
+        [], [ast.arg(argument) for argument in arguments], None, [], [], None, []
+    )
+    definition = ast.FunctionDef(name, parameters, [ast.Return(body)], [], None)
+    module = ast.fix_missing_locations(ast.Module([definition], []))
+    code = compile(module, f"<{name}>", "exec")
+    function_code = next(part for part in code.co_consts if isinstance(part, CodeType))
+    numeric = {function: entry[0] for function, entry in FUNCTIONS.items()}
+    return FunctionType(function_code, numeric | {"copysign": math.copysign})
