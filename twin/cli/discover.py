@@ -165,7 +165,7 @@ def write_results(
     verdict["notes"] += omitted
     (folder / "model.toml").write_text(text, encoding="utf-8")
     (folder / "verdict.json").write_text(dump_contract(Verdict, verdict), encoding="utf-8")
-    write_discovery_page(folder, discovery, logs, verdict)
+    write_discovery_page(folder, discovery, logs, verdict, proposal)
 
 
 def print_verdict(verdict: Json) -> None:

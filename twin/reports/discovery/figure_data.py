@@ -15,11 +15,13 @@ from table_io.block import Float1D, Float2D, Int1D, Label
 from table_io.records import Step
 from twin.identification.candidates import Candidate
 from twin.identification.discover import Discovery, PreparedLog
+from twin.identification.law_search import LawProposal
 from twin.identification.localization import PHASES, classify_phases, is_stepped_sine
 from twin.identification.motion import MeasuredMotion
 from twin.identification.parameters import GENERIC_PREFIX, ParameterSet
 from twin.identification.residuals import FORCE_ROWS, LogResiduals
 from twin.identification.selection import FittedSet
+from twin.model.effects.effect_file import WrittenEffect
 
 MIN_ENTRIES = 20  # of a step in a residual row, for a close-up
 CLOSE_UP_CYCLES = 2
@@ -76,6 +78,7 @@ class DiscoveryView:
 
     discovery: Discovery
     logs: Sequence[PreparedLog]
+    proposal: LawProposal | None = None  # then its law stands for the effects
 
     @property
     def log_residuals(self) -> tuple[LogResiduals, ...]:
@@ -84,7 +87,11 @@ class DiscoveryView:
     @property
     def before_after(self) -> Pair:
         """Sets (before, after)."""
-        return self.discovery.selection.null, self.discovery.verdict.best
+        return self.discovery.selection.null, self._best
+
+    @property
+    def _best(self) -> FittedSet:
+        return self.proposal.fitted if self.proposal else self.discovery.verdict.best
 
     @property
     def models(self) -> tuple[FittedSet, FittedSet, FittedSet]:
@@ -97,6 +104,8 @@ class DiscoveryView:
 
         None if nothing was found.
         """
+        if self.proposal is not None:
+            return self.proposal.fitted
         v = self.discovery.verdict
         if v.generic is not None and (v.outcome == "unexplained" or not v.best.effects):
             return v.generic
@@ -143,9 +152,10 @@ class DiscoveryView:
     @cached_property
     def forces_of_each(self) -> tuple[TermForces, ...]:
         """Forces of each effect found, then of the generic term; sensor errors have none."""
-        v, residuals = self.discovery.verdict, self.log_residuals[self.worst_log]
-        pairs = [(v.best, term) for term in v.best.effects if not term.channel]
-        pairs += [(v.generic, v.generic.effects[-1])] if v.generic else []
+        generic, residuals = self.discovery.verdict.generic, self.log_residuals[self.worst_log]
+        pairs = [(self._best, term) for term in self._best.effects if not term.channel]
+        if generic is not None and self.proposal is None:
+            pairs.append((generic, generic.effects[-1]))
         return tuple(
             compute_term_forces(residuals, fitted.fit.parameters, [term]) for fitted, term in pairs
         )
@@ -153,6 +163,8 @@ class DiscoveryView:
 
 def format_term(term: Candidate) -> str:
     """Return the name of an effect for a reader; a term outside the library is called generic."""
+    if isinstance(term.effect, WrittenEffect):
+        return f"{term.effect.law.title}: {term.effect.law.force}"
     if term.effect is not None:
         return term.name
     return f"generic term {term.name.removeprefix(f'{GENERIC_PREFIX}.')} (no effect of the library)"
@@ -164,7 +176,7 @@ def compute_term_forces(
     """Return the force that terms of a fitted set add, and what the measurement requires of it."""
     without = parameters
     for term in terms:
-        without = without.without(term.free)
+        without = term.remove_from(without)
     required, remaining = (
         residuals.force_errors(own, residuals.motion(own.assumed_sensors()))
         for own in (without, parameters)

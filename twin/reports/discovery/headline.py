@@ -42,6 +42,9 @@ def format_verdict(verdict: Json) -> str:
     text = VERDICT_SENTENCES[verdict["verdict"]].format(names=names)
     if verdict["verdict"] == "none" and verdict["why"].endswith(REFITTED_SUFFIX):
         text = "No effect is missing, but the model agrees only with other parameters than it has."
+    if law := verdict.get("law"):
+        titles = " and ".join(term["title"] for term in law["terms"])
+        return f"{text} A law was found for it: {titles}."
     if verdict["verdict"] == "unexplained":
         if term := verdict["remainder"]["evidence"]:
             text += f" A general law would fit: {term['term']}."
@@ -94,6 +97,30 @@ def describe_proposal(law: Json) -> list[str]:
         f"{law['nearest'] or 'none'}"
     )
     return lines
+
+
+def typeset_proposal(law: Json | None) -> list[Json]:
+    """Return the terms of a proposed law for the page: equation, numbers and range."""
+    if law is None:
+        return []
+    terms = []
+    for term in law["terms"]:
+        symbol = "A" if term["place"] == "input" else "F"
+        equations = [f"{symbol} = {term['force']}"]
+        equations += [f"{name}' = {rate}" for name, rate in term["states"].items()]
+        limits = [
+            f"{name} from {low:.3g} to {high:.3g}" for name, (low, high) in term["range"].items()
+        ]
+        terms.append(
+            {
+                "title": term["title"],
+                "equations": [typeset_law(equation.replace("**", "^")) for equation in equations],
+                "parameters": term["parameters"],
+                "range": ", ".join(limits),
+                "file": f"{term['id']}.toml",
+            }
+        )
+    return terms
 
 
 def _half_width(value: Json) -> float:

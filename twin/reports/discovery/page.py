@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from twin.identification.discover import Discovery, PreparedLog
+from twin.identification.law_search import LawProposal
 from twin.identification.parameters import GAP_PREFIX
 from twin.identification.screening import MIN_STEP_UNITS
 from twin.reports.discovery.figure_data import DiscoveryView, check_instruments
@@ -20,6 +21,7 @@ from twin.reports.discovery.headline import (
     describe_laws,
     format_effect,
     format_verdict,
+    typeset_proposal,
 )
 from twin.reports.discovery.sensor_section import (
     CHANNEL_KINDS,
@@ -40,10 +42,14 @@ SECTIONS = {
 
 
 def write_discovery_page(
-    folder: Path, discovery: Discovery, logs: Sequence[PreparedLog], verdict: Json
+    folder: Path,
+    discovery: Discovery,
+    logs: Sequence[PreparedLog],
+    verdict: Json,
+    proposal: LawProposal | None = None,
 ) -> Path:
     """Write folder/report.html and its figures to folder/figures; return the path of the page."""
-    view = DiscoveryView(discovery, logs)
+    view = DiscoveryView(discovery, logs, proposal)
     runs = run_logs_free(view)
     pictures = draw_discovery_figures(view, verdict, runs, folder / "figures")
     text = render_page(
@@ -52,6 +58,8 @@ def write_discovery_page(
         sentence=format_verdict(verdict),
         laws=describe_laws(verdict),
         excluded=describe_excluded(verdict),
+        proposed=verdict["law"],
+        proposed_terms=typeset_proposal(verdict["law"]),
         quantity=format_interval,
         held_out=describe_held_out(view),
         rows=list_parameter_rows(verdict, [log.signals.name for log in logs]),
@@ -92,6 +100,8 @@ def list_parameter_rows(
     """Return (group, parameter, [value, low, high], unit) of all fitted values, lengths in mm."""
     term = verdict["remainder"]["evidence"]
     groups = [(format_effect(effect), effect["parameters"]) for effect in verdict["effects"]]
+    if law := verdict["law"]:
+        groups += [(f"proposed law, {part['title']}", part["parameters"]) for part in law["terms"]]
     groups += [(f"generic term, {term['term']}", term["parameters"])] if term else []
     base = {_gap_label(name, names): value for name, value in verdict["base"].items()}
     rows = []

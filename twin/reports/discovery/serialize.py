@@ -82,7 +82,7 @@ def verdict_to_json(
             "held_out_after": factor * math.sqrt(best.cost),
             "closed_fraction": closed_fraction(null.cost, best.cost, verdict.floor),
         },
-        "staircase": staircase_to_json(discovery, factor),
+        "staircase": staircase_to_json(discovery, factor, proposal),
         "excluded": excluded_to_json(discovery, factor),
         "remainder": {
             "unexplained": verdict.has_remainder,
@@ -104,7 +104,9 @@ def verdict_to_json(
     }
 
 
-def staircase_to_json(discovery: Discovery, factor: float) -> list[Json]:
+def staircase_to_json(
+    discovery: Discovery, factor: float, proposal: LawProposal | None = None
+) -> list[Json]:
     """Return the misfit step by step: as given, refitted, + each effect, noise floor.
 
     The effects are in the order in which each removes most; a set that was not fitted is left out.
@@ -123,7 +125,9 @@ def staircase_to_json(discovery: Discovery, factor: float) -> list[Json]:
         names = min((n for n in larger if len(n) == smallest), key=lambda n: costs[n])
         steps.append((f"+ {' + '.join(sorted(names - added))}", costs[names]))
         added = names
-    generic = verdict.generic
+    generic = verdict.generic if proposal is None else None
+    if proposal is not None:
+        steps.append(("with the proposed law", proposal.fitted.cost))
     if generic is not None and verdict.outcome == "unexplained":
         term = generic.names[-1].split(".", 1)[1]
         steps.append((f"with the general law {term}", generic.cost))
