@@ -10,7 +10,7 @@ this is what makes a fit converge (see `twin.identification`).
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -252,6 +252,27 @@ def _force_kernel(
             out[1 + side, k] = sign * push if in_contact else 0.0
 
 
+class PreparedForces(NamedTuple):
+    """Coefficients of a model's forces, prepared once for many short motions."""
+
+    coefficients: Coefficients
+    laws: AddedLaws | None
+    fastest_rate: float
+
+    @classmethod
+    def from_model(cls, model: Model) -> "PreparedForces":
+        return cls(*kernel_coefficients(model), _fastest_law_rate(model))
+
+    def evaluate(
+        self, u: Float1D, v: Float1D, time_s: Float1D, contact: npt.NDArray[np.int8]
+    ) -> Float2D:
+        """Return D, F_R and F_L in N, (3, sample); see `forces_along`."""
+        out = np.empty((3, u.size))
+        touched = contact.astype(np.float64, order="C")
+        _force_kernel(u, v, time_s, touched, self.coefficients, self.laws, self.fastest_rate, out)
+        return out
+
+
 def forces_along(
     model: Model, u: Float1D, v: Float1D, time_s: Float1D, contact: npt.NDArray[np.int8]
 ) -> Float2D:
@@ -261,12 +282,7 @@ def forces_along(
     (2, sample) right and left: IN_CONTACT, NO_CONTACT, or CONTACT_UNKNOWN where the model decides.
     Effects on the input (see `Model.added_acceleration`) and on sensors are not included.
     """
-    coefficients, laws = kernel_coefficients(model)
-    fastest_rate = _fastest_law_rate(model)
-    out = np.empty((3, u.size))
-    touched = contact.astype(np.float64, order="C")
-    _force_kernel(u, v, time_s, touched, coefficients, laws, fastest_rate, out)
-    return out
+    return PreparedForces.from_model(model).evaluate(u, v, time_s, contact)
 
 
 def depends_on_history(model: Model) -> bool:
