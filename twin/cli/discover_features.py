@@ -20,6 +20,7 @@ from twin.identification.features.search import (
     choose_pairs,
     list_feature_effects,
     rank_fits,
+    refit_base,
     run_base_job,
     run_effect_job,
     run_pair_job,
@@ -91,6 +92,7 @@ class _FeatureSearch:
                 bar, "effects", partial(run_effect_job, problem, base, effects), effects,
                 is_stopping,
             )  # fmt: skip
+            base = refit_base(problem, base, fits)
             pairs = choose_pairs(fits)
             fits += self._run_stage(
                 bar, "pairs", partial(run_pair_job, problem, base, pairs),
@@ -98,6 +100,8 @@ class _FeatureSearch:
             )  # fmt: skip
         if is_stopping():
             self.notes.append("stopped early: not every effect and pair was fitted")
+            print_line("refitting the base model from the winners")
+            base = refit_base(problem, base, fits)
         return rank_fits(problem, base, fits, excluded)
 
     def _run_stage(

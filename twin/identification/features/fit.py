@@ -168,10 +168,35 @@ class TrialGroup:
     trials: Sequence[ParameterSet]
 
 
-def fit_base(problem: FeatureProblem, given: FeatureFit) -> FeatureFit:
-    """Return the refitted base: K, C, K_j and C_j only."""
-    start = given.parameters.with_free(problem.list_base_factors())
-    return fit_effects(problem, (), [TrialGroup(given, [start])])
+def fit_base(
+    problem: FeatureProblem, given: FeatureFit, winners: Sequence[FeatureFit] = ()
+) -> FeatureFit:
+    """Return the refitted base: K, C, K_j and C_j only.
+
+    From the base as given, from others within its range, and from the bases of the winners of a
+    search: where the base has not converged, every effect seems to gain.
+    """
+    free = problem.list_base_factors()
+    start = given.parameters.with_free(free)
+    starts = [start]
+    for fit in winners:
+        values = {key: fit.parameters.values[key] for p in free for key in p.keys}
+        starts.append(start.with_values(values))
+    if not winners:
+        centre = start.to_vector()
+        for end in ("low", "high"):
+            # Halfway to one end of every range, in logarithms; the damper's and the bumpers' apart.
+            for is_bumper in (False, True):
+                limits = [p.to_internal(getattr(p, end)) for p in free]
+                moves = [str(p.key).startswith("bumper") == is_bumper for p in free]
+                halfway = np.where(moves, (centre + np.array(limits)) / 2, centre)
+                starts.append(start.with_vector(halfway))
+    return fit_effects(problem, (), [TrialGroup(given, [each]) for each in starts])
+
+
+def extend_fit(fit: FeatureFit, other: FeatureFit) -> FeatureFit:
+    """Return a fit with the further effects of another one at their vanishing values."""
+    return _add_vanishing(fit, other.names, other.parameters)
 
 
 def list_trials(problem: FeatureProblem, effect_id: str, start: ParameterSet) -> list[ParameterSet]:

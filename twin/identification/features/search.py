@@ -12,6 +12,7 @@ from twin.identification.features.fit import (
     FeatureFit,
     FeatureProblem,
     TrialGroup,
+    extend_fit,
     fit_base,
     fit_effects,
     judge_model,
@@ -22,6 +23,7 @@ from twin.model.effects import EFFECTS, find_effect, load_plugins
 from twin.model.effects.effect import Effect
 
 PAIRED_EFFECTS = 4  # of the best, tried in pairs
+REFITTED_WINNERS = 3  # from which the base is refitted once more
 
 NOT_TESTED = {
     "mass_error": "one factor on all forces: where only motion is known, the refit has it",
@@ -134,6 +136,15 @@ def _join_fits(start: FeatureFit, added: FeatureFit) -> ParameterSet:
     return start.parameters.with_values(values).with_free((*start.parameters.free, *free))
 
 
+def refit_base(problem: FeatureProblem, base: BaseFits, fits: Sequence[FeatureFit]) -> BaseFits:
+    """Return the fits of the base, refitted also from those of the best effects and pairs."""
+    winners = sorted(fits, key=lambda fit: fit.rank_key)[:REFITTED_WINNERS]
+    if not winners:
+        return base
+    again = fit_base(problem, base.given, winners)
+    return BaseFits(base.given, min(base.refitted, again, key=lambda fit: fit.rank_key))
+
+
 def choose_pairs(singles: Sequence[FeatureFit]) -> list[tuple[FeatureFit, FeatureFit]]:
     """Return the pairs of the best single effects."""
     best = sorted(singles, key=lambda fit: fit.rank_key)[:PAIRED_EFFECTS]
@@ -145,8 +156,12 @@ def rank_fits(
 ) -> FeatureDiscovery:
     """Return the discovery: most features explained first, then the smaller misfit.
 
-    A pair that explains no more features than one of its effects comes after it.
+    A pair that explains no more features than one of its effects comes after it. An effect that was
+    not fitted as well as the base without it vanishes.
     """
+    fits = [
+        min(fit, extend_fit(base.refitted, fit), key=lambda each: each.rank_key) for fit in fits
+    ]
     singles = {fit.names[0]: fit for fit in fits if len(fit.names) == 1}
 
     def order(fit: FeatureFit) -> tuple[int, int, float]:
