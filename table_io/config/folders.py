@@ -1,4 +1,4 @@
-"""Folders in which tests, rigs, models and campaigns are found by their bare names."""
+"""Folders in which tests, rigs, models, features ... are found by their bare names."""
 
 import os
 from pathlib import Path

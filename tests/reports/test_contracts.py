@@ -10,7 +10,13 @@ from pydantic import BaseModel, ValidationError
 from table_io.records import Check, Fault, NormalizedResponse, Timing, Trip
 from twin.compare.curves import Hysteresis, PrcJump
 from twin.reports import contracts
-from twin.reports.contracts import RunSummary, SummaryKeys, Verdict, build_json_schema
+from twin.reports.contracts import (
+    FeatureVerdict,
+    RunSummary,
+    SummaryKeys,
+    Verdict,
+    build_json_schema,
+)
 from twin.reports.summary import dump_contract, dump_strict_json
 
 NAN = float("nan")
@@ -85,7 +91,7 @@ def test_a_summary_of_another_version_is_read() -> None:
         SummaryKeys.model_validate({"run": {}, "verdict": "complete", "steps": [{"index": 0}]})
 
 
-@pytest.mark.parametrize("contract", [RunSummary, Verdict])
+@pytest.mark.parametrize("contract", [RunSummary, Verdict, FeatureVerdict])
 def test_a_schema_describes_every_key_and_gives_a_unit_to_every_number(
     contract: type[BaseModel],
 ) -> None:

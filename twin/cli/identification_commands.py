@@ -25,8 +25,20 @@ study_app = typer.Typer(
 
 
 @identification_app.command("discover", rich_help_panel=LEARN_PANEL)
-def discover_from_logs(
-    logs: LogPaths,
+def discover_missing_effect(
+    logs: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[LOG...]", parser=parse_measured_path, help=f"{MEASURED_LOG_HELP} Repeatable."
+        ),
+    ] = None,
+    features: Annotated[
+        str | None,
+        typer.Option(
+            "--features",
+            help="Instead of recordings, explain the features of a file: a name or a .toml file.",
+        ),
+    ] = None,
     model: Annotated[
         str, typer.Option("--model", help="Test this model: a name or a .toml file.")
     ] = "snm",
@@ -43,6 +55,13 @@ def discover_from_logs(
     ] = None,
 ) -> None:
     """Find the physical effect the model is missing and refit with it."""
+    if features is not None:
+        from twin.cli.discover_features import discover_by_features, require_no_logs
+
+        require_no_logs(logs or [], held_out or [])
+        raise typer.Exit(discover_by_features(features, model, out, without or []))
+    if not logs:
+        raise typer.BadParameter("give one LOG or more, or --features FILE", param_hint="LOG...")
     from twin.cli.discover import discover_command as command
 
     raise typer.Exit(command(logs, model, out, without or [], held_out or []))

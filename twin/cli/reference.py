@@ -28,6 +28,7 @@ TEMPLATES = {
     FileKind.model: "models/snm",
     FileKind.campaign: "campaigns/paper",
     FileKind.study: "studies/bumper_design",
+    FileKind.features: "features/paper",
 }
 EXAMPLE_KIND = 'kind = "stepped_sine"'  # of the excitation of a new test
 WRITTEN_BY_CAMPAIGNS = ("[set_up]", "[resume]")
@@ -118,7 +119,8 @@ def write_template(kind: FileKind, path: Path) -> None:
         text = (PROFILES_DIR / f"{TEMPLATES[kind]}.toml").read_text(encoding="utf-8")
     else:
         raise InputError(
-            "no template", where=f"new {kind}", allowed="test, rig, model, campaign",
+            "no template", where=f"new {kind}",
+            allowed="test, rig, model, campaign, study, features",
             remedy="for a map: shaketwin import FILE --save-map MAP",
         )  # fmt: skip
     _write_new(path, text)

@@ -19,6 +19,7 @@ class FileKind(enum.StrEnum):
     campaign = "campaign"
     map = "map"
     study = "study"
+    features = "features"
 
 
 class ListKind(enum.StrEnum):
@@ -29,12 +30,14 @@ class ListKind(enum.StrEnum):
     models = "models"
     campaigns = "campaigns"
     studies = "studies"
+    features = "features"
     effects = "effects"
     channels = "channels"
 
 
 KindArgument = Annotated[
-    FileKind, typer.Argument(metavar="test|rig|model|campaign|map|study", help="Kind of file.")
+    FileKind,
+    typer.Argument(metavar="test|rig|model|campaign|map|study|features", help="Kind of file."),
 ]
 
 
@@ -51,7 +54,8 @@ def list_names_command(
 @reference_app.command("new", rich_help_panel=REFERENCE_PANEL)
 def new_file_command(
     kind: Annotated[
-        FileKind, typer.Argument(metavar="test|rig|model|campaign|study", help="Kind of file.")
+        FileKind,
+        typer.Argument(metavar="test|rig|model|campaign|study|features", help="Kind of file."),
     ],
     file: Annotated[Path, typer.Argument(metavar="FILE", help="New .toml file.")],
 ) -> None:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from table_io.block import Float1D
 from twin.dynamics.bifurcations import BifurcationKind
@@ -87,22 +88,30 @@ def find_peaks(branches: Sequence[Branch]) -> tuple[float, float, float, float]:
 
 
 def _find_peak(branch: Branch, swings: Float1D) -> tuple[float, float, bool]:
-    """Return (largest swing of a stable orbit, its frequency in Hz, whether at the range's end).
-
-    Between the points by the parabola through three of them; at a fold the point itself.
-    """
+    """Return (largest swing of a stable orbit, its frequency in Hz, whether at the range's end)."""
     stable, frequencies_hz = branch.stable, branch.values
     top = int(np.where(stable, swings, -np.inf).argmax())
     ends = {0: branch.ends[0], len(swings) - 1: branch.ends[1]}
     if top in ends and ends[top].reason == "range end":
         return float(swings[top]), float(frequencies_hz[top]), True
+    return *locate_peak(frequencies_hz, swings, stable), False
+
+
+def locate_peak(
+    frequencies_hz: Float1D, swings: Float1D, stable: npt.NDArray[np.bool_]
+) -> tuple[float, float]:
+    """Return (largest swing of a stable motion along a curve, its frequency in Hz).
+
+    Between the points by the parabola through three of them; at a fold the point itself.
+    """
+    top = int(np.where(stable, swings, -np.inf).argmax())
     x, y = frequencies_hz[top - 1 : top + 2], swings[top - 1 : top + 2]
     if x.size == 3 and stable[top - 1 : top + 2].all() and (x[1] - x[0]) * (x[2] - x[1]) > 0:
         bend, slope, _ = np.polyfit(x - x[1], y, 2)
         if bend < 0:
             shift = -slope / (2 * bend)
-            return float(y[1] + slope * shift / 2), float(x[1] + shift), False
-    return float(swings[top]), float(frequencies_hz[top]), False
+            return float(y[1] + slope * shift / 2), float(x[1] + shift)
+    return float(swings[top]), float(frequencies_hz[top])
 
 
 def half_swings(orbit: Orbit) -> tuple[float, float]:

@@ -14,6 +14,7 @@ from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from twin.campaign.config import CampaignConfig
 from twin.exchange.columns import ColumnMap
+from twin.identification.features.config import FeatureSet
 from twin.model.config import ModelConfig
 from twin.studies.maps.config import StudyConfig
 
@@ -24,6 +25,7 @@ CONFIG_FILES: tuple[tuple[str, str, type[ConfigModel]], ...] = (
     ("Campaign file", "A list of runs with set-up changes between them.", CampaignConfig),
     ("Column map", "Columns of a foreign file, for `import --columns`.", ColumnMap),
     ("Study file", "Outcomes of the model over its parameters, for `map`.", StudyConfig),
+    ("Features file", "What was observed of a specimen, for `discover --features`.", FeatureSet),
 )
 
 PACKAGES_DIR = Path(__file__).resolve().parents[2]  # holds twin and table_io

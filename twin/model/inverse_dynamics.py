@@ -10,7 +10,7 @@ this is what makes a fit converge (see `twin.identification`).
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -275,6 +275,33 @@ def _force_kernel(
             out[1 + side, k] = sign * push if in_contact else 0.0
 
 
+class PreparedForces(NamedTuple):
+    """Coefficients of a model's forces, prepared once for many short motions."""
+
+    coefficients: Coefficients
+    laws: AddedLaws | None
+    fastest_rate: float
+
+    @classmethod
+    def from_model(cls, model: Model) -> "PreparedForces":
+        return cls(*kernel_coefficients(model), _fastest_law_rate(model))
+
+    def evaluate(
+        self,
+        u: Float1D,
+        v: Float1D,
+        base_acc: Float1D,
+        time_s: Float1D,
+        contact: npt.NDArray[np.int8],
+    ) -> Float2D:
+        """Return D, F_R and F_L in N, (3, sample); see `forces_along`."""
+        out = np.empty((3, u.size))
+        touched = contact.astype(np.float64, order="C")
+        p, laws = self.coefficients, self.laws
+        _force_kernel(u, v, base_acc, time_s, touched, p, laws, self.fastest_rate, out)
+        return out
+
+
 def forces_along(
     model: Model,
     u: Float1D,
@@ -291,11 +318,8 @@ def forces_along(
     (see `Model.added_acceleration`) and on sensors are not included.
     """
     compiled, on_arrays = _split_laws(model, bool((contact >= 0).all()))
-    coefficients, laws = kernel_coefficients(compiled)
-    fastest_rate = _fastest_law_rate(compiled)
-    out = np.empty((3, u.size))
-    touched = contact.astype(np.float64, order="C")
-    _force_kernel(u, v, base_acc, time_s, touched, coefficients, laws, fastest_rate, out)
+    prepared = PreparedForces.from_model(compiled)
+    coefficients, out = prepared.coefficients, prepared.evaluate(u, v, base_acc, time_s, contact)
     for effect, values in on_arrays:
         inputs = {"v": v, "a": base_acc, "t": time_s}
         for place in PLACES[effect.place]:

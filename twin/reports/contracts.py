@@ -1,4 +1,4 @@
-"""Contracts of summary.json and verdict.json: each key with its meaning and its unit.
+"""Contracts of summary.json, verdict.json and features.json: each key, its meaning and its unit.
 
 The writers accept nothing else (`twin.reports.summary.dump_contract`). A number that is not finite
 is null in a file, as JSON has no NaN.
@@ -659,3 +659,61 @@ class Verdict(Contract):
     next_run: str = Field(description="test that would decide or confirm")
     seconds: Seconds = Field(description="computing time")
     held_out_logs: list[HeldOutLog] = Field(description="of the logs given to judge the result")
+
+
+class PredictedFeatureResult(Contract):
+    """What a model predicts for a feature."""
+
+    text: str = Field(description="prediction in words")
+    distance: Ratio = Field(description="distance from the feature in tolerances; null: none such")
+    explained: bool = Field(description="whether the distance is at most 1")
+    method: str = Field(description="continuation, stepped sweeps or simulation")
+
+
+class FeatureResult(Contract):
+    """A published feature, and what each model predicts for it."""
+
+    kind: str = Field(description="kind of the feature, as in the features file")
+    gap_m: Annotated[Number, _declare_unit("m")] = Field(
+        description="total gap; null without bumpers, and of permanent contact"
+    )
+    published: str = Field(description="feature in words")
+    place: str = Field(description="where it is published")
+    given: PredictedFeatureResult = Field(description="of the model as given")
+    refitted: PredictedFeatureResult = Field(description="of the refitted base")
+    best: PredictedFeatureResult = Field(description="of the best model")
+
+
+class FeatureFitResult(Contract):
+    """A fit of effects to the features."""
+
+    effects: list[str] = Field(description="its added effects; empty: the base")
+    explained: int = Field(description="number of features that it explains")
+    gained: list[int] = Field(
+        description="features that it explains and the refitted base does not"
+    )
+    lost: list[int] = Field(description="features that only the refitted base explains: the price")
+    misfit: Ratio = Field(description="sum of log(1 + squared distance) of all features")
+    parameters: dict[str, Interval] = Field(description="fitted parameters, base and effects")
+
+
+class FeatureVerdict(Contract):
+    """features.json of a discovery from features; features are numbered from 0."""
+
+    verdict: Literal["none needed", "named", "ambiguous"] = Field(
+        description="whether an effect explains more features than the refitted base, and one only"
+    )
+    why: str = Field(description="reason of the verdict")
+    title: str = Field(description="title of the features file")
+    citation: str = Field(description="source of the features")
+    model: str = Field(description="title of the model")
+    features: list[FeatureResult] = Field(description="every feature, in the file's order")
+    given: FeatureFitResult = Field(description="model as given")
+    refitted: FeatureFitResult = Field(description="its base refitted, without any effect")
+    fits: list[FeatureFitResult] = Field(description="effects and pairs, best first")
+    best: list[str] = Field(description="effects of the best model; empty: the refitted base")
+    unexplained: list[int] = Field(description="features that the best model does not explain")
+    next_run: str = Field(description="test that would decide between the best two")
+    fell_away: dict[str, str] = Field(description="reason of each effect that was not tested")
+    notes: list[str] = Field(description="notes to the user")
+    seconds: Seconds = Field(description="computing time")

@@ -1,7 +1,7 @@
 """Serialization of a verdict to `verdict.json` and of a fitted model to a model file."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from twin.identification.candidates import Candidate
@@ -27,6 +27,7 @@ from twin.identification.sensor_checks import SensorCheck, check_sensors
 from twin.identification.verdict import closed_fraction, suggest_next_run
 from twin.model.effects.effect_file import EffectFile, WrittenEffect
 from twin.model.model import SENSOR_CHANNELS, Model
+from twin.model.parameters import Parameters
 
 Json = dict[str, Any]
 MIN_GAP_ERROR_M = 1e-6  # smaller gap corrections are not reported
@@ -331,19 +332,8 @@ def model_to_toml(
 
     `provisional` is the reason why the model is not to be trusted yet, if there is one.
     """
-    base = fit.parameters.to_model().base
-    lines = [
-        f"title = {_quote_toml(title)}",
-        f"citation = {_quote_toml(citation)}",
-        f"fitted_on = {_quote_toml(fitted_on)}",
-        *([f"provisional = {_quote_toml(provisional)}"] if provisional else []),
-        "[base]",
-        f"stiffness_n_m = {base.stiffness!r}",
-        f"damping_n_s_m = {base.damping!r}",
-        f"bumper_stiffness_n_m = {base.bumper_stiffness_r!r}",
-        f"bumper_damping_n_s_m = {base.bumper_damping_r!r}",
-    ]
     omitted = []
+    kept: dict[tuple[str, str], dict[str, float]] = {}
     effects: dict[tuple[str, str], dict[str, float]] = {}
     for key, value in fit.parameters.values.items():
         if isinstance(key, EffectKey):
@@ -355,24 +345,15 @@ def model_to_toml(
                 "channel and does not predict it; repair or calibrate the sensor"
             )
             continue
-        definition = fit.parameters.effects.get(effect)
-        numbers = [f"{name} = {value!r}" for name, value in values.items()]
-        numbers += [f"channel = {_quote_toml(channel)}"] if channel else []
-        lines += [
-            "[[effects]]",
-            f"file = {_quote_toml(effect_file_name(definition))}"
-            if isinstance(definition, WrittenEffect)
-            else f"id = {_quote_toml(effect)}",
-            f"parameters = {{ {', '.join(numbers)} }}",
-        ]
-    lines += ["[intervals]  # 95 %"]
+        kept[effect, channel] = values
+    intervals: dict[str, tuple[float, float]] = {}
     for free in fit.free:
         if (
             isinstance(free.key, BaseKey | EffectKey | SlipKey)
             and 0 < fit.interval_error(free.key) < math.inf
         ):
             interval = parameter_to_json(fit, free)
-            lines.append(f"{_quote_toml(free.name)} = [{interval['low']!r}, {interval['high']!r}]")
+            intervals[free.name] = interval["low"], interval["high"]
     gaps = {key: value for key, value in fit.values.items() if isinstance(key, GapKey)}
     if any(
         abs(v) > max(INTERVAL_SIGMA * fit.std_errors[k], MIN_GAP_ERROR_M) for k, v in gaps.items()
@@ -381,7 +362,59 @@ def model_to_toml(
         omitted.append(
             f"correct the gaps in the test profile of each log: each side differs by {differences}"
         )
-    return "\n".join(lines) + "\n", omitted
+    texts = {
+        "title": title,
+        "citation": citation,
+        "fitted_on": fitted_on,
+        "provisional": provisional,
+    }
+    files = {
+        effect.id: effect_file_name(effect)
+        for effect in fit.parameters.effects.values()
+        if isinstance(effect, WrittenEffect)
+    }
+    base = fit.parameters.to_model().base
+    return format_model_toml(texts, base, kept, intervals, files), omitted
+
+
+def format_model_toml(
+    texts: Mapping[str, str],
+    base: Parameters,
+    effects: Mapping[tuple[str, str], Mapping[str, float]],
+    intervals: Mapping[str, tuple[float, float]],
+    files: Mapping[str, str] | None = None,
+) -> str:
+    """Return the text of a model file: `texts` by key, those that are empty left out.
+
+    `effects` are values by (effect, channel), `intervals` by parameter, `files` the names of the
+    effect files by effect.
+    """
+    sources = {effect: f"file = {_quote_toml(name)}" for effect, name in (files or {}).items()}
+    lines = [
+        f"{key} = {_quote_toml(text)}"
+        for key, text in texts.items()
+        if text or key != "provisional"
+    ]
+    lines += [
+        "[base]",
+        f"stiffness_n_m = {base.stiffness!r}",
+        f"damping_n_s_m = {base.damping!r}",
+        f"bumper_stiffness_n_m = {base.bumper_stiffness_r!r}",
+        f"bumper_damping_n_s_m = {base.bumper_damping_r!r}",
+    ]
+    for (effect, channel), values in effects.items():
+        numbers = [f"{name} = {value!r}" for name, value in values.items()]
+        numbers += [f"channel = {_quote_toml(channel)}"] if channel else []
+        lines += [
+            "[[effects]]",
+            sources.get(effect, f"id = {_quote_toml(effect)}"),
+            f"parameters = {{ {', '.join(numbers)} }}",
+        ]
+    lines += ["[intervals]  # 95 %"]
+    lines += [
+        f"{_quote_toml(name)} = [{low!r}, {high!r}]" for name, (low, high) in intervals.items()
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def effect_file_name(effect: WrittenEffect) -> str:

@@ -1,0 +1,1 @@
+"""Missing effects from published features: peaks, jumps, hysteresis, contact, impacts."""
