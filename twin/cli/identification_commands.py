@@ -72,7 +72,9 @@ def discover_from_logs(
 
     options = decisive.parse_options(decide, run, rig, budget_min, yes, speed)
     if run and options is not None:
-        code = decisive.play_decisive_tests(logs, model, out, without or [], held_out or [], options)
+        code = decisive.play_decisive_tests(
+            logs, model, out, without or [], held_out or [], options
+        )
         raise typer.Exit(code)
     from twin.cli.discover import discover_command as command
 

@@ -26,6 +26,8 @@ from twin.identification.least_squares import (
     solve_damped,
 )
 from twin.identification.parameters import (
+    BUMPER_DAMPING,
+    BUMPER_STIFFNESS,
     EffectKey,
     GapKey,
     ParameterKey,
@@ -40,6 +42,7 @@ from twin.identification.screening import build_normal_equations
 from twin.identification.selection import (
     MIN_GAIN_SHARE,
     MIN_GAIN_SIGMA,
+    NOISE_UNCERTAINTY,
     FittedSet,
     SelectionProblem,
     SelectionResult,
@@ -77,21 +80,19 @@ class IdealTableMotion:
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """Explanation of the recordings: a set of effects with its fit, and the name to show."""
+    """Explanation of the recordings: a set of effects with its fit, and the name to show.
+
+    With `is_held` a parameter is held at a value, which data may exclude: it is not free.
+    """
 
     name: str
     fitted: FittedSet
+    is_held: bool = False
 
     @property
     def can_be_simulated(self) -> bool:
         """False with a generic term, which is a shape along a measured motion, no model."""
         return not any(isinstance(key, TermKey) for key in self.fitted.fit.parameters.values)
-
-    @property
-    def is_held(self) -> bool:
-        """True if a parameter of its effects is held at a value, so that data may exclude it."""
-        free = {parameter.key for parameter in self.fitted.fit.parameters.free}
-        return any(own.key not in free for effect in self.fitted.effects for own in effect.free)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +138,7 @@ class TestPrediction:
     @property
     def sigma(self) -> float:
         """Expected significance in standard errors: the least of a rival, mean over the truths."""
-        return float(np.mean([min(pair.sigma for pair in pairs) for pairs in self._by_truth]))
+        return _mean([min(pair.sigma for pair in pairs) for pairs in self._by_truth])
 
     @property
     def separation_per_minute(self) -> float:
@@ -149,12 +150,12 @@ class TestPrediction:
         least = np.array([min(pair.sigma for pair in pairs) for pairs in self._by_truth])
         if self.is_confirmation:
             least = np.minimum(least, MIN_GAIN_SIGMA)
-        return float(np.mean(2.0 * least * np.abs(least))) / self.motion.minutes
+        return _mean(2.0 * least * np.abs(least)) / self.motion.minutes
 
     @property
     def probability(self) -> float:
         """Probability that the test excludes all rivals but the true one, whichever that is."""
-        return float(np.mean([min(p.probability for p in pairs) for pairs in self._by_truth]))
+        return _mean([min(pair.probability for pair in pairs) for pairs in self._by_truth])
 
     @property
     def best_probability(self) -> float:
@@ -167,6 +168,11 @@ class TestPrediction:
             return [[pair] for pair in self.pairs]
         truths = dict.fromkeys(pair.truth for pair in self.pairs)
         return [[pair for pair in self.pairs if pair.truth == truth] for truth in truths]
+
+
+def _mean(values: Sequence[float] | Float1D) -> float:
+    """Return the mean; 0 of nothing."""
+    return float(np.mean(values)) if len(values) else 0.0
 
 
 def list_rivals(
@@ -243,7 +249,7 @@ def list_hidden_effects(problem: SelectionProblem, best: FittedSet) -> tuple[Riv
         added = candidate.add_to(parameters, variant.shape, value).with_free(parameters.free)
         fitted = FittedSet((*best.effects, candidate), replace(best.fit, parameters=added))
         if gain >= hidden.get(candidate.name, (-1.0, None))[0]:
-            hidden[candidate.name] = gain, Rival(name_set(fitted), fitted)
+            hidden[candidate.name] = gain, Rival(name_set(fitted), fitted, True)
     return tuple(rival for _, rival in hidden.values())
 
 
@@ -269,7 +275,11 @@ def find_interval_ends(fitted: FittedSet) -> tuple[Rival, ...]:
     ends = [_move_along(fitted, worst, sign * INTERVAL_SIGMA) for sign in (-1.0, 1.0)]
     key = fit.free[worst].key
     return tuple(
-        Rival(f"{key} = {end.fit.parameters.values[key]:.3g} {fit.free[worst].unit}".strip(), end)
+        Rival(
+            f"{key} = {end.fit.parameters.values[key]:.3g} {fit.free[worst].unit}".strip(),
+            end,
+            True,
+        )
         for end in ends
     )
 
@@ -281,8 +291,12 @@ def _move_along(fitted: FittedSet, index: int, sigma: float) -> FittedSet:
     """
     fit = fitted.fit
     values = dict(fit.parameters.values)
+    # the intervals may be wider than the covariance says: its diagonal is then below 1
+    widening = np.sqrt(np.maximum(np.diag(fit.correlation), 1e-12))
+    correlation = fit.correlation[index] / widening / widening[index]
+    correlation[index] = 1.0
     for other, free in enumerate(fit.free):
-        shift = sigma * fit.correlation[other, index] * fit.std_errors[free.key]
+        shift = sigma * correlation[other] * fit.std_errors[free.key]
         value = fit.values[free.key]
         x = free.to_internal(value) + shift / (value if free.logarithmic else 1.0)
         values |= dict.fromkeys(free.keys, free.to_external(x))
@@ -384,7 +398,9 @@ def simulate_log(
     )
 
 
-def simulate_motion(parameters: ParameterSet, motion: IdealTableMotion, like: LogResiduals) -> Block:
+def simulate_motion(
+    parameters: ParameterSet, motion: IdealTableMotion, like: LogResiduals
+) -> Block:
     """Return the readings without noise of the channels of a log, from rest, as of a fit."""
     drive = motion.block
     rest = round(REST_S * drive.rate_hz)
@@ -427,7 +443,7 @@ def _add_noise(block: Block, like: LogSignals) -> Block:
 def _start_rival(fitted: FittedSet, *log_residuals: LogResiduals) -> ParameterSet:
     """Return the parameters of a rival, free, with those of the new log, which is the last.
 
-    A base parameter that no recording determines is free if the new test does.
+    The bumpers, which no recording without contact determines, are free if the new test has some.
     """
     new = log_residuals[-1]
     parameters = fitted.fit.parameters
@@ -439,11 +455,11 @@ def _start_rival(fitted: FittedSet, *log_residuals: LogResiduals) -> ParameterSe
     values: dict[ParameterKey, float] = dict.fromkeys(tares, 0.0)
     values[GapKey(new.log_number)] = parameters.values.get(last, 0.0)
     contacts = [bool((log.contact_state != 0).any()) for log in log_residuals]
-    known = {key for free in parameters.free for key in (free.key, *free.keys)}
+    base = () if any(contacts[:-1]) else (BUMPER_STIFFNESS, BUMPER_DAMPING)
     added = [
         free
         for free in list_base_parameters(contacts, None, tares, new.scale)
-        if free.key not in known and get_log(free.key) in (None, new.log_number)
+        if free.key in base or get_log(free.key) == new.log_number
     ]
     return parameters.with_values(values).with_free((*parameters.free, *added))
 
@@ -510,8 +526,11 @@ def _compare_entries(
     # what chance adds to the new test is not expected of another run of it
     recorded_gain = sum(squares[:-1]) + sum(float(cross.sum()) for cross in crosses[:-1])
     gain = recorded_gain + squares[-1]
-    # the residual of the recordings may be larger than noise and coloured, the simulated one is not
-    colour = max(1.0, sum(chances[:-1]) / max(4.0 * sum(squares[:-1]), 1e-300))
+    # a residual larger than noise is also correlated in time, which the simulated one is not
+    colour = 1.0
+    if mean_square(true_entries[:-1]) > (1 + NOISE_UNCERTAINTY) * mean_square(true_entries[-1:]):
+        recorded = sum(chances[:-1]) / max(sum(squares[:-1]), 1e-300)
+        colour = max(1.0, recorded * squares[-1] / max(chances[-1], 1e-300))
     chance = sum(chances[:-1]) + colour * chances[-1]
     return PairSeparation(
         truth,

@@ -21,6 +21,7 @@ Metres = Annotated[Number, _declare_unit("m")]
 Acceleration = Annotated[Number, _declare_unit("m/s2")]
 Seconds = Annotated[float, _declare_unit("s")]
 Milliseconds = Annotated[Number, _declare_unit("ms")]
+Minutes = Annotated[float, _declare_unit("min")]
 Hertz = Annotated[float, _declare_unit("Hz")]
 Degrees = Annotated[Number, _declare_unit("deg")]
 Index = Annotated[int, _declare_unit("sample")]
@@ -618,7 +619,7 @@ class OtherTest(Contract):
     """Test that was compared with the proposed one."""
 
     title: str = Field(description="what is played")
-    minutes: float = Field(description="expected duration in min")
+    minutes: Minutes = Field(description="expected duration in min")
     sigma: Ratio = Field(description="expected separation in standard errors")
     probability: Ratio = Field(description="that it decides")
 
@@ -631,7 +632,7 @@ class DecisiveTest(Contract):
     profile: str = Field(description="file of its profile")
     set_up: str = Field(description="change by hand before it; empty for none")
     confirmation: bool = Field(description="whether nothing is open and it looks for more effects")
-    minutes: float = Field(description="expected duration in min")
+    minutes: Minutes = Field(description="expected duration in min")
     sigma: Ratio = Field(description="expected separation in standard errors")
     probability: Ratio = Field(description="that it decides; of a confirmation per hidden effect")
     separation_per_min: Ratio = Field(description="expected log likelihood ratio a minute")
@@ -647,7 +648,7 @@ class ChainLink(Contract):
     effects: list[str] = Field(description="effects of the verdict")
     confidence: Ratio = Field(description="of its effects; null without any")
     played: str = Field(description="test that was played for it; empty for the first")
-    minutes: float = Field(description="duration of that test in min")
+    minutes: Minutes = Field(description="duration of that test in min")
     probability: Ratio = Field(description="that was stated for a decision; null for the first")
     log: str = Field(description="recording of that test; empty for the first")
 

@@ -135,14 +135,14 @@ def list_candidate_tests(
     profile = parse_toml(recorded.profile_toml, Profile, f"recording {recorded.run}")
     kept = {key: value for key, value in base.items() if key not in OWN_TABLES}
     tests = []
-    for title, excitation in _list_excitations(profile):
+    for title, excitation in list_excitations(profile):
         tests += _build_tests(kept | {"title": title, "excitation": excitation}, recorded, rig_toml)
     if can_change_gap and math.isfinite(profile.specimen.gap_mm) and profile.specimen.gap_mm > 0:
         for ratio in GAP_RATIOS:
             specimen = {"mass_kg": profile.specimen.mass_kg, "gap_mm": 0.0}
             specimen["gap_mm"] = _round(ratio * profile.specimen.gap_mm)
             gap = "no bumpers" if math.isinf(ratio) else f"total gap {specimen['gap_mm']:g} mm"
-            title, excitation = next(iter(_list_excitations(profile)))
+            title, excitation = next(iter(list_excitations(profile)))
             own = {"title": f"{title}, {gap}", "excitation": excitation, "specimen": specimen}
             tests += _build_tests(kept | own, recorded, rig_toml, f"set: {gap}")
     return [test for test in tests if test.minutes <= max_min]
@@ -185,7 +185,7 @@ def _build_tests(
     return [CandidateTest(config, set_up)]
 
 
-def _list_excitations(profile: Profile) -> Iterator[tuple[str, Table]]:
+def list_excitations(profile: Profile) -> Iterator[tuple[str, Table]]:
     """Yield (title, table [excitation]) of the variants of a test; the first is much as it was."""
     low_hz, high_hz, level_g = _measure_test(profile)
     bands = {
