@@ -25,6 +25,7 @@ from twin.identification.least_squares import (
     fill_jacobian,
     solve_damped,
 )
+from twin.identification.nuisances import linearize_nuisances, list_nuisance_parameters
 from twin.identification.parameters import (
     BUMPER_DAMPING,
     BUMPER_STIFFNESS,
@@ -386,16 +387,21 @@ def simulate_log(
 ) -> tuple[Block, LogResiduals]:
     """Return (true motion, residuals of its noisy readings) of a test, if a fit were the truth.
 
-    The channels, their noise and the corrections of the gaps are those of the last recording.
+    The channels, their noise, the corrections of the gaps and the nuisances that may be fitted are
+    those of the last recording.
     """
     last = problem.log_residuals[-1]
     truth = simulate_motion(fitted.fit.parameters, motion, last)
     readings = _add_noise(truth, last.signals)
     number = last.log_number + 1
     signals = build_signals((readings,), motion.name, motion.mass_kg, motion.gaps_m)
-    return truth, LogResiduals(
+    residuals = LogResiduals(
         number, signals, last.contact_n, last.reference, last.scale, last.weight, last.thinning
     )
+    if last.nuisances is None:
+        return truth, residuals
+    start = _start_rival(fitted, *problem.log_residuals, residuals)
+    return truth, linearize_nuisances(residuals, start, mapper=problem.mapper)
 
 
 def simulate_motion(
@@ -452,7 +458,9 @@ def _start_rival(fitted: FittedSet, *log_residuals: LogResiduals) -> ParameterSe
         TareKey(new.log_number, quantity): new.signals.rest_value(quantity)[1]
         for quantity in new.signals.zero_channels
     }
+    nuisances = list_nuisance_parameters((new,))
     values: dict[ParameterKey, float] = dict.fromkeys(tares, 0.0)
+    values |= dict.fromkeys((nuisance.key for nuisance in nuisances), 0.0)
     values[GapKey(new.log_number)] = parameters.values.get(last, 0.0)
     contacts = [bool((log.contact_state != 0).any()) for log in log_residuals]
     base = () if any(contacts[:-1]) else (BUMPER_STIFFNESS, BUMPER_DAMPING)
@@ -461,7 +469,7 @@ def _start_rival(fitted: FittedSet, *log_residuals: LogResiduals) -> ParameterSe
         for free in list_base_parameters(contacts, None, tares, new.scale)
         if free.key in base or get_log(free.key) == new.log_number
     ]
-    return parameters.with_values(values).with_free((*parameters.free, *added))
+    return parameters.with_values(values).with_free((*parameters.free, *added, *nuisances))
 
 
 def _refit_rival(joint: SelectionProblem, fitted: FittedSet) -> tuple[Float1D, ...]:

@@ -40,6 +40,7 @@ Json = dict[str, Any]
 DEFAULT_CELLS = ("pair/*/1%", "pair/*/5%")
 RESULTS_FILE = "decisive_runs.jsonl"
 MAX_TEST_MIN = 10.0
+MAX_CASE_S = 300.0  # wall clock: what nothing explains takes long to judge, and counts as failed
 STUDY_SWEEP = PROFILE_TOML[PROFILE_TOML.index("start_hz") : PROFILE_TOML.index("[acquisition]")]
 POOR_SWEEP = """\
 start_hz = 2.0
@@ -76,7 +77,8 @@ def run_decide_study(
         catch_interrupts("stopping after the cases in progress") as stop,
         path.open("a", encoding="utf-8") as file,
     ):
-        for result in run_tasks(task, pending, Workers.from_options(workers), stop):
+        processes = Workers.from_options(workers)
+        for result in run_tasks(task, pending, processes, stop, max_task_s=MAX_CASE_S):
             row = result.value or {"number": result.number, "failed": result.failure}
             rows.append(row)
             file.write(json.dumps(row) + "\n")
