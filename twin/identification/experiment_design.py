@@ -120,8 +120,8 @@ class PairSeparation:
 class TestPrediction:
     """Predicted outcome of a test for some rivals; `simulated` are the motions by rival index.
 
-    Of more rivals than `MAX_RIVALS` all but the first are effects that the noise may hide: the test
-    is to show or exclude as many of them as possible, each by itself.
+    In a confirmation all but the first are effects that the noise may hide: the test is to show or
+    exclude as many of them as possible, each by itself.
     """
 
     __test__ = False  # no test of pytest
@@ -134,7 +134,7 @@ class TestPrediction:
     @property
     def is_confirmation(self) -> bool:
         """True if nothing is open, and the test is to show effects that the noise may hide."""
-        return len(self.rivals) > MAX_RIVALS
+        return is_confirmation(self.rivals)
 
     @property
     def sigma(self) -> float:
@@ -169,6 +169,11 @@ class TestPrediction:
             return [[pair] for pair in self.pairs]
         truths = dict.fromkeys(pair.truth for pair in self.pairs)
         return [[pair for pair in self.pairs if pair.truth == truth] for truth in truths]
+
+
+def is_confirmation(rivals: Sequence[Rival]) -> bool:
+    """Return True if nothing is open: all rivals but the first are effects that may be hidden."""
+    return not rivals[0].is_held and all(rival.is_held for rival in rivals[1:])
 
 
 def _mean(values: Sequence[float] | Float1D) -> float:
@@ -331,7 +336,7 @@ def rank_tests(
         report(motion.name)
         screened.append(_predict_pairs(problem, rivals, motion, linear))
     ranked = sorted((test for test in screened if test.pairs), key=_merit, reverse=True)
-    if len(rivals) > MAX_RIVALS:  # of small effects that the noise hides one step is exact
+    if is_confirmation(rivals):  # of small effects that the noise hides one step is exact
         return ranked
     refitted = []
     for test in ranked[:MAX_REFITTED_TESTS]:
@@ -350,16 +355,19 @@ def _predict_pairs(
     pairs, simulated = [], {}
     for truth, rival in enumerate(rivals):
         others = [index for index, other in enumerate(rivals) if _is_separable(rival, other)]
-        if not others or not rival.can_be_simulated or (truth and len(rivals) > MAX_RIVALS):
+        if not others or not rival.can_be_simulated or (truth and is_confirmation(rivals)):
             continue
         simulated[truth], residuals = simulate_log(rival.fitted, motion, problem)
         joint = replace(problem, log_residuals=(*problem.log_residuals, residuals))
+        # what the noise may hide hardly changes the slopes of the set that it is added to
+        slopes = linear[truth].compute_new_slopes(joint) if linear else None
+        shared = slopes if is_confirmation(rivals) else None
         true_entries = (
-            linear[truth].take_step(joint) if linear else _refit_rival(joint, rival.fitted)
+            linear[truth].take_step(joint, slopes) if linear else _refit_rival(joint, rival.fitted)
         )
         for other in others:
             entries = (
-                linear[other].take_step(joint)
+                linear[other].take_step(joint, shared)
                 if linear
                 else _refit_rival(joint, rivals[other].fitted)
             )
@@ -497,13 +505,26 @@ class LinearizedRival:
         fill_jacobian(problem.log_residuals, parameters, before, None, problem.mapper, jacobian)
         return cls(rival.fitted, before, jacobian, jacobian @ jacobian.T, jacobian @ entries)
 
-    def take_step(self, joint: SelectionProblem) -> tuple[Float1D, ...]:
-        """Return its residual after one step to all logs, the last of them new, (entry,) each."""
+    def compute_new_slopes(self, joint: SelectionProblem) -> Float2D:
+        """Return the slopes of its residual of the new log, the last one, (free, entry)."""
         new = joint.log_residuals[-1]
         start = _start_rival(self.fitted, *joint.log_residuals)
         entries = new.evaluate(start)
         slopes = np.empty((len(start.free), entries.size))
         fill_jacobian((new,), start, (entries,), None, joint.mapper, slopes)
+        return slopes
+
+    def take_step(
+        self, joint: SelectionProblem, slopes: Float2D | None = None
+    ) -> tuple[Float1D, ...]:
+        """Return its residual after one step to all logs, the last of them new, (entry,) each.
+
+        `slopes` of the new log may be those of a rival that hardly differs.
+        """
+        if slopes is None:
+            slopes = self.compute_new_slopes(joint)
+        start = _start_rival(self.fitted, *joint.log_residuals)
+        entries = joint.log_residuals[-1].evaluate(start)
         known = len(self.fitted.fit.parameters.free)
         hessian, gradient = slopes @ slopes.T, slopes @ entries
         hessian[:known, :known] += self.hessian
