@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from table_io.clock import RealClock
 from table_io.errors import InputError
+from twin.cli.decide import DecideOptions, JudgedLogs, add_proposal
 from twin.identification.discover import (
     Discovery,
     PreparedLog,
@@ -35,6 +36,7 @@ from twin.reports.discovery.serialize import (
 )
 from twin.reports.finalize import EXIT_INTERRUPTED
 from twin.reports.summary import dump_contract
+from twin.run.decisive_test import TestProposal
 from twin.run.folders import make_run_folder
 from twin.run.run_config import read_model_template
 from twin.run.terminal import catch_interrupts, console, print_line
@@ -49,8 +51,26 @@ def discover_command(
     out: Path | None,
     without: Sequence[str] = (),
     held_out: Sequence[Path] = (),
+    decide: DecideOptions | None = None,
 ) -> int:
-    """Run a discovery and write its results to a new folder; return the exit code."""
+    """Run a discovery and write its results to a new folder; return the exit code.
+
+    With `decide` also propose the test that would decide.
+    """
+    if decide is not None:
+        decide.check()
+    return judge_logs(paths, model, out, without, held_out, decide).code
+
+
+def judge_logs(
+    paths: Sequence[Path],
+    model: str,
+    out: Path | None,
+    without: Sequence[str] = (),
+    held_out: Sequence[Path] = (),
+    decide: DecideOptions | None = None,
+) -> JudgedLogs:
+    """Run a discovery, write its results to a new folder and print them; return the verdict."""
     clock = RealClock()
     start_s = clock.now()
     start, config = read_model_template(model)
@@ -72,19 +92,23 @@ def discover_command(
             held_out_logs = load_logs(held_out)[0] if held_out else ()
             with open_mapper(logs) as mapper:
                 discovery = discover_effects(logs, start, report, without, mapper)
-                proposal = propose_law(discovery, report)
+                law = propose_law(discovery, report)
     except (InputError, Cancelled) as error:
         folder.rmdir()  # leave no empty folder after a failure
         if isinstance(error, InputError):
             raise
         print_line("interrupted before any result; nothing is written")
-        return EXIT_INTERRUPTED
+        return JudgedLogs(folder, {}, (), False, EXIT_INTERRUPTED)
     seconds = clock.now() - start_s
-    verdict = verdict_to_json(discovery, seconds, notes, held_out_logs, start, proposal)
-    write_results(folder, discovery, config, logs, verdict, proposal)
+    verdict = verdict_to_json(discovery, seconds, notes, held_out_logs, start, law)
+    proposals: Sequence[TestProposal] = ()
+    if decide is not None and discovery.selection.complete:
+        proposals = add_proposal(verdict, discovery, paths, folder, decide)
+    write_results(folder, discovery, config, logs, verdict, law)
     print_verdict(verdict)
     print_line(f"{folder}")
-    return 0 if discovery.selection.complete else EXIT_INTERRUPTED
+    code = 0 if discovery.selection.complete else EXIT_INTERRUPTED
+    return JudgedLogs(folder, verdict, proposals, discovery.verdict.is_decided, code)
 
 
 @contextlib.contextmanager

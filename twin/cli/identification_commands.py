@@ -53,6 +53,31 @@ def discover_missing_effect(
         list[Path] | None,
         typer.Option("--held-out", help="Evaluate on this log without fitting to it; repeatable."),
     ] = None,
+    decide: Annotated[
+        Path | None,
+        typer.Option(
+            "--decide",
+            metavar="PROFILE",
+            help="Write the test that would decide best to this new .toml file.",
+        ),
+    ] = None,
+    run: Annotated[
+        bool,
+        typer.Option("--run", help="Play that test and judge again, until it is decided."),
+    ] = False,
+    rig: Annotated[
+        str,
+        typer.Option("--rig", help="Rig of these tests; omitted: that of the last recording."),
+    ] = "",
+    budget_min: Annotated[
+        float, typer.Option("--budget-min", help="Rig time of these tests in minutes.")
+    ] = 10.0,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Ask no operator: --run plays, with the set-up as it is.")
+    ] = False,
+    speed: Annotated[
+        str, typer.Option("--speed", help="Of --run: realtime, or max on a simulated table.")
+    ] = "realtime",
 ) -> None:
     """Find the physical effect the model is missing and refit with it."""
     if features is not None:
@@ -62,9 +87,17 @@ def discover_missing_effect(
         raise typer.Exit(discover_by_features(features, model, out, without or []))
     if not logs:
         raise typer.BadParameter("give one LOG or more, or --features FILE", param_hint="LOG...")
+    from twin.cli import decide as decisive
+
+    options = decisive.parse_options(decide, run, rig, budget_min, yes, speed)
+    if run and options is not None:
+        code = decisive.play_decisive_tests(
+            logs, model, out, without or [], held_out or [], options
+        )
+        raise typer.Exit(code)
     from twin.cli.discover import discover_command as command
 
-    raise typer.Exit(command(logs, model, out, without or [], held_out or []))
+    raise typer.Exit(command(logs, model, out, without or [], held_out or [], options))
 
 
 @identification_app.command("identify", rich_help_panel=LEARN_PANEL)
@@ -158,3 +191,28 @@ def discovery_command(
     raise typer.Exit(
         command(out, seeds, cells or [], workers, resume, controls, laboratory, scheduler)
     )
+
+
+@study_app.command("decide")
+def decide_command(
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="New folder for the study, or an existing one with --resume."),
+    ] = None,
+    seeds: Annotated[int, typer.Option("--seeds", help="Cases per cell; five times as many.")] = 2,
+    cells: Annotated[
+        list[str] | None,
+        typer.Option("--cells", help="Only these cells, such as 'pair/*/1%'; repeatable."),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", help="Processes; default: all cores.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the study in --out.")] = False,
+    poor: Annotated[
+        bool, typer.Option("--poor", help="Begin with one frequency at one level.")
+    ] = False,
+) -> None:
+    """Score the tests that `discover --decide` proposes, and random ones, on hidden plants."""
+    from twin.validation.study.decisive_runs import run_decide_study as command
+
+    raise typer.Exit(command(out, seeds, cells or [], workers, resume, poor))

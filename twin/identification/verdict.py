@@ -53,6 +53,11 @@ class DiscoveryVerdict:
     has_remainder: bool  # the residual exceeds the floor by more than an inexact force law explains
     reason: str
 
+    @property
+    def is_decided(self) -> bool:
+        """True if the effects are named, or none, and nothing remains to be explained."""
+        return self.outcome in ("none", "named") and not self.has_remainder
+
 
 def judge_selection(
     problem: SelectionProblem,

@@ -21,6 +21,7 @@ Metres = Annotated[Number, _declare_unit("m")]
 Acceleration = Annotated[Number, _declare_unit("m/s2")]
 Seconds = Annotated[float, _declare_unit("s")]
 Milliseconds = Annotated[Number, _declare_unit("ms")]
+Minutes = Annotated[float, _declare_unit("min")]
 Hertz = Annotated[float, _declare_unit("Hz")]
 Degrees = Annotated[Number, _declare_unit("deg")]
 Index = Annotated[int, _declare_unit("sample")]
@@ -630,6 +631,63 @@ class ProposedLaw(Contract):
     classes: list[LawClass] = Field(description="best law of each class, best first")
 
 
+class ExpectedPeak(Contract):
+    """Predicted peak of the relative displacement in a step or window of a test."""
+
+    frequency_hz: Annotated[Number, _declare_unit("Hz")] = Field(
+        description="of the step; null in a displacement history"
+    )
+    direction: str = Field(description="of the step, or the window of a history")
+    peak_disp_m: Metres = Field(description="largest displacement of the mass against the table")
+
+
+class RivalPrediction(Contract):
+    """Explanation that the recordings leave open, with what a test is expected to show of it."""
+
+    id: str = Field(description="its effects, joined by +")
+    misfit: Ratio = Field(description="rms residual over the noise if another is true; or null")
+    sigma: Ratio = Field(description="standard errors by which the rest is worse if true; or null")
+    peaks: list[ExpectedPeak] = Field(description="if it is true; empty if it is no whole model")
+
+
+class OtherTest(Contract):
+    """Test that was compared with the proposed one."""
+
+    title: str = Field(description="what is played")
+    minutes: Minutes = Field(description="expected duration in min")
+    sigma: Ratio = Field(description="expected separation in standard errors")
+    probability: Ratio = Field(description="that it decides")
+
+
+class DecisiveTest(Contract):
+    """Test proposed by `discover --decide`, with what is expected of it."""
+
+    title: str = Field(description="what is played")
+    purpose: str = Field(description="what it decides")
+    profile: str = Field(description="file of its profile")
+    set_up: str = Field(description="change by hand before it; empty for none")
+    confirmation: bool = Field(description="whether nothing is open and it looks for more effects")
+    minutes: Minutes = Field(description="expected duration in min")
+    sigma: Ratio = Field(description="expected separation in standard errors")
+    probability: Ratio = Field(description="that it decides; of a confirmation per hidden effect")
+    separation_per_min: Ratio = Field(description="expected log likelihood ratio a minute")
+    count: int = Field(description="tests that were compared")
+    rivals: list[RivalPrediction] = Field(description="explanations, that of the verdict first")
+    others: list[OtherTest] = Field(description="the next best tests")
+
+
+class ChainLink(Contract):
+    """Verdict in a chain of tests, and the test that was played before it."""
+
+    verdict: str = Field(description="none, named, ambiguous or unexplained")
+    effects: list[str] = Field(description="effects of the verdict")
+    confidence: Ratio = Field(description="of its effects; null without any")
+    played: str = Field(description="test that was played for it; empty for the first")
+    minutes: Minutes = Field(description="duration of that test in min")
+    probability: Ratio = Field(description="that was stated for a decision; null for the first")
+    log: str = Field(description="recording of that test; empty for the first")
+
+
 class Verdict(Contract):
     """verdict.json of a discovery."""
 
@@ -659,6 +717,12 @@ class Verdict(Contract):
     next_run: str = Field(description="test that would decide or confirm")
     seconds: Seconds = Field(description="computing time")
     held_out_logs: list[HeldOutLog] = Field(description="of the logs given to judge the result")
+    decide: DecisiveTest | None = Field(
+        None, description="test of `--decide`; null where none separates, absent without the option"
+    )
+    chain: list[ChainLink] | None = Field(
+        None, description="verdicts so far, this one last; absent without `--run`"
+    )
 
 
 class PredictedFeatureResult(Contract):

@@ -21,6 +21,7 @@ from twin.identification.localization import ResidualCell
 from twin.identification.parameters import GENERIC_PREFIX, TARE_PREFIX
 from twin.identification.residuals import FORCE_ROWS, LogResiduals
 from twin.identification.selection import MIN_GAP_SHARE
+from twin.reports.discovery.decisive_section import draw_prediction
 from twin.reports.discovery.figure_data import DiscoveryView, is_periodic, list_phases
 from twin.reports.discovery.force_figures import (
     GENERIC_COLOUR,
@@ -66,6 +67,7 @@ def draw_discovery_figures(
             "histories": draw_force_histories(view),
             "twin": draw_free_running(view, runs, select_logs(view)),
             "time": _draw_time(view),
+            "decide": draw_prediction(verdict.get("decide")),
         }.items()
     }  # fmt: skip
 

@@ -261,9 +261,11 @@ def simulate_truth(
         return simulate_signals(make_rig_toml(0.0, truth=str(path), sha256=hash_truth(text)))
 
 
-def record_test(rig: str, label: str, log: Path, is_protected: bool) -> RunStop:
-    """Record the study's test on the machine of a rig config; return its final record."""
-    bundle = from_texts("case", PROFILE_TOML, rig, MODEL_TOML, f"case {label}")
+def record_test(
+    rig: str, label: str, log: Path, is_protected: bool, profile_toml: str = PROFILE_TOML
+) -> RunStop:
+    """Record a test, by default the study's, on the machine of a rig config; return its end."""
+    bundle = from_texts("case", profile_toml, rig, MODEL_TOML, f"case {label}")
     clock = ManualClock()
     backend = open_backend(bundle.rig, bundle.profile, clock)
     make_start = bundle.make_start_factory(label, "table")

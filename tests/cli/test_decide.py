@@ -1,0 +1,203 @@
+"""`discover --decide`: the proposal, the rig that plays it or refuses, the operator, the chain."""
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from table_io.config.base import PROFILES_DIR
+from table_io.config.profile import Profile
+from table_io.errors import InputError
+from tests.input_errors import raises_input_error
+from twin.cli import decide, discover
+from twin.cli.decide import DecideOptions, parse_options, play_decisive_tests
+from twin.cli.discover import discover_command
+from twin.model.effects import EFFECTS
+from twin.recording.reader import read_recording
+from twin.reports.discovery.serialize import Json
+from twin.reports.finalize import EXIT_INTERRUPTED
+from twin.run import decisive_test, terminal
+from twin.run.run_config import read_run_config
+from twin.run.unpaced import play_unpaced
+
+PROFILE = """
+title = "one frequency"
+rig = "{rig}"
+[specimen]
+mass_kg = 550.0
+gap_mm = inf
+[sweep]
+start_hz = 2.0
+stop_hz = 2.0
+step_hz = 1.0
+cycles = 15
+acceleration_g = 0.05
+directions = ["forward"]
+[acquisition]
+rate_hz = 1000.0
+block_samples = 50
+[loop_check]
+enabled = false
+[control]
+enabled = false
+"""
+TRUTH = '[[effects]]\nid = "maxwell_damper"\nparameters = { k1 = 12000.0, tau = 0.06 }\n'
+KEPT = ("maxwell_damper", "quadratic_damping")
+OTHERS = [effect.id for effect in EFFECTS if effect.id not in KEPT]  # left out: it is quick
+
+
+def record_run(folder: Path, truth: str = "") -> Path:
+    """A recording of one frequency at one level, on a rig that may hide an effect."""
+    folder.mkdir(parents=True)
+    text = (PROFILES_DIR / "rigs" / "simulated.toml").read_text()
+    if truth:
+        (folder / "truth.toml").write_text(truth)
+        digest = hashlib.sha256(truth.encode()).hexdigest()
+        text += f'truth = "{folder / "truth.toml"}"\ntruth_sha256 = "{digest}"\n'
+    (folder / "rig.toml").write_text(text)
+    profile, log = folder / "p.toml", folder / "first.mcap"
+    profile.write_text(PROFILE.format(rig=folder / "rig.toml"))
+    play_unpaced(read_run_config(profile), "first", log, lambda: None, lambda item: None)
+    return log
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record_run(tmp_path_factory.mktemp("decide") / "plain")
+
+
+@pytest.fixture
+def few_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two short candidates: quick to simulate."""
+
+    def list_two(profile: Profile) -> Iterator[tuple[str, Json]]:
+        chosen = [pair for pair in list_excitations(profile) if "higher freq" in pair[0]]
+        yield from chosen[:2]
+
+    list_excitations = decisive_test.list_excitations
+    monkeypatch.setattr(decisive_test, "list_excitations", list_two)
+
+
+@pytest.fixture
+def without_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No figures: they take most of the time."""
+    monkeypatch.setattr(discover, "write_discovery_page", lambda *_: None)
+
+
+def read_verdict(folder: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((folder / "verdict.json").read_text())
+    return content
+
+
+def make_answers(*replies: str) -> Callable[..., str]:
+    """An operator who gives these answers in turn."""
+    remaining = iter(replies)
+    return lambda *_args, **_kwargs: next(remaining)
+
+
+@pytest.mark.slow  # the figures
+@pytest.mark.usefixtures("few_tests")
+def test_the_proposal_is_a_profile_that_check_and_run_load(plain: Path, tmp_path: Path) -> None:
+    profile = tmp_path / "next.toml"
+    options = DecideOptions(profile, rig=str(plain.parent / "rig.toml"))
+    assert discover_command([plain], "snm", tmp_path / "out", OTHERS, (), options) == 0
+    config = read_run_config(profile)
+    verdict = read_verdict(tmp_path / "out")["decide"]
+    assert config.profile.title == f"{verdict['title']}: {verdict['purpose']}"
+    assert "standard errors" in config.profile.notes
+    assert config.expected_s / 60 == pytest.approx(verdict["minutes"])
+    assert verdict["profile"] == profile.name
+    assert verdict["count"] == 2
+    assert verdict["rivals"][0]["peaks"][0]["peak_disp_m"] > 0
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Expected in: " in page
+    assert read_verdict(tmp_path / "out")["next_run"].startswith(verdict["title"])
+
+
+@pytest.mark.usefixtures("few_tests", "without_page")
+def test_the_operator_is_asked_and_may_stop(
+    plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(terminal.console, "input", make_answers("q"))
+    out = tmp_path / "out"
+    code = play_decisive_tests([plain], "snm", out, OTHERS, (), DecideOptions(unpaced=True))
+    assert code == EXIT_INTERRUPTED
+    shown = capsys.readouterr().out
+    assert "TEST: sweep, higher frequencies" in shown
+    assert "SET-UP: as in the recording" in shown
+    assert not (out / "run-1").exists()
+
+
+@pytest.mark.usefixtures("few_tests", "without_page")
+def test_a_refused_test_is_one_message_and_the_next_is_tried(
+    plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    refused: list[Path] = []
+
+    def refuse(profile: Path, *_: object) -> int:
+        refused.append(profile)
+        raise InputError("the pump is off", remedy="start it")
+
+    monkeypatch.setattr(decide, "run_test", refuse)
+    out = tmp_path / "out"
+    options = DecideOptions(asks=False, unpaced=True)
+    assert play_decisive_tests([plain], "snm", out, OTHERS, (), options) == 0
+    lines = capsys.readouterr().out.splitlines()
+    messages = [line for line in lines if line.startswith("the rig refuses ")]
+    assert len(messages) == len(refused) == 2
+    assert len({*messages}) == 2
+    assert all("the pump is off" in message for message in messages)
+    assert lines[-1] == "not decided: no proposed test is left to play"
+
+
+@pytest.mark.usefixtures("without_page")
+def test_a_rig_without_the_stroke_gets_no_proposal(plain: Path, tmp_path: Path) -> None:
+    weak = tmp_path / "weak.toml"
+    text = (plain.parent / "rig.toml").read_text()
+    weak.write_text(text.replace("acceleration_g = 1.0", "acceleration_g = 0.0001"))
+    options = DecideOptions(tmp_path / "next.toml", rig=str(weak))
+    discover_command([plain], "snm", tmp_path / "out", OTHERS, (), options)
+    assert not (tmp_path / "next.toml").exists()
+    verdict = read_verdict(tmp_path / "out")
+    assert verdict["decide"] is None
+    assert "none separates" in verdict["next_run"]
+
+
+def test_options_without_a_proposal_are_refused(tmp_path: Path) -> None:
+    assert parse_options(None, False, "", 10.0, False, "realtime") is None
+    with raises_input_error(key="--rig", remedy="--decide"):
+        parse_options(None, False, "simulated", 10.0, False, "realtime")
+    with raises_input_error(key="--speed", allowed="realtime or max"):
+        parse_options(None, True, "", 10.0, False, "fast")
+    with raises_input_error(key="--budget-min"):
+        DecideOptions(budget_min=0.0).check()
+    existing = tmp_path / "next.toml"
+    existing.touch()
+    with raises_input_error(key="--decide", problem="overwritten"):
+        DecideOptions(existing).check()
+
+
+@pytest.mark.slow
+def test_the_rig_plays_until_a_hidden_effect_is_named(tmp_path: Path) -> None:
+    """At one frequency the branch is stiffness and damping; the played test shows what it is."""
+    log = record_run(tmp_path / "first", TRUTH)
+    out = tmp_path / "out"
+    options = DecideOptions(asks=False, unpaced=True)
+    assert play_decisive_tests([log], "snm", out, (), (), options) == 0
+    verdicts = sorted(out.glob("verdict-*"))
+    verdict = read_verdict(verdicts[-1])
+    chain: Sequence[dict[str, Any]] = verdict["chain"]
+    assert len(chain) == len(verdicts) > 1
+    assert chain[-1]["effects"] == ["maxwell_damper"]
+    assert chain[-1]["confidence"] > 0.5
+    assert chain[0]["played"] == ""
+    recorded = read_recording(out / chain[1]["log"] / "run.mcap").start
+    profile = tomllib.loads(recorded.profile_toml)
+    assert profile["title"].startswith(chain[1]["played"])
+    assert profile["set_up"]["campaign"] == "discover --decide"
+    assert profile["set_up"]["answer"] == "unattended"
+    assert "Chain of verdicts" in (verdicts[-1] / "report.html").read_text()
