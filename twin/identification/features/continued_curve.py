@@ -50,6 +50,7 @@ def find_curve_limits(model: Model, test: FeatureTest) -> tuple[float, float]:
     return max(test.start_hz, min(low_hz, 0.5 * test.end_hz)), test.end_hz
 
 
+@np.errstate(all="ignore")  # a trial of a fit may diverge, and then has no curve
 def compute_curve(model: Model, test: FeatureTest) -> ResponseCurve | None:
     """Return the curve by continuation from the upper end; by stepped sweeps if it breaks off.
 
@@ -95,6 +96,7 @@ def _measure_excess(orbit: Orbit, is_large: bool) -> float:
     return -max(push, MIN_EXCESS_M)
 
 
+@np.errstate(all="ignore")
 def sweep_curve(model: Model, test: FeatureTest) -> ResponseCurve | None:
     """Return the curve of a stepped sweep, forward and backward, at the test's frequency step."""
     low_hz, high_hz = find_curve_limits(model, test)
