@@ -161,6 +161,22 @@ def hold_stiffness(recorded: Recorded, share: float) -> Rival:
     )
 
 
+def test_what_a_refit_absorbs_separates_nothing() -> None:
+    """A set whose stiffness is 5 % off, but free, is the same explanation."""
+    recorded = record_first(SNM)
+    free = recorded.fit()
+    parameters = free.fitted.fit.parameters
+    off = parameters.with_values({STIFFNESS: 1.05 * parameters.values[STIFFNESS]})
+    fitted = replace(free.fitted, fit=replace(free.fitted.fit, parameters=off))
+    motion = make_test(0.8, 4.0, 0.05, cycles=8).motion
+    rivals = free, Rival("off", fitted, is_held=True)
+    prediction = predict_separation(recorded.prepared.problem, rivals, motion)
+    assert len(prediction.pairs) == 1
+    assert abs(prediction.sigma) < 0.1
+    (stepped,) = rank_tests(recorded.prepared.problem, rivals, [motion])
+    assert abs(stepped.sigma) < 0.5
+
+
 def test_the_separation_of_two_stiffnesses_is_the_closed_form() -> None:
     """Forces differ by dK u on the same motion: sum of squares n (dK U)^2 / 2, over the noise.
 
