@@ -4,19 +4,21 @@ Everything in SI. Parameters and signs as in `ground_truth.DEFINITION_BY_ID`.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
 
 from table_io.block import Float2D
 from table_io.sim.filters import FractionalDelay
 from table_io.sim.ground_truth import GroundTruth
+from table_io.sim.hidden_laws import StrangeLaws
 from table_io.sim.hidden_plant import HiddenCoefficients, HiddenPlant
-from table_io.sim.imperfections import resolve_sides
+from table_io.sim.imperfections import Imperfection, resolve_sides
 from table_io.sim.plant import Plant
 
 # Parameters whose coefficient has a different name.
 COEFFICIENT_NAMES = {
-    "coulomb_friction": {"stribeck_speed": "vs", "slip_speed": "v0"},
+    "coulomb_friction": {"slip_speed": "v0"},
     "bouc_wen": {"force": "fy", "yield_displacement": "uy", "exponent": "n"},
     "bumper_maxwell": {"tau": "tau_b"},
     "gap_drift": {"rate": "gap_rate"},
@@ -34,6 +36,7 @@ def build_hidden_plant(plant: Plant, truth: GroundTruth) -> HiddenPlant:
     }
     parameters |= truth.base.model_dump(exclude_none=True)
     coefficients: dict[str, Any] = {}
+    strange: dict[str, Any] = {}  # parameters of each law in turn
     for effect in truth.effects:
         p = effect.parameters
         match effect.id:
@@ -47,10 +50,32 @@ def build_hidden_plant(plant: Plant, truth: GroundTruth) -> HiddenPlant:
                     2 * p["ratio"] / (1 + p["ratio"]),
                     2 / (1 + p["ratio"]),
                 )
+            case "stribeck_friction":
+                coefficients["fs"] = p["fc"] * p["ratio"]
+                coefficients |= {"fc": p["fc"], "vs": p["speed"], "v0": p["slip_speed"]}
+            case name if name in StrangeLaws._fields:
+                strange[name] = tuple(p[q.name] for q in effect.definition.parameters)
             case _ if not effect.definition.is_sensor_effect:
                 names = COEFFICIENT_NAMES.get(effect.id, {})
                 coefficients |= {names.get(key, key): value for key, value in p.items()}
-    for imperfection in truth.imperfections:
+    _apply_imperfections(truth.imperfections, parameters, coefficients)
+    if "fc" in coefficients:
+        coefficients.setdefault("fs", coefficients["fc"])
+    if "w2" in coefficients:
+        coefficients["w2"] *= 2 * math.pi
+    hidden = HiddenCoefficients(
+        **coefficients, is_strange=bool(strange), strange=StrangeLaws(**strange)
+    )
+    return HiddenPlant(**parameters, hidden=hidden)
+
+
+def _apply_imperfections(
+    imperfections: Sequence[Imperfection],
+    parameters: dict[str, Any],
+    coefficients: dict[str, Any],
+) -> None:
+    """Change the parameters and coefficients of a plant by the imperfections of the set-up."""
+    for imperfection in imperfections:
         p = imperfection.parameters
         match imperfection.id:
             case "mass_reading":
@@ -60,13 +85,8 @@ def build_hidden_plant(plant: Plant, truth: GroundTruth) -> HiddenPlant:
                 coefficients["pitch"] = p["per_acceleration"]
             case "time_base":
                 parameters["rate_hz"] *= 1.0 + 1e-6 * p["deviation"]
-    for side, p in resolve_sides(truth.imperfections, "gap_reading").items():
+    for side, p in resolve_sides(imperfections, "gap_reading").items():
         parameters[f"gap_{side}_m"] += p["offset"]
-    if "fc" in coefficients:
-        coefficients.setdefault("fs", coefficients["fc"])
-    if "w2" in coefficients:
-        coefficients["w2"] *= 2 * math.pi
-    return HiddenPlant(**parameters, hidden=HiddenCoefficients(**coefficients))
 
 
 class SensorDistortion:

@@ -17,12 +17,25 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Self
 
 import numpy as np
-from numba import njit
 
 from table_io.block import Float1D, Float2D
 from table_io.compilation import jit_untyped_kernel
 from table_io.errors import InputError
 from table_io.sim import plant as base_plant
+from table_io.sim.hidden_laws import (
+    MEMORY_SIZE,
+    StrangeLaws,
+    inline_jit,
+    memory_force,
+    memory_rates,
+    softening_rate,
+    strange_damper_force,
+    strange_dashpot_push,
+    strange_recovery_rate,
+    strange_resonator,
+    strange_spring_force,
+    strange_spring_push,
+)
 from table_io.sim.hydraulic_table import (
     MAX_HYDRAULIC_SUBSTEP_S,
     HydraulicCoefficients,
@@ -43,7 +56,7 @@ from table_io.sim.plant import (
 from table_io.units import GRAVITY_M_S2
 
 # Continues the state of `plant.py`, float64 (15,): z, Maxwell forces of damper and bumpers in N,
-# position and velocity of the appendage, time in s.
+# position and velocity of the appendage, time in s. The states of strange laws come last, if any.
 Z, F, B, W, VW, T, STATE_SIZE = 8, 9, 10, 12, 13, 14, 15
 PITCH_ITERATIONS = 4  # reduce the error of the pitch to 1e-8 of it
 BISECTION_STEPS = 45  # reduce a sub-step to rounding error
@@ -54,9 +67,6 @@ STRETCH_SCALE_M, HARDENING_SCALE_M, DAMPING_SCALE_M = (
     0.03,
 )  # length scales of the force laws; see `ground_truth.DEFINITION_BY_ID`
 FAST_SPEED_M_S, FAST_ACCELERATION_M_S2 = 0.5, 2.0  # of a fast motion, to bound the sub-step
-
-
-inline_jit = njit(nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 class HiddenCoefficients(NamedTuple):
@@ -93,6 +103,8 @@ class HiddenCoefficients(NamedTuple):
     m2: float = 0.0
     w2: float = 0.0
     z2: float = 0.0
+    is_strange: bool = False  # any of `strange`
+    strange: StrangeLaws = StrangeLaws()
 
     def shortest_time_s(self, plant: Plant) -> float:
         """Return the shortest time scale of the force laws in s."""
@@ -105,6 +117,7 @@ class HiddenCoefficients(NamedTuple):
             self.v0 * min(plant.mass_kg / dry_force, 1.0 / FAST_ACCELERATION_M_S2),
             self.uy / (self.n * FAST_SPEED_M_S),
             1.0 / max(self.w2, 1e-9),
+            self.strange.shortest_time_s,
         )
 
 
@@ -119,6 +132,8 @@ def _spring_force(u, t, params, hidden):  # type: ignore[no-untyped-def]
         force += hidden.k3 * u * u2 / math.sqrt(1.0 + u2 / STRETCH_SCALE_M**2)
     if hidden.dead_width > 0.0:
         force -= params.k * hidden.dead_width * math.tanh(u / hidden.dead_width)
+    if hidden.is_strange:
+        force += strange_spring_force(u, hidden.strange)
     return force
 
 
@@ -136,11 +151,14 @@ def _damper_force(s, params, hidden):  # type: ignore[no-untyped-def]
     if hidden.fc > 0.0 or hidden.fs > 0.0:
         dry_force = hidden.fc + (hidden.fs - hidden.fc) * math.exp(-((v / hidden.vs) ** 2))
         force += dry_force * math.tanh(v / hidden.v0)
+    if hidden.is_strange:
+        force += strange_damper_force(u, v, s[Y], s[VY], s[T], params.c, hidden.strange)
+        force += memory_force(s[s.size - MEMORY_SIZE], s[s.size - 3], hidden.strange)
     return force
 
 
 @inline_jit
-def _bumper_coefficients(d, b, j, params, hidden):  # type: ignore[no-untyped-def]
+def _bumper_coefficients(d, b, softened, j, params, hidden):  # type: ignore[no-untyped-def]
     """Return (static force in N, dashpot in N s/m) of bumper j; d in m, Maxwell force b in N."""
     static = params.kj * hidden.stiffness_ratio[j] * d + hidden.kc * d * d * d + b
     dashpot = params.cj
@@ -153,17 +171,23 @@ def _bumper_coefficients(d, b, j, params, hidden):  # type: ignore[no-untyped-de
         )
     if hidden.ch != 0.0:
         dashpot += hidden.ch * DAMPING_SCALE_M * math.tanh(abs(d) / DAMPING_SCALE_M)
+    if hidden.is_strange:
+        static += strange_spring_push(d, j, softened, hidden.strange)
     return static, dashpot
 
 
 @inline_jit
 def _face_state(s, j, params, hidden):  # type: ignore[no-untyped-def]
     """Return (N_j in N, d_j' in m/s) of the face j."""
-    static, dashpot = _bumper_coefficients(s[D + j], s[B + j], j, params, hidden)
+    softened = s[s.size - 2 + j] if hidden.is_strange else 0.0
+    static, dashpot = _bumper_coefficients(s[D + j], s[B + j], softened, j, params, hidden)
     if s[TOUCHED + j] == 0.0:
-        return 0.0, -static / dashpot
+        return 0.0, strange_recovery_rate(static, dashpot, hidden.strange)
     closing = (1 - 2 * j) * (s[VX] - s[VY]) - hidden.gap_rate
-    return static + dashpot * closing, closing
+    push = static + dashpot * closing
+    if hidden.is_strange:
+        push += strange_dashpot_push(closing, hidden.strange)
+    return push, closing
 
 
 @inline_jit
@@ -207,6 +231,16 @@ def _rates(s, path, t, params, hidden, oil, rate):  # type: ignore[no-untyped-de
     rate[B] = hidden.kb * right_rate - s[B] / hidden.tau_b
     rate[B + 1] = hidden.kb * left_rate - s[B + 1] / hidden.tau_b
     rate[W], rate[VW], rate[T] = s[VW], -swing, 1.0
+    if hidden.is_strange:
+        laws, memory = hidden.strange, s.size - MEMORY_SIZE
+        pull, second_acc = strange_resonator(
+            s[W] - s[X], s[VW] - s[VX], s[W] - s[Y], s[VW] - s[VY], laws
+        )
+        rate[VX] += pull / params.m
+        rate[VW] += second_acc
+        rate[memory], rate[memory + 1] = memory_rates(v, s[memory], s[memory + 1], laws)
+        for j in range(2):
+            rate[memory + 2 + j] = softening_rate(s[TOUCHED + j], s[memory + 2 + j], laws)
 
 
 @inline_jit
@@ -306,7 +340,7 @@ class HiddenPlant(Plant):
     """Plant with hidden effects; a signal `damper_force` is added.
 
     `state` is float64 (15,), or on a hydraulic table that of `HydraulicCoefficients.state_size`:
-    then the bandwidth is not used.
+    then the bandwidth is not used. Strange laws add `MEMORY_SIZE` states.
     """
 
     hidden: HiddenCoefficients = field(default_factory=HiddenCoefficients)
@@ -350,7 +384,7 @@ class HiddenPlant(Plant):
 
         def force(u: float) -> float:
             right, left = (
-                _bumper_coefficients.py_func(d, 0.0, j, params, self.hidden)[0]
+                _bumper_coefficients.py_func(d, 0.0, 0.0, j, params, self.hidden)[0]
                 for j, d in enumerate(compress_bumpers(u))
             )
             return float(_spring_force.py_func(u, 0.0, params, self.hidden) + right - left)
@@ -361,6 +395,7 @@ class HiddenPlant(Plant):
             low, high = (middle, high) if force(middle) < 0.0 else (low, middle)
         u = 0.5 * (low + high)
         size = self.oil.state_size if self.oil.area else STATE_SIZE
+        size += MEMORY_SIZE if self.hidden.is_strange else 0
         state, compressions = np.zeros(size), compress_bumpers(u)
         state[[X, W, T]] = u, u, -1.0 / self.rate_hz  # sample 0 is then at 0 s
         state[D : D + 2], state[TOUCHED : TOUCHED + 2] = compressions, np.array(compressions) > 0.0

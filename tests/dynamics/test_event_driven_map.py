@@ -190,7 +190,7 @@ def test_a_mass_that_never_slips_stays():
 def test_a_model_with_every_effect_has_all_coordinates():
     model = everything().with_effect("gap_drift", rate=0.0)
     period_map = make_period_map(model)
-    assert period_map.size == 8  # u, v, two faces, f, two b_j, z
+    assert period_map.size == 10  # u, v, two faces, f, two b_j, z, two of the appendage
     x = period_map.iterate(start_of(period_map), 3.0, AG, 100)
     x, result = solve_orbit(period_map, 3.0, x)
     assert np.abs(multipliers(result)).max() < 1

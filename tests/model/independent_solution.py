@@ -32,7 +32,8 @@ class Witness:
         k = (self.p.bumper_stiffness_r, self.p.bumper_stiffness_l)[side]
         c = (self.p.bumper_damping_r, self.p.bumper_damping_l)[side]
         k2, ch = self.get("bumper_hardening", "k2"), self.get("hunt_crossley", "ch")
-        return k * d + c * dd + k2 * d * abs(d) + ch * abs(d) * dd + b
+        cubic = self.get("bumper_cubic", "kc") * d**3
+        return k * d + c * dd + k2 * d * abs(d) + cubic + ch * abs(d) * dd + b
 
     def face(self, side: int, t: float, x: np.ndarray) -> tuple[float, float]:
         """(d, d') of a bumper, positive in compression."""
@@ -52,13 +53,26 @@ class Witness:
         total += self.get("cubic_stiffness", "k3") * u**3
         total += self.get("quadratic_damping", "c2") * v * v * self.way
         total += self.get("bouc_wen", "force") * z
+        total += self.get("position_damping", "cu") * u * u * v
+        if width := self.get("dead_band", "width"):
+            total -= self.p.stiffness * u * (1 + abs(u / width) ** 4) ** -0.25
+        total -= self.get("appendage", "mass") * self.rider(x)
         if friction:
             total += self.get("coulomb_friction", "fc") * self.way
+            fc, ratio = (self.get("stribeck_friction", name) for name in ("fc", "ratio"))
+            speed = self.get("stribeck_friction", "speed") or 1.0
+            total += (fc + fc * (ratio - 1) * math.exp(-((v / speed) ** 2))) * self.way
         for side, s in ((0, 1.0), (1, -1.0)):
             if self.contact[side]:
                 d, dd = self.face(side, t, x)
                 total += s * self.bumper(side, d, dd, x[5 + side])
         return total
+
+    def rider(self, x: np.ndarray) -> float:
+        """Acceleration of the attached mass by its spring and dashpot, u - y and their rates."""
+        w = 2 * math.pi * self.get("appendage", "frequency")
+        v = 0.0 if self.way == 0.0 else x[1]
+        return w * w * (x[8] - x[0]) + 2 * self.get("appendage", "damping_ratio") * w * (x[9] - v)
 
     def rhs(self, t: float, x: np.ndarray) -> list[float]:
         stuck = self.way == 0.0
@@ -71,7 +85,7 @@ class Witness:
         branch = [kb * rates[s] - (x[5 + s] / tau_b if tau_b else 0.0) for s in (0, 1)]
         z, uy = x[7], self.get("bouc_wen", "yield_displacement")
         dz = (v - 0.5 * (abs(v) * z * abs(z) + v * z * z)) / uy if uy else 0.0
-        return [*out, *rates, df, *branch, dz]
+        return [*out, *rates, df, *branch, dz, x[9], -self.base(t) - self.rider(x)]
 
     def holding_force(self, t: float, x: np.ndarray) -> float:
         """Friction that would hold the mass."""
@@ -82,19 +96,24 @@ class Witness:
         self.way = way
         return need
 
+    def break_away(self) -> float:
+        stribeck = self.get("stribeck_friction", "fc") * self.get("stribeck_friction", "ratio")
+        return stribeck + self.get("coulomb_friction", "fc")
+
     def guards(self):
         def side(place: int):
             def event(t, x):
                 s = (1.0, -1.0)[place]
                 if self.contact[place]:
-                    return self.bumper(place, *self.face(place, t, x), x[5 + place])
+                    push = self.bumper(place, *self.face(place, t, x), x[5 + place])
+                    return push + self.get("adhesion", "force")
                 gap = self.gap(place, t)
                 return gap + x[2 + place] - s * x[0] if math.isfinite(gap) else 1.0
 
             return event
 
         def turn(t, x):
-            fc = self.get("coulomb_friction", "fc")
+            fc = self.break_away()
             return self.way * x[1] if self.way else fc - abs(self.holding_force(t, x))
 
         events = [side(0), side(1), turn]
@@ -108,16 +127,19 @@ class Witness:
             if self.contact[which]:
                 x[2 + which] = self.face(which, t, x)[0]
             return
-        need, fc = self.holding_force(t, x), self.get("coulomb_friction", "fc")
+        need, fc = self.holding_force(t, x), self.break_away()
         x[1] = 0.0
         self.way = 0.0 if fc and self.way and abs(need) <= fc else math.copysign(1.0, need)
 
     def run(self, x0, times: np.ndarray, tolerance: float = 1e-11) -> np.ndarray:
-        """(u, v, d_R, d_L, f, b_R, b_L, z) at `times` (8, n), and the number of events."""
+        """(u, v, d_R, d_L, f, b_R, b_L, z, y, y') at `times` (10, n), and the number of events.
+
+        x0 (8,): the attached mass starts at rest relative to the table, its spring relaxed.
+        """
         x, t, solution, self.events = (
-            np.array(x0, dtype=float),
+            np.array([*x0, x0[0], 0.0]),
             0.0,
-            np.full((8, times.size), np.nan),
+            np.full((10, times.size), np.nan),
             0,
         )
         self.way = math.copysign(1.0, x[1]) if x[1] else self.way

@@ -205,12 +205,27 @@ class TestInstalled:
     def test_what_does_not_fit_is_refused(self):
         model = add("zener_bumper").with_effect("slip_damper", force=1.0, yield_displacement=1e-3)
         model = model.with_effect("zener_damper", stiffness=1.0, relaxation_time=1.0)
-        model = model.with_effect("smooth_friction", force=1.0, speed=1e-2)
+        model.with_effect("dragged_floor", damping=1.0).prepare(RATE_HZ)
         with pytest.raises(InputError) as error:
-            model.with_effect("cubic_bumper", k3=1.0).with_effect("rocking", tilt=0.1).with_effect(
-                "deep_dashpot", c=1.0
+            model.with_effect("appendage", "", **typical(find_effect("appendage"))).with_effect(
+                "dragged_floor", damping=1.0
             ).prepare(RATE_HZ)
-        assert error.value.allowed.startswith("at most 8")
+        assert error.value.allowed.startswith("at most 6")
+        for extra in (
+            "hard_right",
+            "hard_left",
+            "cubic_bumper",
+            "smooth_friction",
+            "pulling_cable",
+            "ageing_bumper",
+            "carried_mass",
+            "deep_dashpot",
+            "stribeck_friction",
+        ):
+            model = model.with_effect(extra, "", **typical(find_effect(extra)))
+        with pytest.raises(InputError) as error:
+            model.prepare(RATE_HZ)
+        assert error.value.allowed.startswith("at most 16")
         with pytest.raises(InputError) as error:
             add("zener_bumper", base=snm(bumper_damping_r=0.0))
         assert "zener_bumper" in error.value.where
@@ -218,7 +233,7 @@ class TestInstalled:
     @pytest.mark.parametrize(
         ("truth", "name", "parameter", "value", "without"),
         [
-            (format_truth("bumper_cubic", kc=2e9), "cubic_bumper", "k3", 2e9, ()),
+            (format_truth("bumper_cubic", kc=2e9), "cubic_bumper", "k3", 2e9, ("bumper_cubic",)),
             (
                 format_truth("maxwell_damper", k1=8e3, tau=0.05), "zener_damper", "stiffness", 8e3,
                 ("maxwell_damper",),

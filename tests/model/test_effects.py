@@ -17,6 +17,10 @@ TABLE = {
     "maxwell_damper": {"k1": "N/m", "tau": "s"}, "bumper_hardening": {"k2": "N/m2"},
     "hunt_crossley": {"ch": "N s/m2"}, "bumper_maxwell": {"kb": "N/m", "tau": "s"},
     "bumper_asymmetry": {"ratio": ""}, "gap_offset": {"offset": "m"}, "gap_drift": {"rate": "m/s"},
+    "stribeck_friction": {"fc": "N", "ratio": "", "speed": "m/s"},
+    "position_damping": {"cu": "N s/m3"}, "dead_band": {"width": "m"},
+    "appendage": {"mass": "kg", "frequency": "Hz", "damping_ratio": ""},
+    "bumper_cubic": {"kc": "N/m3"}, "adhesion": {"force": "N"},
     "table_tilt": {"tilt": "rad/m"}, "mass_error": {"ratio": ""}, "sensor_gain": {"gain": ""},
     "sensor_lag": {"lag": "s"}, "sensor_offset": {"offset": "unit of the channel"},
 }  # fmt: skip
@@ -115,8 +119,9 @@ class TestMotion:
             model = having(effect, values=lambda _, values=values: values)
             changes.append(np.abs(drive(model, base)[1][0] - plain[0]).max())
         assert changes[0] > 0
-        if effect.id != "coulomb_friction":  # sticks a little longer: not linear in Fc at rest
-            assert changes[1] == pytest.approx(2 * changes[0], rel=0.05)
+        if not effect.id.endswith("_friction"):  # sticks a little longer: not linear in Fc at rest
+            power = 2 if effect.id == "adhesion" else 1  # its impulse is force times delay
+            assert changes[1] == pytest.approx(2**power * changes[0], rel=0.05)
 
     @pytest.mark.parametrize("size", [1, 7, 64, 500])
     def test_blocks_of_any_size_give_the_same_bits(self, effect, size):

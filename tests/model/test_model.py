@@ -19,6 +19,7 @@ from twin.model.closed_form import ClosedFormSolver
 from twin.model.config import ModelConfig
 from twin.model.effects import EFFECTS, find_effect
 from twin.model.effects.effect import Effect, EffectParameter
+from twin.model.effects.law import find_law_problem
 from twin.model.event_integrator import EventDrivenSolver
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model, SensorModel
@@ -266,7 +267,9 @@ def test_a_sampled_sweep_takes_as_many_samples_as_a_hard_bumper_needs():
 def test_every_built_in_effect_is_on_a_path():
     for effect in EFFECTS:
         assert (effect.change is not None) == (effect.acts == "parameters")
-        assert effect.force is None
+        assert (effect.force is None) <= (effect.states == ())
+        assert effect.force is None or effect.acts == "force"
+        assert effect.acts != "force" or not find_law_problem(effect) or effect.force is None
 
 
 @pytest.mark.parametrize("effect", [None, "gap_drift"])

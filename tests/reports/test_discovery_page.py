@@ -365,6 +365,7 @@ def test_only_a_model_that_is_not_sure_is_provisional(every: dict[str, Discovery
         ("ch |u_j| u_j'", "c<sub>h</sub> |u<sub>j</sub>| u<sub>j</sub>′"),
         ("-M g tilt x", "−M g tilt x"),
         ("a < b by rate", "a &lt; b by rate"),
+        ("(1 + (w2 / a)^4)^(1/4)", "(1 + (w<sub>2</sub> / a)<sup>4</sup>)<sup>1/4</sup>"),
     ],
 )
 def test_laws_are_typeset(term: str, typeset: str) -> None:

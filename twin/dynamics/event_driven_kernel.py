@@ -26,8 +26,8 @@ from twin.model.event_integrator_kernel import (
     write_states,
 )  # fmt: skip
 from twin.model.force_laws import (
-    ADDED_LAWS_TYPE,
-    COEFFICIENTS_TYPE,
+    LAWS_TYPES,
+    PLAIN_TYPES,
     AddedLaws,
     Coefficients,
     Motion,
@@ -36,10 +36,10 @@ from twin.model.force_laws import (
 
 _KERNELS = [
     types.void(
-        float64[:, ::1], COEFFICIENTS_TYPE, float64[:, ::1], laws, float64[::1], int64,
+        float64[:, ::1], coefficients, float64[:, ::1], laws, float64[::1], int64,
         float64[:, ::1], float64[:, ::1],
     )
-    for laws in (types.none, ADDED_LAWS_TYPE)
+    for coefficients, laws in (PLAIN_TYPES, LAWS_TYPES)
 ]  # fmt: skip
 
 

@@ -13,7 +13,6 @@ wide; one-sided for a coordinate at its bound, such as a relaxed face.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -134,8 +133,8 @@ class EventDrivenMap:
         if (p.bumper_damping_r, p.bumper_damping_l)[side] or coefficients.ch or coefficients.kb:
             return True
         return any(
-            side in PLACES[effect.place] and has_dashpot(effect, values)
-            for effect, values in self.model.added_laws
+            side in PLACES[effect.place] and has_dashpot(effect, constants)
+            for effect, constants in self.model.added_laws
         )
 
     @cached_property
@@ -155,11 +154,11 @@ class EventDrivenMap:
         sizes[V], sizes[STATE_F], sizes[STATE_Z] = v, coefficients.k1 * u, u / coefficients.uy
         sizes[STATE_B_R : STATE_B_R + 2] = coefficients.kb * u
         index = STATE_S
-        for effect, values in self.model.added_laws:
+        for effect, constants in self.model.added_laws:
             if effect.states:
                 # The rates of a law may saturate: those of a small motion, scaled up.
                 small = SMALL_MOTION_M / u
-                rates = evaluate_law(effect, values)[1](
+                rates = evaluate_law(effect, constants)[1](
                     small * u, small * v, 0.0, 0.0, (0.0,) * len(effect.states)
                 )
                 for _ in PLACES[effect.place]:
@@ -361,9 +360,9 @@ class EventDrivenMap:
         return EventDrivenMap(change_parameter(self.model, name, value))
 
 
-def has_dashpot(effect: Effect, values: Mapping[str, float]) -> bool:
+def has_dashpot(effect: Effect, constants: tuple[float, ...]) -> bool:
     """Return whether a law in a bumper delays the recovery of its face: by rate or by states."""
-    force, _ = evaluate_law(effect, values)
+    force, _ = evaluate_law(effect, constants)
     d, relaxed = SMALL_MOTION_M, (0.0,) * len(effect.states)
     return bool(effect.states) or force(d, 1.0, 0.0, 0.0, relaxed) != force(
         d, 0.0, 0.0, 0.0, relaxed

@@ -4,8 +4,10 @@ Forces depend (nearly) linearly on the amplitude of a candidate, but not on its 
 Each candidate therefore has a ladder of trial shapes; the fit interpolates between them.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 
@@ -28,8 +30,11 @@ from twin.model.effects.effect import Effect, EffectParameter
 LADDER_LENGTH = 9
 # of the largest velocity: trial values; friction near zero velocity varies
 SLIP_SHARES = (5e-5, 1.5e-3, 5e-3, 1.5e-2)
-LADDER_SHARES_M = (0.01, 2.0)  # ends of the ladder of a length, of the largest displacement
-MAX_LADDER_PERIODS = 6.0  # of the main motion: end of the ladder of a relaxation time
+THRESHOLD_SHARES = (0.003, 0.01, 0.03, 0.1, 0.3)  # of its size: trial values of a threshold
+LADDER_SHARES = (0.01, 2.0)  # ends of the ladder of a length or speed, of the largest in the test
+MAX_LADDER_PERIODS = 6.0  # of the main motion: end of the ladder of a relaxation time or frequency
+RESONANCE_RATIO = 1.12  # between trial frequencies: about the width of a resonance of 5 % damping
+MAX_RESONANCE_SHARE = 0.1  # of the sampling rate: highest trial frequency
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +52,8 @@ class Candidate:
     effect: Effect | None = None
     channel: str = ""
     constants: Mapping[ParameterKey, float] = field(default_factory=dict)  # fixed values
+    # Deviations of the amplitude over which its slope is taken; 0: where it vanishes.
+    probes: tuple[float, ...] = (0.0,)
 
     @classmethod
     def from_effect(cls, effect: Effect, channel: str, scale: RecordScale) -> "Candidate":
@@ -59,13 +66,18 @@ class Candidate:
         vanishing = float(effect.parameters[index].vanishing or 0.0)
         name = f"{effect.id}.{channel}" if channel else effect.id
         amplitude = free[index]
-        if effect.id == "coulomb_friction":
+        if effect.is_dry_friction:
             speeds = [share * scale.v for share in SLIP_SHARES]
             slip = FreeParameter(
                 SLIP_SPEED, speeds[0], 3.0 * speeds[-1], speeds[0], "m/s", logarithmic=True
             )
-            free, shapes = (*free, slip), tuple((speed,) for speed in speeds)
-        return cls(name, free, amplitude, vanishing, shapes, effect, channel)
+            # a law with shapes of its own is found with any slip speed
+            trials = speeds if shapes == ((),) else speeds[1:2]
+            shapes = tuple((*shape, speed) for shape in shapes for speed in trials)
+            free = (*free, slip)
+        shares = THRESHOLD_SHARES if effect.is_threshold else (0.0,)
+        probes = tuple(share * amplitude.scale for share in shares)
+        return cls(name, free, amplitude, vanishing, shapes, effect, channel, probes=probes)
 
     def add_to(
         self, parameters: ParameterSet, shape: Sequence[float], amplitude: float | None = None
@@ -165,23 +177,35 @@ def _is_unloaded(candidate: Candidate, log_residuals: Sequence[LogResiduals]) ->
 def _list_shapes(
     effect: Effect, free: Sequence[FreeParameter], scale: RecordScale
 ) -> tuple[tuple[float, ...], ...]:
-    """Return trial shapes: a ladder for a single parameter, the middle of its ladder for more."""
-    ladders = [
-        _shape_ladder(parameter, own, effect, scale)
+    """Return trial shapes: a ladder for a single parameter, every other rung of each for more.
+
+    A resonance is found by its frequency alone: the others have the middle of their ladder.
+    """
+    shapes = [
+        (parameter.unit, _shape_ladder(parameter, own, effect, scale))
         for parameter, own in zip(effect.parameters, free, strict=True)
-        if not own.vanishing and own.logarithmic
+        if own.logarithmic
     ]
-    if len(ladders) == 1:
-        return tuple((rung,) for rung in ladders[0])
-    return (tuple(ladder[len(ladder) // 2] for ladder in ladders),)
+    if len(shapes) > 1:
+        is_resonance = any(unit == "Hz" for unit, _ in shapes)
+        middle = LADDER_LENGTH // 2
+        rest = slice(middle, middle + 1) if is_resonance else slice(None, None, 2)
+        shapes = [(unit, rungs if unit == "Hz" else rungs[rest]) for unit, rungs in shapes]
+    return tuple(product(*(rungs for _, rungs in shapes)))
 
 
 def _shape_ladder(
     parameter: EffectParameter, free: FreeParameter, effect: Effect, scale: RecordScale
 ) -> list[float]:
     """Return the trial values of a shape parameter, within its bounds, SI."""
-    if parameter.unit == "m":
-        low, high = (share * scale.u for share in LADDER_SHARES_M)
+    if parameter.unit == "Hz":
+        main_hz = 1.0 / (2 * np.pi * scale.time_s)
+        low, high = main_hz / MAX_LADDER_PERIODS, MAX_RESONANCE_SHARE / scale.sample_s
+        count = 1 + math.ceil(math.log(max(high / low, 1.0)) / math.log(RESONANCE_RATIO))
+        return [float(rung) for rung in np.geomspace(low, high, count)]
+    if parameter.unit in ("m", "m/s"):
+        largest = scale.u if parameter.unit == "m" else scale.v
+        low, high = (share * largest for share in LADDER_SHARES)
     elif parameter.unit == "s":
         longest = MAX_LADDER_PERIODS * 2 * np.pi * scale.time_s
         low, high = 0.5 * scale.sample_s, min(0.1 * scale.duration_s, longest)

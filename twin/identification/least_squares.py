@@ -93,12 +93,16 @@ def compute_slopes(
     parameters: ParameterSet,
     free: FreeParameter,
     before: Sequence[Float1D],
+    probe: float = 0.0,
 ) -> list[Float1D]:
-    """Return d residual / d parameter (internal value) by finite difference, (entry,) per log."""
+    """Return d residual / d parameter (internal value) by finite difference, (entry,) per log.
+
+    Over a change of `probe`, if given, else over one that is small.
+    """
     if isinstance(free.key, NuisanceKey):
         return [residuals.nuisance_slope(free.key) for residuals in log_residuals]
     x = free.to_internal(parameters.values[free.keys[0]])
-    step = SLOPE_STEP * (1.0 if free.logarithmic else free.scale)
+    step = probe or SLOPE_STEP * (1.0 if free.logarithmic else free.scale)
     if (math.exp(x + step) if free.logarithmic else x + step) > free.high:
         step = -step
     moved = parameters.with_values(dict.fromkeys(free.keys, free.to_external(x + step)))

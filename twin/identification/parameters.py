@@ -380,6 +380,8 @@ def _find_bounds(
     size, vanishing = measure_size(parameter, effect, channel, scale), parameter.vanishing
     if vanishing is None and parameter.unit == "s":
         return 0.02 * scale.sample_s, scale.duration_s
+    if vanishing is None and parameter.unit == "Hz":  # of the record: a cycle, and Nyquist
+        return 1.0 / scale.duration_s, 0.5 / scale.sample_s
     if not size:
         return parameter.low, parameter.high
     if vanishing is None:

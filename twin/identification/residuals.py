@@ -429,8 +429,7 @@ class LogResiduals:
         m = sampled.m
         d, right, left = self._model_forces(model, parameters, sampled)
         if SLIP_SPEED in parameters.values:
-            fc = model.effect_parameter("coulomb_friction", "fc") or 0.0
-            d = d + fc * (
+            d = d + model.break_away_force_n * (
                 np.tanh(m.v / parameters.values[SLIP_SPEED]) - np.where(m.v > 0, 1.0, -1.0)
             )
         if not m.has_load_cells and m.damper is None:
@@ -486,7 +485,7 @@ class LogResiduals:
             rows[0] = self.signals.grid.apply_gain(damper, self.whitening)[places[0]]
         rows += [self._correct_consistency(c, parameters) for c in sampled.consistency]
         if m.has_load_cells and m.damper is None:
-            rows += self._pull_rows(sampled, parameters)
+            rows += self._pull_rows(sampled, parameters, forces)
         return rows
 
     def _correct_consistency(
@@ -504,11 +503,14 @@ class LogResiduals:
             else consistency.values
         )
 
-    def _pull_rows(self, sampled: SampledMotion, parameters: ParameterSet) -> list[Float1D]:
+    def _pull_rows(
+        self, sampled: SampledMotion, parameters: ParameterSet, errors: Sequence[Float1D]
+    ) -> list[Float1D]:
         """Return the tension of each side over the noise of its cells, in its row; 0 for pushes.
 
-        The mean square of pure noise is at most 1: only its negative half enters, scaled by
-        sqrt(2). The undershoot of the low pass after a release is not counted as tension.
+        Where the model has tension, `errors` of the force rows enter as they are. Elsewhere the
+        mean square of pure noise is at most 1: only its negative half enters, scaled by sqrt(2),
+        and the undershoot of the low pass after a release is not counted as tension.
         """
         m = sampled.m
         # a side without cells has no noise and no samples in these rows
@@ -516,15 +518,16 @@ class LogResiduals:
             (m.right, "right", m.noise.right or 1.0),
             (m.left, "left", m.noise.left or 1.0),
         )
-        return [
-            np.minimum(
-                push[place] - parameters.tare_error(self.log_number, name)
-                + MAX_UNDERSHOOT_SHARE * largest, 0.0)
-            * math.sqrt(2.0) / rms
-            for (push, name, rms), place, largest in zip(
-                sides, self._row_places[-len(PULL_ROWS) :], sampled.largest_pushes, strict=True
-            )
-        ]  # fmt: skip
+        rows = []
+        for (push, name, rms), place, largest, error in zip(
+            sides, self._row_places[-len(PULL_ROWS) :], sampled.largest_pushes, errors[1:],
+            strict=True,
+        ):  # fmt: skip
+            measured = push[place] - parameters.tare_error(self.log_number, name)
+            tension = np.minimum(measured + MAX_UNDERSHOOT_SHARE * largest, 0.0) * math.sqrt(2.0)
+            is_held = error[place] > measured
+            rows.append(np.where(is_held, error[place], tension) / rms)
+        return rows
 
     def _rest_entries(self, parameters: ParameterSet) -> Float1D:
         """Return the rest row, (entry,): readings at rest less offsets, tare errors, over noise."""

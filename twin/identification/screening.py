@@ -7,7 +7,7 @@ sweep); any candidate is then fitted to some units and judged on the others from
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import numpy.typing as npt
@@ -151,21 +151,22 @@ def build_normal_equations(
     ]
     before = [residuals.evaluate(parameters) for residuals in log_residuals]
     variants: list[Variant] = []
-    requests: list[tuple[ParameterSet, FreeParameter]] = []
+    requests: list[tuple[ParameterSet, FreeParameter, float]] = []
     for candidate in library:
         amplitude, vanishing = candidate.amplitude, candidate.vanishing
         sign = int(amplitude.low >= vanishing) - int(amplitude.high <= vanishing)
-        for shape in candidate.shapes:
+        for shape, probe in product(candidate.shapes, candidate.probes):
             variants.append(Variant(candidate, shape, len(free) + len(requests), sign))
-            requests.append((candidate.add_to(parameters, shape), amplitude))
+            requests.append((candidate.add_to(parameters, shape), amplitude, probe))
     order = UnitOrder.from_logs(log_residuals)
     residual = order.sort(before)
 
-    def sort_slopes(request: tuple[ParameterSet, FreeParameter]) -> Float32Array:
-        return order.sort(compute_slopes(log_residuals, *request, before))
+    def sort_slopes(request: tuple[ParameterSet, FreeParameter, float]) -> Float32Array:
+        start, parameter, probe = request
+        return order.sort(compute_slopes(log_residuals, start, parameter, before, probe))
 
     base = np.empty((len(free), residual.size), dtype=np.float32)
-    base_requests = [(parameters, parameter) for parameter in free]
+    base_requests = [(parameters, parameter, 0.0) for parameter in free]
     for row, slopes in zip(base, mapper(sort_slopes, base_requests), strict=True):
         row[:] = slopes
 

@@ -306,12 +306,14 @@ def _refit_candidates(
         parameters = parameters.without(dropped.free)
         parameters = problem.fit_effects(parameters, kept).fit.parameters
     kept_names = {effect.name for effect in kept}
+    kept_keys = {free.key for effect in kept for free in effect.free}
     max_refits = MAX_GENERIC_REFITS if generic else MAX_REFITS
     if library is None:
         library = [
             candidate
             for candidate in problem.library
             if candidate.name not in kept_names
+            and kept_keys.isdisjoint(free.key for free in candidate.free)
             and candidate is not dropped
             and not (current.cost < problem.noise and problem.is_limited(candidate))
         ]

@@ -90,6 +90,9 @@ def judge_selection(
     ]:
         alternative = min(unstrained, key=lambda fitted: fitted.cost)
         return judge_selection(problem, replace(selection, best=alternative), floor)
+    if simpler := [fitted for fitted in as_good if _is_limit_case(best, fitted)]:
+        # a law contains its limit, and fits the noise a little better
+        return judge_selection(problem, replace(selection, best=simpler[0]), floor)
     alternatives = tuple({frozenset(fitted.names): fitted for fitted in reversed(as_good)}.values())
     # the form of a force law may be inexact, that of an error of a sensor is not
     is_exact = all(name.startswith("sensor_") for name in best.names)
@@ -265,10 +268,15 @@ def _tares_at_bound(fitted: FittedSet) -> set[ParameterKey]:
     return {key for key in fitted.fit.at_bound if isinstance(key, TareKey)}
 
 
-def _is_limit_case(fitted: FittedSet, best: FittedSet) -> bool:
-    """Return True if the set only replaces Coulomb friction by Bouc-Wen, whose limit it is."""
-    is_swap = {*fitted.names} ^ {*best.names} == {"bouc_wen", "coulomb_friction"}
-    return is_swap and "coulomb_friction" in best.names
+def _is_limit_case(richer: FittedSet, simpler: FittedSet) -> bool:
+    """Return True if the sets differ in one law, and that of the second is a limit of the first."""
+    own = [effect for effect in richer.effects if effect.name not in simpler.names]
+    others = [name for name in simpler.names if name not in richer.names]
+    return (
+        len(own) == len(others) == 1
+        and own[0].effect is not None
+        and others[0] in own[0].effect.limits
+    )
 
 
 def _confidence(
@@ -303,7 +311,10 @@ def suggest_next_run(
     names = {name.split(".")[0] for names in (best, *alternatives) for name in names}
     if outcome == "none":
         return "no further test is needed; a sweep at another amplitude would confirm the result"
-    if names & {"bouc_wen", "maxwell_damper", "coulomb_friction", "quadratic_damping"}:
+    if names & {
+        "bouc_wen", "maxwell_damper", "coulomb_friction", "stribeck_friction", "quadratic_damping",
+        "position_damping",
+    }:  # fmt: skip
         return (
             "the same sweep at half and at twice the amplitude: hysteresis and friction change "
             "with amplitude, relaxation only with frequency"
@@ -312,6 +323,6 @@ def suggest_next_run(
         return "a calibration of the channels named, then the same sweep"
     if names & {"gap_offset", "gap_drift", "bumper_asymmetry"}:
         return "the same sweep again with the set-up unchanged, then with another gap"
-    if names & {"bumper_hardening", "hunt_crossley", "bumper_maxwell"}:
+    if names & {"bumper_hardening", "bumper_cubic", "hunt_crossley", "bumper_maxwell", "adhesion"}:
         return "a sweep at twice the amplitude: deeper contact at higher speed"
     return "the same sweep at another amplitude and, where there are bumpers, another gap"

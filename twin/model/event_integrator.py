@@ -11,7 +11,7 @@ from scipy.linalg import expm
 from table_io.block import Float1D, Float2D
 from table_io.errors import InputError
 from twin.model import closed_form
-from twin.model.added_laws import compile_laws, pack_coefficients
+from twin.model.added_laws import compile_laws, pack_constants
 from twin.model.effects import bumper_hardening, cubic_stiffness
 from twin.model.effects.law import DAMPER, LawProperties, sum_law_properties
 from twin.model.event_integrator_kernel import (
@@ -130,7 +130,7 @@ def kernel_coefficients(model: "Model") -> tuple[Coefficients, AddedLaws | None]
 
     k3, k2 = value("cubic_stiffness", "k3"), value("bumper_hardening", "k2")
     c2, ch = value("quadratic_damping", "c2"), value("hunt_crossley", "ch")
-    fc, fy = value("coulomb_friction", "fc"), value("bouc_wen", "force")
+    fc, fy, pull = model.break_away_force_n, value("bouc_wen", "force"), value("adhesion", "force")
     added = model.added_laws
     has_reversals = bool(c2 or fc or fy or added)
     p = model.parameters
@@ -153,13 +153,14 @@ def kernel_coefficients(model: "Model") -> tuple[Coefficients, AddedLaws | None]
         ch=ch,
         kb=value("bumper_maxwell", "kb"),
         rate_b=rate("bumper_maxwell"),
+        pull=pull,
         drift=value("gap_drift", "rate"),
         gap_r=min(p.gap_r, NO_WALL_M),
         gap_l=min(p.gap_l, NO_WALL_M),
-        is_linear=not (has_reversals or k3 or k2 or ch),
+        is_linear=not (has_reversals or k3 or k2 or ch or pull),
         has_reversals=has_reversals,
         has_bumper_states=any(effect.is_in_bumpers and effect.states for effect, _ in added),
-        laws=pack_coefficients(added),
+        laws=pack_constants(added),
     )
     return coefficients, compile_laws(tuple(effect for effect, _ in added))
 

@@ -24,9 +24,9 @@ from table_io.compilation import (
 )
 from twin.model.event_location import REVERSAL_GUARD, StateAndRates, integrate_to_event
 from twin.model.force_laws import (
-    ADDED_LAWS_TYPE,
-    COEFFICIENTS_TYPE,
     LAW_STATES,
+    LAWS_TYPES,
+    PLAIN_TYPES,
     AddedLaws,
     Coefficients,
     LawInputs,
@@ -174,8 +174,9 @@ def advance_step(
     u, v, u_r, u_l, f, b_r, b_l, s = x
     f, b_r, b_l = flush_value(f), flush_value(b_r), flush_value(b_l)
     s = flush_states(s)
-    u_r = u_r if start.mode & 1 else flush_face(u_r, 1.0, b_r != 0.0 or p.has_bumper_states)
-    u_l = u_l if start.mode & 2 else flush_face(u_l, -1.0, b_l != 0.0 or p.has_bumper_states)
+    may_stretch = p.has_bumper_states or p.pull > 0.0
+    u_r = u_r if start.mode & 1 else flush_face(u_r, 1.0, b_r != 0.0 or may_stretch)
+    u_l = u_l if start.mode & 2 else flush_face(u_l, -1.0, b_l != 0.0 or may_stretch)
     return (Motion(u, v, u_r, u_l, f, b_r, b_l, s), motion[1]), start
 
 
@@ -196,11 +197,11 @@ def set_start(
 def contact_force(
     x: Motion, start: Start, p: Coefficients, side: int, laws: AddedLaws | None
 ) -> float:
-    """Return F_R >= 0 or F_L <= 0 in N at the start of a step."""
+    """Return F_R >= 0 or F_L <= 0 in N at the start of a step; tension only with adhesion."""
     if not (start.mode >> side) & 1:
         return 0.0
     d, dd, b = bumper_deformation(x, start, p, side, 0.0, laws)
-    return (1.0 - 2.0 * side) * max(0.0, bumper_force(p, side, d, dd, b, x.s, laws))
+    return (1.0 - 2.0 * side) * max(-p.pull, bumper_force(p, side, d, dd, b, x.s, laws))
 
 
 _READ = types.Array(float64, 1, "A", readonly=True)
@@ -255,17 +256,17 @@ def _integrate_samples(
     state[CLOCK] = clock + base_acc.size
 
 
-def _compile_kernel(laws_type: types.Type) -> Callable[..., None]:
+def _compile_kernel(coefficients_type: types.Type, laws_type: types.Type) -> Callable[..., None]:
     kernel_type = types.void(
-        float64[::1], COEFFICIENTS_TYPE, float64[:, ::1], laws_type, _READ, _OUT
+        float64[::1], coefficients_type, float64[:, ::1], laws_type, _READ, _OUT
     )
     return jit_kernel(kernel_type, cache=True)(_integrate_samples)
 
 
-integrate_samples = _compile_kernel(types.none)
+integrate_samples = _compile_kernel(*PLAIN_TYPES)
 
 
 @cache
 def build_laws_kernel() -> Callable[..., None]:
     """Return `integrate_samples` for models with added laws; only they wait for its compilation."""
-    return _compile_kernel(ADDED_LAWS_TYPE)
+    return _compile_kernel(*LAWS_TYPES)

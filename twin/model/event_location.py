@@ -194,7 +194,7 @@ def guard_value(
     slope = (k + 2.0 * p.k2 * abs(d)) * dd + (c + hunt_crossley_damping(d, p.ch)) * sign * dx.v
     slope += p.ch * math.copysign(1.0, d) * dd * dd + p.kb * dd - p.rate_b * b
     slope = add_law_slope(slope, guard, d, dd, sign * dx.v, x.s, dx.s, p, laws)
-    return bumper_force(p, guard, d, dd, b, x.s, laws), slope
+    return bumper_force(p, guard, d, dd, b, x.s, laws) + p.pull, slope
 
 
 @jit_helper()

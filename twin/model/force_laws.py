@@ -1,7 +1,7 @@
 """Force laws of all effects in one compiled right-hand side, with their coefficients.
 
     M u'' + C u' + K u + k3 u^3 + c2 u' |u'| + Fc sign(u') + Fy z + f + D + F_R + F_L = -M A
-    contact: F_j = (C_j + ch |u_j|) u_j' + K_j u_j + k2 u_j |u_j| + b_j + B_j
+    contact: F_j = (C_j + ch |u_j|) u_j' + K_j u_j + k2 u_j |u_j| + b_j + B_j, ends at F_j = -pull
              u_R = u - G0R, u_L = u + G0L
     flight:  F_j = 0, that sum is zero and u_j relaxes
     f' = k1 u' - f / tau1,  b_j' = kb u_j' - b_j / tau,  G0j grows with the gap drift
@@ -27,7 +27,7 @@ from twin.model.effects import (
 )
 from twin.model.effects.law import DAMPER
 
-LAW_PARAMETERS, LAW_STATES = 8, 6  # of all added laws of a model together
+LAW_CONSTANTS, LAW_STATES = 16, 6  # of all added laws of a model together
 NO_STATES = (0.0,) * LAW_STATES
 REVERSAL_SPEED_M_S = 1e-300  # of the sign that follows a reversal
 NO_WALL_M = 1e9  # m: gap of an absent bumper; finite, so that zero times it is zero
@@ -44,7 +44,7 @@ ADDED_LAWS_SIGNATURE = types.UniTuple(float64, 1 + LAW_STATES)(
     float64,
     float64,
     types.UniTuple(float64, LAW_STATES),
-    types.UniTuple(float64, LAW_PARAMETERS),
+    types.UniTuple(float64, LAW_CONSTANTS),
 )
 
 
@@ -93,7 +93,7 @@ class Coefficients(NamedTuple):
     """Coefficients of a model at one sampling rate; the step-dependent ones are zero before that.
 
     `rate_1` and `rate_b` are 1/tau; gaps are those at sample 0; `step` is one of `substeps` of the
-    sampling period. `has_reversals`: reversals of u' are events. `laws` are the parameters of the
+    sampling period. `has_reversals`: reversals of u' are events. `laws` are the constants of the
     added laws, `has_bumper_states` is true if one in a bumper has states.
     """
 
@@ -115,27 +115,31 @@ class Coefficients(NamedTuple):
     ch: float
     kb: float
     rate_b: float
+    pull: float
     drift: float
     gap_r: float
     gap_l: float
     is_linear: bool
     has_reversals: bool
     has_bumper_states: bool
-    laws: tuple[float, ...]
+    laws: tuple[float, ...] | None
     period: float = 0.0
     substeps: int = 0
     step: float = 0.0
 
 
-ADDED_LAWS_TYPE = types.FunctionType(ADDED_LAWS_SIGNATURE)
-_NUMBA_TYPES = {
-    float: float64,
-    int: int64,
-    bool: types.boolean,
-    tuple[float, ...]: types.UniTuple(float64, LAW_PARAMETERS),
-}
-COEFFICIENTS_TYPE = types.NamedTuple(
-    [_NUMBA_TYPES[kind] for kind in get_type_hints(Coefficients).values()], Coefficients
+def _coefficients_type(constants_type: types.Type) -> types.NamedTuple:
+    """Return numba's type of `Coefficients` with constants of added laws of this type."""
+    numba_types = {float: float64, int: int64, bool: types.boolean}
+    hints = get_type_hints(Coefficients).values()
+    return types.NamedTuple([numba_types.get(hint, constants_type) for hint in hints], Coefficients)
+
+
+# Types of (coefficients, laws) for which kernels are compiled: without added laws, and with them.
+PLAIN_TYPES = (_coefficients_type(types.none), types.none)
+LAWS_TYPES = (
+    _coefficients_type(types.UniTuple(float64, LAW_CONSTANTS)),
+    types.FunctionType(ADDED_LAWS_SIGNATURE),
 )
 
 cubic_force = jit_helper(inlined=True)(cubic_stiffness.force)

@@ -26,10 +26,10 @@ from twin.model.effects.effect_file import WrittenEffect
 from twin.model.effects.law import DAMPER, PLACES, sum_law_properties
 from twin.model.event_integrator import kernel_coefficients
 from twin.model.force_laws import (
-    ADDED_LAWS_TYPE,
-    COEFFICIENTS_TYPE,
+    LAWS_TYPES,
     NO_STATES,
     NO_WALL_M,
+    PLAIN_TYPES,
     AddedLaws,
     Coefficients,
     LawInputs,
@@ -47,6 +47,7 @@ from twin.model.force_laws import (
 )
 from twin.model.model import Model
 
+PULL_WIDTH = 0.1  # of the pull-off force: over which an adhesive contact lets go along a motion
 MAX_STATE_RELAXATIONS = 0.5  # relaxation times of an added law per step of its integration
 FORCE_ROWS = ("damper", "right", "left")
 # One signature: numba never caches a kernel specialized to the function of an effect.
@@ -58,12 +59,12 @@ _KERNELS = [
         _READ,
         _READ,
         float64[:, ::1],
-        COEFFICIENTS_TYPE,
+        coefficients,
         laws,
         float64,
         float64[:, ::1],
     )
-    for laws in (types.none, ADDED_LAWS_TYPE)
+    for coefficients, laws in (PLAIN_TYPES, LAWS_TYPES)
 ]
 CONTACT_UNKNOWN, NO_CONTACT, IN_CONTACT = -1, 0, 1  # measured contact state
 
@@ -207,6 +208,14 @@ def relaxed_states(laws: Any) -> LawInputs | None:
     return LawInputs(NO_STATES, 0.0, 0.0)
 
 
+@jit_helper()
+def pull_share(push: float, pull: float) -> float:
+    """Return the share of a push in N that is held: 1 down to -pull, then 0, smooth for fits."""
+    if push >= 0.0 or pull <= 0.0:
+        return 1.0
+    return 0.5 + 0.5 * math.tanh((push + pull) / (PULL_WIDTH * pull))
+
+
 @jit_kernel(_KERNELS, cache=True)
 def _force_kernel(
     u: Float1D,
@@ -264,15 +273,20 @@ def _force_kernel(
             elif p.kb > 0.0:
                 face, b = track_face(p, side, d, face, b, was_in_contact, contact[side, k], h)
             push = bumper_force(p, side, d, dd, b, s, laws) if d > -0.5 * NO_WALL_M else 0.0
-            if contact[side, k] < -0.5:
-                in_contact = push > 0.0 and (was_in_contact or d >= face)
+            if contact[side, k] > 0.5:
+                in_contact, is_held = True, 1.0
             else:
-                in_contact = contact[side, k] > 0.5
+                in_contact = push > -(1.0 + 3.0 * PULL_WIDTH) * p.pull and (
+                    was_in_contact or (contact[side, k] < -0.5 and d >= face)
+                )
+                # measured: without adhesion a contact ends where the cells say so
+                in_contact = in_contact and (contact[side, k] < -0.5 or p.pull > 0.0)
+                is_held = pull_share(push, p.pull)
             if side == 0:
                 b_r, face_r, in_contact_r = b, face, in_contact
             else:
                 b_l, face_l, in_contact_l = b, face, in_contact
-            out[1 + side, k] = sign * push if in_contact else 0.0
+            out[1 + side, k] = sign * push * is_held if in_contact else 0.0
 
 
 class PreparedForces(NamedTuple):
@@ -366,7 +380,7 @@ def depends_on_history(model: Model) -> bool:
     """
     p, _ = kernel_coefficients(_split_laws(model, is_contact_known=True)[0])
     has_states = any(effect.states for effect, _ in model.added_laws)
-    return has_states or max(p.fy, p.k1, p.kb) > 0.0
+    return has_states or max(p.fy, p.k1, p.kb, p.pull) > 0.0
 
 
 def _fastest_law_rate(model: Model) -> float:

@@ -10,7 +10,7 @@ from table_io.block import Float1D
 from table_io.errors import InputError, suggest
 from twin.model.effects import find_effect
 from twin.model.effects.effect import Effect
-from twin.model.effects.law import changes_with_time
+from twin.model.effects.law import changes_with_time, list_constants
 from twin.model.parameters import Parameters
 from twin.model.solver import Solver
 
@@ -145,13 +145,21 @@ class Model:
         return None
 
     @cached_property
-    def added_laws(self) -> tuple[tuple[Effect, Mapping[str, float]], ...]:
-        """Present effects that bring their own force law, each with its values."""
+    def added_laws(self) -> tuple[tuple[Effect, tuple[float, ...]], ...]:
+        """Present effects that bring their own force law, each with the constants of its law."""
         return tuple(
-            (instance.effect, instance.values)
+            (instance.effect, list_constants(instance.effect, self.parameters, instance.values))
             for instance in self.present_effects
             if instance.effect.force is not None
         )
+
+    @property
+    def break_away_force_n(self) -> float:
+        """Force in N up to which dry friction holds the mass."""
+        stribeck = self.effect_parameter("stribeck_friction", "fc") or 0.0
+        if stribeck:
+            stribeck *= self.effect_parameter("stribeck_friction", "ratio") or 1.0
+        return stribeck + (self.effect_parameter("coulomb_friction", "fc") or 0.0)
 
     @cached_property
     def _input_effects(self) -> tuple[EffectInstance, ...]:

@@ -113,7 +113,7 @@ def test_what_is_in_the_library_means_what_the_model_means() -> None:
         (
             '[[effects]]\nid = "coulomb_friction"\nform = "x"\nparameters = {}',
             "effects.0.form",
-            ("'x'", "tanh, strib"),
+            ("'x'", "tanh"),
         ),
         ("[base]\nmass = 3.0", "base.mass", ("'mass_kg'",)),
         ("[base]\ngap_left_m = nan", "base.gap_left_m", ("nan",)),

@@ -9,12 +9,16 @@ from itertools import chain
 
 from table_io.config.plugins import list_entry_points, load_entry, make_plugin_error
 from table_io.errors import InputError, suggest
+from twin.model.effects.adhesion import ADHESION
+from twin.model.effects.appendage import APPENDAGE
 from twin.model.effects.bouc_wen import BOUC_WEN
 from twin.model.effects.bumper_asymmetry import BUMPER_ASYMMETRY
+from twin.model.effects.bumper_cubic import BUMPER_CUBIC
 from twin.model.effects.bumper_hardening import BUMPER_HARDENING
 from twin.model.effects.bumper_maxwell import BUMPER_MAXWELL
 from twin.model.effects.coulomb_friction import COULOMB_FRICTION
 from twin.model.effects.cubic_stiffness import CUBIC_STIFFNESS
+from twin.model.effects.dead_band import DEAD_BAND
 from twin.model.effects.effect import Effect
 from twin.model.effects.gap_drift import GAP_DRIFT
 from twin.model.effects.gap_offset import GAP_OFFSET
@@ -22,10 +26,12 @@ from twin.model.effects.hunt_crossley import HUNT_CROSSLEY
 from twin.model.effects.law import find_law_problem
 from twin.model.effects.mass_error import MASS_ERROR
 from twin.model.effects.maxwell_damper import MAXWELL_DAMPER
+from twin.model.effects.position_damping import POSITION_DAMPING
 from twin.model.effects.quadratic_damping import QUADRATIC_DAMPING
 from twin.model.effects.sensor_gain import SENSOR_GAIN
 from twin.model.effects.sensor_lag import SENSOR_LAG
 from twin.model.effects.sensor_offset import SENSOR_OFFSET
+from twin.model.effects.stribeck_friction import STRIBECK_FRICTION
 from twin.model.effects.table_tilt import TABLE_TILT
 
 ENTRY_POINT_GROUP = "shaketwin.effects"
@@ -36,9 +42,15 @@ EFFECTS: tuple[Effect, ...] = (
     COULOMB_FRICTION,
     BOUC_WEN,
     MAXWELL_DAMPER,
+    STRIBECK_FRICTION,
+    POSITION_DAMPING,
+    DEAD_BAND,
+    APPENDAGE,
     BUMPER_HARDENING,
+    BUMPER_CUBIC,
     HUNT_CROSSLEY,
     BUMPER_MAXWELL,
+    ADHESION,
     BUMPER_ASYMMETRY,
     GAP_OFFSET,
     GAP_DRIFT,

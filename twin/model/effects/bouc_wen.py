@@ -38,6 +38,7 @@ BOUC_WEN = Effect(
         ),
     ),
     acts="force",
+    limits=("coulomb_friction",),
     residual=(
         "Stiffer and more dissipative at small amplitude; softening and loss together, the same at "
         "every frequency; a kink of the force at each reversal; present in flight."

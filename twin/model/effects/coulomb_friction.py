@@ -21,6 +21,7 @@ COULOMB_FRICTION = Effect(
     term="Fc sign(u')",
     parameters=(EffectParameter("fc", "N", 0.0, 1e9, 0.0, 50.0, "Friction force during slip."),),
     acts="force",
+    is_dry_friction=True,
     residual=(
         "Loss per cycle in proportion to amplitude, so equivalent damping falls as 1/amplitude; "
         "odd harmonics in phase with u'; at small motion the mass does not move at all."

@@ -58,7 +58,7 @@ class Effect:
         a     acceleration in m/s2 of the table, as the mass feels it
         t     time in s since sample 0 of the run; a law with it has no steady state
         s     s[i] is the value of states[i]
-        c     c[i] is the value of parameters[i]
+        c     `constants(base parameters, values)`, by default the values of the parameters in turn
     so `force(q, w, c)` is a law without memory, and `rates(q, w, a, s, c)` are those of a mass that
     rides along. They are plain Python that numba can compile, continuous, and smooth where w keeps
     its sign. In a bumper the force is elastic plus a dashpot, linear in w, and zero where q, w and
@@ -76,8 +76,12 @@ class Effect:
     place: Place = "damper"
     states: tuple[str, ...] = ()
     rates: Callable[..., tuple[float, ...]] | None = None
+    constants: "Callable[[Parameters, Mapping[str, float]], tuple[float, ...]] | None" = None
     input_acceleration: Callable[[Any, Mapping[str, float]], Any] | None = None
     required_channels: tuple[str, ...] = ()  # without which it is not observable
+    is_threshold: bool = False  # its amplitude is a threshold: no slope where it vanishes
+    is_dry_friction: bool = False  # sticks; fits replace its jump at u' = 0 by a steep slope
+    limits: tuple[str, ...] = ()  # effects that it becomes for extreme shapes
     is_drift: bool = False  # changes with time otherwise than by a law that takes t
 
     @property

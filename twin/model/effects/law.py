@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from twin.model.effects.effect import Effect
+from twin.model.parameters import Parameters
 
 DAMPER = -1  # a bumper has the number of its side: 0 right, 1 left
 PLACES = {"damper": (DAMPER,), "bumpers": (0, 1), "right_bumper": (0,), "left_bumper": (1,)}
@@ -20,6 +21,8 @@ LAW_ARGUMENTS = ("q", "w", "a", "t", "s", "c")  # see `Effect`
 PROBED_DEFORMATIONS = {True: (1e-4, 1e-3, 3e-3), False: (-0.03, -3e-3, -1e-4, 1e-4, 3e-3, 0.03)}
 PROBED_RATES = (-0.3, -0.01, 0.01, 0.3)
 PROBED_DRIVES = ((0.0, 0.0), (1.0, 100.0))
+# Base parameters for the checks of a law that depends on them.
+PROBED_BASE = Parameters(1e3, 1e5, 1e3, 1e6, 1e3, 1e6, 1e3, 1e-3, 1e-3)
 STATE_STEP = 1e-6  # of differences by a state, in its unit
 
 
@@ -37,28 +40,39 @@ def list_arguments(function: Callable[..., Any]) -> tuple[str, ...]:
     return tuple(signature(function).parameters)
 
 
-def take_all_arguments(function: Callable[..., Any], names: Sequence[str]) -> Callable[..., Any]:
-    """Return a function of all `LAW_ARGUMENTS` that calls one of those with these names.
-
-    Made from its text, because numba compiles no call whose number of arguments varies.
-    """
-    text = f"lambda {', '.join(LAW_ARGUMENTS)}: function({', '.join(names)})"
-    return eval(text, {"function": function})
-
-
 def changes_with_time(effect: Effect) -> bool:
     """Return whether an effect depends on the time since the start of the run."""
     functions = [function for function in (effect.force, effect.rates) if function is not None]
     return effect.is_drift or any("t" in list_arguments(function) for function in functions)
 
 
-def law_properties(effect: Effect, values: Mapping[str, float]) -> LawProperties:
+def list_constants(
+    effect: Effect, parameters: Parameters, values: Mapping[str, float]
+) -> tuple[float, ...]:
+    """Return the constants c of a law: of the effect, or the values of its parameters."""
+    if effect.constants is not None:
+        return effect.constants(parameters, values)
+    return tuple(values[parameter.name] for parameter in effect.parameters)
+
+
+@cache
+def count_constants(effect: Effect) -> int:
+    """Return the number of constants of a law."""
+    return len(list_constants(effect, PROBED_BASE, typical_values(effect)))
+
+
+def typical_values(effect: Effect) -> dict[str, float]:
+    """Return the typical value of each parameter of an effect."""
+    return {parameter.name: parameter.typical for parameter in effect.parameters}
+
+
+def law_properties(effect: Effect, c: tuple[float, ...]) -> LawProperties:
     """Return the largest stiffness and rate of the states of a law over the probed motions.
 
     The stiffness is the instantaneous one, dF/dq + dF/ds ds'/dw: fast motion also loads the states.
     The rate is the largest eigenvalue of d rates / d states: of a relaxation or an oscillation.
     """
-    force, rates = evaluate_law(effect, values)
+    force, rates = evaluate_law(effect, c)
     stiffness = relaxation = 0.0
     count = len(effect.states)
     relaxed, steps = (0.0,) * count, STATE_STEP * np.eye(count)
@@ -85,18 +99,21 @@ def law_properties(effect: Effect, values: Mapping[str, float]) -> LawProperties
 
 
 def evaluate_law(
-    effect: Effect, values: Mapping[str, float]
+    effect: Effect, c: tuple[float, ...]
 ) -> tuple[Callable[..., float], Callable[..., tuple[float, ...]]]:
     """Return force(q, w, a, t, s) and rates(q, w, a, t, s) of a law in plain Python."""
-    c = tuple(values[p.name] for p in effect.parameters)
     assert effect.force is not None
-    force = take_all_arguments(effect.force, list_arguments(effect.force))
-    if effect.rates is None:
-        return lambda q, w, a, t, s: force(q, w, a, t, s, c), lambda q, w, a, t, s: ()
-    rates = take_all_arguments(effect.rates, list_arguments(effect.rates))
+    force, rates = effect.force, effect.rates
+    force_names = list_arguments(force)
+    rates_names = () if rates is None else list_arguments(rates)
+
+    def choose(names: Sequence[str], *values: Any) -> list[Any]:
+        arguments = dict(zip(LAW_ARGUMENTS, (*values, c), strict=True))
+        return [arguments[name] for name in names]
+
     return (
-        lambda q, w, a, t, s: force(q, w, a, t, s, c),
-        lambda q, w, a, t, s: rates(q, w, a, t, s, c),
+        lambda *values: force(*choose(force_names, *values)),
+        lambda *values: () if rates is None else rates(*choose(rates_names, *values)),
     )
 
 
@@ -129,7 +146,8 @@ def _find_argument_problem(effect: Effect) -> str:
 
 def _find_value_problem(effect: Effect) -> str:
     """Return what is wrong with the values of a law, "" if nothing."""
-    force, rates = evaluate_law(effect, {p.name: p.typical for p in effect.parameters})
+    constants = list_constants(effect, PROBED_BASE, typical_values(effect))
+    force, rates = evaluate_law(effect, constants)
     relaxed = (0.0,) * len(effect.states)
     in_bumper = effect.place != "damper"
     for q, w, (a, t) in product(PROBED_DEFORMATIONS[in_bumper], PROBED_RATES, PROBED_DRIVES):
@@ -152,12 +170,12 @@ def _find_value_problem(effect: Effect) -> str:
 
 
 def sum_law_properties(
-    laws: Sequence[tuple[Effect, Mapping[str, float]]],
+    laws: Sequence[tuple[Effect, tuple[float, ...]]],
 ) -> dict[int, LawProperties]:
     """Return the summed stiffness and the fastest rate of the states of laws, by place."""
     sums = {place: LawProperties() for place in (DAMPER, 0, 1)}
-    for effect, values in laws:
-        own = law_properties(effect, values)
+    for effect, constants in laws:
+        own = law_properties(effect, constants)
         for place in PLACES[effect.place]:
             sums[place] = LawProperties(
                 sums[place].stiffness + own.stiffness,

@@ -27,7 +27,7 @@ def name_effect(effect: Json) -> str:
     return f"{words} of {effect['channel']}" if effect.get("channel") else words
 
 
-PROPER_NAMES = ("bouc_wen", "coulomb_friction", "hunt_crossley")
+PROPER_NAMES = ("bouc_wen", "coulomb_friction", "hunt_crossley", "stribeck_friction")
 
 
 def format_verdict(verdict: Json) -> str:

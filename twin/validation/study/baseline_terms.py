@@ -79,7 +79,8 @@ class RegressionProblem:
         u, v = self.u, m.v
         columns = {
             "cubic_stiffness": u**3, "quadratic_damping": v * np.abs(v),
-            "coulomb_friction": np.sign(v), "table_tilt": m.table_disp, "mass_error": m.acc,
+            "position_damping": u**2 * v, "coulomb_friction": np.sign(v),
+            "table_tilt": m.table_disp, "mass_error": m.acc,
         }  # fmt: skip
         entries = np.flatnonzero(self.residuals.entry_row == 0)
         return self._regression(entries, [u, v], columns)
@@ -95,7 +96,8 @@ class RegressionProblem:
         depth = side * self.u[samples] - np.where(side > 0, p.gap_r, p.gap_l)
         speed = side * m.v[samples]
         columns = {
-            "bumper_hardening": depth * np.abs(depth), "hunt_crossley": np.abs(depth) * speed,
+            "bumper_hardening": depth * np.abs(depth), "bumper_cubic": depth**3,
+            "hunt_crossley": np.abs(depth) * speed,
             "bumper_asymmetry": side * depth, "gap_offset": side, "gap_drift": m.time_s[samples],
         }  # fmt: skip
         return self._regression(entries, [depth, speed], columns, by_sample=False)

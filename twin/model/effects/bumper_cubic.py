@@ -1,0 +1,28 @@
+"""Cubic hardening of the bumpers: rubber that is squeezed against its plate.
+
+    contact: F_j = C_j u_j' + K_j u_j + kc u_j^3;   flight: that sum is zero, u_j relaxes
+
+Conservative: stored kc u_j^4 / 4. Compared with `bumper_hardening`, u_j |u_j|, it is weaker at
+small depth and steeper at large. Source: Taylor expansion of an elastic law.
+"""
+
+from twin.model.effects.effect import Effect, EffectParameter
+
+
+def force(q: float, c: tuple[float, ...]) -> float:
+    """Return kc d^3 in N, d the compression in m."""
+    return c[0] * q * q * q
+
+
+BUMPER_CUBIC = Effect(
+    id="bumper_cubic",
+    term="kc u_j^3 in each bumper",
+    parameters=(
+        EffectParameter("kc", "N/m3", 0.0, 1e15, 0.0, 4e10, "Coefficient of the depth cubed."),
+    ),
+    acts="force",
+    place="bumpers",
+    residual="In contact only: peak force grows with the cube of the depth; nothing near touch.",
+    confused_with=("bumper_hardening", "hunt_crossley"),
+    force=force,
+)
