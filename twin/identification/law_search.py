@@ -74,8 +74,24 @@ def propose_law(
     verdict, selection = discovery.verdict, discovery.selection
     if verdict.outcome != "unexplained" and not verdict.has_remainder:
         return None
-    problem = discovery.prepared.problem
     starts = [selection.null, *([verdict.best] if verdict.best.effects else [])]
+    singles = [fitted for fitted in selection.tried if len(fitted.effects) == 1]
+    nearest = min(singles, key=lambda fitted: fitted.cost, default=None)
+    nearest_name = nearest.names[0] if nearest else ""
+    return find_law(discovery.prepared.problem, starts, verdict.floor, nearest_name, report)
+
+
+def find_law(
+    problem: SelectionProblem,
+    starts: Sequence[FittedSet],
+    floor: float,
+    nearest: str = "",
+    report: ProgressCallback = lambda progress: None,
+) -> LawProposal | None:
+    """Return the law that explains most of what the first start leaves; None if none helps.
+
+    `floor` is the mean square over the noise that remains without a misfit.
+    """
     fitted_sets = search_laws(problem, starts, report)
     if not fitted_sets:
         return None
@@ -84,21 +100,16 @@ def propose_law(
         (start for start in starts if start.effects == best.effects[: len(start.effects)]),
         key=lambda start: len(start.effects),
     )
-    floor = min(verdict.floor, best.cost)
-    if (
-        not problem.is_worthwhile(start, best)
-        or closed_fraction(selection.null.cost, best.cost, floor) < MIN_CLOSED_SHARE
-    ):
+    floor = min(floor, best.cost)
+    closed_share = closed_fraction(starts[0].cost, best.cost, floor)
+    if closed_share < MIN_CLOSED_SHARE or not problem.is_worthwhile(start, best):
         return None
-    terms = [effect for effect in best.effects if effect not in start.effects]
-    singles = [fitted for fitted in selection.tried if len(fitted.effects) == 1]
-    nearest = min(singles, key=lambda fitted: fitted.cost, default=None)
-    nearest_name = nearest.names[0] if nearest else ""
-    laws = tuple(_describe_law(problem, best, term, nearest_name) for term in terms)
+    terms = best.effects[len(start.effects) :]
+    laws = tuple(_describe_law(problem, best, term, nearest) for term in terms)
     family = find_family(terms[0])
     assert family is not None
     return LawProposal(
-        best, start, laws, floor, nearest_name, family.law_class, _list_best_by_class(fitted_sets)
+        best, start, laws, floor, nearest, family.law_class, _list_best_by_class(fitted_sets)
     )
 
 
