@@ -36,10 +36,10 @@ def judge_case(root: Path, number: int) -> str:
     floor = problem.noise * estimate_repeatability_floor(problem.log_residuals, best.held_out)
     before, after = (math.sqrt(fitted.cost / floor) for fitted in (null, best))
     hidden = json.loads(paths.about.read_text())["effects"]
-    texts = [
-        f"{term.force}, { ({name: float(f'{p.typical:.4g}') for name, p in term.parameters.items()}) }"
-        for term in (law.laws if law else ())
-    ]
+    texts = []
+    for term in law.laws if law else ():
+        values = [f"{name} {own.typical:.4g}" for name, own in term.parameters.items()]
+        texts.append(f"{term.force} ({', '.join(values)})")
     return (
         f"{case.cell.name}: {before:.3f} -> {after:.3f} in {cpu_seconds() - start_s:.0f} s: "
         f"{' + '.join(texts) or 'no law'}; hidden {[effect['parameters'] for effect in hidden]}"

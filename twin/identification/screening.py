@@ -163,7 +163,8 @@ def build_normal_equations(
 
     def sort_slopes(request: tuple[ParameterSet, FreeParameter, float]) -> Float32Array:
         start, parameter, probe = request
-        return order.sort(compute_slopes(log_residuals, start, parameter, before, probe))
+        with np.errstate(over="ignore", invalid="ignore"):  # see `finite` below
+            return order.sort(compute_slopes(log_residuals, start, parameter, before, probe))
 
     base = np.empty((len(free), residual.size), dtype=np.float32)
     base_requests = [(parameters, parameter, 0.0) for parameter in free]
@@ -173,11 +174,12 @@ def build_normal_equations(
     def sum_products(slopes: Float32Array) -> tuple[Float2D, Float1D, Float1D]:
         """Return slopes x (slopes of the base, (unit, base); themselves; residual, (unit,))."""
         parts = [slice(*edges) for edges in pairwise(order.edges)]
-        return (
-            np.array([base[:, part] @ slopes[part] for part in parts]),
-            np.array([np.sum(slopes[part] ** 2, dtype=np.float64) for part in parts]),
-            np.array([slopes[part] @ residual[part] for part in parts]),
-        )
+        with np.errstate(over="ignore", invalid="ignore"):
+            return (
+                np.array([base[:, part] @ slopes[part] for part in parts]),
+                np.array([np.sum(slopes[part] ** 2, dtype=np.float64) for part in parts]),
+                np.array([slopes[part] @ residual[part] for part in parts]),
+            )
 
     # candidates one at a time: all their slopes together would need much memory
     candidate_sums = mapper(lambda request: sum_products(sort_slopes(request)), requests)
@@ -189,6 +191,10 @@ def build_normal_equations(
     for k, sums in enumerate((*map(sum_products, base), *candidate_sums)):
         hessian[:, :base_count, k] = hessian[:, k, :base_count] = sums[0]
         hessian[:, k, k], gradient[:, k] = sums[1:]
+    # A law can overflow along a motion that it would never cause: it is no candidate.
+    finite = np.isfinite(gradient).all(axis=0) & np.isfinite(np.einsum("upp->p", hessian))
+    hessian[:, ~finite], hessian[:, :, ~finite], gradient[:, ~finite] = 0.0, 0.0, 0.0
+    variants = [variant for variant in variants if finite[variant.column]]
     scale = np.sqrt(np.maximum(np.einsum("upp->p", hessian), 1e-300))
     hessian /= np.outer(scale, scale)
     squares = np.array([float(residual[i:k] @ residual[i:k]) for i, k in pairwise(order.edges)])
