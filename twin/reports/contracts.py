@@ -621,6 +621,7 @@ class ProposedLaw(Contract):
 
     terms: list[LawTerm] = Field(description="terms of the law, added up")
     with_effects: list[str] = Field(description="effects of the library that it needs")
+    base: dict[str, Interval] = Field(description="refitted parameters of the model with it")
     law_class: str = Field(description="class of the law")
     held_out_before: Ratio = Field(description="misfit without the law, on held-out steps")
     held_out_after: Ratio = Field(description="misfit with it")

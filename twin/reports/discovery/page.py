@@ -56,7 +56,7 @@ def write_discovery_page(
         Path(__file__).with_name("page.html"),
         verdict=verdict,
         sentence=format_verdict(verdict),
-        laws=describe_laws(verdict),
+        laws=[] if verdict["law"] else describe_laws(verdict),
         excluded=describe_excluded(verdict),
         proposed=verdict["law"],
         proposed_terms=typeset_proposal(verdict["law"]),
@@ -99,11 +99,18 @@ def list_parameter_rows(
 ) -> list[tuple[str, str, list[str], str]]:
     """Return (group, parameter, [value, low, high], unit) of all fitted values, lengths in mm."""
     term = verdict["remainder"]["evidence"]
-    groups = [(format_effect(effect), effect["parameters"]) for effect in verdict["effects"]]
-    if law := verdict["law"]:
+    law = verdict["law"]
+    groups = [
+        (format_effect(effect), effect["parameters"])
+        for effect in verdict["effects"]
+        if law is None or format_effect(effect) in law["with_effects"]
+    ]
+    if law is not None:
         groups += [(f"proposed law, {part['title']}", part["parameters"]) for part in law["terms"]]
+        term = None
     groups += [(f"generic term, {term['term']}", term["parameters"])] if term else []
-    base = {_gap_label(name, names): value for name, value in verdict["base"].items()}
+    fitted_base = law["base"] if law else verdict["base"]
+    base = {_gap_label(name, names): value for name, value in fitted_base.items()}
     rows = []
     for title, parameters in (*groups, ("base parameters, refitted", base)):
         for k, (name, value) in enumerate(parameters.items()):

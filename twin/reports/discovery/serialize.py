@@ -458,6 +458,7 @@ def law_to_json(proposal: LawProposal, factor: float) -> Json:
             for law, term in zip(proposal.laws, terms, strict=True)
         ],
         "with_effects": [*proposal.start.names],
+        "base": base_to_json(fitted),
         "law_class": proposal.law_class,
         "held_out_before": factor * math.sqrt(proposal.start.cost),
         "held_out_after": factor * math.sqrt(fitted.cost),
