@@ -33,6 +33,7 @@ KEY = re.compile(r"(# )?\w+ = ")  # at the start of a line, perhaps commented ou
         ("rigs", {"simulated", "machine"}),
         ("models", {"snm"}),
         ("campaigns", {"paper"}),
+        ("features", {"paper"}),
         ("effects", {effect.id for effect in EFFECTS}),
         ("channels", {channel.name for channel in CHANNELS}),
     ],

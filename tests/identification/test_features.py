@@ -3,12 +3,12 @@
 import math
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from table_io.config.base import PROFILES_DIR, load_config, parse_toml
+from table_io.config.profile import Specimen
 from table_io.errors import InputError
 from tests.model.independent_solution import Witness
 from twin.identification.features.config import Feature, FeatureSet
@@ -31,6 +31,7 @@ from twin.identification.features.search import (
     run_effect_job,
 )
 from twin.identification.parameters import ParameterSet
+from twin.model.config import ModelConfig
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 from twin.reports.discovery.features_summary import judge_discovery
@@ -244,5 +245,14 @@ def judge(problem: FeatureProblem, model: Model) -> FeatureFit:
     return judge_model(problem, ParameterSet.from_model(model, 0))
 
 
-def test_the_shipped_features_are_found_by_name() -> None:
-    assert (Path(PROFILES_DIR) / "features" / "paper.toml").is_file()
+@pytest.mark.slow
+def test_the_shipped_card_explains_what_it_says() -> None:
+    path = PROFILES_DIR / "models" / "paper_hysteresis.toml"
+    card, _ = load_config(path, ModelConfig, "model file")
+    model = card.build_model(Specimen(mass_kg=550.0, gap_mm=0.0))
+    fit = judge(FeatureProblem.create(PAPER, SNM), model)
+    assert fit.score == 25
+    assert "25 of them" in card.provisional
+    unexplained = {f.kind for f, p in zip(PAPER.features, fit.predicted, strict=True)
+                   if not p.is_explained}  # fmt: skip
+    assert unexplained == {"jump_down_frequency", "peak_displacement", "impacts", "peak_frequency"}

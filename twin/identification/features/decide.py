@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from twin.identification.features.config import FeatureSet
+from twin.identification.features.config import FeatureSet, FeatureTest
 from twin.identification.features.continued_curve import compute_curve, set_total_gap
 from twin.identification.features.curve import ResponseCurve
 from twin.identification.features.describing_function import approximate_curve
@@ -43,20 +43,15 @@ def choose_deciding_test(features: FeatureSet, first: Model, second: Model) -> D
     by describing functions, then the best few by continuation.
     """
 
-    def approximate(model: Model, level_m_s2: float) -> ResponseCurve | None:
-        return approximate_curve(model, level_m_s2)
-
-    def follow(model: Model, level_m_s2: float) -> ResponseCurve | None:
-        factor = level_m_s2 / features.test.acceleration_m_s2
-        level_g = features.test.acceleration_g * factor
-        return compute_curve(model, features.test.model_copy(update={"acceleration_g": level_g}))
+    def approximate(model: Model, test: FeatureTest) -> ResponseCurve | None:
+        return approximate_curve(model, test.acceleration_m_s2)
 
     settings = [(gap, factor) for gap in list_test_gaps(features) for factor in LEVEL_FACTORS]
     tests = _compare_settings(features, first, second, settings, approximate)
     best = sorted(tests, key=lambda test: -test.difference)[:SHORTLISTED_TESTS]
     shortlist = [(test.gap_mm, test.acceleration_g / features.test.acceleration_g) for test in best]
     return max(
-        _compare_settings(features, first, second, shortlist, follow),
+        _compare_settings(features, first, second, shortlist, compute_curve),
         key=lambda test: test.difference,
         default=None,
     )
@@ -75,11 +70,12 @@ def _compare_settings(
     first: Model,
     second: Model,
     settings: list[tuple[float, float]],
-    make_curve: Callable[[Model, float], ResponseCurve | None],
+    make_curve: Callable[[Model, FeatureTest], ResponseCurve | None],
 ) -> Iterator[DecidingTest]:
     for gap_mm, factor in settings:
-        level = factor * features.test.acceleration_m_s2
-        curves = [make_curve(set_total_gap(model, gap_mm), level) for model in (first, second)]
+        level_g = factor * features.test.acceleration_g
+        own = features.test.model_copy(update={"acceleration_g": level_g})
+        curves = [make_curve(set_total_gap(model, gap_mm), own) for model in (first, second)]
         if curves[0] is None or curves[1] is None:
             continue
         test = _compare_curves(features, curves[0], curves[1], gap_mm, factor)

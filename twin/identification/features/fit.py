@@ -382,7 +382,7 @@ class _Objective:
         ):
             half = math.sqrt(max(float(variance), 0.0))
             if np.any(column != 0) and least <= value - half and value + half <= most:
-                ends = ((value - half) * unit, (value + half) * unit)
+                ends = float((value - half) * unit), float((value + half) * unit)
                 intervals[free.key] = free.to_external(ends[0]), free.to_external(ends[1])
         return intervals
 

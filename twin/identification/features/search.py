@@ -58,9 +58,10 @@ class FeatureDiscovery:
 
     @property
     def runner_up(self) -> FeatureFit | None:
-        """The best rival of the best fit."""
-        others = [fit for fit in (*self.ranked, self.base.refitted) if fit.names != self.best.names]
-        return min(others, key=lambda fit: fit.rank_key, default=None)
+        """The best fit that shares no effect with the best one: the refitted base at worst."""
+        own = set(self.best.names)
+        others = [fit for fit in (*self.ranked, self.base.refitted) if not own & set(fit.names)]
+        return next((fit for fit in others if fit is not self.best), None)
 
 
 def list_feature_effects(
