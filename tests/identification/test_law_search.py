@@ -71,7 +71,7 @@ class TestProposal:
         from twin.identification.discover import discover_effects
 
         discovery = discover_effects([log(truth)], SNM)
-        proposal = propose_law(discovery)
+        _, proposal = propose_law(discovery)
         assert proposal is not None
         (law,) = proposal.laws
         (parameter,) = law.parameters.values()
@@ -85,4 +85,4 @@ class TestProposal:
     def test_nothing_hidden_proposes_nothing(self):
         from twin.identification.discover import discover_effects
 
-        assert propose_law(discover_effects([log()], SNM)) is None
+        assert propose_law(discover_effects([log()], SNM))[1] is None

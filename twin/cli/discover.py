@@ -92,7 +92,7 @@ def judge_logs(
             held_out_logs = load_logs(held_out)[0] if held_out else ()
             with open_mapper(logs) as mapper:
                 discovery = discover_effects(logs, start, report, without, mapper)
-                law = propose_law(discovery, report)
+                discovery, law = propose_law(discovery, report)
     except (InputError, Cancelled) as error:
         folder.rmdir()  # leave no empty folder after a failure
         if isinstance(error, InputError):

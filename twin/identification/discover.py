@@ -103,6 +103,7 @@ class Discovery:
     map_before: tuple[ResidualCell, ...]
     map_after: tuple[ResidualCell, ...]
     notes: tuple[str, ...]
+    ideal: "Discovery | None" = None  # the same with ideal instruments, where these were tried too
 
     @property
     def model(self) -> Model:
@@ -360,7 +361,7 @@ def discover_effects(
     ideal = _fit_with_effects(prepared, best)
     widened = widen_intervals(best.fit, ideal, prepared.problem.log_residuals)
     verdict = replace(with_nuisances.verdict, best=replace(best, fit=widened))
-    with_nuisances = replace(with_nuisances, verdict=verdict)
+    with_nuisances = replace(with_nuisances, verdict=verdict, ideal=discovery)
     if not with_nuisances.selection.complete:
         return replace(discovery, selection=replace(discovery.selection, complete=False))
     is_ended_early = count_sensor_errors(discovery.selection.best) > MAX_IDEAL_ERRORS

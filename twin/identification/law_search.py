@@ -69,16 +69,26 @@ class LawProposal:
 
 def propose_law(
     discovery: Discovery, report: ProgressCallback = lambda progress: None
-) -> LawProposal | None:
-    """Return a law for what a discovery leaves unexplained; None if nothing is, or none helps."""
+) -> tuple[Discovery, LawProposal | None]:
+    """Return a law for what a discovery leaves unexplained, and the discovery that it belongs to.
+
+    No law if nothing is left unexplained, or none helps. The discovery is another one where a law
+    suffices with ideal instruments.
+    """
     verdict, selection = discovery.verdict, discovery.selection
     if verdict.outcome != "unexplained" and not verdict.has_remainder:
-        return None
+        return discovery, None
+    if discovery.ideal is not None and verdict.outcome == "unexplained":
+        # A law of a few numbers says more than many errors of instruments that do not suffice.
+        ideal, law = propose_law(discovery.ideal, report)
+        if law is not None and law.is_sufficient:
+            return ideal, law
     starts = [selection.null, *([verdict.best] if verdict.best.effects else [])]
     singles = [fitted for fitted in selection.tried if len(fitted.effects) == 1]
     nearest = min(singles, key=lambda fitted: fitted.cost, default=None)
     nearest_name = nearest.names[0] if nearest else ""
-    return find_law(discovery.prepared.problem, starts, verdict.floor, nearest_name, report)
+    problem = discovery.prepared.problem
+    return discovery, find_law(problem, starts, verdict.floor, nearest_name, report)
 
 
 def find_law(

@@ -119,9 +119,12 @@ def staircase_to_json(
     ]
     costs = {frozenset(fitted.names): fitted.cost for fitted in selection.tried}
     costs[frozenset(verdict.best.names)] = verdict.best.cost
+    if proposal is not None:
+        costs[frozenset(proposal.start.names)] = proposal.start.cost
     added: frozenset[str] = frozenset()
-    while added != frozenset(verdict.best.names):
-        larger = [names for names in costs if added < names <= frozenset(verdict.best.names)]
+    best = frozenset(proposal.start.names if proposal else verdict.best.names)
+    while added != best:
+        larger = [names for names in costs if added < names <= best]
         smallest = min(map(len, larger))
         names = min((n for n in larger if len(n) == smallest), key=lambda n: costs[n])
         steps.append((f"+ {' + '.join(sorted(names - added))}", costs[names]))
