@@ -8,6 +8,7 @@ from tests.identification.played import SNM, format_truth, log
 from twin.identification.discover import prepare_problem
 from twin.identification.law_search import propose_law, search_laws
 from twin.identification.law_terms import FAMILIES, list_law_candidates
+from twin.identification.motion import RecordScale
 from twin.model.effects.expression import parse_unit
 
 
@@ -26,6 +27,15 @@ class TestTerms:
         for candidate in candidates:
             assert candidate.shapes
             assert candidate.amplitude.vanishing == 0.0
+
+    @pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+    def test_specimens_of_any_size_have_every_family(self, size):
+        scale = RecordScale(
+            0.006 * size, 0.12 * size, 5.0 * size, 6e-5 * size, 3e3 * size, 0.02 * size, 1e-3, 2.0,
+            {},
+        )  # fmt: skip
+        candidates = list_law_candidates(scale, has_contact=True)
+        assert len(candidates) == len(FAMILIES)
 
     def test_laws_of_bumpers_need_contact(self):
         scale = prepare_problem([log()], SNM).problem.log_residuals[0].scale

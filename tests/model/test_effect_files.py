@@ -111,6 +111,73 @@ class TestGrammar:
         build_written_effect(text.replace("-k", "k"))
 
 
+class TestRefusals:
+    """What a stranger's file must not do, each found by trying."""
+
+    @pytest.mark.parametrize(
+        ("old", "new"),
+        [
+            ("own_cubic", "cubic_stiffness"),
+            ("k * u**3", "k * u**3 + 1e5 * u * (k / k)"),
+            ("k * u**3", "-k*u*1" + "0" * 320),
+            ("k * u**3", "u" + ".a" * 400),
+            ("N/m3", "N/m" + "9" * 400),
+            ("vanishing = 0.0", "vanishing = 1e16"),
+            ("k * u**3", "k * (u / 1)**100000000000000000000000"),
+        ],
+    )
+    def test_a_bad_file_is_one_message(self, old, new):
+        with pytest.raises(InputError):
+            build_written_effect(CUBIC.replace(old, new))
+
+    def test_dry_friction_belongs_to_the_library(self):
+        text = "id = 'dry'\nforce = 'k * sign(v)'\n" + K.format(unit="N", typical=9.0)
+        with pytest.raises(InputError) as caught:
+            build_written_effect(text)
+        assert "coulomb_friction" in str(caught.value)
+
+    def test_too_many_states_are_refused_before_they_are_read(self):
+        states = "".join(f"[states.s{i}]\nunit = 'm'\nrate = 'v'\n" for i in range(3000))
+        with pytest.raises(InputError):
+            build_written_effect(CUBIC + states)
+
+    def test_values_beyond_floats_are_one_message(self):
+        text = "id = 'steep'\nforce = 'k * sinh(u / w)'\n" + K.format(unit="N", typical=1.0)
+        text += "[parameters.w]\nunit = 'm'\nlow = 1e-9\nhigh = 1.0\ntypical = 0.1\n"
+        model = add(build_written_effect(text), k=1.0, w=1e-7)
+        with pytest.raises(InputError) as caught:
+            model.prepare(1000.0)
+        assert "steep" in caught.value.where
+
+    def test_growing_states_are_refused(self):
+        text = BRANCH.replace("- f / tau", "+ f / tau")
+        model = add(build_written_effect(text), k=1.0, tau=1e-3)
+        with pytest.raises(InputError):
+            model.prepare(1000.0)
+
+    @pytest.mark.parametrize("name", ["../own.toml", "/dev/zero", "a\\u0000b", "sub/own.toml", ""])
+    def test_a_model_names_files_next_to_it_only(self, tmp_path, name):
+        folder = tmp_path / "models" / "sub"
+        folder.mkdir(parents=True)
+        for place in (tmp_path, folder):
+            (place / "own.toml").write_text(CUBIC)
+        model = tmp_path / "models" / "model.toml"
+        model.write_text(f'{HEADER}[[effects]]\nfile = "{name}"\nparameters = {{ k = 1.0 }}\n')
+        with pytest.raises(InputError):
+            load_model_config(model)
+
+    def test_a_recorded_text_is_a_model_file(self, tmp_path):
+        (tmp_path / "own.toml").write_text(CUBIC)
+        entry = "[[effects]]\nfile = 'own.toml'\nparameters = { k = 2e7 }\n"
+        (tmp_path / "model.toml").write_text(HEADER + entry)
+        _, text = load_model_config(tmp_path / "model.toml")
+        (tmp_path / "own.toml").unlink()
+        (tmp_path / "model.toml").write_text(text)
+        config, again = load_model_config(tmp_path / "model.toml")
+        assert again == text
+        assert config.effects[0].instance.values == {"k": 2e7}
+
+
 class TestLaws:
     @pytest.mark.parametrize(
         ("text", "values", "library"),
@@ -189,19 +256,23 @@ class TestModelFile:
             parse_toml(HEADER + "[[effects]]\nfile = 'own.toml'\n", ModelConfig, "x")
 
 
+def make_motion(u):
+    return {"u": u, "v": 0.3 + 0 * u, "t": np.arange(u.size) / 1e3}
+
+
 class TestRange:
     def test_the_first_sample_outside_is_found(self):
         effect = build_written_effect(CUBIC + "[range]\nu = [-1e-3, 2e-3]\n")
         u = np.array([0.0, 1e-3, 2.05e-3, 2.1e-3, -2e-3])
-        (range_exit,) = find_range_exits(add(effect, k=1e7), {"u": u})
+        (range_exit,) = find_range_exits(add(effect, k=1e7), make_motion(u))
         assert (range_exit.sample, range_exit.value) == (3, 2.1e-3)
-        assert not [*find_range_exits(add(effect, k=1e7), {"u": u[:3]})]
+        assert not [*find_range_exits(add(effect, k=1e7), make_motion(u[:3]))]
 
     def test_a_bumper_in_flight_is_inside(self):
         effect = build_written_effect(DEEP + "[range]\nd = [0.0, 1e-3]\n")
         gap = SNM.base.gap_r
-        assert not [*find_range_exits(add(effect, k=1e8), {"u": np.array([-0.5 * gap, gap])})]
-        deep = {"u": np.array([0.0, -gap - 1.1e-3])}
+        assert not [*find_range_exits(add(effect, k=1e8), make_motion(np.array([-0.5 * gap, gap])))]
+        deep = make_motion(np.array([0.0, -gap - 1.1e-3]))
         (range_exit,) = find_range_exits(add(effect, k=1e8), deep)
         assert range_exit.sample == 1
         assert math.isclose(range_exit.value, 1.1e-3)

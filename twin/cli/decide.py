@@ -9,6 +9,7 @@ from table_io.clock import local_datetime
 from table_io.config.folders import find_config
 from table_io.config.rig_file import load_rig
 from table_io.errors import InputError
+from table_io.records import RunStart
 from twin.cli.entry import DEFAULT_ENDPOINT
 from twin.cli.run import run_test
 from twin.identification.discover import Discovery
@@ -84,14 +85,7 @@ def add_proposal(
     verdict: Json, discovery: Discovery, paths: Sequence[Path], folder: Path, options: DecideOptions
 ) -> list[TestProposal]:
     """Write the profile of the best test and add it to the verdict; return all proposals."""
-    recorded = open_recording(paths[-1]).start
-    rig_toml = load_named_rig(options.rig) if options.rig else recorded.rig_toml
-    if not recorded.profile_toml or not rig_toml:
-        raise InputError(
-            "no test can be proposed: its profile and rig are not in the recording",
-            where=paths[-1],
-            remedy="import it with --profile, or omit --decide",
-        )
+    recorded, rig_toml = read_recorded_test(paths, options)
     with show_status("simulating candidate tests") as show:
         tests = list_candidate_tests(recorded, rig_toml, options.budget_min, options.asks)
         proposals = propose_tests(discovery, tests, show)
@@ -105,6 +99,19 @@ def add_proposal(
     if options.chain:
         verdict["chain"] = [*options.chain[:-1], options.chain[-1] | list_verdict_entries(verdict)]
     return proposals
+
+
+def read_recorded_test(paths: Sequence[Path], options: DecideOptions) -> tuple[RunStart, str]:
+    """Return the last recorded test and the text of the rig; InputError if either is unknown."""
+    recorded = open_recording(paths[-1]).start
+    rig_toml = load_named_rig(options.rig) if options.rig else recorded.rig_toml
+    if not recorded.profile_toml or not rig_toml:
+        raise InputError(
+            "no test can be proposed: its profile and rig are not in the recording",
+            where=paths[-1],
+            remedy="import it with --profile, or omit --decide",
+        )
+    return recorded, rig_toml
 
 
 def load_named_rig(rig: str) -> str:

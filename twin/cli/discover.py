@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from table_io.clock import RealClock
 from table_io.errors import InputError
-from twin.cli.decide import DecideOptions, JudgedLogs, add_proposal
+from twin.cli.decide import DecideOptions, JudgedLogs, add_proposal, read_recorded_test
 from twin.identification.discover import (
     Discovery,
     PreparedLog,
@@ -76,6 +76,8 @@ def judge_logs(
     start, config = read_model_template(model)
     for name in without:
         find_effect(name)
+    if decide is not None:
+        read_recorded_test(paths, decide)  # before the search: it must not be lost
     folder, _ = make_run_folder(out, "discover")
     try:
         with (
@@ -92,7 +94,10 @@ def judge_logs(
             held_out_logs = load_logs(held_out)[0] if held_out else ()
             with open_mapper(logs) as mapper:
                 discovery = discover_effects(logs, start, report, without, mapper)
-                discovery, law = propose_law(discovery, report)
+                law = None
+                if discovery.selection.complete:
+                    with contextlib.suppress(Cancelled):  # the discovery is kept
+                        discovery, law = propose_law(discovery, report)
     except (InputError, Cancelled) as error:
         folder.rmdir()  # leave no empty folder after a failure
         if isinstance(error, InputError):

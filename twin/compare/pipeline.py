@@ -37,6 +37,7 @@ from twin.model.parameters import free_flight_resonance
 from twin.model.valid_range import find_range_exits, list_ranges
 
 CycleBlocks = tuple[Block, ...]  # the same samples measured, predicted, and without low cuts
+EVENT_KINDS = (*monitoring.EVENT_KINDS, "law_range")  # of the pipeline
 MAX_MISSING_SAMPLES = 3  # samples that a whole held cycle may lack
 
 

@@ -29,7 +29,9 @@ from twin.identification.selection import (
     select_promising,
 )
 from twin.identification.verdict import closed_fraction
+from twin.model.effects.effect import Place
 from twin.model.effects.effect_file import EffectFile, WrittenEffect
+from twin.model.valid_range import list_inputs
 
 FIRST_REFITS, NEXT_REFITS, BEAM_WIDTH = 8, 4, 3
 MAX_EXPLAINED_RATIO = 1.05  # of the mean square to the noise: with less no second term is tried
@@ -132,8 +134,14 @@ def search_laws(
 
     Later starts are tried only if the earlier ones lead to no explanation.
     """
-    has_contact = any((log.contact_state > 0).any() for log in problem.log_residuals)
-    library = list_law_candidates(problem.log_residuals[0].scale, has_contact)
+    # without load cells contact is unknown, not absent
+    has_contact = any((log.contact_state != 0).any() for log in problem.log_residuals)
+    known = [str(key) for key in starts[0].fit.parameters.values]
+    library = [
+        term
+        for term in list_law_candidates(problem.log_residuals[0].scale, has_contact)
+        if not any(name.startswith(f"{term.name}.") for name in known)  # of the model already
+    ]
     fitted_sets: list[FittedSet] = []
     for start in starts:
         if not _explains(problem, fitted_sets):
@@ -249,7 +257,7 @@ def _describe_law(
         for name, parameter in law.parameters.items()
     }
     names = law.parsed_force.names.union(*(rate.names for rate in law.parsed_rates.values()))
-    valid_range = measure_range(problem.log_residuals, fitted.fit.parameters)
+    valid_range = measure_range(problem.log_residuals, fitted.fit.parameters, law.place)
     return law.model_copy(
         update={
             "parameters": parameters,
@@ -261,18 +269,19 @@ def _describe_law(
 
 
 def measure_range(
-    log_residuals: Sequence[LogResiduals], parameters: ParameterSet
+    log_residuals: Sequence[LogResiduals], parameters: ParameterSet, place: Place
 ) -> Mapping[str, tuple[float, float]]:
-    """Return the least and largest value of each variable of a law in the logs, SI."""
+    """Return the least and largest value in the logs of each variable of laws at a place, SI."""
     rows: dict[str, list[float]] = {}
     for residuals in log_residuals:
         m = residuals.motion(parameters.assumed_sensors())
-        p = parameters.model_for_log(residuals.log_number, m).parameters
-        moving = m.moving
-        variables = {"u": m.u, "v": m.v, "a": m.table_acc, "t": m.time_s, "y": m.table_disp}
-        if math.isfinite(min(p.gap_r, p.gap_l)):
-            variables["d"] = np.maximum(np.maximum(m.u - p.gap_r, -m.u - p.gap_l), 0.0)
-        for name, values in variables.items():
-            kept = values[moving & np.isfinite(values)]
-            rows.setdefault(name, []).extend((float(kept.min()), float(kept.max())))
+        model = parameters.model_for_log(residuals.log_number, m)
+        motion = {"u": m.u, "v": m.v, "a": m.table_acc, "t": m.time_s, "y": m.table_disp}
+        motion = {name: values[m.moving] for name, values in motion.items()}
+        opening_m = model.gap_opening_m(1.0) * motion["t"]
+        for inputs in list_inputs(place, model.parameters, opening_m, motion):
+            for name, values in inputs.items():
+                if np.isfinite(values).any():
+                    ends = (float(np.nanmin(values)), float(np.nanmax(values)))
+                    rows.setdefault(name, []).extend(ends)
     return {name: (min(ends), max(ends)) for name, ends in rows.items()}

@@ -24,6 +24,7 @@ from twin.model.effects.effect_file import (
     LawPlace,
     LawState,
     WrittenEffect,
+    list_variables,
 )
 from twin.model.effects.expression import format_dimension, parse_unit
 
@@ -211,9 +212,12 @@ def make_law_candidate(family: TermFamily, scale: RecordScale) -> Candidate:
             unit=REFERENCE_UNITS[name], low=0.5 * value, high=2 * value, typical=value,
             meaning="Reference: largest value in the recordings.",
         )  # fmt: skip
+    ends = {"u": scale.u, "v": scale.v, "d": scale.depth, "a": scale.acc, "y": scale.table_disp}
+    valid_range = {name: (-end, end) for name, end in ends.items()} | {"t": (0.0, scale.duration_s)}
     law = EffectFile(
         id=f"{LAW_PREFIX}{family.name}", title=family.title, place=family.place, force=family.force,
         parameters=parameters, states=dict(family.states),
+        range={name: valid_range[name] for name in list_variables(family.place)},
     )  # fmt: skip
     return make_candidate(law, used, ladders, scale)
 

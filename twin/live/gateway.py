@@ -296,7 +296,7 @@ def run_gateway(config: ProcessConfig, _: str) -> None:
 
 def _open_offers(config: ProcessConfig, external: BusLink) -> OfferFilter:
     # Slow import, needed for a remote twin only.
-    from twin.compare.monitoring import EVENT_KINDS
+    from twin.compare.pipeline import EVENT_KINDS
 
     inbox = external.subscribe(TWIN_TOPICS, history=True, capacity=OFFER_CAPACITY, offered=True)
     return OfferFilter(inbox, config.run, frozenset(EVENT_KINDS))

@@ -181,26 +181,33 @@ def load_model_config(path: Path) -> tuple[ModelConfig, str]:
     """
     text = read_text(path, "model file")
     try:
-        entries = tomllib.loads(text).get("effects", [])
+        table = tomllib.loads(text)
+        entries = [] if "files" in table else table.get("effects", [])
         names = {entry["file"]: None for entry in entries if isinstance(entry.get("file"), str)}
     except (tomllib.TOMLDecodeError, AttributeError, TypeError, RecursionError):
         names = {}  # reported when the text is parsed
     if names:
-        texts = {name: _read_effect_file(path.parent / name, path) for name in names}
+        texts = {name: _read_effect_file(name, path) for name in names}
         text = f"{text}\n{format_toml({'files': texts})}"
     return parse_toml(text, ModelConfig, str(path)), text
 
 
-def _read_effect_file(path: Path, model_path: Path) -> str:
-    """Return the text of an effect file; InputError if it cannot be read or is too large."""
-    try:
-        if path.stat().st_size <= MAX_EFFECT_FILE_BYTES:
-            return read_text(path, "effect file")
-    except OSError as error:
-        raise InputError(
-            f"cannot read this effect file: {error.strerror}", where=model_path, key="file",
-            value=path.name, remedy="put it next to the model file",
-        ) from None  # fmt: skip
+def _read_effect_file(name: str, model_path: Path) -> str:
+    """Return the text of an effect file next to a model file; InputError if it cannot be read."""
+    path = model_path.parent / name
+    problem, allowed = "", f"a regular file of at most {MAX_EFFECT_FILE_BYTES} bytes"
+    if "\0" in name or Path(name).name != name:
+        problem, allowed = "not the name of a file", "a name without folders"
+    elif not path.is_file():
+        problem = "no such effect file"
+    elif path.stat().st_size > MAX_EFFECT_FILE_BYTES:
+        problem = "too large for an effect file"
+    else:
+        try:
+            return path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            problem = f"cannot read this effect file: {error}"
     raise InputError(
-        "too large for an effect file", where=path, allowed=f"at most {MAX_EFFECT_FILE_BYTES} bytes"
-    )
+        problem, where=model_path, key="file", value=name, allowed=allowed,
+        remedy="put the effect file next to the model file",
+    )  # fmt: skip

@@ -2,12 +2,15 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from table_io.block import Float1D
-from twin.model.effects.effect_file import WrittenEffect
-from twin.model.model import Model
+from twin.model.effects.effect import Place
+from twin.model.effects.law import PLACES
+from twin.model.model import EffectInstance, Model
+from twin.model.parameters import Parameters
 
 # Of the width of a range: the end of a measured range is itself uncertain by noise.
 RANGE_MARGIN = 0.02
@@ -36,31 +39,49 @@ class RangeExit:
         )
 
 
-def list_ranges(model: Model) -> tuple[tuple[str, str, float, float], ...]:
-    """Return (effect, variable, low, high) of each range of the laws of effect files."""
-    return tuple(
-        (instance.effect.id, *limits)
-        for instance in model.present_effects
-        if isinstance(instance.effect, WrittenEffect)
-        for limits in instance.effect.valid_range
-    )
+def list_ranges(model: Model) -> tuple[EffectInstance, ...]:
+    """Return the effects whose laws are known in a range alone."""
+    return tuple(instance for instance in model.present_effects if instance.effect.valid_range)
+
+
+def list_inputs(
+    place: Place, parameters: Parameters, opening_m: Any, motion: Mapping[str, Float1D]
+) -> list[dict[str, Float1D]]:
+    """Return what enters a law, by variable, (sample,): of the damper, or of each bumper.
+
+    In a bumper d and v are NaN without contact. `motion` has u, v and what else was measured;
+    `opening_m` is the drift of the gaps.
+    """
+    if place not in PLACES or place == "damper":
+        return [dict(motion)]
+    inputs = []
+    for side in PLACES[place]:
+        sign, gap = (1.0, parameters.gap_r) if side == 0 else (-1.0, parameters.gap_l)
+        depth = sign * motion["u"] - gap - opening_m
+        in_contact = depth > 0.0
+        inputs.append(
+            {
+                **motion,
+                "d": np.where(in_contact, depth, np.nan),
+                "v": np.where(in_contact, sign * motion["v"], np.nan),
+            }
+        )
+    return inputs
 
 
 def find_range_exits(model: Model, motion: Mapping[str, Float1D]) -> Iterator[RangeExit]:
     """Yield the first exit of each range; `motion` (sample,) has u, v, t and what was measured."""
-    for effect, variable, low, high in list_ranges(model):
-        if variable != "d" and variable not in motion:
-            continue
-        if variable == "d":
-            p = model.parameters
-            values = np.maximum(motion["u"] - p.gap_r, -motion["u"] - p.gap_l)
-        else:
-            values = motion[variable]
-        margin = RANGE_MARGIN * (high - low)
-        # A bumper that is not touched has no compression.
-        outside = values > high + margin
-        if variable != "d":
-            outside |= values < low - margin
-        if outside.any():
-            sample = int(outside.argmax())
-            yield RangeExit(effect, variable, sample, float(values[sample]), low, high)
+    opening_m = model.gap_opening_m(1.0) * motion["t"]
+    for instance in list_ranges(model):
+        effect = instance.effect
+        sides = list_inputs(effect.place, model.parameters, opening_m, motion)
+        for variable, low, high in effect.valid_range:
+            margin = RANGE_MARGIN * (high - low)
+            exits = [
+                (int(outside.argmax()), values)
+                for values in (inputs[variable] for inputs in sides if variable in inputs)
+                if (outside := (values > high + margin) | (values < low - margin)).any()
+            ]
+            if exits:
+                sample, values = min(exits, key=lambda pair: pair[0])
+                yield RangeExit(effect.id, variable, sample, float(values[sample]), low, high)

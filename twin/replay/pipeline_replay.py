@@ -29,7 +29,7 @@ from table_io.records import (
     StepAdded,
     Timing,
 )
-from twin.compare import COMPARED_CHANNELS, monitoring, pipeline
+from twin.compare import COMPARED_CHANNELS, pipeline
 from twin.recording.reader import Recording, build_recording
 from twin.recording.recovery import recover_log
 from twin.replay.provenance import find_earlier_run, iter_start_records
@@ -349,5 +349,5 @@ def _is_rig_item(item: Item) -> bool:
     """Return whether an item comes from the rig and is copied, not recomputed by the twin."""
     if isinstance(item, Event):
         # "divergence" is a twin event kind in old logs
-        return item.kind not in (*monitoring.EVENT_KINDS, "divergence")
+        return item.kind not in (*pipeline.EVENT_KINDS, "divergence")
     return not isinstance(item, (Block, RunStart, Timing, *TWIN_RECORDS))

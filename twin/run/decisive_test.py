@@ -41,6 +41,7 @@ MIN_CYCLES, MAX_CYCLES = 4, 60  # held at each frequency
 DWELL_SCHEDULE_DB = (-12.0, -6.0, 0.0)  # levels of a dwell, which grows
 GAP_RATIOS = (math.inf, 0.5, 2.0)  # to the gap of the recorded test; inf: without bumpers
 SIGNIFICANT_DIGITS = 3  # significant, of frequencies and levels
+MAX_DRAWS = 1000  # of a random test
 MIN_PROBABILITY = 0.05  # of a decision, below which a test is not worth its time
 # Tables of a recorded test that are about that run alone.
 OWN_TABLES = ("sweep", "excitation", "dwell", "track", "refine", "resume", "set_up", "tracking")
@@ -161,13 +162,14 @@ def draw_random_test(
     low_hz, high_hz, level_g = _measure_test(profile)
     limits_hz = np.log([low_hz / BAND_RATIO, high_hz * BAND_RATIO])
     limits_g = np.log([level_g * min(LEVEL_RATIOS), level_g * max(LEVEL_RATIOS)])
-    while True:
+    for _ in range(MAX_DRAWS):
         ends_hz = np.sort(np.exp(generator.uniform(limits_hz[0], limits_hz[1], size=2)))
         level = float(np.exp(generator.uniform(limits_g[0], limits_g[1])))
         sweep = _make_sweep((float(ends_hz[0]), float(ends_hz[1])), level, duration_s=60 * minutes)
         content = kept | {"title": "random test", "excitation": sweep}
         if tests := _build_tests(content, recorded, rig_toml):
             return tests[0]
+    raise InputError("the rig can play no random test", where=f"recording {recorded.run}")
 
 
 def _build_tests(

@@ -78,6 +78,7 @@ class Effect:
     rates: Callable[..., tuple[float, ...]] | None = None
     constants: "Callable[[Parameters, Mapping[str, float]], tuple[float, ...]] | None" = None
     input_acceleration: Callable[[Any, Mapping[str, float]], Any] | None = None
+    valid_range: tuple[tuple[str, float, float], ...] = ()  # (variable, low, high) of its fit, SI
     required_channels: tuple[str, ...] = ()  # without which it is not observable
     is_threshold: bool = False  # its amplitude is a threshold: no slope where it vanishes
     is_dry_friction: bool = False  # sticks; fits replace its jump at u' = 0 by a steep slope

@@ -2,9 +2,9 @@
 
     id = "softening_spring"
     place = "damper"
-    force = "-a * u * abs(u) / (1 + abs(u) / w)"
+    force = "-k * u * abs(u) / (1 + abs(u) / w)"
     [parameters]
-    a = { unit = "N/m2", low = 0.0, high = 1e9, vanishing = 0.0, typical = 1e6 }
+    k = { unit = "N/m2", low = 0.0, high = 1e9, vanishing = 0.0, typical = 1e6 }
     w = { unit = "m", low = 1e-4, high = 1.0, typical = 1e-2 }
     [range]
     u = [-0.006, 0.006]
@@ -24,6 +24,7 @@ from pydantic import Field, field_validator, model_validator
 from table_io.config.base import ConfigModel, Finite, parse_toml
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
+from twin.model.effects import EFFECTS
 from twin.model.effects.effect import Effect, EffectParameter
 from twin.model.effects.expression import (
     Expression,
@@ -39,8 +40,13 @@ LawPlace = Literal["damper", "bumpers", "right_bumper", "left_bumper", "input"]
 DAMPER_VARIABLES = {"u": "m", "v": "m/s", "a": "m/s2", "t": "s"}
 BUMPER_VARIABLES = {"d": "m", "v": "m/s", "a": "m/s2", "t": "s"}
 INPUT_VARIABLES = {"y": "m"}
+MAX_STATES, MAX_PARAMETERS = 6, 16  # as many as the laws of a model may have together
+MAX_JUMP_SHARE = 1e-9  # of the largest force: rounding
+LEAST_SPEED_M_S = 1e-300  # on either side of a reversal
+Points = dict[str, Any]
 PROBE_SHARES = (-1.0, -0.3, 0.0, 0.3, 1.0)  # of the range, where a law must be finite
-DEFAULT_RANGE = {"u": 0.03, "d": 0.003, "v": 0.3, "a": 5.0, "t": 600.0, "y": 0.03}  # SI
+DEFAULT_RANGE = {"u": 0.03, "d": 0.003, "v": 0.3, "a": 5.0, "y": 0.03}  # SI
+DEFAULT_DURATION_S = 600.0
 
 
 def list_variables(place: str) -> Mapping[str, str]:
@@ -54,11 +60,10 @@ def list_variables(place: str) -> Mapping[str, str]:
 class WrittenEffect(Effect):
     """An effect of an effect file: `source` is its text, `valid_range` where it was fitted.
 
-    `valid_range` holds (variable, lowest, highest) in SI.
+    Variables of `valid_range` are those of `list_variables`.
     """
 
     source: str = ""
-    valid_range: tuple[tuple[str, float, float], ...] = ()
 
     @property
     def law(self) -> "EffectFile":
@@ -95,11 +100,12 @@ class LawParameter(ConfigModel):
 
     @model_validator(mode="after")
     def _check_order(self) -> "LawParameter":
-        if not self.low <= self.typical <= self.high:
-            raise InputError(
-                "not between low and high", key="typical", value=self.typical,
-                allowed=f"{self.low:g} to {self.high:g}",
-            )  # fmt: skip
+        for key, value in (("typical", self.typical), ("vanishing", self.vanishing)):
+            if value is not None and not self.low <= value <= self.high:
+                raise InputError(
+                    "not between low and high", key=key, value=value,
+                    allowed=f"{self.low:g} to {self.high:g}",
+                )  # fmt: skip
         return self
 
 
@@ -126,8 +132,12 @@ class EffectFile(ConfigModel):
         description="Force in N; in a bumper the push. With place input: an acceleration in m/s2, "
         "added to that of the table."
     )
-    parameters: dict[str, LawParameter] = Field(description="Parameters by name.")
-    states: dict[str, LawState] = Field({}, description="Internal states by name.")
+    parameters: dict[str, LawParameter] = Field(
+        description="Parameters by name.", max_length=MAX_PARAMETERS
+    )
+    states: dict[str, LawState] = Field(
+        {}, description="Internal states by name.", max_length=MAX_STATES
+    )
     range: dict[str, tuple[Finite, Finite]] = Field(
         {}, description="Measured range of each variable; outside it the law is not known."
     )
@@ -146,6 +156,8 @@ class EffectFile(ConfigModel):
 
     @model_validator(mode="after")
     def _check_law(self) -> "EffectFile":
+        if any(effect.id == self.id for effect in EFFECTS):
+            raise InputError("an effect of the library", key="id", value=self.id, remedy="rename")
         variables = list_variables(self.place)
         named = [*variables, *self.states, *self.parameters]
         repeated = sorted({name for name in named if named.count(name) > 1})
@@ -168,7 +180,7 @@ class EffectFile(ConfigModel):
             unit = self.states[name].unit
             per_second = f"{unit} s" if "/" in unit else f"{unit or '1'}/s"
             self._check_dimension(f"states.{name}.rate", rate, per_second)
-        self._check_finite()
+        self._check_values()
         return self
 
     @property
@@ -211,22 +223,23 @@ class EffectFile(ConfigModel):
                 remedy="correct the expression or the units of its parameters",
             )  # fmt: skip
 
-    def _check_finite(self) -> None:
-        """Raise InputError where the law is not finite, or feeds energy in though it dissipates."""
-        values = {name: parameter.typical for name, parameter in self.parameters.items()}
-        ranges = {name: (-size, size) for name, size in DEFAULT_RANGE.items()} | self.range
+    def _check_values(self) -> None:
+        """Raise InputError where the law is not finite, jumps, does not vanish, or feeds energy."""
+        ranges = {name: (-size, size) for name, size in DEFAULT_RANGE.items()}
+        ranges |= {"t": (0.0, DEFAULT_DURATION_S), **self.range}
         names = [*list_variables(self.place)]
         grids = [
             [0.5 * (low + high) + 0.5 * (high - low) * share for share in PROBE_SHARES]
             for low, high in (ranges[name] for name in names)
         ]
-        points = dict(zip(names, map(np.ravel, np.meshgrid(*grids)), strict=True))
-        relaxed = dict.fromkeys(self.states, 0.0)
+        points: Points = dict(zip(names, map(np.ravel, np.meshgrid(*grids)), strict=True))
+        typical = {name: parameter.typical for name, parameter in self.parameters.items()}
+        given: Points = {**points, **typical, **dict.fromkeys(self.states, 0.0)}
         for key, expression in (
             ("force", self.parsed_force),
             *((f"states.{name}.rate", rate) for name, rate in self.parsed_rates.items()),
         ):
-            finite = np.isfinite(expression.evaluate(points | relaxed | values))
+            finite = np.isfinite(expression.evaluate(given))
             if not finite.all():
                 index = int(np.argmin(finite))
                 where = ", ".join(f"{name} = {points[name][index]:g}" for name in names)
@@ -234,16 +247,48 @@ class EffectFile(ConfigModel):
                     f"not finite at {where}", key=key, value=expression.text,
                     remedy="divide by no variable, and give sqrt and log positive arguments",
                 )  # fmt: skip
-        if self.dissipates and "v" in points and not self.states:
-            at_rest = points | {"v": np.zeros_like(points["v"])}
-            moving, still = (
-                self.parsed_force.evaluate(values | place) for place in (points, at_rest)
-            )
-            if np.any((moving - still) * points["v"] < -1e-9 * np.abs(moving * points["v"])):
-                raise InputError(
-                    "feeds energy in, though it dissipates", key="dissipates", value=True,
-                    remedy="change the sign, or set dissipates = false",
-                )  # fmt: skip
+        self._check_vanishing(given)
+        if "v" in points:
+            self._check_rates(given)
+
+    def _check_vanishing(self, given: Points) -> None:
+        """Raise InputError unless the law vanishes with its amplitudes."""
+        absent = given | {
+            name: parameter.vanishing
+            for name, parameter in self.parameters.items()
+            if parameter.vanishing is not None
+        }
+        force, rates = self.parsed_force, self.parsed_rates.values()
+        remains = bool(np.any(force.evaluate(absent)))
+        if not remains and np.any(force.evaluate(absent | dict.fromkeys(self.states, 1.0))):
+            # the states still have an effect, but they may never leave zero
+            remains = any(np.any(rate.evaluate(absent)) for rate in rates)
+        if remains:
+            raise InputError(
+                "does not vanish with its parameters", key="force", value=self.force,
+                remedy="multiply all of it by parameters with a vanishing value",
+            )  # fmt: skip
+
+    def _check_rates(self, given: Points) -> None:
+        """Raise InputError if the force jumps at a reversal, or feeds energy though it dissipates.
+
+        No law of a file sticks: it would switch for ever.
+        """
+        forward, back, still, moving = (
+            self.parsed_force.evaluate(given | {"v": v})
+            for v in (LEAST_SPEED_M_S, -LEAST_SPEED_M_S, 0.0, given["v"])
+        )
+        if np.any(np.abs(forward - back) > MAX_JUMP_SHARE * np.abs(moving).max()):
+            raise InputError(
+                "jumps where the velocity changes its sign", key="force", value=self.force,
+                remedy="write tanh(v / s) with a small speed s, or add coulomb_friction",
+            )  # fmt: skip
+        power = (moving - still) * given["v"]
+        if self.dissipates and np.any(power < -MAX_JUMP_SHARE * np.abs(moving * given["v"])):
+            raise InputError(
+                "feeds energy in, though it dissipates", key="dissipates", value=True,
+                remedy="change the sign, or set dissipates = false",
+            )  # fmt: skip
 
     def format_text(self) -> str:
         """Return the text of the file."""

@@ -10,6 +10,7 @@ import ast
 import copy
 import math
 import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import CodeType, FunctionType
@@ -21,6 +22,8 @@ from table_io.errors import InputError, suggest
 
 MAX_TEXT_LENGTH = 1000  # characters
 MAX_NODES, MAX_DEPTH = 100, 30  # of the tree of one expression
+MAX_EXPONENT = 100  # of a power, as a number
+MAX_UNIT_LENGTH = 40  # characters
 BASE_UNITS: Mapping[str, tuple[float, float, float]] = {  # exponents of kg, m, s
     "N": (1, 1, -2), "m": (0, 1, 0), "s": (0, 0, 1), "kg": (1, 0, 0), "rad": (0, 0, 0),
     "Hz": (0, 0, -1), "1": (0, 0, 0),
@@ -109,7 +112,7 @@ def _check_node(
         raise _refuse("nested too deeply", text, allowed=f"at most {MAX_DEPTH} levels")
     match node:
         case ast.Constant(value=float() | int() as value) if not isinstance(value, bool):
-            if not abs(value) < math.inf:
+            if not abs(value) <= sys.float_info.max:
                 raise _refuse("has a number that is not finite", text)
             return 1
         case ast.Name(id=name):
@@ -124,6 +127,8 @@ def _check_node(
             parts = [operand]
         case ast.BinOp(left=left, op=op, right=right) if type(op) in OPERATORS:
             parts = [left, right]
+            if isinstance(op, ast.Pow) and abs(_find_constant(right) or 0.0) > MAX_EXPONENT:
+                raise _refuse("has a large exponent", text, f"at most {MAX_EXPONENT}")
         case ast.Call(func=ast.Name(id=function), args=parts, keywords=[]):
             if function not in FUNCTIONS:
                 raise _refuse(
@@ -135,8 +140,19 @@ def _check_node(
                     allowed=f"{FUNCTIONS[function][2]}",
                 )  # fmt: skip
         case _:
-            raise _refuse(f"{ast.unparse(node)!r} is outside the grammar", text)
+            raise _refuse(f"{type(node).__name__} is outside the grammar", text)
     return 1 + sum(_check_node(part, text, known_names, names, depth + 1) for part in parts)
+
+
+def _find_constant(node: ast.expr) -> float | None:
+    """Return the value of a part without names; None if it has names or no finite value."""
+    if any(isinstance(part, ast.Name | ast.Call) for part in ast.walk(node)):
+        return None
+    try:
+        with np.errstate(all="ignore"):
+            return float(_evaluate(node, {}))
+    except (OverflowError, KeyError, AssertionError, ValueError):
+        return None
 
 
 def _evaluate(node: ast.expr, values: Mapping[str, Any]) -> Any:
@@ -156,11 +172,13 @@ def _evaluate(node: ast.expr, values: Mapping[str, Any]) -> Any:
 
 def parse_unit(unit: str) -> Dimension:
     """Return the exponents of kg, m and s of a unit such as "N s2/m2"; InputError if unknown."""
+    if len(unit) > MAX_UNIT_LENGTH:
+        raise InputError("too long", value=unit[:20], allowed=f"{MAX_UNIT_LENGTH} characters")
     total = [0.0, 0.0, 0.0]
     numerator, _, denominator = unit.partition("/")
     for factors, direction in ((numerator, 1.0), (denominator, -1.0)):
         for factor in factors.split():
-            matched = re.fullmatch(r"([A-Za-z]+|1)(\d*)", factor)
+            matched = re.fullmatch(r"([A-Za-z]+|1)(\d{0,2})", factor)
             if matched is None or matched[1] not in BASE_UNITS:
                 raise InputError(
                     f"unit {factor!r} is unknown",
@@ -224,9 +242,10 @@ class _DimensionCheck:
         dimension = self.find(base)
         if dimension == DIMENSIONLESS:
             return dimension
-        if not isinstance(exponent, ast.Constant):
+        power = _find_constant(exponent)
+        if power is None:
             raise self._refuse(base, dimension, "a pure number below a variable exponent")
-        return _combine(DIMENSIONLESS, dimension, float(exponent.value))  # type: ignore[arg-type]
+        return _combine(DIMENSIONLESS, dimension, power)
 
     def _find_of_call(self, function: str, parts: Sequence[ast.expr]) -> Dimension:
         match function:
@@ -295,8 +314,8 @@ def build_function(
 
         def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
             left, right = self.visit(node.left), self.visit(node.right)
-            if isinstance(node.op, ast.Pow) and isinstance(node.right, ast.Constant):
-                exponent = float(node.right.value)  # type: ignore[arg-type]
+            if isinstance(node.op, ast.Pow) and _find_constant(node.right) is not None:
+                exponent = _find_constant(node.right) or 0.0
                 if exponent.is_integer():  # compiled to products
                     right = ast.Constant(int(exponent))
             return ast.BinOp(left, node.op, right)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from table_io.errors import InputError
 from twin.model.effects.effect import Effect
 from twin.model.parameters import Parameters
 
@@ -23,6 +24,7 @@ PROBED_RATES = (-0.3, -0.01, 0.01, 0.3)
 PROBED_DRIVES = ((0.0, 0.0), (1.0, 100.0))
 # Base parameters for the checks of a law that depends on them.
 PROBED_BASE = Parameters(1e3, 1e5, 1e3, 1e6, 1e3, 1e6, 1e3, 1e-3, 1e-3)
+MAX_GROWTH_SHARE = 1e-6  # of the largest eigenvalue of states: rounding of a lossless one
 STATE_STEP = 1e-6  # of differences by a state, in its unit
 
 
@@ -66,21 +68,57 @@ def typical_values(effect: Effect) -> dict[str, float]:
     return {parameter.name: parameter.typical for parameter in effect.parameters}
 
 
+def list_probed_motions(effect: Effect) -> list[tuple[float, float]]:
+    """Return deformations in m and rates in m/s at which a law is evaluated for its properties.
+
+    Within the range of its fit, if it is known.
+    """
+    in_bumper = effect.place != "damper"
+    largest = {name: max(abs(low), abs(high)) for name, low, high in effect.valid_range}
+    deformations: tuple[float, ...] = PROBED_DEFORMATIONS[in_bumper]
+    rates: tuple[float, ...] = PROBED_RATES
+    length, speed = (largest.get(name) for name in ("d" if in_bumper else "u", "v"))
+    if length is not None:
+        deformations = tuple(q * length / deformations[-1] for q in deformations)
+    if speed is not None:
+        rates = tuple(w * speed / PROBED_RATES[-1] for w in PROBED_RATES)
+    return [*product(deformations, rates)]
+
+
+def list_probed_drives(effect: Effect) -> tuple[tuple[float, float], ...]:
+    """Return base accelerations in m/s2 and times in s at which a law is evaluated."""
+    ends = {name: high for name, _, high in effect.valid_range}
+    still, (acceleration, time_s) = PROBED_DRIVES
+    return still, (ends.get("a", acceleration), ends.get("t", time_s))
+
+
 def law_properties(effect: Effect, c: tuple[float, ...]) -> LawProperties:
     """Return the largest stiffness and rate of the states of a law over the probed motions.
 
     The stiffness is the instantaneous one, dF/dq + dF/ds ds'/dw: fast motion also loads the states.
     The rate is the largest eigenvalue of d rates / d states: of a relaxation or an oscillation.
     """
+    try:
+        return _measure_law(effect, c)
+    except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
+        raise InputError(
+            f"its law cannot be evaluated with these values: {error}",
+            where=f"effect {effect.id!r}",
+            value=list(c),
+            remedy="change the values of its parameters",
+        ) from None
+
+
+def _measure_law(effect: Effect, c: tuple[float, ...]) -> LawProperties:
     force, rates = evaluate_law(effect, c)
     stiffness = relaxation = 0.0
     count = len(effect.states)
     relaxed, steps = (0.0,) * count, STATE_STEP * np.eye(count)
+    drives = list_probed_drives(effect)
     probes = product(
-        PROBED_DEFORMATIONS[effect.place != "damper"], PROBED_RATES,
-        PROBED_DRIVES if changes_with_time(effect) else PROBED_DRIVES[:1],
-    )  # fmt: skip
-    for q, w, (a, t) in probes:
+        list_probed_motions(effect), drives if changes_with_time(effect) else drives[:1]
+    )
+    for (q, w), (a, t) in probes:
         h = 1e-6 * abs(q)
         k = (force(q + h, w, a, t, relaxed) - force(q - h, w, a, t, relaxed)) / (2 * h)
         slopes = np.zeros((count, count))
@@ -94,7 +132,10 @@ def law_properties(effect: Effect, c: tuple[float, ...]) -> LawProperties:
             slopes[:, i] = change / (2 * STATE_STEP)
         stiffness = max(stiffness, abs(k))
         if count:
-            relaxation = max(relaxation, float(np.abs(np.linalg.eigvals(slopes)).max()))
+            eigenvalues = np.linalg.eigvals(slopes)
+            relaxation = max(relaxation, float(np.abs(eigenvalues).max()))
+            if eigenvalues.real.max() > MAX_GROWTH_SHARE * relaxation:
+                raise ValueError("its states grow without bound")
     return LawProperties(stiffness, relaxation)
 
 
@@ -150,7 +191,8 @@ def _find_value_problem(effect: Effect) -> str:
     force, rates = evaluate_law(effect, constants)
     relaxed = (0.0,) * len(effect.states)
     in_bumper = effect.place != "damper"
-    for q, w, (a, t) in product(PROBED_DEFORMATIONS[in_bumper], PROBED_RATES, PROBED_DRIVES):
+    drives = list_probed_drives(effect)
+    for (q, w), (a, t) in product(list_probed_motions(effect), drives):
         push, slow = force(q, w, a, t, relaxed), force(q, 0.0, a, t, relaxed)
         own = rates(q, w, a, t, relaxed)
         if not all(math.isfinite(value) for value in (push, *own)):
@@ -164,7 +206,7 @@ def _find_value_problem(effect: Effect) -> str:
                     "in a bumper the force must be elastic plus a dashpot: linear in the "
                     "rate, whose zero in flight gives the recovery of the face"
                 )
-    if in_bumper and any(force(0.0, 0.0, a, t, relaxed) != 0.0 for a, t in PROBED_DRIVES):
+    if in_bumper and any(force(0.0, 0.0, a, t, relaxed) != 0.0 for a, t in drives):
         return "in a bumper the force must be zero at deformation 0, rate 0, states relaxed"
     return ""
 
