@@ -136,6 +136,8 @@ def fill_jacobian(
     )
     for row, slopes in zip(jacobian, columns, strict=True):
         row[:] = select_entries(slopes, train)
+        # A law may overflow a step further than where it is: no step in this direction.
+        row[~np.isfinite(row)] = 0.0
 
 
 def select_entries(entries: Sequence[Float1D], train: Sequence[Bool2D] | None) -> Float1D:

@@ -48,6 +48,7 @@ from twin.model.force_laws import (
 from twin.model.model import Model
 
 PULL_WIDTH = 0.1  # of the pull-off force: over which an adhesive contact lets go along a motion
+MAX_RELAXATIONS = 50.0  # of a state or a free face in a sample, that are integrated
 MAX_STATE_RELAXATIONS = 0.5  # relaxation times of an added law per step of its integration
 FORCE_ROWS = ("damper", "right", "left")
 # One signature: numba never caches a kernel specialized to the function of an effect.
@@ -295,10 +296,16 @@ class PreparedForces(NamedTuple):
     coefficients: Coefficients
     laws: AddedLaws | None
     fastest_rate: float
+    face_stiffness: tuple[float, float]  # of right and left in N/m, with the added laws
 
     @classmethod
     def from_model(cls, model: Model) -> "PreparedForces":
-        return cls(*kernel_coefficients(model), _fastest_law_rate(model))
+        properties, p = sum_law_properties(model.added_laws), model.parameters
+        stiffness = (
+            p.bumper_stiffness_r + properties[0].stiffness,
+            p.bumper_stiffness_l + properties[1].stiffness,
+        )
+        return cls(*kernel_coefficients(model), _fastest_law_rate(model), stiffness)
 
     def evaluate(
         self,
@@ -311,8 +318,16 @@ class PreparedForces(NamedTuple):
         """Return D, F_R and F_L in N, (3, sample); see `forces_along`."""
         out = np.empty((3, u.size))
         touched = contact.astype(np.float64, order="C")
-        p, laws = self.coefficients, self.laws
-        _force_kernel(u, v, base_acc, time_s, touched, p, laws, self.fastest_rate, out)
+        p, laws, fastest_rate = self.coefficients, self.laws, self.fastest_rate
+        if fastest_rate > 0.0 and u.size > 1:
+            # What relaxes within a small part of a sample, as a fit may try, would take steps
+            # without end. A face is as good as relaxed; a state that is faster overflows.
+            limit = MAX_RELAXATIONS / float(np.median(np.diff(time_s)))
+            right, left = (stiffness / limit for stiffness in self.face_stiffness)
+            if p.has_bumper_states:
+                p = p._replace(c_r=max(p.c_r, right), c_l=max(p.c_l, left))
+            fastest_rate = min(fastest_rate, limit)
+        _force_kernel(u, v, base_acc, time_s, touched, p, laws, fastest_rate, out)
         return out
 
 
