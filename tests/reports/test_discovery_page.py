@@ -59,7 +59,7 @@ AWAY = (
     "sensor_gain", "sensor_lag", "sensor_offset", "table_tilt", "bumper_maxwell", "hunt_crossley",
     "mass_error", "maxwell_damper", "bouc_wen",
 )  # fmt: skip
-WITHOUT = (*AWAY, "bumper_hardening")
+WITHOUT = (*AWAY, "bumper_hardening", "bumper_cubic")
 VERDICTS = ("none", "named", "ambiguous", "unexplained")
 FIGURES = {
     "staircase", "map_0", "candidates", "damper_force", "bumper_force", "histories", "prc",

@@ -19,6 +19,7 @@ from tests.input_errors import raises_input_error
 from tests.sweeps.small_study import STUDY, TEST, make_stored_study, write_study
 from twin.api import open_study
 from twin.compare.curves import detect_hysteresis
+from twin.model.effects import find_effect
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
 from twin.reports.ideal_points import compute_prc_points
@@ -166,9 +167,12 @@ def test_every_parameter_can_be_varied_and_changes_the_model(tmp_path: Path, nam
             for other in list_parameter_names()
             if other.startswith(f"effects.{effect}.") and other != name
         ]
-        fixed = "[fixed]\n" + "".join(f'"{other}" = 1e-3\n' for other in others)
-        if name.endswith("ratio"):
-            low, high = 0.9, 1.1
+        typical = {
+            f"effects.{effect}.{parameter.name}": parameter.typical
+            for parameter in find_effect(effect).parameters
+        }
+        fixed = "[fixed]\n" + "".join(f'"{other}" = {typical[other]}\n' for other in others)
+        low, high = 0.9 * typical[name], 1.1 * typical[name]
     text = (
         f'{HEAD}outcomes = ["peaks"]\n[[parameters]]\nname = "{name}"\n'
         f"start = {low}\nstop = {high}\ncount = 2\n{fixed}"
