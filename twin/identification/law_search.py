@@ -35,6 +35,7 @@ from twin.model.valid_range import list_inputs
 
 FIRST_REFITS, NEXT_REFITS, BEAM_WIDTH = 8, 4, 3
 MAX_EXPLAINED_RATIO = 1.05  # of the mean square to the noise: with less no second term is tried
+MIN_FIRST_GAIN = 0.3  # of the excess over the noise: a term that gains less is given no second one
 MIN_CLOSED_SHARE = 0.5  # of the misfit that a law must close to be proposed
 SUFFICIENT_RATIO = 1.1  # of the held-out error to the floor: with less, the law explains the record
 MAX_WORSE_SIGMA = 2.0  # standard errors by which a law with a rounded exponent may be worse
@@ -158,7 +159,8 @@ def _search_from(
     """Return the sets of `start` and one or two terms that were fitted."""
     fitted_sets = _extend(problem, start, library, FIRST_REFITS, report)
     for current in fitted_sets[:BEAM_WIDTH]:
-        if _explains(problem, fitted_sets):
+        excess = start.cost - problem.noise
+        if _explains(problem, fitted_sets) or start.cost - current.cost < MIN_FIRST_GAIN * excess:
             break
         further = [term for term in library if term.name not in current.names]
         fitted_sets = [*fitted_sets, *_extend(problem, current, further, NEXT_REFITS, report)]

@@ -48,7 +48,7 @@ from twin.model.force_laws import (
 from twin.model.model import Model
 
 PULL_WIDTH = 0.1  # of the pull-off force: over which an adhesive contact lets go along a motion
-MAX_RELAXATIONS = 50.0  # of a state or a free face in a sample, that are integrated
+MAX_RELAXATIONS, MAX_FACE_RELAXATIONS = 50.0, 5.0  # of a state and of a free face in a sample
 MAX_STATE_RELAXATIONS = 0.5  # relaxation times of an added law per step of its integration
 FORCE_ROWS = ("damper", "right", "left")
 # One signature: numba never caches a kernel specialized to the function of an effect.
@@ -295,7 +295,7 @@ class PreparedForces(NamedTuple):
 
     coefficients: Coefficients
     laws: AddedLaws | None
-    fastest_rate: float
+    law_rate: float  # of the fastest state in 1/s; -1 without states
     face_stiffness: tuple[float, float]  # of right and left in N/m, with the added laws
 
     @classmethod
@@ -305,7 +305,7 @@ class PreparedForces(NamedTuple):
             p.bumper_stiffness_r + properties[0].stiffness,
             p.bumper_stiffness_l + properties[1].stiffness,
         )
-        return cls(*kernel_coefficients(model), _fastest_law_rate(model), stiffness)
+        return cls(*kernel_coefficients(model), _find_law_rate(model), stiffness)
 
     def evaluate(
         self,
@@ -318,15 +318,17 @@ class PreparedForces(NamedTuple):
         """Return D, F_R and F_L in N, (3, sample); see `forces_along`."""
         out = np.empty((3, u.size))
         touched = contact.astype(np.float64, order="C")
-        p, laws, fastest_rate = self.coefficients, self.laws, self.fastest_rate
-        if fastest_rate > 0.0 and u.size > 1:
+        p, laws, fastest_rate = self.coefficients, self.laws, self.law_rate
+        if fastest_rate >= 0.0 and u.size > 1:
             # What relaxes within a small part of a sample, as a fit may try, would take steps
-            # without end. A face is as good as relaxed; a state that is faster overflows.
-            limit = MAX_RELAXATIONS / float(np.median(np.diff(time_s)))
-            right, left = (stiffness / limit for stiffness in self.face_stiffness)
+            # without end. Such a face is as good as relaxed; a state that is faster overflows.
+            sample_s = float(np.median(np.diff(time_s)))
+            fastest_rate = min(fastest_rate, MAX_RELAXATIONS / sample_s)
             if p.has_bumper_states:
-                p = p._replace(c_r=max(p.c_r, right), c_l=max(p.c_l, left))
-            fastest_rate = min(fastest_rate, limit)
+                limit = MAX_FACE_RELAXATIONS / sample_s
+                right, left = self.face_stiffness
+                p = p._replace(c_r=max(p.c_r, right / limit), c_l=max(p.c_l, left / limit))
+                fastest_rate = max(fastest_rate, right / p.c_r, left / p.c_l)
         _force_kernel(u, v, base_acc, time_s, touched, p, laws, fastest_rate, out)
         return out
 
@@ -398,15 +400,8 @@ def depends_on_history(model: Model) -> bool:
     return has_states or max(p.fy, p.k1, p.kb, p.pull) > 0.0
 
 
-def _fastest_law_rate(model: Model) -> float:
-    """Return the fastest relaxation in 1/s of the added laws and their faces; -1 without states."""
+def _find_law_rate(model: Model) -> float:
+    """Return the fastest rate in 1/s of the states of the added laws; -1 without states."""
     if not any(effect.states for effect, _ in model.added_laws):
         return -1.0
-    properties, p = sum_law_properties(model.added_laws), model.parameters
-    rates = [law.relaxation_rate for law in properties.values()]
-    for side, (k, c) in enumerate(
-        ((p.bumper_stiffness_r, p.bumper_damping_r), (p.bumper_stiffness_l, p.bumper_damping_l))
-    ):
-        if c > 0:
-            rates.append((k + properties[side].stiffness) / c)
-    return max(rates)
+    return max(law.relaxation_rate for law in sum_law_properties(model.added_laws).values())
