@@ -22,7 +22,8 @@ from twin.identification.parameters import STIFFNESS, EffectKey, ParameterKey, P
 from twin.identification.selection import FittedSet
 from twin.identification.signals import build_signals
 from twin.identification.verdict import MIN_SEPARATION_SIGMA
-from twin.model.model import Model
+from twin.model.effects.effect_file import build_written_effect
+from twin.model.model import EffectInstance, Model
 from twin.model.parameters import Parameters
 from twin.model.solver import OUTPUT_COUNT
 from twin.run import decisive_test
@@ -233,6 +234,34 @@ def test_the_ends_of_a_wide_interval_are_rivals_and_a_narrow_one_has_none(
     assert values == pytest.approx(expected)
     assert low.is_held
     assert high.is_held
+
+
+def test_the_ends_of_an_interval_keep_the_law_of_an_effect_file() -> None:
+    text = """id = "own_cubic"
+force = "k * u**3"
+[parameters.k]
+unit = "N/m3"
+low = 0.0
+high = 1e12
+vanishing = 0.0
+typical = 1e7
+"""
+    effect = build_written_effect(text)
+    model = Model(SNM.base, (EffectInstance.create(effect, {"k": 2e8}),))
+    test = make_test(2.0, 2.0, 0.05, cycles=10)
+    problem = prepare_problem([record_model(model, test.motion)], model)
+    fitted = problem.problem.fit_effects(problem.parameters, ())
+    key = EffectKey("own_cubic", "k")
+    assert fitted.fit.values[key] == pytest.approx(2e8, rel=0.05)
+    errors = {free.key: 0.0 for free in fitted.fit.free} | {key: 0.2 * fitted.fit.values[key]}
+    wide = replace(fitted, fit=replace(fitted.fit, std_errors=errors))
+    rivals = find_interval_ends(wide)
+    for rival, sign in zip(rivals, (-1.0, 1.0), strict=True):
+        (instance,) = rival.fitted.fit.parameters.to_model().effects
+        assert instance.effect is effect
+        expected = fitted.fit.values[key] * (1.0 + sign * 1.96 * 0.2)
+        assert instance.values["k"] == pytest.approx(expected)
+    assert predict_separation(problem.problem, rivals, test.motion).sigma > 0.0
 
 
 def test_an_effect_that_the_noise_hides_shows_at_a_higher_level() -> None:

@@ -307,7 +307,8 @@ def _move_along(fitted: FittedSet, index: int, sigma: float) -> FittedSet:
         x = free.to_internal(value) + shift / (value if free.logarithmic else 1.0)
         values |= dict.fromkeys(free.keys, free.to_external(x))
     held = fit.free[index]
-    parameters = ParameterSet(values, tuple(free for free in fit.free if free is not held))
+    still_free = tuple(free for free in fit.free if free is not held)
+    parameters = replace(fit.parameters, values=values, free=still_free)
     return FittedSet(fitted.effects, replace(fit, parameters=parameters))
 
 
