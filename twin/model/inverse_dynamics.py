@@ -296,16 +296,19 @@ class PreparedForces(NamedTuple):
     coefficients: Coefficients
     laws: AddedLaws | None
     law_rate: float  # of the fastest state in 1/s; -1 without states
-    face_stiffness: tuple[float, float]  # of right and left in N/m, with the added laws
+    face_stiffness: tuple[float, float]  # of right and left in N/m; 0 without states
 
     @classmethod
     def from_model(cls, model: Model) -> "PreparedForces":
-        properties, p = sum_law_properties(model.added_laws), model.parameters
-        stiffness = (
-            p.bumper_stiffness_r + properties[0].stiffness,
-            p.bumper_stiffness_l + properties[1].stiffness,
-        )
-        return cls(*kernel_coefficients(model), _find_law_rate(model), stiffness)
+        law_rate, face_stiffness = -1.0, (0.0, 0.0)
+        if any(effect.states for effect, _ in model.added_laws):
+            properties, p = sum_law_properties(model.added_laws), model.parameters
+            law_rate = max(law.relaxation_rate for law in properties.values())
+            face_stiffness = (
+                p.bumper_stiffness_r + properties[0].stiffness,
+                p.bumper_stiffness_l + properties[1].stiffness,
+            )
+        return cls(*kernel_coefficients(model), law_rate, face_stiffness)
 
     def evaluate(
         self,
@@ -398,10 +401,3 @@ def depends_on_history(model: Model) -> bool:
     p, _ = kernel_coefficients(_split_laws(model, is_contact_known=True)[0])
     has_states = any(effect.states for effect, _ in model.added_laws)
     return has_states or max(p.fy, p.k1, p.kb, p.pull) > 0.0
-
-
-def _find_law_rate(model: Model) -> float:
-    """Return the fastest rate in 1/s of the states of the added laws; -1 without states."""
-    if not any(effect.states for effect, _ in model.added_laws):
-        return -1.0
-    return max(law.relaxation_rate for law in sum_law_properties(model.added_laws).values())
