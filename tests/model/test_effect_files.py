@@ -6,6 +6,7 @@ import pickle
 import numpy as np
 import pytest
 
+from table_io.compilation import jit_helper
 from table_io.config.base import parse_toml
 from table_io.errors import InputError
 from tests.identification.played import SNM
@@ -80,6 +81,14 @@ class TestGrammar:
             if name == "log" and u == 0.0:
                 continue
             assert function(u, v) == pytest.approx(float(expression.evaluate({"u": u, "v": v})))
+
+    @pytest.mark.parametrize(("zero", "side"), [(0.0, 1.0), (-0.0, -1.0)])
+    def test_the_sign_of_a_zero_is_its_side_in_every_form(self, zero, side):
+        expression = parse_expression("sign(u)", ["u"])
+        function = build_function("f", ["u"], expression, {}, {})
+        assert function(zero) == side
+        assert jit_helper()(function)(zero) == side
+        assert expression.evaluate({"u": np.array([zero])}) == [side]
 
     @pytest.mark.parametrize(
         ("unit", "dimension"),

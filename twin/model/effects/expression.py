@@ -32,15 +32,12 @@ Dimension = tuple[float, float, float]
 DIMENSIONLESS: Dimension = (0.0, 0.0, 0.0)
 
 
-def sign(x: float) -> float:
-    """Return +1 or -1, the sign of a zero included: a force law has a side at a reversal."""
-    return math.copysign(1.0, x)
-
-
 # function -> (of one number, of an array, number of arguments)
 FUNCTIONS: Mapping[str, tuple[Callable[..., float], Callable[..., Any], int]] = {
     "abs": (abs, np.abs, 1),
-    "sign": (sign, lambda x: np.copysign(1.0, x), 1),
+    # +1 or -1, at a zero that of the zero: a force law has a side at a reversal. Of one number it
+    # is called with 1.0 before its argument, see `build_function`: numba knows no such sign.
+    "sign": (math.copysign, lambda x: np.copysign(1.0, x), 1),
     "sqrt": (math.sqrt, np.sqrt, 1),
     "exp": (math.exp, np.exp, 1),
     "log": (math.log, np.log, 1),
@@ -67,12 +64,11 @@ ALLOWED = f"numbers, names, + - * / **, brackets and {', '.join(FUNCTIONS)}"
 
 @dataclass(frozen=True, eq=False)
 class Expression:
-    """A checked expression: its text, tree, names of variables and number of nodes."""
+    """A checked expression: its text, tree and names of variables."""
 
     text: str
     tree: ast.expr
     names: frozenset[str]
-    node_count: int
 
     def evaluate(self, values: Mapping[str, Any]) -> Any:
         """Return the value for numbers or arrays of the names."""
@@ -97,7 +93,7 @@ def parse_expression(text: str, known_names: Sequence[str]) -> Expression:
     node_count = _check_node(tree, text, known_names, names, 0)
     if node_count > MAX_NODES:
         raise _refuse(f"has {node_count} nodes", text, allowed=f"at most {MAX_NODES}")
-    return Expression(text.strip(), tree, frozenset(names), node_count)
+    return Expression(text.strip(), tree, frozenset(names))
 
 
 def _refuse(problem: str, text: str, allowed: str = ALLOWED, remedy: str = "") -> InputError:
@@ -314,10 +310,9 @@ def build_function(
 
         def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
             left, right = self.visit(node.left), self.visit(node.right)
-            if isinstance(node.op, ast.Pow) and _find_constant(node.right) is not None:
-                exponent = _find_constant(node.right) or 0.0
-                if exponent.is_integer():  # compiled to products
-                    right = ast.Constant(int(exponent))
+            exponent = _find_constant(node.right) if isinstance(node.op, ast.Pow) else None
+            if exponent is not None and exponent.is_integer():  # compiled to products
+                right = ast.Constant(int(exponent))
             return ast.BinOp(left, node.op, right)
 
         def visit_Constant(self, node: ast.Constant) -> ast.expr:
@@ -326,10 +321,7 @@ def build_function(
         def visit_Call(self, node: ast.Call) -> ast.expr:
             arguments = [self.visit(part) for part in node.args]
             if isinstance(node.func, ast.Name) and node.func.id == "sign":
-                # a function that numba knows
-                return ast.Call(
-                    ast.Name("copysign", ast.Load()), [ast.Constant(1.0), *arguments], []
-                )
+                arguments.insert(0, ast.Constant(1.0))
             return ast.Call(node.func, arguments, [])
 
     def place(expression: Expression) -> ast.expr:
@@ -349,4 +341,4 @@ def build_function(
     code = compile(module, f"<{name}>", "exec")
     function_code = next(part for part in code.co_consts if isinstance(part, CodeType))
     numeric = {function: entry[0] for function, entry in FUNCTIONS.items()}
-    return FunctionType(function_code, numeric | {"copysign": math.copysign})
+    return FunctionType(function_code, numeric)
