@@ -25,6 +25,7 @@ from twin.identification.parameters import (
     get_log,
     list_base_parameters,
     list_effect_parameters,
+    size_of_unit,
 )
 from twin.model.effects import find_effect
 from twin.model.model import SensorModel
@@ -115,3 +116,16 @@ def test_bumpers_gaps_and_tares_are_free_where_the_logs_determine_them() -> None
     assert by_key[BUMPER_STIFFNESS].keys == SIDES
     tare = by_key[TareKey(0, "acc")]
     assert (tare.low, tare.high, tare.unit) == (-4e-3, 4e-3, "m/s2")
+
+
+@pytest.mark.parametrize(
+    ("unit", "size"),
+    [
+        ("N s2/m2", 300.0 * 0.1**2 / 0.02**2), ("kg", 300.0 * 0.1**2 / 0.02), ("rad/m", 1 / 0.02),
+        ("m", 0.02), ("", None), ("s", None), ("1", None), ("1/s", None), ("Hz", None),
+        ("unit of the channel", None), ("N/m/s", None),
+    ],
+)  # fmt: skip
+def test_a_unit_has_the_size_of_its_parts(unit: str, size: float | None) -> None:
+    expected = size if size is None else pytest.approx(size, rel=1e-12)
+    assert size_of_unit(unit, force=300.0, length=0.02, time=0.1) == expected

@@ -5,16 +5,17 @@ Each parameter has a key: `BaseKey`, `EffectKey`, `TermKey`, `SlipKey`, `GapKey`
 """
 
 import math
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from table_io.block import Float1D
+from table_io.errors import InputError
 from twin.identification.motion import MeasuredMotion, RecordScale
 from twin.model.effects import find_effect
 from twin.model.effects.effect import Effect, EffectParameter
+from twin.model.effects.expression import split_unit
 from twin.model.model import EffectInstance, Model, SensorModel
 from twin.model.parameters import Parameters
 
@@ -334,20 +335,15 @@ def measure_size(
 def size_of_unit(unit: str, force: float, length: float, time: float) -> float | None:
     """Return the product of these sizes in a unit such as "N s2/m2"; None for s and pure numbers.
 
-    None too for a unit that is written otherwise.
+    None too for a unit that is written otherwise, or has a part without a size.
     """
     sizes = {"N": force, "m": length, "s": time, "kg": force * time**2 / length, "rad": 1.0}
     if unit in ("", "s"):
         return None
-    size = 1.0
-    numerator, _, denominator = unit.partition("/")
-    for factors, sign in ((numerator, 1), (denominator, -1)):
-        for factor in factors.split():
-            matched = re.fullmatch(r"([A-Za-z]+)(\d*)", factor)
-            if matched is None or matched[1] not in sizes:
-                return None
-            size *= sizes[matched[1]] ** (sign * int(matched[2] or 1))
-    return size
+    try:
+        return math.prod((sizes[name] ** power for name, power in split_unit(unit)), start=1.0)
+    except (InputError, KeyError):
+        return None
 
 
 def list_effect_parameters(

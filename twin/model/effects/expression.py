@@ -11,7 +11,7 @@ import copy
 import math
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import CodeType, FunctionType
 from typing import Any
@@ -170,9 +170,16 @@ def parse_unit(unit: str) -> Dimension:
     """Return the exponents of kg, m and s of a unit such as "N s2/m2"; InputError if unknown."""
     if len(unit) > MAX_UNIT_LENGTH:
         raise InputError("too long", value=unit[:20], allowed=f"{MAX_UNIT_LENGTH} characters")
-    total = [0.0, 0.0, 0.0]
+    total = DIMENSIONLESS
+    for name, power in split_unit(unit):
+        total = _combine(total, BASE_UNITS[name], power)
+    return total
+
+
+def split_unit(unit: str) -> Iterator[tuple[str, int]]:
+    """Yield (name, power) of each factor of a unit such as "N s2/m2"; InputError if unknown."""
     numerator, _, denominator = unit.partition("/")
-    for factors, direction in ((numerator, 1.0), (denominator, -1.0)):
+    for factors, direction in ((numerator, 1), (denominator, -1)):
         for factor in factors.split():
             matched = re.fullmatch(r"([A-Za-z]+|1)(\d{0,2})", factor)
             if matched is None or matched[1] not in BASE_UNITS:
@@ -181,9 +188,7 @@ def parse_unit(unit: str) -> Dimension:
                     value=unit,
                     allowed=f"products of {', '.join(BASE_UNITS)} with powers, as in N s2/m2",
                 )
-            for index, exponent in enumerate(BASE_UNITS[matched[1]]):
-                total[index] += direction * exponent * int(matched[2] or 1)
-    return (total[0], total[1], total[2])
+            yield matched[1], direction * int(matched[2] or 1)
 
 
 def format_dimension(dimension: Dimension) -> str:
