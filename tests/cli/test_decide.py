@@ -15,7 +15,7 @@ from table_io.errors import InputError
 from tests.input_errors import raises_input_error
 from twin.cli import decide, discover
 from twin.cli.decide import DecideOptions, parse_options, play_decisive_tests
-from twin.cli.discover import discover_command
+from twin.cli.discover import judge_logs
 from twin.model.effects import EFFECTS
 from twin.recording.reader import read_recording
 from twin.reports.discovery.serialize import Json
@@ -104,7 +104,7 @@ def make_answers(*replies: str) -> Callable[..., str]:
 def test_the_proposal_is_a_profile_that_check_and_run_load(plain: Path, tmp_path: Path) -> None:
     profile = tmp_path / "next.toml"
     options = DecideOptions(profile, rig=str(plain.parent / "rig.toml"))
-    assert discover_command([plain], "snm", tmp_path / "out", OTHERS, (), options) == 0
+    assert judge_logs([plain], "snm", tmp_path / "out", OTHERS, (), options).code == 0
     config = read_run_config(profile)
     verdict = read_verdict(tmp_path / "out")["decide"]
     assert config.profile.title == f"{verdict['title']}: {verdict['purpose']}"
@@ -160,7 +160,7 @@ def test_a_rig_without_the_stroke_gets_no_proposal(plain: Path, tmp_path: Path) 
     text = (plain.parent / "rig.toml").read_text()
     weak.write_text(text.replace("acceleration_g = 1.0", "acceleration_g = 0.0001"))
     options = DecideOptions(tmp_path / "next.toml", rig=str(weak))
-    discover_command([plain], "snm", tmp_path / "out", OTHERS, (), options)
+    judge_logs([plain], "snm", tmp_path / "out", OTHERS, (), options)
     assert not (tmp_path / "next.toml").exists()
     verdict = read_verdict(tmp_path / "out")
     assert verdict["decide"] is None
@@ -174,11 +174,11 @@ def test_options_without_a_proposal_are_refused(tmp_path: Path) -> None:
     with raises_input_error(key="--speed", allowed="realtime or max"):
         parse_options(None, True, "", 10.0, False, "fast")
     with raises_input_error(key="--budget-min"):
-        DecideOptions(budget_min=0.0).check()
+        parse_options(None, True, "", 0.0, False, "realtime")
     existing = tmp_path / "next.toml"
     existing.touch()
     with raises_input_error(key="--decide", problem="overwritten"):
-        DecideOptions(existing).check()
+        parse_options(existing, False, "", 10.0, False, "realtime")
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
 from tests.input_errors import raises_input_error
 from twin.cli import discover
-from twin.cli.discover import discover_command
+from twin.cli.discover import judge_logs
 from twin.cli.identify import identify_command
 from twin.exchange.import_table import import_samples
 from twin.identification.discover import Discovery, prepare_problem
@@ -104,13 +104,13 @@ def discover_from(
             "write_discovery_page",
             lambda folder, discovery, *_: discoveries.append(discovery),
         )
-        assert discover_command(logs, model, out, NOTHING_NAMED) == 0
+        assert judge_logs(logs, model, out, NOTHING_NAMED).code == 0
     return json.loads((out / "verdict.json").read_text()), discoveries[0]
 
 
-@pytest.mark.parametrize("learn", [discover_command, identify_command])
+@pytest.mark.parametrize("learn", [judge_logs, identify_command])
 def test_a_log_counts_once_whatever_its_name(
-    plain: Made, tmp_path: Path, learn: Callable[..., int]
+    plain: Made, tmp_path: Path, learn: Callable[..., object]
 ) -> None:
     again = tmp_path / "again.mcap"
     shutil.copy(plain.log, again)
@@ -123,7 +123,7 @@ def test_a_log_counts_once_whatever_its_name(
 def test_what_is_in_the_way_is_said_before_the_long_work(tmp_path: Path) -> None:
     (tmp_path / "there").write_text("mine")
     with raises_input_error(key="--out", value=str(tmp_path)):
-        discover_command([tmp_path / "no.mcap"], "snm", tmp_path)
+        judge_logs([tmp_path / "no.mcap"], "snm", tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["there"]
 
 
@@ -201,7 +201,7 @@ def test_enough_before_anything_leaves_nothing(
         raise Cancelled
 
     monkeypatch.setattr(discover, "discover_effects", interrupt)
-    assert discover_command([plain.log], "snm", tmp_path / "out") == EXIT_INTERRUPTED
+    assert judge_logs([plain.log], "snm", tmp_path / "out").code == EXIT_INTERRUPTED
     assert not (tmp_path / "out").exists()
 
 

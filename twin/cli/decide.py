@@ -56,7 +56,7 @@ class DecideOptions:
 def parse_options(
     profile: Path | None, run: bool, rig: str, budget_min: float, yes: bool, speed: str
 ) -> DecideOptions | None:
-    """Return the options of `--decide` and `--run`; None without either of them."""
+    """Return the checked options of `--decide` and `--run`; None without either of them."""
     if speed not in ("realtime", "max"):
         raise InputError("unknown pace", key="--speed", value=speed, allowed="realtime or max")
     if profile is None and not run:
@@ -67,7 +67,9 @@ def parse_options(
                 remedy="give --decide or --run, too",
             )
         return None
-    return DecideOptions(profile, rig, budget_min, not yes, speed == "max")
+    options = DecideOptions(profile, rig, budget_min, not yes, speed == "max")
+    options.check()
+    return options
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +84,14 @@ class JudgedLogs:
 
 
 def add_proposal(
-    verdict: Json, discovery: Discovery, paths: Sequence[Path], folder: Path, options: DecideOptions
+    verdict: Json,
+    discovery: Discovery,
+    recorded: RunStart,
+    rig_toml: str,
+    folder: Path,
+    options: DecideOptions,
 ) -> list[TestProposal]:
     """Write the profile of the best test and add it to the verdict; return all proposals."""
-    recorded, rig_toml = read_recorded_test(paths, options)
     with show_status("simulating candidate tests") as show:
         tests = list_candidate_tests(recorded, rig_toml, options.budget_min, options.asks)
         proposals = propose_tests(discovery, tests, show)
@@ -158,7 +164,6 @@ def play_decisive_tests(
     """
     from twin.cli.discover import judge_logs  # which imports this module
 
-    options.check()
     logs = [*paths]
     folder, _ = make_run_folder(out, "decide")
     if not options.rig:

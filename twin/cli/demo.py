@@ -22,7 +22,7 @@ from table_io.sim.ground_truth import (
     HiddenEffect,
     parse_ground_truth,
 )
-from twin.cli.discover import discover_command
+from twin.cli.discover import judge_logs
 from twin.cli.run import run_test
 from twin.model.effects import find_effect
 from twin.reports.page import embed_images, render_page
@@ -111,7 +111,7 @@ def run_demo(out: Path | None, seed: int | None, keep: Path | None, show_page: b
     story.add_line(f"Twin error: {before}.")
 
     story.begin_chapter("Discover what the model lacks, from the recording")
-    code = discover_command([folder / FIRST_RUN], "snm", folder / DISCOVERY)
+    code = judge_logs([folder / FIRST_RUN], "snm", folder / DISCOVERY).code
     if code:
         return code
     verdict = json.loads((folder / DISCOVERY / "verdict.json").read_text(encoding="utf-8"))

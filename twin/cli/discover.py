@@ -45,23 +45,6 @@ MIN_THREADED_SAMPLES = 120_000  # of all logs; with fewer, threads do not pay
 MAX_THREADS = 4  # limits memory: each thread holds its own motion
 
 
-def discover_command(
-    paths: Sequence[Path],
-    model: str,
-    out: Path | None,
-    without: Sequence[str] = (),
-    held_out: Sequence[Path] = (),
-    decide: DecideOptions | None = None,
-) -> int:
-    """Run a discovery and write its results to a new folder; return the exit code.
-
-    With `decide` also propose the test that would decide.
-    """
-    if decide is not None:
-        decide.check()
-    return judge_logs(paths, model, out, without, held_out, decide).code
-
-
 def judge_logs(
     paths: Sequence[Path],
     model: str,
@@ -70,14 +53,17 @@ def judge_logs(
     held_out: Sequence[Path] = (),
     decide: DecideOptions | None = None,
 ) -> JudgedLogs:
-    """Run a discovery, write its results to a new folder and print them; return the verdict."""
+    """Run a discovery, write its results to a new folder and print them; return the verdict.
+
+    With `decide` also propose the test that would decide.
+    """
     clock = RealClock()
     start_s = clock.now()
     start, config = read_model_template(model)
     for name in without:
         find_effect(name)
-    if decide is not None:
-        read_recorded_test(paths, decide)  # before the search: it must not be lost
+    # before the search: it must not be lost
+    recorded_test = None if decide is None else read_recorded_test(paths, decide)
     folder, _ = make_run_folder(out, "discover")
     try:
         with (
@@ -107,8 +93,8 @@ def judge_logs(
     seconds = clock.now() - start_s
     verdict = verdict_to_json(discovery, seconds, notes, held_out_logs, start, law)
     proposals: Sequence[TestProposal] = ()
-    if decide is not None and discovery.selection.complete:
-        proposals = add_proposal(verdict, discovery, paths, folder, decide)
+    if decide and recorded_test and discovery.selection.complete:
+        proposals = add_proposal(verdict, discovery, *recorded_test, folder, decide)
     write_results(folder, discovery, config, logs, verdict, law)
     print_verdict(verdict)
     print_line(f"{folder}")

@@ -95,9 +95,9 @@ def discover_missing_effect(
             logs, model, out, without or [], held_out or [], options
         )
         raise typer.Exit(code)
-    from twin.cli.discover import discover_command as command
+    from twin.cli.discover import judge_logs
 
-    raise typer.Exit(command(logs, model, out, without or [], held_out or [], options))
+    raise typer.Exit(judge_logs(logs, model, out, without or [], held_out or [], options).code)
 
 
 @identification_app.command("identify", rich_help_panel=LEARN_PANEL)
