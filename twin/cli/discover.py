@@ -24,9 +24,14 @@ from twin.identification.selection import Cancelled, ProgressCallback, Selection
 from twin.model.config import ModelConfig
 from twin.model.effects import find_effect
 from twin.reports.contracts import Verdict
-from twin.reports.discovery.headline import describe_excluded, describe_proposal, format_verdict
+from twin.reports.discovery.headline import (
+    describe_excluded,
+    describe_proposal,
+    format_interval,
+    format_verdict,
+)
 from twin.reports.discovery.loading import load_logs
-from twin.reports.discovery.page import format_interval, write_discovery_page
+from twin.reports.discovery.page import write_discovery_page
 from twin.reports.discovery.sensor_section import describe_sensors
 from twin.reports.discovery.serialize import (
     Json,

@@ -74,6 +74,11 @@ def describe_excluded(verdict: Json) -> list[Json]:
     return list((verdict.get("excluded") or [])[:MAX_EXCLUDED])
 
 
+def format_interval(value: Json) -> str:
+    """Format a fitted value with half its 95 % interval and its unit."""
+    return format_quantity(value["value"], value["unit"], 0.5 * (value["high"] - value["low"]))
+
+
 def describe_proposal(law: Json) -> list[str]:
     """Return a proposed law as lines: its equation, numbers, range and what it explains."""
     lines = []
@@ -85,8 +90,7 @@ def describe_proposal(law: Json) -> list[str]:
         lines.append(f"proposed law, {term['title']} {where}: {symbol} = {term['force']}")
         lines += [f"  with d{name}/dt = {rate}" for name, rate in term["states"].items()]
         lines += [
-            f"  {name} = {format_quantity(value['value'], value['unit'], _half_width(value))}"
-            for name, value in term["parameters"].items()
+            f"  {name} = {format_interval(value)}" for name, value in term["parameters"].items()
         ]
         limits = [f"{name} {low:.3g} to {high:.3g}" for name, (low, high) in term["range"].items()]
         lines.append(f"  fitted for {', '.join(limits)} (SI)")
@@ -121,7 +125,3 @@ def typeset_proposal(law: Json | None) -> list[Json]:
             }
         )
     return terms
-
-
-def _half_width(value: Json) -> float:
-    return 0.5 * float(value["high"] - value["low"])

@@ -20,6 +20,7 @@ from twin.reports.discovery.headline import (
     describe_excluded,
     describe_laws,
     format_effect,
+    format_interval,
     format_verdict,
     typeset_proposal,
 )
@@ -31,7 +32,6 @@ from twin.reports.discovery.sensor_section import (
 )
 from twin.reports.discovery.serialize import Json
 from twin.reports.page import MAX_PLAIN, embed_images, format_significant, render_page
-from twin.reports.quantities import format_quantity
 
 DIGITS, MAX_DECIMALS = 4, 9  # of a fitted value
 SECTIONS = {
@@ -87,11 +87,6 @@ def order_sections(verdict: Json) -> dict[str, str]:
     if verdict["verdict"] != "unexplained":
         return SECTIONS
     return {"forces": SECTIONS["forces"]} | SECTIONS
-
-
-def format_interval(value: Json) -> str:
-    """Format a fitted value with half its 95 % interval and its unit."""
-    return format_quantity(value["value"], value["unit"], 0.5 * (value["high"] - value["low"]))
 
 
 def list_parameter_rows(
