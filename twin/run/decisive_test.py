@@ -132,18 +132,16 @@ def list_candidate_tests(
     recorded: RunStart, rig_toml: str, max_min: float, can_change_gap: bool = False
 ) -> list[CandidateTest]:
     """Return the variants of a recorded test that a rig can play in `max_min` minutes each."""
-    base = tomllib.loads(recorded.profile_toml)
-    profile = parse_toml(recorded.profile_toml, Profile, f"recording {recorded.run}")
-    kept = {key: value for key, value in base.items() if key not in OWN_TABLES}
-    tests = []
-    for title, excitation in list_excitations(profile):
+    profile, kept = _read_profile(recorded)
+    excitations, tests = [*list_excitations(profile)], []
+    for title, excitation in excitations:
         tests += _build_tests(kept | {"title": title, "excitation": excitation}, recorded, rig_toml)
     if can_change_gap and math.isfinite(profile.specimen.gap_mm) and profile.specimen.gap_mm > 0:
+        title, excitation = excitations[0]
         for ratio in GAP_RATIOS:
-            specimen = {"mass_kg": profile.specimen.mass_kg, "gap_mm": 0.0}
-            specimen["gap_mm"] = _round(ratio * profile.specimen.gap_mm)
-            gap = "no bumpers" if math.isinf(ratio) else f"total gap {specimen['gap_mm']:g} mm"
-            title, excitation = next(iter(list_excitations(profile)))
+            gap_mm = _round(ratio * profile.specimen.gap_mm)
+            specimen = {"mass_kg": profile.specimen.mass_kg, "gap_mm": gap_mm}
+            gap = "no bumpers" if math.isinf(gap_mm) else f"total gap {gap_mm:g} mm"
             own = {"title": f"{title}, {gap}", "excitation": excitation, "specimen": specimen}
             tests += _build_tests(kept | own, recorded, rig_toml, f"set: {gap}")
     return [test for test in tests if test.minutes <= max_min]
@@ -156,9 +154,7 @@ def draw_random_test(
 
     Ends of its band and its level are log-uniform over the range of the candidate tests.
     """
-    base = tomllib.loads(recorded.profile_toml)
-    profile = parse_toml(recorded.profile_toml, Profile, f"recording {recorded.run}")
-    kept = {key: value for key, value in base.items() if key not in OWN_TABLES}
+    profile, kept = _read_profile(recorded)
     low_hz, high_hz, level_g = _measure_test(profile)
     limits_hz = np.log([low_hz / BAND_RATIO, high_hz * BAND_RATIO])
     limits_g = np.log([level_g * min(LEVEL_RATIOS), level_g * max(LEVEL_RATIOS)])
@@ -170,6 +166,13 @@ def draw_random_test(
         if tests := _build_tests(content, recorded, rig_toml):
             return tests[0]
     raise InputError("the rig can play no random test", where=f"recording {recorded.run}")
+
+
+def _read_profile(recorded: RunStart) -> tuple[Profile, Table]:
+    """Return the profile of a recorded test, and of its tables those that any test keeps."""
+    profile = parse_toml(recorded.profile_toml, Profile, f"recording {recorded.run}")
+    tables = tomllib.loads(recorded.profile_toml)
+    return profile, {key: value for key, value in tables.items() if key not in OWN_TABLES}
 
 
 def _build_tests(
