@@ -16,7 +16,7 @@ from table_io.safety.preflight import list_limits
 from table_io.units import GRAVITY_M_S2
 from twin.cli.check import find_worst_rows, print_plan, select_rows, sum_durations_s
 from twin.reports.drive_figure import draw_drive
-from twin.reports.predicted_ranges import format_clipping_warnings, predict_peaks
+from twin.reports.predicted_ranges import format_clipping_warnings, predict_response
 from twin.run.run_config import RunConfig, from_texts, read_run_config
 
 RIG = (PROFILES_DIR / "rigs" / "simulated.toml").read_text()
@@ -111,7 +111,7 @@ def test_of_many_frequencies_the_ends_and_the_worst_are_shown() -> None:
 def test_what_the_sensors_should_see_in_free_flight_is_the_closed_form() -> None:
     test = TEST.replace("gap_mm = 4.0", "gap_mm = inf").replace("stop_hz = 3.4", "stop_hz = 3.0")
     config = bundle(test.replace("cycles = 4", "cycles = 60"))
-    rows = {row.sensor.channel: row for row in predict_peaks(config)}
+    rows = {row.sensor.channel: row for row in predict_response(config).peaks}
     level, w = 0.05 * GRAVITY_M_S2, 2 * math.pi * 3.0
     spring = 36e3 + 1j * w * 1.1e3
     ratio = spring / (spring - 550.0 * w**2)  # acceleration of the mass over that of the table
@@ -123,18 +123,20 @@ def test_what_the_sensors_should_see_in_free_flight_is_the_closed_form() -> None
     assert rows["table_acc_m_s2"].range_share == pytest.approx(0.05 / 2.0)
     # A sweep begins softly, so its first step has no transient of an abrupt start (2.5 times this).
     sweep = bundle(TEST.replace("gap_mm = 4.0", "gap_mm = inf"))
-    (mass,) = (row for row in predict_peaks(sweep) if row.sensor.channel == "mass_acc_m_s2")
+    (mass,) = (
+        row for row in predict_response(sweep).peaks if row.sensor.channel == "mass_acc_m_s2"
+    )
     assert 0.05 * abs(ratio) < mass.peak < 1.7 * 0.05 * abs(ratio)
 
 
 def test_a_load_cell_bears_half_of_its_side_and_the_preload() -> None:
     config = read_shipped("gm10")
-    rows = {row.sensor.channel: row for row in predict_peaks(config)}
+    rows = {row.sensor.channel: row for row in predict_response(config).peaks}
     preload_kn = 510e3 * 5e-3 / 2 / 1e3
     assert preload_kn < rows["force_r1_n"].peak < 3 * preload_kn
     cells = [sensor for sensor in config.rig.sensors if sensor.channel != "force_r2_n"]
     alone = replace(config, rig=config.rig.model_copy(update={"sensors": tuple(cells)}))
-    single = {row.sensor.channel: row for row in predict_peaks(alone)}
+    single = {row.sensor.channel: row for row in predict_response(alone).peaks}
     assert single["force_r1_n"].peak == pytest.approx(2 * rows["force_r1_n"].peak)
     assert single["force_l1_n"].peak == pytest.approx(rows["force_l1_n"].peak)
 
@@ -142,12 +144,12 @@ def test_a_load_cell_bears_half_of_its_side_and_the_preload() -> None:
 def test_a_sensor_that_the_model_drives_out_of_range_is_warned_of_not_refused() -> None:
     small = RIG.replace('unit = "g"\nrange = 5.0', 'unit = "g"\nrange = 0.3')
     config = bundle(rig=small)
-    (warning,) = format_clipping_warnings(predict_peaks(config), config.rig)
+    (warning,) = format_clipping_warnings(predict_response(config).peaks, config.rig)
     assert warning.startswith("mass_acc_m_s2: ")
     text = format_plan(config)
     assert f"warning: {warning}" in " ".join(text.split())
     assert "ready" in text
-    assert format_clipping_warnings(predict_peaks(bundle()), bundle().rig) == []
+    assert format_clipping_warnings(predict_response(bundle()).peaks, bundle().rig) == []
 
 
 @pytest.mark.parametrize(

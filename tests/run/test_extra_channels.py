@@ -22,7 +22,7 @@ from twin.log import open_log
 from twin.monitor.panels import draw_limits, draw_twin, format_gaps
 from twin.monitor.run_state import LiveRunState, update_run_state
 from twin.recording.reader import read_recording
-from twin.reports.predicted_ranges import predict_peaks
+from twin.reports.predicted_ranges import predict_response
 from twin.reports.sensor_table import build_sensor_rows
 from twin.run.run_config import read_run_config
 from twin.transport.codec import Item
@@ -186,9 +186,8 @@ def test_the_report_lists_their_sensors(run: Path) -> None:
 
 
 def test_the_check_predicts_their_peaks(lab: Path) -> None:
-    peaks = {
-        peak.sensor.channel: peak.peak for peak in predict_peaks(read_run_config(laboratory(lab)))
-    }
+    predicted = predict_response(read_run_config(laboratory(lab))).peaks
+    peaks = {peak.sensor.channel: peak.peak for peak in predicted}
     assert peaks[SECOND_ACC] == peaks["mass_acc_m_s2"]
     assert {TEMPERATURE, UPWARD_ACC}.isdisjoint(peaks)
 

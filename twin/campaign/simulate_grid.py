@@ -7,15 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from table_io.block import Float1D, Label
+from table_io.block import Block, Float1D, Label
 from table_io.channels import contact_forces, relative_displacement
 from table_io.config.excitation.record import RecordedHistory
 from table_io.errors import InputError
+from table_io.records import Event
 from twin.campaign.config import PlannedRun, read_plan
 from twin.campaign.figures import draw_gap_pairs
 from twin.campaign.gap_comparison import compare_gaps, describe_comparison, list_record_runs
 from twin.campaign.messages import print_gap_comparison
 from twin.campaign.report import embed_pairs, list_gap_values
+from twin.model.valid_range import EVENT_KIND
 from twin.reports.page import render_page
 from twin.reports.summary import Json, write_json
 from twin.reports.windows import extract_free_twin
@@ -54,6 +56,11 @@ def simulate_grid(path: Path, model: str | None, out: Path | None) -> int:
             runs.append((run.label, run.bundle.profile, simulate_peaks(run.bundle)))
     comparison = compare_gaps(list_record_runs(runs, names), ("twin",))
     assert comparison is not None
+    warnings = [
+        f"{label}: {text}"
+        for label, _, run_summary in runs
+        for text in run_summary.get("warnings", ())
+    ]
     pairs = draw_gap_pairs(comparison, folder / "figures")
     described = describe_comparison(comparison)
     summary = {
@@ -66,6 +73,7 @@ def simulate_grid(path: Path, model: str | None, out: Path | None) -> int:
         "verdict": "complete",
         "reason": f"{len(comparison.records)} records at {len(comparison.gaps_mm)} gaps",
         "gap_comparison": described,
+        "warnings": warnings,
     }
     write_json(summary, folder / "summary.json")
     page = render_page(
@@ -79,24 +87,34 @@ def simulate_grid(path: Path, model: str | None, out: Path | None) -> int:
     )
     (folder / "report.html").write_text(page, encoding="utf-8")
     print_gap_comparison(described)
+    for text in warnings:
+        print_line(f"warning: {text}")
     print_line(f"{summary['reason']}, model alone -> {folder / 'report.html'}")
     return 0
 
 
 def simulate_peaks(config: RunConfig) -> Json:
-    """Return a summary with the peaks of the model on an ideal table, over the whole history."""
+    """Return a summary with the peaks of the model on an ideal table, over the whole history.
+
+    Its warnings say where a law leaves the range in which it was fitted.
+    """
     parts: dict[str, list[Float1D]] = {name: [] for name in ("u", "a", "force_r", "force_l")}
-    for block in generate_ideal_twin(config):
-        playing = block.label == Label.MEASURE
-        if block.stream != "pred" or not playing.any():
+    warnings = []
+    for item in generate_ideal_twin(config):
+        if isinstance(item, Event) and item.kind == EVENT_KIND:
+            warnings.append(item.text)
+        if not isinstance(item, Block) or item.stream != "pred":
             continue
-        twin = extract_free_twin(block)
+        playing = item.label == Label.MEASURE
+        if not playing.any():
+            continue
+        twin = extract_free_twin(item)
         right, left = contact_forces(twin)
         motion = relative_displacement(twin), twin.channel("mass_acc_m_s2"), right, -left
         for name, values in zip(parts, motion, strict=True):
             parts[name].append(values[playing])
     peaks = {name: float(np.abs(np.concatenate(blocks)).max()) for name, blocks in parts.items()}
-    return _describe_motion(**peaks)
+    return _describe_motion(**peaks) | {"warnings": warnings}
 
 
 def _describe_motion(

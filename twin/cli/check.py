@@ -30,7 +30,7 @@ from table_io.safety.preflight import (
 )
 from table_io.units import GRAVITY_M_S2
 from twin.reports.drive_figure import draw_drive
-from twin.reports.predicted_ranges import PredictedPeak, format_clipping_warnings, predict_peaks
+from twin.reports.predicted_ranges import PredictedPeak, format_clipping_warnings, predict_response
 from twin.run.disk import planned_bytes
 from twin.run.folders import make_output_folder
 from twin.run.run_config import RunConfig, make_run_id, read_run_config
@@ -53,13 +53,14 @@ def print_plan(console: Console, config: RunConfig) -> None:
     console.print(f"[bold]{config.profile.title}[/bold]", highlight=False)
     for name, text in _plan_lines(config):
         console.print(f"  {name:<11}{text}", highlight=False, soft_wrap=True)
-    ranges = predict_peaks(config)
+    predicted = predict_response(config)
     print_table(console, _make_steps_table(config))
-    print_table(console, _make_sensors_table(config, ranges))
+    print_table(console, _make_sensors_table(config, predicted.peaks))
     messages = [
         *list_drive_warnings(config.margins, config.rig),
         *list_setup_warnings(config.profile, config.rig),
-        *format_clipping_warnings(ranges, config.rig),
+        *format_clipping_warnings(predicted.peaks, config.rig),
+        *predicted.range_exits,
         *find_overdue_calibrations(config.rig, local_datetime().date()),
     ]
     for sentence in messages:

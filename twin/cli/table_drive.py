@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
-from table_io.block import Float1D, join_blocks
+from table_io.block import Block, Float1D, join_blocks
 from table_io.config.base import parse_toml
 from table_io.config.excitation import (
     History,
@@ -226,7 +226,8 @@ def _simulate_reaction(config: RunConfig, count: int) -> Float1D:
     """Return the force of the specimen on a table that follows the target, N, (sample,)."""
     from twin.run.unpaced import generate_ideal_twin
 
-    predicted = join_blocks([b for b in generate_ideal_twin(config) if b.stream == "pred"])
+    blocks = (item for item in generate_ideal_twin(config) if isinstance(item, Block))
+    predicted = join_blocks([block for block in blocks if block.stream == "pred"])
     acceleration = predicted.channel("free/mass_acc_m_s2")
     first = int(np.flatnonzero(predicted.is_history)[0])
     margin = (count - config.profile.plan.target_m.size) // 2  # 0 if it has a drive already

@@ -32,12 +32,13 @@ from twin.compare.monitoring.jumps import JumpPrediction, predict_jumps
 from twin.compare.monitoring.low_cut import LowCutRemoval
 from twin.compare.sensors import remove_sensor_errors
 from twin.compare.twins import TwinSetup, TwinStates, advance_twins, start_twins
+from twin.model import valid_range
 from twin.model.model import Model
 from twin.model.parameters import free_flight_resonance
-from twin.model.valid_range import find_range_exits, list_ranges
+from twin.model.valid_range import RangeKey, find_range_exits, list_ranges
 
 CycleBlocks = tuple[Block, ...]  # the same samples measured, predicted, and without low cuts
-EVENT_KINDS = (*monitoring.EVENT_KINDS, "law_range")  # of the pipeline
+EVENT_KINDS = (*monitoring.EVENT_KINDS, valid_range.EVENT_KIND)  # of the pipeline
 MAX_MISSING_SAMPLES = 3  # samples that a whole held cycle may lack
 
 
@@ -89,7 +90,7 @@ class PipelineState:
     )  # measured, twin
     monitoring: MonitoringState = field(default_factory=MonitoringState)
     low_cuts: LowCutRemoval = field(default_factory=LowCutRemoval)
-    range_exits: frozenset[tuple[str, str]] = frozenset()  # (effect, variable) reported so far
+    range_exits: frozenset[RangeKey] = frozenset()  # reported so far
 
 
 def prepare_pipeline(
@@ -206,14 +207,11 @@ def _watch_ranges(
         for variable, name in measured.items()
         if name in block.channels
     }
-    exits = [
-        range_exit
-        for range_exit in find_range_exits(model, motion)
-        if (range_exit.effect, range_exit.variable) not in state.range_exits
-    ]
-    reported = {(range_exit.effect, range_exit.variable) for range_exit in exits}
-    return replace(state, range_exits=state.range_exits | reported), [
-        Event(block.index + range_exit.sample, "law_range", str(range_exit)) for range_exit in exits
+    exits = [*find_range_exits(model, motion, state.range_exits)]
+    reported = state.range_exits | {range_exit.key for range_exit in exits}
+    return replace(state, range_exits=reported), [
+        Event(block.index + range_exit.sample, valid_range.EVENT_KIND, str(range_exit))
+        for range_exit in exits
     ]
 
 

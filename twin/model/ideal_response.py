@@ -14,6 +14,7 @@ from twin.model.stepped_sine import (
     simulate_stepped_sine,
     validate_frequencies,
 )
+from twin.model.valid_range import find_range_exits
 
 MIN_SAMPLES_PER_CYCLE = 1000  # underestimates extremes by at most 5e-6 of their value
 
@@ -32,7 +33,7 @@ def simulate_sweep(
     default of all. `stepped_sine` computes it if effects only change parameters. Otherwise the
     drive is linear between `MIN_SAMPLES_PER_CYCLE` samples (a multiple, where a contact needs it)
     and extremes are those of the samples; the table displacement is -A / w^2. Sensor effects are
-    not applied: this is the true motion.
+    not applied: this is the true motion. Exits of ranges of laws are those of all cycles.
     """
     if model.changes_only_parameters:
         return simulate_stepped_sine(
@@ -41,7 +42,7 @@ def simulate_sweep(
     frequencies = validate_frequencies(frequencies_hz, acceleration, cycles)
     levels = np.broadcast_to(np.float64(acceleration), frequencies.shape).tolist()
     extremes = np.empty((frequencies.size, cycles, len(EXTREME_NAMES)))
-    end_states, state = [], None
+    end_states, range_exits, state = [], [], None
     time, in_contact = 0.0, (False, False)
     for index, (frequency_hz, level) in enumerate(zip(frequencies.tolist(), levels, strict=True)):
         samples = MIN_SAMPLES_PER_CYCLE * max(
@@ -55,12 +56,15 @@ def simulate_sweep(
         solver.set_clock(state, time * rate_hz)
         table_disp = -level / (2 * math.pi * frequency_hz) ** 2 * wave
         solver.advance(state, level * wave, table_disp, out)
+        sample_times = time + np.arange(1, wave.size + 1) / rate_hz
+        motion = {"u": out[0], "v": out[1], "a": level * wave, "t": sample_times, "y": table_disp}
+        range_exits.append(tuple(find_range_exits(model, motion)))
         time += cycles / frequency_hz
         extremes[index] = sampled_extremes(out, cycles, in_contact)
         in_contact = bool(out[3, -1] > 0), bool(out[4, -1] < 0)
         end_states.append(state.copy())
     measured = cycles if measured_cycles is None else measured_cycles
-    return SteppedSineResponse(extremes[:, -measured:], np.array(end_states))
+    return SteppedSineResponse(extremes[:, -measured:], np.array(end_states), tuple(range_exits))
 
 
 def sampled_extremes(out: Float2D, cycles: int, in_contact: tuple[bool, bool]) -> Float2D:

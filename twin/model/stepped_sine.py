@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from twin.model.closed_form import continuous_params, rest_state, substep_count
 from twin.model.contact_regime import BASE, STATE_SIZE
 from twin.model.parameters import Parameters
 from twin.model.stepped_sine_kernel import Float3D, run_stepped_sine
+
+if TYPE_CHECKING:
+    from twin.model.valid_range import RangeExit
 
 EXTREME_NAMES = ("u_max", "u_min", "a_max", "a_min", "f_r_max", "f_l_min", "onsets_r", "onsets_l")
 MIN_STEPS_PER_CYCLE = 8  # with fewer, a contact could begin and end undetected
@@ -23,11 +27,13 @@ class SteppedSineResponse:
 
     extremes (step, measured cycle, 8), `EXTREME_NAMES`; states (step, STATE_SIZE). Extremes are
     true ones, from roots of the slope and from both sides of a jump, not samples. F_R >= 0,
-    F_L <= 0; onsets are counted in the cycle in which they happen.
+    F_L <= 0; onsets are counted in the cycle in which they happen. `range_exits`: of each step, the
+    first exit of each range of a law; empty for models without such laws.
     """
 
     extremes: Float3D
     states: Float2D
+    range_exits: "tuple[tuple[RangeExit, ...], ...]" = ()
 
     def column(self, name: str) -> Float2D:
         """Return one of `EXTREME_NAMES`, (step, cycle)."""

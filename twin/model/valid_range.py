@@ -1,6 +1,6 @@
 """Where a law was fitted, and where a run leaves that range: outside it the law is not known."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,8 @@ from twin.model.parameters import Parameters
 
 # Of the width of a range: the end of a measured range is itself uncertain by noise.
 RANGE_MARGIN = 0.02
+RangeKey = tuple[str, str]  # effect and variable
+EVENT_KIND = "law_range"  # of an exit in a recording
 VARIABLE_NAMES = {
     "u": "displacement", "v": "velocity", "d": "compression", "a": "table acceleration",
     "t": "time", "y": "table displacement",
@@ -30,6 +32,11 @@ class RangeExit:
     value: float
     low: float
     high: float
+
+    @property
+    def key(self) -> RangeKey:
+        """What identifies the range: its effect and variable."""
+        return self.effect, self.variable
 
     def __str__(self) -> str:
         name = VARIABLE_NAMES[self.variable]
@@ -69,13 +76,20 @@ def list_inputs(
     return inputs
 
 
-def find_range_exits(model: Model, motion: Mapping[str, Float1D]) -> Iterator[RangeExit]:
-    """Yield the first exit of each range; `motion` (sample,) has u, v, t and what was measured."""
+def find_range_exits(
+    model: Model, motion: Mapping[str, Float1D], reported: Container[RangeKey] = ()
+) -> Iterator[RangeExit]:
+    """Yield the first exit of each range whose key is not in `reported`.
+
+    `motion` (sample,) has u, v, t and what was measured.
+    """
     opening_m = model.gap_opening_m(1.0) * motion["t"]
     for instance in list_ranges(model):
         effect = instance.effect
         sides = list_inputs(effect.place, model.parameters, opening_m, motion)
         for variable, low, high in effect.valid_range:
+            if (effect.id, variable) in reported:
+                continue
             margin = RANGE_MARGIN * (high - low)
             exits = [
                 (int(outside.argmax()), values)
@@ -85,3 +99,11 @@ def find_range_exits(model: Model, motion: Mapping[str, Float1D]) -> Iterator[Ra
             if exits:
                 sample, values = min(exits, key=lambda pair: pair[0])
                 yield RangeExit(effect.id, variable, sample, float(values[sample]), low, high)
+
+
+def select_first_exits(exits: Iterable[RangeExit]) -> list[RangeExit]:
+    """Return the first exit of each range, in order."""
+    first: dict[RangeKey, RangeExit] = {}
+    for range_exit in exits:
+        first.setdefault(range_exit.key, range_exit)
+    return [*first.values()]

@@ -1,21 +1,25 @@
 """Predicted peaks of every sensor compared with its range, from a simulation of the test.
 
-A prediction beyond a range gives a warning only, because the model may be wrong. The demand of the
-drive on the sensors of the table is checked in `table_io.safety.preflight`.
+A prediction beyond a range gives a warning only, because the model may be wrong: so does a law of
+the model that leaves the range in which it was fitted. The demand of the drive on the sensors of
+the table is checked in `table_io.safety.preflight`.
 """
 
 import math
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
-from table_io.block import Float1D
+from table_io.block import Block, Float1D
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.config.rig import RigConfig
 from table_io.config.sensor import SensorConfig
+from table_io.records import Event
 from table_io.safety.preflight import CORRECTION_HEADROOM
 from twin.compare.extra_channels import PREDICTED_SUMS, select_predicted
 from twin.model.ideal_response import simulate_sweep
+from twin.model.valid_range import EVENT_KIND, select_first_exits
 from twin.run.run_config import RunConfig
 
 SETTLING_CYCLES = 30  # at each orbit of a continuation
@@ -49,25 +53,36 @@ class PredictedPeak:
         return self.peak / self.sensor.range
 
 
-def predict_peaks(run_config: RunConfig) -> tuple[PredictedPeak, ...]:
-    """Predict the peak of each sensor of the rig that the model covers."""
+@dataclass(frozen=True, slots=True)
+class PredictedResponse:
+    """Predicted peaks of the sensors that the model covers, and where its laws leave their ranges.
+
+    An exit is a sentence; there is one for each range.
+    """
+
+    peaks: tuple[PredictedPeak, ...]
+    range_exits: tuple[str, ...] = ()
+
+
+def predict_response(run_config: RunConfig) -> PredictedResponse:
+    """Predict the peak of each sensor of the rig that the model covers, and exits of ranges."""
     predictions = []
     if run_config.steps:
-        peaks = _compute_peaks(run_config)
+        peaks, range_exits = _compute_peaks(run_config)
         places = [(step.frequency_hz, step.direction) for step in run_config.steps]
     else:
-        peaks = _simulate_peaks(run_config)
+        peaks, range_exits = _simulate_peaks(run_config)
         places = [(math.nan, f"window {k}") for k in range(run_config.profile.plan.windows)]
     for sensor in run_config.rig.sensors:
         if sensor.channel in peaks:
             values = peaks[sensor.channel]
             peak = float(values.max()) / sensor.si_per_unit
             predictions.append(PredictedPeak(sensor, peak, *places[int(np.argmax(values))]))
-    return tuple(predictions)
+    return PredictedResponse(tuple(predictions), range_exits)
 
 
-def _compute_peaks(run_config: RunConfig) -> dict[str, Float1D]:
-    """Compute the peak of each channel at each step, SI, (step,).
+def _compute_peaks(run_config: RunConfig) -> tuple[dict[str, Float1D], tuple[str, ...]]:
+    """Compute the peak of each channel at each step, SI, (step,), and the exits of ranges.
 
     Total displacement of the mass: upper bound, sum of table and relative displacement.
     """
@@ -108,18 +123,27 @@ def _compute_peaks(run_config: RunConfig) -> dict[str, Float1D]:
         names = PREDICTED_SUMS[channel.quantity, channel.body]
         if channel.name not in peaks and all(name in peaks for name in names):
             peaks[channel.name] = np.sum([peaks[name] for name in names], axis=0)
-    return peaks
+    exits = select_first_exits(chain.from_iterable(motion.range_exits[1:]))
+    return peaks, tuple(map(str, exits))
 
 
-def _simulate_peaks(run_config: RunConfig) -> dict[str, Float1D]:
-    """Simulate the model on the ideal history; return the peak of each channel by window, SI."""
+def _simulate_peaks(run_config: RunConfig) -> tuple[dict[str, Float1D], tuple[str, ...]]:
+    """Simulate the model on the ideal history; return peaks by channel and window, SI, and exits.
+
+    Peaks are (window,).
+    """
     from twin.run.unpaced import generate_ideal_twin  # with the twin's pipeline, slow to import
 
     specimen, windows = run_config.profile.specimen, run_config.profile.plan.windows
     peaks: dict[str, Float1D] = {}
-    for block in generate_ideal_twin(run_config):
-        values = {name.removeprefix("free/"): block.channel(name) for name in block.channels}
-        if block.stream == "pred":
+    range_exits = []
+    for item in generate_ideal_twin(run_config):
+        if isinstance(item, Event) and item.kind == EVENT_KIND:
+            range_exits.append(item.text)
+        if not isinstance(item, Block):
+            continue
+        values = {name.removeprefix("free/"): item.channel(name) for name in item.channels}
+        if item.stream == "pred":
             right, left = 2 * values["force_r1_n"], 2 * values["force_l1_n"]
             values["damper_force_n"] = np.abs(specimen.mass_kg * values["mass_acc_m_s2"]) + np.abs(
                 right + left
@@ -129,9 +153,9 @@ def _simulate_peaks(run_config: RunConfig) -> dict[str, Float1D]:
                 values |= {name: force / len(present) for name in present}
         for name, samples in values.items():
             peak = peaks.setdefault(name, np.zeros(windows))
-            is_played = block.step >= 0
-            np.fmax.at(peak, block.step[is_played], np.abs(samples[is_played]))
-    return peaks
+            is_played = item.step >= 0
+            np.fmax.at(peak, item.step[is_played], np.abs(samples[is_played]))
+    return peaks, tuple(range_exits)
 
 
 def format_clipping_warnings(predictions: tuple[PredictedPeak, ...], rig: RigConfig) -> list[str]:

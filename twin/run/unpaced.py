@@ -99,14 +99,12 @@ def play_unpaced(
 
 def simulate_ideal(config: RunConfig, run: str, path: Path, on_item: ItemHandler) -> None:
     """Simulate the model on the ideal drive, without table and noise, recorded to `path`."""
-    items = add_twin_items(_generate_ideal(config, run), config.prepare_twin(from_rest=True))
-    record_items(items, path, run, config.drive.rate_hz, on_item)
+    record_items(generate_ideal_twin(config, run), path, run, config.drive.rate_hz, on_item)
 
 
-def generate_ideal_twin(config: RunConfig) -> Iterator[Block]:
-    """Yield the blocks of an ideal table, each followed by the twin's block for it."""
-    items = add_twin_items(_generate_ideal(config, ""), config.prepare_twin(from_rest=True))
-    return (item for item in items if isinstance(item, Block))
+def generate_ideal_twin(config: RunConfig, run: str = "") -> Iterator[Item]:
+    """Yield the items of an ideal table, each followed by the twin's items for it."""
+    return add_twin_items(_generate_ideal(config, run), config.prepare_twin(from_rest=True))
 
 
 def _generate_ideal(config: RunConfig, run: str) -> Iterator[Item]:

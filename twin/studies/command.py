@@ -5,6 +5,7 @@ import platform
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
 
 from table_io.clock import RealClock, local_datetime
@@ -12,6 +13,7 @@ from table_io.records import PrcPoint
 from table_io.units import GRAVITY_M_S2
 from twin.compare.curves import detect_hysteresis
 from twin.model.parameters import free_flight_resonance
+from twin.model.valid_range import RangeExit, RangeKey, select_first_exits
 from twin.reports import ideal_points
 from twin.reports.finalize import EXIT_INTERRUPTED
 from twin.reports.summary import Json, write_json
@@ -82,6 +84,7 @@ def _run_cases(
         [case.model for case in cases], [step.frequency_hz for step in steps],
         sweep.one_level_g * GRAVITY_M_S2, sweep.cycles, cores, stop,
     )  # fmt: skip
+    reported: set[tuple[str, RangeKey]] = set()  # label of a model, and its range
     with BatchTable(folder / TABLE_FILE) as table, make_task_bar() as bar:
         task = bar.add_task("sweeps", total=len(cases))
         for index, response in sweeps:
@@ -90,13 +93,23 @@ def _run_cases(
                 case.model, steps, response, sweep.cycles, sweep.measured_cycles
             )
             table.write(make_rows(case, points))
-            entry = _case_entry(case, points, sweep.one_level_g * GRAVITY_M_S2)
+            exits = select_first_exits(chain.from_iterable(response.range_exits))
+            entry = _case_entry(case, points, sweep.one_level_g * GRAVITY_M_S2, exits)
             print_line(f"{index + 1:>4}/{len(cases):<4} {case.name}: {format_case(entry)}")
+            for range_exit in exits:
+                if (case.label, range_exit.key) not in reported:
+                    reported.add((case.label, range_exit.key))
+                    print_line(f"warning: {case.name}: {range_exit}")
             bar.advance(task)
             yield entry
 
 
-def _case_entry(case: StudyCase, points: tuple[PrcPoint, ...], acceleration: float) -> Json:
+def _case_entry(
+    case: StudyCase,
+    points: tuple[PrcPoint, ...],
+    acceleration: float,
+    range_exits: Sequence[RangeExit],
+) -> Json:
     """Build a case of summary.json; the gap without bumpers is "inf", as JSON has no infinity."""
     u_star, a_star, peak_hz = free_flight_resonance(case.model.parameters, acceleration)
     jumps, intervals = detect_hysteresis(points, "twin")
@@ -117,6 +130,7 @@ def _case_entry(case: StudyCase, points: tuple[PrcPoint, ...], acceleration: flo
         "jumps": [asdict(jump) for jump in jumps],
         "hysteresis": [asdict(interval) for interval in intervals],
         "unbounded_from": _location_entry(unbounded_point) if unbounded_point else None,
+        "warnings": [str(range_exit) for range_exit in range_exits],
     }
 
 
