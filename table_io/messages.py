@@ -32,6 +32,7 @@ SEVERITY_KINDS = {
     "WARN": {
         "warning", "calibration", "alarm", "divergence", "late", "stop", "stopped", "sensor",
         "disagreement", "drift", "no jump", "unexpected jump", "attractor", "instrument", "refused",
+        "law_range",
     },
 }  # fmt: skip
 
@@ -43,7 +44,7 @@ def format_record(record: Record, rate_hz: float) -> tuple[str, str] | None:
             level = next(
                 (severity for severity, kinds in SEVERITY_KINDS.items() if kind in kinds), "INFO"
             )
-            return level, f"{kind}: {text}"
+            return level, f"{format_kind(kind)}: {text}"
         case SampleGap(count=count, channel=channel, reason=reason):
             return "WARN", f"dropout: {count} samples of {channel or 'all channels'} {reason}"
         case Fault(component=component, from_index=first, to_index=last, reason=reason):
@@ -69,6 +70,11 @@ def format_record(record: Record, rate_hz: float) -> tuple[str, str] | None:
         case RunStop(verdict=verdict, reason=reason):
             return ("INFO" if verdict == "complete" else "WARN"), f"{verdict}: {reason}"
     return None
+
+
+def format_kind(kind: str) -> str:
+    """Return the kind of an event in words."""
+    return kind.replace("_", " ")
 
 
 def _format_check(check: Check) -> str:

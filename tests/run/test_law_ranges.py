@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from markupsafe import escape
 from rich.console import Console
 
 from table_io.block import join_blocks
@@ -18,7 +19,11 @@ from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
 from twin.model.stepped_sine import SteppedSineResponse
 from twin.model.valid_range import select_first_exits
+from twin.monitor.run_state import LiveRunState, update_run_state
 from twin.recording.reader import read_recording
+from twin.reports.report import render_report
+from twin.reports.report_data import build_report_data
+from twin.reports.summary import summarise
 from twin.run.progress import RunProgress
 from twin.run.run_config import read_model, read_run_config
 from twin.run.unpaced import simulate_ideal
@@ -114,6 +119,25 @@ def test_simulate_shows_and_records_the_exit_once(tmp_path: Path) -> None:
     u = np.abs(join_blocks([*recording.blocks("pred")]).channel("free/rel_disp_m"))
     end_m = 1e-3 + 0.02 * 2e-3  # with the margin, of the width of the range
     assert u[: event.index].max() <= end_m < u[event.index]
+
+
+def test_the_report_and_the_monitor_warn_in_words(tmp_path: Path) -> None:
+    config = read_run_config(write_profile(tmp_path, SWEEP, 1e-3))
+    simulate_ideal(config, "own", tmp_path / "run.mcap", lambda _: None)
+    recording = read_recording(tmp_path / "run.mcap")
+    summary = summarise(recording, config.parameters)
+    (warning,) = summary["warnings"]
+    assert warning["kind"] == "law_range"
+    page = render_report(build_report_data(recording, summary), [])
+    section = page[page.index('id="monitoring"') : page.index("Timing, dropouts")]
+    assert "law range" in section
+    assert escape(warning["text"]) in section
+    assert "law_range" not in page
+    state = LiveRunState()
+    for item in recording.items:
+        state = update_run_state(state, recording.start.run, item)
+    (line,) = (line for line in state.events.values() if "own_cubic" in line.text)
+    assert (line.level, line.text) == ("WARN", f"law range: {warning['text']}")
 
 
 def test_a_batch_warns_once_of_each_model_and_keeps_every_case(

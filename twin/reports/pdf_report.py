@@ -8,6 +8,7 @@ import matplotlib as mpl
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 
+from table_io.messages import format_kind
 from twin.reports.figures import draw_figures
 from twin.reports.plot_style import FIGURE_WIDTH_IN, RC_PARAMS
 from twin.reports.report import format_headline
@@ -54,7 +55,8 @@ def _describe_run(run: ReportData) -> list[str]:
     ]
     lines += ["", "Warnings"]
     lines += [
-        f"  {w['at_s']:.1f} s  {w['kind']}: {w['text']}" for w in summary.get("warnings") or ()
+        f"  {warning['at_s']:.1f} s  {format_kind(warning['kind'])}: {warning['text']}"
+        for warning in summary.get("warnings") or ()
     ]
     return lines
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from table_io.messages import format_kind
 from table_io.records import (
     Agreement,
     Check,
@@ -22,7 +23,7 @@ from table_io.records import (
     Timing,
     Trip,
 )
-from twin.compare.monitoring import EVENT_KINDS as MONITOR_KINDS
+from twin.compare.pipeline import EVENT_KINDS
 from twin.recording.reader import Recording, read_recording
 from twin.reports.contracts import SummaryKeys
 from twin.reports.figures import draw_run_figures
@@ -91,11 +92,10 @@ def render_report(run: ReportData, pictures: list[Picture]) -> str:
         gaps=recording.records(SampleGap),
         faults=recording.records(Fault),
         events=[
-            event
-            for event in recording.records(Event)
-            if event.kind not in ("state", *MONITOR_KINDS)
+            event for event in recording.records(Event) if event.kind not in ("state", *EVENT_KINDS)
         ],
-        monitor_events=[event for event in recording.records(Event) if event.kind in MONITOR_KINDS],
+        monitor_events=[event for event in recording.records(Event) if event.kind in EVENT_KINDS],
+        format_kind=format_kind,
         compared=any(
             np.isfinite(agreement.error).any() for agreement in recording.records(Agreement)
         ),

@@ -34,8 +34,8 @@ from table_io.records import (
 from twin.compare import COMPARED_CHANNELS
 from twin.compare.curves import PrcJump, detect_hysteresis
 from twin.compare.extra_channels import select_predicted
-from twin.compare.monitoring import EVENT_KINDS as MONITOR_KINDS
 from twin.compare.monitoring.cycle import ChannelNoise
+from twin.compare.pipeline import EVENT_KINDS
 from twin.model.model import Model
 from twin.model.parameters import Parameters, free_flight_resonance
 from twin.recording.reader import Recording
@@ -127,7 +127,7 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         "warnings": [
             {"at_s": event.index / start.rate_hz, "kind": event.kind, "text": event.text}
             for event in recording.records(Event)
-            if event.kind in MONITOR_KINDS and event.kind != "jump"
+            if event.kind in EVENT_KINDS and event.kind != "jump"
         ],
     }
     return summary | {"twin_verdict": judge_twin(summary)}

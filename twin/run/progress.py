@@ -13,7 +13,7 @@ from rich.progress import (
 )
 
 from table_io.errors import replace_nonprintable
-from table_io.messages import format_record
+from table_io.messages import format_kind, format_record
 from table_io.records import (
     Check,
     Comparison,
@@ -90,7 +90,7 @@ class RunProgress:
         elif isinstance(item, StepAdded):
             self._steps = max(self._steps, item.step + 1)
         elif isinstance(item, Event):
-            self.print_line(f"{'':>7}  {item.kind}: {item.text}")
+            self.print_line(f"{'':>7}  {format_kind(item.kind)}: {item.text}")
         elif isinstance(item, SampleGap):
             name = item.channel or "all channels"
             self.print_line(f"{'':>7}  gap: {item.count} samples of {name} {item.reason}")
