@@ -37,17 +37,14 @@ class Study:
         config = parse_toml(study_toml, StudyConfig, str(path))
         profile_path = find_config(config.profile, "tests", path)
         profile, profile_toml = load_profile(profile_path)
-        _, model_toml = (
+        model_config, model_toml = (
             read_model(config.model, path)
             if config.model
             else read_model(profile.model, profile_path)
         )
-        texts = {
-            "study_toml": study_toml,
-            "profile_toml": profile_toml,
-            "model_toml": model_toml,
-        }
-        return cls.from_definition(texts, str(path))
+        study = cls(config, profile, model_config, study_toml, profile_toml, model_toml)
+        study.check_cases(str(path))
+        return study
 
     @classmethod
     def from_definition(cls, texts: Mapping[str, str], source: str) -> "Study":
@@ -59,10 +56,7 @@ class Study:
         profile = parse_toml(profile_toml, Profile, f"{source}: profile")
         model_config = parse_toml(model_toml, ModelConfig, f"{source}: model")
         study = cls(config, profile, model_config, study_toml, profile_toml, model_toml)
-        try:
-            study.check_cases()
-        except InputError as error:
-            raise error.add_place(source) from None
+        study.check_cases(source)
         return study
 
     @cached_property
@@ -85,8 +79,17 @@ class Study:
             {key: unit for outcome in self.outcomes for key, unit in outcome.settings.items()},
         )
 
-    def check_cases(self) -> None:
-        """Raise InputError for an unknown parameter or outcome, or a range without a model."""
+    def check_cases(self, source: str) -> None:
+        """Raise InputError, which names `source`, where a case cannot be computed.
+
+        For an unknown parameter or outcome, or a range without a model.
+        """
+        try:
+            self._check_cases()
+        except InputError as error:
+            raise error.add_place(source) from None
+
+    def _check_cases(self) -> None:
         sweep = self.profile.sweep
         if not sweep.has_one_level:
             raise InputError(
