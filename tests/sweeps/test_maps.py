@@ -30,7 +30,7 @@ from twin.studies.maps.page import write_map_page
 from twin.studies.maps.results import find_front
 from twin.studies.maps.sampling import sample_parameters
 from twin.studies.maps.sensitivity import compute_sensitivity
-from twin.studies.maps.store import make_seeds
+from twin.studies.maps.store import make_seeds, open_group
 from twin.studies.maps.study import Study
 
 HEAD = 'title = "T"\nprofile = "g4_ss3"\n'
@@ -116,6 +116,25 @@ def test_the_report_is_written_again_from_the_stored_arrays(study_folder: Path) 
     rows = (study_folder / "cases.csv").read_text().splitlines()
     assert len(rows) == 25
     assert call_main("report", study_folder, "--format", "pdf").returncode == 2
+
+
+def test_the_page_reads_every_array_once(
+    study_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[str] = []
+    group = open_group(study_folder, "r")
+
+    class CountedGroup:
+        def __getitem__(self, name: str) -> object:
+            read.append(name)
+            return group[name]
+
+    monkeypatch.setattr("twin.studies.maps.results.open_group", lambda *_: CountedGroup())
+    monkeypatch.setattr("twin.studies.maps.figures.save_figures", lambda drawn, *_, **__: [*drawn])
+    monkeypatch.setattr("twin.studies.maps.page.embed_images", lambda _: [])
+    write_map_page(study_folder)
+    assert {"peak_disp_m", "specimen.gap_mm"} <= {*read}
+    assert len(read) == len({*read})
 
 
 def test_a_map_of_the_folds_is_the_continuation_of_each_case(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 import re
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,9 +36,10 @@ def open_study(folder: Path | str, variables: Sequence[str] | None = None) -> "x
 
 @dataclass(frozen=True)
 class StudyResults:
-    """The results in the folder of a study, read as they are asked for."""
+    """The results in the folder of a study, each read once, as it is asked for."""
 
     folder: Path
+    _arrays: dict[str, FloatND] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @cached_property
     def study(self) -> Study:
@@ -62,9 +63,10 @@ class StudyResults:
         return self.study.config.sampling == "grid"
 
     def read_by_case(self, name: str) -> FloatND:
-        """Return a variable or parameter, (case, ...)."""
-        values: FloatND = self._group[name][:]
-        return values
+        """Return a variable or parameter, (case, ...); the same array at every call."""
+        if name not in self._arrays:
+            self._arrays[name] = self._group[name][:]
+        return self._arrays[name]
 
     @property
     def stored_flags(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
