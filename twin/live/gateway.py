@@ -39,6 +39,9 @@ from twin.security.access_control import build_open_access
 from twin.security.credentials import read_credentials
 from twin.transport.codec import TOPIC_TYPES, encode_item, topic_for
 from twin.transport.endpoint import (
+    MAX_COMMAND_SESSIONS,
+    MAX_OBSERVER_SESSIONS,
+    MAX_SESSIONS_PER_PERSON,
     MEAS_TOPIC,
     PUBLIC_HUB_SETTINGS,
     check_endpoint,
@@ -55,6 +58,7 @@ log = logging.getLogger(__name__)
 GATEWAY_NICENESS = 5  # observers yield processor time to the rig and the twin
 POLL_INTERVAL_S = 0.005
 MAX_RELAYED_PER_TURN = 32  # fragments relayed before the next request is answered
+MAX_COMMANDS_PER_TURN = 64  # as many as wait, so that no question delays a stop
 MAX_ANSWERS_PER_TURN = 4  # retransmission requests answered per turn
 COMMAND_TIMEOUT_S = 1.5  # for the rig's answer to a command
 PRESENCE_INTERVAL_S = 0.25  # between updates of the mirrored presence
@@ -62,6 +66,10 @@ MAX_DRAIN_S = 5.0  # after the run, for subscribers that are still behind
 ACTIVE_SUBSCRIBER_S = 2.0  # subscribers report twice a second; a silent one is not waited for
 LATENCY_EVERY_BLOCKS = 10  # latency is sampled at every tenth measured block
 OFFER_CAPACITY = 1000  # fragments queued; beyond it they are dropped and requested again
+SESSION_LIMITS = (
+    f"too many at once; allowed: {MAX_SESSIONS_PER_PERSON} of one person, {MAX_OBSERVER_SESSIONS} "
+    f"of all without the role command, {MAX_COMMAND_SESSIONS} of those with it"
+)
 NAME_PATTERN = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 # Token bucket: 10 refusals are recorded at once, further ones at most every 10 s.
 MAX_REFUSAL_BURST, REFUSAL_INTERVAL_S = 10, 10.0
@@ -75,25 +83,31 @@ class RequestServer:
     status: RunStatus
     role_of: Callable[[str], str]
     handle_command: Callable[[Request, str, str, str], None]  # (request, command, sender, text)
+    _commands: RequestQueue = field(init=False)
     _requests: RequestQueue = field(init=False)
     _presence: set[str] = field(init=False)
 
     def __post_init__(self) -> None:
-        self._requests = self.link.declare_requests(*REQUEST_PATHS, "state/role/*", "cmd/*/*")
+        self._commands = self.link.declare_requests("cmd/*/*")
+        self._requests = self.link.declare_requests(*REQUEST_PATHS, "state/role/*")
         self._presence = self.link.watch_components()
 
     def serve(self) -> None:
-        """Answer at most one request, and pending requests for retransmission."""
+        """Answer all commands, then at most one request, and some for retransmission."""
+        for _ in range(MAX_COMMANDS_PER_TURN):
+            command = self._commands.poll()
+            if command is None:
+                break
+            _, name, sender = command.path.split("/")
+            self.handle_command(command, name, sender, command.text)
         for _ in range(MAX_ANSWERS_PER_TURN):
             if not self.link.serve():
                 break
         request = self._requests.poll()
         if request is None:
             return
-        kind, name, *sender = request.path.split("/")
-        if kind == "cmd":
-            self.handle_command(request, name, sender[0], request.text)
-        elif sender:
+        _, _, *sender = request.path.split("/")
+        if sender:
             request.reply(self.role_of(sender[0]))
         else:
             request.reply(self.status.answer(request.path, frozenset(self._presence)))
@@ -176,6 +190,7 @@ class Gateway:
             server.serve()
             if self.clock.now() - presence_checked_s > PRESENCE_INTERVAL_S:
                 self._mirror_presence(set(presence))
+                self._report_closed_sessions()
                 presence_checked_s = self.clock.now()
         deadline_s = self.clock.now() + MAX_DRAIN_S
         while (
@@ -259,6 +274,12 @@ class Gateway:
             command, f"{self.config.run}\n{signed_reason}", request, COMMAND_TIMEOUT_S
         )
         self._publish_event("order", f"{command}: {signed_reason}")
+
+    def _report_closed_sessions(self) -> None:
+        """Record whose sessions were closed because they were too many."""
+        for name in self.external.drain_closed_sessions():
+            sentence = f"session of {sanitize_name(name)}: {SESSION_LIMITS}"
+            self._publish_event("refused", self.refusal_limiter.limit(sentence, self.clock.now()))
 
     def _publish_event(self, kind: str, text: str) -> None:
         if text:

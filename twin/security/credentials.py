@@ -26,7 +26,7 @@ from pydantic import AfterValidator
 from table_io.clock import local_datetime
 from table_io.config.base import ConfigModel, parse_toml, read_text
 from table_io.errors import InputError
-from twin.security.access_control import NO_ROLE, RIG_NAME, build_people_access
+from twin.security.access_control import NO_ROLE, RIG_NAME, ROUTER_ROLE, build_people_access
 
 AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, ACCESS_FILE = (
     "ca.pem",
@@ -125,6 +125,10 @@ class Credentials:
             return read_people(self.folder).get(name, NO_ROLE)
         except InputError:
             return NO_ROLE
+
+    def may_command(self, name: str) -> bool:
+        """Return whether commands come from `name`: a person, a router, or the page of the rig."""
+        return name == RIG_NAME or self.role_of(name) in ("command", ROUTER_ROLE)
 
 
 def read_credentials(folder: Path) -> Credentials:

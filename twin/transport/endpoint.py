@@ -16,7 +16,12 @@ BLOCK_TOPICS = {"meas": MEAS_TOPIC, "pred": PRED_TOPIC}
 STREAM_TOPICS = frozenset((*BLOCK_TOPICS.values(), CMP_TOPIC))  # published for every block
 LOCAL_SOCKET_PREFIX = "unixsock-stream/"  # inside a run, unreachable for other accounts
 OBSERVER_PREFIX = "observer."  # begins the liveliness names of observers
-MAX_SESSIONS = 64
+# Sessions with keys; `session_limits` closes what is more. zenoh's own limit leaves room meanwhile.
+MAX_SESSIONS_PER_PERSON = 8  # of those who may not command
+MAX_OBSERVER_SESSIONS, MAX_COMMAND_SESSIONS = 40, 24
+MAX_SESSIONS = MAX_OBSERVER_SESSIONS + MAX_COMMAND_SESSIONS
+MAX_CLOSING_SESSIONS = 64
+MAX_HALF_OPEN = 256  # connections that have not become a session
 MAX_MESSAGE_BYTES = 64 * 2**10  # of messages from outside, attachment included
 # Query rate limits per session: earlier queries are dropped. A client that waits for each reply
 # (0.4 ms or more) must stay below the limit.
@@ -31,7 +36,11 @@ MAX_RATES_HZ = {
 # Limits of the public hub, enforced by zenoh: excess messages are dropped.
 PUBLIC_HUB_SETTINGS: Settings = {
     "transport": {
-        "unicast": {"max_sessions": MAX_SESSIONS, "accept_pending": 16, "accept_timeout": 5000},
+        "unicast": {
+            "max_sessions": MAX_SESSIONS + MAX_CLOSING_SESSIONS,
+            "accept_pending": 2 * MAX_HALF_OPEN,
+            "accept_timeout": 5000,
+        },
         "link": {"rx": {"max_message_size": 2 * MAX_MESSAGE_BYTES}},
     },
     "low_pass_filter": [

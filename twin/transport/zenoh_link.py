@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 import zenoh
 
+from table_io.clock import RealClock
 from twin.transport.endpoint import (
     LOCAL_SOCKET_PREFIX,
     OBSERVER_PREFIX,
@@ -61,6 +62,7 @@ from twin.transport.requests import (
     parse_history_query,
     parse_request,
 )
+from twin.transport.session_limits import SessionLimiter
 
 if TYPE_CHECKING:
     from twin.security.credentials import Credentials
@@ -87,6 +89,7 @@ class BusLink:
         self._tokens: dict[str, Any] = {}
         self._declared: list[Any] = []
         self._history_queries: Any = None
+        self._session_limiter: SessionLimiter | None = None
         self.subscriber_progress = SubscriberProgress()
 
     def declare(self, topics: tuple[str, ...], *, offered: bool = False) -> None:
@@ -122,6 +125,8 @@ class BusLink:
         Publishing and receiving call this too. An idle publisher must call it until its subscribers
         have caught up.
         """
+        if self._session_limiter is not None:
+            self._session_limiter.sweep()
         query = self._history_queries.try_recv() if self._history_queries is not None else None
         if query is None:
             return False
@@ -260,6 +265,24 @@ class BusLink:
         self._declared.append(liveliness.declare_subscriber(key, callback, history=True))
         return names
 
+    def limit_sessions(self, limiter: SessionLimiter) -> None:
+        """Let `limiter` follow, and close, the sessions of other processes with this hub."""
+        self._session_limiter = limiter
+
+        def on_change(event: Any) -> None:
+            if event.kind == zenoh.SampleKind.PUT:
+                limiter.add(event.link.dst, event.link.auth_identifier or "")
+            else:
+                limiter.remove(event.link.dst)
+
+        callback = zenoh.handlers.Callback(on_change, indirect=False)
+        info = self._session.info
+        self._declared.append(info.declare_link_events_listener(callback, history=True))
+
+    def drain_closed_sessions(self) -> set[str]:
+        """Return the people of whom sessions were closed as too many since the last call."""
+        return set() if self._session_limiter is None else self._session_limiter.drain_closed()
+
     def close(self) -> None:
         """Close the session; may be called again."""
         for declared in (*self._declared, *self._publishers.values(), *self._tokens.values()):
@@ -286,9 +309,13 @@ def open_hub(
         )
     try:
         # "peer" has the same loss and latency; zenoh documents "router" for serving clients.
-        return BusLink(rig, _open_session(config))
+        link = BusLink(rig, _open_session(config))
     except zenoh.ZError as error:
         raise make_listen_error(endpoint, zenoh_error_reason(error)) from None
+    if keys is not None:
+        _, port = split_host_port(endpoint)
+        link.limit_sessions(SessionLimiter(port, keys.may_command, RealClock()))
+    return link
 
 
 def open_spoke(
