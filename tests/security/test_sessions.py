@@ -32,7 +32,7 @@ gap_mm = 4.0
 start_hz = 3.6
 stop_hz = 4.0
 step_hz = 0.2
-cycles = 40
+cycles = 1000
 measured_cycles = 2
 directions = ["forward"]
 [loop_check]
@@ -101,15 +101,15 @@ def test_an_operator_stops_a_run_whose_sessions_an_observer_fills(
     assert filling.stdout is not None
     assert filling.stdout.readline() == "full\n"
     control = [SHAKETWIN, "control", "--connect", endpoint, "--keys", str(own(lab, "anna"))]
-    orders = ("hold", "resume", "stop")
-    results = [
-        subprocess.run([*control, order], capture_output=True, text=True, check=False)
-        for order in orders
-    ]
-    filling.kill()
-    filling.wait()
-    output, _ = run.communicate()
-    assert [result.returncode for result in results] == [0] * len(orders), (results, output)
+    orders = ("hold", "stop")
+    try:
+        for order in orders:
+            subprocess.run([*control, order], check=True)
+    finally:
+        filling.kill()
+        filling.wait()
+        run.terminate()  # again, if it has stopped
+        run.communicate()
     events = read_recording(out / "run.mcap").records(Event)
     assert any(event.text.startswith("session of bob: too many") for event in events)
     assert sum(event.kind == "order" for event in events) == len(orders)

@@ -98,8 +98,8 @@ class RequestServer:
             command = self._commands.poll()
             if command is None:
                 break
-            _, name, sender = command.path.split("/")
-            self.handle_command(command, name, sender, command.text)
+            _, order, who = command.path.split("/")
+            self.handle_command(command, order, who, command.text)
         for _ in range(MAX_ANSWERS_PER_TURN):
             if not self.link.serve():
                 break
