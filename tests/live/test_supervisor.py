@@ -1,5 +1,6 @@
 """What the supervisor does when an order is lost, or a process hangs: with a clock of its own."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import SimpleNamespace
@@ -10,7 +11,12 @@ import pytest
 from table_io.clock import ManualClock
 from table_io.config.profile import OnDeathConfig
 from table_io.records import RunStop, Timing
-from twin.live.supervisor import MAX_COMPONENT_SILENCE_S, MAX_RESTARTS, Supervisor
+from twin.live.supervisor import (
+    MAX_COMPONENT_SILENCE_S,
+    MAX_RESTARTS,
+    RESTART_ALLOWANCE_S,
+    Supervisor,
+)
 from twin.transport.codec import encode_item, topic_for
 
 RUN = "20260101-120000-quickstart"
@@ -97,3 +103,19 @@ def test_a_gate_that_hangs_is_ended_and_the_table_goes_on(
     run_supervisor(played, lambda: None)
     assert played.kills.count("gate") == kills
     assert bool(played.orders) == ("recorder" not in spoken)
+
+
+def test_a_recorder_that_was_restarted_has_time_to_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    played = Played(("rig", "gate"), [], seconds=1.0)
+    supervisor = run_supervisor(played, lambda: None)
+    monkeypatch.setattr(Supervisor, "_start", lambda *_: None)
+    bus: Any = played
+    supervisor._handle_death("recorder", bus)
+    supervisor.last_message_s["gate"] = math.inf
+    for after_s, kills in (
+        (MAX_COMPONENT_SILENCE_S + RESTART_ALLOWANCE_S - 1.0, []),
+        (2.0, ["recorder"]),
+    ):
+        played.clock.time_s += after_s
+        supervisor._kill_hung()
+        assert played.kills == kills
