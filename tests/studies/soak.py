@@ -3,13 +3,15 @@
     python -m tests.studies.soak --hours 3            # unpaced, one process
     python -m tests.studies.soak --minutes 60 --live  # in real time, with page, view and monitor
 
-The test holds two frequencies, up and down. Memory is that of each process (proportional set size),
-every SAMPLE_S; printed are its value once the process has settled and at the end, and the growth.
+The test holds neighbouring frequencies, up and down. Memory is that of each process (proportional
+set size), every SAMPLE_S; printed are its value once the process has settled and at the end, and
+the growth.
 Drift is the change of the measured peak, and of the twin's error, from the first tenth of the
 cycles of a step to the last; live also that of the timing of each process.
 """
 
 import argparse
+import math
 import os
 import pty
 import re
@@ -35,7 +37,7 @@ SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
 SAMPLE_S = 2.0
 SETTLING_ROWS = 20  # cycles, or reports, at the beginning
 SETTLED_SHARE = 0.2  # of the run, after which memory is no longer expected to grow
-MEAN_HZ, STEP_COUNT = 3.1, 4
+START_HZ, STEP_HZ, MAX_CYCLES = 3.0, 0.01, 1000
 TOPICS = ("/run/start", "/run/stop", "/run/timing", "/rig/gap", "/twin/cycle")  # no blocks
 PROFILE = """
 title = "Soak"
@@ -43,9 +45,9 @@ title = "Soak"
 mass_kg = 550.0
 gap_mm = 4.0
 [sweep]
-start_hz = 3.0
-stop_hz = 3.2
-step_hz = 0.2
+start_hz = {start_hz}
+stop_hz = {stop_hz}
+step_hz = {step_hz}
 cycles = {cycles}
 measured_cycles = 20
 [loop_check]
@@ -88,8 +90,8 @@ def watch_memory(
     while runs[0].poll() is None:
         for pid in (pid for run in runs for pid in list_tree(run.pid)):
             with suppress(OSError, IndexError):  # it has just ended
-                key = f"{name_process(pid)} ({pid})"
-                memory[key].append((time.monotonic() - begin_s, memory_mib(pid)))
+                row = time.monotonic() - begin_s, memory_mib(pid)
+                memory[f"{name_process(pid)} ({pid})"].append(row)
         time.sleep(SAMPLE_S)
     return memory
 
@@ -148,21 +150,16 @@ def print_drift(recording: Recording) -> None:
     lost = sum(gap.count for gap in recording.records(SampleGap))
     hours = stop.index / recording.start.rate_hz / 3600
     print(f"{hours:.3f} h of the test, {stop.index} samples, {lost} of them lost")
-    cycles = [cycle for cycle in recording.records(CycleExtremes) if cycle.measured and cycle.twin]
-    for step in sorted({cycle.step for cycle in cycles}):
-        peaks = np.array(
-            [
-                (cycle.measured.u_max, cycle.twin.u_max - cycle.measured.u_max)
-                for cycle in cycles
-                if cycle.step == step and cycle.measured and cycle.twin
-            ]
-        )
-        first, last = means_of_ends(peaks)
-        change = last / first[0] - first / first[0]
-        print(
-            f"step {step}: {len(peaks)} cycles, peak {1e3 * first[0]:.4f} mm, drift of the peak "
-            f"{change[0]:+.4%}, of the twin's error {change[1]:+.4%} of the peak"
-        )
+    peaks: dict[int, list[tuple[float, float]]] = defaultdict(list)
+    for cycle in recording.records(CycleExtremes):
+        if cycle.measured and cycle.twin:
+            u_max = cycle.measured.u_max
+            peaks[cycle.step].append((u_max, cycle.twin.u_max - u_max))
+    ends = {step: means_of_ends(np.array(rows)) for step, rows in sorted(peaks.items())}
+    for step, (first, last) in ends.items():
+        print(f"step {step}, {len(peaks[step])} cycles:", describe_change(first, last))
+    first, last = ends[min(ends)][1], ends[max(ends)][1]
+    print(f"from step {min(ends)} to step {max(ends)}:", describe_change(first, last))
     timings = recording.records(Timing)
     for component in sorted({timing.component for timing in timings}):
         delays = np.array(
@@ -175,6 +172,12 @@ def print_drift(recording: Recording) -> None:
         )
 
 
+def describe_change(first: Float1D, last: Float1D) -> str:
+    """Return what (measured peak in m, twin minus measured) has become, in words."""
+    peak, error = 100 * (last - first) / first[0]
+    return f"peak {1e3 * first[0]:.4f} mm {peak:+.3f} %, twin's error {error:+.3f} % of the peak"
+
+
 def means_of_ends(rows: Float2D) -> tuple[Float1D, Float1D]:
     """Return the means of the first and of the last tenth of the rows, without the first rows."""
     tenth = max(len(rows) // 10, 1)
@@ -184,8 +187,15 @@ def means_of_ends(rows: Float2D) -> tuple[Float1D, Float1D]:
 
 def soak(hours: float, live: bool, folder: Path) -> int:
     """Run the test and print the figures; return the exit code of the run."""
-    cycles = max(round(hours * 3600 * MEAN_HZ / STEP_COUNT), 40)
-    (folder / "soak.toml").write_text(PROFILE.format(cycles=cycles))
+    all_cycles = max(hours * 3600 * START_HZ, 80)
+    frequencies = max(math.ceil(all_cycles / 2 / MAX_CYCLES), 2)
+    profile = PROFILE.format(
+        start_hz=START_HZ,
+        stop_hz=round(START_HZ + STEP_HZ * (frequencies - 1), 3),
+        step_hz=STEP_HZ,
+        cycles=math.ceil(all_cycles / 2 / frequencies),
+    )
+    (folder / "soak.toml").write_text(profile)
     out = folder / "out"
     command = [SHAKETWIN, "run", str(folder / "soak.toml"), "--out", str(out)]
     command += ["--view", "--web"] if live else ["--speed", "max"]
@@ -202,6 +212,8 @@ def soak(hours: float, live: bool, folder: Path) -> int:
         monitor.terminate()
         monitor.wait()
     print(f"{time.monotonic() - begin_s:.0f} s, exit code {run.returncode}")
+    if not out.is_dir():
+        raise SystemExit((folder / "output.txt").read_text())
     print_memory(memory)
     print_drift(read_recording(out / "run.mcap", TOPICS))
     return run.returncode
