@@ -7,8 +7,8 @@ comparison, a sign, a number, a condition or a statement of one line is changed.
 package run on each until the first one fails. A mutant that passes them all has survived: either a
 test is missing, or the change makes no difference. A run beyond the time limit counts as killed.
 
-No file is changed: a process that has imported package and tests is copied for each mutant, and
-its functions and constants are replaced there. So kernels are tested uncompiled, and faults in
+No file is changed: a process that has collected the tests is copied for each mutant, and functions
+and constants of the package are replaced there. So kernels are tested uncompiled, and faults in
 the body of a class, or in what tests start as a command, are not drawn or not seen.
 
 The same seed draws the same mutants as long as the files are the same.
@@ -33,6 +33,7 @@ from typing import Any
 
 import numba
 import pytest
+from _pytest.main import pytest_runtestloop as run_test_loop
 
 REPOSITORY = Path(__file__).parents[2]
 TIME_LIMIT_FACTOR, MIN_TIME_LIMIT_S = 4.0, 60.0
@@ -326,14 +327,59 @@ def run_in_child(action: Callable[[], int], limit_s: float) -> int:
     return -1
 
 
-def run_tests(tests: list[str]) -> int:
-    """Run tests in this process, silently; return pytest's exit code."""
+@dataclass
+class Study:
+    """Plug-in of pytest that, instead of the collected tests, runs all of them for each mutant."""
+
+    name: str
+    files: list[Path]
+    count: int
+    seed: int
+    only: str
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        """Print the fate of the mutants drawn from the package."""
+        begin_s = time.monotonic()
+        if run_in_child(lambda: run_tests(session), 3600.0):
+            raise SystemExit(f"{self.name}: the tests fail on the unchanged code")
+        tests_s = time.monotonic() - begin_s
+        limit_s = max(MIN_TIME_LIMIT_S, TIME_LIMIT_FACTOR * tests_s)
+        modules = {str(file.relative_to(REPOSITORY)): import_file(file) for file in self.files}
+        mutants = [
+            mutant
+            for file, module in modules.items()
+            for mutant in list_mutants(file, Path(str(module.__file__)).read_text())
+            if not self.only or f"{mutant.file}:{mutant.line}" == self.only
+        ]
+        print(f"{self.name}: {len(mutants)} mutants possible, tests take {tests_s:.0f} s")
+        chance = random.Random(f"{self.name} {self.seed}")
+        drawn = chance.sample(mutants, min(self.count, len(mutants)))
+        killed = 0
+        for mutant in drawn:
+
+            def run_mutant(mutant: Mutant = mutant) -> int:
+                patch_module(modules[mutant.file], mutant.text)
+                return run_tests(session)
+
+            survives = run_in_child(run_mutant, limit_s) == 0
+            killed += not survives
+            verdict = "SURVIVED" if survives else "killed  "
+            print(f"{self.name} {verdict} {mutant}", flush=True)
+        print(f"{self.name}: {killed} of {len(drawn)} killed", flush=True)
+        return True
+
+
+def run_tests(session: pytest.Session) -> int:
+    """Run the collected tests silently until one fails; return 0 if none does."""
     with open(os.devnull, "w") as silence:
         os.dup2(silence.fileno(), 1)
         os.dup2(silence.fileno(), 2)
-        options = ["-x", "-q", "-n", "0", "-p", "no:cacheprovider", "--benchmark-disable"]
-        options += ["-o", "addopts=-m 'not slow'", "-o", "filterwarnings=ignore"]
-        return int(pytest.main([*options, *tests]))
+        try:
+            run_test_loop(session)
+        except session.Failed:
+            return 1
+        return int(session.testsfailed > 0)
 
 
 def import_file(file: Path) -> ModuleType:
@@ -343,41 +389,18 @@ def import_file(file: Path) -> ModuleType:
 
 
 def study_package(name: str, count: int, seed: int, only: str) -> int:
-    """Print the fate of the mutants drawn from one package; return 0."""
+    """Study the mutants drawn from one package; return pytest's exit code."""
     target = TARGETS[name]
     if target.uncompiled:
         numba.config.DISABLE_JIT = 1
-    tests = [file for part in target.tests for file in sorted(REPOSITORY.glob(part))]
-    files = [file for part in target.files for file in sorted(REPOSITORY.glob(part))]
-    modules = {str(file.relative_to(REPOSITORY)): import_file(file) for file in files}
-    for test in tests:
-        import_file(test)
-    selected = [str(test.relative_to(REPOSITORY)) for test in tests]
-    mutants = [
-        mutant
-        for file, module in modules.items()
-        for mutant in list_mutants(file, Path(str(module.__file__)).read_text())
-        if not only or f"{mutant.file}:{mutant.line}" == only
-    ]
-    begin_s = time.monotonic()
-    if run_in_child(lambda: run_tests(selected), 3600.0):
-        raise SystemExit(f"{name}: the tests fail on the unchanged code")
-    tests_s = time.monotonic() - begin_s
-    limit_s = max(MIN_TIME_LIMIT_S, TIME_LIMIT_FACTOR * tests_s)
-    print(f"{name}: {len(mutants)} mutants possible, tests take {tests_s:.0f} s", flush=True)
-    drawn = random.Random(f"{name} {seed}").sample(mutants, min(count, len(mutants)))
-    killed = 0
-    for mutant in drawn:
-
-        def run_mutant(mutant: Mutant = mutant) -> int:
-            patch_module(modules[mutant.file], mutant.text)
-            return run_tests(selected)
-
-        survives = run_in_child(run_mutant, limit_s) == 0
-        killed += not survives
-        print(f"{name} {'SURVIVED' if survives else 'killed  '} {mutant}", flush=True)
-    print(f"{name}: {killed} of {len(drawn)} killed", flush=True)
-    return 0
+    tests, files = (
+        [file for part in parts for file in sorted(REPOSITORY.glob(part))]
+        for parts in (target.tests, target.files)
+    )
+    options = ["-x", "-q", "-s", "-n", "0", "-p", "no:cacheprovider", "--benchmark-disable"]
+    options += ["-o", "addopts=-m 'not slow'"]
+    study = Study(name, files, count, seed, only)
+    return int(pytest.main([*options, *map(str, tests)], plugins=[study]))
 
 
 def main() -> None:
