@@ -14,6 +14,7 @@ import pytest
 from table_io.clock import RealClock
 from tests.input_errors import raises_input_error
 from tests.run import task_functions
+from twin.run.folders import find_sharing_problem
 from twin.run.tasks import TaskResult, Workers, order_results, run_tasks
 from twin.run.versions import read_installed_versions
 
@@ -199,3 +200,11 @@ def test_a_worker_that_cannot_do_the_work_is_refused(scheduler: str) -> None:
 def test_processes_and_a_cluster_are_not_asked_for_at_once() -> None:
     with raises_input_error(key="--workers"):
         Workers.from_options(2, "tcp://host:8786")
+
+
+def test_a_folder_that_is_not_shared_is_found_by_a_file_in_it(tmp_path: Path) -> None:
+    path = tmp_path / "definition"
+    assert "does not see" in find_sharing_problem(path, "text")
+    path.write_text("text")
+    assert find_sharing_problem(path, "text") == ""
+    assert "another" in find_sharing_problem(path, "other")

@@ -21,6 +21,7 @@ from typing import Any
 from table_io.errors import InputError
 from twin.run.system import count_cores
 
+TERMINAL_SIGNALS = ("SIGINT", "SIGHUP", "SIGQUIT")
 MAX_TASK_S = 900.0  # time limit of a task in a local process, which is then terminated
 Task = Callable[[int], Any]
 StopFunction = Callable[[], object]
@@ -219,9 +220,11 @@ def _start_worker(task: Task) -> _WorkerProcess:
 def _serve_tasks(pipe: Connection, task: Task) -> None:
     """Run tasks by the numbers from a pipe until it is closed; main function of a worker process.
 
-    Ctrl-C reaches every process of a terminal; only the parent process handles it.
+    Ctrl-C and the end of a terminal reach all its processes; only the parent process handles them.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for name in TERMINAL_SIGNALS:
+        if hasattr(signal, name):  # Windows has the first alone
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
     try:
         while True:
             pipe.send(task(pipe.recv()))
