@@ -11,11 +11,14 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from twin.model import closed_form
+from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 from twin.model.solver import Solver
 from twin.model.stepped_sine import simulate_stepped_sine
-from twin.studies.batch import make_gap_variants, sweep_models
+from twin.run.system import count_cores
+from twin.run.tasks import Workers, run_tasks
+from twin.studies.cases import make_gap_variants
 
 AG, FREQUENCY, CYCLES, RATE = 0.05 * 9.80665, 3.4, 10, 2000.0
 G4 = Parameters(550.0, 36e3, 1100.0, 510e3, 900.0, 510e3, 900.0, 2e-3, 2e-3)
@@ -140,8 +143,8 @@ def test_batch_on_all_cores(benchmark):
     up = np.arange(5, 51) / 10
     frequencies = np.concatenate([up, up[::-1]])
     models = make_gap_variants(Model(G4), np.linspace(2e-3, 0.03, 64))
-    sweep_models(models[:2], frequencies, AG, 10)
-    benchmark(sweep_models, models, frequencies, AG, 10)
+    sweep_models(models[:2], frequencies, count_cores())
+    benchmark(sweep_models, models, frequencies, count_cores())
     if benchmark.stats is None:
         return
     single_core_s = min(_seconds(models, frequencies) for _ in range(3))
@@ -153,7 +156,14 @@ def test_batch_on_all_cores(benchmark):
     )
 
 
+def sweep_models(models: list[Model], frequencies: np.ndarray, cores: int) -> None:
+    def sweep(number: int) -> None:
+        simulate_sweep(models[number], frequencies, AG, 10)
+
+    list(run_tasks(sweep, range(len(models)), Workers(cores, in_threads=True)))
+
+
 def _seconds(models: list[Model], frequencies: np.ndarray) -> float:
     begin = time.perf_counter()
-    sweep_models(models, frequencies, AG, 10, cores=1)
+    sweep_models(models, frequencies, 1)
     return time.perf_counter() - begin

@@ -14,7 +14,8 @@ import pytest
 from table_io.clock import RealClock
 from tests.input_errors import raises_input_error
 from tests.run import task_functions
-from twin.run.tasks import TaskResult, Workers, run_tasks
+from twin.run.folders import find_sharing_problem
+from twin.run.tasks import TaskResult, Workers, order_results, run_tasks
 from twin.run.versions import read_installed_versions
 
 
@@ -85,6 +86,42 @@ def test_a_stop_hands_out_what_is_under_way() -> None:
     ):
         numbers.append(result.number)
     assert numbers == [0, 1]
+
+
+THREADS = Workers(2, in_threads=True)
+
+
+def test_threads_give_the_results_of_processes_without_starting_any() -> None:
+    results = {r.number: r for r in run_tasks(task_functions.square, range(50), THREADS)}
+    assert results == {number: TaskResult(number, number**2) for number in range(50)}
+    processes = {r.value for r in run_tasks(task_functions.return_process, range(8), THREADS)}
+    assert processes == {os.getpid()}
+
+
+def test_a_stop_ends_threads_after_what_is_under_way() -> None:
+    numbers: list[int] = []
+    for result in run_tasks(task_functions.square, range(100), THREADS, lambda: numbers):
+        numbers.append(result.number)
+    assert sorted(numbers) == list(range(len(numbers)))
+    assert 1 <= len(numbers) <= 3
+
+
+def test_what_a_task_raises_in_a_thread_is_raised_here() -> None:
+    with pytest.raises(ValueError, match="three"):
+        list(run_tasks(task_functions.raise_at_three, range(9), THREADS))
+
+
+def test_results_are_put_in_order_without_waiting_for_later_ones() -> None:
+    taken: list[int] = []
+
+    def complete() -> Iterator[TaskResult]:
+        for number in (0, 2, 1, 3, 5):
+            taken.append(number)
+            yield TaskResult(number)
+
+    in_order = order_results(complete())
+    assert [next(in_order).number, *taken] == [0, 0]
+    assert [result.number for result in in_order] == [1, 2, 3]
 
 
 def test_a_cluster_gives_the_results_of_local_processes(scheduler: str) -> None:
@@ -163,3 +200,11 @@ def test_a_worker_that_cannot_do_the_work_is_refused(scheduler: str) -> None:
 def test_processes_and_a_cluster_are_not_asked_for_at_once() -> None:
     with raises_input_error(key="--workers"):
         Workers.from_options(2, "tcp://host:8786")
+
+
+def test_a_folder_that_is_not_shared_is_found_by_a_file_in_it(tmp_path: Path) -> None:
+    path = tmp_path / "definition"
+    assert "does not see" in find_sharing_problem(path, "text")
+    path.write_text("text")
+    assert find_sharing_problem(path, "text") == ""
+    assert "another" in find_sharing_problem(path, "other")

@@ -33,7 +33,6 @@ from twin.studies.maps import command
 from twin.studies.maps.compute import (
     compute_chunk,
     compute_outcomes,
-    find_folder_problem,
 )
 from twin.studies.maps.store import (
     MANIFEST_FILE,
@@ -87,11 +86,23 @@ def test_a_cluster_stores_the_same_bytes(
     assert read_stored_bytes(tmp_path) == read_stored_bytes(whole_study / "out")
 
 
-def test_a_cluster_that_does_not_share_the_folder_is_refused(tmp_path: Path) -> None:
-    assert "does not see" in find_folder_problem(tmp_path, "token")
-    (tmp_path / DEFINITION_FILE).write_text("token")
-    assert find_folder_problem(tmp_path, "token") == ""
-    assert find_folder_problem(tmp_path, "of another study")
+def test_a_cluster_simulates_the_same_batch(
+    whole_study: Path, tmp_path: Path, cluster: distributed.LocalCluster
+) -> None:
+    tables = []
+    for name, places in (
+        ("here", ["--workers", 2]),
+        ("there", ["--scheduler", cluster.scheduler_address]),
+    ):
+        out = tmp_path / name
+        words = ["simulate", whole_study / "across.toml", "--gap", "2:8:1", "--out", out]
+        result = call_main(*words, *places)
+        assert result.returncode == 0, result.stderr
+        tables.append((out / "batch.csv").read_bytes())
+    assert tables[0] == tables[1]
+    assert json.loads((out / "summary.json").read_text())["run"]["workers"].startswith(
+        "the cluster"
+    )
 
 
 def test_a_stopped_study_goes_on_where_it_was(whole_study: Path, tmp_path: Path) -> None:

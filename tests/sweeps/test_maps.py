@@ -26,6 +26,7 @@ from twin.reports.ideal_points import compute_prc_points
 from twin.studies.maps.cases import list_parameter_names, parameter_unit
 from twin.studies.maps.compute import compute_outcomes
 from twin.studies.maps.config import StudyConfig
+from twin.studies.maps.figures import FrontGroup
 from twin.studies.maps.page import write_map_page
 from twin.studies.maps.results import find_front
 from twin.studies.maps.sampling import sample_parameters
@@ -355,6 +356,17 @@ def test_the_front_holds_the_cases_that_no_other_betters() -> None:
             assert bettered or (a, b) in {(first[k], second[k]) for k in front}
 
 
+@pytest.mark.parametrize("limit", [-1.0, 3.0, 12.5, 99.0])
+def test_the_least_within_a_limit_is_that_of_all_cases(limit: float) -> None:
+    rng = np.random.default_rng(9)
+    first, second = rng.permutation(300).astype(float), rng.uniform(0.0, 30.0, 300)
+    cases = np.arange(700, 1000)
+    allowed = [(a, case) for a, b, case in zip(first, second, cases, strict=True) if b <= limit]
+    assert FrontGroup("", cases, first, second).find_least(limit) == (
+        min(allowed)[1] if allowed else None
+    )
+
+
 def test_seeds_are_of_the_case_and_differ() -> None:
     seeds = make_seeds(3, range(100_000))
     assert len(np.unique(seeds)) == 100_000
@@ -418,7 +430,8 @@ PAGES = {
     "panels": (GAP + "values = [4.0, 5.0]\n[[parameters]]\nname = 'specimen.mass_kg'\n"
                "values = [500.0, 600.0]\nscale = 'log'\n[[parameters]]\n"
                "name = 'sweep.acceleration_g'\nvalues = [0.03, 0.05]\n[front]\n"
-               "minimise = ['transmitted_force_n', 'most_impacts']\neach = 'specimen.mass_kg'\n",
+               "minimise = ['transmitted_force_n', 'most_impacts']\neach = 'specimen.mass_kg'\n"
+               "limits = [-1.0, 1e9]\n",
                8),
     "repeats": ("repeats = 3\n" + GAP + "values = [4.0, 5.0]\n", 6),
     "samples": ("sampling = 'latin_hypercube'\nsamples = 6\n" + GAP
@@ -449,6 +462,7 @@ def test_every_kind_of_study_has_a_page(tmp_path: Path, kind: str, is_partial: b
     prefix = "" if kind in ("line", "repeats") else prefix
     assert {f"{prefix}{name}" for name in ("transmitted_force_n", "most_impacts")} <= names
     assert ("front" in names) == (kind == "panels")
+    assert page.count("no case keeps it") == (2 if kind == "panels" else 0)  # a limit below 0
     assert ("sensitivity" in names) == (kind == "sensitivity")
     forces = open_study(out)["transmitted_force_n"]
     assert int(forces.notnull().sum()) == stored

@@ -24,7 +24,7 @@ from twin.run.run_config import RunConfig, make_run_id, read_run_config
 from twin.run.system import count_cores
 from twin.run.terminal import announce_if_slow, console, print_line
 from twin.run.warm_up import COMPILING_MESSAGE
-from twin.studies.batch import make_gap_variants
+from twin.studies.cases import make_gap_variants
 
 MAP_VALUES = 41  # of the second parameter, spread evenly over its range
 ATTRACTOR_MESSAGE = "following the attractors and their basins; chaos takes half a minute"

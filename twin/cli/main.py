@@ -341,6 +341,14 @@ def simulate_command(
     workers: Annotated[
         int | None, typer.Option("--workers", help="Cores for many models or gaps; default: all.")
     ] = None,
+    scheduler: Annotated[
+        str,
+        typer.Option(
+            "--scheduler",
+            metavar="ADDRESS",
+            help="Simulate many models or gaps on the workers of this Dask scheduler.",
+        ),
+    ] = "",
     out: OutOption = None,
     view: Annotated[
         bool, typer.Option("--view", callback=require_view_extra, help="Also write view.rrd.")
@@ -349,7 +357,7 @@ def simulate_command(
     """Run the model alone on the ideal drive; compare models and gaps, or gaps over records."""
     from twin.cli.simulate import simulate_profile as command
 
-    raise typer.Exit(command(profile, model or [], gap or [], workers, out, view))
+    raise typer.Exit(command(profile, model or [], gap or [], workers, out, view, scheduler))
 
 
 @app.command("branches", rich_help_panel=PLAN_PANEL)

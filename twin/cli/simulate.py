@@ -20,20 +20,28 @@ def simulate_profile(
     workers: int | None,
     out: Path | None,
     view: bool,
+    scheduler: str = "",
 ) -> int:
     """Simulate one model, recorded like a run, several models or gaps, or records at gaps."""
     campaign = find_campaign(profile)
     if campaign is not None:
-        if gaps or view or workers is not None or len(models) > 1:
+        if gaps or view or workers is not None or scheduler or len(models) > 1:
             raise InputError(
                 "a campaign states its gaps and is simulated with one model, in one process",
                 where=profile,
-                remedy="omit --gap, --view and --workers, and give one --model",
+                remedy="omit --gap, --view, --workers and --scheduler, and give one --model",
             )
         from twin.campaign.simulate_grid import simulate_grid
 
         return simulate_grid(campaign, models[0] if models else None, out)
     if len(models) <= 1 and not gaps:
+        if scheduler:
+            raise InputError(
+                "one sweep is simulated here",
+                key="--scheduler",
+                value=scheduler,
+                remedy="omit it, or give several --model or --gap",
+            )
         return _simulate_one(profile, models[0] if models else None, out, view)
     if view:
         raise InputError(
@@ -41,7 +49,7 @@ def simulate_profile(
         )
     from twin.studies.command import simulate_all
 
-    return simulate_all(profile, models, gaps, workers, out)
+    return simulate_all(profile, models, gaps, workers, scheduler, out)
 
 
 def _simulate_one(profile: Path, model: str | None, out: Path | None, view: bool) -> int:

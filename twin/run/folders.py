@@ -72,6 +72,18 @@ def replace_text(path: Path, text: str) -> None:
     new.replace(path)
 
 
+def find_sharing_problem(path: Path, text: str) -> str:
+    """Return why this process does not see the file that holds `text`; "" if it does.
+
+    It runs on a worker of a cluster, to tell whether a folder of results is shared with it.
+    """
+    try:
+        seen = path.read_text(encoding="utf-8")
+    except OSError as error:
+        return f"it does not see {path} ({error.strerror})"
+    return "" if seen == text else f"it sees another {path}"
+
+
 def _make_content_error(folder: Path) -> InputError:
     return InputError(
         "exists and has content; nothing recorded is ever overwritten",

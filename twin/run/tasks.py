@@ -1,8 +1,9 @@
-"""Independent numbered tasks in local processes, or on the workers of a Dask cluster.
+"""Independent numbered tasks in local processes or threads, or on the workers of a Dask cluster.
 
 Results are yielded as they are completed. A task is a module-level function of its number, or a
 `functools.partial` of one: it is pickled. What it computes may depend on the number only, so that
-any number of workers gives the same results; what is large it writes to a file itself.
+any number of workers gives the same results; what is large it writes to a file itself. Threads are
+for short tasks in kernels that release the GIL: they start at once and share what is compiled.
 """
 
 import multiprocessing
@@ -12,6 +13,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from itertools import islice
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any
@@ -19,6 +21,7 @@ from typing import Any
 from table_io.errors import InputError
 from twin.run.system import count_cores
 
+TERMINAL_SIGNALS = ("SIGINT", "SIGHUP", "SIGQUIT")
 MAX_TASK_S = 900.0  # time limit of a task in a local process, which is then terminated
 Task = Callable[[int], Any]
 StopFunction = Callable[[], object]
@@ -40,10 +43,11 @@ class TaskResult:
 
 @dataclass(frozen=True, slots=True)
 class Workers:
-    """Where tasks run: in `count` local processes, or on the cluster of a Dask scheduler."""
+    """Where tasks run: `count` local processes or threads, or the cluster of a Dask scheduler."""
 
     count: int
     scheduler: str = ""
+    in_threads: bool = False
 
     def require(self) -> None:
         """Raise InputError if a cluster does not answer, or its workers have other versions."""
@@ -53,11 +57,13 @@ class Workers:
             require_cluster(self.scheduler)
 
     @classmethod
-    def from_options(cls, workers: int | None, scheduler: str = "") -> "Workers":
-        """Return the workers of `--workers` and `--scheduler`; by default a process per core."""
+    def from_options(
+        cls, workers: int | None, scheduler: str = "", in_threads: bool = False
+    ) -> "Workers":
+        """Return the workers of `--workers` and `--scheduler`; by default one per core."""
         if workers is not None and workers < 1:
             raise InputError(
-                "invalid number of processes",
+                "invalid number of workers",
                 key="--workers",
                 value=workers,
                 allowed="1 or more",
@@ -70,12 +76,13 @@ class Workers:
                 value=workers,
                 remedy="omit --workers, or --scheduler to compute on this machine",
             )
-        return cls(workers or count_cores(), scheduler)
+        return cls(workers or count_cores(), scheduler, in_threads)
 
     def __str__(self) -> str:
         if self.scheduler:
             return f"the cluster of {self.scheduler}"
-        return f"{self.count} process{'es' if self.count > 1 else ''}"
+        unit, plural = ("thread", "s") if self.in_threads else ("process", "es")
+        return f"{self.count} {unit}{plural if self.count > 1 else ''}"
 
 
 def run_tasks(
@@ -91,8 +98,9 @@ def run_tasks(
     """Yield the result of the task of every number, in the order of completion.
 
     After `stop()` is true no task is started; those in progress are completed and yielded. A task
-    whose process dies is started again until it has had `attempts`. A cluster has no `max_task_s`:
-    a task that does not end there must be stopped by its operator. `find_problem` runs on every
+    whose process dies is started again until it has had `attempts`. Only a process has a
+    `max_task_s`: a task that does not end on a cluster must be stopped by its operator, and what a
+    task raises in a thread is raised here. `find_problem` runs on every
     worker of a cluster before anything starts and returns why it cannot be used, "" if it can.
     InputError if the cluster cannot be used, or is lost.
     """
@@ -100,7 +108,35 @@ def run_tasks(
         from twin.run.dask_cluster import run_on_cluster
 
         return run_on_cluster(workers.scheduler, task, numbers, stop, attempts, find_problem)
+    if workers.in_threads:
+        return _run_in_threads(task, numbers, workers.count, stop)
     return _run_in_processes(task, numbers, workers.count, stop, max_task_s, attempts)
+
+
+def order_results(results: Iterable[TaskResult]) -> Iterator[TaskResult]:
+    """Yield the results of the tasks 0, 1, ... in this order, each as soon as it is next."""
+    completed: dict[int, TaskResult] = {}
+    following = 0
+    for result in results:
+        completed[result.number] = result
+        while following in completed:
+            yield completed.pop(following)
+            following += 1
+
+
+def _run_in_threads(
+    task: Task, numbers: Iterable[int], count: int, stop: StopFunction
+) -> Iterator[TaskResult]:
+    pending = iter(numbers)
+    running: dict[Future[Any], int] = {}
+    with ThreadPoolExecutor(count) as threads:
+        while True:
+            for number in () if stop() else islice(pending, count - len(running)):
+                running[threads.submit(task, number)] = number
+            if not running:
+                return
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                yield TaskResult(running.pop(future), future.result())
 
 
 def _run_in_processes(
@@ -184,9 +220,11 @@ def _start_worker(task: Task) -> _WorkerProcess:
 def _serve_tasks(pipe: Connection, task: Task) -> None:
     """Run tasks by the numbers from a pipe until it is closed; main function of a worker process.
 
-    Ctrl-C reaches every process of a terminal; only the parent process handles it.
+    Ctrl-C and the end of a terminal reach all its processes; only the parent process handles them.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for name in TERMINAL_SIGNALS:
+        if hasattr(signal, name):  # Windows has the first alone
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
     try:
         while True:
             pipe.send(task(pipe.recv()))

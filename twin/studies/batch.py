@@ -1,69 +1,105 @@
-"""Parallel stepped-sine sweeps of many models in threads; the kernels release the GIL."""
+"""One sweep of a batch: the task of `simulate`, in a thread or on a worker of a cluster."""
 
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import replace
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from itertools import chain
 
-from table_io.block import Float1D
+from table_io.config.base import parse_toml
+from table_io.config.profile import Profile
+from table_io.records import PrcPoint
+from table_io.units import GRAVITY_M_S2
+from twin.compare.curves import detect_hysteresis
+from twin.model.config import ModelConfig
 from twin.model.ideal_response import simulate_sweep
-from twin.model.model import Model
-from twin.model.parameters import Parameters
-from twin.model.stepped_sine import SteppedSineResponse
-from twin.run.system import count_cores
+from twin.model.parameters import free_flight_resonance
+from twin.model.valid_range import RangeExit, select_first_exits
+from twin.reports import ideal_points
+from twin.reports.summary import Json
+from twin.studies.cases import StudyCase, build_cases
+from twin.studies.rows import Row, make_rows
 
-STOP_POLL_S = 0.1  # period of polling `stop`
 
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Every model at every gap under the sweep of a test, as texts from which workers build them.
 
-def sweep_models(
-    models: Iterable[Model | Parameters],
-    frequencies_hz: Sequence[float] | Float1D,
-    acceleration: float,
-    cycles: int,
-    cores: int | None = None,
-) -> list[SteppedSineResponse]:
-    """Simulate one sweep from rest per model, in the order of the models; `acceleration` in m/s2.
-
-    Uses `cores` threads, by default all cores; the results do not depend on their number.
+    `models`: (label, TOML text); `gaps_mm`: total gaps, empty for that of the test; `source` is
+    named in errors.
     """
-    sweeps = iterate_sweeps(models, frequencies_hz, acceleration, cycles, cores)
-    return [sweep for _, sweep in sweeps]
+
+    source: str
+    profile_toml: str
+    models: tuple[tuple[str, str], ...]
+    gaps_mm: tuple[float, ...]
 
 
-def iterate_sweeps(
-    models: Iterable[Model | Parameters],
-    frequencies_hz: Sequence[float] | Float1D,
-    acceleration: float,
-    cycles: int,
-    cores: int | None = None,
-    stop: Callable[[], object] = lambda: False,
-) -> Iterator[tuple[int, SteppedSineResponse]]:
-    """Yield (index, sweep) as in `sweep_models`, in the order of the models.
-
-    Once `stop()` is true no further sweep starts; those in progress are finished and yielded.
-    """
-    prepared_models = [model if isinstance(model, Model) else Model(model) for model in models]
-    with ThreadPoolExecutor(cores or count_cores()) as pool:
-        pending = deque(
-            (index, pool.submit(simulate_sweep, model, frequencies_hz, acceleration, cycles))
-            for index, model in enumerate(prepared_models)
-        )
-        try:
-            while pending:
-                while not pending[0][1].done() and not stop():
-                    wait([pending[0][1]], timeout=STOP_POLL_S)
-                if stop():
-                    pending = deque(item for item in pending if not item[1].cancel())
-                if pending:
-                    index, future = pending.popleft()
-                    yield index, future.result()
-        finally:
-            for _, future in pending:
-                future.cancel()
+@lru_cache(maxsize=1)
+def read_batch(batch: Batch) -> tuple[Profile, list[StudyCase]]:
+    """Return the test and the cases of a batch, models outermost; InputError without a model."""
+    profile = parse_toml(batch.profile_toml, Profile, batch.source)
+    configs = {
+        label: parse_toml(text, ModelConfig, f"{batch.source}: model {label}")
+        for label, text in batch.models
+    }
+    return profile, build_cases(profile, configs, batch.gaps_mm, batch.source)
 
 
-def make_gap_variants(model: Model, gaps_m: Iterable[float]) -> list[Model]:
-    """Return the model at other total gaps in m, half of each gap per side."""
-    return [
-        Model(replace(model.base, gap_r=gap / 2, gap_l=gap / 2), model.effects) for gap in gaps_m
-    ]
+@dataclass(frozen=True, slots=True)
+class CaseResult:
+    """Rows of the table, the entry of summary.json, and where laws leave their fitted ranges."""
+
+    rows: list[Row]
+    entry: Json
+    range_exits: list[RangeExit]
+
+
+def simulate_case(batch: Batch, number: int) -> CaseResult:
+    """Simulate the sweep of one case from rest; return its results."""
+    profile, cases = read_batch(batch)
+    case, sweep = cases[number], profile.sweep
+    acceleration = sweep.one_level_g * GRAVITY_M_S2
+    frequencies = [step.frequency_hz for step in sweep.steps]
+    response = simulate_sweep(case.model, frequencies, acceleration, sweep.cycles)
+    points = ideal_points.compute_prc_points(
+        case.model, sweep.steps, response, sweep.cycles, sweep.measured_cycles
+    )
+    exits = list(select_first_exits(chain.from_iterable(response.range_exits)))
+    return CaseResult(
+        list(make_rows(case, points)), _make_entry(case, points, acceleration, exits), exits
+    )
+
+
+def _make_entry(
+    case: StudyCase,
+    points: tuple[PrcPoint, ...],
+    acceleration_m_s2: float,
+    range_exits: Sequence[RangeExit],
+) -> Json:
+    """Build a case of summary.json; the gap without bumpers is "inf", as JSON has no infinity."""
+    u_star, a_star, peak_hz = free_flight_resonance(case.model.parameters, acceleration_m_s2)
+    jumps, intervals = detect_hysteresis(points, "twin")
+    bounded = [point for point in points if point.twin and math.isfinite(point.twin.eta_d)]
+    peak_point = max(
+        bounded, key=lambda point: point.twin.eta_d if point.twin else 0.0, default=None
+    )
+    unbounded_point = next((point for point in points if point not in bounded), None)
+    return {
+        "model": case.label,
+        "gap_mm": case.gap_mm if math.isfinite(case.gap_mm) else "inf",
+        "u_star_m": u_star,
+        "a_star_m_s2": a_star,
+        "free_flight_hz": peak_hz,
+        "peak": _location_entry(peak_point) | {"eta_d": peak_point.twin.eta_d}
+        if peak_point and peak_point.twin
+        else None,
+        "jumps": [asdict(jump) for jump in jumps],
+        "hysteresis": [asdict(interval) for interval in intervals],
+        "unbounded_from": _location_entry(unbounded_point) if unbounded_point else None,
+        "warnings": [str(range_exit) for range_exit in range_exits],
+    }
+
+
+def _location_entry(point: PrcPoint) -> Json:
+    return {"frequency_hz": point.frequency_hz, "direction": point.direction}

@@ -1,8 +1,8 @@
 """Cases of a batch: every requested model at every requested gap."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from table_io.config.folders import find_config
@@ -13,7 +13,6 @@ from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
 from twin.model.parameters import free_flight_resonance
 from twin.run.run_config import read_model
-from twin.studies.batch import make_gap_variants
 
 MAX_CASES = 10_000
 GAP_HELP = "allowed: a number of mm, inf for no bumpers, or FROM:TO:STEP in mm, as 0:30:2"
@@ -118,7 +117,7 @@ def read_models(words: Sequence[str], profile: Path) -> dict[str, tuple[ModelCon
 
 def build_cases(
     profile: Profile,
-    configs: dict[str, tuple[ModelConfig, str]],
+    configs: Mapping[str, ModelConfig],
     gaps: Sequence[float],
     context: str,
 ) -> list[StudyCase]:
@@ -131,7 +130,7 @@ def build_cases(
         )
     cases: list[StudyCase] = []
     at_gap: dict[float, list[StudyCase]] = {}
-    for label, (config, _) in configs.items():
+    for label, config in configs.items():
         for gap, model in _models_at_gaps(
             config, profile.specimen, gaps, f"{context}: model {label}"
         ):
@@ -174,3 +173,10 @@ def _require_simulable(case: StudyCase, profile: Profile, context: str) -> None:
         simulate_sweep(model, [slowest_hz], 0.0, 1)
     except InputError as error:
         raise error.add_place(f"{context}: {case.name}") from None
+
+
+def make_gap_variants(model: Model, gaps_m: Iterable[float]) -> list[Model]:
+    """Return the model at other total gaps in m, half of each gap per side."""
+    return [
+        Model(replace(model.base, gap_r=gap / 2, gap_l=gap / 2), model.effects) for gap in gaps_m
+    ]

@@ -13,7 +13,7 @@ from table_io.clock import RealClock
 from table_io.errors import InputError, require_package
 from twin.reports.finalize import EXIT_INTERRUPTED
 from twin.run.disk import format_size, free_bytes
-from twin.run.folders import claim_folder, make_output_folder
+from twin.run.folders import claim_folder, find_sharing_problem, make_output_folder
 from twin.run.progress import make_task_bar
 from twin.run.run_config import make_run_id
 from twin.run.tasks import TaskResult, Workers, run_tasks
@@ -22,7 +22,6 @@ from twin.studies import DEFINITION_FILE
 from twin.studies.maps.compute import (
     compute_chunk,
     compute_outcomes,
-    find_folder_problem,
     make_sweep_plan,
 )
 from twin.studies.maps.page import write_map_page
@@ -199,12 +198,12 @@ def _run_chunks(
     stop: Callable[[], object],
 ) -> None:
     """Compute the pending chunks and list each in the manifest; InputError if one cannot be."""
-    token = (folder / DEFINITION_FILE).read_text(encoding="utf-8")
     shared = folder.resolve()
+    definition = (shared / DEFINITION_FILE).read_text(encoding="utf-8")
     results = run_tasks(
         partial(compute_chunk, shared), pending, workers, stop,
         max_task_s=MAX_CHUNK_S, attempts=MAX_ATTEMPTS,
-        find_problem=partial(find_folder_problem, shared, token),
+        find_problem=partial(find_sharing_problem, shared / DEFINITION_FILE, definition),
     )  # fmt: skip
     clock = RealClock()
     started_s = last_line_s = clock.now()

@@ -113,12 +113,3 @@ def compute_chunk(folder: Path, number: int) -> Json:
         "sha256": hash_arrays(results),
         "failures": {first + index: reason for index, reason in sorted(failures.items())},
     }
-
-
-def find_folder_problem(folder: Path, token: str) -> str:
-    """Return why this process cannot store results of a study in a folder; "" if it can."""
-    try:
-        text = (folder / DEFINITION_FILE).read_text(encoding="utf-8")
-    except OSError as error:
-        return f"it does not see the folder {folder} ({error.strerror})"
-    return "" if text == token else f"it sees another study in {folder}"

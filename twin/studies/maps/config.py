@@ -88,6 +88,11 @@ class FrontConfig(ConfigModel):
     each: str = Field(
         "", description="Parameter with a front for each of its values; empty: one front."
     )
+    limits: tuple[Finite, ...] = Field(
+        (),
+        description="Values that the second variable must not exceed, in its unit: the page names "
+        "the case with the least of the first for each.",
+    )
 
 
 class StudyConfig(ConfigModel):

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -308,27 +309,42 @@ def draw_sensitivity(
 
 
 def draw_front(results: StudyResults) -> CaptionedFigure:
-    """Draw two outcomes against each other, and the cases that none betters in both."""
+    """Draw two outcomes against each other, the cases that none betters, and their parameters."""
     front = results.study.config.front
     assert front is not None
     by_name = {variable.name: variable for variable in results.scalars}
     first, second = (by_name[name] for name in front.minimise)
-    figure = Figure(figsize=(10, 5.2))
-    ax = figure.subplots()
+    shown = [p for p in results.study.config.parameters if p.name != front.each]
+    heights = (5.2, 3.0) if shown else (5.2,)
+    figure = Figure(figsize=(10, sum(heights)))
+    parts: Any = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)
+    ax = parts[0, 0].subplots()
+    panels = parts[1, 0].subplots(1, len(shown), squeeze=False)[0] if shown else ()
     groups = list(group_front(results))
     for share, group in zip(np.linspace(0, 0.85, len(groups)), groups, strict=True):
-        colour = COLOURMAP(share)
-        shown = slice(None, None, max(1, group.first.size * len(groups) // (4 * MAX_POINTS)))
-        ax.plot(group.first[shown], group.second[shown], ".", ms=4, alpha=0.35, mew=0,
+        colour, cases = COLOURMAP(share), group.cases[group.front]
+        drawn = slice(None, None, max(1, group.first.size * len(groups) // (4 * MAX_POINTS)))
+        ax.plot(group.first[drawn], group.second[drawn], ".", ms=4, alpha=0.35, mew=0,
                 color=colour, rasterized=True)  # fmt: skip
         ax.plot(group.first[group.front], group.second[group.front], "o-", ms=4, lw=1.4,
                 color=colour, label=group.title or "front")  # fmt: skip
+        for panel, parameter in zip(panels, shown, strict=True):
+            axis = PlotAxis(results, parameter, results.read_by_case(parameter.name)[cases])
+            panel.plot(group.second[group.front], axis.positions, "o-", ms=3, lw=1.2, color=colour)
+            axis.set_up(panel.yaxis)
+            low, high = axis.place(np.array(parameter.limits))
+            panel.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low))
+            panel.set_xlabel(label_variable(second))
+    for limit in front.limits:
+        ax.axhline(limit, color="#777777", lw=0.8, ls=":")
     ax.set_xlabel(label_variable(first))
     ax.set_ylabel(label_variable(second))
     ax.legend(loc="upper right")
     return CaptionedFigure(
         "front", f"{_title(first)} against {second.title}",
-        "Dots: all cases; line: those that no other betters in both. Table: front.csv.", figure,
+        "Dots: all cases; line: those that no other betters in both (front.csv)"
+        + ("; dotted: limits" if front.limits else "")
+        + ". Below: the parameters along the line.", figure,
     )  # fmt: skip
 
 
@@ -344,9 +360,14 @@ class FrontGroup:
     first: Float1D
     second: Float1D
 
-    @property
+    @cached_property
     def front(self) -> np.ndarray[Any, np.dtype[np.intp]]:
         return find_front(self.first, self.second)
+
+    def find_least(self, limit: float) -> int | None:
+        """Return the number of the case of least first whose second is at most `limit`."""
+        places = self.front[self.second[self.front] <= limit]  # ascending in the first
+        return int(self.cases[places[0]]) if places.size else None
 
 
 def group_front(results: StudyResults) -> Iterator[FrontGroup]:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from table_io.block import Float2D
 from twin.reports.page import embed_images, render_page
 from twin.run.system import is_folder_locked
 from twin.studies.maps.figures import draw_outcome_figures, group_front, label_variable
@@ -122,22 +123,54 @@ def write_front_table(results: StudyResults, path: Path) -> dict[str, Any] | Non
         return None
     names = [parameter.name for parameter in results.study.config.parameters]
     columns = {name: results.read_by_case(name) for name in (*names, *front.minimise)}
-    groups = []
+
+    def read_row(case: int, without: str = "") -> list[float]:
+        return [float(values[case]) for name, values in columns.items() if name != without]
+
+    groups, least, all_rows = [], [], []
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["case", *columns])
         for group in group_front(results):
-            cases = group.cases[group.front]
-            rows = [[float(values[case]) for values in columns.values()] for case in cases]
-            writer.writerows([int(case), *row] for case, row in zip(cases, rows, strict=True))
+            cases = group.cases[group.front].tolist()
+            rows = [read_row(case) for case in cases]
+            writer.writerows([case, *row] for case, row in zip(cases, rows, strict=True))
+            all_rows += rows
             thinned = np.unique(
-                np.linspace(0, len(rows) - 1, min(len(rows), MAX_FRONT_ROWS)).round().astype(int)
+                np.linspace(0, len(cases) - 1, min(len(cases), MAX_FRONT_ROWS)).round().astype(int)
             )
             groups.append({"title": group.title, "rows": [rows[index] for index in thinned]})
-    heads = [results.label_parameter(name) for name in names]
+            for limit in front.limits:
+                case = group.find_least(limit)
+                row = None if case is None else read_row(case, without=front.each)
+                least.append({"title": group.title, "limit": limit, "row": row})
     by_name = {variable.name: variable for variable in results.scalars}
-    heads += [label_variable(by_name[name]) for name in front.minimise]
-    return {"heads": heads, "groups": groups}
+    first, second = (label_variable(by_name[name]) for name in front.minimise)
+    heads = {name: results.label_parameter(name) for name in names}
+    return {
+        "heads": [*heads.values(), first, second],
+        "least_heads": [
+            *(head for name, head in heads.items() if name != front.each),
+            first,
+            second,
+        ],
+        "first": first,
+        "second": second,
+        "groups": groups,
+        "least": least,
+        "edges": _describe_edges(results, np.array(all_rows)),
+    }
+
+
+def _describe_edges(results: StudyResults, rows: Float2D) -> list[str]:
+    """Return the parameters, and values, of which every front lies at an end of the range."""
+    front, edges = results.study.config.front, []
+    for column, parameter in enumerate(results.study.config.parameters if rows.size else ()):
+        is_free = front is not None and parameter.name != front.each
+        for end in parameter.limits if is_free else ():
+            if np.isclose(rows[:, column], end, rtol=1e-9).all():
+                edges.append(results.describe_value(parameter.name, end))
+    return edges
 
 
 def _list_indices(

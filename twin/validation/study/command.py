@@ -9,7 +9,7 @@ from typing import Any, TextIO
 from table_io.clock import RealClock
 from table_io.errors import InputError, suggest
 from twin.reports.finalize import EXIT_INTERRUPTED
-from twin.run.folders import claim_folder, make_output_folder
+from twin.run.folders import claim_folder, find_sharing_problem, make_output_folder
 from twin.run.progress import make_task_bar
 from twin.run.tasks import Task, Workers, run_tasks
 from twin.run.terminal import catch_interrupts, print_line
@@ -49,7 +49,8 @@ def run_discovery_study(
     """Evaluate the requested cases that have no result, then the controls; return the exit code."""
     processes = Workers.from_options(workers, scheduler)
     numbers = _parse_cases(seeds, patterns, _parse_laboratory(laboratory))
-    folder = _open_folder(out, resume)
+    processes.require()
+    folder = _open_folder(out, resume).resolve()  # where workers of a cluster must find it
     if describe_missing():
         print_line(describe_missing())
     exit_code = run_cases(folder, numbers, processes, partial(evaluate_case, folder))
@@ -93,10 +94,12 @@ def _evaluate_cases(
     pending: Sequence[int], workers: Workers, work: Task, stop: Callable[[], object], file: TextIO
 ) -> Iterator[Json]:
     """Evaluate the pending cases; yield each row after it is written to the file."""
-    right_count = 0
+    path, right_count = Path(file.name), 0
+    find_problem = partial(find_sharing_problem, path, path.read_text(encoding="utf-8"))
+    results = run_tasks(work, pending, workers, stop, find_problem=find_problem)
     with make_task_bar() as bar:
         task = bar.add_task("cases", total=len(pending))
-        for index, result in enumerate(run_tasks(work, pending, workers, stop), 1):
+        for index, result in enumerate(results, 1):
             row = result.value or {"number": result.number, "failed": result.failure}
             row.setdefault("cell", draw_case(row["number"]).cell.name)
             file.write(json.dumps(row) + "\n")
