@@ -82,10 +82,15 @@ def begin_continuation(state: SequencerState) -> SequencerState:
     plan = config.orbit_plan
     target = plan_target(plan, 0, ())
     lag_s, correction = 0.0, 1.0
+    records = state.records
     if response is not None:
-        transfer = evaluate_transfer(response, target.frequency_hz)
-        lag_s = -math.atan2(transfer.imag, transfer.real) / (2 * math.pi * target.frequency_hz)
-        correction = 1.0 / abs(transfer)
+        lag_s = _find_lag(response, target.frequency_hz)
+        correction = 1.0 / abs(evaluate_transfer(response, target.frequency_hz))
+        timing = (
+            f"the table answers {1e3 * measure_latency(state):.1f} ms after a block; the gains are "
+            f"for {1e3 * plan.latency_s:.1f} ms and a jitter of {1e3 * plan.jitter_s:g} ms"
+        )
+        records = (*records, Event(state.stage.last, "feedback", timing))
     search = OrbitSearch(
         FeedbackState(state.plan.feedback_horizon),
         target,
@@ -94,7 +99,7 @@ def begin_continuation(state: SequencerState) -> SequencerState:
         correction,
         since=state.trajectory.end,
     )
-    state = replace(state, search=search)
+    state = replace(state, search=search, records=records)
     return _approach(state, state.trajectory, _list_leads(plan), CAPTURE_CYCLES)
 
 
@@ -105,25 +110,34 @@ def _list_leads(plan: OrbitPlan) -> tuple[Waypoint, ...]:
     )
 
 
-def check_latency(state: SequencerState) -> str:
-    """Return why the table answers too late for the plan of the orbits; "" if it does not.
+def measure_latency(state: SequencerState) -> float:
+    """Return the latency in s from the end of a block to the table's answer; NaN if not known.
 
-    The latency is that of the feedback's horizon and of the table that the loop check measured.
+    It is that of the feedback's horizon and of the table that the loop check measured.
     """
-    plan, response = _config(state).orbit_plan, state.tuning.response
+    response = state.tuning.response
     if response is None:
-        return ""
-    frequency_hz = plan.points[0].frequency_hz
-    transfer = evaluate_transfer(response, frequency_hz)
-    lag_s = -math.atan2(transfer.imag, transfer.real) / (2 * math.pi * frequency_hz)
-    latency_s = state.plan.feedback_horizon / state.trajectory.rate_hz + lag_s
+        return math.nan
+    lag_s = _find_lag(response, _config(state).orbit_plan.points[0].frequency_hz)
+    return state.plan.feedback_horizon / state.trajectory.rate_hz + lag_s
+
+
+def check_latency(state: SequencerState) -> str:
+    """Return why the table answers too late for the plan of the orbits; "" if it does not."""
+    plan, latency_s = _config(state).orbit_plan, measure_latency(state)
     allowed_s = plan.latency_s + plan.jitter_s + LATENCY_TOLERANCE_S
-    if latency_s <= allowed_s:
+    if not latency_s > allowed_s:
         return ""
     return (
         f"the latency of the feedback is {1e3 * latency_s:.1f} ms, its gains are for at most "
         f"{1e3 * allowed_s:.1f} ms: compute the orbit plan for this latency"
     )
+
+
+def _find_lag(response: FrequencyResponse, frequency_hz: float) -> float:
+    """Return the lag in s of the table behind its command."""
+    transfer = evaluate_transfer(response, frequency_hz)
+    return -math.atan2(transfer.imag, transfer.real) / (2 * math.pi * frequency_hz)
 
 
 def _config(state: SequencerState) -> Continuation:

@@ -118,6 +118,12 @@ def test_unstable_orbits_are_held_without_feedback_left(held: Run) -> None:
     assert held.select(RunStop)[0].verdict == "complete"
 
 
+def test_the_latency_of_the_feedback_is_stated(held: Run) -> None:
+    (event,) = [event for event in held.select(Event) if event.kind == "feedback"]
+    measured_ms = float(event.text.split()[3])
+    assert measured_ms == pytest.approx(45.0, abs=2.0)  # 30 ms to the command, 15 ms of servo
+
+
 def test_measured_orbits_are_those_of_the_plant(held: Run) -> None:
     for point in held.select(OrbitPoint):
         true_mm = np.interp(point.frequency_hz, *TRUE_ORBITS[:, :2].T)
@@ -229,7 +235,7 @@ def test_operator_stops_a_held_orbit(held: Run) -> None:
 
 
 def test_plan_for_a_shorter_latency_is_refused_before_the_orbits() -> None:
-    refused = run(make_profile(latency_s=0.031))
+    refused = run(make_profile(latency_s=0.031, table_lag_ms=1.0))
     assert refused.select(RunStop)[0].verdict == "aborted"
     assert not refused.select(OrbitPoint)
     assert np.abs(refused.command_m).max() < 2e-4  # the loop check only
