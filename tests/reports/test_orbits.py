@@ -183,6 +183,12 @@ def test_no_fold_is_stated_where_too_little_was_measured():
     assert [fold["kind"] for fold in find_measured_folds(refused)] == ["lower"]
 
 
+def test_no_fold_is_stated_far_from_the_measured_orbits():
+    sparse = make_branch()[1::9]
+    assert {orbit["stable"] for orbit in sparse} == {True, False}
+    assert find_measured_folds(sparse) == []
+
+
 def test_a_branch_that_does_not_turn_where_the_plan_says_has_no_fold_there():
     branch = [orbit | {"stable": orbit["fundamental_m"] < 5.7e-3} for orbit in make_branch()]
     assert find_measured_folds(branch) == []

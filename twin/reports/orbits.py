@@ -17,6 +17,7 @@ from table_io.records import OrbitPoint
 from twin.recording.reader import Recording
 
 FOLD_ORBITS = 2  # on either side of a fold, to which a parabola is fitted
+MAX_FOLD_DISTANCE = 0.015  # of the frequency of a fold to theirs: a parabola holds close to it only
 
 
 def summarise_orbits(recording: Recording, plan: OrbitPlan) -> list[dict[str, Any]]:
@@ -58,7 +59,7 @@ def find_measured_folds(orbits: Sequence[dict[str, Any]]) -> list[dict[str, Any]
 
     Where the plan turns from stable to unstable, a parabola of the frequency over the fundamental
     of u is fitted to the accepted orbits, up to FOLD_ORBITS on either side. None is stated without
-    an orbit on either side, or where the parabola turns outside of its orbits.
+    an orbit on either side, or where the parabola turns outside of its orbits or far from them.
     """
     accepted = [orbit for orbit in orbits if orbit["accepted"]]
     amplitudes = np.array([orbit["fundamental_m"] for orbit in accepted])
@@ -72,12 +73,14 @@ def find_measured_folds(orbits: Sequence[dict[str, Any]]) -> list[dict[str, Any]
             continue
         parabola = np.polynomial.Polynomial.fit(x, y, 2)
         turn = float(np.real(parabola.deriv().roots()[0]))
-        if not x.min() < turn < x.max():
+        fold_hz = float(parabola(turn))
+        is_near = np.abs(y - fold_hz).max() <= MAX_FOLD_DISTANCE * fold_hz
+        if not (x.min() < turn < x.max() and is_near):
             continue
         folds.append(
             {
                 "kind": "lower" if parabola.deriv(2)(turn) > 0 else "upper",
-                "frequency_hz": float(parabola(turn)),
+                "frequency_hz": fold_hz,
                 "fundamental_m": turn * float(amplitudes[last]),
                 "orbits": int(x.size),
             }

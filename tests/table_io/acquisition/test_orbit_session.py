@@ -23,12 +23,14 @@ from table_io.control.orbit_feedback import advance_feedback
 from table_io.errors import InputError
 from table_io.records import Event, OrbitPoint, Record, RunStart, RunStop
 from table_io.sequencer import orbits, releases
+from table_io.sim.plant import Plant
+from tests.table_io.sim.plant_orbits import trace_orbits
 
 RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "rig file")[0]
 PLAN = json.loads(Path(__file__).with_name("unstable_orbits.json").read_text(encoding="utf-8"))
 RATE_HZ = 2000.0
 MULTIPLIER_PERIODS = 24  # by default
-# By shooting on the simulated plant itself, payload reaction included: f in Hz, |U_1| in mm,
+# Of the simulated plant itself with payload reaction (`plant_orbits.py`): f in Hz, |U_1| in mm,
 # largest Floquet multiplier.
 TRUE_ORBITS = np.array(
     [
@@ -122,6 +124,19 @@ def test_the_latency_of_the_feedback_is_stated(held: Run) -> None:
     (event,) = [event for event in held.select(Event) if event.kind == "feedback"]
     measured_ms = float(event.text.split()[3])
     assert measured_ms == pytest.approx(45.0, abs=2.0)  # 30 ms to the command, 15 ms of servo
+
+
+def test_true_orbits_are_those_by_shooting_on_the_plant() -> None:
+    plant = Plant(
+        550.0, 36e3, 1100.0, 510e3, 900.0, 2e-3, 2e-3, 2000.0, 20.0, 0.0, True, RATE_HZ
+    )  # fmt: skip
+    orbits = trace_orbits(plant, 0.05 * 9.80665, 2.2e-3, 2.46e-3, start_hz=3.0)
+    by_shooting = [(o.frequency_hz, 1e3 * o.fundamental_m, abs(o.multiplier)) for o in orbits]
+    frequencies_hz, amplitudes_mm, multipliers = np.array(by_shooting).T
+    true_mm = np.interp(TRUE_ORBITS[:, 0], frequencies_hz, amplitudes_mm)
+    assert true_mm == pytest.approx(TRUE_ORBITS[:, 1], rel=2e-4)
+    true = np.interp(TRUE_ORBITS[:, 0], frequencies_hz, multipliers)
+    assert true == pytest.approx(TRUE_ORBITS[:, 2], rel=2e-3)
 
 
 def test_measured_orbits_are_those_of_the_plant(held: Run) -> None:
