@@ -5,7 +5,7 @@
                                        `---> updates used up: the next point
     lost --> decay to rest, capture of the first orbit, along the measured ones to this point, or
              to the next one when its retries are used up
-    last point, or three in a row lost --> the end, with the feedback blended out
+    last point, three in a row or the first one lost --> the end, with the feedback blended out
 
 The feedback acts on every block (`control/orbit_feedback.py`); what is decided here are its
 references, ahead of time, like every other change of the drive.
@@ -320,7 +320,10 @@ def decide_orbit(state: SequencerState) -> SequencerState:
     )
     deviation = fundamental(measured.x - target.reference)
     if deviation > MAX_DEVIATION * fundamental(orbit.harmonics_m):
-        reason = f"it is {1e3 * deviation:.2g} mm from its reference"
+        reason = (
+            f"it is {1e3 * deviation:.2g} mm from its reference, of an amplitude of "
+            f"{1e3 * fundamental(orbit.harmonics_m):.2g} mm"
+        )
         return retry_orbit(replace(state, search=search), stage.last, reason)
     command_m = (
         orbit.acceleration_m_s2 * search.correction / (2 * math.pi * target.frequency_hz) ** 2
@@ -477,7 +480,10 @@ def retry_orbit(state: SequencerState, index: int, reason: str) -> SequencerStat
     is_given_up = is_measured or search.losses >= config.retries
     lost_points = search.lost_points + (is_given_up and not is_measured)
     next_position = position + is_given_up
-    is_last = lost_points >= MAX_LOST_POINTS or next_position == len(config.orbit_plan.points)
+    is_first = is_given_up and not search.measured
+    is_last = (
+        is_first or lost_points >= MAX_LOST_POINTS or next_position == len(config.orbit_plan.points)
+    )
     action = "it is approached again from rest"
     if is_given_up:
         action = "the test ends" if is_last else "the next one is approached from rest"
@@ -492,6 +498,12 @@ def retry_orbit(state: SequencerState, index: int, reason: str) -> SequencerStat
         lost_points=lost_points,
         is_captured=False,
     )
+    if is_first:
+        state = replace(
+            state,
+            refusal=f"the first orbit cannot be held ({reason}): the model departs too far from "
+            "the specimen, or the table from its level; identify the model from a sweep first",
+        )
     if is_last:
         return end_continuation(replace(state, search=search), trajectory)
     changed = trajectory.end

@@ -40,8 +40,15 @@ TRUE_ORBITS = np.array(
 )  # fmt: skip
 
 
-def make_profile(points: slice = slice(None), latency_s: float = 0.046, **keys: Any) -> Profile:
-    plan = PLAN | {"points": PLAN["points"][points], "latency_s": latency_s}
+def make_profile(
+    points: slice = slice(None),
+    latency_s: float = 0.046,
+    planned: dict[str, Any] | None = None,
+    **keys: Any,
+) -> Profile:
+    """Return the profile of some points of the plan, or of one `planned` orbit."""
+    orbits = PLAN["points"][points] if planned is None else [planned]
+    plan = PLAN | {"points": orbits, "latency_s": latency_s}
     excitation = {
         "kind": "continuation",
         "start_hz": 2.85,
@@ -283,3 +290,16 @@ def test_nominal_drive_holds_the_first_orbit() -> None:
     drive = sequencer.nominal_drive(sequencer.make_test_plan(profile, RIG, 40))
     assert {segment.step for segment in drive.sine_segments} == {-1, 0}
     assert replace(drive.steps[1]) == profile.steps[1]
+
+
+def test_a_model_that_departs_too_far_ends_the_test_at_its_first_orbit() -> None:
+    """The plan's orbit has twice the amplitude of the specimen's."""
+    orbit = PLAN["points"][0]
+    doubled = orbit | {"u_m": (2.0 * np.array(orbit["u_m"])).tolist()}
+    far = run(make_profile(planned=doubled, retries=0), stop_s=60.0)
+    stop = far.select(RunStop)[0]
+    assert stop.verdict == "aborted"
+    assert "the first orbit cannot be held" in stop.reason
+    assert "identify the model" in stop.reason
+    assert not any(point.accepted for point in far.select(OrbitPoint))
+    assert np.abs(far.command_m[-200:]).max() < 1e-6
