@@ -111,14 +111,14 @@ def compare(points: list[OrbitPoint], mass: float, stiffness: float) -> None:
     if deviations:
         rms = math.sqrt(np.mean(np.square(deviations)))
         print(f"multipliers: {len(deviations)}, {rms:.2f} standard deviations off (rms)")
-    found = find_measured_folds(
+    measured_folds = find_measured_folds(
         [
             {"accepted": point.accepted, "stable": point.stable,
              "fundamental_m": math.hypot(*point.u_m[2:4]), "frequency_hz": point.frequency_hz}
             for point in points
         ]
     )  # fmt: skip
-    for fold in found:
+    for fold in measured_folds:
         true = min(folds_hz, key=lambda hz: abs(hz - fold["frequency_hz"]))
         print(f"{fold['kind']} fold {fold['frequency_hz']:.4f} Hz, of the plant {true:.4f} Hz")
 

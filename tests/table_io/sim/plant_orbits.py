@@ -12,10 +12,10 @@ import numpy as np
 
 from table_io.sim.plant import Plant
 
-SAMPLES = 400  # of a period
-SCALES = np.array([1e-3, 2e-2, 1e-3, 2e-2, 1e-3, 1.0])
-DIFFERENCE, MAX_STEP, MAX_STEPS = 1e-5, 0.2, 25
-TOLERANCE = 1e-6  # in SCALES
+SAMPLES_PER_PERIOD = 400  # of a period
+UNKNOWN_SCALES = np.array([1e-3, 2e-2, 1e-3, 2e-2, 1e-3, 1.0])
+DIFFERENCE_STEP, MAX_STEP, MAX_STEPS = 1e-5, 0.2, 25
+STEP_TOLERANCE = 1e-6  # in UNKNOWN_SCALES
 SETTLING_PERIODS = 300
 AMPLITUDE_STEP_M = 2e-5
 
@@ -56,14 +56,14 @@ def trace_orbits(
     return orbits
 
 
-def _play(plant: Plant, unknowns: np.ndarray, phase: float, samples: int = SAMPLES):
+def _play(plant: Plant, unknowns: np.ndarray, phase: float, samples: int = SAMPLES_PER_PERIOD):
     """(state, SIGNALS) after samples of a period that starts at a phase of the command."""
     x, v, y, w, amplitude, frequency_hz = unknowns
-    own = replace(plant, rate_hz=SAMPLES * frequency_hz, servo_delay_s=0.0)
+    own = replace(plant, rate_hz=SAMPLES_PER_PERIOD * frequency_hz, servo_delay_s=0.0)
     index = np.arange(-own.history_samples, samples)
     state = np.array([x, v, y, w, 0.0, 0.0, 0.0, 0.0])
     out = np.empty((6, samples))
-    own.advance(state, amplitude * np.sin(math.tau * (phase + index / SAMPLES)), out)
+    own.advance(state, amplitude * np.sin(math.tau * (phase + index / SAMPLES_PER_PERIOD)), out)
     return state, out
 
 
@@ -72,7 +72,11 @@ def _measure(out: np.ndarray, frequency_hz: float) -> tuple[float, float]:
 
     The acceleration itself jumps at an impact, so its samples give no smooth function.
     """
-    turn = 2 / SAMPLES * np.exp(-2j * math.pi * np.arange(out.shape[1]) / SAMPLES)
+    turn = (
+        2
+        / SAMPLES_PER_PERIOD
+        * np.exp(-2j * math.pi * np.arange(out.shape[1]) / SAMPLES_PER_PERIOD)
+    )
     table_m, u_m = (float(abs(values @ turn)) for values in (out[0], out[2] - out[0]))
     return (math.tau * frequency_hz) ** 2 * table_m, u_m
 
@@ -81,7 +85,8 @@ def _residual(plant, unknowns, phase, amplitude_m, level) -> np.ndarray:
     state, out = _play(plant, unknowns, phase)
     acceleration, u_m = _measure(out, unknowns[5])
     return np.append(
-        (state[:4] - unknowns[:4]) / SCALES[:4], [acceleration / level - 1, u_m / amplitude_m - 1]
+        (state[:4] - unknowns[:4]) / UNKNOWN_SCALES[:4],
+        [acceleration / level - 1, u_m / amplitude_m - 1],
     )
 
 
@@ -90,14 +95,14 @@ def _solve(plant, unknowns, phase, amplitude_m, level) -> np.ndarray | None:
         columns = [
             _residual(plant, unknowns + step, phase, amplitude_m, level)
             - _residual(plant, unknowns - step, phase, amplitude_m, level)
-            for step in DIFFERENCE * np.diag(SCALES)
+            for step in DIFFERENCE_STEP * np.diag(UNKNOWN_SCALES)
         ]
-        jacobian = np.column_stack(columns) / (2 * DIFFERENCE)
+        jacobian = np.column_stack(columns) / (2 * DIFFERENCE_STEP)
         residual = _residual(plant, unknowns, phase, amplitude_m, level)
         step = np.linalg.solve(jacobian, -residual)
         step *= min(1.0, MAX_STEP / np.abs(step).max())
-        unknowns = unknowns + step * SCALES
-        if np.abs(step).max() < TOLERANCE:
+        unknowns = unknowns + step * UNKNOWN_SCALES
+        if np.abs(step).max() < STEP_TOLERANCE:
             return unknowns
     return None
 
@@ -105,10 +110,10 @@ def _solve(plant, unknowns, phase, amplitude_m, level) -> np.ndarray | None:
 def _find_multiplier(plant, unknowns, phase) -> complex:
     columns = [
         (_play(plant, unknowns + step, phase)[0] - _play(plant, unknowns - step, phase)[0])[:4]
-        for step in DIFFERENCE * np.diag(SCALES)[:4]
+        for step in DIFFERENCE_STEP * np.diag(UNKNOWN_SCALES)[:4]
     ]
-    jacobian = np.column_stack(columns) / (2 * DIFFERENCE)
-    multipliers = np.linalg.eigvals(jacobian / SCALES[:4, None])
+    jacobian = np.column_stack(columns) / (2 * DIFFERENCE_STEP)
+    multipliers = np.linalg.eigvals(jacobian / UNKNOWN_SCALES[:4, None])
     return complex(multipliers[np.abs(multipliers).argmax()])
 
 
@@ -121,7 +126,7 @@ def _move_section(plant, unknowns, phase) -> tuple[np.ndarray, float]:
         return unknowns, phase
     count = int(upcrossings[0]) + 1
     state = _play(plant, unknowns, phase, count)[0]
-    return np.append(state[:4], unknowns[4:]), (phase + count / SAMPLES) % 1.0
+    return np.append(state[:4], unknowns[4:]), (phase + count / SAMPLES_PER_PERIOD) % 1.0
 
 
 def _settle(plant: Plant, level: float, frequency_hz: float) -> tuple[np.ndarray, float]:
