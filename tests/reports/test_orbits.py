@@ -160,7 +160,7 @@ def make_branch() -> list[dict]:
     return [
         {
             "accepted": True, "stable": not 5.0 < amplitude < 7.0,
-            "fundamental_m": 1e-3 * amplitude, "frequency_hz": frequency,
+            "amplitude_m": 1e-3 * amplitude, "frequency_hz": frequency,
         }
         for amplitude, frequency in zip(amplitudes, frequencies, strict=True)
     ]  # fmt: skip
@@ -171,7 +171,7 @@ def test_folds_are_where_the_measured_branch_turns():
     assert (lower["kind"], upper["kind"], lower["orbits"]) == ("lower", "upper", 4)
     assert lower["frequency_hz"] == pytest.approx(3.0, abs=1e-6)
     assert upper["frequency_hz"] == pytest.approx(3.4, abs=1e-6)
-    assert upper["fundamental_m"] == pytest.approx(7e-3, rel=1e-6)
+    assert upper["amplitude_m"] == pytest.approx(7e-3, rel=1e-6)
 
 
 def test_no_fold_is_stated_where_too_little_was_measured():
@@ -179,7 +179,7 @@ def test_no_fold_is_stated_where_too_little_was_measured():
     unstable = [orbit for orbit in branch if not orbit["stable"]]
     assert find_measured_folds(unstable) == []
     assert find_measured_folds([unstable[-1], *branch[-1:]]) == []
-    refused = [orbit | {"accepted": orbit["fundamental_m"] < 5.2e-3} for orbit in branch]
+    refused = [orbit | {"accepted": orbit["amplitude_m"] < 5.2e-3} for orbit in branch]
     assert [fold["kind"] for fold in find_measured_folds(refused)] == ["lower"]
 
 
@@ -190,5 +190,5 @@ def test_no_fold_is_stated_far_from_the_measured_orbits():
 
 
 def test_a_branch_that_does_not_turn_where_the_plan_says_has_no_fold_there():
-    branch = [orbit | {"stable": orbit["fundamental_m"] < 5.7e-3} for orbit in make_branch()]
+    branch = [orbit | {"stable": orbit["amplitude_m"] < 5.7e-3} for orbit in make_branch()]
     assert find_measured_folds(branch) == []

@@ -356,7 +356,7 @@ class MeasuredFold(Contract):
 
     kind: Literal["lower", "upper"] = Field(description="whether the branch turns up or down there")
     frequency_hz: Hertz = Field(description="where the branch turns")
-    fundamental_m: Metres = Field(description="fundamental of u there")
+    amplitude_m: Metres = Field(description="half of max u - min u there")
     orbits: int = Field(description="measured orbits that the parabola is fitted to")
 
 

@@ -56,7 +56,7 @@ def draw_orbits(run: ReportData) -> CaptionedFigures:
     if folds:
         branch_axis.plot(
             [fold["frequency_hz"] for fold in folds],
-            [1e3 * fold["fundamental_m"] for fold in folds],
+            [1e3 * fold["amplitude_m"] for fold in folds],
             "x", color=DIRECTION_COLOURS["backward"], label="fold, by its neighbours",
         )  # fmt: skip
     noise = [

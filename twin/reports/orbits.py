@@ -57,12 +57,12 @@ def _summarise_orbit(orbit: OrbitPoint, plan: OrbitPlan) -> dict[str, Any]:
 def find_measured_folds(orbits: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the folds between measured orbits, entries of `summarise_orbits` of one branch.
 
-    Where the plan turns from stable to unstable, a parabola of the frequency over the fundamental
+    Where the plan turns from stable to unstable, a parabola of the frequency over the amplitude
     of u is fitted to the accepted orbits, up to FOLD_ORBITS on either side. None is stated without
     an orbit on either side, or where the parabola turns outside of its orbits or far from them.
     """
     accepted = [orbit for orbit in orbits if orbit["accepted"]]
-    amplitudes = np.array([orbit["fundamental_m"] for orbit in accepted])
+    amplitudes = np.array([orbit["amplitude_m"] for orbit in accepted])
     frequencies = np.array([orbit["frequency_hz"] for orbit in accepted])
     is_stable = np.array([orbit["stable"] for orbit in accepted], dtype=bool)
     folds = []
@@ -72,7 +72,10 @@ def find_measured_folds(orbits: Sequence[dict[str, Any]]) -> list[dict[str, Any]
         if x.size < 3:
             continue
         parabola = np.polynomial.Polynomial.fit(x, y, 2)
-        turn = float(np.real(parabola.deriv().roots()[0]))
+        turns = parabola.deriv().roots()
+        if not turns.size:  # three orbits on a straight line
+            continue
+        turn = float(turns[0])
         fold_hz = float(parabola(turn))
         is_near = np.abs(y - fold_hz).max() <= MAX_FOLD_DISTANCE * fold_hz
         if not (x.min() < turn < x.max() and is_near):
@@ -81,7 +84,7 @@ def find_measured_folds(orbits: Sequence[dict[str, Any]]) -> list[dict[str, Any]
             {
                 "kind": "lower" if parabola.deriv(2)(turn) > 0 else "upper",
                 "frequency_hz": fold_hz,
-                "fundamental_m": turn * float(amplitudes[last]),
+                "amplitude_m": turn * float(amplitudes[last]),
                 "orbits": int(x.size),
             }
         )

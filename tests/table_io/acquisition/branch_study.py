@@ -114,7 +114,7 @@ def compare(points: list[OrbitPoint], mass: float, stiffness: float) -> None:
     measured_folds = find_measured_folds(
         [
             {"accepted": point.accepted, "stable": point.stable,
-             "fundamental_m": math.hypot(*point.u_m[2:4]), "frequency_hz": point.frequency_hz}
+             "amplitude_m": point.amplitude_m, "frequency_hz": point.frequency_hz}
             for point in points
         ]
     )  # fmt: skip
