@@ -55,12 +55,14 @@ def make_test_plan(profile: Profile, rig: RigConfig, replace_after: int = 0) -> 
 
 
 def _check_horizon(config: Continuation, horizon_s: float) -> None:
-    """Raise InputError if the feedback comes too late even for a table without lag."""
+    """Raise InputError if the feedback comes too late with the stated lag of the table."""
     plan = config.orbit_plan
-    allowed_s = plan.latency_s + plan.jitter_s
-    if horizon_s > allowed_s:
+    latency_s, allowed_s = horizon_s + 1e-3 * config.table_lag_ms, plan.latency_s + plan.jitter_s
+    if latency_s > allowed_s:
         raise InputError(
-            f"the command can be changed {1e3 * horizon_s:.1f} ms ahead at the soonest",
+            f"the table answers {1e3 * latency_s:.1f} ms after a block at the soonest: "
+            f"{1e3 * horizon_s:.1f} ms until its command can change and a lag of "
+            f"{config.table_lag_ms:g} ms",
             where="continuation",
             key="latency_s",
             value=plan.latency_s,

@@ -5,7 +5,7 @@
                                        `---> updates used up: the next point
     lost --> decay to rest, capture of the first orbit, along the measured ones to this point, or
              to the next one when its retries are used up
-    last point, or three in a row lost --> the end, with the feedback blended out
+    last point, three in a row or the first one lost --> the end, with the feedback blended out
 
 The feedback acts on every block (`control/orbit_feedback.py`); what is decided here are its
 references, ahead of time, like every other change of the drive.
@@ -82,10 +82,15 @@ def begin_continuation(state: SequencerState) -> SequencerState:
     plan = config.orbit_plan
     target = plan_target(plan, 0, ())
     lag_s, correction = 0.0, 1.0
+    records = state.records
     if response is not None:
-        transfer = evaluate_transfer(response, target.frequency_hz)
-        lag_s = -math.atan2(transfer.imag, transfer.real) / (2 * math.pi * target.frequency_hz)
-        correction = 1.0 / abs(transfer)
+        lag_s = _find_lag(response, target.frequency_hz)
+        correction = 1.0 / abs(evaluate_transfer(response, target.frequency_hz))
+        timing = (
+            f"the table answers {1e3 * measure_latency(state):.1f} ms after a block; the gains are "
+            f"for {1e3 * plan.latency_s:.1f} ms and a jitter of {1e3 * plan.jitter_s:g} ms"
+        )
+        records = (*records, Event(state.stage.last, "feedback", timing))
     search = OrbitSearch(
         FeedbackState(state.plan.feedback_horizon),
         target,
@@ -94,7 +99,7 @@ def begin_continuation(state: SequencerState) -> SequencerState:
         correction,
         since=state.trajectory.end,
     )
-    state = replace(state, search=search)
+    state = replace(state, search=search, records=records)
     return _approach(state, state.trajectory, _list_leads(plan), CAPTURE_CYCLES)
 
 
@@ -105,25 +110,34 @@ def _list_leads(plan: OrbitPlan) -> tuple[Waypoint, ...]:
     )
 
 
-def check_latency(state: SequencerState) -> str:
-    """Return why the table answers too late for the plan of the orbits; "" if it does not.
+def measure_latency(state: SequencerState) -> float:
+    """Return the latency in s from the end of a block to the table's answer; NaN if not known.
 
-    The latency is that of the feedback's horizon and of the table that the loop check measured.
+    It is that of the feedback's horizon and of the table that the loop check measured.
     """
-    plan, response = _config(state).orbit_plan, state.tuning.response
+    response = state.tuning.response
     if response is None:
-        return ""
-    frequency_hz = plan.points[0].frequency_hz
-    transfer = evaluate_transfer(response, frequency_hz)
-    lag_s = -math.atan2(transfer.imag, transfer.real) / (2 * math.pi * frequency_hz)
-    latency_s = state.plan.feedback_horizon / state.trajectory.rate_hz + lag_s
+        return math.nan
+    lag_s = _find_lag(response, _config(state).orbit_plan.points[0].frequency_hz)
+    return state.plan.feedback_horizon / state.trajectory.rate_hz + lag_s
+
+
+def check_latency(state: SequencerState) -> str:
+    """Return why the table answers too late for the plan of the orbits; "" if it does not."""
+    plan, latency_s = _config(state).orbit_plan, measure_latency(state)
     allowed_s = plan.latency_s + plan.jitter_s + LATENCY_TOLERANCE_S
-    if latency_s <= allowed_s:
+    if not latency_s > allowed_s:
         return ""
     return (
         f"the latency of the feedback is {1e3 * latency_s:.1f} ms, its gains are for at most "
         f"{1e3 * allowed_s:.1f} ms: compute the orbit plan for this latency"
     )
+
+
+def _find_lag(response: FrequencyResponse, frequency_hz: float) -> float:
+    """Return the lag in s of the table behind its command."""
+    transfer = evaluate_transfer(response, frequency_hz)
+    return -math.atan2(transfer.imag, transfer.real) / (2 * math.pi * frequency_hz)
 
 
 def _config(state: SequencerState) -> Continuation:
@@ -306,7 +320,10 @@ def decide_orbit(state: SequencerState) -> SequencerState:
     )
     deviation = fundamental(measured.x - target.reference)
     if deviation > MAX_DEVIATION * fundamental(orbit.harmonics_m):
-        reason = f"it is {1e3 * deviation:.2g} mm from its reference"
+        reason = (
+            f"it is {1e3 * deviation:.2g} mm from its reference, of an amplitude of "
+            f"{1e3 * fundamental(orbit.harmonics_m):.2g} mm"
+        )
         return retry_orbit(replace(state, search=search), stage.last, reason)
     command_m = (
         orbit.acceleration_m_s2 * search.correction / (2 * math.pi * target.frequency_hz) ** 2
@@ -463,7 +480,10 @@ def retry_orbit(state: SequencerState, index: int, reason: str) -> SequencerStat
     is_given_up = is_measured or search.losses >= config.retries
     lost_points = search.lost_points + (is_given_up and not is_measured)
     next_position = position + is_given_up
-    is_last = lost_points >= MAX_LOST_POINTS or next_position == len(config.orbit_plan.points)
+    is_first = is_given_up and not search.measured
+    is_last = (
+        is_first or lost_points >= MAX_LOST_POINTS or next_position == len(config.orbit_plan.points)
+    )
     action = "it is approached again from rest"
     if is_given_up:
         action = "the test ends" if is_last else "the next one is approached from rest"
@@ -478,6 +498,12 @@ def retry_orbit(state: SequencerState, index: int, reason: str) -> SequencerStat
         lost_points=lost_points,
         is_captured=False,
     )
+    if is_first:
+        state = replace(
+            state,
+            refusal=f"the first orbit cannot be held ({reason}): the model departs too far from "
+            "the specimen, or the table from its level; identify the model from a sweep first",
+        )
     if is_last:
         return end_continuation(replace(state, search=search), trajectory)
     changed = trajectory.end

@@ -15,7 +15,7 @@ from twin.monitor.curves import draw_prc
 from twin.monitor.run_state import LiveRunState
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import read_recording
-from twin.reports.orbits import read_planned_branch
+from twin.reports.orbits import find_measured_folds, read_planned_branch
 from twin.reports.report import write_report
 from twin.reports.summary import parse_toml_tables, summarise, write_summary
 from twin.transport.codec import decode_item, encode_item, topic_for
@@ -149,3 +149,46 @@ def test_monitor_draws_orbits_in_place_of_the_curves():
     text = "\n".join(line.plain for line in draw_prc(run_state, 60, 12))
     assert text.count("●") == 1
     assert "3.2" in text
+
+
+def make_branch() -> list[dict]:
+    """Entries of orbits on f = 3 + 0.2 (A - 5)^2 below 6 mm and f = 3.4 - 0.1 (A - 7)^2 above."""
+    amplitudes = np.arange(4.45, 7.6, 0.1)
+    frequencies = np.where(
+        amplitudes < 6.0, 3.0 + 0.2 * (amplitudes - 5) ** 2, 3.4 - 0.1 * (amplitudes - 7) ** 2
+    )
+    return [
+        {
+            "accepted": True, "stable": not 5.0 < amplitude < 7.0,
+            "amplitude_m": 1e-3 * amplitude, "frequency_hz": frequency,
+        }
+        for amplitude, frequency in zip(amplitudes, frequencies, strict=True)
+    ]  # fmt: skip
+
+
+def test_folds_are_where_the_measured_branch_turns():
+    lower, upper = find_measured_folds(make_branch())
+    assert (lower["kind"], upper["kind"], lower["orbits"]) == ("lower", "upper", 4)
+    assert lower["frequency_hz"] == pytest.approx(3.0, abs=1e-6)
+    assert upper["frequency_hz"] == pytest.approx(3.4, abs=1e-6)
+    assert upper["amplitude_m"] == pytest.approx(7e-3, rel=1e-6)
+
+
+def test_no_fold_is_stated_where_too_little_was_measured():
+    branch = make_branch()
+    unstable = [orbit for orbit in branch if not orbit["stable"]]
+    assert find_measured_folds(unstable) == []
+    assert find_measured_folds([unstable[-1], *branch[-1:]]) == []
+    refused = [orbit | {"accepted": orbit["amplitude_m"] < 5.2e-3} for orbit in branch]
+    assert [fold["kind"] for fold in find_measured_folds(refused)] == ["lower"]
+
+
+def test_no_fold_is_stated_far_from_the_measured_orbits():
+    sparse = make_branch()[1::9]
+    assert {orbit["stable"] for orbit in sparse} == {True, False}
+    assert find_measured_folds(sparse) == []
+
+
+def test_a_branch_that_does_not_turn_where_the_plan_says_has_no_fold_there():
+    branch = [orbit | {"stable": orbit["amplitude_m"] < 5.7e-3} for orbit in make_branch()]
+    assert find_measured_folds(branch) == []

@@ -139,6 +139,17 @@ def test_a_table_under_external_control_is_refused():
         read_run_config(PROFILES_DIR / "tests" / "g4_unstable.toml", "follow_simulated")
 
 
+def test_a_plan_for_a_faster_rig_is_refused_with_both_latencies(tmp_path, planned_config):
+    path = tmp_path / "planned.toml"
+    path.write_text(planned_config.profile_toml)
+    assert read_run_config(path).steps == planned_config.steps
+    with raises_input_error(key="latency_s", allowed="50.0 ms") as error:
+        read_run_config(path, "udp_simulated")
+    assert "65.0 ms" in str(error.value)
+    with raises_input_error(key="backend", value="follow"):
+        read_run_config(path, "follow_simulated")
+
+
 def test_a_profile_that_is_no_table_cannot_take_a_plan(tmp_path, monkeypatch):
     """Refused at once: to make a plan takes seconds."""
 

@@ -351,6 +351,15 @@ class OrbitResult(Contract):
     planned: PlannedOrbitKeys = Field(description="orbit of the twin")
 
 
+class MeasuredFold(Contract):
+    """Fold between measured stable and unstable orbits, by a parabola through the nearest."""
+
+    kind: Literal["lower", "upper"] = Field(description="whether the branch turns up or down there")
+    frequency_hz: Hertz = Field(description="where the branch turns")
+    amplitude_m: Metres = Field(description="half of max u - min u there")
+    orbits: int = Field(description="measured orbits that the parabola is fitted to")
+
+
 class Latency(Contract):
     """Latency of the twin: scheduled last sample of a block to its published Comparison."""
 
@@ -459,6 +468,9 @@ class RunSummary(SummaryKeys, Contract):
     )
     orbits: list[OrbitResult] | None = Field(
         None, description="of a continuation, in order of measurement; absent otherwise"
+    )
+    folds: list[MeasuredFold] | None = Field(
+        None, description="of the branch of a continuation; absent otherwise and in old files"
     )
     visits: list[AddedStep] = Field(description="steps added during the test, not in the PRC")
     findings: list[str] = Field(alias="found", description="of the adaptive policies")

@@ -52,6 +52,13 @@ def draw_orbits(run: ReportData) -> CaptionedFigures:
         if own:
             branch_axis.plot(frequencies, 1e3 * amplitudes, "o", color=colour, label=label)
             feedback_axis.plot(frequencies, 100 * shares, "o", color=colour)
+    folds = run.summary.get("folds") or []
+    if folds:
+        branch_axis.plot(
+            [fold["frequency_hz"] for fold in folds],
+            [1e3 * fold["amplitude_m"] for fold in folds],
+            "x", color=DIRECTION_COLOURS["backward"], label="fold, by its neighbours",
+        )  # fmt: skip
     noise = [
         orbit["noise_m"] * orbit["feedback_share"] / orbit["feedback_m"]
         if orbit["feedback_m"]

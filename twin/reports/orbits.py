@@ -1,6 +1,7 @@
 """Orbits that a continuation measured, beside those of its plan: for the summary and the report."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,9 @@ from table_io.config.excitation.orbit_plan import OrbitPlan
 from table_io.errors import InputError
 from table_io.records import OrbitPoint
 from twin.recording.reader import Recording
+
+FOLD_ORBITS = 2  # on either side of a fold, to which a parabola is fitted
+MAX_FOLD_DISTANCE = 0.015  # of the frequency of a fold to theirs: a parabola holds close to it only
 
 
 def summarise_orbits(recording: Recording, plan: OrbitPlan) -> list[dict[str, Any]]:
@@ -48,6 +52,43 @@ def _summarise_orbit(orbit: OrbitPoint, plan: OrbitPlan) -> dict[str, Any]:
             "multiplier": planned.multiplier_size,
         },
     }
+
+
+def find_measured_folds(orbits: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the folds between measured orbits, entries of `summarise_orbits` of one branch.
+
+    Where the plan turns from stable to unstable, a parabola of the frequency over the amplitude
+    of u is fitted to the accepted orbits, up to FOLD_ORBITS on either side. None is stated without
+    an orbit on either side, or where the parabola turns outside of its orbits or far from them.
+    """
+    accepted = [orbit for orbit in orbits if orbit["accepted"]]
+    amplitudes = np.array([orbit["amplitude_m"] for orbit in accepted])
+    frequencies = np.array([orbit["frequency_hz"] for orbit in accepted])
+    is_stable = np.array([orbit["stable"] for orbit in accepted], dtype=bool)
+    folds = []
+    for last in np.flatnonzero(is_stable[1:] != is_stable[:-1]).tolist():
+        near = slice(max(last + 1 - FOLD_ORBITS, 0), last + 1 + FOLD_ORBITS)
+        x, y = amplitudes[near] / amplitudes[last], frequencies[near]
+        if x.size < 3:
+            continue
+        parabola = np.polynomial.Polynomial.fit(x, y, 2)
+        turns = parabola.deriv().roots()
+        if not turns.size:  # three orbits on a straight line
+            continue
+        turn = float(turns[0])
+        fold_hz = float(parabola(turn))
+        is_near = np.abs(y - fold_hz).max() <= MAX_FOLD_DISTANCE * fold_hz
+        if not (x.min() < turn < x.max() and is_near):
+            continue
+        folds.append(
+            {
+                "kind": "lower" if parabola.deriv(2)(turn) > 0 else "upper",
+                "frequency_hz": fold_hz,
+                "amplitude_m": turn * float(amplitudes[last]),
+                "orbits": int(x.size),
+            }
+        )
+    return folds
 
 
 @dataclass(frozen=True, eq=False)

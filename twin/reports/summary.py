@@ -40,7 +40,7 @@ from twin.model.model import Model
 from twin.model.parameters import Parameters, free_flight_resonance
 from twin.recording.reader import Recording
 from twin.reports.contracts import Contract, RunSummary
-from twin.reports.orbits import summarise_orbits
+from twin.reports.orbits import find_measured_folds, summarise_orbits
 from twin.reports.table_motion import format_tracking, summarise_tracking
 from twin.reports.twin_verdict import judge_twin, summarise_agreement
 from twin.reports.windows import summarise_windows
@@ -171,7 +171,10 @@ def _orbits_entry(recording: Recording, profile: Profile) -> Json:
     """Return the measured orbits of a continuation; {} for other tests."""
     if profile.continuation is None:
         return {}
-    return {"orbits": summarise_orbits(recording, profile.continuation.orbit_plan)}
+    plan = profile.continuation.orbit_plan
+    orbits = summarise_orbits(recording, plan)
+    folds = [] if plan.condition == "phase" else find_measured_folds(orbits)
+    return {"orbits": orbits, "folds": folds}
 
 
 def _estimates_entry(estimates: tuple[Estimate, ...]) -> Json:

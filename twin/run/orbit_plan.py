@@ -19,7 +19,7 @@ from table_io.config.excitation.orbit_plan import OrbitPlan, PlannedOrbit
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
-from table_io.sequencer import FEEDBACK_HORIZON_S
+from table_io.sequencer import FEEDBACK_HORIZON_S, make_test_plan
 from table_io.units import GRAVITY_M_S2
 from twin.dynamics.arclength import NoConvergence, correct, weighted_length
 from twin.dynamics.continuation import Branch, continue_branch, make_problem, orbit_weights
@@ -313,10 +313,23 @@ def _attach_file(text: str, content: str, where: str) -> str:
     )
 
 
+def check_orbit_plan(profile: Profile, rig: RigConfig) -> None:
+    """Raise InputError if a rig answers later than the orbit plan that a profile brings allows."""
+    make_test_plan(profile, rig, _find_replace_after(profile, rig))
+
+
 def find_timing(profile: Profile, rig: RigConfig) -> FeedbackTiming:
     """Return the timing of the feedback on a rig; InputError if it cannot replace its command."""
     config = profile.continuation
     assert config is not None
+    rate_hz = profile.acquisition.rate_hz
+    horizon_s = _find_replace_after(profile, rig) / rate_hz + FEEDBACK_HORIZON_S
+    latency_s = horizon_s + 1e-3 * config.table_lag_ms
+    return FeedbackTiming(latency_s, JITTER_S, profile.acquisition.block_samples / rate_hz)
+
+
+def _find_replace_after(profile: Profile, rig: RigConfig) -> int:
+    """Return how many samples ahead a rig can change its command; InputError if it cannot."""
     if rig.under_external_control:
         raise InputError(
             "another controller drives this table: there is no queued command to replace",
@@ -325,8 +338,4 @@ def find_timing(profile: Profile, rig: RigConfig) -> FeedbackTiming:
             value=rig.backend,
             remedy="use a rig whose backend drives the table",
         )
-    rate_hz = profile.acquisition.rate_hz
-    backend = open_backend(rig, profile, ManualClock())
-    horizon_s = backend.replace_after / rate_hz + FEEDBACK_HORIZON_S
-    latency_s = horizon_s + 1e-3 * config.table_lag_ms
-    return FeedbackTiming(latency_s, JITTER_S, profile.acquisition.block_samples / rate_hz)
+    return open_backend(rig, profile, ManualClock()).replace_after

@@ -179,11 +179,14 @@ def build_run_config(
         model or profile.model, "models", relative_to, option="--model" if model else ""
     )
     model_config, model_toml = load_model_config(model_path)
-    if profile.continuation is not None and profile.continuation.file is None:
-        from twin.run.orbit_plan import attach_orbit_plan
+    if profile.continuation is not None:
+        from twin.run.orbit_plan import attach_orbit_plan, check_orbit_plan
 
-        own_model = model_config.build_model(profile.specimen)
-        profile_toml = attach_orbit_plan(profile_toml, profile, rig, own_model, source)
+        if profile.continuation.file is None:
+            own_model = model_config.build_model(profile.specimen)
+            profile_toml = attach_orbit_plan(profile_toml, profile, rig, own_model, source)
+        else:
+            check_orbit_plan(profile, rig)
     try:
         config = from_texts(name, profile_toml, rig_toml, model_toml, source)
     except InputError as error:

@@ -23,12 +23,14 @@ from table_io.control.orbit_feedback import advance_feedback
 from table_io.errors import InputError
 from table_io.records import Event, OrbitPoint, Record, RunStart, RunStop
 from table_io.sequencer import orbits, releases
+from table_io.sim.plant import Plant
+from tests.table_io.sim.plant_orbits import trace_orbits
 
 RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "rig file")[0]
 PLAN = json.loads(Path(__file__).with_name("unstable_orbits.json").read_text(encoding="utf-8"))
 RATE_HZ = 2000.0
 MULTIPLIER_PERIODS = 24  # by default
-# By shooting on the simulated plant itself, payload reaction included: f in Hz, |U_1| in mm,
+# Of the simulated plant itself with payload reaction (`plant_orbits.py`): f in Hz, |U_1| in mm,
 # largest Floquet multiplier.
 TRUE_ORBITS = np.array(
     [
@@ -38,8 +40,15 @@ TRUE_ORBITS = np.array(
 )  # fmt: skip
 
 
-def make_profile(points: slice = slice(None), latency_s: float = 0.046, **keys: Any) -> Profile:
-    plan = PLAN | {"points": PLAN["points"][points], "latency_s": latency_s}
+def make_profile(
+    points: slice = slice(None),
+    latency_s: float = 0.046,
+    planned: dict[str, Any] | None = None,
+    **keys: Any,
+) -> Profile:
+    """Return the profile of some points of the plan, or of one `planned` orbit."""
+    orbits = PLAN["points"][points] if planned is None else [planned]
+    plan = PLAN | {"points": orbits, "latency_s": latency_s}
     excitation = {
         "kind": "continuation",
         "start_hz": 2.85,
@@ -116,6 +125,25 @@ def test_unstable_orbits_are_held_without_feedback_left(held: Run) -> None:
         assert point.acceleration_m_s2 == pytest.approx(0.49033, rel=0.006)
         assert point.periods <= 150 + MULTIPLIER_PERIODS
     assert held.select(RunStop)[0].verdict == "complete"
+
+
+def test_the_latency_of_the_feedback_is_stated(held: Run) -> None:
+    (event,) = [event for event in held.select(Event) if event.kind == "feedback"]
+    measured_ms = float(event.text.split()[3])
+    assert measured_ms == pytest.approx(45.0, abs=2.0)  # 30 ms to the command, 15 ms of servo
+
+
+def test_true_orbits_are_those_by_shooting_on_the_plant() -> None:
+    plant = Plant(
+        550.0, 36e3, 1100.0, 510e3, 900.0, 2e-3, 2e-3, 2000.0, 20.0, 0.0, True, RATE_HZ
+    )  # fmt: skip
+    orbits = trace_orbits(plant, 0.05 * 9.80665, 2.2e-3, 2.46e-3, start_hz=3.0)
+    by_shooting = [(o.frequency_hz, 1e3 * o.fundamental_m, abs(o.multiplier)) for o in orbits]
+    frequencies_hz, amplitudes_mm, multipliers = np.array(by_shooting).T
+    true_mm = np.interp(TRUE_ORBITS[:, 0], frequencies_hz, amplitudes_mm)
+    assert true_mm == pytest.approx(TRUE_ORBITS[:, 1], rel=2e-4)
+    true = np.interp(TRUE_ORBITS[:, 0], frequencies_hz, multipliers)
+    assert true == pytest.approx(TRUE_ORBITS[:, 2], rel=2e-3)
 
 
 def test_measured_orbits_are_those_of_the_plant(held: Run) -> None:
@@ -229,7 +257,7 @@ def test_operator_stops_a_held_orbit(held: Run) -> None:
 
 
 def test_plan_for_a_shorter_latency_is_refused_before_the_orbits() -> None:
-    refused = run(make_profile(latency_s=0.031))
+    refused = run(make_profile(latency_s=0.031, table_lag_ms=1.0))
     assert refused.select(RunStop)[0].verdict == "aborted"
     assert not refused.select(OrbitPoint)
     assert np.abs(refused.command_m).max() < 2e-4  # the loop check only
@@ -262,3 +290,16 @@ def test_nominal_drive_holds_the_first_orbit() -> None:
     drive = sequencer.nominal_drive(sequencer.make_test_plan(profile, RIG, 40))
     assert {segment.step for segment in drive.sine_segments} == {-1, 0}
     assert replace(drive.steps[1]) == profile.steps[1]
+
+
+def test_a_model_that_departs_too_far_ends_the_test_at_its_first_orbit() -> None:
+    """The plan's orbit has twice the amplitude of the specimen's."""
+    orbit = PLAN["points"][0]
+    doubled = orbit | {"u_m": (2.0 * np.array(orbit["u_m"])).tolist()}
+    far = run(make_profile(planned=doubled, retries=0), stop_s=60.0)
+    stop = far.select(RunStop)[0]
+    assert stop.verdict == "aborted"
+    assert "the first orbit cannot be held" in stop.reason
+    assert "identify the model" in stop.reason
+    assert not any(point.accepted for point in far.select(OrbitPoint))
+    assert np.abs(far.command_m[-200:]).max() < 1e-6
