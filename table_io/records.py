@@ -37,6 +37,7 @@ class RunStart:
     host: str
     started_at: str  # ISO 8601, for display only
     epoch_s: float  # monotonic clock of the host at sample 0, for latencies only
+    predictions_every: int = 0  # of the twin's blocks only every n-th is recorded; 0: all
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +64,18 @@ class Comparison:
     measured_ss: tuple[float, ...]
     free_error_ss: tuple[float, ...]
     window_error_ss: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PredictionHash:
+    """Hash of the twin's output over samples index .. index + count - 1.
+
+    So a replay proves that it predicts the same also where no predictions were recorded.
+    """
+
+    index: int
+    count: int
+    digest: bytes  # BLAKE2b, 16 bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -360,6 +373,7 @@ Record = (
     RunStart
     | Params
     | Comparison
+    | PredictionHash
     | CycleExtremes
     | PrcPoint
     | Event
@@ -378,7 +392,7 @@ Record = (
     | RunStop
 )
 RECORD_TYPES: tuple[type, ...] = (
-    RunStart, Params, Comparison, CycleExtremes, PrcPoint, Event, SampleGap, Fault, Timing,
-    Check, FrequencyResponse, Level, StepAdded, OrbitPoint, Trip, Agreement, Estimate, JumpForecast,
-    RunStop,
+    RunStart, Params, Comparison, PredictionHash, CycleExtremes, PrcPoint, Event, SampleGap, Fault,
+    Timing, Check, FrequencyResponse, Level, StepAdded, OrbitPoint, Trip, Agreement, Estimate,
+    JumpForecast, RunStop,
 )  # fmt: skip

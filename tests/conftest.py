@@ -32,6 +32,8 @@ measured_cycles = 2
 enabled = false
 [acquisition]
 rate_hz = 1000.0
+[recording]
+predictions = "all"
 """
 
 

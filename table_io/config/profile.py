@@ -111,6 +111,16 @@ class ComparisonConfig(ConfigModel):
     contact_n: Positive = Field(10.0, description="Bumper force above which it is in contact.")
 
 
+class RecordingConfig(ConfigModel):
+    """Content of the recording."""
+
+    predictions: Literal["hash", "all"] = Field(
+        "hash",
+        description='What is recorded of the twin\'s output: "hash" is every 10th block and a hash '
+        'of all, from which a replay proves what it recomputes; "all" is every block.',
+    )
+
+
 class OnDeathConfig(ConfigModel):
     """Reaction of the test to the death of a helper process, which is restarted either way."""
 
@@ -192,6 +202,7 @@ class Profile(ConfigModel):
     )
     acquisition: AcquisitionConfig = Field(AcquisitionConfig(), validate_default=True)
     comparison: ComparisonConfig = ComparisonConfig()
+    recording: RecordingConfig = RecordingConfig()
     loop_check: LoopCheckConfig = LoopCheckConfig()
     control: ControlConfig = ControlConfig()
     protection: ProtectionConfig = ProtectionConfig()

@@ -8,7 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from tests.bench.ratios import KEPT_RATIOS, find_regressions, format_table, read_ratios
+from tests.bench.ratios import (
+    KEPT_RATIOS,
+    collect_ratios,
+    find_regressions,
+    format_table,
+    format_times,
+    read_benchmarks,
+)
 
 
 @pytest.mark.parametrize(
@@ -21,11 +28,21 @@ def test_a_growth_of_a_fifth_is_a_regression(ratio: float | None, regressions: l
     assert format_table(ratios, {"a peer": 2.0}).count("regression") == len(regressions)
 
 
-def test_only_ratios_are_read(tmp_path: Path) -> None:
-    path = tmp_path / "bench.json"
-    extra = {"over_solve_ivp": 0.25, "points": 200}
-    path.write_text(json.dumps({"benchmarks": [{"name": "test_sweep", "extra_info": extra}]}))
-    assert read_ratios(path) == {"sweep solve_ivp": 0.25}
+def test_the_smallest_ratio_counts_and_the_page_has_the_times(tmp_path: Path) -> None:
+    paths = [tmp_path / "first.json", tmp_path / "again.json"]
+    for path, ratio in zip(paths, (0.25, 0.2), strict=True):
+        benchmark = {
+            "name": "test_sweep",
+            "group": "solver",
+            "extra_info": {"over_solve_ivp": ratio, "points": 200},
+            "stats": {"min": 0.0012, "median": 1.5},
+        }
+        path.write_text(json.dumps({"benchmarks": [benchmark]}))
+    assert collect_ratios(read_benchmarks(paths[:1])) == {"sweep solve_ivp": 0.25}
+    assert collect_ratios(read_benchmarks(paths)) == {"sweep solve_ivp": 0.2}
+    assert format_times(read_benchmarks(paths[:1])).splitlines()[-1] == (
+        "| sweep | solver | 1.2 ms | 1.5 s | points 200 |"
+    )
 
 
 def test_the_kept_ratios_are_those_of_benchmarks() -> None:

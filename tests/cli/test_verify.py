@@ -89,7 +89,7 @@ def test_a_whole_log_is_whole(log: Path, recording: Recording) -> None:
     code, report = verify(log)
     assert (code, report["sound"]) == (0, True)
     assert report["damage"] == report["gaps"] == report["altered"] == []
-    assert (report["content"], report["schema"]) == ("same", 3)
+    assert (report["content"], report["schema"]) == ("same", 4)
     assert report["samples"]["acquired"] == 1000
     assert report["topics"]["/rig/meas"] == {"messages": 50, "missing": 0}
     assert report["replay"] == {"possible": True, "identical": True, "because": []}

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from table_io.records import Fault
+from table_io.records import Comparison, Fault
 from tests.command_line import call_main
 from twin.recording.reader import Recording, read_recording
 from twin.run.diagnostics import LEVEL_VARIABLE
@@ -193,7 +193,7 @@ def test_a_dead_twin_is_a_fault_a_dead_recorder_no_gap_and_a_dead_viewer_nothing
     (fault,) = recording.records(Fault)
     assert fault.component == "twin"
     assert 0 < fault.from_index < fault.to_index <= summary["run"]["samples"]
-    compared = [block.index for block in recording.blocks("pred")]
+    compared = [comparison.index for comparison in recording.records(Comparison)]
     assert not [index for index in compared if fault.from_index <= index < fault.to_index]
     # On a loaded machine the new twin may be ready only when the test has ended.
     assert fault.to_index in compared or fault.to_index == summary["run"]["samples"]

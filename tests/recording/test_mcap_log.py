@@ -72,7 +72,7 @@ def test_the_log_carries_texts_versions_schemas_and_times(log: Path) -> None:
     assert decode_item("/run/start", texts["start.pb"]) == (START.run, START)
     assert about["attachments"] == {k: sha256(v).hexdigest() for k, v in texts.items()}
     assert about["run"] == {
-        "id": START.run, "schema": "3", "host": "here", "started_at": START.started_at,
+        "id": START.run, "schema": "4", "host": "here", "started_at": START.started_at,
         "shaketwin": "0.1.0",
     }  # fmt: skip
     counted = {name: str(len(stamps)) for name, stamps in times.items()}

@@ -45,6 +45,8 @@ cycles = 4
 measured_cycles = 2
 [acquisition]
 rate_hz = 1000.0
+[recording]
+predictions = "all"
 """
 CELLS = ("force_r1_n", "force_r2_n", "force_l1_n", "force_l2_n")
 

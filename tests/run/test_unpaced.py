@@ -44,6 +44,8 @@ measured_cycles = 2
 enabled = false
 [control]
 enabled = false
+[recording]
+predictions = "all"
 """
 
 

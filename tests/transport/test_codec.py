@@ -54,6 +54,7 @@ def anything_like(hint: Any) -> st.SearchStrategy[Any]:
         bool: st.booleans(),
         float: st.one_of(st.sampled_from(ODD), st.floats()),
         str: st.text(max_size=20),
+        bytes: st.binary(max_size=20),
     }[hint]
 
 
@@ -179,6 +180,8 @@ def describe_field(field: FieldDescriptor) -> tuple[str, str]:
         FieldDescriptor.CPPTYPE_BOOL: "bool",
         FieldDescriptor.CPPTYPE_STRING: "str",
     }
+    if field.type == FieldDescriptor.TYPE_BYTES:
+        return "bytes", "one"
     if field.message_type is None:
         optional = "optional" if field.containing_oneof is not None else "one"
         return kinds[field.cpp_type], "many" if field.is_repeated else optional

@@ -19,6 +19,7 @@ from twin.reports.finalize import EXIT_INTERRUPTED, EXIT_NOT_IDENTICAL, finalize
 from twin.run.folders import make_run_folder
 from twin.run.progress import RunProgress
 from twin.run.recordings import read_recorded_config, warn_if_damaged
+from twin.run.rerun import DRIVE_CHANNEL
 from twin.run.run_config import RunConfig
 from twin.run.terminal import console, print_line
 from twin.run.versions import find_version_changes, format_version_changes
@@ -76,11 +77,11 @@ def open_replay_log(log: Path) -> RecordedRun:
 def require_drive_channel(recording: Recording) -> None:
     """Raise InputError if a recording lacks the channel that drives the twin."""
     channels = recording.start.channels
-    if "table_acc_m_s2" not in channels:
+    if DRIVE_CHANNEL not in channels:
         raise InputError(
             f"not recorded, but it drives the twin; there: {', '.join(channels)}",
             where=recording.path,
-            key="table_acc_m_s2",
+            key=DRIVE_CHANNEL,
             remedy="import the table's acceleration too",
         )
 
@@ -160,9 +161,14 @@ def describe_replay(
         "missing": identity.missing,
         "unrecorded": identity.unrecorded,
         "lost_with_twin": identity.lost_with_twin,
+        "hashes": identity.hashes,
+        "hashes_compared": identity.hashes_compared,
+        "hashes_differing": identity.hashes_differing,
+        "predictions_compared": identity.predictions_compared,
+        "predictions_differing": identity.predictions_differing,
         "first_difference_index": identity.first_difference,
         "largest_difference_of_error_sums": identity.largest,
-        "relative_difference": compute_deviation(recording.path, log) if identity.differing else {},
+        "relative_difference": compute_deviation(recording.path, log) if identity.differs else {},
         "versions_differing": find_version_changes(recording.start.versions),
         "recorded_comparison": summaries.channel_nrmse(
             tuple(item for item in recorded_items if isinstance(item, Comparison)),
@@ -178,7 +184,8 @@ def format_identity(identity: ReplayComparison, comparison: summaries.Json) -> s
     if identity.is_identical:
         lost = identity.lost_with_twin
         suffix = f"; {lost} more died with the twin before they were recorded" if lost else ""
-        return f"{identity.compared} comparisons, identical to the bit{suffix}"
+        hashes = f" and {identity.hashes} hashes of predictions" if identity.hashes else ""
+        return f"{identity.compared} comparisons{hashes}, identical to the bit{suffix}"
     if not identity.recorded:
         return f"no comparisons were recorded; {identity.made} are made"
     parts = [f"its beginning is in {identity.beginning}"] if identity.beginning else []
@@ -186,6 +193,11 @@ def format_identity(identity: ReplayComparison, comparison: summaries.Json) -> s
         f"{identity.differing} of {identity.recorded} comparisons differ, "
         f"{identity.missing} missing, {identity.unrecorded} never recorded"
     ]
+    if identity.hashes_differing or identity.hashes_compared < identity.hashes:
+        parts.append(
+            f"of {identity.hashes} hashes of predictions {identity.hashes_differing} differ, "
+            f"{identity.hashes - identity.hashes_compared} missing"
+        )
     if comparison["relative_difference"]:
         parts.append(describe_deviation(comparison["relative_difference"]))
     if comparison["model"] == RECORDED:

@@ -9,7 +9,7 @@ from typing import Any
 from rich.table import Table
 
 from table_io.errors import InputError
-from table_io.records import Comparison, SampleGap
+from table_io.records import Comparison, PredictionHash, SampleGap
 from twin.recording.log_metadata import ContentHash, find_altered_attachments, read_schema_version
 from twin.recording.reader import Recording, build_recording
 from twin.recording.recovery import Damage, LogMessage, RecoveredLog, recover_log
@@ -80,6 +80,11 @@ def examine_logs(paths: list[Path], unmerged: Sequence[str] = ()) -> Verificatio
             "missing": recording.missing_samples,
             "planned": start.planned_samples,
             "stopped": recording.stop.verdict if recording.stop else None,
+        },
+        "predictions": {
+            "every": max(start.predictions_every, 1),
+            "recorded": sum(map(len, recording.blocks("pred"))),
+            "hashed": sum(entry.count for entry in recording.records(PredictionHash)),
         },
         "gaps": [
             *({"first": first, "count": count, "channel": "", "reason": "missing in this file"}
@@ -238,6 +243,7 @@ def print_verification(report: Json, advise: bool = True) -> None:
         f"  {samples['acquired']} samples at {rate_hz:g} Hz ({seconds:.1f} s), {end}; "
         f"schema version {report['schema']}; content {_describe_content(report)}"
     )
+    print_line(f"  twin: {_describe_predictions(report['predictions'])}")
     table = Table("topic", "messages", "missing", box=None)
     for topic, counts in report["topics"].items():
         table.add_row(topic, str(counts["messages"]), str(counts["missing"] or ""))
@@ -276,6 +282,17 @@ def _describe_content(report: Json) -> str:
         "differs": "differs from its hash",
         "unknown": "without a hash (an unfinished log, or one of version 1)",
     }[report["content"]]
+
+
+def _describe_predictions(predictions: Json) -> str:
+    """Format which predictions are recorded."""
+    samples = f"{predictions['recorded']} samples of its output"
+    if predictions["every"] <= 1:
+        return samples
+    return (
+        f"{samples}, every {predictions['every']}th block, and hashes of "
+        f"{predictions['hashed']}; a replay recomputes the rest and compares"
+    )
 
 
 def _describe_sensor(sensor: Json) -> str:

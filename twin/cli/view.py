@@ -10,6 +10,7 @@ from table_io.clock import RealClock
 from table_io.errors import InputError
 from twin.recording.reader import read_recording
 from twin.recording.run_paths import resolve_log_path
+from twin.run.rerun import restore_predictions
 from twin.run.system import lock_folder
 from twin.run.temporary_folders import VIEW_PREFIX, make_private_folder
 from twin.run.terminal import print_line
@@ -59,7 +60,7 @@ def view_log(log: Path, save: Path | None, picture: Path | None) -> None:
     """Open a recording in Rerun; with `save` or `picture` only write these files."""
     for path in (save, picture):
         _require_parent(path)
-    recording = read_recording(log)
+    recording = restore_predictions(read_recording(log))
     if save is None and picture is None:
         rrd = make_private_folder(VIEW_PREFIX) / "view.rrd"
         write_rrd(recording, rrd)
@@ -80,7 +81,7 @@ def view_log_in_browser(log: Path) -> None:
     with tempfile.TemporaryDirectory(prefix=VIEW_PREFIX) as folder, suppress(KeyboardInterrupt):
         lock_folder(Path(folder))
         rrd = Path(folder) / "view.rrd"
-        write_rrd(read_recording(log), rrd)
+        write_rrd(restore_predictions(read_recording(log)), rrd)
         with serve_web_viewer(rrd) as url:
             print_line(f"page: {url}")
             print_line("Ctrl-C ends it")

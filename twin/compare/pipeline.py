@@ -10,11 +10,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from table_io.block import Block, Float1D, Label, join_blocks
+from table_io.block import Block, Float1D, Float2D, Label, join_blocks
 from table_io.channels import Channel, contact_forces, relative_displacement
 from table_io.config.profile import Profile
 from table_io.records import Comparison, CycleExtremes, Event, Params, Record, Step, StepAdded
-from twin.compare import monitoring
+from twin.compare import TWIN_CHANNELS, monitoring
 from twin.compare.cycles import (
     UNKNOWN_CONTACT,
     ContactState,
@@ -30,6 +30,7 @@ from twin.compare.monitoring import MonitoringState
 from twin.compare.monitoring.cycle import CycleData, MonitoringSetup
 from twin.compare.monitoring.jumps import JumpPrediction, predict_jumps
 from twin.compare.monitoring.low_cut import LowCutRemoval
+from twin.compare.prediction_hash import HASHED_BLOCKS, hash_cells
 from twin.compare.sensors import remove_sensor_errors
 from twin.compare.twins import TwinSetup, TwinStates, advance_twins, start_twins
 from twin.model import valid_range
@@ -91,6 +92,7 @@ class PipelineState:
     monitoring: MonitoringState = field(default_factory=MonitoringState)
     low_cuts: LowCutRemoval = field(default_factory=LowCutRemoval)
     range_exits: frozenset[RangeKey] = frozenset()  # reported so far
+    unhashed: Float2D = field(default_factory=lambda: np.empty((len(TWIN_CHANNELS), 0)))
 
 
 def prepare_pipeline(
@@ -160,7 +162,7 @@ def step(
 ) -> tuple[PipelineState, list[Block | Record]]:
     """Return the state after a block, and the predicted Block with the records it completes.
 
-    Records: Comparison, CycleExtremes, PrcPoint and those of the monitoring.
+    Records: Comparison, PredictionHash, CycleExtremes, PrcPoint and those of the monitoring.
     """
     if block.index != state.twins.index:
         twins = start_twins(setup.twin, block.index)
@@ -186,7 +188,10 @@ def step(
         compared.extend(comparisons)
     predicted = join_blocks(pieces)
     state, events = _watch_ranges(setup, state, block, predicted)
-    return state, [predicted, *compared, *records, *events]
+    cell_samples = HASHED_BLOCKS * setup.twin.grid_samples
+    unhashed, hashes = hash_cells(state.unhashed, block.end, predicted.values, cell_samples)
+    state = replace(state, unhashed=unhashed)
+    return state, [predicted, *compared, *hashes, *records, *events]
 
 
 def _watch_ranges(

@@ -4,13 +4,15 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import chain
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from table_io.errors import InputError, format_pip_line
 from table_io.records import RunStart
 from twin.recording.run_paths import resolve_log_path
-from twin.recording.tabular import LogTable, iter_batches, read_log_table
+from twin.recording.tabular import TWIN_PREFIX, LogTable, iter_batches, read_log_table
 from twin.run.recordings import open_recording
+from twin.run.rerun import restore_log
 from twin.run.terminal import error_console, print_line
 
 # File suffix by format. The Foxglove layout is a second file.
@@ -52,12 +54,14 @@ def export_log(
         raise InputError("exports a whole run", where="--rrd", remedy="omit --channel and --steps")
     # Check everything before the first file is written, so that a second attempt can succeed.
     writers = {kind: _load_writer(kind) for kind in paths if kind != "rrd"}
-    rows = _read_rows(path, channels, steps) if writers else None
-    with ExitStack() as cleanup:
+    needs_twin = not channels or any(name.startswith(TWIN_PREFIX) for name in channels)
+    with TemporaryDirectory() as scratch, ExitStack() as cleanup:
+        whole = restore_log(path, Path(scratch)) if needs_twin else path
+        rows = _read_rows(whole, channels, steps) if writers else None
         _make_folder(paths[formats[0]].absolute().parent, cleanup)
         messages: list[str] = []
         if "rrd" in paths:
-            _write_rrd(path, paths["rrd"])
+            _write_rrd(whole, paths["rrd"])
             cleanup.callback(paths["rrd"].unlink, missing_ok=True)
             messages.append(f"{paths['rrd']}")
         if rows is not None:

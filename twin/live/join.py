@@ -170,7 +170,9 @@ class _JoinedRecorder:
             self._early_messages.append((topic_name, payload))
             return
         try:
-            self.writer.write(topic_name, payload, item.index)
+            for part in self.writer.select_recorded(item):
+                data = payload if part is item else encode_item(part, run)
+                self.writer.write(topic_name, data, part.index)
         except LogTimeError:  # an index beyond any sample of this run
             return
         self.completion.update(item)

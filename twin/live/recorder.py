@@ -132,7 +132,9 @@ class Recorder:
         if isinstance(item, RunStart):
             self.writer.write_run_description(item)
         try:
-            self.writer.write(topic_name, payload, item.index)
+            for part in self.writer.select_recorded(item):
+                data = payload if part is item else encode_item(part, run)
+                self.writer.write(topic_name, data, part.index)
         except LogTimeError:  # an index beyond any sample of this run
             self.impossible_count += 1
             return

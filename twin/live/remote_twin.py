@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from table_io.block import Block
-from table_io.records import Comparison, Event, Fault, Timing
+from table_io.records import Comparison, Event, Fault, PredictionHash, Timing
 from twin.transport.codec import TOPIC_TYPES, Item, WireError, decode_item
 from twin.transport.history_cache import FIRST_FLAG, LAST_FLAG, Fragment
 from twin.transport.reliable_subscriber import ReliableSubscriber
@@ -45,8 +45,8 @@ def _last_sample(item: Item) -> int:
     match item:
         case Block(end=end):
             return end
-        case Comparison(index=index, count=count):
-            return index + count
+        case Comparison() | PredictionHash():
+            return item.index + item.count
         case Fault(index=index, to_index=to_index):
             return max(index, to_index)
     return item.index

@@ -21,7 +21,8 @@
 All arrays share one uniform time axis from the first to the last measured sample. In gaps, and
 where a twin has no output, values are NaN; `step_index`, `label` and `cycle` are -1 there. Arrays
 are float64, bit-identical to the recording, and read-only: copy them to change values. `open_log`
-reads only the start record; a stream is read at its first use and cached.
+reads only the start record; a stream is read at its first use and cached. Where only a part of the
+twin's output was recorded, its first use reruns the twin.
 """
 
 from collections.abc import Iterator
@@ -57,6 +58,7 @@ from twin.model.model import Model
 from twin.recording.reader import Recording, read_recording, read_start
 from twin.recording.run_paths import resolve_log_path
 from twin.recording.tabular import channel_unit, collect_steps
+from twin.run.rerun import restore_predictions
 from twin.transport.codec import RECORD_TOPICS
 from twin.transport.endpoint import MEAS_TOPIC, PRED_TOPIC
 
@@ -190,8 +192,14 @@ class Log:
     def predicted(self) -> Float2D:
         """Outputs of both twins on the time axis, (channel, sample), rows as `TWIN_CHANNELS`."""
         return self._place_on_axis(
-            read_recording(self.path, (PRED_TOPIC,)).contiguous_blocks("pred"), TWIN_CHANNELS
+            self._read_predictions().contiguous_blocks("pred"), TWIN_CHANNELS
         )
+
+    def _read_predictions(self) -> Recording:
+        """Return the recording with the predictions; those not recorded are recomputed."""
+        if self.start.predictions_every <= 1:
+            return read_recording(self.path, (PRED_TOPIC,))
+        return restore_predictions(read_recording(self.path))
 
     @cached_property
     def twin(self) -> ChannelMap:

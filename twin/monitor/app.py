@@ -24,7 +24,7 @@ from twin.run.terminal import console, print_line
 from twin.security.access_control import user_name
 from twin.security.credentials import Credentials
 from twin.transport.codec import RECORD_TOPICS, Item, WireError, decode_item
-from twin.transport.endpoint import MEAS_TOPIC, check_endpoint
+from twin.transport.endpoint import MEAS_TOPIC, STREAM_TOPICS, check_endpoint
 from twin.transport.reliable_subscriber import ReliableSubscriber
 from twin.transport.zenoh_link import BusLink, open_spoke
 
@@ -37,7 +37,7 @@ QUEUE_CAPACITY = 5000
 MAX_ITEMS = 1000  # per drain, so that a replay at full speed leaves time to draw
 COMPARISON_TOPIC = RECORD_TOPICS[Comparison]
 LIVE_TOPICS = (MEAS_TOPIC, COMPARISON_TOPIC)  # without history: old samples are not shown
-HISTORY_TOPICS = tuple(topic for topic in RECORD_TOPICS.values() if topic != COMPARISON_TOPIC)
+HISTORY_TOPICS = tuple(topic for topic in RECORD_TOPICS.values() if topic not in STREAM_TOPICS)
 DEFAULT_SIZE = 120, 40
 CommandSender = Callable[[str], str]  # command -> result for the user
 BEGIN_UPDATE, END_UPDATE = (

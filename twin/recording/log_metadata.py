@@ -14,7 +14,7 @@ from table_io.errors import InputError
 from table_io.records import RunStart
 from twin.transport.codec import encode_item
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 START_COPY_NAME = "start.pb"
 Metadata = dict[str, dict[str, str]]  # metadata record by name, its values by key
 

@@ -5,7 +5,7 @@ the first message, so that an interrupted recording is self-contained. Only this
 """
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -17,6 +17,7 @@ from mcap.records import Metadata as MetadataRecord
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
+from table_io.block import Block
 from table_io.clock import wall_clock_ns
 from table_io.records import RunStart
 from twin.recording.append_only_file import AppendOnlyFile
@@ -27,6 +28,7 @@ from twin.recording.log_metadata import (
     build_attachments,
     hash_attachments,
 )
+from twin.recording.predictions import select_recorded
 from twin.recording.recovery import LogMessage, recover_log
 from twin.transport.codec import (
     TOPIC_TYPES,
@@ -60,6 +62,7 @@ class LogWriter:
         self._channels: dict[str, int] = {}
         self._next_sequence: dict[str, int] = {}
         self._content = ContentHash()
+        self._start: RunStart | None = None
         self._finished = False
 
     @property
@@ -71,6 +74,12 @@ class LogWriter:
     def size(self) -> int:
         """Size in bytes, including data not yet written to the disk."""
         return self._file.tell()
+
+    def select_recorded(self, item: Item) -> Sequence[Item]:
+        """Return what is recorded of an item: itself, of a predicted block perhaps only parts."""
+        if isinstance(item, Block) and self._start is not None:
+            return select_recorded(item, self._start)
+        return (item,)
 
     def write(
         self, topic: str, payload: bytes, index: int, publish_time: int | None = None
@@ -101,6 +110,7 @@ class LogWriter:
 
     def write_run_description(self, start: RunStart) -> None:
         """Write metadata and attachments of the run; call it before the first message."""
+        self._start = start
         texts = build_attachments(start)
         run_metadata = {"id": start.run, "schema": str(SCHEMA_VERSION), "host": start.host}
         self.write_metadata(
@@ -208,5 +218,6 @@ def write_items(path: Path, items: list[Item], start: RunStart) -> None:
     writer = LogWriter(path, start.rate_hz)
     writer.write_run_description(start)
     for item in items:
-        writer.write(topic_for(item), encode_item(item, start.run), item.index)
+        for part in writer.select_recorded(item):
+            writer.write(topic_for(part), encode_item(part, start.run), part.index)
     writer.close()

@@ -40,6 +40,8 @@ def validate_start(start: RunStart) -> str:
         return "no channels, or duplicate channels"
     if not 0 < start.block_samples <= start.rate_hz * MAX_DURATION_S:
         return f"block_samples = {start.block_samples}"
+    if start.predictions_every > MAX_STEPS:
+        return f"predictions_every = {start.predictions_every}"
     if max(start.index, start.planned_samples) > start.rate_hz * MAX_DURATION_S:
         return f"index = {start.index}, planned_samples = {start.planned_samples}"
     if len(start.steps) > MAX_STEPS or not all(map(_is_valid_step, start.steps)):

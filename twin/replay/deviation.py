@@ -1,6 +1,7 @@
 """Relative deviation between the predictions of two recordings of one test."""
 
 import math
+from bisect import bisect_right
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from twin.transport.endpoint import PRED_TOPIC
 
 
 def compute_deviation(old_path: Path, new_path: Path) -> Json:
-    """Return rms(new - old) / rms(old) by predicted channel, over samples finite in both.
+    """Return rms(new - old) / rms(old) by predicted channel, over samples recorded in both.
 
     None where a recording has no predictions of the channel.
     """
@@ -22,10 +23,13 @@ def compute_deviation(old_path: Path, new_path: Path) -> Json:
         for path in (old_path, new_path)
     )
     squares = np.zeros((2, len(TWIN_CHANNELS)))
+    ends = [block.end for block in new_blocks]
     for old_block in old_blocks:
-        for new_block in new_blocks:
+        for new_block in new_blocks[bisect_right(ends, old_block.index) :]:
+            if new_block.index >= old_block.end:
+                break
             first, last = max(old_block.index, new_block.index), min(old_block.end, new_block.end)
-            if first < last and old_block.channels == new_block.channels == TWIN_CHANNELS:
+            if old_block.channels == new_block.channels == TWIN_CHANNELS:
                 squares += _sum_squares(old_block.cut(first, last), new_block.cut(first, last))
     return {
         name: math.sqrt(difference / signal) if signal > 0 else None

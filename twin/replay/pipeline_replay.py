@@ -1,12 +1,10 @@
 """Replay of a recording: the rig's stream as recorded, the twin's results recomputed."""
 
-import heapq
 import math
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -23,25 +21,25 @@ from table_io.records import (
     JumpForecast,
     Params,
     PrcPoint,
-    Record,
+    PredictionHash,
     RunStart,
     RunStop,
-    StepAdded,
     Timing,
 )
-from twin.compare import COMPARED_CHANNELS, pipeline
-from twin.recording.reader import Recording, build_recording
+from twin.compare import COMPARED_CHANNELS
+from twin.recording.predictions import select_recorded
+from twin.recording.reader import Recording, build_recording, read_start
 from twin.recording.recovery import recover_log
 from twin.replay.provenance import find_earlier_run, iter_start_records
+from twin.run.rerun import TWIN_RECORDS, is_rig_item, rerun_twin
 from twin.run.run_config import RunConfig
 from twin.run.unpaced import ItemHandler, record_items
 from twin.transport.codec import RECORD_TOPICS, TOPIC_TYPES, Item, WireError, decode_item, strip_run
-from twin.transport.endpoint import CMP_TOPIC, PRED_TOPIC
+from twin.transport.endpoint import CMP_TOPIC, HASH_TOPIC, PRED_TOPIC
 
 TIMING_TOPIC = RECORD_TOPICS[Timing]
 MAX_COMPARISON_SAMPLES = 10_000  # covered by one comparison
 LAST_WORDS_S = 1.5  # what a twin and a recorder that die together may take with them
-BLOCK_DURATION_S = 1.0  # offline; results do not depend on the block size
 STAMPED_AT_END = (
     CycleExtremes,
     PrcPoint,
@@ -49,26 +47,34 @@ STAMPED_AT_END = (
     Estimate,
     JumpForecast,
 )  # their index is the end of the interval that they describe
-TWIN_RECORDS = (Comparison, Params, *STAMPED_AT_END)
-TWIN_TOPICS = {PRED_TOPIC, *(RECORD_TOPICS[kind] for kind in (Comparison, *STAMPED_AT_END, Timing))}
+TWIN_TOPICS = {
+    PRED_TOPIC,
+    *(RECORD_TOPICS[kind] for kind in TWIN_RECORDS if kind is not Params),
+    TIMING_TOPIC,
+}
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedRun:
     """Recording to replay, and its encoded comparisons by sample index.
 
-    Comparisons stay encoded: a replay reproduces them and compares their bytes. A live twin that is
+    Comparisons stay encoded: a replay reproduces them and compares their bytes. `predictions` are
+    encoded blocks, and only those of a recording that has a part of them. A live twin that is
     at work reports its latencies every second, and at the end; -1 if none was recorded.
     """
 
     recording: Recording
     comparisons: dict[int, bytes]
     last_twin_timing: int = -1
+    hashes: dict[int, PredictionHash] = field(default_factory=dict)
+    predictions: dict[int, bytes] = field(default_factory=dict)
 
     @classmethod
     def open(cls, path: Path) -> "RecordedRun":
         """Read from a log what a replay needs."""
-        own_topics = {CMP_TOPIC, TIMING_TOPIC}
+        own_topics = {CMP_TOPIC, TIMING_TOPIC, HASH_TOPIC}
+        if read_start(path).predictions_every:
+            own_topics.add(PRED_TOPIC)
         recovered = recover_log(path, frozenset(TOPIC_TYPES.keys() - TWIN_TOPICS | own_topics))
         own = [message for message in recovered.messages if message.topic in own_topics]
         recovered.messages = [
@@ -76,21 +82,21 @@ class RecordedRun:
         ]
         recording = build_recording(path, recovered)[0]
         rate = recording.start.rate_hz
-        timing_ends = [
-            item.index
-            for message in own
-            if message.topic == TIMING_TOPIC
-            and isinstance(item := _decode(TIMING_TOPIC, message.payload), Timing)
-            and item.component == "twin"
-        ]
+        payloads: dict[str, dict[int, bytes]] = {topic: {} for topic in own_topics}
+        timing_ends = [-1]
+        for message in own:
+            payloads[message.topic][round(message.log_time * rate / 1e9)] = message.payload
+            if message.topic == TIMING_TOPIC:
+                timing = _decode(TIMING_TOPIC, message.payload)
+                if isinstance(timing, Timing) and timing.component == "twin":
+                    timing_ends.append(timing.index)
+        hashes = (_decode(HASH_TOPIC, payload) for payload in payloads[HASH_TOPIC].values())
         return cls(
             recording,
-            {
-                round(message.log_time * rate / 1e9): message.payload
-                for message in own
-                if message.topic == CMP_TOPIC
-            },
-            last_twin_timing=max(timing_ends, default=-1),
+            payloads[CMP_TOPIC],
+            max(timing_ends),
+            {item.index: item for item in hashes if isinstance(item, PredictionHash)},
+            payloads.get(PRED_TOPIC, {}),
         )
 
     @property
@@ -149,16 +155,16 @@ class SampleRange:
         """Return whether an item belongs to the range; cycles and points have their end index."""
         if isinstance(item, Block):
             return self.first <= item.index and item.end <= self.last
-        if isinstance(item, Comparison):
+        if isinstance(item, (Comparison, PredictionHash)):
             return self.first <= item.index and item.index + item.count <= self.last
-        if isinstance(item, STAMPED_AT_END) or (isinstance(item, Event) and not _is_rig_item(item)):
+        if isinstance(item, STAMPED_AT_END) or (isinstance(item, Event) and not is_rig_item(item)):
             return self.first < item.index <= self.last
         return self.first <= item.index <= self.last
 
 
 @dataclass(slots=True)
 class ReplayComparison:
-    """Result of a replay: its comparisons against the recorded ones, as counts."""
+    """Result of a replay: its comparisons and predictions against the recorded, as counts."""
 
     recorded: int = 0
     compared: int = 0
@@ -167,9 +173,19 @@ class ReplayComparison:
     unrecorded: int = 0  # made by the replay, but missing in a finished recording
     lost_with_twin: int = 0  # the same, where a twin had died before it was recorded
     made: int = 0
+    hashes: int = 0  # of predictions, recorded
+    hashes_compared: int = 0
+    hashes_differing: int = 0
+    predictions_compared: int = 0  # blocks
+    predictions_differing: int = 0
     beginning: str = ""  # run with the samples before the recording, see `find_earlier_run`
     first_difference: int | None = None  # sample index
     largest: dict[str, float] = field(default_factory=dict)  # |difference| of error sums, SI^2
+
+    def note_difference(self, index: int) -> None:
+        """Keep the sample of the first difference."""
+        if self.first_difference is None or index < self.first_difference:
+            self.first_difference = index
 
     @property
     def differs(self) -> bool:
@@ -181,7 +197,14 @@ class ReplayComparison:
         """True if all comparisons are identical; None if there are none or the start is missing."""
         if not self.recorded or self.beginning:
             return None
-        return not (self.differing or self.missing or self.unrecorded)
+        return not (
+            self.differing
+            or self.missing
+            or self.unrecorded
+            or self.hashes_compared < self.hashes
+            or self.hashes_differing
+            or self.predictions_differing
+        )
 
 
 def replay_recording(
@@ -203,7 +226,7 @@ def replay_recording(
     result = ReplayComparison(largest=dict.fromkeys(COMPARED_CHANNELS, 0.0))
     result.beginning = find_earlier_run(recording)
     result.recorded = sum(span.contains_comparison(entry) for entry in recorded.comparisons.items())
-    block_samples = block_samples or round(BLOCK_DURATION_S * recording.start.rate_hz)
+    result.hashes = sum(map(span.includes, recorded.hashes.values()))
 
     unrecorded: list[int] = []
     compare = partial(_compare_item, result, recorded, run, unrecorded)
@@ -248,7 +271,15 @@ def _compare_item(
     new: Item,
     payload: bytes,
 ) -> None:
-    """Update `result` with an item of the replay and its payload, if it is a comparison."""
+    """Update `result` with an item of the replay and its payload, if the recording has the same."""
+    if isinstance(new, PredictionHash) and new.index in recorded.hashes:
+        result.hashes_compared += 1
+        if new != recorded.hashes[new.index]:
+            result.hashes_differing += 1
+            result.note_difference(new.index)
+    elif isinstance(new, Block) and new.stream == "pred" and recorded.predictions:
+        for part in select_recorded(new, recorded.start):
+            _compare_predictions(result, recorded, part)
     if not isinstance(new, Comparison):
         return
     result.made += 1
@@ -261,8 +292,7 @@ def _compare_item(
     if strip_run(old, Comparison, recorded.recording.run) == strip_run(payload, Comparison, run):
         return
     result.differing += 1
-    if result.first_difference is None:
-        result.first_difference = new.index
+    result.note_difference(new.index)
     old_comparison = _decode_comparison(old)
     if old_comparison is None or old_comparison.channels != new.channels:
         return  # damaged: the difference is unknown
@@ -271,6 +301,19 @@ def _compare_item(
     ):
         if math.isfinite(old_sum) and math.isfinite(new_sum):
             result.largest[name] = max(result.largest.get(name, 0.0), abs(old_sum - new_sum))
+
+
+def _compare_predictions(result: ReplayComparison, recorded: RecordedRun, new: Block) -> None:
+    """Update `result` with a predicted block, if a recorded one begins at the same sample."""
+    payload = recorded.predictions.get(new.index)
+    old = None if payload is None else _decode(PRED_TOPIC, payload)
+    if not isinstance(old, Block):
+        return
+    end = min(old.end, new.end)
+    result.predictions_compared += 1
+    if not old.cut(old.index, end).is_identical(new.cut(new.index, end)):
+        result.predictions_differing += 1
+        result.note_difference(new.index)
 
 
 def _decode_comparison(payload: bytes) -> Comparison | None:
@@ -289,65 +332,21 @@ def _decode(topic: str, payload: bytes) -> Item | None:
 def replay_items(
     recording: Recording, config: RunConfig, run: str, span: SampleRange, block_samples: int
 ) -> Iterator[Item]:
-    """Yield the rig's items and recomputed twin results, with recorded faults and changes."""
-    setup = config.prepare_twin(from_rest=recording.start.source == "model")
-    setup = pipeline.add_steps(setup, *recording.records(StepAdded))
-    faults = [fault for fault in recording.records(Fault) if fault.component == "twin"]
-    changes = _parameter_changes(recording, config)
-    edges = {span.first, span.last, *(change.index for change in changes)}
-    edges |= {edge for fault in faults for edge in (fault.from_index, fault.to_index)}
-    yield from iter_start_records(recording, run, config.model_toml, span.first)
-    state, start_records = pipeline.start_pipeline(setup, recording.start.index)
-    yield from (replace(record, index=span.first) for record in start_records)
-    for item in _iter_source(recording, block_samples, sorted(edges)):
-        if isinstance(item, Block):
-            if item.index > span.last:
-                break
-            records: list[Block | Record] = [item]
-            while changes and changes[0].index <= item.index:
-                change = changes.pop(0)
-                setup = pipeline.adopt_params(setup, change)
-                records.append(replace(change, index=max(change.index, span.first)))
-            if not any(fault.from_index <= item.index < fault.to_index for fault in faults):
-                if any(fault.to_index == item.index for fault in faults):
-                    state, start_records = pipeline.start_pipeline(setup, item.index)
-                    records.extend(start_records)
-                state, new_records = pipeline.step(setup, state, item)
-                records.extend(new_records)
-            yield from (record for record in records if span.includes(record))
-        elif span.includes(item) and not (isinstance(item, RunStop) and item.index > span.last):
+    """Yield the rig's items and recomputed twin results, with recorded faults and changes.
+
+    The log of a replay of some steps cannot be replayed, so it has all predictions.
+    """
+    first = recording.start.index
+    is_whole = span.first == first and not find_earlier_run(recording)
+    every = 0 if recording.start.source == "model" or not is_whole else config.predictions_every
+    yield from iter_start_records(recording, run, config.model_toml, span.first, every)
+    for item in rerun_twin(recording, config, block_samples, (span.first, span.last)):
+        if isinstance(item, Block) and item.index > span.last:
+            break
+        if isinstance(item, Params) and (item.reason != "start" or item.index == first):
+            yield replace(item, index=max(item.index, span.first))
+        elif span.includes(item):
             yield item
     stop = recording.stop
     if stop is not None and stop.index > span.last:
         yield RunStop(span.last, stop.verdict, "the steps that were asked for", stop.states)
-
-
-def _parameter_changes(recording: Recording, config: RunConfig) -> list[Params]:
-    """Return the parameter changes during the run; empty for a model other than the recorded."""
-    if config.model_toml != recording.start.model_toml:
-        return []
-    return [params for params in recording.records(Params) if params.reason != "start"]
-
-
-def _iter_source(recording: Recording, block_samples: int, edges: list[int]) -> Iterator[Item]:
-    """Yield the rig's items by sample index, in blocks of `block_samples`, also cut at `edges`."""
-
-    def iter_blocks() -> Iterator[Block]:
-        for block in recording.contiguous_blocks("meas"):
-            boundaries = range(
-                block.index - block.index % block_samples + block_samples, block.end, block_samples
-            )
-            inside = (edge for edge in edges if block.index < edge < block.end)
-            for first, last in pairwise(sorted({block.index, *boundaries, *inside, block.end})):
-                yield block.cut(first, last)
-
-    records: Iterable[Item] = [item for item in recording.items if _is_rig_item(item)]
-    yield from heapq.merge(iter_blocks(), records, key=lambda item: item.index)
-
-
-def _is_rig_item(item: Item) -> bool:
-    """Return whether an item comes from the rig and is copied, not recomputed by the twin."""
-    if isinstance(item, Event):
-        # "divergence" is a twin event kind in old logs
-        return item.kind not in (*pipeline.EVENT_KINDS, "divergence")
-    return not isinstance(item, (Block, RunStart, Timing, *TWIN_RECORDS))

@@ -14,7 +14,7 @@ CUT_EVENT_KIND = "cut"
 
 
 def iter_start_records(
-    recording: Recording, run: str, model_toml: str, first: int
+    recording: Recording, run: str, model_toml: str, first: int, predictions_every: int
 ) -> Iterator[RunStart | Event]:
     """Yield the start record of a replay from sample `first`, and its provenance events.
 
@@ -28,6 +28,7 @@ def iter_start_records(
         versions=dict(read_installed_versions()),
         host=platform.node(),
         started_at=local_datetime().isoformat(timespec="seconds"),
+        predictions_every=predictions_every,
     )
     content = recording.metadata.get("content", {}).get("sha256")
     description = f"sha256 of its content {content}" if content else "which was never finished"

@@ -429,6 +429,13 @@ class ReplayResult(Contract):
     lost_with_twin: int = Field(
         0, description="made by the replay, not recorded because the twin died"
     )
+    hashes: int = Field(0, description="hashes of predictions in the recording")
+    hashes_compared: int = Field(0, description="hashes of both")
+    hashes_differing: int = Field(0, description="hashes that differ")
+    predictions_compared: int = Field(
+        0, description="blocks of predictions of both, where the recording has a part of them"
+    )
+    predictions_differing: int = Field(0, description="blocks of predictions that differ")
     first_difference_index: Index | None = Field(description="first sample that differs")
     largest_difference_of_error_sums: dict[str, SI] = Field(description="by channel, SI squared")
     relative_difference: dict[str, Ratio] = Field(

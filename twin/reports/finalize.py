@@ -7,6 +7,7 @@ from rich.markup import escape
 from twin.recording.reader import read_recording
 from twin.reports import summary as summaries
 from twin.reports.twin_verdict import NOTHING_MEASURED, format_twin_verdict
+from twin.run.rerun import restore_predictions
 from twin.run.run_config import RunConfig
 from twin.run.terminal import console, print_line
 
@@ -20,7 +21,7 @@ def finalize_run(
     """Write summary, report and optional view, print a one-line summary; return the exit code."""
     from twin.reports.report import write_report
 
-    recording = read_recording(folder / "run.mcap")
+    recording = restore_predictions(read_recording(folder / "run.mcap"), run_config)
     summary = summaries.summarise(recording, run_config.parameters)
     summary |= extra or {}
     summaries.write_summary(summary, folder / "summary.json")

@@ -22,6 +22,7 @@ from twin.model.model import Model
 from twin.recording.reader import Recording
 from twin.reports.players import SystemMotion
 from twin.reports.summary import Json, parse_toml_tables, prc_points
+from twin.run.rerun import restore_predictions
 
 Curve = tuple[Float1D, Float1D]  # frequency in Hz, ascending, and quantity
 Envelope = tuple[Float1D, Float1D, Float1D]
@@ -104,6 +105,7 @@ def build_report_data(recording: Recording, summary: Json) -> ReportData:
     except ValidationError:
         specimen = None
     contact_n = ComparisonConfig.model_validate(profile.get("comparison") or {}).contact_n
+    recording = restore_predictions(recording)
     streams = {name: recording.contiguous_blocks(name) for name in ("meas", "pred")}
     return ReportData(recording, summary, streams, specimen, contact_n)
 

@@ -10,6 +10,7 @@ from table_io.channels import contact_forces, relative_displacement
 from table_io.records import Comparison
 from twin.compare.cycles import detect_onsets
 from twin.recording.reader import Recording
+from twin.run.rerun import restore_predictions
 
 Json = dict[str, Any]
 CompareChannels = Callable[[tuple[Comparison, ...]], Json]  # NRMSE by channel
@@ -19,6 +20,7 @@ def summarise_windows(
     recording: Recording, contact_n: float, compare: CompareChannels
 ) -> list[Json]:
     """Return the entry of each window that was played, SI; "twin" is the free-running one."""
+    recording = restore_predictions(recording)
     measured, predicted = (recording.contiguous_blocks(name) for name in ("meas", "pred"))
     comparisons = recording.records(Comparison)
     rate_hz = recording.start.rate_hz

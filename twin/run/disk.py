@@ -13,6 +13,7 @@ from twin.compare import TWIN_CHANNELS
 from twin.run.run_config import RunConfig
 
 SAMPLE_BYTES = 8  # per sample and channel, uncompressed; compressed 0.60 to 0.77 of it, measured
+COMPARISON_CHANNELS = 2  # comparisons and hashes take as much as so many channels
 REPORT_BYTES = 50 * 10**6  # report, figures and summary
 RESERVE_S = 60.0  # of recording: to bring the table to rest and close the file
 LAST_WARNING_S = 120.0  # of recording left, at which the second and last warning is given
@@ -20,7 +21,8 @@ LAST_WARNING_S = 120.0  # of recording left, at which the second and last warnin
 
 def bytes_per_s(config: RunConfig) -> float:
     """Return the upper bound of the recording rate in bytes/s: samples and twin, uncompressed."""
-    return config.drive.rate_hz * SAMPLE_BYTES * (len(config.rig.channels) + len(TWIN_CHANNELS))
+    twin_channels = len(TWIN_CHANNELS) / max(config.predictions_every, 1) + COMPARISON_CHANNELS
+    return config.drive.rate_hz * SAMPLE_BYTES * (len(config.rig.channels) + twin_channels)
 
 
 def planned_bytes(config: RunConfig) -> float:

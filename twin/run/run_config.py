@@ -22,6 +22,7 @@ from table_io.sequencer import make_test_plan, nominal_drive
 from twin.model.config import ModelConfig, load_model_config
 from twin.model.model import Model
 from twin.model.parameters import Parameters
+from twin.recording.predictions import RECORDED_EVERY
 from twin.run.versions import read_installed_versions
 
 if TYPE_CHECKING:
@@ -82,6 +83,11 @@ class RunConfig:
         return planned_s + (continuation.expected_s if continuation is not None else 0.0)
 
     @property
+    def predictions_every(self) -> int:
+        """Of the twin's blocks every n-th is recorded; 0: all."""
+        return 0 if self.profile.recording.predictions == "all" else RECORDED_EVERY
+
+    @property
     def extent(self) -> str:
         """Number of steps, or of windows of a displacement history, as text."""
         return f"{len(self.steps)} steps" if self.steps else f"{self.profile.plan.windows} windows"
@@ -111,6 +117,7 @@ class RunConfig:
                 host=platform.node(),
                 started_at=local_datetime().isoformat(timespec="seconds"),
                 epoch_s=epoch_s,
+                predictions_every=0 if source == "model" else self.predictions_every,
             )
 
         return make_start

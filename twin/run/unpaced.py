@@ -38,7 +38,8 @@ def record_items(
 ) -> None:
     """Write every item to a new log at `path`; the log is closed on errors too.
 
-    `on_payload` is called with each item's payload before writing, `on_item` after.
+    `on_payload` is called with each recorded item and its payload before writing, `on_item` with
+    each item after.
     """
     writer = LogWriter(path, rate_hz)
     flushed_index = 0
@@ -46,9 +47,10 @@ def record_items(
         for item in items:
             if isinstance(item, RunStart):
                 writer.write_run_description(item)
-            payload = encode_item(item, run)
-            on_payload(item, payload)
-            writer.write(topic_for(item), payload, item.index)
+            for part in writer.select_recorded(item):
+                payload = encode_item(part, run)
+                on_payload(part, payload)
+                writer.write(topic_for(part), payload, part.index)
             if item.index - flushed_index > FLUSH_INTERVAL_S * rate_hz:
                 writer.flush()
                 flushed_index = item.index

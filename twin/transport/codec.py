@@ -42,6 +42,7 @@ from table_io.records import (
     OrbitPoint,
     Params,
     PrcPoint,
+    PredictionHash,
     Record,
     RunStart,
     RunStop,
@@ -52,7 +53,7 @@ from table_io.records import (
     Trip,
 )
 from twin.transport import shaketwin_pb2 as pb
-from twin.transport.endpoint import BLOCK_TOPICS, CMP_TOPIC
+from twin.transport.endpoint import BLOCK_TOPICS, CMP_TOPIC, HASH_TOPIC
 
 Item = Block | Record
 
@@ -70,6 +71,7 @@ RECORD_TOPICS: dict[type, str] = {
     Trip: "/rig/trip",
     Params: "/twin/params",
     Comparison: CMP_TOPIC,
+    PredictionHash: HASH_TOPIC,
     CycleExtremes: "/twin/cycle",
     PrcPoint: "/twin/point",
     Agreement: "/twin/agreement",
@@ -96,6 +98,7 @@ MESSAGE_NAMES = {
     Trip: "Trip",
     Params: "Params",
     Comparison: "Comparison",
+    PredictionHash: "PredictionHash",
     CycleExtremes: "Cycle",
     PrcPoint: "Point",
     Agreement: "Agreement",

@@ -12,8 +12,11 @@ Settings = dict[str, Any]
 MEAS_TOPIC = "/rig/meas"
 PRED_TOPIC = "/twin/pred"
 CMP_TOPIC = "/twin/cmp"
+HASH_TOPIC = "/twin/hash"
 BLOCK_TOPICS = {"meas": MEAS_TOPIC, "pred": PRED_TOPIC}
-STREAM_TOPICS = frozenset((*BLOCK_TOPICS.values(), CMP_TOPIC))  # published for every block
+STREAM_TOPICS = frozenset(
+    (*BLOCK_TOPICS.values(), CMP_TOPIC, HASH_TOPIC)
+)  # published all through a run
 LOCAL_SOCKET_PREFIX = "unixsock-stream/"  # inside a run, unreachable for other accounts
 OBSERVER_PREFIX = "observer."  # begins the liveliness names of observers
 # Sessions with keys; `session_limits` closes what is more. zenoh's own limit leaves room meanwhile.

@@ -53,7 +53,7 @@ class Step(_message.Message):
     def __init__(self, index: _Optional[int] = ..., direction: _Optional[str] = ..., frequency_hz: _Optional[float] = ..., acceleration_m_s2: _Optional[float] = ...) -> None: ...
 
 class RunStart(_message.Message):
-    __slots__ = ("index", "run", "name", "source", "profile_toml", "rig_toml", "model_toml", "rate_hz", "block_samples", "channels", "steps", "planned_samples", "tare", "versions", "host", "started_at", "epoch_s")
+    __slots__ = ("index", "run", "name", "source", "profile_toml", "rig_toml", "model_toml", "rate_hz", "block_samples", "channels", "steps", "planned_samples", "tare", "versions", "host", "started_at", "epoch_s", "predictions_every")
     class TareEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -85,6 +85,7 @@ class RunStart(_message.Message):
     HOST_FIELD_NUMBER: _ClassVar[int]
     STARTED_AT_FIELD_NUMBER: _ClassVar[int]
     EPOCH_S_FIELD_NUMBER: _ClassVar[int]
+    PREDICTIONS_EVERY_FIELD_NUMBER: _ClassVar[int]
     index: int
     run: str
     name: str
@@ -102,7 +103,8 @@ class RunStart(_message.Message):
     host: str
     started_at: str
     epoch_s: float
-    def __init__(self, index: _Optional[int] = ..., run: _Optional[str] = ..., name: _Optional[str] = ..., source: _Optional[str] = ..., profile_toml: _Optional[str] = ..., rig_toml: _Optional[str] = ..., model_toml: _Optional[str] = ..., rate_hz: _Optional[float] = ..., block_samples: _Optional[int] = ..., channels: _Optional[_Iterable[str]] = ..., steps: _Optional[_Iterable[_Union[Step, _Mapping]]] = ..., planned_samples: _Optional[int] = ..., tare: _Optional[_Mapping[str, float]] = ..., versions: _Optional[_Mapping[str, str]] = ..., host: _Optional[str] = ..., started_at: _Optional[str] = ..., epoch_s: _Optional[float] = ...) -> None: ...
+    predictions_every: int
+    def __init__(self, index: _Optional[int] = ..., run: _Optional[str] = ..., name: _Optional[str] = ..., source: _Optional[str] = ..., profile_toml: _Optional[str] = ..., rig_toml: _Optional[str] = ..., model_toml: _Optional[str] = ..., rate_hz: _Optional[float] = ..., block_samples: _Optional[int] = ..., channels: _Optional[_Iterable[str]] = ..., steps: _Optional[_Iterable[_Union[Step, _Mapping]]] = ..., planned_samples: _Optional[int] = ..., tare: _Optional[_Mapping[str, float]] = ..., versions: _Optional[_Mapping[str, str]] = ..., host: _Optional[str] = ..., started_at: _Optional[str] = ..., epoch_s: _Optional[float] = ..., predictions_every: _Optional[int] = ...) -> None: ...
 
 class Params(_message.Message):
     __slots__ = ("index", "values", "reason", "run")
@@ -512,3 +514,15 @@ class Ahead(_message.Message):
     high_hz: float
     run: str
     def __init__(self, index: _Optional[int] = ..., step: _Optional[int] = ..., direction: _Optional[str] = ..., frequency_hz: _Optional[float] = ..., kind: _Optional[str] = ..., jump_hz: _Optional[float] = ..., low_hz: _Optional[float] = ..., high_hz: _Optional[float] = ..., run: _Optional[str] = ...) -> None: ...
+
+class PredictionHash(_message.Message):
+    __slots__ = ("index", "count", "digest", "run")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    DIGEST_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    count: int
+    digest: bytes
+    run: str
+    def __init__(self, index: _Optional[int] = ..., count: _Optional[int] = ..., digest: _Optional[bytes] = ..., run: _Optional[str] = ...) -> None: ...

@@ -1,0 +1,148 @@
+"""Predictions that are not recorded: recomputed to the bit, compared by hash, and said."""
+
+from dataclasses import replace
+from hashlib import blake2b
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from table_io.block import Block
+from table_io.records import PredictionHash
+from twin.cli.verify import examine_logs
+from twin.exchange.export import export_log
+from twin.log import open_log
+from twin.recording.mcap_log import write_items
+from twin.recording.predictions import select_recorded
+from twin.recording.reader import Recording, read_recording
+from twin.replay.pipeline_replay import RecordedRun, replay_recording
+from twin.run.recordings import read_recorded_config
+from twin.run.rerun import restore_predictions
+from twin.run.run_config import RunConfig
+from twin.run.unpaced import play_unpaced
+
+
+@pytest.fixture(scope="module")
+def sparse_log(bundle: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run of `recording` again, with every 10th block of predictions only."""
+    profile = bundle.profile_toml.replace('"all"', '"hash"')
+    config = replace(
+        bundle,
+        profile=bundle.profile.model_copy(
+            update={
+                "recording": bundle.profile.recording.model_copy(update={"predictions": "hash"})
+            }
+        ),
+        profile_toml=profile,
+    )
+    path = tmp_path_factory.mktemp("sparse") / "run.mcap"
+    play_unpaced(config, "first", path, lambda: None, lambda _: None)
+    return path
+
+
+@pytest.fixture(scope="module")
+def sparse(sparse_log: Path) -> Recording:
+    return read_recording(sparse_log)
+
+
+def replay(log: Path, folder: Path) -> tuple[bool | None, int, int, int | None]:
+    """Replay: (identical, hashes that differ, blocks that differ, first difference)."""
+    recorded = RecordedRun.open(log)
+    config = read_recorded_config(recorded.recording)
+    result = replay_recording(recorded, config, folder / "again.mcap", "again", lambda _: None)
+    assert result.hashes_compared == result.hashes > 100
+    assert result.predictions_compared > 100
+    return (
+        result.is_identical,
+        result.hashes_differing,
+        result.predictions_differing,
+        result.first_difference,
+    )
+
+
+def test_every_tenth_block_is_recorded_and_the_file_shrinks(
+    sparse: Recording, recording: Recording
+) -> None:
+    assert (sparse.start.predictions_every, recording.start.predictions_every) == (10, 0)
+    assert {block.index // 20 % 10 for block in sparse.blocks("pred")} == {0}
+    assert 9.5 < sum(map(len, recording.blocks("pred"))) / sum(map(len, sparse.blocks("pred"))) < 10
+    assert sparse.path.stat().st_size < 0.6 * recording.path.stat().st_size
+    (measured,), (full,) = (each.contiguous_blocks("meas") for each in (sparse, recording))
+    assert measured.is_identical(full)
+
+
+def test_a_hash_is_that_of_the_encoded_values(recording: Recording) -> None:
+    """As LOG.md says it, computed from a recording with all predictions."""
+    (predicted,) = recording.contiguous_blocks("pred")
+    hashes = recording.records(PredictionHash)
+    assert [entry.index for entry in hashes] == [*range(0, predicted.end - 199, 200)]
+    for entry in hashes:
+        values = predicted.cut(entry.index, entry.index + entry.count).values.copy()
+        values[np.isnan(values)] = np.frombuffer(bytes.fromhex("000000000000f87f"))
+        data = b"".join(row.astype("<f8").tobytes() for row in values)
+        assert blake2b(data, digest_size=16).digest() == entry.digest, entry.index
+
+
+def test_predictions_come_back_to_the_bit(
+    sparse: Recording, recording: Recording, capsys: pytest.CaptureFixture[str]
+) -> None:
+    restored = restore_predictions(sparse)
+    (ours,), (theirs,) = (each.contiguous_blocks("pred") for each in (restored, recording))
+    assert ours.is_identical(theirs)
+    assert restore_predictions(restored) is restored
+    assert restore_predictions(recording) is recording
+    assert capsys.readouterr().err == ""
+
+
+def test_the_log_and_exports_have_all_predictions(
+    sparse_log: Path, log_file: Path, tmp_path: Path
+) -> None:
+    logs = [open_log(path) for path in (sparse_log, log_file)]
+    assert logs[0].predicted.tobytes() == logs[1].predicted.tobytes()
+    for path, name in ((sparse_log, "sparse"), (log_file, "all")):
+        export_log(path, ["csv"], tmp_path / name, ("twin_free_rel_disp_m",), (2, 2))
+    texts = [(tmp_path / f"{name}.csv").read_text().splitlines() for name in ("sparse", "all")]
+    assert texts[0][-500:] == texts[1][-500:]
+
+
+def test_a_replay_compares_hashes_and_recorded_blocks(sparse_log: Path, tmp_path: Path) -> None:
+    assert replay(sparse_log, tmp_path) == (True, 0, 0, None)
+
+
+def test_a_changed_hash_or_block_is_found(
+    sparse: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    entry = sparse.records(PredictionHash)[7]
+    changed = [replace(item, digest=bytes(16)) if item is entry else item for item in sparse.items]
+    write_items(tmp_path / "hash.mcap", changed, sparse.start)
+    assert replay(tmp_path / "hash.mcap", tmp_path) == (False, 1, 0, entry.index)
+    restore_predictions(read_recording(tmp_path / "hash.mcap"))
+    assert "1 of " in capsys.readouterr().err
+
+    block = sparse.blocks("pred")[9]
+    values = block.values.copy()
+    values[3, 4] = np.nextafter(values[3, 4], np.inf)
+    changed = [replace(block, values=values) if item is block else item for item in sparse.items]
+    write_items(tmp_path / "block.mcap", changed, sparse.start)
+    (tmp_path / "b").mkdir()
+    assert replay(tmp_path / "block.mcap", tmp_path / "b") == (False, 0, 1, block.index)
+
+
+def test_verify_says_what_is_recorded(sparse_log: Path, log_file: Path) -> None:
+    sparse, full = (examine_logs([path]).report for path in (sparse_log, log_file))
+    assert (sparse["predictions"]["every"], full["predictions"]["every"]) == (10, 1)
+    assert sparse["predictions"]["hashed"] == full["predictions"]["hashed"]
+    assert sparse["predictions"]["recorded"] < 0.11 * full["predictions"]["recorded"]
+    assert sparse["sound"]
+    assert sparse["replay"]["identical"]
+
+
+@pytest.mark.parametrize("size", [1, 7, 20, 200, 999])
+def test_the_selection_does_not_depend_on_block_boundaries(sparse: Recording, size: int) -> None:
+    (whole,) = restore_predictions(sparse).contiguous_blocks("pred")
+    some = whole.cut(0, 1998)
+    parts: list[Block] = []
+    for first in range(0, len(some), size):
+        parts += select_recorded(some.cut(first, min(first + size, len(some))), sparse.start)
+    samples = [sample for part in parts for sample in range(part.index, part.end)]
+    assert samples == [sample for sample in range(1998) if sample // 20 % 10 == 0]

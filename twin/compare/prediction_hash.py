@@ -1,0 +1,33 @@
+"""Hashes of the twin's output, so that most of it need not be recorded: a replay recomputes it."""
+
+from hashlib import blake2b
+
+import numpy as np
+
+from table_io.block import Float2D
+from table_io.records import PredictionHash
+
+HASHED_BLOCKS = 10  # blocks of the run in one hash
+DIGEST_BYTES = 16
+
+
+def hash_cells(
+    pending: Float2D, end: int, new: Float2D, cell_samples: int
+) -> tuple[Float2D, list[PredictionHash]]:
+    """Return (values of the unfinished cell, hashes of the completed ones).
+
+    Cells end at multiples of `cell_samples`; the first is shorter if the twin started inside it.
+    `pending` and `new` are (channel, sample); sample `end` follows the last of `new`.
+    """
+    values = np.concatenate([pending, new], axis=1) if pending.shape[1] else new
+    first, start, hashes = end - values.shape[1], 0, []
+    for stop in range(-first % cell_samples or cell_samples, values.shape[1] + 1, cell_samples):
+        hashes.append(PredictionHash(first + start, stop - start, _digest(values[:, start:stop])))
+        start = stop
+    return values[:, start:], hashes
+
+
+def _digest(values: Float2D) -> bytes:
+    """Return the hash of (channel, sample), as in an encoded block but with one kind of NaN."""
+    known = np.where(np.isnan(values), np.nan, values).astype("<f8", copy=False)
+    return blake2b(known.tobytes(), digest_size=DIGEST_BYTES).digest()
