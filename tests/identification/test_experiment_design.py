@@ -13,10 +13,15 @@ from twin.identification.discover import PreparedLog, PreparedProblem, prepare_p
 from twin.identification.experiment_design import (
     IdealTableMotion,
     Rival,
+    add_hidden_effects,
     find_interval_ends,
-    list_hidden_effects,
     predict_separation,
     rank_tests,
+)
+from twin.identification.hidden_effects import (
+    MAX_HIDDEN_SHARE,
+    find_blind_spots,
+    find_hidden_effects,
 )
 from twin.identification.parameters import STIFFNESS, EffectKey, ParameterKey, ParameterSet
 from twin.identification.selection import FittedSet
@@ -68,7 +73,7 @@ def build_shipped() -> tuple[str, str]:
     return rig, model
 
 
-def record_model(model: Model, motion: IdealTableMotion) -> PreparedLog:
+def record_model(model: Model, motion: IdealTableMotion, noise_ratio: float = 1.0) -> PreparedLog:
     """Readings with noise of a specimen that is a model, on an ideal table."""
     block = motion.block
     table_disp, table_acc = (block.channel(name) for name in ("table_disp_m", "table_acc_m_s2"))
@@ -76,7 +81,7 @@ def record_model(model: Model, motion: IdealTableMotion) -> PreparedLog:
     solver.advance(solver.rest_state(-1), table_acc, table_disp, out)
     values = np.array([table_disp, table_acc, table_disp + out[0], out[2]])
     noise = np.random.default_rng(7).standard_normal(values.shape)
-    values = values + np.array([*NOISE.values()])[:, None] * noise
+    values = values + noise_ratio * np.array([*NOISE.values()])[:, None] * noise
     measured = replace(block, channels=tuple(NOISE), values=values)
     return PreparedLog(build_signals((measured,), "first", 550.0, motion.gaps_m), 0.0)
 
@@ -102,9 +107,11 @@ class Recorded:
         return Rival(" + ".join(names), problem.fit_effects(start.with_values(given), effects))
 
 
-def record_first(model: Model, level_g: float = 0.05, cycles: int = 20) -> Recorded:
-    """One frequency at one level."""
-    log = record_model(model, make_test(2.0, 2.0, level_g, cycles).motion)
+def record_first(
+    model: Model, level_g: float = 0.05, cycles: int = 20, stop_hz: float = 2.0, noise: float = 1.0
+) -> Recorded:
+    """One frequency at one level, or more frequencies."""
+    log = record_model(model, make_test(2.0, stop_hz, level_g, cycles).motion, noise)
     return Recorded(prepare_problem([log], SNM))
 
 
@@ -268,13 +275,26 @@ def test_an_effect_that_the_noise_hides_shows_at_a_higher_level() -> None:
     recorded = record_first(SNM, level_g=0.02)
     null = recorded.fit()
     problem = recorded.prepared.problem
-    rivals = (null, *list_hidden_effects(problem, null.fitted))
+    hidden = find_hidden_effects(problem, null.fitted)
+    rivals = (null, *add_hidden_effects(null.fitted, hidden))
     assert {"cubic_stiffness", "quadratic_damping"} <= {rival.name for rival in rivals}
     quiet, loud = make_test(2.0, 2.0, 0.02), make_test(2.0, 2.0, 0.2)
     ranked = rank_tests(problem, rivals, [quiet.motion, loud.motion])
     assert ranked[0].motion.name == loud.title
     assert ranked[0].is_confirmation
     assert ranked[0].probability > ranked[1].probability
+
+
+def test_a_sweep_shows_what_a_noisy_test_at_one_frequency_cannot() -> None:
+    """There a Maxwell branch is a spring and a dashpot, and that nothing is left proves nothing."""
+    blind = []
+    for stop_hz in (2.0, 4.0):
+        recorded = record_first(SNM, stop_hz=stop_hz, noise=10.0)
+        null = recorded.fit()
+        spots = find_blind_spots(recorded.prepared.problem, null.fitted)
+        blind.append({effect.candidate.name: effect.share for effect in spots})
+    assert blind[0] == {"maxwell_damper": pytest.approx(MAX_HIDDEN_SHARE)}
+    assert blind[1] == {}
 
 
 @pytest.mark.parametrize("stroke_mm", [60.0, 5.0])
