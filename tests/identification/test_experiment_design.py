@@ -15,6 +15,7 @@ from twin.identification.experiment_design import (
     Rival,
     add_hidden_effects,
     find_interval_ends,
+    list_rivals,
     predict_separation,
     rank_tests,
 )
@@ -23,10 +24,20 @@ from twin.identification.hidden_effects import (
     find_blind_spots,
     find_hidden_effects,
 )
-from twin.identification.parameters import STIFFNESS, EffectKey, ParameterKey, ParameterSet
-from twin.identification.selection import FittedSet
+from twin.identification.parameters import (
+    STIFFNESS,
+    EffectKey,
+    ParameterKey,
+    ParameterSet,
+    is_correction,
+)
+from twin.identification.selection import FittedSet, SelectionResult
 from twin.identification.signals import build_signals
-from twin.identification.verdict import MIN_SEPARATION_SIGMA
+from twin.identification.verdict import (
+    MIN_SEPARATION_SIGMA,
+    DiscoveryVerdict,
+    widen_for_form,
+)
 from twin.model.effects.effect_file import build_written_effect
 from twin.model.model import EffectInstance, Model
 from twin.model.parameters import Parameters
@@ -295,6 +306,29 @@ def test_a_sweep_shows_what_a_noisy_test_at_one_frequency_cannot() -> None:
         blind.append({effect.candidate.name: effect.share for effect in spots})
     assert blind[0] == {"maxwell_damper": pytest.approx(MAX_HIDDEN_SHARE)}
     assert blind[1] == {}
+
+
+def test_a_proposed_law_is_among_the_rivals(relaxing: Recorded) -> None:
+    problem = relaxing.prepared.problem
+    null, law = relaxing.fit().fitted, relaxing.fit("cubic_stiffness").fitted
+    unexplained = DiscoveryVerdict("unexplained", null, 0.9, (), None, 1.0, True, "")
+    rivals = list_rivals(problem, SelectionResult(null, null), unexplained, law)
+    assert [rival.fitted for rival in rivals] == [null, law]
+    assert all(rival.can_be_simulated for rival in rivals)
+
+
+def test_intervals_hold_what_an_inexact_form_leaves(relaxing: Recorded) -> None:
+    """Half of the residual squares: as much in each of the parameters, over their white errors."""
+    best = relaxing.fit("maxwell_damper", k1=12e3, tau=0.06).fitted
+    key = EffectKey("maxwell_damper", "k1", "")
+    exact = DiscoveryVerdict("named", best, 0.9, (), None, best.cost, False, "")
+    assert widen_for_form(exact).best.fit.std_errors == best.fit.std_errors
+    widened = widen_for_form(replace(exact, floor=best.cost / 2)).best.fit
+    count = sum(entries.size for entries in best.held_out)
+    fitted = [free.key for free in best.fit.free if not is_correction(free.key)]
+    squares = best.cost * (1 - 1.05 / 2) * count / len(fitted)
+    own = widened.std_errors[key] ** 2 - best.fit.std_errors[key] ** 2
+    assert own == pytest.approx(squares * best.fit.white_errors[key] ** 2)
 
 
 @pytest.mark.parametrize("stroke_mm", [60.0, 5.0])
