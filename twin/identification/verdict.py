@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from twin.identification.cross_checks import is_of_contact
 from twin.identification.hidden_effects import (
     MAX_HIDDEN_SHARE,
     HiddenEffect,
@@ -142,20 +143,25 @@ def widen_for_form(verdict: DiscoveryVerdict) -> DiscoveryVerdict:
     """Return a verdict whose intervals hold the error of an inexact form of the force laws.
 
     What such a form leaves of the residual squares, beyond what is visible, it has also put into
-    the fitted parameters: as much, in equal parts in each of their directions.
+    the parameters of the same place, damper or bumpers: as much, in equal parts in each direction.
     """
     best = verdict.best
     excess = best.cost - (1 + MIN_VISIBLE_EXCESS) * verdict.floor
     if not best.effects or excess <= 0:
         return verdict
     fit = best.fit
-    fitted = [free.key for free in fit.free if not is_correction(free.key)]
+    is_bumper = {effect.effect.is_in_bumpers for effect in best.effects if effect.effect}
+    fitted = [
+        free.key
+        for free in fit.free
+        if not is_correction(free.key) and is_of_contact(free.key, fit.parameters) in is_bumper
+    ]
     squares = excess * sum(values.size for values in best.held_out) / max(len(fitted), 1)
     form_errors = {key: math.sqrt(squares) * fit.white_errors[key] for key in fitted}
     std_errors = {
         key: math.hypot(error, form_errors.get(key, 0.0)) for key, error in fit.std_errors.items()
     }
-    reason = f"{verdict.reason}; the intervals include the error of such a form"
+    reason = f"{verdict.reason}; intervals include the error of an inexact form of the law"
     widened = replace(best, fit=replace(fit, std_errors=std_errors))
     return replace(verdict, best=widened, reason=reason, form_errors=form_errors)
 
