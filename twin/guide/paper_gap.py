@@ -34,8 +34,9 @@ def write_paper_gap(_: typer.Typer) -> str:
             f"**{content['verdict'].capitalize()}**: {content['why']}.",
             "## Models",
             _format_models(content),
-            f"Gained and lost are counted against the refitted base: what an effect loses is its "
-            f"price. {_describe_excluded(content)}",
+            "Gained and lost are counted against the refitted base: what an effect loses is its "
+            "price.",
+            "\n".join(f"* {note}" for note in content["notes"]),
             f"## The best model: {name}",
             format_table(
                 ("parameter", "value, with half of its 95 % interval"),
@@ -76,12 +77,6 @@ def _format_models(content: Json) -> str:
         for name, fit in fits
     )
     return format_table(("model", "explained", "gained", "lost", "misfit"), rows)
-
-
-def _describe_excluded(content: Json) -> str:
-    tested = len({effect for fit in content["fits"] for effect in fit["effects"]})
-    excluded = ", ".join(f"{name} ({reason})" for name, reason in content["fell_away"].items())
-    return f"{tested} effects were tested, and pairs of the best. Not tested: {excluded}."
 
 
 def _format_features(content: Json, best_name: str) -> str:

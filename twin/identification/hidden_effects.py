@@ -28,13 +28,12 @@ MAX_HIDDEN_SHARE = 0.05
 class HiddenEffect:
     """Effect as large as the recordings may hide it: the end of the 95 % interval of its amplitude.
 
-    `share` is its force in residuals over the noise, of that of the spring of the damper (rms).
+    Or as large as asked for, if the interval has no end before that.
     """
 
     candidate: Candidate
     shape: tuple[float, ...]
     amplitude: float  # in the unit of the candidate's
-    share: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +64,7 @@ def find_hidden_effects(problem: SelectionProblem, best: FittedSet) -> tuple[Hid
         visible = [each for each in variants if each.information >= MIN_INFORMATION_SHARE]
         if visible:
             best_fit = max(visible, key=lambda each: each.gain)
-            hidden.append(_bound_effect(equations, best, best_fit, math.inf))
+            hidden.append(_bound_effect(equations, best_fit, math.inf))
     return tuple(hidden)
 
 
@@ -83,7 +82,7 @@ def find_blind_spots(problem: SelectionProblem, best: FittedSet) -> tuple[Hidden
             continue  # an error of the set-up, which has no size to compare
         clearest = min(variants, key=lambda each: each.half_interval)
         if clearest.half_interval > MAX_HIDDEN_SHARE * spring:
-            blind.append(_bound_effect(equations, best, clearest, MAX_HIDDEN_SHARE * spring))
+            blind.append(_bound_effect(equations, clearest, MAX_HIDDEN_SHARE * spring))
     return tuple(blind)
 
 
@@ -127,15 +126,11 @@ def _measure_spring(equations: NormalEquations, best: FittedSet) -> float:
     return math.inf
 
 
-def _bound_effect(
-    equations: NormalEquations, best: FittedSet, estimate: _Estimate, limit: float
-) -> HiddenEffect:
+def _bound_effect(equations: NormalEquations, estimate: _Estimate, limit: float) -> HiddenEffect:
     """Return the effect at the end of its interval on the side of the estimate, up to a limit."""
     variant, candidate = estimate.variant, estimate.variant.candidate
     end = min(abs(estimate.amplitude) + estimate.half_interval, limit)
     sign = variant.sign or math.copysign(1.0, estimate.amplitude)
     free = candidate.amplitude
     value = candidate.vanishing + sign * end / float(equations.scale[variant.column])
-    value = min(max(value, free.low), free.high)
-    share = end / _measure_spring(equations, best)
-    return HiddenEffect(candidate, variant.shape, value, share)
+    return HiddenEffect(candidate, variant.shape, min(max(value, free.low), free.high))

@@ -139,15 +139,18 @@ def judge_selection(
     return DiscoveryVerdict("named", best, confidence, (), generic, floor, has_remainder, reason)
 
 
-def widen_for_form(verdict: DiscoveryVerdict) -> DiscoveryVerdict:
+def widen_for_form(
+    problem: SelectionProblem, selection: SelectionResult, verdict: DiscoveryVerdict
+) -> DiscoveryVerdict:
     """Return a verdict whose intervals hold the error of an inexact form of the force laws.
 
     What such a form leaves of the residual squares, beyond what is visible, it has also put into
     the parameters of the same place, damper or bumpers: as much, in equal parts in each direction.
+    A form that a further generic term corrects significantly is off by as much again as that term
+    moves the parameters.
     """
     best = verdict.best
-    excess = best.cost - (1 + MIN_VISIBLE_EXCESS) * verdict.floor
-    if not best.effects or excess <= 0:
+    if verdict.outcome != "named":
         return verdict
     fit = best.fit
     is_bumper = {effect.effect.is_in_bumpers for effect in best.effects if effect.effect}
@@ -156,14 +159,39 @@ def widen_for_form(verdict: DiscoveryVerdict) -> DiscoveryVerdict:
         for free in fit.free
         if not is_correction(free.key) and is_of_contact(free.key, fit.parameters) in is_bumper
     ]
+    excess = max(best.cost - (1 + MIN_VISIBLE_EXCESS) * verdict.floor, 0.0)
     squares = excess * sum(values.size for values in best.held_out) / max(len(fitted), 1)
-    form_errors = {key: math.sqrt(squares) * fit.white_errors[key] for key in fitted}
+    corrected = _find_corrected_form(problem, selection, best)
+    form_errors = {
+        key: math.hypot(
+            math.sqrt(squares) * fit.white_errors[key],
+            corrected.fit.values[key] - fit.values[key] if corrected else 0.0,
+        )
+        for key in fitted
+    }
+    if not any(form_errors.values()):
+        return verdict
     std_errors = {
         key: math.hypot(error, form_errors.get(key, 0.0)) for key, error in fit.std_errors.items()
     }
     reason = f"{verdict.reason}; intervals include the error of an inexact form of the law"
     widened = replace(best, fit=replace(fit, std_errors=std_errors))
     return replace(verdict, best=widened, reason=reason, form_errors=form_errors)
+
+
+def _find_corrected_form(
+    problem: SelectionProblem, selection: SelectionResult, best: FittedSet
+) -> FittedSet | None:
+    """Return the best set with a generic term more, if the term improves the fit significantly."""
+    extended = [
+        fitted
+        for fitted in selection.generic_sets
+        if len(fitted.effects) == len(best.effects) + 1 and {*best.names} < {*fitted.names}
+    ]
+    corrected = min(extended, key=lambda fitted: fitted.cost, default=None)
+    if corrected is None or problem.compute_gain(best, corrected)[2] < MIN_SEPARATION_SIGMA:
+        return None
+    return corrected
 
 
 def qualify_none(problem: SelectionProblem, verdict: DiscoveryVerdict) -> DiscoveryVerdict:

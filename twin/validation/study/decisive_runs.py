@@ -19,7 +19,7 @@ from table_io.clock import cpu_seconds
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from twin.identification.discover import Discovery, discover_effects
-from twin.identification.experiment_design import predict_separation
+from twin.identification.experiment_design import rank_tests
 from twin.identification.law_search import LawProposal, propose_law
 from twin.reports.discovery.loading import load_logs
 from twin.reports.finalize import EXIT_INTERRUPTED
@@ -141,9 +141,9 @@ def evaluate_decision(root: Path, first: str, number: int) -> Json:
         "sigma": proposal.prediction.sigma,
         "probability": proposal.prediction.probability,
     }
-    rivals = proposal.prediction.rivals
-    by_chance = predict_separation(discovery.prepared.problem, rivals, random.motion)
-    row["random_probability"] = by_chance.probability
+    rivals, problem = proposal.prediction.rivals, discovery.prepared.problem
+    by_chance = rank_tests(problem, rivals, [random.motion])
+    row["random_probability"] = by_chance[0].probability if by_chance else 0.0
     for label, test in (("proposed", proposal.test), ("random", random)):
         row[label] = plant.evaluate_test(test, label)
     return row | {"seconds": cpu_seconds() - start_s}
