@@ -154,6 +154,13 @@ def test_a_refused_test_is_one_message_and_the_next_is_tried(
     assert lines[-1] == "not decided: no proposed test is left to play"
 
 
+def test_the_budget_counts_the_minutes_that_were_played(plain: Path) -> None:
+    recording = read_recording(plain)
+    moved_s = recording.blocks("meas")[-1].end / 1000.0
+    assert 15 / 2.0 < moved_s < 20.0
+    assert decide.measure_minutes(plain) == pytest.approx(moved_s / 60.0)
+
+
 @pytest.mark.usefixtures("without_page")
 def test_a_rig_without_the_stroke_gets_no_proposal(plain: Path, tmp_path: Path) -> None:
     weak = tmp_path / "weak.toml"

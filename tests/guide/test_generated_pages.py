@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import typer
 
-from table_io.config.base import ConfigModel
+from table_io.config.base import PROFILES_DIR, ConfigModel, load_config
 from table_io.config.key_reference import derive_unit, describe_tables
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
@@ -15,9 +15,13 @@ from twin.cli.main import app
 from twin.guide.gallery import write_gallery
 from twin.guide.loops import compute_loops, find_loops
 from twin.guide.notebook import convert_notebook, list_code
+from twin.guide.paper_gap import RESULT_FILE, write_paper_gap
 from twin.guide.reference import CONFIG_FILES, write_command_reference, write_key_reference
+from twin.identification.features.config import FeatureSet
+from twin.identification.features.prediction import describe_feature
 from twin.model.effects import EFFECTS
 from twin.model.effects.effect import Effect
+from twin.reports.contracts import FeatureVerdict
 
 
 def test_every_key_of_every_file_has_a_meaning() -> None:
@@ -129,3 +133,20 @@ def test_the_shipped_loops_are_those_of_the_model(effect: Effect) -> None:
         np.abs(with_effect.force_kn - without.force_kn).max() / np.abs(without.force_kn).max(),
     )
     assert change > 0.015  # visible
+
+
+def test_the_result_on_the_paper_is_that_of_its_features_file() -> None:
+    """The shipped numbers are stale once a feature is added or reads otherwise."""
+    content = FeatureVerdict.model_validate_json(RESULT_FILE.read_text(encoding="utf-8"))
+    features, _ = load_config(PROFILES_DIR / "features" / "paper.toml", FeatureSet, "features file")
+    published = [(describe_feature(feature), feature.place) for feature in features.features]
+    assert [(entry.published, entry.place) for entry in content.features] == published
+    explained = [
+        sum(getattr(entry, name).explained for entry in content.features)
+        for name in ("given", "refitted", "best")
+    ]
+    assert explained[:2] == [content.given.explained, content.refitted.explained]
+    assert explained[2] == max(fit.explained for fit in content.fits)
+    page = write_paper_gap(typer.Typer())
+    assert page.count(" ✗ |") == 3 * len(published) - sum(explained)
+    assert content.next_run[1:] in page

@@ -13,15 +13,30 @@ from twin.identification.discover import PreparedLog, PreparedProblem, prepare_p
 from twin.identification.experiment_design import (
     IdealTableMotion,
     Rival,
+    add_hidden_effects,
     find_interval_ends,
-    list_hidden_effects,
+    list_rivals,
     predict_separation,
     rank_tests,
 )
-from twin.identification.parameters import STIFFNESS, EffectKey, ParameterKey, ParameterSet
-from twin.identification.selection import FittedSet
+from twin.identification.hidden_effects import (
+    find_blind_spots,
+    find_hidden_effects,
+)
+from twin.identification.parameters import (
+    DAMPING,
+    STIFFNESS,
+    EffectKey,
+    ParameterKey,
+    ParameterSet,
+)
+from twin.identification.selection import FittedSet, SelectionResult
 from twin.identification.signals import build_signals
-from twin.identification.verdict import MIN_SEPARATION_SIGMA
+from twin.identification.verdict import (
+    MIN_SEPARATION_SIGMA,
+    DiscoveryVerdict,
+    widen_for_form,
+)
 from twin.model.effects.effect_file import build_written_effect
 from twin.model.model import EffectInstance, Model
 from twin.model.parameters import Parameters
@@ -68,7 +83,7 @@ def build_shipped() -> tuple[str, str]:
     return rig, model
 
 
-def record_model(model: Model, motion: IdealTableMotion) -> PreparedLog:
+def record_model(model: Model, motion: IdealTableMotion, noise_ratio: float = 1.0) -> PreparedLog:
     """Readings with noise of a specimen that is a model, on an ideal table."""
     block = motion.block
     table_disp, table_acc = (block.channel(name) for name in ("table_disp_m", "table_acc_m_s2"))
@@ -76,7 +91,7 @@ def record_model(model: Model, motion: IdealTableMotion) -> PreparedLog:
     solver.advance(solver.rest_state(-1), table_acc, table_disp, out)
     values = np.array([table_disp, table_acc, table_disp + out[0], out[2]])
     noise = np.random.default_rng(7).standard_normal(values.shape)
-    values = values + np.array([*NOISE.values()])[:, None] * noise
+    values = values + noise_ratio * np.array([*NOISE.values()])[:, None] * noise
     measured = replace(block, channels=tuple(NOISE), values=values)
     return PreparedLog(build_signals((measured,), "first", 550.0, motion.gaps_m), 0.0)
 
@@ -102,9 +117,11 @@ class Recorded:
         return Rival(" + ".join(names), problem.fit_effects(start.with_values(given), effects))
 
 
-def record_first(model: Model, level_g: float = 0.05, cycles: int = 20) -> Recorded:
-    """One frequency at one level."""
-    log = record_model(model, make_test(2.0, 2.0, level_g, cycles).motion)
+def record_first(
+    model: Model, level_g: float = 0.05, cycles: int = 20, stop_hz: float = 2.0, noise: float = 1.0
+) -> Recorded:
+    """One frequency at one level, or more frequencies."""
+    log = record_model(model, make_test(2.0, stop_hz, level_g, cycles).motion, noise)
     return Recorded(prepare_problem([log], SNM))
 
 
@@ -268,13 +285,50 @@ def test_an_effect_that_the_noise_hides_shows_at_a_higher_level() -> None:
     recorded = record_first(SNM, level_g=0.02)
     null = recorded.fit()
     problem = recorded.prepared.problem
-    rivals = (null, *list_hidden_effects(problem, null.fitted))
+    hidden = find_hidden_effects(problem, null.fitted)
+    rivals = (null, *add_hidden_effects(null.fitted, hidden))
     assert {"cubic_stiffness", "quadratic_damping"} <= {rival.name for rival in rivals}
     quiet, loud = make_test(2.0, 2.0, 0.02), make_test(2.0, 2.0, 0.2)
     ranked = rank_tests(problem, rivals, [quiet.motion, loud.motion])
     assert ranked[0].motion.name == loud.title
     assert ranked[0].is_confirmation
     assert ranked[0].probability > ranked[1].probability
+
+
+def test_a_sweep_shows_what_a_noisy_test_at_one_frequency_cannot() -> None:
+    """There a Maxwell branch is a spring and a dashpot, and that nothing is left proves nothing."""
+    blind = []
+    for stop_hz in (2.0, 4.0):
+        recorded = record_first(SNM, stop_hz=stop_hz, noise=10.0)
+        null = recorded.fit()
+        spots = find_blind_spots(recorded.prepared.problem, null.fitted)
+        blind.append([effect.candidate.name for effect in spots])
+    assert blind == [["maxwell_damper"], []]
+
+
+def test_a_proposed_law_is_among_the_rivals(relaxing: Recorded) -> None:
+    problem = relaxing.prepared.problem
+    null, law = relaxing.fit().fitted, relaxing.fit("cubic_stiffness").fitted
+    unexplained = DiscoveryVerdict("unexplained", null, 0.9, (), None, 1.0, True, "")
+    rivals = list_rivals(problem, SelectionResult(null, null), unexplained, law)
+    assert [rival.fitted for rival in rivals] == [null, law]
+    assert all(rival.can_be_simulated for rival in rivals)
+
+
+def test_intervals_hold_what_an_inexact_form_leaves(relaxing: Recorded) -> None:
+    """Half of the residual squares: as much in each of the parameters, over their white errors."""
+    best = relaxing.fit("maxwell_damper", k1=12e3, tau=0.06).fitted
+    key = EffectKey("maxwell_damper", "k1", "")
+    problem, selection = relaxing.prepared.problem, SelectionResult(best, best)
+    exact = DiscoveryVerdict("named", best, 0.9, (), None, best.cost, False, "")
+    assert widen_for_form(problem, selection, exact).best.fit.std_errors == best.fit.std_errors
+    half = replace(exact, floor=best.cost / 2)
+    widened = widen_for_form(problem, selection, half).best.fit
+    count = sum(entries.size for entries in best.held_out)
+    fitted = [STIFFNESS, DAMPING, key, replace(key, name="tau")]
+    squares = best.cost * (1 - 1.05 / 2) * count / len(fitted)
+    own = widened.std_errors[key] ** 2 - best.fit.std_errors[key] ** 2
+    assert own == pytest.approx(squares * best.fit.white_errors[key] ** 2)
 
 
 @pytest.mark.parametrize("stroke_mm", [60.0, 5.0])

@@ -13,6 +13,7 @@ from table_io.records import RunStart
 from twin.cli.entry import DEFAULT_ENDPOINT
 from twin.cli.run import run_test
 from twin.identification.discover import Discovery
+from twin.identification.law_search import LawProposal
 from twin.reports.discovery.decisive_section import describe_next_run, proposal_to_json
 from twin.reports.discovery.serialize import Json
 from twin.reports.finalize import EXIT_GAPS, EXIT_INTERRUPTED
@@ -86,6 +87,7 @@ class JudgedLogs:
 def add_proposal(
     verdict: Json,
     discovery: Discovery,
+    law: LawProposal | None,
     recorded: RunStart,
     rig_toml: str,
     folder: Path,
@@ -94,7 +96,7 @@ def add_proposal(
     """Write the profile of the best test and add it to the verdict; return all proposals."""
     with show_status("simulating candidate tests") as show:
         tests = list_candidate_tests(recorded, rig_toml, options.budget_min, options.asks)
-        proposals = propose_tests(discovery, tests, show)
+        proposals = propose_tests(discovery, tests, show, law.fitted if law else None)
     path = options.profile if options.profile and not options.chain else folder / "decide.toml"
     verdict["decide"] = proposal_to_json(proposals, path.name)
     if proposals:
@@ -185,14 +187,21 @@ def play_decisive_tests(
         if proposal is None:
             return code
         logs.append(run_folder)
-        remaining_min -= proposal.test.minutes
+        played_min = measure_minutes(run_folder)
+        remaining_min -= played_min
         link = make_link(
             proposal.test.title,
-            proposal.test.minutes,
+            played_min,
             proposal.prediction.probability,
             str(run_folder.relative_to(folder)),
         )
         chain = (*chain, link)
+
+
+def measure_minutes(run_folder: Path) -> float:
+    """Return how long the table was played in a run in min, to its end or stop."""
+    recording = open_recording(run_folder)
+    return max(item.end for item in recording.blocks("meas")) / recording.start.rate_hz / 60.0
 
 
 def find_end(judged: JudgedLogs, count: int, remaining_min: float) -> str:
@@ -202,6 +211,8 @@ def find_end(judged: JudgedLogs, count: int, remaining_min: float) -> str:
     """
     if judged.is_decided and count > 1:
         return f"decided after {count - 1} test{'s' if count > 2 else ''}"
+    if remaining_min <= 0:
+        return f"not decided: the rig time is used up after {count - 1} tests"
     if not judged.proposals:
         return f"not decided: no test of at most {remaining_min:.2g} min separates what is open"
     return ""

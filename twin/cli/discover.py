@@ -99,12 +99,13 @@ def judge_logs(
     verdict = verdict_to_json(discovery, seconds, notes, held_out_logs, start, law)
     proposals: Sequence[TestProposal] = ()
     if decide and recorded_test and discovery.selection.complete:
-        proposals = add_proposal(verdict, discovery, *recorded_test, folder, decide)
+        proposals = add_proposal(verdict, discovery, law, *recorded_test, folder, decide)
     write_results(folder, discovery, config, logs, verdict, law)
     print_verdict(verdict)
     print_line(f"{folder}")
     code = 0 if discovery.selection.complete else EXIT_INTERRUPTED
-    return JudgedLogs(folder, verdict, proposals, discovery.verdict.is_decided, code)
+    is_decided = discovery.verdict.is_decided or (law is not None and law.is_sufficient)
+    return JudgedLogs(folder, verdict, proposals, is_decided, code)
 
 
 @contextlib.contextmanager

@@ -27,13 +27,9 @@ from twin.identification.features.search import (
 )
 from twin.model.effects import find_effect
 from twin.reports.contracts import FeatureVerdict
+from twin.reports.discovery.feature_labels import describe_fit, label_feature
 from twin.reports.discovery.features_page import write_features_page
-from twin.reports.discovery.features_summary import (
-    describe_fit,
-    discovery_to_json,
-    feature_model_to_toml,
-    label_feature,
-)
+from twin.reports.discovery.features_summary import discovery_to_json, feature_model_to_toml
 from twin.reports.finalize import EXIT_INTERRUPTED
 from twin.reports.summary import Json, dump_contract
 from twin.run.folders import make_run_folder

@@ -208,11 +208,14 @@ def decide_command(
         int | None, typer.Option("--workers", help="Processes; default: all cores.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the study in --out.")] = False,
-    poor: Annotated[
-        bool, typer.Option("--poor", help="Begin with one frequency at one level.")
-    ] = False,
+    first: Annotated[
+        str,
+        typer.Option(
+            "--first", help="First test: sweep, or at one level: one-frequency, or flight."
+        ),
+    ] = "sweep",
 ) -> None:
     """Score the tests that `discover --decide` proposes, and random ones, on hidden plants."""
     from twin.validation.study.decisive_runs import run_decide_study as command
 
-    raise typer.Exit(command(out, seeds, cells or [], workers, resume, poor))
+    raise typer.Exit(command(out, seeds, cells or [], workers, resume, first))

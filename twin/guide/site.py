@@ -15,6 +15,7 @@ from table_io.errors import InputError
 from twin.guide.gallery import write_gallery
 from twin.guide.markdown import RenderedMarkdown, render_markdown
 from twin.guide.notebook import convert_notebook
+from twin.guide.paper_gap import write_paper_gap
 from twin.guide.reference import (
     PACKAGES_DIR,
     write_api_reference,
@@ -117,6 +118,7 @@ CHAPTERS = (
             _page("controller", "The controller"),
             _page("discovery", "Identification and discovery"),
             GuidePage("effects", "Effects", write_gallery),
+            GuidePage("paper-gap", "The paper's own gap", write_paper_gap),
             _page("recording", "What a recording holds"),
             _page("inside", "How it is built"),
             _page("study", "How good discovery is", "twin/validation/study/README.md"),

@@ -75,9 +75,7 @@ def estimate_subsets(
     """Estimate the parameters from free flight, contacts of each side, and opposed halves."""
     # errors of instruments are determined by all samples together
     free = [parameter for parameter in joint.free if not is_correction(parameter.key)]
-    of_contact = [
-        parameter for parameter in free if _is_of_contact(parameter.key, joint.parameters)
-    ]
+    of_contact = [parameter for parameter in free if is_of_contact(parameter.key, joint.parameters)]
     flight = [parameter for parameter in free if parameter not in of_contact]
     estimates = [
         _estimate_subset(
@@ -107,7 +105,7 @@ def estimate_subsets(
     return tuple(estimate for estimate in estimates if estimate.values)
 
 
-def _is_of_contact(key: ParameterKey, parameters: ParameterSet) -> bool:
+def is_of_contact(key: ParameterKey, parameters: ParameterSet) -> bool:
     """Return True for a parameter of the gaps, of the bumpers, or of an effect in them."""
     if isinstance(key, EffectKey):
         return parameters.get_effect(key.effect).is_in_bumpers

@@ -50,7 +50,12 @@ from twin.identification.selection import (
 )
 from twin.identification.sensor_checks import compare_sensors
 from twin.identification.signals import CELL_PAIRS, SENSOR_PAIRS, LogSignals, derives_acc
-from twin.identification.verdict import DiscoveryVerdict, judge_selection
+from twin.identification.verdict import (
+    DiscoveryVerdict,
+    judge_selection,
+    qualify_none,
+    widen_for_form,
+)
 from twin.model.model import Model
 
 MIN_ENTRIES, MIN_BLOCKS = 1000, 9
@@ -430,7 +435,8 @@ def _select_and_judge(
         * estimate_repeatability_floor(problem.log_residuals, selection.best.held_out),
         selection.best.cost,
     )
-    verdict = judge_selection(problem, selection, floor)
+    verdict = widen_for_form(problem, selection, judge_selection(problem, selection, floor))
+    verdict = qualify_none(problem, verdict)
     # implausible base parameters are reported only if they remain so with the effects added
     pulls = find_pulling_bumpers(problem.log_residuals, verdict.best.held_out)
     notes = (*prepared.notes, *find_implausible_parameters(model, verdict.best.fit), *pulls)

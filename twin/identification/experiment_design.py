@@ -20,6 +20,7 @@ from scipy.special import ndtr
 from table_io.block import Block, Float1D, Float2D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from twin.compare.sensors import apply_sensors, lag_samples
+from twin.identification.hidden_effects import HiddenEffect, find_hidden_effects
 from twin.identification.least_squares import (
     INTERVAL_SIGMA,
     fill_jacobian,
@@ -39,7 +40,6 @@ from twin.identification.parameters import (
     list_base_parameters,
 )
 from twin.identification.residuals import LogResiduals
-from twin.identification.screening import build_normal_equations
 from twin.identification.selection import (
     MIN_GAIN_SHARE,
     MIN_GAIN_SIGMA,
@@ -58,8 +58,6 @@ MAX_RIVALS = 3  # limits the simulations, which grow with its square
 MAX_REFITTED_TESTS = 4  # of the best tests by one linear step, refitted in full
 # Half of a 95 % interval over its value, beyond which a named effect calls for a better test.
 MAX_INTERVAL_SHARE = 0.25
-# of the curvature of an amplitude: with less left by the base, the recordings do not show it
-MIN_INFORMATION_SHARE = 1e-6
 CLEAR_PROBABILITY = 0.9  # from which more separation would decide no better
 REST_S = 2.0  # simulated before a test, from which the noise is measured
 NOISE_SEED = 0
@@ -182,14 +180,18 @@ def _mean(values: Sequence[float] | Float1D) -> float:
 
 
 def list_rivals(
-    problem: SelectionProblem, selection: SelectionResult, verdict: DiscoveryVerdict
+    problem: SelectionProblem,
+    selection: SelectionResult,
+    verdict: DiscoveryVerdict,
+    law: FittedSet | None = None,
 ) -> tuple[Rival, ...]:
     """Return the explanations that the recordings leave open, the best first.
 
-    Besides the best set: the sets as good as it, the one with a generic term that fits better, the
-    sets with one effect more that fit a remainder, and where nothing is explained the next best.
-    Where nothing is open, the ends of the widest interval; where all are narrow, the effects that
-    the noise may hide.
+    Besides the best set: that with a proposed `law`, the sets as good as it, the one with a generic
+    term that fits better, the sets with one effect more that fit a remainder, and where nothing is
+    explained the next best.
+    Where nothing is open, the ends of the widest interval; where all are narrow, the effects to
+    which the recordings are blind, or without such those that the noise may hide.
     """
     best = verdict.best
     names = frozenset(best.names)
@@ -207,6 +209,7 @@ def list_rivals(
         if verdict.outcome == "unexplained" and 0 < len(fitted.effects) <= len(best.effects)
     ]
     others = [
+        *([law] if law is not None else []),
         *verdict.alternatives,
         *([verdict.generic] if verdict.generic is not None else []),
         *sorted(larger.values(), key=lambda fitted: fitted.cost),
@@ -219,44 +222,19 @@ def list_rivals(
         return tuple(Rival(name_set(fitted), fitted) for fitted in (best, *others))
     return find_interval_ends(best) or (
         Rival(name_set(best), best),
-        *list_hidden_effects(problem, best),
+        *add_hidden_effects(best, verdict.blind_to or find_hidden_effects(problem, best)),
     )
 
 
-def list_hidden_effects(problem: SelectionProblem, best: FittedSet) -> tuple[Rival, ...]:
-    """Return the best set with each further force law, held as large as the noise may hide it.
-
-    The amplitude is the end of its 95 % interval, from the linear screening about the best set.
-    """
-    parameters = best.fit.parameters
-    library = [
-        candidate
-        for candidate in problem.library
-        if not candidate.channel and candidate.name not in best.names
-    ]
-    equations = build_normal_equations(problem.log_residuals, parameters, library, problem.mapper)
-    hessian, gradient = equations.hessian.sum(axis=0), equations.gradient.sum(axis=0)
-    base = slice(0, equations.base_count)
-    hidden: dict[str, tuple[float, Rival]] = {}
-    for variant in equations.variants:
-        k = variant.column
-        absorbed = np.linalg.lstsq(hessian[base, base], hessian[base, k], rcond=1e-12)[0]
-        information = float(hessian[k, k] - hessian[base, k] @ absorbed)
-        if information < MIN_INFORMATION_SHARE * hessian[k, k]:
-            continue  # the recordings say nothing about it
-        amplitude = -float(gradient[k] - gradient[base] @ absorbed) / information
-        end = amplitude + math.copysign(INTERVAL_SIGMA / math.sqrt(information), amplitude)
-        end /= float(equations.scale[k])
-        if variant.sign and variant.sign * end < 0:
-            end = -end
-        gain = amplitude**2 * information
-        candidate, free = variant.candidate, variant.candidate.amplitude
-        value = min(max(candidate.vanishing + end, free.low), free.high)
-        added = candidate.add_to(parameters, variant.shape, value).with_free(parameters.free)
-        fitted = FittedSet((*best.effects, candidate), replace(best.fit, parameters=added))
-        if gain >= hidden.get(candidate.name, (-1.0, None))[0]:
-            hidden[candidate.name] = gain, Rival(name_set(fitted), fitted, True)
-    return tuple(rival for _, rival in hidden.values())
+def add_hidden_effects(best: FittedSet, hidden: Sequence[HiddenEffect]) -> list[Rival]:
+    """Return the best set with each further force law, held as large as the recordings hide it."""
+    parameters, rivals = best.fit.parameters, []
+    for effect in hidden:
+        added = effect.candidate.add_to(parameters, effect.shape, effect.amplitude)
+        fit = replace(best.fit, parameters=added.with_free(parameters.free))
+        fitted = FittedSet((*best.effects, effect.candidate), fit)
+        rivals.append(Rival(name_set(fitted), fitted, True))
+    return rivals
 
 
 def name_set(fitted: FittedSet) -> str:

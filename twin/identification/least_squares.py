@@ -55,6 +55,8 @@ class FitResult:
     held_out: tuple[Float1D, ...] = ()  # per log, cross-validation residual, (entry,)
     # blocks (cycles, contacts) that determine each parameter; inf where readings at rest do
     block_counts: Mapping[ParameterKey, float] = field(default_factory=dict)
+    # standard deviations if the residual were white noise, of 1 over the assumed one
+    white_errors: Mapping[ParameterKey, float] = field(default_factory=dict)
 
     @property
     def free(self) -> tuple[FreeParameter, ...]:
@@ -265,14 +267,17 @@ class _LevenbergMarquardt:
         covariance = inverse @ (scatter + rest_scatter) @ inverse
         sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         block_counts = _count_effective_blocks(information, np.diag(hessian))
-        white_sd = np.sqrt(np.maximum(np.diag(inverse), 0.0) * max(cost / max(self.count, 1), 1.0))
+        unit_sd = np.sqrt(np.maximum(np.diag(inverse), 0.0))
+        white_sd = unit_sd * math.sqrt(max(cost / max(self.count, 1), 1.0))
         sd = _widen_for_few_blocks(sd, white_sd, block_counts)
         divisor = np.where(sd > 0, sd, 1.0)
-        values, std_errors, at_bound = {}, {}, []
+        values, std_errors, white_errors, at_bound = {}, {}, {}, []
         for i, free in enumerate(self.free):
             key = free.key
             values[key] = free.to_external(float(x[i]))
-            std_errors[key] = float(sd[i] * (values[key] if free.logarithmic else 1.0))
+            slope = values[key] if free.logarithmic else 1.0
+            std_errors[key] = float(sd[i] * slope)
+            white_errors[key] = float(unit_sd[i] * slope)
             if x[i] in (self.low[i], self.high[i]):
                 at_bound.append(key)
         correlation = covariance / np.outer(divisor, divisor)
@@ -281,6 +286,7 @@ class _LevenbergMarquardt:
             converged,
             tuple(at_bound), self._compute_held_out(x, current, jacobian),
             {free.key: float(n) for free, n in zip(self.free, block_counts, strict=True)},
+            white_errors,
         )  # fmt: skip
 
     def _compute_held_out(

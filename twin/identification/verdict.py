@@ -8,9 +8,15 @@ The gap's excess is the mean square of the cross-validation residual over the no
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
+from twin.identification.cross_checks import is_of_contact
+from twin.identification.hidden_effects import (
+    MAX_HIDDEN_SHARE,
+    HiddenEffect,
+    find_blind_spots,
+)
 from twin.identification.parameters import (
     BUMPER_STIFFNESS,
     DAMPING,
@@ -19,6 +25,7 @@ from twin.identification.parameters import (
     NuisanceKey,
     ParameterKey,
     TareKey,
+    is_correction,
 )
 from twin.identification.selection import (
     MIN_VISIBLE_EXCESS,
@@ -37,6 +44,7 @@ MIN_GENERIC_GAIN_SHARE = 0.012
 # of the gap's excess: the same where it replaces one of several effects
 MIN_REPLACEMENT_GAIN_SHARE = 0.001
 NEVER_AT_BOUND = (STIFFNESS, DAMPING, BUMPER_STIFFNESS)  # positive in a real specimen
+BLIND_CONFIDENCE = 0.5  # of "none", where an effect could be there without a trace
 MIN_NAMED_GAP_SHARE = 0.5  # of the gap's excess that the named effects must close
 
 
@@ -52,11 +60,16 @@ class DiscoveryVerdict:
     floor: float
     has_remainder: bool  # the residual exceeds the floor by more than an inexact force law explains
     reason: str
+    # force laws that could be there without a trace, where nothing is named
+    blind_to: tuple[HiddenEffect, ...] = ()
+    # standard deviations for an inexact form of the laws, which those of `best` include
+    form_errors: Mapping[ParameterKey, float] = field(default_factory=dict)
 
     @property
     def is_decided(self) -> bool:
-        """True if the effects are named, or none, and nothing remains to be explained."""
-        return self.outcome in ("none", "named") and not self.has_remainder
+        """True if the effects are named, or none, and nothing remains or could hide at its size."""
+        is_closed = self.outcome in ("none", "named") and not self.has_remainder
+        return is_closed and not self.blind_to
 
 
 def judge_selection(
@@ -124,6 +137,81 @@ def judge_selection(
     elif has_remainder:
         reason = "part of the misfit remains unexplained"
     return DiscoveryVerdict("named", best, confidence, (), generic, floor, has_remainder, reason)
+
+
+def widen_for_form(
+    problem: SelectionProblem, selection: SelectionResult, verdict: DiscoveryVerdict
+) -> DiscoveryVerdict:
+    """Return a verdict whose intervals hold the error of an inexact form of the force laws.
+
+    What such a form leaves of the residual squares, beyond what is visible, it has also put into
+    the parameters of the same place, damper or bumpers: as much, in equal parts in each direction.
+    A form that a further generic term corrects significantly is off by as much again as that term
+    moves the parameters.
+    """
+    best = verdict.best
+    if verdict.outcome != "named":
+        return verdict
+    fit = best.fit
+    is_bumper = {effect.effect.is_in_bumpers for effect in best.effects if effect.effect}
+    fitted = [
+        free.key
+        for free in fit.free
+        if not is_correction(free.key) and is_of_contact(free.key, fit.parameters) in is_bumper
+    ]
+    excess = max(best.cost - (1 + MIN_VISIBLE_EXCESS) * verdict.floor, 0.0)
+    squares = excess * sum(values.size for values in best.held_out) / max(len(fitted), 1)
+    corrected = _find_corrected_form(problem, selection, best)
+    form_errors = {
+        key: math.hypot(
+            math.sqrt(squares) * fit.white_errors[key],
+            corrected.fit.values[key] - fit.values[key] if corrected else 0.0,
+        )
+        for key in fitted
+    }
+    if not any(form_errors.values()):
+        return verdict
+    std_errors = {
+        key: math.hypot(error, form_errors.get(key, 0.0)) for key, error in fit.std_errors.items()
+    }
+    reason = f"{verdict.reason}; intervals include the error of an inexact form of the law"
+    widened = replace(best, fit=replace(fit, std_errors=std_errors))
+    return replace(verdict, best=widened, reason=reason, form_errors=form_errors)
+
+
+def _find_corrected_form(
+    problem: SelectionProblem, selection: SelectionResult, best: FittedSet
+) -> FittedSet | None:
+    """Return the best set with a generic term more, if the term improves the fit significantly."""
+    extended = [
+        fitted
+        for fitted in selection.generic_sets
+        if len(fitted.effects) == len(best.effects) + 1 and {*best.names} < {*fitted.names}
+    ]
+    corrected = min(extended, key=lambda fitted: fitted.cost, default=None)
+    if corrected is None or problem.compute_gain(best, corrected)[2] < MIN_SEPARATION_SIGMA:
+        return None
+    return corrected
+
+
+def qualify_none(problem: SelectionProblem, verdict: DiscoveryVerdict) -> DiscoveryVerdict:
+    """Return a verdict "none" with the force laws to which the recordings are blind, if any.
+
+    They do not exclude these, so its confidence is at most that of a guess.
+    """
+    if verdict.outcome != "none":
+        return verdict
+    blind = find_blind_spots(problem, verdict.best)
+    if not blind:
+        return verdict
+    names = ", ".join(effect.candidate.name for effect in blind)
+    reason = (
+        f"{verdict.reason}, but the recordings cannot show {names}: other parameters imitate "
+        f"{'them' if len(blind) > 1 else 'it'}, even as large as {100 * MAX_HIDDEN_SHARE:.0f} % of "
+        "the spring of the damper"
+    )
+    confidence = min(verdict.confidence, BLIND_CONFIDENCE)
+    return replace(verdict, confidence=confidence, reason=reason, blind_to=blind)
 
 
 def _judge_common_core(
@@ -305,9 +393,14 @@ def closed_fraction(before: float, after: float, floor: float) -> float:
 
 
 def suggest_next_run(
-    outcome: str, best: Sequence[str], alternatives: Sequence[Sequence[str]]
+    outcome: str,
+    best: Sequence[str],
+    alternatives: Sequence[Sequence[str]],
+    blind_to: Sequence[str] = (),
 ) -> str:
-    """Suggest the test that would distinguish or confirm the effects."""
+    """Suggest the test that would distinguish, confirm or show the effects."""
+    if blind_to:
+        return f"a sweep over other frequencies and levels, to show {', '.join(blind_to)}"
     names = {name.split(".")[0] for names in (best, *alternatives) for name in names}
     if outcome == "none":
         return "no further test is needed; a sweep at another amplitude would confirm the result"

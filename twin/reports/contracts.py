@@ -734,6 +734,9 @@ class Verdict(Contract):
     base: dict[str, Interval] = Field(description="refitted parameters of the given model")
     fell_away: dict[str, str] = Field(description="reason of each effect that was not tested")
     notes: list[str] = Field(description="notes to the user")
+    blind_to: list[str] | None = Field(
+        None, description="effects that could be there without a trace; absent in old files"
+    )
     next_run: str = Field(description="test that would decide or confirm")
     seconds: Seconds = Field(description="computing time")
     held_out_logs: list[HeldOutLog] = Field(description="of the logs given to judge the result")

@@ -30,6 +30,7 @@ from twin.identification.experiment_design import (
     list_rivals,
     rank_tests,
 )
+from twin.identification.selection import FittedSet
 from twin.run.run_config import RunConfig, from_texts
 
 Table = dict[str, Any]
@@ -93,7 +94,7 @@ class TestProposal:
         """What the test is for, as a clause."""
         names = [rival.name for rival in self.prediction.rivals]
         if self.prediction.is_confirmation:
-            return f"confirms {names[0]}: shows further effects that the noise may hide"
+            return f"confirms {names[0]}: shows further effects that the recordings may hide"
         return f"decides between {' and '.join(names)}"
 
     def format_profile(self, rig: str, extra: Mapping[str, Table] | None = None) -> str:
@@ -115,10 +116,14 @@ def propose_tests(
     discovery: Discovery,
     tests: Sequence[CandidateTest],
     report: Callable[[str], None] = lambda title: None,
+    law: FittedSet | None = None,
 ) -> list[TestProposal]:
-    """Return the tests that separate what a discovery leaves open, the best first."""
+    """Return the tests that separate what a discovery leaves open, the best first.
+
+    `law` is the set with a law that was proposed for what the library does not explain.
+    """
     problem = discovery.prepared.problem
-    rivals = list_rivals(problem, discovery.selection, discovery.verdict)
+    rivals = list_rivals(problem, discovery.selection, discovery.verdict, law)
     by_title = {test.title: test for test in tests}
     motions = [test.motion for test in by_title.values()]
     return [

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import brentq
 
+from table_io.block import Float1D
 from twin.identification.features.curve import (
     MIN_EXCESS_M,
     ResponseCurve,
@@ -33,7 +33,8 @@ CURVE_AMPLITUDES = 24  # of a curve
 MIN_AMPLITUDE_RATIO = 0.03  # of the smallest amplitude of a curve to the largest
 FREQUENCY_ITERATIONS = 2  # of the frequency, on which k and h depend little
 MIN_CURVE_POINTS = 3  # on each side of the resonance
-AMPLITUDE_TOL = 1e-4  # of the largest amplitude, relative
+# of the range of the largest amplitude, and the amplitudes of each: to 1e-3, then linearly
+NARROWINGS, NARROWING_POINTS = 4, 12
 MIN_STIFFNESS_RATIO = 1e-3  # of a free motion's stiffness to the damper's
 TOUCH_RATIOS = (0.999, 1.02, 1.1)  # of amplitudes about the touch of a bumper to its gap
 MIN_AMPLITUDE_M, MAX_AMPLITUDE_M = 1e-6, 1.0  # between which the largest amplitude is searched
@@ -41,9 +42,6 @@ MIN_AMPLITUDE_M, MAX_AMPLITUDE_M = 1e-6, 1.0  # between which the largest amplit
 _PHASES = 2 * math.pi * np.arange(1, PRESCRIBED_CYCLES * SAMPLES_PER_CYCLE + 1) / SAMPLES_PER_CYCLE
 _SINE, _COSINE = np.sin(_PHASES), np.cos(_PHASES)
 _LAST = slice(-SAMPLES_PER_CYCLE, None)
-# The phase of the drive to the motion is not known here: laws that feel it are approximate.
-_NO_DRIVE = np.zeros_like(_PHASES)
-_CONTACT = np.full((2, _PHASES.size), CONTACT_UNKNOWN, dtype=np.int8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,55 +55,67 @@ class HarmonicBalance:
     def _forces(self) -> PreparedForces:
         return PreparedForces.from_model(self.model)
 
-    def describe_force(self, amplitude_m: float, w: float) -> tuple[float, float, float]:
-        """Return (k, h, smallest push): force in phase with u and with u' over U, in N/m; N."""
-        forces = self._forces.evaluate(
-            amplitude_m * _SINE, amplitude_m * w * _COSINE, _NO_DRIVE, _PHASES / w, _CONTACT
-        )[:, _LAST]
+    def describe_force(self, amplitudes_m: Float1D, w: Float1D) -> tuple[Float1D, Float1D, Float1D]:
+        """Return (k, h, smallest push): force in phase with u and with u' over U, in N/m; N.
+
+        Each (amplitude,). The motions follow one another in one evaluation, which costs less than
+        one each; hidden states settle to the next amplitude in its first cycles.
+        """
+        u = np.outer(amplitudes_m, _SINE).ravel()
+        v = np.outer(amplitudes_m * w, _COSINE).ravel()
+        starts_s = np.concatenate([[0.0], np.cumsum(_PHASES[-1] / w)[:-1]])
+        time_s = (starts_s[:, None] + _PHASES / w[:, None]).ravel()
+        contact = np.full((2, u.size), CONTACT_UNKNOWN, dtype=np.int8)
+        # the phase of the drive to the motion is not known: laws that feel it are approximate
+        forces = self._forces.evaluate(u, v, np.zeros_like(u), time_s, contact)
+        forces = forces.reshape(3, amplitudes_m.size, -1)[:, :, _LAST]
         force = forces.sum(axis=0)
-        scale = 2 / (SAMPLES_PER_CYCLE * amplitude_m)
-        push = min(float(forces[1].min()), -float(forces[2].max()))
-        return float(scale * (force @ _SINE[_LAST])), float(scale * (force @ _COSINE[_LAST])), push
+        scale = 2 / (SAMPLES_PER_CYCLE * amplitudes_m)
+        push = np.minimum(forces[1].min(axis=1), -forces[2].max(axis=1))
+        return scale * (force @ _SINE[_LAST]), scale * (force @ _COSINE[_LAST]), push
 
-    def _drive(self, w: float) -> float:
-        """Return the amplitude of the acceleration that the mass feels, in m/s2."""
+    def _drive(self, w: Float1D) -> Float1D:
+        """Return the amplitude of the acceleration that the mass feels, in m/s2, (amplitude,)."""
         a = self.acceleration_m_s2
-        return abs(a + (self.model.added_acceleration(-a / w**2) or 0.0))
+        return np.abs(a + (self.model.added_acceleration(-a / w**2) or 0.0))
 
-    def solve_backbone(self, amplitude_m: float) -> tuple[float, float, float]:
-        """Return (w in 1/s at which a free motion has this amplitude, surplus, smallest push).
+    def solve_backbone(self, amplitudes_m: Float1D) -> tuple[Float1D, Float1D, Float1D]:
+        """Return (w in 1/s at which a free motion has an amplitude, surplus, smallest push).
 
-        The surplus, M A / U - h in N/m, vanishes at the largest response.
+        The surplus, M A / U - h in N/m, vanishes at the largest response. Each (amplitude,).
         """
         p = self.model.parameters
-        w, h, push = math.sqrt(p.stiffness / p.mass), 0.0, 0.0
+        w = np.full(amplitudes_m.size, math.sqrt(p.stiffness / p.mass))
+        h = push = np.zeros_like(w)
         for _ in range(FREQUENCY_ITERATIONS + 1):
-            k, h, push = self.describe_force(amplitude_m, w)
-            w = math.sqrt(max(k, MIN_STIFFNESS_RATIO * p.stiffness) / p.mass)
-        return w, p.mass * self._drive(w) / amplitude_m - h, push
+            k, h, push = self.describe_force(amplitudes_m, w)
+            w = np.sqrt(np.maximum(k, MIN_STIFFNESS_RATIO * p.stiffness) / p.mass)
+        return w, p.mass * self._drive(w) / amplitudes_m - h, push
 
     def find_largest_amplitude(self) -> float:
         """Return the largest amplitude in m; NaN if the loss does not limit it."""
 
-        def surplus(log_amplitude: float) -> float:
-            amplitude_m = math.exp(log_amplitude)
-            return self.solve_backbone(amplitude_m)[1] * amplitude_m
+        ends = math.log(MIN_AMPLITUDE_M), math.log(MAX_AMPLITUDE_M)
+        for _ in range(NARROWINGS):
+            logs = np.linspace(*ends, NARROWING_POINTS)
+            amplitudes_m = np.exp(logs)
+            surplus = self.solve_backbone(amplitudes_m)[1] * amplitudes_m
+            if not (surplus[0] > 0 > surplus[-1]):
+                return math.nan
+            k = int((surplus > 0).argmin()) - 1  # before the first without a surplus
+            ends = float(logs[k]), float(logs[k + 1])
+        share = surplus[k] / (surplus[k] - surplus[k + 1])
+        return math.exp(ends[0] + share * (ends[1] - ends[0]))
 
-        low, high = math.log(MIN_AMPLITUDE_M), math.log(MAX_AMPLITUDE_M)
-        if not (surplus(low) > 0 > surplus(high)):
-            return math.nan
-        return math.exp(brentq(surplus, low, high, xtol=AMPLITUDE_TOL))
-
-    def solve_frequency(self, amplitude_m: float, w: float, side: int) -> float:
+    def solve_frequencies(self, amplitudes_m: Float1D, w: Float1D, side: int) -> Float1D:
         """Return w in 1/s below (side -1) or above (+1) the backbone; NaN without a solution."""
         mass = self.model.parameters.mass
         for _ in range(FREQUENCY_ITERATIONS):
-            k, h, _ = self.describe_force(amplitude_m, w)
-            square = (mass * self._drive(w) / amplitude_m) ** 2 - h * h
-            inertia = k + side * math.sqrt(max(square, 0.0))
-            if inertia <= 0:
-                return math.nan
-            w = math.sqrt(inertia / mass)
+            solvable = np.isfinite(w)
+            k, h, _ = self.describe_force(amplitudes_m, np.where(solvable, w, 1.0))
+            square = (mass * self._drive(w) / amplitudes_m) ** 2 - h * h
+            inertia = k + side * np.sqrt(np.maximum(square, 0.0))
+            w = np.sqrt(np.where(solvable & (inertia > 0), inertia, np.nan) / mass)
         return w
 
 
@@ -122,22 +132,21 @@ def approximate_curve(model: Model, acceleration_m_s2: float) -> ResponseCurve |
     touch = min(abs(p.gap_r), abs(p.gap_l))
     if amplitudes[-1] < touch < largest:
         amplitudes = np.append(amplitudes, touch * np.array(TOUCH_RATIOS))
-    rows: list[list[tuple[float, float, float]]] = [[], []]
-    for amplitude in np.unique(amplitudes).tolist():
-        w, _, push = balance.solve_backbone(amplitude)
-        excess = amplitude - touch
-        if p.gap_r + p.gap_l <= 0:
-            stiffness = min(p.bumper_stiffness_r, p.bumper_stiffness_l)
-            excess = -push / stiffness if push > 0 else max(excess, MIN_EXCESS_M)
-        for row, side in zip(rows, (-1, 1), strict=True):
-            if side > 0 and amplitude == largest:
-                continue  # both frequencies are one
-            hz = balance.solve_frequency(amplitude, w, side) / (2 * math.pi)
-            if math.isfinite(hz):
-                row.append((hz, amplitude, excess))
-    if len(rows[0]) < MIN_CURVE_POINTS or len(rows[1]) < MIN_CURVE_POINTS:
+    amplitudes = np.unique(amplitudes)
+    w, _, push = balance.solve_backbone(amplitudes)
+    excess_m = amplitudes - touch
+    if p.gap_r + p.gap_l <= 0:
+        stiffness = min(p.bumper_stiffness_r, p.bumper_stiffness_l)
+        excess_m = np.where(push > 0, -push / stiffness, np.maximum(excess_m, MIN_EXCESS_M))
+    rows = []
+    for side in (-1, 1):
+        hz = balance.solve_frequencies(amplitudes, w, side) / (2 * math.pi)
+        # at the largest amplitude both frequencies are one
+        exists = np.isfinite(hz) & ((side < 0) | (amplitudes < largest))
+        rows.append(np.array([hz, amplitudes, excess_m])[:, exists])
+    if min(row.shape[1] for row in rows) < MIN_CURVE_POINTS:
         return None
-    hz, u, excess_m = np.array(rows[0] + rows[1][::-1]).T
+    hz, u, excess_m = np.concatenate([rows[0], rows[1][:, ::-1]], axis=1)
     stable = np.ones(hz.size, dtype=bool)
     folds = find_folds_along(hz)
     if folds is not None:

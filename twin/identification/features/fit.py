@@ -6,8 +6,8 @@
    the fit repeated. The same difference at the model without the effects is there from the
    beginning. The best model of all rounds and starts, judged by continuation, stays.
 
-Models in closed form are fitted by continuation itself. Parameters of the base have a prior: their
-range in the features file is 95 % of it, and a bound.
+Models in closed form are then fitted by continuation itself, from there. Parameters of the base
+have a prior: their range in the features file is 95 % of it, and a bound.
 """
 
 import itertools
@@ -50,6 +50,7 @@ from twin.model.model import Model
 TRIAL_SHARES = (3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0)
 TRIAL_SHAPES = 7
 MAX_EVALUATIONS = 14  # of least squares, each with its derivatives
+POLISHING_EVALUATIONS = 6  # the same by continuation, which is ten times slower
 CORRECTION_ROUNDS = 2  # of each start
 DERIVATIVE_STEP = 3e-3  # of a parameter's unit: its logarithm, or its trial amplitude
 MIN_FACTOR_STEP = 1e-3  # of a bound: a start lies this far inside
@@ -120,7 +121,7 @@ class FeatureFit:
     parameters: ParameterSet
     predicted: tuple[PredictedFeature, ...]
     curves: dict[float, ResponseCurve | None]  # by total gap in mm
-    rounds: int  # of correction by continuation; 0: fitted by continuation itself, or not fitted
+    rounds: int  # of correction by continuation; 0: fitted by continuation itself at last, or not
     intervals: dict[ParameterKey, tuple[float, float]]  # 95 %, of the free parameters
 
     @property
@@ -231,32 +232,50 @@ def fit_effects(
     """
     features = problem.features
     approximate = partial(approximate_quantities, features)
-    is_exact = groups[0].trials[0].to_model().changes_only_parameters
-    fits: list[tuple[int, float, ParameterSet, Measurement, _Objective]] = []
+    fits: list[_JudgedFit] = []
     for group in groups:
         reference = group.reference
         exact = [feature.quantities for feature in reference.predicted]
         best: ParameterSet | None = None
-        for _ in range(1 if is_exact else CORRECTION_ROUNDS):
-            if is_exact:
-                objective = _Objective(problem, partial(_continue_quantities, features))
-            else:
-                near = approximate((best or reference.parameters).to_model())
-                objective = _Objective(problem, _correct(approximate, near, exact))
+        for _ in range(CORRECTION_ROUNDS):
+            near = approximate((best or reference.parameters).to_model())
+            objective = _Objective(problem, _correct(approximate, near, exact))
             best = objective.minimize(best or min(group.trials, key=objective.measure_cost))
-            measurement = continue_features(features, best.to_model())
-            exact = measurement.quantities
-            judged = _Objective(problem, partial(_repeat_quantities, exact))
-            fits.append((
-                -judged.count_explained(best), judged.measure_cost(best), best, measurement,
-                objective,
-            ))  # fmt: skip
-    _, _, parameters, measurement, objective = min(fits, key=lambda fit: fit[:2])
+            fits.append(_judge_fit(problem, objective, best))
+            exact = fits[-1].measurement.quantities
+    result = min(fits, key=lambda fit: fit.rank_key)
+    is_exact = result.parameters.to_model().changes_only_parameters
+    if is_exact:
+        objective = _Objective(problem, partial(_continue_quantities, features))
+        polished_at = objective.minimize(result.parameters, POLISHING_EVALUATIONS)
+        polished = _judge_fit(problem, objective, polished_at)
+        # its own objective, whose derivatives the intervals need
+        result = min(polished, replace(result, objective=objective), key=lambda fit: fit.rank_key)
+    parameters, measurement, objective = result.parameters, result.measurement, result.objective
     intervals = objective.estimate_intervals(parameters)
     rounds = 0 if is_exact else CORRECTION_ROUNDS
     fit = _complete_fit(problem, names, parameters, measurement, rounds, intervals)
     extended = [_add_vanishing(group.reference, names, group.trials[0]) for group in groups]
     return min([fit, *extended], key=lambda each: each.rank_key)
+
+
+@dataclass(frozen=True, eq=False)
+class _JudgedFit:
+    """Parameters at the end of a minimization, judged by continuation."""
+
+    parameters: ParameterSet
+    measurement: Measurement
+    objective: "_Objective"  # that was minimized
+    rank_key: tuple[int, float]  # the smaller, the better
+
+
+def _judge_fit(
+    problem: FeatureProblem, objective: "_Objective", parameters: ParameterSet
+) -> _JudgedFit:
+    measurement = continue_features(problem.features, parameters.to_model())
+    judged = _Objective(problem, partial(_repeat_quantities, measurement.quantities))
+    rank_key = -judged.count_explained(parameters), judged.measure_cost(parameters)
+    return _JudgedFit(parameters, measurement, objective, rank_key)
 
 
 def _continue_quantities(features: FeatureSet, model: Model) -> list[Quantities]:
@@ -303,6 +322,7 @@ class _Objective:
 
     def __init__(self, problem: FeatureProblem, quantities_of: QuantitiesOf) -> None:
         self._problem, self._quantities_of = problem, quantities_of
+        self._last: tuple[ParameterSet, bytes, Float1D] | None = None
         values = ParameterSet.from_model(problem.model, 0).values
         self._priors = {  # (mean, standard deviation) of the logarithm
             free.key: (
@@ -343,23 +363,30 @@ class _Objective:
         """Return the sum of log(1 + squared residual)."""
         return float(np.log1p(self.compute(parameters) ** 2).sum())
 
-    def minimize(self, start: ParameterSet) -> ParameterSet:
+    def minimize(self, start: ParameterSet, max_evaluations: int = MAX_EVALUATIONS) -> ParameterSet:
         """Return the parameters of least Cauchy loss within their bounds."""
         units, low, high = _scale_bounds(start)
         margin = MIN_FACTOR_STEP * np.minimum(1.0, high - low)
         result = least_squares(
-            lambda x: self.compute(start.with_vector(x * units)),
+            lambda x: self._compute_once(start, x, units),
             np.clip(start.to_vector() / units, low + margin, high - margin),
             lambda x: self._differentiate(start, x, units, high),
-            (low, high), loss="cauchy", max_nfev=MAX_EVALUATIONS,
+            (low, high), loss="cauchy", max_nfev=max_evaluations,
         )  # fmt: skip
         return start.with_vector(np.asarray(result.x) * units)
+
+    def _compute_once(self, start: ParameterSet, x: Float1D, units: Float1D) -> Float1D:
+        """Return the residuals, which least squares and its derivatives want of the same x."""
+        values = x.tobytes()
+        if self._last is None or self._last[0] is not start or self._last[1] != values:
+            self._last = start, values, self.compute(start.with_vector(x * units))
+        return self._last[2]
 
     def _differentiate(
         self, start: ParameterSet, x: Float1D, units: Float1D, high: Float1D
     ) -> Float2D:
         """Return the derivatives of the residuals by x, (residual, free)."""
-        centre, columns = self.compute(start.with_vector(x * units)), []
+        centre, columns = self._compute_once(start, x, units), []
         for j in range(x.size):
             moved = x.copy()
             step = DERIVATIVE_STEP if x[j] + DERIVATIVE_STEP <= high[j] else -DERIVATIVE_STEP

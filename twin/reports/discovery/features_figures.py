@@ -14,7 +14,7 @@ from twin.identification.features.config import Feature
 from twin.identification.features.curve import ResponseCurve
 from twin.identification.features.fit import FeatureFit
 from twin.identification.features.search import FeatureDiscovery
-from twin.reports.discovery.features_summary import label_feature, name_fit
+from twin.reports.discovery.feature_labels import label_feature, name_fit
 from twin.reports.plot_style import CaptionedFigure, Picture, save_figures
 from twin.reports.summary import Json
 

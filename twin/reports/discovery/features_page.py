@@ -5,8 +5,8 @@ from pathlib import Path
 from twin.identification.features.search import FeatureDiscovery, describe_effects
 from twin.model.effects import find_effect
 from twin.model.effects.typesetting import typeset_law
+from twin.reports.discovery.feature_labels import label_feature, name_fit
 from twin.reports.discovery.features_figures import draw_feature_pairs
-from twin.reports.discovery.features_summary import label_feature, name_fit
 from twin.reports.discovery.headline import name_effect
 from twin.reports.page import embed_images, render_page
 from twin.reports.quantities import format_quantity

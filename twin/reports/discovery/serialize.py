@@ -56,6 +56,7 @@ def verdict_to_json(
     where = discovery.localization
     factor = noise_factor(discovery)
     names, alternatives = best.names, [fitted.names for fitted in verdict.alternatives]
+    blind_to = [effect.candidate.name for effect in verdict.blind_to]
     return {
         "verdict": verdict.outcome,
         "why": _format_reason(discovery),
@@ -99,7 +100,8 @@ def verdict_to_json(
             *find_suspicious_parameters(best),
             *([] if selection.complete else [STOPPED_NOTE]),
         ],
-        "next_run": suggest_next_run(verdict.outcome, names, alternatives),
+        "blind_to": blind_to,
+        "next_run": suggest_next_run(verdict.outcome, names, alternatives, blind_to),
         "seconds": seconds,
         "held_out_logs": [_held_out_to_json(log, discovery, given) for log in held_out_logs],
     }

@@ -1,8 +1,9 @@
 """Study of decisive runs: what a proposed test decides on the same hidden plant, and a random one.
 
 The first recording of a case is that of `study discovery`, or of a poorer test, one frequency at
-one level. Where its verdict leaves something open, or names less than what is hidden, the proposed
-test and a random one as long are played with other noise, and all recordings judged again.
+one level, with bumpers or in free flight. Where its verdict leaves something open, or names less
+than what is hidden, the proposed test and a random one as long are played with other noise, and all
+recordings judged again.
 """
 
 import json
@@ -18,6 +19,8 @@ from table_io.clock import cpu_seconds
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from twin.identification.discover import Discovery, discover_effects
+from twin.identification.experiment_design import rank_tests
+from twin.identification.law_search import LawProposal, propose_law
 from twin.reports.discovery.loading import load_logs
 from twin.reports.finalize import EXIT_INTERRUPTED
 from twin.run.decisive_test import (
@@ -38,6 +41,7 @@ from twin.validation.study.strata import Case, draw_case, list_case_numbers
 
 Json = dict[str, Any]
 DEFAULT_CELLS = ("pair/*/1%", "pair/*/5%")
+FIRST_TESTS = ("sweep", "one-frequency", "flight")
 RESULTS_FILE = "decisive_runs.jsonl"
 MAX_TEST_MIN = 10.0
 MAX_CASE_S = 900.0  # wall clock: what nothing explains takes long to judge, and counts as failed
@@ -52,6 +56,11 @@ directions = ["forward"]
 
 """
 POOR_PROFILE_TOML = PROFILE_TOML.replace(STUDY_SWEEP, POOR_SWEEP)
+PROFILES = {
+    "sweep": PROFILE_TOML,
+    "one-frequency": POOR_PROFILE_TOML,
+    "flight": POOR_PROFILE_TOML.replace("gap_mm = 4.0", "gap_mm = inf"),
+}
 PROBABILITY_BINS = (0.0, 0.5, 0.9, 1.0)
 
 
@@ -61,9 +70,16 @@ def run_decide_study(
     cells: Sequence[str],
     workers: int | None,
     resume: bool,
-    poor: bool,
+    first: str,
 ) -> int:
-    """Evaluate decisive runs on the cases that have no result; return the exit code."""
+    """Evaluate decisive runs on the cases that have no result; return the exit code.
+
+    `first` is the first test of a case, of `FIRST_TESTS`.
+    """
+    if first not in FIRST_TESTS:
+        raise InputError(
+            "unknown first test", key="--first", value=first, allowed=", ".join(FIRST_TESTS)
+        )
     numbers = list_case_numbers(seeds, cells or DEFAULT_CELLS)
     if out is not None and resume:
         claim_folder(out)
@@ -72,7 +88,7 @@ def run_decide_study(
     rows = read_json_lines(path)
     finished = {row["number"] for row in rows}
     pending = [number for number in numbers if number not in finished]
-    task = partial(evaluate_decision, folder, poor)
+    task = partial(evaluate_decision, folder, first)
     with (
         catch_interrupts("stopping after the cases in progress") as stop,
         path.open("a", encoding="utf-8") as file,
@@ -97,22 +113,22 @@ def read_json_lines(path: Path) -> list[Json]:
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
-def evaluate_decision(root: Path, poor: bool, number: int) -> Json:
+def evaluate_decision(root: Path, first: str, number: int) -> Json:
     """Return the row of a case: the first verdict, and after the proposed and a random test."""
     case, start_s = draw_case(number), cpu_seconds()
-    plant = _SealedPlant(case, root / "cases" / case.label)
-    plant.play(POOR_PROFILE_TOML if poor else PROFILE_TOML, "first")
-    first = plant.discover("first")
-    truth = [planted.effect.name for planted in case.planted]
+    plant = _SealedPlant(case, root / "cases" / case.label, has_bumpers=first != "flight")
+    plant.play(PROFILES[first], "first")
+    discovery, law = plant.discover("first")
     row: Json = {
-        "number": number, "cell": case.cell.name, "truth": truth,
-        "first": _score_discovery(first, truth),
+        "number": number, "cell": case.cell.name, "truth": plant.truth,
+        "first": plant.score_discovery(discovery, law),
     }  # fmt: skip
-    if row["first"]["right"]:
+    if row["first"]["right"] and row["first"]["decided"]:
         return row | {"seconds": cpu_seconds() - start_s}
     recorded = open_recording(plant.log("first")).start
     rig = recorded.rig_toml
-    proposals = propose_tests(first, list_candidate_tests(recorded, rig, MAX_TEST_MIN))
+    candidates = list_candidate_tests(recorded, rig, MAX_TEST_MIN)
+    proposals = propose_tests(discovery, candidates, law=law.fitted if law else None)
     if not proposals:
         return row | {"proposal": None, "seconds": cpu_seconds() - start_s}
     proposal = proposals[0]
@@ -124,21 +140,27 @@ def evaluate_decision(root: Path, poor: bool, number: int) -> Json:
         "rivals": [rival.name for rival in proposal.prediction.rivals],
         "sigma": proposal.prediction.sigma,
         "probability": proposal.prediction.probability,
-        "is_open": not proposal.prediction.is_confirmation,
     }
+    rivals, problem = proposal.prediction.rivals, discovery.prepared.problem
+    by_chance = rank_tests(problem, rivals, [random.motion])
+    row["random_probability"] = by_chance[0].probability if by_chance else 0.0
     for label, test in (("proposed", proposal.test), ("random", random)):
-        row[label] = plant.evaluate_test(test, label, truth)
+        row[label] = plant.evaluate_test(test, label)
     return row | {"seconds": cpu_seconds() - start_s}
 
 
 class _SealedPlant:
     """Plant of a case with its sealed truth, on which several tests can be played."""
 
-    def __init__(self, case: Case, folder: Path) -> None:
+    def __init__(self, case: Case, folder: Path, has_bumpers: bool) -> None:
         self.case, self.folder, self.tests = case, folder, 0
+        self.truth = [planted.effect.name for planted in case.planted]
         folder.mkdir(parents=True, exist_ok=True)
         shares, _ = find_shares(case)
-        text = f"# {case.salt}\n" + format_toml(make_truth(case, case.planted, shares))
+        truth = make_truth(case, case.planted, shares)
+        if not has_bumpers:  # the gaps are then those of the profile
+            truth["base"] = {k: v for k, v in truth["base"].items() if not k.startswith("gap_")}
+        text = f"# {case.salt}\n" + format_toml(truth)
         (folder / "truth.toml").write_text(text, encoding="utf-8")
         (folder / "model.toml").write_text(MODEL_TOML, encoding="utf-8")
         self.sha256 = hash_truth(text)
@@ -155,33 +177,42 @@ class _SealedPlant:
         rig = make_rig_toml(self.case.cell.noise, seed, truth, self.sha256)
         return record_test(rig, self.case.label, self.log(name), True, profile_toml).verdict
 
-    def discover(self, *names: str) -> Discovery:
-        """Return the discovery from recordings together."""
+    def discover(self, *names: str) -> tuple[Discovery, LawProposal | None]:
+        """Return the discovery from recordings together, and a law for what it leaves open."""
         logs, _ = load_logs([self.log(name) for name in names])
-        return discover_effects(logs, read_model_template(str(self.folder / "model.toml"))[0])
+        model = read_model_template(str(self.folder / "model.toml"))[0]
+        return propose_law(discover_effects(logs, model))
 
-    def evaluate_test(self, test: CandidateTest, name: str, truth: Sequence[str]) -> Json:
+    def evaluate_test(self, test: CandidateTest, name: str) -> Json:
         """Return the verdict after a further test, or why there is none."""
         facts: Json = {"title": test.title, "excitation": str(test.config.profile.excitation)}
         ended = self.play(test.config.profile_toml, name)
         if ended != "complete":
             return facts | {"ended": ended, "outcome": ended, "right": False, "decided": False}
         try:
-            return facts | _score_discovery(self.discover("first", name), truth)
+            return facts | self.score_discovery(*self.discover("first", name))
         except InputError as error:
             return facts | {"outcome": str(error), "right": False, "decided": False}
 
+    def score_discovery(self, discovery: Discovery, law: LawProposal | None) -> Json:
+        """Return the verdict; right: it names all that is hidden and nothing else.
 
-def _score_discovery(discovery: Discovery, truth: Sequence[str]) -> Json:
-    """Return the verdict; right: it names all that is hidden and nothing else."""
-    verdict = discovery.verdict
-    named = [*verdict.best.names]
-    return {
-        "outcome": verdict.outcome, "named": named, "remainder": verdict.has_remainder,
-        "confidence": verdict.confidence, "decided": verdict.is_decided,
-        "right": verdict.outcome == "named" and {*named} == {*truth},
-        "all_named": verdict.outcome == "named" and {*truth} <= {*named},
-    }  # fmt: skip
+        What is not in the library is decided by a law that suffices.
+        """
+        verdict = discovery.verdict
+        named = [*verdict.best.names]
+        has_law = law is not None and law.is_sufficient
+        is_right = verdict.outcome in ("none", "named") and {*named} == {*self.truth}
+        if self.case.cell.kind == "unknown":
+            is_right = verdict.outcome == "unexplained" and has_law
+        return {
+            "outcome": verdict.outcome, "named": named, "remainder": verdict.has_remainder,
+            "alternatives": [[*fitted.names] for fitted in verdict.alternatives],
+            "blind_to": [effect.candidate.name for effect in verdict.blind_to],
+            "law": [*law.fitted.names] if law else [],
+            "confidence": verdict.confidence, "decided": verdict.is_decided or has_law,
+            "right": is_right,
+        }  # fmt: skip
 
 
 def format_decision(row: Json) -> str:
@@ -202,16 +233,16 @@ def format_decision(row: Json) -> str:
 
 
 def _format_verdict(score: Json) -> str:
-    mark = "right" if score["right"] else "MISSED"
-    return f"{score['outcome']} {'+'.join(score.get('named', ()))} {mark}"
+    mark = ("" if score["decided"] else "open, ") + ("right" if score["right"] else "MISSED")
+    return f"{score['outcome']} {'+'.join(score.get('named', ()))} ({mark})"
 
 
 def format_rates(rows: Iterable[Json]) -> str:
     """Return the rates of decisive and random tests with Wilson intervals, and the calibration."""
     usable = [row for row in rows if "first" in row]
     asked = [row for row in usable if not row["first"]["right"]]
-    played = [row for row in asked if row.get("proposal")]
-    undecided = [row for row in asked if not row["first"]["decided"]]
+    undecided = [row for row in usable if not row["first"]["decided"]]
+    confident = [row for row in usable if row["first"]["decided"]]
     lines = ["| | rate | 95 % interval |", "|---|---|---|"]
 
     def add_rate(name: str, hits: Iterable[bool]) -> None:
@@ -221,6 +252,9 @@ def format_rates(rows: Iterable[Json]) -> str:
     def is_right(row: Json, test: str) -> bool:
         return bool(row.get(test, {}).get("right"))
 
+    add_rate("decided by the first recording, of these right", (
+        row["first"]["right"] for row in confident
+    ))  # fmt: skip
     add_rate("all named by the first recording", (row["first"]["right"] for row in usable))
     for test in ("proposed", "random"):
         add_rate(
@@ -237,18 +271,41 @@ def format_rates(rows: Iterable[Json]) -> str:
         )
         add_rate(
             f"undecided before, decided and right after {test}",
-            (is_right(row, test) for row in undecided),
+            (is_decided_right(row.get(test, {})) for row in undecided),
         )
-    lines += ["", "| stated probability | mean | decided |", "|---|---|---|"]
-    for low, high in pairwise(PROBABILITY_BINS):
-        rows_of_bin = [
-            row
-            for row in played
-            if row["proposal"]["is_open"]
-            and low <= row["proposal"]["probability"] < high + (high == 1.0)
-        ]
-        stated = [row["proposal"]["probability"] for row in rows_of_bin]
-        hits = sum(bool(row["proposed"].get("decided")) for row in rows_of_bin)
-        mean = f"{np.mean(stated):.2f}" if stated else "-"
-        lines.append(f"| {low:g} to {high:g} | {mean} | {Rate(hits, len(stated))} |")
+    stated = [
+        (row["proposal"]["probability"], is_decided_right(row["proposed"]))
+        for row in undecided
+        if row.get("proposal")
+    ] + [
+        (row["random_probability"], is_decided_right(row["random"]))
+        for row in undecided
+        if row.get("proposal")
+    ]
+    lines += ["", "| stated probability, proposed and random | mean | decided and right |"]
+    lines += ["|---|---|---|", *_format_bins(stated)]
+    confidences = [
+        (score["confidence"], score["right"])
+        for row in usable
+        for score in (row["first"], row.get("proposed", {}), row.get("random", {}))
+        if score.get("outcome") in ("none", "named")
+    ]
+    lines += ["", "| stated confidence, all verdicts | mean | right |"]
+    lines += ["|---|---|---|", *_format_bins(confidences)]
     return "\n".join(lines) + "\n"
+
+
+def is_decided_right(score: Json) -> bool:
+    """Return True if a verdict leaves nothing open and is right."""
+    return bool(score.get("decided") and score["right"])
+
+
+def _format_bins(stated: Sequence[tuple[float, bool]]) -> list[str]:
+    """Return the rate of hits by stated probability, one row of a table a bin."""
+    rows = []
+    for low, high in pairwise(PROBABILITY_BINS):
+        pairs = [(p, hit) for p, hit in stated if low <= p < high + (high == 1.0)]
+        mean = f"{np.mean([p for p, _ in pairs]):.2f}" if pairs else "-"
+        rate = Rate(sum(hit for _, hit in pairs), len(pairs))
+        rows.append(f"| {low:g} to {high:g} | {mean} | {rate} |")
+    return rows
