@@ -44,6 +44,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "discovery": ("study discovery --seeds 1 --out study",
                   "study discovery --laboratory typical --out study"),
     "decide": ("study decide --seeds 1 --out study", "study decide --poor --cells 'pair/3/1%'"),
+    "laws": ("study laws --out study", "study laws --rivals --cells 'unknown/*/3/1%' --out study"),
     "list": ("list tests", "list effects"),
     "new": ("new test mine.toml", "new rig my_table.toml"),
     "explain": ("explain gap_mm", "explain control.tolerance"),
