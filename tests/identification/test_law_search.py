@@ -1,14 +1,19 @@
 """Search of laws that the library lacks, on recordings of the simulated rig."""
 
+import ast
 import math
 
+import numpy as np
 import pytest
 
 from tests.identification.played import SNM, format_truth, log
+from twin.identification import law_search
 from twin.identification.discover import prepare_problem
 from twin.identification.law_search import propose_law, search_laws
 from twin.identification.law_terms import FAMILIES, list_law_candidates
 from twin.identification.motion import RecordScale
+from twin.identification.parameters import EffectKey
+from twin.identification.symbolic_regression import make_term
 from twin.model.effects.expression import parse_unit
 
 
@@ -43,6 +48,42 @@ class TestTerms:
         assert all(
             candidate.effect and candidate.effect.place in ("damper", "input") for candidate in free
         )
+
+
+class TestExpressions:
+    """Symbolic regression, whose expressions become terms as all others."""
+
+    def make(self, text, place="damper"):
+        scale = prepare_problem([log()], SNM).problem.log_residuals[0].scale
+        u, v = np.random.default_rng(1).uniform(-1.0, 1.0, (2, 200))
+        names = ["(u / u0)" if place == "damper" else "(d / d0)", "(v / v0)"]
+        return make_term(place, ast.parse(text, mode="eval").body, names, [u, v], scale, 0)
+
+    def test_coefficients_that_the_amplitude_holds_are_fixed(self):
+        term = self.make("tanh(8.0 * X2) * abs(-3.0 * X1)")
+        assert term is not None
+        assert term.effect.law.force == "k * (tanh(c1 * (v / v0)) * abs(-c2 * (u / u0)))"
+        assert [free.key.name for free in term.free] == ["k", "c1"]
+        assert term.shapes == ((8.0,),)
+        assert term.constants[EffectKey(term.name, "c2")] == 3.0
+
+    def test_squares_are_powers(self):
+        term = self.make("square(X1) * X2")
+        assert term is not None
+        assert term.effect.law.force == "k * ((u / u0) ** 2 * (v / v0))"
+
+    def test_a_bumper_that_pushes_at_touch_is_no_law(self):
+        assert self.make("X1 + 0.5", "bumpers") is None
+        assert self.make("X1 * X1", "bumpers") is not None
+
+    @pytest.mark.slow
+    def test_an_expression_explains_what_no_family_does(self, monkeypatch):
+        pytest.importorskip("pyoperon")
+        monkeypatch.setattr(law_search, "list_law_candidates", lambda *_: ())
+        prepared, null, fitted_sets = search(format_truth("cubic_damping", c3=4e4))
+        assert fitted_sets[0].effects[-1].name.startswith("law_expression_")
+        assert null.cost > 1.5
+        assert fitted_sets[0].cost < 1.1 * prepared.problem.noise
 
 
 @pytest.mark.parametrize(

@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.integrate import cumulative_trapezoid
+from scipy.optimize import brentq
 
 from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
 from tests.identification.played import SNM, format_truth, log
 from tests.model import laboratory_laws
 from tests.model.cases import RATE_HZ, drive, noisy, typical
+from tests.model.independent_solution import Witness
 from tests.model.motion import sine
 from tests.model.reference import snm
 from tests.plugin_package import install_package
@@ -23,9 +25,10 @@ from twin.identification.discover import discover_effects
 from twin.identification.parameters import EffectKey
 from twin.model.effects import find_effect, load_plugins
 from twin.model.effects.effect import Effect
+from twin.model.effects.effect_file import EffectFile
 from twin.model.effects.law import find_law_problem
 from twin.model.inverse_dynamics import forces_along
-from twin.model.model import Model
+from twin.model.model import EffectInstance, Model
 from twin.model.solver import StateEstimate
 
 KICK = noisy(1.0)
@@ -259,7 +262,7 @@ LAW = laboratory_laws.ZENER_BUMPER
         (replace(LAW, place="table"), "'table'"),  # type: ignore[arg-type]
         (replace(LAW, rates=None), "belong together"),
         (replace(LAW, rates=lambda q, w, s, c: (0.0, 0.0)), "2 values for 1 states"),
-        (replace(LAW, force=lambda q, w, s, c: w * abs(w)), "linear in the rate"),
+        (replace(LAW, force=lambda q, w, s, c: -w * abs(w)), "not linear in the rate"),
         (replace(LAW, force=lambda q, w, s, c: 5.0), "zero at deformation 0"),
         (replace(LAW, force=lambda q, w, z, c: 0.0), "argument 'z'"),
         (replace(LAW, force=lambda q, w, s, c: s[3]), "IndexError"),
@@ -272,6 +275,56 @@ def test_a_law_that_cannot_work_is_told_why(effect, problem):
 
 
 @pytest.mark.usefixtures("drafts")
+class RateWitness(Witness):
+    """Bumpers with a further push of their rate alone, whose free face moves without force."""
+
+    def __init__(self, model, base, extra) -> None:
+        super().__init__(model, base)
+        self.extra = extra
+
+    def bumper(self, side, d, dd, b):
+        return super().bumper(side, d, dd, b) + self.extra(dd)
+
+    def face(self, side, t, x):
+        if self.contact[side]:
+            return super().face(side, t, x)
+        d = x[2 + side]
+        fastest = -d * self.p.bumper_stiffness_r / self.p.bumper_damping_r
+        if d < 1e-12:
+            return d, fastest
+        return d, brentq(lambda rate: self.bumper(side, d, rate, 0.0), 2.0 * fastest, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("force", "unit", "k", "extra"),
+    [
+        ("k * v**3", "N s3/m3", 2e5, lambda v: 2e5 * v**3),
+        pytest.param(
+            "k * max(v, 0)", "N s/m", 2e3, lambda v: 2e3 * max(v, 0.0), marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_a_bumper_whose_damping_is_not_linear_recovers_without_force(force, unit, k, extra):
+    law = EffectFile.model_validate({
+        "id": "rate_law", "place": "bumpers", "force": force,
+        "parameters": {
+            "k": {"unit": unit, "low": 0.0, "high": 1e7, "vanishing": 0.0, "typical": k}
+        },
+    })  # fmt: skip
+    p, kick = snm(), KICK[:900]
+    model = Model(p, (EffectInstance.create(law.build_effect(), {"k": k}),))
+    out = drive(model, kick)[1]
+    times = np.arange(kick.size + 1) / RATE_HZ
+    samples = np.concatenate([[0.0], kick])
+    witness = RateWitness(model, lambda t: float(np.interp(t, times, samples)), extra)
+    expected = witness.run(np.zeros(8), times, 1e-9)
+    assert witness.events > 4
+    assert np.abs(out[0] - expected[0, 1:]).max() < 1e-6 * np.abs(out[0]).max()
+    assert np.abs(out[5] - expected[2, 1:]).max() < 1e-4 * np.abs(out[5]).max()
+    plain = drive(Model(p), kick)[1]
+    assert np.abs(out[0] - plain[0]).max() > 1e-3 * np.abs(out[0]).max()
+
+
 def test_commands_take_it(package, tmp_path):
     """`simulate` with both kinds of law, in a process that finds the installed package."""
     snm_file = (PROFILES_DIR / "models" / "snm.toml").read_text()

@@ -263,12 +263,68 @@ def integrate_relaxation(v: Float1D, dt: float, stiffness: float, tau: float) ->
     return out
 
 
+def evaluate_law(law: dict[str, Any], values: dict[str, float], u: Float1D, dt: float) -> Float1D:
+    """Return the force in N of the law of an effect file on a motion, (sample,), by Heun steps."""
+    states = [*law.get("states", {})]
+    unpack = [f"{name} = {value!r}" for name, value in values.items()]
+    rates = ", ".join(f"({state['rate']})" for state in law.get("states", {}).values())
+    lines = [
+        "def integrate(us, vs, ts, dt, substeps):",
+        *(f"    {line}" for line in unpack),
+        *(f"    {name} = 0.0" for name in states),
+        "    out = np.empty(us.size)",
+        "    for sample in range(us.size):",
+        "        u, v, t, a = us[sample], vs[sample], ts[sample], 0.0",
+        f"        out[sample] = {law['force']}",
+        "        if sample == us.size - 1:",
+        "            break",
+    ]
+    if states:
+        old, first, second = (
+            [f"{prefix}_{name}" for name in states] for prefix in ("old", "first", "second")
+        )
+
+        def assign(targets: Sequence[str], texts: Sequence[str]) -> str:
+            pairs = zip(targets, texts, strict=True)
+            return "; ".join(f"{target} = {text}" for target, text in pairs)
+
+        rows = tuple(zip(states, old, first, second, strict=True))
+        lines += [
+            "        for step in range(substeps):",
+            "            start, end = step / substeps, (step + 1) / substeps",
+            "            u = us[sample] + (us[sample + 1] - us[sample]) * start",
+            "            v = vs[sample] + (vs[sample + 1] - vs[sample]) * start",
+            f"            {assign(old, states)}",
+            f"            {', '.join(first)}, = ({rates},)",
+            f"            {assign(states, [f'{o} + dt * {k}' for _, o, k, _ in rows])}",
+            "            u = us[sample] + (us[sample + 1] - us[sample]) * end",
+            "            v = vs[sample] + (vs[sample + 1] - vs[sample]) * end",
+            f"            {', '.join(second)}, = ({rates},)",
+            "            "
+            + assign(states, [f"{o} + 0.5 * dt * ({k} + {m})" for _, o, k, m in rows]),
+        ]
+    source = "\n".join([*lines, "    return out"])
+    namespace = {
+        **{name: getattr(math, name) for name in ("sqrt", "exp", "log", "sin", "cos")},
+        "sinh": math.sinh, "tanh": math.tanh, "np": np,
+        "sign": nb.njit(lambda x: math.copysign(1.0, x)),
+    }  # fmt: skip
+    exec(source, namespace)  # of a model file that this study has just had written
+    integrate: Callable[..., Float1D] = nb.njit(namespace["integrate"])
+    v = np.gradient(u) / dt
+    steps = SUBSTEPS_PER_SAMPLE
+    return integrate(u, v, dt * np.arange(u.size), dt / steps, steps)
+
+
 def evaluate_force(u: Float1D, rate_hz: float, model: dict[str, Any], slip_speed: float) -> Float1D:
     """Return the force of the damper of a model file on this motion, (sample,), in N."""
     v = np.gradient(u) * rate_hz
     force = model["base"]["stiffness_n_m"] * u + model["base"]["damping_n_s_m"] * v
     for effect in model.get("effects", ()):
         p = effect["parameters"]
+        if "law" in effect:
+            force = force + evaluate_law(effect["law"], p, u, 1.0 / rate_hz)
+            continue
         match effect["id"]:
             case "cubic_stiffness":
                 force = force + p["k3"] * u**3
@@ -466,6 +522,9 @@ def run_case(case: Case, folder: Path, out: Path) -> CaseResult:
     (out / "discover.txt").write_text(text)
     verdict = json.loads((out / "discovery" / "verdict.json").read_text())
     model = tomllib.loads((out / "discovery" / "model.toml").read_text())
+    for effect in model.get("effects", ()):
+        if "file" in effect:
+            effect["law"] = tomllib.loads((out / "discovery" / effect["file"]).read_text())
     if prepared.judge is not None:
         linear_error = prepared.judge(prepared.linear or model)
         return summarize(case, verdict, linear_error, prepared.judge(model), seconds)

@@ -16,9 +16,9 @@ from twin.validation.study.scoring import score_verdict
 def test_without_the_packages_the_study_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(baselines, "find_spec", lambda package: None)
     assert baselines.find_baselines() == {}
-    assert "not installed: pysindy, sklearn; pip install" in baselines.describe_missing()
+    assert "not installed: pysindy, pyoperon, sklearn; pip install" in baselines.describe_missing()
     monkeypatch.setattr(baselines, "find_spec", lambda package: True)
-    assert set(baselines.find_baselines()) == {"pysindy", "blackbox"}
+    assert set(baselines.find_baselines()) == {"pysindy", "pyoperon", "blackbox"}
     assert baselines.describe_missing() == ""
 
 

@@ -18,9 +18,10 @@ from twin.identification.discover import (
     PreparedLog,
     discover_effects,
 )
-from twin.identification.law_search import LawProposal, propose_law
+from twin.identification.law_search import LawProposal, is_explained, propose_law
 from twin.identification.least_squares import MapFunction
 from twin.identification.selection import Cancelled, ProgressCallback, SelectionProgress
+from twin.identification.symbolic_regression import MISSING_MESSAGE, is_available
 from twin.model.config import ModelConfig
 from twin.model.effects import find_effect
 from twin.reports.contracts import Verdict
@@ -95,6 +96,8 @@ def judge_logs(
             raise
         print_line("interrupted before any result; nothing is written")
         return JudgedLogs(folder, {}, (), False, EXIT_INTERRUPTED)
+    if not ((law and law.is_sufficient) or is_explained(discovery) or is_available()):
+        notes = (*notes, MISSING_MESSAGE)
     seconds = clock.now() - start_s
     verdict = verdict_to_json(discovery, seconds, notes, held_out_logs, start, law)
     proposals: Sequence[TestProposal] = ()

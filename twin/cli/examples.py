@@ -45,6 +45,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
                   "study discovery --laboratory typical --out study"),
     "decide": ("study decide --seeds 1 --out study",
                "study decide --first flight --cells 'single/maxwell_damper/*'"),
+    "laws": ("study laws --out study", "study laws --rivals --cells 'unknown/*/3/1%' --out study"),
     "list": ("list tests", "list effects"),
     "new": ("new test mine.toml", "new rig my_table.toml"),
     "explain": ("explain gap_mm", "explain control.tolerance"),

@@ -1,5 +1,6 @@
 """Commands `discover`, `identify` and `study`; they import slow modules only when run."""
 
+import enum
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +15,13 @@ LogPaths = Annotated[
         metavar="LOG...", parser=parse_measured_path, help=f"{MEASURED_LOG_HELP} Repeatable."
     ),
 ]
+
+
+class LawStudyRig(enum.StrEnum):
+    """Rigs of the study of laws."""
+
+    simulated = "simulated"
+    hydraulic = "hydraulic"
 
 
 identification_app = typer.Typer()
@@ -219,3 +227,33 @@ def decide_command(
     from twin.validation.study.decisive_runs import run_decide_study as command
 
     raise typer.Exit(command(out, seeds, cells or [], workers, resume, first))
+
+
+@study_app.command("laws")
+def laws_command(
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="New folder for the study, or an existing one with --resume."),
+    ] = None,
+    seeds: Annotated[
+        int, typer.Option("--seeds", help="Cases per cell; five times as many without effect.")
+    ] = 1,
+    cells: Annotated[
+        list[str] | None,
+        typer.Option("--cells", help="Only these cells, such as 'unknown/*/3/1%'; repeatable."),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", help="Processes; default: all cores.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the study in --out.")] = False,
+    rig: Annotated[
+        LawStudyRig, typer.Option("--rig", help="Rig that records the hidden laws.")
+    ] = LawStudyRig.simulated,
+    rivals: Annotated[
+        bool, typer.Option("--rivals", help="Fit the installed baselines to the same recordings.")
+    ] = False,
+) -> None:
+    """Score the laws that a search proposes for hidden forces that no library holds."""
+    from twin.validation.study.law_study import run_law_study as command
+
+    raise typer.Exit(command(out, seeds, cells or [], workers, resume, rig.value, rivals))

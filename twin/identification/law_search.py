@@ -1,7 +1,8 @@
 """Search for a force law where no effect of the library explains a residual.
 
 Terms of `law_terms` are screened, refitted with the base in the same likelihood and judged on
-held-out steps, as effects are: forward selection with a small beam, over all classes at once.
+held-out steps, as effects are: forward selection with a small beam, over all classes at once. Where
+they do not suffice, expressions of symbolic regression are judged in the same way.
 Exponents that the data allow to be round are rounded.
 """
 
@@ -14,7 +15,7 @@ import numpy as np
 from twin.identification.candidates import Candidate
 from twin.identification.discover import Discovery
 from twin.identification.law_terms import (
-    find_family,
+    find_law_class,
     list_law_candidates,
     round_exponent,
 )
@@ -28,6 +29,7 @@ from twin.identification.selection import (
     SelectionProgress,
     select_promising,
 )
+from twin.identification.symbolic_regression import list_symbolic_candidates
 from twin.identification.verdict import closed_fraction
 from twin.model.effects.effect import Place
 from twin.model.effects.effect_file import EffectFile, WrittenEffect
@@ -70,6 +72,12 @@ class LawProposal:
         return math.sqrt(self.fitted.cost / self.floor) <= SUFFICIENT_RATIO
 
 
+def is_explained(discovery: Discovery) -> bool:
+    """Return whether a discovery leaves nothing for a law to explain."""
+    verdict = discovery.verdict
+    return verdict.outcome != "unexplained" and not verdict.has_remainder
+
+
 def propose_law(
     discovery: Discovery, report: ProgressCallback = lambda progress: None
 ) -> tuple[Discovery, LawProposal | None]:
@@ -79,7 +87,7 @@ def propose_law(
     suffices with ideal instruments.
     """
     verdict, selection = discovery.verdict, discovery.selection
-    if verdict.outcome != "unexplained" and not verdict.has_remainder:
+    if is_explained(discovery):
         return discovery, None
     if discovery.ideal is not None and verdict.outcome == "unexplained":
         # A law of a few numbers says more than many errors of instruments that do not suffice.
@@ -119,10 +127,9 @@ def find_law(
         return None
     terms = best.effects[len(start.effects) :]
     laws = tuple(_describe_law(problem, best, term, nearest) for term in terms)
-    family = find_family(terms[0])
-    assert family is not None
+    law_class = find_law_class(terms[0])
     return LawProposal(
-        best, start, laws, floor, nearest, family.law_class, _list_best_by_class(fitted_sets)
+        best, start, laws, floor, nearest, law_class, _list_best_by_class(fitted_sets)
     )
 
 
@@ -147,6 +154,10 @@ def search_laws(
     for start in starts:
         if not _explains(problem, fitted_sets):
             fitted_sets += _search_from(problem, start, library, report)
+    if not _explains(problem, [*starts, *fitted_sets]):
+        expressions = list_symbolic_candidates(problem.log_residuals, starts[0].fit.parameters)
+        if expressions:
+            fitted_sets += _extend(problem, starts[0], expressions, NEXT_REFITS, report)
     return sorted(fitted_sets, key=lambda fitted: fitted.cost)
 
 
@@ -230,12 +241,9 @@ def _list_best_by_class(fitted_sets: Sequence[FittedSet]) -> tuple[tuple[str, Fi
     """Return (class, its best single term) of each class that was fitted, best first."""
     best: dict[str, FittedSet] = {}
     for fitted in fitted_sets:
-        family = find_family(fitted.effects[-1])
-        if (
-            family is not None
-            and sum(find_family(term) is not None for term in fitted.effects) == 1
-        ):
-            best.setdefault(family.law_class, fitted)
+        law_class = find_law_class(fitted.effects[-1])
+        if law_class and sum(bool(find_law_class(term)) for term in fitted.effects) == 1:
+            best.setdefault(law_class, fitted)
     return tuple(best.items())
 
 

@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 
+import numpy as np
+
 from twin.identification.candidates import Candidate
 from twin.identification.motion import RecordScale
 from twin.identification.parameters import (
@@ -43,7 +45,8 @@ class TermFamily:
     `shapes` gives trial values by name; `units` the unit of each shape and reference. A shape in
     m, m/s or s is relative to the record's largest displacement (depth in a bumper), velocity or
     the duration, as are the references: those named u0, v0, d0 and y0 are the largest values, w0
-    is the largest displacement and t0 the duration. `power` is (variable, is odd) of a power law.
+    is the largest displacement and t0 the duration. `power` is (variable, is odd) of a power law;
+    `amplitude` the name and unit of the parameter with which the law vanishes.
     """
 
     name: str
@@ -54,17 +57,31 @@ class TermFamily:
     power: tuple[str, bool] | None = None
     states: Mapping[str, LawState] = field(default_factory=dict)
     title: str = ""
+    amplitude: tuple[str, str] = ("k", "N")
 
 
 REFERENCE_UNITS = {"u0": "m", "v0": "m/s", "d0": "m", "y0": "m", "t0": "s"}
-SHAPE_UNITS = {"p": "", "w": "m", "s": "m/s", "b": "m/s", "tau": "s", "n": ""}
+SHAPE_UNITS = {
+    "p": "", "w": "m", "s": "m/s", "b": "m/s", "tau": "s", "n": "", "omega2": "1/s2",
+    "decay": "1/s", "cubic": "1/m2 s2", "mass": "kg",
+}  # fmt: skip
+POSITIVE_UNITS = ("kg", "N/m")  # of amplitudes that are positive in every passive law
 ODD_EXPONENTS, EVEN_EXPONENTS = (0.5, 1.5, 2.0, 3.0, 5.0, 8.0), (1.0, 2.0, 4.0)
 LENGTHS = (0.03, 0.06, 0.12, 0.25, 0.5)
+STOPS = (0.1, 0.3, 0.5, 0.7, 0.85)
 SPEEDS = (0.006, 0.015, 0.05, 0.15, 0.5)
 TIMES = (0.1, 0.3, 1.0)
 RELAXATIONS = (3e-4, 1e-3, 3e-3, 1e-2)  # of the duration; see `list_law_candidates`
+CONTACT_TIMES = (1e-4, *RELAXATIONS)
+# Squares of the frequencies of resonators over that of the main motion; a resonance is narrow. On
+# the table it is that with the specimen held: spring and coupling together.
+RESONANCES = tuple(float(ratio) ** 2 for ratio in np.geomspace(0.3, 12.0, 34))
+RESONANCE_DECAYS = (0.15,)  # 2 z omega over the main angular frequency
+CUBIC_RESONANCES = tuple(float(ratio) for ratio in np.geomspace(0.1, 1e3, 44))
 MEMORYLESS, CONTACT, TABLE = "force in u and v", "bumper force", "force on the table's motion"
-MEMORY, DRIFT = "internal state", "drift in time"
+MEMORY, DRIFT, RESONATOR = "internal state", "drift in time", "attached resonator"
+EXPRESSION = "free expression"  # of symbolic regression
+TOUCH = "min(max(100 * d / d0, 0), 1)"  # 1 in contact, 0 where a face is free: it relaxes to d = 0
 
 
 def _power(variable: str, reference: str, odd: bool) -> str:
@@ -104,7 +121,11 @@ FAMILIES: tuple[TermFamily, ...] = (
     TermFamily("exponential_spring", MEMORYLESS, "damper", "k * sinh(u / w)",
                {"w": (0.15, 0.25, 0.5)}, title="exponentially hardening spring"),
     TermFamily("stop_spring", MEMORYLESS, "damper", "k * sign(u) * max(abs(u) - w, 0) / u0",
-               {"w": (0.1, 0.3, 0.5, 0.7, 0.85)}, title="spring with a knee"),
+               {"w": STOPS}, title="spring with a knee"),
+    TermFamily("right_stop_spring", MEMORYLESS, "damper", "k * max(u - w, 0) / u0",
+               {"w": STOPS}, title="spring that acts beyond a clearance on the right"),
+    TermFamily("left_stop_spring", MEMORYLESS, "damper", "k * min(u + w, 0) / u0",
+               {"w": STOPS}, title="spring that acts beyond a clearance on the left"),
     TermFamily("damping_power", MEMORYLESS, "damper", f"k * {_power('v', 'v0', True)}",
                {"p": (0.3, *ODD_EXPONENTS)}, ("v", True), title="nonlinear damping"),
     TermFamily("even_damping", MEMORYLESS, "damper", f"k * {_power('v', 'v0', False)}",
@@ -136,13 +157,41 @@ FAMILIES: tuple[TermFamily, ...] = (
     TermFamily("bumper_damping_power", CONTACT, "bumpers",
                f"k * v / v0 * {_power('d', 'd0', False)}",
                {"p": (0.5, 1.0, 2.0, 3.0)}, ("d", False), title="damping that grows with depth"),
+    TermFamily("bumper_rate_power", CONTACT, "bumpers", f"k * {_power('v', 'v0', True)}",
+               {"p": (0.5, 2.0, 3.0)}, ("v", True), title="nonlinear bumper damping"),
+    TermFamily("compression_damping", CONTACT, "bumpers", "k * (max(v, 0) / v0)**p",
+               {"p": (1.0, 2.0)}, title="bumper damping in compression"),
+    TermFamily("contact_softening", CONTACT, "bumpers", "k * h * d / d0", {"tau": CONTACT_TIMES},
+               states={"h": LawState(unit="", rate=f"({TOUCH} - h) / tau")},
+               title="bumper stiffness that changes with the time since touch"),
     TermFamily("bumper_relaxation", CONTACT, "bumpers", "f", {"tau": RELAXATIONS},
                states={"f": LawState(unit="N", rate="k * v / d0 - f / tau")},
                title="bumper that relaxes"),
     TermFamily("table_power", TABLE, "input", f"g * {_power('y', 'y0', True)}",
-               {"p": (1.0, 2.0, 3.0)}, ("y", True), title="force of the table's position"),
+               {"p": (1.0, 2.0, 3.0)}, ("y", True), title="force of the table's position",
+               amplitude=("g", "m/s2")),
     TermFamily("even_table_power", TABLE, "input", f"g * {_power('y', 'y0', False)}",
-               {"p": (1.0, 2.0)}, ("y", False), title="force of the table's position"),
+               {"p": (1.0, 2.0)}, ("y", False), title="force of the table's position",
+               amplitude=("g", "m/s2")),
+    TermFamily("table_speed", TABLE, "damper", "k * w / v0", {"tau": (0.03, 0.3)},
+               states={"w": LawState(unit="m/s", rate="a - w / tau")},
+               title="force of the table's velocity"),
+    TermFamily("resonator", RESONATOR, "damper", "mass * (-omega2 * s - decay * (y - v))",
+               {"omega2": RESONANCES, "decay": RESONANCE_DECAYS},
+               states={"s": LawState(unit="m", rate="y - v"),
+                       "y": LawState(unit="m/s", rate="-a - omega2 * s - decay * (y - v)")},
+               title="resonator on the specimen", amplitude=("mass", "kg")),
+    TermFamily("cubic_resonator", RESONATOR, "damper", "mass * (-cubic * s**3 - decay * (y - v))",
+               {"cubic": CUBIC_RESONANCES, "decay": RESONANCE_DECAYS},
+               states={"s": LawState(unit="m", rate="y - v"),
+                       "y": LawState(unit="m/s", rate="-a - cubic * s**3 - decay * (y - v)")},
+               title="resonator with a cubic spring", amplitude=("mass", "kg")),
+    TermFamily("table_resonator", RESONATOR, "damper", "k * (u - r)",
+               {"omega2": RESONANCES, "decay": RESONANCE_DECAYS, "mass": (0.1,)},
+               states={"r": LawState(unit="m", rate="y"),
+                       "y": LawState(unit="m/s",
+                                     rate="-a - omega2 * r - decay * y + k * u / mass")},
+               title="resonator on the table, coupled by a spring", amplitude=("k", "N/m")),
     TermFamily("hysteresis", MEMORY, "damper", "k * z",
                {"n": (1.0, 2.0, 4.0), "w": (0.02, 0.06, 0.15, 0.4)},
                states={"z": LawState(unit="", rate="(v - abs(v) * z * abs(z)**(n - 1)) / w")},
@@ -160,8 +209,16 @@ FAMILIES: tuple[TermFamily, ...] = (
 )  # fmt: skip
 
 
+def find_law_class(candidate: Candidate) -> str:
+    """Return the class of a term of a law; "" for an effect of the library."""
+    if not candidate.name.startswith(LAW_PREFIX):
+        return ""
+    family = find_family(candidate)
+    return EXPRESSION if family is None else family.law_class
+
+
 def find_family(candidate: Candidate) -> TermFamily | None:
-    """Return the family of a term; None for an effect of the library."""
+    """Return the family of a term; None for an effect of the library or a free expression."""
     return next(
         (family for family in FAMILIES if candidate.name == f"{LAW_PREFIX}{family.name}"), None
     )
@@ -180,21 +237,23 @@ def make_law_candidate(family: TermFamily, scale: RecordScale) -> Candidate:
     """Return a term family as a candidate, its references at the largest values of the record."""
     in_bumper = family.place not in ("damper", "input")
     length = scale.depth if in_bumper else scale.u
-    sizes = {"m": length, "m/s": scale.v, "s": scale.duration_s, "": 1.0}
-    references = {"u0": scale.u, "v0": scale.v, "d0": scale.depth, "y0": scale.table_disp,
-                  "t0": scale.duration_s}  # fmt: skip
-    texts = [family.force, *(state.rate for state in family.states.values())]
-    used = {name: references[name] for name in references if any(name in text for text in texts)}
-    amplitude, unit = ("g", "m/s2") if family.place == "input" else ("k", "N")
-    size = scale.acc if family.place == "input" else scale.force
+    rate, mass = 1.0 / scale.time_s, scale.force / scale.acc
+    sizes = {
+        "m": length, "m/s": scale.v, "s": scale.duration_s, "": 1.0, "1/s2": rate**2, "1/s": rate,
+        "1/m2 s2": (rate / scale.u) ** 2, "N": scale.force, "m/s2": scale.acc, "kg": mass,
+        "N/m": scale.force / scale.u,
+    }  # fmt: skip
+    used = list_references(scale, [family.force, *(state.rate for state in family.states.values())])
+    amplitude, unit = family.amplitude
+    size = sizes[unit]
     ladders = {
         name: [value * sizes[SHAPE_UNITS[name]] for value in ladder]
         for name, ladder in family.shapes.items()
     }
     parameters = {
         amplitude: LawParameter(
-            unit=unit, low=-100 * size, high=100 * size, vanishing=0.0, typical=0.1 * size,
-            meaning="Amplitude.",
+            unit=unit, low=0.0 if unit in POSITIVE_UNITS else -100 * size, high=100 * size,
+            vanishing=0.0, typical=0.1 * size, meaning="Amplitude.",
         )
     }  # fmt: skip
     for name, ladder in ladders.items():
@@ -212,14 +271,26 @@ def make_law_candidate(family: TermFamily, scale: RecordScale) -> Candidate:
             unit=REFERENCE_UNITS[name], low=0.5 * value, high=2 * value, typical=value,
             meaning="Reference: largest value in the recordings.",
         )  # fmt: skip
-    ends = {"u": scale.u, "v": scale.v, "d": scale.depth, "a": scale.acc, "y": scale.table_disp}
-    valid_range = {name: (-end, end) for name, end in ends.items()} | {"t": (0.0, scale.duration_s)}
     law = EffectFile(
         id=f"{LAW_PREFIX}{family.name}", title=family.title, place=family.place, force=family.force,
         parameters=parameters, states=dict(family.states),
-        range={name: valid_range[name] for name in list_variables(family.place)},
+        range=list_valid_range(family.place, scale),
     )  # fmt: skip
     return make_candidate(law, used, ladders, scale)
+
+
+def list_references(scale: RecordScale, texts: Sequence[str]) -> dict[str, float]:
+    """Return the largest values of the record, SI, to which these expressions refer, by name."""
+    references = {"u0": scale.u, "v0": scale.v, "d0": scale.depth, "y0": scale.table_disp,
+                  "t0": scale.duration_s}  # fmt: skip
+    return {name: own for name, own in references.items() if any(name in text for text in texts)}
+
+
+def list_valid_range(place: LawPlace, scale: RecordScale) -> dict[str, tuple[float, float]]:
+    """Return the range of each variable of a law at a place, SI, by the largest of the record."""
+    ends = {"u": scale.u, "v": scale.v, "d": scale.depth, "a": scale.acc, "y": scale.table_disp}
+    valid_range = {name: (-end, end) for name, end in ends.items()} | {"t": (0.0, scale.duration_s)}
+    return {name: valid_range[name] for name in list_variables(place)}
 
 
 def make_candidate(

@@ -13,7 +13,12 @@ from table_io.errors import InputError
 from twin.model import closed_form
 from twin.model.added_laws import compile_laws, pack_constants
 from twin.model.effects import bumper_hardening, cubic_stiffness
-from twin.model.effects.law import DAMPER, LawProperties, sum_law_properties
+from twin.model.effects.law import (
+    DAMPER,
+    LawProperties,
+    is_linear_in_rate,
+    sum_law_properties,
+)
 from twin.model.event_integrator_kernel import (
     CLOCK,
     DIRECTION,
@@ -160,6 +165,10 @@ def kernel_coefficients(model: "Model") -> tuple[Coefficients, AddedLaws | None]
         is_linear=not (has_reversals or k3 or k2 or ch or pull),
         has_reversals=has_reversals,
         has_bumper_states=any(effect.is_in_bumpers and effect.states for effect, _ in added),
+        has_rate_laws=any(
+            effect.is_in_bumpers and not is_linear_in_rate(effect, constants)
+            for effect, constants in added
+        ),
         laws=pack_constants(added),
     )
     return coefficients, compile_laws(tuple(effect for effect, _ in added))

@@ -31,6 +31,8 @@ LAW_CONSTANTS, LAW_STATES = 16, 6  # of all added laws of a model together
 NO_STATES = (0.0,) * LAW_STATES
 REVERSAL_SPEED_M_S = 1e-300  # of the sign that follows a reversal
 NO_WALL_M = 1e9  # m: gap of an absent bumper; finite, so that zero times it is zero
+MAX_ROOT_STEPS = 60  # of the rate of a free face, where a law is not linear in it
+RATE_TOLERANCE = 1e-13  # relative, of that rate
 
 # (place, deformation, its rate, base acceleration, time, states, coefficients) -> (force in N, rate
 # of each state)
@@ -94,7 +96,8 @@ class Coefficients(NamedTuple):
 
     `rate_1` and `rate_b` are 1/tau; gaps are those at sample 0; `step` is one of `substeps` of the
     sampling period. `has_reversals`: reversals of u' are events. `laws` are the constants of the
-    added laws, `has_bumper_states` is true if one in a bumper has states.
+    added laws, `has_bumper_states` is true if one in a bumper has states, `has_rate_laws` if one
+    there is not linear in the rate.
     """
 
     m: float
@@ -122,6 +125,7 @@ class Coefficients(NamedTuple):
     is_linear: bool
     has_reversals: bool
     has_bumper_states: bool
+    has_rate_laws: bool
     laws: tuple[float, ...] | None
     period: float = 0.0
     substeps: int = 0
@@ -222,6 +226,47 @@ def bumper_dashpot(
     return add_law_dashpot(c + hunt_crossley_damping(d, p.ch), side, d, s, p, laws)
 
 
+@jit_helper_unless_none("laws", lambda rate, side, d, b, s, p, laws: rate)
+def solve_face_rate(
+    rate: float, side: int, d: float, b: float, s: Any, p: Coefficients, laws: Any
+) -> float:
+    """Return the rate in m/s at which a free face feels no force, where a law is not linear in it.
+
+    `rate` is the root of the linear laws alone, which dissipative ones only bring nearer to zero:
+    regula falsi (Illinois) between the two.
+    """
+    if not p.has_rate_laws or rate == 0.0:
+        return rate
+    near, far = 0.0, rate
+    push_near = bumper_force(p, side, d, near, b, s, laws)
+    push_far = bumper_force(p, side, d, far, b, s, laws)
+    for _ in range(MAX_ROOT_STEPS):
+        if push_near * push_far <= 0.0:
+            break
+        near, push_near, far = far, push_far, 2.0 * far
+        push_far = bumper_force(p, side, d, far, b, s, laws)
+    for _ in range(MAX_ROOT_STEPS):
+        if push_far == 0.0 or abs(far - near) <= RATE_TOLERANCE * abs(far):
+            break
+        middle = far - push_far * (far - near) / (push_far - push_near)
+        push = bumper_force(p, side, d, middle, b, s, laws)
+        if push * push_far < 0.0:
+            near, push_near = far, push_far
+        else:
+            push_near *= 0.5
+        far, push_far = middle, push
+    return far
+
+
+@jit_helper(inlined=True)
+def free_face_rate(
+    p: Coefficients, side: int, d: float, b: float, dashpot: float, s: Any, laws: Any
+) -> float:
+    """Return the rate in m/s of the deformation of a free bumper with a dashpot in N s/m."""
+    rate = -bumper_force(p, side, d, 0.0, b, s, laws) / dashpot
+    return solve_face_rate(rate, side, d, b, s, p, laws)
+
+
 @jit_helper(inlined=True)
 def recovery_rate(
     p: Coefficients, side: int, d: float, b: float, s: LawInputs | None, laws: AddedLaws | None
@@ -234,7 +279,7 @@ def recovery_rate(
         return 0.0
     dashpot = bumper_dashpot(p, side, d, s, laws)
     if dashpot > 0.0:
-        return -bumper_force(p, side, d, 0.0, b, s, laws) / dashpot
+        return free_face_rate(p, side, d, b, dashpot, s, laws)
     if b == 0.0:
         return 0.0
     k, _ = bumper_coefficients(p, side)

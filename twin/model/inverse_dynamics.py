@@ -40,6 +40,7 @@ from twin.model.force_laws import (
     bumper_force,
     coulomb_force,
     cubic_force,
+    free_face_rate,
     hysteretic_variable,
     law_rates,
     quadratic_force,
@@ -165,7 +166,7 @@ def recover_face_and_states(
             dashpot = bumper_dashpot(p, side, middle, middle_s, laws)
             if dashpot <= 0.0:
                 return 0.0, 0.0, s
-            w = -bumper_force(p, side, middle, 0.0, middle_b, middle_s, laws) / dashpot
+            w = free_face_rate(p, side, middle, middle_b, dashpot, middle_s, laws)
             rates = law_rates(side, middle, w, middle_s, slope, p, laws)
             b_rate = p.kb * w - p.rate_b * middle_b
             middle, middle_b = face + length * w, b + length * b_rate

@@ -61,8 +61,8 @@ class Effect:
         c     `constants(base parameters, values)`, by default the values of the parameters in turn
     so `force(q, w, c)` is a law without memory, and `rates(q, w, a, s, c)` are those of a mass that
     rides along. They are plain Python that numba can compile, continuous, and smooth where w keeps
-    its sign. In a bumper the force is elastic plus a dashpot, linear in w, and zero where q, w and
-    s are. Force laws of this package may instead be compiled into the solver: `force` is None.
+    its sign. In a bumper the force is zero where q, w and s are; if it is not linear in w, it
+    opposes w. Force laws of this package may instead be compiled into the solver: `force` is None.
     """
 
     id: str

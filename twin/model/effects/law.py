@@ -176,6 +176,19 @@ def find_law_problem(effect: Effect) -> str:
         return f"its law cannot be evaluated: {type(error).__name__}: {error}"
 
 
+@cache
+def is_linear_in_rate(effect: Effect, c: tuple[float, ...]) -> bool:
+    """Return whether a law is elastic plus a dashpot with these constants."""
+    force, _ = evaluate_law(effect, c)
+    relaxed = (0.0,) * len(effect.states)
+    for (q, w), (a, t) in product(list_probed_motions(effect), list_probed_drives(effect)):
+        push, slow = force(q, w, a, t, relaxed), force(q, 0.0, a, t, relaxed)
+        linear = slow + w * (force(q, 1.0, a, t, relaxed) - slow)
+        if abs(push - linear) > 1e-6 * (abs(push) + abs(slow) + abs(linear)):
+            return False
+    return True
+
+
 def _find_argument_problem(effect: Effect) -> str:
     """Return which argument of a law is unknown, "" if none."""
     for function in (effect.force, effect.rates):
@@ -199,13 +212,11 @@ def _find_value_problem(effect: Effect) -> str:
             return f"its law is not finite at deformation {q:g} m, rate {w:g} m/s"
         if len(own) != len(effect.states):
             return f"`rates` returns {len(own)} values for {len(effect.states)} states"
-        if in_bumper:
-            linear = slow + w * (force(q, 1.0, a, t, relaxed) - slow)
-            if abs(push - linear) > 1e-6 * (abs(push) + abs(slow) + abs(linear)):
-                return (
-                    "in a bumper the force must be elastic plus a dashpot: linear in the "
-                    "rate, whose zero in flight gives the recovery of the face"
-                )
+        if in_bumper and not is_linear_in_rate(effect, constants) and (push - slow) * w < 0.0:
+            return (
+                "in a bumper a force that is not linear in the rate must oppose it: its zero in "
+                "flight gives the recovery of the face"
+            )
     if in_bumper and any(force(0.0, 0.0, a, t, relaxed) != 0.0 for a, t in drives):
         return "in a bumper the force must be zero at deformation 0, rate 0, states relaxed"
     return ""

@@ -1,4 +1,4 @@
-"""Optional baseline methods on the same recordings (`pip install shaketwin[rivals]`)."""
+"""Optional baseline methods on the same recordings (`pip install shaketwin[rivals,laws]`)."""
 
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -9,8 +9,11 @@ from twin.validation.study.adapter import load_case
 from twin.validation.study.baseline_terms import RegressionProblem, make_regression_problem
 
 Json = dict[str, Any]
-REQUIRED_PACKAGES = {"pysindy": "pysindy", "blackbox": "sklearn"}  # baseline: required package
-MISSING_MESSAGE = "baselines skipped, packages not installed: {}; pip install 'shaketwin[rivals]'"
+# baseline: required package
+REQUIRED_PACKAGES = {"pysindy": "pysindy", "pyoperon": "pyoperon", "blackbox": "sklearn"}
+MISSING_MESSAGE = (
+    "baselines skipped, packages not installed: {}; pip install 'shaketwin[rivals,laws]'"
+)
 
 
 def run_sindy(case_dir: Path) -> Json:
@@ -27,9 +30,18 @@ def run_blackbox(case_dir: Path) -> Json:
     return fit_boosted_trees(_load_problem(case_dir))
 
 
+def run_symbolic_regression(case_dir: Path) -> Json:
+    """Run pyoperon on the recording of a case; return a verdict with its error."""
+    from twin.validation.study.baseline_symbolic import fit_expressions
+
+    return fit_expressions(_load_problem(case_dir))
+
+
 def find_baselines() -> dict[str, Callable[[Path], Json]]:
     """Return the baselines by name whose package is installed."""
-    baselines = {"pysindy": run_sindy, "blackbox": run_blackbox}
+    baselines = {
+        "pysindy": run_sindy, "pyoperon": run_symbolic_regression, "blackbox": run_blackbox
+    }  # fmt: skip
     return {
         name: baseline for name, baseline in baselines.items() if find_spec(REQUIRED_PACKAGES[name])
     }

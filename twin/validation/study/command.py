@@ -48,9 +48,9 @@ def run_discovery_study(
 ) -> int:
     """Evaluate the requested cases that have no result, then the controls; return the exit code."""
     processes = Workers.from_options(workers, scheduler)
-    numbers = _parse_cases(seeds, patterns, _parse_laboratory(laboratory))
+    numbers = parse_cases(seeds, patterns, _parse_laboratory(laboratory))
     processes.require()
-    folder = _open_folder(out, resume).resolve()  # where workers of a cluster must find it
+    folder = open_study_folder(out or DEFAULT_DIR, resume).resolve()  # where workers find it
     if describe_missing():
         print_line(describe_missing())
     exit_code = run_cases(folder, numbers, processes, partial(evaluate_case, folder))
@@ -67,7 +67,13 @@ def run_discovery_study(
 
 
 def run_cases(
-    folder: Path, numbers: Sequence[int], workers: Workers, work: Task, results: str = RESULTS_FILE
+    folder: Path,
+    numbers: Sequence[int],
+    workers: Workers,
+    work: Task,
+    results: str = RESULTS_FILE,
+    format_row: Callable[[Json], str] | None = None,
+    write_pages: Callable[[Path], Path] = write_study_pages,
 ) -> int:
     """Evaluate the cases without a row in `results`, then write the pages; return the exit code."""
     rows = {row["number"]: row for row in read_rows(folder / results)}
@@ -80,9 +86,14 @@ def run_cases(
         (folder / results).open("a", encoding="utf-8") as file,
     ):
         _terminate_last_line(folder / results, file)
-        done = sum(1 for _ in _evaluate_cases(pending, workers, work, stop, file))
+        done = sum(
+            1
+            for _ in _evaluate_cases(
+                pending, workers, work, stop, file, format_row or _format_discovery
+            )
+        )
         reason = stop()
-    page = write_study_pages(folder)
+    page = write_pages(folder)
     print_line(
         f"{done} cases in {clock.now() - start_s:.0f} s -> {page}"
         + (f"; {reason}" if reason else "")
@@ -91,7 +102,12 @@ def run_cases(
 
 
 def _evaluate_cases(
-    pending: Sequence[int], workers: Workers, work: Task, stop: Callable[[], object], file: TextIO
+    pending: Sequence[int],
+    workers: Workers,
+    work: Task,
+    stop: Callable[[], object],
+    file: TextIO,
+    format_row: Callable[[Json], str],
 ) -> Iterator[Json]:
     """Evaluate the pending cases; yield each row after it is written to the file."""
     path, right_count = Path(file.name), 0
@@ -105,17 +121,21 @@ def _evaluate_cases(
             file.write(json.dumps(row) + "\n")
             file.flush()
             right_count += bool(row.get("right"))
-            print_line(f"{index:>5}/{len(pending):<5} {row['number']:>6}  {_format_row(row)}")
+            text = _format_failure(row) or format_row(row)
+            print_line(f"{index:>5}/{len(pending):<5} {row['number']:>6}  {text}")
             bar.update(task, advance=1, description=f"cases, {right_count} right")
             yield row
 
 
-def _format_row(row: Json) -> str:
-    """Return one line about a case."""
+def _format_failure(row: Json) -> str:
+    """Return why a case was not evaluated, "" if it was."""
     if row.get("failed"):
         return f"{row['cell']}: FAILED: {row['failed']}"
-    if not row["sized"]:
-        return f"{row['cell']}: excluded: {row['ended']}"
+    return "" if row["sized"] else f"{row['cell']}: excluded: {row['ended']}"
+
+
+def _format_discovery(row: Json) -> str:
+    """Return one line about a case."""
     mark = "right" if row["right"] else "MISSED"
     if "said" not in row:
         results = (
@@ -141,7 +161,9 @@ def _parse_laboratory(text: str) -> LaboratoryLevel:
     )
 
 
-def _parse_cases(seeds: int, patterns: Sequence[str], laboratory: LaboratoryLevel) -> list[int]:
+def parse_cases(
+    seeds: int, patterns: Sequence[str], laboratory: LaboratoryLevel = "none"
+) -> list[int]:
     """Return case numbers from cell patterns and numbers, separated by commas."""
     words = [word for pattern in patterns for word in pattern.split(",") if word]
     own = [int(word) for word in words if word.isdecimal()]
@@ -151,9 +173,8 @@ def _parse_cases(seeds: int, patterns: Sequence[str], laboratory: LaboratoryLeve
     return own + (list_case_numbers(seeds, cells, laboratory) if cells or not own else [])
 
 
-def _open_folder(out: Path | None, resume: bool) -> Path:
+def open_study_folder(folder: Path, resume: bool) -> Path:
     """Return the folder of the study: a new one, or with `resume` an existing one."""
-    folder = out or DEFAULT_DIR
     if resume:
         if not (folder / RESULTS_FILE).is_file():
             raise InputError(

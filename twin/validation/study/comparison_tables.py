@@ -9,7 +9,7 @@ from twin.validation.study.rates import Rate, compute_rate, select_latest
 
 Json = Mapping[str, Any]
 DISCOVERY = "discovery"
-ERROR_ONLY_BASELINES = frozenset({"blackbox"})  # baselines that name no effect
+ERROR_ONLY_BASELINES = frozenset({"blackbox", "pyoperon"})  # baselines that name no effect
 CONTROL_TITLES = {
     "reversed": "time reversed: confident name",
     "without": "truth not in the library: confident name",

@@ -39,13 +39,9 @@ def evaluate_case(root: Path, number: int, method: Method = run_discovery) -> Js
     about = json.loads(paths.about.read_text(encoding="utf-8"))
     made_s = cpu_seconds()
     if not about["sized"]:
-        keys = ("number", "cell", "kind", "noise", "size", "reached", "ended", "sized")
-        return {key: about[key] for key in keys} | {
-            "label": case.label,
-            "made_in": made_s - start_s,
-        }
+        return select_case_facts(about) | {"label": case.label, "made_in": made_s - start_s}
     is_identified = about["kind"] == "identify"
-    verdict, failure = _run_method(run_identification if is_identified else method, paths.case_dir)
+    verdict, failure = run_method(run_identification if is_identified else method, paths.case_dir)
     evaluated_s = cpu_seconds()
     paths.verdict.write_text(dump_strict_json(verdict), encoding="utf-8")
     timing = {
@@ -59,7 +55,7 @@ def evaluate_case(root: Path, number: int, method: Method = run_discovery) -> Js
     row = _score_verdict(verdict, about, oracle)
     if oracle and about["kind"] == "pair":
         row["mark"] = _compute_mark(paths, truth, oracle)
-    runs = {name: _run_method(baseline, paths.case_dir) for name, baseline in BASELINES.items()}
+    runs = {name: run_method(baseline, paths.case_dir) for name, baseline in BASELINES.items()}
     baselines = {
         name: _score_verdict(baseline_verdict, about)
         | ({"failed": baseline_failure} if baseline_failure else {})
@@ -68,12 +64,17 @@ def evaluate_case(root: Path, number: int, method: Method = run_discovery) -> Js
     return row | timing | ({"rivals": baselines} if baselines else {})
 
 
+def select_case_facts(about: Json) -> Json:
+    """Return what a row says of its case, whatever is judged."""
+    keys = ("number", "cell", "kind", "noise", "size", "reached", "ended", "sized")
+    return {key: about[key] for key in keys}
+
+
 def _score_in_laboratory(verdict: Json, about: Json) -> Json:
     """Return the row of a case in a laboratory; baselines and oracle know no laboratory."""
     if about["kind"] == "identify":
-        keys = ("number", "cell", "kind", "noise", "size", "reached", "ended", "sized")
         laboratory = about["laboratory"]
-        return {key: about[key] for key in keys} | {
+        return select_case_facts(about) | {
             "laboratory": laboratory["level"], "imperfection": laboratory["imperfection"],
             "truth": [], "named": [], "said": verdict["verdict"], "confidence": None,
             **score_identification(verdict, about),
@@ -88,7 +89,7 @@ def _score_verdict(verdict: Json, about: Json, oracle: float | None = None) -> J
     return score_verdict(verdict, about, oracle) | {"held_out": gap.get("held_out_after")}
 
 
-def _run_method(method: Method, case_dir: Path) -> tuple[Json, str]:
+def run_method(method: Method, case_dir: Path) -> tuple[Json, str]:
     """Run a method; return (verdict, error message), so that a failure ends only one case."""
     try:
         return method(case_dir), ""

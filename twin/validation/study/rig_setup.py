@@ -103,20 +103,30 @@ def compute_noise_rms(noise: float) -> dict[str, float]:
     }
 
 
-def simulate_signals(rig_text: str) -> StudySignals:
+def make_hydraulic_rig_toml(seed: int, truth: str, sha256: str) -> str:
+    """Return the config of the simulated hydraulic rig, with its own sensors and noise."""
+    path = PROFILES_DIR / "rigs" / "hydraulic.toml"
+    config = tomllib.loads(path.read_text(encoding="utf-8"))
+    config["simulated"] |= {"seed": seed, "truth": truth, "truth_sha256": sha256}
+    return format_toml(config)
+
+
+def simulate_signals(rig_text: str, profile: Profile = PROFILE) -> StudySignals:
     """Simulate the study's test on the machine of a rig config, without session and sensors."""
-    return simulate_readings(rig_text)[0]
+    return simulate_readings(rig_text, profile)[0]
 
 
-def simulate_readings(rig_text: str) -> tuple[StudySignals, dict[str, Float1D]]:
-    """Simulate the study's test; return the true signals and the readings of their channels.
+def simulate_readings(
+    rig_text: str, profile: Profile = PROFILE
+) -> tuple[StudySignals, dict[str, Float1D]]:
+    """Simulate a test, by default the study's; return true signals and readings of their channels.
 
     Readings (sample,) are in SI, of the sensors of the rig config before the tare.
     """
-    rig, rate = parse_toml(rig_text, RigConfig, "the study's machine"), PROFILE.acquisition.rate_hz
-    drive = plan_sweep(PROFILE)
+    rig, rate = parse_toml(rig_text, RigConfig, "the study's machine"), profile.acquisition.rate_hz
+    drive = plan_sweep(profile)
     count = drive.planned_end + round(SETTLING_S * rate)
-    backend = SimulatedBackend(rig, PROFILE.specimen, rate, ManualClock())
+    backend = SimulatedBackend(rig, profile.specimen, rate, ManualClock())
     recorded: list[Float2D] = []
     backend.observer = lambda first, command, signals: recorded.append(signals.copy())
     backend.open()

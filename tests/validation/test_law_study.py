@@ -1,0 +1,71 @@
+"""The study of laws: what it measures of a model, and the page of its rows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.identification.played import SNM
+from twin.validation.study.law_study import (
+    STRONGER_TEST,
+    UNUSED_TEST,
+    format_page,
+    measure_curve_error,
+    measure_force_error,
+)
+from twin.validation.study.rig_setup import PROFILE, make_rig_toml, simulate_signals
+
+NOISE = np.array([1.0, 1.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def signals():
+    return simulate_signals(make_rig_toml(0.0), UNUSED_TEST)
+
+
+def with_base(**ratios):
+    right, left = PROFILE.specimen.gaps_m
+    base = replace(SNM.base, mass=PROFILE.specimen.mass_kg, gap_r=right, gap_l=left)
+    values = {name: ratio * getattr(base, name) for name, ratio in ratios.items()}
+    return replace(SNM, base=replace(base, **values))
+
+
+def test_the_other_tests_are_stronger_and_between_the_frequencies():
+    assert STRONGER_TEST.sweep.acceleration_g == 1.25 * PROFILE.sweep.acceleration_g
+    own, other = PROFILE.sweep.frequencies_hz, UNUSED_TEST.sweep.frequencies_hz
+    assert set(own).isdisjoint(other)
+    assert min(own) < min(other)
+    assert max(other) < max(own)
+
+
+def test_the_true_model_has_no_error_and_another_one_has(signals):
+    true, stiffer = with_base(), with_base(stiffness=1.3)
+    assert measure_curve_error(true, signals) < 0.02 < measure_curve_error(stiffer, signals)
+    own, other = (measure_force_error(model, signals, NOISE) for model in (true, stiffer))
+    assert own < 0.05 * other
+    u = signals.channels["mass_disp_m"] - signals.channels["table_disp_m"]
+    expected = 0.3 * true.base.stiffness * np.std(u[signals.moving])
+    # the rows of the bumpers, in contact alone, have no error
+    assert 0.6 * expected < other < 1.05 * expected
+
+
+def make_row(number, after, said=(), error=1.0, law=True, kind="unknown"):
+    return {
+        "number": number, "cell": "unknown/cubic_damping/3/1%", "kind": kind, "noise": 0.01,
+        "sized": True, "before": 3.0, "after": after, "seconds": 10.0, "wall_s": 12.0,
+        "law": [{"force": "k * v", "values": {"k": 1.0}}] if law else [], "exact": law,
+        "outside": {"error": error, "said": [*said]}, "curve": {"before": 0.1, "after": 0.005},
+        "forces": after, "rivals": {"pysindy": {"forces": 2.0}},
+    }  # fmt: skip
+
+
+def test_the_page_counts_what_reaches_its_goal():
+    rows = [
+        make_row(1, 1.0), make_row(2, 1.2, ["law.u"], 9.0), make_row(3, 1.0, error=9.0),
+        make_row(4, 3.0, law=False), make_row(5, 1.0, law=False, kind="none"),
+    ]  # fmt: skip
+    text = "\n".join(format_page(rows))
+    assert "<= 1.1 x floor | >= 85 % | 50.0 % (2/4;" in text
+    assert "or said | >= 90 % | 66.7 % (2/3;" in text
+    assert "nothing hidden: a law proposed | <= 2 % | 0.0 % (0/1;" in text
+    assert "| pysindy | 2.000 | 0.0 % (0/4;" in text

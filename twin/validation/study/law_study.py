@@ -1,0 +1,490 @@
+"""`shaketwin study laws`: laws for what no library holds, on the blind cases; resumable.
+
+The library is not tried first: what is judged is the law alone, from the refitted base. The same
+hidden plant then plays two tests more, without noise: one 25 % stronger, along whose motion the
+forces of the law are compared, and one at other frequencies, which the model simulates freely from
+the motion of the table. The gap there is that of the pseudo-resonance curves: the rms over the
+steps of the error of the excursions, relative to the rms of the true ones.
+"""
+
+import json
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from table_io.clock import RealClock, cpu_seconds
+from table_io.config.base import parse_toml
+from table_io.config.profile import Profile
+from table_io.errors import InputError
+from twin.identification.discover import prepare_problem
+from twin.identification.law_search import LawProposal, find_law
+from twin.identification.law_terms import LAW_PREFIX
+from twin.identification.localization import estimate_repeatability_floor
+from twin.identification.residuals import FORCE_ROWS, LogResiduals
+from twin.identification.selection import FittedSet
+from twin.model.inverse_dynamics import forces_along
+from twin.model.model import Model
+from twin.model.solver import OUTPUT_COUNT
+from twin.model.valid_range import find_range_exits
+from twin.run.tasks import Workers
+from twin.run.terminal import print_line
+from twin.validation.study.adapter import load_case
+from twin.validation.study.baselines import describe_missing, find_baselines
+from twin.validation.study.command import open_study_folder, parse_cases, run_cases
+from twin.validation.study.evaluation import run_method, select_case_facts
+from twin.validation.study.generation import CasePaths, generate_case, hash_truth, record_test
+from twin.validation.study.rates import Rate, select_latest
+from twin.validation.study.report import RESULTS_FILE, read_rows
+from twin.validation.study.rig_setup import (
+    PROFILE,
+    PROFILE_TOML,
+    StudySignals,
+    make_hydraulic_rig_toml,
+    make_rig_toml,
+    simulate_signals,
+)
+from twin.validation.study.strata import Case, draw_case
+
+Json = dict[str, Any]
+DEFAULT_DIR, TABLE_FILE = Path("runs") / "study-laws", "laws.md"
+DEFAULT_CELLS = ("unknown/*/3/1%", "unknown/*/3/5%", "single/appendage/3/*", "none/*")
+STRONGER = 1.25  # ratio of the level of the test that leaves the fitted range
+MAX_FLOOR_RATIO, MAX_RATIO_OUTSIDE, MIN_CLOSED = 1.1, 3.0, 0.9
+MAX_SECONDS, MAX_PARAMETER_ERROR = 60.0, 0.1
+MIN_CURVE_GAP = 0.01  # of the excursions: with less the base needs no law to predict them
+
+
+def _change_sweep(**values: object) -> Profile:
+    """Return the study's test with other values of its sweep."""
+    text = PROFILE_TOML
+    for name, value in values.items():
+        text = re.sub(rf"^{name} = .*$", f"{name} = {value}", text, flags=re.MULTILINE)
+    return parse_toml(text, Profile, "the study's test")
+
+
+STRONGER_TEST = _change_sweep(acceleration_g=0.05 * STRONGER)
+UNUSED_TEST = _change_sweep(start_hz=1.0, stop_hz=4.2)  # between the frequencies of the recording
+
+# Term with the form of the rig's own law, and its exponent; other laws have a form of their own.
+EXACT_TERMS: Mapping[str, tuple[str, float | None]] = {
+    "quintic_stiffness": ("spring_power", 5), "even_stiffness": ("even_spring", 2),
+    "cubic_damping": ("damping_power", 3), "saturating_stiffness": ("saturating_spring", None),
+    "slack_stiffness": ("right_stop_spring", None), "root_friction": ("damping_power", 0.5),
+    "cross_damping": ("speed_stiffness", 2), "one_sided_damping": ("one_way_damping", 2),
+    "position_friction": ("position_friction", 1),
+    "square_position_friction": ("position_friction", 2),
+    "saturating_damping": ("saturating_damping", None), "damping_drift": ("drifting_damping", None),
+    "warming_friction": ("settling_friction", None), "cable_drag": ("table_speed", None),
+    "cable_stiffness": ("table_power", 3), "hertz_bumper": ("bumper_power", 1.5),
+    "quintic_bumper": ("bumper_power", 5), "one_sided_cubic": ("right_bumper_power", 3),
+    "compression_dashpot": ("compression_damping", 1),
+    "cubic_bumper_damping": ("bumper_rate_power", 3),
+    "softening_bumper": ("contact_softening", None), "dahl_friction": ("hysteresis", 1),
+    "cubic_maxwell": ("nonlinear_relaxation", None), "cubic_appendage": ("cubic_resonator", None),
+    "table_resonator": ("table_resonator", None), "appendage": ("resonator", None),
+}  # fmt: skip
+MAX_EXPONENT_ERROR = 0.05
+
+
+NO_PREDICTION: Mapping[str, Any] = {
+    "outside": {"error": math.inf, "said": []}, "curve": {"before": 1.0, "after": 1.0},
+}  # fmt: skip
+
+
+def run_law_study(
+    out: Path | None,
+    seeds: int,
+    patterns: Sequence[str],
+    workers: int | None,
+    resume: bool,
+    rig: str = "simulated",
+    has_rivals: bool = False,
+) -> int:
+    """Evaluate the cases that have no result; return the exit code."""
+    numbers = parse_cases(seeds, patterns or DEFAULT_CELLS)
+    if has_rivals and describe_missing():
+        print_line(describe_missing())
+    folder = open_study_folder(out or DEFAULT_DIR, resume)
+    return run_cases(
+        folder, numbers, Workers.from_options(workers),
+        partial(evaluate_law, folder, rig, has_rivals), RESULTS_FILE, format_law_row, write_page,
+    )  # fmt: skip
+
+
+def evaluate_law(root: Path, rig: str, has_rivals: bool, number: int) -> Json:
+    """Return the row of a case: held-out errors, the law, and what it predicts elsewhere."""
+    case = draw_case(number)
+    paths = generate_case(case, root)
+    about = json.loads(paths.about.read_text(encoding="utf-8"))
+    row = select_case_facts(about) | {"label": case.label, "rig": rig}
+    if not about["sized"]:
+        return row
+    plant = _HiddenPlant(case, paths, rig)
+    row |= plant.record()
+    if not row["sized"]:
+        return row
+    logs, _, model = load_case(plant.folder)
+    clock = RealClock()
+    start_s, start_cpu_s = clock.now(), cpu_seconds()
+    prepared = prepare_problem(logs, model)
+    problem = prepared.problem
+    null = problem.fit_effects(prepared.parameters, ())
+    law = find_law(problem, [null], problem.noise)
+    row |= {"wall_s": clock.now() - start_s, "seconds": cpu_seconds() - start_cpu_s}
+    best = law.fitted if law else null
+    (residuals,) = problem.log_residuals
+    floor = problem.noise * estimate_repeatability_floor(problem.log_residuals, best.held_out)
+    row |= {
+        "hidden": about["effects"],
+        "law": _describe_terms(law),
+        "law_class": law.law_class if law else "",
+        "before": math.sqrt(null.cost / floor),
+        "after": math.sqrt(best.cost / floor),
+        "forces": _measure_forces(residuals, best),
+    }
+    if law is not None:
+        row |= _judge_structure(law, about)
+        try:
+            row |= _judge_predictions(plant, residuals, null, best)
+        except InputError as error:  # a law that cannot be simulated predicts nothing
+            row |= NO_PREDICTION | {"unusable": str(error)}
+    if has_rivals:
+        row["rivals"] = {}
+        for name, method in find_baselines().items():
+            verdict, failure = run_method(method, plant.folder)
+            row["rivals"][name] = {
+                "forces": None if failure else verdict["gap"]["held_out_after"],
+                "failed": failure,
+            }
+    return row
+
+
+class _HiddenPlant:
+    """The sealed plant of a case on a rig, which plays its recording and other tests."""
+
+    def __init__(self, case: Case, paths: CasePaths, rig: str) -> None:
+        self.case, self.rig, self._truth = case, rig, paths.sealed_dir / "truth.toml"
+        self._paths = paths
+        is_simulated = rig == "simulated"
+        self.folder = paths.case_dir if is_simulated else paths.case_dir / rig
+
+    def _make_rig(self, noise: float) -> str:
+        text = self._truth.read_text(encoding="utf-8")
+        truth, sha256 = str(self._truth.resolve()), hash_truth(text)
+        if self.rig == "simulated":
+            return make_rig_toml(noise, self.case.noise_seed, truth, sha256)
+        return make_hydraulic_rig_toml(self.case.noise_seed, truth, sha256)
+
+    def record(self) -> Json:
+        """Record the study's test on another rig than the simulated one; return how it ended."""
+        if self.rig == "simulated":
+            return {}
+        log = self.folder / "log.mcap"
+        self.folder.mkdir(exist_ok=True)
+        log.unlink(missing_ok=True)
+        model = (self._paths.case_dir / "model.toml").read_text(encoding="utf-8")
+        (self.folder / "model.toml").write_text(model, encoding="utf-8")
+        stop = record_test(self._make_rig(self.case.cell.noise), self.case.label, log, True)
+        is_complete = stop.verdict == "complete"
+        return {"sized": is_complete, "ended": f"{stop.verdict}: {stop.reason}"}
+
+    def simulate(self, profile: Profile) -> StudySignals:
+        """Return the true signals of a test."""
+        return simulate_signals(self._make_rig(0.0), profile)
+
+
+def _describe_terms(law: LawProposal | None) -> list[Json]:
+    """Return id, force, rates of states and values of each term of a law."""
+    return [
+        {
+            "id": term.id,
+            "force": term.force,
+            "rates": {name: state.rate for name, state in term.states.items()},
+            "values": {name: own.typical for name, own in term.parameters.items()},
+        }
+        for term in (law.laws if law else ())
+    ]
+
+
+def _measure_forces(residuals: LogResiduals, fitted: FittedSet) -> float:
+    """Return the rms over the noise of the held-out rows of forces, as for the baselines."""
+    values = fitted.held_out[0][residuals.entry_row < len(FORCE_ROWS)]
+    return math.sqrt(float(values @ values) / values.size)
+
+
+def _judge_predictions(
+    plant: _HiddenPlant, residuals: LogResiduals, null: FittedSet, best: FittedSet
+) -> Json:
+    """Return the error in a stronger test, whether its range is said, and the gap in another."""
+    stronger, unused = map(plant.simulate, (STRONGER_TEST, UNUSED_TEST))
+    m = residuals.motion()
+    models = [fitted.fit.parameters.model_for_log(0, m) for fitted in (null, best)]
+    noise = residuals.force_noise(m, m.mass_kg) * residuals.weight
+    motion = _derive_motion(stronger)
+    outside = [*find_range_exits(models[1], motion)]
+    before, after = (measure_curve_error(model, unused) for model in models)
+    return {
+        "outside": {
+            "error": math.hypot(1.0, measure_force_error(models[1], stronger, noise)),
+            "said": [f"{range_exit.effect}.{range_exit.variable}" for range_exit in outside],
+        },
+        "curve": {"before": before, "after": after},
+    }
+
+
+def _derive_motion(signals: StudySignals) -> dict[str, Any]:
+    """Return u, v, a, t and y of a test, (sample,), SI."""
+    rate = PROFILE.acquisition.rate_hz
+    u = signals.channels["mass_disp_m"] - signals.channels["table_disp_m"]
+    return {
+        "u": u, "v": np.gradient(u) * rate, "a": signals.channels["table_acc_m_s2"],
+        "t": np.arange(u.size) / rate, "y": signals.channels["table_disp_m"],
+    }  # fmt: skip
+
+
+def measure_force_error(model: Model, signals: StudySignals, noise: Any) -> float:
+    """Return the rms over the noise, (3,) in N, of the forces of a model along the true motion.
+
+    Of the damper's while the table moves, of a bumper's in contact.
+    """
+    motion, mass = _derive_motion(signals), model.parameters.mass
+    contact = np.array([signals.right > 0.0, signals.left < 0.0], dtype=np.int8)
+    added = model.added_acceleration(motion["y"])
+    extra = 0.0 if added is None else added
+    damper, right, left = forces_along(
+        model, motion["u"], motion["v"], motion["a"] + extra, motion["t"], contact
+    )
+    measured = -mass * signals.channels["mass_acc_m_s2"] - signals.right - signals.left
+    errors = (
+        (measured - damper - mass * extra)[signals.moving] / noise[0],
+        (signals.right - right)[signals.moving & (contact[0] > 0)] / noise[1],
+        (signals.left - left)[signals.moving & (contact[1] > 0)] / noise[2],
+    )
+    values = np.concatenate(errors)
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def measure_curve_error(model: Model, signals: StudySignals) -> float:
+    """Return the error of the excursions of a free simulation, relative to the true ones.
+
+    Excursions of relative displacement and total acceleration in each step, the rms of each over
+    the steps; the mean of the two.
+    """
+    solver = model.prepare(PROFILE.acquisition.rate_hz)
+    base_acc, table_disp = (
+        np.ascontiguousarray(signals.channels[name]) for name in ("table_acc_m_s2", "table_disp_m")
+    )
+    out = np.empty((OUTPUT_COUNT, base_acc.size))
+    solver.advance(solver.rest_state(), base_acc, table_disp, out)
+    true_motion = _derive_motion(signals)
+    errors = []
+    for true, own in (
+        (true_motion["u"], out[0]), (signals.channels["mass_acc_m_s2"], out[2])
+    ):  # fmt: skip
+        expected, simulated = (
+            np.array([np.ptp(values[signals.step == k]) for k in np.unique(signals.step) if k >= 0])
+            for values in (true, own)
+        )
+        errors.append(np.sqrt(np.mean((simulated - expected) ** 2) / np.mean(expected**2)))
+    return float(np.mean(errors))
+
+
+def _judge_structure(law: LawProposal, about: Json) -> Json:
+    """Return whether the law has the form of the hidden one, and the errors of a resonator."""
+    if len(about["effects"]) != 1:
+        return {}
+    (hidden,) = about["effects"]
+    expected, exponent = EXACT_TERMS.get(hidden["name"], ("", None))
+    (term, *further) = law.laws
+    is_exact = not further and term.id == f"{LAW_PREFIX}{expected}"
+    if is_exact and exponent is not None:
+        is_exact = abs(_find_exponent(term.force, term.parameters) - exponent) < MAX_EXPONENT_ERROR
+    row: Json = {"exact": is_exact}
+    truth = hidden["parameters"]
+    values = {name: own.typical for name, own in term.parameters.items()}
+    found = {
+        "appendage": lambda: (
+            values
+            | {
+                "frequency": math.sqrt(values["omega2"]) / (2 * math.pi),
+                "damping_ratio": 0.5 * values["decay"] / math.sqrt(values["omega2"]),
+            }
+        ),
+        "table_resonator": lambda: (
+            values
+            | {
+                "frequency": math.sqrt(max(values["omega2"] - values["k"] / values["mass"], 0.0))
+                / (2 * math.pi),
+                "coupling": values["k"],
+            }
+        ),
+        "cubic_appendage": lambda: values | {"damping": values["decay"]},
+    }.get(hidden["name"])
+    if found is not None and expected == term.id.removeprefix(LAW_PREFIX):
+        own = found()
+        row["resonator"] = {name: own[name] / true - 1.0 for name, true in truth.items()}
+    elif found is not None:
+        row["resonator"] = {}
+    return row
+
+
+def _find_exponent(force: str, parameters: Mapping[str, Any]) -> float:
+    """Return the exponent of a power law: a parameter, or a number in its text."""
+    for name in ("p", "n"):
+        if name in parameters:
+            return float(parameters[name].typical)
+    written = re.findall(r"\*\*\s*([\d.]+)", force)
+    return float(written[0]) if written else 1.0
+
+
+def format_law_row(row: Json) -> str:
+    """Return one line about a case."""
+    text = " + ".join(term["force"] for term in row["law"]) or "no law"
+    curve = row.get("curve")
+    closed = f", curve {curve['before']:.3f} -> {curve['after']:.4f}" if curve else ""
+    return (
+        f"{row['cell']}: {row['before']:.3f} -> {row['after']:.3f}{closed} "
+        f"in {row['seconds']:.0f} s: {text}"
+    )
+
+
+def write_page(folder: Path) -> Path:
+    """Write the figures of the study with counts and Wilson intervals; return the page."""
+    page = folder / TABLE_FILE
+    page.write_text("\n".join(format_page(read_rows(folder / RESULTS_FILE))) + "\n", "utf-8")
+    return page
+
+
+def format_page(rows: Sequence[Json]) -> Iterator[str]:
+    """Yield the lines of the page."""
+    latest = select_latest(rows)
+    failed = [_make_miss(row) for row in latest if row.get("failed")]
+    usable = [*(row for row in latest if row.get("sized") and "law" in row), *failed]
+    yield "# Laws for what no library holds\n"
+    yield (
+        f"{len(usable)} cases, of which {len(failed)} failed and count as misses; "
+        f"{len(latest) - len(usable)} not played. Rates with counts and 95 % Wilson intervals.\n"
+    )
+    yield "| quantity | goal | seen |"
+    yield "|---|---|---|"
+    for name, goal, hits in _list_rates(usable):
+        flags = [*hits]
+        if flags:
+            yield f"| {name} | {goal} | {Rate(sum(flags), len(flags))} |"
+    for name, values in _list_times(usable):
+        if values:
+            yield f"| {name} | | median {np.median(values):.1f}, largest {max(values):.1f} |"
+    yield "\n| case | held out over floor, before -> after | curves | outside | exact | law |"
+    yield "|---|---|---|---|---|---|"
+    for row in usable:
+        if row["kind"] != "none":
+            yield _format_case(row)
+    yield from _format_rivals(usable)
+
+
+def _make_miss(row: Json) -> Json:
+    """Return the row of a case that failed, as one without a law."""
+    cell = draw_case(row["number"]).cell
+    return row | {
+        "kind": cell.kind, "noise": cell.noise, "law": [], "before": math.inf, "after": math.inf,
+        "seconds": math.inf, "wall_s": math.inf, "forces": None,
+    }  # fmt: skip
+
+
+def _list_rates(rows: Sequence[Json]) -> Iterator[tuple[str, str, Iterator[bool]]]:
+    strangers = [row for row in rows if row["kind"] == "unknown"]
+    proposed = [row for row in rows if row["kind"] != "none" and row["law"]]
+    for noise in sorted({row["noise"] for row in strangers}):
+        own = [row for row in strangers if row["noise"] == noise]
+        title = f"laws outside the library, noise {100 * noise:g} %: held-out error of the law"
+        yield (
+            f"{title} <= {MAX_FLOOR_RATIO:g} x floor", ">= 85 %",
+            (bool(row["law"]) and row["after"] <= MAX_FLOOR_RATIO for row in own),
+        )  # fmt: skip
+        yield f"noise {100 * noise:g} %: a law proposed", "", (bool(row["law"]) for row in own)
+    searched = [row for row in rows if row["kind"] != "none"]
+    yield (
+        f"search <= {MAX_SECONDS:g} s of processor time", "",
+        (row["seconds"] <= MAX_SECONDS for row in searched),
+    )  # fmt: skip
+    yield (
+        f"a test 25 % stronger: error <= {MAX_RATIO_OUTSIDE:g} x floor, or said", ">= 90 %",
+        (
+            row["outside"]["error"] <= MAX_RATIO_OUTSIDE or bool(row["outside"]["said"])
+            for row in proposed
+        ),
+    )  # fmt: skip
+    yield (
+        f"a test 25 % stronger: error <= {MAX_RATIO_OUTSIDE:g} x floor", "",
+        (row["outside"]["error"] <= MAX_RATIO_OUTSIDE for row in proposed),
+    )  # fmt: skip
+    curves = [row for row in proposed if row["curve"]["before"] >= MIN_CURVE_GAP]
+    yield (
+        f"gap closed in curves of a run never used >= {MIN_CLOSED:g} (base misses "
+        f">= {100 * MIN_CURVE_GAP:g} %)", ">= 85 %",
+        (1 - row["curve"]["after"] / row["curve"]["before"] >= MIN_CLOSED for row in curves),
+    )  # fmt: skip
+    yield (
+        "exact structure", "reported",
+        (bool(row.get("exact")) for row in searched),
+    )  # fmt: skip
+    yield (
+        "nothing hidden: a law proposed", "<= 2 %",
+        (bool(row["law"]) for row in rows if row["kind"] == "none"),
+    )  # fmt: skip
+    names = ("appendage", "table_resonator", "cubic_appendage")
+    resonators = [row for row in searched if any(name in row["cell"] for name in names)]
+    yield (
+        "attached resonator: all its numbers within 10 %", ">= 90 %",
+        (_is_resonator_right(row) for row in resonators),
+    )  # fmt: skip
+
+
+def _is_resonator_right(row: Json) -> bool:
+    errors = row.get("resonator") or {}
+    return bool(errors) and max(map(abs, errors.values())) <= MAX_PARAMETER_ERROR
+
+
+def _list_times(rows: Sequence[Json]) -> Iterator[tuple[str, list[float]]]:
+    searched = [row for row in rows if row["kind"] != "none"]
+    yield "processor time of the search in s", [row["seconds"] for row in searched]
+    yield "wall clock of the search in s", [row["wall_s"] for row in searched]
+
+
+def _format_case(row: Json) -> str:
+    curve, outside = row.get("curve"), row.get("outside")
+    terms = " + ".join(
+        f"`{term['force']}` ({', '.join(f'{k} {v:.4g}' for k, v in term['values'].items())})"
+        for term in row["law"]
+    )
+    cells = (
+        row["cell"],
+        f"{row['before']:.3f} -> {row['after']:.3f}",
+        f"{curve['before']:.4f} -> {curve['after']:.4f}" if curve else "",
+        f"{outside['error']:.2f}{' said' if outside['said'] else ''}" if outside else "",
+        "yes" if row.get("exact") else "",
+        terms or "none",
+    )
+    return f"| {' | '.join(cells)} |"
+
+
+def _format_rivals(rows: Sequence[Json]) -> Iterator[str]:
+    """Yield a table of the held-out error of the forces by method, on the same recordings."""
+    compared = [row for row in rows if row.get("rivals") and row["kind"] != "none"]
+    if not compared:
+        return
+    yield "\nHeld-out rms of the forces over the noise, on the same recordings.\n"
+    yield f"| method | median | <= {MAX_FLOOR_RATIO:g} |"
+    yield "|---|---|---|"
+    methods: dict[str, Callable[[Json], float | None]] = {"law search": lambda row: row["forces"]}
+    for name in compared[0]["rivals"]:
+        methods[name] = lambda row, name=name: row["rivals"].get(name, {}).get("forces")  # type: ignore[misc]
+    for name, read in methods.items():
+        values = [value for row in compared if (value := read(row)) is not None]
+        hits = sum(value <= MAX_FLOOR_RATIO for value in values)
+        yield f"| {name} | {np.median(values):.3f} | {Rate(hits, len(values))} |"
