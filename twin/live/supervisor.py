@@ -30,9 +30,7 @@ READY_TIMEOUT_S = 30.0
 FINISH_TIMEOUT_S = 15.0  # after the last sample, for all processes to finish
 MAX_RIG_SILENCE_S = 5.0  # the rig reports every second; after this it hangs
 MAX_COMPONENT_SILENCE_S = 10.0  # twice this is well within the history that the bus holds
-RESTART_ALLOWANCE_S = (
-    10.0  # more for one that has just been restarted: a busy computer starts slowly
-)
+RESTART_ALLOWANCE_S = 10.0  # in addition, after a restart: a busy computer starts slowly
 SUPERVISED_COMPONENTS = ("recorder", "gate")
 DRAIN_S = 0.1  # after a process died, to receive its last messages
 MAX_RESTARTS = 5
