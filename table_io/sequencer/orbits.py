@@ -5,7 +5,7 @@
                                        `---> updates used up: the next point
     lost --> decay to rest, capture of the first orbit, along the measured ones to this point, or
              to the next one when its retries are used up
-    last point, three in a row or the first one lost --> the end, with the feedback blended out
+    last point, three in a row or all so far lost --> the end, with the feedback blended out
 
 The feedback acts on every block (`control/orbit_feedback.py`); what is decided here are its
 references, ahead of time, like every other change of the drive.
@@ -480,9 +480,9 @@ def retry_orbit(state: SequencerState, index: int, reason: str) -> SequencerStat
     is_given_up = is_measured or search.losses >= config.retries
     lost_points = search.lost_points + (is_given_up and not is_measured)
     next_position = position + is_given_up
-    is_first = is_given_up and not search.measured
+    has_none = is_given_up and not search.measured
     is_last = (
-        is_first or lost_points >= MAX_LOST_POINTS or next_position == len(config.orbit_plan.points)
+        has_none or lost_points >= MAX_LOST_POINTS or next_position == len(config.orbit_plan.points)
     )
     action = "it is approached again from rest"
     if is_given_up:
@@ -498,11 +498,11 @@ def retry_orbit(state: SequencerState, index: int, reason: str) -> SequencerStat
         lost_points=lost_points,
         is_captured=False,
     )
-    if is_first:
+    if has_none:
         state = replace(
             state,
-            refusal=f"the first orbit cannot be held ({reason}): the model departs too far from "
-            "the specimen, or the table from its level; identify the model from a sweep first",
+            refusal=f"no orbit can be held (orbit {position}: {reason}): the model departs too far "
+            "from the specimen, or the table from its level; identify the model from a sweep first",
         )
     if is_last:
         return end_continuation(replace(state, search=search), trajectory)
