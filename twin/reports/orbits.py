@@ -17,7 +17,7 @@ from table_io.records import OrbitPoint
 from twin.recording.reader import Recording
 
 FOLD_ORBITS = 2  # on either side of a fold, to which a parabola is fitted
-MAX_FOLD_DISTANCE = 0.015  # of the frequency of a fold to theirs: a parabola holds close to it only
+MAX_FOLD_DISTANCE = 0.025  # of the frequency of a fold to theirs: a parabola holds close to it only
 
 
 def summarise_orbits(recording: Recording, plan: OrbitPlan) -> list[dict[str, Any]]:
