@@ -58,7 +58,6 @@ from twin.model.model import Model
 from twin.recording.reader import Recording, read_recording, read_start
 from twin.recording.run_paths import resolve_log_path
 from twin.recording.tabular import channel_unit, collect_steps
-from twin.run.rerun import restore_predictions
 from twin.transport.codec import RECORD_TOPICS
 from twin.transport.endpoint import MEAS_TOPIC, PRED_TOPIC
 
@@ -199,6 +198,8 @@ class Log:
         """Return the recording with the predictions; those not recorded are recomputed."""
         if self.start.predictions_every <= 1:
             return read_recording(self.path, (PRED_TOPIC,))
+        from twin.run.rerun import restore_predictions
+
         return restore_predictions(read_recording(self.path))
 
     @cached_property
