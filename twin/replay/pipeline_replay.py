@@ -226,7 +226,7 @@ def replay_recording(
     result = ReplayComparison(largest=dict.fromkeys(COMPARED_CHANNELS, 0.0))
     result.beginning = find_earlier_run(recording)
     result.recorded = sum(span.contains_comparison(entry) for entry in recorded.comparisons.items())
-    result.hashes = sum(map(span.includes, recorded.hashes.values()))
+    result.hashes = sum(map(span.includes, _list_expected_hashes(recorded)))
 
     unrecorded: list[int] = []
     compare = partial(_compare_item, result, recorded, run, unrecorded)
@@ -236,6 +236,19 @@ def replay_recording(
     result.lost_with_twin = _count_lost_with_twin(recorded, unrecorded)
     result.unrecorded = len(unrecorded) - result.lost_with_twin
     return result
+
+
+def _list_expected_hashes(recorded: RecordedRun) -> list[PredictionHash]:
+    """Return the recorded hashes; without those where the twin had failed, which none makes."""
+    faults = [fault for fault in recorded.recording.records(Fault) if fault.component == "twin"]
+    return [
+        entry
+        for entry in recorded.hashes.values()
+        if not any(
+            fault.from_index < entry.index + entry.count and entry.index < fault.to_index
+            for fault in faults
+        )
+    ]
 
 
 def _count_lost_with_twin(recorded: RecordedRun, unrecorded: Sequence[int]) -> int:
