@@ -16,7 +16,7 @@ from twin.identification.parameters import STIFFNESS
 from twin.identification.screening import NormalEquations, Variant, build_normal_equations
 from twin.identification.selection import FittedSet, SelectionProblem
 
-FORCE_LAWS = ("force", "linear")
+FORCE_LAWS = ("force", "linear")  # by `Effect.acts`: what has a form and a size
 # of an amplitude's curvature: with less left by the base, the recordings do not show it
 MIN_INFORMATION_SHARE = 1e-6
 # Largest force of an effect that recordings may hide, of that of the spring of the damper (rms). At
