@@ -16,7 +16,7 @@ from twin.identification.cross_checks import is_of_contact
 from twin.identification.hidden_effects import (
     FORCE_LAWS,
     MAX_HIDDEN_SHARE,
-    HiddenEffect,
+    UndetectedEffect,
     find_blind_spots,
 )
 from twin.identification.parameters import (
@@ -63,7 +63,7 @@ class DiscoveryVerdict:
     has_remainder: bool  # the residual exceeds the floor by more than an inexact force law explains
     reason: str
     # force laws that could be there without a trace, where nothing is named
-    blind_to: tuple[HiddenEffect, ...] = ()
+    blind_to: tuple[UndetectedEffect, ...] = ()
     # standard deviations that an inexact form of the named laws may cause unseen
     form_errors: Mapping[ParameterKey, float] = field(default_factory=dict)
 
