@@ -11,7 +11,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from twin.identification.candidates import Candidate
 from twin.identification.cross_checks import is_of_contact
 from twin.identification.hidden_effects import (
     FORCE_LAWS,
@@ -149,7 +148,8 @@ def widen_for_form(verdict: DiscoveryVerdict) -> DiscoveryVerdict:
     it is visible; what is too little to be seen is stated, but widens nothing.
     """
     best = verdict.best
-    is_bumper = {effect.effect.is_in_bumpers for effect in best.effects if is_force_law(effect)}
+    laws = [each.effect for each in best.effects if each.effect and each.effect.acts in FORCE_LAWS]
+    is_bumper = {law.is_in_bumpers for law in laws}
     if verdict.outcome != "named" or not is_bumper:
         return verdict
     fit = best.fit
@@ -168,11 +168,6 @@ def widen_for_form(verdict: DiscoveryVerdict) -> DiscoveryVerdict:
     form_errors = {key: math.sqrt(hidden * per_direction) * fit.white_errors[key] for key in keys}
     widened = replace(best, fit=replace(fit, std_errors=std_errors))
     return replace(verdict, best=widened, form_errors=form_errors)
-
-
-def is_force_law(candidate: Candidate) -> bool:
-    """Return True for an effect with a law whose form may be another one in the specimen."""
-    return candidate.effect is not None and candidate.effect.acts in FORCE_LAWS
 
 
 def qualify_none(problem: SelectionProblem, verdict: DiscoveryVerdict) -> DiscoveryVerdict:
