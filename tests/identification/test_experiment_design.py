@@ -27,6 +27,7 @@ from twin.identification.parameters import (
     DAMPING,
     STIFFNESS,
     EffectKey,
+    GapKey,
     ParameterKey,
     ParameterSet,
 )
@@ -319,16 +320,19 @@ def test_intervals_hold_what_an_inexact_form_leaves(relaxing: Recorded) -> None:
     """Half of the residual squares: as much in each of the parameters, over their white errors."""
     best = relaxing.fit("maxwell_damper", k1=12e3, tau=0.06).fitted
     key = EffectKey("maxwell_damper", "k1", "")
-    problem, selection = relaxing.prepared.problem, SelectionResult(best, best)
     exact = DiscoveryVerdict("named", best, 0.9, (), None, best.cost, False, "")
-    assert widen_for_form(problem, selection, exact).best.fit.std_errors == best.fit.std_errors
+    unseen = widen_for_form(exact)
+    assert unseen.best.fit.std_errors == best.fit.std_errors
     half = replace(exact, floor=best.cost / 2)
-    widened = widen_for_form(problem, selection, half).best.fit
+    widened = widen_for_form(half).best.fit
     count = sum(entries.size for entries in best.held_out)
     fitted = [STIFFNESS, DAMPING, key, replace(key, name="tau")]
     squares = best.cost * (1 - 1.05 / 2) * count / len(fitted)
     own = widened.std_errors[key] ** 2 - best.fit.std_errors[key] ** 2
     assert own == pytest.approx(squares * best.fit.white_errors[key] ** 2)
+    stated = math.sqrt(0.05 * best.cost * count / len(fitted)) * best.fit.white_errors[key]
+    assert unseen.form_errors[key] == pytest.approx(stated)
+    assert GapKey(0) not in unseen.form_errors
 
 
 @pytest.mark.parametrize("stroke_mm", [60.0, 5.0])

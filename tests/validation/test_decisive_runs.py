@@ -30,7 +30,7 @@ def find_row(text: str, name: str) -> str:
 def test_an_open_verdict_counts_as_decided_only_if_the_next_is_right() -> None:
     first = score("none", False, False, 0.5)
     proposal = {"probability": 0.95}
-    rows = [
+    rows: list[Json] = [
         {"first": score("named", True, True)},
         {
             "first": first, "proposal": proposal, "random_probability": 0.1,

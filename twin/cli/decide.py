@@ -209,10 +209,11 @@ def find_end(judged: JudgedLogs, count: int, remaining_min: float) -> str:
 
     A first verdict that is decided already is confirmed by one test.
     """
+    played = f"{count - 1} test{'s' if count > 2 else ''}"
     if judged.is_decided and count > 1:
-        return f"decided after {count - 1} test{'s' if count > 2 else ''}"
+        return f"decided after {played}"
     if remaining_min <= 0:
-        return f"not decided: the rig time is used up after {count - 1} tests"
+        return f"not decided: the rig time is used up after {played}"
     if not judged.proposals:
         return f"not decided: no test of at most {remaining_min:.2g} min separates what is open"
     return ""

@@ -41,6 +41,7 @@ from twin.reports.discovery.serialize import (
     verdict_to_json,
 )
 from twin.reports.finalize import EXIT_INTERRUPTED
+from twin.reports.quantities import format_quantity
 from twin.reports.summary import dump_contract
 from twin.run.decisive_test import TestProposal
 from twin.run.folders import make_run_folder
@@ -212,6 +213,12 @@ def print_verdict(verdict: Json) -> None:
     for effect in verdict["effects"]:
         for name, value in effect["parameters"].items():
             print_line(f"  {effect['id']} {name} = {format_interval(value)}")
+    for effect in verdict["effects"]:
+        for name, value in effect["parameters"].items():
+            half = (verdict["form_errors"] or {}).get(f"{effect['id']}.{name}")
+            if half is not None:
+                text = format_quantity(value["value"], value["unit"], half)
+                print_line(f"  {effect['id']} {name} if its law has another form: {text}")
     for rival in describe_excluded(verdict) if verdict["verdict"] == "named" else ():
         print_line(f"  excluded: {rival['id']}, worse by {rival['sigma']:.2g} standard errors")
     for line in describe_sensors(verdict["sensors"]):

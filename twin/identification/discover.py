@@ -435,7 +435,7 @@ def _select_and_judge(
         * estimate_repeatability_floor(problem.log_residuals, selection.best.held_out),
         selection.best.cost,
     )
-    verdict = widen_for_form(problem, selection, judge_selection(problem, selection, floor))
+    verdict = widen_for_form(judge_selection(problem, selection, floor))
     verdict = qualify_none(problem, verdict)
     # implausible base parameters are reported only if they remain so with the effects added
     pulls = find_pulling_bumpers(problem.log_residuals, verdict.best.held_out)

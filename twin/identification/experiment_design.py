@@ -20,7 +20,7 @@ from scipy.special import ndtr
 from table_io.block import Block, Float1D, Float2D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from twin.compare.sensors import apply_sensors, lag_samples
-from twin.identification.hidden_effects import HiddenEffect, find_hidden_effects
+from twin.identification.hidden_effects import UndetectedEffect, find_hidden_effects
 from twin.identification.least_squares import (
     INTERVAL_SIGMA,
     fill_jacobian,
@@ -226,7 +226,7 @@ def list_rivals(
     )
 
 
-def add_hidden_effects(best: FittedSet, hidden: Sequence[HiddenEffect]) -> list[Rival]:
+def add_hidden_effects(best: FittedSet, hidden: Sequence[UndetectedEffect]) -> list[Rival]:
     """Return the best set with each further force law, held as large as the recordings hide it."""
     parameters, rivals = best.fit.parameters, []
     for effect in hidden:

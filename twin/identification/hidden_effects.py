@@ -16,7 +16,7 @@ from twin.identification.parameters import STIFFNESS
 from twin.identification.screening import NormalEquations, Variant, build_normal_equations
 from twin.identification.selection import FittedSet, SelectionProblem
 
-FORCE_LAWS = ("force", "linear")
+FORCE_LAWS = ("force", "linear")  # by `Effect.acts`: what has a form and a size
 # of an amplitude's curvature: with less left by the base, the recordings do not show it
 MIN_INFORMATION_SHARE = 1e-6
 # Largest force of an effect that recordings may hide, of that of the spring of the damper (rms). At
@@ -25,7 +25,7 @@ MAX_HIDDEN_SHARE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class HiddenEffect:
+class UndetectedEffect:
     """Effect as large as the recordings may hide it: the end of the 95 % interval of its amplitude.
 
     Or as large as asked for, if the interval has no end before that.
@@ -37,7 +37,7 @@ class HiddenEffect:
 
 
 @dataclass(frozen=True, eq=False)
-class _Estimate:
+class _AmplitudeEstimate:
     """Estimate of the amplitude of a variant, in columns of norm 1, refitted with the base."""
 
     variant: Variant
@@ -56,7 +56,7 @@ class _Estimate:
         return INTERVAL_SIGMA / math.sqrt(self.information)
 
 
-def find_hidden_effects(problem: SelectionProblem, best: FittedSet) -> tuple[HiddenEffect, ...]:
+def find_hidden_effects(problem: SelectionProblem, best: FittedSet) -> tuple[UndetectedEffect, ...]:
     """Return each further force law as large as the noise may hide it, where it is not blind."""
     equations, estimates = _estimate_amplitudes(problem, best)
     hidden = []
@@ -68,7 +68,7 @@ def find_hidden_effects(problem: SelectionProblem, best: FittedSet) -> tuple[Hid
     return tuple(hidden)
 
 
-def find_blind_spots(problem: SelectionProblem, best: FittedSet) -> tuple[HiddenEffect, ...]:
+def find_blind_spots(problem: SelectionProblem, best: FittedSet) -> tuple[UndetectedEffect, ...]:
     """Return the force laws that could be large in any form without leaving more than noise.
 
     Each as large as `MAX_HIDDEN_SHARE` of the spring, in the form that the recordings show best.
@@ -88,7 +88,7 @@ def find_blind_spots(problem: SelectionProblem, best: FittedSet) -> tuple[Hidden
 
 def _estimate_amplitudes(
     problem: SelectionProblem, best: FittedSet
-) -> tuple[NormalEquations, dict[str, list[_Estimate]]]:
+) -> tuple[NormalEquations, dict[str, list[_AmplitudeEstimate]]]:
     """Return the normal equations about a set, and the estimates of every further force law."""
     library = [
         candidate
@@ -100,7 +100,7 @@ def _estimate_amplitudes(
     )
     hessian, gradient = equations.hessian.sum(axis=0), equations.gradient.sum(axis=0)
     base = slice(0, equations.base_count)
-    estimates: dict[str, list[_Estimate]] = {}
+    estimates: dict[str, list[_AmplitudeEstimate]] = {}
     for variant in equations.variants:
         k = variant.column
         if not hessian[k, k] > 0:
@@ -110,7 +110,7 @@ def _estimate_amplitudes(
         slope = float(gradient[k] - gradient[base] @ absorbed)
         amplitude = -slope / information if information >= MIN_INFORMATION_SHARE else 0.0
         estimates.setdefault(variant.candidate.name, []).append(
-            _Estimate(variant, amplitude, information)
+            _AmplitudeEstimate(variant, amplitude, information)
         )
     return equations, estimates
 
@@ -126,11 +126,13 @@ def _measure_spring(equations: NormalEquations, best: FittedSet) -> float:
     return math.inf
 
 
-def _bound_effect(equations: NormalEquations, estimate: _Estimate, limit: float) -> HiddenEffect:
+def _bound_effect(
+    equations: NormalEquations, estimate: _AmplitudeEstimate, limit: float
+) -> UndetectedEffect:
     """Return the effect at the end of its interval on the side of the estimate, up to a limit."""
     variant, candidate = estimate.variant, estimate.variant.candidate
     end = min(abs(estimate.amplitude) + estimate.half_interval, limit)
     sign = variant.sign or math.copysign(1.0, estimate.amplitude)
     free = candidate.amplitude
     value = candidate.vanishing + sign * end / float(equations.scale[variant.column])
-    return HiddenEffect(candidate, variant.shape, min(max(value, free.low), free.high))
+    return UndetectedEffect(candidate, variant.shape, min(max(value, free.low), free.high))

@@ -13,8 +13,9 @@ from dataclasses import dataclass, field, replace
 
 from twin.identification.cross_checks import is_of_contact
 from twin.identification.hidden_effects import (
+    FORCE_LAWS,
     MAX_HIDDEN_SHARE,
-    HiddenEffect,
+    UndetectedEffect,
     find_blind_spots,
 )
 from twin.identification.parameters import (
@@ -61,8 +62,8 @@ class DiscoveryVerdict:
     has_remainder: bool  # the residual exceeds the floor by more than an inexact force law explains
     reason: str
     # force laws that could be there without a trace, where nothing is named
-    blind_to: tuple[HiddenEffect, ...] = ()
-    # standard deviations for an inexact form of the laws, which those of `best` include
+    blind_to: tuple[UndetectedEffect, ...] = ()
+    # standard deviations that an inexact form of the named laws may cause unseen
     form_errors: Mapping[ParameterKey, float] = field(default_factory=dict)
 
     @property
@@ -139,59 +140,34 @@ def judge_selection(
     return DiscoveryVerdict("named", best, confidence, (), generic, floor, has_remainder, reason)
 
 
-def widen_for_form(
-    problem: SelectionProblem, selection: SelectionResult, verdict: DiscoveryVerdict
-) -> DiscoveryVerdict:
-    """Return a verdict whose intervals hold the error of an inexact form of the force laws.
+def widen_for_form(verdict: DiscoveryVerdict) -> DiscoveryVerdict:
+    """Return a verdict with the error of an inexact form of the named force laws.
 
-    What such a form leaves of the residual squares, beyond what is visible, it has also put into
-    the parameters of the same place, damper or bumpers: as much, in equal parts in each direction.
-    A form that a further generic term corrects significantly is off by as much again as that term
-    moves the parameters.
+    What such a form leaves of the residual squares it has also put into the parameters of the same
+    place, damper or bumpers: as much, in equal parts in each direction. The intervals hold it where
+    it is visible; what is too little to be seen is stated, but widens nothing.
     """
     best = verdict.best
-    if verdict.outcome != "named":
+    laws = [each.effect for each in best.effects if each.effect and each.effect.acts in FORCE_LAWS]
+    is_bumper = {law.is_in_bumpers for law in laws}
+    if verdict.outcome != "named" or not is_bumper:
         return verdict
     fit = best.fit
-    is_bumper = {effect.effect.is_in_bumpers for effect in best.effects if effect.effect}
-    fitted = [
+    keys = [
         free.key
         for free in fit.free
         if not is_correction(free.key) and is_of_contact(free.key, fit.parameters) in is_bumper
     ]
-    excess = max(best.cost - (1 + MIN_VISIBLE_EXCESS) * verdict.floor, 0.0)
-    squares = excess * sum(values.size for values in best.held_out) / max(len(fitted), 1)
-    corrected = _find_corrected_form(problem, selection, best)
-    form_errors = {
-        key: math.hypot(
-            math.sqrt(squares) * fit.white_errors[key],
-            corrected.fit.values[key] - fit.values[key] if corrected else 0.0,
-        )
-        for key in fitted
-    }
-    if not any(form_errors.values()):
-        return verdict
-    std_errors = {
-        key: math.hypot(error, form_errors.get(key, 0.0)) for key, error in fit.std_errors.items()
-    }
-    reason = f"{verdict.reason}; intervals include the error of an inexact form of the law"
+    per_direction = sum(values.size for values in best.held_out) / len(keys)
+    visible = max(best.cost - (1 + MIN_VISIBLE_EXCESS) * verdict.floor, 0.0)
+    hidden = max(best.cost / verdict.floor - 1, MIN_VISIBLE_EXCESS) * verdict.floor
+    std_errors = dict(fit.std_errors)
+    for key in keys:
+        form_error = math.sqrt(visible * per_direction) * fit.white_errors[key]
+        std_errors[key] = math.hypot(std_errors[key], form_error)
+    form_errors = {key: math.sqrt(hidden * per_direction) * fit.white_errors[key] for key in keys}
     widened = replace(best, fit=replace(fit, std_errors=std_errors))
-    return replace(verdict, best=widened, reason=reason, form_errors=form_errors)
-
-
-def _find_corrected_form(
-    problem: SelectionProblem, selection: SelectionResult, best: FittedSet
-) -> FittedSet | None:
-    """Return the best set with a generic term more, if the term improves the fit significantly."""
-    extended = [
-        fitted
-        for fitted in selection.generic_sets
-        if len(fitted.effects) == len(best.effects) + 1 and {*best.names} < {*fitted.names}
-    ]
-    corrected = min(extended, key=lambda fitted: fitted.cost, default=None)
-    if corrected is None or problem.compute_gain(best, corrected)[2] < MIN_SEPARATION_SIGMA:
-        return None
-    return corrected
+    return replace(verdict, best=widened, form_errors=form_errors)
 
 
 def qualify_none(problem: SelectionProblem, verdict: DiscoveryVerdict) -> DiscoveryVerdict:

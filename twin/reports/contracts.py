@@ -737,6 +737,11 @@ class Verdict(Contract):
     blind_to: list[str] | None = Field(
         None, description="effects that could be there without a trace; absent in old files"
     )
+    form_errors: dict[str, Number] | None = Field(
+        None,
+        description="half of the 95 % interval of each parameter, in its SI unit, for a law that "
+        "has another form than in the library, unseen; absent in old files",
+    )
     next_run: str = Field(description="test that would decide or confirm")
     seconds: Seconds = Field(description="computing time")
     held_out_logs: list[HeldOutLog] = Field(description="of the logs given to judge the result")

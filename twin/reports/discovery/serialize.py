@@ -101,6 +101,9 @@ def verdict_to_json(
             *([] if selection.complete else [STOPPED_NOTE]),
         ],
         "blind_to": blind_to,
+        "form_errors": {
+            str(key): INTERVAL_SIGMA * error for key, error in verdict.form_errors.items()
+        },
         "next_run": suggest_next_run(verdict.outcome, names, alternatives, blind_to),
         "seconds": seconds,
         "held_out_logs": [_held_out_to_json(log, discovery, given) for log in held_out_logs],
