@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from table_io.block import Float1D, Float2D
-from table_io.errors import InputError
 from twin.identification.candidates import Candidate
 from twin.identification.law_terms import (
     LAW_PREFIX,
@@ -35,6 +34,7 @@ MISSING_MESSAGE = (
     "no free expressions were tried: pyoperon is not installed; pip install 'shaketwin[laws]'"
 )
 MAX_LENGTH = 12  # nodes of an expression, its coefficients not counted
+MIN_SAMPLES = 100  # of a place, to regress on
 MAX_SAMPLES, POPULATION, GENERATIONS = 2000, 300, 40
 SYMBOLS = "add,sub,mul,abs,tanh,square,constant,variable"
 MIN_INDEPENDENT_SHARE = 0.02  # of a slope by a coefficient, else the others do as well
@@ -80,7 +80,7 @@ def _list_problems(
         ("damper", "u", scale.u, damper), ("bumpers", "d", scale.depth, bumpers),
     ):  # fmt: skip
         q, v, force = np.concatenate(parts, axis=1)
-        if force.size > MAX_LENGTH:
+        if force.size > MIN_SAMPLES:
             features = {(variable, f"{variable}0"): q / length, ("v", "v0"): v / scale.v}
             yield place, features, force  # type: ignore[misc]
 
@@ -187,7 +187,7 @@ def make_term(
             range=list_valid_range(place, scale),
         )  # fmt: skip
         law.build_effect()
-    except InputError:
+    except ValueError:  # InputError, also within the validation of the file
         return None
     free = _select_independent(shape, values, features, motion, references)
     fixed = {name: value for name, value in values.items() if name not in free}

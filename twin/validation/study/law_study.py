@@ -152,7 +152,7 @@ def evaluate_law(root: Path, rig: str, has_rivals: bool, number: int) -> Json:
         try:
             row |= _judge_predictions(plant, residuals, null, best)
         except InputError as error:  # a law that cannot be simulated predicts nothing
-            row |= NO_PREDICTION | {"unusable": str(error)}
+            row |= {**NO_PREDICTION, "unusable": str(error)}
     if has_rivals:
         row["rivals"] = {}
         for name, method in find_baselines().items():
