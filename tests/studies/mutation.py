@@ -338,6 +338,14 @@ class Study:
     only: str
 
     @pytest.hookimpl(tryfirst=True)
+    def pytest_collection(self) -> None:
+        """Let hypothesis stop at the first example that fails."""
+        from hypothesis import Phase, settings  # later than the plug-ins of pytest
+
+        settings.register_profile("mutation", phases=[Phase.explicit, Phase.generate])
+        settings.load_profile("mutation")
+
+    @pytest.hookimpl(tryfirst=True)
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         """Print the fate of the mutants drawn from the package."""
         begin_s = time.monotonic()
