@@ -26,7 +26,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
@@ -299,8 +299,8 @@ def patch_object(old: Any, new: Any) -> None:
     elif isinstance(old, staticmethod | classmethod):
         patch_object(old.__func__, new.__func__)
     elif isinstance(old, FunctionType) and isinstance(new, FunctionType):
-        if hasattr(old, "__wrapped__"):
-            patch_object(old.__wrapped__, new.__wrapped__)
+        if "__wrapped__" in vars(old):
+            patch_object(vars(old)["__wrapped__"], vars(new)["__wrapped__"])
         elif old.__code__.co_freevars == new.__code__.co_freevars:
             old.__code__, old.__defaults__ = new.__code__, new.__defaults__
             old.__kwdefaults__ = new.__kwdefaults__
@@ -336,6 +336,14 @@ class Study:
     count: int
     seed: int
     only: str
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_collection(self) -> None:
+        """Let hypothesis stop at the first example that fails."""
+        from hypothesis import Phase, settings  # later than the plug-ins of pytest
+
+        settings.register_profile("mutation", phases=[Phase.explicit, Phase.generate])
+        settings.load_profile("mutation")
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
@@ -411,8 +419,8 @@ def main() -> None:
     parser.add_argument("--line", default="", help="FILE:LINE: mutants of this line only")
     asked = parser.parse_args()
     for name in asked.packages or TARGETS:
-        study = (name, asked.mutants, asked.seed, asked.line)
-        if run_in_child(lambda study=study: study_package(*study), float("inf")):
+        study = partial(study_package, name, asked.mutants, asked.seed, asked.line)
+        if run_in_child(study, float("inf")):
             print(f"{name}: not studied")
 
 

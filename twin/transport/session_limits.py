@@ -72,7 +72,7 @@ class SessionLimiter:
 
     def add(self, locator: str, name: str) -> None:
         """Note a new session of `name`; close those that are too many then."""
-        address = parse_address(*split_host_port(locator))
+        address = parse_address(*split_host_port(locator.partition("?")[0]))
         with self._lock:
             self._sessions[address] = name
             if self.may_command(name):
@@ -84,7 +84,7 @@ class SessionLimiter:
 
     def remove(self, locator: str) -> None:
         """Note the end of a session."""
-        address = parse_address(*split_host_port(locator))
+        address = parse_address(*split_host_port(locator.partition("?")[0]))
         with self._lock:
             self._sessions.pop(address, None)
             self._commanding.discard(address)
@@ -122,7 +122,7 @@ def open_connections(port: int) -> Iterator[tuple[Address, socket.socket]]:
 
     The socket is closed after the iteration; the connection itself stays open.
     """
-    for file in OPEN_FILES.iterdir():
+    for file in OPEN_FILES.iterdir() if OPEN_FILES.is_dir() else ():  # elsewhere than on Linux
         with suppress(OSError):  # closed meanwhile, or not connected
             if not os.readlink(file).startswith("socket:"):
                 continue

@@ -160,6 +160,34 @@ def test_low_cut_and_delay_are_fitted_and_removed(
 
 
 @LAW
+@given(st.floats(0.0, 0.2), st.floats(1e-5, 1e-3), SIGNS, st.floats(-4.0, 4.0))
+def test_phase_errors_are_fitted_at_a_gain_of_one_from_the_motion_alone(
+    low_cut: float, size_s: float, sign: float, offset: float
+) -> None:
+    chance = np.random.default_rng(8)
+    draws = chance.standard_normal((4, 3)) + 1j * chance.standard_normal((4, 3))
+    displacement, low_cut_term, delay_term, constant = draws * [[3.0], [1e3], [1e5], [1.0]]
+    acceleration = displacement + low_cut * low_cut_term + sign * size_s * delay_term
+    acceleration[0] += offset * constant[0]  # the order that an offset spoils is not used
+    sigma = np.full(3, 1e-6)
+    pair = WeakFormPair(displacement, acceleration, constant, sigma, low_cut_term, delay_term)
+    errors = pair.fit_phase_errors()
+    assert errors.gain == 1.0
+    assert errors.low_cut == pytest.approx(low_cut, rel=0.02, abs=1e-3)
+    assert errors.delay_s == pytest.approx(sign * size_s, rel=0.02, abs=1e-6)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_size_is_that_of_either_sensor_in_either_order(order: int) -> None:
+    pair = make_pair(1000.0)
+    amplitudes = np.array([9.0, 1.0, 1.0], dtype=np.complex128)
+    large = amplitudes.copy()
+    large[order] = -2.0
+    assert replace(pair, displacement=large, acceleration=amplitudes).size == 2.0
+    assert replace(pair, displacement=amplitudes, acceleration=large).size == 2.0
+
+
+@LAW
 @given(st.floats(-math.pi / 4, 3 * math.pi / 4 - 2e-3), st.floats(1.0, 5e3), st.floats(-50.0, 50.0))
 def test_the_share_of_two_cells_is_found_at_any_angle(
     angle: float, size_n: float, mean_n: float
