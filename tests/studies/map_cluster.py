@@ -1,6 +1,6 @@
 """A study on Dask workers of two hosts: its rate, a foreign version, and a scheduler gone silent.
 
-    python -m tests.studies.map_cluster [--cases 8000]
+    python -m tests.studies.map_cluster [--cases 8000] [--only PART]
 
 The hosts are network namespaces with a cable between, which need no privilege; the scheduler is on
 the one, and half of the workers are on either. The rate of w workers is compared with w times that
@@ -102,9 +102,9 @@ def find_rate(out: Path, workers: int) -> float:
 
 def measure_rates(line: Cable, study: Path, folder: Path) -> None:
     """Print the rate of processes here, and of 1, 2 and 4 workers on both hosts."""
-    rates, stored = {}, None
+    rates, stored = {}, read_stored_bytes(folder / "local1")
+    start_map(study, folder / "local2", "--workers", "2").communicate()
     for count in (1, 2):
-        start_map(study, folder / f"local{count}", "--workers", str(count)).communicate()
         print(f"{count} local processes: {find_rate(folder / f'local{count}', count):.0f} sweeps/s")
     for count in (1, 2, 4):
         out = folder / f"cluster{count}"
@@ -114,8 +114,7 @@ def measure_rates(line: Cable, study: Path, folder: Path) -> None:
         rates[count] = find_rate(out, count)
         efficiency = rates[count] / rates[1] / min(count, count_cores())
         print(f"{count} workers on two hosts: {rates[count]:.0f} sweeps/s, {efficiency:.3f} of "
-              f"{min(count, count_cores())} cores", flush=True)  # fmt: skip
-        stored = stored or read_stored_bytes(folder / "local1")
+              f"{min(count, count_cores())} cores")  # fmt: skip
         assert read_stored_bytes(out) == stored, "other bytes than local processes"
     print("bytes identical to those of local processes")
 
@@ -168,13 +167,19 @@ def try_silent_schedulers(line: Cable, study: Path, folder: Path) -> None:
     print(f"nothing lost: {kept} chunks kept, the whole identical after --resume")
 
 
+PARTS = {"rates": measure_rates, "foreign": try_foreign_worker, "silent": try_silent_schedulers}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--cases", type=int, default=8000)
+    parser.add_argument("--only", choices=PARTS)
     parser.add_argument("--enclosed", action="store_true", help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if not asked.enclosed:
         words = ["--enclosed", "--cases", str(asked.cases)]
+        words += ["--only", asked.only] if asked.only else []
+        os.environ["PYTHONUNBUFFERED"] = "1"
         process = start_isolated("tests.studies.map_cluster", *words)
         assert process.stdout is not None
         for text in process.stdout:
@@ -184,9 +189,9 @@ def main() -> None:
         folder = Path(temporary)
         study = folder / "study.toml"
         study.write_text(STUDY.format(chunk=CHUNK, count=asked.cases // 20))
-        measure_rates(line, study, folder)
-        try_foreign_worker(line, study, folder)
-        try_silent_schedulers(line, study, folder)
+        start_map(study, folder / "local1", "--workers", "1").communicate()
+        for name in [asked.only] if asked.only else PARTS:
+            PARTS[name](line, study, folder)
 
 
 if __name__ == "__main__":

@@ -77,6 +77,7 @@ def run_study(
     folder = _open_folder(study, path, out, resume)
     manifest = Manifest(folder, [variable.name for variable in study.variables])
     _require_disk_space(study, folder, study.config.case_count - manifest.case_count)
+    _print_size(study)
     if not resume:
         create_store(folder, study, make_sweep_plan(study), sample_parameters(study.config))
     group = open_group(folder, "r")
@@ -120,18 +121,21 @@ def _estimate_seconds_per_case(study: Study, group: Any) -> float:
     return (clock.now() - started_s) / TRIAL_CASES
 
 
-def _print_plan(study: Study, group: Any, workers: Workers, missing_count: int) -> None:
-    """Print how many cases there are and what the missing ones take."""
-    config, sweep = study.config, make_sweep_plan(study)
+def _print_size(study: Study) -> None:
+    """Print how many cases there are: of many millions, listing them takes a while."""
+    config, steps = study.config, study.profile.sweep.steps
     shape = " x ".join(map(str, config.shape)) + " = " if len(config.shape) > 1 else ""
     print_line(f"{config.title}")
     print_line(
-        f"{shape}{config.case_count} cases of {len(sweep.steps)} steps in {config.chunk_count} "
-        "chunks"
+        f"{shape}{config.case_count} cases of {len(steps)} steps in {config.chunk_count} chunks"
     )
+
+
+def _print_plan(study: Study, group: Any, workers: Workers, missing_count: int) -> None:
+    """Print what the missing cases take, from a few of them."""
     if missing_count:
         seconds = _estimate_seconds_per_case(study, group) * missing_count
-        size = estimate_bytes_per_case(study, sweep) * missing_count
+        size = estimate_bytes_per_case(study, make_sweep_plan(study)) * missing_count
         duration = (
             f"about {format_time_span(seconds)} of one core on {workers}"
             if workers.scheduler
