@@ -13,7 +13,7 @@ from twin.transport.endpoint import (
     MAX_OBSERVER_SESSIONS,
     MAX_SESSIONS_PER_PERSON,
 )
-from twin.transport.session_limits import SessionLimiter, list_excess, parse_address
+from twin.transport.session_limits import SessionLimiter, list_excess, normalize_address
 
 COMMANDERS = ("anna", "carl")
 ARRIVALS = st.lists(st.sampled_from([*COMMANDERS, *(f"p{i}" for i in range(8))]), max_size=200)
@@ -46,8 +46,8 @@ def test_each_new_session_finds_the_places_that_its_person_has(names: list[str])
 
 
 def test_an_address_is_the_same_in_each_spelling() -> None:
-    assert parse_address("::ffff:10.0.0.7", 5) == parse_address("10.0.0.7", 5)
-    assert parse_address("fe80::1%eth0", 5) == parse_address("fe80:0::1", 5)
+    assert normalize_address("::ffff:10.0.0.7", 5) == normalize_address("10.0.0.7", 5)
+    assert normalize_address("fe80::1%eth0", 5) == normalize_address("fe80:0::1", 5)
 
 
 def test_of_connections_without_a_session_the_newest_stay(monkeypatch) -> None:

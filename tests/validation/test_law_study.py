@@ -49,12 +49,12 @@ def test_the_true_model_has_no_error_and_another_one_has(signals):
     assert 0.6 * expected < other < 1.05 * expected
 
 
-def make_row(number, after, said=(), error=1.0, law=True, kind="unknown"):
+def make_row(number, after, warnings=(), error=1.0, law=True, kind="unknown"):
     return {
         "number": number, "cell": "unknown/cubic_damping/3/1%", "kind": kind, "noise": 0.01,
         "sized": True, "before": 3.0, "after": after, "seconds": 10.0, "wall_s": 12.0,
         "law": [{"force": "k * v", "values": {"k": 1.0}}] if law else [], "exact": law,
-        "outside": {"error": error, "said": [*said]}, "curve": {"before": 0.1, "after": 0.005},
+        "outside": {"error": error, "said": [*warnings]}, "curve": {"before": 0.1, "after": 0.005},
         "forces": after, "rivals": {"pysindy": {"forces": 2.0}},
     }  # fmt: skip
 

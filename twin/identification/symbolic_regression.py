@@ -122,7 +122,7 @@ def _strip_scale(tree: ast.expr) -> ast.expr:
     return tree
 
 
-class _Coefficients(ast.NodeTransformer):
+class _ConstantParameters(ast.NodeTransformer):
     """Replaces features by texts, numbers by parameters c1, c2 and so on, squares by powers."""
 
     def __init__(self, features: Sequence[str]) -> None:
@@ -154,7 +154,7 @@ def make_term(
     scale: RecordScale, number: int,
 ) -> Candidate | None:  # fmt: skip
     """Return an expression as a candidate; None if it is no law, as one that pulls at touch."""
-    transformer = _Coefficients(features)
+    transformer = _ConstantParameters(features)
     shape = ast.unparse(ast.fix_missing_locations(transformer.visit(tree)))
     values = {f"c{k}": value for k, value in enumerate(transformer.values, 1) if value > 0.0}
     references = list_references(scale, [shape])

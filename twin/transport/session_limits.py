@@ -72,7 +72,7 @@ class SessionLimiter:
 
     def add(self, locator: str, name: str) -> None:
         """Note a new session of `name`; close those that are too many then."""
-        address = parse_address(*split_host_port(locator.partition("?")[0]))
+        address = normalize_address(*split_host_port(locator.partition("?")[0]))
         with self._lock:
             self._sessions[address] = name
             if self.may_command(name):
@@ -84,7 +84,7 @@ class SessionLimiter:
 
     def remove(self, locator: str) -> None:
         """Note the end of a session."""
-        address = parse_address(*split_host_port(locator.partition("?")[0]))
+        address = normalize_address(*split_host_port(locator.partition("?")[0]))
         with self._lock:
             self._sessions.pop(address, None)
             self._commanding.discard(address)
@@ -111,7 +111,7 @@ class SessionLimiter:
             close_connections(self.port, set(oldest))
 
 
-def parse_address(host: str, port: int) -> Address:
+def normalize_address(host: str, port: int) -> Address:
     """Return an address in its shortest form, with which equal ones compare equal."""
     address = ip_address(host.partition("%")[0])
     return str(getattr(address, "ipv4_mapped", None) or address), port
@@ -136,7 +136,7 @@ def open_connections(port: int) -> Iterator[tuple[Address, socket.socket]]:
                 is_tcp = connection.family in (socket.AF_INET, socket.AF_INET6)
                 if is_tcp and connection.getsockname()[1] == port:
                     host, peer_port, *_ = connection.getpeername()
-                    yield parse_address(host, peer_port), connection
+                    yield normalize_address(host, peer_port), connection
 
 
 def close_connections(port: int, addresses: set[Address]) -> None:

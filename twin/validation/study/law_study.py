@@ -53,7 +53,7 @@ from twin.validation.study.strata import Case, draw_case
 Json = dict[str, Any]
 DEFAULT_DIR, TABLE_FILE = Path("runs") / "study-laws", "laws.md"
 DEFAULT_CELLS = ("unknown/*/3/1%", "unknown/*/3/5%", "single/appendage/3/*", "none/*")
-STRONGER = 1.25  # ratio of the level of the test that leaves the fitted range
+LEVEL_RATIO = 1.25  # ratio of the level of the test that leaves the fitted range
 MAX_FLOOR_RATIO, MAX_RATIO_OUTSIDE, MIN_CLOSED = 1.1, 3.0, 0.9
 MAX_SECONDS, MAX_PARAMETER_ERROR = 60.0, 0.1
 MIN_CURVE_GAP = 0.01  # of the excursions: with less the base needs no law to predict them
@@ -67,7 +67,7 @@ def _change_sweep(**values: object) -> Profile:
     return parse_toml(text, Profile, "the study's test")
 
 
-STRONGER_TEST = _change_sweep(acceleration_g=0.05 * STRONGER)
+STRONGER_TEST = _change_sweep(acceleration_g=0.05 * LEVEL_RATIO)
 UNUSED_TEST = _change_sweep(start_hz=1.0, stop_hz=4.2)  # between the frequencies of the recording
 
 # Term with the form of the rig's own law, and its exponent; other laws have a form of their own.
@@ -112,11 +112,12 @@ def run_law_study(
     folder = open_study_folder(out or DEFAULT_DIR, resume)
     return run_cases(
         folder, numbers, Workers.from_options(workers),
-        partial(evaluate_law, folder, rig, has_rivals), RESULTS_FILE, format_law_row, write_page,
+        partial(evaluate_proposed_law, folder, rig, has_rivals),
+        RESULTS_FILE, format_law_row, write_page,
     )  # fmt: skip
 
 
-def evaluate_law(root: Path, rig: str, has_rivals: bool, number: int) -> Json:
+def evaluate_proposed_law(root: Path, rig: str, has_rivals: bool, number: int) -> Json:
     """Return the row of a case: held-out errors, the law, and what it predicts elsewhere."""
     case = draw_case(number)
     paths = generate_case(case, root)
@@ -124,7 +125,7 @@ def evaluate_law(root: Path, rig: str, has_rivals: bool, number: int) -> Json:
     row = select_case_facts(about) | {"label": case.label, "rig": rig}
     if not about["sized"]:
         return row
-    plant = _HiddenPlant(case, paths, rig)
+    plant = _LawPlant(case, paths, rig)
     row |= plant.record()
     if not row["sized"]:
         return row
@@ -164,7 +165,7 @@ def evaluate_law(root: Path, rig: str, has_rivals: bool, number: int) -> Json:
     return row
 
 
-class _HiddenPlant:
+class _LawPlant:
     """The sealed plant of a case on a rig, which plays its recording and other tests."""
 
     def __init__(self, case: Case, paths: CasePaths, rig: str) -> None:
@@ -218,7 +219,7 @@ def _measure_forces(residuals: LogResiduals, fitted: FittedSet) -> float:
 
 
 def _judge_predictions(
-    plant: _HiddenPlant, residuals: LogResiduals, null: FittedSet, best: FittedSet
+    plant: _LawPlant, residuals: LogResiduals, null: FittedSet, best: FittedSet
 ) -> Json:
     """Return the error in a stronger test, whether its range is said, and the gap in another."""
     stronger, unused = map(plant.simulate, (STRONGER_TEST, UNUSED_TEST))
@@ -307,7 +308,7 @@ def _judge_structure(law: LawProposal, about: Json) -> Json:
     row: Json = {"exact": is_exact}
     truth = hidden["parameters"]
     values = {name: own.typical for name, own in term.parameters.items()}
-    found = {
+    describe_resonator = {
         "appendage": lambda: (
             values
             | {
@@ -325,10 +326,10 @@ def _judge_structure(law: LawProposal, about: Json) -> Json:
         ),
         "cubic_appendage": lambda: values | {"damping": values["decay"]},
     }.get(hidden["name"])
-    if found is not None and expected == term.id.removeprefix(LAW_PREFIX):
-        own = found()
+    if describe_resonator is not None and expected == term.id.removeprefix(LAW_PREFIX):
+        own = describe_resonator()
         row["resonator"] = {name: own[name] / true - 1.0 for name, true in truth.items()}
-    elif found is not None:
+    elif describe_resonator is not None:
         row["resonator"] = {}
     return row
 
