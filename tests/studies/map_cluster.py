@@ -25,7 +25,7 @@ from twin.run.system import count_cores
 
 ROOT = Path(__file__).resolve().parents[2]
 ADDRESS = f"tcp://{HERE}:8786"
-CHUNK = 500
+CHUNK_CASES = 500
 DASK = [sys.executable, "-m", "dask"]
 PROGRAM = [sys.executable, "-c", "from twin.cli.entry import main; main()"]
 STUDY = """
@@ -97,7 +97,7 @@ def find_rate(out: Path, workers: int) -> float:
     """Return the sweeps a second from when every worker has stored its first chunk to the last."""
     chunks = (out / "results.zarr" / "peak_disp_m" / "c").iterdir()
     times = sorted(path.stat().st_mtime for path in chunks)
-    return (len(times) - workers) * CHUNK / (times[-1] - times[workers - 1])
+    return (len(times) - workers) * CHUNK_CASES / (times[-1] - times[workers - 1])
 
 
 def measure_rates(line: Cable, study: Path, folder: Path) -> None:
@@ -188,7 +188,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary, cable() as line:
         folder = Path(temporary)
         study = folder / "study.toml"
-        study.write_text(STUDY.format(chunk=CHUNK, count=asked.cases // 20))
+        study.write_text(STUDY.format(chunk=CHUNK_CASES, count=asked.cases // 20))
         start_map(study, folder / "local1", "--workers", "1").communicate()
         for name in [asked.only] if asked.only else PARTS:
             PARTS[name](line, study, folder)

@@ -78,10 +78,10 @@ def find_sharing_problem(path: Path, text: str) -> str:
     It runs on a worker of a cluster, to tell whether a folder of results is shared with it.
     """
     try:
-        seen = path.read_text(encoding="utf-8")
+        content = path.read_text(encoding="utf-8")
     except OSError as error:
         return f"it does not see {path} ({error.strerror})"
-    return "" if seen == text else f"it sees another {path}"
+    return "" if content == text else f"it sees another {path}"
 
 
 def _make_content_error(folder: Path) -> InputError:
