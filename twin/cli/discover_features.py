@@ -96,8 +96,8 @@ class _FeatureSearch:
             )  # fmt: skip
         if is_stopping():
             self.notes.append("stopped early: not every effect and pair was fitted")
-            print_line("refitting the base model from the winners")
-            base = refit_base(problem, base, fits)
+        print_line("refitting the base model from the winners")
+        base = refit_base(problem, base, fits)
         return rank_fits(problem, base, fits, excluded)
 
     def _run_stage(
