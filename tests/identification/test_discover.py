@@ -283,7 +283,9 @@ def test_whoever_has_enough_keeps_what_was_found() -> None:
     best = reports[-1].best  # of the two that it knew then: the model alone, and the first name
     assert best is not None
     assert best.names == reports[-2].names
-    assert discovery.verdict.best is best
+    kept = discovery.verdict.best  # `best` with wider intervals: a second effect is still missing
+    assert kept is not None
+    assert (kept.names, kept.cost) == (best.names, best.cost)
     assert best.cost < discovery.selection.null.cost
 
 
