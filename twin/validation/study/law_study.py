@@ -44,6 +44,7 @@ from twin.validation.study.rig_setup import (
     PROFILE,
     PROFILE_TOML,
     StudySignals,
+    add_hydraulic_instruments,
     make_hydraulic_rig_toml,
     make_rig_toml,
     simulate_signals,
@@ -176,10 +177,13 @@ class _LawPlant:
 
     def _make_rig(self, noise: float) -> str:
         text = self._truth.read_text(encoding="utf-8")
-        truth, sha256 = str(self._truth.resolve()), hash_truth(text)
         if self.rig == "simulated":
-            return make_rig_toml(noise, self.case.noise_seed, truth, sha256)
-        return make_hydraulic_rig_toml(self.case.noise_seed, truth, sha256)
+            truth = str(self._truth.resolve())
+            return make_rig_toml(noise, self.case.noise_seed, truth, hash_truth(text))
+        path = self._truth.with_name(f"truth_{self.rig}.toml")
+        text = add_hydraulic_instruments(text)
+        path.write_text(text, encoding="utf-8")
+        return make_hydraulic_rig_toml(self.case.noise_seed, str(path.resolve()), hash_truth(text))
 
     def record(self) -> Json:
         """Record the study's test on another rig than the simulated one; return how it ended."""

@@ -104,11 +104,22 @@ def compute_noise_rms(noise: float) -> dict[str, float]:
 
 
 def make_hydraulic_rig_toml(seed: int, truth: str, sha256: str) -> str:
-    """Return the config of the simulated hydraulic rig, with its own sensors and noise."""
-    path = PROFILES_DIR / "rigs" / "hydraulic.toml"
-    config = tomllib.loads(path.read_text(encoding="utf-8"))
+    """Return the config of the simulated hydraulic rig; its instruments are in the truth."""
+    config = _read_hydraulic_rig()
+    del config["simulated"]["hidden"]  # a rig takes either this or a truth
     config["simulated"] |= {"seed": seed, "truth": truth, "truth_sha256": sha256}
     return format_toml(config)
+
+
+def add_hydraulic_instruments(truth: str) -> str:
+    """Return the text of a truth with the instruments of the simulated hydraulic rig."""
+    hidden: dict[str, Any] = _read_hydraulic_rig()["simulated"]["hidden"]
+    return f"{truth}\n{format_toml(hidden)}"
+
+
+def _read_hydraulic_rig() -> dict[str, Any]:
+    path = PROFILES_DIR / "rigs" / "hydraulic.toml"
+    return tomllib.loads(path.read_text(encoding="utf-8"))
 
 
 def simulate_signals(rig_text: str, profile: Profile = PROFILE) -> StudySignals:
