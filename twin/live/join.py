@@ -170,9 +170,7 @@ class _JoinedRecorder:
             self._early_messages.append((topic_name, payload))
             return
         try:
-            for part in self.writer.select_recorded(item):
-                data = payload if part is item else encode_item(part, run)
-                self.writer.write(topic_name, data, part.index)
+            self.writer.write_item(topic_name, item, run, payload)
         except LogTimeError:  # an index beyond any sample of this run
             return
         self.completion.update(item)

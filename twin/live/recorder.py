@@ -132,9 +132,7 @@ class Recorder:
         if isinstance(item, RunStart):
             self.writer.write_run_description(item)
         try:
-            for part in self.writer.select_recorded(item):
-                data = payload if part is item else encode_item(part, run)
-                self.writer.write(topic_name, data, part.index)
+            self.writer.write_item(topic_name, item, run, payload)
         except LogTimeError:  # an index beyond any sample of this run
             self.impossible_count += 1
             return

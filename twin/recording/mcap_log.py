@@ -81,6 +81,12 @@ class LogWriter:
             return select_recorded(item, self._start)
         return (item,)
 
+    def write_item(self, topic: str, item: Item, run: str, payload: bytes = b"") -> None:
+        """Write what is recorded of an item; `payload` is its encoding, where there is one."""
+        for part in self.select_recorded(item):
+            data = payload if payload and part is item else encode_item(part, run)
+            self.write(topic, data, part.index)
+
     def write(
         self, topic: str, payload: bytes, index: int, publish_time: int | None = None
     ) -> None:
@@ -218,6 +224,5 @@ def write_items(path: Path, items: list[Item], start: RunStart) -> None:
     writer = LogWriter(path, start.rate_hz)
     writer.write_run_description(start)
     for item in items:
-        for part in writer.select_recorded(item):
-            writer.write(topic_for(part), encode_item(part, start.run), part.index)
+        writer.write_item(topic_for(item), item, start.run)
     writer.close()
