@@ -147,6 +147,16 @@ def identify_table_from_log(
 identification_app.add_typer(study_app, name="study", rich_help_panel=LEARN_PANEL)
 
 
+StudyFolder = Annotated[
+    Path | None,
+    typer.Option("--out", help="New folder for the study, or an existing one with --resume."),
+]
+StudyWorkers = Annotated[
+    int | None, typer.Option("--workers", help="Processes; default: all cores.")
+]
+StudyResume = Annotated[bool, typer.Option("--resume", help="Continue the study in --out.")]
+
+
 @study_app.callback()
 def _study_callback() -> None:
     """Require the name of the command even though there is one only."""
@@ -154,10 +164,7 @@ def _study_callback() -> None:
 
 @study_app.command("discovery")
 def discovery_command(
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", help="New folder for the study, or an existing one with --resume."),
-    ] = None,
+    out: StudyFolder = None,
     seeds: Annotated[
         int,
         typer.Option(
@@ -171,13 +178,11 @@ def discovery_command(
             help="Only these cells, such as 'single/*/3/1%', or a case number; repeatable.",
         ),
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option("--workers", help="Processes; default: all cores.")
-    ] = None,
+    workers: StudyWorkers = None,
     scheduler: Annotated[
         str, typer.Option("--scheduler", help="Address of a Dask scheduler whose workers compute.")
     ] = "",
-    resume: Annotated[bool, typer.Option("--resume", help="Continue the study in --out.")] = False,
+    resume: StudyResume = False,
     laboratory: Annotated[
         str,
         typer.Option(
@@ -203,19 +208,14 @@ def discovery_command(
 
 @study_app.command("decide")
 def decide_command(
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", help="New folder for the study, or an existing one with --resume."),
-    ] = None,
+    out: StudyFolder = None,
     seeds: Annotated[int, typer.Option("--seeds", help="Cases per cell; five times as many.")] = 2,
     cells: Annotated[
         list[str] | None,
         typer.Option("--cells", help="Only these cells, such as 'pair/*/1%'; repeatable."),
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option("--workers", help="Processes; default: all cores.")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue the study in --out.")] = False,
+    workers: StudyWorkers = None,
+    resume: StudyResume = False,
     first: Annotated[
         str,
         typer.Option(
@@ -231,10 +231,7 @@ def decide_command(
 
 @study_app.command("laws")
 def laws_command(
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", help="New folder for the study, or an existing one with --resume."),
-    ] = None,
+    out: StudyFolder = None,
     seeds: Annotated[
         int, typer.Option("--seeds", help="Cases per cell; five times as many without effect.")
     ] = 1,
@@ -242,10 +239,8 @@ def laws_command(
         list[str] | None,
         typer.Option("--cells", help="Only these cells, such as 'unknown/*/3/1%'; repeatable."),
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option("--workers", help="Processes; default: all cores.")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue the study in --out.")] = False,
+    workers: StudyWorkers = None,
+    resume: StudyResume = False,
     rig: Annotated[
         LawStudyRig, typer.Option("--rig", help="Rig that records the hidden laws.")
     ] = LawStudyRig.simulated,
