@@ -39,6 +39,11 @@ class RunStart:
     epoch_s: float  # monotonic clock of the host at sample 0, for latencies only
     predictions_every: int = 0  # of the twin's blocks only every n-th is recorded; 0: all
 
+    @property
+    def has_all_predictions(self) -> bool:
+        """Whether all of the twin's blocks are recorded."""
+        return self.predictions_every <= 1
+
 
 @dataclass(frozen=True, slots=True)
 class Params:

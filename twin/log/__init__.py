@@ -196,7 +196,7 @@ class Log:
 
     def _read_predictions(self) -> Recording:
         """Return the recording with the predictions; those not recorded are recomputed."""
-        if self.start.predictions_every <= 1:
+        if self.start.has_all_predictions:
             return read_recording(self.path, (PRED_TOPIC,))
         from twin.run.rerun import restore_predictions
 

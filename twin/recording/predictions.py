@@ -13,7 +13,7 @@ def select_recorded(block: Block, start: RunStart) -> list[Block]:
     A block that is recorded whole is returned itself.
     """
     every, size = start.predictions_every, start.block_samples
-    if block.stream != "pred" or every <= 1:
+    if block.stream != "pred" or start.has_all_predictions:
         return [block]
     period = every * size
     begins = range(block.index - block.index % period, block.end, period)

@@ -110,7 +110,7 @@ def restore_predictions(recording: Recording, config: RunConfig | None = None) -
     A recording with all of them is returned itself. Each hash is compared with the recorded one; a
     warning says where predictions are missing or are not those of the run.
     """
-    if recording.start.predictions_every <= 1:
+    if recording.start.has_all_predictions:
         return recording
     try:
         if DRIVE_CHANNEL not in recording.start.channels:
@@ -150,7 +150,7 @@ def _warn(recording: Recording, problem: str) -> None:
 
 def restore_log(path: Path, folder: Path) -> Path:
     """Return a log with all predictions: `path` itself, or a copy of it in `folder`."""
-    if read_start(path).predictions_every <= 1:
+    if read_start(path).has_all_predictions:
         return path
     recording = open_recording(path)
     restored = restore_predictions(recording)
