@@ -266,11 +266,7 @@ def make_law_candidate(family: TermFamily, scale: RecordScale) -> Candidate:
             unit=SHAPE_UNITS[name], low=low, high=high, typical=ladder[len(ladder) // 2],
             meaning="Exponent." if name in ("p", "n") else "Shape.",
         )  # fmt: skip
-    for name, value in used.items():
-        parameters[name] = LawParameter(
-            unit=REFERENCE_UNITS[name], low=0.5 * value, high=2 * value, typical=value,
-            meaning="Reference: largest value in the recordings.",
-        )  # fmt: skip
+    parameters |= describe_references(used)
     law = EffectFile(
         id=f"{LAW_PREFIX}{family.name}", title=family.title, place=family.place, force=family.force,
         parameters=parameters, states=dict(family.states),
@@ -284,6 +280,17 @@ def list_references(scale: RecordScale, texts: Sequence[str]) -> dict[str, float
     references = {"u0": scale.u, "v0": scale.v, "d0": scale.depth, "y0": scale.table_disp,
                   "t0": scale.duration_s}  # fmt: skip
     return {name: own for name, own in references.items() if any(name in text for text in texts)}
+
+
+def describe_references(references: Mapping[str, float]) -> dict[str, LawParameter]:
+    """Return the parameters of a law for largest values of the record, SI, by name."""
+    return {
+        name: LawParameter(
+            unit=REFERENCE_UNITS[name], low=0.5 * value, high=2 * value, typical=value,
+            meaning="Reference: largest value in the recordings.",
+        )
+        for name, value in references.items()
+    }  # fmt: skip
 
 
 def list_valid_range(place: LawPlace, scale: RecordScale) -> dict[str, tuple[float, float]]:

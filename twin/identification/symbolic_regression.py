@@ -17,8 +17,8 @@ from table_io.block import Float1D, Float2D
 from twin.identification.candidates import Candidate
 from twin.identification.law_terms import (
     LAW_PREFIX,
-    REFERENCE_UNITS,
     SHAPE_MARGIN,
+    describe_references,
     list_references,
     list_valid_range,
     make_candidate,
@@ -172,14 +172,7 @@ def make_term(
             typical=value,
             meaning="Coefficient.",
         )
-    for name, value in references.items():
-        parameters[name] = LawParameter(
-            unit=REFERENCE_UNITS[name],
-            low=0.5 * value,
-            high=2 * value,
-            typical=value,
-            meaning="Reference: largest value in the recordings.",
-        )
+    parameters |= describe_references(references)
     try:
         law = EffectFile(
             id=f"{SYMBOLIC_PREFIX}{number + 1}", title="expression of symbolic regression",
