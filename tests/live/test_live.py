@@ -205,6 +205,28 @@ def test_a_dead_twin_is_a_fault_a_dead_recorder_no_gap_and_a_dead_viewer_nothing
     assert "identical to the bit" in again.stdout
 
 
+def test_what_a_dead_twin_missed_reaches_a_recorder_that_starts_after_the_run(
+    tmp_path: Path,
+) -> None:
+    """As on a busy computer: the successors of twin and recorder start when the table rests."""
+    process = start(tmp_path)
+    running(process)
+    for component in ("twin", "recorder"):
+        kill(process, component)
+    deaths = read_until(process, r".*recorder died")
+    successors = [find_component(process, component) for component in ("twin", "recorder")]
+    for successor in successors:
+        os.kill(successor, signal.SIGSTOP)
+    deaths += read_until(process, "state: at rest")
+    for successor in successors:
+        os.kill(successor, signal.SIGCONT)
+    code, output, recording, summary = finish(process, tmp_path)
+    assert code == 0, deaths + output
+    assert_whole(recording)
+    (fault,) = recording.records(Fault)
+    assert (fault.component, fault.to_index) == ("twin", summary["run"]["samples"])
+
+
 @pytest.mark.slow  # 20 s
 def test_a_dead_twin_stops_the_table_where_so_configured(tmp_path: Path) -> None:
     process = start(tmp_path, profile=QUICK + '[on_death]\ntwin = "stop"\n')

@@ -311,17 +311,20 @@ class Supervisor:
             if component in self.children:
                 if component in ("gate", "twin", "rig"):
                     self.children[component].close_input()
-                self._await(component, max(deadline_s - self.clock.now(), 0.1))
+                self._await(component, link, max(deadline_s, self.clock.now() + 0.1))
         link.close()
 
-    def _await(self, component: str, seconds: float) -> None:
-        try:
-            if self.children[component].process.wait(seconds):
-                self.print_line(
-                    f"the {component} failed: {self.children[component].last_output_line}"
-                )
-        except subprocess.TimeoutExpired:
-            self.print_line(f"{component} does not finish; ending it")
+    def _await(self, component: str, link: BusLink, deadline_s: float) -> None:
+        """Wait for a process to end; a recorder that started late may still ask for a Fault."""
+        child = self.children[component]
+        while not child.has_exited:
+            if self.clock.now() > deadline_s:
+                self.print_line(f"{component} does not finish; ending it")
+                return
+            link.serve()
+            self.clock.wait_until(self.clock.now() + 0.01)
+        if child.process.returncode:
+            self.print_line(f"the {component} failed: {child.last_output_line}")
 
     def _reap(self) -> None:
         """End all remaining processes: close their input, then kill."""
