@@ -2,12 +2,14 @@
 
 import hashlib
 import tempfile
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 from table_io.acquisition.session import SessionSetup, run_session
 from table_io.backends import open_backend
 from table_io.block import Block
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.profile import Profile
@@ -15,13 +17,15 @@ from table_io.config.rig import RigConfig
 from table_io.records import RunStart
 from table_io.sim.config import SimulatedTableConfig
 from twin.identification.discover import PreparedLog
-from twin.identification.signals import build_signals
+from twin.identification.signals import LogSignals, build_signals
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 
 RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 TRUE = Parameters(550.0, 36e3, 1.1e3, 510e3, 900.0, 510e3, 900.0, 0.002, 0.002)
 SNM = Model(TRUE)
+CELL_SHARE = 0.52  # of the right force in its first cell, and of the left one in its second
+ACC_GAIN = 1.008
 
 
 def profile(gap_mm: float = 4.0, start_hz: float = 1.4, stop_hz: float = 4.4) -> Profile:
@@ -74,6 +78,24 @@ def log(truth: str = "", noise: float = 1.0, gap_mm: float = 4.0) -> PreparedLog
     test = profile(gap_mm)
     readings = build_signals(blocks(truth, noise, gap_mm), "short", 550.0, test.specimen.gaps_m)
     return PreparedLog(readings, test.comparison.contact_n, test.sweep.steps)
+
+
+def distort(signals: LogSignals) -> LogSignals:
+    """Return the signals of a laboratory with shared loads and a gain of an accelerometer."""
+    spectra = dict(signals.spectra)
+    for cells, share in ((RIGHT_CELLS, CELL_SHARE), (LEFT_CELLS, 1.0 - CELL_SHARE)):
+        force = spectra[cells[0]] + spectra[cells[1]]
+        moved = (share - 0.5) * force
+        spectra |= {cells[0]: spectra[cells[0]] + moved, cells[1]: spectra[cells[1]] - moved}
+    spectra["mass_acc_m_s2"] = ACC_GAIN * spectra["mass_acc_m_s2"]
+    return replace(signals, spectra=spectra)
+
+
+@cache
+def imperfect_log(truth: str = "") -> PreparedLog:
+    """The same, of such a laboratory."""
+    prepared = log(truth)
+    return replace(prepared, signals=distort(prepared.signals))
 
 
 def format_truth(effect: str, channel: str = "", form: str = "", **parameters: float) -> str:

@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from tests.identification.played import SNM, format_truth, log
+from tests.identification.played import SNM, format_truth, imperfect_log, log
 from twin.identification import law_search
 from twin.identification.discover import prepare_problem
-from twin.identification.law_search import propose_law, search_laws
+from twin.identification.law_search import find_law_of_base, propose_law, search_laws
 from twin.identification.law_terms import FAMILIES, list_law_candidates
 from twin.identification.motion import RecordScale
 from twin.identification.parameters import EffectKey
@@ -109,8 +109,22 @@ def test_the_planted_law_is_the_best(truth, name, place):
     assert best.cost < 1.1 * prepared.problem.noise
 
 
+def test_a_law_is_found_beside_the_errors_of_instruments():
+    prepared = prepare_problem([imperfect_log(format_truth("cubic_damping", c3=4e4))], SNM)
+    ideal_null = prepared.problem.fit_effects(prepared.parameters, ())
+    problem, null, proposal = find_law_of_base(prepared, ideal_null)
+    assert null.cost > 1.5 * problem.noise
+    assert proposal is not None
+    assert proposal.is_sufficient
+    (law,) = proposal.laws
+    (parameter,) = law.parameters.values()
+    assert "**3" in law.force
+    assert parameter.typical == pytest.approx(4e4, rel=0.05)
+
+
 @pytest.mark.slow
 class TestProposal:
+    @pytest.mark.parametrize("record", [log, imperfect_log])
     @pytest.mark.parametrize(
         ("truth", "exponent", "value", "unit"),
         [
@@ -118,10 +132,10 @@ class TestProposal:
             (format_truth("even_stiffness", ke=1e6), 2, 1e6, "N/m2"),
         ],
     )
-    def test_the_planted_law_is_written_with_its_number(self, truth, exponent, value, unit):
+    def test_the_planted_law_is_written_with_its_number(self, truth, exponent, value, unit, record):
         from twin.identification.discover import discover_effects
 
-        discovery = discover_effects([log(truth)], SNM)
+        discovery = discover_effects([record(truth)], SNM)
         _, proposal = propose_law(discovery)
         assert proposal is not None
         (law,) = proposal.laws

@@ -8,10 +8,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from table_io.channels import LEFT_CELLS, RIGHT_CELLS
-from tests.identification.played import SNM, TRUE, format_truth, log
+from tests.identification.played import (
+    ACC_GAIN,
+    CELL_SHARE,
+    SNM,
+    TRUE,
+    format_truth,
+    imperfect_log,
+    log,
+)
 from twin.identification.discover import (
-    PreparedLog,
     PreparedProblem,
     add_nuisances,
     discover_effects,
@@ -30,27 +36,6 @@ from twin.identification.nuisances import (
 from twin.identification.parameters import DAMPING, STIFFNESS, NuisanceKey
 from twin.identification.residuals import Nuisance
 from twin.identification.selection import MAX_EXPLAINED_COST
-from twin.identification.signals import LogSignals
-
-CELL_SHARE = 0.52  # of the right force in its first cell, and of the left one in its second
-ACC_GAIN = 1.008
-
-
-def distort(signals: LogSignals) -> LogSignals:
-    """Return the signals of a laboratory with shared loads and a gain of an accelerometer."""
-    spectra = dict(signals.spectra)
-    for cells, share in ((RIGHT_CELLS, CELL_SHARE), (LEFT_CELLS, 1.0 - CELL_SHARE)):
-        force = spectra[cells[0]] + spectra[cells[1]]
-        moved = (share - 0.5) * force
-        spectra |= {cells[0]: spectra[cells[0]] + moved, cells[1]: spectra[cells[1]] - moved}
-    spectra["mass_acc_m_s2"] = ACC_GAIN * spectra["mass_acc_m_s2"]
-    return replace(signals, spectra=spectra)
-
-
-@cache
-def imperfect_log(truth: str = "") -> PreparedLog:
-    prepared = log(truth)
-    return replace(prepared, signals=distort(prepared.signals))
 
 
 @cache

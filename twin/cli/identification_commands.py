@@ -209,7 +209,9 @@ def discovery_command(
 @study_app.command("decide")
 def decide_command(
     out: StudyFolder = None,
-    seeds: Annotated[int, typer.Option("--seeds", help="Cases per cell; five times as many of pairs.")] = 2,
+    seeds: Annotated[
+        int, typer.Option("--seeds", help="Cases per cell; five times as many of pairs.")
+    ] = 2,
     cells: Annotated[
         list[str] | None,
         typer.Option("--cells", help="Only these cells, such as 'pair/*/1%'; repeatable."),

@@ -109,6 +109,8 @@ class Discovery:
     map_after: tuple[ResidualCell, ...]
     notes: tuple[str, ...]
     ideal: "Discovery | None" = None  # the same with ideal instruments, where these were tried too
+    # The same with nuisances, where these were tried too and explain no more than the effects.
+    with_nuisances: "Discovery | None" = None
 
     @property
     def model(self) -> Model:
@@ -166,14 +168,15 @@ def prepare_problem(
 
 
 def add_nuisances(
-    prepared: PreparedProblem, ideal_cost: float, effects: Sequence[Candidate] = ()
+    prepared: PreparedProblem, ideal_cost: float, found: FittedSet | None = None
 ) -> PreparedProblem:
     """Return the problem with linear terms for the nuisances of instruments and set-up.
 
     `ideal_cost` is the mean square over the noise that remains with ideal instruments. Lasers and
     accelerometers are compared first, on the rows that no force law enters: that gives their noise
     in motion, and the nuisances about which the terms are linear. Then the forces have their say,
-    with these `effects` in the model: without one that is there, nuisances would stand in for it.
+    with the effects `found` in the model: without one that is there, nuisances would stand in for
+    it.
     """
     problem, mapper, first = prepared.problem, prepared.problem.mapper, prepared.parameters
     moving = sum(int(residuals.motion().moving.sum()) for residuals in problem.log_residuals)
@@ -199,13 +202,14 @@ def add_nuisances(
             for residuals in log_residuals
         )
         start = _start_nuisances(log_residuals, fit.parameters.with_free(first.free))
-        for effect in effects:
-            start = effect.add_to(start, effect.shapes[0], _small_amplitude(effect))
+        if found is not None:
+            start = add_found_effects(start, found)
         fit = fit_parameters(log_residuals, start, mapper=mapper)
-    if effects:
-        added = [free for effect in effects for free in effect.free]
-        start = _start_nuisances(log_residuals, fit.parameters.without(added))
-        fit = fit_parameters(log_residuals, start, mapper=mapper)
+    if found is not None and found.effects:
+        without = fit.parameters
+        for effect in found.effects:
+            without = effect.remove_from(without)
+        fit = fit_parameters(log_residuals, _start_nuisances(log_residuals, without), mapper=mapper)
     return replace(
         prepared,
         problem=replace(
@@ -218,6 +222,15 @@ def add_nuisances(
         ),
         first_fit=fit,
     )
+
+
+def add_found_effects(parameters: ParameterSet, found: FittedSet) -> ParameterSet:
+    """Return the parameters with the effects of a fitted set, free, at their fitted values."""
+    values = found.fit.parameters.values
+    for effect in found.effects:
+        shape = [values[free.key] for free in effect.free if free is not effect.amplitude]
+        parameters = effect.add_to(parameters, shape, values[effect.amplitude.key])
+    return parameters
 
 
 def _drop_sound_sensors(problem: SelectionProblem) -> tuple[Candidate, ...]:
@@ -358,19 +371,28 @@ def discover_effects(
     if not _can_explain(imperfect, discovery):
         return discovery
     with_nuisances = _select_and_judge(imperfect, logs, model, report)
-    effects = with_nuisances.verdict.best.effects
-    if effects and with_nuisances.selection.complete:
-        imperfect = add_nuisances(prepared, ideal_cost, effects)
+    found = with_nuisances.verdict.best
+    if found.effects and with_nuisances.selection.complete:
+        imperfect = add_nuisances(prepared, ideal_cost, found)
         with_nuisances = _select_and_judge(imperfect, logs, model, report)
-    best = with_nuisances.verdict.best
-    ideal = _fit_with_effects(prepared, best)
-    widened = widen_intervals(best.fit, ideal, prepared.problem.log_residuals)
-    verdict = replace(with_nuisances.verdict, best=replace(best, fit=widened))
+    best = widen_with_ideal(prepared, with_nuisances.verdict.best)
+    verdict = replace(with_nuisances.verdict, best=best)
     with_nuisances = replace(with_nuisances, verdict=verdict, ideal=discovery)
     if not with_nuisances.selection.complete:
         return replace(discovery, selection=replace(discovery.selection, complete=False))
     is_ended_early = count_sensor_errors(discovery.selection.best) > MAX_IDEAL_ERRORS
-    return with_nuisances if is_ended_early or _is_explained(with_nuisances.verdict) else discovery
+    if is_ended_early or _is_explained(with_nuisances.verdict):
+        return with_nuisances
+    return replace(discovery, with_nuisances=with_nuisances)
+
+
+def widen_with_ideal(prepared: PreparedProblem, fitted: FittedSet) -> FittedSet:
+    """Return a set fitted with nuisances, its intervals widened by what these leave open.
+
+    `prepared` is the problem with ideal instruments.
+    """
+    ideal = _fit_with_effects(prepared, fitted)
+    return replace(fitted, fit=widen_intervals(fitted.fit, ideal, prepared.problem.log_residuals))
 
 
 def _can_explain(imperfect: PreparedProblem, ideal: Discovery) -> bool:
@@ -381,7 +403,7 @@ def _can_explain(imperfect: PreparedProblem, ideal: Discovery) -> bool:
     """
     best = ideal.verdict.best
     logs = zip(ideal.prepared.problem.log_residuals, best.held_out, strict=True)
-    if any(_sensors_disagree(residuals, held_out) for residuals, held_out in logs):
+    if any(sensors_disagree(residuals, held_out) for residuals, held_out in logs):
         return True
     max_cost = MAX_EXPLAINED_COST * imperfect.problem.noise
     return (
@@ -391,16 +413,13 @@ def _can_explain(imperfect: PreparedProblem, ideal: Discovery) -> bool:
 
 def _fit_with_effects(prepared: PreparedProblem, fitted: FittedSet) -> FitResult:
     """Return the fit of a prepared problem with the effects of a set that was fitted to another."""
-    problem, start = prepared.problem, prepared.parameters
-    added = [free for effect in fitted.effects for free in effect.free]
-    if not added:
+    if not fitted.effects:
         return prepared.first_fit
-    values = {free.key: fitted.fit.parameters.values[free.key] for free in added}
-    start = start.with_values(values).with_free((*start.free, *added))
+    problem, start = prepared.problem, add_found_effects(prepared.parameters, fitted)
     return fit_parameters(problem.log_residuals, start, mapper=problem.mapper)
 
 
-def _sensors_disagree(residuals: LogResiduals, held_out: Float1D) -> bool:
+def sensors_disagree(residuals: LogResiduals, held_out: Float1D) -> bool:
     """Return True if sensors of one body or side differ beyond their noise."""
     entries = [
         held_out[residuals.entry_row == row] * residuals.weight

@@ -8,12 +8,19 @@ Exponents that the data allow to be round are rounded.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from twin.identification.candidates import Candidate
-from twin.identification.discover import Discovery
+from twin.identification.discover import (
+    Discovery,
+    PreparedProblem,
+    add_found_effects,
+    add_nuisances,
+    sensors_disagree,
+    widen_with_ideal,
+)
 from twin.identification.law_terms import (
     find_law_class,
     list_law_candidates,
@@ -67,9 +74,14 @@ class LawProposal:
         return closed_fraction(self.start.cost, self.fitted.cost, self.floor)
 
     @property
+    def floor_ratio(self) -> float:
+        """Ratio of the held-out error (rms) to the floor."""
+        return math.sqrt(self.fitted.cost / self.floor)
+
+    @property
     def is_sufficient(self) -> bool:
         """True if the held-out error is at most `SUFFICIENT_RATIO` of the floor."""
-        return math.sqrt(self.fitted.cost / self.floor) <= SUFFICIENT_RATIO
+        return self.floor_ratio <= SUFFICIENT_RATIO
 
 
 def is_explained(discovery: Discovery) -> bool:
@@ -83,23 +95,87 @@ def propose_law(
 ) -> tuple[Discovery, LawProposal | None]:
     """Return a law for what a discovery leaves unexplained, and the discovery that it belongs to.
 
-    No law if nothing is left unexplained, or none helps. The discovery is another one where a law
-    suffices with ideal instruments.
+    No law if nothing is left unexplained, or none helps. The discovery is the one with ideal
+    instruments, or with nuisances, where a law suffices with these.
     """
-    verdict, selection = discovery.verdict, discovery.selection
     if is_explained(discovery):
         return discovery, None
-    if discovery.ideal is not None and verdict.outcome == "unexplained":
-        # A law of a few numbers says more than many errors of instruments that do not suffice.
-        ideal, law = propose_law(discovery.ideal, report)
-        if law is not None and law.is_sufficient:
-            return ideal, law
+    # A law of a few numbers says more than many errors of instruments that do not suffice.
+    ideal = discovery.ideal if discovery.verdict.outcome == "unexplained" else None
+    proposals: list[tuple[Discovery, LawProposal]] = []
+    for tried in (ideal, discovery, discovery.with_nuisances):
+        proposal = _propose_law_of(tried, report) if tried is not None else None
+        if proposal is not None:
+            proposals.append(proposal)
+            if proposal[1].is_sufficient:
+                break
+    if not proposals:
+        return discovery, None
+    return min(proposals, key=lambda proposal: proposal[1].floor_ratio)
+
+
+def _propose_law_of(
+    discovery: Discovery, report: ProgressCallback
+) -> tuple[Discovery, LawProposal] | None:
+    """Return a law for what the base, or the best effects, of this discovery leave.
+
+    And the discovery with the problem to which the law was fitted.
+    """
+    verdict, selection = discovery.verdict, discovery.selection
     starts = [selection.null, *([verdict.best] if verdict.best.effects else [])]
     singles = [fitted for fitted in selection.tried if len(fitted.effects) == 1]
     nearest = min(singles, key=lambda fitted: fitted.cost, default=None)
     nearest_name = nearest.names[0] if nearest else ""
-    problem = discovery.prepared.problem
-    return discovery, find_law(problem, starts, verdict.floor, nearest_name, report)
+    prepared = discovery.prepared
+    law = find_law(prepared.problem, starts, verdict.floor, nearest_name, report)
+    if law is not None and discovery.ideal is not None:
+        prepared, law = refit_nuisances(discovery.ideal.prepared, law)
+    return None if law is None else (replace(discovery, prepared=prepared), law)
+
+
+def find_law_of_base(
+    prepared: PreparedProblem, null: FittedSet
+) -> tuple[SelectionProblem, FittedSet, LawProposal | None]:
+    """Return (problem, its base, law) without a search of the library before.
+
+    With nuisances where sensors disagree and no law suffices with ideal ones. `null` is the base of
+    the prepared problem.
+    """
+    problem = prepared.problem
+    law = find_law(problem, [null], problem.noise)
+    logs = zip(problem.log_residuals, null.held_out, strict=True)
+    if (law is not None and law.is_sufficient) or not any(
+        sensors_disagree(residuals, held_out) for residuals, held_out in logs
+    ):
+        return problem, null, law
+    imperfect = add_nuisances(prepared, problem.least_weight**2 * null.cost)
+    own_null = imperfect.problem.fit_effects(imperfect.parameters, ())
+    own = find_law(imperfect.problem, [own_null], imperfect.problem.noise)
+    if own is None:
+        return problem, null, law
+    imperfect, own = refit_nuisances(prepared, own)
+    return imperfect.problem, own_null, own
+
+
+def refit_nuisances(
+    prepared: PreparedProblem, law: LawProposal
+) -> tuple[PreparedProblem, LawProposal]:
+    """Return a law found with nuisances, fitted with nuisances that are linear about it.
+
+    And the problem with these nuisances. `prepared` is the problem with ideal instruments.
+    Nuisances that were fitted without the law stand in for a part of it.
+    """
+    ideal_cost = prepared.problem.least_weight**2 * prepared.first_fit.cost
+    imperfect = add_nuisances(prepared, ideal_cost, law.fitted)
+    start = add_found_effects(imperfect.parameters, law.fitted)
+    refitted = imperfect.problem.fit_effects(start, law.fitted.effects)
+    fitted = widen_with_ideal(prepared, refitted)
+    terms = fitted.effects[len(law.start.effects) :]
+    laws = tuple(
+        _describe_law(imperfect.problem, fitted, term, old.nearest)
+        for term, old in zip(terms, law.laws, strict=True)
+    )
+    return imperfect, replace(law, fitted=fitted, laws=laws, floor=min(law.floor, fitted.cost))
 
 
 def find_law(

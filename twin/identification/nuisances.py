@@ -281,7 +281,9 @@ def _compute_noise_shares(
         noise = evaluate_noise(channel, np.ones_like(signals.omega))
         scaled = {"gain": noise}
         if channel in ACCELEROMETERS:
-            scaled["resonance"] = evaluate_noise(channel, signals.omega**2)
+            # never more than the noise itself, along which a force law need not be linear
+            largest = float(signals.omega[-1]) ** 2
+            scaled["resonance"] = largest * evaluate_noise(channel, signals.omega**2 / largest)
         return {
             kind: np.bincount(rows, weights=noise * values) / counts
             for kind, values in scaled.items()

@@ -22,7 +22,7 @@ from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.errors import InputError
 from twin.identification.discover import prepare_problem
-from twin.identification.law_search import LawProposal, find_law
+from twin.identification.law_search import LawProposal, find_law_of_base
 from twin.identification.law_terms import LAW_PREFIX
 from twin.identification.localization import estimate_repeatability_floor
 from twin.identification.residuals import FORCE_ROWS, LogResiduals
@@ -134,9 +134,8 @@ def evaluate_proposed_law(root: Path, rig: str, has_rivals: bool, number: int) -
     clock = RealClock()
     start_s, start_cpu_s = clock.now(), cpu_seconds()
     prepared = prepare_problem(logs, model)
-    problem = prepared.problem
-    null = problem.fit_effects(prepared.parameters, ())
-    law = find_law(problem, [null], problem.noise)
+    null = prepared.problem.fit_effects(prepared.parameters, ())
+    problem, null, law = find_law_of_base(prepared, null)
     row |= {"wall_s": clock.now() - start_s, "seconds": cpu_seconds() - start_cpu_s}
     best = law.fitted if law else null
     (residuals,) = problem.log_residuals
