@@ -127,9 +127,13 @@ def _propose_law_of(
     nearest = min(singles, key=lambda fitted: fitted.cost, default=None)
     nearest_name = nearest.names[0] if nearest else ""
     prepared = discovery.prepared
-    law = find_law(prepared.problem, starts, verdict.floor, nearest_name, report)
-    if law is not None and discovery.ideal is not None:
-        prepared, law = refit_nuisances(discovery.ideal.prepared, law)
+    if discovery.ideal is None:
+        law = find_law(prepared.problem, starts, verdict.floor, nearest_name, report)
+    else:
+        ideal = discovery.ideal.prepared
+        prepared, _, law = find_law_beside_nuisances(
+            ideal, prepared, starts, verdict.floor, nearest_name, report
+        )
     return None if law is None else (replace(discovery, prepared=prepared), law)
 
 
@@ -150,11 +154,38 @@ def find_law_of_base(
         return problem, null, law
     imperfect = add_nuisances(prepared, problem.least_weight**2 * null.cost)
     own_null = imperfect.problem.fit_effects(imperfect.parameters, ())
-    own = find_law(imperfect.problem, [own_null], imperfect.problem.noise)
-    if own is None:
-        return problem, null, law
-    imperfect, own = refit_nuisances(prepared, own)
-    return imperfect.problem, own_null, own
+    floor = imperfect.problem.noise
+    imperfect, own_null, own = find_law_beside_nuisances(prepared, imperfect, [own_null], floor)
+    return (problem, null, law) if own is None else (imperfect.problem, own_null, own)
+
+
+def find_law_beside_nuisances(
+    prepared: PreparedProblem,
+    imperfect: PreparedProblem,
+    starts: Sequence[FittedSet],
+    floor: float,
+    nearest: str = "",
+    report: ProgressCallback = lambda progress: None,
+) -> tuple[PreparedProblem, FittedSet, LawProposal | None]:
+    """Return (problem, its base, law) of a problem with nuisances, as `find_law` does.
+
+    `prepared` is the same with ideal instruments. Nuisances that are linear about a model without
+    the law may hide how much the law explains: where none suffices, they are made linear about the
+    best one, and the search is repeated.
+    """
+    problem, null = imperfect.problem, starts[0]
+    fitted_sets = search_laws(problem, starts, report)
+    law = select_law(problem, starts, fitted_sets, floor, nearest)
+    if fitted_sets and (law is None or not law.is_sufficient):
+        ideal_cost = prepared.problem.least_weight**2 * prepared.first_fit.cost
+        imperfect = add_nuisances(prepared, ideal_cost, fitted_sets[0])
+        problem = imperfect.problem
+        null = problem.fit_effects(imperfect.parameters, ())
+        law = find_law(problem, [null], floor, nearest, report)
+    if law is None:
+        return imperfect, null, None
+    imperfect, law = refit_nuisances(prepared, law)
+    return imperfect, null, law
 
 
 def refit_nuisances(
@@ -169,7 +200,7 @@ def refit_nuisances(
     imperfect = add_nuisances(prepared, ideal_cost, law.fitted)
     start = add_found_effects(imperfect.parameters, law.fitted)
     refitted = imperfect.problem.fit_effects(start, law.fitted.effects)
-    fitted = widen_with_ideal(prepared, refitted)
+    fitted = widen_with_ideal(prepared, _round_exponents(imperfect.problem, refitted))
     terms = fitted.effects[len(law.start.effects) :]
     laws = tuple(
         _describe_law(imperfect.problem, fitted, term, old.nearest)
@@ -189,7 +220,17 @@ def find_law(
 
     `floor` is the mean square over the noise that remains without a misfit.
     """
-    fitted_sets = search_laws(problem, starts, report)
+    return select_law(problem, starts, search_laws(problem, starts, report), floor, nearest)
+
+
+def select_law(
+    problem: SelectionProblem,
+    starts: Sequence[FittedSet],
+    fitted_sets: Sequence[FittedSet],
+    floor: float,
+    nearest: str,
+) -> LawProposal | None:
+    """Return the law of `find_law` among the sets that a search has fitted."""
     if not fitted_sets:
         return None
     best = _round_exponents(problem, _select_simplest(problem, fitted_sets))
