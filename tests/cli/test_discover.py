@@ -165,6 +165,7 @@ def test_bumpers_that_the_profile_does_not_know(tmp_path: Path) -> None:
     assert sum("no left bumper" in text for text in notes) == 2
 
 
+@pytest.mark.slow  # a minute: every law is tried
 def test_time_that_runs_backwards_is_no_model_and_no_crash(plain: Made, tmp_path: Path) -> None:
     log = change_log(plain, tmp_path, lambda _, values: values[::-1])
     verdict, discovery = discover_from([log], tmp_path / "out")
