@@ -16,7 +16,13 @@ def trials(tmp_path_factory: pytest.TempPathFactory) -> Trials:
     return Trials(tmp_path_factory.mktemp("trials"))
 
 
-@pytest.mark.parametrize("number", [1, 2, 3, 4, 5, 6, 7, 9, 14, 15, 16, 18, 108])
+@pytest.mark.parametrize(
+    "number",
+    [
+        1, 2, 3, 4, 5, 6, 7, 9, 14, 15, 16, 18,
+        pytest.param(108, marks=pytest.mark.slow),  # half a minute
+    ],
+)  # fmt: skip
 def test_a_hostile_file_is_refused_or_read(
     number: int, trials: Trials, capsys: pytest.CaptureFixture[str]
 ) -> None:

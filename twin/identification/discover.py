@@ -168,15 +168,15 @@ def prepare_problem(
 
 
 def add_nuisances(
-    prepared: PreparedProblem, ideal_cost: float, found: FittedSet | None = None
+    prepared: PreparedProblem, ideal_cost: float, fitted: FittedSet | None = None
 ) -> PreparedProblem:
     """Return the problem with linear terms for the nuisances of instruments and set-up.
 
     `ideal_cost` is the mean square over the noise that remains with ideal instruments. Lasers and
     accelerometers are compared first, on the rows that no force law enters: that gives their noise
     in motion, and the nuisances about which the terms are linear. Then the forces have their say,
-    with the effects `found` in the model: without one that is there, nuisances would stand in for
-    it.
+    with the effects of `fitted` in the model: without one that is there, nuisances would stand in
+    for it.
     """
     problem, mapper, first = prepared.problem, prepared.problem.mapper, prepared.parameters
     moving = sum(int(residuals.motion().moving.sum()) for residuals in problem.log_residuals)
@@ -202,12 +202,12 @@ def add_nuisances(
             for residuals in log_residuals
         )
         start = _start_nuisances(log_residuals, fit.parameters.with_free(first.free))
-        if found is not None:
-            start = add_found_effects(start, found)
+        if fitted is not None:
+            start = add_fitted_effects(start, fitted)
         fit = fit_parameters(log_residuals, start, mapper=mapper)
-    if found is not None and found.effects:
+    if fitted is not None and fitted.effects:
         without = fit.parameters
-        for effect in found.effects:
+        for effect in fitted.effects:
             without = effect.remove_from(without)
         fit = fit_parameters(log_residuals, _start_nuisances(log_residuals, without), mapper=mapper)
     return replace(
@@ -224,10 +224,10 @@ def add_nuisances(
     )
 
 
-def add_found_effects(parameters: ParameterSet, found: FittedSet) -> ParameterSet:
+def add_fitted_effects(parameters: ParameterSet, fitted: FittedSet) -> ParameterSet:
     """Return the parameters with the effects of a fitted set, free, at their fitted values."""
-    values = found.fit.parameters.values
-    for effect in found.effects:
+    values = fitted.fit.parameters.values
+    for effect in fitted.effects:
         shape = [values[free.key] for free in effect.free if free is not effect.amplitude]
         parameters = effect.add_to(parameters, shape, values[effect.amplitude.key])
     return parameters
@@ -371,9 +371,9 @@ def discover_effects(
     if not _can_explain(imperfect, discovery):
         return discovery
     with_nuisances = _select_and_judge(imperfect, logs, model, report)
-    found = with_nuisances.verdict.best
-    if found.effects and with_nuisances.selection.complete:
-        imperfect = add_nuisances(prepared, ideal_cost, found)
+    first = with_nuisances.verdict.best
+    if first.effects and with_nuisances.selection.complete:
+        imperfect = add_nuisances(prepared, ideal_cost, first)
         with_nuisances = _select_and_judge(imperfect, logs, model, report)
     best = widen_with_ideal(prepared, with_nuisances.verdict.best)
     verdict = replace(with_nuisances.verdict, best=best)
@@ -415,7 +415,7 @@ def _fit_with_effects(prepared: PreparedProblem, fitted: FittedSet) -> FitResult
     """Return the fit of a prepared problem with the effects of a set that was fitted to another."""
     if not fitted.effects:
         return prepared.first_fit
-    problem, start = prepared.problem, add_found_effects(prepared.parameters, fitted)
+    problem, start = prepared.problem, add_fitted_effects(prepared.parameters, fitted)
     return fit_parameters(problem.log_residuals, start, mapper=problem.mapper)
 
 

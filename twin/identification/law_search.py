@@ -16,7 +16,7 @@ from twin.identification.candidates import Candidate
 from twin.identification.discover import (
     Discovery,
     PreparedProblem,
-    add_found_effects,
+    add_fitted_effects,
     add_nuisances,
     sensors_disagree,
     widen_with_ideal,
@@ -198,7 +198,7 @@ def refit_nuisances(
     """
     ideal_cost = prepared.problem.least_weight**2 * prepared.first_fit.cost
     imperfect = add_nuisances(prepared, ideal_cost, law.fitted)
-    start = add_found_effects(imperfect.parameters, law.fitted)
+    start = add_fitted_effects(imperfect.parameters, law.fitted)
     refitted = imperfect.problem.fit_effects(start, law.fitted.effects)
     fitted = widen_with_ideal(prepared, _round_exponents(imperfect.problem, refitted))
     terms = fitted.effects[len(law.start.effects) :]
