@@ -111,8 +111,7 @@ def test_the_planted_law_is_the_best(truth, name, place):
 
 def test_a_law_is_found_beside_the_errors_of_instruments():
     prepared = prepare_problem([imperfect_log(format_truth("cubic_damping", c3=4e4))], SNM)
-    ideal_null = prepared.problem.fit_effects(prepared.parameters, ())
-    problem, null, proposal = find_law_of_base(prepared, ideal_null)
+    problem, null, proposal = find_law_of_base(prepared)
     assert null.cost > 1.5 * problem.noise
     assert proposal is not None
     assert proposal.is_sufficient

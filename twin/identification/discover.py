@@ -92,6 +92,12 @@ class PreparedProblem:
     def parameters(self) -> ParameterSet:
         return self.first_fit.parameters
 
+    @property
+    def base_cost(self) -> float:
+        """Mean square over the noise that the base leaves, with ideal instruments."""
+        # where model error limits the fit, the residual is divided by it
+        return self.problem.least_weight**2 * self.first_fit.cost
+
 
 @dataclass(frozen=True, eq=False)
 class Discovery:
@@ -109,7 +115,7 @@ class Discovery:
     map_after: tuple[ResidualCell, ...]
     notes: tuple[str, ...]
     ideal: "Discovery | None" = None  # the same with ideal instruments, where these were tried too
-    # The same with nuisances, where these were tried too and explain no more than the effects.
+    # The same with nuisances, where these were tried too and do not explain the recordings either.
     with_nuisances: "Discovery | None" = None
 
     @property
@@ -203,13 +209,11 @@ def add_nuisances(
         )
         start = _start_nuisances(log_residuals, fit.parameters.with_free(first.free))
         if fitted is not None:
-            start = add_fitted_effects(start, fitted)
+            start = fitted.add_to(start)
         fit = fit_parameters(log_residuals, start, mapper=mapper)
     if fitted is not None and fitted.effects:
-        without = fit.parameters
-        for effect in fitted.effects:
-            without = effect.remove_from(without)
-        fit = fit_parameters(log_residuals, _start_nuisances(log_residuals, without), mapper=mapper)
+        start = _start_nuisances(log_residuals, fitted.remove_from(fit.parameters))
+        fit = fit_parameters(log_residuals, start, mapper=mapper)
     return replace(
         prepared,
         problem=replace(
@@ -222,15 +226,6 @@ def add_nuisances(
         ),
         first_fit=fit,
     )
-
-
-def add_fitted_effects(parameters: ParameterSet, fitted: FittedSet) -> ParameterSet:
-    """Return the parameters with the effects of a fitted set, free, at their fitted values."""
-    values = fitted.fit.parameters.values
-    for effect in fitted.effects:
-        shape = [values[free.key] for free in effect.free if free is not effect.amplitude]
-        parameters = effect.add_to(parameters, shape, values[effect.amplitude.key])
-    return parameters
 
 
 def _drop_sound_sensors(problem: SelectionProblem) -> tuple[Candidate, ...]:
@@ -260,11 +255,9 @@ def _start_nuisances(
 
 def explain_with_nuisances(prepared: PreparedProblem) -> PreparedProblem:
     """Return the problem with nuisances if they, but not ideal sensors, explain the logs."""
-    # where model error limits the fit, the residual is divided by it: this is over the noise
-    cost = prepared.problem.least_weight**2 * prepared.first_fit.cost
-    if cost <= MAX_EXPLAINED_COST:
+    if prepared.base_cost <= MAX_EXPLAINED_COST:
         return prepared
-    imperfect = add_nuisances(prepared, cost)
+    imperfect = add_nuisances(prepared, prepared.base_cost)
     is_explained = imperfect.first_fit.cost <= MAX_EXPLAINED_COST * imperfect.problem.noise
     return imperfect if is_explained else prepared
 
@@ -402,8 +395,7 @@ def _can_explain(imperfect: PreparedProblem, ideal: Discovery) -> bool:
     the base or of the best set.
     """
     best = ideal.verdict.best
-    logs = zip(ideal.prepared.problem.log_residuals, best.held_out, strict=True)
-    if any(sensors_disagree(residuals, held_out) for residuals, held_out in logs):
+    if sensors_disagree(ideal.prepared.problem, best):
         return True
     max_cost = MAX_EXPLAINED_COST * imperfect.problem.noise
     return (
@@ -415,14 +407,15 @@ def _fit_with_effects(prepared: PreparedProblem, fitted: FittedSet) -> FitResult
     """Return the fit of a prepared problem with the effects of a set that was fitted to another."""
     if not fitted.effects:
         return prepared.first_fit
-    problem, start = prepared.problem, add_fitted_effects(prepared.parameters, fitted)
+    problem, start = prepared.problem, fitted.add_to(prepared.parameters)
     return fit_parameters(problem.log_residuals, start, mapper=problem.mapper)
 
 
-def sensors_disagree(residuals: LogResiduals, held_out: Float1D) -> bool:
-    """Return True if sensors of one body or side differ beyond their noise."""
+def sensors_disagree(problem: SelectionProblem, fitted: FittedSet) -> bool:
+    """Return True if sensors of one body or side differ beyond their noise in any log."""
     entries = [
         held_out[residuals.entry_row == row] * residuals.weight
+        for residuals, held_out in zip(problem.log_residuals, fitted.held_out, strict=True)
         for row, name in enumerate(residuals.rows)
         if name in SENSOR_PAIRS or name in CELL_PAIRS
     ]

@@ -16,7 +16,6 @@ from twin.identification.candidates import Candidate
 from twin.identification.discover import (
     Discovery,
     PreparedProblem,
-    add_fitted_effects,
     add_nuisances,
     sensors_disagree,
     widen_with_ideal,
@@ -103,8 +102,8 @@ def propose_law(
     # A law of a few numbers says more than many errors of instruments that do not suffice.
     ideal = discovery.ideal if discovery.verdict.outcome == "unexplained" else None
     proposals: list[tuple[Discovery, LawProposal]] = []
-    for tried in (ideal, discovery, discovery.with_nuisances):
-        proposal = _propose_law_of(tried, report) if tried is not None else None
+    for tried in filter(None, (ideal, discovery, discovery.with_nuisances)):
+        proposal = _propose_law_of(tried, report)
         if proposal is not None:
             proposals.append(proposal)
             if proposal[1].is_sufficient:
@@ -138,19 +137,16 @@ def _propose_law_of(
 
 
 def find_law_of_base(
-    prepared: PreparedProblem, null: FittedSet
+    prepared: PreparedProblem,
 ) -> tuple[SelectionProblem, FittedSet, LawProposal | None]:
     """Return (problem, its base, law) without a search of the library before.
 
-    With nuisances where sensors disagree and no law suffices with ideal ones. `null` is the base of
-    the prepared problem.
+    With nuisances where sensors disagree and no law suffices with ideal ones.
     """
     problem = prepared.problem
+    null = problem.fit_effects(prepared.parameters, ())
     law = find_law(problem, [null], problem.noise)
-    logs = zip(problem.log_residuals, null.held_out, strict=True)
-    if (law is not None and law.is_sufficient) or not any(
-        sensors_disagree(residuals, held_out) for residuals, held_out in logs
-    ):
+    if (law is not None and law.is_sufficient) or not sensors_disagree(problem, null):
         return problem, null, law
     imperfect = add_nuisances(prepared, problem.least_weight**2 * null.cost)
     own_null = imperfect.problem.fit_effects(imperfect.parameters, ())
@@ -177,8 +173,7 @@ def find_law_beside_nuisances(
     fitted_sets = search_laws(problem, starts, report)
     law = select_law(problem, starts, fitted_sets, floor, nearest)
     if fitted_sets and (law is None or not law.is_sufficient):
-        ideal_cost = prepared.problem.least_weight**2 * prepared.first_fit.cost
-        imperfect = add_nuisances(prepared, ideal_cost, fitted_sets[0])
+        imperfect = add_nuisances(prepared, prepared.base_cost, fitted_sets[0])
         problem = imperfect.problem
         null = problem.fit_effects(imperfect.parameters, ())
         law = find_law(problem, [null], floor, nearest, report)
@@ -196,9 +191,8 @@ def refit_nuisances(
     And the problem with these nuisances. `prepared` is the problem with ideal instruments.
     Nuisances that were fitted without the law stand in for a part of it.
     """
-    ideal_cost = prepared.problem.least_weight**2 * prepared.first_fit.cost
-    imperfect = add_nuisances(prepared, ideal_cost, law.fitted)
-    start = add_fitted_effects(imperfect.parameters, law.fitted)
+    imperfect = add_nuisances(prepared, prepared.base_cost, law.fitted)
+    start = law.fitted.add_to(imperfect.parameters)
     refitted = imperfect.problem.fit_effects(start, law.fitted.effects)
     fitted = widen_with_ideal(prepared, _round_exponents(imperfect.problem, refitted))
     terms = fitted.effects[len(law.start.effects) :]

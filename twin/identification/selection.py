@@ -59,6 +59,20 @@ class FittedSet:
         """Mean square of the cross-validation residual over the noise."""
         return mean_square(self.held_out)
 
+    def add_to(self, parameters: ParameterSet) -> ParameterSet:
+        """Add the effects, free, to a parameter set at their fitted values."""
+        values = self.fit.parameters.values
+        for effect in self.effects:
+            shape = [values[free.key] for free in effect.free if free is not effect.amplitude]
+            parameters = effect.add_to(parameters, shape, values[effect.amplitude.key])
+        return parameters
+
+    def remove_from(self, parameters: ParameterSet) -> ParameterSet:
+        """Return a parameter set without the parameters of the effects."""
+        for effect in self.effects:
+            parameters = effect.remove_from(parameters)
+        return parameters
+
 
 @dataclass(frozen=True, slots=True)
 class SelectionProgress:
@@ -280,10 +294,7 @@ def _fit_generic_terms(
 
 def _refit_null(problem: SelectionProblem, null: FittedSet, best: FittedSet) -> FittedSet:
     """Refit the null from the best set's parameters; an unconverged null causes false alarms."""
-    parameters = best.fit.parameters
-    for effect in best.effects:
-        parameters = parameters.without(effect.free)
-    refitted = problem.fit_effects(parameters, ())
+    refitted = problem.fit_effects(best.remove_from(best.fit.parameters), ())
     return refitted if refitted.cost < null.cost else null
 
 

@@ -134,8 +134,7 @@ def evaluate_proposed_law(root: Path, rig: str, has_rivals: bool, number: int) -
     clock = RealClock()
     start_s, start_cpu_s = clock.now(), cpu_seconds()
     prepared = prepare_problem(logs, model)
-    null = prepared.problem.fit_effects(prepared.parameters, ())
-    problem, null, law = find_law_of_base(prepared, null)
+    problem, null, law = find_law_of_base(prepared)
     row |= {"wall_s": clock.now() - start_s, "seconds": cpu_seconds() - start_cpu_s}
     best = law.fitted if law else null
     (residuals,) = problem.log_residuals
