@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Generator, Iterator
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pytest
 from table_io.clock import RealClock
 from tests.input_errors import raises_input_error
 from tests.run import task_functions
+from tests.run.clusters import start_cluster
 from twin.run.folders import find_sharing_problem
 from twin.run.tasks import TaskResult, Workers, order_results, run_tasks
 from twin.run.versions import read_installed_versions
@@ -176,6 +178,18 @@ def test_a_cluster_whose_workers_all_die_is_given_up(monkeypatch: pytest.MonkeyP
         assert next(results).number == 0
         cluster.scale(0)
         with raises_input_error(key="--scheduler", problem="no workers"):
+            list(results)
+
+
+def test_a_cluster_whose_scheduler_dies_is_given_up() -> None:
+    with ExitStack() as stack:
+        helpers, address = start_cluster(stack)
+        for helper in helpers:
+            stack.callback(helper.kill)
+        results = run_tasks(task_functions.hang_at_odd, [0, 1, 3], Workers(0, address))
+        assert next(results).number == 0
+        helpers[0].kill()
+        with raises_input_error(key="--scheduler", problem="no longer answers"):
             list(results)
 
 

@@ -5,7 +5,6 @@ import os
 import random
 import resource
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -20,6 +19,7 @@ import pytest
 from tests.command_line import call_main
 from tests.input_errors import raises_input_error
 from tests.plugin_package import install_package
+from tests.run.clusters import start_cluster, start_quietly
 from tests.sweeps.small_study import (
     STUDY,
     make_stored_study,
@@ -230,24 +230,6 @@ def run_with_kills(
         if code == 0:
             return max(kills, 1)
     raise AssertionError(f"not complete after {kills} kills: the last client ended with {code}")
-
-
-def start_cluster(stack: ExitStack) -> tuple[list[subprocess.Popen[bytes]], str]:
-    """Start a scheduler and two workers with nannies; return them and the address."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        address = f"tcp://127.0.0.1:{probe.getsockname()[1]}"
-    dask = [sys.executable, "-m", "dask"]
-    scheduler = [*dask, "scheduler", "--no-dashboard", "--host", address]
-    worker = [*dask, "worker", address, "--nthreads", "1", "--no-dashboard"]
-    helpers = [stack.enter_context(start_quietly(each)) for each in (scheduler, worker, worker)]
-    with distributed.Client(address, timeout="60s", set_as_default=False) as client:
-        client.wait_for_workers(2)
-    return helpers, address
-
-
-def start_quietly(words: list[str]) -> "subprocess.Popen[bytes]":
-    return subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
 def list_children(pid: int) -> list[int]:

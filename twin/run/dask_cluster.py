@@ -1,6 +1,7 @@
 """Tasks on a Dask cluster: every worker must have this version and be able to do the work."""
 
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from itertools import islice
 from typing import Any
@@ -41,7 +42,7 @@ def run_on_cluster(
                 running[future] = number
             if not running:
                 return
-            with suppress(TimeoutError), client.as_current():
+            with suppress(TimeoutError, CancelledError), client.as_current():
                 wait([*running], POLL_S, "FIRST_COMPLETED")
             watch.require_workers()
             for future in [future for future in running if future.done()]:
