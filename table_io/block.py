@@ -138,6 +138,18 @@ def join_blocks(blocks: Sequence[Block]) -> Block:
     )
 
 
+def join_contiguous(blocks: Iterable[Block]) -> tuple[Block, ...]:
+    """Join the blocks of one stream, in order, where they are contiguous with equal channels."""
+    runs: list[list[Block]] = []
+    for block in blocks:
+        last = runs[-1][-1] if runs else None
+        if last and last.end == block.index and last.channels == block.channels:
+            runs[-1].append(block)
+        else:
+            runs.append([block])
+    return tuple(join_blocks(run) for run in runs)
+
+
 def recut_blocks(blocks: Iterable[Block], samples: int) -> Iterable[Block]:
     """Yield the same samples in blocks of length `samples` (the last one may be shorter)."""
     pending: list[Block] = []

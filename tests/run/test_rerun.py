@@ -122,7 +122,12 @@ def test_a_changed_hash_or_block_is_found(
     block = sparse.blocks("pred")[9]
     values = block.values.copy()
     values[3, 4] = np.nextafter(values[3, 4], np.inf)
-    changed = [replace(block, values=values) if item is block else item for item in sparse.items]
+    changed = [
+        replace(block, values=values)
+        if isinstance(item, Block) and (item.stream, item.index) == ("pred", block.index)
+        else item
+        for item in sparse.items
+    ]
     write_items(tmp_path / "block.mcap", changed, sparse.start)
     (tmp_path / "b").mkdir()
     assert replay(tmp_path / "block.mcap", tmp_path / "b") == (False, 0, 1, block.index)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from table_io.block import Block
+from table_io.block import Block, join_contiguous
 from tests.viewer.example_run import RATE_HZ, SAMPLE_COUNT, blocks
 from twin.viewer.levels import WindowPeaks, next_power_of_ten
-from twin.viewer.motion import Trail, extract_motion, join_contiguous
+from twin.viewer.motion import Trail, extract_motion
 from twin.viewer.plots import AxisRange, PlotAxes
 from twin.viewer.scene import Scene
 

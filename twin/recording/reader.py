@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from table_io.block import Block, join_blocks
+from table_io.block import Block
 from table_io.errors import InputError
 from table_io.records import Record, RunStart, RunStop
 from twin.recording.garbage_collection import pause_collection
@@ -19,6 +19,7 @@ from twin.recording.recovery import (
     RecoveredLog,
     recover_log,
 )
+from twin.recording.shared_items import SharedItems
 from twin.recording.validation import (
     has_invalid_labels,
     validate_block,
@@ -53,36 +54,23 @@ class Recording:
     path: Path
     run: str
     start: RunStart
-    items: tuple[Item, ...]
+    items: SharedItems
     is_intact: bool
     damage: tuple[Damage, ...] = ()
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
-    _contiguous_blocks: dict[str, tuple[Block, ...]] = field(
-        default_factory=dict, repr=False, compare=False
-    )
 
     def records(self, kind: type[R]) -> tuple[R, ...]:
         """Return all records of one type, in order of sample index."""
-        return tuple(item for item in self.items if isinstance(item, kind))
+        return tuple(record for record in self.items.records if isinstance(record, kind))
 
     def blocks(self, stream: str) -> tuple[Block, ...]:
         """Return all blocks of stream "meas" or "pred", in order of sample index."""
-        return tuple(
-            item for item in self.items if isinstance(item, Block) and item.stream == stream
-        )
+        return tuple(self.items.iter_blocks(stream))
 
     def contiguous_blocks(self, stream: str) -> tuple[Block, ...]:
-        """Return the stream joined into one block between each pair of gaps; cached."""
-        if stream not in self._contiguous_blocks:
-            runs: list[list[Block]] = []
-            for block in self.blocks(stream):
-                if runs and runs[-1][-1].end == block.index:
-                    runs[-1].append(block)
-                else:
-                    runs.append([block])
-            self._contiguous_blocks[stream] = tuple(join_blocks(run) for run in runs)
-        return self._contiguous_blocks[stream]
+        """Return the stream joined into one block between each pair of gaps."""
+        return self.items.contiguous.get(stream, ())
 
     @property
     def stop(self) -> RunStop | None:
@@ -136,10 +124,10 @@ def build_recording(path: Path, recovered: RecoveredLog) -> tuple[Recording, lis
         *recovered.damage,
         *(Damage(0, 0, text) for text in (*_count_repeats(errors), *_count_repeats(problems))),
     )
-    items = tuple(item for _, item in kept)
+    messages = [message for message, _ in kept]
+    items = SharedItems(item for _, item in kept)
     extras = recovered.metadata, recovered.attachments
-    recording = Recording(path, start.run, start, items, not damage, damage, *extras)
-    return recording, [message for message, _ in kept]
+    return Recording(path, start.run, start, items, not damage, damage, *extras), messages
 
 
 def _assign_unnamed_topics(recovered: RecoveredLog) -> list[str]:
@@ -237,8 +225,8 @@ def _decode_messages(messages: Iterable[LogMessage]) -> tuple[list[_Entry], list
             run, item = decode_item(message.topic, message.payload)
         except WireError as error:
             errors.append(str(error))
-        else:
-            entries.append((message, item, run))
+            continue
+        entries.append((message, item, run))
     return entries, errors
 
 

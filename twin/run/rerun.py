@@ -25,6 +25,7 @@ from table_io.records import (
 )
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import TOPIC_ORDER, Recording, read_start
+from twin.recording.shared_items import SharedItems
 from twin.run.recordings import open_recording, read_recorded_config
 from twin.run.run_config import RunConfig
 from twin.run.terminal import error_console
@@ -119,7 +120,7 @@ def restore_predictions(recording: Recording, config: RunConfig | None = None) -
     except InputError as error:
         _warn(recording, f"only a part is recorded, and the rest cannot be recomputed: {error}")
         return recording
-    blocks: list[Item] = []
+    blocks: list[Block] = []
     hashes: dict[int, PredictionHash] = {}
     for item in rerun_twin(recording, config):
         if isinstance(item, Block) and item.stream == "pred":
@@ -137,7 +138,8 @@ def restore_predictions(recording: Recording, config: RunConfig | None = None) -
         if not (isinstance(item, Block) and item.stream == "pred")
     ]
     items = sorted([*others, *blocks], key=lambda item: (item.index, TOPIC_ORDER[topic_for(item)]))
-    return replace(recording, start=start, items=tuple(items), _contiguous_blocks={})
+    joined = {"meas": recording.contiguous_blocks("meas")}
+    return replace(recording, start=start, items=SharedItems(items, joined))
 
 
 def _warn(recording: Recording, problem: str) -> None:

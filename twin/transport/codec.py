@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, is_dataclass
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
@@ -218,7 +218,7 @@ def _to_block(message: Any) -> Block:
     if message.channels or message.step:
         names, values, labels = _read_number_lists(message)
     else:
-        names = tuple(message.names)
+        names = _share_names(tuple(message.names))
         labels = np.frombuffer(message.labels, "<i4").reshape(3, -1).astype(np.int64)
         values = np.frombuffer(message.values, "<f8").reshape(len(names), labels.shape[1])
     if message.index + labels.shape[1] > MAX_SAMPLE_INDEX:
@@ -276,7 +276,15 @@ def _field_converter(hint: Any) -> Callable[[Any], Any]:
         return lambda value: tuple(_to_record(inner, element) for element in value)
     if is_dataclass(hint):
         return partial(_to_record, hint)
+    if get_origin(hint) is tuple and inner is str:
+        return lambda value: _share_names(tuple(value))
     return get_origin(hint) or (_check_integer if hint is int else hint)
+
+
+@lru_cache(maxsize=256)
+def _share_names(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the same tuple for equal names: almost every item of a recording repeats its own."""
+    return names
 
 
 def _check_integer(value: int) -> int:

@@ -1,12 +1,12 @@
 """Motion of the rig extracted from blocks as arrays, and the trail of the phase plane."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from table_io.block import Block, Float1D, Float2D, join_blocks
+from table_io.block import Block, Float1D, Float2D
 from table_io.channels import contact_forces, relative_displacement
 
 
@@ -64,18 +64,6 @@ def extract_track(block: Block, name: str) -> Block:
     names = tuple(block.channels[row].removeprefix(prefix) for row in rows)
     labels = (block.step, block.label, block.cycle)
     return Block(block.stream, block.index, block.rate_hz, names, block.values[rows], *labels)
-
-
-def join_contiguous(blocks: Iterable[Block]) -> list[Block]:
-    """Join blocks that are contiguous and have the same channels."""
-    runs: list[list[Block]] = []
-    for block in blocks:
-        last = runs[-1][-1] if runs else None
-        if last and last.end == block.index and last.channels == block.channels:
-            runs[-1].append(block)
-        else:
-            runs.append([block])
-    return [join_blocks(run) for run in runs]
 
 
 class Trail:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from table_io.block import Block, Float1D, Int1D
+from table_io.block import Block, Float1D, Int1D, join_contiguous
 from table_io.channels import CHANNEL_BY_NAME
 from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
@@ -34,7 +34,7 @@ from twin.viewer.address import viewer_url
 from twin.viewer.blueprint import log_static, make_blueprint
 from twin.viewer.levels import ReferenceLevels
 from twin.viewer.model_branches import FoldAhead, ModelBranches
-from twin.viewer.motion import BlockMotion, extract_motion, extract_track, join_contiguous
+from twin.viewer.motion import BlockMotion, extract_motion, extract_track
 from twin.viewer.phase_plane import DAMPER_LOOP, PHASE_PLANE, PlanePlot
 from twin.viewer.plots import OrbitCurves, PrcCurves, forecast_lines
 from twin.viewer.scene import Scene
