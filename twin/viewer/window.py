@@ -22,6 +22,7 @@ SETTLE_CHECK_S, MAX_CHECKS, MAX_CHECKS_LIVE = (
     3,
 )  # screenshots are compared until the picture is stable
 MAX_TRIES = 5
+EXIT_TIMEOUT_S = 2.0  # for a viewer that has broken the connection
 WEB_VIEWER_ADDRESS, WEB_DATA_ADDRESS = "127.0.0.1:9090", "127.0.0.1:9900"
 
 
@@ -90,16 +91,17 @@ def take_screenshot(source: Path | str, png: Path, at_s: float | None = None) ->
     try:
         client = _connect_client(process, f"rerun+http://127.0.0.1:{port}/proxy")
         location = source if isinstance(source, str) else str(source.resolve())
-        _retry_request(lambda: client.open(location))
+        _retry_request(process, lambda: client.open(location))
         end_s = _wait_until_loaded(process, client, is_live)
         if at_s is not None or not is_live:
             shown_s = 0.9 * end_s if at_s is None else at_s
             _retry_request(
-                lambda: client.set_time("time", duration=float(shown_s), play_state="paused")
+                process,
+                lambda: client.set_time("time", duration=float(shown_s), play_state="paused"),
             )
         _wait_until_settled(process, client, MAX_CHECKS_LIVE if is_live else MAX_CHECKS)
-        _retry_request(lambda: client.save_screenshot(str(png.resolve())))
-        views = _retry_request(client.get_state).views
+        _retry_request(process, lambda: client.save_screenshot(str(png.resolve())))
+        views = _retry_request(process, client.get_state).views
         return [f"{view.name}: {report.summary}" for view in views for report in view.reports]
     finally:
         process.terminate()
@@ -109,7 +111,7 @@ def take_screenshot(source: Path | str, png: Path, at_s: float | None = None) ->
 def _wait_until_loaded(process: "subprocess.Popen[bytes]", client: Any, is_live: bool) -> float:
     """Wait until the file, or the first live data, is loaded; return its end time in s."""
     for _ in range(600):
-        state = _retry_request(client.get_state)
+        state = _retry_request(process, client.get_state)
         timelines = [timeline for recording in state.recordings for timeline in recording.timelines]
         ends = [timeline.end for timeline in timelines if timeline.name == "time"]
         if ends and (is_live or not state.loading):
@@ -125,18 +127,23 @@ def _wait_until_settled(process: "subprocess.Popen[bytes]", client: Any, max_che
     image = b""
     for _ in range(max_checks):
         _wait_or_fail(process, SETTLE_CHECK_S)
-        previous, image = image, _retry_request(lambda: client.take_screenshot(max_size=960))
+        previous, image = (
+            image,
+            _retry_request(process, lambda: client.take_screenshot(max_size=960)),
+        )
         if image == previous:
             return
 
 
-def _retry_request(request: Callable[[], Any]) -> Any:
+def _retry_request(process: "subprocess.Popen[bytes]", request: Callable[[], Any]) -> Any:
     """Return the answer of the viewer; retry on a timeout, as on a busy computer."""
     for _ in range(MAX_TRIES):
         try:
             return request()
         except TimeoutError:
             continue
+        except ConnectionError:  # a viewer that cannot draw exits
+            _wait_or_fail(process, EXIT_TIMEOUT_S)
     raise InputError("the Rerun viewer does not answer in time", remedy="try again later")
 
 
