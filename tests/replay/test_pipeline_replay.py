@@ -27,7 +27,7 @@ from twin.compare import pipeline, twins
 from twin.compare.monitoring import EVENT_KINDS
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
-from twin.recording.shared_items import SharedItems
+from twin.recording.stored_items import StoredItems
 from twin.replay.pipeline_replay import RecordedRun, ReplayComparison, SampleRange, replay_recording
 from twin.replay.step_range import parse_step_range
 from twin.reports.finalize import EXIT_NOT_IDENTICAL
@@ -200,7 +200,7 @@ def test_parameters_that_changed_are_changed_again(
     assert identity.is_identical
     assert encode_records(made, Params, PrcPoint) == encode_records(other, Params, PrcPoint)
     # without the change the twin goes another way from there on
-    ignored = replace(other, items=SharedItems(
+    ignored = replace(other, items=StoredItems.from_items(
         item for item in other.items
         if not (isinstance(item, Params) and item.reason == "identified")
     ))  # fmt: skip
@@ -226,7 +226,7 @@ def test_a_change_within_a_gap_holds_after_it(
     recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
     other = change_parameters(recording, bundle, 2013, tmp_path / "changed.mcap")
-    holed = replace(other, items=SharedItems(
+    holed = replace(other, items=StoredItems.from_items(
         item for item in other.items if not isinstance(item, Block) or not 2000 <= item.index < 2100
     ))  # fmt: skip
     _, made = again(recorded_in(holed), bundle, tmp_path / "run.mcap")

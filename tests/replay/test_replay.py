@@ -14,7 +14,7 @@ from tests.replay.in_memory import recorded_in
 from twin.compare import pipeline
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
-from twin.recording.shared_items import SharedItems
+from twin.recording.stored_items import StoredItems
 from twin.replay.pipeline_replay import ReplayComparison, replay_recording
 from twin.reports.summary import dump_strict_json, summarise
 from twin.run.run_config import RunConfig, from_texts, read_run_config
@@ -183,7 +183,7 @@ def test_replay_is_dead_where_the_twin_was(
     for a, b in spans:
         assert not any(block.index < b and block.end > a for block in made.blocks("pred"))
     # after the fresh start it differs from a twin that never died, so the fault mattered
-    never, _ = again(replace(died, items=SharedItems(
+    never, _ = again(replace(died, items=StoredItems.from_items(
         item for item in died.items if not isinstance(item, Fault)
     )), bundle, tmp_path)  # fmt: skip
     assert not never.is_identical

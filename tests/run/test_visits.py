@@ -9,7 +9,7 @@ import pytest
 from table_io.config.base import PROFILES_DIR
 from table_io.records import Comparison, Event, Fault, PrcPoint, StepAdded
 from twin.recording.reader import Recording, read_recording
-from twin.recording.shared_items import SharedItems
+from twin.recording.stored_items import StoredItems
 from twin.replay.pipeline_replay import RecordedRun, replay_recording
 from twin.reports.report import format_headline
 from twin.reports.report_data import build_report_data, extract_prc
@@ -93,7 +93,9 @@ def test_visits_that_a_dead_twin_missed_are_measured_all_the_same(run: tuple) ->
     end = recording.stop.index
     fault = Fault(end, "twin", 0, end, "it died")
     kept = tuple(item for item in recording.items if not isinstance(item, PrcPoint))
-    rebuilt = summarise(replace(recording, items=SharedItems([*kept, fault])), bundle.parameters)
+    rebuilt = summarise(
+        replace(recording, items=StoredItems.from_items([*kept, fault])), bundle.parameters
+    )
     assert [visit["measured"] for visit in rebuilt["visits"]] == [
         visit["measured"] for visit in summary["visits"]
     ]

@@ -33,7 +33,7 @@ from table_io.records import (
 )
 from twin.compare import TWIN_CHANNELS
 from twin.recording.reader import Recording
-from twin.recording.shared_items import SharedItems
+from twin.recording.stored_items import StoredItems
 
 RATE_HZ = 2000.0
 SAMPLE_COUNT = 12000
@@ -128,7 +128,7 @@ def records() -> list[Record]:
 def recording(items: Sequence[Block | Record], begin: RunStart | None = None) -> Recording:
     begin = begin or start()
     ordered = sorted(items, key=lambda item: item.index)
-    return Recording(Path("run.mcap"), "r1", begin, SharedItems([begin, *ordered]), True)
+    return Recording(Path("run.mcap"), "r1", begin, StoredItems.from_items([begin, *ordered]), True)
 
 
 @cache

@@ -11,7 +11,7 @@ from rich.table import Table
 from table_io.errors import InputError
 from table_io.records import Comparison, PredictionHash, SampleGap
 from twin.recording.log_metadata import ContentHash, find_altered_attachments, read_schema_version
-from twin.recording.reader import Recording, build_recording
+from twin.recording.reader import Recording, select_messages
 from twin.recording.recovery import Damage, LogMessage, RecoveredLog, recover_log
 from twin.recording.run_paths import explain_unmerged_parts as scattered
 from twin.replay.provenance import find_earlier_run
@@ -59,7 +59,7 @@ def examine_logs(paths: list[Path], unmerged: Sequence[str] = ()) -> Verificatio
     `unmerged` has a sentence for each folder whose parts were not merged.
     """
     parts = [recover_log(path) for path in paths]
-    recording, messages = build_recording(paths[0], _join_parts(paths, parts))
+    recording, messages = select_messages(paths[0], _join_parts(paths, parts))
     start = recording.start
     unrecorded = find_unrecorded_gaps(recording)
     report: Json = {

@@ -171,7 +171,7 @@ def _start_run(previous: LiveRunState, start: RunStart) -> LiveRunState:
 
 def _add_block(run_state: LiveRunState, block: Block, start: RunStart) -> LiveRunState:
     """Add a block; a block near sample 0 after later ones is a replay that starts again."""
-    if validate_block(block, None, start) or has_invalid_labels([block]):
+    if validate_block(block, None, start) or has_invalid_labels(block):
         return run_state
     if block.stream != "meas":
         run_state.traces.add(block)

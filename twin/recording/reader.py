@@ -1,14 +1,16 @@
 """Log reader: all valid items of a log in order of sample index, and a list of the damage."""
 
+import hashlib
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from table_io.block import Block
 from table_io.errors import InputError
 from table_io.records import Record, RunStart, RunStop
+from twin.recording.columns import BlockStore, StoredBlock
 from twin.recording.garbage_collection import pause_collection
 from twin.recording.log_metadata import START_COPY_NAME, read_schema_version
 from twin.recording.mcap_log import iter_messages, read_leading_metadata
@@ -19,7 +21,7 @@ from twin.recording.recovery import (
     RecoveredLog,
     recover_log,
 )
-from twin.recording.shared_items import SharedItems
+from twin.recording.stored_items import StoredItem, StoredItems
 from twin.recording.validation import (
     has_invalid_labels,
     validate_block,
@@ -40,6 +42,7 @@ START_TOPIC = RECORD_TOPICS[RunStart]
 # recording reads the same in whatever order its parts were written.
 TOPIC_ORDER = {topic: place for place, topic in enumerate(TOPIC_TYPES)}
 TOPIC_ORDER |= {START_TOPIC: -1, RECORD_TOPICS[RunStop]: len(TOPIC_TYPES)}
+MIN_LABEL_BYTES = 3  # of the three labels of a sample, in any encoding
 R = TypeVar("R", bound=Record)
 
 
@@ -54,7 +57,7 @@ class Recording:
     path: Path
     run: str
     start: RunStart
-    items: SharedItems
+    items: StoredItems
     is_intact: bool
     damage: tuple[Damage, ...] = ()
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -66,11 +69,11 @@ class Recording:
 
     def blocks(self, stream: str) -> tuple[Block, ...]:
         """Return all blocks of stream "meas" or "pred", in order of sample index."""
-        return tuple(self.items.iter_blocks(stream))
+        return tuple(block.read() for block in self.items.stored_blocks(stream))
 
     def contiguous_blocks(self, stream: str) -> tuple[Block, ...]:
         """Return the stream joined into one block between each pair of gaps."""
-        return self.items.contiguous.get(stream, ())
+        return self.items.contiguous_blocks(stream)
 
     @property
     def stop(self) -> RunStop | None:
@@ -91,12 +94,24 @@ def read_recording(path: Path, topics: Iterable[str] = TOPIC_TYPES) -> Recording
     Raises InputError if it is not a shaketwin log. A damaged log is read as far as possible;
     `damage` lists the rest.
     """
-    return build_recording(path, recover_log(path, frozenset((START_TOPIC, *topics))))[0]
+    return build_recording(path, recover_log(path, frozenset((START_TOPIC, *topics))))
+
+
+def build_recording(path: Path, recovered: RecoveredLog) -> Recording:
+    """Return the recording in a recovered log, whose messages are removed as they are decoded."""
+    return _select_recording(path, recovered, keeps_messages=False)[0]
+
+
+def select_messages(path: Path, recovered: RecoveredLog) -> tuple[Recording, list[LogMessage]]:
+    """Return (recording, message of each of its items) from a recovered log."""
+    return _select_recording(path, recovered, keeps_messages=True)
 
 
 @pause_collection()
-def build_recording(path: Path, recovered: RecoveredLog) -> tuple[Recording, list[LogMessage]]:
-    """Return (recording, message of each of its items) from a recovered log."""
+def _select_recording(
+    path: Path, recovered: RecoveredLog, keeps_messages: bool
+) -> tuple[Recording, list[LogMessage]]:
+    """Return (recording, message of each of its items if they are kept)."""
     problems = _assign_unnamed_topics(recovered)
     topics_present = {*recovered.topics, *(message.topic for message in recovered.messages)}
     if topics_present and not topics_present & TOPIC_TYPES.keys():
@@ -106,12 +121,13 @@ def build_recording(path: Path, recovered: RecoveredLog) -> tuple[Recording, lis
             where=path,
             remedy="give the run.mcap of a run",
         )
-    entries, errors = _decode_messages(
-        [message for message in recovered.messages if message.topic in TOPIC_TYPES]
-    )
+    store = _make_store(recovered.messages)
+    messages = iter(recovered.messages) if keeps_messages else _take_messages(recovered)
+    known = (message for message in messages if message.topic in TOPIC_TYPES)
+    entries, errors = _decode_messages(known, store, keeps_messages)
     start = _find_start(path, entries, errors, recovered.attachments.get(START_COPY_NAME))
-    problems += _remove_mislabelled(entries)
-    entries.sort(key=lambda entry: (entry[1].index, TOPIC_ORDER[entry[0].topic], entry[0].payload))
+    problems += _remove_mislabelled(entries, store)
+    entries.sort(key=lambda entry: (entry.item.index, TOPIC_ORDER[entry.topic], entry.key))
     kept, rejected = _select_valid(entries, start, recovered.is_intact)
     problems += rejected
     try:
@@ -124,10 +140,17 @@ def build_recording(path: Path, recovered: RecoveredLog) -> tuple[Recording, lis
         *recovered.damage,
         *(Damage(0, 0, text) for text in (*_count_repeats(errors), *_count_repeats(problems))),
     )
-    messages = [message for message, _ in kept]
-    items = SharedItems(item for _, item in kept)
+    items = StoredItems(entry.item for entry in kept)
     extras = recovered.metadata, recovered.attachments
-    return Recording(path, start.run, start, items, not damage, damage, *extras), messages
+    recording = Recording(path, start.run, start, items, not damage, damage, *extras)
+    return recording, [entry.message for entry in kept if entry.message is not None]
+
+
+def _take_messages(recovered: RecoveredLog) -> Iterator[LogMessage]:
+    """Yield the messages in their order, each of which is removed."""
+    recovered.messages.reverse()
+    while recovered.messages:
+        yield recovered.messages.pop()
 
 
 def _assign_unnamed_topics(recovered: RecoveredLog) -> list[str]:
@@ -192,41 +215,63 @@ def iter_valid_items(
     These are the rules of `read_recording` for streaming; reasons of rejection are appended to
     `problems`. Repeated samples are not detected: the caller selects among them.
     """
-    entries, errors = _decode_messages([LogMessage(topic, 0, body) for body in payloads])
+    messages = [LogMessage(topic, 0, payload) for payload in payloads]
+    store = _make_store(messages)
+    entries, errors = _decode_messages(messages, store)
     problems += errors
-    problems += _remove_mislabelled(entries)
-    for _, item, run in entries:
-        if reason := _rejection_reason(item, run, None, start):
+    problems += _remove_mislabelled(entries, store)
+    for entry in entries:
+        if reason := _rejection_reason(entry, None, start):
             problems.append(f"{topic}: {reason}")
-        elif not isinstance(item, RunStart):
-            yield item
+        elif not isinstance(entry.item, RunStart):
+            yield entry.item.read() if isinstance(entry.item, StoredBlock) else entry.item
 
 
-def _rejection_reason(item: Item, run: str, before: Block | None, start: RunStart) -> str:
+class _Entry(NamedTuple):
+    """Decoded message; `key` tells it from others of its topic and index."""
+
+    topic: str
+    sequence: int
+    key: bytes  # the payload, or the hash of that of a block, which is large
+    item: StoredItem
+    run: str
+    message: LogMessage | None = None  # where it is kept
+
+
+def _rejection_reason(entry: _Entry, before: StoredBlock | None, start: RunStart) -> str:
     """Return why an item is invalid in the run of `start` after block `before`, or ""."""
-    if run != start.run:
+    if entry.run != start.run:
         return "of another run"
-    return (
-        validate_block(item, before, start)
-        if isinstance(item, Block)
-        else validate_record(item, start)
-    )
+    if isinstance(entry.item, StoredBlock):
+        return validate_block(entry.item, before, start)
+    return validate_record(entry.item, start)
 
 
-_Entry = tuple[LogMessage, Item, str]  # message, decoded item, run id
+def _make_store(messages: Sequence[LogMessage]) -> BlockStore:
+    """Return a store with room for all blocks that these messages may hold."""
+    size = sum(len(message.payload) for message in messages)
+    return BlockStore(lambda block: size // (8 * len(block.channels) + MIN_LABEL_BYTES))
 
 
-def _decode_messages(messages: Iterable[LogMessage]) -> tuple[list[_Entry], list[str]]:
-    """Return (decoded messages, errors of those that do not decode)."""
+def _decode_messages(
+    messages: Iterable[LogMessage], store: BlockStore, keeps_messages: bool = False
+) -> tuple[list[_Entry], list[str]]:
+    """Return (decoded messages, errors of those that do not decode); blocks go into `store`."""
     entries: list[_Entry] = []
     errors = []
     for message in messages:
+        topic, payload = message.topic, message.payload
         try:
-            run, item = decode_item(message.topic, message.payload)
+            run, item = decode_item(topic, payload)
         except WireError as error:
             errors.append(str(error))
             continue
-        entries.append((message, item, run))
+        kept = message if keeps_messages else None
+        if isinstance(item, Block):
+            key = hashlib.blake2b(payload, digest_size=16).digest()
+            entries.append(_Entry(topic, message.sequence, key, store.add(item), run, kept))
+        else:
+            entries.append(_Entry(topic, message.sequence, payload, item, run, kept))
     return entries, errors
 
 
@@ -235,59 +280,59 @@ def _find_start(
 ) -> RunStart:
     """Return the start record or its copy; raise InputError if both are missing."""
     problems = [*errors]
-    for _, item, _ in entries:
-        if isinstance(item, RunStart):
-            if not (reason := validate_start(item)):
-                return item
+    for entry in entries:
+        if isinstance(entry.item, RunStart):
+            if not (reason := validate_start(entry.item)):
+                return entry.item
             problems.append(f"{START_TOPIC}: {reason}")
     copies = [] if copy is None else [LogMessage(START_TOPIC, 0, copy)]
-    for entry in _decode_messages(copies)[0]:
-        if isinstance(entry[1], RunStart):
+    for entry in _decode_messages(copies, _make_store(copies), keeps_messages=True)[0]:
+        if isinstance(entry.item, RunStart):
             entries.append(entry)
             errors.append(f"{START_TOPIC}: lost; its copy is used")
-            return entry[1]
+            return entry.item
     if problems:
         raise InputError(f"damaged or foreign: {problems[0]}", where=path, key=START_TOPIC)
     raise InputError("missing, so profile and model are unknown", where=path, key=START_TOPIC)
 
 
-def _remove_mislabelled(entries: list[_Entry]) -> list[str]:
+def _remove_mislabelled(entries: list[_Entry], store: BlockStore) -> list[str]:
     """Remove blocks with impossible labels; return a problem for each."""
-    blocks = [item for _, item, _ in entries if isinstance(item, Block)]
-    if not blocks or not has_invalid_labels(blocks):
+    if not any(has_invalid_labels(block) for block in store.read_all()):
         return []
     count = len(entries)
     entries[:] = [
         entry
         for entry in entries
-        if not (isinstance(entry[1], Block) and has_invalid_labels([entry[1]]))
+        if not (isinstance(entry.item, StoredBlock) and has_invalid_labels(entry.item.read()))
     ]
     return ["samples with invalid labels"] * (count - len(entries))
 
 
 def _select_valid(
     entries: list[_Entry], start: RunStart, is_intact: bool
-) -> tuple[list[tuple[LogMessage, Item]], list[str]]:
-    """Return (items that are valid together in one run, reasons of rejection of the others)."""
-    kept: list[tuple[LogMessage, Item]] = []
+) -> tuple[list[_Entry], list[str]]:
+    """Return (entries that are valid together in one run, reasons of rejection of the others)."""
+    kept: list[_Entry] = []
     problems = []
-    last_blocks: dict[str, Block] = {}
+    last_blocks: dict[str, StoredBlock] = {}
     seen_keys: set[tuple[str, int, bytes]] = set()
-    for message, item, run in entries:
+    for entry in entries:
+        topic, item = entry.topic, entry.item
         if not is_intact:  # a repeated chunk repeats each of its messages
-            key = (message.topic, message.sequence, message.payload)
+            key = (topic, entry.sequence, entry.key)
             if key in seen_keys:
-                problems.append(f"{message.topic}: duplicate message")
+                problems.append(f"{topic}: duplicate message")
                 continue
             seen_keys.add(key)
-        before = last_blocks.get(item.stream) if isinstance(item, Block) else None
-        reason = _rejection_reason(item, run, before, start)
+        before = last_blocks.get(item.stream) if isinstance(item, StoredBlock) else None
+        reason = _rejection_reason(entry, before, start)
         if item is not start and (reason or isinstance(item, RunStart)):
-            problems.append(f"{message.topic}: {reason or 'duplicate message'}")
+            problems.append(f"{topic}: {reason or 'duplicate message'}")
             continue
-        if isinstance(item, Block):
+        if isinstance(item, StoredBlock):
             last_blocks[item.stream] = item
-        kept.append((message, item))
+        kept.append(entry)
     return kept, problems
 
 

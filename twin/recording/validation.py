@@ -4,9 +4,6 @@ Code that works on a recording may rely on these checks.
 """
 
 import math
-from collections.abc import Sequence
-
-import numpy as np
 
 from table_io.block import Block, Label
 from table_io.records import (
@@ -24,6 +21,7 @@ from table_io.records import (
     Step,
     StepAdded,
 )
+from twin.recording.columns import StoredBlock
 
 DIRECTIONS = ("forward", "backward")
 MAX_STEPS = 100_000
@@ -60,7 +58,9 @@ def _is_valid_step(step: Step) -> bool:
     )
 
 
-def validate_block(block: Block, before: Block | None, start: RunStart) -> str:
+def validate_block(
+    block: Block | StoredBlock, before: Block | StoredBlock | None, start: RunStart
+) -> str:
     """Return why a block is invalid after block `before` of its stream, or ""."""
     if block.rate_hz != start.rate_hz:
         return "the sampling rate is not that of the run"
@@ -75,11 +75,11 @@ def validate_block(block: Block, before: Block | None, start: RunStart) -> str:
     return ""
 
 
-def has_invalid_labels(blocks: Sequence[Block]) -> bool:
-    """Return whether any block has a step, label or cycle out of range."""
+def has_invalid_labels(block: Block) -> bool:
+    """Return whether any step, label or cycle of a block is out of range."""
     limits = {"step": (-1, MAX_STEPS), "label": (0, max(Label)), "cycle": (-1, MAX_CYCLES)}
     for name, (minimum, maximum) in limits.items():
-        labels = np.concatenate([getattr(block, name) for block in blocks])
+        labels = getattr(block, name)
         if labels.size and (labels.min() < minimum or labels.max() > maximum):
             return True
     return False

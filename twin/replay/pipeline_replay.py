@@ -80,7 +80,7 @@ class RecordedRun:
         recovered.messages = [
             message for message in recovered.messages if message.topic not in own_topics
         ]
-        recording = build_recording(path, recovered)[0]
+        recording = build_recording(path, recovered)
         rate = recording.start.rate_hz
         payloads: dict[str, dict[int, bytes]] = {topic: {} for topic in own_topics}
         timing_ends = [-1]

@@ -23,13 +23,14 @@ from table_io.records import (
     StepAdded,
     Timing,
 )
+from twin.recording.columns import BlockStore, StoredBlock
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import TOPIC_ORDER, Recording, read_start
-from twin.recording.shared_items import SharedItems
+from twin.recording.stored_items import StoredItem, StoredItems, find_topic
 from twin.run.recordings import open_recording, read_recorded_config
 from twin.run.run_config import RunConfig
 from twin.run.terminal import error_console
-from twin.transport.codec import Item, topic_for
+from twin.transport.codec import Item
 
 DRIVE_CHANNEL = "table_acc_m_s2"  # of the twin
 BLOCK_DURATION_S = 1.0  # offline; results do not depend on the block size
@@ -120,11 +121,13 @@ def restore_predictions(recording: Recording, config: RunConfig | None = None) -
     except InputError as error:
         _warn(recording, f"only a part is recorded, and the rest cannot be recomputed: {error}")
         return recording
-    blocks: list[Block] = []
+    sample_count = sum(map(len, recording.contiguous_blocks("meas")))
+    store = BlockStore(lambda _: sample_count)
+    blocks: list[StoredItem] = []
     hashes: dict[int, PredictionHash] = {}
     for item in rerun_twin(recording, config):
         if isinstance(item, Block) and item.stream == "pred":
-            blocks.append(item)
+            blocks.append(store.add(item))
         elif isinstance(item, PredictionHash):
             hashes[item.index] = item
     recorded = recording.records(PredictionHash)
@@ -133,13 +136,14 @@ def restore_predictions(recording: Recording, config: RunConfig | None = None) -
         _warn(recording, f"{differing} of {len(recorded)} hashes differ from those of the run")
     start = replace(recording.start, predictions_every=0)
     others = [
-        start if isinstance(item, RunStart) else item
-        for item in recording.items
-        if not (isinstance(item, Block) and item.stream == "pred")
+        start if isinstance(entry, RunStart) else entry
+        for entry in recording.items.entries
+        if not (isinstance(entry, StoredBlock) and entry.stream == "pred")
     ]
-    items = sorted([*others, *blocks], key=lambda item: (item.index, TOPIC_ORDER[topic_for(item)]))
-    joined = {"meas": recording.contiguous_blocks("meas")}
-    return replace(recording, start=start, items=SharedItems(items, joined))
+    entries = sorted(
+        [*others, *blocks], key=lambda entry: (entry.index, TOPIC_ORDER[find_topic(entry)])
+    )
+    return replace(recording, start=start, items=StoredItems(entries))
 
 
 def _warn(recording: Recording, problem: str) -> None:
