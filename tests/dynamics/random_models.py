@@ -161,7 +161,7 @@ def check_orbits(diagram: Diagram, count: int, independent: int, seed: int, find
     orbits = [
         point.orbit
         for branch in diagram.branches
-        for point in branch.points
+        for point in branch.points[1:-1]  # a branch begins and ends at bifurcations of others
         # The Jacobian of a grazing orbit is one-sided, other bifurcations are marginal.
         if not any(point.orbit is b.orbit for b in branch.bifurcations)
     ]
@@ -198,7 +198,7 @@ def contradicts_simulation(orbit: Orbit) -> str:
     x = orbit.x.copy()
     x[0] += RELATIVE_DISTURBANCE * size
     x[1] += 0.7 * RELATIVE_DISTURBANCE * size * period_map.scales[1]
-    times = math.ceil(min(14 / abs(math.log(largest)), 400))
+    times = math.ceil(min(14 / abs(math.log(max(largest, 1e-6))), 400))
     distance = 0.0
     for _ in range(times):
         x = period_map.iterate(x, orbit.frequency_hz, orbit.acceleration_m_s2, n)
