@@ -49,7 +49,7 @@ def test_blocks_of_other_channels_are_kept_apart() -> None:
     blocks = [make_block(0, 5), make_block(5, 5, ("a",)), make_block(10, 5)]
     items = StoredItems.from_items(blocks)
     read = [item for item in items if isinstance(item, Block)]
-    assert all(one.is_identical(other) for one, other in zip(read, blocks, strict=True))
+    assert all(block.is_identical(original) for block, original in zip(read, blocks, strict=True))
     assert [block.channels for block in items.contiguous_blocks("meas")] == [
         ("a", "b"), ("a",), ("a", "b"),
     ]  # fmt: skip
