@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from tests.identification.played import SNM, format_truth, imperfect_log, log
+from tests.recovery.recordings import log_columns, oscillator
 from twin.identification import law_search
 from twin.identification.discover import prepare_problem
 from twin.identification.law_search import find_law_of_base, propose_law, search_laws
-from twin.identification.law_terms import FAMILIES, list_law_candidates
+from twin.identification.law_terms import FAMILIES, list_law_candidates, make_law_candidate
 from twin.identification.motion import RecordScale
 from twin.identification.parameters import EffectKey
 from twin.identification.symbolic_regression import make_term
@@ -107,6 +108,43 @@ def test_the_planted_law_is_the_best(truth, name, place):
     assert effect.place == place
     assert null.cost > 1.5
     assert best.cost < 1.1 * prepared.problem.noise
+
+
+def record_slipping_coupling(hz, seed):
+    """Component test of friction, 10 kN, behind 2 mm of slack and 1.5 mm of yielding coupling."""
+    rate_hz, slack, reach, friction = 200.0, 2e-3, 3.5e-3, 1e4
+    draw = np.random.default_rng(seed)
+    time_s = np.arange(6 * rate_hz / hz) / rate_hz
+    u = np.concatenate([size * np.sin(2 * np.pi * hz * time_s) for size in (6e-3, 12e-3, 20e-3)])
+    deflection, force = 0.0, np.zeros(u.size)
+    for i, step in enumerate(np.diff(u, prepend=0.0)):  # beyond its reach the coupling slips
+        deflection = min(max(deflection + step, -reach), reach)
+        taken_up = max(abs(deflection) - slack, 0.0) / (reach - slack)
+        force[i] = math.copysign(friction * taken_up, deflection)
+    columns = {
+        "rel_disp_m": u + draw.normal(0.0, 1e-6, u.size),
+        "damper_force_n": force + draw.normal(0.0, 50.0, u.size),
+    }
+    return log_columns(f"{hz:g} Hz", rate_hz, columns)
+
+
+def test_friction_behind_slack_is_told_from_plain_hysteresis(monkeypatch):
+    families = [family for family in FAMILIES if family.name.endswith("hysteresis")]
+    monkeypatch.setattr(
+        law_search, "list_law_candidates",
+        lambda scale, _: tuple(make_law_candidate(family, scale) for family in families),
+    )  # fmt: skip
+    logs = [record_slipping_coupling(hz, seed) for hz, seed in ((0.5, 1), (1.0, 2))]
+    prepared = prepare_problem(logs, oscillator(1e5, 1e3))
+    null = prepared.problem.fit_effects(prepared.parameters, ())
+    fitted_sets = search_laws(prepared.problem, [null])
+    fitted = {candidate.names: candidate for candidate in fitted_sets}
+    plain, slack = fitted[("law_hysteresis",)], fitted[("law_slack_hysteresis",)]
+    assert slack.cost < 0.02 * null.cost
+    assert slack.cost < 0.2 * plain.cost
+    values = slack.fit.parameters.values
+    assert values[EffectKey("law_slack_hysteresis", "k")] == pytest.approx(1e4, rel=0.05)
+    assert values[EffectKey("law_slack_hysteresis", "w")] == pytest.approx(3.5e-3, rel=0.05)
 
 
 def test_a_law_is_found_beside_the_errors_of_instruments():

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from table_io.block import Block, Float2D
+from table_io.block import Block, Float2D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR, load_config
@@ -101,3 +101,17 @@ def prepare_log(
     return PreparedLog(
         build_signals(blocks, name, 550.0, gaps), 10.0, plan_sweep(profile(2.0, 2.0)).steps
     )
+
+
+def oscillator(stiffness: float, damping: float) -> Model:
+    """Per unit mass, without bumpers, to start from."""
+    return Model(Parameters(1.0, stiffness, damping, 1.0, 1.0, 1.0, 1.0, np.inf, np.inf))
+
+
+def log_columns(name: str, rate_hz: float, columns: dict[str, np.ndarray]) -> PreparedLog:
+    """Columns as a log that moves all the time."""
+    values = np.array(list(columns.values()))
+    label = np.full(values.shape[1], int(Label.SETTLE), dtype=np.int64)
+    outside = np.full(values.shape[1], -1, dtype=np.int64)
+    block = Block("meas", 0, rate_hz, tuple(columns), values, outside, label, outside.copy())
+    return PreparedLog(build_signals((block,), name, 1.0, (np.inf, np.inf)), 1.0)

@@ -9,32 +9,15 @@ import numpy as np
 import pytest
 from scipy.signal import resample_poly
 
-from table_io.block import Block, Label
+from tests.recovery.recordings import log_columns, oscillator
 from twin.identification.discover import PreparedLog, discover_effects
 from twin.identification.held_out import compute_force_error
 from twin.identification.parameters import INPUT_GAIN, INPUT_OFFSET
-from twin.identification.signals import build_signals
 from twin.model.model import Model
-from twin.model.parameters import Parameters
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
-INF = float("inf")
 SILVERBOX_HZ = 1e7 / 2**14
 ARROW, FIRST_SINE = slice(1000, 40500), 41000  # the growing part; the multisines after it
-
-
-def oscillator(stiffness: float, damping: float) -> Model:
-    """Per unit mass, without bumpers, to start from."""
-    return Model(Parameters(1.0, stiffness, damping, 1.0, 1.0, 1.0, 1.0, INF, INF))
-
-
-def log(name: str, rate_hz: float, columns: dict[str, np.ndarray]) -> PreparedLog:
-    """Columns as a log that moves all the time."""
-    values = np.array(list(columns.values()))
-    label = np.full(values.shape[1], int(Label.SETTLE), dtype=np.int64)
-    outside = np.full(values.shape[1], -1, dtype=np.int64)
-    block = Block("meas", 0, rate_hz, tuple(columns), values, outside, label, outside.copy())
-    return PreparedLog(build_signals((block,), name, 1.0, (INF, INF)), 1.0)
 
 
 def table(path: Path, *columns: int) -> np.ndarray:
@@ -73,7 +56,7 @@ def test_silverbox_has_a_cubic_spring() -> None:
     """
     voltage = table(DATA / "silverbox" / "SNLS80mV.csv", 0, 1)
     part = voltage[FIRST_SINE : FIRST_SINE + 26000]
-    recording = log(
+    recording = log_columns(
         "silverbox", SILVERBOX_HZ, {"table_acc_m_s2": -part[:, 0], "rel_disp_m": part[:, 1]}
     )
     discovery = discover_effects([recording], oscillator(1.5e5, 50.0))
@@ -99,7 +82,7 @@ def test_rubber_bearings_have_hysteresis_and_more() -> None:
     def bearing(name: str) -> PreparedLog:
         rows = table(DATA / "bncs" / f"{name}.csv", 1, 2, 3, 4)
         names = ("rel_disp_m", "damper_force_n", "table_acc_m_s2", "mass_acc_m_s2")
-        return log(name, 200.0, dict(zip(names, rows.T, strict=True)))
+        return log_columns(name, 200.0, dict(zip(names, rows.T, strict=True)))
 
     discovery = discover_effects([bearing("ICA50"), bearing("ICA140")], oscillator(5.0, 0.5))
     verdict = discovery.verdict

@@ -458,7 +458,9 @@ def make_mr_case(variant: str) -> Case:
     )
 
 
-def make_friction_case(training: str) -> Case:
+def make_friction_case(training: str, goal: float) -> Case:
+    """Return the case with half the error of the best linear + Coulomb model as its goal."""
+
     def prepare(folder: Path, scratch: Path) -> PreparedCase:
         return prepare_friction_damper(folder, scratch, training)
 
@@ -466,7 +468,7 @@ def make_friction_case(training: str) -> Case:
         f"friction damper, {training}",
         "Dataset-Friction-Damper-with-Backlash",
         prepare,
-        0.48,
+        goal,
         frozenset({"coulomb_friction", "bouc_wen"}),
         expects_remainder=True,
     )
@@ -476,8 +478,8 @@ CASES = (
     make_mr_case("raw"),
     make_mr_case("mean removed"),
     make_mr_case("rest cut"),
-    make_friction_case("sines"),
-    make_friction_case("earthquakes"),
+    make_friction_case("sines", 0.48),
+    make_friction_case("earthquakes", 0.59),
     Case(
         "BNCS",
         "physics-informed-lstm-base-isolation",
