@@ -114,6 +114,8 @@ def _drifts(
 FAMILIES: tuple[TermFamily, ...] = (
     TermFamily("spring_power", MEMORYLESS, "damper", f"k * {_power('u', 'u0', True)}",
                {"p": ODD_EXPONENTS}, ("u", True), title="nonlinear spring"),
+    TermFamily("constant_force", MEMORYLESS, "damper", "k", {},
+               title="constant force, or offset of its sensor"),
     TermFamily("even_spring", MEMORYLESS, "damper", f"k * {_power('u', 'u0', False)}",
                {"p": EVEN_EXPONENTS}, ("u", False), title="spring that differs by direction"),
     TermFamily("saturating_spring", MEMORYLESS, "damper", "k * tanh(u / w)",
