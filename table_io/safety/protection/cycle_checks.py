@@ -264,11 +264,12 @@ def check_response(
     extra_lag_s = min((-np.angle(ratio) / cycle.omega for ratio in ratios), key=abs)
     limit = max(MAX_LAG_CHANGE_RATIO * lag_s, MAX_LAG_CHANGE_S) + deflection / cycle.omega
     if abs(extra_lag_s) > limit:
+        allowed_s = lag_s + math.copysign(limit, extra_lag_s)
         text = (
             f"the table lags {1e3 * (lag_s + extra_lag_s):.1f} ms behind its command, "
-            f"{1e3 * lag_s:.1f} ms before; allowed: {1e3 * (lag_s + limit):.1f} ms"
+            f"{1e3 * lag_s:.1f} ms before; allowed: {1e3 * allowed_s:.1f} ms"
         )
-        yield Suspicion("response", "table_disp_m", lag_s + extra_lag_s, lag_s + limit, text)
+        yield Suspicion("response", "table_disp_m", lag_s + extra_lag_s, allowed_s, text)
 
 
 def payload_deflection(cycle: DriveCycle, lag_s: float) -> float:
