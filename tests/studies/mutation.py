@@ -8,8 +8,9 @@ package run on each until the first one fails. A mutant that passes them all has
 test is missing, or the change makes no difference. A run beyond the time limit counts as killed.
 
 No file is changed: a process that has collected the tests is copied for each mutant, and functions
-and constants of the package are replaced there. So kernels are tested uncompiled, and faults in
-the body of a class, or in what tests start as a command, are not drawn or not seen.
+and constants of the package are replaced there. Kernels are compiled anew with their fault, or run
+uncompiled; faults in the body of a class, or in what tests start as a command, are not drawn or not
+seen.
 
 The same seed draws the same mutants as long as the files are the same.
 """
@@ -34,6 +35,8 @@ from typing import Any
 import numba
 import pytest
 from _pytest.main import pytest_runtestloop as run_test_loop
+from numba.core.caching import NullCache
+from numba.core.dispatcher import Dispatcher
 
 REPOSITORY = Path(__file__).parents[2]
 TIME_LIMIT_FACTOR, MIN_TIME_LIMIT_S = 4.0, 60.0
@@ -296,6 +299,10 @@ def patch_object(old: Any, new: Any) -> None:
         patch_object(old.fget, new.fget)
     elif isinstance(old, cached_property):
         patch_object(old.func, new.func)
+    elif isinstance(old, Dispatcher):
+        assert not old.overloads, f"{old.py_func.__name__} is compiled before the fault is planted"
+        patch_object(old.py_func, new.py_func)
+        old._cache = NullCache()  # which holds the code without the fault
     elif isinstance(old, staticmethod | classmethod):
         patch_object(old.__func__, new.__func__)
     elif isinstance(old, FunctionType) and isinstance(new, FunctionType):
