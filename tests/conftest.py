@@ -6,11 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from hypothesis import settings
 
 # Before anything is imported that computes; so whatever does is imported where it is needed.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 pytest_plugins = ["tests.reports.folders"]
+settings.register_profile("any machine", deadline=None)  # no test needs a quiet one
+settings.load_profile("any machine")
 
 if TYPE_CHECKING:
     from twin.recording.reader import Recording

@@ -140,7 +140,7 @@ def test_cutting_the_samples_changes_no_bit(
     assert np.isfinite(predicted(whole).values[:, 1000:]).all()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(data=st.data())
 def test_any_cut_of_a_stretch_changes_no_bit(
     setup: pipeline.PipelineSetup, measured: Block, data: st.DataObject

@@ -191,7 +191,7 @@ def hides_nothing(path: Path) -> bool:
 
 
 @given(data=st.data())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_a_damaged_byte_is_noticed_or_does_no_harm(intact: Path, data: st.DataObject) -> None:
     place = data.draw(st.integers(8, intact.stat().st_size - 1))
     assert hides_nothing(flip_bits(intact, place, data.draw(st.integers(1, 255))))

@@ -84,7 +84,7 @@ def test_recut_and_join_give_back_every_bit(samples: int) -> None:
     sizes=st.lists(st.sampled_from([1, 7, 64, 500]), min_size=1, max_size=12),
     samples=st.sampled_from([1, 3, 7, 64, 500]),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_a_recut_does_not_know_how_the_samples_came(sizes: list[int], samples: int) -> None:
     whole = block()
     straight = list(recut_blocks([whole], samples))

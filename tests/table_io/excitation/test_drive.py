@@ -219,7 +219,7 @@ def test_no_cut_into_blocks_changes_a_bit(samples: int) -> None:
 
 
 @given(st.data())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_a_decay_from_any_sample_is_smooth_and_ends_at_rest(data: st.DataObject) -> None:
     name = data.draw(st.sampled_from(["g0", "g4_ss1", "quickstart"]))
     drive = plan_drive(name)

@@ -568,7 +568,7 @@ def find_line(checks: tuple[Check, ...], name: str, channel: str) -> Check:
     frequencies=st.lists(st.floats(0.1, 20.0), min_size=2, max_size=6, unique=True),
     delay_s=st.floats(-0.05, 0.05), start=st.floats(-1.0, 1.0),
 )  # fmt: skip
-@settings(deadline=None, derandomize=True)
+@settings(derandomize=True)
 def test_phases_are_unwrapped_along_a_delay(
     frequencies: list[float], delay_s: float, start: float
 ) -> None:

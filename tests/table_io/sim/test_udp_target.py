@@ -592,9 +592,7 @@ MAD = st.builds(
 )  # fmt: skip
 
 
-FUZZ = settings(
-    max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+FUZZ = settings(max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @FUZZ
