@@ -3,6 +3,7 @@
 import builtins
 import tomllib
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +12,14 @@ from typer.testing import CliRunner
 
 from table_io.backends import MachineLost
 from table_io.block import Float1D, Float2D
-from table_io.clock import Clock
+from table_io.clock import Clock, ManualClock
 from table_io.config.base import PROFILES_DIR, parse_toml
-from table_io.config.calibration_fit import MeanVoltage
+from table_io.config.calibration_fit import MeanVoltage, mean_voltage
 from table_io.config.calibration_record import CalibrationRecord
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.config.rig_file import load_rig
+from table_io.errors import InputError
 from table_io.sim.simulated_table import SimulatedBackend
 from tests.input_errors import raises_input_error
 from twin.cli import calibrate as command
@@ -219,17 +221,185 @@ def test_the_departure_in_standard_deviations_has_the_sign_of_that_in_per_cent(
     assert record.departure_sd == pytest.approx(0.5 / (np.sqrt(2) * 1e-3))
 
 
-def test_a_converter_that_stood_still_is_not_exact() -> None:
+@pytest.mark.parametrize("turned", [1.0, -1.0])
+def test_a_converter_that_stood_still_is_not_exact(turned: float) -> None:
     """Each point counts with a step / sqrt(12) at least."""
-    sensor = CARD.model_copy(update={"bits": 16})
-    step = sensor.lsb * sensor.volts_per_unit
+    sensor = CARD.model_copy(update={"bits": 16, "volts_per_unit": turned * CARD.volts_per_unit})
+    step = sensor.lsb * CARD.volts_per_unit
     for sd in (0.0, 1e-9):
-        means = (MeanVoltage(0.0, 0.0), MeanVoltage(5.0, sd))
+        means = (MeanVoltage(0.0, 0.0), MeanVoltage(5.0 * turned, sd))
         record = command.make_calibration(sensor, ASKED, (0.0, 1.0), means)
         assert record.volts_per_unit_sd == pytest.approx(step * np.sqrt(2 / 12), rel=1e-6)
-    means = (MeanVoltage(0.0, 0.0), MeanVoltage(5.0, 0.05))
+    means = (MeanVoltage(0.0, 0.0), MeanVoltage(5.0 * turned, 0.05))
     record = command.make_calibration(sensor, ASKED, (0.0, 1.0), means)
     assert record.volts_per_unit_sd == pytest.approx(0.05, rel=1e-3)
+
+
+@pytest.mark.parametrize("turned", [1.0, -1.0])
+@pytest.mark.parametrize("departure", [-2.1, -1.9, -0.1, 0.0, 0.1, 1.9, 2.1])
+@pytest.mark.parametrize("shunt", [None, 1.5, -1.5])
+def test_a_departure_to_either_side_is_compared_with_the_tolerance(
+    shunt: float | None, departure: float, turned: float
+) -> None:
+    """2 per cent: asked for, or the tolerance of the shunt over its size."""
+    nominal = turned * CARD.volts_per_unit
+    changes = {"volts_per_unit": nominal, "shunt": shunt, "shunt_tolerance": 0.03}
+    request = replace(ASKED, shunt=shunt is not None, tolerance_percent=2.0, applied_sd=1e-6)
+    applied = (0.0, shunt or 1.0)
+    means = tuple(MeanVoltage(nominal * (1 + departure / 100) * (x + 0.1), 1e-4) for x in applied)
+    record = command.make_calibration(CARD.model_copy(update=changes), request, applied, means)
+    assert record.tolerance_percent == pytest.approx(2.0)
+    assert record.passed == (abs(departure) < 2.0)
+    assert record.departure_percent == pytest.approx(departure, abs=1e-9)
+    expected_sd = departure / 100 * abs(nominal) / record.volts_per_unit_sd
+    assert record.departure_sd == pytest.approx(expected_sd, abs=1e-6)
+    assert record.offset == pytest.approx(0.1)
+    assert (record.applied, record.applied_sd) == (applied, 1e-6)
+    assert record.volts == tuple(mean.volts for mean in means)
+    assert record.volts_sd == (1e-4, 1e-4)
+    assert (record.card_volts_per_unit, record.serial) == (nominal, CARD.serial)
+    assert record.method == ("points" if shunt is None else "shunt")
+
+
+@pytest.mark.parametrize("turned", [1.0, -1.0])
+@pytest.mark.parametrize("applied", [(0.0, 1.0, 0.5), (0.5, 1.0, 0.0), (1.0, 0.5, 0.0)])
+@pytest.mark.parametrize("largest_error", ["noise", "converter"])
+def test_readings_must_differ_by_ten_errors(
+    largest_error: str, applied: tuple[float, ...], turned: float
+) -> None:
+    """From the smallest to the largest applied value, in the largest error of any point."""
+    sensor = CARD.model_copy(update={"volts_per_unit": turned * CARD.volts_per_unit, "bits": 8})
+    step = 2.0 * CARD.range * CARD.volts_per_unit / 256.0
+    error = 2.0 * step if largest_error == "noise" else step
+    for ratio in (-10.001, -9.999, 9.999, 10.001):
+        means = tuple(
+            MeanVoltage(3.0 + ratio * error * x, error if place == 1 and error > step else 0.0)
+            for place, x in enumerate(applied)
+        )
+        if abs(ratio) > 10.0:
+            command.make_calibration(sensor, ASKED, applied, means)
+            continue
+        with raises_input_error(where=CARD.channel):
+            command.make_calibration(sensor, ASKED, applied, means)
+
+
+def test_readings_that_differ_by_exactly_ten_errors_are_refused() -> None:
+    means = (MeanVoltage(0.0, 0.25), MeanVoltage(2.5, 0.25))
+    with raises_input_error(where=CARD.channel):
+        command.make_calibration(CARD, ASKED, (0.0, 1.0), means)
+
+
+@dataclass
+class Inputs:
+    """A machine that only reads: `volts` of one channel, the others are large."""
+
+    channel: str
+    volts: Float1D
+    rate_hz: float = 500.0
+    calls: list[object] = field(default_factory=list)
+
+    def open(self) -> None:
+        self.calls.append("open")
+
+    def tare(self, samples: int) -> Float2D:
+        self.calls.append(samples)
+        rig = parse_toml(TEXT, RigConfig, "card")
+        rows = [self.volts if name == self.channel else self.volts + 1e3 for name in rig.channels]
+        return np.array(rows)
+
+    def close(self) -> None:
+        self.calls.append("close")
+
+
+@pytest.mark.parametrize("turned", [1.0, -1.0])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("share", [0.5, 0.9985, 0.9995, 1.2])
+def test_one_clipped_sample_is_refused_on_either_side(
+    share: float, sign: float, turned: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = parse_toml(TEXT, RigConfig, "card")
+    sensor = CARD.model_copy(update={"volts_per_unit": turned * CARD.volts_per_unit})
+    volts = np.full(500, 0.1)
+    volts[:5] = np.nan
+    volts[77] = sign * share * CARD.range * CARD.volts_per_unit
+    machine = Inputs(CARD.channel, volts)
+    monkeypatch.setattr(command, "make_machine", lambda *_: machine)
+    if share < 0.999:
+        mean = command._measure_mean(rig, sensor, "applied")
+        assert mean == mean_voltage(volts)
+    else:
+        with raises_input_error(where="applied", allowed=f"{CARD.range:g}"):
+            command._measure_mean(rig, sensor, "applied")
+    assert machine.calls == ["open", 500, "close"]
+
+
+@pytest.mark.parametrize("unattended", [True, False])
+def test_a_person_presses_enter_and_an_unattended_table_waits(
+    unattended: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, prompts = ManualClock(3.0), []
+    monkeypatch.setattr(command, "RealClock", lambda: clock)
+    monkeypatch.setattr(builtins, "input", prompts.append)
+    command._wait_for_person("apply 1 g", unattended)
+    assert clock.now() == (8.0 if unattended else 3.0)
+    assert len(prompts) == (0 if unattended else 1)
+
+
+def test_without_a_terminal_nobody_can_be_prompted(monkeypatch: pytest.MonkeyPatch) -> None:
+    def end(_: str) -> str:
+        raise EOFError
+
+    monkeypatch.setattr(builtins, "input", end)
+    with raises_input_error(remedy="--unattended"):
+        command._wait_for_person("apply 1 g", False)
+
+
+@pytest.mark.parametrize(
+    ("changes", "applied"),
+    [
+        ({"points": "-2,2"}, (-2.0, 2.0)),  # the whole range
+        ({"points": "2,-2,0,0"}, (2.0, -2.0, 0.0, 0.0)),
+        ({"points": "1,1.004"}, (1.0, 1.004)),  # a thousandth of 2 g is the least
+        ({"points": "1,1.0019"}, None),
+        ({"points": "0,2.001"}, None),
+        ({"points": "-2.001,0"}, None),
+        ({"points": "1,1"}, None),
+        ({"points": "0,1", "applied_sd": 2.0}, (0.0, 1.0)),
+        ({"points": "0,1", "applied_sd": 2.1}, None),
+        ({"points": "0,1", "applied_sd": -1e-9}, None),
+        ({"points": "0,1", "tolerance_percent": 1e-6}, (0.0, 1.0)),
+        ({"points": "0,1", "tolerance_percent": 0.0}, None),
+        ({"points": "0,1", "tolerance_percent": -1.0}, None),
+        ({"points": "", "shunt": True}, (0.0, -1.5)),
+        ({"points": "0,1", "shunt": True}, None),
+        ({"points": "", "shunt": True, "tolerance_percent": 1.0}, None),
+    ],
+)
+def test_points_are_planned_within_their_bounds(
+    changes: dict[str, object], applied: tuple[float, ...] | None
+) -> None:
+    sensor = CARD.model_copy(update={"shunt": -1.5, "shunt_tolerance": 0.03, "range": 2.0})
+    request = replace(ASKED, **changes)  # type: ignore[arg-type]
+    if applied is None:
+        with pytest.raises(InputError):
+            command._plan_points(request, sensor)
+        return
+    planned, prompts = command._plan_points(request, sensor)
+    assert planned == applied
+    assert len(prompts) == len(applied)
+
+
+def test_the_least_span_is_a_thousandth_of_the_range() -> None:
+    sensor = CARD.model_copy(update={"range": 1024.0})  # a thousandth, exactly as computed
+    least = 1e-3 * 1024.0
+    command._check_span((0.0, least), sensor, "--points")
+    with raises_input_error(where="--points", allowed="1.024"):
+        command._check_span((0.0, np.nextafter(least, 0.0)), sensor, "--points")
+
+
+def test_the_tolerance_is_one_per_cent_unless_asked_for() -> None:
+    assert ASKED.tolerance == 1.0
+    assert replace(ASKED, tolerance_percent=0.3).tolerance == 0.3
 
 
 def test_no_record_is_written_into_the_installed_package(calibrate: Calibrate) -> None:

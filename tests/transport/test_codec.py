@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from table_io.block import Block
 from table_io.records import (
     RECORD_TYPES,
+    Comparison,
     CycleExtremes,
     Extremes,
     PrcPoint,
@@ -100,7 +101,7 @@ def return_through_bytes(item: Item) -> Item:
 @pytest.mark.parametrize("kind", RECORD_TYPES, ids=lambda kind: kind.__name__)
 def test_every_record_comes_back_to_the_bit(kind: type) -> None:
     @given(anything_like(kind))
-    @settings(max_examples=40, deadline=None)
+    @settings(max_examples=40)
     def law(record: Record) -> None:
         back = return_through_bytes(record)
         assert bits(back) == bits(record)
@@ -110,7 +111,7 @@ def test_every_record_comes_back_to_the_bit(kind: type) -> None:
 
 
 @given(any_block())
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 def test_every_block_comes_back_to_the_bit(block: Block) -> None:
     back = return_through_bytes(block)
     assert isinstance(back, Block)
@@ -222,13 +223,13 @@ def refused_or_an_item(name: str, payload: bytes) -> bool:
 
 
 @given(name=st.sampled_from(sorted(codec.TOPIC_TYPES)), payload=st.binary(max_size=200))
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 def test_garbage_is_refused_or_is_an_item(name: str, payload: bytes) -> None:
     assert refused_or_an_item(name, payload)
 
 
 @given(st.data())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_damaged_bytes_are_refused_or_are_an_item(data: st.DataObject) -> None:
     item = data.draw(any_block() if data.draw(st.booleans()) else anything_like(PrcPoint))
     payload = bytearray(encode_item(item, "run"))
@@ -306,3 +307,43 @@ def plain(file: FileDescriptorProto) -> FileDescriptorProto:
         for field in message.field:
             field.ClearField("json_name")
     return file
+
+
+def ends_with_run(kind: type) -> bool:
+    """True if the run is the last field of the message: later ones were added to some kinds."""
+    fields_by_number = getattr(pb, codec.MESSAGE_NAMES[kind]).DESCRIPTOR.fields_by_number
+    return bool(fields_by_number[max(fields_by_number)].name == "run")
+
+
+def test_the_run_is_the_last_field_of_a_comparison() -> None:
+    assert ends_with_run(Comparison)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in RECORD_TYPES if ends_with_run(kind)])
+@given(data=st.data())
+@settings(max_examples=4)
+def test_a_record_without_its_run_is_that_of_any_run(kind: type, data: st.DataObject) -> None:
+    record = data.draw(anything_like(kind))
+    stripped = [codec.strip_run(encode_item(record, run), kind, run) for run in ("a", "run 7")]
+    assert stripped[0] == stripped[1] == encode_item(record, "")
+    other = encode_item(record, "b")
+    assert codec.strip_run(other, kind, "a") == other
+
+
+def test_a_flat_schema_has_its_columns_in_order() -> None:
+    columns = [("t", "time"), ("x", "double"), ("label", "string"), ("n", "int64"), ("u", "time")]
+    schema = codec.build_flat_schema("lab.rig.Row", columns)
+    times, file = FileDescriptorSet.FromString(schema).file
+    assert (file.name, file.package, file.syntax) == ("lab.rig.Row.proto", "lab.rig", "proto3")
+    assert list(file.dependency) == [times.name]
+    (message,) = file.message_type
+    assert message.name == "Row"
+    assert [(column.name, column.number) for column in message.field] == [
+        (name, number) for number, (name, _) in enumerate(columns, 1)
+    ]
+    time_type = f".{times.package}.{times.message_type[0].name}"
+    kinds = {"double": 1, "int64": 3, "string": 9, "time": 11}  # numbers of protobuf
+    assert [(column.type, column.type_name) for column in message.field] == [
+        (kinds[kind], time_type if kind == "time" else "") for _, kind in columns
+    ]
+    assert {column.label for column in message.field} == {FieldDescriptor.LABEL_OPTIONAL}

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from table_io.block import Block
+from table_io.records import SampleGap
 from twin.transport import shaketwin_pb2 as pb
 from twin.transport.codec import WireError, decode_item, encode_item, topic_for
 
@@ -96,3 +97,55 @@ def test_a_block_with_bytes_missing_is_refused(field: str, lost: int) -> None:
     setattr(message, field, getattr(message, field)[:-lost])
     with pytest.raises(WireError, match="not a Block"):
         decode_item("/rig/meas", message.SerializeToString())
+
+
+@pytest.mark.parametrize("past", [-1, 0, 1])
+@pytest.mark.parametrize("count", [0, 1, 5])
+def test_samples_are_counted_as_far_as_numbers_are_exact(count: int, past: int) -> None:
+    labels = np.zeros(count, np.int64)
+    index = 2**53 - count + past
+    block = Block("meas", index, 2e3, ("a",), np.zeros((1, count)), labels, labels, labels)
+    gap = SampleGap(2**53 + past, 2, "a", "lost")
+    for item in (block, gap):
+        payload = encode_item(item, "r")
+        if past > 0:
+            with pytest.raises(WireError):
+                decode_item(topic_for(item), payload)
+        else:
+            assert decode_item(topic_for(item), payload)[1].index == item.index  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("row", [0, 1, 2])
+@pytest.mark.parametrize("label", [2**31 - 1, -(2**31) + 1, 2**31, -(2**31)])
+def test_labels_within_31_bits_come_back_from_every_row(label: int, row: int) -> None:
+    labels = np.zeros((3, 4), np.int64)
+    labels[row, 2] = label
+    block = Block("pred", 0, 1.0, (), np.empty((0, 4)), *labels)
+    if abs(label) > 2**31 - 1:
+        with pytest.raises(ValueError, match="2147483647"):
+            encode_item(block, "")
+    else:
+        decoded = decode_item(topic_for(block), encode_item(block, ""))[1]
+        assert isinstance(decoded, Block)
+        assert decoded.is_identical(block)
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("inf"), float("nan"), 5e-324, 1e300])
+def test_a_rate_is_positive_and_finite(rate_hz: float) -> None:
+    message = pb.Block(stream="meas", rate_hz=rate_hz)
+    if 0.0 < rate_hz < float("inf"):
+        assert decode_item("/rig/meas", message.SerializeToString())[1].rate_hz == rate_hz  # type: ignore[union-attr]
+    else:
+        with pytest.raises(WireError):
+            decode_item("/rig/meas", message.SerializeToString())
+
+
+def test_items_of_one_recording_share_their_names() -> None:
+    labels = np.zeros(1, np.int64)
+    names = tuple(f"channel {number}" for number in range(3))
+    block = Block("meas", 0, 2e3, names, np.zeros((3, 1)), labels, labels, labels)
+    first, second = (decode_item("/rig/meas", encode_item(block, run))[1] for run in ("a", "b"))
+    assert isinstance(first, Block)
+    assert isinstance(second, Block)
+    assert first.channels == names
+    assert first.channels is second.channels

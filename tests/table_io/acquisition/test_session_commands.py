@@ -11,18 +11,26 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from table_io import sequencer
-from table_io.acquisition.event_log import MAX_LATENESS_S
+from table_io.acquisition.event_log import MAX_LATENESS_S, EventLog
 from table_io.acquisition.output_queue import DECISION_S, OutputQueue
-from table_io.acquisition.session import COMMAND_DELAY_S, OperatorCommand
+from table_io.acquisition.session import (
+    COMMAND_DELAY_S,
+    OperatorCommand,
+    SessionSetup,
+    find_gaps,
+    run_session,
+)
 from table_io.backends import MachineLost
 from table_io.block import Block, Float2D, Label, join_blocks
-from table_io.clock import ManualClock
+from table_io.clock import ManualClock, local_datetime
+from table_io.config.calibration_due import find_overdue_calibrations
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import plan_sweep
 from table_io.records import Event, Record, RunStop, SampleGap, Trip
 from table_io.sequencer import actions
 from tests.table_io.acquisition.test_session import (
     RATE_HZ,
+    RIG,
     Hasty,
     Machine,
     Stop,
@@ -30,6 +38,7 @@ from tests.table_io.acquisition.test_session import (
     machine,
     profile,
     session,
+    start_record,
     stop_record,
 )
 from tests.table_io.excitation.sine_segments import sine_segments
@@ -39,7 +48,7 @@ REST_SAMPLES = round(profile().acquisition.rest_s * RATE_HZ)
 BLOCK_COUNT = plan_sweep(profile()).planned_end // BLOCK_SAMPLES
 FIRST_MOVING = sine_segments(plan_sweep(profile()))[0].start // BLOCK_SAMPLES + 1
 LAW = settings(
-    max_examples=12, deadline=None, derandomize=True,
+    max_examples=12, derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )  # fmt: skip
 VERDICTS = {"stop": "stopped", "abort": "aborted"}
@@ -305,3 +314,166 @@ def test_a_feedback_that_comes_too_late_every_time_ends_the_test(
     first = 101 * BLOCK_SAMPLES + subject.replace_after + round(DECISION_S * RATE_HZ)
     assert earliest_samples == [first + BLOCK_SAMPLES * attempt for attempt in range(5)]
     assert_ends_after_rest(items, subject)
+
+
+@dataclass
+class Taring(Machine):
+    """A machine whose sensor `reversed_channel` is mounted the other way round."""
+
+    reversed_channel: str = ""
+    tared: list[int] = field(default_factory=list)
+    shown: dict[int, float] = field(default_factory=dict)  # shares of the range, at samples
+
+    def tare(self, samples: int) -> Float2D:
+        self.tared.append(samples)
+        return super().tare(samples)
+
+    def read(self, samples: int) -> Float2D:
+        first, volts = self.next, super().read(samples)
+        row = self.channels.index("force_l2_n")
+        full_scale = abs(RIG.sensors[row].range_si * RIG.sensors[row].volts_per_si)
+        for sample, share in self.shown.items():
+            if first <= sample < self.next:
+                volts[row, sample - first] = share * full_scale
+        if self.reversed_channel:
+            volts[self.channels.index(self.reversed_channel)] *= -1.0
+        return volts
+
+
+def test_the_tare_is_that_of_one_second_at_rest() -> None:
+    subject = Taring(plan_sweep(profile()), ManualClock())
+    list(session(subject, Stop(2)))
+    assert subject.tared == [RATE_HZ]
+
+
+@pytest.mark.parametrize("is_reversed", [False, True])
+def test_samples_from_999_thousandths_of_the_range_on_are_clipped(is_reversed: bool) -> None:
+    shown = {101: 0.998, 105: 0.999, 110: 1.0, 115: -0.998, 120: -0.999, 125: -1.2}
+    channel = "force_l2_n" if is_reversed else ""
+    subject = Taring(plan_sweep(profile()), ManualClock(), reversed_channel=channel, shown=shown)
+    sensors = tuple(
+        sensor.model_copy(update={"volts_per_unit": -sensor.volts_per_unit})
+        if sensor.channel == channel
+        else sensor
+        for sensor in RIG.sensors
+    )
+    setup = SessionSetup(profile(), RIG.model_copy(update={"sensors": sensors}))
+    items = list(run_session(setup, subject, subject.clock, start_record, Stop(10)))
+    gaps = [item for item in items if isinstance(item, SampleGap)]
+    assert gaps == [
+        SampleGap(at, 1, "force_l2_n", "clipped")
+        for at, share in shown.items()
+        if abs(share) >= 0.999
+    ]
+    whole = join_blocks(blocks(items)).channel("force_l2_n")
+    range_n = RIG.sensors[RIG.channels.index("force_l2_n")].range_si
+    assert whole[list(shown)] == pytest.approx([range_n * share for share in shown.values()])
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("density", [0.0, 0.02, 0.5, 1.0])
+def test_gaps_are_the_runs_of_every_channel(density: float, seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    lost, clipped = (
+        draw.random((2, 3, 30)) < np.array([density, density * (seed % 2)])[:, None, None]
+    )
+    values = np.where(lost, np.nan, 1.0)
+    none = np.zeros(30, dtype=np.int64)
+    block = Block("meas", 400, RATE_HZ, ("a", "b", "c"), values, none, none, none)
+    expected = []
+    for channel, *masks in zip("abc", lost, clipped, strict=True):
+        for mask, reason in zip(masks, ("lost", "clipped"), strict=True):
+            place = 400
+            for is_gap, samples in itertools.groupby(mask.tolist()):
+                count = len(list(samples))
+                expected += [SampleGap(place, count, channel, reason)] if is_gap else []
+                place += count
+    assert list(find_gaps(block, clipped)) == expected
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_first_late_block_of_each_series_is_an_event(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    lateness = draw.choice([0.0, 0.09, MAX_LATENESS_S, 0.101, 0.5], 60).tolist()
+    index = iter(range(1000, 2000))
+    log = EventLog(lambda: next(index))
+    late_ends = []
+    for end, late_s in enumerate(lateness):
+        log.report_lateness(late_s, end)
+        was_late = end > 0 and lateness[end - 1] > 0.1
+        late_ends += [end] if late_s > 0.1 and not was_late else []
+        if end % 7 == 0:
+            log.enter_state(f"state {end // 14}")
+    records = list(log.drain())
+    events_by_kind = {
+        kind: [event for event in records if isinstance(event, Event) and event.kind == kind]
+        for kind in ("late", "state")
+    }
+    assert [event.index for event in records if isinstance(event, Event)] == list(
+        range(1000, 1000 + len(records))
+    )
+    assert len(events_by_kind["late"]) == len(late_ends)
+    for event, end in zip(events_by_kind["late"], late_ends, strict=True):
+        assert {str(end), f"{lateness[end]:.3f}"} <= set(event.text.split())
+    states = [f"state {k}" for k in range(5)]
+    assert [event.text for event in events_by_kind["state"]] == states
+    assert log.states == ["idle", *states]
+    assert list(log.drain()) == []
+
+
+@pytest.mark.parametrize("after", [2000, 6000])
+def test_an_underrun_is_a_trip_at_the_first_sample_of_its_decay(after: int) -> None:
+    subject = Hasty(plan_sweep(profile()), ManualClock(), refused=1, after=after)
+    refused_after = []
+    items = []
+    for item in session(subject, Stop()):
+        items.append(item)
+        if isinstance(item, Block) and subject.refused == 1:
+            refused_after[:] = [item.end]
+    (trip,) = (item for item in items if isinstance(item, Trip))
+    whole = join_blocks(blocks(items))
+    decay_start = int(np.flatnonzero(whole.label == Label.STOP)[0])
+    assert trip == Trip(
+        decay_start, refused_after[0], "late", "", 0.0, 0.0, stop_record(items).reason
+    )
+    assert stop_record(items).states[-2:] == ("stopping", "at rest")
+
+
+def test_a_feedback_that_is_too_late_because_the_lead_ran_out_is_an_underrun(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    answer = sequencer.answer_block
+
+    def answer_with_feedback(state: Any, block: Block, earliest: int) -> Any:
+        state, records = answer(state, block, earliest)
+        is_due = block.end > 100 * BLOCK_SAMPLES
+        return (replace(state, search=object()) if is_due else state), records
+
+    monkeypatch.setattr(sequencer, "answer_block", answer_with_feedback)
+    monkeypatch.setattr(OutputQueue, "replace_drive", lambda *_: False)
+    monkeypatch.setattr(
+        OutputQueue,
+        "has_run_out",
+        property(lambda queue: queue.acquired > 100 * BLOCK_SAMPLES),
+    )
+    items = list(session(machine(stopping=True), Stop()))  # less than the lead plays
+    (trip,) = (item for item in items if isinstance(item, Trip))
+    assert (trip.kind, trip.decided) == ("late", 101 * BLOCK_SAMPLES)
+    assert events(items, "stop") == []
+    assert stop_record(items).verdict == "aborted"
+
+
+@pytest.mark.parametrize("due", ["2020-01-01", "9999-01-01"])
+def test_overdue_calibrations_are_events_before_the_first_block(due: str) -> None:
+    dated = tuple(sensor.model_copy(update={"due": due}) for sensor in RIG.sensors)
+    rig = RIG.model_copy(update={"sensors": dated})
+    subject = machine()
+    items = list(
+        run_session(SessionSetup(profile(), rig), subject, subject.clock, start_record, Stop(2))
+    )
+    warnings = find_overdue_calibrations(rig, local_datetime().date())
+    assert len(warnings) == (len(RIG.sensors) - 1) * (due < "2026")
+    assert [event.text for event in events(items, "calibration")] == warnings
+    assert {event.index for event in events(items, "calibration")} <= {0}
+    first_block = next(place for place, item in enumerate(items) if isinstance(item, Block))
+    assert len(events(items[:first_block], "calibration")) == len(warnings)

@@ -1,5 +1,7 @@
 """Volts and SI, both ways: volts = (value + offset) * volts_per_si; the tare takes the offset."""
 
+from itertools import groupby
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,6 +12,7 @@ from table_io.config.calibration import (
     command_to_si,
     command_to_volts,
     compute_tare,
+    measure_noise,
     si_to_volts,
     volts_to_si,
 )
@@ -43,6 +46,15 @@ def test_both_directions_undo_each_other(offsets: list[float]) -> None:
     np.testing.assert_allclose(back, values, rtol=0, atol=1e-9)
 
 
+def test_a_channel_without_tare_has_no_offset() -> None:
+    sensors, values = (*RIG.sensors, REVERSED), ramp(len(RIG.sensors) + 1)
+    other = {"none of these": 5.0, RIG.channels[2]: 0.5}
+    slope = np.array([sensor.volts_per_si for sensor in sensors])[:, None]
+    offset = np.array([0.5 if place == 2 else 0.0 for place in range(len(sensors))])[:, None]
+    np.testing.assert_allclose(si_to_volts(values, sensors, other), (values + offset) * slope)
+    np.testing.assert_allclose(volts_to_si(values, sensors, other), values / slope - offset)
+
+
 def test_a_tare_removes_what_the_sensors_show_at_rest() -> None:
     shown = {name: 0.01 * (place + 1) for place, name in enumerate(RIG.channels)}
     rest = si_to_volts(np.zeros((len(RIG.channels), 100)), RIG.sensors, shown)
@@ -68,3 +80,29 @@ def test_the_command_fills_its_span_and_comes_back() -> None:
     volts = command_to_volts(metres, output)
     assert (volts[0], volts[-1]) == (-10.0, 10.0)
     np.testing.assert_allclose(command_to_si(volts, output), metres, rtol=1e-15)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_and_tare_are_those_of_the_samples_that_arrived(seed: int) -> None:
+    """Each channel with its own repeated values and losses; one loses all, one is constant."""
+    draw = np.random.default_rng(seed)
+    sensors = (*RIG.sensors, REVERSED)
+    volts = 1e-3 * draw.integers(0, 2 + seed, (len(sensors), 200)).astype(float)
+    volts[draw.random(volts.shape) < 0.1] = np.nan
+    volts[3] = np.nan
+    volts[4] = 0.25
+    noise, tare = measure_noise(volts, sensors), compute_tare(volts, sensors)
+    assert noise.keys() == {sensor.channel for sensor in sensors} - {sensors[3].channel}
+    assert tare.keys() == {sensor.channel for sensor in sensors} - {"drive_disp_m"}
+    rows = {sensor.channel: (row, sensor) for row, sensor in zip(volts, sensors, strict=True)}
+    for channel, (row, sensor) in rows.items():
+        known = row[~np.isnan(row)] / sensor.volts_per_si
+        if channel == sensors[3].channel:
+            assert np.isnan(tare[channel])
+            continue
+        rms, run = noise[channel]
+        assert rms == pytest.approx(np.sqrt(np.mean((known - known.mean()) ** 2)), abs=1e-9)
+        assert run == max(len(list(values)) for _, values in groupby(known.tolist()))
+        if channel in tare:
+            assert tare[channel] == pytest.approx(known.mean(), rel=1e-9, abs=1e-12)
+    assert noise[sensors[4].channel] == (pytest.approx(0.0, abs=1e-9), 200)

@@ -102,3 +102,66 @@ def test_lost_samples_do_not_count_and_nothing_is_made_up() -> None:
     row[:700] = np.nan
     assert mean_voltage(row).volts == 0.5
     assert math.isnan(mean_voltage(np.full(2000, np.nan)).volts)
+
+
+@pytest.mark.parametrize("known_chunks", range(11))
+def test_the_mean_is_that_of_the_tenths_that_have_samples(known_chunks: int) -> None:
+    row = np.random.default_rng(known_chunks).standard_normal(400)
+    tenths = row.reshape(10, 40)
+    tenths[known_chunks:] = np.nan
+    tenths[0, :39] = np.nan  # one sample is enough for its tenth
+    mean = mean_voltage(row)
+    means = [np.nanmean(tenth) for tenth in tenths[:known_chunks]]
+    if known_chunks < 2:
+        assert np.isnan([mean.volts, mean.sd]).all()
+        return
+    assert mean.volts == pytest.approx(np.mean(means), rel=1e-12)
+    scatter = np.sum((np.array(means) - np.mean(means)) ** 2) / (known_chunks - 1)
+    assert mean.sd == pytest.approx(math.sqrt(scatter / known_chunks), rel=1e-12)
+
+
+@pytest.mark.parametrize("sensitivity", [0.13, -2.0])
+@pytest.mark.parametrize("count", [2, 3, 6])
+@pytest.mark.parametrize("noise", [0.2, 5.0])
+@pytest.mark.parametrize("applied_sd", [0.0, 0.02])
+@pytest.mark.parametrize("zeros", [0, 1])
+def test_the_fit_is_weighted_least_squares_with_propagated_covariance(
+    sensitivity: float, count: int, noise: float, applied_sd: float, zeros: int
+) -> None:
+    """`noise` in the stated errors; `zeros` points have none, so all weigh the same then."""
+    draw = np.random.default_rng(count)
+    applied = draw.permutation(np.linspace(-4.0, 9.0, count))
+    sd = 1e-3 * draw.uniform(1.0, 4.0, count)
+    volts = sensitivity * (applied - 0.7) + noise * sd * draw.standard_normal(count)
+    sd[:zeros] = 0.0
+    fit = fit_calibration(
+        tuple(applied.tolist()), applied_sd, tuple(map(MeanVoltage, volts.tolist(), sd.tolist()))
+    )
+    total = np.hypot(sd, applied_sd * np.polyfit(applied, volts, 1)[0])
+    is_known = bool((total > 0).all())
+    weight = 1.0 / total if is_known else np.ones(count)
+    basis = np.stack([applied, np.ones(count)], axis=1)
+    (slope, constant), *_ = np.linalg.lstsq(basis * weight[:, None], volts * weight, rcond=None)
+    residuals = volts - basis @ [slope, constant]
+    scatter = np.sum((weight * residuals) ** 2) / (count - 2) if count > 2 else 0.0
+    scale = max(scatter, 1.0) if is_known else scatter
+    covariance = scale * np.linalg.inv((basis * weight[:, None] ** 2).T @ basis)
+    gradient = np.array([-constant / slope**2, 1.0 / slope])
+    assert fit.volts_per_unit == pytest.approx(slope, rel=1e-9)
+    assert fit.offset == pytest.approx(constant / slope, rel=1e-9)
+    assert fit.volts_per_unit_sd == pytest.approx(math.sqrt(covariance[0, 0]), rel=1e-6)
+    offset_sd = math.sqrt(max(gradient @ covariance @ gradient, 0.0))
+    assert fit.offset_sd == pytest.approx(offset_sd, rel=1e-6)
+    if count == 2:
+        assert fit.linearity_percent is None
+    else:
+        share = np.abs(residuals).max() / abs(slope * 13.0)
+        assert fit.linearity_percent == pytest.approx(100.0 * share, rel=1e-6)
+
+
+def test_a_dead_sensor_has_no_offset_and_no_linearity() -> None:
+    means = (MeanVoltage(0.0, 1e-4),) * 3
+    fit = fit_calibration((-5.0, 0.0, 5.0), 0.0, means)
+    assert fit.volts_per_unit == 0.0
+    assert np.isnan([fit.offset, fit.offset_sd]).all()
+    assert fit.linearity_percent is None

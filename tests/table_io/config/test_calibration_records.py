@@ -2,7 +2,8 @@
 
 import json
 import tomllib
-from datetime import date
+from datetime import date, timedelta
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -132,6 +133,48 @@ def test_sensors_without_any_date_are_told_of_a_real_table_only() -> None:
     assert "mass_acc_m_s2" in warning
     assert "table_acc_m_s2" not in warning
     assert "drive_disp_m" not in warning
+
+
+@pytest.mark.parametrize("is_simulated", [True, False])
+@pytest.mark.parametrize("count", [1, 2, 6])
+def test_sensors_with_overdue_impossible_or_no_dates_are_counted(
+    count: int, is_simulated: bool
+) -> None:
+    """The first `count` sensors after the command have the dates; the others are in order."""
+    simulated = parse_toml(TEXT, RigConfig, "card")
+    rig = simulated if is_simulated else simulated.model_copy(update={"simulated": None})
+    days = {shift: (TODAY + timedelta(shift)).isoformat() for shift in (-400, -1, 0, 1, 400)}
+    assert rig.sensors[0].channel == "drive_disp_m"
+    for calibrated, due in product([None, -400, 0, 1, 400], [None, -1, 0, 1, 400]):
+        dates = {"calibrated": days.get(calibrated or 0), "due": days.get(due or 0)}
+        dates = {
+            key: value
+            for (key, value), shift in zip(dates.items(), (calibrated, due), strict=True)
+            if shift is not None
+        }
+        sensors = tuple(
+            sensor.model_copy(update=dates if place <= count else {"due": days[400]})
+            for place, sensor in enumerate(rig.sensors)
+        )
+        warnings = find_overdue_calibrations(rig.model_copy(update={"sensors": sensors}), TODAY)
+        channels = [sensor.channel for sensor in sensors[1 : count + 1]]
+        if due == -1 or calibrated in (1, 400):
+            assert [warning.split(":")[0] for warning in warnings] == channels
+        elif not dates and not is_simulated:
+            (warning,) = warnings
+            assert [name for name in rig.channels if name in warning] == channels
+        else:
+            assert warnings == []
+
+
+@pytest.mark.parametrize("ago", [1, 2, 400])
+def test_days_overdue_are_counted(ago: int) -> None:
+    due = TODAY - timedelta(ago)
+    rig = parse_toml(card(f"due = {due}"), RigConfig, "card")
+    (warning,) = find_overdue_calibrations(rig, TODAY)
+    numbers = [word for word in warning.split() if word.isdigit()]
+    assert numbers == [str(ago)]
+    assert "(" not in warning  # no serial number is known
 
 
 def record(channel: str = "table_acc_m_s2", **other: object) -> CalibrationRecord:

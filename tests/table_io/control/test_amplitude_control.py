@@ -1,5 +1,6 @@
 """The controller on the simulated table, whose servo rolls off and whose payload pushes back."""
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -11,11 +12,16 @@ from table_io.backends import open_backend
 from table_io.block import Block, Float1D
 from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR, load_config
-from table_io.config.profile import Profile
+from table_io.config.profile import ControlConfig, Profile
 from table_io.config.rig import RigConfig
-from table_io.control.amplitude_control import MAX_CORRECTION, Tuning
+from table_io.control.amplitude_control import (
+    MAX_CORRECTION,
+    Tuning,
+    is_within_tolerance,
+    update_target,
+)
 from table_io.control.frf import evaluate_transfer
-from table_io.control.order_tracking import track_harmonics
+from table_io.control.order_tracking import HarmonicFit, track_harmonics
 from table_io.excitation.trajectory import SineTarget
 from table_io.records import FrequencyResponse, Level, Record, RunStart, Step
 from table_io.units import GRAVITY_M_S2
@@ -117,6 +123,7 @@ def test_prediction_begins_with_the_identified_response() -> None:
 def test_prediction_follows_the_nearest_step_and_remembers_each_frequency() -> None:
     tuning = (
         Tuning(RESPONSE)
+        .add_accepted(SineTarget(2.8, A, 0.80))
         .add_accepted(SineTarget(3.0, A, 1.10))
         .add_accepted(SineTarget(3.2, A, 1.20))
     )
@@ -132,3 +139,134 @@ def test_prediction_follows_the_nearest_step_and_remembers_each_frequency() -> N
 def test_a_prediction_stays_within_its_bounds() -> None:
     weak = FrequencyResponse(0, (1.0,), (0.1,), (0.0,))
     assert Tuning(weak).predict_target(Step(0, "forward", 1.0, A)).correction == MAX_CORRECTION
+
+
+def make_fit(
+    fundamental: float, overtones: tuple[complex, ...] = (), residual_rms: float = 0.0
+) -> HarmonicFit:
+    amplitudes = np.zeros(10, dtype=complex)
+    amplitudes[: 1 + len(overtones)] = (fundamental, *overtones)
+    return HarmonicFit(0.0, amplitudes, residual_rms)
+
+
+@pytest.mark.parametrize("correction", [0.51, 0.9, 1.0, 1.3, 1.97])
+@pytest.mark.parametrize("gain", [0.3, 0.8, 1.0])
+@pytest.mark.parametrize("clamp_db", [0.5, 2.0, 6.0])
+def test_a_correction_changes_by_the_error_to_the_gain_within_its_bounds(
+    correction: float, gain: float, clamp_db: float
+) -> None:
+    config = ControlConfig(gain=gain, clamp_db=clamp_db)
+    for ratio in (0.3, 0.7, 0.95, 0.985, 0.995, 1.005, 1.015, 1.05, 1.4, 3.0):
+        target = SineTarget(3.0, A, correction)
+        measured = make_fit(ratio * A, (0.1j * A,) * 4)
+        changed = update_target(target, measured, measured, Tuning(RESPONSE), config)
+        if abs(ratio - 1.0) <= 0.01:  # half of the tolerance
+            assert changed is target
+            continue
+        change_db = min(max(-20.0 * gain * np.log10(ratio), -clamp_db), clamp_db)
+        expected = min(max(correction * 10 ** (change_db / 20.0), 0.5), 2.0)
+        assert changed == replace(target, correction=pytest.approx(expected, rel=1e-12))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_tolerance_includes_its_bound_and_half_of_it_is_accepted(sign: float) -> None:
+    config = ControlConfig(tolerance=1.0 / 32.0)  # exact in binary, like its half
+    for sixtyfourths in (0.0, 0.99, 1.0, 1.01, 1.99, 2.0, 2.01):
+        target = SineTarget(3.0, 2.0)
+        measured = make_fit(2.0 * (1.0 + sign * sixtyfourths / 64.0))
+        assert is_within_tolerance(target, measured, config) == (sixtyfourths <= 2.0)
+        changed = update_target(target, measured, measured, Tuning(), config)
+        assert (changed == target) == (sixtyfourths <= 1.0)
+
+
+def simulate_overtones(
+    target: SineTarget, tuning: Tuning, disturbance: tuple[complex, ...]
+) -> tuple[complex, ...]:
+    """Harmonics 2 to 5 of the acceleration of a linear table plus a disturbance, m/s2.
+
+    A displacement of relative order k has k^2 times the acceleration.
+    """
+    shape = (*target.shape, 0j, 0j, 0j, 0j)
+    return tuple(
+        disturbance[order - 2]
+        + tuning.transfer(order * target.frequency_hz)
+        * order**2 * target.level_m_s2 * target.correction * shape[order - 2]
+        for order in (2, 3, 4, 5)
+    )  # fmt: skip
+
+
+DISTURBANCE = (0.03 + 0.01j, -0.05j, 0.02 - 0.02j, 0.01 + 0j)
+
+
+@pytest.mark.parametrize("response", [None, RESPONSE])
+@pytest.mark.parametrize("shape", [(), (0.002j, -0.001 + 0j), (0.001 + 0j, 0.002j, 0j, 0.003j)])
+def test_each_update_leaves_a_fifth_of_every_overtone(
+    shape: tuple[complex, ...], response: FrequencyResponse | None
+) -> None:
+    tuning, config = Tuning(response), ControlConfig(harmonics=True)
+    target = SineTarget(1.7, A, 1.2, shape)
+    before = simulate_overtones(target, tuning, DISTURBANCE)
+    measured = make_fit(A, before)
+    changed = update_target(target, measured, measured, tuning, config)
+    after = simulate_overtones(changed, tuning, DISTURBANCE)
+    np.testing.assert_allclose(after, 0.2 * np.array(before), rtol=0, atol=1e-12)
+    assert changed == replace(target, shape=changed.shape)
+    off = ControlConfig(harmonics=False)
+    assert update_target(target, measured, measured, tuning, off) is target
+
+
+@pytest.mark.parametrize("order", [2, 3, 4, 5])
+@pytest.mark.parametrize("goal", ["15 dB", "noise"])
+def test_an_overtone_at_its_goal_keeps_its_shape(goal: str, order: int) -> None:
+    """The goal: 15 dB below the first evaluation, at least 3 sd of an amplitude in noise."""
+    rms = 0.02
+    first = make_fit(A, tuple(0.05 * k * np.exp(1j * k) for k in (2, 3, 4, 5)))
+    limit = abs(first.amplitudes[order - 1]) * 10 ** (-15 / 20)
+    if goal == "noise":
+        limit, first = 3.0 * rms * np.sqrt(2.0 / 1000.0), make_fit(A)
+    shape = (0.01j, 0.02 + 0j, -0.01j, 0j)
+    for ratio, changes in ((0.9999, False), (1.0001, True)):
+        overtones = [0j] * 4
+        overtones[order - 2] = ratio * limit * np.exp(2j)
+        measured = make_fit(A, tuple(overtones), rms if goal == "noise" else 0.0)
+        target = SineTarget(2.0, A, 1.1, shape)
+        tuned = update_target(
+            target, measured, first, Tuning(RESPONSE), ControlConfig(harmonics=True)
+        )
+        assert (tuned.shape[order - 2] != shape[order - 2]) == changes
+        kept = [k for k in range(4) if k != order - 2]
+        assert [tuned.shape[k] for k in kept] == [shape[k] for k in kept]
+
+
+def test_an_overtone_15_db_below_its_first_evaluation_is_cancelled() -> None:
+    first, config = make_fit(A, (1.0 + 0j,) * 4), ControlConfig(harmonics=True)
+    measured = make_fit(A, (10 ** (-15 / 20) + 0j,) * 4)
+    target = SineTarget(2.0, A, 1.1, (0.01j,) * 4)
+    assert update_target(target, measured, first, Tuning(RESPONSE), config) == target
+
+
+def test_a_command_without_overtones_has_no_shape() -> None:
+    measured = make_fit(A)
+    tuned = update_target(
+        SineTarget(2.0, A), measured, measured, Tuning(), ControlConfig(harmonics=True)
+    )
+    assert tuned == SineTarget(2.0, A)
+
+
+@pytest.mark.parametrize("gain", [0.1, 0.5, 0.8, 1.0, 1.6, 2.0, 9.0])
+def test_a_prediction_inverts_the_gain_within_its_bounds(gain: float) -> None:
+    tuning = Tuning(FrequencyResponse(0, (2.0,), (gain,), (0.0,)))
+    expected = min(max(1.0 / gain, 0.5), 2.0)
+    for frequency_hz in (1.0, 2.0, 7.0):
+        predicted = tuning.predict_target(Step(0, "forward", frequency_hz, A))
+        assert predicted == SineTarget(frequency_hz, A, pytest.approx(expected, rel=1e-12))
+
+
+def test_a_remembered_target_takes_the_level_of_the_step() -> None:
+    accepted = SineTarget(3.0, A, 1.1, (0.01j,))
+    tuning = Tuning(RESPONSE).add_accepted(accepted).add_accepted(SineTarget(3.4, A, 1.3))
+    assert tuning.predict_target(Step(5, "backward", 3.0, 2.0 * A)) == replace(
+        accepted, level_m_s2=2.0 * A
+    )
+    again = tuning.add_accepted(SineTarget(3.0, A, 1.2))
+    assert [target.correction for target in again.accepted] == [1.3, 1.2]

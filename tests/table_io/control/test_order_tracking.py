@@ -6,7 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from table_io.block import Float1D
-from table_io.control.order_tracking import HARMONIC_COUNT, track_channels, track_harmonics
+from table_io.control.order_tracking import (
+    HARMONIC_COUNT,
+    NO_FIT,
+    HarmonicFit,
+    track_channels,
+    track_harmonics,
+)
 
 RATE_HZ = 2000.0
 
@@ -22,7 +28,7 @@ def wave(
 
 
 @given(st.floats(0.5, 10.0), st.integers(1, 5), st.floats(-np.pi, np.pi), st.floats(-1, 1))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_without_noise_it_is_exact_whatever_the_frequency(
     f: float, cycles: int, angle: float, offset: float
 ) -> None:
@@ -86,3 +92,57 @@ def test_several_channels_at_once_are_each_alone() -> None:
     both = track_channels(np.array([low, other]), phase)
     for fit, alone in zip(both, (low, other), strict=True):
         np.testing.assert_array_equal(fit.amplitudes, track_harmonics(alone, phase).amplitudes)
+
+
+@pytest.mark.parametrize("harmonics", [1, 2, 3, 10])
+@pytest.mark.parametrize("samples_per_cycle", [3.9, 4.0, 7.9, 8.0, 12.0, 20.5, 41.0, 300.0])
+def test_fit_is_the_least_squares_solution_with_the_orders_that_the_samples_resolve(
+    samples_per_cycle: float, harmonics: int
+) -> None:
+    phase = 0.3 + np.arange(300) / samples_per_cycle
+    values = np.random.default_rng(harmonics).standard_normal(phase.size)
+    fit = track_harmonics(values, phase, harmonics)
+    orders = min(harmonics, int(300 * samples_per_cycle / (4 * 299)))
+    if orders == 0:
+        assert np.isnan([fit.offset, fit.residual_rms, fit.fundamental]).all()
+        return
+    turns = 2 * np.pi * np.outer(phase, np.arange(1, orders + 1))
+    basis = np.hstack([np.ones((phase.size, 1)), np.sin(turns), np.cos(turns)])
+    solution, squares, *_ = np.linalg.lstsq(basis, values, rcond=None)
+    expected = np.zeros(harmonics, dtype=complex)
+    expected[:orders] = solution[1 : orders + 1] + 1j * solution[orders + 1 :]
+    assert fit.offset == pytest.approx(solution[0], abs=1e-9)
+    np.testing.assert_allclose(fit.amplitudes, expected, rtol=0, atol=1e-9)
+    assert (fit.amplitudes[orders:] == 0.0).all()
+    assert fit.residual_rms == pytest.approx(np.sqrt(squares[0] / phase.size), rel=1e-9)
+
+
+@pytest.mark.parametrize("orders", [1, 2, 3])
+def test_fit_needs_two_samples_for_each_coefficient(orders: int) -> None:
+    for count in range(1, 20):
+        phase = np.arange(count) * 0.01
+        fit = track_harmonics(np.cos(phase), phase, orders)
+        assert np.isfinite(fit.offset) == (count >= 2 * (2 * orders + 1))
+
+
+@pytest.mark.parametrize("lost", [np.nan, np.inf, -np.inf])
+def test_a_lost_sample_leaves_no_order_with_a_number(lost: float) -> None:
+    values, phase = wave(100.0, 30, [1.0])  # five orders of ten
+    values[7] = lost
+    fit = track_harmonics(values, phase)
+    assert fit.amplitudes.size == HARMONIC_COUNT
+    assert np.isnan(fit.amplitudes).all()
+    assert np.isnan([fit.offset, fit.residual_rms]).all()
+
+
+def test_no_fit_holds_no_number() -> None:
+    assert np.isnan([NO_FIT.offset, NO_FIT.residual_rms, NO_FIT.fundamental]).all()
+    assert np.isnan(NO_FIT.distortion)
+    assert NO_FIT.amplitudes.size == HARMONIC_COUNT
+    assert np.isnan(NO_FIT.amplitudes).all()
+
+
+def test_distortion_is_the_rss_of_the_overtones_over_the_fundamental() -> None:
+    fit = HarmonicFit(5.0, np.array([3j, -0.4, 0.3j, 1.2]), 7.0)
+    assert fit.fundamental == 3.0
+    assert fit.distortion == pytest.approx(1.3 / 3.0, rel=1e-12)

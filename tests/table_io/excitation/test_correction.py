@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from numpy.testing import assert_array_equal
 
 from table_io.block import Label
@@ -44,3 +45,20 @@ def test_replacing_keeps_what_was_played_and_forgets_the_oldest() -> None:
 def test_replacing_after_a_gap_leaves_zeros() -> None:
     correction = Correction(10, np.ones(2)).replace_from(15, np.ones(1), 0)
     assert_array_equal(correction.displacement(10, 6), [1.0, 1.0, 0.0, 0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("count", [0, 1, 6])
+@pytest.mark.parametrize("keep_from", [0, 5, 11, 14, 40])
+@pytest.mark.parametrize("first", [3, 9, 10, 13, 16, 20])
+def test_replacing_is_that_of_single_samples(first: int, keep_from: int, count: int) -> None:
+    old = {10 + k: 1.0 + k for k in range(6)}
+    new = {first + k: -1.0 - k for k in range(count)}
+    before = {index: value for index, value in old.items() if keep_from <= index < first}
+    correction = Correction(10, np.array(list(old.values())))
+    replaced = correction.replace_from(first, np.array(list(new.values())), keep_from)
+    for at, length in ((0, 60), (12, 1), (11, 4), (2, 8), (16, 9), (30, 5)):
+        for subject, values in ((correction, old), (replaced, before | new)):
+            expected = [values.get(index, 0.0) for index in range(at, at + length)]
+            assert_array_equal(subject.displacement(at, length), expected)
+    assert replaced.end == first + count
+    assert replaced.start == min(max(10, keep_from), first)

@@ -19,7 +19,7 @@ from table_io.safety.protection.consistency import (
 )
 from table_io.sensor_errors import PairErrors
 
-LAW = settings(max_examples=25, deadline=None, derandomize=True)
+LAW = settings(max_examples=25, derandomize=True)
 RATES = st.sampled_from([500.0, 1000.0, 2000.0, 4000.0])
 SIGNS = st.sampled_from([-1.0, 1.0])
 PHASES = st.floats(0.0, 1.0)
@@ -65,6 +65,39 @@ def test_both_amplitudes_are_those_of_the_tone_with_its_phase(
     assert pair.constant[0] == pytest.approx(1.0)
 
 
+@settings(max_examples=8, derandomize=True)
+@given(RATES, st.floats(2.0, 5.0), PHASES, st.floats(0.0, 6.0), st.integers(0, 99))
+def test_the_test_functions_take_the_derivatives_of_any_motion(
+    rate_hz: float, cycles: float, phase: float, low_cut: float, seed: int
+) -> None:
+    """Integration by parts: phi' x is -phi x', and phi'' x is phi x'', at all three orders."""
+    chance = np.random.default_rng(seed)
+    samples = round(1.5 * rate_hz)
+    t = (np.arange(samples) + 0.5) / rate_hz
+    x, speed, a, jerk, filtered = np.full((5, samples), [[0.02], [0.0], [0.0], [0.0], [0.0]])
+    for tone in 2 * math.pi * chance.uniform(0.1, 8.0, 4) / 1.5:
+        wave = AMPLITUDE_M * np.exp(1j * (tone * t + chance.uniform(0.0, 2 * math.pi)))
+        x += wave.real
+        speed += (1j * tone * wave).real
+        a += ((1j * tone) ** 2 * wave).real
+        jerk += ((1j * tone) ** 3 * wave).real
+        filtered += (1j * tone / (1j * tone + low_cut) * wave).real
+    window = make_window(samples, cycles, phase, rate_hz)
+    pair = compare_motion(window, x, a, (0.0, 0.0), (filtered, low_cut))
+    expected = window.phi @ np.array([a, low_cut * filtered - speed, jerk]).T
+    size = np.abs(expected).max(axis=0)
+    for row, amplitudes in enumerate((pair.displacement, pair.low_cut_term, -pair.delay_term)):
+        assert amplitudes == pytest.approx(expected[:, row], abs=1e-6 * size[row])
+    assert pair.acceleration == pytest.approx(expected[:, 0], abs=1e-12 * size[0])
+    # The tone that a window is made for, at its middle: the phase by definition.
+    tone = np.exp(2j * math.pi * (phase + cycles * (t / 1.5 - 0.5)))
+    bell = np.sin(math.pi * t / 1.5) ** 4
+    for order in (1, 2):
+        expected_phi = 2.0 * bell * tone.conj() ** order / bell.sum()
+        assert window.phi[order] == pytest.approx(expected_phi, abs=1e-12)
+    assert window.phi[0] == pytest.approx(bell / bell.sum(), abs=1e-12)
+
+
 @LAW
 @given(RATES, st.floats(0.001, 0.3), SIGNS)
 def test_a_gain_is_a_mismatch_in_both_directions(rate_hz: float, error: float, sign: float) -> None:
@@ -100,6 +133,60 @@ def test_the_standard_error_of_an_offset_is_that_of_many_draws() -> None:
         noise = sigma * (chance.standard_normal(3) + 1j * chance.standard_normal(3))
         offsets.append(replace(pair, acceleration=pair.acceleration + noise).offset)
     assert np.std(offsets) == pytest.approx(replace(pair, sigma=sigma).sigma_offset, rel=0.05)
+
+
+@pytest.mark.parametrize("order", [0, 1, 2])
+@pytest.mark.parametrize("sign", [-1.0, 1.0, 1.0j])
+def test_a_mismatch_is_in_the_orders_that_no_offset_spoils(order: int, sign: complex) -> None:
+    """Of the three orders the average is left out, and of the others the largest is taken."""
+    values = np.array([2.0, 3.0, 4.0], dtype=np.complex128)
+    zeros = np.zeros(3, dtype=np.complex128)
+    moved = values.copy()
+    moved[order] += 5.0 * sign
+    sigma = np.array([0.1, 0.25, 0.5])
+    beyond_noise = (0.0, 5.0 - 6.0 * sigma[1], 5.0 - 6.0 * sigma[2])[order]
+    constant = np.array([1.0, 0.0, 0.0], dtype=np.complex128)
+    for pair in (
+        WeakFormPair(values, moved, constant, sigma, zeros, zeros),
+        WeakFormPair(moved, values, constant, sigma, zeros, zeros),
+    ):
+        assert pair.mismatch == pytest.approx(beyond_noise)
+        assert pair.mismatch_without_offset == pytest.approx(beyond_noise)
+        assert pair.fundamental_mismatch == pytest.approx(beyond_noise if order == 1 else 0.0)
+        averages = abs(values[0].real), abs(moved[0].real)
+        assert pair.average == pytest.approx(max(averages))
+
+
+def test_at_a_standstill_without_noise_there_is_nothing_to_compare() -> None:
+    zeros = np.zeros(3, dtype=np.complex128)
+    pair = WeakFormPair(zeros, zeros, zeros + 1.0, np.zeros(3), zeros, zeros)
+    assert not pair.is_clear
+    # The threshold itself is not clear, be it of the noise or of the motion.
+    clear = replace(pair, displacement=np.array([0.0, 20.0, 0.0]), sigma=np.full(3, 1.0))
+    assert not clear.is_clear
+    assert replace(clear, sigma=np.full(3, np.nextafter(1.0, 0.0))).is_clear
+
+
+@LAW
+@given(st.floats(0.01, 100.0), st.floats(1e-4, 10.0), st.integers(0, 99))
+def test_equations_are_weighted_by_the_error_of_motion_and_noise(
+    scale: float, noise: float, seed: int
+) -> None:
+    """In units of hypot(1 % of the largest amplitude, standard error), an offset eliminated."""
+    chance = np.random.default_rng(seed)
+    draws = scale * (chance.standard_normal((5, 3)) + 1j * chance.standard_normal((5, 3)))
+    displacement, acceleration, constant, low_cut_term, delay_term = draws
+    sigma = noise * np.array([1.0, 2.0, 3.0])
+    pair = WeakFormPair(displacement, acceleration, constant, sigma, low_cut_term, delay_term)
+    largest = max(abs(displacement[1:]).max(), abs(acceleration[1:]).max())
+    error = np.hypot(0.01 * largest, sigma)
+    columns = np.array([displacement, low_cut_term, delay_term, acceleration, constant]) / error
+    columns = np.hstack([columns.real, columns.imag])
+    *rows, offset = columns
+    free = np.array(rows) - np.outer(np.array(rows) @ offset, offset) / (offset @ offset)
+    matrix, rhs = pair.normal_equations()
+    assert matrix == pytest.approx(free[:3] @ free[:3].T)
+    assert rhs == pytest.approx(free[:3] @ free[3])
 
 
 @LAW

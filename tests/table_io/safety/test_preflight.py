@@ -2,22 +2,31 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from table_io.block import Float1D, Label
 from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
+from table_io.excitation.drive import Drive, HistorySegment, Segment
 from table_io.excitation.trajectory import plan_excitation, plan_sweep
-from table_io.records import FrequencyResponse
+from table_io.records import FrequencyResponse, Step
+from table_io.safety import preflight
 from table_io.safety.preflight import (
+    CORRECTION_HEADROOM,
     StepDemand,
     check_corrected_drive,
     check_limits,
     compute_demands,
     list_drive_warnings,
+    list_limits,
     list_setup_warnings,
 )
 from table_io.sequencer import make_test_plan, nominal_drive
@@ -25,6 +34,7 @@ from table_io.units import GRAVITY_M_S2
 
 RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 A = 0.05 * GRAVITY_M_S2
+LAW = settings(max_examples=10, derandomize=True)
 
 
 def rig(table: str = "limits", **changes: float) -> RigConfig:
@@ -155,6 +165,9 @@ def test_the_loop_check_has_rows_of_its_own_before_the_steps() -> None:
         assert row.amplitude_lsb == pytest.approx(
             0.1 * A / (2 * math.pi * f) ** 2 / RIG.output.lsb_m
         )
+    # The first step has the frequency of the check, not its level.
+    (same, *_) = with_check(profile(1.0, 10.0))
+    assert same.amplitude_lsb == pytest.approx(demands[0].amplitude_lsb)
     # The smallest amplitude of the check has 27 DAC steps: neither refused nor warned of.
     assert demands[2].amplitude_lsb < RIG.output.warn_lsb
     check_limits(demands, profile(), RIG, "a.toml")
@@ -327,3 +340,398 @@ def test_a_flow_beyond_that_of_the_valve_is_refused() -> None:
 def test_a_flow_without_its_area_is_no_limit(key: str) -> None:
     with pytest.raises(ValueError, match="go together"):
         rig("limits", **{key: 100.0})
+
+
+# Laws of the demands: what is played, differentiated
+
+
+def differentiate(command_m: Float1D, rate_hz: float) -> Float1D:
+    """Displacement, velocity and acceleration by central differences, without both ends."""
+    before, here, after = command_m[:-2], command_m[1:-1], command_m[2:]
+    speed, acceleration = 0.5 * rate_hz * (after - before), rate_hz**2 * (after - 2 * here + before)
+    return np.array([here, speed, acceleration])
+
+
+@pytest.mark.parametrize("rate_hz", [1000.0, 4000.0])
+@pytest.mark.parametrize("stop_hz", [0.7, 5.0])
+def test_the_demands_of_a_step_are_those_of_its_command_as_played(
+    stop_hz: float, rate_hz: float
+) -> None:
+    """Held cycles and blends of all steps; the ramp to rest belongs to the last one."""
+    test = profile(0.5, stop_hz, acquisition={"rate_hz": rate_hz})
+    drive = plan_sweep(test)
+    motion = differentiate(drive.command(-1, drive.planned_end + 2), rate_hz)
+    demands = compute_demands(drive, test, RIG)
+    assert len(demands) == 4
+    for row in demands:
+        parts = [
+            motion[:, segment.start : segment.end]
+            for segment in drive.sine_segments
+            if segment.step == row.step
+        ]
+        expected = np.abs(np.concatenate(parts, axis=1)).max(axis=1)
+        demanded = row.displacement_m, row.velocity_m_s, row.acceleration_m_s2
+        assert demanded == pytest.approx(expected.tolist(), rel=3e-4)
+        assert row.force_n == pytest.approx(2550.0 * row.acceleration_m_s2)
+
+
+@pytest.mark.parametrize("cycles", [4, 8])
+@pytest.mark.parametrize("phase", [0.0, 0.25, 0.5])
+def test_held_cycles_are_evaluated_at_their_very_peaks(cycles: int, phase: float) -> None:
+    hold = Segment(0, 1000 * cycles, Label.MEASURE, 0, 1.0, 1.0, A, A, phase, cycles)
+    (row,) = compute_demands(Drive(1000.0, (hold,), (Step(0, "forward", 1.0, A),)), profile(), RIG)
+    w = 2 * math.pi
+    demanded = row.displacement_m, row.velocity_m_s, row.acceleration_m_s2
+    assert demanded == pytest.approx((A / w**2, A / w, A), rel=1e-12)
+
+
+def test_a_step_that_is_not_played_yet_counts_with_its_held_cycles() -> None:
+    drive = plan_sweep(profile())
+    without = Drive(drive.rate_hz, (), drive.steps)
+    for row, step in zip(compute_demands(without, profile(), RIG), drive.steps, strict=True):
+        w = 2 * math.pi * step.frequency_hz
+        assert row.velocity_m_s == pytest.approx(A / w)
+        assert row.displacement_m == pytest.approx(A / w**2)
+        assert row.acceleration_m_s2 == pytest.approx(A)
+        assert row.amplitude_lsb == pytest.approx(A / w**2 / RIG.output.lsb_m)
+
+
+def test_feedback_adds_to_every_demand_of_a_step_and_to_no_loop_check() -> None:
+    test = profile()
+    controlled: Any = SimpleNamespace(
+        specimen=test.specimen, continuation=SimpleNamespace(max_feedback=0.4)
+    )
+    drive = nominal_drive(make_test_plan(test, RIG))
+    for plain, row in zip(
+        compute_demands(drive, test, RIG), compute_demands(drive, controlled, RIG), strict=True
+    ):
+        factor = 1.4 if plain.step >= 0 else 1.0
+        for name in ("displacement_m", "velocity_m_s", "acceleration_m_s2", "force_n"):
+            assert getattr(row, name) == pytest.approx(factor * getattr(plain, name)), name
+        assert row.amplitude_lsb == plain.amplitude_lsb  # of the smallest, without feedback
+
+
+def make_history(seed: int, count: int) -> HistorySegment:
+    """A smooth history of five waves from rest to rest, in three windows."""
+    t = np.arange(count) / count
+    sizes = 0.02 * np.random.default_rng(seed).standard_normal(5) / np.arange(1, 6) ** 1.5
+    waves = np.sin(math.pi * np.outer(np.arange(1, 6), t))
+    return HistorySegment(0, sizes @ waves * np.sin(math.pi * t) ** 3, 3)
+
+
+@pytest.mark.parametrize("rate_hz", [500.0, 1000.0])
+@pytest.mark.parametrize("seed", [2, 3])
+def test_the_worst_stop_of_a_history_is_that_of_a_decay_played_from_every_sample(
+    seed: int, rate_hz: float
+) -> None:
+    history = make_history(seed, 900)
+    drive = Drive(rate_hz, (history,), ())
+    *windows, stop = compute_demands(drive, profile(), RIG)
+    length = history.decay_samples(0.0, rate_hz)
+    played = np.zeros(3)
+    for first in range(history.count):
+        motion = differentiate(drive.decay_from(first).command(first - 1, length + 3), rate_hz)
+        played = np.maximum(played, np.abs(motion).max(axis=1))
+    demanded = stop.displacement_m, stop.velocity_m_s, stop.acceleration_m_s2
+    assert demanded == pytest.approx(played.tolist(), rel=1e-5)
+    assert stop.force_n == pytest.approx(2550.0 * stop.acceleration_m_s2)
+    assert stop.amplitude_lsb == pytest.approx(stop.displacement_m / RIG.output.lsb_m)
+    # A stop demands more than the history itself, of whose windows the rows are the peaks.
+    assert stop.acceleration_m_s2 > 1.01 * max(row.acceleration_m_s2 for row in windows)
+    motion = differentiate(np.pad(history.history_m, 1), rate_hz)
+    for k, row in enumerate(windows):
+        expected = np.abs(motion[:, 300 * k : 300 * (k + 1)]).max(axis=1)
+        demanded = row.displacement_m, row.velocity_m_s, row.acceleration_m_s2
+        assert demanded == pytest.approx(expected.tolist())
+        assert row.force_n == pytest.approx(2550.0 * row.acceleration_m_s2)
+        assert row.amplitude_lsb == pytest.approx(row.displacement_m / RIG.output.lsb_m)
+    assert [row.step for row in (*windows, stop)] == [0, 1, 2, 3]
+
+
+# Laws of the limits: what is allowed, and the next number that is not
+
+
+def with_ranges(ranges: dict[str, float]) -> RigConfig:
+    """The rig with other ranges of some sensors, in their unit."""
+    sensors = [
+        {**sensor.model_dump(), "range": ranges.get(sensor.channel, sensor.range)}
+        for sensor in RIG.sensors
+    ]
+    return RigConfig.model_validate(RIG.model_dump() | {"sensors": sensors})
+
+
+SMALL = StepDemand(3, "forward", 2.0, 1e-6, 1e-6, 1e-6, 1e-6, math.inf)
+
+
+def change_demand(row: StepDemand, name: str, value: float) -> StepDemand:
+    changes: dict[str, Any] = {name: value}
+    return replace(row, **changes)
+
+
+LIMITS: list[tuple[str, str, str, str, float]] = [
+    ("limits", "stroke_mm", "displacement", "displacement_m", 1e3),
+    ("output", "span_mm", "displacement", "displacement_m", 1e3),
+    ("limits", "velocity_mm_s", "velocity", "velocity_m_s", 1e3),
+    ("limits", "acceleration_g", "acceleration", "acceleration_m_s2", 1 / 9.80665),
+    ("limits", "force_kn", "force", "force_n", 1e-3),
+    ("limits", "peak_flow_l_min", "flow", "velocity_m_s", 60e3 * 20e-4),
+]
+
+
+@pytest.mark.parametrize(("table", "field", "name", "demand", "to_unit"), LIMITS)
+@given(value=st.floats(1e-3, 0.05), frequency_hz=st.floats(0.1, 9.0) | st.just(math.nan))
+@LAW
+def test_a_demand_at_its_limit_is_allowed_and_beyond_it_refused(
+    table: str,
+    field: str,
+    name: str,
+    demand: str,
+    to_unit: float,
+    value: float,
+    frequency_hz: float,
+) -> None:
+    row = change_demand(replace(SMALL, frequency_hz=frequency_hz), demand, value)
+    area = {"piston_area_cm2": 20.0} if name == "flow" else {}
+
+    def make_limited(allowed: float) -> RigConfig:
+        return rig(table, **{field: allowed}, **area)
+
+    (limit,) = (item for item in list_limits(make_limited(1.0)) if item.name == name)
+    allowed = limit.demand(row)
+    assert allowed == pytest.approx(to_unit * value, rel=1e-12)
+    check_limits((row,), profile(), make_limited(allowed), "a.toml")
+    just_below = make_limited(float(np.nextafter(allowed, 0.0)))
+    with pytest.raises(InputError) as caught:
+        check_limits((SMALL, row, row), profile(), just_below, "a.toml")
+    (fault,) = caught.value.faults
+    assert (fault.key, fault.where) == (name, f"{row.name} and 1 more")
+    assert stated_number(fault) == pytest.approx(allowed, rel=1e-3)
+    with pytest.raises(InputError) as caught:
+        check_limits((row, SMALL), profile(), make_limited(0.99 * allowed), "a.toml")
+    assert [fault.where for fault in caught.value.faults] == [row.name]
+
+
+@pytest.mark.parametrize(
+    ("channel", "demand", "si_per_unit"),
+    [
+        ("drive_disp_m", "displacement_m", 1e-3),
+        ("table_disp_m", "displacement_m", 1e-3),
+        ("table_acc_m_s2", "acceleration_m_s2", 9.80665),
+    ],
+)
+@given(value=st.floats(1e-3, 0.05))
+@LAW
+def test_a_sensor_may_be_used_up_to_its_range(
+    channel: str, demand: str, si_per_unit: float, value: float
+) -> None:
+    row = change_demand(SMALL, demand, value)
+    full = value / si_per_unit
+    check_limits((SMALL, row), profile(), with_ranges({channel: full}), "a.toml")
+    with pytest.raises(InputError) as caught:
+        check_limits(
+            (SMALL, row, SMALL), profile(), with_ranges({channel: full * (1 - 1e-12)}), "a.toml"
+        )
+    (fault,) = caught.value.faults
+    assert (fault.key, fault.where) == (channel, row.name)
+    assert stated_number(fault) == pytest.approx(full, rel=1e-3)
+
+
+@pytest.mark.parametrize("least_lsb", [7, 20])
+def test_the_smallest_step_and_the_peak_of_a_history_need_enough_steps_of_the_dac(
+    least_lsb: int,
+) -> None:
+    card = rig("output", least_lsb=least_lsb)
+    check = replace(SMALL, step=-1, amplitude_lsb=1.0)  # plans its own amplitudes
+    window = replace(SMALL, step=0, frequency_hz=math.nan, amplitude_lsb=1.0)
+    allowed, refused = float(least_lsb), float(np.nextafter(least_lsb, 0.0))
+
+    def list_keys(*demands: StepDemand) -> list[tuple[str, str]]:
+        try:
+            check_limits(demands, profile(), card, "a.toml")
+        except InputError as error:
+            return [(fault.key, fault.where) for fault in error.faults]
+        return []
+
+    for step in (0, 3):
+        smallest = replace(SMALL, step=step, amplitude_lsb=allowed)
+        assert list_keys(check, SMALL, smallest, SMALL) == []
+        coarse = replace(smallest, amplitude_lsb=refused)
+        assert list_keys(check, SMALL, coarse, smallest) == [("amplitude", f"step {step} (2 Hz)")]
+    peak = replace(window, step=1, amplitude_lsb=allowed)
+    assert list_keys(window, peak) == []
+    ((key, _),) = list_keys(window, replace(peak, amplitude_lsb=refused))
+    assert key == "displacement"
+
+
+def test_the_highest_frequency_of_sweep_and_loop_check_is_allowed_and_the_next_is_not() -> None:
+    def list_keys(max_hz: float, **check: Any) -> list[tuple[str, Any]]:
+        test = profile(loop_check=check)
+        try:
+            check_limits((SMALL,), test, rig(frequency_hz=max_hz), "a.toml")
+        except InputError as error:
+            return [(fault.key, fault.value) for fault in error.faults]
+        return []
+
+    below = float(np.nextafter(12.0, 0.0))
+    sweep, check = ("sweep.stop_hz", 10.0), ("loop_check.frequencies_hz", 12.0)
+    assert list_keys(10.0) == []
+    assert list_keys(float(np.nextafter(10.0, 0.0))) == [sweep]
+    assert list_keys(12.0, frequencies_hz=(0.5, 12.0, 3.0)) == []
+    assert list_keys(below, frequencies_hz=(0.5, 12.0, 3.0)) == [check]
+    assert list_keys(9.0, frequencies_hz=(0.5, 12.0, 3.0)) == [sweep, check]
+    assert list_keys(below, frequencies_hz=(0.5, 12.0, 3.0), enabled=False) == []
+
+
+@pytest.mark.parametrize(
+    ("demand", "allowed", "ranges"),
+    [
+        ("displacement_m", 0.06, {}),
+        ("velocity_m_s", 0.5, {}),
+        ("acceleration_m_s2", GRAVITY_M_S2, {}),
+        ("force_n", 30e3, {}),
+        ("displacement_m", 0.04, {"table_disp_m": 40.0, "mass_disp_m": 1.0}),
+        ("acceleration_m_s2", 0.3 * GRAVITY_M_S2, {"table_acc_m_s2": 0.3, "mass_acc_m_s2": 0.1}),
+    ],
+)
+@given(excess=st.floats(1.01, 1e3), level=st.floats(1e-3, 10.0), has_points=st.booleans())
+@LAW
+def test_the_level_that_fits_is_in_proportion_to_the_largest_excess_of_a_history(
+    demand: str,
+    allowed: float,
+    ranges: dict[str, float],
+    excess: float,
+    level: float,
+    has_points: bool,
+) -> None:
+    card = with_ranges(ranges)
+    keys: dict[str, Any] = {"start_hz": 0.4, "stop_hz": 5.0, "duration_s": 20.0}
+    keys |= {"level_points": [[0.4, 0.2], [5.0, 0.2]]} if has_points else {"acceleration_g": level}
+    test = history_profile("chirp", keys)
+    window = replace(SMALL, frequency_hz=math.nan)
+    standstill = StepDemand(0, "window 0", math.nan, 0.0, 0.0, 0.0, 0.0, 0.0)
+    demands = (standstill, window, change_demand(window, demand, excess * allowed), window)
+    with pytest.raises(InputError) as caught:
+        check_limits(demands, test, card, "a.toml")
+    assert caught.value.faults
+    remedy = preflight._suggest_level(demands, test, card)
+    if not ranges:
+        assert caught.value.faults[0].remedy == remedy
+    number = float(remedy.split("by ")[1].split(",")[0] if has_points else remedy.split()[-1])
+    expected = (1.0 if has_points else level) / excess
+    assert number <= expected * (1 + 1e-12)
+    assert number > 0.99 * expected  # rounded to three digits
+    # A stepped motion beyond the limit says nothing of the level of a history.
+    sine = change_demand(SMALL, demand, 1e3 * excess * allowed)
+    assert preflight._suggest_level((*demands, sine), test, card) == remedy
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@given(value=st.floats(1e-9, 1e9))
+@settings(max_examples=100, derandomize=True)
+def test_three_significant_digits_are_kept_and_the_rest_is_cut_off(
+    sign: float, value: float
+) -> None:
+    rounded = sign * preflight._round_towards_zero(sign * value)
+    assert rounded == pytest.approx(float(f"{rounded:.3g}"), rel=1e-12)
+    assert rounded <= value * (1 + 1e-12)
+    assert value - rounded < 0.0100001 * 10.0 ** math.floor(math.log10(value))
+
+
+# Laws of the warnings, each on both sides of its threshold
+
+
+def test_a_step_is_coarse_below_the_steps_of_the_dac_to_warn_of() -> None:
+    fine = replace(SMALL, amplitude_lsb=100.0)
+    coarse = replace(SMALL, amplitude_lsb=float(np.nextafter(100.0, 0.0)))
+    assert list_drive_warnings((fine, fine), RIG) == []
+    for step in (0, 3):
+        assert len(list_drive_warnings((fine, replace(coarse, step=step)), RIG)) == 1
+    check, window = replace(coarse, step=-1), replace(coarse, frequency_hz=math.nan)
+    assert list_drive_warnings((check, window), RIG) == []
+
+
+def test_stroke_is_tight_where_a_correction_of_a_fifth_exceeds_it() -> None:
+    ample = replace(SMALL, displacement_m=0.06 / CORRECTION_HEADROOM * (1 - 1e-9))
+    tight = replace(SMALL, displacement_m=0.06 / 1.2 * (1 + 1e-9))
+    assert list_drive_warnings((ample, ample), RIG) == []
+    assert len(list_drive_warnings((ample, tight, tight), RIG)) == 1
+    assert list_drive_warnings((replace(tight, step=-1),), RIG) == []
+    # At exactly the stroke there is still room.
+    exact = replace(SMALL, displacement_m=0.05)
+    assert 1.2 * (0.05 * 1e3) == 60.0
+    assert list_drive_warnings((exact,), RIG) == []
+
+
+@pytest.mark.parametrize(
+    ("allowed", "doubted"),
+    [
+        ({"mass_kg": 20.0}, {"mass_kg": 19.9999}),
+        ({"mass_kg": 4000.0}, {"mass_kg": 4000.001}),
+        ({"gap_mm": 120.0}, {"gap_mm": 120.0001}),
+        ({"gap_mm": -120.0}, {"gap_mm": -120.0001}),
+        (
+            {"gap_right_mm": -60.0, "gap_left_mm": 60.0},
+            {"gap_right_mm": 1.0, "gap_left_mm": -60.0001},
+        ),
+        (
+            {"gap_right_mm": 60.0, "gap_left_mm": math.inf},
+            {"gap_right_mm": 60.0001, "gap_left_mm": math.inf},
+        ),
+    ],
+)
+def test_a_specimen_is_plausible_from_a_hundredth_to_twice_the_table_and_within_the_stroke(
+    allowed: dict[str, float], doubted: dict[str, float]
+) -> None:
+    plain = {"mass_kg": 550.0, "gap_mm": 4.0}
+    assert list_setup_warnings(profile(specimen=plain | allowed), RIG) == []
+    assert len(list_setup_warnings(profile(specimen=plain | doubted), RIG)) == 1
+
+
+def test_four_blocks_are_queued_or_it_is_worth_a_warning() -> None:
+    for rate_hz in (1000.0, 2000.0, 4000.0):
+        for lead_s in (0.5, 2.0):
+            fourth = round(lead_s * rate_hz / 4)
+            for samples, count in ((fourth, 0), (fourth + 1, 1)):
+                test = profile(acquisition={"rate_hz": rate_hz, "block_samples": samples})
+                card = rig("output", lead_s=lead_s)
+                assert len(list_setup_warnings(test, card)) == count, (rate_hz, samples)
+
+
+@pytest.mark.parametrize("check", [{}, {"frequencies_hz": (1.0, 10.0, 3.0)}])
+def test_a_loop_check_may_end_a_thousandth_below_the_highest_frequency(
+    check: dict[str, Any],
+) -> None:
+    """A tenth of the level has the least steps of the DAC at the frequency that this span gives."""
+    for ratio, count in ((0.9995, 0), (0.9985, 1), (0.5, 1)):
+        amplitude_m = 0.1 * A / (2 * math.pi * ratio * 10.0) ** 2
+        card = rig("output", span_mm=1e3 * amplitude_m / 20 * 2**18 / 2)
+        assert len(list_setup_warnings(profile(loop_check=check), card)) == count, ratio
+        off = profile(loop_check=check | {"enabled": False})
+        assert list_setup_warnings(off, card) == []
+
+
+@pytest.mark.parametrize(
+    ("field", "si", "order"),
+    [("stroke_mm", 1e-3, 2), ("velocity_mm_s", 1e-3, 1), ("acceleration_g", GRAVITY_M_S2, 0)],
+)
+@given(gain=st.floats(0.55, 1.8), frequency_hz=st.floats(0.5, 9.0))
+@LAW
+def test_the_corrected_command_is_the_motion_over_the_gain(
+    field: str, si: float, order: int, gain: float, frequency_hz: float
+) -> None:
+    (step, *_) = profile(frequency_hz, 10.0).sweep.steps
+    flat = FrequencyResponse(5, (1.0,), (gain,), (0.0,))
+    demand = A / (2 * math.pi * frequency_hz) ** order / gain / si
+    wide = {"stroke_mm": 1e3, "velocity_mm_s": 1e5, "acceleration_g": 9.0}
+    roomy = rig("output", span_mm=1e3, bits=32)
+    for share, count in ((1 + 1e-9, 0), (1 - 1e-9, 1)):
+        limits = roomy.limits.model_dump() | wide | {field: share * demand}
+        card = RigConfig.model_validate(roomy.model_dump() | {"limits": limits})
+        assert len(check_corrected_drive((step,), flat, card)) == count
+
+
+def test_a_command_may_be_doubled_and_no_more() -> None:
+    (step, *_) = profile(5.0, 10.0).sweep.steps
+    for gain, count in ((0.5 * (1 + 1e-9), 0), (0.5 * (1 - 1e-9), 1)):
+        flat = FrequencyResponse(5, (1.0,), (gain,), (0.0,))
+        assert len(check_corrected_drive((step, step), flat, RIG)) == count
