@@ -152,6 +152,22 @@ def test_friction_behind_slack_is_told_from_plain_hysteresis(monkeypatch):
     assert values[EffectKey("law_constant_force", "k")] == pytest.approx(1.2e3, rel=0.05)
 
 
+def test_a_law_that_diverges_on_the_record_is_a_bad_fit_and_no_error():
+    """Steps of many yield displacements a sample, to a high power, leave the range of numbers."""
+    prepared = prepare_problem([record_slipping_coupling(1.0, 1)], oscillator(1e5, 1e3))
+    family = next(family for family in FAMILIES if family.name == "slack_hysteresis")
+    term = make_law_candidate(family, prepared.problem.log_residuals[0].scale)
+    yield_displacement = min(shape[2] for shape in term.shapes) / 4
+    start = term.add_to(prepared.parameters, (4.0, 12.0, yield_displacement), 1e4)
+    null = prepared.problem.fit_effects(prepared.parameters, ())
+    diverged = prepared.problem.log_residuals[0].evaluate(start)
+    assert np.isfinite(diverged).all()
+    assert np.abs(diverged).max() > 1e20
+    fitted = prepared.problem.fit_effects(start, (term,))
+    assert math.isfinite(fitted.cost)
+    assert not prepared.problem.is_worthwhile(null, fitted) or fitted.cost < null.cost
+
+
 def test_a_law_is_found_beside_the_errors_of_instruments():
     prepared = prepare_problem([imperfect_log(format_truth("cubic_damping", c3=4e4))], SNM)
     problem, null, proposal = find_law_of_base(prepared)

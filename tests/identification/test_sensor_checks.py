@@ -127,3 +127,10 @@ def test_a_usual_laboratory_is_healthy(seed: int) -> None:
         truth += f'[[imperfections]]\nid = "{entry.id}"\nform = "{entry.form}"\n{place}'
         truth += f"parameters = {{ {numbers} }}\n"
     assert find_faults(join_blocks(blocks(truth))) == {}
+
+
+@pytest.mark.parametrize("kind", ["offset", "filter"])
+def test_a_judgement_is_plain_whatever_its_numbers_are(kind: str) -> None:
+    numbers = map(np.float64, (0.5, -1.0, 1.0))
+    judged = SensorCheck("", kind, (), *numbers, np.float64(0.1))
+    assert judged.is_healthy is True

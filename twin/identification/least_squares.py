@@ -208,8 +208,7 @@ class _LevenbergMarquardt:
                     break
                 trial_values = self.evaluate(trial_x)
                 trial_chosen = self.select_training(trial_values)
-                with np.errstate(over="ignore"):  # a trial that diverges is no better
-                    trial_cost = float(trial_chosen @ trial_chosen)
+                trial_cost = float(trial_chosen @ trial_chosen)
                 if trial_cost < cost:
                     gain = (cost - trial_cost) / max(cost, 1e-300)
                     x, current, r, cost = trial_x, trial_values, trial_chosen, trial_cost

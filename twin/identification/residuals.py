@@ -45,6 +45,7 @@ TARED_CHANNELS = ("acc", "right", "left")
 PULL_ROWS = ("right pull", "left pull")
 # of the largest contact force: undershoot of the low pass after a release
 MAX_UNDERSHOOT_SHARE = 0.005
+MAX_RESIDUAL = 1e30  # times the noise: beyond it a model diverges, however far
 MAX_CACHED_MOTIONS = 3  # for assumed sensor models other than the nominal one
 MAX_SAMPLES = 200_000  # moving samples of all logs together; limits memory
 
@@ -375,20 +376,23 @@ class LogResiduals:
         return numbers
 
     def evaluate(self, parameters: ParameterSet) -> Float1D:
-        """Return the residual over its noise, (entry,): measured minus model, row after row."""
+        """Return the residual over its noise, (entry,): measured minus model, row after row.
+
+        Finite also for a model that diverges, as one of a trial may.
+        """
         m = self.motion(parameters.assumed_sensors())
         rows, rest = self._list_rows(parameters, m), self._rest_entries(parameters)
         if self.nuisances is None:
             entries = np.concatenate([*rows, rest])
             entries /= self.weight
-            return entries
+            return _bound_diverged(entries)
         values, columns = self.nuisances.values(parameters), self.nuisances.columns
         priors = self.nuisances.centre + values
         entries = np.concatenate([*rows, rest, priors])
         entries[: columns.shape[1]] += values.astype(np.float32) @ columns
         # the priors keep their weight where model error limits the fit
         entries[: entries.size - priors.size] /= self.weight
-        return entries
+        return _bound_diverged(entries)
 
     @property
     def gap_correction(self) -> float:
@@ -561,3 +565,11 @@ def build_log_residuals(
         LogResiduals(number, signals, contact_n, reference, scale, weight, thinning)
         for number, ((signals, contact_n), weight) in enumerate(weighted)
     )
+
+
+def _bound_diverged(entries: Float1D) -> Float1D:
+    """Return the entries, changed in place to be finite and at most `MAX_RESIDUAL` in magnitude."""
+    if not -MAX_RESIDUAL <= entries.min(initial=0.0) <= entries.max(initial=0.0) <= MAX_RESIDUAL:
+        np.nan_to_num(entries, copy=False, nan=MAX_RESIDUAL)
+        np.clip(entries, -MAX_RESIDUAL, MAX_RESIDUAL, out=entries)
+    return entries

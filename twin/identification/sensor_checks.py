@@ -70,8 +70,9 @@ class SensorCheck:
         if self.limit is None:
             return True
         if self.kind in ("filter", "resonance"):
-            return self.high >= self.limit
-        return min(abs(self.low), abs(self.high)) <= self.limit or self.low < 0 < self.high
+            return bool(self.high >= self.limit)
+        is_small = min(abs(self.low), abs(self.high)) <= self.limit
+        return bool(is_small or self.low < 0 < self.high)
 
 
 def check_sensors(log_residuals: Sequence[LogResiduals], fit: FitResult) -> tuple[SensorCheck, ...]:
