@@ -332,6 +332,9 @@ def evaluate_force(u: Float1D, rate_hz: float, model: dict[str, Any], slip_speed
                 force = force + p["c2"] * v * np.abs(v)
             case "coulomb_friction":
                 force = force + p["fc"] * np.tanh(v / slip_speed)
+            case "stribeck_friction":
+                falling = 1.0 + (p["ratio"] - 1.0) * np.exp(-((v / p["speed"]) ** 2))
+                force = force + p["fc"] * falling * np.tanh(v / slip_speed)
             case "bouc_wen":
                 z = integrate_hysteresis(v, 1.0 / rate_hz, p["yield_displacement"])
                 force = force + p["force"] * z
