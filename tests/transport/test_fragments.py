@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from table_io.clock import ManualClock
 from twin.transport import history_cache, reliable_subscriber
 from twin.transport.codec import TOPIC_TYPES
 from twin.transport.history_cache import (
@@ -334,18 +335,8 @@ def test_a_reply_holds_what_is_next_rare_topics_first(
         assert build_history_reply(caches, next_sequences, history) == (expected, bodies)
 
 
-@dataclass
-class SteppedClock:
-    """Clock of the tests: stands still until it is set."""
-
-    time_s: float = 100.0
-
-    def now(self) -> float:
-        return self.time_s
-
-
 def test_the_largest_lag_is_that_of_those_who_asked_lately(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock, caches, progress = SteppedClock(), make_caches(), SubscriberProgress()
+    clock, caches, progress = ManualClock(100.0), make_caches(), SubscriberProgress()
     monkeypatch.setattr(history_cache, "CLOCK", clock)
     assert progress.max_lag(caches) == 0
     meas = {"/rig/meas": {SOURCE: 51}}
@@ -400,13 +391,13 @@ def answer(
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> SteppedClock:
-    stepped = SteppedClock()
+def clock(monkeypatch: pytest.MonkeyPatch) -> ManualClock:
+    stepped = ManualClock(100.0)
     monkeypatch.setattr(reliable_subscriber, "CLOCK", stepped)
     return stepped
 
 
-def test_questions_follow_one_another_as_fast_as_they_help(clock: SteppedClock) -> None:
+def test_questions_follow_one_another_as_fast_as_they_help(clock: ManualClock) -> None:
     """Each half second without a gap, each tenth with one, 3 ms after a reply that left one."""
     link = Asked()
     inbox = ReliableSubscriber(link, (TOPIC,), True, 10)
@@ -436,7 +427,7 @@ def test_questions_follow_one_another_as_fast_as_they_help(clock: SteppedClock) 
 
 @pytest.mark.parametrize("later_s", [0.0, 3.0])
 def test_the_gap_of_a_dead_publisher_is_given_up_after_ten_seconds(
-    later_s: float, clock: SteppedClock
+    later_s: float, clock: ManualClock
 ) -> None:
     inbox = ReliableSubscriber(Asked(), (TOPIC,), True, 10)
     send(inbox, 0, 4)
@@ -458,7 +449,7 @@ def test_the_gap_of_a_dead_publisher_is_given_up_after_ten_seconds(
 @pytest.mark.parametrize("history", [True, False])
 @pytest.mark.parametrize("begin", [0, 3])
 def test_a_newcomer_starts_at_the_cache_or_at_what_comes(
-    begin: int, history: bool, clock: SteppedClock
+    begin: int, history: bool, clock: ManualClock
 ) -> None:
     inbox = ReliableSubscriber(Asked(), (TOPIC,), history, 10)
     send(inbox, begin)
@@ -469,7 +460,7 @@ def test_a_newcomer_starts_at_the_cache_or_at_what_comes(
     assert inbox.missed == 0
 
 
-def test_what_left_the_cache_is_missed(clock: SteppedClock) -> None:
+def test_what_left_the_cache_is_missed(clock: ManualClock) -> None:
     inbox = ReliableSubscriber(Asked(), (TOPIC,), True, 10)
     send(inbox, 0, 1, 9)
     assert receive(inbox) == [0, 1]
@@ -483,7 +474,7 @@ def test_what_left_the_cache_is_missed(clock: SteppedClock) -> None:
 
 
 @pytest.mark.parametrize("history", [True, False])
-def test_a_full_queue_drops_the_oldest(history: bool, clock: SteppedClock) -> None:
+def test_a_full_queue_drops_the_oldest(history: bool, clock: ManualClock) -> None:
     """With history the gap is filled again; without, it is skipped and counted."""
     inbox = ReliableSubscriber(Asked(), (TOPIC,), history, 4)
     send(inbox, 0)
@@ -506,14 +497,14 @@ def test_a_full_queue_drops_the_oldest(history: bool, clock: SteppedClock) -> No
     ],
 )  # fmt: skip
 def test_malformed_messages_are_ignored_before_they_are_queued(
-    topic: str, header: bytes | None, size: int, ignored: int, clock: SteppedClock
+    topic: str, header: bytes | None, size: int, ignored: int, clock: ManualClock
 ) -> None:
     inbox = ReliableSubscriber(Asked(), (TOPIC,), True, 10)
     inbox.handle_sample(topic, None if header is None else Bytes(header), Bytes(size))
     assert (inbox.ignored, len(inbox._queue)) == (ignored, 1 - ignored)
 
 
-def test_a_relay_does_not_get_its_own_back(clock: SteppedClock) -> None:
+def test_a_relay_does_not_get_its_own_back(clock: ManualClock) -> None:
     inbox = ReliableSubscriber(Asked(), (TOPIC,), True, 10)
     inbox.excluded_publishers.add("00" * 8)
     send(inbox, 0, 1, publisher="00" * 8)
@@ -525,7 +516,7 @@ def test_a_relay_does_not_get_its_own_back(clock: SteppedClock) -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_every_payload_is_delivered_once_and_in_order_whatever_is_lost(
-    seed: int, clock: SteppedClock
+    seed: int, clock: ManualClock
 ) -> None:
     """Pieces are lost, doubled and reordered; questions are answered from the cache, or lost."""
     chance, caches = random.Random(seed), {(TOPIC, SOURCE): HistoryCache()}
@@ -633,7 +624,7 @@ def test_keys_take_turns_and_malformed_requests_are_dropped() -> None:
 @pytest.mark.parametrize("arrives_at", [0, 3, 100])
 @pytest.mark.parametrize("call", ["get", "get_fragment"])
 def test_waiting_ends_with_a_message_or_the_timeout_and_serves_meanwhile(
-    call: str, arrives_at: int, clock: SteppedClock, monkeypatch: pytest.MonkeyPatch
+    call: str, arrives_at: int, clock: ManualClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Publisher(Asked):
         served = 0

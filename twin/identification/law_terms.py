@@ -69,6 +69,7 @@ POSITIVE_UNITS = ("kg", "N/m")  # of amplitudes that are positive in every passi
 ODD_EXPONENTS, EVEN_EXPONENTS = (0.5, 1.5, 2.0, 3.0, 5.0, 8.0), (1.0, 2.0, 4.0)
 LENGTHS = (0.03, 0.06, 0.12, 0.25, 0.5)
 STOPS = (0.1, 0.3, 0.5, 0.7, 0.85)
+YIELD_LENGTHS = (0.02, 0.06, 0.15, 0.4)
 SPEEDS = (0.006, 0.015, 0.05, 0.15, 0.5)
 TIMES = (0.1, 0.3, 1.0)
 RELAXATIONS = (3e-4, 1e-3, 3e-3, 1e-2)  # of the duration; see `list_law_candidates`
@@ -81,6 +82,7 @@ CUBIC_RESONANCES = tuple(float(ratio) for ratio in np.geomspace(0.1, 1e3, 44))
 MEMORYLESS, CONTACT, TABLE = "force in u and v", "bumper force", "force on the table's motion"
 MEMORY, DRIFT, RESONATOR = "internal state", "drift in time", "attached resonator"
 EXPRESSION = "free expression"  # of symbolic regression
+HYSTERESIS = {"z": LawState(unit="", rate="(v - abs(v) * z * abs(z)**(n - 1)) / w")}
 TOUCH = "min(max(100 * d / d0, 0), 1)"  # 1 in contact, 0 where a face is free: it relaxes to d = 0
 
 
@@ -195,13 +197,11 @@ FAMILIES: tuple[TermFamily, ...] = (
                                      rate="-a - omega2 * r - decay * y + k * u / mass")},
                title="resonator on the table, coupled by a spring", amplitude=("k", "N/m")),
     TermFamily("hysteresis", MEMORY, "damper", "k * z",
-               {"n": (1.0, 2.0, 4.0), "w": (0.02, 0.06, 0.15, 0.4)},
-               states={"z": LawState(unit="", rate="(v - abs(v) * z * abs(z)**(n - 1)) / w")},
-               title="hysteresis"),
+               {"n": (1.0, 2.0, 4.0), "w": YIELD_LENGTHS},
+               states=HYSTERESIS, title="hysteresis"),
     TermFamily("slack_hysteresis", MEMORY, "damper", "k * sign(z) * abs(z)**p",
-               {"p": (2.0, 4.0), "n": (1.0, 4.0), "w": (0.02, 0.06, 0.15, 0.4)},
-               states={"z": LawState(unit="", rate="(v - abs(v) * z * abs(z)**(n - 1)) / w")},
-               title="hysteresis behind slack"),
+               {"p": (2.0, 4.0), "n": (1.0, 4.0), "w": YIELD_LENGTHS},
+               states=HYSTERESIS, title="hysteresis behind slack"),
     TermFamily("relaxation", MEMORY, "damper", "f", {"tau": RELAXATIONS},
                states={"f": LawState(unit="N", rate="k * v / u0 - f / tau")}, title="relaxation"),
     TermFamily("nonlinear_relaxation", MEMORY, "damper", "k * (e / u0)**3",

@@ -135,7 +135,10 @@ def encode_item(item: Item, run: str) -> bytes:
 
 
 def strip_run(payload: bytes, kind: type, run: str) -> bytes:
-    """Return the payload of a record without its run id, its last field, for comparing runs."""
+    """Return the payload of a record without its run id, for comparing runs.
+
+    Of a kind whose last field is the run, as of a `Comparison`; others stay as they are.
+    """
     return payload.removesuffix(_run_suffix(kind, run))
 
 

@@ -566,6 +566,12 @@ def make_baseline(checks: int, gain: float = 1.0, last: WeakFormPair | None = No
     return PairBaseline(last, PairErrorEstimate(PairErrors(gain), check_count=checks))
 
 
+def suspect_pair(
+    rig: RigConfig, names: tuple[tuple[str, ...], str], pair: WeakFormPair, baseline: PairBaseline
+) -> list[Suspicion]:
+    return list(cycle_checks.check_sensor_pair(make_cycle({}, rig), *names, pair, baseline))
+
+
 @pytest.mark.parametrize(("rig", "names", "range_g"), PAIRS)
 @given(
     share=SHARES, sign=SIGNS, gain=st.floats(0.97, 1.03), size=st.floats(0.5, 20.0),
@@ -576,18 +582,13 @@ def test_two_sensors_fit_within_an_eighth_and_within_a_twentieth_of_what_they_di
     rig: RigConfig, names: tuple[tuple[str, ...], str], range_g: float,
     share: float, sign: float, gain: float, size: float, order: int, checks: int,
 ) -> None:  # fmt: skip
-    displacements, acceleration = names
+    displacements, _ = names
 
     def suspect(limit: float, expected: float, at: int, baseline: PairBaseline) -> list[Suspicion]:
         motion = [0.0, size, size]
         moved = [0.0, expected * size, expected * size]
         moved[at] *= 1.0 - share * limit if sign < 0 else 1.0 / (1.0 - share * limit)
-        pair = make_pair(motion, moved)
-        return list(
-            cycle_checks.check_sensor_pair(
-                make_cycle({}, rig), displacements, acceleration, pair, baseline
-            )
-        )
+        return suspect_pair(rig, names, make_pair(motion, moved), baseline)
 
     def check(suspicions: list[Suspicion], limit: float, expected: bool) -> None:
         assert len(suspicions) == expected
@@ -613,14 +614,10 @@ def test_an_offset_is_a_drift_of_the_accelerometer(
     rig: RigConfig, names: tuple[tuple[str, ...], str], range_g: float,
     share: float, sign: float, average: float, sigma: float, checks: int, wave: float,
 ) -> None:  # fmt: skip
-    cycle, (displacements, acceleration) = make_cycle({}, rig), names
+    _, acceleration = names
 
     def suspect(pair: WeakFormPair) -> Suspicion | None:
-        suspicions = list(
-            cycle_checks.check_sensor_pair(
-                cycle, displacements, acceleration, pair, make_baseline(checks)
-            )
-        )
+        suspicions = suspect_pair(rig, names, pair, make_baseline(checks))
         assert len(suspicions) <= 1
         return suspicions[0] if suspicions else None
 
@@ -668,9 +665,7 @@ def test_the_sensor_that_changed_more_is_suspected(
     displacements, acceleration = names
     pair = make_pair([0.0, 11.0, 9.0], [0.0, 14.0, 9.0])
     last = make_pair([5.0, 11.0 - sign, 2.0], [3.0, 14.0 - sign * change, 7.0])
-    (item,) = cycle_checks.check_sensor_pair(
-        make_cycle({}, rig), displacements, acceleration, pair, PairBaseline(last)
-    )
+    (item,) = suspect_pair(rig, names, pair, PairBaseline(last))
     assert item.channel == (acceleration if change > 1.0 else displacements[0])
 
 

@@ -93,7 +93,8 @@ def describe_proposal(law: Json) -> list[str]:
             f"  {name} = {format_interval(value)}" for name, value in term["parameters"].items()
         ]
         limits = [f"{name} {low:.3g} to {high:.3g}" for name, (low, high) in term["range"].items()]
-        lines += [f"  fitted for {', '.join(limits)} (SI)"] if limits else []
+        if limits:
+            lines.append(f"  fitted for {', '.join(limits)} (SI)")
     lines.append(
         f"  it closes {100 * law['closed_fraction']:.0f} % of the misfit: "
         f"{law['held_out_before']:.3g} -> {law['held_out_after']:.3g} times the noise on held-out "
