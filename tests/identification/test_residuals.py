@@ -5,9 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from tests.identification.played import SNM, log
+from tests.identification.played import SNM, format_truth, log
 from twin.identification.parameters import EffectKey, ParameterKey, ParameterSet, TermKey
-from twin.identification.residuals import FORCE_ROWS, build_log_residuals
+from twin.identification.residuals import FORCE_ROWS, PULL_ROWS, build_log_residuals
 
 
 @pytest.mark.parametrize(
@@ -36,3 +36,18 @@ def test_forces_at_the_used_samples_are_those_of_the_whole_motion(
         expected = whole[row][residuals.row_mask[row]] / noise[row]
         assert expected.size
         np.testing.assert_array_equal(rows[entry_row == row], expected)
+
+
+def test_ringing_before_a_step_of_the_force_is_neither_contact_nor_tension() -> None:
+    """A dashpot in compression makes the force jump at touch; a band limit rings before it."""
+    prepared = log(format_truth("compression_dashpot", coefficient=3000.0))
+    (residuals,) = build_log_residuals([(prepared.signals, prepared.contact_n)], SNM)
+    least_samples = 0.02 * residuals.motion().rate_hz  # of an impact; a ringing lasts 2 ms
+    entries = residuals.evaluate(ParameterSet.from_model(SNM, 1))
+    for side, name in enumerate(PULL_ROWS):
+        changes = np.flatnonzero(np.diff(residuals.contact_state[side], prepend=0, append=0))
+        assert changes.size > 80
+        assert np.diff(changes)[::2].min() >= least_samples
+        pulls = entries[residuals.entry_row == residuals.rows.index(name)]
+        assert pulls.size > 200
+        assert np.mean(pulls**2) < 1.0

@@ -20,6 +20,7 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import binary_opening
 
 from table_io.block import Bool2D, Float1D, Float2D, Int1D
 from twin.identification.generic_terms import compute_generic_forces, compute_resonator_force
@@ -36,6 +37,8 @@ from twin.model.model import Model, SensorModel
 
 CONTACT_NOISE_FACTOR = 8.0  # times the rms noise of a load cell: above it there is contact
 MIN_CONTACT_SHARE = 0.02  # of the rms inertia force: below it a load cell shows no contact
+# A shorter contact is the ringing of a filter before or after a step of the force.
+MIN_CONTACT_SAMPLES, MIN_CONTACT_FILTER_CYCLES = 3, 0.5
 CONTACT_MARGIN_S = 0.012  # around contact and release, where the low pass smears the force step
 # The same after an anti-alias filter: periods of its corner until its response to a step has died.
 FILTER_SETTLING_CYCLES = 3.0
@@ -143,11 +146,15 @@ class LogResiduals:
             known = -1 if any(math.isfinite(gap) for gap in m.gaps_m) else 0
             return np.full((2, m.u.size), known, dtype=np.int8)
         sides = []
+        shortest = max(
+            MIN_CONTACT_SAMPLES,
+            math.ceil(MIN_CONTACT_FILTER_CYCLES * m.rate_hz / self.signals.filter_hz) + 1,
+        )
         for push, threshold, gap in zip(
             (m.right, m.left), self.contact_thresholds_n, m.gaps_m, strict=True
         ):
             idle = float(np.median(push[~m.moving])) if gap > 0 and (~m.moving).any() else 0.0
-            sides.append(push - idle > threshold)
+            sides.append(binary_opening(push - idle > threshold, np.ones(shortest)))
         return np.array(sides, dtype=np.int8)
 
     @cached_property
@@ -190,7 +197,10 @@ class LogResiduals:
         for row, name in enumerate(self.rows):
             if name in PULL_ROWS:
                 in_contact = self.contact_state[PULL_ROWS.index(name)] > 0
-                used[row] = m.moving & ~in_contact & (np.convolve(in_contact, recent, "same") > 0)
+                was_in_contact = np.convolve(in_contact, recent, "same") > 0
+                # a filter of linear phase rings before the step of the force at touch, too
+                will_be_in_contact = np.convolve(in_contact, recent[::-1], "same") > 0
+                used[row] = m.moving & ~in_contact & was_in_contact & ~will_be_in_contact
             elif row >= len(FORCE_ROWS):
                 side = {"right cells": 0, "left cells": 1}.get(name)
                 used[row] = m.moving & smooth if side is None else used[1 + side]
