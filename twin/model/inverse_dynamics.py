@@ -51,6 +51,7 @@ from twin.model.model import Model
 PULL_WIDTH = 0.1  # of the pull-off force: over which an adhesive contact lets go along a motion
 MAX_RELAXATIONS, MAX_FACE_RELAXATIONS = 50.0, 5.0  # of a state and of a free face in a sample
 MAX_STATE_RELAXATIONS = 0.5  # relaxation times of an added law per step of its integration
+STILL_FACE_M = 1e-9  # a face that would move less in a sample stays: it has relaxed
 FORCE_ROWS = ("damper", "right", "left")
 # One signature: numba never caches a kernel specialized to the function of an effect.
 _READ = types.Array(float64, 1, "A", readonly=True)
@@ -63,6 +64,7 @@ _KERNELS = [
         float64[:, ::1],
         coefficients,
         laws,
+        float64,
         float64,
         float64[:, ::1],
     )
@@ -126,16 +128,30 @@ def track_face(
     return face, b
 
 
-@jit_helper_unless_none("laws", lambda place, s, q, w, slope, h, steps, p, laws: None)
+class StateRates(NamedTuple):
+    """Rates in 1/s of the fastest state of the added laws, and of a free face; -1 without any."""
+
+    states: float
+    faces: float
+
+
+@jit_helper()
+def count_steps(h: float, rate: float) -> int:
+    """Return the number of steps over h s for what relaxes at a rate in 1/s."""
+    return 1 + int(h * rate / MAX_STATE_RELAXATIONS)
+
+
+@jit_helper_unless_none("laws", lambda place, s, q, w, slope, h, rate, p, laws: None)
 def advance_law_states(
-    place: int, s: Any, q: float, w: float, slope: float, h: float, steps: int,
+    place: int, s: Any, q: float, w: float, slope: float, h: float, rate: float,
     p: Coefficients, laws: Any,
 ) -> LawInputs | None:  # fmt: skip
     """Return the inputs of the added laws after h s with the states of one place advanced.
 
     From deformation q at rate w and with the slope of the base acceleration in m/s3. Classical
-    fourth-order Runge-Kutta in `steps` equal steps.
+    fourth-order Runge-Kutta in equal steps, by the `rate` in 1/s of the fastest state.
     """
+    steps = count_steps(h, rate)
     dt = h / steps
     for n in range(steps):
         q0 = q + n * dt * w
@@ -152,13 +168,20 @@ def advance_law_states(
 
 @jit_helper()
 def recover_face_and_states(
-    side: int, face: float, b: float, s: Any, slope: float, h: float, steps: int,
+    side: int, face: float, b: float, s: Any, slope: float, h: float, rates: StateRates,
     p: Coefficients, laws: Any,
 ) -> tuple[float, float, LawInputs | None]:  # fmt: skip
     """Return (face position, branch force, inputs of added laws) of a free bumper after h s.
 
-    The face moves so that the bumper's force is zero; midpoint rule in `steps` equal steps.
+    The face moves so that the bumper's force is zero; midpoint rule in equal steps. Most of the
+    time it has relaxed, and only the states change, which are slower.
     """
+    push = bumper_force(p, side, face, 0.0, b, s, laws)
+    if abs(push) * h <= STILL_FACE_M * bumper_dashpot(p, side, face, s, laws):
+        # Laws that are not linear in the rate would only slow it down.
+        s = advance_law_states(side, s, face, 0.0, slope, h, rates.states, p, laws)
+        return face, relax_branch(b, p.rate_b, p.kb, 0.0, h), s
+    steps = count_steps(h, max(rates.states, rates.faces))
     dt = h / steps
     for _ in range(steps):
         middle, middle_b, middle_s = face, b, s
@@ -167,39 +190,40 @@ def recover_face_and_states(
             if dashpot <= 0.0:
                 return 0.0, 0.0, s
             w = free_face_rate(p, side, middle, middle_b, dashpot, middle_s, laws)
-            rates = law_rates(side, middle, w, middle_s, slope, p, laws)
+            s_rates = law_rates(side, middle, w, middle_s, slope, p, laws)
             b_rate = p.kb * w - p.rate_b * middle_b
             middle, middle_b = face + length * w, b + length * b_rate
-            middle_s = add_scaled_inputs(s, length, rates)
+            middle_s = add_scaled_inputs(s, length, s_rates)
         face, b, s = middle, middle_b, middle_s
     return face, b, s
 
 
 @jit_helper_unless_none(
-    "laws", lambda side, d, dd, face, b, s, slope, was, contact, h, fastest, p, laws: (face, b, s)
+    "laws", lambda side, d, dd, face, b, s, slope, was, contact, h, rates, p, laws: (face, b, s)
 )
 def track_face_with_laws(
     side: int, d: float, dd: float, face: float, b: float, s: Any, slope: float,
-    was_in_contact: bool, contact: float, h: float, fastest_rate: float, p: Coefficients, laws: Any,
+    was_in_contact: bool, contact: float, h: float, rates: StateRates, p: Coefficients, laws: Any,
 ) -> tuple[float, float, LawInputs | None]:  # fmt: skip
     """Return (face position in m, branch force in N, inputs of added laws) as `track_face`."""
     if h == 0.0:
         return max(d, 0.0) if contact > 0.5 else face, b, s
-    steps = 1 + int(h * fastest_rate / MAX_STATE_RELAXATIONS)
     if was_in_contact:
-        s = advance_law_states(side, s, face, (d - face) / h, slope, h, steps, p, laws)
+        s = advance_law_states(side, s, face, (d - face) / h, slope, h, rates.states, p, laws)
         return d, relax_branch(b, p.rate_b, p.kb, d - face, h), s
-    free_face, free_b, free_s = recover_face_and_states(side, face, b, s, slope, h, steps, p, laws)
+    free_face, free_b, free_s = recover_face_and_states(side, face, b, s, slope, h, rates, p, laws)
     if contact > 0.5 or (contact < -0.5 and d > free_face):
         # The mass met the face on the way; the face follows it from where both were.
         share = 1.0
         if d > free_face and dd > 0.0:
             share = min(1.0, (d - free_face) / (dd * h))
         free_face, free_b, free_s = recover_face_and_states(
-            side, face, b, s, slope, h * (1.0 - share), steps, p, laws
+            side, face, b, s, slope, h * (1.0 - share), rates, p, laws
         )
         w = (d - free_face) / (h * share) if share > 0.0 else 0.0
-        free_s = advance_law_states(side, free_s, free_face, w, slope, h * share, steps, p, laws)
+        free_s = advance_law_states(
+            side, free_s, free_face, w, slope, h * share, rates.states, p, laws
+        )
         return d, free_b + p.kb * (d - free_face), free_s
     return free_face, free_b, free_s
 
@@ -227,7 +251,8 @@ def _force_kernel(
     contact: Float2D,
     p: Coefficients,
     laws: AddedLaws | None,
-    fastest_rate: float,
+    state_rate: float,
+    face_rate: float,
     out: Float2D,
 ) -> None:
     """Fill `out` (3, sample): D, F_R, F_L in N; `contact` (2, sample) as `CONTACT_UNKNOWN`."""
@@ -235,6 +260,7 @@ def _force_kernel(
     face_r, face_l = 0.0, 0.0  # face positions in m, tracked only with relaxation
     in_contact_r, in_contact_l = False, False
     slope = 0.0  # of the base acceleration in m/s3, where states follow it
+    rates = StateRates(state_rate, face_rate)
     for k in range(u.size):
         previous = max(k - 1, 0)
         h = time[k] - time[k - 1] if k else 0.0
@@ -244,11 +270,10 @@ def _force_kernel(
                 z = hysteretic_variable(z, du, math.copysign(1.0, du), p.uy)
             if p.k1 > 0.0 or f != 0.0:
                 f = relax_branch(f, p.rate_1, p.k1, du, h)
-            if fastest_rate >= 0.0:
-                steps = 1 + int(h * fastest_rate / MAX_STATE_RELAXATIONS)
+            if state_rate >= 0.0:
                 slope = (base[k] - base[k - 1]) / h
                 s = set_drive(s, base[previous], time[previous])
-                s = advance_law_states(DAMPER, s, u[k - 1], du / h, slope, h, steps, p, laws)
+                s = advance_law_states(DAMPER, s, u[k - 1], du / h, slope, h, state_rate, p, laws)
         s = set_drive(s, base[k], time[k])
         direction = 1.0 if v[k] > 0.0 else -1.0
         damper = p.k * u[k] + p.c * v[k] + cubic_force(u[k], p.k3)
@@ -269,7 +294,7 @@ def _force_kernel(
                 s = set_drive(s, base[previous], time[previous])
                 face, b, s = track_face_with_laws(
                     side, d, dd, face, b, s, slope, was_in_contact, contact[side, k], h,
-                    fastest_rate, p, laws,
+                    rates, p, laws,
                 )  # fmt: skip
                 s = set_drive(s, base[k], time[k])
             elif p.kb > 0.0:
@@ -322,18 +347,18 @@ class PreparedForces(NamedTuple):
         """Return D, F_R and F_L in N, (3, sample); see `forces_along`."""
         out = np.empty((3, u.size))
         touched = contact.astype(np.float64, order="C")
-        p, laws, fastest_rate = self.coefficients, self.laws, self.law_rate
-        if fastest_rate >= 0.0 and u.size > 1:
+        p, laws, state_rate, face_rate = self.coefficients, self.laws, self.law_rate, -1.0
+        if state_rate >= 0.0 and u.size > 1:
             # What relaxes within a small part of a sample, as a fit may try, would take steps
             # without end. Such a face is as good as relaxed; a state that is faster overflows.
             sample_s = float(np.median(np.diff(time_s)))
-            fastest_rate = min(fastest_rate, MAX_RELAXATIONS / sample_s)
+            state_rate = min(state_rate, MAX_RELAXATIONS / sample_s)
             if p.has_bumper_states:
                 limit = MAX_FACE_RELAXATIONS / sample_s
                 right, left = self.face_stiffness
                 p = p._replace(c_r=max(p.c_r, right / limit), c_l=max(p.c_l, left / limit))
-                fastest_rate = max(fastest_rate, right / p.c_r, left / p.c_l)
-        _force_kernel(u, v, base_acc, time_s, touched, p, laws, fastest_rate, out)
+                face_rate = max(right / p.c_r, left / p.c_l)
+        _force_kernel(u, v, base_acc, time_s, touched, p, laws, state_rate, face_rate, out)
         return out
 
 
