@@ -5,12 +5,16 @@ import os
 import shutil
 import subprocess
 import sys
+import tomllib
 from functools import cache
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
+TYPED_PYTHON = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["mypy"][
+    "python_version"
+]
 SOURCES = ("table_io", "twin", "pyproject.toml", "README.md")
 OWNERS = {  # packages that may import a foreign library
     "cryptography": ("twin/security",),
@@ -167,6 +171,8 @@ def test_top_level_holds_only_what_was_given() -> None:
     ],
 )
 def test_lint_and_types(program: list[str]) -> None:
+    if program[0] == "mypy" and not sys.version.startswith(f"{TYPED_PYTHON}."):
+        pytest.skip("types are checked with the packages of the lowest supported Python")
     tool = Path(sys.executable).parent / program[0]
     result = subprocess.run(
         [str(tool), *program[1:]], cwd=ROOT, capture_output=True, text=True, check=False
