@@ -337,7 +337,8 @@ def test_one_clipped_sample_is_refused_on_either_side(
 def test_a_person_presses_enter_and_an_unattended_table_waits(
     unattended: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clock, prompts = ManualClock(3.0), []
+    clock = ManualClock(3.0)
+    prompts: list[str] = []
     monkeypatch.setattr(command, "RealClock", lambda: clock)
     monkeypatch.setattr(builtins, "input", prompts.append)
     command._wait_for_person("apply 1 g", unattended)

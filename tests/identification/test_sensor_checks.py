@@ -131,6 +131,6 @@ def test_a_usual_laboratory_is_healthy(seed: int) -> None:
 
 @pytest.mark.parametrize("kind", ["offset", "filter"])
 def test_a_judgement_is_plain_whatever_its_numbers_are(kind: str) -> None:
-    numbers = map(np.float64, (0.5, -1.0, 1.0))
-    judged = SensorCheck("", kind, (), *numbers, np.float64(0.1))
+    value, low, high, limit = map(np.float64, (0.5, -1.0, 1.0, 0.1))
+    judged = SensorCheck("", kind, (), value, low, high, limit)
     assert judged.is_healthy is True

@@ -1,5 +1,6 @@
 """A small run as it is written: every kind of item, some samples lost."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,7 @@ def run(missing: frozenset[int] = frozenset()) -> list[Item]:
     return [*items, Event(end, "end", "done"), RunStop(end, "complete", "all played", ("idle",))]
 
 
-def payloads(items: tuple[Item, ...] | list[Item]) -> list[bytes]:
+def payloads(items: Iterable[Item]) -> list[bytes]:
     return [encode_item(item, START.run) for item in items]
 
 

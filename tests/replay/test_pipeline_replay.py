@@ -1,5 +1,6 @@
 """What a replay can do more: any cut, a range of steps, changed parameters, planted differences."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -51,7 +52,7 @@ def encode_records(recording: Recording, *kinds: type) -> list[bytes]:
     return [encode_item(item, "") for item in recording.items if isinstance(item, kinds)]
 
 
-def with_values(items: tuple[Item, ...], old: Item, new: Item) -> list[Item]:
+def with_values(items: Iterable[Item], old: Item, new: Item) -> list[Item]:
     return [new if item is old else item for item in items]
 
 

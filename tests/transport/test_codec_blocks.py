@@ -112,7 +112,7 @@ def test_samples_are_counted_as_far_as_numbers_are_exact(count: int, past: int) 
             with pytest.raises(WireError):
                 decode_item(topic_for(item), payload)
         else:
-            assert decode_item(topic_for(item), payload)[1].index == item.index  # type: ignore[union-attr]
+            assert decode_item(topic_for(item), payload)[1].index == item.index
 
 
 @pytest.mark.parametrize("row", [0, 1, 2])

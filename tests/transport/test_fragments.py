@@ -318,7 +318,7 @@ def test_a_reply_holds_what_is_next_rare_topics_first(
     monkeypatch.setattr(history_cache, "FRAGMENT_BYTES", room)
     caches = make_caches()
     for requested in (None, -5, 0, 2, 52, 59, 70):
-        known = {} if requested is None else {SOURCE: requested}
+        known: dict[str, int] = {} if requested is None else {SOURCE: requested}
         next_sequences = {"/rig/meas": known, "/run/start": known, "/other": {}}
         left, expected, bodies = room, [], b""
         for stream in (("/run/start", SOURCE), ("/rig/meas", "aa"), ("/rig/meas", SOURCE)):

@@ -424,18 +424,16 @@ def test_the_first_late_block_of_each_series_is_an_event(seed: int) -> None:
 @pytest.mark.parametrize("after", [2000, 6000])
 def test_an_underrun_is_a_trip_at_the_first_sample_of_its_decay(after: int) -> None:
     subject = Hasty(plan_sweep(profile()), ManualClock(), refused=1, after=after)
-    refused_after = []
+    refused_after = 0
     items = []
     for item in session(subject, Stop()):
         items.append(item)
         if isinstance(item, Block) and subject.refused == 1:
-            refused_after[:] = [item.end]
+            refused_after = item.end
     (trip,) = (item for item in items if isinstance(item, Trip))
     whole = join_blocks(blocks(items))
     decay_start = int(np.flatnonzero(whole.label == Label.STOP)[0])
-    assert trip == Trip(
-        decay_start, refused_after[0], "late", "", 0.0, 0.0, stop_record(items).reason
-    )
+    assert trip == Trip(decay_start, refused_after, "late", "", 0.0, 0.0, stop_record(items).reason)
     assert stop_record(items).states[-2:] == ("stopping", "at rest")
 
 

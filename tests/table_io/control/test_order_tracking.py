@@ -120,7 +120,7 @@ def test_fit_is_the_least_squares_solution_with_the_orders_that_the_samples_reso
 @pytest.mark.parametrize("orders", [1, 2, 3])
 def test_fit_needs_two_samples_for_each_coefficient(orders: int) -> None:
     for count in range(1, 20):
-        phase = np.arange(count) * 0.01
+        phase = np.arange(count) / 100.0
         fit = track_harmonics(np.cos(phase), phase, orders)
         assert np.isfinite(fit.offset) == (count >= 2 * (2 * orders + 1))
 
