@@ -12,6 +12,7 @@ import pytest
 from table_io.block import Int1D, Label
 from tests.identification.played import SNM, format_truth, log
 from tests.input_errors import raises_input_error
+from tests.recovery.recordings import log_columns, oscillator
 from twin.identification.discover import (
     Discovery,
     PreparedLog,
@@ -129,6 +130,31 @@ def test_a_bumper_that_pulls_is_seen_without_adhesion_in_the_library() -> None:
     assert {"force_r1_n", "force_l1_n"} <= {*discovery.localization.channels}
     assert discovery.localization.phase == "contact_both"
     assert sum("bumper pulls" in note for note in discovery.notes) == 2
+
+
+def record_untared_damper(amplitude_m: float, seed: int) -> PreparedLog:
+    """A component test: spring, dashpot, 50 N of friction, a force cell that was not tared."""
+    rate_hz, frequency_hz, tare_n = 200.0, 2.0, 400.0
+    draw = np.random.default_rng(seed)
+    phase = 2 * np.pi * frequency_hz * np.arange(8 * rate_hz / frequency_hz) / rate_hz
+    u, v = amplitude_m * np.sin(phase), 2 * np.pi * frequency_hz * amplitude_m * np.cos(phase)
+    force = 1500.0 * u + 150.0 * v + 50.0 * np.sign(v) + tare_n
+    columns = {
+        "rel_disp_m": u + draw.normal(0.0, 2e-6, u.size),
+        "damper_force_n": force + draw.normal(0.0, 1.0, u.size),
+    }
+    return log_columns(f"{1e3 * amplitude_m:g} mm", rate_hz, columns)
+
+
+def test_a_channel_that_was_not_tared_hides_no_law() -> None:
+    logs = [record_untared_damper(size, seed) for seed, size in enumerate((2e-3, 5e-3, 10e-3))]
+    verdict = discover_effects(logs, oscillator(1e3, 1e2)).verdict
+    assert verdict.outcome == "named", verdict.reason
+    assert {*verdict.best.names} == {"sensor_offset.damper_force_n", "coulomb_friction"}
+    values = verdict.best.fit.values
+    assert values[EffectKey("coulomb_friction", "fc")] == pytest.approx(50.0, rel=0.05)
+    offset = values[EffectKey("sensor_offset", "offset", "damper_force_n")]
+    assert offset == pytest.approx(400.0, rel=0.02)
 
 
 def test_without_the_truth_in_the_library_nothing_is_named_with_confidence() -> None:

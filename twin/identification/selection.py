@@ -200,6 +200,18 @@ class SelectionResult:
     generic_sets: tuple[FittedSet, ...] = field(default=())  # sets with a generic term
     complete: bool = True  # False after a cancellation
 
+    def find_gap_start(self, fitted: FittedSet) -> FittedSet:
+        """Return the set from which the gap that a set closes is counted.
+
+        The null; with the constant offsets of sensors, if the set has such and more: an untared
+        channel may dwarf every law.
+        """
+        offsets = {effect.name for effect in fitted.effects if is_sensor_offset(effect)}
+        if not offsets or len(offsets) == len(fitted.effects):
+            return self.null
+        starts = [tried for tried in self.tried if {*tried.names} == offsets]
+        return min(starts, key=lambda tried: tried.cost, default=self.null)
+
 
 class Cancelled(Exception):
     """Exception for a progress callback to stop the selection and keep the best set so far."""
@@ -229,6 +241,11 @@ def stepwise_selection(
         return replace(_accept_best(problem, state, cancelled.fitted), complete=False)
 
 
+def is_sensor_offset(effect: Candidate) -> bool:
+    """Return whether an effect is a constant offset of a sensor."""
+    return effect.effect is not None and effect.effect.id == "sensor_offset"
+
+
 def count_sensor_errors(fitted: FittedSet) -> int:
     """Return the number of errors of sensors in a set of effects."""
     return sum(bool(effect.channel) for effect in fitted.effects)
@@ -238,9 +255,7 @@ def _forward_step(
     problem: SelectionProblem, state: SelectionResult, report: ProgressCallback
 ) -> SelectionResult:
     """Add the best further effect, if it is worthwhile."""
-    return _accept_best(
-        problem, state, _refit_candidates(problem, state.best, state.best.effects, report)
-    )
+    return _accept_best(problem, state, _refit_candidates(problem, state.best, state.best, report))
 
 
 def _accept_best(
@@ -249,26 +264,45 @@ def _accept_best(
     """Accept the best set of a round, if it is worthwhile."""
     current, tried = state.best, (*state.tried, *fitted_sets)
     best = min(fitted_sets, key=lambda fitted: fitted.cost, default=current)
-    is_minor = current.effects and current.cost - best.cost < MIN_GAP_SHARE * (
-        state.null.cost - best.cost
-    )
-    if is_minor or not problem.is_worthwhile(current, best):
-        best = current
-    return replace(state, best=best, tried=tried)
+    state = replace(state, tried=tried)
+    return replace(state, best=best) if _is_needed(problem, state, current, best) else state
+
+
+def _is_needed(
+    problem: SelectionProblem, state: SelectionResult, without: FittedSet, with_effect: FittedSet
+) -> bool:
+    """Return True if an effect is worthwhile and, beside others, closes enough of the gap."""
+    gap = state.find_gap_start(with_effect).cost - with_effect.cost
+    is_minor = without.effects and without.cost - with_effect.cost < MIN_GAP_SHARE * gap
+    return not is_minor and problem.is_worthwhile(without, with_effect)
 
 
 def _exchange_step(
     problem: SelectionProblem, state: SelectionResult, report: ProgressCallback
 ) -> SelectionResult:
-    """Replace each earlier effect by a better one, if one exists."""
-    for replaced in state.best.effects[:-1]:
-        kept = tuple(effect for effect in state.best.effects if effect is not replaced)
-        fitted_sets = _refit_candidates(problem, state.best, kept, report, replaced)
+    """Drop each earlier effect that is not needed beside the last, or replace it by a better one.
+
+    What was the best first effect may only have stood in for a later one.
+    """
+    for earlier in state.best.effects[:-1]:
+        reduced = _fit_without(problem, state.best, earlier)
+        costs = [each.cost for each in state.tried if len(each.effects) == len(reduced.effects)]
+        state = replace(state, tried=(*state.tried, reduced))
+        if reduced.cost < min(costs) and not _is_needed(problem, state, reduced, state.best):
+            state = replace(state, best=reduced)
+            continue
+        fitted_sets = _refit_candidates(problem, state.best, reduced, report)
         state = replace(state, tried=(*state.tried, *fitted_sets))
         best = min(fitted_sets, key=lambda fitted: fitted.cost, default=state.best)
         if problem.is_worthwhile(state.best, best):
             state = replace(state, best=best)
     return state
+
+
+def _fit_without(problem: SelectionProblem, fitted: FittedSet, dropped: Candidate) -> FittedSet:
+    """Return a set refitted without one of its effects."""
+    kept = tuple(effect for effect in fitted.effects if effect is not dropped)
+    return problem.fit_effects(dropped.remove_from(fitted.fit.parameters), kept)
 
 
 def _fit_generic_terms(
@@ -282,14 +316,18 @@ def _fit_generic_terms(
         # a generic term is never reported as the best set
         report(replace(progress, best=best))
 
-    fitted_sets = _refit_candidates(problem, state.null, (), report_best, None, library)
+    starts = [state.null]
     if best.effects:
-        fitted_sets += _refit_candidates(problem, best, best.effects, report_best, None, library)
+        starts.append(best)
     if len(best.effects) > 1:
-        for replaced in best.effects:
-            kept = tuple(effect for effect in best.effects if effect is not replaced)
-            fitted_sets += _refit_candidates(problem, best, kept, report_best, replaced, library)
-    return tuple(fitted_sets)
+        starts += [_fit_without(problem, best, replaced) for replaced in best.effects]
+    return tuple(
+        fitted
+        for start in starts
+        for fitted in _refit_candidates(
+            problem, best if start.effects else start, start, report_best, library
+        )
+    )
 
 
 def _refit_null(problem: SelectionProblem, null: FittedSet, best: FittedSet) -> FittedSet:
@@ -301,31 +339,29 @@ def _refit_null(problem: SelectionProblem, null: FittedSet, best: FittedSet) -> 
 def _refit_candidates(
     problem: SelectionProblem,
     current: FittedSet,
-    kept: tuple[Candidate, ...],
+    start: FittedSet,
     report: ProgressCallback,
-    dropped: Candidate | None = None,
     library: Sequence[Candidate] | None = None,
 ) -> list[FittedSet]:
-    """Screen the candidates, then refit the best additions to the kept effects on all data."""
-    parameters, generic = current.fit.parameters, library is not None
+    """Screen the candidates, then refit the best additions to a start set on all data.
+
+    The start is `current`, or the same without an effect that is to be replaced.
+    """
+    kept, parameters, generic = start.effects, start.fit.parameters, library is not None
+    replaced_names = {*current.names} - {*start.names}
     count = len(kept) + 1
     stage = "generic terms" if generic else f"{count} effect{'s' if count > 1 else ''}"
-    if dropped is not None:
-        stage += f", replacing {dropped.name}"
+    stage += "".join(f", replacing {name}" for name in replaced_names)
     report(SelectionProgress(stage, best=current))
-    if dropped is not None:
-        parameters = parameters.without(dropped.free)
-        parameters = problem.fit_effects(parameters, kept).fit.parameters
-    kept_names = {effect.name for effect in kept}
     kept_keys = {free.key for effect in kept for free in effect.free}
     max_refits = MAX_GENERIC_REFITS if generic else MAX_REFITS
     if library is None:
         library = [
             candidate
             for candidate in problem.library
-            if candidate.name not in kept_names
+            if candidate.name not in start.names
             and kept_keys.isdisjoint(free.key for free in candidate.free)
-            and candidate is not dropped
+            and candidate.name not in replaced_names
             and not (current.cost < problem.noise and problem.is_limited(candidate))
         ]
     if not library:

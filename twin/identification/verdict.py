@@ -84,7 +84,7 @@ def judge_selection(
     fitted.
     """
     null, best = selection.null, selection.best
-    gap = max(null.cost - floor, 1e-9)
+    gap = _measure_gap(selection, floor)
     generic = _find_better_generic(problem, selection, floor)
     is_additional = generic is not None and _needs_named_effects(selection, generic, gap)
     if problem.is_noise(null, best):
@@ -138,6 +138,11 @@ def judge_selection(
     elif has_remainder:
         reason = "part of the misfit remains unexplained"
     return DiscoveryVerdict("named", best, confidence, (), generic, floor, has_remainder, reason)
+
+
+def _measure_gap(selection: SelectionResult, floor: float) -> float:
+    """Return the misfit, a mean square over the noise, that the best set may close."""
+    return max(selection.find_gap_start(selection.best).cost - floor, 1e-9)
 
 
 def widen_for_form(verdict: DiscoveryVerdict) -> DiscoveryVerdict:
@@ -234,7 +239,8 @@ def _find_doubt(
     names = " + ".join(best.names)
     if generic is not None:
         return f"{_format_generic(generic)} explains what {names} cannot"
-    if has_remainder and (selection.null.cost - best.cost) < MIN_NAMED_GAP_SHARE * gap:
+    closed = selection.find_gap_start(best).cost - best.cost
+    if has_remainder and closed < MIN_NAMED_GAP_SHARE * gap:
         return "the best effects remove less than half of the misfit"
     at_bound = [
         effect.amplitude.name
@@ -278,7 +284,7 @@ def _find_better_generic(
     problem: SelectionProblem, selection: SelectionResult, floor: float
 ) -> FittedSet | None:
     """Return the set with a generic term that fits much better than the best set without."""
-    best, gap = selection.best, max(selection.null.cost - floor, 1e-9)
+    best, gap = selection.best, _measure_gap(selection, floor)
     for fitted in sorted(selection.generic_sets, key=lambda fitted: fitted.cost):
         gain = best.cost - fitted.cost
         is_additional = len(fitted.effects) > len(best.effects) > 0
@@ -315,13 +321,13 @@ def _find_rivals(
     A rival has as many effects as the best set, but others, and closes nearly as much of the gap.
     """
     best = selection.best
+    start = selection.find_gap_start(best)
     return [
         (rival, problem.compute_gain(rival, best)[2])
         for rival in selection.tried
         if len(rival.effects) == len(best.effects)
         and frozenset(rival.names) != frozenset(best.names)
-        and selection.null.cost - rival.cost
-        >= MIN_RIVAL_GAP_SHARE * (selection.null.cost - best.cost)
+        and start.cost - rival.cost >= MIN_RIVAL_GAP_SHARE * (start.cost - best.cost)
         and not _is_limit_case(rival, best)
         and not _tares_at_bound(rival) - _tares_at_bound(best)
     ]
