@@ -132,6 +132,13 @@ def test_a_bumper_that_pulls_is_seen_without_adhesion_in_the_library() -> None:
     assert sum("bumper pulls" in note for note in discovery.notes) == 2
 
 
+def test_a_misfit_in_the_few_samples_of_contact_is_not_noise() -> None:
+    discovery = discover_effects([log(format_truth("bumper_hardening", k2=3e7), noise=28.0)], SNM)
+    assert discovery.selection.null.cost < 1.15  # of all rows together: as noise may be
+    assert discovery.verdict.outcome in ("named", "ambiguous")
+    assert "bumper_hardening" in discovery.verdict.best.names
+
+
 def record_untared_damper(amplitude_m: float, seed: int) -> PreparedLog:
     """A component test: spring, dashpot, 50 N of friction, a force cell that was not tared."""
     rate_hz, frequency_hz, tare_n = 200.0, 2.0, 400.0

@@ -145,14 +145,30 @@ class SelectionProblem:
         return (1.0 + self.instrument_misfit) * self.least_weight**-2
 
     def is_noise(self, null: FittedSet, best: FittedSet) -> bool:
-        """Return True if the base alone leaves hardly more than noise, and the best set as much."""
+        """Return True if the base alone leaves hardly more than noise, and the best set as much.
+
+        In every row: a bumper that is touched for moments leaves its mark in a small one.
+        """
         limit = 1 + NOISE_UNCERTAINTY
-        return null.cost < limit * min(self.noise, best.cost)
+        before, after = self.mean_squares(null), self.mean_squares(best)
+        return null.cost < limit * min(self.noise, best.cost) and all(
+            before[name] < limit * max(self.noise, after[name]) for name in before
+        )
 
     @cached_property
     def folds(self) -> tuple[Int1D, ...]:
         """Cross-validation fold of each entry, (entry,) per log."""
         return tuple(assign_folds(residuals) for residuals in self.log_residuals)
+
+    def mean_squares(self, fitted: FittedSet) -> dict[str, float]:
+        """Return the mean square of the cross-validation residual by row; without small rows."""
+        rows: dict[str, list[Float1D]] = {}
+        for held_out, residuals in zip(fitted.held_out, self.log_residuals, strict=True):
+            for index, name in enumerate((*residuals.rows, "rest")):
+                mask = residuals.entry_row == index
+                if mask.sum() > MIN_ROW_SHARE * mask.size:
+                    rows.setdefault(name, []).append(held_out[mask])
+        return {name: mean_square(values) for name, values in rows.items()}
 
     def compute_gain(self, before: FittedSet, after: FittedSet) -> tuple[float, float, float]:
         """Return (share of the residual squares removed, largest share in one row, significance).
@@ -162,7 +178,6 @@ class SelectionProblem:
         the blocks; the significance is the gain in standard errors.
         """
         gain, chance = 0.0, 0.0
-        rows: dict[str, list[float]] = {}
         for old, new, residuals in zip(
             before.held_out, after.held_out, self.log_residuals, strict=True
         ):
@@ -170,16 +185,11 @@ class SelectionProblem:
             chance += float(
                 (np.bincount(residuals.entry_block, weights=2 * (old - new) * new) ** 2).sum()
             )
-            for index, name in enumerate((*residuals.rows, "rest")):
-                mask = residuals.entry_row == index
-                if mask.sum() > MIN_ROW_SHARE * mask.size:
-                    row = rows.setdefault(name, [0.0, 0.0])
-                    row[0] += float(old[mask] @ old[mask] - new[mask] @ new[mask])
-                    row[1] += float(old[mask] @ old[mask])
         total = before.cost * sum(a.size for a in before.held_out)
         share = gain / max(total, 1e-300)
+        rows_before, rows_after = self.mean_squares(before), self.mean_squares(after)
         largest = max(
-            (gained / row_total for gained, row_total in rows.values() if row_total > 0),
+            (1 - rows_after[name] / square for name, square in rows_before.items() if square > 0),
             default=share,
         )
         return share, max(largest, share), gain / max(math.sqrt(chance), 1e-300)
