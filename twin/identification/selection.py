@@ -1,4 +1,4 @@
-"""Stepwise (forward with exchange) selection of missing effects by cross-validation.
+"""Stepwise selection of missing effects by cross-validation: addition, elimination, exchange.
 
 Each round screens all candidates by linear least squares around the current fit (`screening`),
 refits the best few on all data, and judges each by three-fold cross-validation over the steps.
@@ -232,17 +232,17 @@ class Cancelled(Exception):
 def stepwise_selection(
     problem: SelectionProblem, start: ParameterSet, report: ProgressCallback = lambda progress: None
 ) -> SelectionResult:
-    """Select effects stepwise from the base alone: forward steps, each followed by exchanges."""
+    """Select effects stepwise from the base alone; each addition puts the earlier ones in doubt."""
     null = problem.fit_effects(start, ())
     state = SelectionResult(null, null)
     try:
         while len(state.best.effects) < MAX_EFFECTS:
             previous, state = state.best, _forward_step(problem, state, report)
-            if state.best is previous:  # its exchanges were tried when it was accepted
+            if state.best is previous:  # it was revised when it was accepted
                 break
             if problem.is_noise(state.null, state.best):  # a second effect would fit noise, too
                 return replace(state, best=state.null)
-            state = _exchange_step(problem, state, report)
+            state = _revise_step(problem, state, report)
             if count_sensor_errors(state.best) > problem.max_sensor_errors:
                 return state
             state = replace(state, null=_refit_null(problem, state.null, state.best))
@@ -287,7 +287,7 @@ def _is_needed(
     return not is_minor and problem.is_worthwhile(without, with_effect)
 
 
-def _exchange_step(
+def _revise_step(
     problem: SelectionProblem, state: SelectionResult, report: ProgressCallback
 ) -> SelectionResult:
     """Drop each earlier effect that is not needed beside the last, or replace it by a better one.
