@@ -129,7 +129,7 @@ def test_the_texts_of_a_run_alone_give_the_run(tmp_path: Path) -> None:
         alone = from_texts(
             bundle.name, bundle.profile_toml, bundle.rig_toml, bundle.model_toml, "alone"
         )
-        assert alone.margins == bundle.margins
+        assert repr(alone.margins) == repr(bundle.margins)  # a record has no frequency: nan
         assert alone.profile == bundle.profile
         assert alone.parameters == bundle.parameters
         np.testing.assert_array_equal(alone.profile.plan.target_m, bundle.profile.plan.target_m)
