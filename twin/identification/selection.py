@@ -33,6 +33,7 @@ MIN_PROMISED_GAIN = 0.003  # of the residual squares: candidates that promise le
 MIN_VISIBLE_EXCESS = 0.05  # of the floor: excess below which there is no gap
 NOISE_UNCERTAINTY = 0.15  # of its mean square, which a rest of some seconds shows to 7 % in rms
 MIN_GAP_SHARE = 0.02  # of the initial gap that a second or third effect must close
+OFFSETS = ("gap_offset", "sensor_offset")  # a constant has no form that could be inexact
 MIN_GAIN_SIGMA = 4.0  # standard errors by which a gain must exceed zero
 MIN_GAIN_SHARE = 0.03  # of the residual squares, overall or in one row, that an effect must remove
 MIN_ROW_SHARE = 0.01  # of all entries: a smaller row is not judged by itself
@@ -213,10 +214,10 @@ class SelectionResult:
     def find_gap_start(self, fitted: FittedSet) -> FittedSet:
         """Return the set from which the gap that a set closes is counted.
 
-        The null; with the constant offsets of sensors, if the set has such and more: an untared
-        channel may dwarf every law.
+        The null; with its offsets alone, if the set has such and more: a channel that was not tared
+        or a gap that was read wrongly may dwarf every law.
         """
-        offsets = {effect.name for effect in fitted.effects if is_sensor_offset(effect)}
+        offsets = {effect.name for effect in fitted.effects if is_offset(effect)}
         if not offsets or len(offsets) == len(fitted.effects):
             return self.null
         starts = [tried for tried in self.tried if {*tried.names} == offsets]
@@ -251,9 +252,9 @@ def stepwise_selection(
         return replace(_accept_best(problem, state, cancelled.fitted), complete=False)
 
 
-def is_sensor_offset(effect: Candidate) -> bool:
-    """Return whether an effect is a constant offset of a sensor."""
-    return effect.effect is not None and effect.effect.id == "sensor_offset"
+def is_offset(effect: Candidate) -> bool:
+    """Return whether an effect is a constant error of an instrument or of the set-up."""
+    return effect.effect is not None and effect.effect.id in OFFSETS
 
 
 def count_sensor_errors(fitted: FittedSet) -> int:
