@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from table_io.block import Block, Bool2D, Float1D
+from table_io.block import Float1D
 from table_io.config.profile import Profile
 from table_io.records import Agreement
 from twin.compare.monitoring.agreement import (
@@ -86,27 +86,25 @@ def _measure_motion(
     ranges: dict[int, dict[int, tuple[float, float]]] = {}
     for block in recording.contiguous_blocks("meas"):
         contact = detect_contact(block, profile.comparison.contact_n, profile.specimen.gaps_m)
-        held = block.cycle >= 0
-        for step in np.unique(block.step[held]).tolist():
-            samples = held & (block.step == step)
-            sums = np.array([samples.sum(), *(side[samples].sum() for side in contact)])
+        starts = np.flatnonzero(np.diff(block.step) | np.diff(block.cycle)) + 1
+        starts = np.concatenate([[0], starts])
+        lengths = np.diff(starts, append=len(block))
+        sides = [np.add.reduceat(side.astype(np.int64), starts) for side in contact]
+        position = np.full(len(block), np.nan)
+        if "table_disp_m" in block.channels:
+            position = block.channel("table_disp_m")
+        lows, highs = (extreme.reduceat(position, starts) for extreme in (np.fmin, np.fmax))
+        for k in np.flatnonzero(block.cycle[starts] >= 0).tolist():
+            step, cycle = int(block.step[starts[k]]), int(block.cycle[starts[k]])
+            sums = np.array([lengths[k], *(side[k] for side in sides)])
             counts[step] = counts.get(step, 0.0) + sums
-            if "table_disp_m" in block.channels:
-                _extend_ranges(ranges.setdefault(step, {}), block, samples)
+            if np.isfinite(lows[k]):
+                low, high = ranges.setdefault(step, {}).get(cycle, (math.inf, -math.inf))
+                ranges[step][cycle] = min(low, float(lows[k])), max(high, float(highs[k]))
     return {
         step: (right / total, left / total, _median_half_range(ranges.get(step, {})))
         for step, (total, right, left) in counts.items()
     }
-
-
-def _extend_ranges(ranges: dict[int, tuple[float, float]], block: Block, samples: Bool2D) -> None:
-    """Extend the range (low, high) in m of the table's displacement by cycle, in place."""
-    position = block.channel("table_disp_m")
-    known = samples & np.isfinite(position)
-    for cycle in np.unique(block.cycle[known]).tolist():
-        values = position[known & (block.cycle == cycle)]
-        low, high = ranges.get(cycle, (math.inf, -math.inf))
-        ranges[cycle] = min(low, float(values.min())), max(high, float(values.max()))
 
 
 def _median_half_range(ranges: Mapping[int, tuple[float, float]]) -> float:
