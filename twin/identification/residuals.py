@@ -44,6 +44,7 @@ CONTACT_MARGIN_S = 0.012  # around contact and release, where the low pass smear
 FILTER_SETTLING_CYCLES = 3.0
 BLOCK_S = 1.0  # block length where there are no forcing cycles
 FORCE_ROWS = ("damper", "right", "left")
+CONTACT_ROWS = ("right", "left")
 TARED_CHANNELS = ("acc", "right", "left")
 PULL_ROWS = ("right pull", "left pull")
 # of the largest contact force: undershoot of the low pass after a release

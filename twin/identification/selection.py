@@ -16,7 +16,7 @@ from table_io.block import Float1D, Int1D
 from twin.identification.candidates import Candidate, list_generic_candidates
 from twin.identification.least_squares import FitResult, MapFunction, fit_parameters
 from twin.identification.parameters import ParameterSet
-from twin.identification.residuals import LogResiduals
+from twin.identification.residuals import CONTACT_ROWS, LogResiduals
 from twin.identification.screening import (
     NormalEquations,
     ScreenedCandidate,
@@ -282,10 +282,28 @@ def _accept_best(
 def _is_needed(
     problem: SelectionProblem, state: SelectionResult, without: FittedSet, with_effect: FittedSet
 ) -> bool:
-    """Return True if an effect is worthwhile and, beside others, closes enough of the gap."""
-    gap = state.find_gap_start(with_effect).cost - with_effect.cost
-    is_minor = without.effects and without.cost - with_effect.cost < MIN_GAP_SHARE * gap
-    return not is_minor and problem.is_worthwhile(without, with_effect)
+    """Return True if an effect is worthwhile and, beside others, closes enough of the gap.
+
+    Of all rows, or of a contact row if it acts in the bumpers: there an inexact form of a law of
+    the damper leaves nothing.
+    """
+    if not problem.is_worthwhile(without, with_effect):
+        return False
+    if not without.effects:
+        return True
+    start = state.find_gap_start(with_effect)
+    if without.cost - with_effect.cost >= MIN_GAP_SHARE * (start.cost - with_effect.cost):
+        return True
+    (added,) = (effect for effect in with_effect.effects if effect.name not in without.names)
+    if added.effect is None or not added.effect.is_in_bumpers:
+        return False
+    initial, before, after = map(problem.mean_squares, (start, without, with_effect))
+    return any(
+        before[row] - after[row]
+        > max(MIN_GAIN_SHARE * before[row], MIN_GAP_SHARE * (initial[row] - after[row]))
+        for row in CONTACT_ROWS
+        if row in before
+    )
 
 
 def _revise_step(
