@@ -139,6 +139,14 @@ def test_a_misfit_in_the_few_samples_of_contact_is_not_noise() -> None:
     assert "bumper_hardening" in discovery.verdict.best.names
 
 
+def test_a_bumper_is_judged_by_the_contact_rows_beside_a_dominant_effect() -> None:
+    truth = format_truth("table_tilt", tilt=10.0) + format_truth("bumper_hardening", k2=3e7)
+    selection = discover_effects([log(truth, noise=20.0)], SNM).selection
+    assert {*selection.best.names} == {"table_tilt", "bumper_hardening"}
+    null, tilted = selection.null.cost, selection.tried[0].cost
+    assert tilted - selection.best.cost < 0.02 * (null - selection.best.cost)  # of all rows: minor
+
+
 def record_untared_damper(amplitude_m: float, seed: int) -> PreparedLog:
     """A component test: spring, dashpot, 50 N of friction, a force cell that was not tared."""
     rate_hz, frequency_hz, tare_n = 200.0, 2.0, 400.0
