@@ -86,13 +86,14 @@ def _measure_motion(
     ranges: dict[int, dict[int, tuple[float, float]]] = {}
     for block in recording.contiguous_blocks("meas"):
         contact = detect_contact(block, profile.comparison.contact_n, profile.specimen.gaps_m)
-        starts = np.flatnonzero(np.diff(block.step) | np.diff(block.cycle)) + 1
-        starts = np.concatenate([[0], starts])
+        changes = np.flatnonzero(np.diff(block.step) | np.diff(block.cycle)) + 1
+        starts = np.concatenate([[0], changes])  # of each cycle, and of what lies between
         lengths = np.diff(starts, append=len(block))
         sides = [np.add.reduceat(side.astype(np.int64), starts) for side in contact]
         position = np.full(len(block), np.nan)
         if "table_disp_m" in block.channels:
             position = block.channel("table_disp_m")
+            position = np.where(np.isfinite(position), position, np.nan)
         lows, highs = (extreme.reduceat(position, starts) for extreme in (np.fmin, np.fmax))
         for k in np.flatnonzero(block.cycle[starts] >= 0).tolist():
             step, cycle = int(block.step[starts[k]]), int(block.cycle[starts[k]])
