@@ -14,7 +14,7 @@ from table_io.config.toml_text import format_toml
 from twin.recording.reader import read_recording
 from twin.reports.summary import Json, summarise, write_summary
 from twin.reports.twin_verdict import (
-    _extend_ranges,
+    _add_cycles,
     _median_half_range,
     judge_twin,
     name_command,
@@ -206,9 +206,13 @@ def test_a_spike_does_not_widen_the_travel() -> None:
     step, label, cycle = np.zeros(60, int), np.zeros(60, int), np.repeat(np.arange(3), 20)
     values = position[np.newaxis]
     block = Block("meas", 0, 100.0, ("table_disp_m",), values, step, label, cycle)
-    ranges: dict[int, tuple[float, float]] = {}
-    _extend_ranges(ranges, block, np.ones(60, bool))
-    assert _median_half_range(ranges) == pytest.approx(0.02)
+    counts: dict[int, np.ndarray] = {}
+    ranges: dict[int, dict[int, tuple[float, float]]] = {}
+    right = np.arange(60) < 15
+    _add_cycles(counts, ranges, block, (right, ~right))
+    assert counts[0].tolist() == [60, 15, 45]
+    assert sorted(ranges[0]) == [0, 1, 2]
+    assert _median_half_range(ranges[0]) == pytest.approx(0.02)
 
 
 def test_the_next_command_quotes_the_folder(clean: Json) -> None:

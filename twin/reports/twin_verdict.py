@@ -18,13 +18,13 @@ unequally; the monitoring judges their sum, and its warning counts here.
 
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from table_io.block import Float1D
+from table_io.block import Block, Bool1D, Float1D
 from table_io.config.profile import Profile
 from table_io.records import Agreement
 from twin.compare.monitoring.agreement import (
@@ -86,26 +86,39 @@ def _measure_motion(
     ranges: dict[int, dict[int, tuple[float, float]]] = {}
     for block in recording.contiguous_blocks("meas"):
         contact = detect_contact(block, profile.comparison.contact_n, profile.specimen.gaps_m)
-        changes = np.flatnonzero(np.diff(block.step) | np.diff(block.cycle)) + 1
-        starts = np.concatenate([[0], changes])  # of each cycle, and of what lies between
-        lengths = np.diff(starts, append=len(block))
-        sides = [np.add.reduceat(side.astype(np.int64), starts) for side in contact]
-        position = np.full(len(block), np.nan)
-        if "table_disp_m" in block.channels:
-            position = block.channel("table_disp_m")
-            position = np.where(np.isfinite(position), position, np.nan)
-        lows, highs = (extreme.reduceat(position, starts) for extreme in (np.fmin, np.fmax))
-        for k in np.flatnonzero(block.cycle[starts] >= 0).tolist():
-            step, cycle = int(block.step[starts[k]]), int(block.cycle[starts[k]])
-            sums = np.array([lengths[k], *(side[k] for side in sides)])
-            counts[step] = counts.get(step, 0.0) + sums
-            if np.isfinite(lows[k]):
-                low, high = ranges.setdefault(step, {}).get(cycle, (math.inf, -math.inf))
-                ranges[step][cycle] = min(low, float(lows[k])), max(high, float(highs[k]))
+        _add_cycles(counts, ranges, block, contact)
     return {
         step: (right / total, left / total, _median_half_range(ranges.get(step, {})))
         for step, (total, right, left) in counts.items()
     }
+
+
+def _add_cycles(
+    counts: dict[int, Float1D],
+    ranges: dict[int, dict[int, tuple[float, float]]],
+    block: Block,
+    contact: Iterable[Bool1D],
+) -> None:
+    """Add the held cycles of a block, in place, in one pass: a recording may have thousands.
+
+    `counts` are the samples by step, in all, in contact right and left; `ranges` are the lowest and
+    highest displacement of the table in m by step and cycle.
+    """
+    changes = np.flatnonzero(np.diff(block.step) | np.diff(block.cycle)) + 1
+    starts = np.concatenate([[0], changes])  # of each cycle, and of what lies between
+    lengths = np.diff(starts, append=len(block))
+    sides = [np.add.reduceat(side.astype(np.int64), starts) for side in contact]
+    position = np.full(len(block), np.nan)
+    if "table_disp_m" in block.channels:
+        position = block.channel("table_disp_m")
+        position = np.where(np.isfinite(position), position, np.nan)
+    lows, highs = (extreme.reduceat(position, starts) for extreme in (np.fmin, np.fmax))
+    for k in np.flatnonzero(block.cycle[starts] >= 0).tolist():
+        step, cycle = int(block.step[starts[k]]), int(block.cycle[starts[k]])
+        counts[step] = counts.get(step, 0.0) + np.array([lengths[k], *(side[k] for side in sides)])
+        if np.isfinite(lows[k]):
+            low, high = ranges.setdefault(step, {}).get(cycle, (math.inf, -math.inf))
+            ranges[step][cycle] = min(low, float(lows[k])), max(high, float(highs[k]))
 
 
 def _median_half_range(ranges: Mapping[int, tuple[float, float]]) -> float:
