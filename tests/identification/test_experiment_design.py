@@ -296,6 +296,26 @@ def test_an_effect_that_the_noise_hides_shows_at_a_higher_level() -> None:
     assert ranked[0].probability > ranked[1].probability
 
 
+def test_a_test_that_leads_a_sensor_out_of_its_range_is_not_proposed() -> None:
+    """The higher level shows more, but the laser does not reach as far: with all rivals in view."""
+    recorded = record_first(SNM, level_g=0.02)
+    problem = recorded.prepared.problem
+    rivals = (recorded.fit(), recorded.fit("quadratic_damping"), recorded.fit("coulomb_friction"))
+    quiet, loud = make_test(2.0, 2.0, 0.02).motion, make_test(2.0, 2.0, 0.2).motion
+    assert rank_tests(problem, rivals, [quiet, loud])[0].motion is loud
+    peak_m = max(
+        np.abs(block.channel("mass_disp_m")).max()
+        for block in predict_separation(problem, rivals, loud).simulated.values()
+    )
+    for reach, expected in ((0.99, [quiet]), (1.01, [loud, quiet])):
+        narrow = [
+            replace(motion, allowed_peaks={"mass_disp_m": reach * peak_m})
+            for motion in (quiet, loud)
+        ]
+        ranked = rank_tests(problem, rivals, narrow)
+        assert [test.motion.name for test in ranked] == [motion.name for motion in expected]
+
+
 def test_a_sweep_shows_what_a_noisy_test_at_one_frequency_cannot() -> None:
     """There a Maxwell branch is a spring and a dashpot, and that nothing is left proves nothing."""
     blind = []
@@ -347,6 +367,7 @@ def test_every_candidate_is_within_the_limits_of_the_rig(stroke_mm: float) -> No
         check_limits(test.config.margins, test.config.profile, test.config.rig, test.title)
         assert max(demand.displacement_m for demand in test.config.margins) <= 1e-3 * stroke_mm
         assert test.minutes <= 1.5
+        assert test.motion.allowed_peaks["mass_disp_m"] == pytest.approx(0.1 / 1.2)
     labels = tests[0].motion.block.label
     assert labels[0] == labels[-1] == Label.REST
     by_set_up = {test.set_up for test in tests}

@@ -10,8 +10,8 @@ the first term; its mean over the noise is twice the logarithm of the likelihood
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -68,6 +68,7 @@ class IdealTableMotion:
     """Ideal motion of the table in a test, for simulations: drive, set-up and duration.
 
     `block` has table_disp_m and table_acc_m_s2, and labels; it begins and ends at rest.
+    `allowed_peaks` are the largest readings by channel that the sensors are meant for, SI.
     """
 
     name: str
@@ -75,6 +76,7 @@ class IdealTableMotion:
     mass_kg: float
     gaps_m: tuple[float, float]
     minutes: float
+    allowed_peaks: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +135,15 @@ class TestPrediction:
     def is_confirmation(self) -> bool:
         """True if nothing is open, and the test is to show effects that the noise may hide."""
         return is_confirmation(self.rivals)
+
+    @property
+    def is_within_ranges(self) -> bool:
+        """False if a sensor would leave its range under one of the rivals."""
+        return all(
+            np.abs(values).max() <= self.motion.allowed_peaks.get(channel, math.inf)
+            for block in self.simulated.values()
+            for channel, values in zip(block.channels, block.values, strict=True)
+        )
 
     @property
     def sigma(self) -> float:
@@ -306,6 +317,7 @@ def rank_tests(
     """Return the predictions of the tests, the best first; only the most promising are refitted.
 
     The best excludes rivals most probably; of several that surely do, it separates most a minute.
+    Tests that lead a sensor out of its range are left out.
     """
     if len(rivals) < 2:
         return []
@@ -314,7 +326,8 @@ def rank_tests(
     for motion in motions:
         report(motion.name)
         screened.append(_predict_pairs(problem, rivals, motion, linear))
-    ranked = sorted((test for test in screened if test.pairs), key=_merit, reverse=True)
+    useful = [test for test in screened if test.pairs and test.is_within_ranges]
+    ranked = sorted(useful, key=_merit, reverse=True)
     if is_confirmation(rivals):  # of small effects that the noise hides one step is exact
         return ranked
     refitted = []

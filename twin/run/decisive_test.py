@@ -21,7 +21,7 @@ from table_io.config.profile import Profile
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from table_io.records import RunStart
-from table_io.safety.preflight import check_limits
+from table_io.safety.preflight import CORRECTION_HEADROOM, check_limits
 from table_io.units import GRAVITY_M_S2
 from twin.identification.discover import Discovery
 from twin.identification.experiment_design import (
@@ -75,7 +75,14 @@ class CandidateTest:
         channels = ("table_disp_m", "table_acc_m_s2")
         block = Block("meas", 0, drive.rate_hz, channels, values, *drive.labels(0, count))
         specimen = config.profile.specimen
-        return IdealTableMotion(self.title, block, specimen.mass_kg, specimen.gaps_m, self.minutes)
+        # the specimen may differ from every rival
+        allowed_peaks = {
+            sensor.channel: sensor.range * sensor.si_per_unit / CORRECTION_HEADROOM
+            for sensor in config.rig.sensors
+        }
+        return IdealTableMotion(
+            self.title, block, specimen.mass_kg, specimen.gaps_m, self.minutes, allowed_peaks
+        )
 
 
 @dataclass(frozen=True, eq=False)
