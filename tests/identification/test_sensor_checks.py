@@ -112,6 +112,19 @@ def test_a_fault_is_found_on_its_channel_with_its_size(name: str) -> None:
     assert places <= {*MASS, *channels} if channel.startswith("mass") else places <= {*channels}
 
 
+def test_a_clipped_reading_is_no_fault_where_it_is_known_to_be_invalid() -> None:
+    """The peaks of the laser, off its range: as they are a fault, as lost samples none."""
+    cut_m = 0.8 * np.abs(record().channel(MASS[0])).max()
+    clipped = distort(MASS[0], lambda x, _: np.clip(x, -cut_m, cut_m))
+    assert ("remainder", MASS) in find_faults(clipped)
+    lost = distort(MASS[0], lambda x, _: np.where(np.abs(x) < cut_m, x, np.nan))
+    assert find_faults(lost) == {}
+    values = lost.values.copy()
+    values[lost.channels.index(MASS[1])] = delay(lost.channel(MASS[1]), lost)
+    fault = find_faults(replace(lost, values=values))["lag", MASS]
+    assert fault.value == pytest.approx(7e-4, rel=0.2)
+
+
 @pytest.mark.parametrize(
     "seed", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)]
 )

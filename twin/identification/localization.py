@@ -211,7 +211,9 @@ def _nonrepeating_variance(
         first_period + shift + 1
     ]
     share = 1.0 + (1 - part) ** 2 + part**2 + 2 * part * (1 - part) * correlation
-    return float(np.nanmean((series[first_period] - next_period) ** 2) / share)
+    difference = series[first_period] - next_period
+    known = difference[np.isfinite(difference)]
+    return float(np.mean(known**2) / share) if known.size else math.nan
 
 
 def localize_excess(

@@ -134,19 +134,19 @@ def _compare_pair(
     strong &= signals.low_pass > 0.5
     if strong.sum() < 10:
         return
-    omega = signals.omega[strong]
-    expected, measured = (
-        values[strong] / sigma[strong] for values in (-(signals.omega**2) * position, acc)
-    )
+    omega = signals.omega
+    expected, measured = -(omega**2) * position / sigma, _observe_valid(signals, acc / sigma)
 
     def residual(errors: Float1D) -> Float1D:
         gain, lag, low_cut = errors[0], 1e-3 * errors[1], errors[2]
-        modelled = gain * expected * np.exp(-1j * omega * lag) / (1.0 - 1j * low_cut / omega)
-        difference = measured - modelled
+        passed = np.divide(omega, omega - 1j * low_cut, out=np.zeros_like(acc), where=omega > 0)
+        modelled = gain * expected * np.exp(-1j * omega * lag) * passed
+        difference = (measured - _observe_valid(signals, modelled))[strong]
         return np.concatenate([difference.real, difference.imag])
 
     fit = least_squares(residual, (1.0, 0.0, 0.01), bounds=([-2, -20, 0], [5, 20, 20]))
-    chi_square = max(float(fit.fun @ fit.fun) / (2 * omega.size - 3), 1.0)
+    count = max(2 * strong.sum() * float(signals.good.mean()), 4.0)
+    chi_square = max(float(fit.fun @ fit.fun) / (count - 3), 1.0)
     sd = np.sqrt(np.diag(np.linalg.pinv(fit.jac.T @ fit.jac)) * chi_square)
     gain, lag, low_cut = fit.x
     rows = (
@@ -157,11 +157,23 @@ def _compare_pair(
     for kind, value, deviation, limit, unit in rows:
         yield _check_estimate(signals, kind, channels, value, deviation, limit, unit)
     ratio = math.sqrt(chi_square)
-    share = float(np.linalg.norm(fit.fun) / np.linalg.norm(measured))
+    share = float(np.linalg.norm(fit.fun) / np.linalg.norm(measured[strong]))
     yield SensorCheck(
         signals.name, "remainder", channels, share, share, share,
         MAX_REMAINDER_SHARE if ratio > MIN_REMAINDER_RATIO else None,
     )  # fmt: skip
+
+
+def _observe_valid(signals: LogSignals, spectrum: Spectrum) -> Spectrum:
+    """Return the spectrum of the valid samples of a signal with white noise, (frequency,).
+
+    Louder noise of other frequencies would leak over the cuts, and the steps at lost samples would
+    ring beyond them without the roll-off of the low pass.
+    """
+    if signals.good.all():
+        return spectrum
+    values = signals.grid.to_time_domain(signals.low_pass * spectrum)
+    return signals.grid.from_time_domain(signals.good * values)
 
 
 def _check_cells(signals: LogSignals) -> Iterator[SensorCheck]:

@@ -161,9 +161,10 @@ class LogSignals:
         rest is noise in motion (light spot, resolution, drift).
         """
         noise = dict(self.noise)
+        weight = self.good / math.sqrt(max(float(self.good.mean()), 1.0 / self.good.size))
         for residual in self.fuse_motion().consistency_residuals:
             channels = SENSOR_PAIRS.get(residual.body, ())
-            ratio = np.sqrt(compare_with_white(residual.values, self.low_pass))
+            ratio = np.sqrt(compare_with_white(weight * residual.values, self.low_pass))
             ratio = np.minimum(ratio, MAX_NOISE_RATIO)
             noise |= {name: noise[name] * ratio for name in channels if name in noise}
         return replace(self, noise=noise)
