@@ -224,6 +224,11 @@ class SampleGap:
     channel: str
     reason: str  # "lost", "late", "clipped"
 
+    @property
+    def end(self) -> int:
+        """Index of the first sample after the gap."""
+        return self.index + self.count
+
 
 @dataclass(frozen=True, slots=True)
 class Fault:

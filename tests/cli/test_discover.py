@@ -14,6 +14,7 @@ import pytest
 from table_io.block import Float1D
 from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
+from table_io.records import SampleGap
 from tests.input_errors import raises_input_error
 from twin.cli import discover
 from twin.cli.discover import judge_logs
@@ -49,6 +50,8 @@ block_samples = 50
 enabled = false
 [control]
 enabled = false
+[protection]
+sensor = "warn"
 """
 NOTHING_NAMED = [effect.id for effect in EFFECTS]  # left out: the verdict is quick
 
@@ -61,9 +64,15 @@ class Made:
     profile: Path
 
 
-def record_run(folder: Path, truth: str = "", gap: str = "4.0") -> Made:
+def record_run(
+    folder: Path, truth: str = "", gap: str = "4.0", laser_range_mm: float = 100.0
+) -> Made:
     folder.mkdir()
     rig, text = folder / "rig.toml", (PROFILES_DIR / "rigs" / "simulated.toml").read_text()
+    text = text.replace(
+        'channel = "mass_disp_m"\nunit = "mm"\nrange = 100.0',
+        f'channel = "mass_disp_m"\nunit = "mm"\nrange = {laser_range_mm}',
+    )
     if truth:
         sealed = folder / "truth.toml"
         sealed.write_text(truth)
@@ -156,6 +165,22 @@ def test_lost_samples_are_counted(plain: Made, tmp_path: Path) -> None:
 
     _, notes = load_logs([change_log(plain, tmp_path, cut_holes)])
     assert any("70 samples of mass_acc_m_s2 are lost" in text for text in notes)
+
+
+def test_samples_beyond_the_range_of_a_sensor_are_not_used(plain: Made, tmp_path: Path) -> None:
+    whole = np.abs(read_recording(plain.log).contiguous_blocks("meas")[0].channel("mass_disp_m"))
+    range_m = 0.6 * whole.max()
+    narrow = record_run(tmp_path / "narrow", laser_range_mm=1e3 * range_m)
+    (log,), notes = load_logs([narrow.log])
+    recording = read_recording(narrow.log)
+    (piece,) = recording.contiguous_blocks("meas")
+    # the tare moves the ends of the range by 0.08 mm
+    at_end = np.abs(piece.channel("mass_disp_m")) > range_m + 0.7e-4
+    assert at_end.sum() > 100
+    count = sum(gap.count for gap in recording.records(SampleGap))
+    assert any(f"{count} samples of mass_disp_m" in text for text in notes)
+    assert not log.signals.good[at_end[:: log.signals.grid.decimation]].any()
+    assert 0.2 < log.signals.good.mean() < 1.0
 
 
 def test_bumpers_that_the_profile_does_not_know(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from table_io.channels import CHANNEL_BY_NAME, LEFT_CELLS, RIGHT_CELLS
 from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.errors import InputError
+from table_io.records import SampleGap
 from twin.identification.discover import PreparedLog
 from twin.identification.signals import (
     LogSignals,
@@ -73,7 +74,10 @@ def load_recording(recording: Recording, name: str) -> LoadedLog:
             remedy="give the recording of a test",
         )
     profile = parse_toml(start.profile_toml, Profile, location)
-    specimen, blocks = profile.specimen, recording.contiguous_blocks("meas")
+    specimen, clipped = profile.specimen, _list_clipped(recording)
+    blocks = tuple(
+        _discard_samples(block, clipped) for block in recording.contiguous_blocks("meas")
+    )
     dead = _find_dead_channels(blocks)
     signals = build_signals(
         _drop_incomplete_cells(blocks, dead), name, specimen.mass_kg, specimen.gaps_m
@@ -87,7 +91,23 @@ def load_recording(recording: Recording, name: str) -> LoadedLog:
     is_stated = "contact_n" in profile.comparison.model_fields_set
     contact_n = profile.comparison.contact_n if is_stated else 0.0  # else from the record
     log = PreparedLog(signals, contact_n, start.steps)
-    return LoadedLog(log, blocks, tuple(_list_notes(recording, profile, signals, blocks, dead)))
+    notes = _list_notes(recording, profile, signals, blocks, dead, clipped)
+    return LoadedLog(log, blocks, tuple(notes))
+
+
+def _list_clipped(recording: Recording) -> tuple[SampleGap, ...]:
+    """Return the stretches of samples at the end of the range of their sensor."""
+    return tuple(gap for gap in recording.records(SampleGap) if gap.reason == "clipped")
+
+
+def _discard_samples(block: Block, gaps: Sequence[SampleGap]) -> Block:
+    """Return a block with nan for the samples of gaps: what a clipped sensor reads is wrong."""
+    values = block.values.copy()
+    for gap in gaps:
+        if gap.channel in block.channels:
+            first, last = (max(index - block.index, 0) for index in (gap.index, gap.end))
+            values[block.channels.index(gap.channel), first:last] = np.nan
+    return replace(block, values=values)
 
 
 def _find_dead_channels(blocks: Sequence[Block]) -> frozenset[str]:
@@ -129,6 +149,7 @@ def _list_notes(
     signals: LogSignals,
     blocks: Sequence[Block],
     dead: frozenset[str],
+    clipped: Sequence[SampleGap],
 ) -> Iterator[str]:
     """Yield notes on the recording that matter for the verdict."""
     name = signals.name
@@ -151,7 +172,13 @@ def _list_notes(
             yield (
                 f"{name}: {channel} stays at its extreme value; it may be clipped: check its range"
             )
-        elif lost := sum(int(np.isnan(block.channel(channel)).sum()) for block in blocks):
+        beyond = sum(gap.count for gap in clipped if gap.channel == channel)
+        if beyond:
+            yield (
+                f"{name}: {beyond} samples of {channel} are at the end of its range; they are not "
+                "used"
+            )
+        if lost := sum(int(np.isnan(block.channel(channel)).sum()) for block in blocks) - beyond:
             yield f"{name}: {lost} samples of {channel} are lost; they are not used"
         if channel in dead:
             unused = ", so all load cells are ignored" if channel in LOAD_CELLS else ""
