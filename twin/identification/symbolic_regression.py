@@ -7,6 +7,7 @@ and judged on held-out steps as every other one: the search's own score decides 
 """
 
 import ast
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from typing import Any
@@ -109,7 +110,10 @@ def fit_regressor(
         pool_size=POPULATION, generations=GENERATIONS, optimizer_iterations=5, n_threads=1,
         objectives=["r2", "length"], epsilon=1e-4, random_state=1,
     )  # fmt: skip
-    return regressor.fit(np.stack([values[kept] for values in features], axis=1), target[kept])
+    with warnings.catch_warnings():
+        # of the shortest expression of the front, a constant
+        warnings.filterwarnings("ignore", "Model contains no variables", UserWarning)
+        return regressor.fit(np.stack([values[kept] for values in features], axis=1), target[kept])
 
 
 def _strip_scale(tree: ast.expr) -> ast.expr:
