@@ -22,7 +22,12 @@ from twin.identification.discover import (
 )
 from twin.identification.parameters import EffectKey, TareKey
 from twin.identification.screening import assign_folds, build_normal_equations, rank_candidates
-from twin.identification.selection import Cancelled, SelectionProgress
+from twin.identification.selection import (
+    Cancelled,
+    SelectionProgress,
+    SelectionResult,
+    revise_step,
+)
 from twin.identification.verdict import closed_fraction, judge_selection
 
 
@@ -145,6 +150,34 @@ def test_a_bumper_is_judged_by_the_contact_rows_beside_a_dominant_effect() -> No
     assert {*selection.best.names} == {"table_tilt", "bumper_hardening"}
     null, tilted = selection.null.cost, selection.tried[0].cost
     assert tilted - selection.best.cost < 0.02 * (null - selection.best.cost)  # of all rows: minor
+
+
+def test_an_effect_that_only_stood_in_for_a_later_one_is_dropped() -> None:
+    """Friction is the nearest to a hysteresis, until the hysteresis itself is in the set."""
+    prepared = prepare_problem(
+        [
+            log(
+                format_truth(
+                    "bouc_wen", force=60.0, yield_displacement=1e-3, exponent=1.0, beta=0.5
+                )
+            )
+        ],
+        SNM,
+    )
+    problem = prepared.problem
+    library = {candidate.name: candidate for candidate in problem.library}
+    friction, hysteresis = library["coulomb_friction"], library["bouc_wen"]
+    null = problem.fit_effects(prepared.parameters, ())
+    first = problem.fit_effects(
+        friction.add_to(null.fit.parameters, friction.shapes[0]), [friction]
+    )
+    both = problem.fit_effects(
+        hysteresis.add_to(first.fit.parameters, hysteresis.shapes[0]), [friction, hysteresis]
+    )
+    assert first.cost < null.cost
+    assert both.cost < first.cost
+    state = SelectionResult(null, both, (first, both))
+    assert revise_step(problem, state, lambda _: None).best.names == ("bouc_wen",)
 
 
 def record_untared_damper(amplitude_m: float, seed: int) -> PreparedLog:

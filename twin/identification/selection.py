@@ -243,7 +243,7 @@ def stepwise_selection(
                 break
             if problem.is_noise(state.null, state.best):  # a second effect would fit noise, too
                 return replace(state, best=state.null)
-            state = _revise_step(problem, state, report)
+            state = revise_step(problem, state, report)
             if count_sensor_errors(state.best) > problem.max_sensor_errors:
                 return state
             state = replace(state, null=_refit_null(problem, state.null, state.best))
@@ -306,12 +306,13 @@ def _is_needed(
     )
 
 
-def _revise_step(
+def revise_step(
     problem: SelectionProblem, state: SelectionResult, report: ProgressCallback
 ) -> SelectionResult:
     """Drop each earlier effect that is not needed beside the last, or replace it by a better one.
 
-    What was the best first effect may only have stood in for a later one.
+    What was the best first effect may only have stood in for a later one. `state` is that after the
+    last effect was added, with every set refitted until then.
     """
     for earlier in state.best.effects[:-1]:
         reduced = _fit_without(problem, state.best, earlier)
