@@ -10,6 +10,7 @@ from table_io.compilation import jit_helper
 from table_io.config.base import parse_toml
 from table_io.errors import InputError
 from tests.identification.played import SNM
+from twin.model.added_laws import compile_laws
 from twin.model.config import ModelConfig, load_model_config
 from twin.model.effects.effect_file import EffectFile, build_written_effect
 from twin.model.effects.expression import FUNCTIONS, build_function, parse_expression, parse_unit
@@ -233,6 +234,17 @@ class TestLaws:
         assert effect.rates(0.0, 0.5, (2.0,), (4.0, 0.1)) == (-18.0,)
         again = parse_toml(law.format_text(), EffectFile, "x")
         assert again == law
+
+    def test_laws_that_compute_the_same_are_compiled_once(self):
+        """A study or a service fits the same laws to one recording after another."""
+        plain = build_written_effect(CUBIC)
+        ranged = build_written_effect(CUBIC + "[range]\nu = [-1e-3, 2e-3]\n")
+        doubled = build_written_effect(CUBIC.replace("k * u**3", "2.0 * k * u**3"))
+        assert plain is not ranged
+        compiled = [compile_laws((effect,)) for effect in (plain, ranged, doubled)]
+        assert compiled[0] is compiled[1]
+        assert compiled[0] is not compiled[2]
+        assert compile_laws((plain, doubled)) is not compile_laws((doubled, plain))
 
 
 class TestModelFile:

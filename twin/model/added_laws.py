@@ -53,15 +53,14 @@ def compile_laws(effects: tuple[Effect, ...]) -> AddedLaws | None:
     """
     if not effects:
         return None
-    namespace: dict[str, Any] = {}
+    functions: list[tuple[str, Callable[..., Any]]] = []
     for number, effect in enumerate(effects):
         assert effect.force is not None
-        namespace[f"force_{number}"] = _register_function(effect.force)
+        functions.append((f"force_{number}", effect.force))
         if effect.rates is not None:
-            namespace[f"rates_{number}"] = _register_function(effect.rates)
-    exec(_write_laws(effects), namespace)
+            functions.append((f"rates_{number}", effect.rates))
     try:
-        return jit_kernel(ADDED_LAWS_SIGNATURE)(namespace["laws"])
+        return _compile_text(_write_laws(effects), tuple(functions))
     except NumbaError as error:
         for effect in effects if len(effects) > 1 else ():
             compile_laws((effect,))  # names the one that fails
@@ -70,6 +69,17 @@ def compile_laws(effects: tuple[Effect, ...]) -> AddedLaws | None:
             where=f"effect {effects[0].id!r}",
             remedy="use only arithmetic, `math`, comparisons and float tuples in it",
         ) from error
+
+
+@cache
+def _compile_text(text: str, functions: tuple[tuple[str, Callable[..., Any]], ...]) -> AddedLaws:
+    """Compile the text of `laws` with the functions that it calls by name.
+
+    Effects that differ in names, bounds or ranges alone share it.
+    """
+    namespace: dict[str, Any] = {name: _register_function(call) for name, call in functions}
+    exec(text, namespace)
+    return jit_kernel(ADDED_LAWS_SIGNATURE)(namespace["laws"])
 
 
 @cache

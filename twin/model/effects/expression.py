@@ -13,6 +13,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from types import CodeType, FunctionType
 from typing import Any
 
@@ -344,6 +345,10 @@ def build_function(
     definition = ast.FunctionDef(name, parameters, [ast.Return(body)], [], None)
     module = ast.fix_missing_locations(ast.Module([definition], []))
     code = compile(module, f"<{name}>", "exec")
-    function_code = next(part for part in code.co_consts if isinstance(part, CodeType))
-    numeric = {function: entry[0] for function, entry in FUNCTIONS.items()}
-    return FunctionType(function_code, numeric)
+    return _make_function(next(part for part in code.co_consts if isinstance(part, CodeType)))
+
+
+@cache
+def _make_function(code: CodeType) -> FunctionType:
+    """Return the function of a code, one object of equal ones: a compiled law is known by it."""
+    return FunctionType(code, {function: entry[0] for function, entry in FUNCTIONS.items()})
