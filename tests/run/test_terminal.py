@@ -14,13 +14,13 @@ from rich.console import Console
 from rich.table import Table
 
 from table_io.config.folders import find_config
-from table_io.records import Event, Fault, NormalizedResponse, PrcPoint
+from table_io.records import Event, Fault, NormalizedResponse, PrcPoint, SampleGap
 from tests.input_errors import raises_input_error
 from tests.reports.recordings import summary
 from twin.reports.prc_table import print_prc
 from twin.run import folders, terminal, warm_up
 from twin.run.folders import make_output_folder, make_run_folder
-from twin.run.progress import RunProgress
+from twin.run.progress import GAP_SERIES_SAMPLES, RunProgress
 from twin.run.run_config import read_run_config
 
 
@@ -142,6 +142,24 @@ def test_what_a_twin_elsewhere_writes_gives_no_orders_to_the_terminal() -> None:
     lines = out.getvalue().splitlines()
     assert all(line.isprintable() for line in lines)
     assert [line[:12] for line in lines[2:]] == [f"{'':>7}  fau", f"{'':>7}  dri"]
+
+
+def test_of_a_series_of_gaps_the_first_is_shown_and_that_more_follow() -> None:
+    """A sensor off its range brings one a block; another channel, or the next series, is new."""
+    out = io.StringIO()
+    show = RunProgress(Console(file=out, width=200), 3, 100)
+    for index in range(0, 6000, 20):
+        show(SampleGap(index, 20, "mass_disp_m", "clipped"))
+        if index == 3000:
+            show(SampleGap(index, 5, "force_r1_n", "clipped"))
+            show(SampleGap(index, 7, "mass_disp_m", "lost"))
+    show(SampleGap(6000 + GAP_SERIES_SAMPLES, 3, "mass_disp_m", "clipped"))
+    shown = [line.split("gap: ")[1].split() for line in out.getvalue().splitlines()]
+    assert [(words[0], words[3], words[4].strip(";")) for words in shown] == [
+        ("20", "mass_disp_m", "clipped"), ("more", "mass_disp_m", "clipped"),
+        ("5", "force_r1_n", "clipped"), ("7", "mass_disp_m", "lost"),
+        ("3", "mass_disp_m", "clipped"),
+    ]  # fmt: skip
 
 
 def test_a_qr_code_is_drawn_module_by_module() -> None:

@@ -34,6 +34,7 @@ TABLE_HEADER = (
     f"{'step':>7}  {'direction':<9} {'f [Hz]':>7}  {'level [g]':>9}   "
     f"{'eta_d':>6} {'twin':>6}   {'impacts R/L':>11} {'twin':>7}   {'latency':>8}"
 )
+GAP_SERIES_SAMPLES = 2000  # 1 s at 2 kHz: a channel that is off its range is so in every cycle
 
 
 def make_task_bar(*columns: ProgressColumn) -> Progress:
@@ -64,6 +65,7 @@ class RunProgress:
         self._task = self._bar.add_task("running", total=samples)
         self._shown_index = 0
         self._header_printed = False
+        self._gap_series: dict[tuple[str, str], tuple[int, int]] = {}  # number in it, end of last
 
     def __enter__(self) -> "RunProgress":
         self._bar.start()
@@ -92,8 +94,7 @@ class RunProgress:
         elif isinstance(item, Event):
             self.print_line(f"{'':>7}  {format_kind(item.kind)}: {item.text}")
         elif isinstance(item, SampleGap):
-            name = item.channel or "all channels"
-            self.print_line(f"{'':>7}  gap: {item.count} samples of {name} {item.reason}")
+            self._print_gap(item)
         elif isinstance(item, Trip) or (isinstance(item, Check) and not item.passed):
             message = format_record(item, 1.0)
             self.print_line(f"{'':>7}  {message[1] if message else ''}")
@@ -107,6 +108,20 @@ class RunProgress:
         """Print one line above the bar, without nonprintable characters (a remote twin's text)."""
         text = replace_nonprintable(text)
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+    def _print_gap(self, gap: SampleGap) -> None:
+        """Print the first gap of a series, and once that more follow: a block may bring each."""
+        name, key = gap.channel or "all channels", (gap.channel, gap.reason)
+        number, end = self._gap_series.get(key, (0, 0))
+        number = number + 1 if number and gap.index - end < GAP_SERIES_SAMPLES else 1
+        self._gap_series[key] = number, gap.end
+        if number == 1:
+            self.print_line(f"{'':>7}  gap: {gap.count} samples of {name} {gap.reason}")
+        elif number == 2:
+            self.print_line(
+                f"{'':>7}  gap: more samples of {name} {gap.reason}; the next are shown after "
+                f"{GAP_SERIES_SAMPLES} valid samples"
+            )
 
     def _print_point(self, point: PrcPoint) -> None:
         if not self._header_printed:
