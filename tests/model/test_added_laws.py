@@ -101,6 +101,29 @@ class TestInstalled:
         effect_size = np.abs(plain - expected)[row].max()
         assert np.abs(forces - expected)[row].max() < 0.02 * effect_size
 
+    def test_half_a_branch_of_ours_and_half_of_theirs_are_one(self):
+        """Along a motion too, on which the mass meets a face that is still, and one that moves."""
+        kb, tau = typical(find_effect("bumper_maxwell")).values()
+        base = 2.0 * sine(2.6, RATE_HZ, 4.0)
+        whole = SNM.with_effect("bumper_maxwell", "", kb=kb, tau=tau)
+        halves = SNM.with_effect("bumper_maxwell", "", kb=0.5 * kb, tau=tau)
+        halves = halves.with_effect("zener_bumper", "", stiffness=0.5 * kb, relaxation_time=tau)
+        expected, out = (
+            drive(model, base, StateEstimate(0, 0.0, 0.0))[1] for model in (whole, halves)
+        )
+        assert (np.abs(out - expected) <= 2e-6 * np.abs(expected).max(axis=1, keepdims=True)).all()
+        u, v, _, right, left = expected[:5]
+        time = np.arange(1, u.size + 1) / RATE_HZ
+        touched = np.array([right > 0, left < 0])
+        early = touched | np.roll(touched, -3, axis=1)  # as a filter makes of a measured contact
+        unknown = np.full(touched.shape, -1)
+        for contact in (touched, early, unknown):
+            one, two, none = (
+                forces_along(model, u, v, 0 * u, time, contact.astype(np.int8))
+                for model in (whole, halves, SNM)
+            )
+            assert np.abs(two - one)[1].max() < 0.02 * np.abs(none - one)[1].max()
+
     def test_one_law_on_each_side_is_the_law_on_both(self):
         both = Model(snm()).with_effect("bumper_hardening", k2=1e8)
         sides = Model(snm()).with_effect("hard_right", k2=1e8).with_effect("hard_left", k2=1e8)

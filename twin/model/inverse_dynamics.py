@@ -78,7 +78,7 @@ def relax_branch(
     branch: float, rate: float, stiffness: float, displacement: float, h: float
 ) -> float:
     """Return the force of a Maxwell branch after h s at constant speed: f' = k v - f / tau."""
-    if rate == 0.0:
+    if rate * h == 0.0:
         return branch + stiffness * displacement
     decay = math.exp(-rate * h)
     return branch * decay + stiffness * displacement * (1.0 - decay) / (rate * h)
