@@ -172,6 +172,7 @@ def test_a_law_that_diverges_on_the_record_is_a_bad_fit_and_no_error():
     assert not prepared.problem.is_worthwhile(null, fitted)
 
 
+@pytest.mark.slow  # 17 s
 def test_a_law_is_found_beside_the_errors_of_instruments():
     prepared = prepare_problem([imperfect_log(format_truth("cubic_damping", c3=4e4))], SNM)
     problem, null, proposal = find_law_of_base(prepared)
