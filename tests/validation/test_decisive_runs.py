@@ -12,9 +12,14 @@ from twin.identification.discover import discover_effects
 from twin.identification.parameters import STIFFNESS, EffectKey
 from twin.reports.discovery.loading import load_logs
 from twin.run.run_config import read_model_template
-from twin.validation.study.decisive_runs import format_rates, run_decide_study
+from twin.validation.study.decisive_runs import (
+    evaluate_decision,
+    format_rates,
+    run_decide_study,
+)
 from twin.validation.study.generation import record_test
 from twin.validation.study.rig_setup import PROFILE_TOML
+from twin.validation.study.strata import draw_case, list_case_numbers
 
 Json = dict[str, Any]
 
@@ -54,6 +59,17 @@ def test_an_open_verdict_counts_as_decided_only_if_the_next_is_right() -> None:
 def test_an_unknown_first_test_is_refused() -> None:
     with raises_input_error(key="--first", allowed="flight"):
         run_decide_study(None, 1, (), None, False, "swep")
+
+
+def test_a_case_in_which_a_study_was_interrupted_is_begun_anew(tmp_path: Path) -> None:
+    (number,) = list_case_numbers(1, ["single/coulomb_friction/10/1%"])
+    folder = tmp_path / "cases" / draw_case(number).label
+    folder.mkdir(parents=True)
+    for name in ("first.mcap", "proposed.mcap"):
+        (folder / name).write_bytes(b"the beginning of a recording")
+    row = evaluate_decision(tmp_path, "one-frequency", number)
+    assert row["first"]["named"] == ["coulomb_friction"]
+    assert {path.name for path in folder.glob("*.mcap")} == {"first.mcap"}
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ recordings judged again.
 """
 
 import json
+import shutil
 from collections.abc import Iterable, Sequence
 from functools import partial
 from itertools import pairwise
@@ -155,7 +156,8 @@ class _SealedPlant:
     def __init__(self, case: Case, folder: Path, has_bumpers: bool) -> None:
         self.case, self.folder, self.tests = case, folder, 0
         self.truth = [planted.effect.name for planted in case.planted]
-        folder.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(folder, ignore_errors=True)  # of a study that was interrupted in this case
+        folder.mkdir(parents=True)
         shares, _ = find_shares(case)
         truth = make_truth(case, case.planted, shares)
         if not has_bumpers:  # the gaps are then those of the profile
