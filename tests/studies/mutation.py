@@ -275,10 +275,16 @@ def patch_module(module: ModuleType, text: str) -> None:
     for name, value in vars(new).items():
         old = vars(module).get(name)
         if isinstance(value, bool | int | float | str | tuple | frozenset | dict):
-            if value != old and not name.startswith("__"):
+            if repr(value) != repr(old) and not name.startswith("__"):  # they may hold arrays
                 rebind_constant(name, old, value)
         elif getattr(value, "__module__", "") == module.__name__:
             patch_object(old, value)
+
+
+def plant(module: ModuleType, text: str) -> int:
+    """Replace a module by another text as `patch_module` does; return 0."""
+    patch_module(module, text)
+    return 0
 
 
 def rebind_constant(name: str, old: Any, new: Any) -> None:
@@ -361,6 +367,10 @@ class Study:
         tests_s = time.monotonic() - begin_s
         limit_s = max(MIN_TIME_LIMIT_S, TIME_LIMIT_FACTOR * tests_s)
         modules = {str(file.relative_to(REPOSITORY)): import_file(file) for file in self.files}
+        for file, module in modules.items():
+            text = Path(str(module.__file__)).read_text()
+            if run_in_child(partial(plant, module, text), limit_s):
+                raise SystemExit(f"{self.name}: {file} cannot be replaced")
         mutants = [
             mutant
             for file, module in modules.items()
