@@ -8,6 +8,7 @@ import pytest
 
 from table_io.block import Label
 from table_io.config.toml_text import format_toml
+from table_io.errors import InputError
 from table_io.safety.preflight import check_limits
 from twin.identification.discover import PreparedLog, PreparedProblem, prepare_problem
 from twin.identification.experiment_design import (
@@ -18,6 +19,7 @@ from twin.identification.experiment_design import (
     list_rivals,
     predict_separation,
     rank_tests,
+    simulate_motion,
 )
 from twin.identification.hidden_effects import (
     find_blind_spots,
@@ -314,6 +316,23 @@ def test_a_test_that_leads_a_sensor_out_of_its_range_is_not_proposed() -> None:
         ]
         ranked = rank_tests(problem, rivals, narrow)
         assert [test.motion.name for test in ranked] == [motion.name for motion in expected]
+
+
+def test_a_rival_too_fast_for_the_sampling_rate_is_refitted_but_not_simulated(
+    relaxing: Recorded,
+) -> None:
+    """A branch that a fit made stiff and short: the solver refuses it, the other is simulated."""
+    slow, branch = relaxing.fit("quadratic_damping"), relaxing.fit("maxwell_damper", tau=0.06)
+    values: dict[ParameterKey, float] = {EffectKey("maxwell_damper", "tau"): 1e-9}
+    parameters = branch.fitted.fit.parameters.with_values(values)
+    fit = replace(branch.fitted.fit, parameters=parameters)
+    fast = Rival("fast", replace(branch.fitted, fit=fit))
+    test = make_test(2.0, 2.0, 0.1)
+    with pytest.raises(InputError):
+        simulate_motion(parameters, test.motion, relaxing.prepared.problem.log_residuals[-1])
+    prediction = predict_separation(relaxing.prepared.problem, (slow, fast), test.motion)
+    assert {*prediction.simulated} == {0}
+    assert [(pair.truth, pair.other) for pair in prediction.pairs] == [(0, 1)]
 
 
 def test_a_sweep_shows_what_a_noisy_test_at_one_frequency_cannot() -> None:

@@ -19,6 +19,7 @@ from scipy.special import ndtr
 
 from table_io.block import Block, Float1D, Float2D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from table_io.errors import InputError
 from twin.compare.sensors import apply_sensors, lag_samples
 from twin.identification.hidden_effects import UndetectedEffect, find_hidden_effects
 from twin.identification.least_squares import (
@@ -349,7 +350,10 @@ def _predict_pairs(
         others = [index for index, other in enumerate(rivals) if _is_separable(rival, other)]
         if not others or not rival.can_be_simulated or (truth and is_confirmation(rivals)):
             continue
-        simulated[truth], residuals = simulate_log(rival.fitted, motion, problem)
+        try:
+            simulated[truth], residuals = simulate_log(rival.fitted, motion, problem)
+        except InputError:  # a fitted relaxation may be too fast for the sampling rate
+            continue
         joint = replace(problem, log_residuals=(*problem.log_residuals, residuals))
         # what the noise may hide hardly changes the slopes of the set that it is added to
         slopes = linear[truth].compute_new_slopes(joint) if linear else None
