@@ -101,9 +101,16 @@ def test_the_base_has_the_curves_of_its_closed_form() -> None:
     assert onset == pytest.approx(-4.265, abs=2e-3)
 
 
-@pytest.mark.parametrize("gap_mm", [16.0, 4.0, 0.0, -1.0, -2.0, -10.0])
-def test_describing_functions_agree_with_continuation(gap_mm: float) -> None:
-    model = set_total_gap(SNM, gap_mm)
+@pytest.mark.parametrize(
+    ("model", "gap_mm"),
+    [
+        *((SNM, gap_mm) for gap_mm in (16.0, 4.0, 0.0, -1.0, -2.0, -10.0)),
+        (SNM.with_effect("table_tilt", tilt=2.0), 4.0),
+        (SNM.with_effect("table_tilt", tilt=2.0), -1.0),
+    ],
+)
+def test_describing_functions_agree_with_continuation(model: Model, gap_mm: float) -> None:
+    model = set_total_gap(model, gap_mm)
     near = approximate_curve(model, PAPER.test.acceleration_m_s2)
     exact = compute_curve(model, PAPER.test)
     assert near is not None

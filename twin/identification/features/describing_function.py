@@ -77,7 +77,8 @@ class HarmonicBalance:
     def _drive(self, w: Float1D) -> Float1D:
         """Return the amplitude of the acceleration that the mass feels, in m/s2, (amplitude,)."""
         a = self.acceleration_m_s2
-        return np.abs(a + (self.model.added_acceleration(-a / w**2) or 0.0))
+        added = self.model.added_acceleration(-a / w**2)
+        return np.abs(np.full_like(w, a) if added is None else a + added)
 
     def solve_backbone(self, amplitudes_m: Float1D) -> tuple[Float1D, Float1D, Float1D]:
         """Return (w in 1/s at which a free motion has an amplitude, surplus, smallest push).
