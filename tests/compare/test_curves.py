@@ -96,6 +96,14 @@ def test_left_hysteresis() -> None:
     )
 
 
+def test_a_jump_may_lead_to_either_end_of_the_grid() -> None:
+    points = sweep(hardening(3.95), hardening(2.05))
+    assert detect_hysteresis(points, "measured") == (
+        [PrcJump("forward", 3.9, 4.0, "down"), PrcJump("backward", 2.1, 2.0, "up")],
+        [Hysteresis("right", 2.1, 3.9)],
+    )
+
+
 def test_the_order_of_the_points_does_not_matter() -> None:
     points = sweep(hardening(3.55), hardening(2.65))
     assert detect_hysteresis(points[::-1], "measured") == RIGHT

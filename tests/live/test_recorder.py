@@ -19,12 +19,12 @@ from tests.reports.recordings import blocks, start_record
 from twin.live import recorder as module
 from twin.live.latency import LatencyHistogram
 from twin.live.process_config import ProcessConfig
-from twin.live.recorder import Recorder
+from twin.live.recorder import CompletionTracker, Recorder
 from twin.recording.mcap_log import LogWriter, iter_messages
 from twin.recording.merge import verify_log
 from twin.recording.reader import read_recording
 from twin.run.disk import DiskForecast, DiskReserve
-from twin.transport.codec import encode_item, topic_for
+from twin.transport.codec import Item, encode_item, topic_for
 
 START = start_record()
 BLOCK_S = 0.05
@@ -119,6 +119,28 @@ def list_recorded(folder: Path) -> list[Any]:
 
 def list_expected() -> list[Any]:
     return sorted((type(item).__name__, item.index) for item in items())
+
+
+def test_a_run_is_complete_with_its_end_all_its_samples_and_the_end_of_the_twin() -> None:
+    run = [item for item in blocks() if isinstance(item, Block) and item.stream == "meas"]
+    end = run[-1].end
+    stop = RunStop(end, "complete", "", ())
+    twin = Timing(end, "twin", 0, 0, 0, 0, 0, 0, "")
+    early, table = replace(twin, index=end - 1), replace(twin, component="table")
+    missing: Item
+    for missing in (run[-1], stop, twin):
+        tracker = CompletionTracker()
+        items: list[Item] = [START, *run, stop, early, table, twin]
+        for item in items:
+            if item is not missing:
+                tracker.update(item)
+        assert tracker.has_started
+        assert not tracker.is_complete
+        tracker.update(missing)
+        # the twin's Timing counts after the end alone
+        assert tracker.is_complete == (missing is not stop)
+        tracker.update(twin)
+        assert tracker.is_complete
 
 
 def test_all_that_came_is_in_the_file_a_quarter_second_later(
