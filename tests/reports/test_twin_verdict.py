@@ -37,6 +37,8 @@ cycles = 4
 measured_cycles = 2
 [acquisition]
 rate_hz = 1000.0
+[protection]
+sensor = "warn"
 [loop_check]
 enabled = false
 [control]
@@ -48,14 +50,21 @@ IMPACTS = {"gap": 4.0, "start": 2.4, "stop": 4.4, "step": 0.4}
 PRECOMPRESSED = {"gap": -2.0, "start": 4.0, "stop": 8.0, "step": 1.0}
 
 
-def run_test(folder: Path, sweep: dict[str, float], truth: str = "") -> Json:
+def run_test(
+    folder: Path, sweep: dict[str, float], truth: str = "", laser_range_mm: float = 100.0
+) -> Json:
     """Summary of a run on a rig that hides a truth, as written."""
     simulated = dict(NOMINAL_RIG["simulated"])
     if truth:
         (folder / "truth.toml").write_text(truth)
         digest = hashlib.sha256(truth.encode()).hexdigest()
         simulated |= {"truth": str(folder / "truth.toml"), "truth_sha256": digest}
-    (folder / "rig.toml").write_text(format_toml(NOMINAL_RIG | {"simulated": simulated}))
+    sensors = [
+        sensor | ({"range": laser_range_mm} if sensor["channel"] == "mass_disp_m" else {})
+        for sensor in NOMINAL_RIG["sensors"]
+    ]
+    rig = NOMINAL_RIG | {"simulated": simulated, "sensors": sensors}
+    (folder / "rig.toml").write_text(format_toml(rig))
     (folder / "test.toml").write_text(TEST.format(name="test", rig=folder / "rig.toml", **sweep))
     config = read_run_config(folder / "test.toml")
     play_unpaced(config, "test", folder / "run.mcap", lambda: None, lambda _: None)
@@ -95,6 +104,21 @@ def test_the_twin_of_another_specimen_departs_while_the_test_is_complete(
     assert verdict["worst"]["misfit"] > 10
     assert verdict["worst"]["error"] > verdict["worst"]["band"]
     assert verdict["next_command"] == "shaketwin discover DIR"
+
+
+@pytest.mark.parametrize(("range_mm", "verdict"), [(6.0, "agrees"), (0.2, "not judged")])
+def test_a_step_with_a_sensor_off_its_range_is_not_judged(
+    range_mm: float, verdict: str, clean: Json, tmp_path: Path
+) -> None:
+    """Of a clean rig with a short laser: the steps of small motion agree, the others are open."""
+    summary = run_test(tmp_path, IMPACTS, laser_range_mm=range_mm)
+    judged = summary["twin_verdict"]
+    assert judged["verdict"] == verdict, judged["reason"]
+    assert judged["steps_outside"] == 0
+    clipped = {*summary["clipped_steps"]}
+    assert judged["steps_judged"] == len(clean["steps"]) - len(clipped)
+    assert any(warning["is_clipped"] for warning in summary["warnings"])
+    assert clipped
 
 
 def judge_changed(clean: Json, **entries: Any) -> Json:
@@ -146,6 +170,8 @@ def test_warnings_that_decide(clean: Json, kind: str, verdict: str) -> None:
     warnings = [{"at_s": 1.0, "kind": kind, "text": ""}]
     judged = judge_changed(clean, warnings=warnings)
     assert (judged["verdict"], judged["warnings"]) == (verdict, 1)
+    clipped = [warning | {"is_clipped": True} for warning in warnings]
+    assert judge_changed(clean, warnings=clipped)["verdict"] == "agrees"
 
 
 def test_a_jump_warning_decides_where_one_direction_alone_was_driven(clean: Json) -> None:

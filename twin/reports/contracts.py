@@ -404,6 +404,9 @@ class WarningEntry(Contract):
     at_s: Seconds = Field(description="time in the test")
     kind: str = Field(description="kind of the event")
     text: str = Field(description="message to the user")
+    is_clipped: bool = Field(
+        False, description="a sensor of the motion was off its range in the step that it is about"
+    )
 
 
 class VersionPair(Contract):
@@ -462,6 +465,9 @@ class RunSummary(SummaryKeys, Contract):
     reason: str = Field(description="why the test ended")
     gaps: int = Field(description="gaps in the recording")
     lost_samples: Index = Field(description="samples missing in the file")
+    clipped_steps: list[Index] = Field(
+        [], description="with a sensor of the motion off its range; absent in old files"
+    )
     faults: list[FaultEntry] = Field(description="failures of components")
     u_star_m: Metres = Field(description="u* that normalizes displacements; null without steps")
     a_star_m_s2: Acceleration = Field(description="a* that normalizes accelerations")

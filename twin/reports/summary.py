@@ -42,7 +42,7 @@ from twin.recording.reader import Recording
 from twin.reports.contracts import Contract, RunSummary
 from twin.reports.orbits import find_measured_folds, summarise_orbits
 from twin.reports.table_motion import format_tracking, summarise_tracking
-from twin.reports.twin_verdict import judge_twin, summarise_agreement
+from twin.reports.twin_verdict import find_clipped_cycles, judge_twin, summarise_agreement
 from twin.reports.windows import summarise_windows
 
 Json = dict[str, Any]
@@ -62,11 +62,13 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
     twin_jumps, twin_intervals = detect_hysteresis(planned, "twin")
     levels = recording.records(Level)
     noise = find_channel_noise(recording)
+    clipped = find_clipped_cycles(recording)
     agreement = summarise_agreement(
         recording,
         parameters,
         profile,
         {name: _compared_noise(noise, name) for name in COMPARED_CHANNELS},
+        clipped,
     )
 
     def describe_step(point: PrcPoint) -> Json:
@@ -96,6 +98,7 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         "reason": stop.reason if stop else "the recording ends without a stop record",
         "gaps": len(recording.records(SampleGap)) + (1 if recording.missing_samples else 0),
         "lost_samples": recording.missing_samples,
+        "clipped_steps": sorted({*clipped.values()}),
         "faults": [asdict(fault) for fault in recording.records(Fault)],
         "u_star_m": u_star,
         "a_star_m_s2": a_star,
@@ -125,7 +128,12 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         ),
         "estimates": _estimates_entry(recording.records(Estimate)),
         "warnings": [
-            {"at_s": event.index / start.rate_hz, "kind": event.kind, "text": event.text}
+            {
+                "at_s": event.index / start.rate_hz,
+                "kind": event.kind,
+                "text": event.text,
+                "is_clipped": event.index in clipped,
+            }
             for event in recording.records(Event)
             if event.kind in EVENT_KINDS and event.kind != "jump"
         ],

@@ -11,6 +11,8 @@ sqrt(noise^2 + 5 %^2).
 One step outside is a departure; agreement needs at least half of the measured steps judged, and
 holds for what was measured: the reason states its share of the planned steps.
 
+A step in which a sensor of the motion was off its range (clipped) says nothing about the twin.
+
 A bumper touched 0.1 mm too early or late belongs to every set-up, so its share of the error is
 added to the band. Forces are not judged by step, because the cells of a side may share their force
 unequally; the monitoring judges their sum, and its warning counts here.
@@ -18,7 +20,7 @@ unequally; the monitoring judges their sum, and its warning counts here.
 
 import math
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +28,7 @@ import numpy as np
 
 from table_io.block import Block, Bool1D, Float1D
 from table_io.config.profile import Profile
-from table_io.records import Agreement
+from table_io.records import Agreement, SampleGap
 from twin.compare.monitoring.agreement import (
     AMPLITUDE_TOLERANCE,
     GAP_ERROR_M,
@@ -43,6 +45,9 @@ Json = dict[str, Any]
 CHANNEL_SYMBOLS = {"rel_disp_m": ("u", "m"), "mass_acc_m_s2": ("a", "m/s2")}
 JUDGED_CHANNELS = tuple(CHANNEL_SYMBOLS)
 UNKNOWN = (0.0, 0.0, math.nan)  # shares in contact, travel
+MOTION_CHANNELS = (
+    "rel_disp_m", "mass_disp_m", "mass_acc_m_s2", "table_disp_m", "table_acc_m_s2",
+)  # fmt: skip
 PHASES = ("flight", "contact_right", "contact_left")
 DEPARTURE_KIND = "disagreement"  # of warnings
 JUMP_KINDS = ("no jump", "unexpected jump")  # hints, where one direction alone shows no branches
@@ -56,16 +61,22 @@ TOLERANCE_TEXT = (
 
 
 def summarise_agreement(
-    recording: Recording, parameters: Parameters, profile: Profile, noise_rms: Mapping[str, float]
+    recording: Recording,
+    parameters: Parameters,
+    profile: Profile,
+    noise_rms: Mapping[str, float],
+    clipped: Container[int],
 ) -> dict[int, Json]:
     """Return by step and channel the error of the restarted twin, its band and its phase.
 
     The cycle is that with the median of error over band; rms in SI, `misfit` in multiples of the
-    noise. Channels without a known error or band are absent.
+    noise. Channels without a known error or band are absent, as are cycles of which the end is in
+    `clipped`.
     """
     by_step: dict[int, list[Agreement]] = {}
     for record in recording.records(Agreement):
-        by_step.setdefault(record.step, []).append(record)
+        if record.index not in clipped:
+            by_step.setdefault(record.step, []).append(record)
     motion = _measure_motion(recording, profile) if by_step else {}
     return {
         step: _summarise_step(
@@ -73,6 +84,28 @@ def summarise_agreement(
         )
         for step, records in by_step.items()
     }
+
+
+def find_clipped_cycles(recording: Recording) -> dict[int, int]:
+    """Return the steps with a sensor of the motion off its range, by the ends of their held cycles.
+
+    All cycles of such a step: the filters, and the restart of the twin, reach over their ends.
+    """
+    gaps = [
+        gap
+        for gap in recording.records(SampleGap)
+        if gap.reason == "clipped" and gap.channel in MOTION_CHANNELS
+    ]
+    starts, ends = np.sort([gap.index for gap in gaps]), np.sort([gap.end for gap in gaps])
+
+    def is_clipped(record: Agreement) -> bool:
+        begun = np.searchsorted(starts, record.index, "left")
+        over = np.searchsorted(ends, record.index - record.count, "right")
+        return bool(begun > over)
+
+    records = recording.records(Agreement)
+    steps = {record.step for record in records if is_clipped(record)}
+    return {record.index: record.step for record in records if record.step in steps}
 
 
 def _measure_motion(
@@ -171,7 +204,11 @@ def judge_twin(summary: Mapping[str, Any]) -> Json:
     warnings = summary.get("warnings") or []
     is_one_way = len({step["direction"] for step in summary["steps"]}) == 1
     kinds = (DEPARTURE_KIND, *(JUMP_KINDS if is_one_way else ()))
-    departures = [warning for warning in warnings if warning["kind"] in kinds]
+    departures = [
+        warning
+        for warning in warnings
+        if warning["kind"] in kinds and not warning.get("is_clipped")
+    ]
     reasons = []
     if outside:
         reasons.append(f"{len(outside)} of {_count_judged(summary)} steps outside the tolerance")
@@ -201,8 +238,11 @@ def judge_twin(summary: Mapping[str, Any]) -> Json:
         if _is_remarkable(misfit):
             reasons.append(f"but u differs by {misfit:.2g} times the noise")
     planned = _count_planned(summary)
+    clipped = summary.get("clipped_steps") or ()
     if worst and judged < planned:
         reasons.append(f"{judged} of {planned} steps judged")
+    if worst and clipped:
+        reasons.append(f"a sensor off its range in {len(clipped)}")
     return {
         "verdict": verdict,
         "reason": ", ".join(reasons),
@@ -243,6 +283,8 @@ def _explain_no_tolerance(summary: Mapping[str, Any]) -> str:
     is_compared = (summary.get("run") or {}).get("source") != "model" and error.get("nrmse")
     if not is_compared or not _count_planned(summary):
         return NOTHING_MEASURED
+    if summary.get("clipped_steps"):
+        return "a sensor was off its range in every step that could be compared"
     if error.get("noise_floor"):
         return "no step has a whole cycle of twin and rig to compare"
     return "the noise of the sensors is unknown, so no step has a tolerance"
