@@ -112,17 +112,41 @@ def test_a_fault_is_found_on_its_channel_with_its_size(name: str) -> None:
     assert places <= {*MASS, *channels} if channel.startswith("mass") else places <= {*channels}
 
 
-def test_a_clipped_reading_is_no_fault_where_it_is_known_to_be_invalid() -> None:
-    """The peaks of the laser, off its range: as they are a fault, as lost samples none."""
-    cut_m = 0.8 * np.abs(record().channel(MASS[0])).max()
-    clipped = distort(MASS[0], lambda x, _: np.clip(x, -cut_m, cut_m))
-    assert ("remainder", MASS) in find_faults(clipped)
-    lost = distort(MASS[0], lambda x, _: np.where(np.abs(x) < cut_m, x, np.nan))
+def discard_peaks(channel: str, share: float) -> Block:
+    """Return the recording with lost samples where a channel exceeds a share of its largest."""
+    limit = share * np.abs(record().channel(channel)).max()
+    return distort(channel, lambda x, _: np.where(np.abs(x) < limit, x, np.nan))
+
+
+def test_the_peaks_of_a_laser_that_are_cut_off_are_a_fault() -> None:
+    limit_m = 0.8 * np.abs(record().channel(MASS[0])).max()
+    assert ("remainder", MASS) in find_faults(
+        distort(MASS[0], lambda x, _: np.clip(x, -limit_m, limit_m))
+    )
+
+
+@pytest.mark.parametrize(
+    ("channel", "share"),
+    [(MASS[0], 0.8), (MASS[0], 0.3), (MASS[1], 0.3), ("force_r1_n", 0.5), ("force_r1_n", 0.2)],
+)
+def test_samples_that_are_known_to_be_invalid_are_no_fault(channel: str, share: float) -> None:
+    lost = discard_peaks(channel, share)
     assert find_faults(lost) == {}
     values = lost.values.copy()
     values[lost.channels.index(MASS[1])] = delay(lost.channel(MASS[1]), lost)
     fault = find_faults(replace(lost, values=values))["lag", MASS]
     assert fault.value == pytest.approx(7e-4, rel=0.2)
+
+
+def test_an_offset_beside_lost_samples_is_no_noise() -> None:
+    lost = discard_peaks(MASS[0], 0.8)
+    values = lost.values.copy()
+    values[lost.channels.index(MASS[1])] += 0.02
+    noises = [
+        build_signals((block,), "log", MASS_KG, (0.002, 0.002)).calibrate_noise().noise[MASS[1]]
+        for block in (lost, replace(lost, values=values))
+    ]
+    assert noises[1] == pytest.approx(noises[0], rel=0.2)
 
 
 @pytest.mark.parametrize(

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from table_io.block import Float1D, Label
+from table_io.block import Bool2D, Float1D, Label
 from table_io.channels import CHANNEL_BY_NAME
 from twin.identification.least_squares import INTERVAL_SIGMA, FitResult
 from twin.identification.parameters import GapKey, NuisanceKey
 from twin.identification.residuals import LogResiduals
 from twin.identification.selection import MAX_EXPLAINED_COST
-from twin.identification.signals import CELL_PAIRS, SENSOR_PAIRS, LogSignals
+from twin.identification.signals import CELL_PAIRS, OPEN_END_S, SENSOR_PAIRS, LogSignals
 from twin.identification.spectra import Spectrum
 
 STRONG_RATIO = 25.0  # power of a spectral line over its noise: weaker ones are not compared
@@ -134,18 +134,18 @@ def _compare_pair(
     strong &= signals.low_pass > 0.5
     if strong.sum() < 10:
         return
-    omega = signals.omega
-    expected, measured = -(omega**2) * position / sigma, _observe_valid(signals, acc / sigma)
+    omega, valid = signals.omega, _select_valid(signals)
+    expected, measured = -(omega**2) * position / sigma, _observe(signals, acc / sigma, valid)
 
     def residual(errors: Float1D) -> Float1D:
         gain, lag, low_cut = errors[0], 1e-3 * errors[1], errors[2]
         passed = np.divide(omega, omega - 1j * low_cut, out=np.zeros_like(acc), where=omega > 0)
         modelled = gain * expected * np.exp(-1j * omega * lag) * passed
-        difference = (measured - _observe_valid(signals, modelled))[strong]
+        difference = (measured - _observe(signals, modelled, valid))[strong]
         return np.concatenate([difference.real, difference.imag])
 
     fit = least_squares(residual, (1.0, 0.0, 0.01), bounds=([-2, -20, 0], [5, 20, 20]))
-    count = max(2 * strong.sum() * float(signals.good.mean()), 4.0)
+    count = max(2 * strong.sum() * float(valid.mean()), 4.0)
     chi_square = max(float(fit.fun @ fit.fun) / (count - 3), 1.0)
     sd = np.sqrt(np.diag(np.linalg.pinv(fit.jac.T @ fit.jac)) * chi_square)
     gain, lag, low_cut = fit.x
@@ -164,16 +164,29 @@ def _compare_pair(
     )  # fmt: skip
 
 
-def _observe_valid(signals: LogSignals, spectrum: Spectrum) -> Spectrum:
+def _select_valid(signals: LogSignals) -> Bool2D:
+    """Return the samples to compare, (sample,): of a record with lost ones not its ends either.
+
+    What a spectrum leaves at the ends of a record is small beside the whole of it, not beside what
+    losses may leave.
+    """
+    valid = signals.good.copy()
+    if not valid.all():
+        margin = round(OPEN_END_S * signals.grid.rate_hz / signals.grid.decimation)
+        valid[:margin] = valid[valid.size - margin :] = False
+    return valid
+
+
+def _observe(signals: LogSignals, spectrum: Spectrum, valid: Bool2D) -> Spectrum:
     """Return the spectrum of the valid samples of a signal with white noise, (frequency,).
 
-    Louder noise of other frequencies would leak over the cuts, and the steps at lost samples would
-    ring beyond them without the roll-off of the low pass.
+    Louder noise of other frequencies would leak over the cuts, as would an offset, and the steps at
+    lost samples would ring beyond them without the roll-off of the low pass.
     """
-    if signals.good.all():
+    if valid.all() or not valid.any():
         return spectrum
     values = signals.grid.to_time_domain(signals.low_pass * spectrum)
-    return signals.grid.from_time_domain(signals.good * values)
+    return signals.grid.from_time_domain(np.where(valid, values - values[valid].mean(), 0.0))
 
 
 def _check_cells(signals: LogSignals) -> Iterator[SensorCheck]:

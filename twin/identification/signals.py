@@ -161,10 +161,15 @@ class LogSignals:
         rest is noise in motion (light spot, resolution, drift).
         """
         noise = dict(self.noise)
-        weight = self.good / math.sqrt(max(float(self.good.mean()), 1.0 / self.good.size))
+        if not self.good.any():
+            return self
+        share = float(self.good.mean())
         for residual in self.fuse_motion().consistency_residuals:
             channels = SENSOR_PAIRS.get(residual.body, ())
-            ratio = np.sqrt(compare_with_white(weight * residual.values, self.low_pass))
+            # an offset would leak over the cuts at lost samples
+            offset = residual.values[self.good].mean() if share < 1.0 else 0.0
+            values = np.where(self.good, residual.values - offset, 0.0) / math.sqrt(share)
+            ratio = np.sqrt(compare_with_white(values, self.low_pass))
             ratio = np.minimum(ratio, MAX_NOISE_RATIO)
             noise |= {name: noise[name] * ratio for name in channels if name in noise}
         return replace(self, noise=noise)
