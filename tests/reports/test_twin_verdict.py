@@ -106,7 +106,9 @@ def test_the_twin_of_another_specimen_departs_while_the_test_is_complete(
     assert verdict["next_command"] == "shaketwin discover DIR"
 
 
-@pytest.mark.parametrize(("range_mm", "verdict"), [(6.0, "agrees"), (0.2, "not judged")])
+@pytest.mark.parametrize(
+    ("range_mm", "verdict"), [(6.0, "agrees"), (2.0, "not judged"), (0.2, "not judged")]
+)
 def test_a_step_with_a_sensor_off_its_range_is_not_judged(
     range_mm: float, verdict: str, clean: Json, tmp_path: Path
 ) -> None:
@@ -190,6 +192,11 @@ def test_a_history_is_judged_by_its_nrmse(clean: Json, nrmse: float, verdict: st
     assert judged["verdict"] == verdict
     assert "jump" not in judged["reason"]
     assert judged["misfit"] == pytest.approx(nrmse / 0.003)
+    clipped = judge_changed(
+        clean, **history, comparison=comparison, clipped_channels=["mass_disp_m"]
+    )
+    assert clipped["verdict"] == "not judged"
+    assert "mass_disp_m" in clipped["reason"]
 
 
 def test_a_model_alone_is_not_judged(clean: Json) -> None:

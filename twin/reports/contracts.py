@@ -465,6 +465,9 @@ class RunSummary(SummaryKeys, Contract):
     reason: str = Field(description="why the test ended")
     gaps: int = Field(description="gaps in the recording")
     lost_samples: Index = Field(description="samples missing in the file")
+    clipped_channels: list[str] = Field(
+        [], description="of the motion, with samples off the range of the sensor"
+    )
     clipped_steps: list[Index] = Field(
         [], description="with a sensor of the motion off its range; absent in old files"
     )

@@ -42,7 +42,12 @@ from twin.recording.reader import Recording
 from twin.reports.contracts import Contract, RunSummary
 from twin.reports.orbits import find_measured_folds, summarise_orbits
 from twin.reports.table_motion import format_tracking, summarise_tracking
-from twin.reports.twin_verdict import find_clipped_cycles, judge_twin, summarise_agreement
+from twin.reports.twin_verdict import (
+    find_clipped_cycles,
+    judge_twin,
+    list_clipped_channels,
+    summarise_agreement,
+)
 from twin.reports.windows import summarise_windows
 
 Json = dict[str, Any]
@@ -98,6 +103,7 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         "reason": stop.reason if stop else "the recording ends without a stop record",
         "gaps": len(recording.records(SampleGap)) + (1 if recording.missing_samples else 0),
         "lost_samples": recording.missing_samples,
+        "clipped_channels": list_clipped_channels(recording),
         "clipped_steps": sorted({*clipped.values()}),
         "faults": [asdict(fault) for fault in recording.records(Fault)],
         "u_star_m": u_star,

@@ -48,6 +48,7 @@ UNKNOWN = (0.0, 0.0, math.nan)  # shares in contact, travel
 MOTION_CHANNELS = (
     "rel_disp_m", "mass_disp_m", "mass_acc_m_s2", "table_disp_m", "table_acc_m_s2",
 )  # fmt: skip
+CLIPPING_REACH_S = 1.0  # after which a sensor that was off its range is forgotten
 PHASES = ("flight", "contact_right", "contact_left")
 DEPARTURE_KIND = "disagreement"  # of warnings
 JUMP_KINDS = ("no jump", "unexpected jump")  # hints, where one direction alone shows no branches
@@ -86,17 +87,29 @@ def summarise_agreement(
     }
 
 
-def find_clipped_cycles(recording: Recording) -> dict[int, int]:
-    """Return the steps with a sensor of the motion off its range, by the ends of their held cycles.
+def list_clipped_channels(recording: Recording) -> list[str]:
+    """Return the channels of the motion of which samples were off the range of the sensor."""
+    clipped = {gap.channel for gap in _list_clipped(recording)}
+    return [channel for channel in MOTION_CHANNELS if channel in clipped]
 
-    All cycles of such a step: the filters, and the restart of the twin, reach over their ends.
-    """
-    gaps = [
+
+def _list_clipped(recording: Recording) -> list[SampleGap]:
+    return [
         gap
         for gap in recording.records(SampleGap)
         if gap.reason == "clipped" and gap.channel in MOTION_CHANNELS
     ]
-    starts, ends = np.sort([gap.index for gap in gaps]), np.sort([gap.end for gap in gaps])
+
+
+def find_clipped_cycles(recording: Recording) -> dict[int, int]:
+    """Return the steps with a sensor of the motion off its range, by the ends of their held cycles.
+
+    Or off it within `CLIPPING_REACH_S` before: filters and the restarted twin remember it. All
+    cycles of such a step count.
+    """
+    gaps = _list_clipped(recording)
+    reach = round(CLIPPING_REACH_S * recording.start.rate_hz)
+    starts, ends = np.sort([gap.index for gap in gaps]), np.sort([gap.end + reach for gap in gaps])
 
     def is_clipped(record: Agreement) -> bool:
         begun = np.searchsorted(starts, record.index, "left")
@@ -226,23 +239,25 @@ def judge_twin(summary: Mapping[str, Any]) -> Json:
     judged = _count_judged(summary)
     is_covered = 2 * judged >= len(summary["steps"])
     misfit = _overall_misfit(summary)
+    planned, clipped = _count_planned(summary), summary.get("clipped_steps") or ()
     if (summary.get("run") or {}).get("source") == "model" or worst is None:
         verdict, reasons = "not judged", [_explain_no_tolerance(summary)]
+    elif not planned and summary.get("clipped_channels"):
+        channels = ", ".join(summary["clipped_channels"])
+        verdict, reasons = "not judged", [f"off the range of their sensor: {channels}"]
     elif reasons:
         verdict = "departs"
     else:
         verdict = "agrees" if is_covered else "not judged"
-        reasons = ["within the tolerance"] if is_covered else ["too few steps have a tolerance"]
+        reasons = ["within the tolerance"] if is_covered else ["too few steps can be judged"]
         if is_covered and summary["steps"] and summary["verdict"] == "complete":
             reasons.append("every jump in its place")
         if _is_remarkable(misfit):
             reasons.append(f"but u differs by {misfit:.2g} times the noise")
-    planned = _count_planned(summary)
-    clipped = summary.get("clipped_steps") or ()
     if worst and judged < planned:
         reasons.append(f"{judged} of {planned} steps judged")
     if worst and clipped:
-        reasons.append(f"a sensor off its range in {len(clipped)}")
+        reasons.append(f"{len(clipped)} steps with a sensor off its range")
     return {
         "verdict": verdict,
         "reason": ", ".join(reasons),
@@ -283,8 +298,8 @@ def _explain_no_tolerance(summary: Mapping[str, Any]) -> str:
     is_compared = (summary.get("run") or {}).get("source") != "model" and error.get("nrmse")
     if not is_compared or not _count_planned(summary):
         return NOTHING_MEASURED
-    if summary.get("clipped_steps"):
-        return "a sensor was off its range in every step that could be compared"
+    if len(summary.get("clipped_steps") or ()) == len(summary["steps"]) > 0:
+        return "a sensor was off its range in every step"
     if error.get("noise_floor"):
         return "no step has a whole cycle of twin and rig to compare"
     return "the noise of the sensors is unknown, so no step has a tolerance"
