@@ -75,9 +75,8 @@ def load_recording(recording: Recording, name: str) -> LoadedLog:
         )
     profile = parse_toml(start.profile_toml, Profile, location)
     specimen, clipped = profile.specimen, _list_clipped(recording)
-    blocks = tuple(
-        _discard_samples(block, clipped) for block in recording.contiguous_blocks("meas")
-    )
+    recorded = recording.contiguous_blocks("meas")
+    blocks = tuple(_discard_samples(block, clipped) for block in recorded)
     dead = _find_dead_channels(blocks)
     signals = build_signals(
         _drop_incomplete_cells(blocks, dead), name, specimen.mass_kg, specimen.gaps_m
@@ -91,8 +90,9 @@ def load_recording(recording: Recording, name: str) -> LoadedLog:
     is_stated = "contact_n" in profile.comparison.model_fields_set
     contact_n = profile.comparison.contact_n if is_stated else 0.0  # else from the record
     log = PreparedLog(signals, contact_n, start.steps)
-    notes = _list_notes(recording, profile, signals, blocks, dead, clipped)
-    return LoadedLog(log, blocks, tuple(notes))
+    notes = _list_notes(recording, profile, signals, recorded, blocks, dead)
+    clipping = _count_clipped(name, recorded, blocks)
+    return LoadedLog(log, blocks, (*notes, *clipping))
 
 
 def _list_clipped(recording: Recording) -> tuple[SampleGap, ...]:
@@ -147,11 +147,11 @@ def _list_notes(
     recording: Recording,
     profile: Profile,
     signals: LogSignals,
+    recorded: Sequence[Block],
     blocks: Sequence[Block],
     dead: frozenset[str],
-    clipped: Sequence[SampleGap],
 ) -> Iterator[str]:
-    """Yield notes on the recording that matter for the verdict."""
+    """Yield notes on the recording that matter for the verdict; `blocks` is what is used of it."""
     name = signals.name
     if recording.missing_samples:
         yield f"{name}: {recording.missing_samples} samples are missing; they are not used"
@@ -172,17 +172,26 @@ def _list_notes(
             yield (
                 f"{name}: {channel} stays at its extreme value; it may be clipped: check its range"
             )
-        beyond = sum(gap.count for gap in clipped if gap.channel == channel)
-        if beyond:
-            yield (
-                f"{name}: {beyond} samples of {channel} are at the end of its range; they are not "
-                "used"
-            )
-        if lost := sum(int(np.isnan(block.channel(channel)).sum()) for block in blocks) - beyond:
+        elif lost := _count_missing(recorded, channel):
             yield f"{name}: {lost} samples of {channel} are lost; they are not used"
         if channel in dead:
             unused = ", so all load cells are ignored" if channel in LOAD_CELLS else ""
             yield f"{name}: {channel} is dead{unused}; effects that need it are not tested"
+
+
+def _count_clipped(name: str, recorded: Sequence[Block], blocks: Sequence[Block]) -> Iterator[str]:
+    """Yield a note for each channel of which samples were discarded from what was recorded."""
+    for channel in blocks[0].channels if blocks else ():
+        count = _count_missing(blocks, channel) - _count_missing(recorded, channel)
+        if count:
+            yield (
+                f"{name}: {count} samples of {channel} are at the end of its range; they are not "
+                "used"
+            )
+
+
+def _count_missing(blocks: Sequence[Block], channel: str) -> int:
+    return sum(int(np.isnan(block.channel(channel)).sum()) for block in blocks)
 
 
 def _check_loads(
