@@ -34,7 +34,8 @@ TABLE_HEADER = (
     f"{'step':>7}  {'direction':<9} {'f [Hz]':>7}  {'level [g]':>9}   "
     f"{'eta_d':>6} {'twin':>6}   {'impacts R/L':>11} {'twin':>7}   {'latency':>8}"
 )
-GAP_SERIES_SAMPLES = 2000  # 1 s at 2 kHz: a channel that is off its range is so in every cycle
+# 10 s at 2 kHz: a channel that is off its range is so in every cycle, also of a slow motion.
+GAP_SERIES_SAMPLES = 20_000
 
 
 def make_task_bar(*columns: ProgressColumn) -> Progress:
