@@ -103,7 +103,10 @@ def add_proposal(
         path.write_text(format_proposal(proposals[0], options), encoding="utf-8")
         verdict["next_run"] = describe_next_run(verdict["decide"])
     else:
-        verdict["next_run"] = f"of {len(tests)} tests that the rig can play, none separates"
+        verdict["next_run"] = (
+            f"of {len(tests)} tests that the rig can play, none separates with every sensor within "
+            "its range"
+        )
     if options.chain:
         verdict["chain"] = [*options.chain[:-1], options.chain[-1] | list_verdict_entries(verdict)]
     return proposals

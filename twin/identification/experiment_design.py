@@ -350,10 +350,12 @@ def _predict_pairs(
         others = [index for index, other in enumerate(rivals) if _is_separable(rival, other)]
         if not others or not rival.can_be_simulated or (truth and is_confirmation(rivals)):
             continue
+        last = problem.log_residuals[-1]
         try:
-            simulated[truth], residuals = simulate_log(rival.fitted, motion, problem)
-        except InputError:  # a fitted relaxation may be too fast for the sampling rate
+            simulated[truth] = simulate_motion(rival.fitted.fit.parameters, motion, last)
+        except (InputError, ArithmeticError):  # fitted too fast for the sampling rate, or to a pole
             continue
+        residuals = make_residuals(rival.fitted, motion, problem, simulated[truth])
         joint = replace(problem, log_residuals=(*problem.log_residuals, residuals))
         # what the noise may hide hardly changes the slopes of the set that it is added to
         slopes = linear[truth].compute_new_slopes(joint) if linear else None
@@ -386,16 +388,15 @@ def _merit(test: TestPrediction) -> tuple[float, float]:
     return min(test.probability, CLEAR_PROBABILITY), test.separation_per_minute
 
 
-def simulate_log(
-    fitted: FittedSet, motion: IdealTableMotion, problem: SelectionProblem
-) -> tuple[Block, LogResiduals]:
-    """Return (true motion, residuals of its noisy readings) of a test, if a fit were the truth.
+def make_residuals(
+    fitted: FittedSet, motion: IdealTableMotion, problem: SelectionProblem, truth: Block
+) -> LogResiduals:
+    """Return the residuals of noisy readings of a test whose true motion, of a fit, is `truth`.
 
     The channels, their noise, the corrections of the gaps and the nuisances that may be fitted are
     those of the last recording.
     """
     last = problem.log_residuals[-1]
-    truth = simulate_motion(fitted.fit.parameters, motion, last)
     readings = _add_noise(truth, last.signals)
     number = last.log_number + 1
     signals = build_signals((readings,), motion.name, motion.mass_kg, motion.gaps_m)
@@ -403,9 +404,9 @@ def simulate_log(
         number, signals, last.contact_n, last.reference, last.scale, last.weight, last.thinning
     )
     if last.nuisances is None:
-        return truth, residuals
+        return residuals
     start = _start_rival(fitted, *problem.log_residuals, residuals)
-    return truth, linearize_nuisances(residuals, start, mapper=problem.mapper)
+    return linearize_nuisances(residuals, start, mapper=problem.mapper)
 
 
 def simulate_motion(
