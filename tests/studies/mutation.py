@@ -33,6 +33,7 @@ from types import FunctionType, ModuleType
 from typing import Any
 
 import numba
+import numpy as np
 import pytest
 from _pytest.main import pytest_runtestloop as run_test_loop
 from numba.core.caching import NullCache
@@ -275,13 +276,15 @@ def patch_module(module: ModuleType, text: str) -> None:
     for name, value in vars(new).items():
         old = vars(module).get(name)
         if isinstance(value, bool | int | float | str | tuple | frozenset | dict):
-            if repr(value) != repr(old) and not name.startswith("__"):  # they may hold arrays
+            with np.printoptions(threshold=sys.maxsize):
+                is_same = repr(value) == repr(old)  # they may hold arrays
+            if not is_same and not name.startswith("__"):
                 rebind_constant(name, old, value)
         elif getattr(value, "__module__", "") == module.__name__:
             patch_object(old, value)
 
 
-def plant(module: ModuleType, text: str) -> int:
+def try_patch(module: ModuleType, text: str) -> int:
     """Replace a module by another text as `patch_module` does; return 0."""
     patch_module(module, text)
     return 0
@@ -369,7 +372,7 @@ class Study:
         modules = {str(file.relative_to(REPOSITORY)): import_file(file) for file in self.files}
         for file, module in modules.items():
             text = Path(str(module.__file__)).read_text()
-            if run_in_child(partial(plant, module, text), limit_s):
+            if run_in_child(partial(try_patch, module, text), limit_s):
                 raise SystemExit(f"{self.name}: {file} cannot be replaced")
         mutants = [
             mutant
