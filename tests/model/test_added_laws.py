@@ -118,11 +118,11 @@ class TestInstalled:
         early = touched | np.roll(touched, -3, axis=1)  # as a filter makes of a measured contact
         unknown = np.full(touched.shape, -1)
         for contact in (touched, early, unknown):
-            one, two, none = (
+            forces, own, plain = (
                 forces_along(model, u, v, 0 * u, time, contact.astype(np.int8))
                 for model in (whole, halves, SNM)
             )
-            assert np.abs(two - one)[1].max() < 0.02 * np.abs(none - one)[1].max()
+            assert np.abs(own - forces)[1].max() < 0.02 * np.abs(plain - forces)[1].max()
 
     def test_one_law_on_each_side_is_the_law_on_both(self):
         both = Model(snm()).with_effect("bumper_hardening", k2=1e8)
