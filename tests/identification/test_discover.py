@@ -286,6 +286,13 @@ def test_short_logs_are_enough_together() -> None:
     assert prepared.first_fit.converged
 
 
+def test_a_log_with_a_sensor_off_its_range_throughout_is_refused() -> None:
+    whole = log()
+    signals = replace(whole.signals, good=np.zeros_like(whole.signals.good))
+    with raises_input_error(where=signals.name, allowed="at least 1000"):
+        discover_effects([replace(whole, signals=signals)], SNM)
+
+
 def shorten(whole: PreparedLog, samples: Int1D) -> PreparedLog:
     """The log with only these samples usable."""
     good = np.zeros_like(whole.signals.good)

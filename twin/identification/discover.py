@@ -312,7 +312,8 @@ def _check_enough_data(log_residuals: Sequence[LogResiduals]) -> None:
             f"too few usable samples: {0 if empty else entries} in {blocks} cycles",
             where=where[0],
             allowed=f"at least {MIN_ENTRIES} in {MIN_BLOCKS} cycles, in all logs together",
-            remedy="record a longer test, or give several recordings of the specimen",
+            remedy="record a longer test, every sensor within its range, or give several "
+            "recordings of the specimen",
         )
 
 

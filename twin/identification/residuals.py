@@ -162,7 +162,8 @@ class LogResiduals:
     def contact_thresholds_n(self) -> tuple[float, float]:
         """Force of the right and of the left cells in N above which there is contact."""
         m = self.motion()
-        inertia_n = m.mass_kg * float(np.sqrt(np.nan_to_num(m.acc[m.moving] ** 2).mean()))
+        squares = np.nan_to_num(m.acc[m.moving] ** 2)
+        inertia_n = m.mass_kg * math.sqrt(squares.mean()) if squares.size else 0.0
         least = max(self.contact_n, MIN_CONTACT_SHARE * inertia_n)
         right, left = (
             max(least, CONTACT_NOISE_FACTOR * rms) for rms in (m.noise.right, m.noise.left)
