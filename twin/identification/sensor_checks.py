@@ -134,14 +134,28 @@ def _compare_pair(
     strong &= signals.low_pass > 0.5
     if strong.sum() < 10:
         return
-    omega, valid = signals.omega, _select_valid(signals)
-    expected, measured = -(omega**2) * position / sigma, _observe(signals, acc / sigma, valid)
+    valid = _select_valid(signals)
+    # what is cut out of a record mixes its frequencies
+    used = strong if valid.all() or not valid.any() else signals.omega > 0
+    omega = signals.omega[used]
+
+    def observe(values: Spectrum) -> Spectrum:
+        """Return the strong frequencies of what is seen of a signal, from those used."""
+        if used is strong:
+            return values
+        spectrum = np.zeros(used.size, dtype=np.complex128)
+        spectrum[used] = values
+        return _cut_spectrum(signals, spectrum, valid)[strong]
+
+    expected, measured = (
+        values[used] / sigma[used] for values in (-(signals.omega**2) * position, acc)
+    )
+    measured = observe(measured)
 
     def residual(errors: Float1D) -> Float1D:
         gain, lag, low_cut = errors[0], 1e-3 * errors[1], errors[2]
-        passed = np.divide(omega, omega - 1j * low_cut, out=np.zeros_like(acc), where=omega > 0)
-        modelled = gain * expected * np.exp(-1j * omega * lag) * passed
-        difference = (measured - _observe(signals, modelled, valid))[strong]
+        modelled = gain * expected * np.exp(-1j * omega * lag) / (1.0 - 1j * low_cut / omega)
+        difference = measured - observe(modelled)
         return np.concatenate([difference.real, difference.imag])
 
     fit = least_squares(residual, (1.0, 0.0, 0.01), bounds=([-2, -20, 0], [5, 20, 20]))
@@ -157,7 +171,7 @@ def _compare_pair(
     for kind, value, deviation, limit, unit in rows:
         yield _check_estimate(signals, kind, channels, value, deviation, limit, unit)
     ratio = math.sqrt(chi_square)
-    share = float(np.linalg.norm(fit.fun) / np.linalg.norm(measured[strong]))
+    share = float(np.linalg.norm(fit.fun) / np.linalg.norm(measured))
     yield SensorCheck(
         signals.name, "remainder", channels, share, share, share,
         MAX_REMAINDER_SHARE if ratio > MIN_REMAINDER_RATIO else None,
@@ -177,14 +191,12 @@ def _select_valid(signals: LogSignals) -> Bool2D:
     return valid
 
 
-def _observe(signals: LogSignals, spectrum: Spectrum, valid: Bool2D) -> Spectrum:
+def _cut_spectrum(signals: LogSignals, spectrum: Spectrum, valid: Bool2D) -> Spectrum:
     """Return the spectrum of the valid samples of a signal with white noise, (frequency,).
 
     Louder noise of other frequencies would leak over the cuts, as would an offset, and the steps at
     lost samples would ring beyond them without the roll-off of the low pass.
     """
-    if valid.all() or not valid.any():
-        return spectrum
     values = signals.grid.to_time_domain(signals.low_pass * spectrum)
     return signals.grid.from_time_domain(np.where(valid, values - values[valid].mean(), 0.0))
 
