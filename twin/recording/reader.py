@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeVar
 
 from table_io.block import Block
 from table_io.errors import InputError
-from table_io.records import Record, RunStart, RunStop
+from table_io.records import Record, RunStart, RunStop, SampleGap
 from twin.recording.columns import BlockStore, StoredBlock
 from twin.recording.garbage_collection import pause_collection
 from twin.recording.log_metadata import START_COPY_NAME, read_schema_version
@@ -79,6 +79,11 @@ class Recording:
     def stop(self) -> RunStop | None:
         stops = self.records(RunStop)
         return stops[-1] if stops else None
+
+    @property
+    def clipped_gaps(self) -> tuple[SampleGap, ...]:
+        """Stretches of samples at the end of the range of their sensor."""
+        return tuple(gap for gap in self.records(SampleGap) if gap.reason == "clipped")
 
     @property
     def missing_samples(self) -> int:

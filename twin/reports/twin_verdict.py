@@ -28,7 +28,7 @@ import numpy as np
 
 from table_io.block import Block, Bool1D, Float1D
 from table_io.config.profile import Profile
-from table_io.records import Agreement, SampleGap
+from table_io.records import Agreement
 from twin.compare.monitoring.agreement import (
     AMPLITUDE_TOLERANCE,
     GAP_ERROR_M,
@@ -45,7 +45,7 @@ Json = dict[str, Any]
 CHANNEL_SYMBOLS = {"rel_disp_m": ("u", "m"), "mass_acc_m_s2": ("a", "m/s2")}
 JUDGED_CHANNELS = tuple(CHANNEL_SYMBOLS)
 UNKNOWN = (0.0, 0.0, math.nan)  # shares in contact, travel
-MOTION_CHANNELS = (
+MOTION_SENSORS = (
     "rel_disp_m", "mass_disp_m", "mass_acc_m_s2", "table_disp_m", "table_acc_m_s2",
 )  # fmt: skip
 CLIPPING_REACH_S = 1.0  # after which a sensor that was off its range is forgotten
@@ -89,16 +89,8 @@ def summarise_agreement(
 
 def list_clipped_channels(recording: Recording) -> list[str]:
     """Return the channels of the motion of which samples were off the range of the sensor."""
-    clipped = {gap.channel for gap in _list_clipped(recording)}
-    return [channel for channel in MOTION_CHANNELS if channel in clipped]
-
-
-def _list_clipped(recording: Recording) -> list[SampleGap]:
-    return [
-        gap
-        for gap in recording.records(SampleGap)
-        if gap.reason == "clipped" and gap.channel in MOTION_CHANNELS
-    ]
+    clipped = {gap.channel for gap in recording.clipped_gaps}
+    return [channel for channel in MOTION_SENSORS if channel in clipped]
 
 
 def find_clipped_cycles(recording: Recording) -> dict[int, int]:
@@ -107,7 +99,7 @@ def find_clipped_cycles(recording: Recording) -> dict[int, int]:
     Or off it within `CLIPPING_REACH_S` before: filters and the restarted twin remember it. All
     cycles of such a step count.
     """
-    gaps = _list_clipped(recording)
+    gaps = [gap for gap in recording.clipped_gaps if gap.channel in MOTION_SENSORS]
     reach = round(CLIPPING_REACH_S * recording.start.rate_hz)
     starts, ends = np.sort([gap.index for gap in gaps]), np.sort([gap.end + reach for gap in gaps])
 

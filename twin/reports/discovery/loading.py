@@ -74,7 +74,7 @@ def load_recording(recording: Recording, name: str) -> LoadedLog:
             remedy="give the recording of a test",
         )
     profile = parse_toml(start.profile_toml, Profile, location)
-    specimen, clipped = profile.specimen, _list_clipped(recording)
+    specimen, clipped = profile.specimen, recording.clipped_gaps
     recorded = recording.contiguous_blocks("meas")
     blocks = tuple(_discard_samples(block, clipped) for block in recorded)
     dead = _find_dead_channels(blocks)
@@ -91,17 +91,14 @@ def load_recording(recording: Recording, name: str) -> LoadedLog:
     contact_n = profile.comparison.contact_n if is_stated else 0.0  # else from the record
     log = PreparedLog(signals, contact_n, start.steps)
     notes = _list_notes(recording, profile, signals, recorded, blocks, dead)
-    clipping = _count_clipped(name, recorded, blocks)
+    clipping = _list_clipping_notes(name, clipped, recorded, blocks)
     return LoadedLog(log, blocks, (*notes, *clipping))
-
-
-def _list_clipped(recording: Recording) -> tuple[SampleGap, ...]:
-    """Return the stretches of samples at the end of the range of their sensor."""
-    return tuple(gap for gap in recording.records(SampleGap) if gap.reason == "clipped")
 
 
 def _discard_samples(block: Block, gaps: Sequence[SampleGap]) -> Block:
     """Return a block with nan for the samples of gaps: what a clipped sensor reads is wrong."""
+    if not gaps:
+        return block
     values = block.values.copy()
     for gap in gaps:
         if gap.channel in block.channels:
@@ -179,9 +176,14 @@ def _list_notes(
             yield f"{name}: {channel} is dead{unused}; effects that need it are not tested"
 
 
-def _count_clipped(name: str, recorded: Sequence[Block], blocks: Sequence[Block]) -> Iterator[str]:
+def _list_clipping_notes(
+    name: str, clipped: Sequence[SampleGap], recorded: Sequence[Block], blocks: Sequence[Block]
+) -> Iterator[str]:
     """Yield a note for each channel of which samples were discarded from what was recorded."""
+    clipped_channels = {gap.channel for gap in clipped}
     for channel in blocks[0].channels if blocks else ():
+        if channel not in clipped_channels:
+            continue
         count = _count_missing(blocks, channel) - _count_missing(recorded, channel)
         if count:
             yield (
