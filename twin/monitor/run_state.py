@@ -219,9 +219,7 @@ def _add_event(run_state: LiveRunState, record: Record) -> None:
         if record.index < end:
             return
         samples += record.count
-        _put_bounded(
-            run_state.gaps, gap_key, (record.index + record.count, samples), MAX_COMPONENTS
-        )
+        _put_bounded(run_state.gaps, gap_key, (record.end, samples), MAX_COMPONENTS)
         record = replace(record, count=samples)
     entry = format_record(record, run_state.rate_hz)
     if entry and not _is_shown_elsewhere(record):

@@ -77,8 +77,7 @@ class CandidateTest:
         specimen = config.profile.specimen
         # the specimen may differ from every rival
         allowed_peaks = {
-            sensor.channel: sensor.range * sensor.si_per_unit / CORRECTION_HEADROOM
-            for sensor in config.rig.sensors
+            sensor.channel: sensor.range_si / CORRECTION_HEADROOM for sensor in config.rig.sensors
         }
         return IdealTableMotion(
             self.title, block, specimen.mass_kg, specimen.gaps_m, self.minutes, allowed_peaks
