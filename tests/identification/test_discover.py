@@ -148,9 +148,8 @@ def test_a_misfit_in_the_few_samples_of_contact_is_not_noise() -> None:
 def test_a_bumper_is_judged_by_the_contact_rows_beside_a_dominant_effect() -> None:
     truth = format_truth("table_tilt", tilt=10.0) + format_truth("bumper_hardening", k2=3e7)
     library = {"table_tilt", "bumper_hardening", "cubic_stiffness", "coulomb_friction"}
-    without = [
-        effect.id for effect in EFFECTS if effect.id not in library
-    ]  # else it takes a minute
+    # with the whole library it takes a minute
+    without = [effect.id for effect in EFFECTS if effect.id not in library]
     selection = discover_effects([log(truth, noise=20.0)], SNM, without=without).selection
     assert {*selection.best.names} == {"table_tilt", "bumper_hardening"}
     null, tilted = selection.null.cost, selection.tried[0].cost
@@ -159,16 +158,8 @@ def test_a_bumper_is_judged_by_the_contact_rows_beside_a_dominant_effect() -> No
 
 def test_an_effect_that_only_stood_in_for_a_later_one_is_dropped() -> None:
     """Friction is the nearest to a hysteresis, until the hysteresis itself is in the set."""
-    prepared = prepare_problem(
-        [
-            log(
-                format_truth(
-                    "bouc_wen", force=60.0, yield_displacement=1e-3, exponent=1.0, beta=0.5
-                )
-            )
-        ],
-        SNM,
-    )
+    truth = format_truth("bouc_wen", force=60.0, yield_displacement=1e-3, exponent=1.0, beta=0.5)
+    prepared = prepare_problem([log(truth)], SNM)
     problem = prepared.problem
     library = {candidate.name: candidate for candidate in problem.library}
     friction, hysteresis = library["coulomb_friction"], library["bouc_wen"]

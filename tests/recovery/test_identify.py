@@ -163,6 +163,10 @@ def test_too_short_a_log_is_refused() -> None:
     short = (block.cut(0, 3000),)
     with pytest.raises(InputError) as error:
         identify_parameters([prepare_log(short)], [short], FAR)
+    assert error.value.remedy == (
+        "record a longer test, every sensor within its range, or give several recordings of the "
+        "specimen"
+    )
     assert error.value.allowed is not None
     assert error.value.allowed.startswith("at least 1000")
 
