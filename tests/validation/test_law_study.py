@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from table_io.block import Label
 from tests.identification.played import SNM
 from twin.validation.study.law_study import (
     STRONGER_TEST,
@@ -47,6 +48,20 @@ def test_the_true_model_has_no_error_and_another_one_has(signals):
     expected = 0.3 * true.base.stiffness * np.std(u[signals.moving])
     # the rows of the bumpers, in contact alone, have no error
     assert 0.6 * expected < other < 1.05 * expected
+
+
+def test_a_curve_is_that_of_the_measured_cycles(signals):
+    """In the passage to a step the motion still dies away, after a jump for long."""
+    model, acc = with_base(), signals.channels["mass_acc_m_s2"]
+
+    def spoil(is_measured):
+        is_spoiled = (signals.step >= 0) & ((signals.label == Label.MEASURE) == is_measured)
+        channels = {**signals.channels, "mass_acc_m_s2": np.where(is_spoiled, 2 * acc, acc)}
+        return measure_curve_error(model, replace(signals, channels=channels))
+
+    own = measure_curve_error(model, signals)
+    assert spoil(is_measured=False) == own
+    assert spoil(is_measured=True) > own + 0.2
 
 
 def make_row(number, after, warnings=(), error=1.0, law=True, kind="unknown"):

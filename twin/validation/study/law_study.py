@@ -4,7 +4,7 @@ The library is not tried first: what is judged is the law alone, from the refitt
 hidden plant then plays two tests more, without noise: one 25 % stronger, along whose motion the
 forces of the law are compared, and one at other frequencies, which the model simulates freely from
 the motion of the table. The gap there is that of the pseudo-resonance curves: the rms over the
-steps of the error of the excursions, relative to the rms of the true ones.
+steps of the error of the excursions in the measured cycles, relative to the rms of the true ones.
 """
 
 import json
@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from table_io.block import Label
 from table_io.clock import RealClock, cpu_seconds
 from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
@@ -275,8 +276,8 @@ def measure_force_error(model: Model, signals: StudySignals, noise: Any) -> floa
 def measure_curve_error(model: Model, signals: StudySignals) -> float:
     """Return the error of the excursions of a free simulation, relative to the true ones.
 
-    Excursions of relative displacement and total acceleration in each step, the rms of each over
-    the steps; the mean of the two.
+    Excursions of relative displacement and total acceleration in the measured cycles of each step,
+    as in the curves of a run; the rms of each over the steps; the mean of the two.
     """
     solver = model.prepare(PROFILE.acquisition.rate_hz)
     base_acc, table_disp = (
@@ -285,12 +286,13 @@ def measure_curve_error(model: Model, signals: StudySignals) -> float:
     out = np.empty((OUTPUT_COUNT, base_acc.size))
     solver.advance(solver.rest_state(), base_acc, table_disp, out)
     true_motion = _derive_motion(signals)
+    measured = np.where(signals.label == Label.MEASURE, signals.step, -1)
     errors = []
     for true, own in (
         (true_motion["u"], out[0]), (signals.channels["mass_acc_m_s2"], out[2])
     ):  # fmt: skip
         expected, simulated = (
-            np.array([np.ptp(values[signals.step == k]) for k in np.unique(signals.step) if k >= 0])
+            np.array([np.ptp(values[measured == k]) for k in np.unique(measured) if k >= 0])
             for values in (true, own)
         )
         errors.append(np.sqrt(np.mean((simulated - expected) ** 2) / np.mean(expected**2)))
