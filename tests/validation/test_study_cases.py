@@ -135,7 +135,7 @@ def noisy(signals: StudySignals, truly: StudySignals, rms: Mapping[str, float]) 
     left = signals.left - noise["force_l1_n"] - noise["force_l2_n"]
     channels = {name: values + noise[name] for name, values in signals.channels.items()}
     return evaluate_residual(
-        StudySignals(channels, right, left, signals.step, signals.moving), truly, rms
+        StudySignals(channels, right, left, signals.step, signals.label), truly, rms
     )
 
 

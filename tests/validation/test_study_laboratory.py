@@ -9,7 +9,7 @@ import pytest
 
 from table_io.acquisition.session import run_session
 from table_io.backends import Backend, open_backend
-from table_io.block import Block
+from table_io.block import Block, Label
 from table_io.clock import ManualClock
 from table_io.config.base import parse_toml
 from table_io.errors import InputError
@@ -138,7 +138,8 @@ def make_signals() -> StudySignals:
         for tones in [[(hz, draw.uniform(0, 6)) for hz in (0.8, 1.7, 3.1)]]
     }
     nothing = np.zeros(time.size)
-    return StudySignals(channels, nothing, nothing, np.zeros(time.size, int), moving)
+    label = np.where(moving, Label.MEASURE, Label.REST)
+    return StudySignals(channels, nothing, nothing, np.zeros(time.size, int), label)
 
 
 def test_the_errors_of_channels_are_measured() -> None:

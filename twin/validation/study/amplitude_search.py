@@ -144,7 +144,7 @@ def apply_sensor_effect(
     right = signals.right + (error if name.startswith("force_r") else 0.0)
     left = signals.left - (error if name.startswith("force_l") else 0.0)
     readings = {**signals.channels, name: values_read}
-    return StudySignals(readings, right, left, signals.step, signals.moving)
+    return StudySignals(readings, right, left, signals.step, signals.label)
 
 
 def evaluate_residual(

@@ -5,7 +5,9 @@ hidden plant then plays two tests more, without noise: one 25 % stronger, along 
 forces of the law are compared, and one at other frequencies, which the model simulates freely from
 the motion of the table. The gap there is that of the pseudo-resonance curves: the rms over the
 steps of the error of the excursions, relative to the rms of the true ones. A curve shows steady
-motion, so that test holds each step longer: four cycles after a jump the motion still dies away.
+motion: that test holds each step longer, and a step counts where the true motion repeats itself.
+Where it is chaotic, or still dies away after a jump, its excursions are not those of a model that
+is as good as exact either.
 """
 
 import json
@@ -18,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from table_io.block import Int1D, Label
 from table_io.clock import RealClock, cpu_seconds
 from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
@@ -70,8 +73,9 @@ def _change_sweep(**values: object) -> Profile:
 
 
 STRONGER_TEST = _change_sweep(acceleration_g=0.05 * LEVEL_RATIO)
-# Between the frequencies of the recording, each step twice as long as its transient lasts.
+# Between the frequencies of the recording, each step twice as long as a transient mostly lasts.
 STEADY_CYCLES = 8
+MAX_CHANGE = 0.03  # of the motion from a cycle to the next or the one after, where it is steady
 UNUSED_TEST = _change_sweep(start_hz=1.0, stop_hz=4.2, cycles=2 * STEADY_CYCLES)
 
 # Term with the form of the rig's own law, and its exponent; other laws have a form of their own.
@@ -278,15 +282,11 @@ def measure_force_error(model: Model, signals: StudySignals, noise: Any) -> floa
 def measure_curve_error(model: Model, signals: StudySignals) -> float:
     """Return the error of a free simulation of the unused test in its excursions, relative.
 
-    Excursions of relative displacement and total acceleration in the last `STEADY_CYCLES` of each
-    step, the rms of each over the steps; the mean of the two.
+    Excursions of relative displacement and total acceleration in the steady cycles, the rms of each
+    over the steps; the mean of the two.
     """
-    rate = PROFILE.acquisition.rate_hz
-    steady = [
-        np.flatnonzero(signals.step == number)[-round(STEADY_CYCLES * rate / step.frequency_hz) :]
-        for number, step in enumerate(UNUSED_TEST.sweep.steps)
-    ]
-    solver = model.prepare(rate)
+    steady = list_steady_samples(signals)
+    solver = model.prepare(PROFILE.acquisition.rate_hz)
     base_acc, table_disp = (
         np.ascontiguousarray(signals.channels[name]) for name in ("table_acc_m_s2", "table_disp_m")
     )
@@ -302,6 +302,22 @@ def measure_curve_error(model: Model, signals: StudySignals) -> float:
         )
         errors.append(np.sqrt(np.mean((simulated - expected) ** 2) / np.mean(expected**2)))
     return float(np.mean(errors))
+
+
+def list_steady_samples(signals: StudySignals) -> list[Int1D]:
+    """Return the samples of the last cycles of each step of the unused test with steady motion."""
+    u, steady = _derive_motion(signals)["u"], []
+    held = np.where(np.isin(signals.label, (Label.SETTLE, Label.MEASURE)), signals.step, -1)
+    for number, step in enumerate(UNUSED_TEST.sweep.steps):
+        period = PROFILE.acquisition.rate_hz / step.frequency_hz
+        samples = np.flatnonzero(held == number)[-round(STEADY_CYCLES * period) :]
+        changes = [
+            float(np.std(u[samples[lag:]] - u[samples[:-lag]]))
+            for lag in (round(period), round(2 * period))
+        ]
+        if min(changes) <= MAX_CHANGE * np.std(u[samples]):
+            steady.append(samples)
+    return steady
 
 
 def _judge_structure(law: LawProposal, about: Json) -> Json:

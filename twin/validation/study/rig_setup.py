@@ -68,13 +68,21 @@ SIGNAL_CHANNELS = (
 
 @dataclass(frozen=True, eq=False)
 class StudySignals:
-    """Signals in SI, (sample,) each; F_R >= 0, F_L <= 0; `step` is -1 outside of any step."""
+    """Signals in SI, (sample,) each; F_R >= 0, F_L <= 0.
+
+    `step` is -1 outside of any step, `label` the `Label` of each sample.
+    """
 
     channels: Mapping[str, Float1D]
     right: Float1D
     left: Float1D
     step: Int1D
-    moving: Bool2D
+    label: Int1D
+
+    @property
+    def moving(self) -> Bool2D:
+        """Samples at which the table is not at rest, (sample,)."""
+        return np.asarray(self.label != Label.REST)
 
 
 def make_rig_toml(noise: float, seed: int = 0, truth: str = "", sha256: str = "") -> str:
@@ -157,8 +165,7 @@ def simulate_readings(
         name: volts[rig.channels.index(name)] / rig.sensors[rig.channels.index(name)].volts_per_si
         for name in channels
     }
-    moving = np.asarray(label) != Label.REST
-    return StudySignals(channels, force_right, force_left, step, moving), readings
+    return StudySignals(channels, force_right, force_left, step, np.asarray(label)), readings
 
 
 def _si_per_unit(channel: str) -> float:
