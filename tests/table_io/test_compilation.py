@@ -78,7 +78,9 @@ def write_package(folder: Path, name: str, **changed: float) -> None:
     for module, text in (
         ("laws", LAW_MODULE), ("constants", CONSTANTS_MODULE), ("kernels", KERNEL_MODULE)
     ):  # fmt: skip
-        (package / f"{module}.py").write_text(text.format(package=name, **VALUES | changed))
+        path, own = package / f"{module}.py", text.format(package=name, **VALUES | changed)
+        if not path.exists() or path.read_text() != own:  # older versions of numba see a rewriting
+            path.write_text(own)
 
 
 def run_kernel(folder: Path, cache: Path) -> list[str]:
