@@ -156,6 +156,25 @@ def test_friction_behind_slack_is_told_from_plain_hysteresis(monkeypatch):
     assert values[EffectKey("law_constant_force", "k")] == pytest.approx(1.2e3, rel=0.05)
 
 
+def test_a_term_that_stood_in_for_another_is_dropped(monkeypatch):
+    """A resonator on the table looks like one on the specimen, until it is fitted itself."""
+    monkeypatch.setattr(law_search, "FIRST_REFITS", 1)
+    monkeypatch.setattr(
+        law_search, "list_law_candidates",
+        lambda scale, has_contact: list_terms(scale, "resonator", "table_resonator"),
+    )  # fmt: skip
+    truth = {"mass": 27.0, "frequency": 4.1, "coupling": 19e3}
+    prepared, _, fitted_sets = search(format_truth("table_resonator", **truth))
+    assert fitted_sets[0].names == ("law_table_resonator",)
+    assert fitted_sets[0].cost < 1.05 * prepared.problem.noise
+    values = fitted_sets[0].fit.parameters.values
+    fitted = {key.name: value for key, value in values.items() if isinstance(key, EffectKey)}
+    assert fitted["k"] == pytest.approx(truth["coupling"], rel=0.02)
+    assert fitted["mass"] == pytest.approx(truth["mass"], rel=0.02)
+    held = (2 * math.pi * truth["frequency"]) ** 2 + truth["coupling"] / truth["mass"]
+    assert fitted["omega2"] == pytest.approx(held, rel=0.02)
+
+
 def test_a_law_that_diverges_on_the_record_is_a_bad_fit_and_no_error():
     """Steps of many yield displacements a sample, to a high power, leave the range of numbers."""
     prepared = prepare_problem([record_slipping_coupling(1.0, 1)], oscillator(1e5, 1e3))

@@ -33,6 +33,7 @@ from twin.identification.selection import (
     ProgressCallback,
     SelectionProblem,
     SelectionProgress,
+    fit_without,
     select_promising,
 )
 from twin.identification.symbolic_regression import list_symbolic_candidates
@@ -286,6 +287,10 @@ def _search_from(
             break
         further = [term for term in library if term.name not in current.names]
         fitted_sets = [*fitted_sets, *_extend(problem, current, further, NEXT_REFITS, report)]
+    best = min(fitted_sets, key=lambda fitted: fitted.cost, default=start)
+    if len(best.effects) == len(start.effects) + 2:
+        # the first term may only have stood in for the second, which screening alone did not show
+        fitted_sets.append(fit_without(problem, best, best.effects[-2]))
     return fitted_sets
 
 

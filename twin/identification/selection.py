@@ -315,7 +315,7 @@ def revise_step(
     last effect was added, with every set refitted until then.
     """
     for earlier in state.best.effects[:-1]:
-        reduced = _fit_without(problem, state.best, earlier)
+        reduced = fit_without(problem, state.best, earlier)
         costs = [each.cost for each in state.tried if len(each.effects) == len(reduced.effects)]
         state = replace(state, tried=(*state.tried, reduced))
         if reduced.cost < min(costs) and not _is_needed(problem, state, reduced, state.best):
@@ -329,7 +329,7 @@ def revise_step(
     return state
 
 
-def _fit_without(problem: SelectionProblem, fitted: FittedSet, dropped: Candidate) -> FittedSet:
+def fit_without(problem: SelectionProblem, fitted: FittedSet, dropped: Candidate) -> FittedSet:
     """Return a set refitted without one of its effects."""
     kept = tuple(effect for effect in fitted.effects if effect is not dropped)
     return problem.fit_effects(dropped.remove_from(fitted.fit.parameters), kept)
@@ -350,7 +350,7 @@ def _fit_generic_terms(
     if best.effects:
         starts.append(best)
     if len(best.effects) > 1:
-        starts += [_fit_without(problem, best, replaced) for replaced in best.effects]
+        starts += [fit_without(problem, best, replaced) for replaced in best.effects]
     return tuple(
         fitted
         for start in starts
