@@ -5,9 +5,9 @@ hidden plant then plays two tests more, without noise: one 25 % stronger, along 
 forces of the law are compared, and one at other frequencies, which the model simulates freely from
 the motion of the table. The gap there is that of the pseudo-resonance curves: the rms over the
 steps of the error of the excursions, relative to the rms of the true ones. A curve shows steady
-motion: that test holds each step longer, and a step counts where the true motion repeats itself.
-Where it is chaotic, or still dies away after a jump, its excursions are not those of a model that
-is as good as exact either.
+motion: that test holds each step longer, and a step counts where the true motion repeats itself
+from cycle to cycle, as it did in the step before. Chaos, the subharmonics beside it, the orbit to
+which it leads, and what dies away slowly after a jump are not those of a nearly exact model either.
 """
 
 import json
@@ -75,7 +75,7 @@ def _change_sweep(**values: object) -> Profile:
 STRONGER_TEST = _change_sweep(acceleration_g=0.05 * LEVEL_RATIO)
 # Between the frequencies of the recording, each step twice as long as a transient mostly lasts.
 STEADY_CYCLES = 8
-MAX_CHANGE = 0.03  # of the motion from a cycle to the next or the one after, where it is steady
+MAX_CHANGE = 0.03  # of the motion from a cycle to the next, where it is steady
 UNUSED_TEST = _change_sweep(start_hz=1.0, stop_hz=4.2, cycles=2 * STEADY_CYCLES)
 
 # Term with the form of the rig's own law, and its exponent; other laws have a form of their own.
@@ -305,18 +305,18 @@ def measure_curve_error(model: Model, signals: StudySignals) -> float:
 
 
 def list_steady_samples(signals: StudySignals) -> list[Int1D]:
-    """Return the samples of the last cycles of each step of the unused test with steady motion."""
+    """Return the samples of the last cycles of each step that counts, of the unused test."""
     u, steady = _derive_motion(signals)["u"], []
     held = np.where(np.isin(signals.label, (Label.SETTLE, Label.MEASURE)), signals.step, -1)
+    was_steady = True
     for number, step in enumerate(UNUSED_TEST.sweep.steps):
-        period = PROFILE.acquisition.rate_hz / step.frequency_hz
-        samples = np.flatnonzero(held == number)[-round(STEADY_CYCLES * period) :]
-        changes = [
-            float(np.std(u[samples[lag:]] - u[samples[:-lag]]))
-            for lag in (round(period), round(2 * period))
-        ]
-        if min(changes) <= MAX_CHANGE * np.std(u[samples]):
+        period = round(PROFILE.acquisition.rate_hz / step.frequency_hz)
+        samples = np.flatnonzero(held == number)[-STEADY_CYCLES * period :]
+        change = np.std(u[samples[period:]] - u[samples[:-period]])
+        is_steady = bool(change <= MAX_CHANGE * np.std(u[samples]))
+        if is_steady and was_steady:
             steady.append(samples)
+        was_steady = is_steady
     return steady
 
 
