@@ -3,7 +3,7 @@
 import json
 import math
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
@@ -81,24 +81,9 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         return entry | ({"agreement": agreement[point.step]} if point.step in agreement else {})
 
     stop = recording.stop
-    end = stop.index if stop else max((block.end for block in recording.blocks("meas")), default=0)
-    samples = max(end - start.index, 0)
     summary = {
-        "run": {
-            "id": start.run,
-            "name": start.name,
-            "title": profile.title,
-            "source": start.source,
-            "started_at": start.started_at,
-            "host": start.host,
-            "rate_hz": start.rate_hz,
-            "samples": samples,
-            "duration_s": samples / start.rate_hz,
-            "normalisation": normalisation,
-            "gap_m": sum(profile.specimen.gaps_m),  # infinite without bumpers: null in the file
-            "model": parse_toml_tables(start.model_toml).get("title"),
-            "branches_from": source,
-        },
+        "run": _run_entry(recording, profile)
+        | {"normalisation": normalisation, "branches_from": source},
         "verdict": stop.verdict if stop else "halted",
         "reason": stop.reason if stop else "the recording ends without a stop record",
         "gaps": len(recording.records(SampleGap)) + (1 if recording.missing_samples else 0),
@@ -133,18 +118,43 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
             noise,
         ),
         "estimates": _estimates_entry(recording.records(Estimate)),
-        "warnings": [
-            {
-                "at_s": event.index / start.rate_hz,
-                "kind": event.kind,
-                "text": event.text,
-                "is_clipped": event.index in clipped,
-            }
-            for event in recording.records(Event)
-            if event.kind in EVENT_KINDS and event.kind != "jump"
-        ],
+        "warnings": _warning_entries(recording, clipped),
     }
     return summary | {"twin_verdict": judge_twin(summary)}
+
+
+def _run_entry(recording: Recording, profile: Profile) -> Json:
+    """Return what was run, where and when."""
+    start, stop = recording.start, recording.stop
+    end = stop.index if stop else max((block.end for block in recording.blocks("meas")), default=0)
+    samples = max(end - start.index, 0)
+    return {
+        "id": start.run,
+        "name": start.name,
+        "title": profile.title,
+        "source": start.source,
+        "started_at": start.started_at,
+        "host": start.host,
+        "rate_hz": start.rate_hz,
+        "samples": samples,
+        "duration_s": samples / start.rate_hz,
+        "gap_m": sum(profile.specimen.gaps_m),  # infinite without bumpers: null in the file
+        "model": parse_toml_tables(start.model_toml).get("title"),
+    }
+
+
+def _warning_entries(recording: Recording, clipped: Container[int]) -> list[Json]:
+    """Return the warnings of the monitoring; `clipped` are ends of cycles with a clipped sensor."""
+    return [
+        {
+            "at_s": event.index / recording.start.rate_hz,
+            "kind": event.kind,
+            "text": event.text,
+            "is_clipped": event.index in clipped,
+        }
+        for event in recording.records(Event)
+        if event.kind in EVENT_KINDS and event.kind != "jump"
+    ]
 
 
 def parse_toml_tables(text: str) -> dict[str, Any]:
