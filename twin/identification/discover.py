@@ -393,15 +393,16 @@ def _can_explain(imperfect: PreparedProblem, ideal: Discovery) -> bool:
     """Return True if nuisances can be what the best set with ideal instruments leaves.
 
     Either instruments disagree, which no force law makes them do, or nuisances close the gap of
-    the base or of the best set.
+    the base or of the best set. The latter only if no generic term closes it with ideal ones: one
+    unknown law says more than the best known ones and many errors of instruments.
     """
-    best = ideal.verdict.best
-    if sensors_disagree(ideal.prepared.problem, best):
-        return True
+    best, generic, problem = ideal.verdict.best, ideal.verdict.generic, ideal.prepared.problem
     max_cost = MAX_EXPLAINED_COST * imperfect.problem.noise
-    return (
-        imperfect.first_fit.cost <= max_cost or _fit_with_effects(imperfect, best).cost <= max_cost
-    )
+    if sensors_disagree(problem, best) or imperfect.first_fit.cost <= max_cost:
+        return True
+    if generic is not None and generic.cost <= MAX_EXPLAINED_COST * problem.noise:
+        return False
+    return _fit_with_effects(imperfect, best).cost <= max_cost
 
 
 def _fit_with_effects(prepared: PreparedProblem, fitted: FittedSet) -> FitResult:
