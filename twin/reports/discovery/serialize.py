@@ -9,6 +9,7 @@ from twin.identification.discover import Discovery, PreparedLog
 from twin.identification.held_out import compute_force_error
 from twin.identification.law_search import LawProposal
 from twin.identification.least_squares import INTERVAL_SIGMA, FitResult
+from twin.identification.nuisances import TYPICAL_LIMITS
 from twin.identification.parameters import (
     SLIP_SPEED,
     BaseKey,
@@ -25,6 +26,7 @@ from twin.identification.parameters import (
 from twin.identification.selection import FittedSet
 from twin.identification.sensor_checks import SensorCheck, check_sensors
 from twin.identification.verdict import closed_fraction, suggest_next_run
+from twin.model.effects import find_effect
 from twin.model.effects.effect_file import EffectFile, WrittenEffect
 from twin.model.model import SENSOR_CHANNELS, Model
 from twin.model.parameters import Parameters
@@ -333,6 +335,19 @@ def generic_term_to_json(general: FittedSet | None, factor: float = 1.0) -> Json
     }
 
 
+def _is_faulty(fit: FitResult, effect: str, channel: str, values: Mapping[str, float]) -> bool:
+    """Return True if an error of a sensor exceeds its interval and that of any laboratory."""
+    ideal = {own.name: own.vanishing for own in find_effect(effect).parameters}
+    return any(
+        abs(value - (ideal[name] or 0.0))
+        > max(
+            INTERVAL_SIGMA * fit.interval_error(EffectKey(effect, name, channel)),
+            TYPICAL_LIMITS.get(effect, 0.0),
+        )
+        for name, value in values.items()
+    )
+
+
 def model_to_toml(
     fit: FitResult, title: str, citation: str, fitted_on: str, provisional: str = ""
 ) -> tuple[str, list[str]]:
@@ -348,10 +363,11 @@ def model_to_toml(
             effects.setdefault((key.effect, key.channel), {})[key.name] = value
     for (effect, channel), values in effects.items():
         if channel and channel not in SENSOR_CHANNELS:
-            omitted.append(
-                f"{effect}.{channel}: not in the model file, because the twin is driven by this "
-                "channel and does not predict it; repair or calibrate the sensor"
-            )
+            if _is_faulty(fit, effect, channel, values):
+                omitted.append(
+                    f"{effect}.{channel}: not in the model file, because the twin is driven by "
+                    "this channel and does not predict it; repair or calibrate the sensor"
+                )
             continue
         kept[effect, channel] = values
     intervals: dict[str, tuple[float, float]] = {}

@@ -1,0 +1,38 @@
+"""The model file that a discovery writes, and what it says of sensors that the file cannot hold."""
+
+from dataclasses import replace
+
+import pytest
+
+from tests.identification.played import SNM, log
+from twin.identification.discover import prepare_problem
+from twin.identification.least_squares import FitResult
+from twin.identification.parameters import INPUT_GAIN, INPUT_OFFSET
+from twin.reports.discovery.serialize import model_to_toml
+
+
+@pytest.fixture(scope="module")
+def fit() -> FitResult:
+    return prepare_problem([log()], SNM).first_fit
+
+
+@pytest.mark.parametrize(
+    ("gain", "std_error", "offset", "faulty"),
+    [
+        (1.0001, 5e-5, 1e-5, []),
+        (1.012, 5e-5, 0.0, []),  # as in any laboratory
+        (1.05, 5e-5, 0.0, ["sensor_gain"]),
+        (1.05, 0.04, 0.0, []),  # not known that well
+        (1.0, 5e-5, 0.01, ["sensor_offset"]),
+    ],
+)
+def test_a_sound_sensor_of_the_table_is_not_to_be_repaired(
+    gain: float, std_error: float, offset: float, faulty: list[str], fit: FitResult
+) -> None:
+    """Without an accelerometer on the specimen that of the table is fitted in every recording."""
+    parameters = fit.parameters.with_values({INPUT_GAIN: gain, INPUT_OFFSET: offset})
+    std_errors = {**fit.std_errors, INPUT_GAIN: std_error, INPUT_OFFSET: 1e-4}
+    fitted = replace(fit, parameters=parameters, std_errors=std_errors)
+    text, notes = model_to_toml(fitted, "specimen", "", "a log")
+    assert "sensor" not in text
+    assert [note.partition(".")[0] for note in notes] == faulty
