@@ -176,7 +176,7 @@ EFFECT_DEFINITIONS: tuple[EffectDefinition, ...] = (
     EffectDefinition("cubic_bumper_damping", "v3", False,
          (Q("coefficient", "N s3/m3", 0.0, 1e8, 0.0, 1e5),), "coefficient d'^3 in each bumper"),
     EffectDefinition("softening_bumper", "contact_time", False,
-         # below the stiffness of a bumper, which would pull else, ever harder
+         # below the stiffness of usual bumpers, or their total stiffness would be negative
          (Q("stiffness", "N/m", 0.0, 4e5, 0.0, 1e5), Q("time", "s", 1e-3, 100.0, None, 0.02)),
          "-stiffness h d in each bumper, h' = (1 in contact, else 0, minus h) / time"),
     EffectDefinition("dahl_friction", "n1", False,

@@ -349,6 +349,17 @@ class HiddenPlant(Plant):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        softening = self.hidden.strange.softening_bumper[0]
+        softest = self.bumper_stiffness_n_m * min(self.hidden.stiffness_ratio)
+        if softening >= softest:
+            raise InputError(
+                f"bumpers that soften by {softening:g} N/m push with a negative stiffness",
+                where="ground truth",
+                key="softening_bumper.stiffness",
+                value=softening,
+                allowed=f"less than {softest:g} N/m, the stiffness of the softer bumper",
+                remedy="let them soften less",
+            )
         shortest_s, min_time_s = (
             self.hidden.shortest_time_s(self),
             1.0 / (base_plant.MAX_SUBSTEP_RATIO * base_plant.MAX_SUBSTEPS * self.rate_hz),

@@ -14,6 +14,7 @@ from table_io.sim.ground_truth_applied import build_hidden_plant
 from table_io.sim.hidden_plant import HiddenCoefficients, HiddenPlant
 from table_io.sim.plant import Plant
 from table_io.units import GRAVITY_M_S2
+from tests.input_errors import raises_input_error
 from tests.table_io.sim.hidden_reference import CJ, KJ, MT, C, G, H, K, M, Reference
 
 RIG = Plant(M, K, C, KJ, CJ, G, G, MT, 20.0, 0.005, True, 1.0 / H)
@@ -275,3 +276,14 @@ def test_a_law_too_fast_to_follow_is_refused_with_a_limit() -> None:
     with pytest.raises(InputError, match="2e-06 s") as error:
         with_effect(kind, {"force": 1.0, "yield_displacement": 1e-5, "exponent": 10.0})
     assert error.value.allowed.startswith("at least 5e-06 s")
+
+
+def test_bumpers_that_soften_below_zero_are_refused() -> None:
+    """They would pull the mass in, ever harder: no step of the integrator follows that."""
+    kind = next(each for each in EFFECT_DEFINITIONS if each.id == "softening_bumper")
+    soft, stiffness = replace(RIG, bumper_stiffness_n_m=1e5), kind.parameters[0]
+    values = {"stiffness": 1.1e5, "time": 0.02}
+    assert stiffness.low < values["stiffness"] < stiffness.high < KJ
+    with raises_input_error(key="softening_bumper.stiffness", value=1.1e5, allowed="100000"):
+        with_effect(kind, values, soft)
+    with_effect(kind, {**values, "stiffness": 0.9e5}, soft)
