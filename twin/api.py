@@ -245,7 +245,7 @@ def discover(
     title = f"{config.title}; {' + '.join(best.names) or 'nothing added'}"
     names = ", ".join(log.signals.name for log in prepared)
     provisional = verdict["why"] if verdict["verdict"] in ("ambiguous", "unexplained") else ""
-    text, omitted = model_to_toml(best.fit, title, config.citation, names, provisional)
+    text, omitted = model_to_toml(best.fit, title, config.citation, names, provisional, best.names)
     verdict["notes"] += omitted
     return DiscoveredModel(text, Verdict.model_validate_json(dump_contract(Verdict, verdict)))
 

@@ -183,7 +183,7 @@ def write_results(
     provisional = verdict["why"] if verdict["verdict"] in ("ambiguous", "unexplained") else ""
     if proposal:
         provisional = "the law was found in these recordings and holds in its range alone"
-    text, omitted = model_to_toml(best.fit, title, config.citation, names, provisional)
+    text, omitted = model_to_toml(best.fit, title, config.citation, names, provisional, best.names)
     laws = proposal.laws if proposal else ()
     for name, law_text in list_effect_files(best.fit, laws).items():
         (folder / name).write_text(law_text, encoding="utf-8")

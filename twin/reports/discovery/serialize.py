@@ -11,6 +11,7 @@ from twin.identification.law_search import LawProposal
 from twin.identification.least_squares import INTERVAL_SIGMA, FitResult
 from twin.identification.nuisances import TYPICAL_LIMITS
 from twin.identification.parameters import (
+    INPUT_GAIN,
     SLIP_SPEED,
     BaseKey,
     EffectKey,
@@ -26,7 +27,6 @@ from twin.identification.parameters import (
 from twin.identification.selection import FittedSet
 from twin.identification.sensor_checks import SensorCheck, check_sensors
 from twin.identification.verdict import closed_fraction, suggest_next_run
-from twin.model.effects import find_effect
 from twin.model.effects.effect_file import EffectFile, WrittenEffect
 from twin.model.model import SENSOR_CHANNELS, Model
 from twin.model.parameters import Parameters
@@ -335,25 +335,24 @@ def generic_term_to_json(general: FittedSet | None, factor: float = 1.0) -> Json
     }
 
 
-def _is_faulty(fit: FitResult, effect: str, channel: str, values: Mapping[str, float]) -> bool:
-    """Return True if an error of a sensor exceeds its interval and that of any laboratory."""
-    ideal = {own.name: own.vanishing for own in find_effect(effect).parameters}
-    return any(
-        abs(value - (ideal[name] or 0.0))
-        > max(
-            INTERVAL_SIGMA * fit.interval_error(EffectKey(effect, name, channel)),
-            TYPICAL_LIMITS.get(effect, 0.0),
-        )
-        for name, value in values.items()
-    )
+def _is_input_gain_off(fit: FitResult) -> bool:
+    """Return True if the whole interval of the gain of the table's sensor is off by too much."""
+    half = INTERVAL_SIGMA * fit.interval_error(INPUT_GAIN)
+    return abs(fit.parameters.values[INPUT_GAIN] - 1.0) - half > TYPICAL_LIMITS[INPUT_GAIN.effect]
 
 
 def model_to_toml(
-    fit: FitResult, title: str, citation: str, fitted_on: str, provisional: str = ""
+    fit: FitResult,
+    title: str,
+    citation: str,
+    fitted_on: str,
+    provisional: str = "",
+    named: Sequence[str] = (),
 ) -> tuple[str, list[str]]:
     """Return (text of a model file, notes on what it omits); gaps belong to the test profiles.
 
-    `provisional` is the reason why the model is not to be trusted yet, if there is one.
+    `provisional` is the reason why the model is not to be trusted yet, if there is one, `named` are
+    the effects that were added.
     """
     omitted = []
     kept: dict[tuple[str, str], dict[str, float]] = {}
@@ -363,7 +362,9 @@ def model_to_toml(
             effects.setdefault((key.effect, key.channel), {})[key.name] = value
     for (effect, channel), values in effects.items():
         if channel and channel not in SENSOR_CHANNELS:
-            if _is_faulty(fit, effect, channel, values):
+            # gain and offset of an input are fitted in every log without another accelerometer
+            is_off = EffectKey(effect, "gain", channel) == INPUT_GAIN and _is_input_gain_off(fit)
+            if is_off or f"{effect}.{channel}" in named:
                 omitted.append(
                     f"{effect}.{channel}: not in the model file, because the twin is driven by "
                     "this channel and does not predict it; repair or calibrate the sensor"
