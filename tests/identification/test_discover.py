@@ -90,8 +90,10 @@ def test_what_is_not_in_the_library_is_unexplained(truth: str) -> None:
     assert discovery.verdict.outcome == "unexplained"
     assert discovery.verdict.confidence <= 0.3 or not discovery.verdict.best.effects
     assert discovery.verdict.generic is not None
-    # one term explains it with ideal instruments: errors of these beside known laws say less
-    assert discovery.with_nuisances is discovery.ideal is None
+    alone = [each.cost for each in discovery.selection.generic_sets if len(each.effects) == 1]
+    if min(alone) < 1.1 * discovery.verdict.floor:
+        # with ideal instruments: their errors beside known laws say less
+        assert discovery.with_nuisances is discovery.ideal is None
 
 
 NEW_EFFECTS = [

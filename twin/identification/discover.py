@@ -393,14 +393,17 @@ def _can_explain(imperfect: PreparedProblem, ideal: Discovery) -> bool:
     """Return True if nuisances can be what the best set with ideal instruments leaves.
 
     Either instruments disagree, which no force law makes them do, or nuisances close the gap of
-    the base or of the best set. The latter only if no generic term closes it with ideal ones: one
-    unknown law says more than the best known ones and many errors of instruments.
+    the base or of the best set. The latter only if no generic term closes it alone with ideal ones:
+    one unknown law says more than the best known ones and many errors of instruments.
     """
-    best, generic, problem = ideal.verdict.best, ideal.verdict.generic, ideal.prepared.problem
+    best, problem = ideal.verdict.best, ideal.prepared.problem
     max_cost = MAX_EXPLAINED_COST * imperfect.problem.noise
     if sensors_disagree(problem, best) or imperfect.first_fit.cost <= max_cost:
         return True
-    if generic is not None and generic.cost <= MAX_EXPLAINED_COST * problem.noise:
+    if ideal.verdict.outcome == "unexplained" and any(
+        len(fitted.effects) == 1 and fitted.cost <= MAX_EXPLAINED_COST * problem.noise
+        for fitted in ideal.selection.generic_sets
+    ):
         return False
     return _fit_with_effects(imperfect, best).cost <= max_cost
 
