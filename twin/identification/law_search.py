@@ -288,8 +288,12 @@ def _search_from(
         further = [term for term in library if term.name not in current.names]
         fitted_sets = [*fitted_sets, *_extend(problem, current, further, NEXT_REFITS, report)]
     best = min(fitted_sets, key=lambda fitted: fitted.cost, default=start)
-    if len(best.effects) == len(start.effects) + 2:
+    names = (*start.names, *best.names[-1:])
+    if len(best.effects) == len(start.effects) + 2 and all(
+        fitted.names != names for fitted in fitted_sets
+    ):
         # the first term may only have stood in for the second, which screening alone did not show
+        report(SelectionProgress("a law", names, 1, 1, best))
         fitted_sets.append(fit_without(problem, best, best.effects[-2]))
     return fitted_sets
 
