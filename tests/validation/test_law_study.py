@@ -1,10 +1,12 @@
 """The study of laws: what it measures of a model, and the page of its rows."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from table_io.block import Label
 from tests.identification.played import SNM
 from twin.validation.study.law_study import (
     STEADY_CYCLES,
@@ -71,6 +73,8 @@ def test_a_curve_is_that_of_steady_motion(signals):
 
     own = measure_curve_error(model, signals)
     assert spoil(~steady) == own < 1e-3
+    restless = replace(signals, label=np.where(signals.step < 13, Label.BLEND, signals.label))
+    assert math.isnan(measure_curve_error(model, restless))
     assert spoil(steady) > own + 0.2
 
 
