@@ -3,6 +3,7 @@
 The whole study is `shaketwin study discovery`; here stands one case of each kind of verdict.
 """
 
+import math
 from dataclasses import replace
 from functools import cache
 
@@ -13,6 +14,7 @@ from table_io.block import Int1D, Label
 from tests.identification.played import SNM, format_truth, log
 from tests.input_errors import raises_input_error
 from tests.recovery.recordings import log_columns, oscillator
+from twin.identification.candidates import Candidate, list_generic_candidates
 from twin.identification.discover import (
     Discovery,
     PreparedLog,
@@ -24,6 +26,7 @@ from twin.identification.parameters import EffectKey, TareKey
 from twin.identification.screening import assign_folds, build_normal_equations, rank_candidates
 from twin.identification.selection import (
     Cancelled,
+    FittedSet,
     SelectionProgress,
     SelectionResult,
     revise_step,
@@ -256,6 +259,27 @@ def test_where_several_sets_do_as_well_what_they_share_is_named() -> None:
         judge_selection(bench, replace(named, best=apart[0], tried=tuple(apart)), 1.0).outcome
         == "ambiguous"
     )
+
+
+@pytest.mark.parametrize(("excess", "outcome"), [(0.0, "unexplained"), (0.1, "named")])
+def test_one_generic_term_that_leaves_but_noise_is_believed(excess: float, outcome: str) -> None:
+    """Of a large misfit a wrong effect may leave little, too little for a share of it to tell."""
+    discovery = discover(format_truth("bumper_hardening", k2=3e7))
+    named, problem = discovery.selection, discovery.prepared.problem
+    (exact,) = named.best.held_out
+    draw = np.random.default_rng(1)
+
+    def make_set(effects: tuple[Candidate, ...], mean_square: float) -> FittedSet:
+        rest = draw.normal(0.0, math.sqrt(mean_square), exact.size)
+        fit = replace(named.best.fit, held_out=(exact + rest,))
+        return replace(named.best, effects=effects, fit=fit)
+
+    null, wrong = make_set((), 60.0), make_set(named.best.effects, 0.3)
+    generic = make_set(list_generic_candidates(problem.log_residuals)[:1], excess)
+    selection = replace(named, null=null, best=wrong, tried=(wrong,), generic_sets=(generic,))
+    verdict = judge_selection(problem, selection, named.best.cost)
+    assert verdict.outcome == outcome
+    assert (verdict.generic is generic) == (outcome == "unexplained")
 
 
 @pytest.mark.slow  # 5 s

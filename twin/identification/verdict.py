@@ -302,6 +302,14 @@ def _find_better_generic(
             return fitted
         if len(fitted.effects) < len(best.effects) and gain > -MIN_GENERIC_GAIN_SHARE * gap:
             return fitted  # one generic term fits as well as several effects
+        leaves_noise = fitted.cost <= (1 + MIN_VISIBLE_EXCESS) * floor
+        if (
+            len(fitted.effects) == 1
+            and leaves_noise
+            and best.cost > (1 + 2 * MIN_VISIBLE_EXCESS) * floor
+            and problem.compute_gain(best, fitted)[2] > MIN_SEPARATION_SIGMA
+        ):
+            return fitted  # it explains all, however little the best effects leave of a large gap
     return None
 
 
