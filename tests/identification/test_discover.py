@@ -261,9 +261,17 @@ def test_where_several_sets_do_as_well_what_they_share_is_named() -> None:
     )
 
 
-@pytest.mark.parametrize(("excess", "outcome"), [(0.0, "unexplained"), (0.1, "named")])
-def test_one_generic_term_that_leaves_but_noise_is_believed(excess: float, outcome: str) -> None:
-    """Of a large misfit a wrong effect may leave little, too little for a share of it to tell."""
+@pytest.mark.parametrize(
+    ("place", "excess", "outcome"),
+    [("damper", 0.0, "unexplained"), ("damper", 0.1, "named"), ("bumper", 0.0, "named")],
+)
+def test_one_generic_term_elsewhere_that_leaves_but_noise_is_believed(
+    place: str, excess: float, outcome: str
+) -> None:
+    """Of a large misfit a wrong effect may leave little, too little for a share of it to tell.
+
+    A term in the same place may be another form of the effect.
+    """
     discovery = discover(format_truth("bumper_hardening", k2=3e7))
     named, problem = discovery.selection, discovery.prepared.problem
     (exact,) = named.best.held_out
@@ -275,7 +283,9 @@ def test_one_generic_term_that_leaves_but_noise_is_believed(excess: float, outco
         return replace(named.best, effects=effects, fit=fit)
 
     null, wrong = make_set((), 60.0), make_set(named.best.effects, 0.3)
-    generic = make_set(list_generic_candidates(problem.log_residuals)[:1], excess)
+    terms = list_generic_candidates(problem.log_residuals)
+    term = next(each for each in terms if each.name.split(".", 1)[1].startswith(place))
+    generic = make_set((term,), excess)
     selection = replace(named, null=null, best=wrong, tried=(wrong,), generic_sets=(generic,))
     verdict = judge_selection(problem, selection, named.best.cost)
     assert verdict.outcome == outcome

@@ -302,15 +302,24 @@ def _find_better_generic(
             return fitted
         if len(fitted.effects) < len(best.effects) and gain > -MIN_GENERIC_GAIN_SHARE * gap:
             return fitted  # one generic term fits as well as several effects
-        leaves_noise = fitted.cost <= (1 + MIN_VISIBLE_EXCESS) * floor
         if (
-            len(fitted.effects) == 1
-            and leaves_noise
+            _acts_elsewhere(fitted, best)
+            and fitted.cost <= (1 + MIN_VISIBLE_EXCESS) * floor
             and best.cost > (1 + 2 * MIN_VISIBLE_EXCESS) * floor
             and problem.compute_gain(best, fitted)[2] > MIN_SEPARATION_SIGMA
         ):
-            return fitted  # it explains all, however little the best effects leave of a large gap
+            return fitted  # what the best effects leave, however little, is no inexact form of them
     return None
+
+
+def _acts_elsewhere(generic: FittedSet, best: FittedSet) -> bool:
+    """Return True for one generic term, of damper or bumpers, where no best effect acts there."""
+    if len(generic.effects) != 1 or not best.effects:
+        return False
+    in_bumpers = generic.names[0].startswith(f"{GENERIC_PREFIX}.bumper ")
+    return not any(
+        each.effect is not None and each.effect.is_in_bumpers == in_bumpers for each in best.effects
+    )
 
 
 def _needs_named_effects(selection: SelectionResult, generic: FittedSet, gap: float) -> bool:
