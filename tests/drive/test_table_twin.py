@@ -26,8 +26,8 @@ LINEAR = TableParameters(pressure_feedback_s=0.003, viscous_n_s_m=2e3, frame_rat
 
 
 def rehearse(friction_n: float, noise: bool = True) -> TableRehearsal:
-    """Return 40 s of random motion of 0.02 g rms, with the noise of the rig's sensors."""
-    command = make_random_motion(40.0, (0.3, 35.0), 0.02 * GRAVITY_M_S2, seed=4)
+    """Return 20 s of random motion of 0.02 g rms, with the noise of the rig's sensors."""
+    command = make_random_motion(20.0, (0.3, 35.0), 0.02 * GRAVITY_M_S2, seed=4)
     signals = play(build_rig(friction_n), command)
     rng = np.random.default_rng(5)
     y = signals[0] + noise * 5e-6 * rng.standard_normal(command.size)
