@@ -285,30 +285,26 @@ def _find_better_generic(
 ) -> FittedSet | None:
     """Return the set with a generic term that fits much better than the best set without."""
     best, gap = selection.best, _measure_gap(selection, floor)
+    leaves_more = best.cost > (1 + 2 * MIN_VISIBLE_EXCESS) * floor
     for fitted in sorted(selection.generic_sets, key=lambda fitted: fitted.cost):
         gain = best.cost - fitted.cost
-        is_additional = len(fitted.effects) > len(best.effects) > 0
-        if (
-            gain > (MAX_REMAINDER_SHARE if is_additional else MIN_GENERIC_GAIN_SHARE) * gap
-            and problem.compute_gain(best, fitted)[2] > MIN_SEPARATION_SIGMA
-        ):
-            return fitted
-        is_replacement = len(fitted.effects) == len(best.effects) > 1
-        if (
-            is_replacement
-            and gain > MIN_REPLACEMENT_GAIN_SHARE * gap
-            and problem.compute_gain(best, fitted)[2] > MIN_SEPARATION_SIGMA
-        ):
-            return fitted
         if len(fitted.effects) < len(best.effects) and gain > -MIN_GENERIC_GAIN_SHARE * gap:
             return fitted  # one generic term fits as well as several effects
-        if (
-            _acts_elsewhere(fitted, best)
+        if len(fitted.effects) > len(best.effects) > 0:
+            least_share = MAX_REMAINDER_SHARE
+        elif len(fitted.effects) == len(best.effects) > 1:
+            least_share = MIN_REPLACEMENT_GAIN_SHARE
+        else:
+            least_share = MIN_GENERIC_GAIN_SHARE
+        # what the best effects leave, however little, is then no inexact form of them
+        explains_elsewhere = (
+            leaves_more
             and fitted.cost <= (1 + MIN_VISIBLE_EXCESS) * floor
-            and best.cost > (1 + 2 * MIN_VISIBLE_EXCESS) * floor
-            and problem.compute_gain(best, fitted)[2] > MIN_SEPARATION_SIGMA
-        ):
-            return fitted  # what the best effects leave, however little, is no inexact form of them
+            and _acts_elsewhere(fitted, best)
+        )
+        is_better = gain > least_share * gap or explains_elsewhere
+        if is_better and problem.compute_gain(best, fitted)[2] > MIN_SEPARATION_SIGMA:
+            return fitted
     return None
 
 
