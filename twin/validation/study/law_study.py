@@ -240,12 +240,13 @@ def _judge_predictions(
     outside = [*find_range_exits(models[1], motion)]
     before, after = (measure_curve_error(model, unused) for model in models)
     steps = len(list_steady_samples(unused))
+    curve = {"before": before, "after": after, "steps": steps}
     return {
         "outside": {
             "error": math.hypot(1.0, measure_force_error(models[1], stronger, noise)),
             "said": [f"{range_exit.effect}.{range_exit.variable}" for range_exit in outside],
         },
-        "curve": {"before": before, "after": after, "steps": steps} if steps >= MIN_STEPS else None,
+        "curve": None if math.isnan(before) else curve,
     }
 
 
