@@ -12,7 +12,7 @@ from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.records import Comparison
-from tests.table_io.lab_rig import EXTRA, LAB_TEXT, SECOND_ACC, TEMPERATURE, UPWARD_ACC
+from tests.builders.rigs import EXTRA, LAB_TEXT, SECOND_ACC, TEMPERATURE, UPWARD_ACC
 from tests.viewer.example_run import scalars
 from twin.cli.main import app
 from twin.compare import COMPARED_CHANNELS

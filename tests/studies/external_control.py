@@ -24,7 +24,7 @@ from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.excitation.drive import Drive
 from table_io.sim.controller import DrivePlayback
-from tests.table_io.excitation.sine_segments import sine_segments
+from tests.builders.drives import sine_segments
 
 RATE_HZ = 2000.0
 LSB = 2 * 0.06 / 2**24

@@ -26,7 +26,7 @@ from table_io.config.rig import RigConfig
 from table_io.records import Event, Record, RunStart, RunStop, SampleGap, Trip
 from table_io.sim.config import FAULT_KINDS
 from table_io.sim.simulated_table import SimulatedBackend
-from tests.table_io.safety.guarded import RIG, machine
+from tests.builders.rigs import RIG, make_faulty_rig
 
 TOLD = frozenset({"sensor", "alarm", "late", "level"})  # kinds of events that tell of a fault
 # Large enough to matter: a tenth of the test's level, or of what a sensor shows in it.
@@ -98,7 +98,7 @@ def times(profile: Profile, count: int, seed: int) -> list[tuple[float, float]]:
     Not in its first 15 %, where what is usual is learnt, and not in its last 30 %.
     """
     step: list[np.ndarray] = []
-    for item, _ in session(profile, machine()):
+    for item, _ in session(profile, make_faulty_rig()):
         if isinstance(item, Block):
             step.append(item.step)
     steps = np.concatenate(step)
@@ -124,7 +124,7 @@ def faults() -> Iterator[dict[str, Any]]:
 def try_fault(profile: Profile, fault: dict[str, Any], at_s: float, hz: float) -> Outcome:
     """One fault planted in one session."""
     delay_s, by, early, ended = float("nan"), "", 0, ""
-    for item, now_s in session(profile, machine(({"at_s": at_s, **fault},))):
+    for item, now_s in session(profile, make_faulty_rig(({"at_s": at_s, **fault},))):
         if isinstance(item, RunStop):
             ended = item.verdict
         elif isinstance(item, (Trip, SampleGap)) or (isinstance(item, Event) and item.kind in TOLD):
@@ -228,7 +228,7 @@ def false_findings() -> str:
     for seed, name in enumerate(SWEEPS, 11):
         profile = load_config(PROFILES_DIR / "tests" / f"{name}.toml", Profile, "test profile")[0]
         trips, events, end = 0, 0, 0
-        for item, _ in session(profile, machine(seed=seed)):
+        for item, _ in session(profile, make_faulty_rig(seed=seed)):
             trips += isinstance(item, Trip)
             events += isinstance(item, Event) and item.kind in TOLD
             end = item.index

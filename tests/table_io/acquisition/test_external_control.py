@@ -19,8 +19,8 @@ from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.excitation.drive import Drive
 from table_io.records import Check, Event, FrequencyResponse, RunStart, RunStop, Trip
+from tests.builders.drives import sine_segments
 from tests.table_io.acquisition.external_controller import Bystander, whole
-from tests.table_io.excitation.sine_segments import sine_segments
 
 DRIVE_START_SAMPLE = 4000.37
 SWEEP = {

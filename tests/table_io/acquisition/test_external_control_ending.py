@@ -11,6 +11,7 @@ from table_io.block import Float1D, Label
 from table_io.config.folders import find_config
 from table_io.errors import InputError
 from table_io.excitation.drive import Drive
+from tests.builders.drives import sine_segments
 from tests.table_io.acquisition.external_controller import Bystander, whole
 from tests.table_io.acquisition.test_external_control import (
     DRIVE_START_SAMPLE,
@@ -21,7 +22,6 @@ from tests.table_io.acquisition.test_external_control import (
     setup,
     stopped_early,
 )
-from tests.table_io.excitation.sine_segments import sine_segments
 
 
 class Floating(Bystander):

@@ -14,6 +14,7 @@ from table_io.config.calibration import command_to_si
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import SineTarget, Trajectory, plan_sweep
 from table_io.records import Event, FrequencyResponse
+from tests.builders.drives import sine_segments
 from tests.table_io.acquisition.test_session import (
     RATE_HZ,
     RIG,
@@ -28,7 +29,6 @@ from tests.table_io.acquisition.test_session import (
     start_record,
     stop_record,
 )
-from tests.table_io.excitation.sine_segments import sine_segments
 
 BLOCK_SAMPLES = 20
 

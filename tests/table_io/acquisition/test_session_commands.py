@@ -28,6 +28,7 @@ from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import plan_sweep
 from table_io.records import Event, Record, RunStop, SampleGap, Trip
 from table_io.sequencer import actions
+from tests.builders.drives import sine_segments
 from tests.table_io.acquisition.test_session import (
     RATE_HZ,
     RIG,
@@ -41,7 +42,6 @@ from tests.table_io.acquisition.test_session import (
     start_record,
     stop_record,
 )
-from tests.table_io.excitation.sine_segments import sine_segments
 
 BLOCK_SAMPLES = 20
 REST_SAMPLES = round(profile().acquisition.rest_s * RATE_HZ)

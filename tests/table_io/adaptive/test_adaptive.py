@@ -31,7 +31,7 @@ from table_io.sequencer import (
     start_test,
 )
 from table_io.units import GRAVITY_M_S2
-from tests.table_io.excitation.sine_segments import sine_segments
+from tests.builders.drives import sine_segments
 
 RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 A = 0.05 * GRAVITY_M_S2

@@ -13,9 +13,9 @@ from table_io.clock import RealClock
 from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
+from tests.builders.rigs import DECLARED, EXTRA, TEMPERATURE, make_lab_rig
 from tests.table_io.backends.ni_wire import CARD, Bed
 from tests.table_io.backends.udp_bench import SPECIMEN, card, python_target
-from tests.table_io.lab_rig import DECLARED, EXTRA, TEMPERATURE, lab_rig
 
 RATE_HZ = 2000.0
 LAST_WIRE = '{ channel = "force_l2_n", physical = "Dev1/ai8" },'
@@ -29,7 +29,7 @@ def read_at_rest(source: Backend | AcquisitionSource) -> None:
     source.open()
     try:
         for volts in (source.tare(400), _start_and_read(source)):
-            assert volts.shape[0] == len(lab_rig().channels)
+            assert volts.shape[0] == len(make_lab_rig().channels)
             assert volts[row].mean() == pytest.approx(0.05 * (50.0 + 21.5), abs=1e-3)
             assert np.ptp(volts[row]) > 0.0
     finally:

@@ -11,7 +11,7 @@ from table_io.config.channel import CONSTANT, QUANTITIES, read_channels
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.units import UNITS
-from tests.table_io.lab_rig import EXTRA, LAB_TEXT, SECOND_ACC, TEMPERATURE, lab_rig
+from tests.builders.rigs import EXTRA, LAB_TEXT, SECOND_ACC, TEMPERATURE, make_lab_rig
 from twin.recording.tabular import LABEL_UNITS, TIME_COLUMN, TWIN_PREFIX
 
 
@@ -23,7 +23,7 @@ def list_faults(text: str) -> tuple[InputError, ...]:
 
 
 def test_a_declared_channel_is_one_of_the_rig() -> None:
-    rig = lab_rig()
+    rig = make_lab_rig()
     assert rig.channels[-3:] == EXTRA
     assert rig.channel_by_name == {
         **CHANNEL_BY_NAME,
@@ -183,4 +183,4 @@ def test_channels_of_a_foreign_rig_file_are_read_as_far_as_they_are_valid() -> N
     assert read_channels("channels = 3") == CHANNEL_BY_NAME
     text = LAB_TEXT.replace('body = "other"', 'body = "moon"')
     assert [*read_channels(text)] == [*CHANNEL_BY_NAME, EXTRA[0], EXTRA[2]]
-    assert read_channels(LAB_TEXT) == lab_rig().channel_by_name
+    assert read_channels(LAB_TEXT) == make_lab_rig().channel_by_name

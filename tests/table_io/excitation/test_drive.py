@@ -16,7 +16,7 @@ from table_io.config.profile import Profile, load_profile
 from table_io.excitation.drive import Drive, Segment, segment_motion
 from table_io.excitation.trajectory import plan_sweep
 from table_io.units import GRAVITY_M_S2
-from tests.table_io.excitation.sine_segments import sine_segment_at, sine_segments
+from tests.builders.drives import sine_segment_at, sine_segments
 
 SHIPPED = sorted(
     path.stem

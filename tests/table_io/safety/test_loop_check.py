@@ -35,7 +35,7 @@ from table_io.safety.loop_check import (
 )
 from table_io.safety.loop_check.checks import MIN_TONE_SNR, unwrap_phase
 from table_io.safety.protection.consistency import WeakFormPair, compare_motion, make_window
-from tests.table_io.excitation.sine_segments import sine_segments
+from tests.builders.drives import sine_segments
 
 RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 SHIPPED = sorted(

@@ -26,7 +26,7 @@ from table_io.safety.protection import (
     start_protection,
 )
 from table_io.units import GRAVITY_M_S2
-from tests.table_io.safety.guarded import RIG
+from tests.builders.rigs import RIG
 
 RATE_HZ = 2000.0
 NAMES = RIG.channels

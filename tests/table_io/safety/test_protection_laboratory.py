@@ -11,7 +11,8 @@ from table_io.config.profile import Profile
 from table_io.config.toml_text import format_toml
 from table_io.safety.protection import Finding
 from table_io.sim.imperfections import draw_laboratory
-from tests.table_io.safety.guarded import machine, play
+from tests.builders.rigs import make_faulty_rig
+from tests.builders.sessions import play_guarded
 from tests.table_io.safety.test_protection_simulated import identify_servo
 
 RATE_HZ, FAULT_TIME_S = 1000.0, 9.0
@@ -44,8 +45,8 @@ def list_findings(
         "truth": str(path),
         "truth_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
     }
-    rig = machine(tuple(faults), seed=seed, **truth)
-    return play(profile(), rig, identify_servo()).findings
+    rig = make_faulty_rig(tuple(faults), seed=seed, **truth)
+    return play_guarded(profile(), rig, identify_servo()).timed_findings
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

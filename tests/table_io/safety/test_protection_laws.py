@@ -41,7 +41,7 @@ from table_io.safety.protection.load_cells import ForceShare, check_cell_pairs
 from table_io.safety.protection.sample_checks import TABLE_GAIN, TABLE_LAG
 from table_io.sensor_errors import PairErrorEstimate, PairErrors, highpass
 from table_io.units import GRAVITY_M_S2
-from tests.table_io.safety.guarded import RIG
+from tests.builders.rigs import RIG
 
 NAMES = RIG.channels
 DRIVE, TABLE, ACC, MASS, MASS_ACC = range(5)

@@ -8,8 +8,9 @@ import pytest
 from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.profile import Profile
 from table_io.records import FrequencyResponse
+from tests.builders.rigs import make_faulty_rig
+from tests.builders.sessions import play_guarded
 from tests.studies.planted_faults import SWEEPS, faults, short, study, try_fault
-from tests.table_io.safety.guarded import machine, play
 
 SEEDS = (1, 2, 3)
 
@@ -49,8 +50,8 @@ def identify_servo() -> FrequencyResponse:
     ],
 )
 def test_a_sound_table_is_left_alone(rate_hz: float, noise: float, gap_mm: float) -> None:
-    rig = machine(noise=noise, seed=round(rate_hz + 10 * noise))
-    assert play(profile(gap_mm, rate_hz), rig, identify_servo()).findings == []
+    rig = make_faulty_rig(noise=noise, seed=round(rate_hz + 10 * noise))
+    assert play_guarded(profile(gap_mm, rate_hz), rig, identify_servo()).findings == []
 
 
 @pytest.mark.parametrize(
@@ -62,16 +63,14 @@ def test_a_sound_table_is_left_alone(rate_hz: float, noise: float, gap_mm: float
     ],
 )
 def test_whatever_servo_a_sound_table_has(servo: dict[str, Any]) -> None:
-    findings = [finding for _, finding in play(profile(), machine((), **servo)).findings]
+    findings = play_guarded(profile(), make_faulty_rig((), **servo)).findings
     assert {(finding.kind, finding.stop) for finding in findings} <= {("level", False)}
 
 
 def test_fast_and_small_motions_are_left_alone_too() -> None:
     for gap_mm in (4.0, -10.0):
         fast = profile(gap_mm, start_hz=7.0, stop_hz=10.0, step_hz=1.5, cycles=20)
-        findings = [
-            finding for _, finding in play(fast, machine(noise=3.0), identify_servo()).findings
-        ]
+        findings = play_guarded(fast, make_faulty_rig(noise=3.0), identify_servo()).findings
         # Without control the servo's roll-off shows, and is told as what it is.
         assert {(finding.kind, finding.stop) for finding in findings} <= {("level", False)}
 
@@ -117,11 +116,11 @@ FAULTS: tuple[tuple[dict[str, Any], set[str], bool, float], ...] = (
 def test_a_planted_fault_is_found(
     fault: dict[str, Any], kinds: set[str], stops: bool, within_s: float
 ) -> None:
-    rig = machine(({"at_s": FAULT_TIME_S, **fault},))
+    rig = make_faulty_rig(({"at_s": FAULT_TIME_S, **fault},))
     at = round(FAULT_TIME_S * 2000)
-    played = play(profile(cycles=12), rig, identify_servo(), stop_after=at)
-    (known, finding), *_ = played.since(at)
-    assert played.findings[0][0] > at, "found before it was there"
+    played = play_guarded(profile(cycles=12), rig, identify_servo(), stop_after=at)
+    (known, finding), *_ = played.findings_since(at)
+    assert played.timed_findings[0][0] > at, "found before it was there"
     assert finding.kind in kinds
     assert finding.stop == stops
     assert (known - at) / 2000 <= within_s
@@ -138,7 +137,7 @@ def test_a_planted_fault_is_found(
 @pytest.mark.parametrize("seed", SEEDS)
 def test_whole_sweeps_of_a_sound_table_are_left_alone(name: str, seed: int) -> None:
     test = load_config(PROFILES_DIR / "tests" / f"{name}.toml", Profile, "test profile")[0]
-    findings = [finding for _, finding in play(test, machine(seed=seed), identify_servo()).findings]
+    findings = play_guarded(test, make_faulty_rig(seed=seed), identify_servo()).findings
     assert {(finding.kind, finding.stop) for finding in findings} <= {("level", False)}
 
 

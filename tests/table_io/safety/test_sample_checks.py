@@ -49,7 +49,7 @@ from table_io.safety.protection.thresholds import (
     make_sample_state,
 )
 from table_io.units import GRAVITY_M_S2
-from tests.table_io.safety.guarded import RIG
+from tests.builders.rigs import RIG
 from tests.table_io.safety.test_protection_laws import make_profile
 
 CHANNEL_COUNT = len(RIG.channels)

@@ -25,7 +25,7 @@ from table_io.sequencer import (
     start_test,
 )
 from table_io.units import GRAVITY_M_S2
-from tests.table_io.excitation.sine_segments import sine_segment_at, sine_segments
+from tests.builders.drives import sine_segment_at, sine_segments
 
 RATE_HZ = 2000.0
 A = 0.05 * GRAVITY_M_S2

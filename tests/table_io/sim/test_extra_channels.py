@@ -14,10 +14,10 @@ from table_io.config.rig import RigConfig
 from table_io.safety.protection.thresholds import compute_thresholds
 from table_io.safety.wiring_check import RestingInputs, check_resting_inputs, list_stimuli
 from table_io.sim.simulated_table import SimulatedBackend
-from tests.table_io.lab_rig import EXTRA, SECOND_ACC, TEMPERATURE, UPWARD_ACC, lab_rig
-from tests.table_io.safety.guarded import play
+from tests.builders.rigs import EXTRA, SECOND_ACC, TEMPERATURE, UPWARD_ACC, make_lab_rig
+from tests.builders.sessions import play_guarded
+from tests.builders.truths import seal_truth
 from tests.table_io.safety.test_tap_test import tap
-from tests.table_io.sim.test_ground_truth import seal_truth
 
 RATE_HZ = 2000.0
 PROFILE = Profile.model_validate(
@@ -48,7 +48,7 @@ def quiet(rig: RigConfig) -> RigConfig:
 
 
 def test_a_declared_channel_is_the_stated_sum_and_absolute_values_are_not_tared() -> None:
-    block = acquire_sine(quiet(lab_rig()))
+    block = acquire_sine(quiet(make_lab_rig()))
     mass, table = block.channel("mass_acc_m_s2"), block.channel("table_acc_m_s2")
     assert np.ptp(mass) > 0.1
     np.testing.assert_allclose(block.channel(SECOND_ACC), -mass, atol=2e-5)
@@ -58,7 +58,7 @@ def test_a_declared_channel_is_the_stated_sum_and_absolute_values_are_not_tared(
 
 
 def test_noise_offset_range_and_steps_are_those_of_its_sensor() -> None:
-    rig = lab_rig()
+    rig = make_lab_rig()
     backend = SimulatedBackend(rig, PROFILE.specimen, RATE_HZ, ManualClock())
     backend.open()
     volts = backend.tare(20_000)
@@ -76,7 +76,7 @@ id = "sensor_gain"
 channel = "{SECOND_ACC}"
 parameters = {{ gain = 2.0 }}
 """
-    block = acquire_sine(quiet(lab_rig(**seal_truth(tmp_path, truth))))
+    block = acquire_sine(quiet(make_lab_rig(**seal_truth(tmp_path, truth))))
     np.testing.assert_allclose(
         block.channel(SECOND_ACC), -2 * block.channel("mass_acc_m_s2"), atol=4e-5
     )
@@ -96,15 +96,15 @@ parameters = {{ gain = 2.0 }}
 def test_a_fault_of_a_declared_channel_is_found(channel: str, kind: str, finding_kind: str) -> None:
     fault = {"kind": kind, "at_s": 1.0, "channel": channel}
     fault |= {"size": 100.0} if kind == "spike" else {}
-    assert play(PROFILE, lab_rig()).findings == []
-    findings = [finding for _, finding in play(PROFILE, lab_rig(faults=(fault,))).findings]
+    assert play_guarded(PROFILE, make_lab_rig()).findings == []
+    findings = play_guarded(PROFILE, make_lab_rig(faults=(fault,))).findings
     assert {(finding.channel, finding.kind) for finding in findings} >= {(channel, finding_kind)}
     assert {finding.channel for finding in findings} == {channel}
     assert min(finding.index for finding in findings) == pytest.approx(RATE_HZ, abs=50)
 
 
 def test_every_table_accelerometer_may_show_the_steps_of_a_stiff_table() -> None:
-    rig = lab_rig()
+    rig = make_lab_rig()
     channels = tuple(
         channel.model_copy(update={"body": "table"}) if channel.name == SECOND_ACC else channel
         for channel in rig.extra_channels
@@ -118,7 +118,7 @@ def test_every_table_accelerometer_may_show_the_steps_of_a_stiff_table() -> None
 
 
 def test_the_wiring_check_knows_them() -> None:
-    rig = lab_rig()
+    rig = make_lab_rig()
     backend = SimulatedBackend(rig, PROFILE.specimen, RATE_HZ, ManualClock())
     backend.open()
     lines = check_resting_inputs(RestingInputs(rig, RATE_HZ, backend.tare(8000)))
@@ -133,7 +133,7 @@ def test_the_wiring_check_knows_them() -> None:
 def test_a_tap_proves_the_polarity_of_a_declared_sensor(sign: float, verdict: str) -> None:
     from table_io.safety.wiring_check import TapResponse, evaluate_tap
 
-    rig = lab_rig()
+    rig = make_lab_rig()
     mass = list_stimuli(rig)[1]
     assert mass.channels == ("mass_acc_m_s2", "mass_disp_m", SECOND_ACC)  # not the upward one
     noise = np.array([sensor.noise_rms for sensor in rig.sensors])

@@ -16,7 +16,7 @@ from table_io.errors import InputError
 from table_io.sim.config import FAULT_KINDS
 from table_io.sim.faults import CONVERTER_NOISE_RATIO, VALVE_CLOSING_S
 from table_io.sim.simulated_table import SimulatedBackend
-from tests.table_io.safety.guarded import RIG, machine
+from tests.builders.rigs import RIG, make_faulty_rig
 
 SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
 RATE_HZ = 2000.0
@@ -69,7 +69,7 @@ def read(rig: RigConfig, cut: int = 4000) -> Float2D:
 
 def both(**fault: Any) -> tuple[Float2D, Float2D]:
     """(without the fault, with it), (channel, sample) in V."""
-    return read(machine()), read(machine(({"at_s": AT, **fault},)))
+    return read(make_faulty_rig()), read(make_faulty_rig(({"at_s": AT, **fault},)))
 
 
 def test_every_kind_is_tried_here() -> None:
@@ -83,7 +83,7 @@ def test_the_cut_into_reads_changes_no_fault(fault: dict[str, Any], cut: int) ->
         return
     if cut == 1 and fault["kind"] not in ("power_loss", "oil_loss", "repeated"):
         return  # what acts sample by sample has no more to show
-    rig = machine(({"at_s": AT, **fault},))
+    rig = make_faulty_rig(({"at_s": AT, **fault},))
     assert read(rig, cut).tobytes() == read(rig).tobytes()
 
 
@@ -113,10 +113,12 @@ def test_a_sensor_fault_is_its_channel_s_alone_and_ends(fault: dict[str, Any]) -
 
 def test_what_each_sensor_fault_shows() -> None:
     inside = slice(FIRST, LAST)
-    sound = read(machine())[MASS]
+    sound = read(make_faulty_rig())[MASS]
 
     def read_mass(**fault: Any) -> Float1D:
-        row: Float1D = read(machine(({"at_s": AT, "channel": "mass_disp_m", **fault},)))[MASS]
+        row: Float1D = read(make_faulty_rig(({"at_s": AT, "channel": "mass_disp_m", **fault},)))[
+            MASS
+        ]
         return row
 
     assert (read_mass(kind="stuck")[FIRST:] == sound[FIRST - 1]).all()
@@ -142,7 +144,7 @@ def test_a_fault_stays_within_the_range_of_the_converter() -> None:
 
 
 def test_a_stuck_sensor_at_the_very_start_stays_there() -> None:
-    broken = read(machine(({"kind": "stuck", "channel": "mass_disp_m", "at_s": 0.0},)))
+    broken = read(make_faulty_rig(({"kind": "stuck", "channel": "mass_disp_m", "at_s": 0.0},)))
     assert (broken[MASS] == broken[MASS, 0]).all()
 
 
@@ -170,7 +172,7 @@ def test_a_replayed_command_moves_the_table_again() -> None:
 
 def test_samples_come_late_by_the_size_and_only_once() -> None:
     clock = ManualClock()
-    rig = machine(({"kind": "late", "at_s": AT, "size": 0.1},))
+    rig = make_faulty_rig(({"kind": "late", "at_s": AT, "size": 0.1},))
     backend = start_backend(rig, clock=clock)
     for at in range(0, 4000, 100):
         before = clock.now()
@@ -186,7 +188,7 @@ def test_samples_come_late_by_the_size_and_only_once() -> None:
 @pytest.mark.parametrize("fault", [{"kind": "stall"}, {"kind": "late", "size": 0.6}])
 def test_a_machine_that_does_not_deliver_is_lost_after_its_patience(fault: dict[str, Any]) -> None:
     clock = ManualClock()
-    backend = start_backend(machine(({"at_s": AT, **fault},)), clock=clock)
+    backend = start_backend(make_faulty_rig(({"at_s": AT, **fault},)), clock=clock)
     backend.read(2000)
     with pytest.raises(MachineLost, match=rf"\b2099\b.* {SAMPLE_TIMEOUT_S:g} s"):
         backend.read(100)
@@ -212,9 +214,9 @@ def test_without_oil_the_bandwidth_falls() -> None:
     """At 2 Hz a servo of 20 Hz lags 15 ms, one of 8 Hz 31 ms."""
     sound, broken = both(kind="oil_loss", size=0.4)
     table = RIG.channels.index("table_disp_m")
-    rig = machine(({"kind": "oil_loss", "at_s": 0.0, "size": 0.4},))
+    rig = make_faulty_rig(({"kind": "oil_loss", "at_s": 0.0, "size": 0.4},))
     long = start_backend(rig, 5.0).read(10000)[table, -2000:]
-    fine = start_backend(machine(), 5.0).read(10000)[table, -2000:]
+    fine = start_backend(make_faulty_rig(), 5.0).read(10000)[table, -2000:]
     turn = np.exp(-2j * np.pi * 2.0 * np.arange(2000) / RATE_HZ)
     lag = np.angle((fine @ turn) / (long @ turn)) / (2 * np.pi * 2.0)
     pole = 2 * np.pi * 20.0 / np.sqrt(np.sqrt(2.0) - 1)

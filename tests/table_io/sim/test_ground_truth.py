@@ -24,6 +24,7 @@ from table_io.sim.ground_truth import (
 )
 from table_io.sim.ground_truth_applied import SensorDistortion
 from table_io.sim.simulated_table import SimulatedBackend
+from tests.builders.truths import seal_truth
 from twin.model.effects import EFFECTS
 from twin.recording.reader import read_recording
 from twin.recording.recovery import recover_log
@@ -45,13 +46,6 @@ parameters = { force = 151.37, yield_displacement = 2.9173e-3 }
 id = "gap_drift"
 parameters = { rate = 4.8231e-6 }
 """
-
-
-def seal_truth(folder: Path, text: str) -> dict[str, str]:
-    """The keys of [simulated] that name a truth of this text."""
-    path = folder / "a.toml"
-    path.write_text(text)
-    return {"truth": str(path), "truth_sha256": hashlib.sha256(text.encode()).hexdigest()}
 
 
 def machine(folder: Path, text: str | None, **sensor: float) -> SimulatedBackend:
@@ -142,7 +136,7 @@ def test_the_seal_is_checked_and_the_file_is_named(tmp_path: Path) -> None:
     digest = hashlib.sha256((PHYSICS + "\n").encode()).hexdigest()
     with pytest.raises(InputError, match=digest) as error:
         SimulatedBackend(card, SPECIMEN, RATE_HZ, ManualClock())
-    assert error.value.where.endswith("a.toml")
+    assert error.value.where.endswith("truth.toml")
     assert (error.value.key, error.value.value) == ("truth_sha256", keys["truth_sha256"])
     Path(keys["truth"]).unlink()
     with pytest.raises(InputError) as error:

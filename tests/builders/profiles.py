@@ -1,0 +1,30 @@
+"""Profiles of tests: a stepped sine or a history, with only what a test is about stated."""
+
+from typing import Any
+
+from table_io.config.profile import Profile, Specimen
+
+SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
+GRID = {"start_hz": 2.0, "stop_hz": 3.0, "step_hz": 0.5, "cycles": 4, "measured_cycles": 2}
+
+
+def make_profile(
+    gap_mm: float = 4.0, tables: dict[str, dict[str, Any]] | None = None, **sweep: Any
+) -> Profile:
+    """Return a test of 2, 2.5 and 3 Hz up and down, with other keys of [sweep] and tables.
+
+    `tables` replace [specimen] and add the others, e.g. {"loop_check": {"enabled": False}}.
+    """
+    raw: dict[str, Any] = {
+        "title": "short",
+        "specimen": {"mass_kg": 550.0, "gap_mm": gap_mm},
+        "sweep": GRID | sweep,
+    }
+    return Profile.model_validate(raw | (tables or {}))
+
+
+def make_history_profile(kind: str, **excitation: Any) -> Profile:
+    """Return a test of another kind than a stepped sine, with its keys of [excitation]."""
+    specimen = {"mass_kg": 550.0, "gap_mm": 4.0}
+    raw = {"title": kind, "specimen": specimen, "excitation": {"kind": kind, **excitation}}
+    return Profile.model_validate(raw)
