@@ -30,7 +30,7 @@ def test_a_full_disk_leaves_no_half_of_a_file(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("twin.recording.append_only_file.os.write", full)
+        patch.setattr("twin.recording.mcap_log.os.write", full)
         with pytest.raises(OSError, match="No space left"):
             write_repaired(verified, [old], new)
     assert not new.exists()

@@ -26,9 +26,8 @@ from tests.input_errors import raises_input_error
 from twin.cli.main import app
 from twin.cli.verify import examine_logs
 from twin.recording.mcap_log import LogWriter, write_items
-from twin.recording.mcap_records import ATTACHMENT, CHUNK
 from twin.recording.reader import Recording, read_recording
-from twin.recording.recovery import recover_log
+from twin.recording.recovery import ATTACHMENT, CHUNK, recover_log
 from twin.recording.run_paths import PARTS_FOLDER
 from twin.run.run_config import read_run_config
 from twin.run.unpaced import add_twin_items

@@ -17,7 +17,7 @@ import zstandard
 from table_io.block import Block
 from table_io.records import RunStart
 from twin.recording.mcap_log import LogWriter
-from twin.recording.mcap_records import CHUNK, MAGIC, RECORD_HEADER
+from twin.recording.recovery import CHUNK, MAGIC, RECORD_HEADER
 from twin.transport.codec import Item, encode_item, topic_for
 
 LOG_SAMPLES = 3000  # of the log that is damaged: enough for chunks, few enough for thousands

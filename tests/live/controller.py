@@ -19,7 +19,7 @@ from table_io.config.base import load_config
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.records import Event, RunStop
-from twin.live.scheduling import request_realtime
+from twin.live.process_config import request_realtime
 
 
 def read_command() -> str:

@@ -17,8 +17,7 @@ from table_io.records import Event, RunStop, Timing
 from tests.input_errors import raises_input_error
 from tests.reports.recordings import blocks, start_record
 from twin.live import recorder as module
-from twin.live.latency import LatencyHistogram
-from twin.live.process_config import ProcessConfig
+from twin.live.process_config import LatencyHistogram, ProcessConfig
 from twin.live.recorder import CompletionTracker, Recorder
 from twin.recording.mcap_log import LogWriter, iter_messages
 from twin.recording.merge import verify_log

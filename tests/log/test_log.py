@@ -13,8 +13,7 @@ from table_io.block import Block, Label
 from table_io.channels import relative_displacement
 from table_io.records import CycleExtremes, Event, PrcPoint, StepAdded
 from tests.input_errors import raises_input_error
-from twin.log import Log, open_log
-from twin.log.log_data import ChannelMap
+from twin.log import ChannelMap, Log, open_log
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
 from twin.run.run_config import RunConfig

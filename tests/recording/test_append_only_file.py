@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.recording.example_run import RATE_HZ, START, payloads, run, write
-from twin.recording.append_only_file import AppendOnlyFile
-from twin.recording.mcap_log import LogWriter, iter_messages
+from twin.recording.mcap_log import AppendOnlyFile, LogWriter, iter_messages
 from twin.recording.merge import verify_log
 from twin.recording.reader import read_recording
 from twin.recording.recovery import recover_log

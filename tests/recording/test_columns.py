@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from table_io.block import Block
-from twin.recording.columns import BlockStore
-from twin.recording.stored_items import StoredItems
+from twin.recording.columns import BlockStore, StoredItems
 
 
 def make_block(index: int, count: int, channels: tuple[str, ...] = ("a", "b")) -> Block:

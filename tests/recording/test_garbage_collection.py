@@ -4,7 +4,7 @@ import gc
 
 import pytest
 
-from twin.recording.garbage_collection import pause_collection
+from twin.recording.recovery import pause_collection
 
 
 def test_it_goes_on_after_the_outermost_pause() -> None:

@@ -9,8 +9,8 @@ import lz4.frame
 import pytest
 import zstandard
 
-from twin.recording import mcap_records
-from twin.recording.mcap_records import (
+from twin.recording import recovery
+from twin.recording.recovery import (
     MIN_RECORD_LENGTHS,
     InvalidRecordError,
     decompress_chunk,
@@ -166,9 +166,9 @@ def test_the_least_lengths_are_those_of_records_without_content() -> None:
         "ATTACHMENT": "QQIIQI", "ATTACHMENT_INDEX": "QQQQQII", "STATISTICS": "QHIIIIQQI",
         "METADATA": "II", "METADATA_INDEX": "QQI", "SUMMARY_OFFSET": "BQQ", "DATA_END": "I",
     }  # fmt: skip
-    opcodes = [getattr(mcap_records, name) for name in formats]
+    opcodes = [getattr(recovery, name) for name in formats]
     assert opcodes == list(range(1, 16))
-    least = {getattr(mcap_records, name): struct.calcsize(f"<{text}") for name, text in
+    least = {getattr(recovery, name): struct.calcsize(f"<{text}") for name, text in
              formats.items()}  # fmt: skip
     assert least == MIN_RECORD_LENGTHS
 

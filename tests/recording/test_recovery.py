@@ -20,17 +20,18 @@ from tests.exchange.mutants import BOMBS, bomb, spans, write_messages
 from tests.input_errors import raises_input_error
 from tests.recording.example_run import RATE_HZ, START, payloads, run, write
 from twin.recording.mcap_log import LogWriter
-from twin.recording.mcap_records import (
+from twin.recording.merge import merge
+from twin.recording.reader import read_recording
+from twin.recording.recovery import (
     CHUNK,
     MAGIC,
     MAX_RECORD_BYTES,
     MESSAGE_INDEX,
     RECORD_HEADER,
     find_record_candidates,
+    recover_log,
+    work_limit,
 )
-from twin.recording.merge import merge
-from twin.recording.reader import read_recording
-from twin.recording.recovery import recover_log, work_limit
 from twin.transport.codec import Item, encode_item, topic_for
 
 CHUNK_MESSAGES = 7  # messages in a chunk

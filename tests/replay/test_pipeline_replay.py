@@ -26,11 +26,11 @@ from tests.replay.in_memory import recorded_in
 from twin.cli.replay import ReplayRequest, replay_logs
 from twin.compare import pipeline, twins
 from twin.compare.monitoring import EVENT_KINDS
+from twin.recording.columns import StoredItems
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
-from twin.recording.stored_items import StoredItems
+from twin.recording.tabular import parse_step_range
 from twin.replay.pipeline_replay import RecordedRun, ReplayComparison, SampleRange, replay_recording
-from twin.replay.step_range import parse_step_range
 from twin.reports.finalize import EXIT_NOT_IDENTICAL
 from twin.run.run_config import RunConfig
 from twin.transport.codec import Item, encode_item

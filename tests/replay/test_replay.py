@@ -12,9 +12,9 @@ from table_io.block import Block
 from table_io.records import Comparison, Event, Fault, Params, PrcPoint, Record, RunStart, RunStop
 from tests.replay.in_memory import recorded_in
 from twin.compare import pipeline
+from twin.recording.columns import StoredItems
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
-from twin.recording.stored_items import StoredItems
 from twin.replay.pipeline_replay import ReplayComparison, replay_recording
 from twin.reports.summary import dump_strict_json, summarise
 from twin.run.run_config import RunConfig, from_texts, read_run_config

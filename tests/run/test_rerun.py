@@ -12,8 +12,8 @@ from table_io.records import PredictionHash
 from twin.cli.verify import examine_logs
 from twin.exchange.export import export_log
 from twin.log import open_log
+from twin.recording.log_metadata import select_recorded
 from twin.recording.mcap_log import write_items
-from twin.recording.predictions import select_recorded
 from twin.recording.reader import Recording, read_recording
 from twin.replay.pipeline_replay import RecordedRun, replay_recording
 from twin.run.recordings import read_recorded_config

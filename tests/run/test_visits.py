@@ -8,8 +8,8 @@ import pytest
 
 from table_io.config.base import PROFILES_DIR
 from table_io.records import Comparison, Event, Fault, PrcPoint, StepAdded
+from twin.recording.columns import StoredItems
 from twin.recording.reader import Recording, read_recording
-from twin.recording.stored_items import StoredItems
 from twin.replay.pipeline_replay import RecordedRun, replay_recording
 from twin.reports.report import format_headline
 from twin.reports.report_data import build_report_data, extract_prc

@@ -122,10 +122,7 @@ TARGETS = {
     "recorder": Target(
         (
             "twin/live/recorder.py",
-            *(
-                f"twin/recording/{name}.py"
-                for name in ("append_only_file", "mcap_log", "mcap_records", "merge", "recovery")
-            ),
+            *(f"twin/recording/{name}.py" for name in ("mcap_log", "merge", "recovery")),
         ),
         ("tests/live/test_recorder.py", "tests/recording/test_*.py"),
     ),

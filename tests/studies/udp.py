@@ -39,7 +39,7 @@ from tests.table_io.backends.udp_bench import (
     python_target,
     relay_packets,
 )
-from twin.live.scheduling import request_realtime
+from twin.live.process_config import request_realtime
 
 RATE_HZ = 2000.0
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")

@@ -32,8 +32,8 @@ from table_io.records import (
     Timing,
 )
 from twin.compare import TWIN_CHANNELS
+from twin.recording.columns import StoredItems
 from twin.recording.reader import Recording
-from twin.recording.stored_items import StoredItems
 
 RATE_HZ = 2000.0
 SAMPLE_COUNT = 12000

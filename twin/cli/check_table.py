@@ -88,7 +88,7 @@ class WiringCheckResult:
 def check_wiring(table: str, unattended: bool, as_json: bool) -> int:
     """Check the wiring and print the result; return 0, or 2 if a line fails."""
     from twin.cli.wiring_table import print_wiring_result
-    from twin.live.scheduling import request_realtime
+    from twin.live.process_config import request_realtime
     from twin.run.terminal import print_line
 
     rig, _ = load_rig(find_config(table, "rigs", option="--table"))

@@ -190,7 +190,7 @@ def export_command(
     formats = [kind for kind, wanted in requested.items() if wanted]
     step_span = None
     if steps is not None:
-        from twin.replay.step_range import parse_step_range
+        from twin.recording.tabular import parse_step_range
 
         step_span = parse_step_range(steps)
     raise typer.Exit(export_log(log, formats, out, tuple(channel or ()), step_span))

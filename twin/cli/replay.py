@@ -11,9 +11,15 @@ from table_io.records import Comparison
 from twin.live.replay_publishing import open_publisher
 from twin.recording.reader import Recording, iter_valid_items
 from twin.recording.run_paths import resolve_log_path
-from twin.replay.deviation import compute_deviation, describe_deviation
-from twin.replay.pipeline_replay import RecordedRun, ReplayComparison, SampleRange, replay_recording
-from twin.replay.step_range import parse_step_range
+from twin.recording.tabular import parse_step_range
+from twin.replay.pipeline_replay import (
+    RecordedRun,
+    ReplayComparison,
+    SampleRange,
+    compute_deviation,
+    describe_deviation,
+    replay_recording,
+)
 from twin.reports import summary as summaries
 from twin.reports.finalize import EXIT_INTERRUPTED, EXIT_NOT_IDENTICAL, finalize_run
 from twin.run.folders import make_run_folder

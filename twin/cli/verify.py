@@ -14,7 +14,6 @@ from twin.recording.log_metadata import ContentHash, find_altered_attachments, r
 from twin.recording.reader import Recording, select_messages
 from twin.recording.recovery import Damage, LogMessage, RecoveredLog, recover_log
 from twin.recording.run_paths import explain_unmerged_parts as scattered
-from twin.replay.provenance import find_earlier_run
 from twin.reports.finalize import EXIT_GAPS
 from twin.reports.sensor_table import build_sensor_rows
 from twin.run.recordings import list_parts, read_recorded_config
@@ -174,7 +173,7 @@ def assess_replay(recording: Recording) -> Json:
         return {"possible": False, "identical": False, "because": [str(error)]}
     if recording.missing_samples:
         reasons.append(f"{recording.missing_samples} samples are missing")
-    if log_of_beginning := find_earlier_run(recording):
+    if log_of_beginning := recording.earlier_run:
         reasons.append(f"its beginning is in {log_of_beginning}")
     if version_changes := format_version_changes(find_version_changes(recording.start.versions)):
         reasons.append(f"versions differ: {version_changes}")

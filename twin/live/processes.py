@@ -22,16 +22,17 @@ from table_io.clock import RealClock
 from table_io.errors import InputError
 from table_io.records import Event, RunStart, RunStop
 from twin.live.gateway import GATEWAY_NICENESS, run_gateway
-from twin.live.latency import TIMING_INTERVAL_BLOCKS, LatencyHistogram
 from twin.live.process_config import (
     CONNECT_TIMEOUT_S,
     LINGER_S,
+    TIMING_INTERVAL_BLOCKS,
+    LatencyHistogram,
     ProcessConfig,
     is_orphaned,
     process_token,
+    request_realtime,
 )
 from twin.live.recorder import run_recorder
-from twin.live.scheduling import request_realtime
 from twin.run.diagnostics import configure_logging
 from twin.run.run_config import compile_rig_kernels
 from twin.transport.codec import TOPIC_TYPES, Item, encode_item, topic_for

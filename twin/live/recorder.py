@@ -11,11 +11,11 @@ from table_io.block import Block
 from table_io.clock import Clock, RealClock
 from table_io.errors import InputError
 from table_io.records import Event, RunStart, RunStop, Timing
-from twin.live.latency import LatencyHistogram
 from twin.live.process_config import (
     CONNECT_TIMEOUT_S,
     INBOX_CAPACITY,
     MAX_QUIET_S,
+    LatencyHistogram,
     ProcessConfig,
     is_orphaned,
     process_token,

@@ -4,9 +4,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from table_io.clock import RealClock
-from twin.live.gateway import RequestServer
+from twin.live.gateway import RequestServer, RunStatus
 from twin.live.process_config import LINGER_S, ProcessConfig
-from twin.live.status import RunStatus
 from twin.run.run_config import RunConfig
 from twin.run.terminal import print_line
 from twin.security.access_control import build_open_access

@@ -9,18 +9,19 @@ from table_io.block import Block
 from table_io.clock import Clock, RealClock
 from table_io.records import Fault, RunStart, RunStop, StepAdded
 from twin.compare import pipeline
-from twin.live.latency import TIMING_INTERVAL_BLOCKS, LatencyHistogram
 from twin.live.process_config import (
     CONNECT_TIMEOUT_S,
     INBOX_CAPACITY,
     LINGER_S,
     MAX_QUIET_S,
+    TIMING_INTERVAL_BLOCKS,
+    LatencyHistogram,
     ProcessConfig,
     is_orphaned,
     process_token,
+    request_realtime,
 )
 from twin.live.remote_twin import TWIN_TOPICS
-from twin.live.scheduling import request_realtime
 from twin.run.run_config import compile_twin_kernels
 from twin.transport.codec import Item, decode_item, encode_item, topic_for
 from twin.transport.endpoint import MEAS_TOPIC

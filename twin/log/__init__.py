@@ -25,20 +25,21 @@ reads only the start record; a stream is read at its first use and cached. Where
 twin's output was recorded, its first use reruns the twin.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from table_io.block import Block, Float1D, Float2D, Int1D
-from table_io.channels import list_derived_channels
+from table_io.block import Block, Float1D, Float2D, Int1D, Label
+from table_io.channels import RELATIVE_DISP_SOURCES, Channel, list_derived_channels
 from table_io.config.base import parse_toml
 from table_io.config.channel import read_channels
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
-from table_io.errors import InputError
+from table_io.errors import InputError, format_pip_line
 from table_io.records import (
     CycleExtremes,
     Event,
@@ -52,7 +53,6 @@ from table_io.records import (
     StepAdded,
 )
 from twin.compare import TWIN_CHANNELS
-from twin.log.log_data import UNKNOWN_LABEL, ChannelMap, StepView
 from twin.model.config import ModelConfig
 from twin.model.model import Model
 from twin.recording.reader import Recording, read_recording, read_start
@@ -62,7 +62,111 @@ from twin.transport.codec import RECORD_TOPICS
 from twin.transport.endpoint import MEAS_TOPIC, PRED_TOPIC
 
 if TYPE_CHECKING:
-    from twin.log.dataset import Dataset
+    from xarray import Dataset  # of the extra `notebook`
+
+UNKNOWN_LABEL = -1  # step, label and cycle of a sample that was not recorded
+
+
+class ChannelMap(Mapping[str, Float1D]):
+    """Channels of one source (measured or a twin) by name, (sample,) each, u always among them."""
+
+    def __init__(self, name: str, names: tuple[str, ...], values: Float2D) -> None:
+        self._source, self._rows, self._values = name, names, values
+        self._names = (*names, *list_derived_channels(names))
+
+    def __getitem__(self, name: str) -> Float1D:
+        if name not in self._names:
+            available = ", ".join(self._names)
+            raise KeyError(f"no channel {name!r} ({self._source}); available: {available}")
+        if name in self._rows:
+            return self._values[self._rows.index(name)]
+        mass_disp, table_disp = (self[source] for source in RELATIVE_DISP_SOURCES)
+        values = mass_disp - table_disp
+        values.setflags(write=False)
+        return values
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def __repr__(self) -> str:
+        return f"<{self._source}: {', '.join(self._names)}>"
+
+    def cut(self, samples: slice) -> "ChannelMap":
+        return ChannelMap(self._source, self._rows, self._values[:, samples])
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class StepView:
+    """Samples of one step or of its held cycles, with the planned `step` and its PRC `point`."""
+
+    step: Step
+    point: PrcPoint | None
+    cycles: tuple[CycleExtremes, ...]
+    log: "Log"
+    samples: slice
+
+    def __getitem__(self, name: str) -> Float1D:
+        return self.measured[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.log)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.log
+
+    def keys(self) -> tuple[str, ...]:
+        return self.log.keys()
+
+    @property
+    def measured(self) -> ChannelMap:
+        return self.log.measured.cut(self.samples)
+
+    @property
+    def twin(self) -> ChannelMap:
+        return self.log.twin.cut(self.samples)
+
+    @property
+    def window(self) -> ChannelMap:
+        return self.log.window.cut(self.samples)
+
+    @property
+    def time_s(self) -> Float1D:
+        return self.log.time_s[self.samples]
+
+    @property
+    def label(self) -> Int1D:
+        return self.log.label[self.samples]
+
+    @property
+    def cycle(self) -> Int1D:
+        return self.log.cycle[self.samples]
+
+    @property
+    def held(self) -> "StepView":
+        """Only the cycles that enter the PRC point; empty if the step has none."""
+        held_samples = np.flatnonzero(self.label == Label.MEASURE)
+        first, last = (held_samples[0], held_samples[-1] + 1) if held_samples.size else (0, 0)
+        base = self.samples.start
+        cut = slice(base + int(first), base + int(last))
+        return StepView(self.step, self.point, self.cycles, self.log, cut)
+
+    def to_xarray(self) -> "Dataset":
+        """Return these samples as `Log.to_xarray` does."""
+        return self.log.to_xarray().isel(time=self.samples)
+
+    def __len__(self) -> int:
+        return int(self.samples.stop - self.samples.start)
+
+    def __repr__(self) -> str:
+        step = self.step
+        return (
+            f"<step {step.index}: {step.frequency_hz:g} Hz {step.direction}, "
+            f"{step.acceleration_m_s2:.3g} m/s2, {len(self)} samples>"
+        )
+
 
 RECORD_TOPICS_READ = [
     RECORD_TOPICS[kind]
@@ -278,8 +382,6 @@ class Log:
 
         `step`, `label` and `cycle` are coordinates; units and meanings are attributes.
         """
-        from twin.log.dataset import build_dataset
-
         return build_dataset(self)
 
     def _select_track(self, track: str, title: str) -> ChannelMap:
@@ -315,3 +417,44 @@ def _make_read_only(values: Any) -> Any:
 
 def _get_value(values: NormalizedResponse | None, name: str) -> float:
     return np.nan if values is None else float(getattr(values, name))
+
+
+LABEL_MEANINGS = ", ".join(f"{int(label)} {label.name.lower()}" for label in Label)
+
+
+def build_dataset(log: "Log") -> "Dataset":
+    """Build a Dataset of all channels over `time` in s, with units and run as attributes."""
+    try:
+        import xarray
+    except ImportError:
+        raise InputError(
+            "to_xarray needs xarray, which is not installed",
+            remedy=format_pip_line("notebook"),
+        ) from None
+    channels = read_channels(log.start.rig_toml)
+    data = {name: ("time", log[name], _channel_attributes(name, channels)) for name in log.channels}
+    for row, name in zip(log.predicted, TWIN_CHANNELS, strict=True):
+        data[f"twin_{name.replace('/', '_')}"] = (
+            "time",
+            row,
+            _channel_attributes(name.split("/")[1], channels),
+        )
+    coordinates = {
+        "time": ("time", log.time_s, {"units": "s"}),
+        "step": ("time", log.step_index, {"meaning": "index of the step, -1 outside"}),
+        "label": ("time", log.label, {"meaning": f"what the drive did: {LABEL_MEANINGS}"}),
+        "cycle": ("time", log.cycle, {"meaning": "held cycle within the step, -1 outside"}),
+    }
+    run = log.start
+    attributes = {
+        "run": run.run, "name": run.name, "title": log.profile.title, "rate_hz": run.rate_hz,
+        "started_at": run.started_at, "host": run.host, "profile_toml": run.profile_toml,
+        "rig_toml": run.rig_toml, "model_toml": run.model_toml,
+    }  # fmt: skip
+    return xarray.Dataset(data, coordinates, attributes)
+
+
+def _channel_attributes(name: str, channels: dict[str, Channel]) -> dict[str, str]:
+    channel = channels.get(name)
+    details = {"positive": channel.positive, "meaning": channel.meaning} if channel else {}
+    return {"units": channel_unit(name, channels), **details}

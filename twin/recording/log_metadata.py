@@ -1,4 +1,4 @@
-"""Metadata of a log: schema version, attachments, and hashes of attachments and content.
+"""What is in a log: schema version, attachments, hashes, and which of the twin's blocks.
 
 `LOG.md` in this folder specifies the format.
 """
@@ -10,12 +10,14 @@ import tomllib
 from collections import Counter
 from pathlib import Path
 
+from table_io.block import Block
 from table_io.errors import InputError
 from table_io.records import RunStart
 from twin.transport.codec import encode_item
 
 SCHEMA_VERSION = 4
 START_COPY_NAME = "start.pb"
+RECORDED_EVERY = 10  # blocks, where not all are recorded
 Metadata = dict[str, dict[str, str]]  # metadata record by name, its values by key
 
 
@@ -100,3 +102,21 @@ def build_calibration_json(start: RunStart) -> str:
         tare = value if math.isfinite(value) else None
         channels.setdefault(name, {})["tare_si"] = tare
     return json.dumps(channels, indent=1, default=str) + "\n"
+
+
+def select_recorded(block: Block, start: RunStart) -> list[Block]:
+    """Return the parts of a block that are recorded, of the twin's output every n-th block.
+
+    Blocks are counted by sample index, so that the selection does not depend on their boundaries.
+    A block that is recorded whole is returned itself.
+    """
+    every, size = start.predictions_every, start.block_samples
+    if block.stream != "pred" or start.has_all_predictions:
+        return [block]
+    period = every * size
+    begins = range(block.index - block.index % period, block.end, period)
+    inside = ((max(begin, block.index), min(begin + size, block.end)) for begin in begins)
+    parts = [(first, end) for first, end in inside if first < end]
+    if parts == [(block.index, block.end)]:
+        return [block]
+    return [block.cut(first, end) for first, end in parts]

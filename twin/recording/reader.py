@@ -1,6 +1,7 @@
 """Log reader: all valid items of a log in order of sample index, and a list of the damage."""
 
 import hashlib
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -9,9 +10,8 @@ from typing import NamedTuple, TypeVar
 
 from table_io.block import Block
 from table_io.errors import InputError
-from table_io.records import Record, RunStart, RunStop, SampleGap
-from twin.recording.columns import BlockStore, StoredBlock
-from twin.recording.garbage_collection import pause_collection
+from table_io.records import Event, Record, RunStart, RunStop, SampleGap
+from twin.recording.columns import BlockStore, StoredBlock, StoredItem, StoredItems
 from twin.recording.log_metadata import START_COPY_NAME, read_schema_version
 from twin.recording.mcap_log import iter_messages, read_leading_metadata
 from twin.recording.recovery import (
@@ -19,9 +19,9 @@ from twin.recording.recovery import (
     Damage,
     LogMessage,
     RecoveredLog,
+    pause_collection,
     recover_log,
 )
-from twin.recording.stored_items import StoredItem, StoredItems
 from twin.recording.validation import (
     has_invalid_labels,
     validate_block,
@@ -36,12 +36,14 @@ from twin.transport.codec import (
     decode_item,
     encode_item,
 )
+from twin.transport.endpoint import BLOCK_TOPICS
 
 START_TOPIC = RECORD_TOPICS[RunStart]
 # Order of items with the same sample index: start first, then by table of topics, stop last. So a
 # recording reads the same in whatever order its parts were written.
 TOPIC_ORDER = {topic: place for place, topic in enumerate(TOPIC_TYPES)}
 TOPIC_ORDER |= {START_TOPIC: -1, RECORD_TOPICS[RunStop]: len(TOPIC_TYPES)}
+CUT_EVENT_KIND = "cut"  # says of which run a recording of some steps is a part
 MIN_LABEL_BYTES = 3  # of the three labels of a sample, in any encoding
 R = TypeVar("R", bound=Record)
 
@@ -86,6 +88,18 @@ class Recording:
         return tuple(gap for gap in self.records(SampleGap) if gap.reason == "clipped")
 
     @property
+    def earlier_run(self) -> str:
+        """Run with the samples before a recording of some steps, "" for a full recording.
+
+        The twin of such a log started earlier, so a replay of the log alone has another state.
+        """
+        for event in self.records(Event):
+            match = re.fullmatch(r"from (.*) at sample \d+", event.text)
+            if event.kind == CUT_EVENT_KIND and event.index == self.start.index and match:
+                return match[1]
+        return ""
+
+    @property
     def missing_samples(self) -> int:
         """Number of measured samples between start and stop that are not in the file."""
         pieces = self.contiguous_blocks("meas")
@@ -100,6 +114,13 @@ def read_recording(path: Path, topics: Iterable[str] = TOPIC_TYPES) -> Recording
     `damage` lists the rest.
     """
     return build_recording(path, recover_log(path, frozenset((START_TOPIC, *topics))))
+
+
+def find_topic(entry: StoredItem) -> str:
+    """Return the topic on which an item is logged, as `topic_for` does."""
+    if isinstance(entry, StoredBlock):
+        return BLOCK_TOPICS[entry.stream]
+    return RECORD_TOPICS[type(entry)]
 
 
 def build_recording(path: Path, recovered: RecoveredLog) -> Recording:

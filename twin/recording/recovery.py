@@ -3,44 +3,42 @@
 Invalid records are skipped. Reading resumes after a damaged chunk at the next valid chunk, at the
 latest at the end that it declares, and after other damage at the next valid record. Work and memory
 are limited from the start.
+
+The parser follows the specification (mcap.dev/spec): a record is an opcode (1 byte), the length of
+its content (8 bytes) and the content. Numbers are little-endian; a string is preceded by its length
+(4 bytes). Messages are in compressed chunks, each with a checksum.
 """
 
+import gc
 import os
+import struct
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from table_io.errors import InputError
-from twin.recording.garbage_collection import pause_collection
-from twin.recording.mcap_records import (
-    ATTACHMENT,
-    CHANNEL,
-    CHUNK,
-    DATA_END,
-    FIXED_LENGTH_OPCODES,
-    FOOTER,
-    HEADER,
-    MAGIC,
-    MAX_RECORD_BYTES,
-    MESSAGE,
-    MESSAGE_HEADER,
-    MESSAGE_INDEX,
-    METADATA,
-    MIN_RECORD_LENGTHS,
-    RECORD_HEADER,
-    UINT32,
-    UINT64,
-    InvalidRecordError,
-    decompress_chunk,
-    find_record_candidates,
-    iter_records,
-    parse_attachment,
-    parse_string,
-    parse_string_map,
-    read_uncompressed_size,
-)
+import lz4.frame
+import numpy as np
+import zstandard
 
+from table_io.errors import InputError
+
+MAGIC = b"\x89MCAP0\r\n"
+MAX_RECORD_BYTES = 64 * 2**20  # compressed or not; records of LogWriter have about 1 MiB
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = range(1, 8)
+CHUNK_INDEX, ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA = range(8, 13)
+METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(13, 16)
+MIN_RECORD_LENGTHS = {
+    HEADER: 8, FOOTER: 20, SCHEMA: 14, CHANNEL: 16, MESSAGE: 22, CHUNK: 40, MESSAGE_INDEX: 6,
+    CHUNK_INDEX: 64, ATTACHMENT: 36, ATTACHMENT_INDEX: 48, STATISTICS: 46, METADATA: 8,
+    METADATA_INDEX: 20, SUMMARY_OFFSET: 17, DATA_END: 4,
+}  # fmt: skip
+FIXED_LENGTH_OPCODES = (FOOTER, SUMMARY_OFFSET, DATA_END)  # the minimum length is their length
+RECORD_HEADER = struct.Struct("<BQ")  # opcode, length
+MESSAGE_HEADER = struct.Struct("<HIQQ")  # channel, sequence, log and publish time in ns
+CHUNK_HEADER = struct.Struct("<QQQI")  # first and last log time, uncompressed size, checksum
 UNFINISHED_REASON = "the file was never finished: its recorder was killed, or still writes"
 # Searched at once for the next record: little at first, since it may be near after each of many
 # damaged places, then twice as much each time.
@@ -54,6 +52,113 @@ WORK_PER_BYTE, MIN_WORK_BYTES = 250, 256 * 2**20
 WORK_PER_RECORD = 512  # minimum cost of a record
 ENTRY_OVERHEAD_BYTES = 400  # memory of a message or damage entry in addition to its payload
 DEFAULT_MEMORY_BYTES = 4 * 2**30
+UINT32, UINT64 = struct.Struct("<I"), struct.Struct("<Q")
+
+
+class InvalidRecordError(ValueError):
+    """Bytes that are not a valid MCAP record."""
+
+
+def read_uncompressed_size(content: bytes) -> int:
+    """Return the declared uncompressed size of a chunk in bytes; raise if it is too large."""
+    size = int(CHUNK_HEADER.unpack_from(content)[2])
+    if size > MAX_RECORD_BYTES:
+        raise InvalidRecordError("a chunk that decompresses to too many bytes")
+    return size
+
+
+def decompress_chunk(content: bytes) -> bytes:
+    """Return the decompressed records of a chunk; raise InvalidRecordError if it is damaged."""
+    size, crc = read_uncompressed_size(content), CHUNK_HEADER.unpack_from(content)[3]
+    compression, offset = parse_string(content, CHUNK_HEADER.size)
+    if (
+        offset + 8 > len(content)
+        or UINT64.unpack_from(content, offset)[0] != len(content) - offset - 8
+    ):
+        raise InvalidRecordError("a chunk of the wrong length")
+    try:
+        data = _decompress(compression, content[offset + 8 :], size)
+    except (zstandard.ZstdError, RuntimeError, EOFError) as error:
+        raise InvalidRecordError(f"a chunk that does not decompress: {error}") from None
+    if len(data) != size or crc not in (0, zlib.crc32(data)):
+        raise InvalidRecordError("a chunk with a wrong checksum")
+    return data
+
+
+def iter_records(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield (opcode, first byte of the content, end of the content) of each record in a chunk."""
+    offset, size = 0, len(data)
+    while offset < size:
+        if offset + RECORD_HEADER.size > size:
+            raise InvalidRecordError("a chunk with half a record")
+        opcode, length = RECORD_HEADER.unpack_from(data, offset)
+        begin, offset = offset + RECORD_HEADER.size, offset + RECORD_HEADER.size + length
+        if offset > size or length < MIN_RECORD_LENGTHS.get(opcode, 0):
+            raise InvalidRecordError("a chunk with half a record")
+        yield opcode, begin, offset
+
+
+def find_record_candidates(window: bytes) -> list[int]:
+    """Return the offsets in `window` that may be record headers; most are false positives."""
+    window_bytes = np.frombuffer(window, np.uint8)
+    count = max(len(window_bytes) - RECORD_HEADER.size + 1, 0)
+    is_candidate = (window_bytes[:count] > 0) & (window_bytes[:count] <= DATA_END)
+    for byte in range(5, 9):  # upper length bytes: no record has 4 GiB
+        is_candidate &= window_bytes[byte : byte + count] == 0
+    return [int(place) for place in np.flatnonzero(is_candidate)]
+
+
+def _decompress(compression: str, compressed: bytes, size: int) -> bytes:
+    """Decompress at most about `size` bytes, whatever size the compressed data declare."""
+    if compression == "zstd":
+        if zstandard.frame_content_size(compressed) not in (size, -1):
+            raise InvalidRecordError("a chunk that decompresses to another size")
+        return zstandard.ZstdDecompressor().decompress(compressed, max_output_size=size)
+    if compression == "lz4":
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(compressed, max_length=size + 1))
+    if compression:
+        raise InvalidRecordError(f"a chunk with unknown compression {compression[:20]!r}")
+    return compressed
+
+
+def parse_string(content: bytes, offset: int) -> tuple[str, int]:
+    """Parse the string at `offset`; return (text, offset after it)."""
+    if offset + 4 > len(content):
+        raise InvalidRecordError("a record with half a text")
+    end = offset + 4 + UINT32.unpack_from(content, offset)[0]
+    if end > len(content):
+        raise InvalidRecordError("a record with half a text")
+    try:
+        return content[offset + 4 : end].decode(), end
+    except UnicodeDecodeError:
+        raise InvalidRecordError("a record with a text that is not UTF-8") from None
+
+
+def parse_string_map(content: bytes, offset: int) -> dict[str, str]:
+    """Parse the map of strings at the end of a record."""
+    if offset + 4 > len(content) or offset + 4 + UINT32.unpack_from(content, offset)[0] != len(
+        content
+    ):
+        raise InvalidRecordError("a record of the wrong length")
+    offset, values = offset + 4, {}
+    while offset < len(content):
+        key, offset = parse_string(content, offset)
+        values[key], offset = parse_string(content, offset)
+    return values
+
+
+def parse_attachment(content: bytes) -> tuple[str, bytes]:
+    """Parse an attachment; return (name, data)."""
+    name, offset = parse_string(content, 16)
+    offset = parse_string(content, offset)[1]
+    if (
+        offset + 12 > len(content)
+        or UINT64.unpack_from(content, offset)[0] != len(content) - offset - 12
+    ):
+        raise InvalidRecordError("an attachment of the wrong length")
+    if UINT32.unpack_from(content, len(content) - 4)[0] not in (0, zlib.crc32(content[:-4])):
+        raise InvalidRecordError("an attachment with a wrong checksum")
+    return name, content[offset + 8 : -4]
 
 
 class LogMessage(NamedTuple):
@@ -88,6 +193,18 @@ class RecoveredLog:
     damage: list[Damage] = field(default_factory=list)
     topics: frozenset[str] = frozenset()  # of all messages, wanted or not
     is_intact: bool = False
+
+
+@contextmanager
+def pause_collection() -> Iterator[None]:
+    """Pause the collection of reference cycles, which would visit all that was made many times."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 @pause_collection()

@@ -6,6 +6,7 @@ twin columns are NaN where the twin has no output. Invalid items are left out by
 `reader.read_recording`.
 """
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -253,6 +254,20 @@ def collect_steps(start: RunStart, items: Iterable[Item]) -> dict[int, Step]:
                 record.step, record.direction, record.frequency_hz, record.acceleration_m_s2
             )
     return steps
+
+
+def parse_step_range(steps: str) -> tuple[int, int]:
+    """Return (first, last) step index of "FIRST:LAST" or of a single step."""
+    match = re.fullmatch(r"(\d{1,9})(?::(\d{1,9}))?", steps)
+    first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+    if last < first:
+        raise InputError(
+            "not a range of steps",
+            where=f"--steps {steps}",
+            allowed="FIRST:LAST, both ends included, or one step, by `index` in summary.json "
+            "(from 0), for example 12:20",
+        )
+    return first, last
 
 
 def channel_unit(name: str, channels: Mapping[str, Channel]) -> str:

@@ -1,8 +1,9 @@
 """Replay of a recording: the rig's stream as recorded, the twin's results recomputed."""
 
 import math
+import platform
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from table_io.block import Block
+from table_io.clock import local_datetime
 from table_io.errors import InputError
 from table_io.records import (
     Agreement,
@@ -26,16 +28,47 @@ from table_io.records import (
     RunStop,
     Timing,
 )
-from twin.compare import COMPARED_CHANNELS
-from twin.recording.predictions import select_recorded
-from twin.recording.reader import Recording, build_recording, read_start
+from twin.compare import COMPARED_CHANNELS, TWIN_CHANNELS
+from twin.recording.log_metadata import select_recorded
+from twin.recording.reader import (
+    CUT_EVENT_KIND,
+    Recording,
+    build_recording,
+    read_recording,
+    read_start,
+)
 from twin.recording.recovery import recover_log
-from twin.replay.provenance import find_earlier_run, iter_start_records
 from twin.run.rerun import TWIN_RECORDS, is_rig_item, rerun_twin
 from twin.run.run_config import RunConfig
 from twin.run.unpaced import ItemHandler, record_items
+from twin.run.versions import read_installed_versions
 from twin.transport.codec import RECORD_TOPICS, TOPIC_TYPES, Item, WireError, decode_item, strip_run
 from twin.transport.endpoint import CMP_TOPIC, HASH_TOPIC, PRED_TOPIC
+
+
+def iter_start_records(
+    recording: Recording, run: str, model_toml: str, first: int, predictions_every: int
+) -> Iterator[RunStart | Event]:
+    """Yield the start record of a replay from sample `first`, and its provenance events.
+
+    Host, time and versions are those of the replay; the recording keeps its own.
+    """
+    yield replace(
+        recording.start,
+        index=first,
+        run=run,
+        model_toml=model_toml,
+        versions=dict(read_installed_versions()),
+        host=platform.node(),
+        started_at=local_datetime().isoformat(timespec="seconds"),
+        predictions_every=predictions_every,
+    )
+    content = recording.metadata.get("content", {}).get("sha256")
+    description = f"sha256 of its content {content}" if content else "which was never finished"
+    yield Event(first, "replay", f"replay of {recording.run}, {description}")
+    if first > recording.start.index:
+        yield Event(first, CUT_EVENT_KIND, f"from {recording.run} at sample {first}")
+
 
 TIMING_TOPIC = RECORD_TOPICS[Timing]
 MAX_COMPARISON_SAMPLES = 10_000  # covered by one comparison
@@ -178,7 +211,7 @@ class ReplayComparison:
     hashes_differing: int = 0
     predictions_compared: int = 0  # blocks
     predictions_differing: int = 0
-    beginning: str = ""  # run with the samples before the recording, see `find_earlier_run`
+    beginning: str = ""  # run with the samples before the recording, see `Recording.earlier_run`
     first_difference: int | None = None  # sample index
     largest: dict[str, float] = field(default_factory=dict)  # |difference| of error sums, SI^2
 
@@ -224,7 +257,7 @@ def replay_recording(
     recording = recorded.recording
     span = span or SampleRange.all_samples(recording)
     result = ReplayComparison(largest=dict.fromkeys(COMPARED_CHANNELS, 0.0))
-    result.beginning = find_earlier_run(recording)
+    result.beginning = recording.earlier_run
     result.recorded = sum(span.contains_comparison(entry) for entry in recorded.comparisons.items())
     result.hashes = sum(map(span.includes, _list_expected_hashes(recorded)))
 
@@ -350,7 +383,7 @@ def replay_items(
     The log of a replay of some steps cannot be replayed, so it has all predictions.
     """
     first = recording.start.index
-    is_whole = span.first == first and not find_earlier_run(recording)
+    is_whole = span.first == first and not recording.earlier_run
     every = 0 if recording.start.source == "model" or not is_whole else config.predictions_every
     yield from iter_start_records(recording, run, config.model_toml, span.first, every)
     for item in rerun_twin(recording, config, block_samples, (span.first, span.last)):
@@ -363,3 +396,50 @@ def replay_items(
     stop = recording.stop
     if stop is not None and stop.index > span.last:
         yield RunStop(span.last, stop.verdict, "the steps that were asked for", stop.states)
+
+
+def compute_deviation(old_path: Path, new_path: Path) -> dict[str, float | None]:
+    """Return rms(new - old) / rms(old) by predicted channel, over samples recorded in both.
+
+    None where a recording has no predictions of the channel.
+    """
+    old_blocks, new_blocks = (
+        read_recording(path, (PRED_TOPIC,)).contiguous_blocks("pred")
+        for path in (old_path, new_path)
+    )
+    squares = np.zeros((2, len(TWIN_CHANNELS)))
+    ends = [block.end for block in new_blocks]
+    for old_block in old_blocks:
+        for new_block in new_blocks[bisect_right(ends, old_block.index) :]:
+            if new_block.index >= old_block.end:
+                break
+            first, last = max(old_block.index, new_block.index), min(old_block.end, new_block.end)
+            if old_block.channels == new_block.channels == TWIN_CHANNELS:
+                squares += _sum_squares(old_block.cut(first, last), new_block.cut(first, last))
+    return {
+        name: math.sqrt(difference / signal) if signal > 0 else None
+        for name, difference, signal in zip(TWIN_CHANNELS, *squares.tolist(), strict=True)
+    }
+
+
+def _sum_squares(old: Block, new: Block) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    """Return the sums of squares of difference and old signal, both finite, (2, channel)."""
+    known = np.isfinite(old.values) & np.isfinite(new.values)
+    signal = np.where(known, old.values, 0.0)
+    difference = signal - np.where(known, new.values, 0.0)
+    return np.array([(difference**2).sum(axis=1), (signal**2).sum(axis=1)])
+
+
+def describe_deviation(shares: Mapping[str, float | None]) -> str:
+    """Describe the channel with the largest deviation, for the restarted and the free twin."""
+    parts = []
+    for track, title in (("window", "restarted twin"), ("free", "free-running twin")):
+        track_shares = {
+            name: share for name, share in shares.items() if name.startswith(track) and share
+        }
+        if track_shares:
+            name = max(track_shares, key=lambda channel: track_shares[channel])
+            parts.append(
+                f"the {title} by up to {track_shares[name]:.2g} of {name.split('/')[1]} (rms)"
+            )
+    return " and ".join(parts) or "the predictions are the same"

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
-from twin.recording.garbage_collection import pause_collection
+from twin.recording.recovery import pause_collection
 from twin.reports.report_data import DIRECTIONS
 from twin.run.terminal import show_status
 

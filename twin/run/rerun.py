@@ -23,10 +23,9 @@ from table_io.records import (
     StepAdded,
     Timing,
 )
-from twin.recording.columns import BlockStore, StoredBlock
+from twin.recording.columns import BlockStore, StoredBlock, StoredItem, StoredItems
 from twin.recording.mcap_log import write_items
-from twin.recording.reader import TOPIC_ORDER, Recording, read_start
-from twin.recording.stored_items import StoredItem, StoredItems, find_topic
+from twin.recording.reader import TOPIC_ORDER, Recording, find_topic, read_start
 from twin.run.recordings import open_recording, read_recorded_config
 from twin.run.run_config import RunConfig
 from twin.run.terminal import error_console

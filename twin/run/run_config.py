@@ -22,7 +22,7 @@ from table_io.sequencer import make_test_plan, nominal_drive
 from twin.model.config import ModelConfig, load_model_config
 from twin.model.model import Model
 from twin.model.parameters import Parameters
-from twin.recording.predictions import RECORDED_EVERY
+from twin.recording.log_metadata import RECORDED_EVERY
 from twin.run.versions import read_installed_versions
 
 if TYPE_CHECKING:
