@@ -52,6 +52,10 @@ def jit_untyped_kernel(function: Callable[..., Any]) -> Any:
     return jit_kernel(cache=True)(function)
 
 
+# Marks a helper of kernels that Python never calls.
+inline_jit = njit(nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
+
 def jit_helper(*, inlined: bool = False) -> Callable[[F], F]:
     """Mark a helper for compilation into the kernels that call it; Python runs it uncompiled.
 

@@ -20,7 +20,7 @@ own, whose path and hash the rig file states:
 
 Only the simulated backend reads it, never the twin.
 `DEFINITION_BY_ID` lists the effects that can be hidden. Signs and meanings are those of the effects
-of the same name in the model library; the functional forms differ (`hidden_plant.py`), so that no
+of the same name in the model library; the functional forms differ (`plant.py`), so that no
 model can reproduce the truth exactly.
 """
 

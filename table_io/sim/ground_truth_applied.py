@@ -1,20 +1,19 @@
-"""Application of a ground truth: plant with hidden effects, and distortion of sensor readings.
+"""Application of a ground truth: hidden laws of the plant, distortion of sensor readings.
 
 Everything in SI. Parameters and signs as in `ground_truth.DEFINITION_BY_ID`.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import replace
 from typing import Any
 
 from table_io.block import Float2D
 from table_io.sim.filters import FractionalDelay
 from table_io.sim.ground_truth import GroundTruth
 from table_io.sim.hidden_laws import StrangeLaws
-from table_io.sim.hidden_plant import HiddenCoefficients, HiddenPlant
 from table_io.sim.imperfections import Imperfection, resolve_sides
-from table_io.sim.plant import Plant
+from table_io.sim.plant import HiddenCoefficients, Plant
 
 # Parameters whose coefficient has a different name.
 COEFFICIENT_NAMES = {
@@ -29,10 +28,10 @@ COEFFICIENT_NAMES = {
 }
 
 
-def build_hidden_plant(plant: Plant, truth: GroundTruth) -> HiddenPlant:
-    """Build the plant with hidden effects from the nominal plant."""
-    parameters: dict[str, Any] = {
-        field.name: getattr(plant, field.name) for field in fields(plant) if field.name != "hidden"
+def hide_laws(plant: Plant, truth: GroundTruth) -> Plant:
+    """Return the nominal plant with the true parameters and the hidden effects of a truth."""
+    parameters = {
+        name: getattr(plant, name) for name in ("mass_kg", "gap_right_m", "gap_left_m", "rate_hz")
     }
     parameters |= truth.base.model_dump(exclude_none=True)
     coefficients: dict[str, Any] = {}
@@ -66,7 +65,7 @@ def build_hidden_plant(plant: Plant, truth: GroundTruth) -> HiddenPlant:
     hidden = HiddenCoefficients(
         **coefficients, is_strange=bool(strange), strange=StrangeLaws(**strange)
     )
-    return HiddenPlant(**parameters, hidden=hidden)
+    return replace(plant, **parameters, hidden=hidden)
 
 
 def _apply_imperfections(

@@ -2,7 +2,7 @@
 
 Each field of `StrangeLaws` is an effect of `ground_truth.DEFINITION_BY_ID` with its parameters in
 their order, SI; with the first the effect vanishes. Dry friction is smooth over 1 mm/s. Forces of
-the damper are on the left side of the equation of motion of `hidden_plant`, in a bumper they push.
+the damper are on the left side of the equation of motion of `plant.py`, in a bumper they push.
 """
 
 import math
@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 from numba import njit
 
+from table_io.compilation import inline_jit
+
 SLIP_SPEED_M_S = 1e-3  # over which dry friction changes its sign
 CORNER_M = 1e-4  # over which a spring with slack takes hold
 PLASTIC_EXPONENT = 20  # of the yielding: elastic up to a sharp corner
 MEMORY_SIZE = 4  # states: two of the damper's law with memory, softening of each bumper
-
-inline_jit = njit(nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 class StrangeLaws(NamedTuple):

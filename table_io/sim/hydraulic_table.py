@@ -35,11 +35,10 @@ not faster than the integrator resolves; the friction in steady motion stays g.
 import math
 from typing import NamedTuple
 
-from numba import njit
-
+from table_io.compilation import inline_jit
 from table_io.sim.hydraulic_config import HydraulicTableConfig
 
-# Continues the state of `hidden_plant.py`: load pressure in Pa and its slow part, spool and its
+# Continues the state of `plant.py`: load pressure in Pa and its slow part, spool and its
 # rate in 1/s, bristles in m, frame in m and m/s.
 P, P_LOW, SPOOL, SPOOL_RATE, BRISTLE, YF, VYF = 15, 16, 17, 18, 19, 20, 21
 HYDRAULIC_STATE_SIZE = 22
@@ -57,7 +56,7 @@ MAX_RELAXATION_1_S = 1.0 / MAX_HYDRAULIC_SUBSTEP_S  # of bristles under little f
 
 
 class HydraulicCoefficients(NamedTuple):
-    """Coefficients of the equations above in SI; an area of 0 stands for a table without oil."""
+    """Coefficients of the equations above in SI."""
 
     area: float = 0.0
     table_mass: float = 1.0
@@ -149,16 +148,13 @@ def make_coefficients(config: HydraulicTableConfig, table_mass_kg: float) -> Hyd
     )
 
 
-inline_hydraulic_jit = njit(nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-
-
-@inline_hydraulic_jit
+@inline_jit
 def _round_corner(x, width):  # type: ignore[no-untyped-def]
     """Return a smooth max(x, 0) whose corner is rounded over this width."""
     return max(x, 0.0) + width * math.log1p(math.exp(-abs(x) / width))
 
 
-@inline_hydraulic_jit
+@inline_jit
 def _read_stroke(s, stroke, oil, rate):  # type: ignore[no-untyped-def]
     """Return the stroke in m as the loop reads it; write the rates of its filters."""
     reading = stroke
@@ -171,7 +167,7 @@ def _read_stroke(s, stroke, oil, rate):  # type: ignore[no-untyped-def]
     return reading
 
 
-@inline_hydraulic_jit
+@inline_jit
 def _press_stops(offset, speed, oil):  # type: ignore[no-untyped-def]
     """Return the force of the piston on the table in N; piston less table in m and m/s."""
     depth = offset - min(max(offset, -0.5 * oil.play), 0.5 * oil.play)
@@ -183,8 +179,8 @@ def _press_stops(offset, speed, oil):  # type: ignore[no-untyped-def]
     return max(push, 0.0) if depth > 0.0 else min(push, 0.0)
 
 
-@inline_hydraulic_jit
-def _write_hydraulic_rates(s, y, vy, command, command_rate, oil, rate):  # type: ignore[no-untyped-def]
+@inline_jit
+def write_hydraulic_rates(s, y, vy, command, command_rate, oil, rate):  # type: ignore[no-untyped-def]
     """Write the rates of oil, valve, bristles and frame; return the force on the table in N.
 
     y in m and vy in m/s are those of the table, `command` is in m and `command_rate` in m/s.

@@ -6,7 +6,6 @@ time and as fast as possible. Injected faults are in `faults.py`.
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -23,11 +22,11 @@ from table_io.errors import InputError
 from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.faults import build_faults
 from table_io.sim.ground_truth import GroundTruth, parse_ground_truth
-from table_io.sim.ground_truth_applied import SensorDistortion, build_hidden_plant
+from table_io.sim.ground_truth_applied import SensorDistortion, hide_laws
 from table_io.sim.hydraulic_table import make_coefficients
 from table_io.sim.imperfections import Imperfection
 from table_io.sim.laboratory import Laboratory
-from table_io.sim.plant import SIGNALS, Plant
+from table_io.sim.plant import RECORDED_SIGNALS, SIGNALS, HiddenCoefficients, Plant
 
 MIN_REPLACE_AHEAD_S = 0.02
 
@@ -35,7 +34,10 @@ MIN_REPLACE_AHEAD_S = 0.02
 def build_plant(table: SimulatedTableConfig, specimen: Specimen, rate_hz: float) -> Plant:
     """Build the nominal plant of a simulated table and a specimen."""
     right, left = specimen.gaps_m
-    plant = Plant(
+    oil = None
+    if table.hydraulic is not None:
+        oil = make_coefficients(table.hydraulic, table.moving_mass_kg)
+    return Plant(
         mass_kg=specimen.mass_kg,
         damper_stiffness_n_m=table.damper_stiffness_n_m,
         damper_damping_n_s_m=table.damper_damping_n_s_m,
@@ -48,11 +50,9 @@ def build_plant(table: SimulatedTableConfig, specimen: Specimen, rate_hz: float)
         servo_delay_s=table.servo_delay_ms * 1e-3,
         payload_reaction=table.payload_reaction,
         rate_hz=rate_hz,
+        hidden=None if oil is None else HiddenCoefficients(),
+        oil=oil,
     )
-    if table.hydraulic is None:
-        return plant
-    oil = make_coefficients(table.hydraulic, table.moving_mass_kg)
-    return replace(build_hidden_plant(plant, GroundTruth()), oil=oil)
 
 
 def load_ground_truth(table: SimulatedTableConfig) -> GroundTruth | None:
@@ -127,7 +127,7 @@ class SimulatedBackend:
         self._distortion: SensorDistortion | None = None
         self._imperfections: tuple[Imperfection, ...] = ()
         if truth := load_ground_truth(table):
-            self._plant = build_hidden_plant(self._plant, truth)
+            self._plant = hide_laws(self._plant, truth)
             self._distortion = SensorDistortion(truth, rig.channels, self._plant.rate_hz)
             self._imperfections = truth.imperfections
         self._plant_with_share = lru_cache(2)(self._plant.with_servo_share)
@@ -146,13 +146,14 @@ class SimulatedBackend:
         self._next = 0
         self._epoch: float | None = None
         self._is_open = False
-        # Called with the true values of samples taken: (first sample, command in m, SIGNALS in SI).
+        # Called with the true values of samples taken: (first sample, command in m,
+        # RECORDED_SIGNALS in SI).
         self.observer: Callable[[int, Float1D, Float2D], None] | None = None
 
     def open(self) -> None:
         """Check the rate and compile the plant, so that the first read is not late."""
         self._rig.check_rate(self.rate_hz)
-        no_samples = np.empty((len(self._plant.signals), 0))
+        no_samples = np.empty((len(SIGNALS), 0))
         self._plant.advance(
             self._plant.rest_state(), np.zeros(self._plant.history_samples), no_samples
         )
@@ -208,7 +209,7 @@ class SimulatedBackend:
             self._faults.history_samples :
         ]
         command = self._faults.apply_to_servo(first - self._plant.history_samples, drive)
-        signals = np.empty((len(self._plant.signals), samples))
+        signals = np.empty((len(SIGNALS), samples))
         done = 0
         for count, share in self._faults.bandwidth_shares(first, samples):
             end = done + count
@@ -218,7 +219,7 @@ class SimulatedBackend:
         self._next += samples
         played_m = drive[self._plant.history_samples :]
         if self.observer is not None:
-            self.observer(first, played_m, signals[: len(SIGNALS)])
+            self.observer(first, played_m, signals[: len(RECORDED_SIGNALS)])
         values = self._laboratory.measure(self._true_values(played_m, signals), signals)
         if self._distortion is not None:
             values = self._distortion.apply(values)
@@ -274,8 +275,7 @@ class SimulatedBackend:
 
         A declared channel is the sum of those above that the rig file states for it.
         """
-        y, y_acc, x, x_acc, right, left, *hidden = signals
-        balance = -self._plant.mass_kg * x_acc - right - left
+        y, y_acc, x, x_acc, _, _, damper = signals
         true = {
             "drive_disp_m": drive,
             "table_disp_m": y,
@@ -283,7 +283,7 @@ class SimulatedBackend:
             "mass_disp_m": x,
             "mass_acc_m_s2": x_acc,
             **self._laboratory.cell_forces(signals),
-            "damper_force_n": hidden[0] if hidden else balance,
+            "damper_force_n": damper,
             "rel_disp_m": x - y,
             CONSTANT: np.ones(drive.size),
         }

@@ -10,7 +10,7 @@ from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.sim.config import SimulatedTableConfig
-from table_io.sim.hidden_plant import HiddenPlant
+from table_io.sim.plant import SIGNALS, Plant
 from table_io.sim.simulated_table import build_plant
 
 RATE_HZ = 1000.0
@@ -19,16 +19,16 @@ TABLE = RIG.require_section("simulated", SimulatedTableConfig)
 SPECIMEN_KG = 550.0
 
 
-def build_rig(friction_n: float = 500.0, gap_mm: float = math.inf) -> HiddenPlant:
+def build_rig(friction_n: float = 500.0, gap_mm: float = math.inf) -> Plant:
     """Return the shipped table with this friction, and a specimen on it."""
     plant = build_plant(TABLE, Specimen(mass_kg=SPECIMEN_KG, gap_mm=gap_mm), RATE_HZ)
-    assert isinstance(plant, HiddenPlant)
+    assert isinstance(plant, Plant)
     return replace(plant, oil=plant.oil._replace(fc=friction_n, fs=1.3 * friction_n))
 
 
-def play(plant: HiddenPlant, command: Float1D) -> Float2D:
+def play(plant: Plant, command: Float1D) -> Float2D:
     """Return the true signals, (7, sample), for a command in m."""
-    out = np.empty((len(plant.signals), command.size))
+    out = np.empty((len(SIGNALS), command.size))
     before = np.zeros(plant.history_samples)
     plant.advance(plant.rest_state(), np.concatenate([before, command]), out)
     return out

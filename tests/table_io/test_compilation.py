@@ -191,7 +191,7 @@ def list_kernels() -> list[Any]:
     """Return the kernels of this package that are kept on disk, in the order of their modules."""
     from table_io import sensor_errors
     from table_io.safety.protection import sample_checks
-    from table_io.sim import hidden_plant, plant
+    from table_io.sim import plant
     from twin.drive import spectra, table_model
     from twin.dynamics import event_driven_kernel, stroboscopic_kernel
     from twin.model import (
@@ -205,7 +205,7 @@ def list_kernels() -> list[Any]:
     return [
         kernel
         for module in (
-            sensor_errors, sample_checks, hidden_plant, plant, spectra, table_model,
+            sensor_errors, sample_checks, plant, spectra, table_model,
             event_driven_kernel, stroboscopic_kernel, closed_form_kernel, event_integrator_kernel,
             inverse_dynamics, periodic_orbit, stepped_sine_kernel,
         )

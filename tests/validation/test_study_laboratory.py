@@ -16,7 +16,7 @@ from table_io.errors import InputError
 from table_io.records import RunStart, RunStop
 from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.ground_truth import GroundTruth, HiddenEffect
-from table_io.sim.ground_truth_applied import build_hidden_plant
+from table_io.sim.ground_truth_applied import hide_laws
 from table_io.sim.imperfections import IMPERFECTION_IDS, Imperfection
 from table_io.sim.simulated_table import build_plant
 from tests.validation.test_study_scores import OTHER, TRUE, about, verdict
@@ -175,8 +175,8 @@ def test_errors_of_the_set_up_are_those_of_the_plant() -> None:
     rig = from_texts("x", PROFILE_TOML, make_rig_toml(0.0), MODEL_TOML, "x").rig
     table = rig.require_section("simulated", SimulatedTableConfig)
     nominal = build_plant(table, PROFILE.specimen, 1000.0)
-    by_laboratory = build_hidden_plant(nominal, GroundTruth(imperfections=entries))
-    by_effects = build_hidden_plant(nominal, GroundTruth(effects=effects))
+    by_laboratory = hide_laws(nominal, GroundTruth(imperfections=entries))
+    by_effects = hide_laws(nominal, GroundTruth(effects=effects))
     assert by_effects.mass_kg == pytest.approx(by_laboratory.mass_kg)
     assert by_effects.hidden.tilt == pytest.approx(by_laboratory.hidden.tilt)
     mean = 0.5 * (3e-4 - 1e-4)  # is no asymmetry: a gap is fitted

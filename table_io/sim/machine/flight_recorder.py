@@ -25,10 +25,10 @@ from table_io.backends.machine.protocol import (
 )
 from table_io.block import Float1D, Float2D
 from table_io.errors import InputError
-from table_io.sim.plant import SIGNALS
+from table_io.sim.plant import RECORDED_SIGNALS
 
 # Of each sample, SI: the command as the converter played it, and the plant.
-RECORDED_FIELDS = ("command_m", *SIGNALS)
+RECORDED_FIELDS = ("command_m", *RECORDED_SIGNALS)
 
 
 class FlightRecorder:
@@ -65,7 +65,7 @@ class FlightRecorder:
         self._write(values_message(MessageKind.QUEUE, volts, index))
 
     def record_samples(self, index: int, command_m: Float1D, signals: Float2D) -> None:
-        """Record played samples: command in m, (sample,), and SIGNALS, (6, sample)."""
+        """Record played samples: command in m, (sample,), and RECORDED_SIGNALS, (6, sample)."""
         self._write(values_message(MessageKind.PLAYED, np.vstack([command_m, signals]).T, index))
 
     def note(self, index: int, text: str) -> None:

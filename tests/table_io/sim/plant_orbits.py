@@ -62,7 +62,7 @@ def _play(plant: Plant, unknowns: np.ndarray, phase: float, samples: int = SAMPL
     own = replace(plant, rate_hz=SAMPLES_PER_PERIOD * frequency_hz, servo_delay_s=0.0)
     index = np.arange(-own.history_samples, samples)
     state = np.array([x, v, y, w, 0.0, 0.0, 0.0, 0.0])
-    out = np.empty((6, samples))
+    out = np.empty((7, samples))
     own.advance(state, amplitude * np.sin(math.tau * (phase + index / SAMPLES_PER_PERIOD)), out)
     return state, out
 

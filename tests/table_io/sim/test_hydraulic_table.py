@@ -13,8 +13,8 @@ from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.sim.config import SimulatedTableConfig
-from table_io.sim.hidden_plant import HiddenPlant
 from table_io.sim.hydraulic_table import BRISTLE, SPOOL, HydraulicCoefficients, P
+from table_io.sim.plant import SIGNALS, Plant
 from table_io.sim.simulated_table import build_plant
 
 RATE_HZ = 1000.0
@@ -24,16 +24,16 @@ FREE = Specimen(mass_kg=550.0, gap_mm=math.inf)
 MASS_KG = CONFIG.moving_mass_kg
 
 
-def build_table(**changes: float) -> HiddenPlant:
+def build_table(**changes: float) -> Plant:
     """Return the shipped table without payload reaction, some coefficients replaced."""
     plant = build_plant(CONFIG, FREE, RATE_HZ)
-    assert isinstance(plant, HiddenPlant)
+    assert isinstance(plant, Plant)
     return replace(plant, payload_reaction=False, oil=plant.oil._replace(**changes))
 
 
-def play(plant: HiddenPlant, command: Float1D, state: Float1D | None = None) -> Float2D:
+def play(plant: Plant, command: Float1D, state: Float1D | None = None) -> Float2D:
     """Return the signals, (7, sample), for a command in m that stood at 0 before."""
-    out = np.empty((len(plant.signals), command.size))
+    out = np.empty((len(SIGNALS), command.size))
     state = plant.rest_state() if state is None else state
     plant.advance(state, np.concatenate([np.zeros(plant.history_samples), command]), out)
     return out
@@ -197,7 +197,7 @@ def test_no_cut_into_blocks_changes_a_bit() -> None:
     padded = np.concatenate([np.zeros(plant.history_samples), command])
     state, done = plant.rest_state(), 0
     for count in (1, 7, 64, 228):
-        out = np.empty((len(plant.signals), count))
+        out = np.empty((len(SIGNALS), count))
         plant.advance(state, padded[done : done + plant.history_samples + count], out)
         np.testing.assert_array_equal(out, whole[:, done : done + count])
         done += count

@@ -16,7 +16,7 @@ from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.sim.ground_truth import GroundTruth
-from table_io.sim.ground_truth_applied import build_hidden_plant
+from table_io.sim.ground_truth_applied import hide_laws
 from table_io.sim.imperfections import (
     IMPERFECTION_DEFINITIONS,
     IMPERFECTION_IDS,
@@ -585,7 +585,7 @@ def test_mass_and_gaps_were_misread() -> None:
     side = "right"
     parameters = { offset = -3e-4 }
     """
-    true = build_hidden_plant(plant, parse_toml(text, GroundTruth, "x"))
+    true = hide_laws(plant, parse_toml(text, GroundTruth, "x"))
     assert true.mass_kg == pytest.approx(561.0)
     assert (true.gap_right_m, true.gap_left_m) == pytest.approx((1.7e-3, 1.2e-3))
     assert true.rate_hz == RATE_HZ

@@ -20,7 +20,7 @@ Y, Y_ACC, X, X_ACC, F_R, F_L = range(6)
 def run(plant: Plant, command: Float1D, state: Float1D | None = None) -> Float2D:
     """SIGNALS, (6, sample), for a command in m that stood at 0 before."""
     state = plant.rest_state() if state is None else state
-    out = np.empty((6, command.size))
+    out = np.empty((7, command.size))
     plant.advance(state, np.concatenate([np.zeros(plant.history_samples), command]), out)
     return out
 
@@ -47,7 +47,7 @@ def phasor(signal: Float1D, f: float, rate_hz: float) -> complex:
 
 def one_at_a_time(plant: Plant, state: Float1D, samples: int) -> tuple[Float2D, Float2D]:
     """(signals (6, sample), states (8, sample)) with the table commanded to stay at 0."""
-    signals, states = np.empty((6, samples)), np.empty((8, samples))
+    signals, states = np.empty((7, samples)), np.empty((8, samples))
     for i in range(samples):
         plant.advance(state, np.zeros(plant.history_samples + 1), signals[:, i : i + 1])
         states[:, i] = state
@@ -186,7 +186,9 @@ def test_static_equilibrium_of_pressed_bumpers_holds(gaps: tuple[float, float]) 
     expected = [KJ * max(u - gaps[0], 0.0), -KJ * max(-u - gaps[1], 0.0)]
     out = run(plant, np.zeros(500), state)
     assert K * u + sum(expected) == pytest.approx(0.0, abs=1e-9)
-    np.testing.assert_allclose(out[F_R:], np.array(expected)[:, None] * np.ones(500), atol=1e-6)
+    np.testing.assert_allclose(
+        out[F_R : F_R + 2], np.array(expected)[:, None] * np.ones(500), atol=1e-6
+    )
     assert np.abs(out[X] - out[X, 0]).max() < 1e-11
 
 
@@ -259,7 +261,7 @@ def test_the_cut_into_calls_changes_no_bit() -> None:
         state, parts = plant.rest_state(), np.empty_like(whole)
         for first in range(0, command.size, samples):
             last = min(first + samples, command.size)
-            part = np.empty((6, last - first))
+            part = np.empty((7, last - first))
             plant.advance(state, padded[first : last + plant.history_samples], part)
             parts[:, first:last] = part
         assert parts.tobytes() == whole.tobytes(), samples
@@ -274,4 +276,4 @@ def test_a_bumper_too_fast_to_follow_is_refused_with_a_limit() -> None:
 
 def test_a_command_that_does_not_span_the_output_is_refused() -> None:
     with pytest.raises(ValueError, match="does not span"):
-        RIG.advance(RIG.rest_state(), np.zeros(3), np.empty((6, 10)))
+        RIG.advance(RIG.rest_state(), np.zeros(3), np.empty((7, 10)))

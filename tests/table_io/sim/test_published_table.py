@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from table_io.sim.hidden_plant import HiddenPlant
+from table_io.sim.plant import Plant
 from tests.drive.hydraulic_rig import build_rig, play
 
 A1B0, A2, A3, B1, B2 = 2.13e13, 4.23e6, 3.3, 425.0, 1e5
@@ -27,7 +27,7 @@ RATE_HZ = 8000.0
 OUTPUT_DELAY_S = 0.5 / RATE_HZ  # least delay of the simulated output stage
 
 
-def build_published_table() -> HiddenPlant:
+def build_published_table() -> Plant:
     """Return the simulated table as the published one: linear, on a frame that does not move."""
     area_m2, supply_pa, open_flow = 1e-3, 1e15, 1.0
     plant = build_rig()
